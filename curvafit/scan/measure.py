@@ -7,6 +7,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from dataclasses import field as default
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -22,7 +23,7 @@ from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.scan.grids import median_thickness, remove_specks
 from curvafit.scan.prepare import LARGEST_WINDOW, Prepared, prepare, smallest_piece
-from curvafit.scan.structure import check_options, find_structure, is_rounded
+from curvafit.scan.structure import check_options, find_structure, is_rounded, read_labels, region_of_interest
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.read import Source, field_of
 
@@ -36,6 +37,8 @@ Row = TypeVar("Row", bound=Any)
 SMALLEST_CUBE = 24
 #: The fewest blocks, and the most along an axis; the length of a block in periods of the structure.
 LEAST, MOST, PERIODS = 8, 6, 1.0
+#: The most labels of a region of interest.
+MOST_COMPARTMENTS = 100
 #: How sure intervals are.
 SURE = 0.95
 
@@ -109,6 +112,10 @@ class Measures:
         Areas over (κ1, κ2), in the scan's unit.
     blocks
         Blocks along (z, y, x) over which the intervals are estimated.
+    part
+        What of the scan this is, by a label: `("compartment", 2)`; None of all of it.
+    compartments
+        The measures within each label of the region, by label.
     """
 
     source: str
@@ -119,6 +126,8 @@ class Measures:
     diagram: Diagram
     blocks: tuple[int, int, int]
     notes: tuple[str, ...]
+    part: tuple[str, int] | None = None
+    compartments: Mapping[int, Measures] = default(default_factory=dict)
 
     def __repr__(self) -> str:
         some = ", ".join(f"{each.symbol} {each.value:.4g}" for each in self.quantities[:4])
@@ -148,7 +157,8 @@ class Measures:
             spread=old.spread / factor,
             places=None if old.places is None else old.places * factor,
         )
-        return replace(self, unit=unit, quantities=tuple(quantities), diagram=diagram)
+        parts = {label: each.convert(unit) for label, each in self.compartments.items()}
+        return replace(self, unit=unit, quantities=tuple(quantities), diagram=diagram, compartments=parts)
 
 
 def find_quantity(rows: Sequence[Row], name: str) -> Row:
@@ -166,6 +176,7 @@ def measure(
     periodic: bool = False,
     threshold: Literal["otsu"] | float = "otsu",
     dark: bool = False,
+    roi: Source | None = None,
     progress: Progress = silent,
     **reading: Any,
 ) -> Measures:
@@ -174,8 +185,8 @@ def measure(
     Volume fraction, thickness, spacing, connectivity, surface and fabric are those of the structure on the scan's own
     voxels, all of them. Curvature is that of the scan on the working grid, as `infer` reads it. Intervals are 95 %, by
     a jackknife over blocks of a period (thickness and spacing) of the structure (`errors`); a scan with fewer than
-    eight has none. Raises ValueError if the scan has no structure, or none that the voxels resolve; or as
-    `curvafit.load`, and FileNotFoundError if there is no such file.
+    eight has none. Raises ValueError if the scan has no structure, or none that the voxels resolve, or a region does
+    not fit it; or as `curvafit.load`, and FileNotFoundError if there is no such file.
 
     Parameters
     ----------
@@ -183,72 +194,133 @@ def measure(
         The path of a file, a `Field`, or an array or tensor (Z, Y, X).
     kind, periodic, threshold, dark
         As in `infer`.
+    roi
+        A region of the scan, nonzero where it counts; each of its labels is a compartment of its own. Structure,
+        thickness, surface and curvature are those of the whole scan, and what lies inside is summed.
     reading
         Options of reading a file, or the place of an array: see `curvafit.load`.
     """
     check_options(kind, threshold, reading.get("label"))
     field = field_of(scan, **reading)
     options = {"threshold": threshold, "dark": dark, "periodic": periodic}
-    totals = sum_over_blocks(field, kind, options, progress=progress)
-    blocks, table, notes = totals.blocks, totals.table, totals.notes
-    values, names = combine(table.sum(0)), [name for name, *_ in QUANTITIES]
-    whole = [names.index("Euler number"), names.index("connectivity density")]
-    values[whole] = measure_connectivity(totals.mask, field.spacing, periodic=periodic)
-    halves = errors(table, blocks, combine) if blocks.count >= LEAST else np.full(len(values), np.nan)
-    if blocks.count < LEAST:
-        notes = (*notes, f"No intervals: they need {LEAST} blocks of a period, and the scan has {blocks.count}.")
+    labels = None if roi is None else _read_compartments(roi, field, reading.get("crop"))
+    maps = measure_maps(field, kind, options, progress)
+    blocks = maps.divide()
+    if labels is None:
+        return _summarise(field, maps, blocks)
+    parts = {
+        label: _summarise(field, maps, replace(blocks, region=labels == label), ("compartment", label))
+        for label in np.unique(labels[labels != 0]).tolist()
+    }
+    return replace(_summarise(field, maps, replace(blocks, region=labels != 0)), compartments=parts)
+
+
+def _read_compartments(roi: Source, field: Field, crop: Any) -> np.ndarray:
+    """Return the labels of a region, of the scan's shape, or raise ScanError."""
+    region = field_of(roi)
+    region = region if crop is None else region.crop(crop)
+    region_of_interest(region, field)
+    labels = read_labels(region, "a region of interest with labels")
+    if (count := len(np.unique(labels))) > MOST_COMPARTMENTS:
+        raise ScanError(f"expected at most {MOST_COMPARTMENTS} labels in a region of interest, got {count}")
+    return labels
+
+
+def _summarise(field: Field, maps: Maps, blocks: Blocks, part: tuple[str, int] | None = None) -> Measures:
+    """Return the measures of what lies in blocks, and of the whole scan with its own χ."""
+    table, notes, drawn = maps.sum(blocks), maps.notes, maps.diagram
+    total, volumes = table.sum(0), table[:, SUMS.index("volume")]
+    values, names = combine(total), [name for name, *_ in QUANTITIES]
+    if blocks.region is None:
+        whole = [names.index("Euler number"), names.index("connectivity density")]
+        values[whole] = measure_connectivity(maps.mask, field.spacing, periodic=maps.periodic)
+        count, weights = blocks.count, None
+    else:
+        count, weights = round(volumes.sum() ** 2 / np.square(volumes).sum()), volumes / volumes.mean()
+        inside = blocks.region[blocks.locate(maps.curved[0])]
+        drawn = replace(
+            drawn, points=drawn.points[inside], weights=drawn.weights[inside], places=np.asarray(drawn.places)[inside]
+        )
+    halves = errors(table, blocks, combine, weights) if count >= LEAST else np.full(len(values), np.nan)
+    if count < LEAST:
+        where = "scan" if blocks.region is None else " ".join(map(str, part or ("region",)))
+        notes = (*notes, f"No intervals: they need {LEAST} blocks of a period, and the {where} has {count}.")
     rows = zip(QUANTITIES, values, halves, strict=True)
-    _, axes = np.linalg.eigh(_tensor(dict(zip(SUMS, table.sum(0), strict=True))))
     return Measures(
         source=field.source,
         unit=field.unit,
-        kind=totals.kind,
+        kind=maps.kind,
         quantities=tuple(Quantity(name, symbol, float(v), float(h), power) for (name, symbol, power, _), v, h in rows),
-        direction=tuple(map(float, axes[:, 0] * np.sign(axes[np.abs(axes[:, 0]).argmax(), 0]))),  # type: ignore[arg-type]
-        diagram=totals.diagram,
+        direction=_direction(dict(zip(SUMS, total, strict=True))),
+        diagram=drawn,
         blocks=blocks.counts,
         notes=notes,
+        part=part,
     )
 
 
-class Totals(NamedTuple):
-    """What a scan sums up to over `blocks`: `table` (N, C) has a row for each block, a column for each of `SUMS`.
+class Maps(NamedTuple):
+    """What is measured at each voxel and triangle of a scan, from which `combine` makes its numbers once it is summed.
 
-    `mask` is the structure on the scan's voxels, and `diagram` has the whole scan's areas in its unit.
+    `mask` is the structure on the scan's voxels; `thickness`, `gap` and `euler` (shares of χ) are on them too.
+    `surface` and `curved` are places (M, 3) in voxels from the first centre, and columns (M, C) of area and of
+    curvatures times area, as in `SUMS`. `diagram` has the whole scan's areas in its unit, at the places of `curved`.
     """
 
-    blocks: Blocks
-    table: np.ndarray
+    spacing: tuple[float, float, float]
+    periodic: bool
     mask: np.ndarray
+    thickness: np.ndarray
+    gap: np.ndarray
+    euler: np.ndarray
+    surface: tuple[np.ndarray, np.ndarray]
+    curved: tuple[np.ndarray, np.ndarray]
     diagram: Diagram
     kind: str
     notes: tuple[str, ...]
 
+    def divide(self) -> Blocks:
+        """Divide the scan into blocks of a period."""
+        period = sum(float(each[each > 0].mean(dtype=np.float64)) for each in (self.thickness, self.gap))
+        return Blocks.divide(self.mask.shape, self.spacing, period)
 
-def sum_over_blocks(
-    field: Field, kind: str, options: dict[str, Any], blocks: Blocks | None = None, progress: Progress = silent
-) -> Totals:
-    """Return the sums from which `combine` makes a scan's numbers, over blocks, by default of a period.
+    def sum(self, blocks: Blocks) -> np.ndarray:
+        """Return sums (N, C): a row for each block, a column for each of `SUMS`."""
+        volumes = (
+            blocks.sums(np.ones(self.mask.shape, dtype=bool)),
+            blocks.sums(self.mask),
+            blocks.sums(self.thickness),
+            blocks.sums(np.square(self.thickness)),
+            blocks.sums(self.gap),
+        )
+        voxel, euler = math.prod(self.spacing), blocks.sums(self.euler)
+        surfaces = (blocks.gather(*each) for each in (self.surface, self.curved))
+        return np.column_stack([*(voxel * each for each in volumes), euler, *surfaces])
 
-    `options` are the threshold, dark and periodic of `measure`, whose errors are these too.
-    """
+
+def measure_maps(field: Field, kind: str, options: dict[str, Any], progress: Progress = silent) -> Maps:
+    """Measure what is summed of a scan; `options` are the threshold, dark and periodic of `measure`, as are errors."""
+    periodic: bool = options["periodic"]
     progress("finding the structure", 0.0)
     mask, seen, notes = _find_structure(field, kind, options)
     progress("measuring thickness", 0.1)
-    maps = [local_thickness(each, field.spacing, periodic=options["periodic"]) for each in (mask, ~mask)]
-    if blocks is None:
-        period = sum(float(each[each > 0].mean(dtype=np.float64)) for each in maps)
-        blocks = Blocks.divide(field.shape, field.spacing, period)
+    thickness, gap = (local_thickness(each, field.spacing, periodic=periodic) for each in (mask, ~mask))
     progress("measuring curvature", 0.6)
     prepared = prepare(field, kind=seen, **options)  # type: ignore[arg-type]
-    curved, diagram = _sum_curvatures(blocks, prepared)
-    sums = {
-        **_sum_voxels(blocks, mask, maps, field.spacing),
-        **_sum_surface(blocks, mask, field.spacing, options["periodic"]),
-        **curved,
-    }
-    notes = (*notes, *(f"Of curvature: {note}" for note in prepared.notes if note not in notes))
-    return Totals(blocks, np.stack([sums[name] for name in SUMS], axis=1), mask, diagram, prepared.kind, notes)
+    curved, diagram = _find_curvatures(prepared)
+    return Maps(
+        spacing=field.spacing,
+        periodic=periodic,
+        mask=mask,
+        thickness=thickness,
+        gap=gap,
+        euler=euler_shares(mask, periodic=periodic),
+        surface=_find_surface(mask, field.spacing, periodic),
+        curved=curved,
+        diagram=diagram,
+        kind=prepared.kind,
+        notes=(*notes, *(f"Of curvature: {note}" for note in prepared.notes if note not in notes)),
+    )
 
 
 def _find_structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[np.ndarray, str, tuple[str, ...]]:
@@ -267,35 +339,19 @@ def _find_structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[n
     return mask, seen, notes
 
 
-def _sum_voxels(
-    blocks: Blocks, mask: np.ndarray, maps: list[np.ndarray], spacing: tuple[float, float, float]
-) -> dict[str, np.ndarray]:
-    """Return each block's sums over voxels: volume, structure, thickness and gaps."""
-    voxel, (thickness, gap) = math.prod(spacing), maps
-    return {
-        "volume": voxel * blocks.sums(np.ones(mask.shape, dtype=bool)),
-        "inside": voxel * blocks.sums(mask),
-        "thickness": voxel * blocks.sums(thickness),
-        "thickness²": voxel * blocks.sums(np.square(thickness)),
-        "gap": voxel * blocks.sums(gap),
-    }
-
-
-def _sum_surface(
-    blocks: Blocks, mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool
-) -> dict[str, np.ndarray]:
-    """Return the sums of χ, of area, and of n⊗n dA in the upper triangle's order (z, y, x)."""
+def _find_surface(
+    mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the triangles' places in voxels, their areas, and n⊗n dA in the upper triangle's order (z, y, x)."""
     mesh = smooth_surface(mask, spacing, periodic=periodic)
     normals = area_vectors(mesh)[:, ::-1]
     area = np.linalg.norm(normals, axis=1)
     parts = normals[:, _UPPER[0]] * normals[:, _UPPER[1]] / np.where(area > 0, area, 1)[:, None]
-    sums = blocks.gather(mesh.barycentres / np.array(spacing), np.column_stack([area, parts]))
-    names = ("area", *(f"n{k}" for k in range(6)))
-    return {"χ": blocks.sums(euler_shares(mask, periodic=periodic)), **dict(zip(names, sums.T, strict=True))}
+    return mesh.barycentres / np.array(spacing), np.column_stack([area, parts])
 
 
-def _sum_curvatures(blocks: Blocks, prepared: Prepared) -> tuple[dict[str, np.ndarray], Diagram]:
-    """Return the sums of curvatures times area, and the diagram, in the scan's unit."""
+def _find_curvatures(prepared: Prepared) -> tuple[tuple[np.ndarray, np.ndarray], Diagram]:
+    """Return places in the scan's voxels, curvatures times area, and the diagram, in the scan's unit."""
     working = scan_diagram(prepared)
     length = prepared.working_voxel / WORKING_SPACING
     physical = replace(
@@ -310,8 +366,7 @@ def _sum_curvatures(blocks: Blocks, prepared: Prepared) -> tuple[dict[str, np.nd
     H = (κ1 + κ2) / 2
     kinds = np.eye(len(FAMILIES))[families(working.points, prepared.thickness / 2 * WORKING_SPACING)]
     columns = np.column_stack([np.ones_like(H), H, H**2, κ1 * κ2, κ1, κ2, np.hypot(κ1, κ2) / math.sqrt(2), kinds])
-    sums = blocks.gather(voxels, columns * physical.weights[:, None])
-    return dict(zip(("curved", "H", "H²", "K", "κ1", "κ2", "C", *FAMILIES), sums.T, strict=True)), physical
+    return (voxels, columns * physical.weights[:, None]), physical
 
 
 def combine(sums: np.ndarray) -> np.ndarray:
@@ -339,6 +394,15 @@ def _anisotropy(sums: Sums) -> np.ndarray:
     known = np.asarray(np.isfinite(tensor).all(axis=(-1, -2)))[..., None]
     spectrum = np.where(known, np.linalg.eigvalsh(np.where(known[..., None], tensor, 0)), np.nan)
     return 1 - spectrum[..., 0] / spectrum[..., 2]
+
+
+def _direction(sums: Sums) -> tuple[float, float, float]:
+    """Return the unit vector (z, y, x) to which the surface is most nearly parallel; NaN without surface."""
+    if not sums["area"] > 0:
+        return math.nan, math.nan, math.nan
+    _, axes = np.linalg.eigh(_tensor(sums))
+    z, y, x = (axes[:, 0] * np.sign(axes[np.abs(axes[:, 0]).argmax(), 0])).tolist()
+    return z, y, x
 
 
 def scan_diagram(prepared: Prepared) -> Diagram:
@@ -416,10 +480,14 @@ def _largest_cube(region: np.ndarray) -> tuple[slice, slice, slice] | None:
 
 @dataclass(frozen=True)
 class Blocks:
-    """A division of a volume (Z, Y, X) into blocks: the first voxel of each along (z, y, x)."""
+    """A division of a volume (Z, Y, X) into blocks: the first voxel of each along (z, y, x).
+
+    Of a `region`, bool (Z, Y, X), what lies inside alone is summed.
+    """
 
     shape: tuple[int, int, int]
     starts: tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
+    region: np.ndarray | None = None
 
     @classmethod
     def divide(cls, shape: Sequence[int], spacing: Sequence[float], period: float) -> Blocks:
@@ -442,22 +510,31 @@ class Blocks:
     def sums(self, values: np.ndarray) -> np.ndarray:
         """Return the sum of a volume (Z, Y, X) over each block, float64 (N,)."""
         kind = np.float64 if values.dtype.kind == "f" else np.int64
+        values = values if self.region is None else values * self.region
         for axis, starts in enumerate(self.starts):
             values = np.add.reduceat(values, starts, axis=axis, dtype=kind)
         return values.ravel().astype(np.float64)
 
     def gather(self, places: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return sums over each block, (N, …), of weights (M, …) at places (M, 3) in voxels from the first centre."""
-        numbers = np.zeros(len(places), dtype=np.int64)
+        voxels, numbers = self.locate(places), np.zeros(len(places), dtype=np.int64)
         for axis, starts in enumerate(self.starts):
-            voxels = np.clip(np.rint(places[:, axis]), 0, self.shape[axis] - 1)
-            numbers = numbers * len(starts) + np.searchsorted(starts, voxels, side="right") - 1
-        columns = weights.reshape(len(weights), -1)
+            numbers = numbers * len(starts) + np.searchsorted(starts, voxels[axis], side="right") - 1
+        if self.region is not None:
+            inside = self.region[voxels]
+            numbers, weights = numbers[inside], weights[inside]
+        columns = weights.reshape(len(weights), math.prod(weights.shape[1:]))
         sums = [np.bincount(numbers, column, minlength=self.count) for column in columns.T]
         return np.stack(sums, axis=1).reshape(self.count, *weights.shape[1:])
 
+    def locate(self, places: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the indices (z, y, x) of the voxels nearest to places (M, 3) in voxels from the first centre."""
+        return tuple(np.clip(np.rint(places), 0, np.array(self.shape) - 1).astype(np.int64).T)
 
-def errors(sums: np.ndarray, blocks: Blocks, figures: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+
+def errors(
+    sums: np.ndarray, blocks: Blocks, figures: Callable[[np.ndarray], np.ndarray], weights: np.ndarray | None = None
+) -> np.ndarray:
     """Return half the width of the `SURE` interval of each figure, (K,), by a jackknife over neighbours that correlate.
 
     `figures` gives figures (…, K) from sums (…, C); `sums` has those of each block, (N, C). With ψ the change of a
@@ -465,12 +542,15 @@ def errors(sums: np.ndarray, blocks: Blocks, figures: Callable[[np.ndarray], np.
     two blocks are neighbours (Bartlett's kernel, as Newey & West 1987 for series). Were blocks independent, ψᵀ W ψ
     would be σ² tr(P W P) / n², P taking the mean off: that sets its scale, and with tr² / tr(·²) the degrees of freedom
     of Student's t. A bootstrap over single blocks would take neighbours for independent.
+
+    `weights`, of mean 1, are the parts of blocks that count, and a block's mean varies by one over its weight.
     """
-    form, kernel = _neighbour_forms(blocks.counts)
     count, total = len(sums), sums.sum(0)
-    change = (figures(total) - figures(total - sums)) * (count - 1) / count
+    weights = np.ones(count) if weights is None else weights
+    form, kernel = _neighbour_forms(blocks.counts, weights)
+    change = (figures(total) - figures(total - sums)) * (1 - weights / count)[:, None]
     variance = (change * (kernel @ change)).sum(0) * count / np.trace(form)
-    return interval_reach(blocks.counts) * np.sqrt(np.maximum(variance, 0))
+    return _reach(form) * np.sqrt(np.maximum(variance, 0))
 
 
 def interval_reach(counts: Sequence[int]) -> float:
@@ -480,14 +560,18 @@ def interval_reach(counts: Sequence[int]) -> float:
     """
     if math.prod(counts) == 1:
         return math.nan
-    form, _ = _neighbour_forms(counts)
+    form, _ = _neighbour_forms(counts, np.ones(math.prod(counts)))
+    return _reach(form)
+
+
+def _reach(form: np.ndarray) -> float:
     return float(stats.t.ppf((1 + SURE) / 2, np.trace(form) ** 2 / (form**2).sum()))
 
 
-def _neighbour_forms(counts: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return P W P and W of `errors`, each (N, N)."""
+def _neighbour_forms(counts: Sequence[int], weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return P W P and W of `errors`, each (N, N); with weights w, P is √w - w √wᵀ / n (rows by columns)."""
     kernel = np.ones((1, 1))
     for n in counts:
         kernel = np.kron(kernel, np.eye(n) + (np.eye(n, k=1) + np.eye(n, k=-1)) / 2)
-    centred = np.eye(len(kernel)) - 1 / len(kernel)
-    return centred @ kernel @ centred, kernel
+    centred = np.diag(np.sqrt(weights)) - np.outer(weights, np.sqrt(weights)) / len(kernel)
+    return centred.T @ kernel @ centred, kernel

@@ -47,6 +47,8 @@ _DEEP, _FEWEST, _UNEVEN = 3.5, 500, 4.0
 _NORMAL_MEDIAN = 0.6745
 #: Smoothed noise over contrast, and slices' thickness over the finest edge, from which on a scan is worse than a mask.
 NOISY, SLICED = 0.02, 1.5
+#: The least share of neighbours, where one has a label, that both have the same one.
+_ALIKE = 0.25
 #: A field of a few thousand values was rounded.
 _ROUNDED_VALUES = 4096
 
@@ -115,6 +117,20 @@ def region_of_interest(roi: Field | np.ndarray | str | os.PathLike[str] | None, 
     if not region.any():
         raise ScanError("expected a region of interest with voxels in it, got an empty one")
     return region
+
+
+def read_labels(labels: Field, what: str) -> np.ndarray:
+    """Return a volume's labels, whole numbers (Z, Y, X); ScanError if all are 0, or the values are grey levels."""
+    values = labels.values
+    if values.dtype.kind == "f":
+        values = values.astype(np.int64)
+    left, right = values[..., :-1], values[..., 1:]
+    pairs, alike = np.count_nonzero(left | right), np.count_nonzero((left == right) & (left != 0))
+    if not values.any():
+        raise ScanError(f"expected {what}, got none: every voxel is 0")
+    if alike < _ALIKE * pairs or (values != labels.values).any():
+        raise ScanError(f"expected {what}, whole numbers that neighbours share, got grey levels")
+    return values
 
 
 def is_noise(mask: np.ndarray) -> bool:

@@ -27,14 +27,15 @@ FORMAT = Format("curvafit measures 1", title="a table of measures")
 def rows_of(measures: Measures, **more: str | float) -> list[dict[str, Any]]:
     """Return a row for each quantity of a scan, as values by column; None where a number is not known.
 
-    `more` are further columns with the same value in each row.
+    A compartment has its label in the column `compartment`. `more` are further columns with the same value in each row.
     """
     release, z, y, x = version("curvafit"), *measures.direction
+    more = dict([measures.part] if measures.part else []) | more
     rows = []
     for each in measures.quantities:
         ends = (each.value, each.value - each.half, each.value + each.half)
         value, low, high = (end if math.isfinite(end) else None for end in ends)
-        axis = f"{z:.4f} {y:.4f} {x:.4f}" if each.symbol == "DA" else ""
+        axis = f"{z:.4f} {y:.4f} {x:.4f}" if each.symbol == "DA" and math.isfinite(z) else ""
         unit = plain_unit(measures.unit, each.power)
         cells = (measures.source, each.name, each.symbol, value, low, high, unit, axis, release)
         rows.append(dict(zip(COLUMNS, cells, strict=True)) | more)
@@ -52,11 +53,17 @@ def check_table(path: str | PathLike[str], inputs: Sequence[str | Path] = (), ov
 
 
 def write_table(measures: Sequence[Measures], path: str | PathLike[str], *, overwrite: bool = False) -> Path:
-    """Write a table of scans as `.csv`, `.json` or `.parquet`, and return its path; errors are `check_table`'s."""
+    """Write a table of scans as `.csv`, `.json` or `.parquet`, and return its path; errors are `check_table`'s.
+
+    A scan with compartments has the rows of each of them.
+    """
     target = check_table(path, overwrite=overwrite)
-    rows = [row for each in measures for row in rows_of(each)]
+    parts = [part for each in measures for part in (each.compartments.values() or (each,))]
+    rows = [row for part in parts for row in rows_of(part)]
+    columns = dict.fromkeys(name for row in rows for name in row)
+    rows = [{name: row.get(name) for name in columns} for row in rows]
     if target.suffix.lower() == ".parquet":
-        frame = _pandas().DataFrame(rows, columns=list(COLUMNS))
+        frame = _pandas().DataFrame(rows)
         return write_atomically(target, lambda temporary: frame.to_parquet(temporary, index=False))
     if target.suffix.lower() == ".json":
         scans = [

@@ -15,7 +15,7 @@ from curvafit.core.extras import require
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import format_length, format_percent
-from curvafit.scan.measure import QUANTITIES, Blocks, combine, sum_over_blocks
+from curvafit.scan.measure import QUANTITIES, Blocks, combine, measure_maps
 from curvafit.scan.structure import check_options
 from curvafit.studies.tables import plain_unit
 from curvafit.volumes.field import Field
@@ -154,8 +154,8 @@ def windows(
     sizes, strides = _check_grid(field.shape, size, stride)
     starts = tuple(tuple(range(0, n, step)) for n, step in zip(field.shape, strides, strict=True))
     options = {"threshold": threshold, "dark": dark, "periodic": periodic}
-    totals = sum_over_blocks(field, kind, options, Blocks(field.shape, starts), progress)  # type: ignore[arg-type]
-    values = _sum_windows(totals.table.reshape(*totals.blocks.counts, -1), field, sizes, strides)
+    maps, blocks = measure_maps(field, kind, options, progress), Blocks(field.shape, starts)  # type: ignore[arg-type]
+    values = _sum_windows(maps.sum(blocks).reshape(*blocks.counts, -1), field, sizes, strides)
     labels, explained = _cluster(values, clusters, seed)
     corner = field.move_origin([(n - 1) / 2 for n in sizes]).affine
     assert corner is not None
@@ -164,17 +164,17 @@ def windows(
     rest = [n % step for n, step in zip(field.shape, strides, strict=True)]
     left = f"The last {', '.join(map(str, rest))} voxels along z, y, x are in no window."
     return Windows(
-        kind=totals.kind,
+        kind=maps.kind,
         size=sizes,
         stride=strides,
         values=values,
         clusters=grid,
         explained=explained,
-        sections=tuple(totals.mask.take(n // 2, axis) for axis, n in enumerate(field.shape)),
+        sections=tuple(maps.mask.take(n // 2, axis) for axis, n in enumerate(field.shape)),
         options={"size": sizes, "stride": strides, "clusters": clusters, "seed": seed, "kind": kind}
         | options
         | reading,
-        notes=(*totals.notes, *([left] if any(rest) else [])),
+        notes=(*maps.notes, *([left] if any(rest) else [])),
     )
 
 

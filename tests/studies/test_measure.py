@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -13,7 +14,7 @@ from calling import call, refused
 
 from curvafit.geometry.morphometry import morphometry
 from curvafit.geometry.topology import euler_number, euler_shares
-from curvafit.scan.measure import LEAST, QUANTITIES, Blocks, Measures, errors, measure
+from curvafit.scan.measure import LEAST, QUANTITIES, Blocks, Measures, errors, measure, measure_maps
 from curvafit.studies import tables
 from curvafit.studies.tables import COLUMNS, rows_of, write_table
 from curvafit.volumes.field import Field
@@ -247,3 +248,78 @@ def test_bad_input_is_refused(cut: np.ndarray, tmp_path: Path) -> None:
         refused(call("measure", *arguments), words)
     assert foreign.read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.csv", "scan.npy"]
+
+
+# ---- compartments ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rods() -> tuple[np.ndarray, np.ndarray]:
+    """Rods of 8 voxels before rods of 12, along y and x, and 1 and 2 where each are."""
+    halves = [tubes(N, 24, radius).transpose(axes) for radius, axes in ((4.0, (1, 0, 2)), (6.0, (1, 2, 0)))]
+    return np.concatenate(halves), np.repeat(np.uint8([1, 2]), N)[:, None, None] * np.ones((1, N, N), np.uint8)
+
+
+def test_each_half_of_a_scan_has_its_own_numbers(rods: tuple[np.ndarray, np.ndarray]) -> None:
+    found = measure(rods[0], roi=rods[1], kind="mask")
+    assert list(found.compartments) == [1, 2]
+    for label, radius, axis in ((1, 4.0, 1), (2, 6.0, 2)):
+        part = found.compartments[label]
+        assert part["Tb.Th"].value == pytest.approx(2 * radius, rel=0.1)
+        assert part["BV/TV"].value == pytest.approx(rods[0][rods[1] == label].mean(), abs=1e-12)
+        assert part["κ1"].value == pytest.approx(1 / radius, rel=0.1)
+        assert abs(part.direction[axis]) == pytest.approx(1, abs=0.01)
+    areas = [each.diagram.area for each in (found, *found.compartments.values())]
+    assert areas[0] == pytest.approx(sum(areas[1:]), rel=1e-9)
+
+
+def test_compartments_add_up_to_the_whole(cut: np.ndarray) -> None:
+    maps = measure_maps(Field(cut), "mask", {"threshold": "otsu", "dark": False, "periodic": False})
+    blocks = maps.divide()
+    labels = np.random.default_rng(0).integers(0, 3, cut.shape)
+    parts = [maps.sum(dataclasses.replace(blocks, region=labels == k)) for k in range(3)]
+    assert np.sum(parts, axis=0) == pytest.approx(maps.sum(blocks), rel=1e-6, abs=1e-6)
+
+
+def test_a_region_of_everything_has_the_intervals_of_the_scan(cut: np.ndarray, measures: Measures) -> None:
+    """Blocks differ by a voxel along an axis, which their weights count and the scan's do not: by some percent."""
+    found = measure(Field(cut, (0.5, 0.5, 0.5), "um"), roi=np.ones(cut.shape, np.uint8)).compartments[1]
+    for symbol in ("BV/TV", "Tb.Th", "BS/BV", "H", "K"):
+        assert found[symbol].value == pytest.approx(measures[symbol].value, rel=1e-9)
+        assert found[symbol].half == pytest.approx(measures[symbol].half, rel=0.05)
+
+
+def test_intervals_of_blocks_of_unequal_weight_hold_as_often_as_they_say() -> None:
+    blocks, rng = Blocks((12, 12, 12), ((0, 3, 6, 9),) * 3), np.random.default_rng(1)  # type: ignore[arg-type]
+    weights = rng.permutation(np.repeat([0.0, 0.1, 1.0], [24, 20, 20]))
+    weights /= weights.mean()
+    held = 0
+    for _ in range(2000):
+        values = np.sqrt(weights) * rng.standard_normal(64)  # a sum over a part of a block
+        half = errors(np.stack([values, weights], axis=1), blocks, mean, weights)
+        held += abs(values.mean()) <= half[0]
+    assert held / 2000 == pytest.approx(0.95, abs=0.03)
+
+
+def test_a_compartment_without_structure_has_none(cut: np.ndarray) -> None:
+    labels = np.zeros(cut.shape, np.uint8)
+    labels[:2, :2, :2], labels[30:] = 7, 1
+    found = measure(np.where(labels == 7, 0, cut), roi=labels, kind="mask").compartments[7]
+    assert found["BV/TV"].value == 0
+    assert math.isnan(found["Tb.Th"].value)
+    assert rows_of(found)[1]["value"] is None
+
+
+def test_the_command_writes_a_row_set_for_each_compartment(rods: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    scan, region, table = (tmp_path / name for name in ("scan.npy", "region.npy", "table.csv"))
+    for path, values in ((scan, rods[0]), (region, rods[1])):
+        np.save(path, values)
+    result = call("measure", scan, "--roi", region, "--kind", "mask", "-o", table)
+    assert result.exit_code == 0, result.output
+    rows = list(csv.DictReader(table.read_text(encoding="utf-8").splitlines()))
+    assert tuple(rows[0]) == (*COLUMNS, "compartment")
+    assert [row["compartment"] for row in rows] == ["1"] * len(QUANTITIES) + ["2"] * len(QUANTITIES)
+    grey = np.random.default_rng(0).integers(0, 99, rods[1].shape)
+    for values, word in ((0 * rods[1], "vary"), (rods[1][1:], "shape"), (grey, "grey")):
+        np.save(region, values)
+        refused(call("measure", scan, "--roi", region), word)
