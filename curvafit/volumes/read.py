@@ -20,7 +20,7 @@ from curvafit.core.checks import quoted
 from curvafit.core.runtime import one_line
 from curvafit.core.units import parse_unit
 from curvafit.volumes.field import Field, positive_triple
-from curvafit.volumes.formats.arrays import read_hdf5, read_npy, read_npz, read_raw
+from curvafit.volumes.formats.arrays import read_hdf5, read_imaris, read_npy, read_npz, read_raw
 from curvafit.volumes.formats.base import Damaged, Raw, ScanError, check_regular, collect_complaints
 from curvafit.volumes.formats.medical import is_dicom, read_dicom, read_metaimage, read_mrc, read_nrrd
 from curvafit.volumes.formats.nifti import read_nifti
@@ -39,6 +39,7 @@ READERS: dict[str, Callable[..., Raw]] = {
     ".npy": read_npy,
     ".npz": read_npz,
     **dict.fromkeys((".h5", ".hdf5"), read_hdf5),
+    ".ims": read_imaris,
     **dict.fromkeys((".raw", ".bin", ".vol"), read_raw),
     ".zarr": read_zarr,
     ".nrrd": read_nrrd,
@@ -51,7 +52,7 @@ READERS: dict[str, Callable[..., Raw]] = {
 }
 
 #: Readers of formats that can hold several arrays, by key.
-KEYED = (read_npz, read_hdf5, read_zarr, read_dicom)
+KEYED = (read_npz, read_hdf5, read_imaris, read_zarr, read_dicom)
 
 
 def load(
@@ -76,8 +77,8 @@ def load(
     Parameters
     ----------
     path
-        NIfTI, TIFF, NPY, NPZ, HDF5, RAW, Zarr, Scanco's ISQ and AIM; with `curvafit[io]` also NRRD, MHA/MHD, MRC and
-        DICOM folders. `file.h5::key` names an array within a file; `key` does the same.
+        NIfTI, TIFF, NPY, NPZ, HDF5, Imaris, RAW, Zarr, Scanco's ISQ and AIM; with `curvafit[io]` also NRRD, MHA/MHD,
+        MRC and DICOM folders. `file.h5::key` names an array within a file; `key` does the same.
     spacing, unit
         Voxel edges (z, y, x), or one for all, and nm, um, mm or m, in place of what the file says. A `unit` alone
         renames the file's numbers; it does not convert them.
@@ -88,7 +89,7 @@ def load(
         The voxels that have this value, as a mask.
     crop
         A box of voxels, `"z0:z1,y0:y1,x0:x1"` or three slices; the affine says where the box lies. From Zarr, HDF5,
-        NPY, RAW, ISQ, AIM and uncompressed NIfTI only the box is read.
+        Imaris, NPY, RAW, ISQ, AIM and uncompressed NIfTI only the box is read.
     raw_shape, dtype
         Voxels (z, y, x) and numpy type of a RAW file, which does not state them.
     strict
@@ -188,7 +189,7 @@ def read_file(
         raise FileNotFoundError(one_line(f"no such file: {path}"))
     reader = pick_reader(check_regular(path), raw_shape is not None)
     if key is not None and reader not in KEYED:
-        raise ScanError(f"a key applies to NPZ, HDF5, Zarr and DICOM only, got {quoted(key)} for {path}")
+        raise ScanError(f"a key applies to NPZ, HDF5, Imaris, Zarr and DICOM only, got {quoted(key)} for {path}")
     try:
         with collect_complaints():
             return reader(path, key=key, raw_shape=raw_shape, dtype=dtype, part=part)

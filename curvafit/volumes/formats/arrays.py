@@ -1,4 +1,4 @@
-"""NPY, NPZ, HDF5 and RAW files."""
+"""NPY, NPZ, HDF5, Imaris and RAW files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,16 @@ import numpy as np
 
 from curvafit.core.checks import quoted
 from curvafit.core.records import read_member
-from curvafit.volumes.formats.base import Damaged, Raw, ScanError, check_regular, map_numbers, pick_key, read_spacing
+from curvafit.volumes.formats.base import (
+    Damaged,
+    Raw,
+    ScanError,
+    check_array,
+    check_regular,
+    map_numbers,
+    pick_key,
+    read_spacing,
+)
 from curvafit.volumes.formats.part import Part, read_part
 
 #: Attributes that may state a spacing or its unit.
@@ -46,17 +55,59 @@ def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, *
     import h5py
 
     with h5py.File(path, "r") as file:
-        keys: list[str] = []
-        file.visititems(lambda name, item: keys.append(name) if isinstance(item, h5py.Dataset) else None)
-        dataset: Any = file[pick_key(keys, key, path)]
-        if dataset.external:
-            raise ScanError(f"the values of {path} lie in other files, which are not read")
-        if dataset.shape is None:
-            raise ScanError(f"a volume must be 3D, got no values in {path}")
+        dataset: Any = file[pick_key(_list_datasets(file), key, path)]
+        _check_dataset(dataset, path)
         attributes = {name: dataset.attrs[name] for name in _ATTRIBUTES if name in dataset.attrs}
         spacing, unit = read_spacing(attributes, dataset.ndim)
         gaps = tuple(_gaps(dataset, path))
         return read_part(dataset, part, path)._replace(spacing=spacing, unit=unit, gaps=gaps)
+
+
+def read_imaris(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
+    """Read a channel of an Imaris file at full resolution, without the voxels that fill up its last chunks.
+
+    The key names one channel of several, as in `TimePoint 0/Channel 1`.
+    """
+    import h5py
+
+    level = "DataSet/ResolutionLevel 0/"
+    with h5py.File(path, "r") as file:
+        names = [name for name in _list_datasets(file) if name.startswith(level) and name.endswith("/Data")]
+        keys = [name.removeprefix(level).removesuffix("/Data") for name in names]
+        channel: Any = file[level + pick_key(keys, key, path)]
+        dataset, image = channel["Data"], file["DataSetInfo/Image"]
+        _check_dataset(dataset, path)
+        shape = [int(_read_text(channel, f"ImageSize{axis}")) for axis in "ZYX"]
+        ends = [[float(_read_text(image, f"Ext{end}{k}")) for k in (2, 1, 0)] for end in ("Min", "Max")]
+        if len(dataset.shape) != 3 or not all(0 < n <= stored for n, stored in zip(shape, dataset.shape, strict=True)):
+            raise Damaged(f"{shape} voxels by its header, {list(dataset.shape)} in the file")
+        index = (part or Part()).index(shape, None, path)[0]
+        check_array([edge.stop - edge.start for edge in index], dataset.dtype, path)
+        spacing = tuple((last - first) / n for first, last, n in zip(*ends, shape, strict=True))
+        unit = _read_text(image, "Unit") if "Unit" in image.attrs else "um"
+        return Raw(dataset[index], spacing, unit, gaps=tuple(_gaps(dataset, path)), whole=tuple(shape))
+
+
+def _list_datasets(file: Any) -> list[str]:
+    """Return the names of a file's datasets; links to other files are not followed."""
+    import h5py
+
+    names: list[str] = []
+    file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+    return names
+
+
+def _check_dataset(dataset: Any, path: Path) -> None:
+    """Raise ScanError where the values of a dataset are not in its file."""
+    if dataset.external:
+        raise ScanError(f"the values of {path} lie in other files, which are not read")
+    if dataset.shape is None:
+        raise ScanError(f"a volume must be 3D, got no values in {path}")
+
+
+def _read_text(item: Any, name: str) -> str:
+    """Return an attribute that Imaris writes as an array of single characters."""
+    return np.asarray(item.attrs[name]).astype("S").tobytes().decode("latin-1").strip("\0 ")
 
 
 def _gaps(dataset: Any, path: Path) -> Iterator[str]:
