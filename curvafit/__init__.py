@@ -11,7 +11,8 @@ curvatures at constant volume.
 - Compare: `compare(group_a, group_b)` tells whether two groups of scans differ, and in what.
 - Map: `windows(scan)` measures a scan in windows: where its texture differs, in maps and clusters.
 - Follow: `trajectory(scans, times)` tells what a series of scans of one thing does over time.
-- Measure: `measure(scan)`, `diagram(u, grid, epsilon)` and `wasserstein(a, b)`; more in `curvafit.geometry`.
+- Measure: `measure(scan)`, `measure_instances(labels)`, `diagram(u, grid, epsilon)` and `wasserstein(a, b)`; more in
+  `curvafit.geometry`.
 
 A law is `Coefficients`, the name of a preset (`preset`), or the path of a `fit.json`. The public names are loaded when
 they are first used: importing the package imports nothing.
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from curvafit.priors.coefficients import Coefficients as Coefficients
     from curvafit.priors.grid import Grid as Grid
     from curvafit.priors.law import preset as preset
+    from curvafit.scan.instances import measure_instances as measure_instances
     from curvafit.scan.measure import Measures as Measures
     from curvafit.scan.measure import measure as measure
     from curvafit.segmentation.reconstruct import reconstruct as reconstruct

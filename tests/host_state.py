@@ -212,6 +212,7 @@ class Calls:
             "refine": lambda: curvafit.refine(0.1 + 0.8 * self.ball, "tubes", weight=1.0, steps=2),
             "infer": self._infer,
             "measure": lambda: curvafit.measure(self.ball.astype(np.uint8)),
+            "measure_instances": lambda: curvafit.measure_instances(self.ball.astype(np.uint8)),
             "windows": lambda: curvafit.windows((np.indices((24, 24, 36))[2] % 12 < 6).astype(np.uint8), 24, 12),
             "compare": lambda: curvafit.compare(*[[np.roll(self.ball, k, 0).astype(np.uint8) for k in (0, 1)]] * 2),
             "trajectory": lambda: curvafit.trajectory([self.ball.astype(np.uint8)] * 2),

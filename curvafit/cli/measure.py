@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from curvafit.cli.console import print_table, say, say_notes, show_stages
-from curvafit.cli.options import FILES, OverwriteOption, Reading, Structure, command
+from curvafit.cli.options import FILES, OverwriteOption, Reading, Structure, command, parse_structure
 
 if TYPE_CHECKING:
     from curvafit.scan.measure import Measures
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     "curvafit measure bone.tif --spacing 0.0195 --unit mm",
     "curvafit measure mouse1.nii.gz mouse2.nii.gz mouse3.nii.gz -o measures.csv",
     "curvafit measure femur.nii.gz --roi cortex_and_marrow.nii.gz -o compartments.csv",
+    "curvafit measure mitochondria_labels.tif --labels --spacing 5 --unit nm -o mitochondria.csv",
     "curvafit measure cells.ome.zarr --channel 1 --dark --threshold 90 -o measures.parquet",
 )
 def measure(
@@ -27,38 +30,67 @@ def measure(
     roi: Annotated[
         Path | None, typer.Option(help="Region to measure, of the scan's shape; each label by itself.")
     ] = None,
+    labels: Annotated[bool, typer.Option("--labels", help="Scans are label images: measure each instance.")] = False,
     *,
     structure: Structure,
     reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure scans in seconds: morphometry, fabric and curvature in physical units, with 95 % intervals."""
+    if labels and (roi is not None or structure != parse_structure()):
+        raise ValueError("--labels states the structure: leave out --roi, --kind, --periodic, --threshold and --dark")
     with show_stages() as progress:
+        from curvafit.scan.instances import measure_instances
         from curvafit.scan.measure import measure as measure_scan
         from curvafit.studies.tables import check_table, write_table
 
         if out is not None:
             check_table(out, scans if roi is None else [*scans, roi], overwrite)
-        found: list[Measures] = []
+        found: list[tuple[Measures, ...]] = []
 
         def watch(text: str, share: float) -> None:
             progress(f"{scans[len(found)]}: {text}", (len(found) + share) / len(scans))
 
         for scan in scans:
-            found.append(measure_scan(scan, roi=roi, progress=watch, **structure, **reading))
+            if labels:
+                found.append(measure_instances(scan, progress=watch, **reading))
+            else:
+                found.append((measure_scan(scan, roi=roi, progress=watch, **structure, **reading),))
     for measures in found:
         if len(scans) > 1:
-            say(measures.source, style="bold")
-        parts = list(measures.compartments.values()) or [measures]
-        say_notes(dict.fromkeys(note for part in parts for note in part.notes))
-        for part in parts:
-            _print_measures(part)
+            say(measures[0].source, style="bold")
+        if labels:
+            _print_instances(measures)
+        else:
+            _print_scan(measures[0])
     if out is not None:
-        say(str(write_table(found, out, overwrite=overwrite)))
+        say(str(write_table([each for measures in found for each in measures], out, overwrite=overwrite)))
+
+
+def _print_instances(instances: Sequence[Measures]) -> None:
+    """Print the least, the median and the greatest of each number of instances."""
+    from curvafit.core.units import format_number, power_name
+
+    rows = []
+    for same in zip(*(each.quantities for each in instances), strict=True):
+        values = sorted(each.value for each in same if math.isfinite(each.value)) or [math.nan]
+        shown = (format_number(each, 4) for each in (values[0], median(values), values[-1]))
+        rows.append((same[0].name, same[0].symbol, *shown, power_name(instances[0].unit, same[0].power)))
+    print_table(("", "", "least", "median", "greatest", "unit"), rows, right=(2, 3, 4))
+    cut = sum(each["S.cut"].value > 0 for each in instances)
+    thin = sum(math.isnan(each["H"].value) for each in instances)
+    say(f"{len(instances)} instances; {cut} are cut by the border, {thin} too thin for curvature.")
+
+
+def _print_scan(measures: Measures) -> None:
+    """Print the notes and the numbers of a scan or of its compartments."""
+    parts = list(measures.compartments.values()) or [measures]
+    say_notes(dict.fromkeys(note for part in parts for note in part.notes))
+    for part in parts:
+        _print_measures(part)
 
 
 def _print_measures(measures: Measures) -> None:
-    """Print the numbers of a scan or a part of it."""
     if measures.part is not None:
         say(" ".join(map(str, measures.part)), style="bold")
     rows = [(each.name, each.symbol, *each.format(measures.unit)) for each in measures.quantities]

@@ -96,8 +96,8 @@ def per_unit(unit: str, power: int) -> str:
 
 
 def power_name(unit: str, power: int) -> str:
-    """Return a unit to a power as written in text: µm, 1/µm³, or nothing for a plain number."""
-    return "" if power == 0 else unit_name(unit) if power > 0 else per_unit(unit, -power)
+    """Return a unit to a power as written in text: µm, µm³, 1/µm³, or nothing for a plain number."""
+    return "" if power == 0 else per_unit(unit, abs(power))[2 if power > 0 else 0 :]
 
 
 def unit_name(unit: str, count: float = 1) -> str:

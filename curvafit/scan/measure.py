@@ -113,7 +113,7 @@ class Measures:
     blocks
         Blocks along (z, y, x) over which the intervals are estimated.
     part
-        What of the scan this is, by a label: `("compartment", 2)`; None of all of it.
+        What of the scan this is, by a label: `("compartment", 2)` or `("instance", 7)`; None of all of it.
     compartments
         The measures within each label of the region, by label.
     """
@@ -251,7 +251,7 @@ def _summarise(field: Field, maps: Maps, blocks: Blocks, part: tuple[str, int] |
         unit=field.unit,
         kind=maps.kind,
         quantities=tuple(Quantity(name, symbol, float(v), float(h), power) for (name, symbol, power, _), v, h in rows),
-        direction=_direction(dict(zip(SUMS, total, strict=True))),
+        direction=find_direction(dict(zip(SUMS, total, strict=True))),
         diagram=drawn,
         blocks=blocks.counts,
         notes=notes,
@@ -307,7 +307,7 @@ def measure_maps(field: Field, kind: str, options: dict[str, Any], progress: Pro
     thickness, gap = (local_thickness(each, field.spacing, periodic=periodic) for each in (mask, ~mask))
     progress("measuring curvature", 0.6)
     prepared = prepare(field, kind=seen, **options)  # type: ignore[arg-type]
-    curved, diagram = _find_curvatures(prepared)
+    curved, diagram = measure_curvatures(prepared)
     return Maps(
         spacing=field.spacing,
         periodic=periodic,
@@ -315,7 +315,7 @@ def measure_maps(field: Field, kind: str, options: dict[str, Any], progress: Pro
         thickness=thickness,
         gap=gap,
         euler=euler_shares(mask, periodic=periodic),
-        surface=_find_surface(mask, field.spacing, periodic),
+        surface=measure_surface(mask, field.spacing, periodic),
         curved=curved,
         diagram=diagram,
         kind=prepared.kind,
@@ -339,7 +339,7 @@ def _find_structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[n
     return mask, seen, notes
 
 
-def _find_surface(
+def measure_surface(
     mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the triangles' places in voxels, their areas, and n⊗n dA in the upper triangle's order (z, y, x)."""
@@ -350,8 +350,8 @@ def _find_surface(
     return mesh.barycentres / np.array(spacing), np.column_stack([area, parts])
 
 
-def _find_curvatures(prepared: Prepared) -> tuple[tuple[np.ndarray, np.ndarray], Diagram]:
-    """Return places in the scan's voxels, curvatures times area, and the diagram, in the scan's unit."""
+def measure_curvatures(prepared: Prepared) -> tuple[tuple[np.ndarray, np.ndarray], Diagram]:
+    """Return triangles' places in the scan's voxels, curvatures times area, and the diagram, in the scan's unit."""
     working = scan_diagram(prepared)
     length = prepared.working_voxel / WORKING_SPACING
     physical = replace(
@@ -396,7 +396,7 @@ def _anisotropy(sums: Sums) -> np.ndarray:
     return 1 - spectrum[..., 0] / spectrum[..., 2]
 
 
-def _direction(sums: Sums) -> tuple[float, float, float]:
+def find_direction(sums: Sums) -> tuple[float, float, float]:
     """Return the unit vector (z, y, x) to which the surface is most nearly parallel; NaN without surface."""
     if not sums["area"] > 0:
         return math.nan, math.nan, math.nan

@@ -27,7 +27,8 @@ FORMAT = Format("curvafit measures 1", title="a table of measures")
 def rows_of(measures: Measures, **more: str | float) -> list[dict[str, Any]]:
     """Return a row for each quantity of a scan, as values by column; None where a number is not known.
 
-    A compartment has its label in the column `compartment`. `more` are further columns with the same value in each row.
+    A compartment or an instance has its label in a column of that name.
+    `more` are further columns with the same value in each row.
     """
     release, z, y, x = version("curvafit"), *measures.direction
     more = dict([measures.part] if measures.part else []) | more
@@ -67,7 +68,9 @@ def write_table(measures: Sequence[Measures], path: str | PathLike[str], *, over
         return write_atomically(target, lambda temporary: frame.to_parquet(temporary, index=False))
     if target.suffix.lower() == ".json":
         scans = [
-            {"scan": each.source, "kind": each.kind, "blocks": each.blocks, "notes": each.notes} for each in measures
+            {"scan": each.source, "kind": each.kind, "blocks": each.blocks, "notes": each.notes}
+            | dict([each.part] if each.part else [])
+            for each in measures
         ]
         return FORMAT.write(target, {"scans": scans, "rows": rows})
     return write_content(target, format_csv(rows))
