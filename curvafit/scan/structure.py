@@ -47,7 +47,7 @@ _DEEP, _FEWEST, _UNEVEN = 3.5, 500, 4.0
 _NORMAL_MEDIAN = 0.6745
 #: Smoothed noise over contrast, and slices' thickness over the finest edge, from which on a scan is worse than a mask.
 NOISY, SLICED = 0.02, 1.5
-#: The least share of neighbours, where one has a label, that both have the same one.
+#: The least share of neighbours with labels that have the same one.
 _ALIKE = 0.25
 #: A field of a few thousand values was rounded.
 _ROUNDED_VALUES = 4096
@@ -125,10 +125,11 @@ def read_labels(labels: Field, what: str) -> np.ndarray:
     if values.dtype.kind == "f":
         values = values.astype(np.int64)
     left, right = values[..., :-1], values[..., 1:]
-    pairs, alike = np.count_nonzero(left | right), np.count_nonzero((left == right) & (left != 0))
+    pairs = (left != 0) & (right != 0)
     if not values.any():
         raise ScanError(f"expected {what}, got none: every voxel is 0")
-    if alike < _ALIKE * pairs or (values != labels.values).any():
+    alike = np.count_nonzero(pairs & (left == right)) >= _ALIKE * np.count_nonzero(pairs)
+    if not alike or (values != labels.values).any():
         raise ScanError(f"expected {what}, whole numbers that neighbours share, got grey levels")
     return values
 
