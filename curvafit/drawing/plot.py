@@ -44,6 +44,8 @@ BINS, DECADES = 72, 3.0
 _DRAWN, _SQUARE = "#2B6FA8", 1.25
 #: Percent of the voxels that are drawn black, white; most voxels along an axis of which these are taken.
 TAILS, THIN = (0.5, 99.5), 256
+#: Symbols of the numbers that a figure of numbers shows first.
+FAMILIAR = ("BV/TV", "Tb.Th", "Tb.Sp", "Tb.N", "Conn.D", "DA")
 #: Most values of masks and labels, which are drawn from the least to the greatest.
 FEW = 3
 
@@ -273,11 +275,11 @@ def section_figure(
     for axis, name in enumerate("zyx"):
         rows_name, columns_name = (other for other in "zyx" if other != name)
         axes[0, axis].set_title(f"{name} = {places[axis]}  ({rows_name} down, {columns_name} across)", fontsize=8)
-    _scale_on(axes[-1, 0], spacing[2], unit)
+    scale_on(axes[-1, 0], spacing[2], unit)
     return figure
 
 
-def _scale_on(axes: Axes, edge: float, unit: str) -> None:
+def scale_on(axes: Axes, edge: float, unit: str) -> None:
     """Draw a bar of a round length below a slice whose voxels are `edge` wide."""
     width = abs(np.diff(axes.get_xlim()).item())
     power = 10.0 ** math.floor(math.log10(width * edge / 3))

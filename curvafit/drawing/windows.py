@@ -7,72 +7,119 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from curvafit.core.units import power_name
-from curvafit.drawing.plot import LABELS, TAILS, THIN, make_figure
+from curvafit.core.units import format_length, format_number, power_name, unit_name
+from curvafit.drawing.plot import FAMILIAR, INK, LABELS, make_figure, scale_on
 from curvafit.drawing.render import QUIET
 
-#: Panels in a row; grey of structure whose windows are not known.
-COLUMNS, UNKNOWN = 5, 0.88
+#: Grey of structure whose windows are not known.
+UNKNOWN = 0.88
 #: Colours of clusters from 0 on: the strong ones of labels first.
 COLOURS = np.vstack([LABELS[:1], LABELS[1::2], LABELS[2::2]])
 
 
 def windows_figure(windows: Any) -> Figure:
-    """Return a figure of the clusters on the middle slices across z, y and x, and of each number across z.
+    """Return a figure of the clusters on the middle slices, and of familiar numbers where they are least and greatest.
 
-    Each voxel of the structure has the colour of the nearest window, grey where this is not known.
+    Each voxel of the structure has the colour of the nearest window, grey where this is not known. A number's two
+    slices are across z, through the windows of its extremes, which are framed; its colours go from one to the other.
     """
-    quantities = windows.quantities
-    rows = -(-(3 + len(quantities)) // COLUMNS)
-    figure = make_figure(13.2, 3.1 * rows, layout="constrained")
-    panels = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
-    for axes in panels[3 + len(quantities) :]:
-        axes.set_axis_off()
-    for axis, axes in enumerate(panels[:3]):
-        plane = _colour_structure(windows, windows.clusters.values, axis)
+    figure = make_figure(13.2, 13.2, layout="constrained")
+    panels = figure.subplots(4, 4)
+    structure = windows.structure
+    for axis, axes in enumerate(panels[0, :3]):
+        place = structure.shape[axis] // 2
+        plane = _colour_structure(windows, windows.clusters.values, axis, place)
         shown = COLOURS[np.where(np.isfinite(plane), plane, 0).astype(int)]
         shown[~np.isfinite(plane) | (plane == 0)] = 0
-        _section_on(axes, windows, shown, axis)
-        axes.set_title(f"clusters, across {'zyx'[axis]}", fontsize=9.5)
-    for axes, (name, symbol, power), k in zip(panels[3:], quantities, range(len(quantities)), strict=False):
-        values = windows.values[..., k]
-        low, high = np.nanpercentile(values, TAILS) if np.isfinite(values).any() else (0, 1)
-        plane = _colour_structure(windows, values, 0)
-        picture = _section_on(axes, windows, plane, 0, vmin=low, vmax=max(high, low + 1e-12), cmap="viridis")
-        unit = power_name(windows.unit, power)
-        axes.set_title(f"{symbol if power or symbol != name else name}{f' ({unit})' if unit else ''}", fontsize=9.5)
-        bar = figure.colorbar(picture, ax=axes, orientation="horizontal", ticks=MaxNLocator(3), pad=0.02, shrink=0.9)
-        bar.ax.tick_params(labelsize=7.5, length=2)
+        _section_on(axes, windows, shown, axis, place)
+        axes.set_title(f"clusters, {_position(windows, axis, place)}", fontsize=9.5)
+    _legend_on(panels[0, 3], windows)
+    pairs = panels[1:].reshape(len(FAMILIAR), 2)
+    familiar = [each for each in windows.quantities if each[1] in FAMILIAR]
+    for pair, (name, symbol, power) in zip(pairs, familiar, strict=True):
+        values = windows[name].values
+        label = f"{symbol} ({power_name(windows.unit, power)})" if power else symbol
+        ends = windows.extremes(name)
+        for axes, word, window in zip(pair, ("least", "greatest"), ends, strict=False):
+            low, high = (values[end] for end in ends)
+            place = _fullest_slice(windows, window)
+            plane = _colour_structure(windows, values, 0, place)
+            picture = _section_on(axes, windows, plane, 0, place, vmin=low, vmax=max(high, low + 1e-12), cmap="viridis")
+            extreme = format_number(values[window] + 0.0)  # of -0 as well
+            axes.set_title(f"{word} {symbol}: {extreme}, {_position(windows, 0, place)}", fontsize=9.5)
+            axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
+            _frame_on(axes, windows, window)
+        if not ends:
+            pair[0].set_title(f"{label} is not known", fontsize=9.5)
+            continue
+        scale_on(pair[0], 1.0, windows.unit)
+        bar = figure.colorbar(picture, ax=list(pair), label=label, ticks=MaxNLocator(5), pad=0.02, shrink=0.85)
+        bar.ax.tick_params(labelsize=8, length=2)
         bar.outline.set_visible(False)  # type: ignore[operator]
     return figure
 
 
-def _section_on(axes: Axes, windows: Any, plane: np.ndarray, axis: int, **colours: Any) -> Any:
-    """Draw a slice over the structure in grey, and return its picture."""
-    edges = np.delete(np.array(windows.clusters.spacing) / windows.stride, axis)
-    mask = windows.sections[axis][_thin(windows.sections[axis])]
-    axes.imshow(np.where(mask, UNKNOWN, 1.0), cmap="gray", vmin=0, vmax=1, aspect=edges[0] / edges[1])
-    axes.set(xticks=[], yticks=[])
+def _position(windows: Any, axis: int, place: int) -> str:
+    """Return where a slice lies, in the scan's unit."""
+    where = place * windows.structure.spacing[axis]
+    return f"{'zyx'[axis]} = {format_number(where)} {unit_name(windows.unit, 2)}"
+
+
+def _legend_on(axes: Axes, windows: Any) -> None:
+    """Write which colour is which cluster, with its number of windows and its thickness."""
+    labels, thickness = windows.clusters.values, windows["thickness"].values
+    marks = [Patch(color=str(UNKNOWN), label=f"not known: {(labels == 0).sum()} of {labels.size}")] * bool(
+        (labels == 0).any()
+    )
+    for k in range(1, 1 + int(labels.max())):
+        mean = format_length(float(thickness[labels == k].mean()), windows.unit)
+        marks.append(Patch(color=COLOURS[k], label=f"{k}: {(labels == k).sum()} windows, {mean} thick"))
+    axes.set_axis_off()
+    axes.legend(handles=marks, title="cluster", loc="center left", frameon=False, fontsize=9.5, alignment="left")
+
+
+def _section_on(axes: Axes, windows: Any, plane: np.ndarray, axis: int, place: int, **colours: Any) -> Any:
+    """Draw a slice over the structure in grey, with positions in the scan's unit, and return its picture."""
+    mask, (down, across) = windows.structure.values.take(place, axis), np.delete(windows.structure.spacing, axis)
+    rows, columns = mask.shape
+    extent = (-across / 2, (columns - 0.5) * across, (rows - 0.5) * down, -down / 2)
+    axes.imshow(np.where(mask, UNKNOWN, 1.0), cmap="gray", vmin=0, vmax=1, extent=extent)
+    axes.locator_params(nbins=4)
+    axes.tick_params(length=2, labelsize=8)
     axes.spines[:].set_color(QUIET)
-    return axes.imshow(plane, aspect=edges[0] / edges[1], interpolation="nearest", **colours)
+    named = [f"{name} ({unit_name(windows.unit, 2)})" for k, name in enumerate("zyx") if k != axis]
+    axes.set_ylabel(named[0], fontsize=8)
+    axes.set_xlabel(named[1], fontsize=8)
+    return axes.imshow(plane, extent=extent, interpolation="nearest", **colours)
 
 
-def _colour_structure(windows: Any, values: np.ndarray, axis: int) -> np.ndarray:
-    """Return each voxel's value on the middle slice across an axis, the nearest window's; NaN off the structure."""
-    across_z, across_y, _ = windows.sections
-    shape = (*across_y.shape[:1], *across_z.shape)
-    nearest = [
-        np.clip((np.arange(n) - (edge - step) // 2) // step, 0, count - 1)
-        for n, edge, step, count in zip(shape, windows.size, windows.stride, values.shape, strict=True)
-    ]
+def _frame_on(axes: Axes, windows: Any, window: tuple[int, ...]) -> None:
+    """Draw the frame of a window on a slice across z."""
+    edges = (np.array(windows.size) * windows.clusters.spacing / windows.stride)[1:]
+    corner = windows.centres[window][1:] - edges / 2
+    axes.add_patch(Rectangle(corner[::-1], *edges[::-1], fill=False, edgecolor=INK, linestyle=(0, (4, 3))))
+
+
+def _nearest(windows: Any, axis: int) -> np.ndarray:
+    """Return for each plane of voxels across an axis the number of the nearest windows along it."""
+    count, step = windows.clusters.shape[axis], windows.clusters.spacing[axis]
+    places = np.arange(windows.structure.shape[axis]) * windows.structure.spacing[axis]
+    return np.clip(np.rint((places - windows.centres[0, 0, 0, axis]) / step).astype(int), 0, count - 1)
+
+
+def _fullest_slice(windows: Any, window: tuple[int, ...]) -> int:
+    """Return the number of the slice across z that has most structure in a window's colour."""
+    near = [_nearest(windows, axis) == k for axis, k in enumerate(window)]
+    inside = windows.structure.values[np.ix_(*near)].sum((1, 2))
+    return int(np.flatnonzero(near[0])[inside.argmax()])
+
+
+def _colour_structure(windows: Any, values: np.ndarray, axis: int, place: int) -> np.ndarray:
+    """Return each voxel's value on a slice across an axis, the nearest window's; NaN off the structure."""
+    nearest = [_nearest(windows, k) for k in range(3)]
     rows, columns = (places for k, places in enumerate(nearest) if k != axis)
-    plane = values.take(nearest[axis][shape[axis] // 2], axis)[np.ix_(rows, columns)]
-    mask = windows.sections[axis]
-    return np.where(mask, plane, np.nan)[_thin(mask)]
-
-
-def _thin(mask: np.ndarray) -> tuple[slice, ...]:
-    """Return the slices that leave at most `THIN` pixels along each axis."""
-    return tuple(slice(None, None, -(-n // THIN)) for n in mask.shape)
+    plane = values.take(nearest[axis][place], axis)[np.ix_(rows, columns)]
+    return np.where(windows.structure.values.take(place, axis), plane, np.nan)

@@ -72,7 +72,9 @@ def write_windows(windows: Windows, directory: str | Path, *, command: str = "",
             **record,
             version=record["curvafit"],
             title="A scan in windows",
-            picture=Picture(b64encode(picture).decode("ascii"), "The structure, coloured by clusters and numbers"),
+            picture=Picture(
+                b64encode(picture).decode("ascii"), "The structure, coloured by clusters and by six numbers"
+            ),
             clusters=range(1, 1 + int(windows.clusters.values.max())),
             rows=[_format_row(windows, k) for k in range(len(NAMES))],
         )

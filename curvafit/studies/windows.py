@@ -14,7 +14,7 @@ from curvafit.core.checks import as_tuple, check_int, check_seed
 from curvafit.core.extras import require
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, silent
-from curvafit.core.units import format_length, format_percent
+from curvafit.core.units import format_length, format_number, format_percent, unit_name
 from curvafit.scan.measure import QUANTITIES, Blocks, combine, measure_maps
 from curvafit.scan.structure import check_options
 from curvafit.studies.tables import plain_unit
@@ -22,8 +22,8 @@ from curvafit.volumes.field import Field
 from curvafit.volumes.read import Source, field_of
 
 NAMES, SYMBOLS = (tuple(str(each[k]) for each in QUANTITIES) for k in (0, 1))
-#: The most clusters, and the most blocks of a stride.
-MOST_CLUSTERS, MOST_BLOCKS = 20, 10**6
+#: The most clusters, the most blocks of a stride, and the most voxels along an axis that are kept for pictures.
+MOST_CLUSTERS, MOST_BLOCKS, MOST_SHOWN = 20, 10**6, 256
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -44,8 +44,8 @@ class Windows(Pictured):
         0 where a number is not known.
     explained
         The part of the variance of standardised numbers that is between clusters.
-    sections
-        The structure on the middle slices across z, y and x.
+    structure
+        The structure, for pictures: every n-th voxel, so that at most `MOST_SHOWN` remain along each axis.
     """
 
     kind: str
@@ -54,7 +54,7 @@ class Windows(Pictured):
     values: np.ndarray
     clusters: Field
     explained: float
-    sections: tuple[np.ndarray, ...]
+    structure: Field
     options: dict[str, Any]
     notes: tuple[str, ...]
 
@@ -92,16 +92,31 @@ class Windows(Pictured):
 
     @property
     def status(self) -> str:
-        """Return the answer in a sentence or two: how many windows, and in which clusters."""
+        """Return the answer in some sentences: how many windows, in which clusters, and where the extremes are."""
         labels, thickness = self.clusters.values, self.values[..., NAMES.index("thickness")]
         edges = " x ".join(map(str, self.size))
         each = (
             f"{k} ({(labels == k).sum()} windows, {format_length(thickness[labels == k].mean(), self.unit)} thick)"
             for k in range(1, labels.max() + 1)
         )
+        ends = (
+            f"{name} window at {', '.join(map(format_number, self.centres[place]))}: "
+            f"{format_length(thickness[place], self.unit, 3)}"
+            for name, place in zip(("thinnest", "thickest"), self.extremes("thickness"), strict=True)
+        )
         return (
             f"{labels.size} windows of {edges} voxels, {(~self.known).sum()} of them without enough structure. "
-            f"Clusters: {', '.join(each)}; {format_percent(self.explained)} of the variance is between them."
+            f"Clusters: {', '.join(each)}; {format_percent(self.explained)} of the variance is between them. "
+            f"By z, y, x in {unit_name(self.unit, 2)}: {'; '.join(ends)}."
+        )
+
+    def extremes(self, name: str) -> tuple[tuple[int, ...], ...]:
+        """Return the indices of the windows of the least and the greatest of a number, by name; of none if unknown."""
+        values = self[name].values
+        if not np.isfinite(values).any():
+            return ()
+        return tuple(
+            tuple(map(int, np.unravel_index(end(values), values.shape))) for end in (np.nanargmin, np.nanargmax)
         )
 
     def to_anndata(self) -> Any:
@@ -162,6 +177,8 @@ def windows(
     spacing = tuple(h * step for h, step in zip(field.spacing, strides, strict=True))
     grid = replace(field, values=labels, spacing=spacing, affine=corner @ np.diag([*strides[::-1], 1]))
     rest = [n % step for n, step in zip(field.shape, strides, strict=True)]
+    thin = tuple(-(-n // MOST_SHOWN) for n in field.shape)
+    shown = np.ascontiguousarray(maps.mask[tuple(slice(None, None, step) for step in thin)])
     left = f"The last {', '.join(map(str, rest))} voxels along z, y, x are in no window."
     return Windows(
         kind=maps.kind,
@@ -170,7 +187,7 @@ def windows(
         values=values,
         clusters=grid,
         explained=explained,
-        sections=tuple(maps.mask.take(n // 2, axis) for axis, n in enumerate(field.shape)),
+        structure=Field(shown, tuple(h * n for h, n in zip(field.spacing, thin, strict=True)), field.unit),
         options={"size": sizes, "stride": strides, "clusters": clusters, "seed": seed, "kind": kind}
         | options
         | reading,

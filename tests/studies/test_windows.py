@@ -45,6 +45,7 @@ def test_a_volume_of_two_halves_gives_its_map_back(mapped: Windows) -> None:
     assert (mapped.clusters.values[0] == 1).all()
     assert (mapped.clusters.values[2] == 2).all()  # the windows between straddle
     assert mapped.explained > 0.5
+    assert [place[0] for place in mapped.extremes("thickness")] == [0, 2]
     assert mapped["share of tubes"].values[0].min() > 0.9
 
 
