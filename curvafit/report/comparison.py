@@ -21,6 +21,7 @@ from curvafit.geometry.distances import DIRECTIONS, QUANTILES
 from curvafit.report.page import check_result_folder, picture_of, render_template, write_study
 from curvafit.scan.measure import Measures
 from curvafit.studies.compare import BINS, LEVEL, SMOOTH, Comparison, Number
+from curvafit.studies.scans import merge_notes
 from curvafit.studies.tables import format_csv, plain_unit, rows_of
 from curvafit.studies.trajectory import Change, Trajectory
 
@@ -92,10 +93,8 @@ def describe_methods(comparison: Comparison) -> str:
     return " ".join(
         [
             f"Scans of two groups, {' and '.join(_count_scans(c))}, were measured with curvafit {version('curvafit')}; "
-            f"{say_kinds(c.measures, c.options)}.",
-            "Thickness and spacing are mean diameters of the largest balls that fit (Hildebrand & Rüegsegger 1997); "
-            "connectivity is that of the Euler number.",
-            "The curvature diagram of a scan is the share of its surface's area over the principal curvatures κ₁ ≥ κ₂.",
+            f"{say_kinds(c.measures)}.",
+            *describe_measures(c.measures),
             "Scans of a subject were averaged; subjects are what all tests count.",
             "Diagrams were compared by the energy distance (Székely & Rizzo 2004) of the groups, over the sliced "
             f"Wasserstein distance of subjects' diagrams ({DIRECTIONS} directions, {QUANTILES} quantiles): "
@@ -112,10 +111,31 @@ def describe_methods(comparison: Comparison) -> str:
     )
 
 
-def say_kinds(measures: Sequence[Measures], options: dict[str, Any]) -> str:
-    """Return what scans were taken for, and the threshold of images."""
-    kinds = " and ".join(f"{n} were taken for {kind}s" for kind, n in Counter(each.kind for each in measures).items())
-    return kinds + (f" (threshold {options['threshold']})" if "image" in kinds and "threshold" in options else "")
+def say_kinds(measures: Sequence[Measures]) -> str:
+    """Return what scans were taken for."""
+    return " and ".join(f"{n} were taken for {kind}s" for kind, n in Counter(each.kind for each in measures).items())
+
+
+def describe_measures(measures: Sequence[Measures]) -> list[str]:
+    """Return sentences, for a paper, on what was done to scans, how their numbers are made, and what to cite."""
+    done = (
+        note if len(scans) == len(measures) else f"Of {len(scans)} of {len(measures)} scans: {note}"
+        for scans, note in merge_notes(measures)
+    )
+    return [
+        *done,
+        "Thickness (Tb.Th) and spacing (Tb.Sp) are mean diameters of the largest balls that fit (Hildebrand & "
+        "Rüegsegger 1997); the number per length (Tb.N) is (BV/TV) / Tb.Th; connectivity is that of the Euler number "
+        "(Odgaard & Gundersen 1993); the surface (BS) is that of marching cubes of the mask after a Gaussian of "
+        "0.7 voxels; anisotropy (DA) is 1 less the ratio of the smallest eigenvalue to the largest of the "
+        "mean of n⊗n over the surface's normals n.",
+        "Curvatures are those of the level set of a smooth profile of the mask; the curvature diagram of a scan is the "
+        "share of its surface's area over the principal curvatures κ₁ ≥ κ₂, and its families part "
+        "that area by the direction of (κ₁, κ₂), but for layers, where both are small.",
+        f"The program: the curvafit authors, curvafit, version {version('curvafit')} (software); with Song (2022), "
+        "Generation of Tubular and Membranous Shape Textures with Curvature Functionals, Journal of Mathematical "
+        "Imaging and Vision 64, 17, doi:10.1007/s10851-021-01049-9.",
+    ]
 
 
 def _count_scans(comparison: Comparison) -> list[str]:
@@ -175,7 +195,7 @@ def _record(comparison: Comparison, command: str) -> dict[str, Any]:
         **record_study(comparison, command, FILES),
         "groups": list(comparison.groups),
         "scans": [
-            {"scan": each.source, "subject": case.subject, "group": case.group, "kind": each.kind}
+            {"scan": each.source, "subject": case.subject, "group": case.group, "kind": each.kind, "notes": each.notes}
             for each, case in zip(comparison.measures, comparison.cases, strict=True)
         ],
         "energy": comparison.energy,

@@ -24,7 +24,7 @@ from curvafit.geometry.diagram import FAMILIES
 from curvafit.geometry.distances import DIRECTIONS, QUANTILES
 from curvafit.inference.atlas import load_atlas
 from curvafit.priors.grid import WORKING_SPACING
-from curvafit.report.comparison import known, name_quantity, record_study, say_kinds
+from curvafit.report.comparison import describe_measures, known, name_quantity, record_study, say_kinds
 from curvafit.report.page import check_result_folder, picture_of, render_template, write_study
 from curvafit.scan.prepare import WORKING_THICKNESS
 from curvafit.studies.compare import LEVEL
@@ -164,25 +164,24 @@ def describe_series(trajectory: Trajectory) -> str:
     changed = ", ".join(f"{each.symbol} ({say_change(each, t.unit)})" for each in t.changes if each.significant)
     lines = [
         f"{len(t.times)} scans of one object, from {' to '.join(t.ends)}, were measured with curvafit "
-        f"{version('curvafit')}; {say_kinds(t.measures, t.options)}.",
+        f"{version('curvafit')}; {say_kinds(t.measures)}.",
+        *describe_measures(t.measures),
         "Intervals of each scan's numbers are 95 %, by a jackknife over blocks; that of the change from the first scan "
         "to the last is the root of the sum of the squares of both.",
         f"Of {len(t.changes)} numbers, these intervals are without 0 of {changed or 'none'}.",
-        "The curvature diagram of a scan is the share of its surface's area over the principal curvatures κ₁ ≥ κ₂; the "
-        f"sliced Wasserstein distance ({DIRECTIONS} directions, {QUANTILES} quantiles) of the last from the first is "
-        f"{format_number(t.distances[-1], 3)} {unit}.",
+        f"The sliced Wasserstein distance ({DIRECTIONS} directions, {QUANTILES} quantiles) of the last diagram from "
+        f"the first is {format_number(t.distances[-1], 3)} {unit}.",
     ]
     if not math.isnan(t.p):
         tried = (
             f"all {t.permutations} orders" if t.exact else f"{t.permutations} orders (random, seed {t.options['seed']})"
         )
-        moving = ", ".join(
-            f"{each.symbol} (r = {format_number(each.correlation, 2)})" for each in t.changes if each.moves
-        )
+        moving = [f"{each.symbol} (r = {format_number(each.correlation, 2)})" for each in t.changes if each.moves]
+        found = f"These numbers move with time: {', '.join(moving)}" if moving else "No number moves with time"
         lines += [
             f"Each number's correlation with the scan's place in the series was tested over {tried} of the scans, and "
             "corrected for all numbers by the greatest correlation in each order (Westfall & Young 1993).",
-            f"At a family-wise level of {LEVEL:.2g} move {moving or 'none'}.",
+            t.limit or f"{found} (family-wise level {LEVEL:.2g}).",
             "Whether the distance of two diagrams goes with theirs in the series was tested over the same orders "
             f"(Mantel 1967): p = {format_number(t.p, 2)}.",
         ]
@@ -211,7 +210,13 @@ def _record(trajectory: Trajectory, command: str) -> dict[str, Any]:
         **record_study(trajectory, command, FILES),
         "unit_of_time": trajectory.unit_of_time,
         "scans": [
-            {"scan": each.source, "time": time, "kind": each.kind, "distance": float(distance)}
+            {
+                "scan": each.source,
+                "time": time,
+                "kind": each.kind,
+                "distance": float(distance),
+                "notes": each.notes,
+            }
             for each, time, distance in zip(trajectory.measures, trajectory.times, trajectory.distances, strict=True)
         ],
         "changes": changes,

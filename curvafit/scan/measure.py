@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage, stats
 
 from curvafit.core.runtime import Progress, silent
-from curvafit.core.units import convert_length, format_number, power_name
+from curvafit.core.units import convert_length, format_number, format_sampling, power_name
 from curvafit.geometry.descriptors import descriptors
 from curvafit.geometry.diagram import FAMILIES, MARGIN, Diagram, diagram, families
 from curvafit.geometry.mesh import NoSurface, area_vectors
@@ -244,7 +244,10 @@ def _summarise(field: Field, maps: Maps, blocks: Blocks, part: tuple[str, int] |
     halves = errors(table, blocks, combine, weights) if count >= LEAST else np.full(len(values), np.nan)
     if count < LEAST:
         where = "scan" if blocks.region is None else " ".join(map(str, part or ("region",)))
-        notes = (*notes, f"No intervals: they need {LEAST} blocks of a period, and the {where} has {count}.")
+        notes = (
+            *notes,
+            f"No intervals: they need {LEAST} blocks of a period (thickness and spacing), and the {where} has {count}.",
+        )
     rows = zip(QUANTITIES, values, halves, strict=True)
     return Measures(
         source=field.source,
@@ -303,6 +306,7 @@ def measure_maps(field: Field, kind: str, options: dict[str, Any], progress: Pro
     periodic: bool = options["periodic"]
     progress("finding the structure", 0.0)
     mask, seen, notes = _find_structure(field, kind, options)
+    sampling = format_sampling(field.shape, field.spacing, field.unit)
     progress("measuring thickness", 0.1)
     thickness, gap = (local_thickness(each, field.spacing, periodic=periodic) for each in (mask, ~mask))
     progress("measuring curvature", 0.6)
@@ -319,7 +323,7 @@ def measure_maps(field: Field, kind: str, options: dict[str, Any], progress: Pro
         curved=curved,
         diagram=diagram,
         kind=prepared.kind,
-        notes=(*notes, *(f"Of curvature: {note}" for note in prepared.notes if note not in notes)),
+        notes=(f"{sampling}.", *notes, *(f"Of curvature: {note}" for note in prepared.notes if note not in notes)),
     )
 
 

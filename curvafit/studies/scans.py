@@ -24,6 +24,7 @@ from curvafit.volumes.read import field_of
 FINE = 0.1
 #: Voxel edges of groups that differ by more than this part deserve a note.
 ALIKE_EDGES = 0.1
+_NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
 def measure_scans(
@@ -42,13 +43,27 @@ def measure_scans(
 
 
 def gather_notes(measures: Sequence[Measures], cases: Sequence[Case]) -> Iterator[str]:
-    """Yield the scans' notes; of those that differ in numbers only, the first."""
-    alike: dict[str, list[str]] = {}
-    for scan, case in zip(measures, cases, strict=True):
+    """Yield the scans' notes, with whose they are; those that differ in numbers only are one."""
+    for scans, note in merge_notes(measures):
+        first, more = cases[scans[0]].name, len(scans) - 1
+        who = f"{first} and {more} more" if more else first
+        yield f"{who if len(scans) < len(cases) else f'All {len(cases)} scans'}: {note}"
+
+
+def merge_notes(measures: Sequence[Measures]) -> Iterator[tuple[list[int], str]]:
+    """Yield the scans' notes, each after the numbers of the scans that have it: `([0, 1], "Split at 78–84.")`.
+
+    Notes that differ in numbers only are one, with the range of each number.
+    """
+    alike: dict[str, list[tuple[int, str]]] = {}
+    for k, scan in enumerate(measures):
         for note in scan.notes:
-            alike.setdefault(re.sub(r"[\d.e-]+", "", note), []).append(f"{case.name}: {note}")
-    for first, *more in alike.values():
-        yield first + (f" And so, but for numbers, of {len(more)} more." if more else "")
+            alike.setdefault(_NUMBER.sub("#", note), []).append((k, note))
+    for found in alike.values():
+        columns = zip(*(_NUMBER.findall(note) for _, note in found), strict=True)
+        ends = ((min(column, key=float), max(column, key=float)) for column in columns)
+        ranges = iter([low if float(low) == float(high) else f"{low}–{high}" for low, high in ends])
+        yield sorted({k for k, _ in found}), _NUMBER.sub(lambda _, ranges=ranges: next(ranges), found[0][1])
 
 
 def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progress) -> tuple[str, list[str]]:

@@ -19,12 +19,12 @@ from curvafit.scan.measure import Measures, find_quantity
 from curvafit.scan.structure import check_options
 from curvafit.studies.compare import LEVEL, PERMUTATIONS
 from curvafit.studies.groups import list_series
-from curvafit.studies.permutation import correct_by_most, correlate, reorder, share_beyond
+from curvafit.studies.permutation import TIE, correct_by_most, correlate, reorder, share_beyond
 from curvafit.studies.scans import gather_notes, measure_scans
 from curvafit.volumes.read import Source
 
-#: The fewest scans whose order is tested.
-FEWEST = 4
+#: The fewest scans whose order is tested, and the fewest whose p can be as small as `LEVEL`.
+FEWEST, ENOUGH = 4, 5
 #: Numbers that the status names.
 NAMED = 3
 
@@ -128,19 +128,31 @@ class Trajectory(Pictured):
         some = ", ".join(f"{each.name} {say_change(each, self.unit)}" for each in changed[:NAMED])
         told = f"{len(changed)} of {count} numbers change by more than their intervals"
         if all(math.isnan(each.half) for each in self.changes):
-            told = "the numbers have no intervals: the scans are too small"
+            told = "the numbers have no intervals: scans need eight blocks of a period (thickness and spacing)"
         lines = [
             f"From {' to '.join(self.ends)}, {told}" + (f", most clearly {some}." if changed else "."),
             f"The curvature diagram goes {format_number(self.distances[-1], 2)} {unit} from the first.",
         ]
         if math.isnan(self.p):
-            return " ".join([*lines, f"Whether anything moves with time needs {FEWEST} scans."])
+            return " ".join([*lines, f"Whether anything moves with time needs {ENOUGH} scans."])
+        p = format_number(self.p, 2)
+        if self.limit:
+            return " ".join([*lines, self.limit, f"The diagram has p = {p}."])
         word = "moves" if self.p <= LEVEL else "is not seen to move"
         moving = ", ".join(each.symbol for each in self.changes if each.moves) or "none"
-        lines.append(f"It {word} with time (p = {format_number(self.p, 2)}); numbers that do: {moving}.")
-        if (least := 2 / self.permutations) > LEVEL:
-            lines.append(f"So few scans cannot give a p below {format_number(least, 2)}.")
-        return " ".join(lines)
+        return " ".join([*lines, f"It {word} with time (p = {p}); numbers that do: {moving}."])
+
+    @property
+    def limit(self) -> str:
+        """Return why nothing can be said to move, as a sentence; empty where it can."""
+        least = 2 / self.permutations
+        if math.isnan(self.p) or least <= LEVEL:
+            return ""
+        steady = ", ".join(each.symbol for each in self.changes if each.p <= least * (1 + TIE))
+        return (
+            f"So few scans cannot give a p below {format_number(least, 2)}, so nothing can be said to move with time, "
+            f"which needs {ENOUGH}; numbers that have this p: {steady or 'none'}."
+        )
 
 
 def say_change(change: Change, unit: str = "") -> str:

@@ -31,6 +31,7 @@ from curvafit.studies.permutation import (
     relabel,
     share_beyond,
 )
+from curvafit.studies.scans import merge_notes
 from curvafit.volumes.field import Field
 
 N = 32
@@ -260,6 +261,34 @@ def test_windows_of_one_texture_are_not_told_apart() -> None:
     assert found.p > 0.1 and "not told apart" in found.status  # .9 here, which other processors move little
     assert any("counted in voxels" in note for note in found.notes)
     assert any("No intervals" in note for note in found.notes)
+
+
+@pytest.mark.slow
+def test_each_scans_threshold_is_told(tmp_path: Path) -> None:
+    """Grey levels 20 and 20 + c split half way: each scan's threshold is in the record, their range in the methods."""
+    contrasts = (100.0, 110.0, 120.0, 140.0)
+    scans = fields([20 + c * tubes(5.0) for c in contrasts])
+    found = compare(scans[:2], scans[2:], kind="image", periodic=True)
+    write_comparison(found, tmp_path / "out")
+    record = json.loads((tmp_path / "out" / "compare.json").read_text(encoding="utf-8"))
+    for scan, contrast in zip(record["scans"], contrasts, strict=True):
+        assert any(f"threshold of {20 + contrast / 2:g}:" in note for note in scan["notes"])
+    assert "70–90" in record["methods"] and "0.01 mm" in record["methods"]
+    assert any("70–90" in note for note in found.notes)
+
+
+def test_notes_that_differ_in_numbers_are_one_with_their_ranges() -> None:
+    notes = [("3 of 1e-05.", "own"), ("-2.5 of 1e-05.",), ("7 of 1e-05.", "own")]
+    scans = [replace(drawn(np.random.default_rng(0)), notes=each) for each in notes]
+    assert list(merge_notes(scans)) == [([0, 1, 2], "-2.5–7 of 1e-05."), ([0, 2], "own")]
+
+
+def test_the_methods_cite_the_program(shapes: Comparison) -> None:
+    cited = (Path(__file__).parents[2] / "CITATION.cff").read_text(encoding="utf-8")
+    methods = describe_methods(shapes)
+    for name in ("version", "- name", "doi", "journal", "- family-names"):
+        match = re.search(rf"^\s*{name}: (.+)$", cited, re.MULTILINE)
+        assert match and match[1] in methods
 
 
 def test_units_are_converted(shapes: Comparison) -> None:

@@ -18,6 +18,7 @@ from scipy import stats
 
 import curvafit
 from curvafit.geometry.diagram import Diagram
+from curvafit.report.comparison import describe_measures
 from curvafit.report.trajectory import FILES, check_trajectory, describe_series, numbers_figure, write_trajectory
 from curvafit.scan.measure import QUANTITIES, Measures, Quantity
 from curvafit.studies.permutation import reorder
@@ -81,6 +82,7 @@ def test_what_moves_all_the_way_has_the_least_exact_p(count: int) -> None:
     assert found.p == pytest.approx(least)
     assert [each.family for each in found.changes] == pytest.approx([least] * len(QUANTITIES))
     assert ("few scans" in found.status) == (least > 0.05)
+    assert not found.limit or found.limit in describe_series(found)
 
 
 def test_a_number_that_a_scan_lacks_has_no_trend() -> None:
@@ -162,6 +164,7 @@ def test_a_series_writes_itself(grown: Trajectory, tmp_path: Path) -> None:
     record = json.loads((tmp_path / "out" / "trajectory.json").read_text(encoding="utf-8"))
     assert [each["time"] for each in record["scans"]] == [0, 7, 14, 28, 56] and record["unit_of_time"] == "d"
     assert record["methods"] == describe_series(grown) and "120 orders" in record["methods"]
+    assert " ".join(describe_measures(grown.measures)) in record["methods"]
     rows = list(csv.DictReader((tmp_path / "out" / "trajectory.csv").read_text(encoding="utf-8").splitlines()))
     assert len(rows) == 5 * len(QUANTITIES) and {row["time"] for row in rows} == {"0.0", "7.0", "14.0", "28.0", "56.0"}
     assert check_trajectory(tmp_path / "out") == tmp_path / "out"  # its own files may be replaced
@@ -188,7 +191,7 @@ def test_the_command_follows_two_scans(scans: Path) -> None:
         "trajectory", "t0.npy", "t1.npy", "--times", "0,2.5", "--unit-of-time", "$d$", "--periodic", "-o", "out"
     )
     assert result.exit_code == 0, (result.output, result.exception)
-    assert "2.5 $d$" in result.stdout and "needs 4 scans" in result.stdout
+    assert "2.5 $d$" in result.stdout and "needs 5 scans" in result.stdout
     assert {path.name for path in (scans / "out").iterdir()} == set(FILES)
 
 
