@@ -35,7 +35,7 @@ def compare(
         from curvafit.studies.compare import compare as compare_groups
 
         inputs = [place for place in (group_a, group_b, subjects) if place is not None]
-        check_comparison(out, inputs, overwrite)
+        check_comparison(out, inputs, overwrite, command_line())
         how = {"permutations": permutations, "seed": seed, "workers": workers, "progress": progress}
         comparison = compare_groups(group_a, group_b, subjects=subjects, **structure, **how, **reading)
         progress("drawing the page", 1.0)

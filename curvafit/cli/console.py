@@ -122,8 +122,8 @@ def _say_warnings(caught: list[warnings.WarningMessage]) -> None:
 
 
 def command_line() -> str:
-    """Return the command as typed."""
-    return shlex.join(["curvafit", *sys.argv[1:]])
+    """Return the command as typed, but for leave to replace files."""
+    return shlex.join(["curvafit", *(word for word in sys.argv[1:] if word != "--overwrite")])
 
 
 # ---- printing --------------------------------------------------------------------------------------------------------

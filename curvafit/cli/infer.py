@@ -41,7 +41,8 @@ def infer(
         from curvafit.inference.infer import infer as infer_scan
         from curvafit.report.page import check_report, with_command, write_inference
 
-        check_report(out, [scan, *(file for file in files.values() if file is not None)], overwrite)
+        inputs = [scan, *(file for file in files.values() if file is not None)]
+        check_report(out, inputs, overwrite, command_line())
         how = {"method": method, "fast": fast, "seed": seed, "progress": progress}
         inference = infer_scan(scan, **structure, **files, **how, **reading)
         progress("drawing the report", 1.0)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from curvafit.core.workers import Workers
 
 #: Whether files of other programs, or of other commands, may be replaced.
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace files that other programs wrote.")]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace files that another command wrote.")]
 
 
 # ---- commands --------------------------------------------------------------------------------------------------------

@@ -37,7 +37,7 @@ def trajectory(
         from curvafit.studies.trajectory import say_change
         from curvafit.studies.trajectory import trajectory as follow
 
-        check_trajectory(out, scans, overwrite)
+        check_trajectory(out, scans, overwrite, command_line())
         how = {"permutations": permutations, "seed": seed, "workers": workers, "progress": progress}
         found = follow(scans, moments, unit_of_time=unit_of_time, **structure, **how, **reading)
         progress("drawing the page", 1.0)

@@ -34,7 +34,7 @@ def windows(
         from curvafit.report.windows import check_windows, write_windows
         from curvafit.studies.windows import windows as measure_windows
 
-        check_windows(out, scan, overwrite)
+        check_windows(out, scan, overwrite, command_line())
         found = measure_windows(scan, *grid, clusters=clusters, seed=seed, progress=progress, **structure, **reading)
         progress("drawing the page", 1.0)
         page = write_windows(found, out, command=command_line(), overwrite=overwrite)

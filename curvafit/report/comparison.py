@@ -32,9 +32,11 @@ FILES = ("compare.json", "compare.html", "measures.csv", "numbers.csv")
 FILES += ("difference.svg", "difference.png", "numbers.svg", "numbers.png")
 
 
-def check_comparison(directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False) -> Path:
+def check_comparison(
+    directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False, command: str = ""
+) -> Path:
     """Return the folder if `write_comparison` can write there, else raise ValueError; call it before the work."""
-    return check_result_folder(FORMAT, FILES, directory, inputs, overwrite)
+    return check_result_folder(FORMAT, FILES, directory, inputs, overwrite, command)
 
 
 def write_comparison(
@@ -42,10 +44,10 @@ def write_comparison(
 ) -> Path:
     """Write the page, figures, tables and record of a comparison into a folder, and return the page's path.
 
-    The files (`FILES`) are moved into the folder once all are whole. Those of an earlier comparison are replaced;
+    The files (`FILES`) are moved into the folder once all are whole. Those of the same command are replaced;
     others are a ValueError without `overwrite`. `command` is what the record calls the command line.
     """
-    target = check_comparison(directory, overwrite=overwrite)
+    target = check_comparison(directory, overwrite=overwrite, command=command)
     figures = {"difference": comparison_figure(comparison), "numbers": numbers_figure(comparison)}
     record = _record(comparison, command)
     texts = {

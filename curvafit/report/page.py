@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -103,18 +104,29 @@ class Picture(NamedTuple):
 
 
 def check_result_folder(
-    kind: Format, files: Sequence[str], directory: str | Path, inputs: Iterable[str | Path], overwrite: bool
+    kind: Format,
+    files: Sequence[str],
+    directory: str | Path,
+    inputs: Iterable[str | Path],
+    overwrite: bool,
+    command: str = "",
 ) -> Path:
     """Return the folder if a result's files, the record and the page first, can be written there; else ValueError.
 
-    `inputs` are files or folders that are read, and so never written over; `overwrite` allows to replace files that no
-    such result wrote.
+    `inputs` are files or folders that are read, and so never written over. A result of the same `command` is replaced;
+    `overwrite` allows to replace others, and files that are no result.
     """
     folder = Path(directory)
     first, page, *more = (folder / name for name in files)
-    ours = kind.owns(first) and has_mark(page, MARK)
+    ours = kind.owns(first) and has_mark(page, MARK) and _command_of(first) == command
     can_write(first, lambda _: ours, more=(page, *more), inputs=inputs, overwrite=overwrite)
     return folder
+
+
+def _command_of(record: Path) -> str:
+    """Return the command line that a result's record states; an empty one where Python made it."""
+    content = json.loads(record.read_text(encoding="utf-8"))
+    return str(content.get("command") or content.get("provenance", {}).get("command") or "")
 
 
 @contextmanager
@@ -147,18 +159,21 @@ def write_study(
     return target / files[1]
 
 
-def check_report(directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False) -> Path:
+def check_report(
+    directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False, command: str = ""
+) -> Path:
     """Return the folder if `write_inference` can write there, else raise ValueError; call it before the work."""
-    return check_result_folder(Format(FORMAT), FILES, directory, inputs, overwrite)
+    return check_result_folder(Format(FORMAT), FILES, directory, inputs, overwrite, command)
 
 
 def write_inference(inference: Inference, directory: str | Path, *, overwrite: bool = False) -> Path:
     """Write `fit.json`, `report.html` and, if a shape was regenerated, `regenerated.nii.gz` into a folder.
 
-    Return the report's path. The files are moved into the folder once all are whole. Those of an earlier inference are
-    replaced; others are a ValueError without `overwrite`.
+    Return the report's path. The files are moved into the folder once all are whole. Those of an earlier inference by
+    the same command are replaced; others are a ValueError without `overwrite`.
     """
-    target = check_report(directory, overwrite=overwrite)
+    command = inference.fit.provenance.get("command", "")
+    target = check_report(directory, overwrite=overwrite, command=command)
     with fill_folder(target, FILES) as work:
         (work / "fit.json").write_text(inference.fit.to_json(), encoding="utf-8")
         write_report(inference, work / "report.html")

@@ -41,9 +41,11 @@ LATER = LinearSegmentedColormap.from_list("later", ["#C4C9D1", INK])
 NAMED = 0.1
 
 
-def check_trajectory(directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False) -> Path:
+def check_trajectory(
+    directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False, command: str = ""
+) -> Path:
     """Return the folder if `write_trajectory` can write there, else raise ValueError; call it before the work."""
-    return check_result_folder(FORMAT, FILES, directory, inputs, overwrite)
+    return check_result_folder(FORMAT, FILES, directory, inputs, overwrite, command)
 
 
 def write_trajectory(
@@ -51,10 +53,10 @@ def write_trajectory(
 ) -> Path:
     """Write the page, figures, table and record of a series into a folder, and return the page's path.
 
-    The files (`FILES`) are moved into the folder once all are whole. Those of an earlier series are replaced; others
+    The files (`FILES`) are moved into the folder once all are whole. Those of the same command are replaced; others
     are a ValueError without `overwrite`. `command` is what the record calls the command line.
     """
-    target = check_trajectory(directory, overwrite=overwrite)
+    target = check_trajectory(directory, overwrite=overwrite, command=command)
     path, numbers = trajectory_figure(trajectory), numbers_figure(trajectory)
     record = _record(trajectory, command)
     page = render_template(

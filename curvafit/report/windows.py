@@ -33,19 +33,19 @@ def list_files(source: str | Path) -> tuple[str, ...]:
     return (*FILES, *(f"{name.replace(' ', '_')}{suffix}" for name in ("clusters", *NAMES)))
 
 
-def check_windows(directory: str | Path, source: str | Path = "", overwrite: bool = False) -> Path:
+def check_windows(directory: str | Path, source: str | Path = "", overwrite: bool = False, command: str = "") -> Path:
     """Return the folder if `write_windows` can write there, else raise ValueError; call it before the work."""
-    return check_result_folder(FORMAT, list_files(source), directory, [source] if source else [], overwrite)
+    return check_result_folder(FORMAT, list_files(source), directory, [source] if source else [], overwrite, command)
 
 
 def write_windows(windows: Windows, directory: str | Path, *, command: str = "", overwrite: bool = False) -> Path:
     """Write the page, maps, figure, table and record of windows into a folder, and return the page's path.
 
-    The files are moved into the folder once all are whole. Those of earlier windows are replaced; others are a
+    The files are moved into the folder once all are whole. Those of the same command are replaced; others are a
     ValueError without `overwrite`. `command` is what the record calls the command line.
     """
     source = windows.clusters.source
-    target, files = check_windows(directory, source, overwrite), list_files(source)
+    target, files = check_windows(directory, source, overwrite, command), list_files(source)
     record = {
         "curvafit": version("curvafit"),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),

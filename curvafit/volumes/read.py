@@ -264,6 +264,10 @@ def to_field(raw: Raw, source: str, spacing: Sequence[float] | float | None, uni
         raise ScanError(f"{reason} for {source}") from None
     if spacing is not None:
         edges = np.array(positive_triple(spacing))
+        if (
+            unit is None and name == "voxel" and edges.min() != 1
+        ):  # edges of which the finest is 1 are ratios, in voxels of that one
+            raise ScanError(f"expected the unit of the spacing {quoted(spacing)} of {source}, such as mm, got none")
     elif raw.spacing is not None:
         edges = factor * np.array(positive_triple(raw.spacing))
     else:

@@ -96,7 +96,9 @@ def test_the_command_writes_maps_table_and_page(halves: Field, mapped: Windows, 
     record = json.loads((out / "windows.json").read_text(encoding="utf-8"))
     assert record["options"]["seed"] == 0
     assert {path.name for path in out.iterdir()} == set(record["files"])
-    assert check_windows(out, scan) == out  # its own files
+    assert check_windows(out, scan, command=record["command"]) == out  # its own files
+    with pytest.raises(ValueError, match="free"):
+        check_windows(out, scan, command="curvafit windows another.npy -o maps")
     (out / "windows.json").write_text("{}", encoding="utf-8")
     refused(call(*arguments), "free")
 

@@ -574,3 +574,11 @@ def test_truncated_files_are_refused(tmp_path: Path, suffix: str, kept: float, d
 def test_real_scans(data: Path, name: str, options: dict, shape, spacing, unit: str) -> None:
     field = load(data / "scans" / name, **options)
     assert (field.shape, field.spacing, field.unit) == (shape, spacing, unit)
+
+
+def test_a_spacing_needs_a_unit_unless_it_is_a_ratio(tmp_path: Path) -> None:
+    np.save(tmp_path / "scan.npy", np.zeros((2, 3, 4), np.uint8))
+    with pytest.raises(ScanError, match="unit of the spacing"):
+        load(tmp_path / "scan.npy", spacing=0.0195)
+    assert load(tmp_path / "scan.npy", spacing=(2.5, 1, 1)).unit == "voxel"
+    assert load(tmp_path / "scan.npy", spacing=0.0195, unit="mm").spacing == (0.0195,) * 3
