@@ -7,50 +7,73 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, QuadMesh
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from curvafit.core.units import format_number, power_name
-from curvafit.drawing.plot import INK, diagram_on, frame_diagram, make_figure
+from curvafit.drawing.plot import FAMILIAR, INK, diagram_on, frame_diagram, make_figure
 from curvafit.drawing.render import QUIET
 
 #: Colours of the first group and the second, and of what is more in either (Okabe & Ito 2008).
 FIRST, SECOND = "#0072B2", "#D55E00"
 MORE = LinearSegmentedColormap.from_list("more", [FIRST, "#8CC0E0", "#FFFFFF", "#F0B48A", SECOND])
-#: Panels of numbers in a row.
-COLUMNS = 6
+#: Symbols of numbers that are shown first and larger, and of those that can be negative.
+FIRST_SHOWN, SIGNED = (*FAMILIAR, "H", "K"), ("χ", "Conn.D", "H", "K", "κ1", "κ2")
+#: Larger and smaller panels of numbers in a row.
+LARGE, SMALL = 4, 7
+#: Share of each curvature's area that a diagram's axis holds at the least.
+SHOWN = 0.995
 #: Letters of a group's name that a panel has room for.
 WORD = 14
 
 
 def comparison_figure(comparison: Any) -> Figure:
-    """Return a figure of both groups' mean curvature diagrams, and of the second less the first.
+    """Return a figure of both groups' mean curvature diagrams, and of the second less the first, with the test's p.
 
     The outline holds the bins that differ significantly among all.
     """
     edges, (a, b) = comparison.edges, map(plain, comparison.groups)
-    limits, unit = (edges[0], edges[-1]), comparison.unit
-    figure = make_figure(13.2, 4.5)
-    for k, (name, diagram) in enumerate(zip((a, b), comparison.diagrams, strict=True)):
-        axes = figure.add_axes((0.05 + 0.325 * k, 0.12, 0.27, 0.79))
-        diagram_on(axes, diagram, limits=limits, unit=unit)
-        subjects = f"{comparison.counts[k]} subjects"
-        axes.set_title(f"{name}, {subjects}", fontsize=11, color=(FIRST, SECOND)[k])
-    axes = figure.add_axes((0.70, 0.12, 0.27, 0.79))
+    limits, unit, window = (edges[0], edges[-1]), comparison.unit, _shown_window(comparison.diagrams)
+    figure = make_figure(13.2, 3.6, layout="constrained")
+    panels = figure.subplots(1, 3)
+    for k, (axes, name, diagram) in enumerate(zip(panels, (a, b), comparison.diagrams, strict=False)):
+        picture = diagram_on(axes, diagram, limits=limits, unit=unit, window=window)
+        axes.set_title(f"{name}, {comparison.counts[k]} subjects", fontsize=11, color=(FIRST, SECOND)[k])
+        _bar_on(axes, picture, format=FuncFormatter(lambda share, _: f"{100 * share:g}"))
+    axes = panels[2]
     shown = 100 * comparison.difference
     most = max(float(np.abs(shown).max()), 1e-9)
     picture = axes.pcolormesh(edges, edges, shown, cmap=MORE, norm=Normalize(-most, most), rasterized=True, zorder=0.5)
-    frame_diagram(axes, limits, unit)
+    frame_diagram(axes, limits, unit, window)
     _outline_on(axes, edges, comparison.significant)
-    axes.set_title(f"{b} less {a}", fontsize=11)
-    inset = axes.inset_axes((0.06, 0.93, 0.42, 0.03))
-    bar = figure.colorbar(picture, cax=inset, orientation="horizontal", ticks=MaxNLocator(3, symmetric=True))
-    bar.ax.tick_params(labelsize=8, length=2)
-    bar.outline.set_linewidth(0.5)  # type: ignore[union-attr]
-    axes.text(0.06, 0.855, "% of the surface a bin", transform=axes.transAxes, fontsize=8, va="top")
+    axes.set_title(f"{b} less {a}, p = {format_number(comparison.p, 2)}", fontsize=11)
+    _bar_on(axes, picture, ticks=MaxNLocator(4, symmetric=True))
     return figure
+
+
+def _bar_on(axes: Axes, picture: QuadMesh, **options: Any) -> None:
+    """Draw a colour bar of the surface in each bin beside a diagram."""
+    bar = axes.figure.colorbar(picture, ax=axes, shrink=0.7, pad=0.02, **options)
+    bar.set_label("% of the surface a bin", fontsize=8)
+    bar.ax.tick_params(labelsize=8, length=2)
+    bar.outline.set_linewidth(0.5)
+
+
+def _shown_window(diagrams: Sequence[Any]) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the intervals of κ1 and of κ2 that hold 0 and `SHOWN` of each diagram's area, with a margin."""
+    ends = np.zeros((2, 2))
+    for diagram in diagrams:
+        for bounds, kappa in zip(ends, np.asarray(diagram.points).T, strict=True):
+            order = np.argsort(kappa)
+            area = np.cumsum(np.asarray(diagram.weights)[order])
+            tail = (1 - SHOWN) / 2 * area[-1]
+            low, high = kappa[order][np.searchsorted(area, [tail, area[-1] - tail])]
+            bounds[:] = min(bounds[0], low), max(bounds[1], high)
+    low, high = ends.T + 0.08 * np.ptp(ends) * np.array([[-1], [1]])
+    return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
 
 
 def _outline_on(axes: Axes, edges: np.ndarray, inside: np.ndarray) -> None:
@@ -73,45 +96,73 @@ def numbers_figure(comparison: Any) -> Figure:
         comparison.numbers,
         comparison.unit,
         comparison.level,
-        lambda number: f"g = {format_number(number.effect, 2)}, p = {format_number(number.p, 2)}",
+        lambda number: (
+            f"g = {format_number(number.effect, 2)}, p = {format_number(number.p, 2)}"
+            f"\nfamily-wise p = {format_number(number.family, 2)}"
+        ),
     )
     second = np.array([group == comparison.groups[1] for group, _ in comparison.subjects])
     for k, (axes, number) in enumerate(zip(panels, comparison.numbers, strict=True)):
         for side, colour in ((0, FIRST), (1, SECOND)):
             values, errors = (table[second == bool(side), k] for table in (comparison.values, comparison.errors))
             places = side + np.linspace(-0.18, 0.18, len(values))
-            axes.vlines(places, values - 1.96 * errors, values + 1.96 * errors, color=colour, alpha=0.35, linewidth=1.4)
+            low = values - 1.96 * errors
+            low = low if number.symbol in SIGNED else np.maximum(low, 0)
+            axes.vlines(places, low, values + 1.96 * errors, color=colour, alpha=0.35, linewidth=1.4)
             axes.plot(places, values, "o", color=colour, markersize=4, markeredgewidth=0)
             axes.hlines(number.means[side], side - 0.32, side + 0.32, color=INK, linewidth=1.4)
-        axes.set_xticks([0, 1], [plain(name)[:WORD] for name in comparison.groups], fontsize=8)
+        names = zip(comparison.groups, comparison.counts, strict=True)
+        axes.set_xticks([0, 1], [f"{plain(name[:WORD])}\nn = {count}" for name, count in names], fontsize=8)
         axes.set_xlim(-0.6, 1.6)
+        keep_sign(axes, number.symbol)
+    marks = [
+        Line2D([], [], color=QUIET, marker="o", linestyle="", markersize=4, label="a subject"),
+        Line2D([], [], color=QUIET, linewidth=1.4, label="95 % interval of the subject's own scans"),
+        Line2D([], [], color=INK, linewidth=1.4, label="mean of the group"),
+    ]
+    figure.legend(handles=marks, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     return figure
+
+
+def keep_sign(axes: Axes, symbol: str) -> None:
+    """Let the axis of a number that is never negative begin at 0 at the lowest."""
+    if symbol not in SIGNED and axes.get_ylim()[0] < 0:
+        axes.set_ylim(bottom=0)
 
 
 def number_panels(
     numbers: Sequence[Any], unit: str, level: float, label: Callable[[Any], str]
 ) -> tuple[Figure, list[Axes]]:
-    """Return a figure with a panel for each quantity, its symbol above and its label below.
+    """Return a figure and a panel for each quantity, its symbol and label above it; the familiar ones first and larger.
 
     The symbol is bold where the quantity's family-wise p is at most `level`.
     """
-    rows = -(-len(numbers) // COLUMNS)
-    figure = make_figure(13.2, 2.5 * rows, layout="constrained")
-    panels = list(figure.subplots(rows, COLUMNS, squeeze=False).ravel())
-    for axes in panels[len(numbers) :]:
-        axes.set_axis_off()
-    for axes, number in zip(panels, numbers, strict=False):
+    ranks = {symbol: k for k, symbol in enumerate(FIRST_SHOWN)}
+    order = sorted(range(len(numbers)), key=lambda k: ranks.get(numbers[k].symbol, len(ranks)))
+    first = sum(number.symbol in ranks for number in numbers)
+    large, small = -(-first // LARGE), -(-(len(numbers) - first) // SMALL)
+    figure = make_figure(13.2, 3.1 * large + 2.5 * small, layout="constrained")
+    parts = figure.add_gridspec(2, 1, height_ratios=(max(3.1 * large, 0.01), max(2.5 * small, 0.01)))
+    grids = parts[0].subgridspec(max(large, 1), LARGE), parts[1].subgridspec(max(small, 1), SMALL)
+    panels: dict[int, Axes] = {}
+    for place, k in enumerate(order):
+        grid, columns, here = (grids[0], LARGE, place) if place < first else (grids[1], SMALL, place - first)
+        axes, number = figure.add_subplot(grid[divmod(here, columns)]), numbers[k]
         name = power_name(unit, number.power)
         axes.set_title(
             number.symbol + (f" ({name})" if name else ""),
-            fontsize=9.5,
+            fontsize=11 if place < first else 9.5,
             fontweight="bold" if number.family <= level else "normal",
+            pad=6 + 10 * (1 + label(number).count("\n")),
         )
-        axes.set_xlabel(label(number), fontsize=8)
+        axes.annotate(
+            label(number), (0.5, 1), (0, 3), "axes fraction", "offset points", ha="center", va="bottom", fontsize=7.5
+        )
         axes.yaxis.set_major_locator(MaxNLocator(4))
         axes.tick_params(length=2, labelsize=8)
         axes.spines[:].set_color(QUIET)
-    return figure, panels[: len(numbers)]
+        panels[k] = axes
+    return figure, [panels[k] for k in range(len(numbers))]
 
 
 def plain(name: str) -> str:

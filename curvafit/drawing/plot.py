@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import QuadMesh
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
@@ -167,12 +168,18 @@ def diagram_figure(
 
 
 def diagram_on(
-    axes: Axes, diagram: Diagram, *, limits: Limits, unit: str = "working unit", length: float = 1.0
-) -> None:
+    axes: Axes,
+    diagram: Diagram,
+    *,
+    limits: Limits,
+    unit: str = "working unit",
+    length: float = 1.0,
+    window: tuple[Limits, Limits] | None = None,
+) -> QuadMesh:
     """Draw the share of area over (κ1, κ2): κ1 to the right, κ2 up, colours by the logarithm.
 
     The diagram's own unit of length is `length` in `unit`: curvatures are divided by it. `limits`, in 1 / `unit`, are
-    those of both axes.
+    those of both axes; `window` is what of these is shown, of κ1 and κ2. Returns the picture, for a colour bar.
     """
     low, high = limits
     edges = np.linspace(low, high, BINS + 1)
@@ -183,25 +190,27 @@ def diagram_on(
     highest = max(float(shares.max()), 1e-9)
     shown = np.ma.masked_less(shares, highest * 10**-DECADES)
     norm = LogNorm(highest * 10**-DECADES, highest)
-    axes.pcolormesh(edges, edges, shown, cmap=DENSITY, norm=norm, rasterized=True, zorder=2)
-    frame_diagram(axes, limits, unit)
+    picture = axes.pcolormesh(edges, edges, shown, cmap=DENSITY, norm=norm, rasterized=True, zorder=2)
+    frame_diagram(axes, limits, unit, window)
+    return picture
 
 
-def frame_diagram(axes: Axes, limits: Limits, unit: str) -> None:
-    """Draw what is around the areas of a diagram: axes, the line κ1 = κ2, names of families."""
+def frame_diagram(axes: Axes, limits: Limits, unit: str, window: tuple[Limits, Limits] | None = None) -> None:
+    """Draw what is around the areas of a diagram: axes, the line κ1 = κ2, names of families; see `diagram_on`."""
     low, high = limits
     axes.add_patch(Polygon([(low, low), (low, high), (high, high)], color="#F3F4F6", zorder=0))
     axes.axhline(0, color=QUIET, linewidth=0.7, zorder=1)
     axes.axvline(0, color=QUIET, linewidth=0.7, zorder=1)
     axes.plot([low, high], [low, high], color=DIAGONAL, linewidth=1.4, zorder=3)
-    axes.set(xlim=limits, ylim=limits, aspect="equal")
+    across, up = window or (limits, limits)
+    axes.set(xlim=across, ylim=up, aspect="equal")
     axes.spines[:].set_color(QUIET)
     name = unit_name(unit)
     axes.set_xlabel(f"κ₁ (1/{name})", labelpad=2)
     axes.set_ylabel(f"κ₂ (1/{name})", labelpad=2)
     axes.locator_params(nbins=5)
     axes.tick_params(length=3, labelsize=9)
-    _name_families(axes, limits)
+    _name_families(axes, across, up)
 
 
 def shared_limits(diagrams: Sequence[Diagram], *, length: float = 1.0) -> Limits:
@@ -218,21 +227,19 @@ def shared_limits(diagrams: Sequence[Diagram], *, length: float = 1.0) -> Limits
     return bounds[0] - 0.08 * width, bounds[1] + 0.08 * width
 
 
-def _name_families(axes: Axes, limits: Limits) -> None:
+def _name_families(axes: Axes, across: Limits, up: Limits) -> None:
     """Write small words where spheres, tubes and saddles lie, in the corners that hold no mass."""
-    low, high = limits
-    pad = 0.02 * (high - low)
+    pad = 0.02 * (across[1] - across[0])
     style = {"fontsize": 8.5, "color": "#5B616B", "style": "italic", "zorder": 4}
     style["path_effects"] = [withStroke(linewidth=2, foreground="white")]
-    at = high - 5 * pad
+    at = min(across[1], up[1]) - 5 * pad
     axes.text(at, at + pad, "spheres", rotation=45, rotation_mode="anchor", ha="right", va="bottom", **style)
-    axes.text(high - pad, 0.4 * pad, "tubes", ha="right", va="bottom", **style)
-    if low < -0.15 * high:
-        end = min(high, -low) - 4 * pad
-        axes.plot(
-            [0, min(high, -low)], [0, -min(high, -low)], color=QUIET, linewidth=0.7, linestyle=(0, (2, 3)), zorder=1
-        )
-        axes.text(end, -end + pad, "saddles", rotation=-45, rotation_mode="anchor", ha="right", va="bottom", **style)
+    axes.text(across[1] - pad, 0.4 * pad, "tubes", ha="right", va="bottom", **style)
+    if up[0] < -0.15 * across[1]:
+        end = min(across[1], -up[0])
+        axes.plot([0, end], [0, -end], color=QUIET, linewidth=0.7, linestyle=(0, (2, 3)), zorder=1)
+        side = "right" if end > 0.8 * across[1] else "left"
+        axes.text(end + (-pad if side == "right" else pad), pad - end, "saddles", ha=side, va="bottom", **style)
 
 
 # ---- three middle slices ---------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from matplotlib.patheffects import withStroke
 from curvafit.atlas_map.picture import FAMILY_COLOURS, map_on
 from curvafit.core.records import Format
 from curvafit.core.units import format_number, per_unit
-from curvafit.drawing.groups import FIRST, number_panels, plain
+from curvafit.drawing.groups import FIRST, SIGNED, keep_sign, number_panels, plain
 from curvafit.drawing.plot import INK, QUIET, make_figure
 from curvafit.geometry.diagram import FAMILIES
 from curvafit.geometry.distances import DIRECTIONS, QUANTILES
@@ -37,8 +37,10 @@ FORMAT = Format("curvafit trajectory", 1, title="the record of a series of scans
 FILES = ("trajectory.json", "trajectory.html", "trajectory.csv", "path.svg", "path.png", "numbers.svg", "numbers.png")
 #: Colours of scans from the first to the last.
 LATER = LinearSegmentedColormap.from_list("later", ["#C4C9D1", INK])
-#: Least share of the surface of a family that is named in its area.
-NAMED = 0.1
+#: Shapes of the map that a path is shown among at the least; least step between names of families, of the panel.
+AROUND, APART = 25, 0.055
+#: Least reach of a number's axis below and above its mean, as a share of it.
+LEAST_REACH = 0.1
 
 
 def check_trajectory(
@@ -92,13 +94,13 @@ def trajectory_figure(trajectory: Trajectory) -> Figure:
     """
     figure = make_figure(13.2, 4.4)
     away, shares, place = (
-        figure.add_axes((left, 0.13, width, 0.78)) for left, width in ((0.05, 0.23), (0.33, 0.23), (0.6, 0.39))
+        figure.add_axes((left, 0.13, width, 0.78)) for left, width in ((0.045, 0.2), (0.285, 0.2), (0.59, 0.4))
     )
     away.plot(trajectory.times, trajectory.distances, "o-", color=FIRST, markersize=5, clip_on=False)
     away.set(ylim=(0, None), title=f"distance from the first ({per_unit(trajectory.unit, 1)})")
     _shares_on(shares, trajectory)
     for axes in (away, shares):
-        axes.set_xlabel(plain(f"time ({trajectory.unit_of_time})" if trajectory.unit_of_time else "time"))
+        axes.set_xlabel(_name_time(trajectory))
         axes.set_xlim(trajectory.times[0], trajectory.times[-1])
         axes.title.set_fontsize(11)
         axes.tick_params(length=3, labelsize=9)
@@ -106,6 +108,7 @@ def trajectory_figure(trajectory: Trajectory) -> Figure:
     length = trajectory.measures[0]["thickness"].value / (WORKING_THICKNESS * WORKING_SPACING)
     seen_as = "field" if all(each.kind == "field" for each in trajectory.measures) else "mask"
     own = map_on(place, load_atlas(), seen_as, trajectory.embeddings * length)
+    _zoom_on(place, own)
     for k, shade in enumerate(LATER(np.linspace(0, 1, len(own)))):
         place.plot(
             *own[max(k - 1, 0) : k + 1].T,
@@ -117,21 +120,43 @@ def trajectory_figure(trajectory: Trajectory) -> Figure:
         place.scatter(*own[k], s=60, color=shade, edgecolors="white", linewidths=1.0, zorder=6)
     words = {"textcoords": "offset points", "fontsize": 10, "fontweight": "bold", "zorder": 7}
     words["path_effects"] = [withStroke(linewidth=3, foreground="white")]
-    place.annotate(plain(trajectory.ends[0]), own[0], (-8, -8), ha="right", va="top", **words)
-    place.annotate(plain(trajectory.ends[1]), own[-1], (8, 8), **words)
+    ahead = place.transData.transform(own[[0, -1]])
+    ahead = (ahead[1] - ahead[0]) / max(float(np.linalg.norm(ahead[1] - ahead[0])), 1e-9)
+    for name, at, side in zip(trajectory.ends, (own[0], own[-1]), (-ahead, ahead), strict=True):
+        place.annotate(plain(name), at, 22 * side, ha="center", va="center", **words)
     return figure
 
 
+def _name_time(trajectory: Trajectory) -> str:
+    """Return what an axis of time says."""
+    return plain(f"time ({trajectory.unit_of_time})" if trajectory.unit_of_time else "time")
+
+
+def _zoom_on(axes: Axes, path: np.ndarray) -> None:
+    """Narrow a map to a path (n, 2) and at least the `AROUND` shapes that are nearest to its middle."""
+    limits = np.array([axes.get_xlim(), axes.get_ylim()])
+    spans, middle = np.ptp(limits, axis=1), (path.min(0) + path.max(0)) / 2
+    shapes = np.concatenate([np.asarray(each.get_offsets()) for each in axes.collections])
+    away = np.sort(np.abs((shapes - middle) / spans).max(1))
+    reach = max(0.8 * float((np.ptp(path, axis=0) / spans).max()), float(away[min(AROUND, len(away)) - 1]))
+    if reach < 0.5:
+        (left, right), (bottom, top) = middle[:, None] + reach * spans[:, None] * [-1, 1]
+        axes.set(xlim=(left, right), ylim=(bottom, top))
+
+
 def _shares_on(axes: Axes, trajectory: Trajectory) -> None:
-    """Draw the share of each family over time, one above the other, each with its name where it is thickest."""
+    """Draw the share of each family over time, one above the other, with their names at the last scan."""
     shares = np.stack([trajectory.table(f"share of {name}")[0] for name in FAMILIES])
     axes.stackplot(trajectory.times, shares, colors=[FAMILY_COLOURS[name] for name in FAMILIES], alpha=0.8, linewidth=0)
-    middles = shares.cumsum(0) - shares / 2
-    sides = {0: "left", len(trajectory.times) - 1: "right"}
-    for name, share, middle in zip(FAMILIES, shares, middles, strict=True):
-        k = int(share.argmax())
-        if share[k] >= NAMED:
-            axes.text(trajectory.times[k], middle[k], f" {name} ", ha=sides.get(k, "center"), va="center", fontsize=9)
+    heights = (shares.cumsum(0) - shares / 2)[:, -1]
+    for k in range(1, len(heights)):
+        heights[k] = max(heights[k], heights[k - 1] + APART)
+    heights -= np.maximum(heights - 1 + APART * np.arange(len(heights))[::-1], 0)
+    for name, height, share in zip(FAMILIES, heights, shares[:, -1], strict=True):
+        label = axes.annotate(
+            f"{name} {share:.0%}", (1, height), (5, 0), "axes fraction", "offset points", fontsize=8.5
+        )
+        label.set(va="center", color=FAMILY_COLOURS[name])
     axes.set(ylim=(0, 1), title="shares of the surface")
 
 
@@ -152,8 +177,14 @@ def numbers_figure(trajectory: Trajectory) -> Figure:
     )
     for axes, change in zip(panels, trajectory.changes, strict=True):
         values, halves = trajectory.table(change.name)
-        axes.fill_between(trajectory.times, values - halves, values + halves, color=FIRST, alpha=0.2, linewidth=0)
+        lows = values - halves if change.symbol in SIGNED else np.maximum(values - halves, 0)
+        axes.fill_between(trajectory.times, lows, values + halves, color=FIRST, alpha=0.2, linewidth=0)
         axes.plot(trajectory.times, values, "o-", color=FIRST, markersize=4, markeredgewidth=0, linewidth=1.2)
+        if np.isfinite(mean := values.mean()):
+            (low, high), reach = axes.get_ylim(), LEAST_REACH * abs(mean)
+            axes.set_ylim(min(low, mean - reach), max(high, mean + reach))
+        keep_sign(axes, change.symbol)
+        axes.set_xlabel(_name_time(trajectory), fontsize=8)
     return figure
 
 

@@ -187,7 +187,9 @@ def windows(
         values=values,
         clusters=grid,
         explained=explained,
-        structure=Field(shown, tuple(h * n for h, n in zip(field.spacing, thin, strict=True)), field.unit),
+        structure=replace(
+            field, values=shown, spacing=tuple(h * n for h, n in zip(field.spacing, thin, strict=True)), affine=None
+        ),
         options={"size": sizes, "stride": strides, "clusters": clusters, "seed": seed, "kind": kind}
         | options
         | reading,
