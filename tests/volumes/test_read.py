@@ -577,8 +577,8 @@ def test_real_scans(data: Path, name: str, options: dict, shape, spacing, unit: 
 
 
 def test_a_spacing_needs_a_unit_unless_it_is_a_ratio(tmp_path: Path) -> None:
-    np.save(tmp_path / "scan.npy", np.zeros((2, 3, 4), np.uint8))
+    np.save(tmp_path / "scan.npy", np.arange(24, dtype=np.uint8).reshape(2, 3, 4))
     with pytest.raises(ScanError, match="unit of the spacing"):
         load(tmp_path / "scan.npy", spacing=0.0195)
     assert load(tmp_path / "scan.npy", spacing=(2.5, 1, 1)).unit == "voxel"
-    assert load(tmp_path / "scan.npy", spacing=0.0195, unit="mm").spacing == (0.0195,) * 3
+    assert load(tmp_path / "scan.npy", spacing=0.0195, unit="mm").spacing == pytest.approx((0.0195,) * 3)
