@@ -24,6 +24,7 @@ def compare(
     *,
     structure: Structure,
     reading: Reading,
+    primary: Annotated[str | None, typer.Option(help="One number named beforehand, tested alone: Tb.Th.")] = None,
     permutations: Annotated[int, typer.Option(help="Permutations of subjects; all where there are fewer.")] = 9999,
     seed: Annotated[int, typer.Option(help="Seed of the permutations, where not all are tried.")] = 0,
     workers: Annotated[int, typer.Option(help="Processes that measure; 0 is this one.")] = 0,
@@ -36,7 +37,7 @@ def compare(
 
         inputs = [place for place in (group_a, group_b, subjects) if place is not None]
         check_comparison(out, inputs, overwrite, command_line())
-        how = {"permutations": permutations, "seed": seed, "workers": workers, "progress": progress}
+        how = {"primary": primary, "permutations": permutations, "seed": seed, "workers": workers, "progress": progress}
         comparison = compare_groups(group_a, group_b, subjects=subjects, **structure, **how, **reading)
         progress("drawing the page", 1.0)
         page = write_comparison(comparison, out, command=command_line(), overwrite=overwrite)

@@ -62,7 +62,7 @@ def _page(comparison: Comparison, record: dict[str, Any], figures: dict[str, Fig
     """Return the page of a comparison, with its record and its figures, as text."""
     a, b = comparison.groups
     bins = int(comparison.significant.sum())
-    title = f"{a} and {b} {'differ' if comparison.p <= LEVEL else 'are not told apart'}"
+    title = comparison.verdict
     region = f"The outline holds the bins that differ at a family-wise level of {LEVEL:.2g}."
     return render_template(
         "compare.html",
@@ -92,6 +92,11 @@ def describe_methods(comparison: Comparison) -> str:
     found = ", ".join(f"{each.symbol} (g = {format_number(each.effect, 2)})" for each in differ)
     found = f"{len(differ)} of them differ{f': {found}' if differ else ''}."
     tested = int(np.isfinite(c.bins_p).sum())
+    named = (
+        [f"Named beforehand and tested alone was {c.primary.symbol}: p = {format_number(c.primary.p, 2)}."]
+        if c.primary
+        else []
+    )
     return " ".join(
         [
             f"Scans of two groups, {' and '.join(_count_scans(c))}, were measured with curvafit {version('curvafit')}; "
@@ -106,6 +111,7 @@ def describe_methods(comparison: Comparison) -> str:
             "corrected for all of them by the greatest correlation with the group in each permutation (Westfall & "
             "Young 1993), besides the corrections of Holm and of Benjamini and Hochberg.",
             f"At a family-wise level of {LEVEL:.2g}, {found}",
+            *named,
             "Effect sizes are Hedges' g, with 95 % intervals of the noncentral t distribution (normal subjects).",
             f"The difference of the mean diagrams, over {BINS} × {BINS} bins and smoothed by a Gaussian of {SMOOTH:g} "
             f"bins, was tested in the {tested} with area, corrected likewise; {int(c.significant.sum())} differ.",

@@ -13,14 +13,14 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.distance import cdist
 from scipy.stats import false_discovery_control
 
-from curvafit.core.checks import check_int, check_seed
+from curvafit.core.checks import check_choice, check_int, check_seed
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.units import format_number, format_percent, per_unit
+from curvafit.core.units import format_number, format_percent, per_unit, power_name
 from curvafit.drawing.plot import shared_limits
 from curvafit.geometry.diagram import FAMILIES, Diagram
 from curvafit.geometry.distances import sliced_embedding
-from curvafit.scan.measure import SURE, Measures, find_quantity, interval_reach
+from curvafit.scan.measure import QUANTITIES, SURE, Measures, find_quantity, interval_reach
 from curvafit.scan.structure import check_options
 from curvafit.studies.groups import Case, Group, list_cases
 from curvafit.studies.permutation import (
@@ -38,6 +38,8 @@ from curvafit.studies.scans import gather_notes, measure_scans
 PERMUTATIONS = 9999
 #: What p must not exceed for a difference that is shown.
 LEVEL = 1 - SURE
+#: The familiar numbers, without those of curvature.
+FAMILIAR = ("BV/TV", "Tb.Th", "Tb.Th.SD", "Tb.Sp", "Tb.N", "Conn.D", "χ", "BS/BV", "BS/TV", "DA")
 #: Bins along each axis of the difference of diagrams, and the width in bins of the Gaussian that smooths it.
 BINS, SMOOTH = 48, 2.0
 #: Bins with less than this part of the fullest one's area are not tested.
@@ -161,11 +163,17 @@ class Comparison(Pictured):
     def status(self) -> str:
         """Return the answer in a sentence or a few: whether, by how much, in which direction."""
         (a, b), unit = self.groups, per_unit(self.unit, 1)
-        word = "differ" if self.p <= LEVEL else "are not told apart"
-        lines = [
-            f"{a} and {b} {word}: p = {format_number(self.p, 2)} for equal curvature diagrams.",
-            f"Their mean diagrams lie {format_number(self.apart, 2)} {unit} apart, two subjects of a group "
-            f"{format_number(self.within, 2)} {unit} on average.",
+        least = (1 + (self.counts[0] == self.counts[1])) / self.permutations
+        most = max((self[name] for name in FAMILIAR), key=lambda each: abs(np.nan_to_num(each.effect)))
+        lines = [f"So few subjects cannot give a p below {format_number(least, 2)}."] if least > LEVEL else []
+        if self.primary:
+            lines.append(f"{self.verdict}, named beforehand: {self._say(self.primary)}.")
+        lines += [
+            f"{self._judge(self.p, 'curvature diagrams')}: p = {format_number(self.p, 2)}.",
+            f"Of the familiar numbers the one that differs most: {self._say(most)}, "
+            f"{format_number(most.family, 2)} among all {len(self.numbers)} numbers.",
+            f"In curvature the groups' mean diagrams lie {format_number(self.apart, 2)} {unit} apart, those of two "
+            f"subjects of a group {format_number(self.within, 2)} {unit} on average (sliced Wasserstein distance).",
         ]
         shifts = sorted((self[f"share of {name}"].difference, name) for name in FAMILIES)
         (fall, loser), (rise, winner) = shifts[0], shifts[-1]
@@ -174,10 +182,31 @@ class Comparison(Pictured):
                 f"From {a} to {b} the share of {loser} falls by {format_percent(-fall)} "
                 f"of the surface, and that of {winner} rises by {format_percent(rise)}."
             )
-        least = (1 + (self.counts[0] == self.counts[1])) / self.permutations
-        if least > LEVEL:
-            lines.append(f"So few subjects cannot give a p below {format_number(least, 2)}.")
         return " ".join(lines)
+
+    @property
+    def primary(self) -> Number | None:
+        """Return the number that was named beforehand, whose p alone counts; None where none was."""
+        name = self.options.get("primary")
+        return self[name] if name else None
+
+    @property
+    def verdict(self) -> str:
+        """Return whether the groups differ, in a few words: in the number named beforehand, or in their diagrams."""
+        if self.primary:
+            return self._judge(self.primary.p, self.primary.name)
+        return self._judge(self.p, "curvature diagrams")
+
+    def _judge(self, p: float, what: str) -> str:
+        return f"{' and '.join(self.groups)} {'differ' if p <= LEVEL else 'are not told apart'} by their {what}"
+
+    def _say(self, number: Number) -> str:
+        """Return a number with both means and its p as text."""
+        means = " to ".join(format_number(mean) for mean in number.means)
+        unit = power_name(self.unit, number.power)
+        return f"{number.name} ({number.symbol}) goes from {means} {unit}".rstrip() + (
+            f", p = {format_number(number.p, 2)} alone"
+        )
 
 
 def compare(
@@ -189,6 +218,7 @@ def compare(
     periodic: bool = False,
     threshold: Literal["otsu"] | float = "otsu",
     dark: bool = False,
+    primary: str | None = None,
     permutations: int = PERMUTATIONS,
     seed: int = 0,
     workers: int = 0,
@@ -212,6 +242,8 @@ def compare(
         Paths are relative to the table. Without it each scan is a subject.
     kind, periodic, threshold, dark
         As in `measure`.
+    primary
+        The symbol or name of the one number that was chosen before the scans were seen: its p needs no correction.
     permutations
         Most permutations of subjects to try; where there are fewer, all are.
     seed
@@ -224,11 +256,14 @@ def compare(
     check_options(kind, threshold, reading.get("label"))
     check_int(permutations, "a number of permutations from 99", 99, 10**6)
     check_seed(seed)
+    if primary is not None:
+        names = {each for name, symbol, *_ in QUANTITIES for each in (name, symbol)}
+        check_choice(primary, names, f"a primary number of {', '.join(symbol for _, symbol, *_ in QUANTITIES)}")
     cases, notes = list_cases(group_a, group_b, subjects)
     options = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark}
     measures, more = measure_scans(cases, options, reading, workers, sub_progress(progress, 0.0, 0.97))
     progress("comparing", 0.97)
-    parameters = {**options, **reading, "permutations": permutations, "seed": seed}
+    parameters = {**options, **reading, "primary": primary, "permutations": permutations, "seed": seed}
     return compare_measures(measures, cases, parameters, [*notes, *more])
 
 

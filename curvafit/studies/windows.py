@@ -175,7 +175,7 @@ def windows(
     corner = field.move_origin([(n - 1) / 2 for n in sizes]).affine
     assert corner is not None
     spacing = tuple(h * step for h, step in zip(field.spacing, strides, strict=True))
-    grid = replace(field, values=labels, spacing=spacing, affine=corner @ np.diag([*strides[::-1], 1]))
+    grid = replace(field, values=labels, spacing=spacing, affine=corner @ np.diag([*strides[::-1], 1]))  # type: ignore[arg-type]
     rest = [n % step for n, step in zip(field.shape, strides, strict=True)]
     thin = tuple(-(-n // MOST_SHOWN) for n in field.shape)
     shown = np.ascontiguousarray(maps.mask[tuple(slice(None, None, step) for step in thin)])

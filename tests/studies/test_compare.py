@@ -185,6 +185,22 @@ def test_a_number_that_a_subject_lacks_is_not_tested() -> None:
     assert sum(axes.axison for axes in numbers_figure(found).axes) == len(QUANTITIES)
 
 
+def test_the_number_named_beforehand_leads_by_its_own_p() -> None:
+    """A thickness that is apart where no diagram is: alone its p is the least, in a family of 22 it may not be."""
+    random = np.random.default_rng(11)
+    scans = [drawn(random) for _ in range(8)]
+    for k, scan in enumerate(scans):
+        rows = [replace(each, value=each.value + 99 * (k > 3) * (each.symbol == "Tb.Th")) for each in scan.quantities]
+        scans[k] = replace(scan, quantities=tuple(rows))
+    plain, named = (compare(scans[:4], scans[4:], primary=name) for name in (None, "Tb.Th"))
+    assert plain.primary is None and named.primary == plain["thickness"] and named.primary.p == pytest.approx(2 / 70)
+    assert "not told apart" in plain.verdict and "not told apart" not in named.verdict
+    assert named.verdict in named.status and named.verdict not in plain.status
+    assert "thickness" in plain.status and "Tb.Th" in describe_methods(named)  # it differs most
+    with pytest.raises(ValueError, match="primary"):
+        compare(scans[:4], scans[4:], primary="nothing")
+
+
 # ---- subjects --------------------------------------------------------------------------------------------------------
 
 
