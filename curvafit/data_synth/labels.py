@@ -90,7 +90,7 @@ def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Col
         if "instances" in wanted:
             labels["instances"] = instances_of(distance, grid)
         if "radius" in wanted:
-            labels["radius"] = _measure_radius(distance, grid)
+            labels["radius"] = local_thickness(distance > 0, grid.spacing, periodic=grid.periodic) / 2
     if wanted & {"kappa1", "kappa2"}:
         labels["kappa1"], labels["kappa2"] = _measure_curvatures(u, mask, grid, epsilon)
     if "betti" in wanted:
@@ -155,11 +155,6 @@ def _find_touching(mask: np.ndarray, grid: Grid) -> np.ndarray:
     touching, inner = np.zeros_like(mask), (slice(MARGIN, -MARGIN),) * 3
     touching[inner] = find_boundaries(mask)[inner]
     return touching
-
-
-def _measure_radius(distance: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return half the local thickness."""
-    return local_thickness(distance > 0, grid.spacing, periodic=grid.periodic) / 2
 
 
 def _check_field(field: Tensor | np.ndarray, grid: Grid, epsilon: float) -> Tensor:

@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from curvafit.core.records import Format
 from curvafit.core.units import format_number, format_percent, per_unit, power_name
 from curvafit.drawing.groups import comparison_figure, numbers_figure
 from curvafit.geometry.distances import DIRECTIONS, QUANTILES
-from curvafit.report.page import check_result_folder, picture_of, render_template, write_study
+from curvafit.report.page import (
+    Picture,
+    check_result_folder,
+    picture_of,
+    record_study,
+    render_template,
+    write_study,
+)
 from curvafit.scan.measure import Measures
 from curvafit.studies.compare import BINS, LEVEL, SMOOTH, Comparison, Number
 from curvafit.studies.scans import merge_notes
 from curvafit.studies.tables import format_csv, plain_unit, rows_of
-from curvafit.studies.trajectory import Change, Trajectory
+from curvafit.studies.trajectory import Trajectory
 
 #: `format` of a comparison's record.
 FORMAT = Format("curvafit comparison", 1, title="the record of a comparison")
@@ -48,18 +52,22 @@ def write_comparison(
     others are a ValueError without `overwrite`. `command` is what the record calls the command line.
     """
     target = check_comparison(directory, overwrite=overwrite, command=command)
-    figures = {"difference": comparison_figure(comparison), "numbers": numbers_figure(comparison)}
+    difference, numbers = comparison_figure(comparison), numbers_figure(comparison)
+    drawn = {
+        "difference": (difference, picture_of(difference, "Mean curvature diagrams and their difference")),
+        "numbers": (numbers, picture_of(numbers, "Each number by group")),
+    }
     record = _record(comparison, command)
     texts = {
         "measures.csv": format_csv(list(_measure_rows(comparison))),
         "numbers.csv": format_csv(list(_test_rows(comparison))),
-        "compare.html": _page(comparison, record, figures),
+        "compare.html": _page(comparison, record, {name: picture for name, (_, picture) in drawn.items()}),
     }
-    return write_study(target, FORMAT, FILES, record, texts, **figures)
+    return write_study(target, FORMAT, FILES, record, texts, drawn)
 
 
-def _page(comparison: Comparison, record: dict[str, Any], figures: dict[str, Figure]) -> str:
-    """Return the page of a comparison, with its record and its figures, as text."""
+def _page(comparison: Comparison, record: dict[str, Any], pictures: dict[str, Picture]) -> str:
+    """Return the page of a comparison, with its record and its pictures, as text."""
     a, b = comparison.groups
     bins = int(comparison.significant.sum())
     title = comparison.verdict
@@ -72,11 +80,10 @@ def _page(comparison: Comparison, record: dict[str, Any], figures: dict[str, Fig
         b=b,
         scans="; ".join(_count_scans(comparison)) + ".",
         status=comparison.status,
-        difference=picture_of(figures["difference"], "Mean curvature diagrams and their difference"),
         region=region if bins else f"No bin differs at a family-wise level of {LEVEL:.2g}.",
         rows=[_format_row(number, comparison.unit) for number in comparison.numbers],
         level=f"{LEVEL:.2g}",
-        numbers=picture_of(figures["numbers"], "Each number by group"),
+        **pictures,
         methods=record["methods"],
         notes=comparison.notes,
         provenance=[(name, record[name]) for name in ("command", "date", "seed", "permutations") if record[name] != ""],
@@ -165,13 +172,14 @@ def _format_row(number: Number, unit: str) -> dict[str, Any]:
     interval = f"{format_number(number.low, 2)} to {format_number(number.high, 2)}"
     known = "–" if math.isnan(number.known) else "all" if number.known >= 1 else format_percent(number.known)
     cells = (*means, format_number(number.difference), format_number(number.effect, 2), interval, *ps, known)
-    return {**name_quantity(number, unit), "cells": cells, "chosen": number.family <= LEVEL}
+    named = name_quantity(number.name, number.symbol, number.power, unit)
+    return {**named, "cells": cells, "chosen": number.family <= LEVEL}
 
 
-def name_quantity(number: Number | Change, unit: str) -> dict[str, str]:
+def name_quantity(name: str, symbol: str, power: int, unit: str) -> dict[str, str]:
     """Return the name of a quantity, and its symbol and unit, as a table has them."""
-    parts = ("" if number.symbol in number.name else number.symbol, power_name(unit, number.power))
-    return {"name": number.name[0].upper() + number.name[1:], "symbol": ", ".join(part for part in parts if part)}
+    parts = ("" if symbol in name else symbol, power_name(unit, power))
+    return {"name": name[0].upper() + name[1:], "symbol": ", ".join(part for part in parts if part)}
 
 
 # ---- tables and record -----------------------------------------------------------------------------------------------
@@ -201,6 +209,7 @@ def _record(comparison: Comparison, command: str) -> dict[str, Any]:
     """Return the content of `compare.json`."""
     return {
         **record_study(comparison, command, FILES),
+        **record_test(comparison),
         "groups": list(comparison.groups),
         "scans": [
             {"scan": each.source, "subject": case.subject, "group": case.group, "kind": each.kind, "notes": each.notes}
@@ -214,22 +223,10 @@ def _record(comparison: Comparison, command: str) -> dict[str, Any]:
     }
 
 
-def record_study(study: Comparison | Trajectory, command: str, files: Sequence[str]) -> dict[str, Any]:
-    """Return what the records of all studies hold."""
-    return {
-        "curvafit": version("curvafit"),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": command,
-        "unit": study.unit,
-        "options": json.loads(json.dumps(study.options, default=str)),
-        "seed": study.options["seed"],
-        "permutations": study.permutations,
-        "exact": study.exact,
-        "status": study.status,
-        "p": known(study.p),
-        "notes": list(study.notes),
-        "files": list(files),
-    }
+def record_test(study: Comparison | Trajectory) -> dict[str, Any]:
+    """Return what the records of studies with a test by permutation hold of it."""
+    more = {"permutations": study.permutations, "exact": study.exact, "p": known(study.p)}
+    return {"seed": study.options["seed"], **more}
 
 
 def known(cell: Any) -> Any:

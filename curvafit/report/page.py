@@ -9,8 +9,10 @@ import base64
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -51,6 +53,9 @@ from curvafit.volumes.write import save
 if TYPE_CHECKING:
     from curvafit.geometry.diagram import Diagram
     from curvafit.inference.infer import Inference
+    from curvafit.studies.compare import Comparison
+    from curvafit.studies.trajectory import Trajectory
+    from curvafit.studies.windows import Windows
 
 #: The mark by which a page is known as this program's.
 MARK = '<meta name="generator" content="curvafit'
@@ -145,15 +150,40 @@ def fill_folder(target: Path, files: Sequence[str]) -> Iterator[Path]:
             move_together(sorted(work.iterdir()), target)
 
 
+def record_study(study: Comparison | Trajectory | Windows, command: str, files: Sequence[str]) -> dict[str, Any]:
+    """Return what the records of all studies hold."""
+    return {
+        "curvafit": version("curvafit"),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": command,
+        "unit": study.unit,
+        "options": json.loads(json.dumps(study.options, default=str)),
+        "status": study.status,
+        "notes": list(study.notes),
+        "files": list(files),
+    }
+
+
 def write_study(
-    target: Path, form: Format, files: Sequence[str], record: dict[str, Any], texts: dict[str, str], **figures: Figure
+    target: Path,
+    form: Format,
+    files: Sequence[str],
+    record: dict[str, Any],
+    texts: Mapping[str, str],
+    drawn: Mapping[str, tuple[Figure, Picture]],
+    maps: Mapping[str, Field] | None = None,
 ) -> Path:
-    """Write a study's record, texts, and figures as PNG and SVG, into a folder together; return the page's path."""
+    """Write a study's record, texts, maps, and figures as PNG and SVG, into a folder together; return the page's path.
+
+    `drawn` has each figure with its picture for the page.
+    """
     with fill_folder(target, files) as work:
+        for name, field in (maps or {}).items():
+            save(field, work / name, kind=form.name)
         for name, text in texts.items():
             (work / name).write_text(text, encoding="utf-8", newline="")
-        for name, figure in figures.items():
-            (work / f"{name}.png").write_bytes(png(figure))
+        for name, (figure, picture) in drawn.items():
+            (work / f"{name}.png").write_bytes(base64.b64decode(picture.data or ""))
             (work / f"{name}.svg").write_bytes(svg(figure))
         form.write(work / files[0], record)
     return target / files[1]

@@ -24,8 +24,8 @@ from curvafit.geometry.diagram import FAMILIES
 from curvafit.geometry.distances import DIRECTIONS, QUANTILES
 from curvafit.inference.atlas import load_atlas
 from curvafit.priors.grid import WORKING_SPACING
-from curvafit.report.comparison import describe_measures, known, name_quantity, record_study, say_kinds
-from curvafit.report.page import check_result_folder, picture_of, render_template, write_study
+from curvafit.report.comparison import describe_measures, known, name_quantity, record_test, say_kinds
+from curvafit.report.page import check_result_folder, picture_of, record_study, render_template, write_study
 from curvafit.scan.prepare import WORKING_THICKNESS
 from curvafit.studies.compare import LEVEL
 from curvafit.studies.tables import format_csv, plain_unit, rows_of
@@ -60,14 +60,17 @@ def write_trajectory(
     """
     target = check_trajectory(directory, overwrite=overwrite, command=command)
     path, numbers = trajectory_figure(trajectory), numbers_figure(trajectory)
+    drawn = {
+        "path": (path, picture_of(path, "The curvature diagram over time")),
+        "numbers": (numbers, picture_of(numbers, "Each number over time")),
+    }
     record = _record(trajectory, command)
     page = render_template(
         "trajectory.html",
         version=version("curvafit"),
         title=f"{len(trajectory.times)} scans, {' to '.join(trajectory.ends)}",
         status=trajectory.status,
-        path=picture_of(path, "The curvature diagram over time"),
-        numbers=picture_of(numbers, "Each number over time"),
+        **{name: picture for name, (_, picture) in drawn.items()},
         ends=trajectory.ends,
         rows=[_format_row(trajectory, change) for change in trajectory.changes],
         level=f"{LEVEL:.2g}",
@@ -81,7 +84,7 @@ def write_trajectory(
         for row in rows_of(measures, time=time, unit_of_time=trajectory.unit_of_time)
     ]
     texts = {"trajectory.html": page, "trajectory.csv": format_csv(rows)}
-    return write_study(target, FORMAT, FILES, record, texts, path=path, numbers=numbers)
+    return write_study(target, FORMAT, FILES, record, texts, drawn)
 
 
 # ---- figures ---------------------------------------------------------------------------------------------------------
@@ -227,7 +230,7 @@ def _format_row(trajectory: Trajectory, change: Change) -> dict[str, Any]:
     texts = [f"{format_number(values[k])} ± {format_number(halves[k], 2)}" for k in (0, -1)]
     tests = (format_number(each, 2) for each in (change.correlation, change.p, change.family))
     return {
-        **name_quantity(change, trajectory.unit),
+        **name_quantity(change.name, change.symbol, change.power, trajectory.unit),
         "cells": (*texts, say_change(change), *tests),
         "chosen": (2,) * change.significant + (5,) * change.moves,
     }
@@ -241,6 +244,7 @@ def _record(trajectory: Trajectory, command: str) -> dict[str, Any]:
     ]
     return {
         **record_study(trajectory, command, FILES),
+        **record_test(trajectory),
         "unit_of_time": trajectory.unit_of_time,
         "scans": [
             {

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import json
-from base64 import b64encode
 from collections.abc import Iterator
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from curvafit.core.records import Format
-from curvafit.core.units import format_number, format_percent, power_name
-from curvafit.drawing.plot import png, svg
+from curvafit.core.units import format_number, format_percent
 from curvafit.drawing.windows import windows_figure
-from curvafit.report.page import Picture, check_result_folder, fill_folder, render_template
+from curvafit.report.comparison import name_quantity
+from curvafit.report.page import check_result_folder, picture_of, record_study, render_template, write_study
 from curvafit.studies.tables import format_csv
 from curvafit.studies.windows import NAMES, Windows
-from curvafit.volumes.write import save
 
 #: `format` of the record.
 FORMAT = Format("curvafit windows", 1, title="the record of a scan measured in windows")
@@ -46,41 +41,24 @@ def write_windows(windows: Windows, directory: str | Path, *, command: str = "",
     """
     source = windows.clusters.source
     target, files = check_windows(directory, source, overwrite, command), list_files(source)
-    record = {
-        "curvafit": version("curvafit"),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": command,
-        "scan": source,
-        "kind": windows.kind,
-        "unit": windows.unit,
-        "options": json.loads(json.dumps(windows.options, default=str)),
-        "status": windows.status,
-        "explained": windows.explained,
-        "notes": list(windows.notes),
-        "files": list(files),
-    }
+    record = record_study(windows, command, files)
+    record |= {"scan": source, "kind": windows.kind, "explained": windows.explained}
     figure = windows_figure(windows)
-    picture = png(figure)
-    with fill_folder(target, files) as work:
-        for name, each in zip(files[len(FILES) :], (windows.clusters, *map(windows.__getitem__, NAMES)), strict=True):
-            save(each, work / name, kind=FORMAT.name)
-        (work / "windows.png").write_bytes(picture)
-        (work / "windows.svg").write_bytes(svg(figure))
-        (work / "windows.csv").write_text(format_csv(list(_rows(windows))), encoding="utf-8", newline="")
-        page = render_template(
-            "windows.html",
-            **record,
-            version=record["curvafit"],
-            title="A scan in windows",
-            picture=Picture(
-                b64encode(picture).decode("ascii"), "The structure, coloured by clusters and by six numbers"
-            ),
-            clusters=range(1, 1 + int(windows.clusters.values.max())),
-            rows=[_format_row(windows, k) for k in range(len(NAMES))],
-        )
-        (work / "windows.html").write_text(page, encoding="utf-8")
-        FORMAT.write(work / "windows.json", record)
-    return target / "windows.html"
+    picture = picture_of(figure, "The structure, coloured by clusters and by six numbers")
+    page = render_template(
+        "windows.html",
+        version=record["curvafit"],
+        title="A scan in windows",
+        status=windows.status,
+        picture=picture,
+        clusters=range(1, 1 + int(windows.clusters.values.max())),
+        rows=[_format_row(windows, k) for k in range(len(NAMES))],
+        notes=windows.notes,
+        provenance=[(name, record[name]) for name in ("scan", "command", "date", "options") if record[name]],
+    )
+    texts = {"windows.html": page, "windows.csv": format_csv(list(_rows(windows)))}
+    maps = dict(zip(files[len(FILES) :], (windows.clusters, *map(windows.__getitem__, NAMES)), strict=True))
+    return write_study(target, FORMAT, files, record, texts, {"windows": (figure, picture)}, maps)
 
 
 def _rows(windows: Windows) -> Iterator[dict[str, Any]]:
@@ -91,16 +69,12 @@ def _rows(windows: Windows) -> Iterator[dict[str, Any]]:
         yield {**dict(centre), "unit": windows.unit, "cluster": int(windows.clusters.values[place]), **dict(numbers)}
 
 
-def _format_row(windows: Windows, k: int) -> tuple[str, ...]:
+def _format_row(windows: Windows, k: int) -> dict[str, Any]:
     """Return a row of the page's table: a number's name, range, cluster means, and share of variance between these."""
-    name, symbol, power = windows.quantities[k]
     labels, values = windows.clusters.values, windows.values[..., k]
     parts = [values[labels == label] for label in range(1, 1 + int(labels.max()))]
     total = float(np.var(values[labels > 0]) * np.count_nonzero(labels)) if parts else 0.0
     ends = np.nanpercentile(values, (0, 50, 100)) if np.isfinite(values).any() else [np.nan] * 3
-    return (
-        name[0].upper() + name[1:],
-        ", ".join(part for part in (symbol if symbol not in name else "", power_name(windows.unit, power)) if part),
-        *(format_number(float(each)) for each in (*ends, *(part.mean() for part in parts))),
-        format_percent(1 - sum(part.var() * len(part) for part in parts) / total) if total > 0 else "–",
-    )
+    between = format_percent(1 - sum(part.var() * len(part) for part in parts) / total) if total > 0 else "–"
+    cells = (*(format_number(float(each)) for each in (*ends, *(part.mean() for part in parts))), between)
+    return {**name_quantity(*windows.quantities[k], windows.unit), "cells": cells}

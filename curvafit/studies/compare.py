@@ -32,7 +32,7 @@ from curvafit.studies.permutation import (
     relabel,
     share_beyond,
 )
-from curvafit.studies.scans import gather_notes, measure_scans
+from curvafit.studies.scans import gather_notes, measure_scans, stack_numbers
 
 #: Permutations of subjects that are tried: all where there are no more.
 PERMUTATIONS = 9999
@@ -338,9 +338,7 @@ def _compare_bins(
 
 def _average(measures: Sequence[Measures], scans: Sequence[Sequence[int]]) -> tuple[np.ndarray, np.ndarray]:
     """Return `values` and `errors` of a `Comparison`; `scans` are the numbers of each subject's."""
-    values, halves = (
-        np.array([[getattr(each, name) for each in scan.quantities] for scan in measures]) for name in ("value", "half")
-    )
+    values, halves = stack_numbers(measures)
     variances = (halves / np.array([[interval_reach(scan.blocks)] for scan in measures])) ** 2
     errors = np.sqrt([variances[own].mean(0) / len(own) for own in scans])
     return np.stack([values[own].mean(0) for own in scans]), errors

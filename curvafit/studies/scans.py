@@ -42,6 +42,14 @@ def measure_scans(
     return [each.convert(unit) for each in measures], notes
 
 
+def stack_numbers(measures: Sequence[Measures]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the quantities of N scans, and half the widths of their intervals, both (N, K)."""
+    values, halves = (
+        np.array([[getattr(each, name) for each in scan.quantities] for scan in measures]) for name in ("value", "half")
+    )
+    return values, halves
+
+
 def gather_notes(measures: Sequence[Measures], cases: Sequence[Case]) -> Iterator[str]:
     """Yield the scans' notes, with whose they are; those that differ in numbers only are one."""
     for scans, note in merge_notes(measures):

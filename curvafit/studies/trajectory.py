@@ -20,7 +20,7 @@ from curvafit.scan.structure import check_options
 from curvafit.studies.compare import LEVEL, PERMUTATIONS
 from curvafit.studies.groups import list_series
 from curvafit.studies.permutation import TIE, correct_by_most, correlate, reorder, share_beyond
-from curvafit.studies.scans import gather_notes, measure_scans
+from curvafit.studies.scans import gather_notes, measure_scans, stack_numbers
 from curvafit.volumes.read import Source
 
 #: The fewest scans whose order is tested, and the fewest whose p can be as small as `LEVEL`.
@@ -251,9 +251,7 @@ def _test_distances(away: np.ndarray, orders: np.ndarray) -> float:
 
 def _follow_numbers(measures: Sequence[Measures], orders: np.ndarray) -> tuple[Change, ...]:
     """Return the change of each quantity, tested over orders (m, N) of the scans."""
-    values, halves = (
-        np.array([[getattr(each, name) for each in scan.quantities] for scan in measures]) for name in ("value", "half")
-    )
+    values, halves = stack_numbers(measures)
     correlation, p, family = np.full((3, values.shape[1]), np.nan)
     if len(measures) >= FEWEST:
         told = np.isfinite(values).all(0)
