@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 
 _what = partial(typer.Option, rich_help_panel="What to do")
 
-Target = Annotated[Path, typer.Option("-o", "--output", help="Mask to write: .nii.gz .nii .tif .npy .mrc .zarr.")]
+Target = Annotated[
+    Path,
+    typer.Option("-o", "--output", help="Mask to write: .nii.gz .nii .tif .npy .mrc .zarr; or IMAGE.zarr/labels/NAME."),
+]
 Weight = Annotated[float | None, _what(help="Cost of a unit of the energy, in nats; by default chosen, with the law.")]
 OwnPrior = Annotated[
     str | None, _what("--prior", help="A law as in segment, which is tried from the network's volume; by default none.")
@@ -190,7 +193,7 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
     """
     from curvafit.core.files import remove
     from curvafit.priors.law import Law, preset_name
-    from curvafit.segmentation.result import check_mask_target, write_mask
+    from curvafit.segmentation.result import beside, check_mask_target, write_mask
     from curvafit.segmentation.tiles import Tiling
     from curvafit.volumes.boxes import boxes_of, read_whole
 
@@ -206,9 +209,10 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
     with show_stages() as progress:
         progress("reading", 0.0)
         boxes = boxes_of(job.source, **reading) if read is None else boxes_of(read(job.source, **reading))
-        check_mask_target(job.out, boxes.frame.unit, **options)  # again, as a format may not hold the unit
+        check_mask_target(job.out, boxes.frame, **options)  # again, as a format may not hold the unit
         tiling = Tiling.of(boxes.frame, record["epsilon"], record["tile"], periodic=record.get("periodic", False))
-        store = job.out.with_name(f".{job.out.name}.curvafit-tiles")
+        place = beside(job.out, ".tiles")  # not within the user's store
+        store = place.with_name(f".{job.out.name}.curvafit-tiles")
         tiles = tiling.count > 1 and (record["job"] != "reconstruct" or job.prior is not None)
         with resumable() if tiles else nullcontext():
             result = compute(boxes, progress, tile=record["tile"], store=store, workers=job.workers)

@@ -36,7 +36,7 @@ _DOUBLE = (".nii.gz", ".ome.tif", ".ome.tiff", ".ome.zarr")
 #: Seconds after its record within which a file is the one that was written with it.
 LATER = 10.0
 #: Files of a Zarr group of images that `curvafit.volumes` wrote.
-_WRITTEN = re.compile(r"(\d+/)?zarr\.json|\d+/c(/\d+)*")
+_WRITTEN = re.compile(r"(\d+/)?(zarr\.json|\.zgroup|\.zattrs|\.zarray)|\d+/(c/)?(\d+/)*\d+|\d+/c")
 #: What the making of a result from a damaged file may raise.
 _FAULTS = (KeyError, ValueError, IndexError, TypeError, AttributeError, RuntimeError)
 #: The most digits of a whole number in JSON.
@@ -189,7 +189,7 @@ def can_write(
     """
     target = Path(path)
     check_folder(target.parent)
-    if target.is_dir() and not target.name.lower().endswith(".zarr"):
+    if target.is_dir() and not (target.name.lower().endswith(".zarr") or is_zarr(target)):
         raise ValueError(f"{target} is a folder: give the name of a file")
     listed = ours.companions(target) if isinstance(ours, Format) else []
 
@@ -240,6 +240,11 @@ def sibling(path: str | Path, ending: str) -> Path:
     return target.with_name(target.name[: len(target.name) - len(suffix)] + ending)
 
 
+def is_zarr(folder: Path) -> bool:
+    """Return whether a folder is a group or an array of Zarr."""
+    return any((folder / name).exists() for name in ("zarr.json", ".zgroup", ".zarray"))
+
+
 def is_own_zarr(folder: Path, kind: str) -> bool:
     """Return whether a folder is empty, or a Zarr group of images with the mark of this kind and nothing else in it."""
     if folder.is_symlink():
@@ -247,8 +252,9 @@ def is_own_zarr(folder: Path, kind: str) -> bool:
     if is_empty(folder):
         return True
     try:
-        attributes = parse_json((folder / "zarr.json").read_bytes(), "a Zarr group", folder)["attributes"]
-        if attributes[MARK]["kind"] != kind:
+        old = folder / ".zattrs"
+        content = parse_json((old if old.exists() else folder / "zarr.json").read_bytes(), "a Zarr group", folder)
+        if (content if old.exists() else content["attributes"])[MARK]["kind"] != kind:
             return False
     except (OSError, *_FAULTS):
         return False

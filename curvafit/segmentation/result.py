@@ -14,7 +14,7 @@ import numpy as np
 from curvafit.core.checks import SEEDS, check_float, check_int
 from curvafit.core.files import move_together, remove, temporary_folder
 from curvafit.core.pictures import Pictured
-from curvafit.core.records import Format, can_write, sibling
+from curvafit.core.records import Format, can_write, is_own_zarr, sibling
 from curvafit.core.runtime import hold_signals
 from curvafit.core.units import format_sampling
 from curvafit.priors.coefficients import Coefficients
@@ -22,6 +22,7 @@ from curvafit.segmentation.tiles import LoweredVolume
 from curvafit.segmentation.uncertainty import entropy
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.nifti import write_nifti_like
+from curvafit.volumes.formats.zarr import add_labels, check_place, image_of, mark, store_of, write_labels
 from curvafit.volumes.write import pick_writer, save
 
 if TYPE_CHECKING:
@@ -167,21 +168,39 @@ def flow_summary(lowered: LoweredVolume) -> str:
 
 def check_mask_target(
     path: str | Path,
-    unit: str | None = None,
+    scan: Field | None = None,
     inputs: Iterable[str | Path] = (),
     overwrite: bool = False,
     *,
     maps: Sequence[str] = (),
 ) -> Path:
-    """Return the path, or raise ValueError where a mask in `unit` cannot be written there; called before the work.
+    """Return the path, or raise ValueError where the mask of a scan cannot be written there; called before the work.
 
-    None of the `inputs`, files or folders, may be overwritten. `overwrite` says whether files of other origin may be
-    replaced, `maps` which of `MAPS` go beside the mask.
+    None of the `inputs`, files or folders, may be overwritten, but the image that gets labels. `overwrite` says whether
+    files of other origin may be replaced, `maps` which of `MAPS` go beside the mask.
     """
-    target = Path(path)
-    pick_writer(target, unit or "mm")
-    more = [sibling(target, ".json"), sibling(target, ".png"), *(_map_path(target, name) for name in maps)]
-    return can_write(target, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
+    target, image = Path(path), image_of(Path(path))
+    pick_writer(target, "mm" if scan is None else scan.unit)
+    first, *more = beside(target, ".json"), beside(target, ".png"), *(_map_path(target, name) for name in maps)
+    if image is None:
+        return can_write(target, FORMAT, more=(first, *more), inputs=inputs, overwrite=overwrite)
+    if scan is not None:
+        check_place(scan, image)
+    inputs = list(inputs)
+    own = [each for each in inputs if Path(str(each).replace("::", "/")).resolve().is_relative_to(target.resolve())]
+    can_write(target, lambda there: is_own_zarr(there, FORMAT.name), inputs=own, overwrite=overwrite)
+    can_write(first, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
+    return target
+
+
+def beside(target: Path, ending: str) -> Path:
+    """Return the path of what lies beside a mask: `mask.json` for `mask.nii.gz`.
+
+    For labels of an image, `scan.zarr/labels/NAME`, it is `scan_NAME.json`, beside the store.
+    """
+    if (image := image_of(target)) is None:
+        return sibling(target, ending)
+    return sibling(store_of(image), f"_{target.name}{ending}")
 
 
 def write_mask(
@@ -198,7 +217,8 @@ def write_mask(
     """Write the mask (0 and 1, uint8) or labels, a picture, a record, and the probability where there is one.
 
     The files `mask.nii.gz`, `mask.png`, `mask.json` and `mask_probability.nii.gz` appear together once all are whole;
-    their paths are returned. Former ones of `MAPS` are removed.
+    their paths are returned. Former ones of `MAPS` are removed. Of labels in an image, `scan.zarr/labels/NAME`, all
+    others lie beside the store: `scan_NAME.png` and so on.
 
     Parameters
     ----------
@@ -220,8 +240,9 @@ def write_mask(
         name: each.values for name, each in zip(MAPS, (segmentation.probability, sure), strict=True) if each is not None
     }
     inputs = () if like is None else (like,)
-    target = check_mask_target(path, scan.unit, inputs, overwrite, maps=list(maps))
-    listed = FORMAT.companions(target)
+    target = check_mask_target(path, scan, inputs, overwrite, maps=list(maps))
+    image, note = image_of(target), beside(target, ".json")
+    listed = FORMAT.companions(target if image is None else note)
     former = [place for name in MAPS if name not in maps and (place := _map_path(target, name)).name in listed]
 
     def write(values: np.ndarray, place: Path) -> Path:
@@ -231,22 +252,26 @@ def write_mask(
             save(Field(values, scan.spacing, scan.unit, scan.affine), place, kind=FORMAT.name)
         return place
 
-    with temporary_folder(target) as work:
-        temporary = work / target.name
+    with temporary_folder(note) as work:
         mask, labels = segmentation.mask.values, segmentation.labels
-        write(mask.view(np.uint8) if labels is None else labels.values, temporary)
-        picture, note = sibling(temporary, ".png"), sibling(temporary, ".json")
+        values = mask.view(np.uint8) if labels is None else labels.values
+        parts = [work / beside(target, ending).name for ending in (".png", ".json")]
+        parts += [write(values, work / _map_path(target, name).name) for name, values in maps.items()]
+        if image is None:
+            parts = [write(values, work / target.name), *parts]
+        else:
+            write_labels(replace(scan, values=values), work / target.name, image=image)
+            mark(work / target.name, FORMAT.name)
         rows = {"scan": (scan.values, None), "mask": (scan.values, mask)}
-        _figure(segmentation, rows).savefig(picture, dpi=DPI)
-        parts = [temporary, picture, note]
-        parts += [write(values, _map_path(temporary, name)) for name, values in maps.items()]
+        _figure(segmentation, rows).savefig(work / beside(target, ".png").name, dpi=DPI)
         content = {**_record(segmentation, scan, record or {}), "files": [part.name for part in parts]}
-        FORMAT.write(note, content)
+        FORMAT.write(work / note.name, content)
         with hold_signals():
-            files = move_together(parts, target.parent)
+            added = () if image is None else (add_labels(work / target.name, image, target.name),)
+            files = move_together(parts, note.parent)
             for place in former:
                 remove(place)
-        return files
+        return (*added, *files)
 
 
 def segmentation_figure(segmentation: Segmentation) -> Figure:
@@ -280,7 +305,8 @@ def _figure(segmentation: Segmentation, rows: Mapping[str, tuple[np.ndarray, np.
 
 def _map_path(target: Path, name: str) -> Path:
     """Return `mask_probability.nii.gz` for `mask.nii.gz` and `probability`."""
-    return sibling(target, f"_{name}{target.name.removeprefix(sibling(target, '').name)}")
+    suffix = ".zarr" if image_of(target) else target.name.removeprefix(sibling(target, "").name)
+    return beside(target, f"_{name}{suffix}")
 
 
 def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> dict[str, Any]:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from curvafit.core.files import write_atomically
+from curvafit.core.files import temporary_folder, write_atomically
 from curvafit.core.records import can_write, is_own_zarr
 from curvafit.volumes.formats.arrays import write_npy
 from curvafit.volumes.formats.base import ScanError
 from curvafit.volumes.formats.medical import check_mrc, write_mrc
 from curvafit.volumes.formats.nifti import write_nifti
 from curvafit.volumes.formats.tiff import write_ome_tiff, write_tiff
-from curvafit.volumes.formats.zarr import mark, write_zarr
+from curvafit.volumes.formats.zarr import add_labels, image_of, mark, store_of, write_labels, write_zarr
 from curvafit.volumes.read import Source, field_of
 
 #: Suffix -> writer(field, path).
@@ -42,13 +43,14 @@ def save(
     kind: str = "volume",
     overwrite: bool = False,
 ) -> Path:
-    """Write a volume as NIfTI, TIFF, NPY, MRC or Zarr, by suffix.
+    """Write a volume as NIfTI, TIFF, NPY, MRC or Zarr, by suffix; or as labels of an OME-Zarr image.
 
     A file of that name is replaced once the new one is whole. A folder is replaced only if it is empty, if it is a Zarr
     store that `save` wrote with the same `kind`, or with `overwrite`.
 
     NIfTI keeps the affine (qform and sform) and the unit. TIFF (ImageJ's or OME's metadata), MRC (in Å) and Zarr
-    (OME-NGFF 0.5, with halved copies of a large volume) keep spacing and unit. NPY keeps the values only.
+    (OME-Zarr 0.5, with halved copies of a large volume) keep spacing, unit and the first voxel's place. NPY keeps the
+    values only. A path `IMAGE/labels/NAME` in an image of OME-Zarr 0.4 or 0.5 gets labels on that image's voxels.
 
     Raises ValueError if the suffix is unknown, the format cannot hold the values' type or needs a unit and the volume
     has none, the source is not a volume, or another folder has that name.
@@ -74,11 +76,18 @@ def save(
         if temporary.is_dir():
             mark(temporary, kind)
 
-    return write_atomically(target, write)
+    image = image_of(target)
+    if image is None:
+        return write_atomically(target, write)
+    with temporary_folder(store_of(image)) as work:
+        write(work / target.name)
+        return add_labels(work / target.name, image, target.name)
 
 
 def pick_writer(path: Path, unit: str) -> Callable[[Any, Path], None]:
-    """Return the writer of a file by its suffix, if the format can hold lengths in `unit`."""
+    """Return the writer of a file by its suffix, or of labels, if the format can hold lengths in `unit`."""
+    if (image := image_of(path)) is not None:
+        return partial(write_labels, image=image)
     suffix = next((known for known in WRITERS if path.name.lower().endswith(known)), None)
     if suffix is None:
         raise ScanError(f"a volume's name must end in one of {', '.join(WRITERS)}, got {path.name!r}")

@@ -1,18 +1,23 @@
-"""Zarr: reading of bare arrays, groups and OME-Zarr; writing of OME-NGFF 0.5."""
+"""Zarr: reading of arrays, groups and OME-Zarr; writing of OME-Zarr 0.5, and of labels into images of 0.4 and 0.5."""
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from curvafit.core.records import MARK
+from curvafit.core.files import move_into_place, write_content
+from curvafit.core.records import MARK, is_zarr
 from curvafit.core.runtime import hold_signals
+from curvafit.core.units import format_sampling, parse_unit
 from curvafit.volumes.formats.base import Damaged, Raw, ScanError, pick_key, read_spacing
 from curvafit.volumes.formats.part import Part, index_of, read_part
 
@@ -20,41 +25,73 @@ from curvafit.volumes.formats.part import Part, index_of, read_part
 CHUNK = 64
 #: Chunks of an array at most; more would take hours to read.
 _MOST = 10_000_000
-#: Spacing along all axes, unit and axis of channels of an array, each where it is known.
-_Place = tuple[tuple[Any, ...] | None, Any, int | None]
-#: Our unit -> OME-NGFF's, which has none for the voxel.
+#: Our unit -> OME-Zarr's, which has none for the voxel.
 _UNITS = {"nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter"}
+#: Version of OME-Zarr -> Zarr's format, for writing.
+_FORMATS = {"0.4": 2, "0.5": 3}
+
+
+class _Place(NamedTuple):
+    """Where an array's voxels lie: spacing and first voxel along all axes, unit and axis of channels, where known."""
+
+    spacing: tuple[Any, ...] | None = None
+    unit: Any = None
+    channels: int | None = None
+    first: tuple[float, ...] | None = None
+
+    @property
+    def affine(self) -> np.ndarray | None:
+        """Return the affine `(4, 4)`, x first; None where the first voxel is at 0, or not known."""
+        if self.spacing is None or self.first is None or len(self.spacing) < 3 or not any(self.first[-3:]):
+            return None
+        affine = np.diag([*self.spacing[:-4:-1], 1.0])
+        affine[:3, 3] = self.first[:-4:-1]
+        return affine
 
 
 def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
-    """Read an array, or one array of a group, with spacing and unit of its attributes or of OME-Zarr's multiscales."""
+    """Read an array, or one of a group, with spacing and unit of its attributes or of OME-Zarr's multiscales.
+
+    A key names an array, or an image of OME-Zarr, of which the finest level is read. Without one a group is that image,
+    holds one besides labels, or has a single array.
+    """
     import zarr
 
     _check_store(path)
     node: Any = zarr.open(path, mode="r")
     if isinstance(node, zarr.Array):
-        return _read_array(node, path, (*read_spacing(node.attrs.asdict(), node.ndim), None), part)
-    arrays = {name: member for name, member in node.members(max_depth=None) if isinstance(member, zarr.Array)}
-    attributes = node.attrs.asdict()
-    scales = _multiscales(attributes)
-    if key is None and scales:
-        key = next(iter(scales))
+        return _read_array(node, path, _Place(*read_spacing(node.attrs.asdict(), node.ndim)), part)
+    members = dict(node.members(max_depth=None))
+    arrays = {name: member for name, member in members.items() if isinstance(member, zarr.Array)}
+    images = {"": node} | {name: member for name, member in members.items() if name not in arrays}
+    levels = {name: _levels(name, group.attrs.asdict()) for name, group in images.items()}
+    firsts = {name: next(iter(places)) for name, places in levels.items() if places}
+    if key is None:
+        volumes = [name for name in firsts if "labels" not in name.split("/")]
+        key = firsts.get("") or (firsts[volumes[0]] if len(volumes) == 1 else None)
+    elif key.strip("/") in firsts:
+        key = firsts[key.strip("/")]
     name = pick_key(sorted(arrays), key, path)
     array = arrays[name]
-    place = scales.get(name) or (*read_spacing({**attributes, **array.attrs.asdict()}, array.ndim), None)
+    place = next((places[name] for places in levels.values() if name in places), None)
+    if place is None:
+        place = _Place(*read_spacing({**node.attrs.asdict(), **array.attrs.asdict()}, array.ndim))
     return _read_array(array, path / array.path, place, part)
 
 
 def _read_array(array: Any, folder: Path, place: _Place, part: Part | None) -> Raw:
     """Return the values of an array in a folder, with a sentence on chunks that are not stored."""
-    spacing, unit, channels = place
-    index_of(array, part, folder, channels)  # before chunks are counted: a header may claim any number of them
+    index_of(array, part, folder, place.channels)  # before chunks are counted: a header may claim any number of them
     gaps = _missing_chunks(array, folder)
-    return read_part(array, part, folder, channels)._replace(spacing=spacing, unit=unit, gaps=gaps)
+    raw = read_part(array, part, folder, place.channels)
+    return raw._replace(spacing=place.spacing, unit=place.unit, affine=place.affine, gaps=gaps)
 
 
-def write_zarr(field: Any, path: Path) -> None:
-    """Write an OME-NGFF 0.5 group of one image: the volume as `0`, halved copies as `1`, `2` … down to one chunk."""
+def write_zarr(field: Any, path: Path, version: str = "0.5", labels: bool = False) -> None:
+    """Write an image of OME-Zarr: the volume as `0`, halved copies as `1`, `2` … down to one chunk.
+
+    `labels` says that its whole numbers are labels of the image two folders above.
+    """
     import zarr
 
     levels = list(_halvings(np.asarray(field.values)))
@@ -64,20 +101,137 @@ def write_zarr(field: Any, path: Path) -> None:
     datasets = []
     for k in range(len(levels)):
         transforms = [{"type": "scale", "scale": [2**k * h for h in field.spacing]}]
-        if shift and k:
-            transforms += [{"type": "translation", "translation": [shift * (2**k - 1) * h for h in field.spacing]}]
+        first = [x + shift * (2**k - 1) * h for x, h in zip(_first(field), field.spacing, strict=True)]
+        if any(first):
+            transforms += [{"type": "translation", "translation": first}]
         datasets.append({"path": str(k), "coordinateTransformations": transforms})
-    image = {"name": "volume", "axes": [{"name": name, **kind} for name in "zyx"], "datasets": datasets}
+    image = {
+        "name": path.name if labels else "volume",
+        "axes": [{"name": name, **kind} for name in "zyx"],
+        "datasets": datasets,
+    }
+    old = _FORMATS[version] == 2
+    content: dict[str, Any] = {"multiscales": [image | {"version": version} if old else image]}
+    if labels:
+        content["image-label"] = {"source": {"image": "../../"}} | ({"version": version} if old else {})
+    naming: dict[str, Any] = {"chunk_key_encoding": {"name": "v2", "separator": "/"}} if old else {}
+    naming |= {} if old else {"dimension_names": ("z", "y", "x")}
     with hold_signals():  # Zarr's own threads would go on to write while the folder is deleted
-        group = zarr.create_group(path, attributes={"ome": {"version": "0.5", "multiscales": [image]}})
+        attributes = content if old else {"ome": {"version": version, **content}}
+        group = zarr.create_group(path, attributes=attributes, zarr_format=2 if old else 3)
         for k, values in enumerate(levels):
             group.create_array(
                 str(k),
                 data=values,
                 chunks=tuple(min(CHUNK, n) for n in values.shape),
-                dimension_names=("z", "y", "x"),
                 config={"write_empty_chunks": True},  # so that a chunk that is not there is one that was lost
+                **naming,
             )
+
+
+def _first(field: Any) -> tuple[float, ...]:
+    """Return where a field's first voxel lies (z, y, x); at 0 if its axes are turned, which OME-Zarr cannot say."""
+    affine = field.affine
+    if affine is None or not np.allclose(affine[:3, :3], np.diag(field.spacing[::-1]), rtol=1e-5, atol=0):
+        return (0.0, 0.0, 0.0)
+    return tuple(affine[2::-1, 3].tolist())
+
+
+# ---- labels of an image ----------------------------------------------------------------------------------------------
+
+
+def image_of(path: Path) -> Path | None:
+    """Return the OME-Zarr image of which a path, `IMAGE/labels/NAME`, is to be labels; None if it is another path.
+
+    Raises ScanError if there is no such image, its version is not 0.4 or 0.5, or the name is none.
+    """
+    image = path.parent.parent
+    if path.parent.name != "labels" or not is_zarr(image):
+        return None
+    found = _version_of(image)
+    if found not in _FORMATS:
+        said = "no image of OME-Zarr" if found is None else f"OME-Zarr {found}"
+        raise ScanError(f"labels are written into an image of OME-Zarr 0.4 or 0.5, {image} is {said}")
+    if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", path.name):
+        raise ScanError(f"a name of labels has letters, digits and _ . - alone, got {path.name!r}")
+    return image
+
+
+def store_of(image: Path) -> Path:
+    """Return the outermost Zarr group around an image."""
+    groups = [image]
+    while is_zarr(groups[-1].parent):
+        groups.append(groups[-1].parent)
+    return groups[-1]
+
+
+def write_labels(field: Any, path: Path, *, image: Path) -> None:
+    """Write whole numbers, or a mask, as labels of an image; `path` may be anywhere until `add_labels`."""
+    if field.values.dtype.kind not in "biu":
+        raise ScanError(f"labels must be whole numbers, got values of type {field.values.dtype}")
+    check_place(field, image)
+    whole = replace(field, values=field.values.view(np.uint8)) if field.values.dtype.kind == "b" else field
+    write_zarr(whole, path, _version_of(image) or "", labels=True)
+
+
+def check_place(field: Any, image: Path) -> None:
+    """Raise ScanError where a field's voxels are not those of a level of an image, or of a part of one."""
+    import zarr
+
+    group: Any = zarr.open_group(image, mode="r")
+    places = _levels("", group.attrs.asdict())
+    for name, place in places.items():
+        edges = np.array(place.spacing or (1.0, 1.0, 1.0), dtype=np.float64)[-3:]
+        start = np.array(place.first or (0.0, 0.0, 0.0))[-3:]
+        unit, factor = parse_unit(place.unit)
+        first = (np.array(_first(field)) / factor - start) / edges
+        last = first + field.shape
+        alike = np.allclose(np.array(field.spacing) / factor, edges, rtol=1e-3, atol=0)
+        inside = (first > -0.01).all() and (last < np.array(group[name].shape[-3:]) + 0.01).all()
+        if unit == field.unit and alike and inside:
+            return
+    size = format_sampling(field.shape, field.spacing, field.unit)
+    raise ScanError(f"labels must have the voxels of a level of {image} or of a part of one, got {size}")
+
+
+@hold_signals()
+def add_labels(written: Path, image: Path, name: str) -> Path:
+    """Move written labels into an image, under a name, list them there, and return where they are."""
+    import zarr
+
+    folder = image / "labels"
+    folder.mkdir(exist_ok=True)
+    target = move_into_place(written, folder / name)
+    version, old = _version_of(image), (image / ".zgroup").exists()
+    place = folder / (".zattrs" if old else "zarr.json")
+    content = json.loads(place.read_text(encoding="utf-8")) if place.exists() else {}
+    if old:
+        listed = content
+    else:
+        content = {"zarr_format": 3, "node_type": "group", "attributes": {}, **content}
+        listed = content["attributes"].setdefault("ome", {"version": version})
+    if name not in listed.setdefault("labels", []):
+        listed["labels"].append(name)
+        write_content(place, json.dumps(content, indent=2))
+    if old and not (folder / ".zgroup").exists():
+        write_content(folder / ".zgroup", json.dumps({"zarr_format": 2}))
+    root = store_of(image)
+    if (root / ".zmetadata").exists() or zarr.open_group(root, mode="r").metadata.consolidated_metadata is not None:
+        with warnings.catch_warnings():  # that format 3 does not specify what this store has
+            warnings.simplefilter("ignore")
+            zarr.consolidate_metadata(root)
+    return target
+
+
+def _version_of(image: Path) -> str | None:
+    """Return the version of OME-Zarr of an image; None if a group is none."""
+    import zarr
+
+    attributes: Any = zarr.open_group(image, mode="r").attrs.asdict()
+    scales = attributes.get("ome", attributes).get("multiscales")
+    if not scales:
+        return None
+    return str(attributes.get("ome", {}).get("version") or scales[0].get("version") or "0.4")
 
 
 @hold_signals()
@@ -105,7 +259,7 @@ def _halvings(values: np.ndarray) -> Iterator[np.ndarray]:
         yield values
 
 
-def _multiscales(attributes: Mapping[str, Any]) -> dict[str, _Place]:
+def _levels(name: str, attributes: Mapping[str, Any]) -> dict[str, _Place]:
     """Return the place of each level of an OME-Zarr image, by the level's path; the unit is that of the last axis."""
     image = next(iter(attributes.get("ome", attributes).get("multiscales") or []), {})
     axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", [])]
@@ -113,8 +267,16 @@ def _multiscales(attributes: Mapping[str, Any]) -> dict[str, _Place]:
     channels = next((k for k, axis in enumerate(axes) if axis.get("type", axis.get("name")) in ("channel", "c")), None)
     places: dict[str, _Place] = {}
     for level in image.get("datasets", []):
-        scales = [t["scale"] for t in level.get("coordinateTransformations", []) if t.get("type") == "scale"]
-        places[level["path"]] = (tuple(float(h) for h in scales[0]) if scales else None, unit, channels)
+        scale, first = None, None
+        # Those of all levels come after those of one.
+        for step in (*level.get("coordinateTransformations", []), *image.get("coordinateTransformations", [])):
+            if step.get("type") == "scale":
+                by = np.array(step["scale"], dtype=np.float64)
+                scale, first = by if scale is None else by * scale, None if first is None else by * first
+            elif step.get("type") == "translation":
+                first = np.array(step["translation"], dtype=np.float64) + (0.0 if first is None else first)
+        spacing, corner = (None if each is None else tuple(each.tolist()) for each in (scale, first))
+        places[f"{name}/{level['path']}".strip("/")] = _Place(spacing, unit, channels, corner)
     return places
 
 

@@ -1,0 +1,168 @@
+"""Labels in an image of OME-Zarr 0.4 and 0.5: listed, on the right voxels, and nothing else is touched."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+from calling import call, refused
+
+from curvafit.volumes import Field, ScanError, load, save
+
+SHAPE, SPACING = (20, 70, 66), (0.5, 0.25, 0.25)
+pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
+
+
+def content(path: Path, version: str) -> dict[str, Any]:
+    """The attributes of a group, of OME's namespace where the version has one."""
+    if version == "0.4":
+        return json.loads((path / ".zattrs").read_text())
+    return json.loads((path / "zarr.json").read_text())["attributes"]["ome"]
+
+
+def files(path: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
+
+
+@pytest.fixture(params=["0.4", "0.5"])
+def image(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, str]:
+    """A tube in noise, as the second of two channels, with two levels; the first voxel is not at 0."""
+    z, y, x = np.mgrid[: SHAPE[0], : SHAPE[1], : SHAPE[2]]
+    tube = np.hypot(y - 30 + 5 * np.sin(z / 5), x - 32) < 12
+    grey = (60 + 100 * tube + 10 * np.random.default_rng(0).standard_normal(SHAPE)).astype(np.uint8)
+    old, path = request.param == "0.4", tmp_path / "scan.zarr"
+    naming: dict[str, Any] = {"chunk_key_encoding": {"name": "v2", "separator": "/"}} if old else {}
+    group, levels = zarr.open_group(path, mode="w", zarr_format=2 if old else 3), []
+    for k, n in enumerate((1, 2)):
+        values = np.stack([np.zeros_like(grey), grey])[None, :, ::n, ::n, ::n]
+        group.create_array(str(k), data=values, chunks=(1, 1, 16, 32, 32), **naming)
+        scale = {"type": "scale", "scale": [1, 1, *(n * h / 2 for h in SPACING)]}
+        levels.append({"path": str(k), "coordinateTransformations": [scale]})
+    axes = [{"name": "t", "type": "time"}, {"name": "c", "type": "channel"}]
+    axes += [{"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"]
+    all_levels = [{"type": "scale", "scale": [1, 1, 2, 2, 2]}, {"type": "translation", "translation": [0, 0, 3, 2, 1]}]
+    scales = {"axes": axes, "datasets": levels, "coordinateTransformations": all_levels}
+    named = (
+        {"multiscales": [scales | {"version": "0.4"}]} if old else {"ome": {"version": "0.5", "multiscales": [scales]}}
+    )
+    group.attrs.update(named)
+    return path, request.param
+
+
+def test_steps_of_all_levels_place_each(image: tuple[Path, str]) -> None:
+    field = load(image[0], channel=1)
+    assert (field.shape, field.spacing, field.unit) == (SHAPE, SPACING, "um")
+    assert field.affine is not None and field.affine[:3, 3].tolist() == [1, 2, 3]
+    coarse = load(f"{image[0]}::1", channel=1)
+    assert (
+        coarse.spacing == (1.0, 0.5, 0.5) and coarse.affine is not None and coarse.affine[:3, 3].tolist() == [1, 2, 3]
+    )
+
+
+def test_labels_lie_on_the_image_and_are_listed(image: tuple[Path, str]) -> None:
+    path, version = image
+    before, field = files(path), load(path, channel=1)
+    mask = Field(field.values > 110, field.spacing, field.unit, field.affine)
+    assert save(mask, path / "labels/tube") == path / "labels/tube"
+    part = load(path, channel=1, crop="4:14,:,:")
+    save(Field((part.values > 110).astype(np.uint16) * 700, part.spacing, part.unit, part.affine), path / "labels/part")
+    assert {name: data for name, data in files(path).items() if not name.startswith("labels")} == before
+    assert content(path / "labels", version)["labels"] == ["tube", "part"]
+    own = content(path / "labels/tube", version)
+    assert own["image-label"]["source"] == {"image": "../../"}
+    (scales,) = own["multiscales"]
+    assert scales["name"] == "tube" and [axis["name"] for axis in scales["axes"]] == list("zyx")
+    steps = [level["coordinateTransformations"] for level in scales["datasets"]]
+    for k, (scale, first) in enumerate(steps):
+        assert scale["scale"] == [2**k * h for h in SPACING] and first["translation"] == [3, 2, 1]
+    back = load(f"{path}::labels/tube")
+    assert back.values.dtype == np.uint8 and np.array_equal(back.values, mask.values)
+    np.testing.assert_array_equal(back.affine, field.affine)
+    low = load(f"{path}::labels/part")
+    assert low.values.max() == 700 and low.affine is not None and low.affine[:3, 3].tolist() == [1, 2, 5]
+    assert load(path, channel=1).shape == SHAPE  # the image is still what the store is read as
+
+
+def test_a_crop_keeps_its_place_in_a_store_of_its_own(image: tuple[Path, str], tmp_path: Path) -> None:
+    part = load(image[0], channel=1, crop="4:14,8:,:")
+    back = load(save(part, tmp_path / "part.zarr"))
+    np.testing.assert_allclose(back.affine, part.affine)
+
+
+def test_labels_are_replaced_by_what_wrote_them_alone(image: tuple[Path, str]) -> None:
+    path, version = image
+    field = load(path, channel=1)
+    mask = Field(field.values > 110, field.spacing, field.unit, field.affine)
+    for _ in range(2):
+        save(mask, path / "labels/tube", kind="ours")
+    assert content(path / "labels", version)["labels"] == ["tube"]
+    with pytest.raises(ValueError, match="not free"):
+        save(mask, path / "labels/tube", kind="other")
+
+
+def test_a_consolidated_store_shows_its_labels(image: tuple[Path, str]) -> None:
+    path = image[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        zarr.consolidate_metadata(path)
+    field = load(path, channel=1)
+    save(Field(field.values > 110, field.spacing, field.unit, field.affine), path / "labels/tube")
+    assert "labels/tube/0" in dict(zarr.open_group(path, mode="r").members(max_depth=None))
+
+
+@pytest.mark.parametrize(
+    ("change", "name", "words"),
+    [
+        ({"spacing": (0.5, 0.25, 0.2)}, "tube", "voxels of a level"),
+        ({"unit": "mm"}, "tube", "voxels of a level"),
+        ({"affine": None}, "tube", "voxels of a level"),  # it begins before the image does
+        ({"values": np.ones(SHAPE, np.float32)}, "tube", "whole numbers"),
+        ({}, ".tube", "name of labels"),
+    ],
+)
+def test_other_voxels_are_refused(image: tuple[Path, str], change: dict[str, Any], name: str, words: str) -> None:
+    path, field = image[0], load(image[0], channel=1)
+    before = files(path)
+    told = {"values": field.values, "spacing": field.spacing, "unit": field.unit, "affine": field.affine} | change
+    with pytest.raises(ScanError, match=words):
+        save(Field(**told), path / "labels" / name)
+    assert files(path) == before
+
+
+def test_an_image_of_another_version_or_none_is_refused(tmp_path: Path) -> None:
+    group = zarr.open_group(tmp_path / "scan.zarr", mode="w")
+    with pytest.raises(ScanError, match="no image of OME-Zarr"):
+        save(Field(np.eye(4, dtype=bool)[None] | np.zeros((4, 4, 4), bool)), tmp_path / "scan.zarr/labels/a")
+    group.attrs["ome"] = {"version": "0.6", "multiscales": [{}]}
+    with pytest.raises(ScanError, match=r"OME-Zarr 0\.6"):
+        save(Field(np.eye(4, dtype=bool)[None] | np.zeros((4, 4, 4), bool)), tmp_path / "scan.zarr/labels/a")
+
+
+def test_a_command_writes_labels_and_the_rest_beside_the_store(image: tuple[Path, str], monkeypatch) -> None:
+    path, version = image
+    monkeypatch.chdir(path.parent)
+    command = ("segment", "scan.zarr", "--channel", 1, "--prior", "tubes", "--weight", 0.1, "--steps", 2)
+    for _ in range(2):  # the second replaces the first
+        result = call(*command, "-o", "scan.zarr/labels/tube")
+        assert result.exit_code == 0, result.stderr
+    assert sorted(place.name for place in path.parent.iterdir()) == ["scan.zarr", "scan_tube.json", "scan_tube.png"]
+    assert content(path / "labels", version)["labels"] == ["tube"]
+    record = json.loads(Path("scan_tube.json").read_text())
+    assert record["files"] == ["scan_tube.png", "scan_tube.json"]
+    truth = load(path, channel=1).values > 110
+    assert (load(f"{path}::labels/tube").values == truth).mean() > 0.97
+    before = files(path.parent)
+    refused(
+        call(*command, "--spacing", 0.3, "--unit", "um", "-o", "scan.zarr/labels/tube"),
+        "voxels of a level",
+        progress=True,
+    )
+    refused(
+        call("segment", "scan.zarr::labels/tube", *command[4:], "-o", "scan.zarr/labels/tube"), "write over the input"
+    )
+    assert files(path.parent) == before
