@@ -22,7 +22,7 @@ FLOORS = (
     ("atlas_map",),
     ("studies",),
     ("report",),
-    ("cli", "nnunet"),
+    ("cli", "napari", "nnunet"),
     ("__main__",),
 )
 

@@ -1,0 +1,72 @@
+"""A napari layer as a volume, and a volume as a layer: values, voxel edges and their unit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from curvafit.core.units import METRES, parse_unit
+from curvafit.volumes.field import Field, ScanError
+
+#: Our unit -> napari's.
+_UNITS = {"voxel": "pixel", "nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter"}
+
+
+def field_of_layer(layer: Any) -> Field:
+    """Return the values of a layer, of its finest level, with its scale and unit; else ScanError.
+
+    The layer has three axes, besides any of length one before them, and no colours. A turned or sheared layer is read
+    on its own axes.
+    """
+    if layer is None:
+        raise ScanError("expected a layer, got none: add one")
+    if getattr(layer, "rgb", False):
+        raise ScanError(f"expected grey levels or labels, got colours in the layer {layer.name}")
+    data = layer.data[0] if layer.multiscale else layer.data
+    if len(data.shape) < 3 or any(n != 1 for n in data.shape[:-3]):
+        raise ScanError(f"expected a layer of three axes, got {layer.name} of shape {tuple(data.shape)}")
+    values = np.asarray(data).reshape(data.shape[-3:])
+    spacing, unit = _lengths(layer)
+    return Field(values, spacing, unit, source=layer.name)
+
+
+def _lengths(layer: Any) -> tuple[tuple[float, float, float], str]:
+    """Return voxel edges (z, y, x) and their unit, that of the last axis."""
+    found = []
+    for each in layer.units[-3:]:
+        try:
+            found.append(parse_unit(str(each)))
+        except ValueError:
+            raise ScanError(f"expected lengths along the axes of {layer.name}, got the unit {each}") from None
+    unit = found[-1][0]
+    if any((name == "voxel") != (unit == "voxel") for name, _ in found):
+        raise ScanError(f"expected one kind of unit along the axes of {layer.name}, got pixels and lengths")
+    into = [1.0 if name == unit else METRES[name] / METRES[unit] for name, _ in found]
+    z, y, x = (abs(float(h)) * f * g for h, (_, f), g in zip(layer.scale[-3:], found, into, strict=True))
+    return (z, y, x), unit
+
+
+def place_of_layer(layer: Any) -> dict[str, Any]:
+    """Return options of a new layer that lies, with its three last axes, where a layer does."""
+    return {
+        "scale": layer.scale[-3:],
+        "translate": layer.translate[-3:],
+        "rotate": layer.rotate[-3:, -3:],
+        "shear": layer.shear if len(layer.scale) == 3 else None,
+        "units": layer.units[-3:],
+    }
+
+
+def place_of_field(field: Field) -> dict[str, Any]:
+    """Return options of a layer for a field."""
+    return {"scale": field.spacing, "units": (_UNITS[field.unit],) * 3}
+
+
+def put_layer(viewer: Any, kind: str, data: Any, name: str, **options: Any) -> Any:
+    """Add a layer of a kind, such as `"labels"`, in the place of one of its name and kind that the plugin added."""
+    mark = {"curvafit": name}
+    for old in list(viewer.layers):
+        if old.metadata.get("curvafit") == name and type(old).__name__.lower() == kind:
+            viewer.layers.remove(old)
+    return getattr(viewer, f"add_{kind}")(data, name=name, metadata=mark, **options)

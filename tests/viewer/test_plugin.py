@@ -1,0 +1,220 @@
+"""The plugin in a real napari, driven by its own buttons: xvfb-run -a python -m pytest -W ignore tests/viewer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+napari = pytest.importorskip("napari")
+pytest.importorskip("qtpy.QtWidgets", exc_type=ImportError)
+
+from qtpy.QtCore import Qt  # noqa: E402
+from qtpy.QtTest import QTest  # noqa: E402
+from qtpy.QtWidgets import QApplication  # noqa: E402
+
+from curvafit.napari.complete import Complete  # noqa: E402
+from curvafit.napari.generate import Generate, annotated_tubes  # noqa: E402
+from curvafit.napari.layers import field_of_layer  # noqa: E402
+from curvafit.napari.measure import Measure  # noqa: E402
+from curvafit.volumes import ScanError  # noqa: E402
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
+PLACE = {"scale": (0.5, 0.25, 0.25), "units": ("micrometer",) * 3, "translate": (10, 20, 30)}
+
+
+@pytest.fixture
+def viewer() -> Iterator[Any]:
+    viewer = napari.Viewer(show=False)
+    yield viewer
+    viewer.close()
+
+
+def docked(viewer: Any, kind: type) -> Any:
+    widget = kind(viewer)
+    viewer.window.add_dock_widget(widget)
+    return widget
+
+
+def wait(done: Callable[[], bool], seconds: float = 120) -> None:
+    end = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < end
+        QApplication.processEvents()
+        time.sleep(0.01)
+
+
+def click(button: Any) -> None:
+    QTest.mouseClick(button.native, Qt.MouseButton.LeftButton)
+
+
+def run(widget: Any) -> str:
+    """Press the button, wait for the end, and return what the widget says."""
+    click(widget.run_button)
+    wait(lambda: widget.run_button.enabled)
+    return widget.status.value
+
+
+def rods(shape: tuple[int, int, int] = (33, 40, 44)) -> np.ndarray:
+    """Two rods along z with the labels 3 and 7."""
+    z, y, x = np.mgrid[: shape[0], : shape[1], : shape[2]]
+    labels = np.where(np.hypot(y - 12 + 3 * np.sin(z / 6), x - 12) < 5, 3, 0)
+    return np.where(np.hypot(y - 28, x - 30 + 3 * np.cos(z / 6)) < 6, 7, labels)
+
+
+def dice(a: np.ndarray, b: np.ndarray) -> float:
+    return 2 * np.count_nonzero(a & b) / (np.count_nonzero(a) + np.count_nonzero(b))
+
+
+def test_labels_are_completed_and_it_can_be_undone(viewer: Any) -> None:
+    truth = rods()
+    some = np.zeros_like(truth)
+    some[::8] = truth[::8]
+    layer = viewer.add_labels(some.copy(), name="cells", **PLACE)
+    widget = docked(viewer, Complete)
+    assert "filled by the network" in run(widget)
+    for label in (3, 7):
+        assert dice(layer.data == label, truth == label) > 0.9
+    np.testing.assert_array_equal(layer.data[::8], truth[::8])
+    doubt = viewer.layers["doubt of cells"]
+    np.testing.assert_allclose(doubt.scale, PLACE["scale"])
+    np.testing.assert_allclose(doubt.translate, PLACE["translate"])
+    assert str(doubt.units[0]) == "micrometer" and doubt.data.max() <= 1 and not doubt.data[::8].any()
+    layer.undo()
+    np.testing.assert_array_equal(layer.data, some)
+    layer.redo()
+    assert dice(layer.data == 3, truth == 3) > 0.9
+
+
+def test_slices_are_suggested_and_a_button_goes_there(viewer: Any) -> None:
+    truth = rods()
+    some = np.zeros_like(truth)
+    some[[0, 4, 8, 32]] = truth[[0, 4, 8, 32]]
+    layer = viewer.add_labels(some, name="cells", **PLACE)
+    layer.selected_label = 7
+    widget = docked(viewer, Complete)
+    widget.which.value, widget.suggest.value = "the selected label", 2
+    run(widget)
+    assert dice(layer.data == 7, truth == 7) > 0.8
+    np.testing.assert_array_equal(layer.data == 3, some == 3)  # the other label is left alone
+    frames = viewer.layers["suggested slices of cells"]
+    buttons = list(widget.suggestions)
+    slices = [int(button.text.split()[1]) for button in buttons]
+    assert len(slices) == 2 and all(8 < k < 32 for k in slices)  # the largest gap
+    assert [float(frame[0, 0]) for frame in frames.data] == slices
+    click(buttons[1])
+    assert viewer.dims.current_step[0] == slices[1]
+    run(widget)
+    assert [each.name for each in viewer.layers].count("doubt of cells") == 1  # in the place of the former
+
+
+def test_an_image_and_another_axis(viewer: Any) -> None:
+    truth = np.moveaxis(rods(), 0, 2)
+    some = np.zeros_like(truth)
+    some[:, :, ::8] = truth[:, :, ::8]
+    place = {"scale": (0.25, 0.25, 0.5), "units": ("micrometer",) * 3}
+    grey = (60 + 80 * (truth > 0) + 15 * np.random.default_rng(0).standard_normal(truth.shape)).astype(np.float32)
+    viewer.add_image(grey, name="scan", **place)
+    layer = viewer.add_labels(some, name="cells", **place)
+    widget = docked(viewer, Complete)
+    widget.image.value, widget.axis.value, widget.known.value = viewer.layers["scan"], "x", "0::8"
+    assert "image" in run(widget)
+    assert dice(layer.data > 0, truth > 0) > 0.93
+
+
+def test_work_stops_where_it_is_told_to(viewer: Any) -> None:
+    widget = docked(viewer, Generate)
+    widget.edge.value, widget.steps.value = 64, 20000
+    click(widget.run_button)
+    assert not widget.run_button.enabled
+    wait(lambda: "Growing" in widget.status.value)
+    click(widget.stop_button)
+    wait(lambda: widget.run_button.enabled, 30)
+    assert widget.status.value == "Stopped." and not len(viewer.layers)
+
+
+def test_a_texture_is_grown_at_its_scale_and_measured(viewer: Any, tmp_path: Any) -> None:
+    widget = docked(viewer, Generate)
+    widget.edge.value, widget.steps.value, widget.spacing.value, widget.unit.value = 40, 300, 0.5, "um"
+    widget.phase.value = True
+    run(widget)
+    layer = viewer.layers["tubes, seed 0"]
+    field = field_of_layer(layer)
+    assert field.shape == (40, 40, 40) and field.spacing == (0.5,) * 3 and field.unit == "um"
+    assert np.array_equal(viewer.layers["phase field of tubes, seed 0"].data > 0, layer.data > 0)
+    gauge = docked(viewer, Measure)
+    gauge.layer.value, gauge.file.value = layer, tmp_path / "tubes.csv"
+    assert "tubes.csv written" in run(gauge)
+    rows = dict(zip(gauge.table.row_headers, gauge.table.data.to_list(), strict=True))
+    assert 3 < float(rows["Tb.Th (µm)"][0]) < 7 and gauge.canvas is not None
+    assert "thickness" in (tmp_path / "tubes.csv").read_text()
+    gauge.file.value = tmp_path / "mine.csv"
+    gauge.file.value.write_text("mine")
+    assert "not free" in run(gauge) and gauge.file.value.read_text() == "mine"
+
+
+def test_each_label_has_its_row_and_its_numbers_beneath_the_mouse(viewer: Any) -> None:
+    layer = viewer.add_labels(rods(), name="cells", **PLACE)
+    gauge = docked(viewer, Measure)
+    run(gauge)
+    assert [int(each) for each in gauge.table.row_headers] == [3, 7] and [each.part[1] for each in gauge.measures] == [
+        3,
+        7,
+    ]
+    voxels = layer.features.set_index("index")["V (µm³)"] / (0.5 * 0.25 * 0.25)
+    assert voxels.to_dict() == pytest.approx({k: np.count_nonzero(rods() == k) for k in (3, 7)})
+
+
+@pytest.mark.parametrize(
+    ("data", "options", "words"),
+    [
+        (np.ones((8, 8), int), {}, "three axes"),
+        (np.ones((3, 8, 8, 8), int), {}, "three axes"),
+        (np.zeros((8, 8, 8), int), {}, "slices with labels"),
+        (np.ones((8, 8, 8), int), {"units": ("pixel", "micrometer", "micrometer")}, "kind of unit"),
+        (np.ones((8, 8, 8), int), {"units": ("second",) * 3}, "unit second"),
+    ],
+)
+def test_what_is_no_volume_is_said_in_a_sentence(viewer: Any, data: np.ndarray, options: dict, words: str) -> None:
+    viewer.add_labels(data, name="cells", **options)
+    widget = docked(viewer, Complete)
+    assert words in run(widget) and len(viewer.layers) == 1
+
+
+@pytest.mark.parametrize("text", ["a", "0,99", "1:2:3:4", "-1"])
+def test_slices_that_are_none_are_said(viewer: Any, text: str) -> None:
+    viewer.add_labels(rods(), name="cells")
+    widget = docked(viewer, Complete)
+    widget.known.value = text
+    assert "known slices" in run(widget)
+
+
+def test_no_layer_is_said(viewer: Any) -> None:
+    for kind in (Complete, Measure):
+        assert "got none" in run(docked(viewer, kind))
+
+
+def test_colours_and_other_units() -> None:
+    from napari.layers import Image
+
+    with pytest.raises(ScanError, match="colours"):
+        field_of_layer(Image(np.zeros((8, 8, 8, 3), np.uint8), rgb=True))
+    field = field_of_layer(Image(np.zeros((1, 8, 9, 10)), scale=(1, 2, 300, 300), units=("s", "um", "nm", "nm")))
+    assert field.shape == (8, 9, 10) and field.unit == "nm" and field.spacing == pytest.approx((2000, 300, 300))
+
+
+def test_the_manifest_names_what_is_there(viewer: Any) -> None:
+    from npe2 import PluginManager
+
+    manager = PluginManager.instance()
+    manager.discover()
+    names = {each.display_name for each in manager.get_manifest("curvafit").contributions.widgets}
+    assert names == {"Complete", "Measure", "Generate"}
+    for name in names:
+        viewer.window.add_plugin_dock_widget("curvafit", name)
+    viewer.open_sample("curvafit", "tubes")
+    assert [each.name for each in viewer.layers] == ["tubes", "every 8th slice", "all of them"]
+    assert annotated_tubes()[1][0][1].sum() == 0
