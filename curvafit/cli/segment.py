@@ -73,7 +73,7 @@ def segment(
 
 
 @command(
-    "curvafit reconstruct labels.nii.gz --every 8 -o volume.nii.gz",
+    "curvafit reconstruct labels.nii.gz -o volume.nii.gz",
     "curvafit reconstruct labels.nii.gz --every 8 --image scan.nii.gz -o volume.nii.gz",
     "curvafit reconstruct labels.nii.gz --every 8 --example whole.nii.gz -o volume.nii.gz",
     "curvafit reconstruct labels.tif --known 0,7,15 --axis x --suggest 3 -o volume.tif",
@@ -85,7 +85,9 @@ def reconstruct(
     slices: Volume,
     out: Target,
     prior: OwnPrior = None,
-    every: Annotated[int | None, _what(help="Distance of known slices: with 8, every eighth slice is known.")] = None,
+    every: Annotated[
+        int | None, _what(help="Distance of known slices, 8: every eighth. By default those with labels are known.")
+    ] = None,
     first: Annotated[int | None, _what(help="Number of the first known slice, with --every; by default 0.")] = None,
     known: Annotated[str | None, _what("--known", "--slices", help="Or also: numbers of known slices, 0,7,15.")] = None,
     ignore: Annotated[
@@ -122,7 +124,7 @@ def reconstruct(
     """Fill a mask between known slices; write it, the probability of each voxel, a picture and a record."""
     if axis.lower() not in ("z", "y", "x"):
         raise ValueError(f"--axis must be z, y or x, got {axis!r}")
-    if (every is None and known is None) == (ignore is None):
+    if (every is not None or known is not None) and ignore is not None:
         raise ValueError("give either --every and --known, which slices are known, or --ignore, what is not")
     if labels is not None and (reading["label"] is not None or suggest):
         raise ValueError("--labels is for several structures; --label and --suggest are for one")

@@ -36,6 +36,7 @@ from curvafit.segmentation.slices import (
     check_place,
     check_spacing,
     known_places,
+    labelled_slices,
     mark_known,
     require_labels,
 )
@@ -122,7 +123,7 @@ def reconstruct(
         A law as in `segment`, to be tried; by default none. Each law that a fit trusts is tried.
     every, first
         Slices `first`, `first + every`, … along `axis` are known. Before the first known slice and beyond the last, the
-        volume goes on as that slice is, or as an image tells.
+        volume goes on as that slice is, or as an image tells. By default the slices with labels are known.
     known
         The numbers of known slices, in place of `every` or besides.
     ignore
@@ -158,7 +159,7 @@ def reconstruct(
     """
     volume = field_of(slices, **reading)
     axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
-    places, marks = _find_known(volume, axis, every, first, known, ignore)
+    places, marks, which = _find_known(volume, axis, every, first, known, ignore)
     target = Slices.of(volume, places, axis, periodic, marks)
     suggest = check_int(suggest, "a number of slices from 0", 0, volume.shape[axis] - len(places))
     if stiffness is not None:
@@ -207,7 +208,7 @@ def reconstruct(
     return Segmentation.of(
         volume, _turn_back(axis, mask), _turn_back(axis, phase), chosen.law, width,
         (
-            *_doubt_places(volume, axis, places, every), *_doubt_labels(volume, axis, places, ignore), *notes,
+            *which, *_doubt_labels(volume, axis, places, ignore), *notes,
             *_extrapolated(places, volume.shape[axis], evidence is not None),
         ),
         weight=None, status=said, uncertainty=uncertain, image=seen,
@@ -304,26 +305,34 @@ def _profile(level: np.ndarray, epsilon: float) -> np.ndarray:
 
 def _find_known(
     volume: Field, axis: int, every: int | None, first: int, known: Sequence[int] | None, ignore: int | None
-) -> tuple[list[int], np.ndarray | None]:
-    """Return the numbers of the known slices, and the marks in others."""
-    if ignore is None:
-        return known_places(volume.shape[axis], every, first, known), None
-    if every is not None or known is not None:
-        raise ScanError("give either every, known or ignore")
-    return annotated_slices(np.moveaxis(volume.values, axis, 0), check_int(ignore, "a label to ignore", -SEEDS, SEEDS))
+) -> tuple[list[int], np.ndarray | None, tuple[str, ...]]:
+    """Return the numbers of the known slices, the marks in others, and notes."""
+    values = np.moveaxis(volume.values, axis, 0)
+    if ignore is not None:
+        if every is not None or known is not None:
+            raise ScanError("give either every, known or ignore")
+        return *annotated_slices(values, check_int(ignore, "a label to ignore", -SEEDS, SEEDS)), ()
+    if every is None and known is None:
+        places = labelled_slices(values)
+        which = f"The {len(places)} slices with labels are known: {_list(places, 24)}."
+        return places, None, (f"{which} One that is rightly empty must be named.",)
+    places = known_places(len(values), every, first, known)
+    return places, None, () if every is None else _doubt_places(values, places)
 
 
-def _doubt_places(volume: Field, axis: int, places: list[int], every: int | None) -> tuple[str, ...]:
-    """Return a sentence where few slices have labels, and some of them are not every `every`-th."""
-    if every is None:
-        return ()
-    labelled = np.flatnonzero((np.moveaxis(volume.values, axis, 0) > 0).any((1, 2)))
+def _doubt_places(values: np.ndarray, places: list[int]) -> tuple[str, ...]:
+    """Return a sentence where few slices have labels, and some of them are not among the known ones."""
+    labelled = np.flatnonzero((values > 0).any((1, 2)))
     strange = sorted(set(labelled.tolist()) - set(places))
     if not strange or 2 * len(labelled) > np.ptp(labelled) + 1:
         return ()
-    numbers = ", ".join(map(str, strange[:FEW])) + (", …" if len(strange) > FEW else "")
-    few = f"Only {len(labelled)} of {volume.shape[axis]} slices have labels, but {numbers} are not among the known ones"
+    few = f"Only {len(labelled)} of {len(values)} slices have labels, but {_list(strange)} are not among the known ones"
     return (f"{few}: if those are what you annotated, another every or first is meant, or known.",)
+
+
+def _list(numbers: Sequence[int], most: int = FEW) -> str:
+    """Return the first of some numbers as a list."""
+    return ", ".join(map(str, numbers[:most])) + (", …" if len(numbers) > most else "")
 
 
 def _doubt_labels(volume: Field, axis: int, places: list[int], ignore: int | None) -> tuple[str, ...]:
@@ -499,12 +508,11 @@ def reconstruct_labels(
     """
     volume = field_of(slices, spacing=spacing, unit=unit)
     axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
-    places, marks = _find_known(volume, axis, every, first, known, ignore)
+    places, marks, misplaced = _find_known(volume, axis, every, first, known, ignore)
     moved = np.moveaxis(volume.values, axis, 0)
     known_voxels = _turn_back(axis, mark_known(moved.shape, places, marks))
     numbers = find_labels(moved[places], chosen)
     full = bool(np.isin(moved[places], numbers).all())
-    misplaced = _doubt_places(volume, axis, places, every)
     other = None if example is None else _load_example(example, volume, {"spacing": spacing, "unit": unit})
     seen = None if image is None else _load_image(image, volume, {"spacing": spacing, "unit": unit})
     laws = prior if isinstance(prior, Mapping) else dict.fromkeys(numbers, prior)

@@ -188,6 +188,18 @@ def known_places(length: int, every: int | None, first: int, known: Sequence[int
     return places
 
 
+def labelled_slices(values: np.ndarray) -> list[int]:
+    """Return the numbers of the slices (Z, Y, X) with labels, which are known where nothing else is said."""
+    places = np.flatnonzero((values > 0).any((1, 2)))
+    if len(places) < 2:
+        raise ScanError(f"two or more slices must have labels, got {len(places)}; or give every or known")
+    if np.diff(places).max() == 1:
+        raise ScanError(
+            "no slice without labels lies between those with labels: give every or known, which slices count"
+        )
+    return places.tolist()
+
+
 def _to_int(number: Any) -> Any:
     """Return a float that is a whole number as an int."""
     return int(number) if isinstance(number, float) and number.is_integer() else number

@@ -223,7 +223,7 @@ def test_a_picture_shows_the_slices(oblique: Path, tmp_path: Path) -> None:
         ("segment SCAN --prior tubes --threshold low", "--threshold"),
         ("segment SCAN --prior tubes --spacing 0", "--spacing"),
         ("segment none.tif --prior tubes", "no such file"),
-        ("reconstruct SCAN --prior tubes", "--every"),
+        ("reconstruct SCAN --prior tubes", "every"),
         ("reconstruct SCAN --prior tubes --every 4 --axis w", "--axis"),
         ("reconstruct SCAN --prior tubes --slices 1,a", "--known"),
         ("reconstruct SCAN --every 4 --ignore 2", "--ignore"),

@@ -350,6 +350,21 @@ def test_slices_with_labels_that_are_not_among_the_known_ones_are_said() -> None
         assert not any("labels" in note for note in well.notes)
 
 
+def test_slices_with_labels_are_known_unasked() -> None:
+    truth, places = leaning().astype(np.uint8), [3, 7, 12, 20, 28]
+    sparse = np.zeros_like(truth)
+    sparse[places] = truth[places]
+    unasked, named = reconstruct(sparse), reconstruct(sparse, known=places)
+    np.testing.assert_array_equal(unasked.mask.values, named.mask.values)
+    assert any("5 slices with labels are known: 3, 7, 12, 20, 28." in note for note in unasked.notes)
+    assert any("are known: 3, 7" in note for note in reconstruct_labels(5 * sparse).notes)
+    one = np.zeros_like(truth)
+    one[7] = truth[7]
+    for values, word in ((one, "got 1"), (np.zeros_like(truth), "got 0"), (truth, "no slice without labels")):
+        with pytest.raises(ScanError, match=word):
+            reconstruct(values)
+
+
 # ---- several structures ----------------------------------------------------------------------------------------------
 
 
