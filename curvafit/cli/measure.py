@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @command(
     "curvafit measure bone.tif --spacing 0.0195 --unit mm",
-    "curvafit measure mouse1.nii.gz mouse2.nii.gz mouse3.nii.gz -o measures.csv",
+    "curvafit measure mouse1.nii.gz mouse2.nii.gz mouse3.nii.gz --subjects mice.csv -o measures.csv",
     "curvafit measure femur.nii.gz --roi cortex_and_marrow.nii.gz -o compartments.csv",
     "curvafit measure mitochondria_labels.tif --labels --spacing 5 --unit nm -o mitochondria.csv",
     "curvafit measure cells.ome.zarr --channel 1 --dark --threshold 90 -o measures.parquet",
@@ -31,6 +31,9 @@ def measure(
         Path | None, typer.Option(help="Region to measure, of the scan's shape; each label by itself.")
     ] = None,
     labels: Annotated[bool, typer.Option("--labels", help="Scans are label images: measure each instance.")] = False,
+    subjects: Annotated[
+        Path | None, typer.Option(help="CSV: scan, and columns for the table, such as subject, group, time.")
+    ] = None,
     *,
     structure: Structure,
     reading: Reading,
@@ -39,13 +42,17 @@ def measure(
     """Measure scans in seconds: morphometry, fabric and curvature in physical units, with 95 % intervals."""
     if labels and (roi is not None or structure != parse_structure()):
         raise ValueError("--labels states the structure: leave out --roi, --kind, --periodic, --threshold and --dark")
+    if subjects is not None and out is None:
+        raise ValueError("--subjects is for the table: give its name with -o")
     with show_stages() as progress:
         from curvafit.scan.instances import measure_instances
         from curvafit.scan.measure import measure as measure_scan
-        from curvafit.studies.tables import check_table, write_table
+        from curvafit.studies.groups import read_columns
+        from curvafit.studies.tables import COLUMNS, OF_PARTS, check_table, write_table
 
         if out is not None:
-            check_table(out, scans if roi is None else [*scans, roi], overwrite)
+            check_table(out, [*scans, *(each for each in (roi, subjects) if each is not None)], overwrite)
+        told = None if subjects is None else read_columns(subjects, scans, (*COLUMNS, *OF_PARTS))
         found: list[tuple[Measures, ...]] = []
 
         def watch(text: str, share: float) -> None:
@@ -56,15 +63,22 @@ def measure(
                 found.append(measure_instances(scan, progress=watch, **reading))
             else:
                 found.append((measure_scan(scan, roi=roi, progress=watch, **structure, **reading),))
+    _print_found(found, labels)
+    if out is not None:
+        columns = None if told is None else [row for row, each in zip(told, found, strict=True) for _ in each]
+        table = [each for measures in found for each in measures]
+        say(str(write_table(table, out, columns=columns, overwrite=overwrite)))
+
+
+def _print_found(found: Sequence[tuple[Measures, ...]], labels: bool) -> None:
+    """Print the numbers of scans, or of the bodies of label images."""
     for measures in found:
-        if len(scans) > 1:
+        if len(found) > 1:
             say(measures[0].source, style="bold")
         if labels:
             _print_instances(measures)
         else:
             _print_scan(measures[0])
-    if out is not None:
-        say(str(write_table([each for measures in found for each in measures], out, overwrite=overwrite)))
 
 
 def _print_instances(instances: Sequence[Measures]) -> None:

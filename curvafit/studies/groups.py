@@ -49,7 +49,8 @@ def list_cases(
             case for group, name in zip((first, second), names, strict=True) for case in _gather(group, name, notes)
         ]
         if rows is not None:
-            cases = [case._replace(subject=_find_subject(case, rows, Path(fspath(table)))) for case in cases]  # type: ignore[arg-type]
+            file = Path(fspath(table or ""))
+            cases = [case._replace(subject=_find_row(case.source, case.name, rows, file)) for case in cases]
         elif not any(isinstance(group, Mapping) for group in (first, second)):
             notes.append("Each scan counts as a subject; a table (--subjects) tells if several are of one.")
             both = set.intersection(*({case.subject for case in cases if case.group == name} for name in names))
@@ -164,13 +165,28 @@ def _read_subjects(table: Path) -> dict[str, str]:
     return {row["scan"]: row["subject"] for row in rows}
 
 
-def _find_subject(case: Case, subjects: Mapping[str, str], table: Path) -> str:
-    """Return the subject of a scan, which the table names by its path or by the name of its file."""
-    place = Path(str(case.source))
-    for name, subject in subjects.items():
-        if name == case.name or place.resolve() in (Path(name).resolve(), (table.parent / name).resolve()):
-            return subject
-    raise ValueError(f"expected a row for each scan in {table}, got none for {case.name}")
+def read_columns(table: str | PathLike[str], scans: Sequence[str], taken: Sequence[str] = ()) -> list[dict[str, str]]:
+    """Return what a table says of each scan: its columns but `scan`, such as subject, group and time.
+
+    Raises ValueError where a scan has no row, or a column's name is `taken`; FileNotFoundError where there is no table.
+    """
+    place = Path(table)
+    if not place.exists():
+        raise FileNotFoundError(f"no such file: {place}")
+    rows = {row["scan"]: row for row in _read_table(place, ("scan",))}
+    if both := sorted({name for row in rows.values() for name in row} & set(taken) - {"scan"}):
+        raise ValueError(f"expected columns in {place} that a table of measures has not, got {', '.join(both)}")
+    found = (_find_row(scan, Path(scan.partition("::")[0]).name, rows, place) for scan in scans)
+    return [{name: value for name, value in row.items() if name != "scan"} for row in found]
+
+
+def _find_row(source: object, name: str, rows: Mapping[str, Any], table: Path) -> Any:
+    """Return the row of a scan, which the table names by its path or by the name of its file."""
+    place = Path(str(source))
+    for said, row in rows.items():
+        if said == name or place.resolve() in (Path(said).resolve(), (table.parent / said).resolve()):
+            return row
+    raise ValueError(f"expected a row for each scan in {table}, got none for {name}")
 
 
 def _read_table(table: Path, needed: Sequence[str]) -> list[dict[str, str]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
@@ -20,6 +20,8 @@ from curvafit.scan.measure import Measures
 SUFFIXES = (".csv", ".json", ".parquet")
 #: Columns of a table; a CSV file begins with them.
 COLUMNS = ("scan", "quantity", "symbol", "value", "low", "high", "unit", "direction", "version")
+#: Columns that rows of a part of a scan have besides.
+OF_PARTS = ("compartment", "instance")
 #: `format` of a JSON table.
 FORMAT = Format("curvafit measures 1", title="a table of measures")
 
@@ -53,16 +55,23 @@ def check_table(path: str | PathLike[str], inputs: Sequence[str | Path] = (), ov
     return can_write(target, _ours, inputs=inputs, overwrite=overwrite)
 
 
-def write_table(measures: Sequence[Measures], path: str | PathLike[str], *, overwrite: bool = False) -> Path:
+def write_table(
+    measures: Sequence[Measures],
+    path: str | PathLike[str],
+    *,
+    columns: Sequence[Mapping[str, str]] | None = None,
+    overwrite: bool = False,
+) -> Path:
     """Write a table of scans as `.csv`, `.json` or `.parquet`, and return its path; errors are `check_table`'s.
 
-    A scan with compartments has the rows of each of them.
+    A scan with compartments has the rows of each of them. `columns` has further ones of each scan, such as its subject.
     """
     target = check_table(path, overwrite=overwrite)
-    parts = [part for each in measures for part in (each.compartments.values() or (each,))]
-    rows = [row for part in parts for row in rows_of(part)]
-    columns = dict.fromkeys(name for row in rows for name in row)
-    rows = [{name: row.get(name) for name in columns} for row in rows]
+    rows = []
+    for each, more in zip(measures, columns or [{}] * len(measures), strict=True):
+        rows += [row for part in (each.compartments.values() or (each,)) for row in rows_of(part, **more)]
+    names = dict.fromkeys(name for row in rows for name in row)
+    rows = [{name: row.get(name) for name in names} for row in rows]
     if target.suffix.lower() == ".parquet":
         frame = _pandas().DataFrame(rows)
         return write_atomically(target, lambda temporary: frame.to_parquet(temporary, index=False))

@@ -206,6 +206,26 @@ def test_tables_are_tidy(measures: Measures, tmp_path: Path) -> None:
     assert write_table([measures], path) == path  # its own file
 
 
+def test_a_table_says_whose_the_scans_are(cut: np.ndarray, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        np.save(tmp_path / f"{name}.npy", cut)
+    study, out = tmp_path / "study.csv", tmp_path / "table.csv"
+    study.write_text("scan;Subject;group;time\nb.npy;m2;treated;14\na.npy;m1;control;0\n", encoding="utf-8")
+    scans = (tmp_path / "a.npy", tmp_path / "b.npy")
+    result = call("measure", *scans, "--subjects", study, "-o", out)
+    assert result.exit_code == 0, result.output
+    rows = list(csv.DictReader(out.read_text(encoding="utf-8").splitlines()))
+    assert [tuple(rows[k][name] for name in ("subject", "group", "time")) for k in (0, -1)] == [
+        ("m1", "control", "0"),
+        ("m2", "treated", "14"),
+    ]
+    for text, word in (("scan,group\na.npy,x\n", "none for b.npy"), ("scan,value\na.npy,1\nb.npy,2\n", "got value")):
+        study.write_text(text, encoding="utf-8")
+        refused(call("measure", *scans, "--subjects", study, "-o", tmp_path / "no.csv"), word, progress=True)
+    refused(call("measure", *scans, "--subjects", study), "--subjects is for the table")
+    assert not (tmp_path / "no.csv").exists()
+
+
 def test_parquet_has_the_same_rows(measures: Measures, tmp_path: Path) -> None:
     pandas = pytest.importorskip("pandas", reason="the extra 'tables' is not installed")
     pytest.importorskip("pyarrow", reason="the extra 'tables' is not installed")
