@@ -24,17 +24,23 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from benchmarks.harness import Cases, Figure, Values, run_python, show
 from benchmarks.rivals import run_elsewhere
 from curvafit.generation.flow import generate
+from curvafit.geometry.diagram import Diagram, family_shares
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.scan.measure import measure
+from curvafit.scan.prepare import prepare
+from curvafit.volumes.field import Field
 
 #: Edge of the box in thicknesses; positions of each phantom by its thickness in voxels.
 EDGE = 6
 PLACES = {4: 3, 5: 1, 6: 3, 8: 1, 16: 1}
 OBLIQUE = np.array([1, 2, 2]) / 3
+#: Families whose shares are compared.
+SHOWN = ("spheres", "layers", "tubes")
 #: Area of the nodal gyroid in the box, by marching cubes on 160³ points.
 GYROID_AREA = 3.0919 * EDGE**2
 #: A package's module, and how its map of thickness, or its numbers, come from a mask.
@@ -132,6 +138,53 @@ PHANTOMS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "torus": torus,
     "gyroid": gyroid_sheet,
 }
+
+
+#: Semi-axes of ellipsoids, in thicknesses.
+ELLIPSOIDS = {"rod_like": (0.5, 0.5, 1.5), "plate_like": (0.5, 1.5, 1.5), "between": (0.5, 1.0, 2.0)}
+
+
+def ellipsoid(axes: tuple[float, float, float], thickness: int) -> np.ndarray:
+    """Return an ellipsoid, turned, in a box of `EDGE` thicknesses."""
+    turn = Rotation.from_rotvec([0.4, 0.7, -0.3]).as_matrix()
+    points = (np.moveaxis(np.indices((EDGE * thickness,) * 3), 0, -1) + 0.5) / thickness - EDGE / 2
+    return np.square((points @ turn) / np.array(axes)).sum(-1) < 1
+
+
+def exact_diagram(name: str) -> Diagram:
+    """Return the curvature diagram of a torus or an ellipsoid, in thicknesses, of 400² patches."""
+    φ, θ = np.meshgrid((np.arange(400) + 0.5) * 2 * np.pi / 400, (np.arange(400) + 0.5) * np.pi / 400)
+    if name == "torus":
+        R, r = 1.5, 0.5
+        around = np.cos(2 * θ)
+        κ1, κ2, area = np.full_like(θ, 1 / r), around / (R + r * around), R + r * around
+    else:
+        a, b, c = ELLIPSOIDS[name]
+        x, y, z = a * np.sin(θ) * np.cos(φ), b * np.sin(θ) * np.sin(φ), c * np.cos(θ)
+        p = np.sqrt(x**2 / a**4 + y**2 / b**4 + z**2 / c**4)
+        K, H = (a * b * c * p**2) ** -2, (a**2 + b**2 + c**2 - x**2 - y**2 - z**2) / (2 * (a * b * c) ** 2 * p**3)
+        root = np.sqrt(np.maximum(H**2 - K, 0))
+        κ1, κ2, area = H + root, H - root, a * b * c * p * np.sin(θ)
+    area = area * {"torus": 4 * np.pi**2 * 1.5 * 0.5 / area.sum()}.get(name, 2 * np.pi**2 / 400**2)
+    return Diagram(np.column_stack([κ1.ravel(), κ2.ravel()]), area.ravel())
+
+
+def shares(thickness: int) -> Values:
+    """Return the shares of families of phantoms: of exact curvatures, at the measured thickness; by `measure`."""
+    points = (np.moveaxis(np.indices((EDGE * thickness,) * 3), 0, -1) + 0.5) / thickness
+    given = {"oblique": slabs(points, OBLIQUE) > 0, "rod": rod(points) > 0, "ball": ball(points) > 0}
+    exact: dict[str, dict[str, float]] = {"oblique": {"layers": 1}, "rod": {"tubes": 1}, "ball": {"spheres": 1}}
+    given["torus"] = torus(points) > 0
+    given |= {name: ellipsoid(axes, thickness) for name, axes in ELLIPSOIDS.items()}
+    found = {}
+    for name, mask in given.items():
+        measured = measure(mask.astype(np.uint8), kind="mask", periodic=True)
+        if name not in exact:
+            prepared = prepare(Field(mask), kind="mask", periodic=True)
+            radius = prepared.thickness * prepared.working_voxel / 2 / thickness
+            exact[name] = family_shares(exact_diagram(name), radius)
+        found[name] = [[exact[name].get(family, 0.0), measured[f"share of {family}"].value] for family in SHOWN]
+    return found
 
 
 def truths(name: str) -> Values:
@@ -254,14 +307,18 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     pythons = [Path(each) for each in options.packages.split(",") if each]
-    found = {column: interpreter(module, pythons) for column, (module, _) in PACKAGES.items()}
-    jobs = {f"{column}-{thickness}": partial(case, column, thickness, found.get(column), cases)
-            for thickness in PLACES for column in ("curvafit", "bonej", *(name for name in PACKAGES if found[name]))
+    packages = {column: interpreter(module, pythons) for column, (module, _) in PACKAGES.items()}
+    jobs = {f"{column}-{thickness}": partial(case, column, thickness, packages.get(column), cases)
+            for thickness in PLACES for column in ("curvafit", "bonej", *(name for name in PACKAGES if packages[name]))
             if thickness == 8 or column not in AT_EIGHT}  # fmt: skip
+    by_family = cases.all({f"shares-{thickness}": partial(shares, thickness) for thickness in (8, 16)})
     tables = cases.all(dict(list(jobs.items())[:2]) if options.quick else jobs)
-    failed = {name: f"no interpreter has {PACKAGES[name][0]}" for name in PACKAGES if not found[name]}
+    failed = {name: f"no interpreter has {PACKAGES[name][0]}" for name in PACKAGES if not packages[name]}
     failed |= {name: values["failed"] for name, values in tables.items() if "failed" in values}
-    figures = {}
+    figures = {f"phantom_shares.{phantom}_{family}.{column}": Figure(pair[column != "truth"])
+               for name, found in by_family.items() for phantom, pairs in found.items()
+               for family, pair in zip(SHOWN, pairs, strict=True)
+               for column in ("truth", f"at_{name.removeprefix('shares-')}")}  # fmt: skip
     for name, values in tables.items():
         column, _, thickness = name.partition("-")
         for phantom in {} if name in failed else values:

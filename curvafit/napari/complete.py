@@ -2,30 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from magicgui.widgets import ComboBox, Container, LineEdit, PushButton, SpinBox, create_widget
 
 from curvafit.core.runtime import Progress
 from curvafit.napari.dock import Dock
-from curvafit.napari.layers import field_of_layer, place_of_layer, put_layer
+from curvafit.napari.layers import drop_layer, field_of_layer, place_of_layer, put_layer
 from curvafit.segmentation.reconstruct import reconstruct, reconstruct_labels
 from curvafit.segmentation.result import Segmentation
+from curvafit.segmentation.slices import check_shared, labelled_slices
 from curvafit.segmentation.uncertainty import entropy
-from curvafit.volumes.field import ScanError
+from curvafit.volumes.field import Field, ScanError
 
 _ALL, _ONE = "all labels", "the selected label"
 
 
-class _Filled(NamedTuple):
-    """A filled layer: its labels after, and what was found."""
+@dataclass(frozen=True)
+class Task:
+    """A labels layer to fill: its field, the labels, the axis across its slices, the known ones, and the rest."""
 
     layer: Any
+    field: Field
+    numbers: Sequence[int]
     axis: int
-    values: np.ndarray
+    known: Sequence[int]
+    image: Field | None
+    suggest: int
+
+
+@dataclass(frozen=True)
+class Filled:
+    """What was known of a filled layer, its values before and after, and what was found."""
+
+    task: Task
+    before: np.ndarray
+    after: np.ndarray
     found: Segmentation
 
 
@@ -46,69 +63,76 @@ class Complete(Dock):
         choices = [self.annotated, self.image, self.which, self.axis, self.known, self.suggest]
         super().__init__(napari_viewer, choices, "Fill")
         self.append(self.suggestions)
+        #: The last fill of each layer: what is changed after it is known at the next.
+        self.fills: WeakKeyDictionary[Any, Filled] = WeakKeyDictionary()
 
-    def prepare(self) -> Callable[[Progress], _Filled]:
+    def prepare(self) -> Callable[[Progress], Filled]:
         """Read the layers and what is known of them."""
+        self.suggestions.clear()
         layer, axis = self.annotated.value, "zyx".index(self.axis.value)
         field = field_of_layer(layer)
-        values = np.array(field.values)
+        if layer.multiscale or not isinstance(layer.data, np.ndarray):
+            raise ScanError(f"expected labels that can be edited, got {layer.name}, which is no NumPy array")
+        field = replace(field, values=np.array(field.values))
+        values = np.moveaxis(field.values, axis, 0)
         numbers = [int(layer.selected_label)] if self.which.value == _ONE else np.unique(values[values != 0]).tolist()
-        shown = np.moveaxis(np.isin(values, numbers), axis, 0)
-        known = _parse_slices(self.known.value, len(shown)) or np.flatnonzero(shown.any((1, 2))).tolist()
-        image = None if self.image.value is None else field_of_layer(self.image.value)
-        options = {"known": known, "axis": axis, "image": image}
-        if len(numbers) > 1:
-            return partial(self._fill_several, layer, field, numbers, options)
-        if not numbers or not shown.any():
+        if not np.isin(values, numbers).any():
             what = "labels" if self.which.value == _ALL else f"voxels of label {numbers[0]}"
             raise ScanError(f"expected slices with {what} in {layer.name}, got none")
-        inside = np.where(values == numbers[0], np.uint8(1), np.uint8(0))
-        suggest = min(self.suggest.value, len(shown) - len(known))
-        return partial(self._fill_one, layer, field, values, numbers[0], inside, options | {"suggest": suggest})
+        known = self._list_known(layer, axis, values, numbers)
+        image = None if self.image.value is None else field_of_layer(self.image.value)
+        suggest = min(self.suggest.value, len(values) - len(known))
+        return partial(_fill, Task(layer, field, numbers, axis, known, image, suggest))
 
-    @staticmethod
-    def _fill_several(
-        layer: Any, field: Any, numbers: list[int], options: dict[str, Any], progress: Progress
-    ) -> _Filled:
-        found = reconstruct_labels(field, chosen=numbers, progress=progress, **options)
-        assert found.labels is not None
-        return _Filled(layer, options["axis"], found.labels.values, found)
+    def _list_known(self, layer: Any, axis: int, values: np.ndarray, numbers: Sequence[int]) -> list[int]:
+        """Return the slices that are named, or those with labels, and those that were changed after the last fill."""
+        named, last = _parse_slices(self.known.value, len(values)), self.fills.get(layer)
+        changed: list[int] = []
+        if last is not None and last.after.shape == layer.data.shape[-3:]:
+            after, before = (np.moveaxis(each, axis, 0) for each in (last.after, last.before))
+            differs, stands = ((values != each).any((1, 2)) for each in (after, before))
+            changed = np.flatnonzero(differs & stands).tolist()
+            last = last if stands.any() else None  # else it was undone
+        else:
+            last = None
+        if not named and last is not None and last.task.axis == axis and set(numbers) <= set(last.task.numbers):
+            named = list(last.task.known)
+        elif not named:
+            named = labelled_slices(np.isin(values, numbers))
+            check_shared(values, named, numbers)
+        return sorted({*named, *changed})
 
-    @staticmethod
-    def _fill_one(
-        layer: Any, field: Any, values: np.ndarray, number: int, inside: np.ndarray, options: dict[str, Any],
-        progress: Progress,
-    ) -> _Filled:  # fmt: skip
-        """Fill one label; it takes no voxel of another."""
-        from dataclasses import replace
-
-        found = reconstruct(replace(field, values=inside), progress=progress, **options)
-        free = (values == 0) | (values == number)
-        return _Filled(layer, options["axis"], np.where(free, number * found.mask.values, values), found)
-
-    def show_result(self, result: _Filled) -> str:
+    def show_result(self, result: Filled) -> str:
         """Write the labels, as one step to undo, the doubt as a layer, and the slices to annotate next."""
-        layer, found = result.layer, result.found
-        write_labels(layer, result.values)
+        task, found = result.task, result.found
+        layer, (doubt_name, frames_name) = task.layer, _names(task.layer)
+        if layer not in self.viewer.layers or layer.data.shape[-3:] != result.after.shape:
+            return "The layer that was filled is gone."
+        for name in (doubt_name, frames_name):
+            drop_layer(self.viewer, name)
+        now = layer.data.reshape(result.after.shape)
+        after = np.where(now == result.before, result.after, now)  # what was painted meanwhile stays
+        write_labels(layer, after)
+        self.fills[layer] = replace(result, after=after.copy())
         assert found.uncertainty is not None
         doubt = entropy(found.uncertainty.probability.values).astype(np.float32) / np.float32(np.log(2))
         options = {"colormap": "inferno", "blending": "additive", "contrast_limits": (0.2, 1), "opacity": 0.6}
-        put_layer(self.viewer, "image", doubt, f"doubt of {layer.name}", **options, **place_of_layer(layer))
-        self._mark_suggestions(layer, result.axis, found.uncertainty.suggestions)
+        put_layer(self.viewer, "image", doubt, doubt_name, **options, **place_of_layer(layer))
+        self._mark_suggestions(task, found.uncertainty.suggestions)
         self.viewer.layers.selection.active = layer
         return f"{found.status} (undo: Ctrl+Z in the labels layer)."
 
-    def _mark_suggestions(self, layer: Any, axis: int, slices: tuple[int, ...]) -> None:
+    def _mark_suggestions(self, task: Task, slices: Sequence[int]) -> None:
         """Frame the suggested slices in the viewer, and give each a button that goes there."""
-        name = f"suggested slices of {layer.name}"
-        self.suggestions.clear()
-        frames = [_frame(layer.data.shape[-3:], axis, k) for k in slices]
+        layer = task.layer
+        frames = [_frame(layer.data.shape[-3:], task.axis, k) for k in slices]
         style = {"face_color": "transparent", "edge_color": "yellow", "edge_width": 0.5}
         if frames:
-            put_layer(self.viewer, "shapes", frames, name, shape_type="polygon", **style, **place_of_layer(layer))
+            place = place_of_layer(layer)
+            put_layer(self.viewer, "shapes", frames, _names(layer)[1], shape_type="polygon", **style, **place)
         for k in slices:
             button = PushButton(text=f"slice {k}", tooltip="Go to this slice, to annotate it next.")
-            button.changed.connect(partial(self._go_to, layer, axis, k))
+            button.changed.connect(partial(self._go_to, layer, task.axis, k))
             self.suggestions.append(button)
 
     def _go_to(self, layer: Any, axis: int, k: int) -> None:
@@ -121,31 +145,49 @@ class Complete(Dock):
 
 def write_labels(layer: Any, values: np.ndarray) -> None:
     """Write values (Z, Y, X) into a labels layer, as one step that napari can undo."""
-    if layer.multiscale or not isinstance(layer.data, np.ndarray):
-        raise ScanError(f"expected labels in memory, which can be edited, got {layer.name} in a file")
     new = values.astype(layer.data.dtype).reshape(layer.data.shape)
     where = np.nonzero(new != layer.data)
     if len(where[0]):
         layer.data_setitem(where, new[where])
 
 
+def _fill(task: Task, progress: Progress) -> Filled:
+    """Fill one label, which takes no voxel of another, or several."""
+    options = {"known": task.known, "axis": task.axis, "image": task.image, "progress": progress}
+    values = task.field.values
+    if len(task.numbers) > 1:
+        found = reconstruct_labels(task.field, chosen=task.numbers, **options)
+        assert found.labels is not None
+        return Filled(task, values, found.labels.values, found)
+    number = task.numbers[0]
+    inside = replace(task.field, values=(values == number).astype(np.uint8))
+    found = reconstruct(inside, suggest=task.suggest, **options)
+    free = (values == 0) | (values == number)
+    return Filled(task, values, np.where(free, number * found.mask.values, values), found)
+
+
+def _names(layer: Any) -> tuple[str, str]:
+    """Return the names of the layers of a layer's doubt and of its suggested slices."""
+    return f"doubt of {layer.name}", f"suggested slices of {layer.name}"
+
+
 def _parse_slices(text: str, count: int) -> list[int]:
-    """Return the numbers of slices in a text such as `0,9,17` or `0::8`."""
+    """Return the numbers of slices in a text such as `0,9,17` or `0::8`; none of an empty one."""
     found: list[int] = []
     try:
         for part in filter(None, text.replace(" ", "").split(",")):
             edges = [int(each) if each else None for each in part.split(":")]
             found += [edges[0]] if len(edges) == 1 else range(count)[slice(*edges)]  # type: ignore[list-item]
     except (ValueError, TypeError):
-        raise ScanError(f"expected known slices as 0,9,17 or 0::8, got {text!r}") from None
-    if any(not 0 <= k < count for k in found):
-        raise ScanError(f"expected known slices from 0 to {count - 1}, got {text!r}")
+        found = [-1]
+    if any(not 0 <= k < count for k in found) or (text.strip() and len(set(found)) < 2):
+        raise ScanError(f"expected two or more known slices from 0 to {count - 1}, as 0,9,17 or 0::8, got {text!r}")
     return sorted(set(found))
 
 
 def _frame(shape: tuple[int, ...], axis: int, k: int) -> np.ndarray:
     """Return the corners (4, 3) of a slice."""
-    (a, b), corners = [axis_ for axis_ in range(3) if axis_ != axis], np.zeros((4, 3))
+    (a, b), corners = [each for each in range(3) if each != axis], np.zeros((4, 3))
     corners[:, axis] = k
     corners[[1, 2], a], corners[[2, 3], b] = shape[a] - 1, shape[b] - 1
     return corners

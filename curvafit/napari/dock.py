@@ -10,6 +10,7 @@ from typing import Any
 from magicgui.widgets import Container, Label, ProgressBar, PushButton
 from napari.qt.threading import create_worker
 from qtpy.QtCore import QTimer
+from qtpy.QtWidgets import QSizePolicy
 
 from curvafit.core.runtime import Progress
 
@@ -34,6 +35,7 @@ class Dock(Container):
         buttons = Container(widgets=[self.run_button, self.stop_button], layout="horizontal", labels=False)
         super().__init__(widgets=[*choices, buttons, self.progress, self.status])
         self.status.native.setWordWrap(True)
+        self.status.native.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.MinimumExpanding)
         self.run_button.changed.connect(self.run)
         self.stop_button.changed.connect(self.stop)
         self._stopping, self._told, self.worker = threading.Event(), ("", 0.0), None
@@ -89,7 +91,10 @@ class Dock(Container):
 
     def _end(self, result: Any) -> None:
         self._timer.stop()
-        self.say("Stopped." if self._stopping.is_set() else self.show_result(result))
+        try:
+            self.say("Stopped." if self._stopping.is_set() else self.show_result(result))
+        except (ValueError, OSError) as reason:
+            self.say(f"{reason}.")
 
     def _fail(self, error: Exception) -> None:
         self._timer.stop()

@@ -27,6 +27,8 @@ def field_of_layer(layer: Any) -> Field:
     if len(data.shape) < 3 or any(n != 1 for n in data.shape[:-3]):
         raise ScanError(f"expected a layer of three axes, got {layer.name} of shape {tuple(data.shape)}")
     values = np.asarray(data).reshape(data.shape[-3:])
+    if faults := np.count_nonzero(~np.isfinite(values)):
+        raise ScanError(f"expected finite values in the layer {layer.name}, got {faults} that are not")
     spacing, unit = _lengths(layer)
     return Field(values, spacing, unit, source=layer.name)
 
@@ -64,9 +66,13 @@ def place_of_field(field: Field) -> dict[str, Any]:
 
 
 def put_layer(viewer: Any, kind: str, data: Any, name: str, **options: Any) -> Any:
-    """Add a layer of a kind, such as `"labels"`, in the place of one of its name and kind that the plugin added."""
-    mark = {"curvafit": name}
+    """Add a layer of a kind, such as `"labels"`, in the place of one of its name that the plugin added."""
+    drop_layer(viewer, name)
+    return getattr(viewer, f"add_{kind}")(data, name=name, metadata={"curvafit": name}, **options)
+
+
+def drop_layer(viewer: Any, name: str) -> None:
+    """Remove the layer of a name that the plugin added, if it is there."""
     for old in list(viewer.layers):
-        if old.metadata.get("curvafit") == name and type(old).__name__.lower() == kind:
+        if old.metadata.get("curvafit") == name:
             viewer.layers.remove(old)
-    return getattr(viewer, f"add_{kind}")(data, name=name, metadata=mark, **options)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from magicgui.widgets import FileEdit, Table, create_widget
+from magicgui.widgets import CheckBox, ComboBox, FileEdit, Table
 from matplotlib.backends.backend_qtagg import FigureCanvasQTAgg
 
 from curvafit.core.runtime import Progress
@@ -28,9 +28,8 @@ class Measure(Dock):
     """Measure a labels layer, by label, or an image; the table can be saved."""
 
     def __init__(self, napari_viewer: Any) -> None:
-        self.layer = create_widget(label="layer", annotation="napari.layers.Layer")
-        self.dark = create_widget(label="dark", annotation=bool, value=False)
-        self.dark.tooltip = "Of an image: the structure is darker than what is around it."
+        self.layer = ComboBox(label="layer", choices=lambda _: _list_layers(napari_viewer))
+        self.dark = CheckBox(text="dark", tooltip="Of an image: the structure is darker than what is around it.")
         self.file = FileEdit(label="save as", mode="w", filter="*.csv *.json *.parquet", nullable=True)
         super().__init__(napari_viewer, [self.layer, self.dark, self.file], "Measure")
         self.table, self.canvas = Table(), None
@@ -41,14 +40,18 @@ class Measure(Dock):
     def prepare(self) -> Callable[[Progress], tuple[Measures, ...]]:
         """Read the layer, and check the file."""
         layer, path = self.layer.value, self._path
-        if layer is not None and type(layer).__name__ not in ("Labels", "Image"):
-            raise ValueError(f"expected a labels or an image layer, got {layer.name}")
+        self.table.value = {"data": [], "columns": []}
+        self._draw(None)
         field = field_of_layer(layer)
         if path is not None:
             check_table(path)
         if type(layer).__name__ == "Image":
             return partial(_measure_one, field, {"dark": self.dark.value})
         numbers = np.unique(field.values[field.values != 0])
+        places = np.flatnonzero((field.values != 0).any((1, 2)))
+        if len(numbers) == 0 or (len(places) > 1 and np.diff(places).min() > 1):
+            what = "labels" if len(numbers) == 0 else "labels on neighbouring slices: complete the layer first"
+            raise ValueError(f"expected {what}, got none in {layer.name}")
         if len(numbers) > 1:
             return lambda progress: measure_instances(field, progress=progress)
         return partial(_measure_one, field, {"kind": "mask"})
@@ -84,18 +87,23 @@ class Measure(Dock):
         chosen = self.file.value
         return None if chosen is None or str(chosen) in ("", ".") else Path(chosen)
 
-    def _draw(self, diagram: Diagram) -> None:
-        """Show a curvature diagram below the table."""
+    def _draw(self, diagram: Diagram | None) -> None:
+        """Show a curvature diagram below the table, or none."""
         if self.canvas is not None:
             self.native.layout().removeWidget(self.canvas)
             self.canvas.deleteLater()
             self.canvas = None
-        if len(diagram.points):
+        if diagram is not None and len(diagram.points):
             figure = diagram_figure(diagram)
             figure.set_layout_engine("tight")
             self.canvas = FigureCanvasQTAgg(figure)
             self.canvas.setMinimumHeight(280)
             self.native.layout().addWidget(self.canvas)
+
+
+def _list_layers(viewer: Any) -> list[tuple[str, Any]]:
+    """Return the layers that can be measured, by name."""
+    return [(each.name, each) for each in viewer.layers if type(each).__name__ in ("Labels", "Image")]
 
 
 def _measure_one(field: Any, options: dict[str, Any], progress: Progress) -> tuple[Measures, ...]:

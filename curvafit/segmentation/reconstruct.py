@@ -34,6 +34,7 @@ from curvafit.segmentation.slices import (
     Slices,
     annotated_slices,
     check_place,
+    check_shared,
     check_spacing,
     known_places,
     labelled_slices,
@@ -512,6 +513,8 @@ def reconstruct_labels(
     moved = np.moveaxis(volume.values, axis, 0)
     known_voxels = _turn_back(axis, mark_known(moved.shape, places, marks))
     numbers = find_labels(moved[places], chosen)
+    if every is None and known is None and ignore is None:
+        check_shared(moved, places, numbers)
     full = bool(np.isin(moved[places], numbers).all())
     other = None if example is None else _load_example(example, volume, {"spacing": spacing, "unit": unit})
     seen = None if image is None else _load_image(image, volume, {"spacing": spacing, "unit": unit})

@@ -24,6 +24,8 @@ WAYS = ("spline", "linear", "nearest")
 LABELS, FEW = 256, 16
 #: Share by which the voxel sizes of two files may differ, and voxels by which their places may.
 SAME, ASTRAY = 1e-3, 0.1
+#: Share of slices with labels, between a label's first and last, that may lack it if all count as known to all.
+APART = 1 / 3
 #: The box that is all of a volume.
 WHOLE: Box = (slice(0, None), slice(0, None), slice(0, None))
 
@@ -198,6 +200,18 @@ def labelled_slices(values: np.ndarray) -> list[int]:
             "no slice without labels lies between those with labels: give every or known, which slices count"
         )
     return places.tolist()
+
+
+def check_shared(values: np.ndarray, places: Sequence[int], labels: Sequence[int]) -> None:
+    """Raise ScanError where labels are drawn on slices (Z, Y, X) of their own, so that one's absence says nothing."""
+    for label in labels:
+        there = (values[list(places)] == label).any((1, 2))
+        span = there[there.argmax() : len(there) - there[::-1].argmax()]
+        if (missing := np.count_nonzero(~span)) > APART * len(span):
+            some = f"label {label} is on {len(span) - missing} of the {len(span)} slices with labels that it spans"
+            raise ScanError(
+                f"{some}: fill labels that have slices of their own one after the other, or name known slices"
+            )
 
 
 def _to_int(number: Any) -> Any:

@@ -358,6 +358,10 @@ def test_slices_with_labels_are_known_unasked() -> None:
     np.testing.assert_array_equal(unasked.mask.values, named.mask.values)
     assert any("5 slices with labels are known: 3, 7, 12, 20, 28." in note for note in unasked.notes)
     assert any("are known: 3, 7" in note for note in reconstruct_labels(5 * sparse).notes)
+    apart = np.zeros_like(truth)
+    apart[::8], apart[4::8] = 2 * truth[::8], 5 * truth[4::8]
+    with pytest.raises(ScanError, match="one after the other"):
+        reconstruct_labels(apart)
     one = np.zeros_like(truth)
     one[7] = truth[7]
     for values, word in ((one, "got 1"), (np.zeros_like(truth), "got 0"), (truth, "no slice without labels")):

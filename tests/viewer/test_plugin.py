@@ -111,6 +111,52 @@ def test_slices_are_suggested_and_a_button_goes_there(viewer: Any) -> None:
     assert [each.name for each in viewer.layers].count("doubt of cells") == 1  # in the place of the former
 
 
+def test_a_correction_is_known_at_the_next_fill(viewer: Any) -> None:
+    truth = rods()
+    some = np.zeros_like(truth)
+    some[::16] = truth[::16]
+    layer = viewer.add_labels(some, name="cells", **PLACE)
+    widget = docked(viewer, Complete)
+    assert "3 of 33 slices known" in run(widget)
+    layer.data[8] = truth[8]
+    assert "4 of 33 slices known" in run(widget)
+    np.testing.assert_array_equal(layer.data[[0, 8, 16, 32]], truth[[0, 8, 16, 32]])
+    layer.data[20] = truth[20]
+    widget.known.value = "0::16"  # what was corrected counts besides
+    assert "4 of 33 slices known" in run(widget)
+    np.testing.assert_array_equal(layer.data[20], truth[20])
+
+
+def test_what_is_painted_meanwhile_stays(viewer: Any) -> None:
+    truth = rods()
+    some = np.zeros_like(truth)
+    some[::8] = truth[::8]
+    layer = viewer.add_labels(some, name="cells", **PLACE)
+    widget = docked(viewer, Complete)
+    click(widget.run_button)
+    layer.data[3, :4, :4] = 7
+    wait(lambda: widget.run_button.enabled)
+    assert (layer.data[3, :4, :4] == 7).all() and dice(layer.data == 3, truth == 3) > 0.9
+    click(widget.run_button)
+    viewer.layers.remove(layer)
+    wait(lambda: widget.run_button.enabled)
+    assert "gone" in widget.status.value and layer not in viewer.layers
+
+
+def test_labels_on_slices_of_their_own_are_filled_one_after_the_other(viewer: Any) -> None:
+    truth, some = rods(), np.zeros_like(rods())
+    some[::8] = np.where(truth[::8] == 3, 3, 0)
+    some[4::8] = np.where(truth[4::8] == 7, 7, 0)
+    layer = viewer.add_labels(some, name="cells", **PLACE)
+    widget = docked(viewer, Complete)
+    assert "one after the other" in run(widget)
+    widget.which.value = "the selected label"
+    for label in (3, 7):
+        layer.selected_label = label
+        run(widget)
+    assert dice(layer.data == 3, truth == 3) > 0.9 and dice(layer.data == 7, truth == 7) > 0.85
+
+
 def test_an_image_and_another_axis(viewer: Any) -> None:
     truth = np.moveaxis(rods(), 0, 2)
     some = np.zeros_like(truth)
@@ -176,6 +222,7 @@ def test_each_label_has_its_row_and_its_numbers_beneath_the_mouse(viewer: Any) -
         (np.zeros((8, 8, 8), int), {}, "slices with labels"),
         (np.ones((8, 8, 8), int), {"units": ("pixel", "micrometer", "micrometer")}, "kind of unit"),
         (np.ones((8, 8, 8), int), {"units": ("second",) * 3}, "unit second"),
+        (np.ones((8, 8, 8), int), {}, "slice without labels lies between"),
     ],
 )
 def test_what_is_no_volume_is_said_in_a_sentence(viewer: Any, data: np.ndarray, options: dict, words: str) -> None:
@@ -184,7 +231,23 @@ def test_what_is_no_volume_is_said_in_a_sentence(viewer: Any, data: np.ndarray, 
     assert words in run(widget) and len(viewer.layers) == 1
 
 
-@pytest.mark.parametrize("text", ["a", "0,99", "1:2:3:4", "-1"])
+def test_layers_that_cannot_be_edited_or_measured_are_said(viewer: Any) -> None:
+    from dask.array import from_array
+
+    some = np.zeros_like(rods())
+    some[::8] = rods()[::8]
+    viewer.add_labels(from_array(some), name="cells")
+    assert "no NumPy array" in run(docked(viewer, Complete))
+    gauge = docked(viewer, Measure)
+    assert "complete the layer first" in run(gauge)
+    viewer.layers.clear()
+    image = viewer.add_image(np.where(rods() == 3, np.nan, 1.0), name="scan")
+    gauge.reset_choices()
+    gauge.layer.value = image
+    assert "not" in run(gauge) and "finite" in gauge.status.value
+
+
+@pytest.mark.parametrize("text", ["a", "0,99", "1:2:3:4", "-1", "5:2", "3"])
 def test_slices_that_are_none_are_said(viewer: Any, text: str) -> None:
     viewer.add_labels(rods(), name="cells")
     widget = docked(viewer, Complete)
