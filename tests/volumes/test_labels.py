@@ -143,6 +143,35 @@ def test_an_image_of_another_version_or_none_is_refused(tmp_path: Path) -> None:
         save(Field(np.eye(4, dtype=bool)[None] | np.zeros((4, 4, 4), bool)), tmp_path / "scan.zarr/labels/a")
 
 
+def test_levels_that_disagree_are_said_and_one_can_be_named(image: tuple[Path, str]) -> None:
+    path = image[0]
+    group: Any = zarr.open_group(path, mode="r+")
+    attributes = group.attrs.asdict()
+    scales = attributes.get("ome", attributes)["multiscales"][0]
+    scales["datasets"][1]["coordinateTransformations"][0]["scale"][3] *= 2
+    group.attrs.update(attributes)
+    refused(call("measure", path, "--channel", 1), "levels of", progress=True)
+    assert load(f"{path}::0", channel=1).shape == SHAPE
+    scales["datasets"][1]["path"] = "9"
+    group.attrs.update(attributes)
+    with pytest.raises(ScanError, match="level 9, which is not there"):
+        load(path, channel=1)
+
+
+def test_an_interrupted_writing_is_made_whole_by_the_next(image: tuple[Path, str], monkeypatch) -> None:
+    path, version = image
+    field = load(path, channel=1)
+    mask = Field(field.values > 110, field.spacing, field.unit, field.affine)
+    with monkeypatch.context() as patch:
+        patch.setattr("curvafit.volumes.formats.zarr.write_content", lambda *_: (_ for _ in ()).throw(OSError("full")))
+        with pytest.raises(OSError, match="full"):
+            save(mask, path / "labels/tube")
+    save(mask, path / "labels/tube")
+    assert content(path / "labels", version)["labels"] == ["tube"]
+    assert np.array_equal(load(f"{path}::labels/tube").values, mask.values)
+    assert [place.name for place in path.parent.iterdir()] == ["scan.zarr"]
+
+
 def test_a_command_writes_labels_and_the_rest_beside_the_store(image: tuple[Path, str], monkeypatch) -> None:
     path, version = image
     monkeypatch.chdir(path.parent)

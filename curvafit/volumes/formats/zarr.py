@@ -66,6 +66,7 @@ def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, *
     images = {"": node} | {name: member for name, member in members.items() if name not in arrays}
     levels = {name: _levels(name, group.attrs.asdict()) for name, group in images.items()}
     firsts = {name: next(iter(places)) for name, places in levels.items() if places}
+    unasked = key is None
     if key is None:
         volumes = [name for name in firsts if "labels" not in name.split("/")]
         key = firsts.get("") or (firsts[volumes[0]] if len(volumes) == 1 else None)
@@ -73,7 +74,10 @@ def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, *
         key = firsts[key.strip("/")]
     name = pick_key(sorted(arrays), key, path)
     array = arrays[name]
-    place = next((places[name] for places in levels.values() if name in places), None)
+    places = next((each for each in levels.values() if name in each), {})
+    if unasked:
+        _check_levels(arrays, places, path)
+    place = places.get(name)
     if place is None:
         place = _Place(*read_spacing({**node.attrs.asdict(), **array.attrs.asdict()}, array.ndim))
     return _read_array(array, path / array.path, place, part)
@@ -278,6 +282,22 @@ def _levels(name: str, attributes: Mapping[str, Any]) -> dict[str, _Place]:
         spacing, corner = (None if each is None else tuple(each.tolist()) for each in (scale, first))
         places[f"{name}/{level['path']}".strip("/")] = _Place(spacing, unit, channels, corner)
     return places
+
+
+def _check_levels(arrays: Mapping[str, Any], places: Mapping[str, _Place], path: Path) -> None:
+    """Raise ScanError where levels of an image are missing, or differ in extent by more than one of their voxels."""
+    extents: dict[str, np.ndarray] = {}
+    for name, place in places.items():
+        if name not in arrays:
+            raise ScanError(f"{path} lists the level {name}, which is not there: name another, as in {path}::0")
+        if place.spacing is None or len(place.spacing) != arrays[name].ndim:
+            continue
+        extents[name] = np.array(place.spacing) * arrays[name].shape
+        first = next(iter(extents))
+        if (np.abs(extents[name] - extents[first]) > 1.01 * np.array(place.spacing)).any():
+            sizes = (" x ".join(f"{edge:g}" for edge in extents[each]) for each in (first, name))
+            said = " and ".join(f"{size} of {each}" for size, each in zip(sizes, (first, name), strict=True))
+            raise ScanError(f"the levels of {path} disagree in extent, {said}: name one, as in {path}::{first}")
 
 
 # ---- chunks that are not stored --------------------------------------------------------------------------------------
