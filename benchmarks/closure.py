@@ -331,12 +331,11 @@ def on_unseen(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
             median, held = over_laws(off[part], laws[part], np.median), over_laws(inside[part], laws[part], np.mean)
             table += [[f"{name}: error", *median], ["in 90", *held]]
             if name == "all":
-                key = f"unseen.{view}"
-                figures |= {f"{key}.error.{slug}": each for slug, each in zip(SLUGS, median, strict=True)}
-                figures |= {f"{key}.in90.{slug}": each for slug, each in zip(SLUGS, held, strict=True)}
+                figures |= {f"unseen.{view}_error.{slug}": each for slug, each in zip(SLUGS, median, strict=True)}
+                figures |= {f"unseen.{view}_in90.{slug}": each for slug, each in zip(SLUGS, held, strict=True)}
         known = combinations_known(error, truth, laws)
-        figures |= {f"unseen.{view}.combination.{k + 1}": Figure(value) for k, value in enumerate(known)}
-        figures |= {f"unseen.{view}.tarp": Figure(row["TARP"][0]), f"unseen.{view}.tarp_p": Figure(row["TARP"][1])}
+        figures |= {f"unseen_known.{view}.{k + 1}": Figure(value) for k, value in enumerate(known)}
+        figures |= {f"unseen_known.{view}.tarp_p": Figure(row["TARP"][1])}
         table += [["width", *np.mean(row["width"], axis=0)], ["R² of combinations", *known]]
         show([view, *PARAMETERS], table, f"{len(laws)} queries of {len(np.unique(laws))} laws; TARP {row['TARP']}")
     return figures
