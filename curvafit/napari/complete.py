@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -46,6 +46,16 @@ class Filled:
     found: Segmentation
 
 
+class Fill(NamedTuple):
+    """What is remembered of a layer's last fill: its known slices, its labels, and its values before and after."""
+
+    axis: int
+    known: Sequence[int]
+    numbers: Sequence[int]
+    before: np.ndarray
+    after: np.ndarray
+
+
 class Complete(Dock):
     """Fill a labels layer between annotated slices; it can be undone."""
 
@@ -64,7 +74,7 @@ class Complete(Dock):
         super().__init__(napari_viewer, choices, "Fill")
         self.append(self.suggestions)
         #: The last fill of each layer: what is changed after it is known at the next.
-        self.fills: WeakKeyDictionary[Any, Filled] = WeakKeyDictionary()
+        self.fills: WeakKeyDictionary[Any, Fill] = WeakKeyDictionary()
 
     def prepare(self) -> Callable[[Progress], Filled]:
         """Read the layers and what is known of them."""
@@ -95,8 +105,8 @@ class Complete(Dock):
             last = last if stands.any() else None  # else it was undone
         else:
             last = None
-        if not named and last is not None and last.task.axis == axis and set(numbers) <= set(last.task.numbers):
-            named = list(last.task.known)
+        if not named and last is not None and last.axis == axis and set(numbers) <= set(last.numbers):
+            named = list(last.known)
         elif not named:
             named = labelled_slices(np.isin(values, numbers))
             check_shared(values, named, numbers)
@@ -113,7 +123,7 @@ class Complete(Dock):
         now = layer.data.reshape(result.after.shape)
         after = np.where(now == result.before, result.after, now)  # what was painted meanwhile stays
         write_labels(layer, after)
-        self.fills[layer] = replace(result, after=after.copy())
+        self.fills[layer] = Fill(task.axis, task.known, task.numbers, result.before, after)
         assert found.uncertainty is not None
         doubt = entropy(found.uncertainty.probability.values).astype(np.float32) / np.float32(np.log(2))
         options = {"colormap": "inferno", "blending": "additive", "contrast_limits": (0.2, 1), "opacity": 0.6}

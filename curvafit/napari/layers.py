@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.core.units import METRES, parse_unit
+from curvafit.core.units import convert_length, parse_unit
 from curvafit.volumes.field import Field, ScanError
 
 #: Our unit -> napari's.
@@ -38,14 +38,14 @@ def _lengths(layer: Any) -> tuple[tuple[float, float, float], str]:
     found = []
     for each in layer.units[-3:]:
         try:
-            found.append(parse_unit(str(each)))
+            found.append(parse_unit(str(each))[0])
         except ValueError:
             raise ScanError(f"expected lengths along the axes of {layer.name}, got the unit {each}") from None
-    unit = found[-1][0]
-    if any((name == "voxel") != (unit == "voxel") for name, _ in found):
+    unit = found[-1]
+    if any((name == "voxel") != (unit == "voxel") for name in found):
         raise ScanError(f"expected one kind of unit along the axes of {layer.name}, got pixels and lengths")
-    into = [1.0 if name == unit else METRES[name] / METRES[unit] for name, _ in found]
-    z, y, x = (abs(float(h)) * f * g for h, (_, f), g in zip(layer.scale[-3:], found, into, strict=True))
+    pairs = zip(layer.scale[-3:], layer.units[-3:], strict=True)
+    z, y, x = (convert_length(abs(float(length)), str(own), unit) for length, own in pairs)
     return (z, y, x), unit
 
 

@@ -62,21 +62,18 @@ class Measure(Dock):
         several = first.part is not None
         names = [_heading(each, first.unit) for each in first.quantities]
         if several:
-            rows = {str(each.part[1]): [format_number(q.value, 4) for q in each.quantities] for each in result}  # type: ignore[index]
+            labels = [each.part[1] for each in result if each.part]
+            cells = [[format_number(q.value, 4) for q in each.quantities] for each in result]
+            self.table.value = {"data": cells, "columns": names, "index": list(map(str, labels))}
         else:
-            rows = {"value": [format_number(q.value, 4) for q in first.quantities]}
-            rows["95 %"] = [f"± {format_number(q.half, 2)}" for q in first.quantities]
-        cells = list(map(list, zip(*rows.values(), strict=True))) if not several else list(rows.values())
-        columns, index = (names, list(rows)) if several else (list(rows), names)
-        self.table.value = {"data": cells, "columns": columns, "index": index}
+            cells = [[format_number(q.value, 4), f"± {format_number(q.half, 2)}"] for q in first.quantities]
+            self.table.value = {"data": cells, "columns": ["value", "95 %"], "index": names}
         self._draw(_join([each.diagram for each in result]))
         if several and type(layer).__name__ == "Labels":
             import pandas
 
-            table: dict[str, Any] = {"index": [each.part[1] for each in result]}  # type: ignore[index]
-            for k, name in enumerate(names):
-                table[name] = [each.quantities[k].value for each in result]
-            layer.features = pandas.DataFrame(table)
+            values = [[q.value for q in each.quantities] for each in result]
+            layer.features = pandas.DataFrame(values, columns=names).assign(index=labels)
         if self._path is None:
             why = [note for each in result for note in each.notes if note.startswith("No intervals")]
             return f"{len(result)} labels measured." if several else " ".join(["Measured.", *why[:1]])

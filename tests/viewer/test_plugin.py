@@ -65,14 +65,19 @@ def rods(shape: tuple[int, int, int] = (33, 40, 44)) -> np.ndarray:
     return np.where(np.hypot(y - 28, x - 30 + 3 * np.cos(z / 6)) < 6, 7, labels)
 
 
+def sparse(every: int = 8) -> np.ndarray:
+    """The rods on every so many slices."""
+    some = np.zeros_like(rods())
+    some[::every] = rods()[::every]
+    return some
+
+
 def dice(a: np.ndarray, b: np.ndarray) -> float:
     return 2 * np.count_nonzero(a & b) / (np.count_nonzero(a) + np.count_nonzero(b))
 
 
 def test_labels_are_completed_and_it_can_be_undone(viewer: Any) -> None:
-    truth = rods()
-    some = np.zeros_like(truth)
-    some[::8] = truth[::8]
+    truth, some = rods(), sparse()
     layer = viewer.add_labels(some.copy(), name="cells", **PLACE)
     widget = docked(viewer, Complete)
     assert "filled by the network" in run(widget)
@@ -113,9 +118,7 @@ def test_slices_are_suggested_and_a_button_goes_there(viewer: Any) -> None:
 
 def test_a_correction_is_known_at_the_next_fill(viewer: Any) -> None:
     truth = rods()
-    some = np.zeros_like(truth)
-    some[::16] = truth[::16]
-    layer = viewer.add_labels(some, name="cells", **PLACE)
+    layer = viewer.add_labels(sparse(16), name="cells", **PLACE)
     widget = docked(viewer, Complete)
     assert "3 of 33 slices known" in run(widget)
     layer.data[8] = truth[8]
@@ -129,9 +132,7 @@ def test_a_correction_is_known_at_the_next_fill(viewer: Any) -> None:
 
 def test_what_is_painted_meanwhile_stays(viewer: Any) -> None:
     truth = rods()
-    some = np.zeros_like(truth)
-    some[::8] = truth[::8]
-    layer = viewer.add_labels(some, name="cells", **PLACE)
+    layer = viewer.add_labels(sparse(), name="cells", **PLACE)
     widget = docked(viewer, Complete)
     click(widget.run_button)
     layer.data[3, :4, :4] = 7
@@ -234,9 +235,7 @@ def test_what_is_no_volume_is_said_in_a_sentence(viewer: Any, data: np.ndarray, 
 def test_layers_that_cannot_be_edited_or_measured_are_said(viewer: Any) -> None:
     from dask.array import from_array
 
-    some = np.zeros_like(rods())
-    some[::8] = rods()[::8]
-    viewer.add_labels(from_array(some), name="cells")
+    viewer.add_labels(from_array(sparse()), name="cells")
     assert "no NumPy array" in run(docked(viewer, Complete))
     gauge = docked(viewer, Measure)
     assert "complete the layer first" in run(gauge)
