@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -39,6 +40,7 @@ _out = partial(typer.Option, rich_help_panel="What to write")
     "curvafit generate --prior bone/fit.json --shape 128 --seed 3 -o more_bone.tif",
     "curvafit generate --preset tubes --maps maps.npz -o graded.nii.gz",
     "curvafit generate --preset tubes --shape 300 --checkpoint run.pt --snapshots 10,100,1000 -o large.nii.gz",
+    "torchrun --nproc-per-node 2 -m curvafit generate --preset tubes --shape 512 -o larger.zarr",
 )
 def generate(
     out: Annotated[
@@ -71,6 +73,11 @@ def generate(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make a shape from parameters, with a record (.json) and a picture (.png) beside it."""
+    from curvafit.generation.slabs import count_processes, serve
+
+    if count_processes()[0]:
+        serve()
+        return
     from curvafit.drawing.shapes import check_target, shape_record
     from curvafit.generation.schedule import schedule as named
     from curvafit.geometry.mesh import SUFFIXES
@@ -184,19 +191,21 @@ def _plan_output(
 def _grow(options: dict[str, Any]) -> Flow:
     """Run the flow with progress; exit with code 1 where it failed or has no surface."""
     from curvafit.generation.flow import generate as make
+    from curvafit.generation.slabs import count_processes, lead
 
-    saved = options["checkpoint"]
+    saved, several = options["checkpoint"], count_processes()[1] > 1
 
     def again() -> str:
         return "the same command" if saved is not None and saved.exists() else ""
 
-    with resumable(again), show_stages() as progress:
+    with resumable(again), show_stages() as progress, lead() if several else nullcontext():
         progress("starting (a first run compiles the kernels for this processor)", 0.0)
 
         def watch(step: int, total: int, state: State) -> None:
             progress("growing", step / total)
 
-        flow = make(**options, callbacks=[watch], keep_checkpoint=True)
+        backend = "slabs" if several else "auto"
+        flow = make(**options, callbacks=[watch], keep_checkpoint=True, backend=backend)
     if not (flow.finite and flow.viability.lowest < 0 < flow.viability.highest):
         _remove(options["checkpoint"])
         say(f"{flow.status}; nothing was written", to=error_console())

@@ -61,7 +61,7 @@ def generate_batch(
     grid = grid if isinstance(grid, Grid) else Grid(grid)  # type: ignore[arg-type]
     options = {"schedule": plan, "epsilon": epsilon, "blur": blur, "reject_early": reject_early}
     options |= {"backend": backend, "device": device}
-    check_choice(backend, BACKENDS, f"a backend among {', '.join(BACKENDS)}")
+    check_choice(backend, BACKENDS[:-1], f"a backend among {', '.join(BACKENDS[:-1])}")
     check_device(device)
     size = 1
     if backend in ("torch", "compiled") or not kernels.has_kernel(device):

@@ -20,6 +20,7 @@ from curvafit.generation.loop import FlowOptions, first_mass, run
 from curvafit.generation.result import Callback, Flow
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
+from curvafit.generation.slabs import SlabStepper
 from curvafit.generation.stepper import FusedStepper, LbfgsStepper, Stepper, TorchStepper
 from curvafit.priors import kernels, stencils
 from curvafit.priors.grid import WORKING_EPSILON, Bool, Float, Grid
@@ -30,7 +31,7 @@ WORKING_BLUR = 0.02
 #: Seconds between two checkpoints by default.
 CHECKPOINT_EVERY = 60.0
 #: The ways to run a flow: see `generate`.
-Backend = Literal["auto", "torch", "fused", "compiled"]
+Backend = Literal["auto", "torch", "fused", "compiled", "slabs"]
 BACKENDS = get_args(Backend)
 
 
@@ -90,7 +91,7 @@ def generate(
     backend
         `"auto"` takes the fused step on processors and plain torch elsewhere; `"torch"` and `"fused"` take only that
         step. `"compiled"` passes the plain step through `torch.compile`; where that fails, a warning says so and the
-        step stays plain.
+        step stays plain. `"slabs"` is the fused step over the processes of `slabs.lead`.
     device
         Where torch runs, such as `"cpu"` or `"cuda"`.
 
@@ -223,6 +224,10 @@ class _Execution:
         has_kernel = kernels.has_kernel(self.device)
         if self.backend == "fused" and not has_kernel:
             raise ValueError(f"the device {self.device} has no fused step: take backend='torch', or the device 'cpu'")
+        if self.backend == "slabs":
+            if not has_kernel or not isinstance(form, DivergenceForm) or optimiser != "adam" or frozen is not None:
+                raise ValueError("slabs are for a flow of `generate` on processors: leave the backend out")
+            return SlabStepper(start, form, cost, betas)
         fusible = optimiser == "adam" and cost.data is None and not self.plain
         if fusible and has_kernel and isinstance(form, DivergenceForm):
             return FusedStepper(start, form, cost, betas, frozen)
@@ -237,7 +242,9 @@ class _Execution:
             return None
         plan, share, snapshots = options.plan, options.volume_fraction, [*options.snapshots]
         job = {**vars(options.cost), "schedule": plan, "volume_fraction": share, "snapshots": snapshots, **start}
-        place = {"stepper": type(stepper).__name__, "backend": self.backend, "device": self.device}
+        # Slabs go on from what one process saved, and the other way round.
+        name = FusedStepper.__name__ if isinstance(stepper, SlabStepper) else type(stepper).__name__
+        place = {"stepper": name, "backend": self.backend.replace("slabs", "auto"), "device": self.device}
         return Checkpoint(self.checkpoint, self.every, identity(**job, **place), self.keep)
 
 

@@ -7,6 +7,7 @@ and x, with -∇, Adam, and the next step's blur of div A along y and x.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -50,17 +51,26 @@ def gaussian_blur(u: np.ndarray, grid: Grid, width: float) -> np.ndarray:
     return _view_field(volume, grid).copy()
 
 
+def halo(grid: Grid, width: float) -> int:
+    """Return how many planes beyond its own a step of a slab needs: the blur's reach, and the stencils' two."""
+    return _pad_taps(width / grid.spacing[0])[1] + EDGE
+
+
 class FusedFlow:
     """The flow u = k ∗ (div A + base) under Adam on A, stepped in place; its cost is as in `fused_energy_gradient`.
 
     `start` is A at the first step, `(3, Z, Y, X)`, components z, y, x; None for zeros, to be filled in place through
     `vector`. `base` is k ∗ base: the mass m₀, or a blurred field. `width` is the blur's standard deviation in spacing's
     unit; A is constant in `frozen` voxels; `betas` and `adam_eps` are `torch.optim.Adam`'s.
+
+    Of a slab of a larger box, `own` are the planes that count, and `exchange` fills the others, `halo` of them on
+    either side, in a volume `(Z, …)` whose own planes are known.
     """
 
     def __init__(
-        self, start, base, a, grid: Grid, epsilon, width: float, frozen=None, *, betas, adam_eps, orientation=None
-    ) -> None:
+        self, start, base, a, grid: Grid, epsilon, width: float, frozen=None, *, betas, adam_eps, orientation=None,
+        own: slice = slice(None), exchange: Callable[[np.ndarray], object] | None = None,
+    ) -> None:  # fmt: skip
         Z, Y, X = grid.shape
         self.grid, self.taken = grid, 0
         self._adam_eps = adam_eps
@@ -68,6 +78,7 @@ class FusedFlow:
         self.betas = betas
         self._threads = threads = _choose_threads(grid)
         size = 3 * Z * Y * X
+        self._own, self._exchange = own, exchange
         self._vector, self._first, self._second = (_make_zeros(size + 2 * SLACK) for _ in range(3))
         #: Whether the last step has left the next one's blurred div A in place of its gradient.
         self._ahead = False
@@ -76,7 +87,7 @@ class FusedFlow:
         self._half = np.array([0.5 / h for h in grid.spacing], np.float32)
         self._blur, self._density = _Blur(grid, width, threads), _Density(a, grid, epsilon, threads, orientation)
         self._mass, self._base = (base, _NO_FIELD) if np.ndim(base) == 0 else (0.0, _pad_field(base, grid))
-        self._keep, self._free = np.empty(0, np.float32), size
+        self._keep, self._free = np.empty(0, np.float32), 3 * len(range(Z)[own]) * Y * X
         if frozen is not None:
             self._keep = _make_zeros(size // 3 + 2 * SLACK)
             self._keep[SLACK:-SLACK] = 1 - np.asarray(frozen, np.float32).ravel()
@@ -119,13 +130,22 @@ class FusedFlow:
         if not self._ahead:  # a step leaves div A blurred along y and x for the next one
             self._adam_step(ALL, np.zeros(6, np.float32))
         self._ahead = False
+        self._fill_halos()
         self.blur_along_z()
         return self.fill_gradient()
 
     def update(self, rate: float) -> tuple[float, float]:
         """Make an Adam step of length `rate` along the last gradient; return maximum and mean of |∂F_ε/∂A|."""
+        self._fill_halos()
         self.blur_gradient_along_z()
         return self.blur_adam(rate)
+
+    def _fill_halos(self) -> None:
+        """Fill the planes of the gradient, or of what takes its place, that others own."""
+        if self._exchange is not None:
+            Z, Y, X = self.grid.shape
+            size = loops.pitch(Y, X)
+            self._exchange(self._gradient[SLACK : SLACK + Z * size].reshape(Z, size))
 
     def blur_along_z(self) -> None:
         """Blur along z and add the base, the first part of a step."""
@@ -133,7 +153,7 @@ class FusedFlow:
 
     def fill_gradient(self) -> float:
         """Compute F_ε and its gradient with respect to u, the second part of a step."""
-        return self._density(self._field, self._gradient)
+        return self._density(self._field, self._gradient, self._own)
 
     def blur_gradient_along_z(self) -> None:
         """Blur the gradient along z, the third part of a step."""
@@ -150,7 +170,8 @@ class FusedFlow:
         adam = np.array([1 - β1, β2, 1 - β2, length, spread, self._adam_eps], np.float32)
         self._adam_step(MOVE, adam)
         self._adam_step(ENDS, adam)
-        return float(self._highest.max().view(np.float32)), float(self._sums.sum()) / max(1, self._free)
+        most, total = self._highest[self._own].max(), self._sums[self._own].sum()
+        return float(most.view(np.float32)), float(total) / max(1, self._free)
 
     def _adam_step(self, phase: int, adam: np.ndarray) -> None:
         """Run the last pass, or a part of it."""
@@ -226,14 +247,14 @@ class _Density:
         part = -(-max(self._tile, self._block + 1) * stride // _LINE) * _LINE + SLACK
         self._sums = _make_scratch(threads, 4 * part + 2 * SLACK)
 
-    def __call__(self, u: np.ndarray, gradient: np.ndarray) -> float:
-        """Fill the gradient; return the energy."""
+    def __call__(self, u: np.ndarray, gradient: np.ndarray, planes: slice = slice(None)) -> float:
+        """Fill the gradient; return the energy of some planes."""
         with limit_threads(self._threads):
             loops.fill_gradient(
                 u, gradient, self._energies, self._rings, self._sums, self._inside, self._constants, *self._general,
                 self._index, self._block, self._tile, *self._grid.shape,
             )  # fmt: skip
-        return float(self._energies.sum())
+        return float(self._energies[:, planes].sum())
 
 
 _NO_FIELD = np.empty(0, np.float32)
