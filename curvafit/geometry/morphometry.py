@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numba import njit
 from scipy import ndimage
-from skimage.measure import block_reduce
 
 from curvafit.core.schema import Rule
+from curvafit.geometry.balls import ball_radii, paint_balls, paint_coarse_balls
 from curvafit.geometry.mesh import Surface, areas, surface
 from curvafit.geometry.topology import euler_number, euler_of_window
 from curvafit.priors.grid import Grid
@@ -114,77 +113,13 @@ def local_thickness(
     for width in _WRAPPED if periodic else (0,):
         margin = [min(n // 2, width) for n in mask.shape]
         inner = tuple(slice(m, m + n) for m, n in zip(margin, mask.shape, strict=True))
-        padded = np.pad(mask, [(m, m) for m in margin], mode="wrap")
-        radius = ndimage.distance_transform_edt(padded, sampling=spacing).astype(np.float32)  # type: ignore[union-attr]
+        radius = ball_radii(np.pad(mask, [(m, m) for m in margin], mode="wrap"), spacing)
         if radius[inner].max() < width * edge:
             break
     factor = math.ceil(float(radius[inner].max()) / edge / largest)
     if factor == 1:
-        return 2 * _largest_balls(radius[inner], np.asarray(spacing, dtype=np.float32), edge, periodic)
-    coarse = block_reduce(radius, factor, np.max)
-    painted = _largest_balls(coarse, np.asarray(spacing, dtype=np.float32) * factor, edge)
-    fine = painted.repeat(factor, 0).repeat(factor, 1).repeat(factor, 2)[tuple(slice(n) for n in padded.shape)]
-    return np.where(padded, 2 * np.maximum(fine, radius), np.float32(0))[inner]
-
-
-def _largest_balls(radius: np.ndarray, spacing: np.ndarray, edge: float, periodic: bool = False) -> np.ndarray:
-    centres = np.flatnonzero(radius > 0)
-    order = centres[np.argsort(-radius.ravel()[centres], kind="stable")]
-    painted = np.zeros(radius.size, dtype=np.float32)
-    owner = np.full(radius.size, -1, dtype=np.int64)
-    _paint(order, (radius.ravel(), painted, owner), np.array(radius.shape), spacing, np.float32(edge), periodic)
-    return np.where(radius > 0, painted.reshape(radius.shape), np.float32(0))
-
-
-@njit(cache=True)
-def _paint(order, balls, shape, spacing, edge, periodic):  # pragma: no cover
-    """Paint balls in descending size; each voxel keeps the first, hence largest, that covers it (and which it was)."""
-    radius, _, owner = balls
-    nz, ny, nx = shape
-    hz, hy, hx = spacing
-    for centre in order:
-        r = radius[centre]
-        if owner[centre] >= 0:
-            o = owner[centre]
-            dz, dy, dx = (
-                abs(centre // (ny * nx) - o // (ny * nx)),
-                abs(centre // nx % ny - o // nx % ny),
-                abs(centre % nx - o % nx),
-            )
-            if periodic:
-                dz, dy, dx = min(dz, nz - dz), min(dy, ny - dy), min(dx, nx - dx)
-            out = np.sqrt((dz * hz) ** 2 + (dy * hy) ** 2 + (dx * hx) ** 2) + r - radius[o]
-            if out <= max(0.5 * edge, 0.05 * radius[o]):
-                continue
-        _paint_ball(centre, balls, shape, spacing, r + 0.5 * edge, periodic)
-
-
-@njit(cache=True)
-def _paint_ball(centre, balls, shape, spacing, reach, periodic):  # pragma: no cover
-    """Paint one ball where no larger one is."""
-    radius, painted, owner = balls
-    nz, ny, nx = shape
-    hz, hy, hx = spacing
-    r, z, y, x = radius[centre], centre // (ny * nx), centre // nx % ny, centre % nx
-    kz, ky = int(reach / hz), int(reach / hy)
-    lowest, highest = (z - kz, z + kz + 1) if periodic else (max(0, z - kz), min(nz, z + kz + 1))
-    front, back = (y - ky, y + ky + 1) if periodic else (max(0, y - ky), min(ny, y + ky + 1))
-    for k in range(lowest, highest):
-        plane = (k + nz if k < 0 else k - nz if k >= nz else k) * ny
-        for j in range(front, back):
-            rest = reach * reach - ((k - z) * hz) ** 2 - ((j - y) * hy) ** 2
-            if rest < 0:
-                continue
-            kx = int(np.sqrt(rest) / hx)
-            row = (plane + (j + ny if j < 0 else j - ny if j >= ny else j)) * nx
-            for i in range(row + max(0, x - kx), row + min(nx, x + kx + 1)):
-                if painted[i] < r:
-                    painted[i] = r
-                    owner[i] = centre
-            for i in range(x - kx, x + kx + 1 if periodic else x - kx):
-                if not 0 <= i < nx and painted[row + i % nx] < r:
-                    painted[row + i % nx] = r
-                    owner[row + i % nx] = centre
+        return 2 * paint_balls(radius[inner], spacing, periodic=periodic)
+    return 2 * paint_coarse_balls(radius, spacing, factor)[inner]
 
 
 def smooth_surface(mask: np.ndarray, spacing: tuple[float, float, float], *, periodic: bool = False) -> Surface:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -12,8 +13,8 @@ from curvafit.geometry.morphometry import local_thickness
 
 Window = tuple[slice, slice, slice]
 
-#: Thickness is measured in a box of at most this many voxels a side.
-_MEASURED = 160
+#: Median thickness is measured in a box of at most this many voxels a side.
+MEASURED = 160
 _CONNECTED_26 = np.ones((3, 3, 3), dtype=bool)
 
 
@@ -39,10 +40,17 @@ def median_thickness(mask: np.ndarray, spacing: tuple[float, float, float], peri
     the scale. Both are in spacing's unit, from the box of at most 160 voxels a side that `boxes_by_surface` puts first.
     """
     surface = surface_voxels(mask)
-    boxes = boxes_by_surface(surface, _MEASURED)
+    boxes = boxes_by_surface(surface, MEASURED)
     part = mask[boxes[0]] if boxes else mask
-    thickness = local_thickness(part, spacing, periodic=periodic and part.shape == mask.shape)
-    values = thickness[surface[boxes[0]]] if boxes else thickness[part]
+    below = surface[boxes[0]] if boxes else part
+    return thickness_beneath(part, below, spacing, periodic and part.shape == mask.shape)
+
+
+def thickness_beneath(
+    mask: np.ndarray, surface: np.ndarray, spacing: tuple[float, float, float], periodic: bool = False
+) -> tuple[float, float]:
+    """Return the median and 95th percentile of the local thickness of a mask over its `surface`, of its shape."""
+    values = local_thickness(mask, spacing, periodic=periodic)[surface]
     return float(np.median(values)), float(np.percentile(values, 95))
 
 
@@ -56,17 +64,26 @@ def boxes_by_surface(content: np.ndarray, size: int | Sequence[int]) -> list[Win
 
     The first is the middle one, unless it holds less than half of what the others hold on average: then the fullest.
     """
+    candidates = candidate_boxes(content.shape, size)
+    return order_boxes(candidates, [int(np.count_nonzero(content[box])) for box in candidates])
+
+
+def candidate_boxes(shape: Sequence[int], size: int | Sequence[int]) -> list[Window]:
+    """Return the middle box of a volume, of at most `size` voxels a side, and others that cover the volume."""
     sides = [size] * 3 if isinstance(size, int) else list(size)
-    middle = tuple(_middle(slice(0, n), side) for n, side in zip(content.shape, sides, strict=True))
-    tiles = [_tiles(n, side) for n, side in zip(content.shape, sides, strict=True)]
-    candidates = [middle] + [(z, y, x) for z in tiles[0] for y in tiles[1] for x in tiles[2] if (z, y, x) != middle]
-    counts = [int(np.count_nonzero(content[box])) for box in candidates]
+    middle = tuple(_middle(slice(0, n), side) for n, side in zip(shape, sides, strict=True))
+    tiles = [_tiles(n, side) for n, side in zip(shape, sides, strict=True)]
+    return [middle] + [(z, y, x) for z in tiles[0] for y in tiles[1] for x in tiles[2] if (z, y, x) != middle]  # type: ignore[list-item]
+
+
+def order_boxes(candidates: Sequence[Window], counts: Sequence[int]) -> list[Window]:
+    """Return the boxes of `candidate_boxes` that hold anything, in the order of `boxes_by_surface`."""
     filled = [(count, box) for count, box in zip(counts, candidates, strict=True) if count]
     ordered = [box for _, box in sorted(filled, key=lambda pair: -pair[0])]
     if ordered and counts[0] >= 0.5 * sum(counts) / len(counts):
-        ordered.remove(middle)
-        ordered.insert(0, middle)
-    return ordered  # type: ignore[return-value]
+        ordered.remove(candidates[0])
+        ordered.insert(0, candidates[0])
+    return ordered
 
 
 def box_with_most_surface(mask: np.ndarray, edge: int | Sequence[int]) -> Window:
@@ -125,6 +142,7 @@ def resample(
     *,
     periodic: bool = False,
     nearest: bool = False,
+    corner: Sequence[int] = (0, 0, 0),
 ) -> np.ndarray:
     """Resample values to a grid whose voxels are `scale` old voxels long; the first voxels' corners coincide.
 
@@ -141,14 +159,16 @@ def resample(
         First voxel and number of voxels of the part that is wanted, in new voxels.
     nearest
         Take the nearest value instead (labels).
+    corner
+        The old voxel that `values` begin with, where they are a part of a volume.
     """
     width = [0.0 if nearest else max(0.0, (s - 1) / 2) for s in scale]
     cut, first = values, [0, 0, 0]
     if not periodic:
         margin = [math.ceil(4 * w) + 2 for w in width]
-        first = [max(0, math.floor(a * s) - m) for a, s, m in zip(start, scale, margin, strict=True)]
+        first = [max(c, math.floor(a * s) - m) for a, s, m, c in zip(start, scale, margin, corner, strict=True)]
         last = [math.ceil((a + n) * s) + m for a, n, s, m in zip(start, shape, scale, margin, strict=True)]
-        cut = values[tuple(slice(a, b) for a, b in zip(first, last, strict=True))]
+        cut = values[tuple(slice(a - c, b - c) for a, b, c in zip(first, last, corner, strict=True))]
     smooth = ndimage.gaussian_filter(cut, width, mode="wrap" if periodic else "nearest") if any(width) else cut
     offset = [(a + 0.5) * s - 0.5 - f for a, s, f in zip(start, scale, first, strict=True)]
     mode = "grid-wrap" if periodic else "nearest"
@@ -156,27 +176,44 @@ def resample(
     return ndimage.affine_transform(smooth, np.asarray(scale), np.asarray(offset), tuple(shape), order=order, mode=mode)  # type: ignore[arg-type]
 
 
-def remove_specks(mask: np.ndarray, smallest: float, periodic: bool) -> tuple[np.ndarray, int, int]:
+def remove_specks(
+    mask: np.ndarray, smallest: float, periodic: bool, part: CutOut | None = None
+) -> tuple[np.ndarray, int, int]:
     """Drop specks (26-connected) and pinholes (6-connected) under `smallest` voxels; return the mask and both counts.
 
-    Pieces that touch the faces of a periodic box may go on beyond, and stay.
+    Pieces that touch the faces of a periodic box, or those by which a part was cut from a volume, may go on beyond, and
+    stay. Of a part, pieces are counted whose first voxel lies in its core.
     """
-    specks, count = _small_pieces(mask, smallest, periodic, _CONNECTED_26)
+    part = part or CutOut(tuple(slice(0, n) for n in mask.shape), ((periodic, periodic),) * 3)  # type: ignore[arg-type]
+    specks, count = _small_pieces(mask, smallest, part, _CONNECTED_26)
     cleaned = mask & ~specks
-    pinholes, holes = _small_pieces(~cleaned, smallest, periodic, None)
+    pinholes, holes = _small_pieces(~cleaned, smallest, part, None)
     return cleaned | pinholes, count, holes
 
 
+class CutOut(NamedTuple):
+    """A part of a volume: its core, and whether it was cut at the low and the high end of each axis."""
+
+    core: Window
+    cut: Sequence[tuple[bool, bool]]
+
+
 def _small_pieces(
-    mask: np.ndarray, smallest: float, periodic: bool, structure: np.ndarray | None
+    mask: np.ndarray, smallest: float, part: CutOut, structure: np.ndarray | None
 ) -> tuple[np.ndarray, int]:
     labels: np.ndarray = ndimage.label(mask, structure)[0]  # type: ignore[index]
     small: np.ndarray = np.bincount(labels.ravel()) < smallest
     small[0] = False
-    if periodic:
-        for axis in range(3):
-            small[np.unique(np.take(labels, [0, -1], axis=axis))] = False
-    return small[labels], int(small.sum())
+    for axis, ends in enumerate(part.cut):
+        for end, cut in zip((0, -1), ends, strict=True):
+            if cut:
+                small[np.unique(np.take(labels, end, axis=axis))] = False
+    pieces = small[labels]
+    where = np.flatnonzero(pieces)
+    first = where[np.unique(labels.ravel()[where], return_index=True)[1]]
+    inside = np.zeros(mask.shape, dtype=bool)
+    inside[part.core] = True
+    return pieces, int(np.count_nonzero(inside.ravel()[first]))
 
 
 def _middle(whole: slice, length: int) -> slice:

@@ -228,34 +228,54 @@ def _read_compartments(roi: Source, field: Field, crop: Any) -> np.ndarray:
 
 def _summarise(field: Field, maps: Maps, blocks: Blocks, part: tuple[str, int] | None = None) -> Measures:
     """Return the measures of what lies in blocks, and of the whole scan with its own χ."""
-    table, notes, drawn = maps.sum(blocks), maps.notes, maps.diagram
-    total, volumes = table.sum(0), table[:, SUMS.index("volume")]
-    values, names = combine(total), [name for name, *_ in QUANTITIES]
+    drawn, table, connectivity = maps.diagram, maps.sum(blocks), None
     if blocks.region is None:
-        whole = [names.index("Euler number"), names.index("connectivity density")]
-        values[whole] = measure_connectivity(maps.mask, field.spacing, periodic=maps.periodic)
-        count, weights = blocks.count, None
+        connectivity = measure_connectivity(maps.mask, field.spacing, periodic=maps.periodic)
     else:
-        count, weights = round(volumes.sum() ** 2 / np.square(volumes).sum()), volumes / volumes.mean()
         inside = blocks.region[blocks.locate(maps.curved[0])]
         drawn = replace(
             drawn, points=drawn.points[inside], weights=drawn.weights[inside], places=np.asarray(drawn.places)[inside]
         )
+    return summarise_sums(field, Summed(maps.kind, blocks, table, connectivity, drawn, maps.notes), part)
+
+
+class Summed(NamedTuple):
+    """What is summed of a scan: a row of `SUMS` for each block; χ and connectivity density of all of it, None of a
+    region; the areas over (κ1, κ2); and notes."""
+
+    kind: str
+    blocks: Blocks
+    table: np.ndarray
+    connectivity: tuple[float, float] | None
+    diagram: Diagram
+    notes: tuple[str, ...]
+
+
+def summarise_sums(frame: Field, summed: Summed, part: tuple[str, int] | None = None) -> Measures:
+    """Return the measures that follow from sums over blocks; of `frame` the source and the unit count."""
+    _, blocks, table, connectivity, _, notes = summed
+    total, volumes = table.sum(0), table[:, SUMS.index("volume")]
+    values, names = combine(total), [name for name, *_ in QUANTITIES]
+    if connectivity is not None:
+        values[[names.index("Euler number"), names.index("connectivity density")]] = connectivity
+        count, weights = blocks.count, None
+    else:
+        count, weights = round(volumes.sum() ** 2 / np.square(volumes).sum()), volumes / volumes.mean()
     halves = errors(table, blocks, combine, weights) if count >= LEAST else np.full(len(values), np.nan)
     if count < LEAST:
-        where = "scan" if blocks.region is None else " ".join(map(str, part or ("region",)))
+        where = "scan" if connectivity is not None else " ".join(map(str, part or ("region",)))
         notes = (
             *notes,
             f"No intervals: they need {LEAST} blocks of a period (thickness and spacing), and the {where} has {count}.",
         )
     rows = zip(QUANTITIES, values, halves, strict=True)
     return Measures(
-        source=field.source,
-        unit=field.unit,
-        kind=maps.kind,
+        source=frame.source,
+        unit=frame.unit,
+        kind=summed.kind,
         quantities=tuple(Quantity(name, symbol, float(v), float(h), power) for (name, symbol, power, _), v, h in rows),
         direction=find_direction(dict(zip(SUMS, total, strict=True))),
-        diagram=drawn,
+        diagram=summed.diagram,
         blocks=blocks.counts,
         notes=notes,
         part=part,
@@ -421,7 +441,7 @@ def scan_diagram(prepared: Prepared) -> Diagram:
         with contextlib.suppress(NoSurface):
             parts.append(_measure_tile(prepared, tile))
     if not parts:
-        raise ValueError("expected a surface inside the scan, got none away from its borders")
+        raise NoSurface("expected a surface inside the scan, got none away from its borders")
     points, areas, places = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("points", "weights", "places")
     )

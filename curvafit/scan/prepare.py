@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 import torch
 
+from curvafit.core.runtime import check_memory
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.topology import betti_numbers
 from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
@@ -46,6 +47,8 @@ THINNEST = 3.0
 LARGEST_WINDOW = 128
 LARGEST_BOX = 200
 LARGEST_SCAN = 512
+#: The least bytes that a working voxel takes while it is made.
+WORKED = 32
 #: A structure that fills more than this part of the volume may be the wrong phase, which a note says.
 HALF = 0.5
 MOSTLY = "The structure fills {:.0%} of the volume: if the other phase was meant, turn the two round (--dark)."
@@ -162,6 +165,7 @@ def prepare(
     threshold: Literal["otsu"] | float = "otsu",
     dark: bool = False,
     roi: Field | np.ndarray | str | os.PathLike[str] | None = None,
+    whole: bool = False,
 ) -> Prepared:
     """Find the structure and put it on the working grid, where its median thickness is a known number of voxels.
 
@@ -187,10 +191,12 @@ def prepare(
         The structure is the dark phase (of a mask: its lower value; of a field: where it is negative).
     roi
         Nonzero where the scan counts (array, field or file of the scan's shape).
+    whole
+        Use all of a scan whatever its size, or raise ValueError where its working grid does not fit into memory.
     """
     check_options(kind, threshold)
     region = region_of_interest(roi, field)
-    where, notes = bounding_box(field.shape, region, LARGEST_SCAN)
+    where, notes = bounding_box(field.shape, region, max(field.shape) if whole else LARGEST_SCAN)
     region = None if region is None else region[where]
     part = replace(field, values=field.values[where], affine=None, notes=field.notes + notes)
     periodic = periodic and part.shape == field.shape
@@ -198,7 +204,7 @@ def prepare(
     extremes = (field.values.min(), field.values.max())
     seen, signed = find_structure(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
     mask, quality = signed.values > 0, None
-    prepared = _put_on_grid(_Scan(seen, signed, periodic, region, noise=seen != "field" and is_noise(mask)))
+    prepared = _put_on_grid(_Scan(seen, signed, periodic, region, noise=seen != "field" and is_noise(mask)), whole)
     if seen == "image":
         quality = measure_quality(-part.values if dark else part.values, mask, part.spacing)
     corner = tuple(s.start + o for s, o in zip(where, prepared.origin, strict=True))
@@ -239,13 +245,12 @@ class _Scan:
         return self.mask if self.region is None else self.mask & self.region
 
 
-def _put_on_grid(scan: _Scan) -> Prepared:
+def _put_on_grid(scan: _Scan, whole: bool) -> Prepared:
     """Choose the working voxel, move the scan to it, drop specks, profile the mask, choose windows."""
     thickness, notes = _measure_thickness(scan)
     scale, why = _choose_scale(scan, thickness)
-    start, shape, cut = _choose_box(scan, scale)
-    edges = [s * h for s, h in zip(scale, scan.field.spacing, strict=True)]
-    edge = edges[0] if max(edges) <= (1 + 1e-9) * min(edges) else math.prod(edges) ** (1 / 3)
+    start, shape, cut = _choose_box(scan, scale, whole)
+    edge = working_edge(scale, scan.field.spacing)
     values, region = _move(scan, scale, start, shape)
     grid = Grid(
         shape,
@@ -283,16 +288,35 @@ def _measure_thickness(scan: _Scan) -> tuple[float, tuple[str, ...]]:
     """Return the median thickness in the scan's unit, and a note; refuse what is too thin to have a shape."""
     phase, name = scan.thinner
     median, thick = median_thickness(phase, scan.field.spacing, scan.periodic)
-    voxel = math.prod(scan.field.spacing) ** (1 / 3)
+    return median, (judge_thickness(name, median, thick, scan.field.spacing, scan.keeps_grid),)
+
+
+def judge_thickness(
+    name: str, median: float, thick: float, spacing: tuple[float, float, float], keeps_grid: bool
+) -> str:
+    """Return a note on the thickness of a phase; raise ScanError where its 95th percentile is too thin for a shape."""
+    voxel = math.prod(spacing) ** (1 / 3)
     thin = thick < (THINNEST - 0.5) * voxel  # balls on the grid understate thin tubes
-    if thin and not scan.keeps_grid:
+    if thin and not keeps_grid:
         raise ScanError(
             f"expected a {name} at least {THINNEST:g} voxels thick, got one that is thinner nearly everywhere"
         )
-    note = f"Median thickness of the {name} {median / voxel:.3g} scan voxels."
     if median < THINNEST * voxel:
-        note = f"Half of the {name} is thinner than {median / voxel:.2g} scan voxels: its curvature is uncertain."
-    return median, (note,)
+        return f"Half of the {name} is thinner than {median / voxel:.2g} scan voxels: its curvature is uncertain."
+    return f"Median thickness of the {name} {median / voxel:.3g} scan voxels."
+
+
+def choose_scale(
+    kind: Kind, frame: Field, noise: bool, thickness: float
+) -> tuple[tuple[float, float, float], tuple[str, ...]]:
+    """Return the working voxel of a scan in its own voxels (z, y, x), and notes; of `frame` only the place counts."""
+    return _choose_scale(_Scan(kind, frame, False, None, noise=noise), thickness)
+
+
+def working_edge(scale: Sequence[float], spacing: Sequence[float]) -> float:
+    """Return the edge of a working voxel in the scan's unit; the mean of edges that are not quite alike."""
+    edges = [s * h for s, h in zip(scale, spacing, strict=True)]
+    return edges[0] if max(edges) <= (1 + 1e-9) * min(edges) else math.prod(edges) ** (1 / 3)
 
 
 def _choose_scale(scan: _Scan, thickness: float) -> tuple[tuple[float, float, float], tuple[str, ...]]:
@@ -314,15 +338,23 @@ def _choose_scale(scan: _Scan, thickness: float) -> tuple[tuple[float, float, fl
     return (scale[0], scale[1], scale[2]), (f"{note}: a working voxel is {edges} scan voxels (z, y, x).",)
 
 
+def count_voxels(shape: Sequence[int], scale: Sequence[float]) -> tuple[int, int, int]:
+    """Return the working voxels of a scan of a shape along each axis; raise ScanError where they are too few."""
+    z, y, x = (math.floor(n / s + 1e-6) for n, s in zip(shape, scale, strict=True))
+    if min(z, y, x) < 4:
+        raise ScanError(f"expected at least 4 working voxels along each axis, got {_join_sides((z, y, x))}")
+    return z, y, x
+
+
 def _choose_box(
-    scan: _Scan, scale: tuple[float, float, float]
+    scan: _Scan, scale: tuple[float, float, float], whole: bool
 ) -> tuple[tuple[int, int, int], tuple[int, int, int], tuple[str, ...]]:
     """Return the first working voxel, number of voxels, and a note where that is not all of the scan."""
-    full = [math.floor(n / s + 1e-6) for n, s in zip(scan.field.shape, scale, strict=True)]
-    if min(full) < 4:
-        raise ScanError(f"expected at least 4 working voxels along each axis, got {_join_sides(full)}")
-    if max(full) <= LARGEST_BOX:
-        return (0, 0, 0), (full[0], full[1], full[2]), ()
+    full = count_voxels(scan.field.shape, scale)
+    if whole:
+        check_memory(full, WORKED, "a working grid")
+    if whole or max(full) <= LARGEST_BOX:
+        return (0, 0, 0), full, ()
     sides = [min(n, LARGEST_BOX) for n in full]
     size = [math.ceil(n * s) for n, s in zip(sides, scale, strict=True)]
     boxes = boxes_by_surface(surface_voxels(scan.counted), size)

@@ -29,9 +29,11 @@ from curvafit.volumes.read import load
 Kind = Literal["field", "mask", "image"]
 
 #: Median third difference of neighbours from which values are noisy; fields rounded to 1/100 reach 0.02.
-_NOISE = 0.045
+JITTER = 0.045
+#: The share of a phase field's voxels that lie in its plateaus, further from 0 than this.
+PLATEAUS, PLATEAU = 0.6, 0.35
 #: Offsets in scan voxels, beyond the reach of smoothing, and the correlation that noise stays below there.
-_LAGS, _UNCORRELATED = (4, 5, 6, 7, 8), 0.06
+LAGS, UNCORRELATED = (4, 5, 6, 7, 8), 0.06
 #: Blurs that are tried, in voxels of the finest axis.
 _BLURS = (0.0, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
 #: Shifts of the boundary that are tried, in voxels of the finest axis.
@@ -43,6 +45,8 @@ _MEASURED = 64
 #: Voxels this far from the surface lie deep within their phase; the least number of them; and the width beyond which
 #: grey levels vary by their lighting, in voxels of the finest axis.
 _DEEP, _FEWEST, _UNEVEN = 3.5, 500, 4.0
+#: Voxels that smoothing grey levels reaches.
+SMOOTHED = 3
 #: Median of the absolute value of a normal number.
 _NORMAL_MEDIAN = 0.6745
 #: Smoothed noise over contrast, and slices' thickness over the finest edge, from which on a scan is worse than a mask.
@@ -139,13 +143,13 @@ def is_noise(mask: np.ndarray) -> bool:
     share = float(mask.mean())
     variance = share * (1 - share)
     for axis in range(3):
-        for lag in _LAGS:
+        for lag in LAGS:
             if mask.shape[axis] <= 2 * lag:
                 continue
             lines = np.moveaxis(mask, axis, 0)
             both = float(np.count_nonzero(lines[lag:] & lines[:-lag])) / lines[lag:].size
             ends = float(lines[lag:].mean()) * float(lines[:-lag].mean())
-            if abs(both - ends) > _UNCORRELATED * variance:
+            if abs(both - ends) > UNCORRELATED * variance:
                 return False
     return True
 
@@ -160,12 +164,16 @@ def _guess_kind(values: np.ndarray, threshold: Literal["otsu"] | float, two: boo
     a phase field; anything else is an image."""
     if two:
         return "mask"
-    lowest, highest = values.min(), values.max()
-    if values.dtype.kind == "f" and threshold == "otsu" and -2 <= lowest <= -0.7 and 0.3 <= highest <= 2:
+    if may_be_field(values.dtype, threshold, values.min(), values.max()):
         jitter = float(np.median(np.abs(np.diff(values, 3, axis=2)))) if values.shape[2] > 3 else 0.0
-        if jitter < _NOISE and np.count_nonzero(np.abs(values) > 0.35) > 0.6 * values.size:
+        if jitter < JITTER and np.count_nonzero(np.abs(values) > PLATEAU) > PLATEAUS * values.size:
             return "field"
     return "image"
+
+
+def may_be_field(dtype: np.dtype, threshold: Literal["otsu"] | float, lowest: float, highest: float) -> bool:
+    """Return whether a phase field may have this type of numbers and these extremes."""
+    return dtype.kind == "f" and threshold == "otsu" and -2 <= lowest <= -0.7 and 0.3 <= highest <= 2
 
 
 def _find_threshold(values: np.ndarray) -> float:
@@ -177,6 +185,22 @@ def _find_threshold(values: np.ndarray) -> float:
     return float(values[high].mean(dtype=np.float64) + values[~high].mean(dtype=np.float64)) / 2
 
 
+def smooth_levels(values: np.ndarray, spacing: tuple[float, float, float], periodic: bool = False) -> np.ndarray:
+    """Return grey levels (Z, Y, X) smoothed by one voxel of the finest axis, float32; they reach `SMOOTHED` of them."""
+    width = [min(spacing) / h for h in spacing]
+    mode = "wrap" if periodic else "nearest"
+    return ndimage.gaussian_filter(values.astype(np.float32), width, mode=mode, truncate=3.0)
+
+
+def describe_split(level: float, otsu: bool, dark: bool, lowest: float, highest: float) -> str:
+    """Return the note on a threshold; raise ScanError where it is not between the extremes of the smoothed levels."""
+    if not lowest < level < highest:
+        levels = f"{lowest:.4g} to {highest:.4g}"
+        raise ScanError(f"expected a threshold within the smoothed scan's {levels}, got {level:.4g}")
+    how, side = "Otsu's" if otsu else "the given", "dark" if dark else "bright"
+    return f"Smoothed by one voxel, split at {how} threshold of {level:.4g}: the {side} phase is the structure."
+
+
 def _split_image(
     field: Field, threshold: Literal["otsu"] | float, dark: bool, region: np.ndarray | None, periodic: bool
 ) -> tuple[np.ndarray, str]:
@@ -184,19 +208,10 @@ def _split_image(
 
     Smoothing lowers thin structures' grey: a threshold of the smoothed levels would sink and make them fat.
     """
-    finest = min(field.spacing)
-    width = [finest / h for h in field.spacing]
-    mode = "wrap" if periodic else "nearest"
-    smooth = ndimage.gaussian_filter(field.values.astype(np.float32), width, mode=mode, truncate=3.0)
+    smooth = smooth_levels(field.values, field.spacing, periodic)
     counted, raw = (smooth, field.values) if region is None else (smooth[region], field.values[region])
     level = _find_threshold(raw) if threshold == "otsu" else float(threshold)
-    lowest, highest = float(counted.min()), float(counted.max())
-    if not lowest < level < highest:
-        levels = f"{lowest:.4g} to {highest:.4g}"
-        raise ScanError(f"expected a threshold within the smoothed scan's {levels}, got {level:.4g}")
-    how = "Otsu's" if threshold == "otsu" else "the given"
-    side = "dark" if dark else "bright"
-    note = f"Smoothed by one voxel, split at {how} threshold of {level:.4g}: the {side} phase is the structure."
+    note = describe_split(level, threshold == "otsu", dark, float(counted.min()), float(counted.max()))
     return (level - smooth if dark else smooth - level), note
 
 

@@ -1,0 +1,323 @@
+"""The balls that fit into a mask: how large they are around each voxel, and which is the largest that covers a voxel.
+
+`_paint` visits balls in descending size, so that each voxel is painted once; bits of what is still free tell at once
+that most balls paint nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+from skimage.measure import block_reduce
+
+#: Columns whose distances are found together.
+_COLUMNS = 16
+
+
+def ball_radii(mask: np.ndarray, spacing: tuple[float, float, float], limit: float = math.inf) -> np.ndarray:
+    """Return the distance of each voxel of a mask to the nearest voxel outside, at most `limit`; float32 (Z, Y, X).
+
+    Distances are exact, from centre to centre, in spacing's unit.
+    """
+    edge = float(min(spacing))
+    steps = np.array(spacing, dtype=np.float32) / np.float32(edge)
+    reach = min(limit / edge, 2.0 * math.hypot(*(n * h for n, h in zip(mask.shape, steps.tolist(), strict=True))))
+    squares = np.empty(mask.shape, dtype=np.float32)
+    scratch = np.empty((max(mask.shape), _COLUMNS), dtype=np.float32)
+    _square_distances(np.ascontiguousarray(mask), steps, np.float32(reach), squares, scratch)
+    np.sqrt(squares, out=squares)
+    squares *= np.float32(edge)
+    return squares
+
+
+def paint_coarse_balls(radius: np.ndarray, spacing: tuple[float, float, float], factor: int) -> np.ndarray:
+    """Return what `paint_balls` returns, of balls painted on a grid that is coarser by a whole factor."""
+    coarse = block_reduce(radius, factor, np.max)
+    painted = paint_balls(coarse, [h * factor for h in spacing], edge=float(min(spacing)))
+    fine = painted.repeat(factor, 0).repeat(factor, 1).repeat(factor, 2)[tuple(slice(n) for n in radius.shape)]
+    return np.where(radius > 0, np.maximum(fine, radius), np.float32(0))
+
+
+def paint_balls(
+    radius: np.ndarray,
+    spacing: Sequence[float],
+    *,
+    edge: float | None = None,
+    periodic: bool = False,
+    core: tuple[slice, ...] | None = None,
+) -> np.ndarray:
+    """Return the radius of the largest ball that covers each voxel, of balls of `radius` (Z, Y, X) around the voxels.
+
+    A ball covers voxels up to half an `edge`, by default the finest, beyond its rim. Of a part of a volume what lies in
+    its `core` is wanted: balls too far away to reach it, or to keep a ball that does from being painted, are left out.
+    """
+    edge = float(min(spacing)) if edge is None else edge
+    steps, rim = np.asarray(spacing, dtype=np.float32), np.float32(edge)
+    radius = np.ascontiguousarray(radius)
+    shape = np.array(radius.shape)
+    box = [(0, n) if end is None else (end.start, end.stop) for n, end in zip(shape, core or (None,) * 3, strict=True)]
+    reach = 2 * reaching_radius(radius, spacing, core) + edge if core else math.inf
+    order = np.empty((2, np.count_nonzero(radius)), dtype=np.int64)
+    count = _order_balls(radius, steps, np.array(box), np.float64(reach), order[0])
+    _sort_balls(radius.ravel(), order[:, :count])
+    painted, owner = np.zeros(radius.size, dtype=np.float32), np.full(radius.size, -1, dtype=np.int32)
+    words = -(-radius.shape[2] // 64)
+    free = np.zeros(radius.shape[0] * radius.shape[1] * words, dtype=np.uint64)
+    blocks = np.zeros(-(-radius.shape[0] // 4) * -(-radius.shape[1] // 4) * words, dtype=np.uint64)
+    _mark_free(radius, free, blocks)
+    _paint(order[0, :count], (radius.ravel(), painted, owner, free, blocks), shape, steps, rim, periodic)
+    return painted.reshape(radius.shape)
+
+
+def reaching_radius(radius: np.ndarray, spacing: Sequence[float], core: tuple[slice, ...]) -> float:
+    """Return the largest of the balls, of `radius` (Z, Y, X) around the voxels, that reach into a core."""
+    box = np.array([(edge.start, edge.stop) for edge in core])
+    return float(_find_reaching(np.ascontiguousarray(radius), np.asarray(spacing, dtype=np.float32), box))
+
+
+@njit(cache=True)
+def _square_distances(mask, steps, reach, squares, scratch):  # pragma: no cover
+    """Fill the squared distance of each voxel of a mask to the nearest outside, along x, then y, then z."""
+    nz, ny, nx = mask.shape
+    hz, hy, hx = steps
+    for z in range(nz):
+        for y in range(ny):
+            _fill_row(mask[z, y], hx, reach, squares[z, y])
+    for z in range(nz):
+        for first in range(0, nx, _COLUMNS):
+            _lower_columns(squares[z, :, first : first + _COLUMNS], hy, scratch)
+    for y in range(ny):
+        for first in range(0, nx, _COLUMNS):
+            _lower_columns(squares[:, y, first : first + _COLUMNS], hz, scratch)
+
+
+@njit(cache=True)
+def _fill_row(mask, step, reach, squares):  # pragma: no cover
+    """Fill the squared distances to the nearest outside within a row."""
+    n, since = len(mask), reach / step + 1
+    for x in range(n):
+        since = since + 1 if mask[x] else np.float32(0)
+        squares[x] = min((since * step) ** 2, reach * reach)
+    since = reach / step + 1
+    for x in range(n - 1, -1, -1):
+        since = since + 1 if mask[x] else np.float32(0)
+        squares[x] = min((since * step) ** 2, squares[x])
+
+
+@njit(cache=True)
+def _lower_columns(squares, step, scratch):  # pragma: no cover
+    """Lower squares, (n, columns), to the least of those at k steps along the columns, plus (k step)²."""
+    n, width = squares.shape
+    for at in range(n):
+        for i in range(width):
+            scratch[at, i] = squares[at, i]
+    for at in range(n):
+        for i in range(width):
+            best, k, cost = scratch[at, i], 1, step * step
+            while cost < best and (at - k >= 0 or at + k < n):
+                if at - k >= 0:
+                    best = min(best, scratch[at - k, i] + cost)
+                if at + k < n:
+                    best = min(best, scratch[at + k, i] + cost)
+                k += 1
+                cost = (k * step) * (k * step)
+            squares[at, i] = best
+
+
+@njit(cache=True)
+def _gap(at, low, high):  # pragma: no cover
+    """Return how many voxels a place lies outside of a stretch of an axis."""
+    return low - at if at < low else at - high + 1 if at >= high else 0
+
+
+@njit(cache=True)
+def _find_reaching(radius, steps, box):  # pragma: no cover
+    """Return the largest radius of a ball that reaches into a box."""
+    nz, ny, nx = radius.shape
+    hz, hy, hx = steps
+    largest = 0.0
+    for z in range(nz):
+        dz = _gap(z, box[0, 0], box[0, 1]) * hz
+        for y in range(ny):
+            dy = _gap(y, box[1, 0], box[1, 1]) * hy
+            for x in range(nx):
+                if radius[z, y, x] > largest:
+                    dx = _gap(x, box[2, 0], box[2, 1]) * hx
+                    r = radius[z, y, x] + hx
+                    if dz * dz + dy * dy + dx * dx <= r * r:
+                        largest = radius[z, y, x]
+    return largest
+
+
+@njit(cache=True)
+def _order_balls(radius, steps, box, reach, order):  # pragma: no cover
+    """Fill the centres of balls whose distance to a box is at most `reach` less their radius; return their number."""
+    nz, ny, nx = radius.shape
+    hz, hy, hx = steps
+    count = 0
+    for z in range(nz):
+        dz = _gap(z, box[0, 0], box[0, 1]) * hz
+        for y in range(ny):
+            dy = _gap(y, box[1, 0], box[1, 1]) * hy
+            for x in range(nx):
+                r = radius[z, y, x]
+                if r > 0:
+                    dx = _gap(x, box[2, 0], box[2, 1]) * hx
+                    if np.sqrt(dz * dz + dy * dy + dx * dx) <= max(reach - r, r):
+                        order[count] = (z * ny + y) * nx + x
+                        count += 1
+    return count
+
+
+def _sort_balls(radius: np.ndarray, order: np.ndarray) -> None:
+    """Sort centres, the first of two rows, by descending radius; equal ones stay in their order."""
+    counts = np.zeros(1 << 16, dtype=np.int64)
+    for shift in (0, 16):  # a positive float's bits order as the float
+        _sort_digits(radius.view(np.uint32), order[shift // 16], order[1 - shift // 16], counts, shift)
+
+
+@njit(cache=True)
+def _sort_digits(keys, source, target, counts, shift):  # pragma: no cover
+    """Sort centres by descending 16 bits of their keys."""
+    counts[:] = 0
+    for centre in source:
+        counts[(keys[centre] >> shift) & 0xFFFF] += 1
+    place = 0
+    for digit in range(len(counts) - 1, -1, -1):
+        number = counts[digit]
+        counts[digit] = place
+        place += number
+    for centre in source:
+        digit = (keys[centre] >> shift) & 0xFFFF
+        target[counts[digit]] = centre
+        counts[digit] += 1
+
+
+@njit(cache=True)
+def _mark_free(radius, free, blocks):  # pragma: no cover
+    """Set a bit for each voxel with a ball: in 64 of a row, and in those of 4 x 4 rows together."""
+    nz, ny, nx = radius.shape
+    words, across = (nx + 63) // 64, (ny + 3) // 4
+    for z in range(nz):
+        for y in range(ny):
+            for x in range(nx):
+                if radius[z, y, x] > 0:
+                    bit = np.uint64(1) << np.uint64(x % 64)
+                    free[(z * ny + y) * words + x // 64] |= bit
+                    blocks[((z // 4) * across + y // 4) * words + x // 64] |= bit
+
+
+@njit(cache=True)
+def _paint(order, balls, shape, spacing, edge, periodic):  # pragma: no cover
+    """Paint balls in descending size; each voxel keeps the first, hence largest, that covers it (and which it was)."""
+    radius, _, owner, _, _ = balls
+    nz, ny, nx = shape
+    hz, hy, hx = spacing
+    for centre in order:
+        r = radius[centre]
+        if owner[centre] >= 0:
+            o = owner[centre]
+            dz, dy, dx = (
+                abs(centre // (ny * nx) - o // (ny * nx)),
+                abs(centre // nx % ny - o // nx % ny),
+                abs(centre % nx - o % nx),
+            )
+            if periodic:
+                dz, dy, dx = min(dz, nz - dz), min(dy, ny - dy), min(dx, nx - dx)
+            out = np.sqrt((dz * hz) ** 2 + (dy * hy) ** 2 + (dx * hx) ** 2) + r - radius[o]
+            if out <= max(0.5 * edge, 0.05 * radius[o]):
+                continue
+        reach = r + 0.5 * edge
+        z, y, x = centre // (ny * nx), centre // nx % ny, centre % nx
+        _paint_ball(centre, balls, (z, y, x), shape, spacing, reach)
+        if periodic:
+            kz, ky, kx = int(reach / hz), int(reach / hy), int(reach / hx)
+            for k in range(z - nz, z + nz + 1, nz):
+                for j in range(y - ny, y + ny + 1, ny):
+                    for i in range(x - nx, x + nx + 1, nx):
+                        beyond = k != z or j != y or i != x
+                        if beyond and _gap(k, 0, nz) <= kz and _gap(j, 0, ny) <= ky and _gap(i, 0, nx) <= kx:
+                            _paint_ball(centre, balls, (k, j, i), shape, spacing, reach)
+
+
+@njit(cache=True)
+def _paint_ball(centre, balls, place, shape, spacing, reach):  # pragma: no cover
+    """Paint one ball, at a place that may lie beyond the box, where none is; by 4 x 4 rows: most have no free voxel."""
+    blocks = balls[4]
+    nz, ny, nx = shape
+    hz, hy, hx = spacing
+    z, y, x = place
+    kz, ky = int(reach / hz), int(reach / hy)
+    lowest, highest = max(0, z - kz), min(nz, z + kz + 1)
+    front, back = max(0, y - ky), min(ny, y + ky + 1)
+    words, across = (nx + 63) // 64, (ny + 3) // 4
+    for block in range(lowest // 4, (highest + 3) // 4):
+        dz = _gap(z, 4 * block, 4 * block + 4) * hz
+        for part in range(front // 4, (back + 3) // 4):
+            dy = _gap(y, 4 * part, 4 * part + 4) * hy
+            rest = reach * reach - dz**2 - dy**2
+            if rest < 0:
+                continue
+            kx = int(np.sqrt(rest) / hx)
+            row = (block * across + part) * words
+            if not _any_free(blocks, row, max(0, x - kx), min(nx, x + kx + 1)):
+                continue
+            painted = 0
+            for k in range(max(lowest, 4 * block), min(highest, 4 * block + 4)):
+                for j in range(max(front, 4 * part), min(back, 4 * part + 4)):
+                    rest = reach * reach - ((k - z) * hz) ** 2 - ((j - y) * hy) ** 2
+                    kx = int(np.sqrt(max(rest, 0)) / hx)
+                    if rest >= 0:
+                        painted += _paint_run(centre, balls, k * ny + j, max(0, x - kx), min(nx, x + kx + 1), nx)
+            if painted:
+                _mark_block(balls, block, part, shape)
+
+
+@njit(cache=True)
+def _mark_block(balls, block, part, shape):  # pragma: no cover
+    """Set the bits of 4 x 4 rows anew."""
+    free, blocks = balls[3], balls[4]
+    nz, ny, nx = shape
+    words, across = (nx + 63) // 64, (ny + 3) // 4
+    row = (block * across + part) * words
+    for word in range(words):
+        blocks[row + word] = 0
+        for k in range(4 * block, min(nz, 4 * block + 4)):
+            for j in range(4 * part, min(ny, 4 * part + 4)):
+                blocks[row + word] |= free[(k * ny + j) * words + word]
+
+
+@njit(cache=True)
+def _any_free(bits, row, start, stop):  # pragma: no cover
+    """Return whether any bit from `start` to `stop` of a row of words is set."""
+    for word in range(start // 64, (stop + 63) // 64):
+        if bits[row + word] & _between(start - 64 * word, stop - 64 * word):
+            return True
+    return False
+
+
+@njit(cache=True)
+def _between(start, stop):  # pragma: no cover
+    """Return a word whose bits from `start` to `stop` are set."""
+    every = np.uint64(0xFFFFFFFFFFFFFFFF)
+    return (every << np.uint64(max(start, 0))) & (every >> np.uint64(64 - min(stop, 64)))
+
+
+@njit(cache=True)
+def _paint_run(centre, balls, row, start, stop, nx):  # pragma: no cover
+    """Paint the free voxels from `start` to `stop` of a row; return how many there were."""
+    radius, painted, owner, free, _ = balls
+    words, count = (nx + 63) // 64, 0
+    for word in range(start // 64, (stop + 63) // 64):
+        bits = free[row * words + word] & _between(start - 64 * word, stop - 64 * word)
+        if bits:
+            free[row * words + word] ^= bits
+            for k in range(max(start - 64 * word, 0), min(stop - 64 * word, 64)):
+                if bits & (np.uint64(1) << np.uint64(k)):
+                    painted[row * nx + 64 * word + k] = radius[centre]
+                    owner[row * nx + 64 * word + k] = centre
+                    count += 1
+    return count
