@@ -17,7 +17,7 @@ from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import convert_length, format_number, format_sampling, power_name
 from curvafit.geometry.descriptors import descriptors
 from curvafit.geometry.diagram import FAMILIES, MARGIN, Diagram, diagram, families
-from curvafit.geometry.mesh import NoSurface, area_vectors
+from curvafit.geometry.mesh import NoSurface, Surface, area_vectors
 from curvafit.geometry.morphometry import local_thickness, measure_connectivity, smooth_surface
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
@@ -367,7 +367,11 @@ def measure_surface(
     mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the triangles' places in voxels, their areas, and n⊗n dA in the upper triangle's order (z, y, x)."""
-    mesh = smooth_surface(mask, spacing, periodic=periodic)
+    return tabulate_surface(smooth_surface(mask, spacing, periodic=periodic), spacing)
+
+
+def tabulate_surface(mesh: Surface, spacing: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `measure_surface` does, of a mesh."""
     normals = area_vectors(mesh)[:, ::-1]
     area = np.linalg.norm(normals, axis=1)
     parts = normals[:, _UPPER[0]] * normals[:, _UPPER[1]] / np.where(area > 0, area, 1)[:, None]

@@ -1,0 +1,404 @@
+"""What all tiles of a volume must have in common: its kind, threshold, noise and thickness, found box by box.
+
+Three passes read the volume. The first finds its extremes and kind; the second, of images alone, Otsu's threshold; the
+third counts the structure, and where it has most surface. There the thickness is measured that sets the working grid.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from skimage.filters import threshold_otsu
+
+from curvafit.geometry.balls import ball_radii
+from curvafit.scan.grids import MEASURED, Window, candidate_boxes, order_boxes, surface_voxels, thickness_beneath
+from curvafit.scan.prepare import (
+    HALF,
+    MOSTLY,
+    choose_scale,
+    count_voxels,
+    judge_thickness,
+    smallest_piece,
+    working_edge,
+)
+from curvafit.scan.structure import (
+    JITTER,
+    LAGS,
+    PLATEAU,
+    PLATEAUS,
+    SMOOTHED,
+    UNCORRELATED,
+    Kind,
+    describe_split,
+    may_be_field,
+    smooth_levels,
+)
+from curvafit.volumes.boxes import Boxes, boxes_of
+from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.read import Source
+
+#: Voxels that the first passes read at once.
+PIECE = 2**24
+#: The most grey levels of a volume of whole numbers whose threshold is found.
+_MOST_LEVELS = 2**22
+
+#: What was found in a piece of a volume, by name.
+Found = Mapping[str, np.ndarray]
+#: Finds something in the pieces of a volume, by a name and their number: in the order of the pieces.
+Finder = Callable[[str, Callable[[int], Found], int], Iterator[Found]]
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A volume of which boxes are read, and what the caller says of its structure: see `measure.measure`.
+
+    `source` is a path, which each process opens for itself, or boxes in memory.
+    """
+
+    source: Source | Boxes
+    reading: Mapping[str, Any]
+    label: int | None
+    kind: Literal["auto", "field", "mask", "image"]
+    threshold: Literal["otsu"] | float
+    dark: bool
+
+    def open(self) -> Boxes:
+        """Return the boxes of the volume."""
+        return boxes_of(self.source, **self.reading)
+
+    def read(self, boxes: Boxes, box: Window) -> np.ndarray:
+        """Return the values of a box; of a label, where it is."""
+        values = boxes.part(box)
+        values = values if self.label is None else values == self.label
+        return values.view(np.uint8) if values.dtype.kind == "b" else values
+
+
+@dataclass(frozen=True)
+class Split:
+    """How a volume's structure is told from its background: the kind, the extremes, and the threshold of an image."""
+
+    kind: Kind
+    lowest: float
+    highest: float
+    two: bool
+    level: float = 0.0
+
+
+class Place(NamedTuple):
+    """The shape of a volume, its spacing and unit, and where it came from."""
+
+    shape: tuple[int, int, int]
+    spacing: tuple[float, float, float]
+    unit: str
+    source: str
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, frame: Field) -> Place:
+        """Return the place of a volume without its values."""
+        return cls(frame.shape, frame.spacing, frame.unit, frame.source, frame.notes)
+
+    @property
+    def frame(self) -> Field:
+        """Return the volume with zeros that take no memory."""
+        return Field(np.broadcast_to(np.uint8(0), self.shape), self.spacing, self.unit, None, self.source, self.notes)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the tiles of a volume have in common.
+
+    Attributes
+    ----------
+    noise
+        Whether voxels have nothing to do with those a few voxels away.
+    smallest
+        The fewest voxels of a piece of an image's structure that is no speck; 0 where all pieces count.
+    thickness
+        Median thickness of the phase that fills less, in `place.unit`.
+    scale, working
+        Working voxel in the volume's voxels, and how many there are, along (z, y, x).
+    edge
+        Edge of a working voxel in `place.unit`.
+    reach
+        Radius of the largest ball where the thickness was measured, in `place.unit`.
+    """
+
+    volume: Volume
+    place: Place
+    split: Split
+    noise: bool
+    smallest: float
+    thickness: float
+    scale: tuple[float, float, float]
+    working: tuple[int, int, int]
+    edge: float
+    reach: float
+    notes: tuple[str, ...]
+    working_notes: tuple[str, ...]
+
+    def levels(self, boxes: Boxes, box: Window) -> np.ndarray:
+        """Return a box of the volume as float32 values that are above 0 in its structure."""
+        return find_levels(self.volume, self.split, self.place, boxes, box)
+
+
+def grow(box: Window, by: Sequence[int], shape: Sequence[int]) -> Window:
+    """Return a box with more voxels on every side, as far as the volume has them."""
+    z, y, x = (
+        slice(max(0, edge.start - more), min(n, edge.stop + more)) for edge, more, n in zip(box, by, shape, strict=True)
+    )
+    return z, y, x
+
+
+def within(inner: Window, outer: Window) -> Window:
+    """Return a box in the voxels of another."""
+    z, y, x = (slice(a.start - b.start, a.stop - b.start) for a, b in zip(inner, outer, strict=True))
+    return z, y, x
+
+
+def find_levels(volume: Volume, split: Split, place: Place, boxes: Boxes, box: Window) -> np.ndarray:
+    """Return a box of a volume as float32 values that are above 0 in its structure, as `structure.find_structure`."""
+    if split.kind == "image":
+        around = grow(box, (SMOOTHED,) * 3, place.shape)
+        smooth = smooth_levels(volume.read(boxes, around), place.spacing)[within(box, around)]
+        return split.level - smooth if volume.dark else smooth - split.level
+    values = volume.read(boxes, box)
+    if split.kind == "field":
+        return (-values if volume.dark else values).astype(np.float32)
+    mask = values == split.highest if split.two else values > 0
+    return np.where(mask != volume.dark, np.float32(1), np.float32(-1))
+
+
+def survey(volume: Volume, find: Finder) -> Plan:
+    """Find what the tiles of a volume have in common; raise ScanError as `measure.measure`."""
+    boxes = volume.open()
+    place = Place.of(boxes.frame)
+    split, note = _find_split(volume, place, boxes.frame.values.dtype, find)
+    pieces = _cut(place.shape, [round(PIECE ** (1 / 3))] * 3)
+    total = _add(find("counting the structure", partial(_count_structure, volume, split, place, pieces), len(pieces)))
+    if split.kind == "image":
+        otsu = volume.threshold == "otsu"
+        ends = [float(e) for e in (total["lowest"], total["highest"])]
+        low, high = sorted(split.level - e for e in ends) if volume.dark else [split.level + e for e in ends]
+        note = describe_split(split.level, otsu, volume.dark, low, high)
+    size, filled = math.prod(place.shape), int(total["filled"])
+    for count, one, other in ((filled, "structure", "background"), (size - filled, "background", "structure")):
+        if not count:
+            start = "a structure" if one == "structure" else "background"
+            raise ScanError(f"expected {start} in the scan, got none: every voxel is {other}")
+    noise = split.kind != "field" and _is_noise(place.shape, filled / size, total["pairs"])
+    plan = Plan(volume, place, split, noise, 0.0, 0.0, (1.0, 1.0, 1.0), place.shape, 1.0, 0.0, (*place.notes, note), ())
+    thinner = filled <= HALF * size
+    candidates = candidate_boxes(place.shape, MEASURED)
+    median, thick, plan = _measure_thickness(plan, boxes, order_boxes(candidates, total["surface"].tolist()), True)
+    if split.kind == "image":
+        plan = replace(plan, smallest=smallest_piece(median) / math.prod(place.spacing))
+    if not thinner:
+        order = order_boxes(candidates, total["other surface"].tolist())
+        median, thick, plan = _measure_thickness(plan, boxes, order, False)
+    return _choose_grid(plan, median, thick, "structure" if thinner else "background")
+
+
+def _choose_grid(plan: Plan, median: float, thick: float, name: str) -> Plan:
+    """Return the plan with its working grid, as `prepare.prepare` chooses it."""
+    kind, place = plan.split.kind, plan.place
+    note = judge_thickness(name, median, thick, place.spacing, kind == "field" or plan.noise)
+    scale, why = choose_scale(kind, place.frame, plan.noise, median)
+    return replace(
+        plan,
+        thickness=median,
+        scale=scale,
+        working=count_voxels(place.shape, scale),
+        edge=working_edge(scale, place.spacing),
+        working_notes=(note, *why),
+    )
+
+
+def note_on_filling(share: float) -> tuple[str, ...]:
+    """Return a note where the structure fills more than the background, as `prepare.prepare` gives it."""
+    return (MOSTLY.format(share),) if share > HALF else ()
+
+
+def _measure_thickness(plan: Plan, boxes: Boxes, order: Sequence[Window], inside: bool) -> tuple[float, float, Plan]:
+    """Return median and 95th percentile of a phase's thickness, as `grids.median_thickness`, and the plan's reach."""
+    place = plan.place
+    box = order[0]
+    around = grow(box, (1, 1, 1), place.shape)
+    mask = (plan.levels(boxes, around) > 0) == inside
+    part, surface = (each[within(box, around)] for each in (mask, surface_voxels(mask)))
+    median, thick = thickness_beneath(part, surface, place.spacing)
+    finite = [
+        float(ball_radii(each, place.spacing, _extent(part, place)).max()) for each in (part, ~part) if each.any()
+    ]
+    return median, thick, replace(plan, reach=max(plan.reach, *finite))
+
+
+def _extent(part: np.ndarray, place: Place) -> float:
+    """Return half the longest side of a box."""
+    return max(n * h for n, h in zip(part.shape, place.spacing, strict=True)) / 2
+
+
+def _cut(shape: Sequence[int], edges: Sequence[int]) -> list[Window]:
+    """Cut a volume into boxes of at most these edges, z slowest; the last along an axis may be smaller."""
+    axes = ([slice(a, min(a + edge, n)) for a in range(0, n, edge)] for n, edge in zip(shape, edges, strict=True))
+    return [(z, y, x) for z, y, x in itertools.product(*axes)]
+
+
+def _add(found: Iterable[Found]) -> dict[str, np.ndarray]:
+    """Return the sums over pieces; of what is called lowest and highest the extremes."""
+    total: dict[str, np.ndarray] = {}
+    for each in found:
+        for name, value in each.items():
+            join = {"lowest": np.minimum, "highest": np.maximum}.get(name, np.add)
+            total[name] = join(total[name], value) if name in total else value
+    return total
+
+
+# ---- kind and threshold ----------------------------------------------------------------------------------------------
+
+
+def _find_split(volume: Volume, place: Place, dtype: np.dtype, find: Finder) -> tuple[Split, str]:
+    """Return how structure and background are split, and a note for fields and masks."""
+    side = max(1, math.isqrt(PIECE // place.shape[2]))
+    bars = _cut(place.shape, (side, side, place.shape[2]))
+    found = list(find("reading", partial(_look_at_values, volume, bars), len(bars)))
+    total = _add({name: each[name] for name in each if name != "two"} for each in found)
+    if faults := int(total["faults"]):
+        raise ScanError(f"a volume must be finite, got {faults} values that are not in {place.source}")
+    lowest, highest = total["lowest"], total["highest"]
+    if lowest == highest:
+        if volume.label is not None:
+            raise ScanError(f"label {volume.label} is no label of the scan, or the only one")
+        raise ScanError(f"every voxel of {place.source} is {lowest}: a volume must vary")
+    ends = {float(lowest), float(highest)}
+    two = all(bool(each["two"]) and {float(each["lowest"]), float(each["highest"])} <= ends for each in found)
+    kind = volume.kind
+    if kind == "auto":
+        kind = "mask" if two else "image"
+        if not two and may_be_field(dtype, volume.threshold, float(lowest), float(highest)):
+            steady = 2 * total["steady"] > total["steps"] or not total["steps"]
+            kind = "field" if steady and total["plateau"] > PLATEAUS * math.prod(place.shape) else "image"
+    split = Split(kind, float(lowest), float(highest), two)
+    if kind == "field":
+        return split, f"Taken for a phase field: values {float(lowest):.3g} to {float(highest):.3g}."
+    if kind == "mask":
+        positive = "Taken for a mask: the structure is where it is positive."
+        return split, f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else positive
+    if volume.threshold != "otsu":
+        return replace(split, level=float(volume.threshold)), ""
+    return replace(split, level=_find_threshold(volume, bars, lowest, highest, find)), ""
+
+
+def _look_at_values(volume: Volume, bars: Sequence[Window], number: int) -> Found:
+    """Return the extremes of a bar, whether it has two values at most, and the signs of a phase field."""
+    values = volume.read(volume.open(), bars[number])
+    lowest, highest = values.min(), values.max()
+    found = {"lowest": lowest, "highest": highest, "two": np.all((values == lowest) | (values == highest))}
+    if values.dtype.kind != "f":
+        return {**found, "faults": np.int64(0)}
+    found["faults"] = np.int64(values.size - np.count_nonzero(np.isfinite(values)))
+    if volume.kind == "auto" and not found["faults"] and -2 <= lowest and highest <= 2:
+        steps = np.abs(np.diff(values, 3, axis=2)) if values.shape[2] > 3 else np.empty(0)
+        found |= {"steady": np.count_nonzero(steps < JITTER), "steps": np.int64(steps.size)}
+        found["plateau"] = np.count_nonzero(np.abs(values) > PLATEAU)
+    return {name: np.asarray(value) for name, value in found.items()}
+
+
+def _find_threshold(
+    volume: Volume, bars: Sequence[Window], lowest: np.ndarray, highest: np.ndarray, find: Finder
+) -> float:
+    """Return the threshold of grey levels, as `structure.find_structure` finds it."""
+    lowest, highest = lowest[()], highest[()]
+    whole = lowest.dtype.kind in "iu"
+    if whole and int(highest) - int(lowest) >= _MOST_LEVELS:
+        raise ScanError(f"expected at most {_MOST_LEVELS} grey levels, got {lowest} to {highest}: give a threshold")
+    name = "finding the threshold"
+    counts = _add(find(name, partial(_count_levels, volume, bars, lowest, highest), len(bars)))["counts"]
+    if whole:
+        centres = np.arange(int(lowest), int(highest) + 1)
+        high = centres > threshold_otsu(hist=(counts, centres))
+        means = [np.dot(counts[side], centres[side].astype(np.float64)) / counts[side].sum() for side in (high, ~high)]
+        return float(sum(means)) / 2
+    edges = np.histogram_bin_edges(np.empty(0, lowest.dtype), 256, (lowest, highest))
+    otsu = threshold_otsu(hist=(counts, (edges[1:] + edges[:-1]) / 2))
+    sums = _add(find(f"{name}'s sides", partial(_sum_sides, volume, bars, otsu), len(bars)))["sums"]
+    return float(sums[0, 1] / sums[0, 0] + sums[1, 1] / sums[1, 0]) / 2
+
+
+def _count_levels(volume: Volume, bars: Sequence[Window], lowest: Any, highest: Any, number: int) -> Found:
+    """Return a histogram of a bar: of each whole number, or of 256 bins."""
+    values = volume.read(volume.open(), bars[number]).ravel()
+    if values.dtype.kind in "iu":
+        counts = np.bincount(values.astype(np.int64) - int(lowest), minlength=int(highest) - int(lowest) + 1)
+    else:
+        counts = np.histogram(values, 256, (lowest, highest))[0]
+    return {"counts": counts}
+
+
+def _sum_sides(volume: Volume, bars: Sequence[Window], level: float, number: int) -> Found:
+    """Return the numbers and sums of the values above a level, and of the others."""
+    values = volume.read(volume.open(), bars[number])
+    high = values > level
+    sides = [(values[side].size, values[side].sum(dtype=np.float64)) for side in (high, ~high)]
+    return {"sums": np.array(sides, dtype=np.float64)}
+
+
+# ---- structure -------------------------------------------------------------------------------------------------------
+
+
+def _count_structure(volume: Volume, split: Split, place: Place, pieces: Sequence[Window], number: int) -> Found:
+    """Return the structure's voxels in a piece, its surface in boxes that may be measured, and pairs (see `_pairs`)."""
+    core = pieces[number]
+    box = grow(core, (max(LAGS),) * 3, place.shape)
+    levels = find_levels(volume, split, place, volume.open(), box)
+    inner = within(core, box)
+    found = {"lowest": levels[inner].min(), "highest": levels[inner].max()}
+    mask = levels > 0
+    found["filled"] = np.int64(np.count_nonzero(mask[inner]))
+    for name, phase in (("surface", mask), ("other surface", ~mask)):
+        surface = surface_voxels(phase)[inner]
+        shared = [_overlap(core, each) for each in candidate_boxes(place.shape, MEASURED)]
+        counts = [0 if each is None else np.count_nonzero(surface[within(each, core)]) for each in shared]
+        found[name] = np.array(counts, dtype=np.int64)
+    found["pairs"] = _pairs(mask, inner, core, place.shape)
+    return {name: np.asarray(value) for name, value in found.items()}
+
+
+def _overlap(one: Window, other: Window) -> Window | None:
+    """Return what two boxes share."""
+    z, y, x = (slice(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(one, other, strict=True))
+    return (z, y, x) if all(edge.start < edge.stop for edge in (z, y, x)) else None
+
+
+def _pairs(mask: np.ndarray, inner: Window, core: Window, shape: Sequence[int]) -> np.ndarray:
+    """Return, for each axis and each of `LAGS`, how many pairs a lag apart are inside, how many first and last ones."""
+    counts = np.zeros((3, len(LAGS), 3), dtype=np.int64)
+    for axis, (edge, n) in enumerate(zip(inner, shape, strict=True)):
+        start = core[axis].start
+        for k, lag in enumerate(LAGS):
+            stop = edge.start + max(0, min(core[axis].stop, n - lag) - start)
+            here = [*inner]
+            here[axis] = slice(edge.start, stop)
+            there = [*inner]
+            there[axis] = slice(edge.start + lag, stop + lag)
+            first, last = mask[tuple(here)], mask[tuple(there)]
+            counts[axis, k] = [np.count_nonzero(first & last), np.count_nonzero(first), np.count_nonzero(last)]
+    return counts
+
+
+def _is_noise(shape: Sequence[int], share: float, pairs: np.ndarray) -> bool:
+    """Return whether voxels a few apart have nothing to do with each other, as `structure.is_noise`."""
+    for axis, n in enumerate(shape):
+        for k, lag in enumerate(LAGS):
+            if n <= 2 * lag:
+                continue
+            both, first, last = pairs[axis, k] / (math.prod(shape) / n * (n - lag))
+            if abs(both - first * last) > UNCORRELATED * share * (1 - share):
+                return False
+    return True

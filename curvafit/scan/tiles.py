@@ -1,0 +1,651 @@
+"""The numbers of a scan that need not fit into memory: sums over tiles, each read with what lies around it.
+
+Every number of `measure` follows from sums over blocks. A tile sums what lies in its core, on the finest division that
+blocks may need; what surrounds the core is read because balls, distances and pieces of structure reach across its
+faces. So a scan in tiles has the numbers of the scan in one piece.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from functools import partial
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from filelock import FileLock, Timeout
+
+from curvafit.core.files import write_content
+from curvafit.core.runtime import Progress, silent
+from curvafit.core.units import format_sampling
+from curvafit.core.workers import ThisProcess, Workers, cluster, collect_all
+from curvafit.geometry.balls import ball_radii, paint_balls, paint_coarse_balls, reaching_radius
+from curvafit.geometry.diagram import BIN_WIDTH, MARGIN, Diagram
+from curvafit.geometry.mesh import NoSurface, surface
+from curvafit.geometry.morphometry import SOFTENED, soften
+from curvafit.geometry.topology import euler_shares
+from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
+from curvafit.priors.kernels.threads import one_thread
+from curvafit.scan.grids import CutOut, Window, centre_distance, remove_specks, resample
+from curvafit.scan.measure import (
+    MOST,
+    SUMS,
+    Blocks,
+    Measures,
+    Summed,
+    measure_curvatures,
+    summarise_sums,
+    tabulate_surface,
+)
+from curvafit.scan.prepare import Prepared, smallest_piece
+from curvafit.scan.survey import Found, Plan, Volume, grow, note_on_filling, survey, within
+from curvafit.volumes.boxes import Boxes
+from curvafit.volumes.field import ScanError
+
+#: Radius, in voxels of the finest axis, from which balls are painted on a coarser grid, and the largest ball's.
+COARSE, WIDEST = 24, 36
+#: Working voxels around a core that its curvature depends on: a profile is made of distances of 20 voxels, blurred by
+#: 16, and corrected at thin places.
+HALO = 40
+#: Voxels of a tile with its surroundings, by default; the shortest edge of a core.
+LARGEST_TILE, SHORTEST = 256**3, 32
+#: Bytes that a voxel of a tile with its surroundings takes, and those of the program itself.
+_EACH, _PROGRAM = 40, 300 * 2**20
+#: Bins of the stored curvature diagram, in `diagram.BIN_WIDTH`.
+_BIN = 0.25
+#: Names of the passes over tiles.
+_FIRST, _AGAIN = "measuring tiles", "measuring wide balls"
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """The cores of a volume's tiles, and the division of the volume that tiles are summed on.
+
+    `factors` are those of the coarser grids on which balls of the structure and of the background are painted.
+    """
+
+    plan: Plan
+    cores: tuple[Window, ...]
+    factors: tuple[int, int] = (1, 1)
+
+    @classmethod
+    def of(cls, plan: Plan, edge: int | None = None) -> Tiling:
+        """Cut a volume into tiles of `edge` voxels a side, by default as large as `LARGEST_TILE` leaves them."""
+        shape, edges = plan.place.shape, (edge,) * 3 if edge else _choose_edges(plan)
+        axes = ([slice(a, min(a + e, n)) for a in range(0, n, e)] for n, e in zip(shape, edges, strict=True))
+        return cls(plan, tuple(itertools.product(*axes)))  # type: ignore[arg-type]
+
+    @property
+    def finest(self) -> Blocks:
+        """Return the division whose parts make up the blocks of any number along an axis up to `MOST`."""
+        starts = (sorted({n * k // count for count in range(1, MOST + 1) for k in range(count)}) for n in self.shape)
+        return Blocks(self.shape, tuple(map(tuple, starts)))  # type: ignore[arg-type]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Return the shape of the volume."""
+        return self.plan.place.shape
+
+    def describe(self, processes: int) -> str:
+        """Return how many tiles there are, and how much memory they take at most, as a sentence."""
+        sides = " x ".join(str(max(core[axis].stop - core[axis].start for core in self.cores)) for axis in range(3))
+        spacing = self.plan.place.spacing
+        reach = _reach(self.plan.reach, min(spacing))
+        most = 0
+        for core in self.cores:
+            around = grow(core, [math.ceil(reach / h) + 1 for h in spacing], self.shape)
+            worked = _around(self.plan, core)[0]
+            most = max(most, *(math.prod(edge.stop - edge.start for edge in box) for box in (around, worked)))
+        each, base = processes * _EACH * most, (processes + (processes > 1)) * _PROGRAM
+        return f"{len(self.cores)} tiles of {sides} voxels, in about {(each + base) / 1e9:.2g} GB of memory."
+
+
+def _choose_edges(plan: Plan) -> tuple[int, ...]:
+    """Return the edges of tiles that are `LARGEST_TILE` voxels with their surroundings, on both grids."""
+    side, finest = round(LARGEST_TILE ** (1 / 3)), min(plan.place.spacing)
+    edges = []
+    for n, h, scale in zip(plan.place.shape, plan.place.spacing, plan.scale, strict=True):
+        most = side - 2 * math.ceil(_reach(plan.reach, finest) / h)
+        most = max(SHORTEST, min(most, int((side - 2 * HALO) * scale)))
+        edges.append(math.ceil(n / math.ceil(n / most)))
+    return tuple(edges)
+
+
+def _reach(radius: float, edge: float) -> float:
+    """Return how far around a core voxels are read for balls of a radius: what keeps them from being painted too."""
+    return 3 * radius if radius <= COARSE * edge else 2 * radius + COARSE * edge
+
+
+# ---- one tile --------------------------------------------------------------------------------------------------------
+
+
+def _measure_tile(tiling: Tiling, number: int) -> Found:
+    """Return the sums over a tile's core, on the rows of the finest division that it touches, and what else adds up."""
+    plan, core, boxes = tiling.plan, tiling.cores[number], tiling.plan.volume.open()
+    sums = _Sums(tiling.finest, core)
+    balls = _measure_balls(plan, boxes, core, tiling.factors)
+    mask, inner = balls.mask, within(core, balls.box)
+    voxel = math.prod(plan.place.spacing)
+    thickness, gap = balls.thickness
+    sums.add("volume", np.ones(thickness.shape, dtype=bool), voxel)
+    sums.add("inside", mask[inner], voxel)
+    sums.add("thickness", thickness, voxel)
+    sums.add("thickness²", np.square(thickness), voxel)
+    sums.add("gap", gap, voxel)
+    del thickness, gap
+    lower = tuple(slice(edge.start - (edge.start > 0), edge.stop) for edge in inner)
+    first = tuple(slice(edge.start - part.start, None) for edge, part in zip(inner, lower, strict=True))
+    sums.add("χ", euler_shares(mask[lower])[first], 1.0)
+    found = {"euler": np.float64(_share_of_euler(mask, inner, core, tiling.shape)), "pieces": np.array(balls.pieces)}
+    found |= {"widest": np.array(balls.widest), "wide": np.array(balls.wide)}
+    with_surface = _measure_surface(plan, mask, balls.box, core)
+    if with_surface is not None:
+        sums.gather("area", *with_surface)
+    del mask, balls
+    found |= _measure_curvature(plan, boxes, core, sums)
+    return {**found, **sums.rows}
+
+
+def _measure_wide(tiling: Tiling, number: int) -> Found:
+    """Return the sums over a tile's core that balls on a coarser grid change."""
+    plan, core = tiling.plan, tiling.cores[number]
+    sums, voxel = _Sums(tiling.finest, core), math.prod(plan.place.spacing)
+    thickness, gap = _measure_balls(plan, plan.volume.open(), core, tiling.factors).thickness
+    if tiling.factors[0] > 1:
+        sums.add("thickness", thickness, voxel)
+        sums.add("thickness²", np.square(thickness), voxel)
+    if tiling.factors[1] > 1:
+        sums.add("gap", gap, voxel)
+    return sums.rows
+
+
+class _Sums:
+    """Sums of a core on the finest division of a volume."""
+
+    def __init__(self, finest: Blocks, core: Window) -> None:
+        self._finest, self._core = finest, core
+        self.table = np.zeros((finest.count, len(SUMS)))
+        self._where, starts = [], []
+        for edge, all_starts in zip(core, finest.starts, strict=True):
+            first, last = (int(np.searchsorted(all_starts, at, side="right")) - 1 for at in (edge.start, edge.stop - 1))
+            self._where.append(slice(first, last + 1))
+            starts.append(tuple(max(all_starts[k] - edge.start, 0) for k in range(first, last + 1)))
+        z, y, x = (edge.stop - edge.start for edge in core)
+        self._local = Blocks((z, y, x), tuple(starts))  # type: ignore[arg-type]
+
+    def add(self, name: str, values: np.ndarray, each: float) -> None:
+        """Add a volume's values on the core."""
+        column = self.table[:, SUMS.index(name)].reshape(self._finest.counts)
+        column[tuple(self._where)] += each * self._local.sums(values).reshape(self._local.counts)
+
+    def gather(self, name: str, places: np.ndarray, columns: np.ndarray) -> None:
+        """Add columns, of which the first is `name`, at places in voxels from the volume's first centre."""
+        first = SUMS.index(name)
+        self.table[:, first : first + columns.shape[1]] += self._finest.gather(places, columns)
+
+    @property
+    def rows(self) -> Found:
+        """Return the numbers of the rows that hold anything, and the rows."""
+        rows = np.flatnonzero(self.table.any(axis=1))
+        return {"rows": rows, "sums": self.table[rows]}
+
+
+@dataclass(frozen=True)
+class _Balls:
+    """The structure around a core, and the thickness of both phases on the core.
+
+    Attributes
+    ----------
+    box, mask
+        What was read, and the structure there.
+    pieces
+        Specks and pinholes that were dropped.
+    widest
+        Radius of the largest ball around a voxel of the core, of structure and background.
+    wide
+        Voxels of the core around which a ball is larger than `WIDEST`.
+    """
+
+    box: Window
+    mask: np.ndarray
+    pieces: tuple[int, int]
+    thickness: tuple[np.ndarray, np.ndarray]
+    widest: tuple[float, float]
+    wide: tuple[int, int]
+
+
+def _measure_balls(plan: Plan, boxes: Boxes, core: Window, factors: tuple[int, int]) -> _Balls:
+    """Measure the thickness of both phases on a core, from as much around it as its balls reach.
+
+    Where balls are wider than `COARSE` and yet to be painted on the finer grid, the thickness is left out (0).
+    """
+    spacing, finest = plan.place.spacing, min(plan.place.spacing)
+    reach = min(_reach(plan.reach, finest), _reach(WIDEST * finest, finest))
+    while True:
+        box, mask, pieces = _find_structure(plan, boxes, core, reach)
+        inner = within(core, box)
+        radii = [ball_radii(phase, spacing, WIDEST * finest) for phase in (mask, ~mask)]
+        largest = [reaching_radius(radius, spacing, inner) for radius in radii]
+        if _reach(max(largest), finest) <= reach * (1 + 1e-6):
+            break
+        reach = _reach(max(largest), finest)
+    thickness, widest, wide = [], [], []
+    for most, factor in zip(largest, factors, strict=True):
+        radius = radii.pop(0)
+        widest.append(float(radius[inner].max()))
+        wide.append(int(np.count_nonzero(radius[inner] > (WIDEST - 1e-3) * finest)))
+        if factor > 1:
+            painted = paint_coarse_balls(radius, spacing, factor)[inner]
+        elif most <= COARSE * finest:
+            painted = paint_balls(radius, spacing, core=inner)[inner]
+        else:
+            painted = np.zeros_like(radius[inner])
+        thickness.append(2 * painted)
+    return _Balls(box, mask, pieces, tuple(thickness), tuple(widest), tuple(wide))  # type: ignore[arg-type]
+
+
+def _find_structure(plan: Plan, boxes: Boxes, core: Window, reach: float) -> tuple[Window, np.ndarray, tuple[int, int]]:
+    """Return a box around a core, the structure there, and how many specks and pinholes were dropped."""
+    least = 2 * SOFTENED + 2
+    around = grow(core, [max(math.ceil(reach / h), least) for h in plan.place.spacing], plan.place.shape)
+    # a coarser grid begins with the volume: boxes begin and end where two voxels of it meet
+    z, y, x = (
+        slice(e.start // 2 * 2, min(-(-e.stop // 2) * 2, n)) for e, n in zip(around, plan.place.shape, strict=True)
+    )
+    box, pieces = (z, y, x), (0, 0)
+    mask = plan.levels(boxes, box) > 0
+    if plan.smallest:
+        mask, *pieces = remove_specks(mask, plan.smallest, False, _cut_out(core, box, plan.place.shape))
+    return box, mask, tuple(pieces)  # type: ignore[return-value]
+
+
+def _cut_out(core: Window, box: Window, shape: Sequence[int]) -> CutOut:
+    cut = [(edge.start > 0, edge.stop < n) for edge, n in zip(box, shape, strict=True)]
+    return CutOut(within(core, box), cut)
+
+
+def _share_of_euler(mask: np.ndarray, inner: Window, core: Window, shape: Sequence[int]) -> float:
+    """Return what a core adds to χ of the window, as `topology.euler_of_window` counts it."""
+    ends = [(edge.start == 0, edge.stop == n) for edge, n in zip(core, shape, strict=True)]
+    taken = mask[tuple(slice(e.start - (not first), e.stop) for e, (first, _) in zip(inner, ends, strict=True))]
+    padded = np.pad(taken, [(int(first), int(last)) for first, last in ends])
+    total = 0.0
+    for layers in itertools.product((None, 0, 1), repeat=3):
+        if all(layer is None or end[layer] for layer, end in zip(layers, ends, strict=True)):
+            part = padded[tuple({None: slice(None), 0: 1, 1: -2}[layer] for layer in layers)]
+            total += (-0.5) ** (3 - part.ndim) * _count_cells(part)
+    return total
+
+
+def _count_cells(mask: np.ndarray) -> int:
+    """Return χ of the closed voxels of a mask of any dimension, less what belongs to its first layers alone."""
+    total = 0
+    for axes in itertools.chain.from_iterable(
+        itertools.combinations(range(mask.ndim), k) for k in range(mask.ndim + 1)
+    ):
+        cells = mask
+        for axis in axes:
+            cells = cells | np.roll(cells, 1, axis)
+        total += (-1) ** (mask.ndim - len(axes)) * int(np.count_nonzero(cells[(slice(1, None),) * mask.ndim]))
+    return total
+
+
+# ---- surface and curvature -------------------------------------------------------------------------------------------
+
+
+def _widen(start: int, stop: int, first: int, last: int) -> tuple[int, int]:
+    """Return a stretch of cells with more of `first` to `last`, until there are three: fewer make no grid."""
+    stop = min(max(stop, start + 3), last)
+    return max(min(start, stop - 3), first), stop
+
+
+def _measure_surface(plan: Plan, mask: np.ndarray, box: Window, core: Window) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return places and columns, as `measure.measure_surface`, of the cells that begin in a core; None if there are
+    none."""
+    shape, spacing = plan.place.shape, plan.place.spacing
+    own = [(edge.start, min(edge.stop, n - 1)) for edge, n in zip(core, shape, strict=True)]
+    if any(start >= stop for start, stop in own):
+        return None
+    wide = [_widen(*cells, 0, n - 1) for cells, n in zip(own, shape, strict=True)]
+    part: Window = tuple(slice(start, stop + 1) for start, stop in wide)  # type: ignore[assignment]
+    around = grow(part, (SOFTENED,) * 3, shape)
+    soft = soften(mask[within(around, box)])[within(part, around)]
+    try:
+        mesh = surface(soft, Grid(soft.shape, spacing, "replicate"), 0.5)  # type: ignore[arg-type]
+    except NoSurface:
+        return None
+    places, columns = tabulate_surface(mesh, spacing)
+    places = places + [edge.start for edge in part]
+    kept = _find_own(places, own, wide)
+    return places[kept], columns[kept]
+
+
+def _find_own(places: np.ndarray, own: Sequence[tuple[int, int]], wide: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Return which places lie in a tile's own cells, of places in more."""
+    kept = np.ones(len(places), dtype=bool)
+    for axis, (cells, more) in enumerate(zip(own, wide, strict=True)):
+        if cells != more:
+            kept &= (places[:, axis] >= cells[0]) & (places[:, axis] < cells[1])
+    return kept
+
+
+def _around(plan: Plan, core: Window) -> tuple[Window, Window]:
+    """Return the working voxels that a core's curvature depends on, and those of the core."""
+    owned = []
+    for edge, n, scale, count in zip(core, plan.place.shape, plan.scale, plan.working, strict=True):
+        start, stop = (count if at == n else min(count, round(at / scale)) for at in (edge.start, edge.stop))
+        owned.append(slice(start, stop))
+    z, y, x = owned
+    return grow((z, y, x), (HALO,) * 3, plan.working), (z, y, x)
+
+
+def _measure_curvature(plan: Plan, boxes: Boxes, core: Window, sums: _Sums) -> Found:
+    """Sum the curvatures in the working cells that begin in a core; return the bins of the diagram and other counts."""
+    box, owned = _around(plan, core)
+    found: dict[str, Any] = {"specks": np.zeros(2, np.int64), "changed": np.int64(0), "filled": np.int64(0)}
+    if any(edge.start >= edge.stop for edge in owned):
+        return found
+    values = _find_working_levels(plan, boxes, box)
+    mask, inner = values > 0, within(owned, box)
+    if plan.split.kind != "field":
+        smallest, part = smallest_piece(plan.thickness / plan.edge), _cut_out(owned, box, plan.working)
+        cleaned, *specks = remove_specks(mask, smallest, False, part)
+        found |= {"specks": np.array(specks), "changed": np.count_nonzero((cleaned != mask)[inner])}
+        mask = cleaned
+    found["filled"] = np.count_nonzero(mask[inner])
+    own = [(max(e.start, MARGIN), min(e.stop, n - 1 - MARGIN)) for e, n in zip(owned, plan.working, strict=True)]
+    if any(start >= stop for start, stop in own) or mask.all() or not mask.any():
+        return found
+    wide = [_widen(*cells, MARGIN, n - 1 - MARGIN) for cells, n in zip(own, plan.working, strict=True)]
+    part: Window = tuple(slice(start - MARGIN, stop + MARGIN + 1) for start, stop in wide)  # type: ignore[assignment]
+    seen = mask[within(part, box)]
+    if seen.all() or not seen.any():
+        return found
+    if plan.split.kind != "field":
+        values = phase_field(
+            torch.from_numpy(mask), Grid(mask.shape, (WORKING_SPACING,) * 3, "replicate"), WORKING_EPSILON
+        ).numpy()
+    try:
+        (places, columns), drawn = measure_curvatures(_prepare_part(plan, values[within(part, box)], seen, part))
+    except NoSurface:
+        return found
+    corner = np.asarray(drawn.places) / WORKING_SPACING + [edge.start for edge in part]
+    kept = _find_own(corner, own, wide)
+    sums.gather("curved", places[kept], columns[kept])
+    return found | _bin(plan, drawn, kept)
+
+
+def _find_working_levels(plan: Plan, boxes: Boxes, box: Window) -> np.ndarray:
+    """Return values that are above 0 in the structure on a box of the working grid, as `prepare.prepare` makes them."""
+    if plan.scale == (1.0, 1.0, 1.0):
+        return plan.levels(boxes, box)
+    place = plan.place
+    ends = [(math.floor(e.start * s), math.ceil(e.stop * s)) for e, s in zip(box, plan.scale, strict=True)]
+    z, y, x = (slice(min(a, n), min(b, n)) for (a, b), n in zip(ends, place.shape, strict=True))
+    blurred = [math.ceil(4 * max(0.0, (s - 1) / 2)) + 2 for s in plan.scale]
+    limit = 4 * max(max(s * h, h) for s, h in zip(plan.scale, place.spacing, strict=True))
+    far = [math.ceil(limit / h) + 1 for h in place.spacing] if plan.split.kind == "mask" else [0] * 3
+    around = grow((z, y, x), [a + b for a, b in zip(blurred, far, strict=True)], place.shape)
+    values = plan.levels(boxes, around)
+    if plan.split.kind == "mask":
+        values = centre_distance(values > 0, place.spacing, limit)
+    start, shape = [edge.start for edge in box], [edge.stop - edge.start for edge in box]
+    return resample(values, plan.scale, start, shape, corner=[edge.start for edge in around])
+
+
+def _prepare_part(plan: Plan, phase: np.ndarray, mask: np.ndarray, part: Window) -> Prepared:
+    """Return a part of the working grid as if it were a scan of its own, at its place in the volume."""
+    z, y, x = phase.shape
+    return Prepared(
+        kind=plan.split.kind,
+        phase=np.ascontiguousarray(phase, dtype=np.float32),
+        mask=mask,
+        grid=Grid((z, y, x), (WORKING_SPACING,) * 3, "replicate"),
+        scale=plan.scale,
+        working_voxel=plan.edge,
+        unit=plan.place.unit,
+        thickness=plan.thickness / plan.edge,
+        windows=((slice(0, z), slice(0, y), slice(0, x)),),
+        notes=(),
+        origin=tuple(edge.start * s for edge, s in zip(part, plan.scale, strict=True)),  # type: ignore[arg-type]
+    )
+
+
+def _bin(plan: Plan, drawn: Diagram, kept: np.ndarray) -> Found:
+    """Return the bins of a diagram's points that are kept: their place, and area times 1, κ1, κ2 and κ1² + κ2²."""
+    points, weights = drawn.points[kept], drawn.weights[kept]
+    bins, index = np.unique(np.floor(points / _bin_width(plan)).astype(np.int64), axis=0, return_inverse=True)
+    columns = np.column_stack([np.ones(len(points)), points, (points**2).sum(1)]) * weights[:, None]
+    index = index.reshape(-1)
+    areas = [np.bincount(index, column, minlength=len(bins)) for column in columns.T]
+    return {"bins": bins, "areas": np.stack(areas, axis=1), "lost": np.float64(drawn.excluded * weights.sum())}
+
+
+def _bin_width(plan: Plan) -> float:
+    """Return the edge of a bin in the volume's unit."""
+    return _BIN * BIN_WIDTH * WORKING_SPACING / plan.edge
+
+
+# ---- all tiles -------------------------------------------------------------------------------------------------------
+
+
+def measure_tiles(
+    volume: Volume,
+    *,
+    edge: int | None = None,
+    workers: Workers | int | None = None,
+    store: str | PathLike[str] | None = None,
+    progress: Progress = silent,
+) -> Measures:
+    """Measure a volume in tiles, as `measure.measure` does in one piece; raise as it does.
+
+    Parameters
+    ----------
+    volume
+        What is measured.
+    edge
+        Voxels a side of a tile's core; by default as many as 256³ voxels with the surroundings leave.
+    workers
+        Workers, or a number of processes, of a volume that is in a file; by default this process measures.
+    store
+        A folder where what was found stays, so that a killed run goes on; by default there is none.
+    """
+    digest = volume.open().digest
+    run = {"scan": digest, "label": volume.label, "kind": volume.kind, "threshold": volume.threshold}
+    run |= {"dark": volume.dark, "tile": edge}
+    opened = nullcontext(None) if store is None else open_store(store, {name: str(each) for name, each in run.items()})
+    with _start(workers) as crew, opened as folder, one_thread():
+        find = _Finder(crew, folder, progress)
+        tiling = Tiling.of(survey(volume, find), edge)
+        processes = 1 if isinstance(crew, ThisProcess) else max(1, crew.places // 2)
+        stated = tiling.describe(processes)
+        find.announce(stated)
+        found = list(find(_FIRST, partial(_measure_tile, tiling), len(tiling.cores)))
+        wide = replace(tiling, factors=_choose_factors(tiling, found))
+        again: list[Found] = []
+        if max(wide.factors) > 1:
+            again = list(find(_AGAIN, partial(_measure_wide, wide), len(tiling.cores)))
+    return _summarise(wide, found, again, stated)
+
+
+@contextmanager
+def _start(workers: Workers | int | None) -> Iterator[Workers]:
+    """Start a number of processes, if there is one; by default this process is the only worker."""
+    if isinstance(workers, int) and workers:
+        with cluster(workers) as crew:
+            yield crew
+    else:
+        yield workers or ThisProcess()
+
+
+def _choose_factors(tiling: Tiling, found: Sequence[Found]) -> tuple[int, int]:
+    """Return the factors of the grids on which balls are painted, as `morphometry.local_thickness` chooses them."""
+    finest = min(tiling.plan.place.spacing)
+    widest = np.max([each["widest"] for each in found], axis=0)
+    one, other = (max(1, math.ceil(radius / finest / COARSE)) for radius in widest)
+    return one, other
+
+
+def _summarise(tiling: Tiling, found: Sequence[Found], again: Sequence[Found], stated: str) -> Measures:
+    """Return the measures of a volume from what was found in its tiles."""
+    plan, finest = tiling.plan, tiling.finest
+    table = np.zeros((finest.count, len(SUMS)))
+    for each in found:
+        table[each["rows"]] += each["sums"]
+    for factor, names in zip(tiling.factors, (("thickness", "thickness²"), ("gap",)), strict=True):
+        if factor > 1:
+            table[:, [SUMS.index(name) for name in names]] = 0
+    for each in again:
+        table[each["rows"]] += each["sums"]
+    total = dict(zip(SUMS, table.sum(0), strict=True))
+    if not 0 < total["inside"] < total["volume"]:
+        raise ScanError("expected a structure and background in the scan, got one of them only")
+    if not total["curved"] > 0:
+        raise ScanError("expected a surface between structure and background, got none on the working grid")
+    period = total["thickness"] / total["inside"] + total["gap"] / (total["volume"] - total["inside"])
+    blocks = Blocks.divide(plan.place.shape, plan.place.spacing, period)
+    shape = plan.place.shape
+    χ = float(sum(each["euler"] for each in found))
+    sampled = math.prod(max(n - 1, 1) for n in shape) * math.prod(plan.place.spacing)
+    notes = (*_notes(tiling, found), f"Measured in {stated[0].lower()}{stated[1:]}")
+    summed = Summed(
+        plan.split.kind, blocks, _merge(table, finest, blocks), (χ, (1 - χ) / sampled), _draw(plan, found), notes
+    )
+    return summarise_sums(plan.place.frame, summed)
+
+
+def _merge(table: np.ndarray, finest: Blocks, blocks: Blocks) -> np.ndarray:
+    """Return the sums over blocks from those over the finest division."""
+    sums = table.reshape(*finest.counts, -1)
+    for axis, (fine, starts) in enumerate(zip(finest.starts, blocks.starts, strict=True)):
+        sums = np.add.reduceat(sums, np.searchsorted(fine, starts), axis=axis)
+    return sums.reshape(blocks.count, -1)
+
+
+def _draw(plan: Plan, found: Sequence[Found]) -> Diagram:
+    """Return the diagram of all tiles: the barycentres of its bins."""
+    parts = [each for each in found if "bins" in each]
+    bins, index = np.unique(np.concatenate([each["bins"] for each in parts]), axis=0, return_inverse=True)
+    areas, index = np.concatenate([each["areas"] for each in parts]), index.reshape(-1)
+    area, κ1, κ2, square = (np.bincount(index, column, minlength=len(bins)) for column in areas.T)
+    points = np.stack([κ1, κ2], axis=1) / area[:, None]
+    spread = max(float((square - area * (points**2).sum(1)).sum() / area.sum()), 0.0)
+    lost = float(sum(each["lost"] for each in parts)) / float(area.sum())
+    return Diagram(points, area, f"1/{plan.place.unit}", math.sqrt(spread), lost)
+
+
+def _notes(tiling: Tiling, found: Sequence[Found]) -> tuple[str, ...]:
+    """Return notes on how a volume was measured, as `measure.measure` gives them."""
+    plan = tiling.plan
+    notes = [f"{format_sampling(plan.place.shape, plan.place.spacing, plan.place.unit)}.", *plan.notes]
+    specks, holes = (int(n) for n in np.sum([each["pieces"] for each in found], axis=0))
+    if specks or holes:
+        counts = f"{specks} specks, {holes} pinholes"
+        notes.append(f"Dropped what is smaller than a ball of half the median thickness: {counts}.")
+    wide = np.sum([each["wide"] for each in found], axis=0)
+    for name, count in zip(("structure", "background"), wide, strict=True):
+        if count:
+            share = count / math.prod(plan.place.shape)
+            notes.append(
+                f"Balls wider than {2 * WIDEST} voxels count as that wide: around {share:.2g} of the voxels, in the {name}."
+            )
+    working, count = [*plan.working_notes], math.prod(plan.working)
+    specks, holes = (int(n) for n in np.sum([each["specks"] for each in found], axis=0))
+    if specks or holes:
+        counts = (
+            f"specks: {specks}, pinholes: {holes}, {sum(int(e['changed']) for e in found) / count:.2g} of the volume"
+        )
+        working.append(f"Dropped what is smaller than a ball of half the median thickness ({counts}).")
+    working.extend(note_on_filling(sum(int(each["filled"]) for each in found) / count))
+    return (*notes, *(f"Of curvature: {note}" for note in working))
+
+
+# ---- finding in pieces, and keeping what was found -------------------------------------------------------------------
+
+
+class _Finder:
+    """Finds something in the pieces of a volume, by workers, and keeps it in a folder, if there is one."""
+
+    def __init__(self, crew: Workers, folder: Path | None, progress: Progress) -> None:
+        self._crew, self._folder, self._progress, self._share = crew, folder, progress, 0.0
+
+    def announce(self, text: str) -> None:
+        """Say a sentence before tiles are measured."""
+        self._progress(text, self._share)
+
+    def __call__(self, name: str, find: Any, count: int) -> Iterator[Found]:
+        """Yield what is found in each piece, in their order."""
+        found = {} if self._folder is None else _read_found(self._folder, name, count)
+        rest = [number for number in range(count) if number not in found]
+        start = self._share
+        self._share = stop = max(start, 0.95 if name == _FIRST else 1.0 if name == _AGAIN else start + 0.02)
+        requests = [(partial(_find, find), Path(), [number]) for number in rest]
+        self._progress(name, start)
+        for done, (number, each) in enumerate(collect_all(self._crew, requests), count - len(rest) + 1):
+            found[number] = each
+            if self._folder is not None:
+                _write_found(self._folder, name, number, each)
+            self._progress(name, start + (stop - start) * done / count)
+        return iter([found[number] for number in range(count)])
+
+
+def _find(find: Any, _: Path, numbers: Sequence[int]) -> list[tuple[int, Found]]:
+    """Find something in pieces by their numbers, on one thread: the workers share the cores."""
+    with one_thread():
+        return [(number, find(number)) for number in numbers]
+
+
+def _file_of(folder: Path, name: str, number: int) -> Path:
+    return folder / f"{name.replace(' ', '-').replace(chr(39), '')}-{number:06d}.npz"
+
+
+def _read_found(folder: Path, name: str, count: int) -> dict[int, Found]:
+    """Return what earlier runs found, by number of the piece."""
+    found = {}
+    for number in range(count):
+        path = _file_of(folder, name, number)
+        if path.exists():
+            with np.load(path, allow_pickle=False) as arrays:
+                found[number] = dict(arrays)
+    return found
+
+
+def _write_found(folder: Path, name: str, number: int, found: Mapping[str, np.ndarray]) -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **found)
+    write_content(_file_of(folder, name, number), buffer.getvalue())
+
+
+@contextmanager
+def open_store(folder: str | PathLike[str], run: Mapping[str, str]) -> Iterator[Path]:
+    """Open the folder of a run, or make it, and lock it; `run` is what runs have in common that share it.
+
+    Raises ValueError if the folder holds other things or another run's, or is in use.
+    """
+    place = Path(folder)
+    names = {path.name for path in place.iterdir()} if place.is_dir() else set()
+    if ("run.json" not in names and names - {"lock"}) or (place.exists() and not place.is_dir()):
+        raise ValueError(f"tiles need a new folder, but {place} holds something else")
+    place.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(place / "lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ValueError(f"the tiles in {place} are in use by another run") from None
+    try:
+        other = json.loads((place / "run.json").read_bytes()) if "run.json" in names else run
+        if other != run:
+            changed = ", ".join(sorted(name for name in run if other.get(name) != run[name]))
+            raise ValueError(f"the tiles in {place} are another run's, which differs in {changed}: delete them")
+        write_content(place / "run.json", json.dumps(run, indent=2))
+        yield place
+    finally:
+        lock.release()
