@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from curvafit.priors.law import preset as preset
     from curvafit.scan.instances import measure_instances as measure_instances
     from curvafit.scan.measure import Measures as Measures
-    from curvafit.scan.measure import measure as measure
+    from curvafit.scan.tiles import measure as measure
     from curvafit.segmentation.reconstruct import reconstruct as reconstruct
     from curvafit.segmentation.refine import refine as refine
     from curvafit.segmentation.result import Segmentation as Segmentation

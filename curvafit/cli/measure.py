@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from curvafit.cli.console import print_table, say, say_notes, show_stages
+from curvafit.cli.console import print_table, resumable, say, say_notes, show_stages
 from curvafit.cli.options import FILES, OverwriteOption, Reading, Structure, command, parse_structure
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     "curvafit measure femur.nii.gz --roi cortex_and_marrow.nii.gz -o compartments.csv",
     "curvafit measure mitochondria_labels.tif --labels --spacing 5 --unit nm -o mitochondria.csv",
     "curvafit measure cells.ome.zarr --channel 1 --dark --threshold 90 -o measures.parquet",
+    "curvafit measure lung_2048.ome.zarr --workers 2 -o lung.csv",
 )
 def measure(
     scans: Annotated[list[str], typer.Argument(help=FILES)],
@@ -34,6 +35,11 @@ def measure(
     subjects: Annotated[
         Path | None, typer.Option(help="CSV: scan, and columns for the table, such as subject, group, time.")
     ] = None,
+    tile: Annotated[
+        int | None,
+        typer.Option(help="Voxels a side of a tile; by default a large scan is cut so that 2 GB are enough.", min=32),
+    ] = None,
+    workers: Annotated[int | None, typer.Option(help="Processes that measure tiles; by default one.", min=0)] = None,
     *,
     structure: Structure,
     reading: Reading,
@@ -42,11 +48,15 @@ def measure(
     """Measure scans in seconds: morphometry, fabric and curvature in physical units, with 95 % intervals."""
     if labels and (roi is not None or structure != parse_structure()):
         raise ValueError("--labels states the structure: leave out --roi, --kind, --periodic, --threshold and --dark")
+    if labels and tile is not None:
+        raise ValueError("--labels measures instances, each in its own box: leave out --tile")
     if subjects is not None and out is None:
         raise ValueError("--subjects is for the table: give its name with -o")
-    with show_stages() as progress:
+    store = None if out is None else out.with_name(f".{out.name}.curvafit-tiles")
+    saved = store is not None and store.exists
+    with resumable(lambda: "the same command" if saved and saved() else ""), show_stages() as progress:
         from curvafit.scan.instances import measure_instances
-        from curvafit.scan.measure import measure as measure_scan
+        from curvafit.scan.tiles import measure as measure_scan
         from curvafit.studies.groups import read_columns
         from curvafit.studies.tables import COLUMNS, OF_PARTS, check_table, write_table
 
@@ -62,12 +72,17 @@ def measure(
             if labels:
                 found.append(measure_instances(scan, progress=watch, **reading))
             else:
-                found.append((measure_scan(scan, roi=roi, progress=watch, **structure, **reading),))
+                tiles = {"tile": tile, "workers": workers, "store": store and store / f"{len(found):04d}"}
+                found.append((measure_scan(scan, roi=roi, progress=watch, **tiles, **structure, **reading),))
     _print_found(found, labels)
     if out is not None:
         columns = None if told is None else [row for row, each in zip(told, found, strict=True) for _ in each]
         table = [each for measures in found for each in measures]
         say(str(write_table(table, out, columns=columns, overwrite=overwrite)))
+    if store is not None and store.exists():
+        from curvafit.core.files import remove
+
+        remove(store)
 
 
 def _print_found(found: Sequence[tuple[Measures, ...]], labels: bool) -> None:

@@ -20,7 +20,7 @@ from curvafit.napari.dock import Dock
 from curvafit.napari.layers import field_of_layer
 from curvafit.scan.instances import measure_instances
 from curvafit.scan.measure import Measures
-from curvafit.scan.measure import measure as measure_scan
+from curvafit.scan.tiles import measure as measure_scan
 from curvafit.studies.tables import check_table, write_table
 
 

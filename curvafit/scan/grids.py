@@ -170,10 +170,21 @@ def resample(
         last = [math.ceil((a + n) * s) + m for a, n, s, m in zip(start, shape, scale, margin, strict=True)]
         cut = values[tuple(slice(a - c, b - c) for a, b, c in zip(first, last, corner, strict=True))]
     smooth = ndimage.gaussian_filter(cut, width, mode="wrap" if periodic else "nearest") if any(width) else cut
-    offset = [(a + 0.5) * s - 0.5 - f for a, s, f in zip(start, scale, first, strict=True)]
-    mode = "grid-wrap" if periodic else "nearest"
-    order = 0 if nearest else 1
-    return ndimage.affine_transform(smooth, np.asarray(scale), np.asarray(offset), tuple(shape), order=order, mode=mode)  # type: ignore[arg-type]
+    for axis, (a, n, s, f) in enumerate(zip(start, shape, scale, first, strict=True)):
+        # places in the whole volume, whatever part of it this is: a part has the whole's values to the bit
+        places = (np.arange(a, a + n) + 0.5) * s - 0.5
+        smooth = _interpolate(smooth, axis, np.floor(places + 0.5) if nearest else places, f, periodic)
+    return smooth
+
+
+def _interpolate(values: np.ndarray, axis: int, places: np.ndarray, first: int, periodic: bool) -> np.ndarray:
+    """Return values at places along an axis, whose first value is at `first`, linearly."""
+    n, low = values.shape[axis], np.floor(places).astype(np.int64)
+    weights = (places - low).reshape([-1 if k == axis else 1 for k in range(3)])
+    lower, upper = (
+        values.take((at % n) if periodic else np.clip(at, 0, n - 1), axis) for at in (low - first, low + 1 - first)
+    )
+    return lower + (upper - lower) * weights.astype(values.dtype) if weights.any() else lower
 
 
 def remove_specks(

@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import numpy as np
 from scipy import ndimage, stats
 
-from curvafit.core.runtime import Progress, silent
+from curvafit.core.runtime import Progress, check_memory, memory, silent
 from curvafit.core.units import convert_length, format_number, format_sampling, power_name
 from curvafit.geometry.descriptors import descriptors
 from curvafit.geometry.diagram import FAMILIES, MARGIN, Diagram, diagram, families
@@ -22,7 +22,7 @@ from curvafit.geometry.morphometry import local_thickness, measure_connectivity,
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.scan.grids import median_thickness, remove_specks
-from curvafit.scan.prepare import LARGEST_WINDOW, Prepared, prepare, smallest_piece
+from curvafit.scan.prepare import LARGEST_WINDOW, WORKED, Prepared, prepare, smallest_piece
 from curvafit.scan.structure import check_options, find_structure, is_rounded, read_labels, region_of_interest
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.read import Source, field_of
@@ -180,13 +180,14 @@ def measure(
     progress: Progress = silent,
     **reading: Any,
 ) -> Measures:
-    """Measure the structure in a scan, with an interval for each number.
+    """Measure the structure in a scan that is taken in one piece, with an interval for each number.
 
     Volume fraction, thickness, spacing, connectivity, surface and fabric are those of the structure on the scan's own
     voxels, all of them. Curvature is that of the scan on the working grid, as `infer` reads it. Intervals are 95 %, by
     a jackknife over blocks of a period (thickness and spacing) of the structure (`errors`); a scan with fewer than
-    eight has none. Raises ValueError if the scan has no structure, or none that the voxels resolve, or a region does
-    not fit it; or as `curvafit.load`, and FileNotFoundError if there is no such file.
+    eight has none. `tiles.measure` measures scans that do not fit into memory. Raises ValueError if the scan has no
+    structure, or none that the voxels resolve, a region does not fit it, or the scan is too large; or as
+    `curvafit.load`, and FileNotFoundError if there is no such file.
 
     Parameters
     ----------
@@ -203,16 +204,17 @@ def measure(
     check_options(kind, threshold, reading.get("label"))
     field = field_of(scan, **reading)
     options = {"threshold": threshold, "dark": dark, "periodic": periodic}
+    check_memory(field.shape, WORKED, "a scan in one piece")
     labels = None if roi is None else _read_compartments(roi, field, reading.get("crop"))
-    maps = measure_maps(field, kind, options, progress)
+    maps = measure_maps(field, kind, options, progress, memory() // WORKED)
     blocks = maps.divide()
     if labels is None:
-        return _summarise(field, maps, blocks)
+        return summarise(field, maps, blocks)
     parts = {
-        label: _summarise(field, maps, replace(blocks, region=labels == label), ("compartment", label))
+        label: summarise(field, maps, replace(blocks, region=labels == label), ("compartment", label))
         for label in np.unique(labels[labels != 0]).tolist()
     }
-    return replace(_summarise(field, maps, replace(blocks, region=labels != 0)), compartments=parts)
+    return replace(summarise(field, maps, replace(blocks, region=labels != 0)), compartments=parts)
 
 
 def _read_compartments(roi: Source, field: Field, crop: Any) -> np.ndarray:
@@ -226,7 +228,7 @@ def _read_compartments(roi: Source, field: Field, crop: Any) -> np.ndarray:
     return labels
 
 
-def _summarise(field: Field, maps: Maps, blocks: Blocks, part: tuple[str, int] | None = None) -> Measures:
+def summarise(field: Field, maps: Maps, blocks: Blocks, part: tuple[str, int] | None = None) -> Measures:
     """Return the measures of what lies in blocks, and of the whole scan with its own χ."""
     drawn, table, connectivity = maps.diagram, maps.sum(blocks), None
     if blocks.region is None:
@@ -321,17 +323,23 @@ class Maps(NamedTuple):
         return np.column_stack([*(voxel * each for each in volumes), euler, *surfaces])
 
 
-def measure_maps(field: Field, kind: str, options: dict[str, Any], progress: Progress = silent) -> Maps:
-    """Measure what is summed of a scan; `options` are the threshold, dark and periodic of `measure`, as are errors."""
+def measure_maps(
+    field: Field, kind: str, options: dict[str, Any], progress: Progress = silent, most: int | None = None
+) -> Maps:
+    """Measure what is summed of a scan; `options` are the threshold, dark and periodic of `measure`, as are errors.
+
+    Curvature is that of all of the scan if it has at most `most` working voxels, else TooLarge is raised; by default a
+    large scan's curvature is that of a part (`prepare.prepare`).
+    """
     periodic: bool = options["periodic"]
     progress("finding the structure", 0.0)
     mask, seen, notes = _find_structure(field, kind, options)
     sampling = format_sampling(field.shape, field.spacing, field.unit)
-    progress("measuring thickness", 0.1)
-    thickness, gap = (local_thickness(each, field.spacing, periodic=periodic) for each in (mask, ~mask))
-    progress("measuring curvature", 0.6)
-    prepared = prepare(field, kind=seen, **options)  # type: ignore[arg-type]
+    progress("measuring curvature", 0.1)
+    prepared = prepare(field, kind=seen, most=most, **options)  # type: ignore[arg-type]
     curved, diagram = measure_curvatures(prepared)
+    progress("measuring thickness", 0.5)
+    thickness, gap = (local_thickness(each, field.spacing, periodic=periodic) for each in (mask, ~mask))
     return Maps(
         spacing=field.spacing,
         periodic=periodic,

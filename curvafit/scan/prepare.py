@@ -12,7 +12,6 @@ from typing import Literal
 import numpy as np
 import torch
 
-from curvafit.core.runtime import check_memory
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.topology import betti_numbers
 from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
@@ -47,8 +46,8 @@ THINNEST = 3.0
 LARGEST_WINDOW = 128
 LARGEST_BOX = 200
 LARGEST_SCAN = 512
-#: The least bytes that a working voxel takes while it is made.
-WORKED = 32
+#: Bytes that a working voxel takes while it is made.
+WORKED = 64
 #: A structure that fills more than this part of the volume may be the wrong phase, which a note says.
 HALF = 0.5
 MOSTLY = "The structure fills {:.0%} of the volume: if the other phase was meant, turn the two round (--dark)."
@@ -57,6 +56,10 @@ FEWEST = 32
 #: Least mean of √(κ1² + κ2²) times the window's edge at which a surface is not flat; a ball that fits has 2.8.
 FLATTEST = 2.0
 NOISE = "No law: the scan is noise, its voxels have nothing to do with those a few voxels away."
+
+
+class TooLarge(ScanError):
+    """A scan whose working grid is larger than the caller allows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +168,7 @@ def prepare(
     threshold: Literal["otsu"] | float = "otsu",
     dark: bool = False,
     roi: Field | np.ndarray | str | os.PathLike[str] | None = None,
-    whole: bool = False,
+    most: int | None = None,
 ) -> Prepared:
     """Find the structure and put it on the working grid, where its median thickness is a known number of voxels.
 
@@ -191,12 +194,13 @@ def prepare(
         The structure is the dark phase (of a mask: its lower value; of a field: where it is negative).
     roi
         Nonzero where the scan counts (array, field or file of the scan's shape).
-    whole
-        Use all of a scan whatever its size, or raise ValueError where its working grid does not fit into memory.
+    most
+        Use all of the scan, or raise TooLarge where that is more than so many working voxels. By default a large scan
+        is cut, and a note says so.
     """
     check_options(kind, threshold)
     region = region_of_interest(roi, field)
-    where, notes = bounding_box(field.shape, region, max(field.shape) if whole else LARGEST_SCAN)
+    where, notes = bounding_box(field.shape, region, LARGEST_SCAN if most is None else max(field.shape))
     region = None if region is None else region[where]
     part = replace(field, values=field.values[where], affine=None, notes=field.notes + notes)
     periodic = periodic and part.shape == field.shape
@@ -204,7 +208,7 @@ def prepare(
     extremes = (field.values.min(), field.values.max())
     seen, signed = find_structure(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
     mask, quality = signed.values > 0, None
-    prepared = _put_on_grid(_Scan(seen, signed, periodic, region, noise=seen != "field" and is_noise(mask)), whole)
+    prepared = _put_on_grid(_Scan(seen, signed, periodic, region, noise=seen != "field" and is_noise(mask)), most)
     if seen == "image":
         quality = measure_quality(-part.values if dark else part.values, mask, part.spacing)
     corner = tuple(s.start + o for s, o in zip(where, prepared.origin, strict=True))
@@ -245,11 +249,11 @@ class _Scan:
         return self.mask if self.region is None else self.mask & self.region
 
 
-def _put_on_grid(scan: _Scan, whole: bool) -> Prepared:
+def _put_on_grid(scan: _Scan, most: int | None) -> Prepared:
     """Choose the working voxel, move the scan to it, drop specks, profile the mask, choose windows."""
     thickness, notes = _measure_thickness(scan)
     scale, why = _choose_scale(scan, thickness)
-    start, shape, cut = _choose_box(scan, scale, whole)
+    start, shape, cut = _choose_box(scan, scale, most)
     edge = working_edge(scale, scan.field.spacing)
     values, region = _move(scan, scale, start, shape)
     grid = Grid(
@@ -347,13 +351,13 @@ def count_voxels(shape: Sequence[int], scale: Sequence[float]) -> tuple[int, int
 
 
 def _choose_box(
-    scan: _Scan, scale: tuple[float, float, float], whole: bool
+    scan: _Scan, scale: tuple[float, float, float], most: int | None
 ) -> tuple[tuple[int, int, int], tuple[int, int, int], tuple[str, ...]]:
     """Return the first working voxel, number of voxels, and a note where that is not all of the scan."""
     full = count_voxels(scan.field.shape, scale)
-    if whole:
-        check_memory(full, WORKED, "a working grid")
-    if whole or max(full) <= LARGEST_BOX:
+    if most is not None and math.prod(full) > most:
+        raise TooLarge(f"expected at most {most} working voxels in one piece, got {_join_sides(full)}")
+    if most is not None or max(full) <= LARGEST_BOX:
         return (0, 0, 0), full, ()
     sides = [min(n, LARGEST_BOX) for n in full]
     size = [math.ceil(n * s) for n, s in zip(sides, scale, strict=True)]

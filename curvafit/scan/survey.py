@@ -192,8 +192,9 @@ def survey(volume: Volume, find: Finder) -> Plan:
         if not count:
             start = "a structure" if one == "structure" else "background"
             raise ScanError(f"expected {start} in the scan, got none: every voxel is {other}")
+    labelled = () if volume.label is None else (f"The structure is label {volume.label}.",)
     noise = split.kind != "field" and _is_noise(place.shape, filled / size, total["pairs"])
-    plan = Plan(volume, place, split, noise, 0.0, 0.0, (1.0, 1.0, 1.0), place.shape, 1.0, 0.0, (*place.notes, note), ())
+    plan = Plan(volume, place, split, noise, 0.0, 0.0, (1.0, 1.0, 1.0), place.shape, 1.0, 0.0, (*place.notes, *labelled, note), ())
     thinner = filled <= HALF * size
     candidates = candidate_boxes(place.shape, MEASURED)
     median, thick, plan = _measure_thickness(plan, boxes, order_boxes(candidates, total["surface"].tolist()), True)
@@ -303,7 +304,7 @@ def _look_at_values(volume: Volume, bars: Sequence[Window], number: int) -> Foun
     if values.dtype.kind != "f":
         return {**found, "faults": np.int64(0)}
     found["faults"] = np.int64(values.size - np.count_nonzero(np.isfinite(values)))
-    if volume.kind == "auto" and not found["faults"] and -2 <= lowest and highest <= 2:
+    if volume.kind == "auto" and not found["faults"] and lowest >= -2 and highest <= 2:
         steps = np.abs(np.diff(values, 3, axis=2)) if values.shape[2] > 3 else np.empty(0)
         found |= {"steady": np.count_nonzero(steps < JITTER), "steps": np.int64(steps.size)}
         found["plateau"] = np.count_nonzero(np.abs(values) > PLATEAU)

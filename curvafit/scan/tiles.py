@@ -11,18 +11,20 @@ import io
 import itertools
 import json
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from filelock import FileLock, Timeout
 
+from curvafit.core.checks import check_int
 from curvafit.core.files import write_content
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import format_sampling
@@ -42,13 +44,18 @@ from curvafit.scan.measure import (
     Measures,
     Summed,
     measure_curvatures,
+    measure_maps,
+    summarise,
     summarise_sums,
     tabulate_surface,
 )
-from curvafit.scan.prepare import Prepared, smallest_piece
+from curvafit.scan.measure import measure as measure_in_one
+from curvafit.scan.prepare import LARGEST_BOX, Prepared, TooLarge, smallest_piece
+from curvafit.scan.structure import check_options
 from curvafit.scan.survey import Found, Plan, Volume, grow, note_on_filling, survey, within
-from curvafit.volumes.boxes import Boxes
+from curvafit.volumes.boxes import Boxes, InFile, InMemory, boxes_of
 from curvafit.volumes.field import ScanError
+from curvafit.volumes.read import Source, field_of
 
 #: Radius, in voxels of the finest axis, from which balls are painted on a coarser grid, and the largest ball's.
 COARSE, WIDEST = 24, 36
@@ -63,6 +70,74 @@ _EACH, _PROGRAM = 40, 300 * 2**20
 _BIN = 0.25
 #: Names of the passes over tiles.
 _FIRST, _AGAIN = "measuring tiles", "measuring wide balls"
+
+
+def measure(
+    scan: Source,
+    *,
+    kind: Literal["auto", "field", "mask", "image"] = "auto",
+    periodic: bool = False,
+    threshold: Literal["otsu"] | float = "otsu",
+    dark: bool = False,
+    roi: Source | None = None,
+    tile: int | None = None,
+    workers: Workers | int | None = None,
+    store: str | PathLike[str] | None = None,
+    progress: Progress = silent,
+    **reading: Any,
+) -> Measures:
+    """Measure the structure in a scan of any size, with an interval for each number.
+
+    Volume fraction, thickness, spacing, connectivity, surface and fabric are those of the structure on the scan's own
+    voxels, all of them. Curvature is that of the scan on the working grid, as `infer` reads it. Intervals are 95 %, by
+    a jackknife over blocks of a period (thickness and spacing) of the structure (`errors`); a scan with fewer than
+    eight has none. A scan with a side of more than `LARGEST_BOX` voxels is measured in tiles, which have the numbers of
+    the scan in one piece; of Zarr, HDF5, NPY, RAW and uncompressed NIfTI no more than a tile is in memory. Raises
+    ValueError if the scan has no structure, or none that the voxels resolve, a region does not fit it, or a large scan
+    has a region or is periodic and does not fit into memory; or as `curvafit.load`, and FileNotFoundError if there is
+    no such file.
+
+    Parameters
+    ----------
+    scan
+        The path of a file, a `Field`, or an array or tensor (Z, Y, X).
+    kind, periodic, threshold, dark
+        As in `infer`.
+    roi
+        A region of the scan, nonzero where it counts; each of its labels is a compartment of its own. Structure,
+        thickness, surface and curvature are those of the whole scan, and what lies inside is summed.
+    tile
+        Voxels a side of a tile, of a scan of any size; by default a large scan's memory decides.
+    workers
+        Processes that measure tiles of a file, or dask's workers; by default this process does.
+    store
+        A folder where finished tiles stay, so that a killed run goes on; by default there is none.
+    reading
+        Options of reading a file, or the place of an array: see `curvafit.load`.
+    """
+    check_options(kind, threshold, reading.get("label"))
+    if tile is not None:
+        check_int(tile, f"a tile of {SHORTEST} or more voxels a side", SHORTEST, 2**31)
+    options = {"kind": kind, "threshold": threshold, "dark": dark}
+    if roi is not None or periodic:
+        if tile is not None:
+            raise ValueError(
+                "a scan with a region of interest or a periodic one is measured in one piece: leave out tile"
+            )
+        return measure_in_one(scan, periodic=periodic, roi=roi, progress=progress, **options, **reading)  # type: ignore[arg-type]
+    label = reading.pop("label", None)
+    boxes = boxes_of(scan, **reading)
+    if tile is None and max(boxes.frame.shape) <= LARGEST_BOX:
+        field = boxes.field if isinstance(boxes, InMemory) else field_of(scan, **reading)
+        field = field if label is None else field.label(label)
+        with suppress(TooLarge):
+            maps = measure_maps(
+                field, kind, {"threshold": threshold, "dark": dark, "periodic": False}, progress, LARGEST_BOX**3
+            )
+            return summarise(field, maps, maps.divide())
+    path = isinstance(boxes, InFile) and isinstance(scan, str | PathLike)
+    volume = Volume(os.fspath(scan) if path else boxes, reading if path else {}, label, **options)  # type: ignore[arg-type]
+    return measure_tiles(volume, edge=tile, workers=workers if path else None, store=store, progress=progress)
 
 
 @dataclass(frozen=True)
@@ -553,10 +628,8 @@ def _notes(tiling: Tiling, found: Sequence[Found]) -> tuple[str, ...]:
     wide = np.sum([each["wide"] for each in found], axis=0)
     for name, count in zip(("structure", "background"), wide, strict=True):
         if count:
-            share = count / math.prod(plan.place.shape)
-            notes.append(
-                f"Balls wider than {2 * WIDEST} voxels count as that wide: around {share:.2g} of the voxels, in the {name}."
-            )
+            share = f"around {count / math.prod(plan.place.shape):.2g} of the voxels, in the {name}"
+            notes.append(f"Balls wider than {2 * WIDEST} voxels count as that wide: {share}.")
     working, count = [*plan.working_notes], math.prod(plan.working)
     specks, holes = (int(n) for n in np.sum([each["specks"] for each in found], axis=0))
     if specks or holes:

@@ -9,7 +9,7 @@ from curvafit.core.faces import attach_lazy_names
 if TYPE_CHECKING:
     from curvafit.scan.measure import Measures as Measures
     from curvafit.scan.measure import Quantity as Quantity
-    from curvafit.scan.measure import measure as measure
+    from curvafit.scan.tiles import measure as measure
     from curvafit.studies.compare import Comparison as Comparison
     from curvafit.studies.compare import Number as Number
     from curvafit.studies.compare import compare as compare

@@ -15,7 +15,8 @@ import numpy as np
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number
 from curvafit.core.workers import cluster, collect_all
-from curvafit.scan.measure import Measures, measure
+from curvafit.scan.measure import Measures
+from curvafit.scan.tiles import measure
 from curvafit.studies.groups import Case
 from curvafit.volumes.field import ScanError
 from curvafit.volumes.read import field_of
