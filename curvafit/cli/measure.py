@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Annotated
@@ -53,8 +54,7 @@ def measure(
     if subjects is not None and out is None:
         raise ValueError("--subjects is for the table: give its name with -o")
     store = None if out is None else out.with_name(f".{out.name}.curvafit-tiles")
-    saved = store is not None and store.exists
-    with resumable(lambda: "the same command" if saved and saved() else ""), show_stages() as progress:
+    with _keep_tiles(store), show_stages() as progress:
         from curvafit.scan.instances import measure_instances
         from curvafit.scan.tiles import measure as measure_scan
         from curvafit.studies.groups import read_columns
@@ -79,9 +79,22 @@ def measure(
         columns = None if told is None else [row for row, each in zip(told, found, strict=True) for _ in each]
         table = [each for measures in found for each in measures]
         say(str(write_table(table, out, columns=columns, overwrite=overwrite)))
-    if store is not None and store.exists():
-        from curvafit.core.files import remove
 
+
+@contextmanager
+def _keep_tiles(store: Path | None) -> Iterator[None]:
+    """Keep a folder of finished tiles while the command is at work, and where a signal or an error ends it."""
+    from curvafit.core.files import is_empty, remove
+
+    saved = store is not None and store.exists
+    with resumable(lambda: "the same command" if saved and saved() else ""):
+        try:
+            yield
+        except ValueError:
+            if store is not None and store.is_dir() and is_empty(store):
+                remove(store)
+            raise
+    if store is not None and store.exists():
         remove(store)
 
 

@@ -48,8 +48,8 @@ PIECE = 2**24
 #: The most grey levels of a volume of whole numbers whose threshold is found.
 _MOST_LEVELS = 2**22
 
-#: What was found in a piece of a volume, by name.
-Found = Mapping[str, np.ndarray]
+#: Arrays and numbers that were found in a piece of a volume, by name.
+Found = Mapping[str, Any]
 #: Finds something in the pieces of a volume, by a name and their number: in the order of the pieces.
 Finder = Callable[[str, Callable[[int], Found], int], Iterator[Found]]
 
@@ -194,7 +194,20 @@ def survey(volume: Volume, find: Finder) -> Plan:
             raise ScanError(f"expected {start} in the scan, got none: every voxel is {other}")
     labelled = () if volume.label is None else (f"The structure is label {volume.label}.",)
     noise = split.kind != "field" and _is_noise(place.shape, filled / size, total["pairs"])
-    plan = Plan(volume, place, split, noise, 0.0, 0.0, (1.0, 1.0, 1.0), place.shape, 1.0, 0.0, (*place.notes, *labelled, note), ())
+    plan = Plan(
+        volume,
+        place,
+        split,
+        noise,
+        0.0,
+        0.0,
+        (1.0, 1.0, 1.0),
+        place.shape,
+        1.0,
+        0.0,
+        (*place.notes, *labelled, note),
+        (),
+    )
     thinner = filled <= HALF * size
     candidates = candidate_boxes(place.shape, MEASURED)
     median, thick, plan = _measure_thickness(plan, boxes, order_boxes(candidates, total["surface"].tolist()), True)
@@ -311,9 +324,7 @@ def _look_at_values(volume: Volume, bars: Sequence[Window], number: int) -> Foun
     return {name: np.asarray(value) for name, value in found.items()}
 
 
-def _find_threshold(
-    volume: Volume, bars: Sequence[Window], lowest: np.ndarray, highest: np.ndarray, find: Finder
-) -> float:
+def _find_threshold(volume: Volume, bars: Sequence[Window], lowest: Any, highest: Any, find: Finder) -> float:
     """Return the threshold of grey levels, as `structure.find_structure` finds it."""
     lowest, highest = lowest[()], highest[()]
     whole = lowest.dtype.kind in "iu"

@@ -25,7 +25,7 @@ import torch
 from filelock import FileLock, Timeout
 
 from curvafit.core.checks import check_int
-from curvafit.core.files import write_content
+from curvafit.core.files import remove, write_content
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import format_sampling
 from curvafit.core.workers import ThisProcess, Workers, cluster, collect_all
@@ -66,6 +66,7 @@ HALO = 40
 LARGEST_TILE, SHORTEST = 256**3, 32
 #: Bytes that a voxel of a tile with its surroundings takes, and those of the program itself.
 _EACH, _PROGRAM = 40, 300 * 2**20
+_SPACING = (WORKING_SPACING, WORKING_SPACING, WORKING_SPACING)
 #: Bins of the stored curvature diagram, in `diagram.BIN_WIDTH`.
 _BIN = 0.25
 #: Names of the passes over tiles.
@@ -202,7 +203,7 @@ def _reach(radius: float, edge: float) -> float:
 # ---- one tile --------------------------------------------------------------------------------------------------------
 
 
-def _measure_tile(tiling: Tiling, number: int) -> Found:
+def measure_tile(tiling: Tiling, number: int) -> Found:
     """Return the sums over a tile's core, on the rows of the finest division that it touches, and what else adds up."""
     plan, core, boxes = tiling.plan, tiling.cores[number], tiling.plan.volume.open()
     sums = _Sums(tiling.finest, core)
@@ -431,8 +432,8 @@ def _measure_curvature(plan: Plan, boxes: Boxes, core: Window, sums: _Sums) -> F
     values = _find_working_levels(plan, boxes, box)
     mask, inner = values > 0, within(owned, box)
     if plan.split.kind != "field":
-        smallest, part = smallest_piece(plan.thickness / plan.edge), _cut_out(owned, box, plan.working)
-        cleaned, *specks = remove_specks(mask, smallest, False, part)
+        smallest, cut = smallest_piece(plan.thickness / plan.edge), _cut_out(owned, box, plan.working)
+        cleaned, *specks = remove_specks(mask, smallest, False, cut)
         found |= {"specks": np.array(specks), "changed": np.count_nonzero((cleaned != mask)[inner])}
         mask = cleaned
     found["filled"] = np.count_nonzero(mask[inner])
@@ -445,9 +446,7 @@ def _measure_curvature(plan: Plan, boxes: Boxes, core: Window, sums: _Sums) -> F
     if seen.all() or not seen.any():
         return found
     if plan.split.kind != "field":
-        values = phase_field(
-            torch.from_numpy(mask), Grid(mask.shape, (WORKING_SPACING,) * 3, "replicate"), WORKING_EPSILON
-        ).numpy()
+        values = phase_field(torch.from_numpy(mask), Grid(mask.shape, _SPACING, "replicate"), WORKING_EPSILON).numpy()
     try:
         (places, columns), drawn = measure_curvatures(_prepare_part(plan, values[within(part, box)], seen, part))
     except NoSurface:
@@ -455,7 +454,7 @@ def _measure_curvature(plan: Plan, boxes: Boxes, core: Window, sums: _Sums) -> F
     corner = np.asarray(drawn.places) / WORKING_SPACING + [edge.start for edge in part]
     kept = _find_own(corner, own, wide)
     sums.gather("curved", places[kept], columns[kept])
-    return found | _bin(plan, drawn, kept)
+    return {**found, **_bin(plan, drawn, kept)}
 
 
 def _find_working_levels(plan: Plan, boxes: Boxes, box: Window) -> np.ndarray:
@@ -483,7 +482,7 @@ def _prepare_part(plan: Plan, phase: np.ndarray, mask: np.ndarray, part: Window)
         kind=plan.split.kind,
         phase=np.ascontiguousarray(phase, dtype=np.float32),
         mask=mask,
-        grid=Grid((z, y, x), (WORKING_SPACING,) * 3, "replicate"),
+        grid=Grid((z, y, x), _SPACING, "replicate"),
         scale=plan.scale,
         working_voxel=plan.edge,
         unit=plan.place.unit,
@@ -497,11 +496,15 @@ def _prepare_part(plan: Plan, phase: np.ndarray, mask: np.ndarray, part: Window)
 def _bin(plan: Plan, drawn: Diagram, kept: np.ndarray) -> Found:
     """Return the bins of a diagram's points that are kept: their place, and area times 1, κ1, κ2 and κ1² + κ2²."""
     points, weights = drawn.points[kept], drawn.weights[kept]
-    bins, index = np.unique(np.floor(points / _bin_width(plan)).astype(np.int64), axis=0, return_inverse=True)
+    bins = np.floor(points / _bin_width(plan)).astype(np.int64)
+    first = bins.min(0, initial=0)
+    across = int(bins[:, 1].max(initial=0) - first[1]) + 1
+    numbers = (bins - first) @ np.array([across, 1])
     columns = np.column_stack([np.ones(len(points)), points, (points**2).sum(1)]) * weights[:, None]
-    index = index.reshape(-1)
-    areas = [np.bincount(index, column, minlength=len(bins)) for column in columns.T]
-    return {"bins": bins, "areas": np.stack(areas, axis=1), "lost": np.float64(drawn.excluded * weights.sum())}
+    areas = np.stack([np.bincount(numbers, column) for column in columns.T], axis=1)
+    held = np.flatnonzero(areas[:, 0])
+    bins = np.stack(np.divmod(held, across), axis=1) + first
+    return {"bins": bins, "areas": areas[held], "lost": np.float64(drawn.excluded * weights.sum())}
 
 
 def _bin_width(plan: Plan) -> float:
@@ -543,7 +546,7 @@ def measure_tiles(
         processes = 1 if isinstance(crew, ThisProcess) else max(1, crew.places // 2)
         stated = tiling.describe(processes)
         find.announce(stated)
-        found = list(find(_FIRST, partial(_measure_tile, tiling), len(tiling.cores)))
+        found = list(find(_FIRST, partial(measure_tile, tiling), len(tiling.cores)))
         wide = replace(tiling, factors=_choose_factors(tiling, found))
         again: list[Found] = []
         if max(wide.factors) > 1:
@@ -701,7 +704,8 @@ def _write_found(folder: Path, name: str, number: int, found: Mapping[str, np.nd
 def open_store(folder: str | PathLike[str], run: Mapping[str, str]) -> Iterator[Path]:
     """Open the folder of a run, or make it, and lock it; `run` is what runs have in common that share it.
 
-    Raises ValueError if the folder holds other things or another run's, or is in use.
+    Where a ScanError is raised the folder is removed. Raises ValueError if the folder holds other things or another
+    run's, or is in use.
     """
     place = Path(folder)
     names = {path.name for path in place.iterdir()} if place.is_dir() else set()
@@ -720,5 +724,9 @@ def open_store(folder: str | PathLike[str], run: Mapping[str, str]) -> Iterator[
             raise ValueError(f"the tiles in {place} are another run's, which differs in {changed}: delete them")
         write_content(place / "run.json", json.dumps(run, indent=2))
         yield place
+    except ScanError:  # of a scan that cannot be measured nothing is of use
+        lock.release()
+        remove(place)
+        raise
     finally:
         lock.release()

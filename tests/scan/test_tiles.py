@@ -1,0 +1,194 @@
+"""A scan in tiles has the numbers of the scan in one piece, whatever the tiles; a killed run goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calling import call, refused
+from scipy import ndimage
+from shapes import grown
+
+from curvafit.core.workers import cluster
+from curvafit.geometry.balls import ball_radii, paint_balls, paint_coarse_balls
+from curvafit.geometry.morphometry import local_thickness
+from curvafit.scan import tiles
+from curvafit.scan.measure import Measures
+from curvafit.scan.measure import measure as measure_in_one
+from curvafit.scan.tiles import measure
+from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.write import save
+
+SHAPE = (99, 67, 73)
+
+
+def texture(shape: tuple[int, int, int] = SHAPE) -> np.ndarray:
+    """A grown texture, repeated as far as a shape goes."""
+    phase = grown("tubes", 48, 1).numpy()
+    return phase[np.ix_(*(np.arange(n) % 48 for n in shape))]
+
+
+def noisy(mask: np.ndarray, seed: int = 0) -> np.ndarray:
+    """The image of a mask, float32: grey levels of contrast 100 under noise of 20."""
+    grey = 100 * ndimage.gaussian_filter(mask.astype(np.float32), 0.7)
+    return grey + np.random.default_rng(seed).normal(0, 20, mask.shape).astype(np.float32)
+
+
+def scans() -> dict[str, Field]:
+    mask = texture() > 0
+    flat = mask[::2]
+    return {
+        "mask": Field(mask.astype(np.uint8), 0.5, "um"),  # type: ignore[arg-type]
+        "image": Field(noisy(mask), 0.5, "um"),  # type: ignore[arg-type]
+        "dark levels": Field(np.clip(200 - noisy(mask), 0, 255).astype(np.uint8)),
+        "field": Field(texture()),
+        "slices": Field(flat.astype(np.uint8), (2.0, 1.0, 1.0), "nm"),
+        "slices of an image": Field(noisy(flat), (2.0, 1.0, 1.0), "nm"),
+    }
+
+
+def check_alike(found: Measures, whole: Measures) -> None:
+    """Sums over tiles are those over the whole but for the order of additions, in float32 for triangles: shares of some
+    ten thousand of them differ by under a millionth, and χ, of which whole numbers are summed, not at all."""
+    for one, other in zip(found.quantities, whole.quantities, strict=True):
+        assert one.value == pytest.approx(other.value, rel=1e-6, abs=1e-9), one.name
+        # an interval is made of differences of such sums
+        assert one.half == pytest.approx(other.half, rel=1e-3, abs=1e-7, nan_ok=True), one.name
+    assert found["χ"].value == whole["χ"].value
+    assert (found.kind, found.unit, found.blocks) == (whole.kind, whole.unit, whole.blocks)
+    assert [note for note in found.notes if not note.startswith("Measured in")] == list(whole.notes)
+    assert found.direction == pytest.approx(whole.direction, abs=1e-6)
+    assert found.diagram.area == pytest.approx(whole.diagram.area, rel=1e-6)
+    assert found.diagram.mean() == pytest.approx(whole.diagram.mean(), rel=1e-5)
+
+
+# ---- tiles are the whole ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "edge"), [("mask", 35), ("image", 48), ("slices", 32), ("dark levels", 64)])
+def test_tiles_equal_the_whole(name: str, edge: int) -> None:
+    """An edge of 35 leaves a last tile of 3 voxels along y and x, 32 one of 1 voxel along z of 33."""
+    scan = scans()[name]
+    dark = name.startswith("dark")
+    check_alike(measure(scan, tile=edge, dark=dark), measure_in_one(scan, dark=dark))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("edge", [33, 47, 64, 96])
+@pytest.mark.parametrize("name", ["mask", "image", "field", "slices", "slices of an image"])
+def test_tiles_of_any_size_equal_the_whole(name: str, edge: int) -> None:
+    scan = scans()[name]
+    check_alike(measure(scan, tile=edge), measure_in_one(scan))
+
+
+def test_wide_balls_are_those_of_the_whole() -> None:
+    """A background with balls of over 24 voxels in radius is painted on a coarser grid, in tiles too."""
+    z, y, x = np.ogrid[:104, :70, :66]
+    mask = np.zeros((104, 70, 66), dtype=bool)
+    for row, column in ((6, 8), (64, 60), (62, 6), (8, 58)):
+        mask |= np.hypot(y - row, x - column - 3 * np.sin(z / 12)) < 5
+    assert 24 < ball_radii(~mask, (1.0, 1.0, 1.0)).max() < tiles.WIDEST
+    scan = Field(mask.astype(np.uint8))
+    check_alike(measure(scan, tile=52), measure_in_one(scan))
+
+
+def test_a_label_is_measured_in_tiles() -> None:
+    labels = np.where(texture() > 0, 7, 3).astype(np.uint16)
+    found = measure(labels, label=7, tile=64)
+    check_alike(found, measure_in_one(labels, label=7))
+    with pytest.raises(ScanError, match="label 5"):
+        measure(labels, label=5, tile=64)
+
+
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.3, 0.17, 0.17)])
+def test_balls_of_a_core_are_those_of_the_whole(spacing: tuple[float, float, float]) -> None:
+    mask = texture((70, 60, 50)) > 0
+    for phase in (mask, ~mask):
+        core = (slice(24, 50), slice(20, 40), slice(10, 30))
+        radius = ball_radii(phase, spacing)
+        assert radius == pytest.approx(ndimage.distance_transform_edt(phase, sampling=spacing), rel=1e-6)
+        whole = paint_balls(radius, spacing)
+        assert np.array_equal(2 * whole, local_thickness(phase, spacing))
+        assert np.array_equal(paint_balls(radius, spacing, core=core)[core], whole[core])
+        assert np.mean(paint_coarse_balls(radius, spacing, 2)[phase]) == pytest.approx(whole[phase].mean(), rel=0.1)
+
+
+# ---- files, workers, kills -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    scan = Field(noisy(texture((70, 48, 48)) > 0), 0.5, "um")  # type: ignore[arg-type]
+    return save(scan, tmp_path_factory.mktemp("scans") / "scan.zarr")
+
+
+def test_workers_make_the_same_bytes(store: Path, tmp_path: Path) -> None:
+    with cluster(2) as crew:
+        two = measure(store, tile=40, workers=crew)
+    one = measure(store, tile=40)
+    numbers = [np.array([(each.value, each.half) for each in found.quantities]) for found in (one, two)]
+    assert numbers[0].tobytes() == numbers[1].tobytes()
+    assert two.diagram.points.tobytes() == one.diagram.points.tobytes()
+
+
+def test_the_same_command_goes_on_after_a_kill(store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, target = tmp_path / "whole.csv", tmp_path / "killed.csv"
+    assert call("measure", store, "--tile", 40, "-o", whole).exit_code == 0
+    calls: list[int] = []
+
+    def stop(plan: tiles.Tiling, number: int, measured=tiles.measure_tile) -> object:
+        calls.append(number)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return measured(plan, number)
+
+    monkeypatch.setattr(tiles, "measure_tile", stop)
+    result = call("measure", store, "--tile", 40, "-o", target)
+    assert result.exit_code == 130 and "same command" in result.stderr
+    assert not target.exists()
+    refused(call("measure", store, "--tile", 36, "-o", target), "tile")
+    result = call("measure", store, "--tile", 40, "-o", target)
+    assert result.exit_code == 0, result.output
+    assert calls[3:] == [2, 3, 4, 5, 6, 7]
+    assert target.read_bytes() == whole.read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["killed.csv", "whole.csv"]
+
+
+# ---- bad input -------------------------------------------------------------------------------------------------------
+
+
+def test_bad_input_ends_in_one_sentence(store: Path, tmp_path: Path) -> None:
+    values = noisy(texture((64, 40, 40)) > 0)
+    broken, out = tmp_path / "nan.npy", tmp_path / "table.csv"
+    values[50, 3, 3] = np.nan
+    np.save(broken, values)
+    flat = tmp_path / "flat.npy"
+    np.save(flat, np.full((64, 40, 40), 3, np.uint8))
+    for arguments, word in (
+        ((broken,), "finite"),
+        ((flat,), "vary"),
+        ((flat, "--label", 3), "label"),
+        ((store, "--threshold", 1e6), "threshold"),
+        ((store, "--tile", 8), "tile"),
+        ((store, "--roi", flat), "tile"),
+        ((store, "--labels"), "tile"),
+    ):
+        more = () if "--tile" in arguments else ("--tile", 40)
+        refused(call("measure", *arguments, *more, "-o", out), word, progress=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["flat.npy", "nan.npy"]
+
+
+def test_a_store_that_ends_while_it_is_read(store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    values = (texture((64, 40, 40)) > 0).astype(np.uint8)
+    scan, out = tmp_path / "scan.npy", tmp_path / "table.csv"
+    np.save(scan, values)
+
+    def cut(plan: tiles.Tiling, number: int, measured=tiles.measure_tile) -> object:
+        if number == 1:
+            scan.write_bytes(scan.read_bytes()[:5000])
+        return measured(plan, number)
+
+    monkeypatch.setattr(tiles, "measure_tile", cut)
+    refused(call("measure", scan, "--tile", 40, "-o", out), "scan.npy", progress=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["scan.npy"]
