@@ -13,6 +13,9 @@ import numpy as np
 from numba import njit
 from skimage.measure import block_reduce
 
+#: A ball keeps a smaller one from being painted only if it nearly contains it: balls that end this many voxels, of the
+#: finest axis, or more before a core change nothing there.
+NEAR = 5
 #: Columns whose distances are found together.
 _COLUMNS = 16
 
@@ -154,7 +157,7 @@ def _find_reaching(radius, steps, box):  # pragma: no cover
 
 @njit(cache=True)
 def _order_balls(radius, steps, box, reach, order):  # pragma: no cover
-    """Fill the centres of balls whose distance to a box is at most `reach` less their radius; return their number."""
+    """Fill the centres of balls that reach a box, or end near it and are smaller; return their number."""
     nz, ny, nx = radius.shape
     hz, hy, hx = steps
     count = 0
@@ -166,7 +169,7 @@ def _order_balls(radius, steps, box, reach, order):  # pragma: no cover
                 r = radius[z, y, x]
                 if r > 0:
                     dx = _gap(x, box[2, 0], box[2, 1]) * hx
-                    if np.sqrt(dz * dz + dy * dy + dx * dx) <= max(reach - r, r):
+                    if np.sqrt(dz * dz + dy * dy + dx * dx) <= min(max(reach - r, r), r + NEAR * min(hz, hy, hx)):
                         order[count] = (z * ny + y) * nx + x
                         count += 1
     return count

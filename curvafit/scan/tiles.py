@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from filelock import FileLock, Timeout
 
 from curvafit.core.checks import check_int
@@ -29,12 +28,12 @@ from curvafit.core.files import remove, write_content
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import format_sampling
 from curvafit.core.workers import ThisProcess, Workers, cluster, collect_all
-from curvafit.geometry.balls import ball_radii, paint_balls, paint_coarse_balls, reaching_radius
+from curvafit.geometry.balls import NEAR, ball_radii, paint_balls, paint_coarse_balls, reaching_radius
 from curvafit.geometry.diagram import BIN_WIDTH, MARGIN, Diagram
 from curvafit.geometry.mesh import NoSurface, surface
 from curvafit.geometry.morphometry import SOFTENED, soften
 from curvafit.geometry.topology import euler_shares
-from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
+from curvafit.priors.grid import WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread
 from curvafit.scan.grids import CutOut, Window, centre_distance, remove_specks, resample
 from curvafit.scan.measure import (
@@ -51,6 +50,7 @@ from curvafit.scan.measure import (
 )
 from curvafit.scan.measure import measure as measure_in_one
 from curvafit.scan.prepare import LARGEST_BOX, Prepared, TooLarge, smallest_piece
+from curvafit.scan.profiles import profile_mask
 from curvafit.scan.structure import check_options
 from curvafit.scan.survey import Found, Plan, Volume, grow, note_on_filling, survey, within
 from curvafit.volumes.boxes import Boxes, InFile, InMemory, boxes_of
@@ -58,7 +58,7 @@ from curvafit.volumes.field import ScanError
 from curvafit.volumes.read import Source, field_of
 
 #: Radius, in voxels of the finest axis, from which balls are painted on a coarser grid, and the largest ball's.
-COARSE, WIDEST = 24, 36
+COARSE, WIDEST = 24, 48
 #: Working voxels around a core that its curvature depends on: a profile is made of distances of 20 voxels, blurred by
 #: 16, and corrected at thin places.
 HALO = 40
@@ -196,8 +196,8 @@ def _choose_edges(plan: Plan) -> tuple[int, ...]:
 
 
 def _reach(radius: float, edge: float) -> float:
-    """Return how far around a core voxels are read for balls of a radius: what keeps them from being painted too."""
-    return 3 * radius if radius <= COARSE * edge else 2 * radius + COARSE * edge
+    """Return how far around a core voxels are read for balls of a radius: as far as those reach that reach into it."""
+    return 2 * radius + (NEAR + 1) * edge
 
 
 # ---- one tile --------------------------------------------------------------------------------------------------------
@@ -446,7 +446,7 @@ def _measure_curvature(plan: Plan, boxes: Boxes, core: Window, sums: _Sums) -> F
     if seen.all() or not seen.any():
         return found
     if plan.split.kind != "field":
-        values = phase_field(torch.from_numpy(mask), Grid(mask.shape, _SPACING, "replicate"), WORKING_EPSILON).numpy()
+        values = profile_mask(mask)
     try:
         (places, columns), drawn = measure_curvatures(_prepare_part(plan, values[within(part, box)], seen, part))
     except NoSurface:
