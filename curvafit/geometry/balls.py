@@ -63,15 +63,17 @@ def paint_balls(
     shape = np.array(radius.shape)
     box = [(0, n) if end is None else (end.start, end.stop) for n, end in zip(shape, core or (None,) * 3, strict=True)]
     reach = 2 * reaching_radius(radius, spacing, core) + edge if core else math.inf
-    order = np.empty((2, np.count_nonzero(radius)), dtype=np.int64)
+    number = np.int32 if radius.size < 2**31 else np.int64
+    order = np.empty((2, np.count_nonzero(radius)), dtype=number)
     count = _order_balls(radius, steps, np.array(box), np.float64(reach), order[0])
     _sort_balls(radius.ravel(), order[:, :count])
-    painted, owner = np.zeros(radius.size, dtype=np.float32), np.full(radius.size, -1, dtype=np.int32)
+    order = order[0, :count].copy()
+    painted, owner = np.zeros(radius.size, dtype=np.float32), np.full(radius.size, -1, dtype=number)
     words = -(-radius.shape[2] // 64)
     free = np.zeros(radius.shape[0] * radius.shape[1] * words, dtype=np.uint64)
     blocks = np.zeros(-(-radius.shape[0] // 4) * -(-radius.shape[1] // 4) * words, dtype=np.uint64)
     _mark_free(radius, free, blocks)
-    _paint(order[0, :count], (radius.ravel(), painted, owner, free, blocks), shape, steps, rim, periodic)
+    _paint(order, (radius.ravel(), painted, owner, free, blocks), shape, steps, rim, periodic)
     return painted.reshape(radius.shape)
 
 

@@ -63,9 +63,9 @@ COARSE, WIDEST = 24, 48
 #: 16, and corrected at thin places.
 HALO = 40
 #: Voxels of a tile with its surroundings, by default; the shortest edge of a core.
-LARGEST_TILE, SHORTEST = 256**3, 32
+LARGEST_TILE, SHORTEST = 224**3, 32
 #: Bytes that a voxel of a tile with its surroundings takes, and those of the program itself.
-_EACH, _PROGRAM = 40, 300 * 2**20
+_EACH, _PROGRAM = 60, 300 * 2**20
 _SPACING = (WORKING_SPACING, WORKING_SPACING, WORKING_SPACING)
 #: Bins of the stored curvature diagram, in `diagram.BIN_WIDTH`.
 _BIN = 0.25
@@ -435,7 +435,8 @@ def _measure_curvature(plan: Plan, boxes: Boxes, core: Window, sums: _Sums) -> F
         smallest, cut = smallest_piece(plan.thickness / plan.edge), _cut_out(owned, box, plan.working)
         cleaned, *specks = remove_specks(mask, smallest, False, cut)
         found |= {"specks": np.array(specks), "changed": np.count_nonzero((cleaned != mask)[inner])}
-        mask = cleaned
+        mask, values = cleaned, values[:0]
+        del cleaned
     found["filled"] = np.count_nonzero(mask[inner])
     own = [(max(e.start, MARGIN), min(e.stop, n - 1 - MARGIN)) for e, n in zip(owned, plan.working, strict=True)]
     if any(start >= stop for start, stop in own) or mask.all() or not mask.any():
@@ -530,7 +531,7 @@ def measure_tiles(
     volume
         What is measured.
     edge
-        Voxels a side of a tile's core; by default as many as 256³ voxels with the surroundings leave.
+        Voxels a side of a tile's core; by default as many as 224³ voxels with the surroundings leave.
     workers
         Workers, or a number of processes, of a volume that is in a file; by default this process measures.
     store

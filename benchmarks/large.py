@@ -1,0 +1,69 @@
+"""Time and peak memory of `curvafit measure` on a volume in tiles, from a Zarr store in chunks, as large as wanted.
+
+A generated shape of 64³ is repeated along each axis, blurred, under noise of a quarter of its contrast. The store is
+written chunk by chunk. The command runs in a process of its own with its workers; the memory is that of the largest
+worker times their number, and the main process's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from benchmarks.completion import EDGE, shape
+from benchmarks.harness import Cases, Figure, Values, run_python, show
+
+#: Runs the command line, and prints the peak memory of the main process and of its largest worker in KiB.
+PROGRAM = """
+from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
+from curvafit.cli.app import app
+try:
+    app()
+finally:
+    print(*(getrusage(who).ru_maxrss for who in (RUSAGE_SELF, RUSAGE_CHILDREN)))
+"""
+
+
+def write_scan(law: str, edge: int, path: Path, cases: Cases) -> None:
+    """Write an image of a repeated shape, uint8, in chunks of two periods."""
+    import zarr
+
+    mask = shape(law, 0, cases).astype(np.float32)
+    period = ndimage.gaussian_filter(np.tile(mask, (2, 2, 2)), 1.0, mode="wrap")
+    array = zarr.create_array(path, shape=(edge,) * 3, chunks=(2 * EDGE,) * 3, dtype="u1", overwrite=True)
+    for number, start in enumerate(product(range(0, edge, 2 * EDGE), repeat=3)):
+        box = tuple(slice(a, min(a + 2 * EDGE, edge)) for a in start)
+        part = period[tuple(slice(0, b.stop - b.start) for b in box)]
+        noise = np.random.default_rng(number).standard_normal(part.shape, dtype=np.float32)
+        array[box] = np.clip(60 + 100 * part + 25 * noise, 0, 255).astype(np.uint8)
+
+
+def timed(law: str, edge: int, workers: int, cases: Cases) -> Values:
+    """Return the seconds and the memory in GB of one command."""
+    path = cases.folder / f"scan-{law}-{edge}.zarr"
+    write_scan(law, edge, path, cases)
+    begun = time.monotonic()
+    said = run_python(
+        "-c", PROGRAM, "measure", path, "--workers", workers, "-o", cases.folder / f"{law}-{edge}.csv", "--overwrite"
+    )  # fmt: skip
+    main, worker = map(int, said.strip().splitlines()[-1].split())
+    return {"seconds": time.monotonic() - begun, "memory": (main + max(workers, 0) * worker) * 1024 / 1e9}
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--law", default="tubes")
+    parser.add_argument("--edge", type=int, default=1024)
+    parser.add_argument("--workers", type=int, default=2)
+
+
+def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    edge, workers = (208, 0) if options.quick else (options.edge, options.workers)
+    name = f"{options.law}-{edge}-{workers}"
+    found = cases.all({name: lambda: timed(options.law, edge, workers, cases)})
+    show(["case", "seconds", "GB"], [[case, *row.values()] for case, row in found.items()])
+    return {f"{edge}.{key}": Figure(value) for row in found.values() for key, value in row.items()}
