@@ -73,7 +73,8 @@ def paint_balls(
     free = np.zeros(radius.shape[0] * radius.shape[1] * words, dtype=np.uint64)
     blocks = np.zeros(-(-radius.shape[0] // 4) * -(-radius.shape[1] // 4) * words, dtype=np.uint64)
     _mark_free(radius, free, blocks)
-    _paint(order, (radius.ravel(), painted, owner, free, blocks), shape, steps, rim, periodic)
+    runs = np.empty([int((float(radius.max(initial=0)) + edge) / h) + 2 for h in steps[:2]], dtype=np.int64)
+    _paint(order, (radius.ravel(), painted, owner, free, blocks), runs, shape, steps, rim, periodic)
     return painted.reshape(radius.shape)
 
 
@@ -216,11 +217,12 @@ def _mark_free(radius, free, blocks):  # pragma: no cover
 
 
 @njit(cache=True)
-def _paint(order, balls, shape, spacing, edge, periodic):  # pragma: no cover
+def _paint(order, balls, runs, shape, spacing, edge, periodic):  # pragma: no cover
     """Paint balls in descending size; each voxel keeps the first, hence largest, that covers it (and which it was)."""
     radius, _, owner, _, _ = balls
     nz, ny, nx = shape
     hz, hy, hx = spacing
+    last = np.float32(0)
     for centre in order:
         r = radius[centre]
         if owner[centre] >= 0:
@@ -236,8 +238,11 @@ def _paint(order, balls, shape, spacing, edge, periodic):  # pragma: no cover
             if out <= max(0.5 * edge, 0.05 * radius[o]):
                 continue
         reach = r + 0.5 * edge
+        if r != last:
+            last = r
+            _fill_runs(reach, spacing, runs)
         z, y, x = centre // (ny * nx), centre // nx % ny, centre % nx
-        _paint_ball(centre, balls, (z, y, x), shape, spacing, reach)
+        _paint_ball(centre, balls, runs, (z, y, x), shape, (int(reach / hz), int(reach / hy)))
         if periodic:
             kz, ky, kx = int(reach / hz), int(reach / hy), int(reach / hx)
             for k in range(z - nz, z + nz + 1, nz):
@@ -245,37 +250,40 @@ def _paint(order, balls, shape, spacing, edge, periodic):  # pragma: no cover
                     for i in range(x - nx, x + nx + 1, nx):
                         beyond = k != z or j != y or i != x
                         if beyond and _gap(k, 0, nz) <= kz and _gap(j, 0, ny) <= ky and _gap(i, 0, nx) <= kx:
-                            _paint_ball(centre, balls, (k, j, i), shape, spacing, reach)
+                            _paint_ball(centre, balls, runs, (k, j, i), shape, (kz, ky))
 
 
 @njit(cache=True)
-def _paint_ball(centre, balls, place, shape, spacing, reach):  # pragma: no cover
+def _fill_runs(reach, spacing, runs):  # pragma: no cover
+    """Fill how far a ball reaches along x at each distance in voxels along z and y; -1 where it does not."""
+    hz, hy, hx = spacing
+    for k in range(int(reach / hz) + 1):
+        for j in range(int(reach / hy) + 1):
+            rest = reach * reach - (k * hz) ** 2 - (j * hy) ** 2
+            runs[k, j] = int(np.sqrt(rest) / hx) if rest >= 0 else -1
+
+
+@njit(cache=True)
+def _paint_ball(centre, balls, runs, place, shape, reach):  # pragma: no cover
     """Paint one ball, at a place that may lie beyond the box, where none is; by 4 x 4 rows: most have no free voxel."""
     blocks = balls[4]
     nz, ny, nx = shape
-    hz, hy, hx = spacing
     z, y, x = place
-    kz, ky = int(reach / hz), int(reach / hy)
-    lowest, highest = max(0, z - kz), min(nz, z + kz + 1)
-    front, back = max(0, y - ky), min(ny, y + ky + 1)
+    lowest, highest = max(0, z - reach[0]), min(nz, z + reach[0] + 1)
+    front, back = max(0, y - reach[1]), min(ny, y + reach[1] + 1)
     words, across = (nx + 63) // 64, (ny + 3) // 4
     for block in range(lowest // 4, (highest + 3) // 4):
-        dz = _gap(z, 4 * block, 4 * block + 4) * hz
+        dz = _gap(z, 4 * block, 4 * block + 4)
         for part in range(front // 4, (back + 3) // 4):
-            dy = _gap(y, 4 * part, 4 * part + 4) * hy
-            rest = reach * reach - dz**2 - dy**2
-            if rest < 0:
-                continue
-            kx = int(np.sqrt(rest) / hx)
+            kx = runs[dz, _gap(y, 4 * part, 4 * part + 4)]
             row = (block * across + part) * words
-            if not _any_free(blocks, row, max(0, x - kx), min(nx, x + kx + 1)):
+            if kx < 0 or not _any_free(blocks, row, max(0, x - kx), min(nx, x + kx + 1)):
                 continue
             painted = 0
             for k in range(max(lowest, 4 * block), min(highest, 4 * block + 4)):
                 for j in range(max(front, 4 * part), min(back, 4 * part + 4)):
-                    rest = reach * reach - ((k - z) * hz) ** 2 - ((j - y) * hy) ** 2
-                    kx = int(np.sqrt(max(rest, 0)) / hx)
-                    if rest >= 0:
+                    kx = runs[abs(k - z), abs(j - y)]
+                    if kx >= 0:
                         painted += _paint_run(centre, balls, k * ny + j, max(0, x - kx), min(nx, x + kx + 1), nx)
             if painted:
                 _mark_block(balls, block, part, shape)
