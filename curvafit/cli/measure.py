@@ -54,31 +54,32 @@ def measure(
     if subjects is not None and out is None:
         raise ValueError("--subjects is for the table: give its name with -o")
     store = None if out is None else out.with_name(f".{out.name}.curvafit-tiles")
-    with _keep_tiles(store), show_stages() as progress:
-        from curvafit.scan.instances import measure_instances
-        from curvafit.scan.tiles import measure as measure_scan
-        from curvafit.studies.groups import read_columns
-        from curvafit.studies.tables import COLUMNS, OF_PARTS, check_table, write_table
+    with _keep_tiles(store):
+        with show_stages() as progress:
+            from curvafit.scan.instances import measure_instances
+            from curvafit.scan.tiles import measure as measure_scan
+            from curvafit.studies.groups import read_columns
+            from curvafit.studies.tables import COLUMNS, OF_PARTS, check_table, write_table
 
+            if out is not None:
+                check_table(out, [*scans, *(each for each in (roi, subjects) if each is not None)], overwrite)
+            told = None if subjects is None else read_columns(subjects, scans, (*COLUMNS, *OF_PARTS))
+            found: list[tuple[Measures, ...]] = []
+
+            def watch(text: str, share: float) -> None:
+                progress(f"{scans[len(found)]}: {text}", (len(found) + share) / len(scans))
+
+            for scan in scans:
+                if labels:
+                    found.append(measure_instances(scan, progress=watch, **reading))
+                else:
+                    tiles = {"tile": tile, "workers": workers, "store": store and store / f"{len(found):04d}"}
+                    found.append((measure_scan(scan, roi=roi, progress=watch, **tiles, **structure, **reading),))
+        _print_found(found, labels)
         if out is not None:
-            check_table(out, [*scans, *(each for each in (roi, subjects) if each is not None)], overwrite)
-        told = None if subjects is None else read_columns(subjects, scans, (*COLUMNS, *OF_PARTS))
-        found: list[tuple[Measures, ...]] = []
-
-        def watch(text: str, share: float) -> None:
-            progress(f"{scans[len(found)]}: {text}", (len(found) + share) / len(scans))
-
-        for scan in scans:
-            if labels:
-                found.append(measure_instances(scan, progress=watch, **reading))
-            else:
-                tiles = {"tile": tile, "workers": workers, "store": store and store / f"{len(found):04d}"}
-                found.append((measure_scan(scan, roi=roi, progress=watch, **tiles, **structure, **reading),))
-    _print_found(found, labels)
-    if out is not None:
-        columns = None if told is None else [row for row, each in zip(told, found, strict=True) for _ in each]
-        table = [each for measures in found for each in measures]
-        say(str(write_table(table, out, columns=columns, overwrite=overwrite)))
+            columns = None if told is None else [row for row, each in zip(told, found, strict=True) for _ in each]
+            table = [each for measures in found for each in measures]
+            say(str(write_table(table, out, columns=columns, overwrite=overwrite)))
 
 
 @contextmanager

@@ -225,18 +225,8 @@ def _paint(order, balls, runs, shape, spacing, edge, periodic):  # pragma: no co
     last = np.float32(0)
     for centre in order:
         r = radius[centre]
-        if owner[centre] >= 0:
-            o = owner[centre]
-            dz, dy, dx = (
-                abs(centre // (ny * nx) - o // (ny * nx)),
-                abs(centre // nx % ny - o // nx % ny),
-                abs(centre % nx - o % nx),
-            )
-            if periodic:
-                dz, dy, dx = min(dz, nz - dz), min(dy, ny - dy), min(dx, nx - dx)
-            out = np.sqrt((dz * hz) ** 2 + (dy * hy) ** 2 + (dx * hx) ** 2) + r - radius[o]
-            if out <= max(0.5 * edge, 0.05 * radius[o]):
-                continue
+        if owner[centre] >= 0 and _is_nearly_inside(centre, owner[centre], radius, shape, spacing, edge, periodic):
+            continue
         reach = r + 0.5 * edge
         if r != last:
             last = r
@@ -251,6 +241,22 @@ def _paint(order, balls, runs, shape, spacing, edge, periodic):  # pragma: no co
                         beyond = k != z or j != y or i != x
                         if beyond and _gap(k, 0, nz) <= kz and _gap(j, 0, ny) <= ky and _gap(i, 0, nx) <= kx:
                             _paint_ball(centre, balls, runs, (k, j, i), shape, (kz, ky))
+
+
+@njit(cache=True)
+def _is_nearly_inside(centre, o, radius, shape, spacing, edge, periodic):  # pragma: no cover
+    """Return whether a ball sticks out of another, around the voxel o, so little that it is left out."""
+    nz, ny, nx = shape
+    hz, hy, hx = spacing
+    dz, dy, dx = (
+        abs(centre // (ny * nx) - o // (ny * nx)),
+        abs(centre // nx % ny - o // nx % ny),
+        abs(centre % nx - o % nx),
+    )
+    if periodic:
+        dz, dy, dx = min(dz, nz - dz), min(dy, ny - dy), min(dx, nx - dx)
+    out = np.sqrt((dz * hz) ** 2 + (dy * hy) ** 2 + (dx * hx) ** 2) + radius[centre] - radius[o]
+    return out <= max(0.5 * edge, 0.05 * radius[o])
 
 
 @njit(cache=True)

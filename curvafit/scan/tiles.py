@@ -546,8 +546,7 @@ def measure_tiles(
         tiling = Tiling.of(survey(volume, find), edge)
         processes = 1 if isinstance(crew, ThisProcess) else max(1, crew.places // 2)
         stated = tiling.describe(processes)
-        find.announce(stated)
-        found = list(find(_FIRST, partial(measure_tile, tiling), len(tiling.cores)))
+        found = list(find(_FIRST, partial(measure_tile, tiling), len(tiling.cores), stated))
         wide = replace(tiling, factors=_choose_factors(tiling, found))
         again: list[Found] = []
         if max(wide.factors) > 1:
@@ -654,23 +653,19 @@ class _Finder:
     def __init__(self, crew: Workers, folder: Path | None, progress: Progress) -> None:
         self._crew, self._folder, self._progress, self._share = crew, folder, progress, 0.0
 
-    def announce(self, text: str) -> None:
-        """Say a sentence before tiles are measured."""
-        self._progress(text, self._share)
-
-    def __call__(self, name: str, find: Any, count: int) -> Iterator[Found]:
-        """Yield what is found in each piece, in their order."""
+    def __call__(self, name: str, find: Any, count: int, shown: str = "") -> Iterator[Found]:
+        """Return what is found in each piece, in their order; the progress says the name, or what is `shown`."""
         found = {} if self._folder is None else _read_found(self._folder, name, count)
         rest = [number for number in range(count) if number not in found]
         start = self._share
         self._share = stop = max(start, 0.95 if name == _FIRST else 1.0 if name == _AGAIN else start + 0.02)
         requests = [(partial(_find, find), Path(), [number]) for number in rest]
-        self._progress(name, start)
+        self._progress(shown or name, start)
         for done, (number, each) in enumerate(collect_all(self._crew, requests), count - len(rest) + 1):
             found[number] = each
             if self._folder is not None:
                 _write_found(self._folder, name, number, each)
-            self._progress(name, start + (stop - start) * done / count)
+            self._progress(shown or name, start + (stop - start) * done / count)
         return iter([found[number] for number in range(count)])
 
 
