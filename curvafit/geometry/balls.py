@@ -13,9 +13,9 @@ import numpy as np
 from numba import njit
 from skimage.measure import block_reduce
 
-#: A ball keeps a smaller one from being painted only if it nearly contains it: balls that end this many voxels, of the
-#: finest axis, or more before a core change nothing there.
-NEAR = 5
+#: A ball may keep a smaller one, which it nearly contains, from being painted: balls that end this many voxels, of the
+#: finest axis, before a core count there.
+NEAR = 8
 #: Columns whose distances are found together.
 _COLUMNS = 16
 
@@ -62,10 +62,10 @@ def paint_balls(
     radius = np.ascontiguousarray(radius)
     shape = np.array(radius.shape)
     box = [(0, n) if end is None else (end.start, end.stop) for n, end in zip(shape, core or (None,) * 3, strict=True)]
-    reach = 2 * reaching_radius(radius, spacing, core) + edge if core else math.inf
+    near = NEAR * edge if core else math.inf
     number = np.int32 if radius.size < 2**31 else np.int64
     order = np.empty((2, np.count_nonzero(radius)), dtype=number)
-    count = _order_balls(radius, steps, np.array(box), np.float64(reach), order[0])
+    count = _order_balls(radius, steps, np.array(box), near, order[0])
     _sort_balls(radius.ravel(), order[:, :count])
     order = order[0, :count].copy()
     painted, owner = np.zeros(radius.size, dtype=np.float32), np.full(radius.size, -1, dtype=number)
@@ -79,9 +79,9 @@ def paint_balls(
 
 
 def reaching_radius(radius: np.ndarray, spacing: Sequence[float], core: tuple[slice, ...]) -> float:
-    """Return the largest of the balls, of `radius` (Z, Y, X) around the voxels, that reach into a core."""
-    box = np.array([(edge.start, edge.stop) for edge in core])
-    return float(_find_reaching(np.ascontiguousarray(radius), np.asarray(spacing, dtype=np.float32), box))
+    """Return the largest of the balls, of `radius` (Z, Y, X) around the voxels, that count in a core (see `NEAR`)."""
+    box, near = np.array([(edge.start, edge.stop) for edge in core]), NEAR * float(min(spacing))
+    return float(_find_reaching(np.ascontiguousarray(radius), np.asarray(spacing, dtype=np.float32), box, near))
 
 
 @njit(cache=True)
@@ -140,8 +140,8 @@ def _gap(at, low, high):  # pragma: no cover
 
 
 @njit(cache=True)
-def _find_reaching(radius, steps, box):  # pragma: no cover
-    """Return the largest radius of a ball that reaches into a box."""
+def _find_reaching(radius, steps, box, near):  # pragma: no cover
+    """Return the largest radius of a ball that reaches a box, or ends near it."""
     nz, ny, nx = radius.shape
     hz, hy, hx = steps
     largest = 0.0
@@ -152,15 +152,15 @@ def _find_reaching(radius, steps, box):  # pragma: no cover
             for x in range(nx):
                 if radius[z, y, x] > largest:
                     dx = _gap(x, box[2, 0], box[2, 1]) * hx
-                    r = radius[z, y, x] + hx
+                    r = radius[z, y, x] + near
                     if dz * dz + dy * dy + dx * dx <= r * r:
                         largest = radius[z, y, x]
     return largest
 
 
 @njit(cache=True)
-def _order_balls(radius, steps, box, reach, order):  # pragma: no cover
-    """Fill the centres of balls that reach a box, or end near it and are smaller; return their number."""
+def _order_balls(radius, steps, box, near, order):  # pragma: no cover
+    """Fill the centres of balls that reach a box, or end near it; return their number."""
     nz, ny, nx = radius.shape
     hz, hy, hx = steps
     count = 0
@@ -172,7 +172,7 @@ def _order_balls(radius, steps, box, reach, order):  # pragma: no cover
                 r = radius[z, y, x]
                 if r > 0:
                     dx = _gap(x, box[2, 0], box[2, 1]) * hx
-                    if np.sqrt(dz * dz + dy * dy + dx * dx) <= min(max(reach - r, r), r + NEAR * min(hz, hy, hx)):
+                    if np.sqrt(dz * dz + dy * dy + dx * dx) <= r + near:
                         order[count] = (z * ny + y) * nx + x
                         count += 1
     return count

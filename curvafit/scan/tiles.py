@@ -61,7 +61,7 @@ from curvafit.volumes.read import Source, field_of
 COARSE, WIDEST = 24, 48
 #: Working voxels around a core that its curvature depends on: a profile is made of distances of 20 voxels, blurred by
 #: 16, and corrected at thin places.
-HALO = 40
+HALO = 32
 #: Voxels of a tile with its surroundings, by default; the shortest edge of a core.
 LARGEST_TILE, SHORTEST = 224**3, 32
 #: Bytes that a voxel of a tile with its surroundings takes, and those of the program itself.
