@@ -25,6 +25,7 @@ from curvafit.scan.grids import (
     resample,
     surface_voxels,
 )
+from curvafit.scan.profiles import profile_mask
 from curvafit.scan.structure import (
     Kind,
     Quality,
@@ -268,7 +269,8 @@ def _put_on_grid(scan: _Scan, most: int | None) -> Prepared:
     if not windows:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
     if scan.kind != "field":
-        phase = _profile(mask, grid)
+        # the profile of `measure`, whose scans may be large: the same to some 1e-7
+        phase = _profile(mask, grid) if most is None or grid.periodic else profile_mask(mask)
     else:
         phase = values if region is None or region.all() else np.minimum(values, _profile(region, grid))
     return Prepared(
