@@ -38,7 +38,7 @@ def measure(
     ] = None,
     tile: Annotated[
         int | None,
-        typer.Option(help="Voxels a side of a tile; by default a large scan is cut so that 2 GB are enough.", min=32),
+        typer.Option(help="Voxels a side of a tile; by default so many that a process takes a good GB.", min=32),
     ] = None,
     workers: Annotated[int | None, typer.Option(help="Processes that measure tiles; by default one.", min=0)] = None,
     *,

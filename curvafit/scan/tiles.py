@@ -65,7 +65,7 @@ HALO = 32
 #: Voxels of a tile with its surroundings, by default; the shortest edge of a core.
 LARGEST_TILE, SHORTEST = 224**3, 32
 #: Bytes that a voxel of a tile with its surroundings takes, and those of the program itself.
-_EACH, _PROGRAM = 60, 300 * 2**20
+_EACH, _PROGRAM = 100, 300 * 2**20
 _SPACING = (WORKING_SPACING, WORKING_SPACING, WORKING_SPACING)
 #: Bins of the stored curvature diagram, in `diagram.BIN_WIDTH`.
 _BIN = 0.25
