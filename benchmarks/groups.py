@@ -35,6 +35,7 @@ from scipy.spatial.distance import cdist
 
 from benchmarks.completion import shape, sides
 from benchmarks.harness import Cases, Figure, Values, run_python, show
+from curvafit.core.permutation import correct_by_most, correct_holm, measure_energy, relabel, share_beyond
 from curvafit.data_synth.design import INTERVALS
 from curvafit.generation.flow import generate
 from curvafit.geometry.diagram import Diagram
@@ -42,7 +43,6 @@ from curvafit.geometry.distances import sliced_embedding
 from curvafit.priors.law import Law
 from curvafit.scan.measure import QUANTITIES, Measures, Quantity, measure
 from curvafit.studies.compare import LEVEL, compare
-from curvafit.studies.permutation import correct_by_most, correct_holm, measure_energy, relabel, share_beyond
 from curvafit.studies.scans import FINE
 from curvafit.volumes.field import Field, ScanError
 

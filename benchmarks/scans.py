@@ -1,10 +1,10 @@
 """Reports of real scans: the verdict on each, and how far the laws of a scan's halves lie apart.
 
 Needs $CURVAFIT_DATA. Of each scan by `infer`: the structure's share, thickness and spacing in working voxels; p of
-`misfit`; the means of the chosen law's twins over the scan; the verdict. Of the halves along the longest axis, by the
-posterior alone (`--halves`), in working units and deviations of the prior: the distance between the means of their
-posteriors (root mean square over the six parameters), and the distance to the nearest half of another tissue. Means
-move less than posteriors are wide, so a small distance alone says nothing: compare the two.
+`misfit` and the blocks of descriptors that reject it; the means of the chosen law's twins over the scan; the verdict.
+Of the halves along the longest axis, by the posterior alone (`--halves`): p that both are of one law, by the difference
+of draws from their posteriors (χ² of its mean in units of its covariance), and the part of the halves of other tissues
+that are not (p at most .05).
 """
 
 from __future__ import annotations
@@ -16,10 +16,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import stats
 
 from benchmarks.harness import Cases, Figure, Values, show
 from curvafit.inference.infer import infer
 from curvafit.inference.posterior import load_posterior
+from curvafit.inference.table import PARAMETERS
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.read import load
 
@@ -69,24 +71,30 @@ def report(name: str) -> Values:
         values |= {"spacing": own.spacing_mean / voxel}
         for key in RATIOS if twins else ():
             values[key] = float(np.mean([getattr(each, key) for each in twins]) / getattr(own, key))
-    return values | ({} if fit.misfit is None else {"p": fit.misfit.probability})
+    if fit.misfit is not None:
+        values |= {"p": fit.misfit.probability}
+        values["rejected by"] = ", ".join(name for name, p in fit.misfit.blocks.items() if p <= 0.05)
+    return values
 
 
 def halves(name: str) -> Values:
-    """Return the means of the posteriors of a scan's two halves, in deviations of the prior."""
-    field, scale = field_of(name), np.ptp(load_posterior().box, axis=1) / np.sqrt(12)
+    """Return draws from the posteriors of a scan's two halves, without bounds."""
+    field, posterior = field_of(name), load_posterior()
     axis = int(np.argmax([n * h for n, h in zip(field.shape, field.spacing, strict=True)]))
     middle, found = field.shape[axis] // 2, {}
     for k, part in enumerate((slice(None, middle), slice(middle, None))):
         box = tuple(part if axis == n else slice(None) for n in range(3))
         fit = infer(field.crop(box), kind=SCANS[name].kind, fast=True).fit  # type: ignore[arg-type]
         if fit.draws is not None:
-            found[str(k)] = (fit.draws / scale).mean(0).tolist()
+            found[str(k)] = posterior.standardise(fit.draws)[:, : len(PARAMETERS)].round(4).tolist()
     return found
 
 
-def distance(one: list[float], other: list[float]) -> float:
-    return float(np.sqrt(np.square(np.subtract(one, other)).mean()))
+def same_law(one: list[list[float]], other: list[list[float]]) -> float:
+    """Return p that two posteriors are of one law, by draws `(n, 6)`."""
+    first, second = np.array(one), np.array(other)
+    away, spread = first.mean(0) - second.mean(0), np.cov(first.T) + np.cov(second.T)
+    return float(stats.chi2.sf(away @ np.linalg.solve(spread, away), len(away)))
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -100,33 +108,30 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     names = ["capillaries"] if options.quick else options.only.split(",")
     if options.halves or options.quick:
         found = cases.all({f"halves-{name}": lambda name=name: halves(name) for name in names})
-        return compare_halves({name.removeprefix("halves-"): means for name, means in found.items()})
+        return compare_halves({name.removeprefix("halves-"): draws for name, draws in found.items()})
     found = cases.all({name: lambda name=name: report(name) for name in names})
-    columns = ("share", "thickness", "spacing", "p", *RATIOS, "verdict")
+    columns = ("share", "thickness", "spacing", "p", *RATIOS, "rejected by", "verdict")
     show(["scan", *columns], [[name, *(row.get(key, "") for key in columns)] for name, row in found.items()])
     figures = {f"scans.{name}.{key}": Figure(row[key]) for name, row in found.items()
-               for key in columns[:-1] if key in row}  # fmt: skip
+               for key in columns[:-2] if key in row}  # fmt: skip
     if len(found) == len(SCANS):
         supported = sum(row["verdict"] == "Supported" for row in found.values())
         figures["scans.supported"] = Figure(float(supported))
     return figures
 
 
-def compare_halves(means: Mapping[str, Values]) -> dict[str, Figure]:
+def compare_halves(draws: Mapping[str, Values]) -> dict[str, Figure]:
     rows, figures = [], {}
-    for name, mine in means.items():
+    for name, mine in draws.items():
         if len(mine) < 2:
             continue
-        own = distance(mine["0"], mine["1"])
-        others = {
-            other: min(distance(a, b) for a in mine.values() for b in each.values())
-            for other, each in means.items()
-            if SCANS[other].tissue != SCANS[name].tissue and each
-        }
-        nearest = min(others, key=others.__getitem__, default="")
-        rows.append([name, own, others.get(nearest, ""), nearest])
-        figures[f"halves.{name}.apart"] = Figure(own)
-        if nearest:
-            figures[f"halves.{name}.other"] = Figure(others[nearest])
-    show(["halves of", "apart", "nearest half of another tissue", ""], rows)
+        own = same_law(mine["0"], mine["1"])
+        foreign = [each for other, each in draws.items() if SCANS[other].tissue != SCANS[name].tissue]
+        others = [same_law(a, b) <= 0.05 for each in foreign for a in mine.values() for b in each.values()]
+        figures[f"halves.{name}.alike"] = Figure(own)
+        rows.append([name, own, ""])
+        if others:
+            figures[f"halves.{name}.others"] = Figure(float(np.mean(others)))
+            rows[-1][-1] = float(np.mean(others))
+    show(["halves of", "p of one law", "halves of other tissues told apart"], rows)
     return figures

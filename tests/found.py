@@ -13,6 +13,7 @@ from curvafit.geometry.diagram import Diagram, diagram
 from curvafit.geometry.morphometry import Morphometry
 from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Misfit, Twin
+from curvafit.inference.combinations import Combination
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import Inference
 from curvafit.priors import Coefficients, Grid, preset
@@ -72,13 +73,14 @@ def made_fit(chosen: str | None = "posterior", lost: bool = False) -> Fit:
     near = preset("tubes")
     other = Coefficients(1, 1.8, 5.2, -38.5, -41, 433)
     rng = np.random.default_rng(1)
-    rows = np.array([1.8, np.log(5.2), -38.5, -41, 433, -0.58]) + rng.normal(size=(60, 6)) * [0.4, 0.2, 6, 9, 51, 0.02]
+    middle = np.array([1.8, np.log(5.2), -38.5, -41, 433, -0.58, np.log(8)])
+    rows = middle + rng.normal(size=(60, 7)) * [0.4, 0.2, 6, 9, 51, 0.02, 0.1]
     matches = tuple(Match(f"0-{k:05d}", 2.1 + 0.4 * k, near.coefficients, -0.6 + 0.02 * k, 40 + k) for k in range(5))
     own = {"a20": 0.0, "a11": 0.4, "a02": 0.9, "a10": 6.0, "a01": 9.0, "a00": 51.0, "mass": 0.02}
-    grown = (None, None, ()) if lost else (1.6, 1.1, (NUMBERS, NUMBERS))
+    grown = (8.0, None, None, ()) if lost else (8.0, 1.6, 1.1, (NUMBERS, NUMBERS))
     candidates = (
         Candidate("posterior", other, -0.58, own, *grown, status="No shape grew: one phase." if lost else ""),
-        Candidate("match", near.coefficients, near.mass, {}, 2.2, None, (NUMBERS,)),
+        Candidate("match", near.coefficients, near.mass, {}, 8.0, 2.2, None, (NUMBERS,)),
     )
     return Fit(
         kind="image",
@@ -87,12 +89,16 @@ def made_fit(chosen: str | None = "posterior", lost: bool = False) -> Fit:
         chosen=chosen,
         draws=rows if chosen else None,
         view="scan" if chosen else "",
-        weak_directions=("a11 and a00 together: anything from 1 to 2 grows this texture.",),
+        combinations=(
+            Combination("flat", "round", {"a11": 0.1, "log a02": 0.8}, 1.2, (1.0, 1.4), 0.98),
+            Combination("sparse", "full", {"a11": 0.9, "log a02": 0.1}, 0.1, (-1.5, 1.6), 0.02),
+        ),
         misfit=Misfit(0.4, {"curvature": 0.3, "fabric": 0.004}, "12 simulations"),
         drift=0.25,
         scale=(1.0, 1.0, 1.0),
         working_voxel=SCALE,
         length_unit="mm",
+        thickness=8 * SCALE,
         matches=matches,
         status="Supported: 1.6 < 2.2 & so on.",
         morphometry=NUMBERS,

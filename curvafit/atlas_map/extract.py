@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import json
+import math
 import time
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,23 +23,31 @@ from curvafit.data_synth.design import design_box
 from curvafit.data_synth.store import Record, Store, open_store
 from curvafit.generation.result import FORMED, is_well_formed
 from curvafit.generation.schedule import SCHEDULES, present_name
-from curvafit.geometry.descriptors import Descriptors, descriptors
-from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, diagrams
-from curvafit.geometry.mesh import NoSurface
+from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, diagram
 from curvafit.inference.atlas import Atlas
 from curvafit.inference.table import VIEWS, Table, load_table, parameters_of, save_table, to_row
 from curvafit.priors.grid import Grid
-from curvafit.volumes.field import ScanError
+from curvafit.scan.measure import Reading, read_texture, scan_diagram
+from curvafit.scan.prepare import prepare, thinner_thickness
+from curvafit.volumes.field import Field, ScanError
 
 #: Seconds between two writings of a table that grows.
 PAUSE = 60.0
 
-#: A row of a table: shape, view, parameters, descriptors.
-Row = tuple[str, str, np.ndarray, np.ndarray]
+#: A row of a table: its columns in their order.
+Row = tuple[str, str, np.ndarray, float, np.ndarray, float]
 #: A draw of a store.
 Drawn = tuple[Store, Record]
-#: What is measured of a shape: volume fraction of {u > 0}, diagram of the field, diagram of its mask.
-Measured = tuple[float, Diagram, Diagram]
+
+
+class Measured(NamedTuple):
+    """What is measured of a shape: the volume fraction of {u > 0}, its thickness in voxels, and the diagrams of the
+    field, and of its mask as that of a scan is measured."""
+
+    fraction: float
+    thickness: float
+    field: Diagram
+    mask: Diagram
 
 
 # ---- atlases ---------------------------------------------------------------------------------------------------------
@@ -88,23 +97,27 @@ def shape_id(store: Store, record: Record) -> str:
 
 
 def measure_shape(store: Store, record: Record) -> Measured:
-    """Return the volume fraction of {u > 0}, and the diagrams of field and mask, of one viable draw."""
-    field = torch.from_numpy(store.field(record.index))
-    grid = Grid(store.settings.shape, store.settings.spacing)
-    return float((field > 0).double().mean()), *diagrams(field, grid, store.settings.epsilon)
+    """Return the volume fraction of {u > 0}, its thickness, and the diagrams of field and mask, of one viable draw."""
+    field = store.field(record.index)
+    grid, epsilon = Grid(store.settings.shape, store.settings.spacing), store.settings.epsilon
+    mask = prepare(Field((field > 0).astype(np.uint8)), kind="mask", periodic=True, one_scale=True)
+    both = (diagram(torch.from_numpy(field), grid, epsilon), scan_diagram(mask))
+    thinned = (each.thin(BIN_WIDTH, TAIL_SHARE) for each in both)
+    return Measured(float((field > 0).mean()), thinner_thickness(field > 0), *thinned)
 
 
 def to_atlas(
     draws: Sequence[Drawn], shapes: Sequence[Drawn], measures: Sequence[Measured], command: Sequence[str] = ()
 ) -> Atlas:
     """Return the atlas of measured shapes, which are some of the draws."""
-    fractions, field_diagrams, mask_diagrams = zip(*measures, strict=True)
+    fractions, thicknesses, field_diagrams, mask_diagrams = zip(*measures, strict=True)
     return Atlas(
         ids=tuple(shape_id(store, record) for store, record in shapes),
         coefficients=np.array([list(record.coefficients) for _, record in shapes], dtype=np.float64),
         masses=np.array([record.mass for _, record in shapes]),
         seeds=np.array([record.seed for _, record in shapes], dtype=np.int64),
         volume_fractions=np.array(fractions),
+        thicknesses=np.array(thicknesses),
         field_diagrams=field_diagrams,
         mask_diagrams=mask_diagrams,
         provenance=_provenance(draws, command),
@@ -180,8 +193,9 @@ def describe(
     begun = load_table(path) if path.exists() and not overwrite else None
     provenance, rows = _table_provenance(begun, sources, command), []
     if begun is not None:
-        rows += zip(begun.shapes.tolist(), begun.views.tolist(), begun.parameters, begun.descriptors, strict=True)
-    present = {(shape, view) for shape, view, _, _ in rows}
+        rows += zip(begun.shapes.tolist(), begun.views.tolist(), begun.parameters, begun.thickness.tolist(),
+                    begun.descriptors, begun.amount.tolist(), strict=True)  # fmt: skip
+    present = {row[:2] for row in rows}
     jobs = [job for store in sources for job in _jobs(store, views, present)]
     if not jobs and not rows:
         raise ValueError(f"no well-formed shape in {', '.join(store.name for store in sources)}")
@@ -190,9 +204,10 @@ def describe(
     try:
         for count, shape in enumerate(collect_all(workers or ThisProcess(), requests), 1):
             rows += (
-                (shape["shape"], view, shape["parameters"], to_row(numbers).astype(np.float32))
-                for view, numbers in shape["views"].items()
-            )
+                (shape["shape"], view, shape["parameters"], shape["thickness"], to_row(reading).astype(np.float32),
+                 math.nan if reading is None else reading.amount)
+                for view, reading in shape["views"].items()
+            )  # fmt: skip
             progress(f"measured {count} of {len(jobs)} shapes", count / len(jobs))
             if time.monotonic() - last_save > PAUSE:
                 save_table(_to_table(rows, provenance), path)
@@ -209,7 +224,6 @@ def measure(path: Path, indices: Sequence[int], views: Sequence[str]) -> list[di
     A shape that is no longer in the store has no views. One that is damaged is a ValueError.
     """
     store = open_store(path)
-    grid, epsilon = Grid(store.settings.shape, store.settings.spacing), store.settings.epsilon
     rows = []
     for index in indices:
         rows.append({"shape": _shape(store, index), "views": {}})
@@ -218,17 +232,17 @@ def measure(path: Path, indices: Sequence[int], views: Sequence[str]) -> list[di
         except KeyError:
             continue
         rows[-1]["parameters"] = parameters_of(record.coefficients, record.mass)
-        rows[-1]["views"] = {name: _view_descriptors(u, grid, epsilon, name, record.seed) for name in views}
+        rows[-1]["thickness"] = thinner_thickness(u > 0)
+        rows[-1]["views"] = {name: _read_view(u, name, record.seed) for name in views}
     return rows
 
 
-def _view_descriptors(u: np.ndarray, grid: Grid, epsilon: float, name: str, seed: int) -> Descriptors | None:
-    """Return the descriptors of a field in one view, None where that shows no surface."""
-    rng = np.random.default_rng([seed, *name.encode()])
+def _read_view(u: np.ndarray, name: str, seed: int) -> Reading | None:
+    """Return what is read of a field in one view, as `infer` reads a scan; None where that shows no surface."""
     try:
-        view = VIEWS[name](u, grid, rng)
-        return descriptors(view.shape, view.grid, epsilon)
-    except (NoSurface, ScanError):
+        seen = VIEWS[name](u, np.random.default_rng([seed, *name.encode()]))
+        return read_texture(prepare(seen.scan, kind=seen.kind, periodic=seen.periodic, one_scale=True))
+    except ScanError:
         return None
 
 
@@ -248,9 +262,9 @@ def _table_provenance(table: Table | None, stores: Sequence[Store], command: Seq
 
 def _to_table(rows: Sequence[Row], provenance: dict[str, Any]) -> Table:
     """Return rows as a table."""
-    shapes, views, parameters, numbers = zip(*rows, strict=True) if rows else ((),) * 4
-    names = np.array(shapes, dtype=str), np.array(views, dtype=str)
-    return Table(*names, np.array(parameters), np.array(numbers), provenance)
+    shapes, views, *numbers = (np.array(column) for column in zip(*rows, strict=True)) if rows else [np.array(())] * 6
+    parameters, thickness, found, amount = numbers
+    return Table(shapes.astype(str), views.astype(str), parameters, thickness, found, amount, provenance)
 
 
 def _jobs(

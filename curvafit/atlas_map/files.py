@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.atlas_map.extract import measure_shape, read_draws, shape_id, to_atlas
+from curvafit.atlas_map.extract import Measured, measure_shape, read_draws, shape_id, to_atlas
 from curvafit.atlas_map.layout import AtlasMap, check_extra, check_size, diagram_distances, map_atlas
 from curvafit.atlas_map.page import Miniature, page_html, regrow_command, shrink
 from curvafit.atlas_map.picture import map_picture
@@ -82,7 +82,8 @@ def write_map(
     for done, (store, record) in enumerate(shapes):
         progress(f"measuring {len(shapes)} shapes", 0.6 * done / len(shapes))
         arrays = _measure_once(store, record, cache)
-        measures.append((float(arrays["fraction"]), *(_diagram(arrays, view) for view in ("field", "mask"))))
+        fraction, thickness = map(float, arrays["numbers"])
+        measures.append(Measured(fraction, thickness, _diagram(arrays, "field"), _diagram(arrays, "mask")))
         views.append(Miniature(arrays["thumbnail"].tobytes(), arrays["volume"].tobytes()))
     atlas = to_atlas(draws, shapes, measures)
     distances = _compare_once(atlas, cache, sub_progress(progress, 0.6, 0.85))
@@ -114,11 +115,11 @@ def _measure_once(store: Store, record: Record, cache: Path) -> _Arrays:
 
 def _measure(store: Store, record: Record) -> _Arrays:
     """Return what is measured and shown of a shape, as arrays."""
-    fraction, *diagrams = measure_shape(store, record)
+    measured = measure_shape(store, record)
     views = shrink(store.field(record.index))._asdict()
-    arrays = {"fraction": np.array(fraction)}
+    arrays = {"numbers": np.array([measured.fraction, measured.thickness])}
     arrays |= {name: np.frombuffer(view, dtype=np.uint8) for name, view in views.items()}
-    for view, diagram in zip(("field", "mask"), diagrams, strict=True):
+    for view, diagram in (("field", measured.field), ("mask", measured.mask)):
         figures = np.array([diagram.spread, diagram.excluded])
         arrays |= {f"{view}_points": diagram.points, f"{view}_weights": diagram.weights, f"{view}_figures": figures}
     return arrays

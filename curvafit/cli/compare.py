@@ -24,6 +24,9 @@ def compare(
     *,
     structure: Structure,
     reading: Reading,
+    laws: Annotated[
+        bool, typer.Option("--laws", help="Read each scan's law too: what it tells of six combinations of parameters.")
+    ] = False,
     primary: Annotated[str | None, typer.Option(help="One number named beforehand, tested alone: Tb.Th.")] = None,
     permutations: Annotated[int, typer.Option(help="Permutations of subjects; all where there are fewer.")] = 9999,
     seed: Annotated[int, typer.Option(help="Seed of the permutations, where not all are tried.")] = 0,
@@ -37,7 +40,8 @@ def compare(
 
         inputs = [place for place in (group_a, group_b, subjects) if place is not None]
         check_comparison(out, inputs, overwrite, command_line())
-        how = {"primary": primary, "permutations": permutations, "seed": seed, "workers": workers, "progress": progress}
+        how = {"laws": laws, "primary": primary, "permutations": permutations, "seed": seed}
+        how |= {"workers": workers, "progress": progress}
         comparison = compare_groups(group_a, group_b, subjects=subjects, **structure, **how, **reading)
         progress("drawing the page", 1.0)
         page = write_comparison(comparison, out, command=command_line(), overwrite=overwrite)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from curvafit.cli.console import command_line, print_table, say, say_notes, show_stages
-from curvafit.cli.options import OverwriteOption, Reading, Structure, Volume, command
+from curvafit.cli.options import FILES, OverwriteOption, Reading, Structure, command
 
 if TYPE_CHECKING:
     from curvafit.inference.infer import Inference
@@ -20,31 +20,40 @@ if TYPE_CHECKING:
     "curvafit infer cells.ome.zarr --channel 1 --crop 0:64,100:300,100:300 --dark --threshold 90 -o cells",
     "curvafit infer vessels.nii.gz --method match -o vessels",
     "curvafit infer fibres.raw --raw-shape 128,128,128 --dtype u1 -o fibres",
+    "curvafit infer mouse1.nii.gz mouse2.nii.gz mouse3.nii.gz --fast -o mice",
 )
 def infer(
-    scan: Volume,
-    out: Annotated[Path, typer.Option("-o", "--output", help="Folder for fit.json, report.html, regenerated.nii.gz.")],
+    scans: Annotated[list[str], typer.Argument(help=FILES)],
+    out: Annotated[Path, typer.Option("-o", "--output", help="Folder for the report; of several scans, for theirs.")],
     atlas: Annotated[Path | None, typer.Option(help="Atlas (.npz) instead of the packaged one.")] = None,
     posterior: Annotated[Path | None, typer.Option(help="Posterior (.npz) instead of the packaged one.")] = None,
     method: Annotated[str, typer.Option(help="posterior, or match: the nearest shape, refined.")] = "posterior",
     fast: Annotated[bool, typer.Option("--fast", help="Seconds, not minutes: nothing is grown or checked.")] = False,
+    test: Annotated[bool, typer.Option(help="Grow shapes to test whether the law can have made the scan.")] = True,
     roi: Annotated[Path | None, typer.Option(help="Mask of the region to measure, of the scan's shape.")] = None,
     *,
     structure: Structure,
     reading: Reading,
     seed: Annotated[int, typer.Option(help="Seed of the shapes that are generated for comparison.")] = 0,
+    workers: Annotated[int, typer.Option(help="Processes that infer several scans; 0 is this one.")] = 0,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Infer the parameters of a scanned volume, and write a report."""
+    """Infer the parameters of scanned volumes, and write a report of each; of several, a table and a page of all."""
     files = {"roi": roi, "atlas": atlas, "posterior": posterior}
     with show_stages() as progress:
         from curvafit.inference.infer import infer as infer_scan
+        from curvafit.report.laws import infer_scans
         from curvafit.report.page import check_report, with_command, write_inference
 
-        inputs = [scan, *(file for file in files.values() if file is not None)]
+        what = {**structure, **files, "method": method, "fast": fast, "test": test, "seed": seed, **reading}
+        if len(scans) > 1:
+            how = {"workers": workers, "command": command_line(), "overwrite": overwrite, "progress": progress}
+            page = infer_scans(scans, out, **how, **what)
+            say(str(page))
+            return
+        inputs = [*scans, *(file for file in files.values() if file is not None)]
         check_report(out, inputs, overwrite, command_line())
-        how = {"method": method, "fast": fast, "seed": seed, "progress": progress}
-        inference = infer_scan(scan, **structure, **files, **how, **reading)
+        inference = infer_scan(scans[0], progress=progress, **what)
         progress("drawing the report", 1.0)
         say_notes(inference.scan.notes)
         report = write_inference(with_command(inference, command_line()), out, overwrite=overwrite)
@@ -61,11 +70,11 @@ def _print_result(inference: Inference) -> None:
     fit = inference.fit
     say(f"{describe(inference)}.", style="bold")
     say(fit.status)
+    for each in fit.combinations:
+        say(str(each))
     if rows := parameter_table(inference):
         heads = ("", "working units", "±", "90 % of the posterior", f"with lengths in {fit.length_unit}")
         print_table(heads, rows, right=range(1, 5))
-    for sentence in fit.weak_directions:
-        say(sentence)
     if inference.twins:
         distances = [f"{TITLES.get(each.name, each.name)} {format_number(each.distance, 2)}" for each in fit.candidates]
         unit = format_length(fit.length, fit.length_unit, 3)

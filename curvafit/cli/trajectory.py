@@ -25,6 +25,9 @@ def trajectory(
     *,
     structure: Structure,
     reading: Reading,
+    laws: Annotated[
+        bool, typer.Option("--laws", help="Read each scan's law too: what it tells of six combinations of parameters.")
+    ] = False,
     permutations: Annotated[int, typer.Option(help="Orders of the scans to try; all where there are fewer.")] = 9999,
     seed: Annotated[int, typer.Option(help="Seed of the orders, where not all are tried.")] = 0,
     workers: Annotated[int, typer.Option(help="Processes that measure; 0 is this one.")] = 0,
@@ -38,7 +41,7 @@ def trajectory(
         from curvafit.studies.trajectory import trajectory as follow
 
         check_trajectory(out, scans, overwrite, command_line())
-        how = {"permutations": permutations, "seed": seed, "workers": workers, "progress": progress}
+        how = {"laws": laws, "permutations": permutations, "seed": seed, "workers": workers, "progress": progress}
         found = follow(scans, moments, unit_of_time=unit_of_time, **structure, **how, **reading)
         progress("drawing the page", 1.0)
         page = write_trajectory(found, out, command=command_line(), overwrite=overwrite)

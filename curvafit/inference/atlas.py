@@ -14,8 +14,9 @@ from curvafit.core.schema import Rule
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.distances import one_to_many, sliced_embedding, wasserstein
 from curvafit.priors.coefficients import Coefficients
+from curvafit.scan.prepare import WORKING_THICKNESS
 
-VERSION = 1
+VERSION = 2
 ATLAS_FILE = Format("curvafit atlas", VERSION, "an atlas file", remedy="extract it again from its store")
 #: How a shape can be seen: as its phase field, or as the mask {u > 0} re-profiled.
 SEEN_AS = ("field", "mask")
@@ -26,8 +27,9 @@ class Atlas:
     """N generated shapes: parameters in working units, and their geometric diagrams, binned.
 
     `ids` name the shapes; `coefficients` is float64 (N, 6) in the order of `curvafit.priors.coefficients.NAMES`,
-    `masses` m₀ and `volume_fractions` of {u > 0} float64 (N,), `seeds` int64 (N,) those of the noise each shape grew
-    from. `provenance` says how they were made: grid, schedule, law, versions, command, date.
+    `masses` m₀, `volume_fractions` of {u > 0} and `thicknesses` in voxels float64 (N,), `seeds` int64 (N,) those of the
+    noise each shape grew from. Masks are measured as scans are, on voxels of which they are eight thick. `provenance`
+    says how they were made: grid, schedule, law, versions, command, date.
     """
 
     ids: tuple[str, ...]
@@ -35,6 +37,7 @@ class Atlas:
     masses: np.ndarray
     seeds: np.ndarray
     volume_fractions: np.ndarray
+    thicknesses: np.ndarray
     field_diagrams: tuple[Diagram, ...]
     mask_diagrams: tuple[Diagram, ...]
     provenance: dict[str, Any]
@@ -43,7 +46,13 @@ class Atlas:
 
     def __post_init__(self) -> None:
         n = len(self.ids)
-        expected = {"coefficients": (n, 6), "masses": (n,), "seeds": (n,), "volume_fractions": (n,)}
+        expected = {
+            "coefficients": (n, 6),
+            "masses": (n,),
+            "seeds": (n,),
+            "volume_fractions": (n,),
+            "thicknesses": (n,),
+        }
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"expected {name} of shape {shape}, got {getattr(self, name).shape}")
@@ -80,7 +89,9 @@ def save_atlas(atlas: Atlas, path: str | Path) -> None:
     Points are stored in float16: κ is rounded by at most 2⁻¹¹ of itself (0.03 at 100), far below the bins' width of 2.
     Weights, as parts of a diagram's area, are stored in float32.
     """
-    arrays = {name: getattr(atlas, name) for name in ("coefficients", "masses", "seeds", "volume_fractions")}
+    arrays = {
+        name: getattr(atlas, name) for name in ("coefficients", "masses", "seeds", "volume_fractions", "thicknesses")
+    }
     for view in SEEN_AS:
         arrays |= {f"{view}_{name}": value for name, value in _pack_diagrams(atlas.diagrams(view)).items()}
     ATLAS_FILE.write(path, {"ids": list(atlas.ids), "provenance": atlas.provenance}, arrays)
@@ -125,6 +136,7 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Atlas
         masses=arrays["masses"],
         seeds=arrays["seeds"],
         volume_fractions=arrays["volume_fractions"],
+        thicknesses=arrays["thicknesses"],
         field_diagrams=_unpack_diagrams(arrays, "field"),
         mask_diagrams=_unpack_diagrams(arrays, "mask"),
         provenance=header["provenance"],
@@ -147,7 +159,7 @@ def _unpack_diagrams(arrays: dict[str, np.ndarray], view: str) -> tuple[Diagram,
 class Match:
     """A shape of an atlas, and the Wasserstein distance of its diagram to the query's (1 / working unit).
 
-    `coefficients` (working units), `mass` m₀ and the noise `seed` made the shape.
+    `coefficients` (working units), `mass` m₀ and the noise `seed` made the shape, `thickness` of its voxels thick.
     """
 
     id: str
@@ -155,6 +167,7 @@ class Match:
     coefficients: Coefficients
     mass: Annotated[float, Rule(above=-1, below=1)]
     seed: Annotated[int, Rule(least=0)]
+    thickness: Annotated[float, Rule(above=0)] = WORKING_THICKNESS
 
 
 def mirror_match(match: Match) -> Match:
@@ -202,6 +215,7 @@ def nearest(
             coefficients=atlas.shape_coefficients(near[k]),
             mass=float(atlas.masses[near[k]]),
             seed=int(atlas.seeds[near[k]]),
+            thickness=float(atlas.thicknesses[near[k]]),
         )
         for k in np.argsort(distances, kind="stable")[:count]
     ]

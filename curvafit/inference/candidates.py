@@ -7,26 +7,21 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-import torch
 
 from curvafit.core.schema import Rule
 from curvafit.generation.flow import Flow, generate
 from curvafit.generation.schedule import LEARNED, Schedule
-from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.distances import one_to_many
-from curvafit.geometry.mesh import NoSurface
 from curvafit.geometry.morphometry import Morphometry, morphometry
 from curvafit.priors.coefficients import NAMES, Coefficients
-from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.priors.profile import phase_field
-from curvafit.scan.prepare import Prepared
+from curvafit.priors.grid import Grid
+from curvafit.scan.measure import scan_diagram
+from curvafit.scan.prepare import Prepared, thinner_thickness
 from curvafit.volumes.field import ScanError
 
 #: Greatest mass of either sign: a rare structure's field lies a little beyond ±1 in the mean.
 RARE = 1 - 1e-6
-#: Twins within this many seeds' distances of the scan support their law: true laws' twins lie one away, of a badly
-#: degraded scan some 1.8.
-CLOSE = 2.0
 #: Where a law comes from, as people read it.
 TITLES = {
     "refined": "refined by simulation",
@@ -36,8 +31,8 @@ TITLES = {
     "stationarity": "refined by stationarity",
     "match": "nearest match",
 }
-#: Longest edge, in working voxels, of the boxes in which twins grow.
-LONGEST_EDGE = 100
+#: Edges, in voxels, of the boxes in which twins grow.
+EDGES = (32, 100)
 
 NotNegative = Annotated[float, Rule(least=0)]
 #: Standard deviations by coefficient, and of the mass.
@@ -57,6 +52,9 @@ class Candidate:
         Where the law comes from: a key of `TITLES`.
     uncertainty
         Standard deviations by coefficient, and of the mass where it has one; empty where they are not known.
+    thickness
+        How many of their own voxels the law's shapes are thick: its twins once they are grown. None where that is not
+        known, or the law is of a phase field's own voxels.
     distance
         Mean distance of its twins' curvature diagrams from the scan's, 1 / working unit; None where none grew.
     seed_noise
@@ -71,6 +69,7 @@ class Candidate:
     coefficients: Coefficients
     mass: Annotated[float, Rule(above=-1, below=1)]
     uncertainty: Deviations
+    thickness: Annotated[float | None, Rule(above=0)] = None
     distance: Annotated[float | None, Rule(least=0)] = None
     seed_noise: Annotated[float | None, Rule(least=0)] = None
     twins: tuple[Morphometry, ...] = ()
@@ -87,24 +86,22 @@ class Candidate:
         numbers = tuple(each.morphometry for each in twins if each.morphometry is not None)
         mass = float(np.clip(np.mean([each.mass for each in twins if each.phase is not None]), -RARE, RARE))
         known = {name: value for name, value in self.uncertainty.items() if name != "mass" or mass == self.mass}
-        return replace(self, mass=mass, uncertainty=known, distance=distance, seed_noise=noise, twins=numbers)
+        thickness = float(np.mean([thinner_thickness(each.phase > 0) for each in twins if each.phase is not None]))
+        found = replace(self, mass=mass, uncertainty=known, thickness=thickness)
+        return replace(found, distance=distance, seed_noise=noise, twins=numbers)
 
 
 def best_candidate(candidates: Sequence[Candidate]) -> Candidate | None:
     """Return the first candidate within seed noise of the one nearest to the scan; None where nothing grew.
 
-    The noise is the distance between the nearest candidate's twins. Of the candidates within it, the first is preferred
-    whose twins lie at most `CLOSE` times as far from the scan as from each other: where the seeds of a law are more
-    alike than that, the scan is another texture.
+    The noise is the distance between the nearest candidate's twins.
     """
     grown = [(each.distance, each) for each in candidates if each.distance is not None]
     if not grown:
         return None
     least, nearest = min(grown, key=lambda pair: pair[0])
     reach = least + (nearest.seed_noise or 0.0)
-    within = [(distance, each) for distance, each in grown if distance <= reach]
-    close = (each for distance, each in within if each.seed_noise is None or distance <= CLOSE * each.seed_noise)
-    return next(close, within[0][1])
+    return next(each for distance, each in grown if distance <= reach)
 
 
 def seed_noise_of(candidates: Sequence[Candidate]) -> float | None:
@@ -118,8 +115,8 @@ def seed_noise_of(candidates: Sequence[Candidate]) -> float | None:
 class Twin:
     """A shape grown from a law, or the reason why none grew.
 
-    `phase` and `mass` are the shape's own. `diagram` and `morphometry` are measured as the scan's were: with its blur
-    and noise, and in a window where the scan is one.
+    `phase` and `mass` are the shape's own. `seen` is the shape as the scan would show it, with its blur and noise;
+    `diagram` and `morphometry` are measured of that.
     """
 
     phase: np.ndarray | None
@@ -127,42 +124,41 @@ class Twin:
     diagram: Diagram | None
     morphometry: Morphometry | None
     reason: str = ""
+    seen: Prepared | None = None
 
 
 def twin(
-    coefficients: Coefficients, mass: float, prepared: Prepared, seed: int, schedule: Schedule | str = LEARNED
+    law: Candidate, prepared: Prepared, seed: int, schedule: Schedule | str = LEARNED, longest: int = EDGES[1]
 ) -> Twin:
-    """Grow a shape of a law in a box of the scan's main window, at most `LONGEST_EDGE` voxels a side.
+    """Grow a shape of a law in a box as many thicknesses long as the scan's main window, within `EDGES` voxels.
 
     A mask or an image does not state a mass: the shape fills as much of its box as the structure does
     (`Prepared.true_volume_fraction`), or has the law's own mass where nothing grows so.
     """
-    z, y, x = (min(edge.stop - edge.start, LONGEST_EDGE) for edge in prepared.windows[0])
+    ratio = 1.0 if law.thickness is None else law.thickness / prepared.thickness
+    z, y, x = (int(np.clip(ratio * (edge.stop - edge.start), EDGES[0], longest)) for edge in prepared.windows[0])
     grid = Grid((z, y, x), prepared.grid.spacing, "periodic")
     options = {"schedule": schedule, "seed": seed, "reject_early": True}
     if prepared.kind != "field":
         share = prepared.true_volume_fraction
-        flow = generate(coefficients, mass, grid, volume_fraction=share, **options)
+        flow = generate(law.coefficients, law.mass, grid, volume_fraction=share, **options)
         if (grown := _measure_twin(flow, prepared, seed)).phase is not None:
             return grown
-    return _measure_twin(generate(coefficients, mass, grid, **options), prepared, seed)
+    return _measure_twin(generate(law.coefficients, law.mass, grid, **options), prepared, seed)
 
 
 def _measure_twin(flow: Flow, prepared: Prepared, seed: int) -> Twin:
     """Return a flow's shape with its diagram and numbers, as the scan would show it."""
     if not flow.viability.viable:
         return Twin(None, flow.mass, None, None, flow.viability.reason)
+    field = flow.field.numpy()
     try:
-        mask, field = flow.field.numpy() > 0, flow.field
-        window = Grid(flow.grid.shape, flow.grid.spacing, prepared.grid.boundary)
-        if prepared.kind != "field":
-            mask = prepared.rescan(mask, seed)
-            field = phase_field(torch.from_numpy(mask), window, WORKING_EPSILON)
-        curvature = diagram(field, window, WORKING_EPSILON)
-    except (NoSurface, ScanError) as error:
+        seen = prepared.scan_alike(field, seed)
+        curvature = scan_diagram(seen)
+    except (ValueError, ScanError) as error:
         return Twin(None, flow.mass, None, None, str(error))
-    numbers = morphometry(mask, prepared.working_voxel, prepared.unit, periodic=window.periodic)
-    return Twin(flow.field.numpy(), flow.mass, curvature, numbers)
+    numbers = morphometry(seen.mask, seen.working_voxel, seen.unit, periodic=seen.grid.periodic)
+    return Twin(field, flow.mass, curvature, numbers, seen=seen)
 
 
 @dataclass(frozen=True)

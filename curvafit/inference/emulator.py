@@ -1,8 +1,7 @@
 """The emulator: from parameters to the descriptors of the shapes that they grow; and the parameters that fit best.
 
 It states a mean, by an ensemble of small networks, and a covariance between seeds, from what the networks miss. So the
-likelihood of descriptors has exact derivatives by the parameters, and says in which directions a texture leaves its
-parameters open.
+likelihood of descriptors has exact derivatives by the parameters.
 """
 
 from __future__ import annotations
@@ -14,18 +13,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from curvafit.core.units import format_number
 from curvafit.inference.stationarity import double_precision_on_cpu
-from curvafit.inference.table import PARAMETERS, Compression
+from curvafit.inference.table import PARAMETERS, Compression, encode_seen
+from curvafit.scan.measure import Reading
 
 #: Most steps from a start.
 STEPS = 60
 #: Least deviation between seeds, of a direction whose mean one is 1.
 FAINTEST = 0.05
-#: A direction is weak where the descriptors leave more than this part of the prior's deviation open.
-WEAK = 0.7
-#: A direction's least share of a parameter that is named, and normal deviations of a 90 % interval.
-NAMED, NINETY = 0.35, 1.645
 
 
 class Layer(NamedTuple):
@@ -72,22 +67,18 @@ class Emulator:
     basis: np.ndarray
     inflation: float
 
-    def __call__(self, parameters: np.ndarray, view: str) -> Emulated:
-        """Return the mean and deviations of the compressed descriptors of parameters `(N, 6)`."""
-        inputs = self.inputs(parameters, view)
+    def __call__(self, parameters: np.ndarray, views: np.ndarray, amount: np.ndarray) -> Emulated:
+        """Return the mean and deviations of the compressed descriptors of parameters `(N, 6)`, each seen in a view, and
+        so much of it; or all alike, where those have one element."""
+        inputs = self.inputs(parameters, views, amount)
         mean, spread = forward(self.mean, inputs).mean(0), forward(self.spread, inputs).mean(0)
         return Emulated(mean, np.maximum(np.exp(spread), FAINTEST))
 
-    def inputs(self, parameters: np.ndarray, view: str) -> np.ndarray:
-        """Return what the networks read: the parameters in deviations of the prior, and the kind of view."""
+    def inputs(self, parameters: np.ndarray, views: np.ndarray, amount: np.ndarray) -> np.ndarray:
+        """Return what the networks read: the parameters in deviations of the prior, how much is seen, and in what."""
         scaled = (np.atleast_2d(parameters) - self.centre) / self.deviation
-        return np.concatenate([scaled, np.repeat(self.encode_view(view)[None], len(scaled), 0)], 1)
-
-    def encode_view(self, view: str) -> np.ndarray:
-        """Return a number for each kind of view: 1 for this one, 0 for the others."""
-        if view not in self.views:
-            raise ValueError(f"expected views among {', '.join(self.views)}, got {view}")
-        return (np.array(self.views) == view).astype(float)
+        seen = encode_seen(self.views, views, amount)
+        return np.concatenate([scaled, np.broadcast_to(seen, (len(scaled), seen.shape[1]))], 1)
 
     @property
     def centre(self) -> np.ndarray:
@@ -99,34 +90,30 @@ class Emulator:
         """Return the deviations `(6,)` of parameters uniform in the box."""
         return (self.box[:, 1] - self.box[:, 0]) / np.sqrt(12)
 
-    def slopes(self, parameters: np.ndarray, view: str) -> np.ndarray:
+    def slopes(self, parameters: np.ndarray, views: np.ndarray, amount: np.ndarray) -> np.ndarray:
         """Return the derivatives `(N, k, 6)` of the whitened mean by parameters `(N, 6)` in deviations of the prior."""
         with double_precision_on_cpu():
             import jax.numpy as jnp
 
-            places = jnp.asarray(self.inputs(parameters, view))
+            places = jnp.asarray(self.inputs(parameters, views, amount))
             slopes = np.asarray(_jacobian()(_as_jax(self.mean), places))[..., : len(PARAMETERS)]
-        return (self.basis @ slopes) / self(parameters, view).deviation[..., None]
+        return (self.basis @ slopes) / self(parameters, views, amount).deviation[..., None]
 
 
-def best_parameters(
-    emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the parameters `(6,)` of greatest posterior density given a row of descriptors, and their covariance.
+def best_parameters(emulator: Emulator, reading: Reading, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the parameters `(6,)` of greatest posterior density given a reading, and their covariance.
 
     Levenberg and Marquardt's method from many starts, with exact derivatives in float64, by optimistix. The covariance
     `(6, 6)` is Laplace's approximation. Both are in working units (`PARAMETERS`); the box is the prior.
 
     Parameters
     ----------
-    descriptors
-        `(351,)`.
     starts
         `(n, 6)`: parameters to start from, such as draws of a posterior; the covariance between seeds is the mean of
         theirs.
     """
-    row = np.atleast_2d(descriptors)
-    parameters, slopes, _, values = _minimise(emulator, row, view, np.asarray(starts, dtype=np.float64)[None])
+    seen = reading.columns
+    parameters, slopes, _, values = _minimise(emulator, *seen, np.asarray(starts, dtype=np.float64)[None])
     best = int(values[0].argmin())
     slope, deviation = slopes[0, best], emulator.deviation
     # In deviations of the prior, whose own precision is 1.
@@ -134,27 +121,14 @@ def best_parameters(
     return parameters[0, best], np.outer(deviation, deviation) * covariance
 
 
-def describe_weak_directions(emulator: Emulator, parameters: np.ndarray, covariance: np.ndarray) -> tuple[str, ...]:
-    """Return sentences on the directions known up to more than `WEAK` of the prior's deviation, the weakest first."""
-    # In direction v of singular value s the posterior's deviation is 1 / √(1 + s²) of the prior's, so a direction that
-    # the descriptors do not see keeps the prior's.
-    variances, directions = np.linalg.eigh(covariance / np.outer(emulator.deviation, emulator.deviation))
-    weak = []
-    for spread, direction in zip(np.sqrt(variances[::-1]), directions.T[::-1], strict=True):
-        if spread > WEAK:
-            direction = direction * np.sign(direction[np.abs(direction).argmax()])
-            step = NINETY * spread * direction * emulator.deviation
-            ends = [np.clip(parameters + sign * step, *emulator.box.T) for sign in (-1, 1)]
-            weak.append(_describe_direction(direction, ends))
-    return tuple(weak)
-
-
-def misfits(emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.ndarray) -> np.ndarray:
+def misfits(
+    emulator: Emulator, descriptors: np.ndarray, views: np.ndarray, amount: np.ndarray, starts: np.ndarray
+) -> np.ndarray:
     """Return the sums of squares `(N,)` of whitened descriptors that the best parameters leave unexplained.
 
-    Rows of descriptors are `(N, 351)`, the starts of each `(N, n, 6)`.
+    Rows of descriptors are `(N, 351)`, of views and how much was seen `(N,)`, the starts of each `(N, n, 6)`.
     """
-    _, _, left, values = _minimise(emulator, descriptors, view, starts)
+    _, _, left, values = _minimise(emulator, descriptors, views, amount, starts)
     return left[np.arange(len(descriptors)), values.argmin(1)]
 
 
@@ -177,7 +151,7 @@ def _tanh(values: Any) -> Any:
 
 
 def _minimise(
-    emulator: Emulator, descriptors: np.ndarray, view: str, starts: np.ndarray
+    emulator: Emulator, descriptors: np.ndarray, views: np.ndarray, amount: np.ndarray, starts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return where the solver ends, for N rows of descriptors from n starts `(N, n, 6)` each.
 
@@ -185,7 +159,8 @@ def _minimise(
     squares, and twice the negative log posterior.
     """
     target = emulator.compression(descriptors)
-    emulated = emulator(starts.reshape(-1, starts.shape[-1]), view)
+    each = [np.repeat(column, starts.shape[1]) for column in (views, amount)]
+    emulated = emulator(starts.reshape(-1, starts.shape[-1]), *each)
     deviation = np.sqrt(np.square(emulated.deviation).reshape(*starts.shape[:2], -1).mean(1))
     low, high = emulator.box.T
     share = np.clip((starts - low) / (high - low), 0.01, 0.99)
@@ -193,7 +168,13 @@ def _minimise(
         import jax.numpy as jnp
 
         deviation *= np.sqrt(emulator.inflation)
-        rest = (emulator.basis, target, deviation, emulator.encode_view(view), np.log(share / (1 - share)))
+        rest = (
+            emulator.basis,
+            target,
+            deviation,
+            encode_seen(emulator.views, views, amount),
+            np.log(share / (1 - share)),
+        )
         ends = _minimiser()(_as_jax(emulator.mean), *(jnp.asarray(part, float) for part in rest))
         free, jacobian, misfit, value = (np.asarray(part) for part in ends)
     return low + (high - low) / (1 + np.exp(-free)), jacobian, misfit, value
@@ -257,17 +238,4 @@ def _minimiser() -> Callable[..., Any]:
         return free, slope, jnp.sum(left**2), jnp.sum(residual(free, args) ** 2)
 
     starts = jax.vmap(minimise, (None, None, None, None, None, 0))
-    return jax.jit(jax.vmap(starts, (None, None, 0, 0, None, 0)))
-
-
-def _describe_direction(direction: np.ndarray, ends: list[np.ndarray]) -> str:
-    """Return a sentence on a direction, in deviations of the prior, that is open between two ends `(6,)`."""
-    chosen = [k for k in np.argsort(-np.abs(direction)) if abs(direction[k]) >= NAMED] or [
-        int(np.abs(direction).argmax())
-    ]
-    low, high = (", ".join(f"{PARAMETERS[k]} {format_number(float(end[k]), 2)}" for k in chosen) for end in ends)
-    names = [PARAMETERS[k] for k in chosen]
-    together = ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else names[0]
-    steps = ", ".join(f"{direction[k]:+.1f}" for k in chosen)
-    by = f" together by ({steps})" if len(names) > 1 else ""
-    return f"{together}{by}: anything from {low} to {high} grows this texture."
+    return jax.jit(jax.vmap(starts, (None, None, 0, 0, 0, 0)))

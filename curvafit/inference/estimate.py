@@ -6,47 +6,43 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
+from scipy.spatial.distance import cdist
 
-from curvafit.core.runtime import Progress, sub_progress
+from curvafit.core.permutation import measure_energy, relabel, share_beyond
+from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.generation.flow import generate
-from curvafit.generation.schedule import Schedule
-from curvafit.geometry.descriptors import BLOCKS, descriptors
-from curvafit.geometry.mesh import NoSurface
+from curvafit.generation.schedule import LEARNED, Schedule
+from curvafit.geometry.descriptors import BLOCKS
 from curvafit.inference.atlas import Match
-from curvafit.inference.candidates import Candidate, Misfit
-from curvafit.inference.emulator import best_parameters, describe_weak_directions, misfits
+from curvafit.inference.candidates import Candidate, Misfit, twin
+from curvafit.inference.emulator import best_parameters, misfits
 from curvafit.inference.fit import COLUMNS, Fit, to_columns
 from curvafit.inference.posterior import Posterior
 from curvafit.inference.simulate import Search, Simulate, simulate_draws
 from curvafit.inference.table import (
-    PARAMETERS,
-    VIEWS,
     column_names,
     columns_of,
     law_of,
     mirror_parameters,
     parameters_of,
-    to_row,
 )
 from curvafit.priors.grid import Grid
-from curvafit.scan.measure import scan_descriptors
+from curvafit.scan.measure import Reading, read_texture
 from curvafit.scan.prepare import HALF, Prepared
 from curvafit.volumes.field import ScanError
 
 #: Draws from the posterior, and those among which more are chosen to be grown.
 DRAWS, POOL = 400, 2000
-#: Edges, in working voxels, of the boxes in which draws are grown.
-EDGES = (32, 64)
-#: Draws by which a row is summarised in `check`, and those of them from which the best parameters are looked for.
-SUMMARY_DRAWS, STARTS = 64, 8
-#: Least simulations to compare with.
+#: Edge, in voxels, of the boxes in which draws are grown.
+EDGE = 64
+#: Draws from which the best parameters are looked for.
+STARTS = 8
+#: Least simulations to go on from, and least shapes to test a law with.
 FEWEST = 6
-#: Simulations that the prior of a block's regression on the summaries counts as, and least deviation of a column, of
-#: the mean of its block's.
-RIDGE, FAINTEST = 3.0, 0.05
-#: Squares added to what is unexplained, so that a perfect fit has a logarithm.
-FLOOR = 0.1
+#: Shapes that a law is tested with, and the least deviation of a column, of the mean of its block's.
+TESTED, FAINTEST = 24, 0.05
+#: Most relabellings of windows that are tried; where there are fewer, all of them are.
+RELABELLED = 1999
 
 
 def estimate_law(
@@ -70,7 +66,7 @@ def estimate_law(
     Returns
     -------
     tuple
-        The fit with draws, weak directions, misfit and candidates, the most trusted first; the same fit where the
+        The fit with draws, combinations and candidates, the most trusted first; the same fit where the
         descriptors cannot be measured. And by block of descriptors the scan's numbers `(k,)` and those of the
         simulations `(n, k)`; None without simulations.
     """
@@ -78,35 +74,36 @@ def estimate_law(
     if (found := _measure_descriptors(prepared)) is None:
         return fit, None
     # Of a structure that fills over half, the background is described: `turn` gives the law of the structure.
-    seen, row, view, turn = found
+    seen, reading, turn = found
     progress("reading the posterior", 0.1)
-    parameters = posterior.sample(row, view, DRAWS, seed)
-    best = best_parameters(posterior.emulator, row, view, parameters[:STARTS])
-    other = "Of the other phase: " if turn is mirror_parameters else ""
-    weak = tuple(other + each for each in describe_weak_directions(posterior.emulator, *best))
-    fit = replace(fit, draws=turn(parameters), view=view, weak_directions=weak)
-    likely = Candidate("posterior", *law_of(turn(middle_of(parameters))), _deviations(turn(parameters)))
-    simulate = _simulator(seen, view, schedule)
+    draws = posterior.draw(reading, DRAWS, seed)
+    parameters = draws[:, :-1]
+    best = best_parameters(posterior.emulator, reading, parameters[:STARTS])
+    told = posterior.combinations.read(parameters, background=turn is mirror_parameters)
+    fit = replace(fit, draws=np.column_stack([turn(parameters), draws[:, -1]]), view=reading.view, combinations=told)
+    thickness = float(np.exp(np.median(draws[:, -1])))
+    likely = Candidate("posterior", *law_of(turn(middle_of(parameters))), _deviations(turn(parameters)), thickness)
+    simulate = _simulator(seen, reading.view, schedule)
     grown = None
     if simulations:
         part = sub_progress(progress, 0.15, 0.45)
         grown = simulate_draws(parameters, simulate, simulations, seed=seed, progress=part)
     if grown is None or len(grown.parameters) < FEWEST:
-        left = misfits(posterior.emulator, row[None], view, parameters[None, :STARTS])[0]
-        misfit = Misfit(tail_probability(posterior, view, left), {}, "by the best fit, nothing grown")
-        return replace(fit, misfit=misfit, candidates=(likely, _best_fit(posterior, *best, turn))), None
-    pool = posterior.sample(row, view, POOL, seed)
-    search = Search(posterior.emulator, view, row)
+        left = misfits(posterior.emulator, *reading.columns, parameters[None, :STARTS])[0]
+        misfit = Misfit(tail_probability(posterior, reading.view, left), {}, "by the best fit, nothing grown")
+        return replace(fit, misfit=misfit, candidates=(likely, _best_fit(posterior, *best, turn, thickness))), None
+    pool = posterior.draw(reading, POOL, seed)[:, :-1]
+    search = Search(posterior.emulator, reading)
     part = sub_progress(progress, 0.45, 1.0)
     likeliest, every = search.run(pool, grown, simulate, rounds=rounds, seed=seed, progress=part)
     near = every.parameters[search.nearest(every)[0]]
     refined, simulation = (
-        Candidate(name, *law_of(turn(each)), {}) for name, each in (("refined", likeliest), ("simulation", near))
+        Candidate(name, *law_of(turn(each)), {}, thickness)
+        for name, each in (("refined", likeliest), ("simulation", near))
     )
-    names = np.array(column_names())
-    blocks = {name: (row[names == name], grown.descriptors[:, names == name]) for name in BLOCKS}
-    misfit = check(posterior, row, view, grown.descriptors)
-    return replace(fit, misfit=misfit, candidates=(refined, likely, simulation)), blocks
+    names, row, rows = np.array(column_names()), reading.descriptors, grown.columns[0]
+    blocks = {name: (row[names == name], rows[:, names == name]) for name in BLOCKS}
+    return replace(fit, candidates=(refined, likely, simulation)), blocks
 
 
 def refine_matches(prepared: Prepared, posterior: Posterior, matches: Sequence[Match]) -> tuple[Candidate, ...]:
@@ -117,9 +114,10 @@ def refine_matches(prepared: Prepared, posterior: Posterior, matches: Sequence[M
     """
     if (found := _measure_descriptors(prepared)) is None:
         return ()
-    _, row, view, turn = found
+    _, reading, turn = found
     starts = turn(np.stack([parameters_of(each.coefficients, each.mass) for each in matches]))
-    return (_best_fit(posterior, *best_parameters(posterior.emulator, row, view, starts), turn),)
+    best = best_parameters(posterior.emulator, reading, starts)
+    return (_best_fit(posterior, *best, turn, matches[0].thickness),)
 
 
 def middle_of(parameters: np.ndarray) -> np.ndarray:
@@ -132,52 +130,48 @@ def middle_of(parameters: np.ndarray) -> np.ndarray:
 Turn = Callable[[np.ndarray], np.ndarray]
 
 
-def _measure_descriptors(prepared: Prepared) -> tuple[Prepared, np.ndarray, str, Turn] | None:
-    """Return the phase that is described, its row of descriptors and kind of view, and the way to the structure's law.
+def _measure_descriptors(prepared: Prepared) -> tuple[Prepared, Reading, Turn] | None:
+    """Return the phase that is described, what is read of it, and the way to the structure's law.
 
     Of a structure that fills most of the volume the background is described, as the shapes of the training were thin.
     """
     turned = prepared.volume_fraction > HALF
     seen = prepared.inverted if turned else prepared
-    measured = scan_descriptors(seen)
-    if measured is None:
-        return None
-    return seen, *measured, mirror_parameters if turned else np.asarray
+    reading = read_texture(seen)
+    return None if reading is None else (seen, reading, mirror_parameters if turned else np.asarray)
 
 
-def _best_fit(posterior: Posterior, best: np.ndarray, covariance: np.ndarray, turn: Turn) -> Candidate:
+def _best_fit(
+    posterior: Posterior, best: np.ndarray, covariance: np.ndarray, turn: Turn, thickness: float
+) -> Candidate:
     """Return the best fit of the descriptors, with deviations by draws from the normal distribution around it."""
     near = np.random.default_rng(0).multivariate_normal(best, covariance, DRAWS, check_valid="ignore")
-    return Candidate("optimum", *law_of(turn(best)), _deviations(turn(np.clip(near, *posterior.box.T))))
+    return Candidate(
+        "optimum", *law_of(turn(best)), _deviations(turn(np.clip(near, *posterior.emulator.box.T))), thickness
+    )
 
 
 def _deviations(parameters: np.ndarray) -> dict[str, float]:
     """Return the standard deviations by name, 0 for a20, of parameters `(n, 6)`."""
-    return {"a20": 0.0} | dict(zip(COLUMNS, to_columns(parameters).std(1).tolist(), strict=True))
+    return {"a20": 0.0} | dict(zip(COLUMNS, to_columns(parameters).std(1).tolist(), strict=False))
 
 
 def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simulate:
     """Return a function that grows a shape from parameters and measures its descriptors as the scan's were measured.
 
-    Blur, noise and window are the scan's own. Shapes grow in a periodic box of the main window's size, within `EDGES`.
+    Shapes grow in the periodic boxes of the training, and are scanned as the scan was.
     """
-    z, y, x = (int(np.clip(edge.stop - edge.start, *EDGES)) for edge in prepared.windows[0])
-    grid = Grid((z, y, x), prepared.grid.spacing, "periodic")
-    # A window of something larger loses what its faces cut; a box that repeats loses nothing.
-    apply_view = VIEWS["mask" if prepared.part(prepared.windows[0]).periodic else "crop"]
+    grid = Grid((EDGE, EDGE, EDGE))
 
-    def simulate(parameters: np.ndarray, seed: int) -> np.ndarray:
+    def simulate(parameters: np.ndarray, seed: int) -> Reading | None:
         flow = generate(*law_of(parameters), grid, schedule=schedule, seed=seed, reject_early=True)
         if not flow.viability.viable:
-            return to_row(None)
-        field = flow.field.numpy()
+            return None
         try:
-            if view == "field":
-                return descriptors(field, grid).vector()
-            seen = apply_view(prepared.rescan(field > 0, seed), grid, np.random.default_rng(seed))
-            return descriptors(*seen).vector()
-        except (ScanError, NoSurface):
-            return to_row(None)
+            reading = read_texture(prepared.scan_alike(flow.field.numpy(), seed))
+        except ScanError:
+            return None
+        return None if reading is None else reading._replace(view=view)
 
     return simulate
 
@@ -188,44 +182,55 @@ def tail_probability(posterior: Posterior, view: str, misfit: float) -> float:
     return float((1 + (usual >= misfit).sum()) / (1 + len(usual)))
 
 
-def check(posterior: Posterior, descriptors: np.ndarray, view: str, simulated: np.ndarray) -> Misfit:
-    """Compare a row of descriptors `(351,)` with those of simulations of the posterior's draws `(n, 351)`.
+def check_law(
+    law: Candidate,
+    prepared: Prepared,
+    posterior: Posterior,
+    *,
+    count: int = TESTED,
+    seed: int = 0,
+    schedule: Schedule | str = LEARNED,
+    progress: Progress = silent,
+) -> Misfit | None:
+    """Compare a scan's windows with those of shapes of a law, seen as the scan is (`compare_windows`).
 
-    The probability of a block is that of its residual from a linear regression on the posterior's mean; it is cautious.
-    Raises ValueError if there are fewer than `FEWEST` simulations.
+    Returns None where the scan's descriptors cannot be measured, or fewer than `FEWEST` of `count` shapes grow.
     """
-    if len(simulated) < FEWEST:
-        raise ValueError(f"expected at least {FEWEST} simulations to compare with, got {len(simulated)}")
-    rows = np.concatenate([np.atleast_2d(descriptors), simulated])
-    draws = posterior.sample(rows, view, SUMMARY_DRAWS)
-    left = np.log(misfits(posterior.emulator, rows, view, draws[:, :STARTS]) + FLOOR)
-    summaries = posterior.standardise(draws).mean(1)
-    blocks = {name: _tail(_residuals(columns_of(rows, [name]), summaries)) for name in BLOCKS}
-    return Misfit(_tail(left), blocks, f"{len(simulated)} shapes grown from draws")
+    if (found := _measure_descriptors(prepared)) is None:
+        return None
+    seen, reading, _ = found
+    turned, rows = seen is not prepared, []
+    for k in range(count):
+        grown = twin(law, prepared, seed + k, schedule, longest=EDGE)
+        if grown.seen is not None:
+            own = read_texture(grown.seen.inverted if turned else grown.seen)
+            rows += [] if own is None else [own.windows]
+        progress(f"testing the law: {k + 1} of {count} shapes", (k + 1) / count)
+    return None if len(rows) < FEWEST else compare_windows(posterior, reading.windows, np.concatenate(rows))
 
 
-def _tail(values: np.ndarray) -> float:
-    """Return the probability that a value of the same normal distribution as the rest exceeds the first."""
-    first, rest = values[0], values[1:]
-    score = (first - rest.mean()) / (rest.std(ddof=1) * np.sqrt(1 + 1 / len(rest)) + 1e-9)
-    return float(stats.t.sf(score, len(rest) - 1))
+def probability_alike(scan: np.ndarray, twins: np.ndarray, seed: int = 0) -> float:
+    """Return the probability that windows of one texture differ as much as a scan's `(k, d)` and its twins' `(n, d)`.
 
-
-def _residuals(rows: np.ndarray, summaries: np.ndarray) -> np.ndarray:
-    """Return the leave-one-out residual of each row, regressed on its summary; the query, row 0, is never in the fit.
-
-    It is the logarithm of the mean square over columns, in deviations of the other rows.
+    The statistic is the energy distance of both sets. If all windows are of one law, each choice of some of them for
+    the scan's was as likely, so that values up to p come up with probability p: of a single window this is the scan's
+    rank among the twins. Where not all choices are tried, some are drawn, by a seed.
     """
-    values = []
-    for k in range(len(rows)):
-        rest = np.delete(np.arange(1, len(rows)), k - 1) if k else np.arange(1, len(rows))
-        mean, scale = summaries[rest].mean(0), summaries[rest].std(0) + 1e-9
-        regressors = (summaries - mean) / scale
-        away = rows - rows[rest].mean(0)
-        X = regressors[rest]
-        slope = np.linalg.solve(X.T @ X + RIDGE * np.eye(len(PARAMETERS)), X.T @ away[rest])
-        left = away - regressors @ slope
-        deviation = left[rest].std(0, ddof=1)
-        deviation = np.maximum(deviation, FAINTEST * deviation.mean() + 1e-12)
-        values.append(np.log(np.square(left[k] / deviation).mean() + 1e-12))
-    return np.array(values)
+    rows = np.concatenate([scan, twins])
+    choices, _ = relabel(np.arange(len(rows)) < len(scan), RELABELLED, seed)
+    return float(share_beyond(measure_energy(cdist(rows, rows), choices)))
+
+
+def compare_windows(posterior: Posterior, scan: np.ndarray, twins: np.ndarray) -> Misfit:
+    """Return how probable it is that windows of a scan `(k, 351)` differ so from those of twins `(n, 351)`.
+
+    All descriptors are compared in the emulator's uncorrelated directions, each block in deviations of the twins.
+    """
+    compress, basis = posterior.emulator.compression, posterior.emulator.basis
+    p = probability_alike(compress(scan) @ basis.T, compress(twins) @ basis.T)
+    blocks = {}
+    for name in BLOCKS:
+        own, others = columns_of(scan, [name]), columns_of(twins, [name])
+        spread = others.std(0) + FAINTEST * others.std(0).mean() + 1e-12
+        blocks[name] = probability_alike(own / spread, others / spread)
+    return Misfit(p, blocks, f"{len(twins)} windows of shapes of the law, {len(scan)} of the scan")

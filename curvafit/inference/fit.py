@@ -19,6 +19,7 @@ from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.morphometry import Morphometry
 from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Deviations, Misfit, NotNegative
+from curvafit.inference.combinations import Combination
 from curvafit.priors.coefficients import NAMES, POWERS, Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.priors.law import FORMAT, Law, LawLike, Mass, Positive, parse_fit, read_fit
@@ -26,7 +27,7 @@ from curvafit.priors.law import FORMAT, Law, LawLike, Mass, Positive, parse_fit,
 #: What a scan was taken for, in words.
 KINDS = {"field": "a phase field", "mask": "a mask", "image": "an image"}
 #: What is drawn, in the order of the columns; a20 = 1 is the gauge.
-COLUMNS = ("a11", "a02", "a10", "a01", "a00", "mass")
+COLUMNS = ("a11", "a02", "a10", "a01", "a00", "mass", "thickness")
 #: Levels of the intervals, in percent.
 LEVELS = (50, 90)
 #: How draws come about, in words, and the significant digits of a draw, as a file has them.
@@ -44,12 +45,13 @@ class Fit(Pictured):
     chosen
         Name of the candidate that is best supported; None where none is a law of the scan: `status` says why.
     draws
-        Draws from the posterior `(n, 6)`, in the order of `table.PARAMETERS`; None where the scan's descriptors could
-        not be measured.
+        Draws from the posterior `(n, 7)`, in the order of `table.TARGETS`; None where the scan's descriptors could not
+        be measured.
     view
         What the scan was taken for: a kind of view that the posterior was trained on.
-    weak_directions
-        Sentences, one for each direction in which the scan leaves the parameters open.
+    combinations
+        What the scan tells of sums of the parameters, the best known first; of the background's where the structure
+        fills over half.
     misfit
         How the scan's descriptors lie among those that the model makes; None where that is not known.
     drift
@@ -57,14 +59,17 @@ class Fit(Pictured):
     scale
         Working voxel in scan voxels, (z, y, x).
     working_voxel, length_unit
-        Edge of a working voxel, and the unit that it and every physical number here is in.
+        Edge of a working voxel, which is one of the chosen law's shapes where their thickness is the scan's; and the
+        unit that it and every physical number here is in.
+    thickness
+        Median thickness of the scan's structure beneath its surface.
     matches
         The nearest shapes of the atlas.
     status
         The verdict, in a sentence or two.
     diagram
         The scan's curvature diagram, binned as an atlas's are, in 1 / working unit: with it the scan finds its place on
-        an atlas's map.
+        an atlas's map. Of masks and images a working unit is 100 voxels of which the structure is eight thick.
     """
 
     kind: str
@@ -72,6 +77,7 @@ class Fit(Pictured):
     scale: tuple[float, float, float]
     working_voxel: float
     length_unit: str
+    thickness: float
     status: str
     morphometry: Morphometry
     notes: tuple[str, ...]
@@ -81,7 +87,7 @@ class Fit(Pictured):
     chosen: str | None = None
     draws: np.ndarray | None = None
     view: str = ""
-    weak_directions: tuple[str, ...] = ()
+    combinations: tuple[Combination, ...] = ()
     misfit: Misfit | None = None
     drift: float | None = None
     matches: tuple[Match, ...] = ()
@@ -127,17 +133,18 @@ class Fit(Pictured):
         """Return the interface width ε in `length_unit`."""
         return WORKING_EPSILON * self.length
 
-    def intervals(self, length: float = 1.0) -> dict[str, dict[str, Any]] | None:
+    def intervals(self, *, physical: bool = False) -> dict[str, dict[str, Any]] | None:
         """Return the median and the central intervals of each parameter's draws; None without draws.
 
-        A working length of 1 is `length` in their unit.
+        Lengths are in the working units of each draw, or physical: a draw's shapes are as thick as the scan's.
         """
         if self.draws is None:
             return None
-        parts = {}
+        parts, columns = {}, to_columns(self.draws)
+        lengths = self.thickness / columns[-1] / WORKING_SPACING if physical else 1.0
         powers = (*(POWERS[name] for name in NAMES[1:]), 0)
-        for name, power, column in zip(COLUMNS, powers, to_columns(self.draws), strict=True):
-            values = column * length**-power
+        for name, power, column in zip(COLUMNS, powers, columns, strict=False):
+            values = column * lengths**-power
             parts[name] = {"median": float(np.median(values))} | {
                 str(level): [float(x) for x in np.percentile(values, (50 - level / 2, 50 + level / 2))]
                 for level in LEVELS
@@ -182,9 +189,10 @@ class Fit(Pictured):
 
 
 def to_columns(draws: np.ndarray) -> np.ndarray:
-    """Return draws of `table.PARAMETERS` `(n, 6)` as `COLUMNS` `(6, n)`: a02 in place of its logarithm."""
+    """Return draws of `table.TARGETS` `(n, 7)`, or of the parameters alone, as `COLUMNS`: without logarithms."""
     columns = draws.T.copy()
-    columns[1] = np.exp(columns[1])
+    for k in {1, 6} & set(range(len(columns))):
+        columns[k] = np.exp(columns[k])
     return columns
 
 
@@ -203,6 +211,7 @@ class _DrawColumns:
     a01: Column
     a00: Column
     mass: Column
+    thickness: Column
 
 
 @dataclass(frozen=True)
@@ -231,7 +240,7 @@ class _Columns:
 class _File:
     """The content of a `fit.json`, entry by entry: a `Fit`, and what follows from it for other programs."""
 
-    format: Literal["curvafit-fit-2"]
+    format: Literal["curvafit-fit-3"]
     status: str
     kind: Literal["field", "mask", "image"]
     family: str
@@ -242,11 +251,12 @@ class _File:
     scale: tuple[Positive, Positive, Positive]
     working_voxel: Positive
     length_unit: Literal["voxel", *METRES]  # type: ignore[valid-type]
+    thickness: Positive
     coefficients_physical: Coefficients | None
     epsilon_physical: Positive
     intervals: dict[str, Any] | None
     intervals_physical: dict[str, Any] | None
-    weak_directions: tuple[str, ...]
+    combinations: tuple[Combination, ...]
     misfit: Misfit | None
     drift: Annotated[float | None, Rule(least=0)]
     candidates: tuple[Candidate, ...]
@@ -287,7 +297,7 @@ def _file_of(fit: Fit) -> _File:
         coefficients_physical=fit.coefficients_physical,
         epsilon_physical=fit.epsilon_physical,
         intervals=fit.intervals(),
-        intervals_physical=fit.intervals(fit.length),
+        intervals_physical=fit.intervals(physical=True),
         posterior=None if fit.draws is None else _posterior_of(fit.draws, fit.view),
         diagram=None if fit.diagram is None else _columns_of(fit.diagram, fit.kind),
     )  # type: ignore[arg-type]
@@ -315,7 +325,7 @@ def _draws_of(posterior: _Posterior) -> np.ndarray:
     columns = [getattr(posterior.draws, name) for name in COLUMNS]
     _check_lengths(columns, "draws", "posterior")
     draws = np.array(columns, dtype=np.float64).T
-    draws[:, 1] = np.log(draws[:, 1])
+    draws[:, [1, 6]] = np.log(draws[:, [1, 6]])
     return draws
 
 

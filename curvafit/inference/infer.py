@@ -22,7 +22,7 @@ from curvafit.geometry.morphometry import morphometry
 from curvafit.inference.atlas import Atlas, Match, load_atlas, mirror_match, nearest
 from curvafit.inference.candidates import TITLES, Candidate, Twin, best_candidate, twin
 from curvafit.inference.drift import drift
-from curvafit.inference.estimate import estimate_law, refine_matches
+from curvafit.inference.estimate import check_law, estimate_law, refine_matches
 from curvafit.inference.fit import KINDS, Fit
 from curvafit.inference.posterior import Posterior, load_posterior
 from curvafit.inference.simulate import ROUNDS
@@ -30,15 +30,18 @@ from curvafit.inference.stationarity import stationarity
 from curvafit.inference.verdict import verdict
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law
+from curvafit.priors.profile import phase_field
 from curvafit.scan.measure import scan_diagram
 from curvafit.scan.prepare import HALF, NOISE, Prepared, prepare, why_no_texture
-from curvafit.scan.structure import check_options, is_rounded
+from curvafit.scan.structure import check_options, is_rounded, sample_mask
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Crop
 from curvafit.volumes.read import Source, field_of
 
 #: Number of nearest shapes, and of those from which stationarity starts.
 MATCHES, STARTS = 5, 3
+#: The seeds of the shapes that test a law come so much later than those of its twins.
+TWINS = 1000
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -105,6 +108,7 @@ def infer(
     simulations: int = 16,
     rounds: int = ROUNDS,
     twins: int = 3,
+    test: bool = True,
     schedule: Schedule | str = LEARNED,
     progress: Progress = silent,
     **reading: Any,
@@ -145,6 +149,8 @@ def infer(
         them suggest.
     twins
         How many shapes of the best law are grown.
+    test
+        Whether further shapes of the best law are grown to test whether it can have made the scan.
     schedule
         Steps of each shape.
     progress
@@ -165,7 +171,7 @@ def infer(
     volume = field_of(scan, label=label, crop=crop, **reading)
     region = None if roi is None else field_of(roi)
     region = region if region is None or crop is None else region.crop(crop)
-    prepared = prepare(volume, kind=kind, periodic=periodic, threshold=threshold, dark=dark, roi=region)
+    prepared = prepare(volume, kind=kind, periodic=periodic, threshold=threshold, dark=dark, roi=region, one_scale=True)
     progress("measuring curvature", 0.05)
     measured = None if prepared.noise else scan_diagram(prepared)
     reason = NOISE if measured is None else why_no_texture(prepared, measured)
@@ -182,13 +188,24 @@ def infer(
     read = fit.candidates if method == "posterior" else refine_matches(prepared, posterior, matches)
     laws, grown = _list_laws(prepared, read, matches, seed, sub_progress(progress, 0.5, 0.6)), {}
     if not fast:
-        part = sub_progress(progress, 0.6, 1.0)
+        part = sub_progress(progress, 0.6, 0.8 if test else 1.0)
         laws, grown = _grow(laws, measured, prepared, count=twins, schedule=schedule, seed=seed, progress=part)
     fit = replace(fit, candidates=laws, matches=matches)
+    if test and not fast and (best := best_candidate(laws)) is not None:
+        part = sub_progress(progress, 0.8, 1.0)
+        fit = replace(
+            fit, misfit=check_law(best, prepared, posterior, seed=seed + TWINS, schedule=schedule, progress=part)
+        )
     chosen, status = verdict(fit, fast=fast)
     fit = replace(fit, chosen=chosen, status=status)
+    if prepared.kind != "field" and fit.best is not None and fit.best.thickness is not None:
+        # A voxel of the law's shapes is as long on the scan as makes them as thick as its structure.
+        ratio = prepared.thickness / fit.best.thickness
+        scale = tuple(ratio * each for each in prepared.scale)
+        fit = replace(fit, working_voxel=ratio * prepared.working_voxel, scale=scale)
     if fit.coefficients is not None:
-        fit = replace(fit, drift=drift(*_main_window(prepared), WORKING_EPSILON, fit.coefficients))
+        step = fit.working_voxel / prepared.working_voxel
+        fit = replace(fit, drift=drift(*_main_window(prepared, step), WORKING_EPSILON, fit.coefficients))
     progress("done", 1.0)
     return Inference(volume, prepared, measured, grown, fit, simulated)
 
@@ -211,7 +228,7 @@ def _list_laws(
 ) -> tuple[Candidate, ...]:
     """Return the laws to grow, the most trusted first: of a phase field its stationarity, those that were read from the
     descriptors, and the nearest match."""
-    laws = (*read, Candidate("match", matches[0].coefficients, matches[0].mass, {}))
+    laws = (*read, Candidate("match", matches[0].coefficients, matches[0].mass, {}, matches[0].thickness))
     if prepared.kind != "field" or is_rounded(prepared.phase):
         return laws
     starts = [each.coefficients for each in (*read[:1], *matches[:STARTS])]
@@ -219,10 +236,14 @@ def _list_laws(
     return (stationarity(*field, WORKING_EPSILON, starts=starts, seed=seed, progress=progress), *laws)
 
 
-def _main_window(prepared: Prepared) -> tuple[torch.Tensor, Grid]:
-    """Return the phase field of the main window and its grid."""
+def _main_window(prepared: Prepared, step: float = 1.0) -> tuple[torch.Tensor, Grid]:
+    """Return the phase field of the main window and its grid, on voxels of `step` working voxels."""
     where = prepared.windows[0]
-    return torch.from_numpy(np.ascontiguousarray(prepared.phase[where])), prepared.part(where)
+    if step == 1:
+        return torch.from_numpy(np.ascontiguousarray(prepared.phase[where])), prepared.part(where)
+    mask, boundary = sample_mask(prepared.mask[where], [step] * 3, prepared.grid.periodic), prepared.grid.boundary
+    grid = Grid(mask.shape, prepared.grid.spacing, boundary)
+    return phase_field(torch.from_numpy(mask), grid, WORKING_EPSILON), grid
 
 
 def _grow(
@@ -242,7 +263,7 @@ def _grow(
         """Grow another twin of a law."""
         start = seed + len(twins.get(law.name, ()))
         progress(f"growing: {TITLES[law.name]}, seed {start}", share)
-        twins[law.name] = (*twins.get(law.name, ()), twin(law.coefficients, law.mass, prepared, start, schedule))
+        twins[law.name] = (*twins.get(law.name, ()), twin(law, prepared, start, schedule))
         return law.compare(measured, twins[law.name])
 
     laws = tuple(grow(law, 0.7 * k / len(laws)) for k, law in enumerate(laws))
@@ -263,6 +284,7 @@ def _describe(prepared: Prepared, measured: Diagram | None, provenance: dict[str
         scale=prepared.scale,
         working_voxel=prepared.working_voxel,
         length_unit=prepared.unit,
+        thickness=prepared.thickness * prepared.working_voxel,
         status=status,
         morphometry=morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=grid.periodic),
         notes=prepared.notes,

@@ -15,10 +15,12 @@ from curvafit.core.extras import require
 from curvafit.core.files import open_packaged
 from curvafit.core.records import Format
 from curvafit.geometry.descriptors import BLOCKS
+from curvafit.inference.combinations import Combinations
 from curvafit.inference.emulator import Emulator, Layer
-from curvafit.inference.table import PARAMETERS, Compression, column_names
+from curvafit.inference.table import PARAMETERS, TARGETS, Compression, column_names, encode_seen
+from curvafit.scan.measure import Reading
 
-POSTERIOR_FILE = Format("curvafit posterior", 3, "a posterior", "train it again", {"blocks": BLOCKS})
+POSTERIOR_FILE = Format("curvafit posterior", 4, "a posterior", "train it again", {"blocks": BLOCKS})
 #: Largest size of a flow, and most flows of an ensemble.
 WIDEST, MOST = 2048, 64
 #: Which of the parameters is the mass.
@@ -50,7 +52,7 @@ class Architecture:
 
 
 class Member(nn.Module):
-    """One flow of an ensemble: a conditional distribution of the six parameters, in coordinates without bounds.
+    """One flow of an ensemble: a conditional distribution of `TARGETS`, in coordinates without bounds.
 
     The mass is modelled as a straight line of the context, one for each view, plus a remainder of deviation `width`
     `(views,)`: dropout would hide the volume fraction, which tells the mass.
@@ -61,11 +63,11 @@ class Member(nn.Module):
 
     def __init__(self, architecture: Architecture, views: int) -> None:
         super().__init__()
-        context = architecture.components + views
+        context = architecture.components + 1 + views
         sizes, splines = architecture.hidden, architecture.transforms
         zuko = require("zuko", "infer", "reading a posterior")
         self.flow = zuko.flows.NSF(
-            len(PARAMETERS), context, bins=architecture.bins, transforms=splines, hidden_features=sizes
+            len(TARGETS), context, bins=architecture.bins, transforms=splines, hidden_features=sizes
         )
         self.dropout = nn.Dropout(architecture.dropout)
         self.register_buffer("slope", torch.zeros(views, context))
@@ -73,7 +75,7 @@ class Member(nn.Module):
 
     def forward(self, context: Tensor) -> torch.distributions.Distribution:
         view = context[:, -len(self.width) :]
-        mean = torch.zeros(len(context), len(PARAMETERS))
+        mean = torch.zeros(len(context), len(TARGETS))
         width = torch.ones_like(mean)
         mean[:, MASS], width[:, MASS] = (view @ self.slope * context).sum(1), view @ self.width
         line = torch.distributions.AffineTransform(mean, width, event_dim=1)
@@ -82,7 +84,8 @@ class Member(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """The posterior of (a11, log a02, a10, a01, a00, m₀), with a20 = 1, given descriptors: all in working units.
+    """The posterior of (a11, log a02, a10, a01, a00, m₀), with a20 = 1, and of the thickness of their shapes, given
+    descriptors in voxels of which the structure is eight thick.
 
     Attributes
     ----------
@@ -93,13 +96,15 @@ class Posterior:
     views
         Kinds of views that it was trained on.
     box
-        `(6, 2)`: the parameters' least and greatest values.
+        `(7, 2)`: least and greatest values of `TARGETS`.
     centre, spread
-        `(6,)`: mean and deviation of the parameters without bounds.
+        `(7,)`: mean and deviation of these without bounds.
     emulator
         What parameters make of the descriptors.
     misfits
         By view, what the emulator's best parameters leave unexplained of shapes that it did not learn from, increasing.
+    combinations
+        The sums of parameters that textures tell.
     """
 
     architecture: Architecture
@@ -111,35 +116,37 @@ class Posterior:
     spread: np.ndarray
     emulator: Emulator
     misfits: dict[str, np.ndarray]
+    combinations: Combinations
     provenance: dict[str, Any]
 
-    def sample(self, descriptors: np.ndarray, view: str, count: int = 1000, seed: int = 0) -> np.ndarray:
-        """Draw parameters `(N, count, 6)` given descriptors `(N, 351)`; `(count, 6)` given one.
+    def sample(
+        self, descriptors: np.ndarray, views: np.ndarray, amount: np.ndarray, count: int = 1000, seed: int = 0
+    ) -> np.ndarray:
+        """Draw `TARGETS` `(N, count, 7)` given descriptors `(N, 351)`, kinds of views and how much was seen `(N,)`.
 
-        Raises ValueError if it was not trained on the view, or descriptors are not finite.
+        Raises ValueError if it was not trained on a view, or descriptors are not finite.
         """
-        rows = np.atleast_2d(descriptors)
-        context = self.context(rows, np.full(len(rows), view))
+        context = self.context(descriptors, views, amount)
         parts = [len(part) for part in np.array_split(np.arange(count), len(self.members))]
         with torch.random.fork_rng(), torch.no_grad():
             torch.manual_seed(seed)
             draws = [member(context).sample(torch.Size((n,))) for member, n in zip(self.members, parts, strict=True)]
         standard = torch.cat(draws).movedim(0, 1).double().numpy()
-        parameters = self.from_logits(standard * self.spread + self.centre)
-        return parameters[0] if descriptors.ndim == 1 else parameters
+        return self.from_logits(standard * self.spread + self.centre)
 
-    def context(self, descriptors: np.ndarray, views: np.ndarray) -> Tensor:
-        """Return what the flows see: components of the descriptors and the kind of each view.
+    def draw(self, reading: Reading, count: int, seed: int = 0) -> np.ndarray:
+        """Draw `TARGETS` `(count, 7)` given what was read of a scan."""
+        return self.sample(*reading.columns, count, seed)[0]
+
+    def context(self, descriptors: np.ndarray, views: np.ndarray, amount: np.ndarray) -> Tensor:
+        """Return what the flows see: components of the descriptors, how much was seen, and the kind of each view.
 
         Raises ValueError if a view is of another kind, or descriptors are not finite.
         """
-        unknown = sorted(set(views.tolist()) - set(self.views))
-        if unknown:
-            raise ValueError(f"expected views among {', '.join(self.views)}, got {', '.join(unknown)}")
+        seen = encode_seen(self.views, views, amount)
         if bad := int((~np.isfinite(descriptors)).any(1).sum()):
             raise ValueError(f"expected descriptors that are finite, got {bad} of {len(descriptors)} rows with others")
-        kinds = views[:, None] == np.array(self.views)
-        return torch.from_numpy(np.concatenate([self.compression(descriptors), kinds], axis=1)).float()
+        return torch.from_numpy(np.concatenate([self.compression(descriptors), seen], axis=1)).float()
 
     def to_logits(self, parameters: np.ndarray) -> np.ndarray:
         """Return the logits of the parameters' places in the box: numbers without bounds."""
@@ -174,11 +181,13 @@ def save_posterior(posterior: Posterior, path: str | Path) -> None:
             arrays |= {f"emulator.{name}.{level}.{part}": value for part, value in layer._asdict().items()}
     arrays["emulator.basis"] = posterior.emulator.basis.astype(np.float32)
     arrays |= {f"misfits.{view}": values.astype(np.float32) for view, values in posterior.misfits.items()}
+    arrays |= {f"combinations.{name}": getattr(posterior.combinations, name) for name in ("weights", "centre")}
     header = {
         "architecture": asdict(posterior.architecture),
         "members": len(posterior.members),
         "inflation": posterior.emulator.inflation,
         "views": posterior.views,
+        "ends": posterior.combinations.ends,
         "provenance": posterior.provenance,
     }
     POSTERIOR_FILE.write(path, header, arrays)
@@ -206,8 +215,9 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
     views = tuple(str(view) for view in header["views"])
     columns, components = int(np.isin(column_names(), architecture.blocks).sum()), architecture.components
     expected = {"mean": (columns,), "scale": (columns,), "basis": (components, columns)}
-    expected |= {"box": (len(PARAMETERS), 2), "centre": (len(PARAMETERS),), "spread": (len(PARAMETERS),)}
+    expected |= {"box": (len(TARGETS), 2), "centre": (len(TARGETS),), "spread": (len(TARGETS),)}
     expected |= {"emulator.basis": (components, components)}
+    expected |= {"combinations.weights": (len(PARAMETERS), len(PARAMETERS)), "combinations.centre": (len(PARAMETERS),)}
     for name, shape in expected.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{name} of shape {arrays[name].shape}, not {shape}")
@@ -225,6 +235,9 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
     misfits = {view: arrays[f"misfits.{view}"] for view in views}
     if any(each.ndim != 1 or not len(each) for each in misfits.values()):
         raise ValueError("misfits that are no columns of numbers")
+    ends = tuple((str(low), str(high)) for low, high in header["ends"])
+    if len(ends) != len(PARAMETERS):
+        raise ValueError(f"words for {len(ends)} combinations, not {len(PARAMETERS)}")
     return Posterior(
         architecture,
         tuple(members),
@@ -233,8 +246,11 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
         arrays["box"],
         arrays["centre"],
         arrays["spread"],
-        Emulator(compression, views, arrays["box"], mean, spread, arrays["emulator.basis"], inflation),
+        Emulator(
+            compression, views, arrays["box"][: len(PARAMETERS)], mean, spread, arrays["emulator.basis"], inflation
+        ),
         misfits,
+        Combinations(arrays["combinations.weights"], arrays["combinations.centre"], ends),
         header["provenance"],
     )
 
@@ -243,7 +259,7 @@ def _read_layers(arrays: dict[str, np.ndarray], name: str, views: int, outputs: 
     """Return the layers (member, out, in) of an ensemble; raise ValueError where their shapes do not chain."""
     count = sum(key.startswith(f"{name}.") for key in arrays) // 2
     layers = [Layer(arrays[f"{name}.{k}.weight"], arrays[f"{name}.{k}.bias"]) for k in range(count)]
-    inputs = len(PARAMETERS) + views
+    inputs = len(PARAMETERS) + 1 + views
     for weight, bias in layers:
         if weight.ndim != 3 or weight.shape[2] != inputs or bias.shape != weight.shape[:2]:
             raise ValueError(f"{name} with layers of shapes {weight.shape} and {bias.shape} for {inputs} inputs")

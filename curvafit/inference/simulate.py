@@ -7,7 +7,7 @@ is added to it, and says which parameters to simulate next (Gutmann & Corander 2
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from scipy import linalg
 from curvafit.core.checks import check_int
 from curvafit.core.runtime import Progress, silent
 from curvafit.inference.emulator import Emulator
+from curvafit.scan.measure import Reading
 
 #: Rounds, simulations in a round, and most rounds at the end that simulate the likeliest parameters alone.
 ROUNDS, BATCH, LAST = 7, 3, 4
@@ -30,17 +31,29 @@ BARREN, REACH = 50.0, 0.3
 
 
 class Simulations(NamedTuple):
-    """The `n` simulations, of `count`, that grew: parameters `(n, 6)`, seeds `(n,)` and descriptors `(n, 351)`."""
+    """The `n` simulations, of `count`, that grew: parameters `(n, 6)`, seeds `(n,)` and readings."""
 
     parameters: np.ndarray
     seeds: np.ndarray
-    descriptors: np.ndarray
+    readings: tuple[Reading, ...]
     count: int
 
+    @property
+    def columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return descriptors `(n, 351)`, views and amounts `(n,)`."""
+        parts = zip(*(reading.columns for reading in self.readings), strict=True)
+        return tuple(map(np.concatenate, parts))  # type: ignore[return-value]
 
-#: Grows a shape from parameters `(6,)` and a seed, and returns its descriptors `(351,)`, measured as the query's were;
-#: NaN where nothing grows.
-Simulate = Callable[[np.ndarray, int], np.ndarray]
+    def add(self, parameters: np.ndarray, seeds: np.ndarray, readings: Sequence[Reading | None]) -> Simulations:
+        """Return these and further ones, of which those without a reading did not grow."""
+        grown = np.array([reading is not None for reading in readings])
+        both = (np.concatenate([self.parameters, parameters[grown]]), np.concatenate([self.seeds, seeds[grown]]))
+        return Simulations(*both, (*self.readings, *filter(None, readings)), self.count + len(parameters))
+
+
+#: Grows a shape from parameters `(6,)` and a seed, and returns what is read of it, seen as the query was; None where
+#: nothing grows.
+Simulate = Callable[[np.ndarray, int], Reading | None]
 
 
 def simulate_draws(
@@ -49,13 +62,11 @@ def simulate_draws(
     """Grow a shape from each of `count` of a posterior's draws `(n, 6)`; the k-th has the seed `seed` + k."""
     count = check_int(count, "a number of simulations", 1, len(draws))
     chosen = draws[np.random.default_rng(seed).choice(len(draws), count, replace=False)]
-    rows = []
+    readings = []
     for k, parameters in enumerate(chosen):
-        rows.append(simulate(parameters, seed + k))
+        readings.append(simulate(parameters, seed + k))
         progress(f"simulated {k + 1} of {count}", (k + 1) / count)
-    descriptors = np.array(rows)
-    grown = np.isfinite(descriptors).all(1)
-    return Simulations(chosen[grown], seed + np.flatnonzero(grown), descriptors[grown], count)
+    return Simulations(chosen[:0], np.arange(0), (), 0).add(chosen, seed + np.arange(count), readings)
 
 
 class Process(NamedTuple):
@@ -96,16 +107,15 @@ class Process(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """A search for the parameters whose shapes have the descriptors of a query, `(351,)`, of a kind of view."""
+    """A search for the parameters whose shapes are read as a query was."""
 
     emulator: Emulator
-    view: str
-    query: np.ndarray
+    query: Reading
 
     def nearest(self, simulated: Simulations) -> np.ndarray:
         """Return the numbers of the simulations, those whose descriptors are nearest to the query's first."""
-        deviation = self.emulator(simulated.parameters, self.view).deviation.mean(0)
-        away = self._decorrelate(simulated.descriptors) - self._decorrelate(self.query[None])
+        deviation = self.emulator(simulated.parameters, *simulated.columns[1:]).deviation.mean(0)
+        away = self._decorrelate(simulated.columns[0]) - self._decorrelate(self.query.columns[0])
         return np.square(away / deviation).sum(1).argsort(kind="stable")
 
     def run(
@@ -136,12 +146,10 @@ class Search:
             others = rng.choice(len(candidates), BATCH - 1 if k < rounds else 0, p=likelihood / likelihood.sum())
             chosen = candidates[[int(deviance.argmin()), *others]]
             seeds = seed + simulated.count + np.arange(len(chosen))
-            rows = np.array([simulate(each, int(start)) for each, start in zip(chosen, seeds, strict=True)])
-            grown = np.isfinite(rows).all(1)
+            readings = [simulate(each, int(start)) for each, start in zip(chosen, seeds, strict=True)]
+            grown = np.array([reading is not None for reading in readings])
             barren = np.concatenate([barren, chosen[~grown]])
-            new = (chosen[grown], seeds[grown], rows[grown])
-            every = [np.concatenate(pair) for pair in zip(simulated[:3], new, strict=True)]
-            simulated = Simulations(every[0], every[1], every[2], simulated.count + len(chosen))
+            simulated = simulated.add(chosen, seeds, readings)
             progress(f"refined by {simulated.count} simulations", min((k + 1) / (rounds + 1), 1.0))
             if k >= rounds and grown.all():
                 return chosen[0], simulated
@@ -166,12 +174,14 @@ class Search:
         Descriptors are compared in uncorrelated directions, in units of the emulator's mean deviation along each; that
         unit is the same for all candidates, so its logarithm is left out.
         """
-        emulated = self.emulator(simulated.parameters, self.view)
+        descriptors, *seen = simulated.columns
+        emulated = self.emulator(simulated.parameters, *seen)
         basis, deviation = self.emulator.basis, emulated.deviation.mean(0)
-        residuals = (self._decorrelate(simulated.descriptors) - emulated.mean @ basis.T) / deviation
+        residuals = (self._decorrelate(descriptors) - emulated.mean @ basis.T) / deviation
         mean, variance = Process.fit(self._standardise(simulated.parameters), residuals)(self._standardise(candidates))
-        expected = self.emulator(candidates, self.view).mean @ basis.T / deviation + mean
-        scan_residual = self._decorrelate(self.query[None]) / deviation - expected
+        row, *asked = self.query.columns
+        expected = self.emulator(candidates, *asked).mean @ basis.T / deviation + mean
+        scan_residual = self._decorrelate(row) / deviation - expected
         return np.square(scan_residual).sum(1) / variance + scan_residual.shape[1] * np.log(variance)
 
     def _decorrelate(self, descriptors: np.ndarray) -> np.ndarray:

@@ -5,35 +5,35 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
 from curvafit.core.records import Format, encode_json
-from curvafit.geometry.descriptors import BLOCKS, Descriptors
+from curvafit.geometry.descriptors import BLOCKS
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.grid import Grid
-from curvafit.scan.grids import median_thickness, remove_specks
-from curvafit.scan.prepare import KEPT_THICKNESS, THINNEST, smallest_piece
-from curvafit.scan.structure import split, voxelise
-from curvafit.volumes.field import Field, ScanError
+from curvafit.scan.measure import Reading
+from curvafit.scan.prepare import thinner_thickness
+from curvafit.scan.structure import sample_mask
+from curvafit.volumes.field import Field
 
 TABLE_FILE = Format(
     "curvafit descriptors",
-    1,
+    2,
     "a table of descriptors",
     "describe the stores into another file, or with --overwrite",
     {"blocks": BLOCKS},
 )
-#: What is inferred, with a20 = 1 as the gauge, in working units.
+#: What is inferred, with a20 = 1 as the gauge, in working units; and with it how thick the law's shapes are, in their
+#: own voxels, which says how long those are on a scan.
 PARAMETERS = ("a11", "log a02", "a10", "a01", "a00", "m0")
-#: Part of each side that a crop keeps.
-WINDOW = 0.75
-#: Least and greatest voxel of a resampled shape, in voxels of the field.
-SCALES = (0.5, 2.0)
+TARGETS = (*PARAMETERS, "log thickness")
+#: Voxels that a mask's scanner puts into a thickness, and its least and greatest voxel, in voxels of the field.
+SAMPLED, SCALES = (4.0, 16.0), (0.5, 2.0)
 #: A degraded scan: deviation of the blur in voxels, contrast over the noise's deviation, and voxels a slice is thick.
 BLUR, SNR, SLICE = 1.0, 5.0, 2
 #: Blocks whose logarithm is taken, and the least value that goes into it.
@@ -43,27 +43,33 @@ LEAST = 1e-3
 BENDS, EULERS = 50.0, 100.0
 #: Furthest that a column may lie from its mean, in its deviations.
 FURTHEST = 6.0
+#: How much is usually seen of a texture, and the most that training shows, in cubes of a thickness.
+USUAL, MOST_SEEN = 500.0, 8000.0
 #: Deviations that blocks have before compression, 1 where none is named.
 WEIGHTS = {"curvature": 3.0}
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Descriptors of N views of shapes, and the parameters of the shapes.
+    """Readings of N views of shapes, and what made the shapes.
 
-    `shapes` and `views` name them (str, `(N,)`); `parameters` is `(N, 6)` (`PARAMETERS`); `descriptors` `(N, 351)` has
-    the blocks of `Descriptors` in their order, NaN where a view shows no surface.
+    `shapes` and `views` name them (str, `(N,)`); `parameters` is `(N, 6)` (`PARAMETERS`), `thickness` `(N,)` how many
+    of its own voxels a shape is thick; `descriptors` `(N, 351)` has the blocks of `Descriptors` in their order, NaN
+    where a view shows no surface, and `amount` `(N,)` says how much was seen (`Reading`).
     """
 
     shapes: np.ndarray
     views: np.ndarray
     parameters: np.ndarray
+    thickness: np.ndarray
     descriptors: np.ndarray
+    amount: np.ndarray
     provenance: dict[str, Any]
 
     def __post_init__(self) -> None:
         n = len(self.shapes)
-        expected = {"views": (n,), "parameters": (n, len(PARAMETERS)), "descriptors": (n, sum(BLOCKS.values()))}
+        expected: dict[str, tuple[int, ...]] = dict.fromkeys(("views", "thickness", "amount"), (n,))
+        expected |= {"parameters": (n, len(PARAMETERS)), "descriptors": (n, sum(BLOCKS.values()))}
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"expected {name} of shape {shape}, got {getattr(self, name).shape}")
@@ -74,7 +80,8 @@ class Table:
     def rows(self, chosen: np.ndarray) -> Table:
         """Return some rows, by their numbers or a mask."""
         i = np.asarray(chosen)
-        return Table(self.shapes[i], self.views[i], self.parameters[i], self.descriptors[i], self.provenance)
+        columns = {field.name: getattr(self, field.name)[i] for field in fields(self)[:-1]}
+        return replace(self, **columns)
 
     def select_views(self, views: Sequence[str]) -> Table:
         """Return the rows of some kinds of views; raise ValueError if there is none of a kind."""
@@ -84,9 +91,34 @@ class Table:
         return self.rows(np.isin(self.views, list(views)))
 
     @property
+    def targets(self) -> np.ndarray:
+        """Return what is inferred `(N, 7)` (`TARGETS`)."""
+        return np.column_stack([self.parameters, np.log(self.thickness)])
+
+    @property
     def visible(self) -> Table:
         """Return the rows whose view shows a surface."""
         return self.rows(np.asarray(np.isfinite(self.descriptors).all(1)))
+
+    @property
+    def laws(self) -> np.ndarray:
+        """Return the number of each row's law, from 0 `(N,)`."""
+        return np.unique(np.round(self.parameters, 9), axis=0, return_inverse=True)[1].ravel()
+
+    @property
+    def pooled(self) -> Table:
+        """Return the rows, and those of 2, 4, 8, … shapes of one law in one view, as if one scan had shown them all:
+        the means of their descriptors, and the sum of what was seen."""
+        parts, laws = [[k] for k in range(len(self))], self.laws
+        for law, view in product(np.unique(laws), np.unique(self.views)):
+            group = np.flatnonzero((laws == law) & (self.views == view)).tolist()
+            for size in (2**k for k in range(1, len(group).bit_length())):
+                parts += [group[start : start + size] for start in range(0, len(group) - size + 1, size)]
+        found = self.rows(np.array([part[0] for part in parts]))
+        means = np.array([self.descriptors[part].mean(0) for part in parts])
+        thickness = np.array([self.thickness[part].mean() for part in parts])
+        amount = np.array([self.amount[part].sum() for part in parts])
+        return replace(found, descriptors=means, thickness=thickness, amount=amount)
 
 
 def parameters_of(law: Coefficients, mass: float) -> np.ndarray:
@@ -113,21 +145,33 @@ def mirror_parameters(parameters: np.ndarray) -> np.ndarray:
     return np.stack([a11 / a02, -log_a02, -a01 / a02, -a10 / a02, a00 / a02, -mass], -1)
 
 
+def encode_seen(kinds: Sequence[str], views: np.ndarray, amount: np.ndarray) -> np.ndarray:
+    """Return how textures were seen as numbers `(N, 1 + kinds)`: how much, and a 1 for the kind of view.
+
+    More than `MOST_SEEN` counts as so much: training says nothing of more. Raises ValueError if a view is of another
+    kind.
+    """
+    if unknown := sorted(set(views.tolist()) - set(kinds)):
+        raise ValueError(f"expected views among {', '.join(kinds)}, got {', '.join(unknown)}")
+    much = np.log10(np.minimum(amount, MOST_SEEN) / USUAL)
+    return np.concatenate([much[:, None], views[:, None] == np.array(kinds)], axis=1)
+
+
 def column_names() -> list[str]:
     """Return the name of the block that each column of descriptors belongs to."""
     return [name for name, length in BLOCKS.items() for _ in range(length)]
 
 
-def to_row(view: Descriptors | None) -> np.ndarray:
-    """Return the row of a view's descriptors; NaN where there are none."""
-    return np.full(sum(BLOCKS.values()), np.nan) if view is None else view.vector()
+def to_row(reading: Reading | None) -> np.ndarray:
+    """Return the descriptors of a reading; NaN where there is none."""
+    return np.full(sum(BLOCKS.values()), np.nan) if reading is None else reading.descriptors
 
 
 def save_table(table: Table, path: str | Path) -> None:
     """Write a table as one compressed `.npz`: arrays (descriptors in float32) and a JSON header."""
     arrays = {
         "names": encode_json([table.shapes.tolist(), table.views.tolist()]),
-        "parameters": table.parameters,
+        **{name: getattr(table, name) for name in ("parameters", "thickness", "amount")},
         "descriptors": table.descriptors.astype(np.float32),
     }
     TABLE_FILE.write(path, {"provenance": table.provenance}, arrays)
@@ -149,84 +193,59 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Table
         raise ValueError("parameters that are not finite")
     if arrays["descriptors"].dtype.kind != "f" or not isinstance(header["provenance"], dict):
         raise ValueError("descriptors that are no numbers, or no provenance")
-    return Table(shapes, views, arrays["parameters"], arrays["descriptors"], header["provenance"])
+    parameters, thickness, found, amount = (
+        arrays[name] for name in ("parameters", "thickness", "descriptors", "amount")
+    )
+    return Table(shapes, views, parameters, thickness, found, amount, header["provenance"])
 
 
-class View(NamedTuple):
-    """A phase field (float32) or a mask (bool) `(Z, Y, X)`, and its grid: not periodic where it is a part."""
-
-    shape: np.ndarray
-    grid: Grid
+# ---- views -----------------------------------------------------------------------------------------------------------
 
 
-def see_field(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
+class Scanned(NamedTuple):
+    """What a scanner makes of a shape, and what `prepare` is told of it: its kind, and whether it repeats."""
+
+    scan: Field
+    kind: Literal["field", "mask", "image"]
+    periodic: bool = False
+
+
+def see_field(u: np.ndarray, rng: np.random.Generator) -> Scanned:
     """Return the phase field itself."""
-    return View(u, grid)
+    return Scanned(Field(u), "field", periodic=True)
 
 
-def see_mask(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
-    """Return {u > 0} on the field's own voxels."""
-    return View(u > 0, grid)
+def see_mask(u: np.ndarray, rng: np.random.Generator) -> Scanned:
+    """Return {u > 0}, opened anywhere, on voxels of a scanner on which it is 4 to 16 thick."""
+    inside = _open(u, rng)
+    voxel = float(np.clip(thinner_thickness(inside) / math.exp(rng.uniform(*np.log(SAMPLED))), *SCALES))
+    coarse = sample_mask(inside, [voxel] * 3, periodic=False)
+    return Scanned(Field(coarse.astype(np.uint8)), "mask")
 
 
-def see_crop(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
-    """Return {u > 0} in a window of three quarters of each side, anywhere in the repeated box."""
-    turned = np.roll(u > 0, [int(rng.integers(n)) for n in u.shape], (0, 1, 2))
-    nz, ny, nx = (round(WINDOW * n) for n in u.shape)
-    part = np.ascontiguousarray(turned[:nz, :ny, :nx])
-    if part.all() or not part.any():
-        raise ScanError("expected a window with an inside and an outside, got one of them only")
-    return View(part, Grid((nz, ny, nx), grid.spacing, "replicate"))
-
-
-def see_resampled(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
-    """Return a crop resampled to other voxels, on which it is 5 to 16 thick, and back, by signed distances.
-
-    A scan's mask is brought to the working grid in the same way.
-    """
-    part, window = see_crop(u, grid, rng)
-    thickness = _measure_thickness(part)
-    voxel = float(np.clip(thickness / math.exp(rng.uniform(*np.log(KEPT_THICKNESS))), *SCALES))
-    return View(voxelise(part, (1 / voxel,) * 3, smallest_piece(thickness), periodic=False), window)
-
-
-def see_scan(u: np.ndarray, grid: Grid, rng: np.random.Generator) -> View:
-    """Return a crop scanned badly, split by Otsu's threshold: blurred, slices two voxels thick, noise at SNR 5.
-
-    Prepared as `infer` prepares an image: smoothed by a voxel, split, interpolated to cubic voxels, cleared of specks.
-    """
-    part, window = see_crop(u, grid, rng)
-    inside = split(_degrade(part, rng), part.shape)
-    return View(remove_specks(inside, smallest_piece(_measure_thickness(inside)), False)[0], window)
-
-
-def _degrade(part: np.ndarray, rng: np.random.Generator) -> Field:
-    """Return a mask as a bad scan shows it: blurred, slices two voxels thick, noise at SNR 5."""
-    grey = ndimage.gaussian_filter(part.astype(np.float32), BLUR, mode="nearest")
+def see_scan(u: np.ndarray, rng: np.random.Generator) -> Scanned:
+    """Return {u > 0}, opened anywhere, scanned badly: blurred, slices two voxels thick, noise at SNR 5."""
+    grey = ndimage.gaussian_filter(_open(u, rng).astype(np.float32), BLUR, mode="nearest")
     whole = np.pad(grey, ((0, -len(grey) % SLICE), (0, 0), (0, 0)), mode="edge")
     grey = whole.reshape(-1, SLICE, *grey.shape[1:]).mean(1)
     grey += rng.standard_normal(grey.shape, dtype=np.float32) / SNR
-    return Field(grey, (float(SLICE), 1.0, 1.0), "voxel")
-
-
-def _measure_thickness(part: np.ndarray) -> float:
-    """Return the median thickness in voxels, or raise ScanError where a structure is too thin for `infer`."""
-    if not part.any():
-        raise ScanError("expected a structure in the window, got none")
-    thickness, thick = median_thickness(part, (1.0, 1.0, 1.0), False)
-    if thick < THINNEST - 0.5:
-        raise ScanError(f"expected a structure {THINNEST:g} voxels thick, got one of {thick:.2g}")
-    return thickness
+    return Scanned(Field(grey, (float(SLICE), 1.0, 1.0), "voxel"), "image")
 
 
 #: Views by name.
-VIEWS: dict[str, Callable[[np.ndarray, Grid, np.random.Generator], View]] = {
+VIEWS: dict[str, Callable[[np.ndarray, np.random.Generator], Scanned]] = {
     "field": see_field,
     "mask": see_mask,
-    "crop": see_crop,
-    "resampled": see_resampled,
     "scan": see_scan,
 }
+
+
+def _open(u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return {u > 0} of a box that repeats, cut open anywhere."""
+    return np.roll(u > 0, [int(rng.integers(n)) for n in u.shape], (0, 1, 2))
+
+
+# ---- compression -----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -14,9 +14,10 @@ from torch import Tensor, nn
 
 from curvafit.core.checks import check_int, check_seed
 from curvafit.core.runtime import Progress, silent, sub_progress
+from curvafit.inference.combinations import Combinations, find_combinations
 from curvafit.inference.emulator import FAINTEST, Emulator, Layer, misfits
 from curvafit.inference.posterior import MASS, MOST, Architecture, Member, Posterior
-from curvafit.inference.table import PARAMETERS, Compression, Table, compression_of
+from curvafit.inference.table import PARAMETERS, TARGETS, Compression, Table, compression_of
 
 #: Part of the shapes, of all of whose views a member learns nothing: they tell when it has learnt enough.
 VALIDATION = 0.1
@@ -34,6 +35,8 @@ HIDDEN = (96, 96)
 REFERENCE = 400
 #: Least and most rows of a step, and steps that an epoch has between the two.
 BATCH, PACE = (64, 512), 100
+#: Draws of a flow whose mean is compared with the truth.
+DRAWS = 200
 #: Largest norm of a step's gradient.
 STEEPEST = 5.0
 
@@ -82,37 +85,53 @@ def train_posterior(
         Called after each epoch with a sentence and the share of the epochs that are done at most.
     """
     members, seed = check_int(members, "a number of flows", 1, MOST), check_seed(seed)
-    sizes, table = architecture or Architecture(), table.visible
-    shapes, number = np.unique(table.shapes, return_inverse=True)
-    if len(shapes) < 2 * sizes.components:
-        raise ValueError(f"expected at least {2 * sizes.components} shapes to train on, got {len(shapes)}")
+    sizes, table = architecture or Architecture(), table.visible.pooled
+    number, laws = table.laws, len(np.unique(table.laws))
+    if laws < 2 * sizes.components:
+        raise ValueError(f"expected shapes of {2 * sizes.components} laws or more to train on, got {laws}")
     views = tuple(sorted(set(table.views.tolist())))
-    box = np.stack([table.parameters.min(0), table.parameters.max(0)], axis=1)
-    if fixed := [name for name, (low, high) in zip(PARAMETERS, box, strict=True) if low == high]:
+    box = np.stack([table.targets.min(0), table.targets.max(0)], axis=1)
+    if fixed := [name for name, (low, high) in zip(TARGETS, box, strict=True) if low == high]:
         raise ValueError(f"expected shapes whose parameters all vary, got {', '.join(fixed)} the same in all")
     compression = compression_of(table.descriptors, sizes.components, sizes.blocks)
     flow_plan, emulator_plan = plans or PLANS
     part = sub_progress(progress, 0.0, EMULATOR_PART)
-    emulator, left = train_emulator(table, compression, box, seed=seed, plan=emulator_plan, progress=part)
-    counts = {"shapes": len(shapes), "rows": len(table), "members": members}
+    emulator, left = train_emulator(
+        table, compression, box[: len(PARAMETERS)], seed=seed, plan=emulator_plan, progress=part
+    )
+    counts = {"shapes": len(np.unique(table.shapes)), "laws": laws, "rows": len(table), "members": members}
     provenance = {"table": table.provenance, **counts, "seed": seed}
-    zero, one = np.zeros(len(PARAMETERS)), np.ones(len(PARAMETERS))
-    posterior = Posterior(sizes, (), compression, views, box, zero, one, emulator, left, provenance)
-    logits = posterior.to_logits(table.parameters)
+    zero, one = np.zeros(len(TARGETS)), np.ones(len(TARGETS))
+    none = Combinations(np.eye(len(PARAMETERS)), zero[: len(PARAMETERS)], ())
+    posterior = Posterior(sizes, (), compression, views, box, zero, one, emulator, left, none, provenance)
+    logits = posterior.to_logits(table.targets)
     centre, spread = logits.mean(0), logits.std(0)
     target = torch.from_numpy((logits - centre) / spread).float()
-    context = posterior.context(table.descriptors, table.views)
-    flows = []
+    context = posterior.context(table.descriptors, table.views, table.amount)
+    flows, apart = [], []
     for k in range(members):
         rng = np.random.default_rng([seed, k])
-        holdout = rng.permutation(len(shapes))[: max(1, round(VALIDATION * len(shapes)))]
+        holdout = rng.permutation(laws)[: max(1, round(VALIDATION * laws))]
         validation = torch.from_numpy(np.isin(number, holdout))
         part = sub_progress(progress, *(EMULATOR_PART + (1 - EMULATOR_PART) * end / members for end in (k, k + 1)))
         with torch.random.fork_rng():
             torch.manual_seed(int(rng.integers(2**31)))
             flow = Member(sizes, len(views))
             flows.append(_fit(flow, context, target, validation, flow_plan, f"member {k + 1} of {members}", part))
-    return dataclasses.replace(posterior, members=tuple(flows), centre=centre, spread=spread)
+        apart.append(np.flatnonzero(validation.numpy()))
+    posterior = dataclasses.replace(posterior, members=tuple(flows), centre=centre, spread=spread)
+    return dataclasses.replace(posterior, combinations=_find_combinations(posterior, table, apart))
+
+
+def _find_combinations(posterior: Posterior, table: Table, apart: Sequence[np.ndarray]) -> Combinations:
+    """Return the combinations of parameters that each flow tells best of the rows that it has not learnt."""
+    errors = []
+    for flow, rows in zip(posterior.members, apart, strict=True):
+        alone, asked = dataclasses.replace(posterior, members=(flow,)), table.rows(rows)
+        draws = alone.sample(asked.descriptors, asked.views, asked.amount, DRAWS)
+        errors.append(draws[..., : len(PARAMETERS)].mean(1) - asked.parameters)
+    asked = table.rows(np.concatenate(apart))
+    return find_combinations(np.concatenate(errors), asked.parameters, asked.descriptors)
 
 
 def _fit(
@@ -158,14 +177,11 @@ def train_emulator(
     """
     views = tuple(sorted(set(table.views.tolist())))
     target = compression(table.descriptors)
-    shapes, number = np.unique(table.shapes, return_inverse=True)
-    part = np.random.default_rng(seed).permutation(len(shapes))[number] % FOLDS
+    number = table.laws
+    part = np.random.default_rng(seed).permutation(number.max() + 1)[number] % FOLDS
     none = (Layer(np.zeros((1, 1, 1)), np.zeros((1, 1))),)
     blank = Emulator(compression, views, box, none, none, np.eye(target.shape[1]), 1.0)
-    inputs = np.empty((len(table), 6 + len(views)))
-    for view in views:
-        mine = table.views == view
-        inputs[mine] = blank.inputs(table.parameters[mine], view)
+    inputs = blank.inputs(table.parameters, table.views, table.amount)
     x, y = torch.from_numpy(inputs).float(), torch.from_numpy(target).float()
 
     means = _train_ensemble(x, y, part, _mean_square, plan, seed, sub_progress(progress, 0.0, 0.5))
@@ -193,7 +209,7 @@ def _misfits(emulator: Emulator, number: int, rows: Table) -> np.ndarray:
         for layers in (emulator.mean, emulator.spread)
     )
     single = dataclasses.replace(emulator, mean=mean, spread=spread)
-    return misfits(single, rows.descriptors, str(rows.views[0]), rows.parameters[:, None])
+    return misfits(single, rows.descriptors, rows.views, rows.amount, rows.parameters[:, None])
 
 
 def _inflation(emulator: Emulator, table: Table, left: np.ndarray) -> float:
@@ -204,7 +220,7 @@ def _inflation(emulator: Emulator, table: Table, left: np.ndarray) -> float:
     squared, expected = 0.0, 0.0
     for view in emulator.views:
         mine = table.views == view
-        slopes = emulator.slopes(table.parameters[mine], view)
+        slopes = emulator.slopes(table.parameters[mine], table.views[mine], table.amount[mine])
         pulls = np.einsum("nkd,nk->nd", slopes, left[mine])
         firmness = np.einsum("nkd,nke->nde", slopes, slopes)
         covariance = np.linalg.inv(firmness + np.eye(len(PARAMETERS)))

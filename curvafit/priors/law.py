@@ -19,7 +19,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 
 #: The format of a `fit.json`.
-FORMAT = "curvafit-fit-2"
+FORMAT = "curvafit-fit-3"
 
 
 @dataclass(frozen=True)

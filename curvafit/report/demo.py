@@ -25,6 +25,7 @@ from curvafit.report.page import (
     SYMBOLS,
     check_report,
     describe_scan,
+    list_strips,
     picture_of,
     render_template,
     write_inference,
@@ -167,7 +168,7 @@ def demo_page(
         map=picture_of(_map_figure(inference, atlas), "The scan's curvature diagram, and its place on the atlas's map"),
         reading=fit.status,
         parameters=_parameter_rows(fit.draws, box),
-        weak=fit.weak_directions,
+        strips=list_strips(fit),
         notes=dict.fromkeys((*inference.scan.notes, *fit.notes)),
     )
 
@@ -201,7 +202,7 @@ def _map_figure(inference: Inference, atlas: Atlas) -> Figure:
     """Return a figure of the scan's diagram and its place among the atlas's, on the main axes of sliced quantiles."""
     assert inference.diagram is not None
     figure = make_figure(10.2, 4.6)
-    λ, unit = inference.fit.length, inference.fit.length_unit
+    λ, unit = inference.prepared.length, inference.fit.length_unit
     left = figure.add_axes((0.07, 0.13, 0.36, 0.78))
     diagram_on(left, inference.diagram, limits=shared_limits([inference.diagram], length=λ), unit=unit, length=λ)
     left.set_title("how much surface has which curvatures", fontsize=11)
@@ -241,7 +242,7 @@ def _parameter_rows(draws: np.ndarray | None, box: np.ndarray) -> list[tuple[str
     rows = []
     low, high = np.percentile(draws, (5, 95), axis=0)
     shares = (high - low) / (0.9 * (box[:, 1] - box[:, 0]))
-    for name, a, b, share in zip(SYMBOLS, low, high, shares, strict=True):
+    for name, a, b, share in zip(SYMBOLS, low, high, shares, strict=False):
         word = "read" if share <= _READ else "partly read" if share <= _PARTLY else "not read"
         rows.append((name, f"{a:.3g} to {b:.3g}", f"{share:.0%}", word))
     return rows

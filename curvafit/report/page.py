@@ -44,6 +44,7 @@ from curvafit.drawing.plot import (
     svg,
 )
 from curvafit.inference.candidates import TITLES, Candidate, seed_noise_of
+from curvafit.inference.combinations import KNOWN
 from curvafit.inference.table import parameters_of
 from curvafit.inference.verdict import UNBELIEVED, UNDECIDED
 from curvafit.priors.law import FORMAT
@@ -52,6 +53,7 @@ from curvafit.volumes.write import save
 
 if TYPE_CHECKING:
     from curvafit.geometry.diagram import Diagram
+    from curvafit.inference.fit import Fit
     from curvafit.inference.infer import Inference
     from curvafit.studies.compare import Comparison
     from curvafit.studies.trajectory import Trajectory
@@ -74,6 +76,8 @@ _TERMS = {
 #: The parameters as a corner plot names them.
 SYMBOLS = ("a₁₁", "log a₀₂", "a₁₀", "a₀₁", "a₀₀", "m₀")
 _AXES = "zyx"
+#: Deviations among laws from the middle of a strip to its end.
+STRIP = 2.5
 #: tan 22.5°: how far in direction a point may lie from a family's ideal one.
 _NARROW = math.tan(math.pi / 8)
 _Radii = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -257,6 +261,7 @@ def report_html(inference: Inference) -> str:
         noise=seed_noise_of(fit.candidates),
         twins=0 if fit.best is None else len(fit.best.twins),
         numbers=_number_rows(inference),
+        strips=list_strips(fit),
         law=_law(inference),
         corner=_corner(inference),
         bands=bands(inference),
@@ -272,7 +277,7 @@ def describe(inference: Inference) -> str:
     """Return the sentence that a report opens with: family, size, share of the volume."""
     fit, numbers = inference.fit, inference.fit.morphometry
     radius = None if inference.diagram is None else family_radius(inference.diagram, fit.family)
-    physical = numbers.thickness_mean / 2 if radius is None else radius * fit.length
+    physical = numbers.thickness_mean / 2 if radius is None else radius * inference.prepared.length
     pattern = _SIZES.get(fit.family, "{family}, {thickness} thick, {share} of the volume")
     return pattern.format(
         family=fit.family.capitalize(),
@@ -305,7 +310,7 @@ def describe_scan(inference: Inference) -> str:
     spacing = (scan.spacing[0],) if same else scan.spacing
     voxel = " × ".join(f"{h:.4g}" for h in spacing) + f" {unit_name(scan.unit, spacing[0])}"
     line = f"{Path(scan.source).name or 'a volume'}: {kind} of {shape} voxels (z, y, x), voxel edge {voxel}."
-    return f"{line} Measured on voxels of {format_length(fit.working_voxel, fit.length_unit, 3)}."
+    return f"{line} Measured on voxels of {format_length(inference.prepared.working_voxel, fit.length_unit, 3)}."
 
 
 def _bars(inference: Inference) -> list[dict[str, Any]]:
@@ -373,6 +378,17 @@ def _parameters(inference: Inference) -> list[tuple[str, tuple[str, ...], str]]:
         cells = (format_number(value), _deviation(best, name), median, *ranges, scaled)
         rows.append((name, cells, per_unit(fit.length_unit, power) if power else ""))
     return rows
+
+
+def list_strips(fit: Fit) -> list[dict[str, Any]]:
+    """Return the bars of what a fit tells of each combination of parameters, in percent of a strip."""
+    strips = []
+    for each in fit.combinations:
+        start, end = (100 * float(np.clip(0.5 + x / (2 * STRIP), 0, 1)) for x in each.interval)
+        low, high = (format_number(x, 2) for x in each.interval)
+        strips.append({"low": each.low, "high": each.high, "start": f"{start:.1f}", "width": f"{end - start:.1f}",
+                       "known": each.known >= KNOWN, "text": f"{low} to {high}"})  # fmt: skip
+    return strips
 
 
 def _law(inference: Inference) -> dict[str, Any] | None:
@@ -517,7 +533,7 @@ def _diagrams(inference: Inference) -> list[Picture]:
         if each.name in (inference.fit.chosen, "match"):
             grown = (twin.diagram for twin in inference.twins.get(each.name, ()) if twin.diagram)
             diagrams.append((f"{_title(each)}, regrown", next(grown, None)))
-    λ, unit = inference.fit.length, inference.fit.length_unit
+    λ, unit = inference.prepared.length, inference.fit.length_unit
     limits = shared_limits([diagram for _, diagram in diagrams if diagram is not None], length=λ)
     return [
         Picture(None, "", title)
@@ -531,9 +547,9 @@ def _diagrams(inference: Inference) -> list[Picture]:
 
 def _corner(inference: Inference) -> Picture | None:
     """Return a corner plot of the posterior's draws, in working units, with marks for the chosen law and the match."""
-    draws = inference.fit.draws
-    if draws is None or inference.fit.best is None:
+    if inference.fit.draws is None or inference.fit.best is None:
         return None
+    draws = inference.fit.draws[:, : len(SYMBOLS)]
     shown = [each for each in inference.fit.candidates if each.name in (inference.fit.chosen, "match")]
     marks = {_title(each): parameters_of(each.coefficients, each.mass) for each in shown}
     rows = [np.percentile(draws, (0.5, 99.5), axis=0), *(mark[None] for mark in marks.values())]

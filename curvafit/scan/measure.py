@@ -21,7 +21,7 @@ from curvafit.geometry.mesh import NoSurface, Surface, area_vectors
 from curvafit.geometry.morphometry import local_thickness, measure_connectivity, smooth_surface
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
-from curvafit.scan.grids import median_thickness, remove_specks
+from curvafit.scan.grids import Window, median_thickness, remove_specks
 from curvafit.scan.prepare import LARGEST_WINDOW, WORKED, Prepared, prepare, smallest_piece
 from curvafit.scan.structure import check_options, find_structure, is_rounded, read_labels, region_of_interest
 from curvafit.volumes.field import Field, ScanError
@@ -35,6 +35,8 @@ Sums = Mapping[str, np.ndarray]
 Row = TypeVar("Row", bound=Any)
 #: Least edge, in working voxels, of a cube whose descriptors are measured.
 SMALLEST_CUBE = 24
+#: Least edge, in working voxels, of the windows of a larger scan: those that training sees are about as large.
+READ = 56
 #: The fewest blocks, and the most along an axis; the length of a block in periods of the structure.
 LEAST, MOST, PERIODS = 8, 6, 1.0
 #: The most labels of a region of interest.
@@ -478,30 +480,54 @@ def _measure_tile(prepared: Prepared, tile: tuple[slice, ...]) -> Diagram:
     return replace(part, places=part.places + corner)
 
 
-def scan_descriptors(prepared: Prepared) -> tuple[np.ndarray, str] | None:
-    """Measure a scan's descriptors `(351,)`, and name the kind of view that it is (`curvafit.inference.table`).
+class Reading(NamedTuple):
+    """What the windows of a scan showed: the descriptors of each `(k, 351)`, in voxels of which the structure is
+    `WORKING_THICKNESS` thick; the kind of view; and how much was seen, in cubes of a thickness."""
 
-    They are those of the main window, or of the largest cube within the region of interest. None where that cube is
-    smaller than `SMALLEST_CUBE` voxels, or shows no surface.
-    """
-    where = prepared.windows[0] if prepared.roi is None else _largest_cube(prepared.roi)
-    if where is None:
-        return None
-    mask, grid = np.ascontiguousarray(prepared.mask[where]), prepared.part(where)
-    view = _kind_of_view(prepared, grid)
-    try:
-        return descriptors(prepared.phase if view == "field" else mask, grid).vector(), view
-    except NoSurface:
-        return None
+    windows: np.ndarray
+    view: str
+    amount: float
+
+    @property
+    def descriptors(self) -> np.ndarray:
+        """Return the means over windows `(351,)`."""
+        return self.windows.mean(0)
+
+    @property
+    def columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return descriptors `(1, 351)`, view and amount `(1,)`, as of many readings."""
+        return self.descriptors[None], np.array([self.view]), np.array([self.amount])
 
 
-def _kind_of_view(prepared: Prepared, grid: Grid) -> str:
+def read_texture(prepared: Prepared) -> Reading | None:
+    """Measure a scan's descriptors in windows of one size that fill its grid, or in the largest cube within its region
+    of interest. None where that cube is smaller than `SMALLEST_CUBE` voxels, or no window shows a surface."""
+    rows, view = [], _kind_of_view(prepared)
+    windows = _windows(prepared) if prepared.roi is None else [_largest_cube(prepared.roi)]
+    for where in windows:
+        if where is not None:
+            seen = prepared.phase if view == "field" else prepared.mask
+            with contextlib.suppress(NoSurface):
+                rows.append(descriptors(np.ascontiguousarray(seen[where]), prepared.part(where)).vector())
+                size = prepared.mask[where].size
+    return Reading(np.array(rows), view, len(rows) * size / prepared.thickness**3) if rows else None
+
+
+def _windows(prepared: Prepared) -> list[Window]:
+    """Cut the working grid into windows of one size, of `READ` voxels a side or more; one that repeats stays whole."""
+    shape = prepared.grid.shape
+    counts = [1 if prepared.grid.periodic else max(n // READ, 1) for n in shape]
+    edges = [n // count for n, count in zip(shape, counts, strict=True)]
+    starts = itertools.product(*(range(0, count * edge, edge) for count, edge in zip(counts, edges, strict=True)))
+    return [tuple(slice(a, a + edge) for a, edge in zip(start, edges, strict=True)) for start in starts]  # type: ignore[misc]
+
+
+def _kind_of_view(prepared: Prepared) -> str:
     """Return the kind of view for a posterior: a part of a field is read as its mask, a clean image as a mask."""
     if prepared.quality is not None and prepared.quality.degraded:
         return "scan"
-    if grid.periodic:
-        return "field" if prepared.kind == "field" and not is_rounded(prepared.phase) else "mask"
-    return "crop" if prepared.scale == (1.0, 1.0, 1.0) else "resampled"
+    whole = prepared.kind == "field" and prepared.grid.periodic and not is_rounded(prepared.phase)
+    return "field" if whole else "mask"
 
 
 def _largest_cube(region: np.ndarray) -> tuple[slice, slice, slice] | None:

@@ -34,18 +34,19 @@ from curvafit.scan.structure import (
     is_noise,
     measure_quality,
     region_of_interest,
-    voxelise,
+    sample_mask,
 )
 from curvafit.volumes.field import Field, ScanError
 
-#: Median thickness, in voxels, of an isotropic scan whose grid is kept; and the one a scan is resampled to.
-KEPT_THICKNESS = (5.0, 16.0)
+#: Median thickness in voxels that a scan is resampled to; those of isotropic scans whose grid is kept: where a shape is
+#: measured, and where a law is read.
 WORKING_THICKNESS = 8.0
+KEPT, KEPT_FOR_LAWS = (5.0, 16.0), (7.84, 8.16)
 #: A structure is refused when it is nowhere thicker than this many scan voxels.
 THINNEST = 3.0
 #: Longest sides: of a window and of the whole working grid, in working voxels; of what is read, in scan voxels.
 LARGEST_WINDOW = 128
-LARGEST_BOX = 200
+LARGEST_BOX = 256
 LARGEST_SCAN = 512
 #: Bytes that a working voxel takes while it is made.
 WORKED = 64
@@ -53,7 +54,7 @@ WORKED = 64
 HALF = 0.5
 MOSTLY = "The structure fills {:.0%} of the volume: if the other phase was meant, turn the two round (--dark)."
 #: Coarsening stops where a side would have fewer working voxels than this.
-FEWEST = 32
+FEWEST = 24
 #: Least mean of √(κ1² + κ2²) times the window's edge at which a surface is not flat; a ball that fits has 2.8.
 FLATTEST = 2.0
 NOISE = "No law: the scan is noise, its voxels have nothing to do with those a few voxels away."
@@ -95,6 +96,8 @@ class Prepared:
         Whether the structure's voxels have nothing to do with those a few voxels away.
     quality
         Blur and noise of an image; None of fields and masks.
+    one_scale
+        Whether it was prepared for a law to be read.
     """
 
     kind: Kind
@@ -111,41 +114,49 @@ class Prepared:
     roi: np.ndarray | None = None
     noise: bool = False
     quality: Quality | None = None
+    one_scale: bool = False
+
+    @property
+    def length(self) -> float:
+        """Return a working length of 1 in `unit`."""
+        return self.working_voxel / WORKING_SPACING
 
     @property
     def volume_fraction(self) -> float:
         """Return the part of the scan, or of its region of interest, that is structure."""
         return float((self.mask if self.roi is None else self.mask[self.roi]).mean())
 
-    @property
-    def smallest(self) -> float:
-        """Return the volume, in working voxels, of the smallest piece that counts as structure."""
-        return smallest_piece(self.thickness)
+    def scan_alike(self, grown: np.ndarray, seed: int) -> Prepared:
+        """Scan a grown shape as this scan was made, and prepare it alike: its phase field if this is one, else its mask
+        `(Z, Y, X)`, a period of it, at this scan's thickness in voxels; an image as blurred and noisy as this one.
 
-    def rescan(self, mask: np.ndarray, seed: int) -> np.ndarray:
-        """Scan a periodic mask `(Z, Y, X)` on working voxels as this scan was made; return the mask that comes back.
-
-        An image is as blurred and noisy as this one, with noise of a seed; a mask is one on this scan's voxels.
+        Raises ScanError as `prepare`.
         """
-        if self.quality is not None:
-            return self.quality.rescan(mask, self.scale, self.smallest, seed)
-        return mask if self.scale == (1.0, 1.0, 1.0) else voxelise(mask, self.scale, self.smallest)
+        if self.kind == "field":
+            return prepare(Field(grown), kind="field", periodic=True, one_scale=self.one_scale)
+        mask, (z, y, x) = grown > 0, self.scale
+        step = [thinner_thickness(mask) / (scale * self.thickness) for scale in self.scale]
+        edges = (self.working_voxel / z, self.working_voxel / y, self.working_voxel / x)
+        values = sample_mask(mask, step) if self.quality is None else self.quality.image(mask, step, seed)
+        values = values.astype(np.uint8 if self.quality is None else np.float32)
+        scan = Field(values, edges, self.unit)
+        return prepare(scan, kind=self.kind, periodic=self.grid.periodic, one_scale=self.one_scale)
 
     @cached_property
     def true_volume_fraction(self) -> float:
         """Return the structure's volume fraction, corrected for the bias of blur and noise.
 
-        The bias is estimated by scanning the main window's structure once more (`rescan`).
+        The bias is estimated by scanning the main window's structure once more (`scan_alike`).
         """
         if self.quality is None:
             return self.volume_fraction
         mask = self.mask[self.windows[0]]
         inside = centre_distance(mask, (1.0, 1.0, 1.0), 4.0) > self.quality.boundary_shift / max(self.scale)
         try:
-            seen = np.count_nonzero(self.rescan(inside, 0))
+            seen = self.scan_alike(inside, 0).volume_fraction
         except ScanError:
             return self.volume_fraction
-        share = self.volume_fraction * np.count_nonzero(inside) / max(seen, 1)
+        share = self.volume_fraction * inside.mean() / seen
         return share if 0 < share < 1 else self.volume_fraction
 
     def part(self, where: Window) -> Grid:
@@ -169,6 +180,7 @@ def prepare(
     threshold: Literal["otsu"] | float = "otsu",
     dark: bool = False,
     roi: Field | np.ndarray | str | os.PathLike[str] | None = None,
+    one_scale: bool = False,
     most: int | None = None,
 ) -> Prepared:
     """Find the structure and put it on the working grid, where its median thickness is a known number of voxels.
@@ -195,6 +207,8 @@ def prepare(
         The structure is the dark phase (of a mask: its lower value; of a field: where it is negative).
     roi
         Nonzero where the scan counts (array, field or file of the scan's shape).
+    one_scale
+        Keep no grid but a phase field's: laws are read where structures are of one thickness in voxels.
     most
         Use all of the scan, or raise TooLarge where that is more than so many working voxels. By default a large scan
         is cut, and a note says so.
@@ -209,7 +223,8 @@ def prepare(
     extremes = (field.values.min(), field.values.max())
     seen, signed = find_structure(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
     mask, quality = signed.values > 0, None
-    prepared = _put_on_grid(_Scan(seen, signed, periodic, region, noise=seen != "field" and is_noise(mask)), most)
+    noise = seen != "field" and is_noise(mask)
+    prepared = _put_on_grid(_Scan(seen, signed, periodic, region, noise, one_scale), most)
     if seen == "image":
         quality = measure_quality(-part.values if dark else part.values, mask, part.spacing)
     corner = tuple(s.start + o for s, o in zip(where, prepared.origin, strict=True))
@@ -225,6 +240,7 @@ class _Scan:
     periodic: bool
     region: np.ndarray | None
     noise: bool
+    one_scale: bool
 
     @property
     def mask(self) -> np.ndarray:
@@ -287,6 +303,7 @@ def _put_on_grid(scan: _Scan, most: int | None) -> Prepared:
         origin=tuple(a * s for a, s in zip(start, scale, strict=True)),  # type: ignore[arg-type]
         roi=region,
         noise=scan.noise,
+        one_scale=scan.one_scale,
     )
 
 
@@ -316,7 +333,7 @@ def choose_scale(
     kind: Kind, frame: Field, noise: bool, thickness: float
 ) -> tuple[tuple[float, float, float], tuple[str, ...]]:
     """Return the working voxel of a scan in its own voxels (z, y, x), and notes; of `frame` only the place counts."""
-    return _choose_scale(_Scan(kind, frame, False, None, noise=noise), thickness)
+    return _choose_scale(_Scan(kind, frame, False, None, noise, one_scale=False), thickness)
 
 
 def working_edge(scale: Sequence[float], spacing: Sequence[float]) -> float:
@@ -329,7 +346,8 @@ def _choose_scale(scan: _Scan, thickness: float) -> tuple[tuple[float, float, fl
     """Return the working voxel in scan voxels, per axis; all ones where the scan's grid is kept."""
     spacing, finest = scan.field.spacing, min(scan.field.spacing)
     isotropic = max(spacing) <= 1.01 * finest
-    if isotropic and (scan.keeps_grid or KEPT_THICKNESS[0] <= thickness / finest <= KEPT_THICKNESS[1]):
+    low, high = KEPT_FOR_LAWS if scan.one_scale else KEPT
+    if isotropic and (scan.keeps_grid or low <= thickness / finest <= high):
         return (1.0, 1.0, 1.0), ("The scan's grid is kept.",)
     edge = finest if scan.keeps_grid else thickness / WORKING_THICKNESS
     extent = min(n * h for n, h in zip(scan.field.shape, spacing, strict=True))
@@ -400,6 +418,11 @@ def _clean_mask(
     counts = f"specks: {specks}, pinholes: {pinholes}, {(cleaned != mask).mean():.2g} of the volume"
     cleaned = cleaned if region is None else cleaned & region
     return cleaned, (f"Dropped what is smaller than a ball of half the median thickness ({counts}).",)
+
+
+def thinner_thickness(mask: np.ndarray) -> float:
+    """Return the median thickness, in voxels, of the phase of a period `(Z, Y, X)` that fills less."""
+    return median_thickness(mask if mask.mean() <= HALF else ~mask, (1.0, 1.0, 1.0), periodic=True)[0]
 
 
 def smallest_piece(thickness: float) -> float:

@@ -1,7 +1,7 @@
 """What in a scan is structure, how blurred it is and how noisy.
 
 `find_structure` decides the kind of a scan and splits structure from background. `Quality` is how the scan blurs and
-how noisy it is, measured from its grey levels (`measure_quality`), and scans a grown shape alike (`Quality.rescan`).
+how noisy it is, measured from its grey levels (`measure_quality`), and images a grown shape alike (`Quality.image`).
 
 Two rooms split grey levels otherwise, on purpose. `segmentation.evidence` needs the noise of each voxel: it smooths as
 far as the noise asks, and splits half way between the means of the raw levels. `data_synth.imaging` follows brightness
@@ -22,7 +22,7 @@ from scipy import ndimage
 from skimage.filters import threshold_otsu
 
 from curvafit.core.checks import SEEDS, check_choice, check_float, check_int
-from curvafit.scan.grids import boxes_by_surface, centre_distance, remove_specks, resample, surface_voxels
+from curvafit.scan.grids import boxes_by_surface, centre_distance, resample, surface_voxels
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.read import load
 
@@ -249,49 +249,27 @@ class Quality:
         """Return whether a texture is harder to read from the scan than from a mask."""
         return self.smoothed > NOISY or max(self.spacing) > SLICED * min(self.spacing)
 
-    def rescan(self, mask: np.ndarray, scale: Sequence[float], smallest: float, seed: int) -> np.ndarray:
-        """Scan a periodic mask `(Z, Y, X)` as this scan was made, and return the mask that comes back.
-
-        The mask, on working voxels, is blurred, sampled on the scan's voxels (a working voxel is `scale` of them), made
-        noisy with noise of a seed, and prepared as an image is: smoothed, split by Otsu's threshold, brought back to
-        its own grid, cleared of pieces under `smallest` working voxels. Raises ScanError if nothing is left to be
-        split.
-        """
-        shape, voxel = _sample_grid(mask.shape, scale)
+    def image(self, mask: np.ndarray, step: Sequence[float], seed: int) -> np.ndarray:
+        """Return grey levels of a periodic mask `(Z, Y, X)` as this scan would show it: blurred, sampled on voxels of
+        `step` of the mask's (z, y, x), and made noisy with noise of a seed."""
         filled = np.clip(centre_distance(mask, (1.0, 1.0, 1.0), 2.0, periodic=True) + 0.5, 0, 1)
-        grey = resample(filled, voxel, (0, 0, 0), shape, periodic=True)
-        grey = ndimage.gaussian_filter(grey, [self.blur * min(voxel) / h for h in voxel], mode="wrap")
+        grey = resample(filled, step, (0, 0, 0), sampled_shape(mask.shape, step), periodic=True)
+        widths = [min(self.spacing) / h for h in self.spacing]
+        grey = ndimage.gaussian_filter(grey, [self.blur * width for width in widths], mode="wrap")
         noise = np.random.default_rng(seed).standard_normal(grey.shape, dtype=np.float32)
-        noise = ndimage.gaussian_filter(noise, [self.grain * min(voxel) / h for h in voxel], mode="wrap")
-        grey += np.float32(self.noise) * noise / noise.std()
-        edges = (voxel[0], voxel[1], voxel[2])
-        return remove_specks(split(Field(grey, edges, "voxel"), mask.shape, periodic=True), smallest, True)[0]
+        noise = ndimage.gaussian_filter(noise, [self.grain * width for width in widths], mode="wrap")
+        return grey + np.float32(self.noise) * noise / noise.std()
 
 
-def split(scan: Field, shape: Sequence[int], *, periodic: bool = False) -> np.ndarray:
-    """Return the structure of grey levels, split as an image is, on cubic voxels of edge 1 `(Z, Y, X)`."""
-    _, signed = find_structure(scan, kind="image", periodic=periodic)
-    return resample(signed.values, [1 / h for h in scan.spacing], (0, 0, 0), shape, periodic=periodic) > 0
+def sample_mask(mask: np.ndarray, step: Sequence[float], periodic: bool = True) -> np.ndarray:
+    """Return a mask `(Z, Y, X)` on voxels of `step` of its own (z, y, x), by signed distances."""
+    distance = centre_distance(mask, (1.0, 1.0, 1.0), 4 * max(1.0, *step), periodic)
+    return resample(distance, step, (0, 0, 0), sampled_shape(mask.shape, step), periodic=periodic) > 0
 
 
-def voxelise(mask: np.ndarray, scale: Sequence[float], smallest: float, periodic: bool = True) -> np.ndarray:
-    """Return a mask `(Z, Y, X)` as it comes back from a mask on the voxels of a scan.
-
-    It is resampled there and back by signed distances, and pieces of under `smallest` working voxels are dropped.
-    `scale` is a working voxel in scan voxels (z, y, x).
-    """
-    shape, voxel = _sample_grid(mask.shape, scale)
-    distance = centre_distance(mask, (1.0, 1.0, 1.0), 4 * max(voxel), periodic)
-    coarse = resample(distance, voxel, (0, 0, 0), shape, periodic=periodic) > 0
-    distance = centre_distance(coarse, voxel, 4 * max(1.0, *voxel), periodic)
-    inside = resample(distance, [1 / h for h in voxel], (0, 0, 0), mask.shape, periodic=periodic) > 0
-    return remove_specks(inside, smallest, periodic)[0]
-
-
-def _sample_grid(shape: Sequence[int], scale: Sequence[float]) -> tuple[list[int], list[float]]:
-    """Return the scan's voxels in a box of working voxels, and their edges in working voxels."""
-    voxels = [max(4, round(n * s)) for n, s in zip(shape, scale, strict=True)]
-    return voxels, [n / m for n, m in zip(shape, voxels, strict=True)]
+def sampled_shape(shape: Sequence[int], step: Sequence[float]) -> tuple[int, ...]:
+    """Return how many voxels of `step` lie along the axes of a box of voxels of 1."""
+    return tuple(max(4, int(n / h)) for n, h in zip(shape, step, strict=True))
 
 
 def measure_quality(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, float, float]) -> Quality:

@@ -14,6 +14,15 @@ from scipy.spatial.distance import cdist
 from scipy.stats import false_discovery_control
 
 from curvafit.core.checks import check_choice, check_int, check_seed
+from curvafit.core.permutation import (
+    correct_by_most,
+    correct_holm,
+    correlate,
+    measure_effect,
+    measure_energy,
+    relabel,
+    share_beyond,
+)
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number, format_percent, per_unit, power_name
@@ -23,15 +32,6 @@ from curvafit.geometry.distances import sliced_embedding
 from curvafit.scan.measure import QUANTITIES, SURE, Measures, find_quantity, interval_reach
 from curvafit.scan.structure import check_options
 from curvafit.studies.groups import Case, Group, list_cases
-from curvafit.studies.permutation import (
-    correct_by_most,
-    correct_holm,
-    correlate,
-    measure_effect,
-    measure_energy,
-    relabel,
-    share_beyond,
-)
 from curvafit.studies.scans import gather_notes, measure_scans, stack_numbers
 
 #: Permutations of subjects that are tried: all where there are no more.
@@ -218,6 +218,7 @@ def compare(
     periodic: bool = False,
     threshold: Literal["otsu"] | float = "otsu",
     dark: bool = False,
+    laws: bool = False,
     primary: str | None = None,
     permutations: int = PERMUTATIONS,
     seed: int = 0,
@@ -242,6 +243,8 @@ def compare(
         Paths are relative to the table. Without it each scan is a subject.
     kind, periodic, threshold, dark
         As in `measure`.
+    laws
+        Compare what each scan tells of its law, too: the six combinations of parameters, where its law can be read.
     primary
         The symbol or name of the one number that was chosen before the scans were seen: its p needs no correction.
     permutations
@@ -261,7 +264,7 @@ def compare(
         check_choice(primary, names, f"a primary number of {', '.join(symbol for _, symbol, *_ in QUANTITIES)}")
     cases, notes = list_cases(group_a, group_b, subjects)
     options = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark}
-    measures, more = measure_scans(cases, options, reading, workers, sub_progress(progress, 0.0, 0.97))
+    measures, more = measure_scans(cases, options, reading, workers, sub_progress(progress, 0.0, 0.97), laws)
     progress("comparing", 0.97)
     parameters = {**options, **reading, "primary": primary, "permutations": permutations, "seed": seed}
     return compare_measures(measures, cases, parameters, [*notes, *more])

@@ -15,7 +15,12 @@ import numpy as np
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number
 from curvafit.core.workers import cluster, collect_all
-from curvafit.scan.measure import Measures
+from curvafit.inference.infer import Inference, infer
+from curvafit.inference.posterior import Posterior, load_posterior
+from curvafit.inference.table import PARAMETERS
+from curvafit.inference.verdict import UNBELIEVABLE
+from curvafit.scan.measure import SURE, Measures, Quantity
+from curvafit.scan.prepare import HALF
 from curvafit.scan.tiles import measure
 from curvafit.studies.groups import Case
 from curvafit.volumes.field import ScanError
@@ -29,15 +34,23 @@ _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
 def measure_scans(
-    cases: Sequence[Case], options: dict[str, Any], reading: dict[str, Any], workers: int, progress: Progress
+    cases: Sequence[Case],
+    options: dict[str, Any],
+    reading: dict[str, Any],
+    workers: int,
+    progress: Progress,
+    laws: bool = False,
 ) -> tuple[list[Measures], list[str]]:
     """Measure scans with `options` of `measure`; return their measures, in the first scan's unit, and notes.
 
-    All are read before the first is measured. Raises ValueError, with the scan's name, as `measure`; and where only
-    some scans have a physical unit.
+    With `laws`, the measures have what the scans tell of their laws besides (`add_combinations`). All are read before
+    the first is measured. Raises ValueError, with the scan's name, as `measure`; and where only some scans have a
+    physical unit.
     """
+    if laws and any(isinstance(case.source, Measures) for case in cases):
+        raise ValueError("expected scans whose laws can be read, got one that is measured already")
     unit, notes = _check_scans(cases, reading, sub_progress(progress, 0.0, 0.05))
-    measures = _measure_all(cases, options | reading, workers, sub_progress(progress, 0.05, 1.0))
+    measures = _measure_all(cases, options | reading, laws, workers, sub_progress(progress, 0.05, 1.0))
     units = {each.unit for each in measures}
     notes += [] if len(units) == 1 else [f"Lengths in {', '.join(sorted(units))} were converted to {unit}."]
     return [each.convert(unit) for each in measures], notes
@@ -102,13 +115,15 @@ def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progr
     return next(iter(units)), notes
 
 
-def _measure_all(cases: Sequence[Case], options: dict[str, Any], workers: int, progress: Progress) -> list[Measures]:
+def _measure_all(
+    cases: Sequence[Case], options: dict[str, Any], laws: bool, workers: int, progress: Progress
+) -> list[Measures]:
     """Measure the scans, in this process or by several, and return their measures in order."""
     found = {k: case.source for k, case in enumerate(cases) if isinstance(case.source, Measures)}
     left = [k for k in range(len(cases)) if k not in found]
     with cluster(workers) as crew:
         watches = {k: sub_progress(progress, k / len(cases), (k + 1) / len(cases)) for k in left}
-        make = {k: partial(_measure_case, cases[k], options, silent if workers else watches[k]) for k in left}
+        make = {k: partial(_measure_case, cases[k], options, laws, silent if workers else watches[k]) for k in left}
         for k, measures in collect_all(crew, ((make[k], Path(), [k]) for k in left)):
             found[k] = measures
             progress(f"{len(found)} of {len(cases)} scans measured", len(found) / len(cases))
@@ -116,13 +131,43 @@ def _measure_all(cases: Sequence[Case], options: dict[str, Any], workers: int, p
 
 
 def _measure_case(
-    case: Case, options: dict[str, Any], progress: Progress, folder: Path, indices: Sequence[int]
+    case: Case, options: dict[str, Any], laws: bool, progress: Progress, folder: Path, indices: Sequence[int]
 ) -> list[tuple[int, Measures]]:
     """Measure one scan; its diagram is binned finely, so that many scans take little memory."""
     with _named(case):
         measures = measure(case.source, progress=lambda text, share: progress(f"{case.name}: {text}", share), **options)  # type: ignore[arg-type]
+        if laws:
+            measures = add_combinations(measures, infer(case.source, fast=True, **options))  # type: ignore[arg-type]
     diagram = measures.diagram.bin(FINE / measures["thickness"].value)
     return [(k, replace(measures, diagram=diagram, source=measures.source or case.name)) for k in indices]
+
+
+def add_combinations(measures: Measures, inference: Inference) -> Measures:
+    """Return measures with six more quantities, `L1` to `L6`: what the scan tells of the combinations of a law's
+    parameters, in deviations among laws; NaN where the packaged posterior does not know scans of its kind."""
+    posterior = load_posterior()
+    values, halves, why = _read_combinations(inference, posterior)
+    ends = posterior.combinations.ends
+    rows = [
+        Quantity(f"{low} to {high}", f"L{k}", float(value), float(half), 0)
+        for k, ((low, high), value, half) in enumerate(zip(ends, values, halves, strict=True), 1)
+    ]
+    notes = (*measures.notes, f"No combinations of a law's parameters: {why}.") if why else measures.notes
+    return replace(measures, quantities=(*measures.quantities, *rows), notes=notes)
+
+
+def _read_combinations(inference: Inference, posterior: Posterior) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return the medians and half the widths of the `SURE` intervals of combinations, or why they are not known."""
+    fit, unknown = inference.fit, np.full(len(PARAMETERS), np.nan)
+    if fit.draws is None:
+        return unknown, unknown, "the scan shows no texture"
+    if inference.prepared.volume_fraction > HALF:
+        return unknown, unknown, "the structure fills more than half of the scan"
+    if fit.misfit is not None and fit.misfit.probability < UNBELIEVABLE:
+        return unknown, unknown, f"no law makes such scans (p = {format_number(fit.misfit.probability, 2)})"
+    sums = posterior.combinations(fit.draws[:, : len(PARAMETERS)])
+    low, middle, high = np.quantile(sums, ((1 - SURE) / 2, 0.5, (1 + SURE) / 2), axis=0)
+    return middle, (high - low) / 2, ""
 
 
 @contextmanager

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from curvafit.core.checks import as_tuple, check_float, check_int, check_seed, check_type, quoted
+from curvafit.core.permutation import TIE, correct_by_most, correlate, reorder, share_beyond
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number, per_unit, power_name
@@ -19,7 +20,6 @@ from curvafit.scan.measure import Measures, find_quantity
 from curvafit.scan.structure import check_options
 from curvafit.studies.compare import LEVEL, PERMUTATIONS
 from curvafit.studies.groups import list_series
-from curvafit.studies.permutation import TIE, correct_by_most, correlate, reorder, share_beyond
 from curvafit.studies.scans import gather_notes, measure_scans, stack_numbers
 from curvafit.volumes.read import Source
 
@@ -171,6 +171,7 @@ def trajectory(
     periodic: bool = False,
     threshold: Literal["otsu"] | float = "otsu",
     dark: bool = False,
+    laws: bool = False,
     permutations: int = PERMUTATIONS,
     seed: int = 0,
     workers: int = 0,
@@ -191,6 +192,8 @@ def trajectory(
         When each scan was made, by default 0, 1, 2 …; and the unit's name, any text.
     kind, periodic, threshold, dark
         As in `measure`.
+    laws
+        Follow what each scan tells of its law, too: the six combinations of parameters, where its law can be read.
     permutations
         Most orders of the scans to try; where there are fewer, all are.
     seed
@@ -207,7 +210,7 @@ def trajectory(
     cases = list_series(scans)
     moments = check_times(times, len(cases))
     options = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark}
-    measures, notes = measure_scans(cases, options, reading, workers, sub_progress(progress, 0.0, 0.97))
+    measures, notes = measure_scans(cases, options, reading, workers, sub_progress(progress, 0.0, 0.97), laws)
     orders, exact = reorder(len(cases), permutations, seed)
     embeddings = np.stack([sliced_embedding(each.diagram) for each in measures])
     away = cdist(embeddings, embeddings)

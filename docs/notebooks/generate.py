@@ -49,7 +49,7 @@ for (a, b), distance in sorted(distances.items(), key=lambda item: item[1]):
 
 # %% [markdown]
 # `curvafit infer` searches an atlas, a collection of shapes with their diagrams and parameters. The one that comes with
-# the package has 1090; these are nearest to the tubes:
+# the package has 885; these are nearest to the tubes:
 
 # %%
 atlas = load_atlas(None)

@@ -9,30 +9,32 @@ import numpy as np
 import pytest
 from exact import Gyroid, centres
 from exact_store import exact_record, exact_store
+from scipy import ndimage
 from typer.testing import CliRunner
 
 from curvafit.atlas_map.extract import describe
 from curvafit.cli.app import app
 from curvafit.core.workers import cluster
 from curvafit.geometry.descriptors import BLOCKS, descriptors
-from curvafit.geometry.mesh import NoSurface
 from curvafit.inference.table import (
     BLUR,
     PARAMETERS,
     SNR,
     VIEWS,
     Table,
-    View,
     column_names,
     law_of,
     load_table,
     parameters_of,
     save_table,
+    see_field,
 )
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import preset
 from curvafit.priors.profile import optimal_profile
+from curvafit.scan.measure import read_texture
+from curvafit.scan.prepare import WORKING_THICKNESS, prepare, thinner_thickness
 from curvafit.volumes.field import ScanError
 
 FAST = ("field", "mask")
@@ -45,47 +47,54 @@ def gyroid(n: int = 48) -> tuple[np.ndarray, Grid]:
 
 @pytest.mark.parametrize("name", VIEWS)
 def test_a_view_shows_the_shape(name: str) -> None:
+    """Eight voxels thick, all but a field; and as much of it as there is."""
     u, grid = gyroid()
-    view = VIEWS[name](u, grid, np.random.default_rng(1))
-    assert view.shape.shape == view.grid.shape
-    assert view.grid.spacing == grid.spacing
-    assert (view.grid.shape == grid.shape) == (name in FAST) == view.grid.periodic
-    assert view.shape.dtype == (np.float32 if name == "field" else bool)
-    seen, whole = descriptors(view.shape, view.grid), descriptors(u, grid)
-    assert seen.fraction == pytest.approx(whole.fraction, abs=0.03)
-    assert seen.densities == pytest.approx(whole.densities, rel=0.3, abs=0.3 * whole.densities[0])  # κ is up to 20
-    assert seen.chords[3:7] == pytest.approx(whole.chords[3:7], abs=0.012)  # 0.01 is a voxel
+    seen = VIEWS[name](u, np.random.default_rng(1))
+    prepared = prepare(seen.scan, kind=seen.kind, periodic=seen.periodic, one_scale=True)
+    reading, whole = read_texture(prepared), descriptors(u, grid)
+    assert reading is not None and reading.view == ("mask" if name == "field" else name)  # symmetry leaves few values
+    thickness = thinner_thickness(u > 0)
+    assert reading.amount == pytest.approx(grid.shape[0] ** 3 / thickness**3, rel=0.35)
+    assert prepared.thickness == pytest.approx(thickness if name == "field" else WORKING_THICKNESS, rel=0.03)
+    scale = thickness / prepared.thickness
+    row, names = reading.descriptors, np.array(column_names())
+    assert row[names == "fraction"] == pytest.approx(whole.fraction, abs=0.03)
+    assert row[names == "chords"][3:7] * scale == pytest.approx(whole.chords[3:7], abs=0.02)  # 0.01 is a voxel
+    area = whole.densities[0]
+    assert row[names == "densities"][0] / scale == pytest.approx(area, rel=0.15)
 
 
-@pytest.mark.parametrize("n", [20, 36, 46])
-def test_a_window_may_have_an_odd_number_of_planes(n: int) -> None:
-    u, grid = gyroid(n)
-    assert VIEWS["scan"](u, grid, np.random.default_rng(1)).shape.shape == (round(0.75 * n),) * 3
-
-
-@pytest.mark.parametrize("name", ["crop", "resampled", "scan"])
-def test_a_window_without_a_structure_is_refused(name: str) -> None:
-    u = np.full((24, 24, 24), -1.0, np.float32)
-    with pytest.raises(ScanError, match="inside"):
-        VIEWS[name](u, Grid(u.shape), np.random.default_rng(1))
-
-
-@pytest.mark.parametrize("name", ["crop", "resampled", "scan"])
+@pytest.mark.parametrize("name", ["mask", "scan"])
 def test_a_view_depends_on_its_generator_alone(name: str) -> None:
-    u, grid = gyroid()
-    first, again, other = (VIEWS[name](u, grid, np.random.default_rng(seed)).shape for seed in (1, 1, 2))
+    u, _ = gyroid()
+    first, again, other = (VIEWS[name](u, np.random.default_rng(seed)).scan.values for seed in (1, 1, 2))
     assert np.array_equal(first, again)
-    assert not np.array_equal(first, other)
+    assert first.shape != other.shape or not np.array_equal(first, other)
 
 
 def test_a_scan_is_blurred_and_noisy() -> None:
     """Half of what Otsu gets wrong lies at the surface, as blur and slices of two voxels do it."""
     assert BLUR > 0
     assert SNR > 0
-    u, grid = gyroid()
-    rng = np.random.default_rng
-    scan, crop = VIEWS["scan"](u, grid, rng(1)).shape, VIEWS["crop"](u, grid, rng(1)).shape
-    assert 0.005 < (scan != crop).mean() < 0.1
+    u, _ = gyroid()
+    scan = VIEWS["scan"](u, np.random.default_rng(1)).scan
+    assert scan.spacing == (2.0, 1.0, 1.0)
+    near = ndimage.gaussian_filter((u > 0).astype(np.float32), BLUR).reshape(24, 2, 48, 48).mean(1)
+    rolled = max(np.corrcoef(np.roll(near, shift, 0).ravel(), scan.values.ravel())[0, 1] for shift in range(24))
+    assert rolled < 1
+
+
+def test_what_is_pooled_is_as_if_one_scan_had_shown_it() -> None:
+    """Five shapes of one law and one of another: pairs, and four; means of descriptors, sums of what was seen."""
+    rows = small_table(6)
+    rows.parameters[:5] = rows.parameters[0]
+    pooled = rows.pooled
+    assert len(pooled) == 6 + 2 + 1
+    assert pooled.descriptors[:6] == pytest.approx(rows.descriptors)
+    assert pooled.descriptors[6:8] == pytest.approx(rows.descriptors[:4].reshape(2, 2, -1).mean(1))
+    assert pooled.descriptors[8] == pytest.approx(rows.descriptors[:4].mean(0))
+    assert pooled.amount[8] == pytest.approx(rows.amount[:4].sum())
+    assert (pooled.parameters[6:] == rows.parameters[0]).all()
 
 
 def test_a_table_has_each_view_of_each_shape(tmp_path: Path) -> None:
@@ -102,8 +111,9 @@ def test_a_table_has_each_view_of_each_shape(tmp_path: Path) -> None:
         index = int(shape[-6:])
         record, u = exact_record(index), store.field(index)
         assert np.array_equal(parameters, parameters_of(record.coefficients, record.mass))
-        seen = descriptors(u if view == "field" else u > 0, Grid(u.shape))
-        assert row == pytest.approx(seen.vector(), rel=1e-5, abs=1e-5)
+        seen = VIEWS[view](u, np.random.default_rng([record.seed, *view.encode()]))
+        reading = read_texture(prepare(seen.scan, kind=seen.kind, periodic=seen.periodic, one_scale=True))
+        assert reading is not None and row == pytest.approx(reading.descriptors, rel=1e-5, abs=1e-5)
     assert load_table(tmp_path / "table.npz").provenance["stores"]["store"]["seed"] == store.settings.seed
 
 
@@ -112,11 +122,11 @@ def test_a_stopped_table_goes_on_and_grows(tmp_path: Path, monkeypatch: pytest.M
     whole = describe([store.path], tmp_path / "whole.npz", FAST)
     measured: list[int] = []
 
-    def stops(u, grid, rng):
+    def stops(u, rng):
         measured.append(1)
         if len(measured) == 2:
             raise KeyboardInterrupt
-        return View(u, grid)
+        return see_field(u, rng)
 
     with monkeypatch.context() as patch:
         patch.setitem(VIEWS, "field", stops)
@@ -127,17 +137,17 @@ def test_a_stopped_table_goes_on_and_grows(tmp_path: Path, monkeypatch: pytest.M
     for name in ("shapes", "views", "parameters", "descriptors"):
         assert np.array_equal(getattr(table, name), getattr(whole, name)), name
     exact_store(store.path, 6, first=4)
-    grown = describe([store.path], tmp_path / "table.npz", ("crop",))
-    assert grown.views.tolist() == whole.views.tolist() + ["crop"] * 5
+    grown = describe([store.path], tmp_path / "table.npz", ("scan",))
+    assert grown.views.tolist() == whole.views.tolist() + ["scan"] * 5
     assert np.array_equal(grown.descriptors[: len(whole)], whole.descriptors)
 
 
 def test_a_shape_that_is_removed_meanwhile_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = exact_store(tmp_path / "store.zarr", 4)
 
-    def thief(u, grid, rng):
+    def thief(u, rng):
         shutil.rmtree(store.path / "draws" / "000001", ignore_errors=True)
-        return View(u, grid)
+        return see_field(u, rng)
 
     monkeypatch.setitem(VIEWS, "field", thief)
     table = describe([store.path], tmp_path / "table.npz", ("field",))
@@ -147,9 +157,9 @@ def test_a_shape_that_is_removed_meanwhile_is_left_out(tmp_path: Path, monkeypat
 @pytest.mark.slow
 def test_workers_measure_the_same(tmp_path: Path) -> None:
     store = exact_store(tmp_path / "store.zarr", 6)
-    alone = describe([store.path], tmp_path / "alone.npz", ("mask", "crop"))
+    alone = describe([store.path], tmp_path / "alone.npz", ("mask", "scan"))
     with cluster(2) as workers:
-        table = describe([store.path], tmp_path / "table.npz", ("mask", "crop"), workers=workers)
+        table = describe([store.path], tmp_path / "table.npz", ("mask", "scan"), workers=workers)
     order, other = (np.lexsort((each.views, each.shapes)) for each in (table, alone))
     assert np.array_equal(table.shapes[order], alone.shapes[other])
     expected = alone.descriptors[other]  # a worker has one thread, which sums in another order
@@ -157,13 +167,13 @@ def test_workers_measure_the_same(tmp_path: Path) -> None:
 
 
 def test_a_view_without_a_surface_is_a_row_without_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def empty(u, grid, rng):
-        raise NoSurface("expected a surface, got none")
+    def empty(u, rng):
+        raise ScanError("expected a surface, got none")
 
-    monkeypatch.setitem(VIEWS, "crop", empty)
-    table = describe([exact_store(tmp_path / "store.zarr", 2).path], tmp_path / "table.npz", ("mask", "crop"))
+    monkeypatch.setitem(VIEWS, "scan", empty)
+    table = describe([exact_store(tmp_path / "store.zarr", 2).path], tmp_path / "table.npz", ("mask", "scan"))
     assert table.visible.views.tolist() == ["mask", "mask"]
-    assert np.isnan(table.descriptors[table.views == "crop"]).all()
+    assert np.isnan(table.descriptors[table.views == "scan"]).all()
 
 
 def test_parameters_are_those_of_the_law_in_its_gauge() -> None:
@@ -184,7 +194,10 @@ def test_parameters_are_those_of_the_law_in_its_gauge() -> None:
 
 def small_table(rows: int = 3) -> Table:
     rng, names = np.random.default_rng(0), np.array([f"s/{k:06d}" for k in range(rows)])
-    return Table(names, np.array(["mask"] * rows), rng.random((rows, 6)), rng.random((rows, sum(BLOCKS.values()))), {})
+    return Table(
+        names, np.array(["mask"] * rows), rng.random((rows, 6)), rng.uniform(4, 9, rows),
+        rng.random((rows, sum(BLOCKS.values()))), rng.uniform(100, 900, rows), {},
+    )  # fmt: skip
 
 
 def test_damaged_tables_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -204,7 +217,7 @@ def test_damaged_tables_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     with pytest.raises(ValueError, match="blocks"):
         load_table(path)
     with pytest.raises(ValueError, match="shape"):
-        Table(np.array(["s/0"]), np.array(["mask"]), np.zeros((1, 6)), np.zeros((1, 3)), {})
+        Table(np.array(["s/0"]), np.array(["mask"]), np.zeros((1, 6)), np.ones(1), np.zeros((1, 3)), np.ones(1), {})
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,7 @@ def fit() -> dict[str, Any]:
     own = {"name": "posterior", "coefficients": six, "mass": -0.6, "uncertainty": dict.fromkeys(NAMES, 0.5)}
     physical = [value / length**power for value, power in zip(COEFFICIENTS, (0, 0, 0, 1, 1, 2), strict=True)]
     return {
-        "format": "curvafit-fit-2",
+        "format": "curvafit-fit-3",
         "kind": "image",
         "family": "tubes",
         "coefficients": six,
@@ -72,15 +72,16 @@ def fit() -> dict[str, Any]:
         "scale": [1.0, 1.0, 1.0],
         "working_voxel": 0.0195,
         "length_unit": "mm",
+        "thickness": 0.156,
         "coefficients_physical": dict(zip(NAMES, physical, strict=True)),
         "epsilon_physical": 0.039,
         "matches": [],
         "intervals": None,
         "intervals_physical": None,
-        "weak_directions": [],
+        "combinations": [],
         "misfit": None,
         "drift": None,
-        "candidates": [own | {"distance": 1.6, "seed_noise": 1.1, "twins": [], "status": ""}],
+        "candidates": [own | {"thickness": 8.0, "distance": 1.6, "seed_noise": 1.1, "twins": [], "status": ""}],
         "status": "Supported.",
         "morphometry": {"volume_fraction": 0.187},
         "notes": [],

@@ -95,16 +95,17 @@ def test_intervals_in_the_scan_s_unit_are_the_draws_in_that_unit(fit: Fit) -> No
         column = to_columns(fit.draws)[COLUMNS.index(name)]
         assert working["median"] == pytest.approx(np.median(column))
         assert working["90"] == pytest.approx(np.percentile(column, (5, 95)).tolist())
-        assert physical["90"] == pytest.approx([x / fit.length**power for x in working["90"]])
+        lengths = fit.thickness / to_columns(fit.draws)[-1] / 0.01  # a draw's shapes are as thick as the scan's
+        assert physical["90"] == pytest.approx(np.percentile(column / lengths**power, (5, 95)).tolist())
 
 
 def test_intervals_are_central_and_in_powers_of_a_length(fit: Fit) -> None:
-    draws = np.outer(np.arange(1.0, 102.0), np.ones(6))
-    draws[:, 1] = np.log(draws[:, 1])
-    even = dataclasses.replace(fit, draws=draws)
-    working, other = even.intervals(), even.intervals(2.0)
-    assert working is not None and other is not None and list(working) == list(COLUMNS)
-    for name, scale in zip(COLUMNS, (1, 1, 2, 2, 4, 1), strict=True):
+    draws = np.outer(np.arange(1.0, 102.0), np.ones(7))
+    draws[:, 1], draws[:, 6] = np.log(draws[:, 1]), np.log(8)
+    even = dataclasses.replace(fit, draws=draws, thickness=8 * 0.02)
+    working, other = even.intervals(), even.intervals(physical=True)
+    assert working is not None and other is not None and list(working) == list(COLUMNS[:6])
+    for name, scale in zip(COLUMNS[:6], (1, 1, 2, 2, 4, 1), strict=True):
         assert working[name]["median"] == pytest.approx(51)
         assert (working[name]["50"], working[name]["90"]) == (pytest.approx([26, 76]), pytest.approx([6, 96]))
         assert other[name]["90"] == pytest.approx([6 / scale, 96 / scale])

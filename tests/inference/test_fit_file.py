@@ -60,7 +60,7 @@ def test_content_that_is_no_object_and_another_format(tmp_path: Path) -> None:
     for text in ("[]", "7", '"x"', "null", "{}"):
         assert "expected a fit.json written by `curvafit infer` with" in refused(tmp_path / "fit.json", text)
     said = refused(tmp_path / "fit.json", json.dumps({"format": ["x" * 10**6] * 100}))
-    assert "expected a fit.json of format curvafit-fit-2, got [" in said
+    assert "expected a fit.json of format curvafit-fit-3, got [" in said
 
 
 def test_what_is_written_is_what_can_be_read() -> None:

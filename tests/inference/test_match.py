@@ -22,11 +22,14 @@ def atlas_of(fields: tuple[Diagram, ...], masks: tuple[Diagram, ...]) -> Atlas:
     n = len(fields)
     coefficients = np.arange(6.0 * n).reshape(n, 6) + 1
     ids = tuple(f"0-{i:05d}" for i in range(n))
-    return Atlas(ids, coefficients, -0.1 * np.arange(n), np.arange(n) + 100, np.full(n, 0.3), fields, masks, {})
+    return Atlas(
+        ids, coefficients, -0.1 * np.arange(n), np.arange(n) + 100, np.full(n, 0.3), np.full(n, 8.0), fields, masks, {}
+    )
 
 
 def every_third(atlas: Atlas) -> Atlas:
-    names = ("ids", "coefficients", "masses", "seeds", "volume_fractions", "field_diagrams", "mask_diagrams")
+    names = ("ids", "coefficients", "masses", "seeds", "volume_fractions", "thicknesses")
+    names += ("field_diagrams", "mask_diagrams")
     return dataclasses.replace(atlas, **{name: getattr(atlas, name)[::3] for name in names})
 
 

@@ -24,6 +24,7 @@ from curvafit.inference.table import (
     save_table,
 )
 from curvafit.inference.training import PLANS, train_posterior
+from curvafit.scan.measure import Reading
 
 LOW, HIGH = np.array([-4, -2.7, -200, -200, -3000, -0.75]), np.array([4, 2.7, 200, 200, 3000, -0.15])
 SMALL = Architecture(components=4, hidden=(64,), transforms=1, dropout=0.0)
@@ -45,8 +46,17 @@ def table(shapes: int = 400, seed: int = 0) -> Table:
             told = standard[:, k] + noise * rng.standard_normal(shapes)
             descriptors[first : first + shapes, column : column + 40] = 5 + told[:, None]
     names = np.array([f"s/{i:06d}" for i in range(shapes)])
-    views = np.repeat(["mask", "crop"], shapes)
-    return Table(np.tile(names, 2), views, np.tile(parameters, (2, 1)), descriptors, {})
+    views, thickness, amount = (
+        np.repeat(["mask", "crop"], shapes),
+        rng.uniform(5, 12, shapes),
+        10 ** rng.uniform(2, 4, shapes),
+    )
+    columns = (np.tile(parameters, (2, 1)), np.tile(thickness, 2), descriptors, np.tile(amount, 2))
+    return Table(np.tile(names, 2), views, *columns, {})
+
+
+def columns(rows: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return rows.descriptors, rows.views, rows.amount
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +77,7 @@ def test_it_tells_what_the_descriptors_hold_and_no_more(posterior: Posterior) ->
     fresh, spread = table(200, seed=1), (HIGH - LOW) / np.sqrt(12)
     for view, told in (("mask", (0.15, 0.45)), ("crop", (0.55, 0.85))):
         seen = fresh.select_views([view])
-        draws = posterior.sample(seen.descriptors, view, 200)
+        draws = posterior.sample(*columns(seen), 200)[..., :6]
         width = draws.std(1).mean(0) / spread
         for k in range(6):
             low, high = told if k in TOLD.values() else (0.9, 1.1)
@@ -89,40 +99,40 @@ def test_what_tells_the_mass_is_not_hidden_by_dropout() -> None:
     learnt = train_posterior(rows.rows(known), dataclasses.replace(SMALL, dropout=0.5), members=1, plans=plans)
     for view in ("mask", "crop"):
         fresh = rows.rows(~known).select_views([view])
-        draws = learnt.sample(fresh.descriptors, view, 200)[..., 5]
+        draws = learnt.sample(*columns(fresh), 200)[..., 5]
         assert np.std(draws.mean(1) - fresh.parameters[:, 5]) < 0.2 * spread
         assert draws.std(1).mean() < 0.25 * spread
 
 
 def test_draws_lie_in_the_box_and_come_back(raw: Posterior) -> None:
-    row = table(1, seed=2).select_views(["mask"]).descriptors
-    draws = raw.sample(row[0], "mask", 500, seed=3)
+    row = table(1, seed=2).select_views(["mask"])
+    draws = raw.sample(*columns(row), 500, seed=3)[0]
     low, high = raw.box.T
     rim = 0.025 * (high - low)
-    assert draws.shape == (500, 6)
+    assert draws.shape == (500, 7)
     assert ((draws > low - rim) & (draws < high + rim)).all()
-    assert np.array_equal(draws, raw.sample(row, "mask", 500, seed=3)[0])
-    assert not np.array_equal(draws, raw.sample(row[0], "mask", 500, seed=4))
+    assert np.array_equal(draws, raw.draw(Reading(row.descriptors, "mask", row.amount[0]), 500, seed=3))
+    assert not np.array_equal(draws, raw.sample(*columns(row), 500, seed=4)[0])
     assert raw.from_logits(raw.to_logits(draws)) == pytest.approx(draws, rel=1e-4)
 
 
 def test_views_that_it_does_not_know_are_refused(raw: Posterior) -> None:
     with pytest.raises(ValueError, match="ghost"):
-        raw.sample(np.ones(sum(BLOCKS.values())), "ghost")
+        raw.sample(np.ones((1, sum(BLOCKS.values()))), np.array(["ghost"]), np.ones(1))
 
 
 def test_descriptors_that_are_not_finite_are_refused(raw: Posterior) -> None:
-    rows = table(2, seed=2).select_views(["mask"]).descriptors
-    rows[1, 5] = np.nan
+    rows = table(2, seed=2).select_views(["mask"])
+    rows.descriptors[1, 5] = np.nan
     with pytest.raises(ValueError, match="finite"):
-        raw.sample(rows, "mask")
+        raw.sample(*columns(rows))
 
 
 def test_a_file_holds_it(raw: Posterior, tmp_path: Path) -> None:
     path = tmp_path / "posterior.npz"
     save_posterior(raw, path)
-    again, row = load_posterior(path), table(1, seed=2).descriptors[0]
-    assert np.array_equal(again.sample(row, "mask", 50), raw.sample(row, "mask", 50))
+    again, row = load_posterior(path), columns(table(1, seed=2).select_views(["mask"]))
+    assert np.array_equal(again.sample(*row, 50), raw.sample(*row, 50))
     assert again.provenance == raw.provenance
     content = path.read_bytes()
     path.write_bytes(content[:1000])
@@ -173,7 +183,7 @@ def test_blocks_are_chosen_by_name() -> None:
 
 
 def test_too_few_shapes_are_refused() -> None:
-    with pytest.raises(ValueError, match="8 shapes"):
+    with pytest.raises(ValueError, match="8 laws"):
         train_posterior(table(7), SMALL)
 
 

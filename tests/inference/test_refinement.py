@@ -8,7 +8,7 @@ import nibabel
 import numpy as np
 import pytest
 import torch
-from emulated import BOX, linear, row
+from emulated import BOX, linear, reading, row
 from shapes import grown
 
 from curvafit.inference.drift import deblur, drift, halo_of
@@ -75,7 +75,9 @@ def test_a_fit_in_float64_leaves_jax_as_it_is() -> None:
 
     before, at = jax.config.jax_enable_x64, BOX.mean(1)
     with ThreadPoolExecutor(3) as pool:
-        fits = [pool.submit(best_parameters, linear(), row(at[None]), "mask", np.tile(at, (8, 1))) for _ in range(2)]
+        fits = [
+            pool.submit(best_parameters, linear(), reading(row(at[None])[0]), np.tile(at, (8, 1))) for _ in range(2)
+        ]
         seen = {pool.submit(lambda: jax.config.jax_enable_x64).result() for _ in range(20)}
         ends = [fit.result() for fit in fits]
     assert seen == {before} and jax.config.jax_enable_x64 == before

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from emulated import BOX, HIGH, LOW, NOISE, linear, row, told
+from emulated import BOX, HIGH, LOW, NOISE, linear, reading, row, told
 
 from curvafit.inference.simulate import BATCH, LAST, ROUNDS, Process, Search, Simulate, Simulations, simulate_draws
-from curvafit.inference.table import to_row
+from curvafit.scan.measure import Reading
 
 #: What the emulator misses of each of the five sums, in deviations of the prior.
 MISSED = np.array([0.4, -0.3, 0.3, 0.2, -0.4])
@@ -19,12 +19,12 @@ QUERY[:5] += MISSED
 def simulator(barren: float = -np.inf) -> Simulate:
     """Shapes whose sums are off by `MISSED`, in noise; none grows where a11 is below a bound."""
 
-    def simulate(parameters: np.ndarray, seed: int) -> np.ndarray:
+    def simulate(parameters: np.ndarray, seed: int) -> Reading | None:
         if parameters[0] < barren:
-            return to_row(None)
+            return None
         values = row(parameters[None])[0]
         values[:5] += MISSED + 0.3 * NOISE * np.random.default_rng(seed).standard_normal(5)
-        return values
+        return reading(values)
 
     return simulate
 
@@ -34,7 +34,7 @@ def searched(simulate: Simulate) -> tuple[np.ndarray, Simulations, np.ndarray]:
     rng = np.random.default_rng(0)
     draws = np.clip(TRUTH + (0.1 + 0.15 * rng.standard_normal((400, 6))) * (HIGH - LOW), LOW, HIGH)
     first = simulate_draws(draws, simulate, 12)
-    return *Search(linear(), "mask", QUERY).run(draws, first, simulate), draws
+    return *Search(linear(), reading(QUERY)).run(draws, first, simulate), draws
 
 
 def apart(parameters: np.ndarray) -> float:
@@ -49,7 +49,7 @@ def test_what_the_emulator_misses_is_learnt() -> None:
     assert (parameters >= LOW).all() and (parameters <= HIGH).all()
     assert every.count == len(every.parameters) == 12 + ROUNDS * BATCH + 1
     assert len(set(every.seeds.tolist())) == every.count
-    nearest = every.parameters[Search(linear(), "mask", QUERY).nearest(every)[0]]
+    nearest = every.parameters[Search(linear(), reading(QUERY)).nearest(every)[0]]
     assert apart(nearest) <= min(map(apart, every.parameters)) + 1.0  # noise is .3
 
 
@@ -67,8 +67,8 @@ def test_where_nothing_grows_is_avoided() -> None:
 def test_the_answer_grows_or_is_the_nearest_that_did() -> None:
     """Nothing grows after the first simulations: the nearest of those is the answer."""
     first = simulate_draws(np.random.default_rng(0).uniform(LOW, HIGH, (400, 6)), simulator(), 12)
-    search = Search(linear(), "mask", QUERY)
-    parameters, every = search.run(first.parameters, first, lambda *_: to_row(None))
+    search = Search(linear(), reading(QUERY))
+    parameters, every = search.run(first.parameters, first, lambda *_: None)
     assert every.count == 12 + ROUNDS * BATCH + LAST and len(every.parameters) == 12
     assert np.array_equal(parameters, first.parameters[search.nearest(first)[0]])
 

@@ -104,7 +104,7 @@ def test_the_page_says_what_was_found(html: str) -> None:
         assert name in text, name
     assert "curvafit generate --prior fit.json" in text
     assert text.count("best supported") == 1
-    assert "moves its surface by 0.25 voxels" in text and "a11 and a00 together" in text
+    assert "moves its surface by 0.25 voxels" in text and "flat 1.0 to 1.4"[:4] in text
     assert "12 simulations" in text and "p = 0.40" in text
 
 

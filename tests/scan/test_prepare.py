@@ -202,6 +202,14 @@ def test_the_grid_is_kept_from_5_to_16_voxels(radius: float, kept: bool) -> None
     assert any("grid is kept" in note for note in prepared.notes) is kept
 
 
+@pytest.mark.parametrize(("radius", "kept"), [(1.8, False), (4.4, True), (7, False), (11, False)])
+def test_laws_are_read_at_8_voxels(radius: float, kept: bool) -> None:
+    side = 32 if radius < 3 else 72
+    prepared = prepare(Field(tube_mask((side, side, side), (1, 1, 1), radius)), one_scale=True)
+    assert prepared.thickness == pytest.approx(WORKING_THICKNESS, rel=0.03)
+    assert (prepared.scale == (1, 1, 1)) is kept
+
+
 @given(st.tuples(*[st.floats(0.4, 3)] * 3), st.tuples(*[st.integers(0, 3)] * 3), st.tuples(*[st.floats(-2, 2)] * 3))
 @settings(max_examples=30, deadline=None)
 def test_resampling_keeps_linear_functions_of_position(scale, start, slope) -> None:

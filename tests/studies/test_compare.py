@@ -17,12 +17,7 @@ from calling import call, refused
 from scipy import ndimage, stats
 
 import curvafit
-from curvafit.drawing.groups import numbers_figure
-from curvafit.geometry.diagram import Diagram
-from curvafit.report.comparison import FILES, check_comparison, describe_methods, write_comparison
-from curvafit.scan.measure import QUANTITIES, Measures, Quantity, interval_reach
-from curvafit.studies.compare import Comparison, compare
-from curvafit.studies.permutation import (
+from curvafit.core.permutation import (
     correct_by_most,
     correct_holm,
     correlate,
@@ -31,6 +26,11 @@ from curvafit.studies.permutation import (
     relabel,
     share_beyond,
 )
+from curvafit.drawing.groups import numbers_figure
+from curvafit.geometry.diagram import Diagram
+from curvafit.report.comparison import FILES, check_comparison, describe_methods, write_comparison
+from curvafit.scan.measure import QUANTITIES, Measures, Quantity, interval_reach
+from curvafit.studies.compare import Comparison, compare
 from curvafit.studies.scans import merge_notes
 from curvafit.volumes.field import Field
 
@@ -313,7 +313,7 @@ def test_units_are_converted(shapes: Comparison) -> None:
     assert mixed.unit == "mm" and mixed.p == shapes.p
     assert mixed.energy == pytest.approx(shapes.energy, rel=1e-4)
     for one, other in zip(mixed.numbers, shapes.numbers, strict=True):
-        assert one.means == pytest.approx(other.means, rel=1e-4, abs=1e-5), one.name  # float32's distances
+        assert one.means == pytest.approx(other.means, rel=5e-4, abs=1e-5), one.name  # float32's distances
     assert any("converted" in note for note in mixed.notes)
 
 

@@ -17,11 +17,11 @@ from calling import call, refused
 from scipy import stats
 
 import curvafit
+from curvafit.core.permutation import reorder
 from curvafit.geometry.diagram import Diagram
 from curvafit.report.comparison import describe_measures
 from curvafit.report.trajectory import FILES, check_trajectory, describe_series, numbers_figure, write_trajectory
 from curvafit.scan.measure import QUANTITIES, Measures, Quantity
-from curvafit.studies.permutation import reorder
 from curvafit.studies.trajectory import Trajectory, trajectory
 from curvafit.volumes.field import Field
 
