@@ -102,7 +102,7 @@ def find_combinations(errors: np.ndarray, parameters: np.ndarray, descriptors: n
     weights = linalg.eigh(errors.T @ errors / len(errors), away.T @ away / len(away))[1].T
     scores, looks = away @ weights.T, np.array(list(LOOKS.values()), dtype=object)
     looked = _look(descriptors)
-    alike = scores.T @ ((looked - looked.mean(0)) / looked.std(0)) / len(scores)
+    alike = scores.T @ ((looked - looked.mean(0)) / np.maximum(looked.std(0), 1e-9)) / len(scores)
     signs = np.sign(np.take_along_axis(alike, np.abs(alike).argmax(1)[:, None], 1))
     ends = []
     for row in signs * alike:

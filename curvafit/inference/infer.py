@@ -303,7 +303,7 @@ def _provenance(volume: Field, atlas: Atlas, posterior: Posterior, seed: int) ->
         "schedule": SCHEDULES[LEARNED].as_dict(),
         "epsilon": WORKING_EPSILON,
         "atlas": {"format": atlas.format_version, "shapes": len(atlas.ids)},
-        "posterior": posterior.provenance,
+        "posterior": {name: value for name, value in posterior.provenance.items() if name != "table"},
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "python": platform.python_version(),
         "torch": version("torch"),
