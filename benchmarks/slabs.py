@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import time
 from resource import RUSAGE_SELF, getrusage
 
@@ -48,7 +49,8 @@ def lead(edge: int, steps: int) -> None:
 def timed(edge: int, steps: int, count: int) -> Values:
     call = f"from benchmarks.slabs import lead; lead({edge}, {steps})"
     start = ("-m", "torch.distributed.run", "--no-python", "--nproc-per-node", count, "python") if count > 1 else ()
-    rows = [json.loads(line) for line in run_python(*start, "-c", call).splitlines() if line.startswith("{")]
+    # Two processes may print on one line.
+    rows = list(map(json.loads, re.findall(r"{[^{}]*}", run_python(*start, "-c", call))))
     first = next(row for row in rows if "seconds" in row)
     return first | {"memory": max(row["memory"] for row in rows)}
 

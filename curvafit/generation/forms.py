@@ -99,5 +99,5 @@ def white_noise(grid: Grid, seed: int) -> Float[torch.Tensor, "3 z y x"]:
     check_type(grid, Grid, "a Grid")
     generator = torch.Generator().manual_seed(check_seed(seed))
     check_memory((*grid.shape, 3), FIELD, "a box")
-    noise = AMPLITUDE * torch.rand((3, *grid.shape), generator=generator, dtype=torch.float32)
-    return noise if grid.periodic else noise - AMPLITUDE / 2
+    noise = torch.rand((3, *grid.shape), generator=generator, dtype=torch.float32).mul_(AMPLITUDE)
+    return noise if grid.periodic else noise.sub_(AMPLITUDE / 2)

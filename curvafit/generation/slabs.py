@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -94,6 +95,7 @@ def serve() -> None:
             name, arguments = message
             with _together():
                 if name == "begin":
+                    part = None  # of an earlier shape
                     part = _Part(*arguments)
                 else:
                     getattr(part, name)(*arguments)
@@ -214,7 +216,7 @@ class _Part:
         dist.scatter_object_list(mine, None if numbers is None else [[*map(each.cut, numbers)] for each in slabs])
         *a, epsilon, base = mine[0]
         local = Grid((len(slab.places), *self._shape[1:]), grid.spacing, grid.boundary)
-        begin, exchange = self._scatter(start), self._exchange
+        begin, exchange = self._scatter(start), partial(_exchange, slab, self._rank, len(slabs))
         # Processes of one machine share its cores.
         with limit_threads(max(1, count_threads() // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))):
             self._flow = FusedFlow(begin, base, a, local, epsilon, own=slab.own, exchange=exchange, **options)
@@ -254,26 +256,17 @@ class _Part:
         parts = {name: self._scatter(None if arrays is None else arrays[name]) for name in _ARRAYS}
         self._flow.restore(numbers | parts)
 
-    def _exchange(self, volume: np.ndarray) -> None:
-        """Fill the planes of a volume `(Z, n)` beyond the own ones with the neighbours' own."""
-        slab, planes = self._slab, torch.from_numpy(volume)
-        own, waiting = planes[slab.own], []
-        for beyond, step, way in ((planes[slab.below], -1, _DOWN), (planes[slab.above], 1, _UP)):
-            other, halo = (self._rank + step) % len(self._slabs), len(beyond)
-            mine = own[:halo] if way == _DOWN else own[-halo:]
-            waiting += [dist.irecv(beyond, other, tag=1 - way), dist.isend(mine, other, tag=way)]
-        for each in waiting:
-            each.wait()
-
     def _scatter(self, whole: np.ndarray | None) -> np.ndarray:
-        """Send to each process its part of an array `(3, Z, Y, X)` of the first one."""
-        if whole is None:
-            part = torch.empty((3, len(self._slab.places), *self._shape[1:]))
-            dist.recv(part, 0)
-            return part.numpy()
-        for rank, slab in enumerate(self._slabs[1:], 1):
-            dist.send(torch.from_numpy(slab.cut(whole)), rank)
-        return self._slab.cut(whole)
+        """Send to each process its part of an array `(3, Z, Y, X)` of the first one, a component at a time."""
+        part = np.empty((3, len(self._slab.places), *self._shape[1:]), np.float32)
+        for k, component in enumerate(part):
+            if whole is None:
+                dist.recv(torch.from_numpy(component), 0)
+                continue
+            for rank, slab in enumerate(self._slabs[1:], 1):
+                dist.send(torch.from_numpy(slab.cut(whole[k])), rank)
+            component[...] = self._slab.cut(whole[k])
+        return part
 
     def _gather(self, values: np.ndarray) -> np.ndarray | None:
         """Bring the own planes of an array `(…, Z, Y, X)` of all processes together in the first one."""
@@ -288,3 +281,15 @@ class _Part:
             dist.recv(part, rank)
             whole[..., slab.first : slab.last, :, :] = part.numpy()
         return whole
+
+
+def _exchange(slab: Slab, rank: int, count: int, volume: np.ndarray) -> None:
+    """Fill the planes of a volume `(Z, n)` beyond a process's own with the neighbours' own."""
+    planes = torch.from_numpy(volume)
+    own, waiting = planes[slab.own], []
+    for beyond, step, way in ((planes[slab.below], -1, _DOWN), (planes[slab.above], 1, _UP)):
+        other, halo = (rank + step) % count, len(beyond)
+        mine = own[:halo] if way == _DOWN else own[-halo:]
+        waiting += [dist.irecv(beyond, other, tag=1 - way), dist.isend(mine, other, tag=way)]
+    for each in waiting:
+        each.wait()
