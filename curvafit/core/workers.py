@@ -134,6 +134,16 @@ def cluster(count: int | None = None, scheduler: str | None = None, dashboard: i
 
 
 @contextmanager
+def join_workers(workers: Workers | int | None) -> Iterator[Workers | None]:
+    """Take the workers that are given, or start a number of processes on this machine; None where there are none."""
+    if isinstance(workers, int) and workers:
+        with cluster(workers) as crew:
+            yield crew
+    else:
+        yield workers or None  # type: ignore[misc]
+
+
+@contextmanager
 def _start(count: int | None, dashboard: int | None) -> Iterator[Client]:
     """Start workers on this machine."""
     import dask.config

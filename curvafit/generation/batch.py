@@ -61,7 +61,8 @@ def generate_batch(
     grid = grid if isinstance(grid, Grid) else Grid(grid)  # type: ignore[arg-type]
     options = {"schedule": plan, "epsilon": epsilon, "blur": blur, "reject_early": reject_early}
     options |= {"backend": backend, "device": device}
-    check_choice(backend, BACKENDS[:-1], f"a backend among {', '.join(BACKENDS[:-1])}")
+    backends = [name for name in BACKENDS if name != "slabs"]  # which are of one shape
+    check_choice(backend, backends, f"a backend among {', '.join(backends)}")
     check_device(device)
     size = 1
     if backend in ("torch", "compiled") or not kernels.has_kernel(device):

@@ -141,8 +141,8 @@ def demo_page(
 ) -> str:
     """Return the page: a self-contained HTML text.
 
-    The scan is placed on the map of `atlas`; `box` (6, 2) has the bounds of the posterior's prior (a11, log a02, a10,
-    a01, a00, m₀); `title` is the heading, plain text.
+    The scan is placed on the map of `atlas`; `box` (7, 2) has the bounds of the posterior's prior (a11, log a02, a10,
+    a01, a00, m₀, log thickness); `title` is the heading, plain text.
     """
     fit = inference.fit
     shapes = {
@@ -240,9 +240,9 @@ def _parameter_rows(draws: np.ndarray | None, box: np.ndarray) -> list[tuple[str
     if draws is None:
         return []
     rows = []
-    low, high = np.percentile(draws, (5, 95), axis=0)
-    shares = (high - low) / (0.9 * (box[:, 1] - box[:, 0]))
-    for name, a, b, share in zip(SYMBOLS, low, high, shares, strict=False):
+    low, high = np.percentile(draws[:, : len(SYMBOLS)], (5, 95), axis=0)
+    shares = (high - low) / (0.9 * np.ptp(box[: len(SYMBOLS)], axis=1))
+    for name, a, b, share in zip(SYMBOLS, low, high, shares, strict=True):
         word = "read" if share <= _READ else "partly read" if share <= _PARTLY else "not read"
         rows.append((name, f"{a:.3g} to {b:.3g}", f"{share:.0%}", word))
     return rows

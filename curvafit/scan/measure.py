@@ -182,26 +182,9 @@ def measure(
     progress: Progress = silent,
     **reading: Any,
 ) -> Measures:
-    """Measure the structure in a scan that is taken in one piece, with an interval for each number.
+    """Measure a scan in one piece, as `tiles.measure` measures one of any size; its arguments are the same.
 
-    Volume fraction, thickness, spacing, connectivity, surface and fabric are those of the structure on the scan's own
-    voxels, all of them. Curvature is that of the scan on the working grid, as `infer` reads it. Intervals are 95 %, by
-    a jackknife over blocks of a period (thickness and spacing) of the structure (`errors`); a scan with fewer than
-    eight has none. `tiles.measure` measures scans that do not fit into memory. Raises ValueError if the scan has no
-    structure, or none that the voxels resolve, a region does not fit it, or the scan is too large; or as
-    `curvafit.load`, and FileNotFoundError if there is no such file.
-
-    Parameters
-    ----------
-    scan
-        The path of a file, a `Field`, or an array or tensor (Z, Y, X).
-    kind, periodic, threshold, dark
-        As in `infer`.
-    roi
-        A region of the scan, nonzero where it counts; each of its labels is a compartment of its own. Structure,
-        thickness, surface and curvature are those of the whole scan, and what lies inside is summed.
-    reading
-        Options of reading a file, or the place of an array: see `curvafit.load`.
+    Raises what that does, and ValueError if the scan does not fit into memory.
     """
     check_options(kind, threshold, reading.get("label"))
     field = field_of(scan, **reading)

@@ -27,7 +27,7 @@ from curvafit.core.checks import check_int
 from curvafit.core.files import remove, write_content
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import format_sampling
-from curvafit.core.workers import ThisProcess, Workers, cluster, collect_all
+from curvafit.core.workers import ThisProcess, Workers, collect_all, join_workers
 from curvafit.geometry.balls import NEAR, ball_radii, paint_balls, paint_coarse_balls, reaching_radius
 from curvafit.geometry.diagram import BIN_WIDTH, MARGIN, Diagram
 from curvafit.geometry.mesh import NoSurface, surface
@@ -541,7 +541,8 @@ def measure_tiles(
     run = {"scan": digest, "label": volume.label, "kind": volume.kind, "threshold": volume.threshold}
     run |= {"dark": volume.dark, "tile": edge}
     opened = nullcontext(None) if store is None else open_store(store, {name: str(each) for name, each in run.items()})
-    with _start(workers) as crew, opened as folder, one_thread():
+    with join_workers(workers) as joined, opened as folder, one_thread():
+        crew = joined or ThisProcess()
         find = _Finder(crew, folder, progress)
         tiling = Tiling.of(survey(volume, find), edge)
         processes = 1 if isinstance(crew, ThisProcess) else max(1, crew.places // 2)
@@ -552,16 +553,6 @@ def measure_tiles(
         if max(wide.factors) > 1:
             again = list(find(_AGAIN, partial(_measure_wide, wide), len(tiling.cores)))
     return _summarise(wide, found, again, stated)
-
-
-@contextmanager
-def _start(workers: Workers | int | None) -> Iterator[Workers]:
-    """Start a number of processes, if there is one; by default this process is the only worker."""
-    if isinstance(workers, int) and workers:
-        with cluster(workers) as crew:
-            yield crew
-    else:
-        yield workers or ThisProcess()
 
 
 def _choose_factors(tiling: Tiling, found: Sequence[Found]) -> tuple[int, int]:

@@ -24,7 +24,7 @@ from filelock import FileLock, Timeout
 from curvafit.core.checks import check_int
 from curvafit.core.files import write_content
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.workers import Workers, cluster, collect_all
+from curvafit.core.workers import Workers, collect_all, join_workers
 from curvafit.generation.checkpoint import identity
 from curvafit.generation.data import Data
 from curvafit.priors.grid import MOST
@@ -272,7 +272,7 @@ def lower_volume(
     run = {**problem.inputs, "law": trial.law, "steps": trial.steps, "tiles": tiling.counts, "place": tiling.place}
     folder = store if tiling.count > 1 else None
     opened = nullcontext(TileStore(tiling.shape)) if folder is None else open_store(folder, tiling.shape, run)
-    with _start(workers if tiling.count > 1 else None) as crew, opened as finished:
+    with join_workers(workers if tiling.count > 1 else None) as crew, opened as finished:
         tiles = tiling.tiles
         rest = [tile for tile in tiles if tile.number not in finished.energies]
         if crew is None:
@@ -288,16 +288,6 @@ def lower_volume(
     energies = [finished.energies[tile.number] for tile in tiles]
     steps = 0 if trial.law is None else trial.steps
     return LoweredVolume(finished.mask, finished.phase, tuple(map(sum, zip(*energies, strict=True))), steps)
-
-
-@contextmanager
-def _start(workers: Workers | int | None) -> Iterator[Workers | None]:
-    """Start a number of processes, if there is one."""
-    if isinstance(workers, int) and workers:
-        with cluster(workers) as crew:
-            yield crew
-    else:
-        yield workers or None  # type: ignore[misc]
 
 
 def _lower_in_turn(problem: Problem, tiling: Tiling, tiles: Sequence[Tile], progress: Progress) -> Iterator[Piece]:
