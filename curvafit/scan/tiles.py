@@ -7,27 +7,22 @@ faces. So a scan in tiles has the numbers of the scan in one piece.
 
 from __future__ import annotations
 
-import io
 import itertools
-import json
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from os import PathLike
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from filelock import FileLock, Timeout
 
 from curvafit.core.checks import check_int
-from curvafit.core.files import remove, write_content
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import format_sampling
-from curvafit.core.workers import ThisProcess, Workers, collect_all, join_workers
+from curvafit.core.workers import Workers
 from curvafit.geometry.balls import NEAR, ball_radii, paint_balls, paint_coarse_balls, reaching_radius
 from curvafit.geometry.diagram import BIN_WIDTH, MARGIN, Diagram
 from curvafit.geometry.mesh import NoSurface, surface
@@ -49,6 +44,7 @@ from curvafit.scan.measure import (
     tabulate_surface,
 )
 from curvafit.scan.measure import measure as measure_in_one
+from curvafit.scan.pieces import open_finder
 from curvafit.scan.prepare import LARGEST_BOX, Prepared, TooLarge, smallest_piece
 from curvafit.scan.profiles import profile_mask
 from curvafit.scan.structure import check_options
@@ -540,13 +536,9 @@ def measure_tiles(
     digest = volume.open().digest
     run = {"scan": digest, "label": volume.label, "kind": volume.kind, "threshold": volume.threshold}
     run |= {"dark": volume.dark, "tile": edge}
-    opened = nullcontext(None) if store is None else open_store(store, {name: str(each) for name, each in run.items()})
-    with join_workers(workers) as joined, opened as folder, one_thread():
-        crew = joined or ThisProcess()
-        find = _Finder(crew, folder, progress)
+    with open_finder(workers, store, run, progress, {_FIRST: 0.95, _AGAIN: 1.0}) as find, one_thread():
         tiling = Tiling.of(survey(volume, find), edge)
-        processes = 1 if isinstance(crew, ThisProcess) else max(1, crew.places // 2)
-        stated = tiling.describe(processes)
+        stated = tiling.describe(find.processes)
         found = list(find(_FIRST, partial(measure_tile, tiling), len(tiling.cores), stated))
         wide = replace(tiling, factors=_choose_factors(tiling, found))
         again: list[Found] = []
@@ -633,87 +625,3 @@ def _notes(tiling: Tiling, found: Sequence[Found]) -> tuple[str, ...]:
         working.append(f"Dropped what is smaller than a ball of half the median thickness ({counts}).")
     working.extend(note_on_filling(sum(int(each["filled"]) for each in found) / count))
     return (*notes, *(f"Of curvature: {note}" for note in working))
-
-
-# ---- finding in pieces, and keeping what was found -------------------------------------------------------------------
-
-
-class _Finder:
-    """Finds something in the pieces of a volume, by workers, and keeps it in a folder, if there is one."""
-
-    def __init__(self, crew: Workers, folder: Path | None, progress: Progress) -> None:
-        self._crew, self._folder, self._progress, self._share = crew, folder, progress, 0.0
-
-    def __call__(self, name: str, find: Any, count: int, shown: str = "") -> Iterator[Found]:
-        """Return what is found in each piece, in their order; the progress says the name, or what is `shown`."""
-        found = {} if self._folder is None else _read_found(self._folder, name, count)
-        rest = [number for number in range(count) if number not in found]
-        start = self._share
-        self._share = stop = max(start, 0.95 if name == _FIRST else 1.0 if name == _AGAIN else start + 0.02)
-        requests = [(partial(_find, find), Path(), [number]) for number in rest]
-        self._progress(shown or name, start)
-        for done, (number, each) in enumerate(collect_all(self._crew, requests), count - len(rest) + 1):
-            found[number] = each
-            if self._folder is not None:
-                _write_found(self._folder, name, number, each)
-            self._progress(shown or name, start + (stop - start) * done / count)
-        return iter([found[number] for number in range(count)])
-
-
-def _find(find: Any, _: Path, numbers: Sequence[int]) -> list[tuple[int, Found]]:
-    """Find something in pieces by their numbers, on one thread: the workers share the cores."""
-    with one_thread():
-        return [(number, find(number)) for number in numbers]
-
-
-def _file_of(folder: Path, name: str, number: int) -> Path:
-    return folder / f"{name.replace(' ', '-').replace(chr(39), '')}-{number:06d}.npz"
-
-
-def _read_found(folder: Path, name: str, count: int) -> dict[int, Found]:
-    """Return what earlier runs found, by number of the piece."""
-    found = {}
-    for number in range(count):
-        path = _file_of(folder, name, number)
-        if path.exists():
-            with np.load(path, allow_pickle=False) as arrays:
-                found[number] = dict(arrays)
-    return found
-
-
-def _write_found(folder: Path, name: str, number: int, found: Mapping[str, np.ndarray]) -> None:
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **found)
-    write_content(_file_of(folder, name, number), buffer.getvalue())
-
-
-@contextmanager
-def open_store(folder: str | PathLike[str], run: Mapping[str, str]) -> Iterator[Path]:
-    """Open the folder of a run, or make it, and lock it; `run` is what runs have in common that share it.
-
-    Where a ScanError is raised the folder is removed. Raises ValueError if the folder holds other things or another
-    run's, or is in use.
-    """
-    place = Path(folder)
-    names = {path.name for path in place.iterdir()} if place.is_dir() else set()
-    if ("run.json" not in names and names - {"lock"}) or (place.exists() and not place.is_dir()):
-        raise ValueError(f"tiles need a new folder, but {place} holds something else")
-    place.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(place / "lock")
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        raise ValueError(f"the tiles in {place} are in use by another run") from None
-    try:
-        other = json.loads((place / "run.json").read_bytes()) if "run.json" in names else run
-        if other != run:
-            changed = ", ".join(sorted(name for name in run if other.get(name) != run[name]))
-            raise ValueError(f"the tiles in {place} are another run's, which differs in {changed}: delete them")
-        write_content(place / "run.json", json.dumps(run, indent=2))
-        yield place
-    except ScanError:  # of a scan that cannot be measured nothing is of use
-        lock.release()
-        remove(place)
-        raise
-    finally:
-        lock.release()

@@ -8,7 +8,7 @@ slice, so that the background around a structure, or a cut into tiles, changes n
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -276,46 +276,68 @@ def fill(
         Called with a sentence, and the share of the gaps that are filled.
     """
     raster = Raster.of(slices)
-    known = [raster.distances(mask) for mask in slices.inside]
     logits = (SLOPE / raster.pixel) * slices.level("nearest")
-    places, count = list(slices.places), len(slices.places)
     if evidence is not None and not slices.periodic:
-        for outer in (slice(0, places[0]), slice(places[-1] + 1, None)):
+        for outer in (slice(0, slices.places[0]), slice(slices.places[-1] + 1, None)):
             logits[outer] = evidence[outer]
-    gaps = [(k, (places[(k + 1) % count] - places[k]) % slices.length) for k in range(count - (not slices.periodic))]
+    filled = fill_gaps(slices, taught, raster, evidence=evidence, careful=careful, progress=progress)
+    for numbers, inside in filled:
+        logits[numbers] = inside
+    return logits
+
+
+def fill_gaps(
+    slices: Slices,
+    taught: Taught,
+    raster: Raster,
+    rows: slice = slice(None),
+    *,
+    evidence: np.ndarray | None = None,
+    careful: bool = False,
+    progress: Progress = silent,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the numbers of slices in gaps, and their log-odds as `fill` returns them, float32 (n, Y, X), on the core of
+    a raster; of gaps that reach into some `rows` of the volume."""
+    places, count = list(slices.places), len(slices.places)
+    start, stop, _ = rows.indices(slices.length)
+    steps = [(k, (places[(k + 1) % count] - places[k]) % slices.length) for k in range(count - (not slices.periodic))]
+    gaps = [(k, gap) for k, gap in steps if gap > 1 and places[k] < stop - 1 and places[k] + gap > start + 1]
+    seen, known = raster.seen, dict[int, np.ndarray]()
     for number, (k, gap) in enumerate(gaps):
         progress("filling the gaps", number / len(gaps))
-        if gap < 2:
-            continue
-        rows = [k - 1, k, k + 1, k + 2]
-        rows = [row % count for row in rows] if slices.periodic else [min(max(row, 0), count - 1) for row in rows]
-        stack = np.stack([known[row] for row in rows])
+        four = [k - 1, k, k + 1, k + 2]
+        four = [row % count for row in four] if slices.periodic else [min(max(row, 0), count - 1) for row in four]
+        for row in four:
+            if row not in known:
+                known[row] = raster.distances(slices.inside[(row, *seen)])
         step = slices.spacing[0] / raster.pixel
         numbers = np.arange(places[k] + 1, places[k] + gap) % slices.length
-        marks = None if slices.marks is None else raster.marks(slices.marks[numbers])
-        read = None if evidence is None else np.stack([raster.spread(plane) for plane in evidence[numbers]])
+        marks = None if slices.marks is None else raster.marks(slices.marks[(numbers, *seen)])
+        read = None if evidence is None else np.stack([raster.spread(plane) for plane in evidence[(numbers, *seen)]])
+        stack = np.stack([known[row] for row in four])
         inside = _fill_gap(taught.filler, stack, marks, read, gap - 1, step, careful) / taught.temperature(gap * step)
-        logits[numbers] = raster.to_slices(inside)
+        yield numbers, raster.to_slices(inside)
     progress("filling the gaps", 1.0)
-    return logits
 
 
 @dataclass(frozen=True)
 class Raster:
-    """Square pixels for slices, `pixel` wide in the unit of their spacing, so that structures are some pixels thick."""
+    """Square pixels for slices, `pixel` wide in the unit of their spacing, so that structures are some pixels thick.
+
+    The pixels cover the core (y, x) of slices of a shape; those of a core lie where those of the whole do.
+    """
 
     shape: tuple[int, int]
     edges: tuple[float, float]
     pixel: float
+    core: tuple[slice, slice]
 
     @classmethod
     def of(cls, slices: Slices) -> Raster:
-        edges, finest = slices.spacing[1:], min(slices.spacing[1:])
-        thickness = plane_thickness(slices.inside, edges) / finest
-        gap = slices.gap * slices.spacing[0] / finest
-        coarser = float(np.clip(gap / LONG, 1.0, max(thickness / THICKNESS[1], 1.0)))
-        pixel = finest * min(thickness / THICKNESS[0], coarser)
-        return cls(slices.inside.shape[1:], edges, pixel)  # type: ignore[arg-type]
+        """Return the pixels of whole slices."""
+        edges, shape = slices.spacing[1:], slices.shape[1:]
+        pixel = choose_pixel(plane_thickness(slices.inside, edges), edges, slices.gap * slices.spacing[0])
+        return cls(shape, edges, pixel, (slice(0, shape[0]), slice(0, shape[1])))
 
     @property
     def scale(self) -> tuple[float, float]:
@@ -324,50 +346,86 @@ class Raster:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Pixels of a slice, a multiple of 4 that covers it."""
-        return tuple(4 * math.ceil(n * h / 4) for n, h in zip(self.shape, self.scale, strict=True))  # type: ignore[return-value]
+        """Pixels of the core, a multiple of 4 that covers it."""
+        return tuple(edge.stop - edge.start for edge in self._pixels)  # type: ignore[return-value]
+
+    @property
+    def seen(self) -> tuple[slice, slice]:
+        """The voxels that the core's pixels depend on, (y, x)."""
+        ends = zip(self._window, self.shape, strict=True)
+        return tuple(slice(max(edge.start, 0), min(edge.stop, n)) for edge, n in ends)  # type: ignore[return-value]
 
     def distances(self, mask: np.ndarray) -> np.ndarray:
-        """Return the signed distances of a slice (Y, X) in pixels, cut at `FAR`, float32.
+        """Return the signed distances of the part of a slice that is seen, in pixels, cut at `FAR`, float32.
 
         The outlines are continued by `REACH` pixels on each side: the shape is `size` + 2 `REACH`.
         """
-        margins = self._margins
-        signed = centre_distance(np.pad(mask, margins, mode="edge"), self.edges, FAR * self.pixel) / self.pixel
-        return self._resample(signed, margins)
+        padded = np.pad(mask, self._padding, mode="edge")
+        return self._resample(centre_distance(padded, self.edges, FAR * self.pixel) / self.pixel)
 
     def spread(self, plane: np.ndarray) -> np.ndarray:
-        """Return a plane (Y, X) in pixels, float32; its border is continued as that of `distances`."""
-        margins = self._margins
-        return self._resample(np.pad(plane, margins, mode="edge"), margins)
-
-    @property
-    def _margins(self) -> list[tuple[int, int]]:
-        """Voxels before and beyond a slice, along both axes, that cover the margin."""
-        before = [math.ceil(REACH / h) for h in self.scale]
-        beyond = [math.ceil((m + REACH) / h) - n for n, m, h in zip(self.shape, self.size, self.scale, strict=True)]
-        return list(zip(before, beyond, strict=True))
-
-    def _resample(self, plane: np.ndarray, margins: list[tuple[int, int]]) -> np.ndarray:
-        """Return a plane with margins in pixels, `size` + 2 `REACH`."""
-        if self.scale == (1.0, 1.0):
-            return plane
-        start = [before - REACH / h for (before, _), h in zip(margins, self.scale, strict=True)]
-        return _sample(plane, [m + 2 * REACH for m in self.size], [1 / h for h in self.scale], start)
+        """Return the seen part of a plane in pixels, float32; its border is continued as that of `distances`."""
+        return self._resample(np.pad(plane, self._padding, mode="edge"))
 
     def marks(self, marks: np.ndarray) -> np.ndarray:
-        """Return marks (n, Y, X) in pixels, float32, 0 in the margin."""
+        """Return marks (n, Y, X) of the part that is seen in pixels, float32, 0 beyond the slices."""
         kept = np.zeros((len(marks), *(m + 2 * REACH for m in self.size)), dtype=np.float32)
-        centres = [((np.arange(m) + 0.5) / h).astype(int) for m, h in zip(self.size, self.scale, strict=True)]
-        ys, xs = (each[each < n] for each, n in zip(centres, self.shape, strict=True))
-        kept[:, REACH : REACH + len(ys), REACH : REACH + len(xs)] = marks[:, ys][:, :, xs]
+        inner, taken = [], []
+        for edge, n, h, seen in zip(self._pixels, self.shape, self.scale, self.seen, strict=True):
+            numbers = np.arange(edge.start - REACH, edge.stop + REACH)
+            voxels = np.floor((numbers + 0.5) / h).astype(int)
+            there = np.flatnonzero((voxels >= 0) & (voxels < n))
+            inner.append(there)
+            taken.append(voxels[there] - seen.start)
+        kept[np.ix_(np.arange(len(marks)), *inner)] = marks[np.ix_(np.arange(len(marks)), *taken)]
         return kept
 
     def to_slices(self, values: np.ndarray) -> np.ndarray:
-        """Return values (n, *size) on the voxels of the slices, (n, Y, X)."""
+        """Return values (n, *size) on the voxels of the core, (n, Y, X)."""
+        shape = [edge.stop - edge.start for edge in self.core]
+        pairs = zip(self.core, self.scale, self._pixels, strict=True)
+        first = [core.start * h - edge.start for core, h, edge in pairs]
         if self.scale == (1.0, 1.0):
-            return values[:, : self.shape[0], : self.shape[1]]
-        return np.stack([_sample(plane, self.shape, self.scale, (0.0, 0.0)) for plane in values])
+            y, x = (int(start) for start in first)
+            return values[:, y : y + shape[0], x : x + shape[1]]
+        return np.stack([_sample(plane, shape, self.scale, first) for plane in values])
+
+    @property
+    def _pixels(self) -> list[slice]:
+        """The pixels that the core's voxels are interpolated from, in those of the whole slice, along both axes."""
+        found = []
+        for core, n, h in zip(self.core, self.shape, self.scale, strict=True):
+            most = 4 * math.ceil(n * h / 4)
+            first = 0 if core.start == 0 else max(math.floor((core.start + 0.5) * h - 0.5), 0)
+            stop = most if core.stop == n else min(math.ceil((core.stop - 0.5) * h - 0.5) + 1, most)
+            found.append(slice(first // 4 * 4, 4 * math.ceil(stop / 4)))
+        return found
+
+    @property
+    def _window(self) -> list[slice]:
+        """The voxels, also those beyond the slices, that cover all that the core's pixels depend on."""
+        found = []
+        for edge, n, h in zip(self._pixels, self.shape, self.scale, strict=True):
+            most = math.ceil((4 * math.ceil(n * h / 4) + REACH) / h)
+            first = math.floor((edge.start - REACH - FAR) / h) - 2
+            stop = math.ceil((edge.stop + REACH + FAR) / h) + 2
+            found.append(slice(max(first, -math.ceil(REACH / h)), min(stop, most)))
+        return found
+
+    @property
+    def _padding(self) -> list[tuple[int, int]]:
+        """Voxels of the window before and beyond the slices, along both axes."""
+        return [(max(-edge.start, 0), max(edge.stop - n, 0)) for edge, n in zip(self._window, self.shape, strict=True)]
+
+    def _resample(self, plane: np.ndarray) -> np.ndarray:
+        """Return a plane of the window in pixels, `size` + 2 `REACH`."""
+        shape = [m + 2 * REACH for m in self.size]
+        pairs = zip(self._pixels, self.scale, self._window, strict=True)
+        start = [(edge.start - REACH) / h - window.start for edge, h, window in pairs]
+        if self.scale == (1.0, 1.0):
+            y, x = map(int, start)
+            return plane[y : y + shape[0], x : x + shape[1]]
+        return _sample(plane, shape, [1 / h for h in self.scale], start)
 
 
 def _sample(plane: np.ndarray, shape: Sequence[int], step: Sequence[float], start: Sequence[float]) -> np.ndarray:
@@ -378,12 +436,32 @@ def _sample(plane: np.ndarray, shape: Sequence[int], step: Sequence[float], star
 
 
 def plane_thickness(masks: np.ndarray, edges: Sequence[float]) -> float:
-    """Return the mean thickness of a structure in planes (N, Y, X) with voxel edges (y, x), in their unit.
+    """Return the mean thickness of a structure in planes (N, Y, X) with voxel edges (y, x), in their unit."""
+    return thickness_of_sums([sum_depths(mask, edges) for mask in masks])
 
-    Four times the mean distance to the outline inside, which is the width of a strip.
-    """
-    means = [centre_distance(mask, edges)[mask] for mask in masks if mask.any() and not mask.all()]
-    return 4 * float(np.concatenate(means).mean()) if means else math.inf
+
+def sum_depths(mask: np.ndarray, edges: Sequence[float]) -> tuple[float, int]:
+    """Return the sum of the distances to the outline inside a plane (Y, X), and the pixels there; 0 without outline."""
+    if not mask.any() or mask.all():
+        return 0.0, 0
+    inside = centre_distance(mask, edges)[mask]
+    return float(inside.sum(dtype=np.float64)), len(inside)
+
+
+def thickness_of_sums(sums: Sequence[tuple[float, int]]) -> float:
+    """Return the mean thickness in planes whose `sum_depths` these are: four times the mean distance to the outline
+    inside, which is the width of a strip."""
+    total, count = (sum(each) for each in zip(*sums, strict=True))
+    return 4 * total / count if count else math.inf
+
+
+def choose_pixel(thickness: float, edges: Sequence[float], gap: float) -> float:
+    """Return the edge of a pixel for structures of a thickness in slices with voxel edges (y, x), at most a gap
+    apart."""
+    finest = min(edges)
+    thick, long = thickness / finest, gap / finest
+    coarser = float(np.clip(long / LONG, 1.0, max(thick / THICKNESS[1], 1.0)))
+    return finest * min(thick / THICKNESS[0], coarser)
 
 
 @torch.inference_mode()

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
 import curvafit.segmentation.filler as room
 from curvafit.segmentation.filler import (
@@ -18,6 +19,7 @@ from curvafit.segmentation.filler import (
     Raster,
     Taught,
     fill,
+    fill_gaps,
     interpolate,
     plane_thickness,
 )
@@ -154,6 +156,24 @@ def test_what_is_known_in_a_slice_to_fill_reaches_the_network_and_stays() -> Non
     raster = Raster.of(coarse)
     assert raster.scale == (2.0, 1.0)
     assert np.array_equal(raster.marks(marks[:1])[0, REACH + 36 : REACH + 38, REACH : REACH + 37], marks[0, [18, 18]])
+
+
+@pytest.mark.parametrize(
+    ("thickness", "spacing"), [(4.0, EDGES), (1.2, EDGES), (3.0, (3.0, 1.0, 1.7)), (14.0, (2.0, 1.0, 1.0))]
+)
+def test_a_core_is_filled_as_in_the_whole(thickness: float, spacing: tuple[float, float, float]) -> None:
+    """Pixels of a core are those of the whole, of any size: what differs is the order of sums in convolutions."""
+    noise = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal((17, 121, 96)), thickness)
+    marks = np.zeros(noise.shape, np.int8)
+    marks[:, 20:60, 31] = np.where(noise[:, 20:60, 31] > 0, 1, -1)
+    slices, taught = replace(known(noise > 0.3 * noise.std(), spacing=spacing), marks=marks), stirred()
+    whole, raster = fill(slices, taught), Raster.of(slices)
+    for core in ((slice(51, 102), slice(0, 32)), (slice(118, 121), slice(33, 96))):
+        rows = []
+        for numbers, found in fill_gaps(slices, taught, replace(raster, core=core), slice(7, 13)):
+            assert np.abs(found - whole[(numbers, *core)]).max() < 1e-4
+            rows += numbers.tolist()
+        assert rows == [7, 8, 9, 10, 11]
 
 
 # ---- pixels ----------------------------------------------------------------------------------------------------------

@@ -1,0 +1,136 @@
+"""Finding something in the pieces of a volume, by workers; what was found may stay in a folder that outlives a kill."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from functools import partial
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import FileLock, Timeout
+
+from curvafit.core.files import remove, write_content
+from curvafit.core.runtime import Progress, silent
+from curvafit.core.workers import ThisProcess, Workers, collect_all, join_workers
+from curvafit.priors.kernels.threads import one_thread
+from curvafit.scan.survey import Found
+from curvafit.volumes.field import ScanError
+
+
+class Finder:
+    """Finds something in the pieces of a volume, by workers, and keeps it in a folder, if there is one.
+
+    Parameters
+    ----------
+    crew
+        Who finds: workers do on one thread each, as they share the cores.
+    folder
+        Where what was found stays; None for nowhere.
+    progress
+        Called with what is being found, and the share of the whole that is done.
+    ends
+        The share that is done after a pass, by the pass's name; the others take a fiftieth each.
+    """
+
+    def __init__(self, crew: Workers, folder: Path | None, progress: Progress, ends: Mapping[str, float]) -> None:
+        self.processes = 1 if isinstance(crew, ThisProcess) else max(1, crew.places // 2)
+        self._crew, self._folder, self._progress, self._ends = crew, folder, progress, ends
+        self._share = 0.0
+
+    def __call__(self, name: str, find: Any, count: int, shown: str = "") -> Iterator[Found]:
+        """Return what is found in each piece, in their order; the progress says the name, or what is `shown`."""
+        found = {} if self._folder is None else _read_found(self._folder, name, count)
+        rest = [number for number in range(count) if number not in found]
+        start = self._share
+        self._share = stop = max(start, self._ends.get(name, start + 0.02))
+        make = partial(_find if isinstance(self._crew, ThisProcess) else _find_on_one_thread, find)
+        requests = [(make, Path(), [number]) for number in rest]
+        self._progress(shown or name, start)
+        for done, (number, each) in enumerate(collect_all(self._crew, requests), count - len(rest) + 1):
+            found[number] = each
+            if self._folder is not None:
+                _write_found(self._folder, name, number, each)
+            self._progress(shown or name, start + (stop - start) * done / count)
+        return iter([found[number] for number in range(count)])
+
+
+def _find(find: Any, _: Path, numbers: Sequence[int]) -> list[tuple[int, Found]]:
+    """Find something in pieces by their numbers."""
+    return [(number, find(number)) for number in numbers]
+
+
+def _find_on_one_thread(find: Any, _: Path, numbers: Sequence[int]) -> list[tuple[int, Found]]:
+    with one_thread():
+        return _find(find, _, numbers)
+
+
+def _file_of(folder: Path, name: str, number: int) -> Path:
+    return folder / f"{name.replace(' ', '-').replace(chr(39), '')}-{number:06d}.npz"
+
+
+def _read_found(folder: Path, name: str, count: int) -> dict[int, Found]:
+    """Return what earlier runs found, by number of the piece."""
+    found = {}
+    for number in range(count):
+        path = _file_of(folder, name, number)
+        if path.exists():
+            with np.load(path, allow_pickle=False) as arrays:
+                found[number] = dict(arrays)
+    return found
+
+
+def _write_found(folder: Path, name: str, number: int, found: Mapping[str, np.ndarray]) -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **found)
+    write_content(_file_of(folder, name, number), buffer.getvalue())
+
+
+@contextmanager
+def open_finder(
+    workers: Workers | int | None,
+    store: str | PathLike[str] | None,
+    run: Mapping[str, Any],
+    progress: Progress = silent,
+    ends: Mapping[str, float] | None = None,
+) -> Iterator[Finder]:
+    """Start workers, or a number of processes, open the folder of a run, if there is one, and return what finds."""
+    same = {name: str(each) for name, each in run.items()}
+    with join_workers(workers) as joined, nullcontext() if store is None else open_store(store, same) as folder:
+        yield Finder(joined or ThisProcess(), folder, progress, ends or {})
+
+
+@contextmanager
+def open_store(folder: str | PathLike[str], run: Mapping[str, str]) -> Iterator[Path]:
+    """Open the folder of a run, or make it, and lock it; `run` is what runs have in common that share it.
+
+    Where a ScanError is raised the folder is removed. Raises ValueError if the folder holds other things or another
+    run's, or is in use.
+    """
+    place = Path(folder)
+    names = {path.name for path in place.iterdir()} if place.is_dir() else set()
+    if ("run.json" not in names and names - {"lock"}) or (place.exists() and not place.is_dir()):
+        raise ValueError(f"tiles need a new folder, but {place} holds something else")
+    place.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(place / "lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ValueError(f"the tiles in {place} are in use by another run") from None
+    try:
+        other = json.loads((place / "run.json").read_bytes()) if "run.json" in names else run
+        if other != run:
+            changed = ", ".join(sorted(name for name in run if other.get(name) != run[name]))
+            raise ValueError(f"the tiles in {place} are another run's, which differs in {changed}: delete them")
+        write_content(place / "run.json", json.dumps(run, indent=2))
+        yield place
+    except ScanError:  # of a scan that cannot be measured nothing is of use
+        lock.release()
+        remove(place)
+        raise
+    finally:
+        lock.release()
