@@ -7,8 +7,9 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,12 +20,14 @@ from curvafit.core.records import MARK, is_zarr
 from curvafit.core.runtime import hold_signals
 from curvafit.core.units import format_sampling, parse_unit
 from curvafit.volumes.formats.base import Damaged, Raw, ScanError, pick_key, read_spacing
-from curvafit.volumes.formats.part import Part, index_of, read_part
+from curvafit.volumes.formats.part import Box, Part, index_of, read_part
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
 CHUNK = 64
 #: Chunks of an array at most; more would take hours to read.
 _MOST = 10_000_000
+#: Chunks a side of the boxes by which a level is halved.
+_HALVED = 2
 #: Our unit -> OME-Zarr's, which has none for the voxel.
 _UNITS = {"nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter"}
 #: Version of OME-Zarr -> Zarr's format, for writing.
@@ -96,16 +99,34 @@ def write_zarr(field: Any, path: Path, version: str = "0.5", labels: bool = Fals
 
     `labels` says that its whole numbers are labels of the image two folders above.
     """
+    values = np.asarray(field.values)
+    with hold_signals():  # Zarr's own threads would go on to write while the folder is deleted
+        group = create_zarr(field, values.dtype, path, version, labels)
+        level_of(group, 0)[...] = values
+        for level in range(1, len(group)):
+            for core in cores_of(group, level):
+                halve_level(group, level, core)
+
+
+def create_zarr(
+    frame: Any, dtype: np.dtype, path: Path, version: str = "0.5", labels: bool = False, chunk: int = CHUNK
+) -> Any:
+    """Create an image of OME-Zarr with a volume's shape and place, in chunks of an edge, and return its group.
+
+    Level `0` is to be written by whole chunks, in any order, and each level after it by `halve_level`.
+    """
     import zarr
 
-    levels = list(_halvings(np.asarray(field.values)))
+    shapes = [tuple(frame.shape)]
+    while max(shapes[-1]) > CHUNK:
+        shapes.append(tuple(-(-n // 2) for n in shapes[-1]))
     # A mean of 2ᵏ voxels along an axis lies (2ᵏ - 1) / 2 voxels behind the first one's centre; a picked voxel does not.
-    shift = 0.5 if field.values.dtype.kind == "f" else 0.0
-    kind = {"type": "space", **({"unit": _UNITS[field.unit]} if field.unit in _UNITS else {})}
+    shift = 0.5 if dtype.kind == "f" else 0.0
+    kind = {"type": "space", **({"unit": _UNITS[frame.unit]} if frame.unit in _UNITS else {})}
     datasets = []
-    for k in range(len(levels)):
-        transforms = [{"type": "scale", "scale": [2**k * h for h in field.spacing]}]
-        first = [x + shift * (2**k - 1) * h for x, h in zip(_first(field), field.spacing, strict=True)]
+    for k in range(len(shapes)):
+        transforms = [{"type": "scale", "scale": [2**k * h for h in frame.spacing]}]
+        first = [x + shift * (2**k - 1) * h for x, h in zip(_first(frame), frame.spacing, strict=True)]
         if any(first):
             transforms += [{"type": "translation", "translation": first}]
         datasets.append({"path": str(k), "coordinateTransformations": transforms})
@@ -120,17 +141,59 @@ def write_zarr(field: Any, path: Path, version: str = "0.5", labels: bool = Fals
         content["image-label"] = {"source": {"image": "../../"}} | ({"version": version} if old else {})
     naming: dict[str, Any] = {"chunk_key_encoding": {"name": "v2", "separator": "/"}} if old else {}
     naming |= {} if old else {"dimension_names": ("z", "y", "x")}
-    with hold_signals():  # Zarr's own threads would go on to write while the folder is deleted
-        attributes = content if old else {"ome": {"version": version, **content}}
-        group = zarr.create_group(path, attributes=attributes, zarr_format=2 if old else 3)
-        for k, values in enumerate(levels):
-            group.create_array(
-                str(k),
-                data=values,
-                chunks=tuple(min(CHUNK, n) for n in values.shape),
-                config={"write_empty_chunks": True},  # so that a chunk that is not there is one that was lost
-                **naming,
-            )
+    attributes = content if old else {"ome": {"version": version, **content}}
+    group = zarr.create_group(path, attributes=attributes, zarr_format=2 if old else 3)
+    for k, shape in enumerate(shapes):
+        group.create_array(
+            str(k),
+            shape=shape,
+            dtype=dtype.newbyteorder("="),
+            chunks=tuple(min(chunk, n) for n in shape),
+            **naming,
+        )
+    return group
+
+
+def open_zarr(path: Path) -> Any:
+    """Open a group that `create_zarr` made, to write its levels."""
+    import zarr
+
+    return zarr.open_group(path, mode="r+")
+
+
+def level_of(group: Any, level: int) -> Any:
+    """Return a level of an image to write to: a chunk that is not there afterwards is one that was lost."""
+    return group[str(level)].with_config({"write_empty_chunks": True})
+
+
+def cores_of(group: Any, level: int) -> list[Box]:
+    """Return the boxes of whole chunks by which `halve_level` makes a level."""
+    array = group[str(level)]
+    return cut_cores(array.shape, [_HALVED * edge for edge in array.chunks])
+
+
+def cut_cores(shape: Sequence[int], edge: int | Sequence[int]) -> list[Box]:
+    """Cut a volume into boxes of an edge, or of one along each axis, z slowest; the last ones may be smaller."""
+    edges = (edge,) * 3 if isinstance(edge, int) else edge
+    axes = ([slice(a, min(a + e, n)) for a in range(0, n, e)] for n, e in zip(shape, edges, strict=True))
+    return list(product(*axes))  # type: ignore[arg-type]
+
+
+def halve_level(group: Any, level: int, core: Box) -> None:
+    """Write a core of whole chunks of a level, from the level before it.
+
+    Floats are means of 2³ voxels (the last voxels count twice where the number is odd). Whole numbers, which may be
+    labels, are every second value.
+    """
+    finer = group[str(level - 1)]
+    values = finer[tuple(slice(2 * e.start, min(2 * e.stop, n)) for e, n in zip(core, finer.shape, strict=True))]
+    if values.dtype.kind == "f":
+        even = np.pad(values, [(0, n % 2) for n in values.shape], mode="edge")
+        nz, ny, nx = (n // 2 for n in even.shape)
+        values = even.reshape(nz, 2, ny, 2, nx, 2).mean((1, 3, 5), dtype=np.float32).astype(values.dtype)
+    else:
+        values = values[::2, ::2, ::2]
+    level_of(group, level)[core] = values
 
 
 def _first(field: Any) -> tuple[float, ...]:
@@ -244,23 +307,6 @@ def mark(folder: Path, kind: str) -> None:
     import zarr
 
     zarr.open_group(folder, mode="r+").attrs[MARK] = {"kind": kind}
-
-
-def _halvings(values: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the volume and its halved copies, down to one chunk.
-
-    Floats are means of 2³ voxels (the last voxels count twice where the number is odd). Whole numbers, which may be
-    labels, are every second value.
-    """
-    yield values
-    while max(values.shape) > CHUNK:
-        if values.dtype.kind == "f":
-            even = np.pad(values, [(0, n % 2) for n in values.shape], mode="edge")
-            nz, ny, nx = (n // 2 for n in even.shape)
-            values = even.reshape(nz, 2, ny, 2, nx, 2).mean((1, 3, 5), dtype=np.float32).astype(values.dtype)
-        else:
-            values = values[::2, ::2, ::2]
-        yield values
 
 
 def _levels(name: str, attributes: Mapping[str, Any]) -> dict[str, _Place]:
