@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -171,7 +171,35 @@ def reconstruct(
         "sure": sure,
     }
     record["filler"] = None if filler is None else str(filler)
-    run_job(Job(slices, out, prior, reading, record, overwrite, workers), compute)
+    job = Job(slices, out, prior, reading, record, overwrite, workers)
+    alone = not (prior or labels or image or example or periodic or ignore is not None or sure or stiffness)
+    if not (alone and _fill_blocks(job, {**place, "careful": careful, "epsilon": epsilon, "suggest": suggest})):
+        run_job(job, compute)
+
+
+def _fill_blocks(job: Job, options: dict[str, Any]) -> bool:
+    """Fill a volume between known slices in blocks, if it is so large, and return whether it is."""
+    from curvafit.segmentation.blocks import fits_blocks, reconstruct_file
+    from curvafit.segmentation.result import check_mask_target
+    from curvafit.volumes.boxes import boxes_of
+
+    reading, tile, filler = dict(job.reading), job.record["tile"], job.record["filler"]
+    options = {**options, "label": reading.pop("label"), "tile": tile, "filler": filler, "workers": job.workers}
+    del options["ignore"]
+    if not fits_blocks(job.out, (), 1):
+        return False
+    inputs = [] if filler is None else [filler]
+    check_mask_target(job.out, None, [job.source, *inputs], job.overwrite, maps=["probability"])
+    with show_stages() as progress:
+        progress("reading", 0.0)
+        if not fits_blocks(job.out, boxes_of(job.source, **reading).frame.shape, tile):
+            return False
+        content = {"command": command_line(), "prior": None, **job.record}
+        options |= {"inputs": inputs, "overwrite": job.overwrite, "record": content, "progress": progress}
+        with resumable():
+            filled = reconstruct_file(job.source, job.out, **options, **reading)
+    _print_mask(filled.notes, filled.status, filled.paths)
+    return True
 
 
 @dataclass(frozen=True)
@@ -195,7 +223,7 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
     """
     from curvafit.core.files import remove
     from curvafit.priors.law import Law, preset_name
-    from curvafit.segmentation.result import beside, check_mask_target, write_mask
+    from curvafit.segmentation.result import check_mask_target, hidden_store, write_mask
     from curvafit.segmentation.tiles import Tiling
     from curvafit.volumes.boxes import boxes_of, read_whole
 
@@ -213,8 +241,7 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
         boxes = boxes_of(job.source, **reading) if read is None else boxes_of(read(job.source, **reading))
         check_mask_target(job.out, boxes.frame, **options)  # again, as a format may not hold the unit
         tiling = Tiling.of(boxes.frame, record["epsilon"], record["tile"], periodic=record.get("periodic", False))
-        place = beside(job.out, ".tiles")  # not within the user's store
-        store = place.with_name(f".{job.out.name}.curvafit-tiles")
+        store = hidden_store(job.out)
         tiles = tiling.count > 1 and (record["job"] != "reconstruct" or job.prior is not None)
         with resumable() if tiles else nullcontext():
             result = compute(boxes, progress, tile=record["tile"], store=store, workers=job.workers)
@@ -228,8 +255,13 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
         how = {"sure": sure, "like": like, "unit": reading["unit"], "record": content, "overwrite": job.overwrite}
         paths = write_mask(result, read_whole(boxes), job.out, **how)
         remove(store)
-    for note in result.notes:
+    _print_mask(result.notes, result.status, paths)
+
+
+def _print_mask(notes: Sequence[str], status: str, paths: Sequence[Path]) -> None:
+    """Print what is said of a mask, and where it is."""
+    for note in notes:
         say(note)
-    say(f"{result.status[0].upper()}{result.status[1:]}.", style="bold")
+    say(f"{status[0].upper()}{status[1:]}.", style="bold")
     for path in paths:
         say(str(path))

@@ -10,7 +10,7 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps, rc_context
@@ -263,21 +263,44 @@ def section_figure(
     None. The spacing is voxel edges (z, y, x) in `unit`; `places` are the numbers of the slices, by default the middle
     ones. Rows of the titles in `labelled` hold labels, each drawn in a colour of its own.
     """
-    figure = make_figure(7.2, 2.5 * len(rows), layout="constrained")
-    axes = figure.subplots(len(rows), 3, squeeze=False)
     places = [n // 2 for n in next(iter(rows.values()))[0].shape] if places is None else places
-    for row, (title, (values, mask)) in zip(axes, rows.items(), strict=True):
+    drawn = {}
+    for title, (values, mask) in rows.items():
         if not values.size or (values.dtype.kind == "f" and not np.isfinite(values).all()):
             raise ValueError("a volume to draw needs voxels, all of finite values")
-        thinned = values[tuple(slice(None, None, -(-n // THIN)) for n in values.shape)].astype(np.float32)
-        levels = np.unique(thinned)
-        low, high = levels[[0, -1]] if len(levels) <= FEW else np.percentile(thinned, TAILS)
+        planes = [np.take(values, place, axis) for axis, place in enumerate(places)]
+        if title in labelled:
+            planes = [LABELS[np.where(plane, (plane - 1) % (len(LABELS) - 1) + 1, 0)] for plane in planes]
+        outlines = None if mask is None else [np.take(mask, place, axis) for axis, place in enumerate(places)]
+        drawn[title] = Sections(planes, outlines, grey_limits(values))
+    return draw_sections(drawn, spacing, unit, places)
+
+
+class Sections(NamedTuple):
+    """Slices across z, y and x, what is outlined over them, if anything is, and the levels of black and white."""
+
+    planes: Sequence[np.ndarray]
+    outlines: Sequence[np.ndarray] | None
+    limits: Limits
+
+
+def grey_limits(values: np.ndarray) -> Limits:
+    """Return the levels of black and white of a volume: the extremes of a few values, else percentiles."""
+    thinned = values[tuple(slice(None, None, -(-n // THIN)) for n in values.shape)].astype(np.float32)
+    levels = np.unique(thinned)
+    low, high = levels[[0, -1]] if len(levels) <= FEW else np.percentile(thinned, TAILS)
+    return float(low), float(high)
+
+
+def draw_sections(rows: Mapping[str, Sections], spacing: Sequence[float], unit: str, places: Sequence[int]) -> Figure:
+    """Return a figure of rows of slices by their titles, with the scale; `places` are the numbers of the slices."""
+    figure = make_figure(7.2, 2.5 * len(rows), layout="constrained")
+    axes = figure.subplots(len(rows), 3, squeeze=False)
+    for row, (title, (planes, outlines, limits)) in zip(axes, rows.items(), strict=True):
         for axis in range(3):
-            plane = np.take(values, places[axis], axis)
-            plane = LABELS[np.where(plane, (plane - 1) % (len(LABELS) - 1) + 1, 0)] if title in labelled else plane
-            outline = None if mask is None else np.take(mask, places[axis], axis)
             edges = [spacing[other] for other in range(3) if other != axis]
-            section_on(row[axis], plane, outline, (low, high), edges[0] / edges[1])
+            outline = None if outlines is None else outlines[axis]
+            section_on(row[axis], planes[axis], outline, limits, edges[0] / edges[1])
         row[0].set_ylabel(title)
     for axis, name in enumerate("zyx"):
         rows_name, columns_name = (other for other in "zyx" if other != name)

@@ -7,6 +7,7 @@ slice, so that the background around a structure, or a cut into tiles, changes n
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -535,6 +536,14 @@ class Taught:
     def temperature(self, gap: float) -> float:
         """Return by what log-odds are divided in a gap of so many pixels."""
         return float(np.interp(gap, *self.temperatures))
+
+    @property
+    def digest(self) -> str:
+        """A text that changes with weights and temperatures."""
+        content = hashlib.sha256(self.temperatures.tobytes())
+        for value in self.filler.state_dict().values():
+            content.update(value.numpy().tobytes())
+        return content.hexdigest()[:16]
 
     def save(self, path: str | Path) -> None:
         """Write weights and card as one `.npz`; nothing in it runs when it is read."""

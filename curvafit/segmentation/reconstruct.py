@@ -28,6 +28,15 @@ from curvafit.segmentation.engine import STEPS, WorkingGrid, choose_epsilon, law
 from curvafit.segmentation.examples import PART, Example, crop_to_surface
 from curvafit.segmentation.filler import Taught, fill
 from curvafit.segmentation.image import find_shift, read_image
+from curvafit.segmentation.notes import (
+    FEW,
+    describe_errors,
+    doubt_gaps,
+    doubt_labels,
+    doubt_places,
+    note_ends,
+    note_labelled,
+)
 from curvafit.segmentation.result import Segmentation, Uncertainty, flow_summary, volume_summary
 from curvafit.segmentation.slices import (
     WHOLE,
@@ -36,6 +45,7 @@ from curvafit.segmentation.slices import (
     check_place,
     check_shared,
     check_spacing,
+    find_labelled,
     known_places,
     labelled_slices,
     mark_known,
@@ -69,16 +79,14 @@ STIFFEST = (1e-9, 1e12)
 PULLS = (0.0, 1e4, 3e4)
 #: Label of unknown voxels in the mask of one structure.
 UNKNOWN = 255
-#: Least expected Dice of a volume that slices tell.
-HALF = 0.5
 #: Fewest grey levels of an image, and most voxels in which they are counted.
 GREY, SAMPLED = 8, 1_000_000
 #: Least share of the entropy of slices held out that an image takes away: that of the structure takes half or more.
 TOLD = 0.1
 SHIFTED = "The image seems to lie off the annotated slices by {where}: it fits them better when it is moved back."
 UNTOLD = "The image does not tell the structure in annotated slices held out: it is left out."
-#: Labels whose status is told one by one; voxels around a label's box.
-FEW, ROOM = 4, 16
+#: Voxels around a label's box.
+ROOM = 16
 #: Probabilities of labels are at least this.
 SURE = 1e-6
 
@@ -192,7 +200,7 @@ def reconstruct(
     if chosen.law is None:
         phase = engine.run(target, chosen)
         mask, likely = target.keep_known(phase > 0), (expit(engine.logits(target)), taught.error)
-        summary = volume_summary(mask)
+        summary = volume_summary(float(mask.mean()))
     else:
         tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
         problem = SlicesProblem(chosen, target, engine.level(target))
@@ -201,16 +209,15 @@ def reconstruct(
         likely = _weigh_evidence(engine, chosen, task, target, phase)
         notes = (*notes, *tiling.place.notes)
     uncertain = _uncertainty(*likely, mask, target, volume, axis, suggest)
-    if uncertain.expected_dice < HALF:
-        notes = (*notes, "Known slices lie too far apart: what lies between them is more unknown than known.")
+    notes = (*notes, *doubt_gaps(uncertain.expected_dice))
     tested = "the example" if other else "slices left out" if chosen.law else "generated shapes"
-    end = _describe_errors(uncertain, tested)
+    end = describe_errors(uncertain.expected_dice, uncertain.calibration_error, uncertain.suggestions, tested)
     said = f"{said}: {len(places)} of {volume.shape[axis]} slices known, {summary}; {end}"
     return Segmentation.of(
         volume, _turn_back(axis, mask), _turn_back(axis, phase), chosen.law, width,
         (
-            *which, *_doubt_labels(volume, axis, places, ignore), *notes,
-            *_extrapolated(places, volume.shape[axis], evidence is not None),
+            *which, *doubt_labels(np.unique(np.moveaxis(volume.values, axis, 0)[places]), ignore), *notes,
+            *note_ends(places, volume.shape[axis], evidence is not None),
         ),
         weight=None, status=said, uncertainty=uncertain, image=seen,
     )  # fmt: skip
@@ -315,33 +322,9 @@ def _find_known(
         return *annotated_slices(values, check_int(ignore, "a label to ignore", -SEEDS, SEEDS)), ()
     if every is None and known is None:
         places = labelled_slices(values)
-        which = f"The {len(places)} slices with labels are known: {_list(places, 24)}."
-        return places, None, (f"{which} One that is rightly empty must be named.",)
+        return places, None, note_labelled(places)
     places = known_places(len(values), every, first, known)
-    return places, None, () if every is None else _doubt_places(values, places)
-
-
-def _doubt_places(values: np.ndarray, places: list[int]) -> tuple[str, ...]:
-    """Return a sentence where few slices have labels, and some of them are not among the known ones."""
-    labelled = np.flatnonzero((values > 0).any((1, 2)))
-    strange = sorted(set(labelled.tolist()) - set(places))
-    if not strange or 2 * len(labelled) > np.ptp(labelled) + 1:
-        return ()
-    few = f"Only {len(labelled)} of {len(values)} slices have labels, but {_list(strange)} are not among the known ones"
-    return (f"{few}: if those are what you annotated, another every or first is meant, or known.",)
-
-
-def _list(numbers: Sequence[int], most: int = FEW) -> str:
-    """Return the first of some numbers as a list."""
-    return ", ".join(map(str, numbers[:most])) + (", …" if len(numbers) > most else "")
-
-
-def _doubt_labels(volume: Field, axis: int, places: list[int], ignore: int | None) -> tuple[str, ...]:
-    """Return a sentence where known slices have several labels, which are filled as one structure."""
-    values = np.unique(np.moveaxis(volume.values, axis, 0)[places])
-    count = np.count_nonzero((values > 0) & (values != ignore))
-    how = "reconstruct_labels, or --labels all, fills each by itself"
-    return (f"The known slices have {count} labels, which are filled as one structure: {how}.",) if count > 1 else ()
+    return places, None, () if every is None else doubt_places(find_labelled(values), places)
 
 
 def _pose_task(slices: Slices, example: Example | None) -> Task[Slices]:
@@ -390,14 +373,6 @@ def _uncertainty(
     return Uncertainty(replace(volume, values=_turn_back(axis, values), notes=()), error, suggestions, dice)
 
 
-def _describe_errors(uncertain: Uncertainty, tested: str) -> str:
-    """Say how good probabilities are, and on what, and what to annotate next, as the end of a sentence."""
-    text = f"expect a Dice of {uncertain.expected_dice:.2f} between known slices"
-    text = f"{text}; probabilities err by {uncertain.calibration_error:.3f} near the surface of {tested}"
-    following = ", ".join(map(str, uncertain.suggestions))
-    return f"{text}; annotate next: {following}" if following else text
-
-
 def _turn_back(axis: int, values: np.ndarray) -> np.ndarray:
     """Move the first axis of a volume back to where it was."""
     return np.ascontiguousarray(np.moveaxis(values, 0, axis))
@@ -443,15 +418,6 @@ def _load_example(example: Source, volume: Field, reading: dict[str, Any]) -> Fi
     check_spacing(field, volume, "the slices")
     require_labels(field.values, "the example")
     return field
-
-
-def _extrapolated(places: list[int], length: int, image: bool) -> tuple[str, ...]:
-    """Return sentences on the slices before the first known one and beyond the last."""
-    before, beyond = places[0], length - 1 - places[-1]
-    how = "told by the image alone" if image else "as that one is"
-    first = f"Before the first known slice: {before} of the volume, {how}."
-    last = f"Beyond the last known slice: {beyond} of the volume, {how}."
-    return *((first,) if before else ()), *((last,) if beyond else ())
 
 
 # ---- several structures ----------------------------------------------------------------------------------------------

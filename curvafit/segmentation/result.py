@@ -145,15 +145,15 @@ class Segmentation(Pictured):
         return f"Segmentation({size}, {count}: {self.status})"
 
 
-def volume_summary(mask: np.ndarray) -> str:
+def volume_summary(share: float) -> str:
     """Say which share of the volume is inside."""
-    return f"{100 * mask.mean():.2f} % of the volume is inside"
+    return f"{100 * share:.2f} % of the volume is inside"
 
 
 def flow_summary(lowered: LoweredVolume) -> str:
     """Say whether a flow settled, if there was one, and which share of the volume is inside."""
     share, energy, steps = float(lowered.mask.mean()), lowered.energies, lowered.steps
-    inside = volume_summary(lowered.mask)
+    inside = volume_summary(share)
     if not steps:
         return inside
     fall = (energy[0] - energy[-1]) / max(abs(energy[-1]), 1e-30) if len(energy) > 1 else 1.0
@@ -181,7 +181,7 @@ def check_mask_target(
     """
     target, image = Path(path), image_of(Path(path))
     pick_writer(target, "mm" if scan is None else scan.unit)
-    first, *more = beside(target, ".json"), beside(target, ".png"), *(_map_path(target, name) for name in maps)
+    first, *more = beside(target, ".json"), beside(target, ".png"), *(map_path(target, name) for name in maps)
     if image is None:
         return can_write(target, FORMAT, more=(first, *more), inputs=inputs, overwrite=overwrite)
     if scan is not None:
@@ -201,6 +201,11 @@ def beside(target: Path, ending: str) -> Path:
     if (image := image_of(target)) is None:
         return sibling(target, ending)
     return sibling(store_of(image), f"_{target.name}{ending}")
+
+
+def hidden_store(target: Path) -> Path:
+    """Return the folder beside a mask, and not within the user's store, where finished parts of a run are."""
+    return beside(target, ".tiles").with_name(f".{target.name}.curvafit-tiles")
 
 
 def write_mask(
@@ -234,44 +239,55 @@ def write_mask(
     overwrite
         Whether files of other origin may be replaced.
     """
-    from curvafit.drawing.plot import DPI
-
     maps = {
         name: each.values for name, each in zip(MAPS, (segmentation.probability, sure), strict=True) if each is not None
     }
     inputs = () if like is None else (like,)
     target = check_mask_target(path, scan, inputs, overwrite, maps=list(maps))
-    image, note = image_of(target), beside(target, ".json")
-    listed = FORMAT.companions(target if image is None else note)
-    former = [place for name in MAPS if name not in maps and (place := _map_path(target, name)).name in listed]
+    image = image_of(target)
 
-    def write(values: np.ndarray, place: Path) -> Path:
+    def write(values: np.ndarray, place: Path) -> None:
         if like is not None and all(str(each).lower().endswith(_NIFTI) for each in (like, target)):
             write_nifti_like(values, Path(like), place, unit)
         else:
             save(Field(values, scan.spacing, scan.unit, scan.affine), place, kind=FORMAT.name)
-        return place
 
-    with temporary_folder(note) as work:
+    with temporary_folder(beside(target, ".json")) as work:
         mask, labels = segmentation.mask.values, segmentation.labels
         values = mask.view(np.uint8) if labels is None else labels.values
-        parts = [work / beside(target, ending).name for ending in (".png", ".json")]
-        parts += [write(values, work / _map_path(target, name).name) for name, values in maps.items()]
+        for name, each in maps.items():
+            write(each, work / map_path(target, name).name)
         if image is None:
-            parts = [write(values, work / target.name), *parts]
+            write(values, work / target.name)
         else:
             write_labels(replace(scan, values=values), work / target.name, image=image)
             mark(work / target.name, FORMAT.name)
         rows = {"scan": (scan.values, None), "mask": (scan.values, mask)}
-        _figure(segmentation, rows).savefig(work / beside(target, ".png").name, dpi=DPI)
-        content = {**_record(segmentation, scan, record or {}), "files": [part.name for part in parts]}
-        FORMAT.write(work / note.name, content)
-        with hold_signals():
-            added = () if image is None else (add_labels(work / target.name, image, target.name),)
-            files = move_together(parts, note.parent)
-            for place in former:
-                remove(place)
-        return (*added, *files)
+        content = _record(segmentation, scan, record or {})
+        return finish_mask(work, target, list(maps), _figure(segmentation, rows), content)
+
+
+def finish_mask(
+    work: Path, target: Path, maps: Sequence[str], figure: Figure, content: dict[str, Any]
+) -> tuple[Path, ...]:
+    """Write picture and record into a folder beside a target where the mask and its `maps` are, move all together to
+    where they belong, remove former maps, and return the paths."""
+    from curvafit.drawing.plot import DPI
+
+    image, note = image_of(target), beside(target, ".json")
+    listed = FORMAT.companions(target if image is None else note)
+    former = [place for name in MAPS if name not in maps and (place := map_path(target, name)).name in listed]
+    parts = [work / beside(target, ending).name for ending in (".png", ".json")]
+    parts += [work / map_path(target, name).name for name in maps]
+    parts = parts if image else [work / target.name, *parts]
+    figure.savefig(work / beside(target, ".png").name, dpi=DPI)
+    FORMAT.write(work / note.name, {**content, "files": [part.name for part in parts]})
+    with hold_signals():
+        added = () if image is None else (add_labels(work / target.name, image, target.name),)
+        files = move_together(parts, note.parent)
+        for place in former:
+            remove(place)
+    return (*added, *files)
 
 
 def segmentation_figure(segmentation: Segmentation) -> Figure:
@@ -303,7 +319,7 @@ def _figure(segmentation: Segmentation, rows: Mapping[str, tuple[np.ndarray, np.
     return section_figure(shown, mask.spacing, mask.unit, places, ["filled"])
 
 
-def _map_path(target: Path, name: str) -> Path:
+def map_path(target: Path, name: str) -> Path:
     """Return `mask_probability.nii.gz` for `mask.nii.gz` and `probability`."""
     suffix = ".zarr" if image_of(target) else target.name.removeprefix(sibling(target, "").name)
     return beside(target, f"_{name}{suffix}")
@@ -315,19 +331,29 @@ def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> di
         doubts = {name: getattr(uncertain, name) for name in ("calibration_error", "suggestions", "expected_dice")}
         if uncertain.dice_of_labels:
             doubts["dice_of_labels"] = {str(number): dice for number, dice in uncertain.dice_of_labels.items()}
-    return {
-        "status": segmentation.status,
-        **more,
-        "scan": scan.source,
-        "shape": list(scan.shape),
-        "spacing": list(scan.spacing),
-        "unit": scan.unit,
+    found = {
         "coefficients": None if segmentation.coefficients is None else segmentation.coefficients.as_dict(),
         "epsilon": segmentation.epsilon,
         "weight": segmentation.weight,
         "volume_fraction": float(segmentation.mask.values.mean()),
         **doubts,
-        "notes": list(segmentation.notes),
+    }
+    return describe_run(segmentation.status, more, scan, found, segmentation.notes)
+
+
+def describe_run(
+    status: str, options: Mapping[str, Any], scan: Field, found: Mapping[str, Any], notes: Sequence[str]
+) -> dict[str, Any]:
+    """Return the record of a mask of a scan: its status, the run's options, what was found, and notes."""
+    return {
+        "status": status,
+        **options,
+        "scan": scan.source,
+        "shape": list(scan.shape),
+        "spacing": list(scan.spacing),
+        "unit": scan.unit,
+        **found,
+        "notes": list(notes),
         "curvafit": version("curvafit"),
         "torch": version("torch"),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),

@@ -73,16 +73,9 @@ class Slices:
         Raises `ScanError` if they hold grey levels, or are all empty or all full; the message calls them `name`.
         """
         inside = require_labels(np.moveaxis(volume.values, axis, 0)[list(places)], name) > 0
-        if inside.all() or not inside.any():
-            state = "full" if inside.all() else "empty"
-            raise ScanError(
-                f"{name} must have voxels inside and outside, but all are {state}; is another "
-                "slice the first, is there a label that nobody annotated, or are there several labels?"
-            )
-        edges = [volume.spacing[k] for k in (axis, *(k for k in range(3) if k != axis))]
-        return cls(
-            inside, tuple(places), volume.shape[axis], (edges[0], edges[1], edges[2]), volume.unit, periodic, marks
-        )
+        require_outline(int(np.count_nonzero(inside)), inside.size, name)
+        edges = turn_axes(volume.spacing, axis)
+        return cls(inside, tuple(places), volume.shape[axis], edges, volume.unit, periodic, marks)
 
     def select(self, rows: Sequence[int]) -> Slices:
         """Keep some of the known slices, by their rows in `inside`."""
@@ -190,9 +183,25 @@ def known_places(length: int, every: int | None, first: int, known: Sequence[int
     return places
 
 
+def turn_axes(numbers: Sequence[Any], axis: int) -> tuple[Any, Any, Any]:
+    """Return what there is along each axis, that of `axis` first."""
+    first, second, third = (numbers[k] for k in (axis, *(k for k in range(3) if k != axis)))
+    return first, second, third
+
+
 def labelled_slices(values: np.ndarray) -> list[int]:
     """Return the numbers of the slices (Z, Y, X) with labels, which are known where nothing else is said."""
-    places = np.flatnonzero((values > 0).any((1, 2)))
+    return choose_labelled(find_labelled(values))
+
+
+def find_labelled(values: np.ndarray) -> np.ndarray:
+    """Return whether each slice (Z, Y, X) has labels, (Z,)."""
+    return np.asarray((values > 0).any((1, 2)))
+
+
+def choose_labelled(there: np.ndarray) -> list[int]:
+    """Return the numbers of the slices with labels, given whether each has some, (Z,)."""
+    places = np.flatnonzero(there)
     if len(places) < 2:
         raise ScanError(f"two or more slices must have labels, got {len(places)}; or give every or known")
     if np.diff(places).max() == 1:
@@ -283,6 +292,15 @@ def require_labels(values: np.ndarray, name: str, most: float = LABELS) -> np.nd
             f"{name} must be a mask or labels, got a grey image: {count} values, and most neighbours differ"
         )
     return values
+
+
+def require_outline(inside: int, count: int, name: str) -> None:
+    """Raise ScanError where of so many voxels none or all are inside; the message calls them `name`."""
+    if inside in (0, count):
+        raise ScanError(
+            f"{name} must have voxels inside and outside, but all are {'full' if inside else 'empty'}; is another "
+            "slice the first, is there a label that nobody annotated, or are there several labels?"
+        )
 
 
 def check_spacing(example: Field, volume: Field, name: str) -> None:

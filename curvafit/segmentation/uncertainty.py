@@ -60,7 +60,16 @@ def best_threshold(probability: np.ndarray) -> float:
     voxels; its maximum leaves out what is less likely than half of it. At one half, structures that are hard to
     predict would get lost.
     """
-    counts, edges = np.histogram(probability, THRESHOLDS, (0.0, 1.0))
+    return _choose_threshold(count_probabilities(probability))
+
+
+def count_probabilities(probability: np.ndarray) -> np.ndarray:
+    """Return how many probabilities lie in each of `THRESHOLDS` equal bins from 0 to 1; the counts of parts add up."""
+    return np.histogram(probability, THRESHOLDS, (0.0, 1.0))[0]
+
+
+def _choose_threshold(counts: np.ndarray) -> float:
+    edges = np.linspace(0.0, 1.0, THRESHOLDS + 1)
     sizes, sums = (np.cumsum(each[::-1]) for each in (counts, counts * (edges[1:] + edges[:-1]) / 2))
     best = int(np.argmax(sums / np.maximum(sizes + sums[-1], 1e-9)))
     return min(0.5, float(edges[::-1][best + 1]))
@@ -76,7 +85,12 @@ def best_log_odds(logits: np.ndarray) -> float:
 
     Where structures are thinner than those that taught, probabilities are too small, and so would the threshold be.
     """
-    return float(logit(max(best_threshold(expit(logits)), LEAST)))
+    return float(logit(lowest_inside(count_probabilities(expit(logits)))))
+
+
+def lowest_inside(counts: np.ndarray) -> float:
+    """Return the `best_threshold` of probabilities by their counts, but not less than `LEAST`."""
+    return max(_choose_threshold(counts), LEAST)
 
 
 def fit_temperature(logits: np.ndarray, inside: np.ndarray) -> float:

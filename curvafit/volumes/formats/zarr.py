@@ -215,7 +215,7 @@ def image_of(path: Path) -> Path | None:
     image = path.parent.parent
     if path.parent.name != "labels" or not is_zarr(image):
         return None
-    found = _version_of(image)
+    found = version_of(image)
     if found not in _FORMATS:
         said = "no image of OME-Zarr" if found is None else f"OME-Zarr {found}"
         raise ScanError(f"labels are written into an image of OME-Zarr 0.4 or 0.5, {image} is {said}")
@@ -238,7 +238,7 @@ def write_labels(field: Any, path: Path, *, image: Path) -> None:
         raise ScanError(f"labels must be whole numbers, got values of type {field.values.dtype}")
     check_place(field, image)
     whole = replace(field, values=field.values.view(np.uint8)) if field.values.dtype.kind == "b" else field
-    write_zarr(whole, path, _version_of(image) or "", labels=True)
+    write_zarr(whole, path, version_of(image) or "", labels=True)
 
 
 def check_place(field: Any, image: Path) -> None:
@@ -269,7 +269,7 @@ def add_labels(written: Path, image: Path, name: str) -> Path:
     folder = image / "labels"
     folder.mkdir(exist_ok=True)
     target = move_into_place(written, folder / name)
-    version, old = _version_of(image), (image / ".zgroup").exists()
+    version, old = version_of(image), (image / ".zgroup").exists()
     place = folder / (".zattrs" if old else "zarr.json")
     content = json.loads(place.read_text(encoding="utf-8")) if place.exists() else {}
     if old:
@@ -290,7 +290,7 @@ def add_labels(written: Path, image: Path, name: str) -> Path:
     return target
 
 
-def _version_of(image: Path) -> str | None:
+def version_of(image: Path) -> str | None:
     """Return the version of OME-Zarr of an image; None if a group is none."""
     import zarr
 

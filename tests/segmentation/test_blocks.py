@@ -1,0 +1,215 @@
+"""A volume filled in blocks from a file is the volume filled whole, whatever the blocks; a killed run goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from calling import call, refused
+from shapes import grown
+
+from curvafit.core.workers import cluster
+from curvafit.segmentation import blocks
+from curvafit.segmentation.blocks import fits_blocks, reconstruct_file
+from curvafit.segmentation.reconstruct import reconstruct
+from curvafit.segmentation.result import write_mask
+from curvafit.volumes import Field, load, save
+from curvafit.volumes.formats.zarr import write_zarr
+
+#: Blocks of 64 leave a last one of 3 voxels along z, and of 5 along x.
+SHAPE = (67, 40, 69)
+
+
+def texture(shape: tuple[int, int, int] = SHAPE) -> np.ndarray:
+    """A grown texture, repeated as far as a shape goes."""
+    phase = grown("tubes", 48, 1).numpy()
+    return (phase[np.ix_(*(np.arange(n) % 48 for n in shape))] > 0).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def labels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save(Field(texture(), (0.5, 0.5, 0.5), "um"), tmp_path_factory.mktemp("labels") / "labels.zarr")
+
+
+@pytest.fixture(scope="module")
+def whole(labels: Path) -> Path:
+    """The volume filled whole, as files."""
+    volume, target = load(labels), labels.with_name("whole.zarr")
+    write_mask(reconstruct(volume, every=8), volume, target)
+    return target
+
+
+def files(path: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
+
+
+def check_alike(found: Path, whole: Path) -> None:
+    """Float32 sums of convolutions in another order move a probability by some millionths, and a voxel that lies just
+    there to the other side."""
+    for name, most in (("", 1e-4), ("_probability", 1e-4)):
+        one, other = (each.with_name(f"{each.stem}{name}.zarr") for each in (found, whole))
+        assert (one / "zarr.json").read_bytes() == (other / "zarr.json").read_bytes()
+        for level in zarr.open_group(other, mode="r"):
+            values, expected = (zarr.open_group(each, mode="r")[level] for each in (one, other))
+            assert values.shape == expected.shape and values.dtype == expected.dtype
+            assert np.abs(values[...].astype(np.float32) - expected[...]).mean() < most
+    notes = [json.loads(each.with_suffix(".json").read_text()) for each in (found, whole)]
+    assert notes[0]["status"] == notes[1]["status"] and notes[0]["notes"] == notes[1]["notes"]
+    for name in ("calibration_error", "suggestions", "epsilon", "shape", "spacing", "unit", "coefficients", "weight"):
+        assert notes[0][name] == notes[1][name], name
+    for name in ("expected_dice", "volume_fraction"):
+        assert notes[0][name] == pytest.approx(notes[1][name], rel=1e-3), name
+
+
+# ---- blocks are the whole --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "edge", [64, pytest.param(33, marks=pytest.mark.slow), pytest.param(96, marks=pytest.mark.slow)]
+)
+def test_blocks_equal_the_whole(labels: Path, whole: Path, tmp_path: Path, edge: int) -> None:
+    target = tmp_path / whole.name
+    result = call("reconstruct", labels, "--every", 8, "--tile", edge, "-o", target)
+    assert result.exit_code == 0, (result.output, result.exception)
+    check_alike(target, whole)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "whole.json", "whole.png", "whole.zarr", "whole_probability.zarr",
+    ]  # fmt: skip
+    assert json.loads((tmp_path / "whole.json").read_text())["tile"] == edge
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+def test_slices_across_any_axis(tmp_path: Path, axis: int) -> None:
+    """Labelled slices are known where none are named; suggestions are those of the whole."""
+    mask, shape = texture(), np.array(SHAPE)
+    places = [0, 5, 14, 20, shape[axis] - 3]
+    kept = np.zeros_like(mask)
+    index = tuple(places if k == axis else slice(None) for k in range(3))
+    kept[index] = mask[index]
+    source, options = tmp_path / "labels.npy", {"axis": axis, "suggest": 2, "spacing": (1.5, 1.0, 0.8), "unit": "mm"}
+    np.save(source, kept)
+    volume = load(source, spacing=(1.5, 1.0, 0.8), unit="mm")
+    write_mask(reconstruct(volume, axis=axis, suggest=2), volume, tmp_path / "whole.zarr")
+    found = reconstruct_file(source, tmp_path / "blocks" / "whole.zarr", tile=40, **options)
+    assert "annotate next" in found.status and found.paths[0] == tmp_path / "blocks" / "whole.zarr"
+    check_alike(tmp_path / "blocks" / "whole.zarr", tmp_path / "whole.zarr")
+
+
+@pytest.mark.parametrize("version", ["0.4", "0.5"])
+def test_labels_of_an_image_are_those_of_the_whole(labels: Path, tmp_path: Path, version: str) -> None:
+    """With chunks, metadata and their place in the image's list."""
+    for name in ("one", "two"):
+        volume = load(labels)
+        write_zarr(volume.label(1), tmp_path / name / "scan.zarr", version)
+        target = tmp_path / name / "scan.zarr" / "labels" / "filled"
+        more = ("--tile", 64) if name == "two" else ()
+        result = call("reconstruct", labels, "--every", 8, *more, "-o", target)
+        assert result.exit_code == 0, (result.output, result.exception)
+    one, two = (files(tmp_path / name / "scan.zarr") for name in ("one", "two"))
+    assert one.keys() == two.keys()
+    assert all(one[name] == two[name] for name in one if not name.rpartition("/")[2].isdigit())
+    levels = [
+        zarr.open_group(tmp_path / name / "scan.zarr/labels/filled", mode="r")["0"][...] for name in ("one", "two")
+    ]
+    assert (levels[0] != levels[1]).mean() < 1e-4
+    assert sorted(path.name for path in (tmp_path / "one").iterdir()) == sorted(
+        path.name for path in (tmp_path / "two").iterdir()
+    )
+
+
+def test_only_a_large_volume_into_zarr_is_filled_in_blocks(tmp_path: Path) -> None:
+    assert fits_blocks("mask.zarr", (257, 9, 9), None) and fits_blocks("mask.ome.zarr", (9, 9, 9), 64)
+    assert not fits_blocks("mask.zarr", (256, 256, 256), None) and not fits_blocks("mask.nii.gz", (999, 9, 9), 64)
+
+
+# ---- workers, kills --------------------------------------------------------------------------------------------------
+
+
+def test_the_same_command_goes_on_after_a_kill(labels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def command(name: str) -> tuple:
+        return ("reconstruct", labels, "--every", 8, "--tile", 64, "-o", tmp_path / name / "mask.zarr")
+
+    assert call(*command("whole")).exit_code == 0
+    filled: list[int] = []
+
+    def stop(job: blocks.Job, number: int, fill=blocks.fill_block) -> object:
+        filled.append(number)
+        if len(filled) == 3:
+            raise KeyboardInterrupt
+        return fill(job, number)
+
+    monkeypatch.setattr(blocks, "fill_block", stop)
+    result = call(*command("killed"))
+    assert result.exit_code == 130 and "same command" in result.stderr
+    assert [path.name for path in (tmp_path / "killed").iterdir()] == [".mask.zarr.curvafit-tiles"]
+    refused(call(*command("killed"), "--axis", "y"), "tiles", progress=True)
+    result = call(*command("killed"))
+    assert result.exit_code == 0, (result.output, result.exception)
+    assert filled[3:] == [2, 3]
+    for name in ("mask.zarr", "mask_probability.zarr"):
+        assert files(tmp_path / "killed" / name) == files(tmp_path / "whole" / name)
+    assert len(list((tmp_path / "killed").iterdir())) == 4
+
+
+@pytest.mark.slow
+def test_workers_that_are_killed_lose_no_voxel(labels: Path, tmp_path: Path) -> None:
+    """Each of two workers is killed once, while blocks are filled; what a half-written chunk leaves is removed."""
+    reconstruct_file(labels, tmp_path / "one" / "mask.zarr", every=8, tile=32)
+    killed: list[int] = []
+    with cluster(2) as crew:
+
+        def kill(text: str, share: float) -> None:
+            if "blocks" in text and len(killed) < 2 and share > 0.2 + 0.3 * len(killed):
+                pids = crew._client.run(os.getpid)  # type: ignore[union-attr]
+                killed.append(min(set(pids.values()) - set(killed)))
+                os.kill(killed[-1], signal.SIGKILL)
+
+        reconstruct_file(labels, tmp_path / "two" / "mask.zarr", every=8, tile=32, workers=crew, progress=kill)
+    assert len(killed) == 2
+    for name in ("mask.zarr", "mask_probability.zarr"):
+        assert files(tmp_path / "one" / name).keys() == files(tmp_path / "two" / name).keys()
+    check_alike(tmp_path / "two" / "mask.zarr", tmp_path / "one" / "mask.zarr")
+
+
+# ---- bad input -------------------------------------------------------------------------------------------------------
+
+
+def test_bad_input_ends_in_one_sentence_and_leaves_nothing(labels: Path, tmp_path: Path) -> None:
+    values = texture()
+    grey = np.random.default_rng(0).integers(0, 999, SHAPE).astype(np.int16)
+    broken = values.astype(np.float32)
+    broken[50, 3, 3] = np.nan
+    for name, array in {"empty": 0 * values, "grey": grey, "nan": broken}.items():
+        np.save(tmp_path / f"{name}.npy", array)
+    save(Field(values), tmp_path / "torn.zarr")
+    chunk = tmp_path / "torn.zarr/0/c/1/0/0"
+    chunk.write_bytes(chunk.read_bytes()[:-9])
+    there = sorted(path.name for path in tmp_path.iterdir())
+    for source, more, word in (
+        ("empty.npy", ("--every", 8), "inside and outside"),
+        ("empty.npy", (), "labels"),
+        ("grey.npy", ("--every", 8), "labels"),
+        ("nan.npy", ("--every", 8), "finite"),
+        ("torn.zarr", ("--every", 8), "torn.zarr"),
+        ("torn.zarr", ("--every", 800), "known"),
+        ("torn.zarr", ("--every", 8, "--suggest", 60), "at most 58"),
+        ("torn.zarr", ("--every", 8, "-o", tmp_path / "torn.zarr"), "torn.zarr"),
+    ):
+        refused(
+            call("reconstruct", tmp_path / source, "--tile", 64, "-o", tmp_path / "mask.zarr", *more),
+            word,
+            progress=True,
+        )
+    assert sorted(path.name for path in tmp_path.iterdir()) == there
+
+
+def test_a_missing_chunk_is_said(tmp_path: Path) -> None:
+    save(Field(texture()), tmp_path / "labels.zarr")
+    (tmp_path / "labels.zarr/0/c/1/0/0").unlink()
+    found = reconstruct_file(tmp_path / "labels.zarr", tmp_path / "mask.zarr", every=8, tile=64)
+    assert any("1 of 4 chunks" in note for note in found.notes)
