@@ -1,8 +1,9 @@
-"""Time and peak memory of `curvafit measure` on a volume in tiles, from a Zarr store in chunks, as large as wanted.
+"""Time and peak memory of `curvafit measure` or `reconstruct` on a volume in parts, in Zarr, as large as wanted.
 
-A generated shape of 64³ is repeated along each axis, blurred, under noise of a quarter of its contrast. The store is
-written chunk by chunk. The command runs in a process of its own with its workers; the memory is that of the largest
-worker times their number, and the main process's.
+A generated shape of 64³ is repeated along each axis: for `measure` blurred, under noise of a quarter of its contrast;
+for `reconstruct` as labels, of which every eighth slice is known. The store is written chunk by chunk. The command runs
+in a process of its own with its workers; the memory is that of the largest worker times their number, and the main
+process's.
 """
 
 from __future__ import annotations
@@ -17,7 +18,11 @@ from scipy import ndimage
 
 from benchmarks.completion import EDGE, shape
 from benchmarks.harness import Cases, Figure, Values, run_python, show
+from curvafit.core.files import remove
+from curvafit.segmentation.result import hidden_store
 
+#: Distance of known slices, and the longest side of a volume that is filled at once unless blocks have an edge.
+EVERY, WHOLE = 8, 256
 #: Runs the command line, and prints the peak memory of the main process and of its largest worker in KiB.
 PROGRAM = """
 from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
@@ -29,41 +34,50 @@ finally:
 """
 
 
-def write_scan(law: str, edge: int, path: Path, cases: Cases) -> None:
-    """Write an image of a repeated shape, uint8, in chunks of two periods."""
+def write_scan(law: str, edge: int, path: Path, cases: Cases, *, labels: bool = False) -> None:
+    """Write an image of a repeated shape, or its labels, uint8, in chunks of two periods."""
     import zarr
 
     mask = shape(law, 0, cases).astype(np.float32)
-    period = ndimage.gaussian_filter(np.tile(mask, (2, 2, 2)), 1.0, mode="wrap")
+    period = np.tile(mask, (2, 2, 2)) if labels else ndimage.gaussian_filter(np.tile(mask, (2, 2, 2)), 1.0, mode="wrap")
     array = zarr.create_array(path, shape=(edge,) * 3, chunks=(2 * EDGE,) * 3, dtype="u1", overwrite=True)
     for number, start in enumerate(product(range(0, edge, 2 * EDGE), repeat=3)):
         box = tuple(slice(a, min(a + 2 * EDGE, edge)) for a in start)
         part = period[tuple(slice(0, b.stop - b.start) for b in box)]
+        if labels:
+            array[box] = part.astype(np.uint8)
+            continue
         noise = np.random.default_rng(number).standard_normal(part.shape, dtype=np.float32)
         array[box] = np.clip(60 + 100 * part + 25 * noise, 0, 255).astype(np.uint8)
 
 
-def timed(law: str, edge: int, workers: int, cases: Cases) -> Values:
+def timed(job: str, law: str, edge: int, workers: int, cases: Cases) -> Values:
     """Return the seconds and the memory in GB of one command."""
-    path = cases.folder / f"scan-{law}-{edge}.zarr"
-    write_scan(law, edge, path, cases)
+    fills, tile = job == "reconstruct", ("--tile", 2 * EDGE) if edge <= WHOLE else ()
+    path = cases.folder / f"{'labels' if fills else 'scan'}-{law}-{edge}.zarr"
+    write_scan(law, edge, path, cases, labels=fills)
+    how = ("--every", EVERY, *tile, "-o", cases.folder / f"filled-{law}-{edge}.zarr") if fills else ()
+    how = how or ("-o", cases.folder / f"{law}-{edge}.csv")
+    remove(hidden_store(cases.folder / f"filled-{law}-{edge}.zarr"))  # of a run that was stopped
     begun = time.monotonic()
-    said = run_python(
-        "-c", PROGRAM, "measure", path, "--workers", workers, "-o", cases.folder / f"{law}-{edge}.csv", "--overwrite"
-    )  # fmt: skip
+    said = run_python("-c", PROGRAM, job, path, "--workers", workers, *how, "--overwrite")
     main, worker = map(int, said.strip().splitlines()[-1].split())
     return {"seconds": time.monotonic() - begun, "memory": (main + max(workers, 0) * worker) * 1024 / 1e9}
 
 
 def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--command", choices=["measure", "reconstruct"], default="measure")
     parser.add_argument("--law", default="tubes")
     parser.add_argument("--edge", type=int, default=1024)
     parser.add_argument("--workers", type=int, default=2)
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
-    edge, workers = (208, 0) if options.quick else (options.edge, options.workers)
-    name = f"{options.law}-{edge}-{workers}"
-    found = cases.all({name: lambda: timed(options.law, edge, workers, cases)})
+    job, edge, workers = options.command, options.edge, options.workers
+    if options.quick:
+        edge, workers = 64 if job == "reconstruct" else 208, 0
+    name = f"{options.law}-{edge}-{workers}" if job == "measure" else f"filled-{options.law}-{edge}-{workers}"
+    found = cases.all({name: lambda: timed(job, options.law, edge, workers, cases)})
     show(["case", "seconds", "GB"], [[case, *row.values()] for case, row in found.items()])
-    return {f"{edge}.{key}": Figure(value) for row in found.values() for key, value in row.items()}
+    row = edge if job == "measure" else f"filled-{edge}"
+    return {f"{row}.{key}": Figure(value) for each in found.values() for key, value in each.items()}

@@ -116,8 +116,11 @@ def reconstruct(
     ] = None,
     epsilon: Epsilon = None,
     steps: Steps = 400,
-    tile: TileOption = None,
-    workers: WorkersOption = None,
+    tile: Annotated[
+        int | None,
+        _what(help="Side of a block, in voxels, of a volume filled into Zarr; with a law as in segment.", min=8),
+    ] = None,
+    workers: Annotated[int | None, _what(help="Processes for blocks or tiles; by default one.", min=0)] = None,
     reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:

@@ -17,7 +17,7 @@ from scipy import ndimage
 from scipy.special import expit
 
 from curvafit.core.checks import SEEDS, check_float, check_int
-from curvafit.core.runtime import Progress, silent, sub_progress
+from curvafit.core.runtime import Progress, check_memory, silent, sub_progress
 from curvafit.core.workers import Workers
 from curvafit.generation import data
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
@@ -81,6 +81,8 @@ PULLS = (0.0, 1e4, 3e4)
 UNKNOWN = 255
 #: Fewest grey levels of an image, and most voxels in which they are counted.
 GREY, SAMPLED = 8, 1_000_000
+#: Bytes that each voxel takes at least while a volume is filled at once.
+LEAST_BYTES = 30
 #: Least share of the entropy of slices held out that an image takes away: that of the structure takes half or more.
 TOLD = 0.1
 SHIFTED = "The image seems to lie off the annotated slices by {where}: it fits them better when it is moved back."
@@ -167,6 +169,7 @@ def reconstruct(
         If an image is given, and scikit-learn is not installed.
     """
     volume = field_of(slices, **reading)
+    check_memory(volume.shape, LEAST_BYTES, "a volume that is filled at once, not in blocks into Zarr,")
     axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
     places, marks, which = _find_known(volume, axis, every, first, known, ignore)
     target = Slices.of(volume, places, axis, periodic, marks)

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,16 +49,21 @@ def files(path: Path) -> dict[str, bytes]:
     return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
 
 
+def levels(store: Path) -> dict[str, np.ndarray]:
+    group: Any = zarr.open_group(store, mode="r")
+    return {name: group[name][...] for name in group}
+
+
 def check_alike(found: Path, whole: Path) -> None:
     """Float32 sums of convolutions in another order move a probability by some millionths, and a voxel that lies just
     there to the other side."""
     for name, most in (("", 1e-4), ("_probability", 1e-4)):
         one, other = (each.with_name(f"{each.stem}{name}.zarr") for each in (found, whole))
         assert (one / "zarr.json").read_bytes() == (other / "zarr.json").read_bytes()
-        for level in zarr.open_group(other, mode="r"):
-            values, expected = (zarr.open_group(each, mode="r")[level] for each in (one, other))
+        for level, expected in levels(other).items():
+            values = levels(one)[level]
             assert values.shape == expected.shape and values.dtype == expected.dtype
-            assert np.abs(values[...].astype(np.float32) - expected[...]).mean() < most
+            assert np.abs(values.astype(np.float32) - expected).mean() < most
     notes = [json.loads(each.with_suffix(".json").read_text()) for each in (found, whole)]
     assert notes[0]["status"] == notes[1]["status"] and notes[0]["notes"] == notes[1]["notes"]
     for name in ("calibration_error", "suggestions", "epsilon", "shape", "spacing", "unit", "coefficients", "weight"):
@@ -113,10 +119,8 @@ def test_labels_of_an_image_are_those_of_the_whole(labels: Path, tmp_path: Path,
     one, two = (files(tmp_path / name / "scan.zarr") for name in ("one", "two"))
     assert one.keys() == two.keys()
     assert all(one[name] == two[name] for name in one if not name.rpartition("/")[2].isdigit())
-    levels = [
-        zarr.open_group(tmp_path / name / "scan.zarr/labels/filled", mode="r")["0"][...] for name in ("one", "two")
-    ]
-    assert (levels[0] != levels[1]).mean() < 1e-4
+    first, second = (levels(tmp_path / name / "scan.zarr/labels/filled")["0"] for name in ("one", "two"))
+    assert (first != second).mean() < 1e-4
     assert sorted(path.name for path in (tmp_path / "one").iterdir()) == sorted(
         path.name for path in (tmp_path / "two").iterdir()
     )
@@ -162,11 +166,12 @@ def test_workers_that_are_killed_lose_no_voxel(labels: Path, tmp_path: Path) -> 
     reconstruct_file(labels, tmp_path / "one" / "mask.zarr", every=8, tile=32)
     killed: list[int] = []
     with cluster(2) as crew:
+        found: Any = crew._client.run(os.getpid)  # type: ignore[union-attr]
+        pids = list(found.values())
 
         def kill(text: str, share: float) -> None:
             if "blocks" in text and len(killed) < 2 and share > 0.2 + 0.3 * len(killed):
-                pids = crew._client.run(os.getpid)  # type: ignore[union-attr]
-                killed.append(min(set(pids.values()) - set(killed)))
+                killed.append(pids[len(killed)])
                 os.kill(killed[-1], signal.SIGKILL)
 
         reconstruct_file(labels, tmp_path / "two" / "mask.zarr", every=8, tile=32, workers=crew, progress=kill)
