@@ -101,8 +101,8 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     blocks, kills = ((64,), 1) if options.quick else (BLOCKS, options.kills)
     jobs = {f"{law}-{edge}-{block}": lambda block=block: compare(law, edge, block, cases) for block in blocks}
     found = cases.all(jobs)
-    # kills are of a smaller volume: the more blocks are at work, the less a kill says of the writing
-    killed = cases.all({f"kills-{law}-{kills}": lambda: kill(law, 2 * EDGE + REST, kills, cases)} if kills else {})
+    small = (1 if options.quick else 2) * EDGE + REST
+    killed = cases.all({f"kills-{law}-{kills}": lambda: kill(law, small, kills, cases)} if kills else {})
     show(["case", "Dice", "largest difference"], [[name, *row.values()] for name, row in found.items()])
     show(["case", "voxels lost", "kills", "files left"], [[name, *row.values()] for name, row in killed.items()])
     figures: dict[str, Figure] = {}
