@@ -92,7 +92,7 @@ SLAB, THICK = 2**26, CHUNK
 #: Slices of a block by default, and voxels a side across them at most.
 DEEP, WIDE = 2 * CHUNK, 4 * CHUNK
 #: Bytes that a pixel of a slice takes in the network, those of a voxel of a block, and of the program itself.
-_EACH, _VOXEL, _PROGRAM = 500, 24, 450 * 2**20
+_EACH, _VOXEL, _PROGRAM = 800, 24, 600 * 2**20
 #: Names of the passes, and the share of the work that is done after each.
 _LOOK, _READ, _FILL, _CUT = "looking for labels", "reading known slices", "filling blocks", "cutting the mask"
 _ENDS = {_LOOK: 0.02, _READ: 0.07, _FILL: 0.9, _CUT: 0.94}
