@@ -232,10 +232,12 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
 
     record, reading = job.record, job.reading
     law_file = None if preset_name(job.prior) else job.prior
-    shown = (job.image, *(record.get(name) for name in ("image", "example", "example_probabilities", "filler")))
+    named = ("image", "example", "example_probabilities", "filler", "repairer")
+    shown = (job.image, *(record.get(name) for name in named))
     options = {"inputs": [file for file in (job.source, law_file, *shown) if file], "overwrite": job.overwrite}
     least = record.get("sure")
-    options["maps"] = (["probability"] if record["job"] == "reconstruct" else []) + (["sure"] if least else [])
+    likely = record["job"] == "reconstruct" or record.get("repair")
+    options["maps"] = (["probability"] if likely else []) + (["sure"] if least else [])
     check_mask_target(job.out, **options)
     if job.prior is not None:
         Law.of(job.prior)
@@ -245,7 +247,7 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
         check_mask_target(job.out, boxes.frame, **options)  # again, as a format may not hold the unit
         tiling = Tiling.of(boxes.frame, record["epsilon"], record["tile"], periodic=record.get("periodic", False))
         store = hidden_store(job.out)
-        tiles = tiling.count > 1 and (record["job"] != "reconstruct" or job.prior is not None)
+        tiles = tiling.count > 1 and (not likely or job.prior is not None)
         with resumable() if tiles else nullcontext():
             result = compute(boxes, progress, tile=record["tile"], store=store, workers=job.workers)
         progress("writing", 1.0)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.special import expit
 from torch import Tensor
 
 from curvafit.core.checks import SEEDS, check_float, check_int, quoted
@@ -24,16 +25,20 @@ from curvafit.segmentation.engine import (
     WorkingGrid,
     add_willmore,
     bending,
+    choose_epsilon,
     infer_law,
     laws_of,
     likelihood,
 )
 from curvafit.segmentation.evidence import VoxelEvidence, probability_evidence
-from curvafit.segmentation.result import Segmentation, flow_summary
+from curvafit.segmentation.repair import Repairer
+from curvafit.segmentation.result import Segmentation, Uncertainty, flow_summary, volume_summary
 from curvafit.segmentation.segment import TRIALS, WEIGHTS
 from curvafit.segmentation.slices import check_place, check_spacing, require_labels
+from curvafit.segmentation.teach_repair import tune_repair
 from curvafit.segmentation.tiles import Problem, Tiling, lower_volume
 from curvafit.segmentation.trials import Task, Trial, choose_by_masks
+from curvafit.segmentation.uncertainty import expected_dice
 from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box, Crop
@@ -93,6 +98,7 @@ def refine(
     prior: LawLike | None = None,
     *,
     example: tuple[Source, Source] | Calibration | None = None,
+    repair: bool | str | Path | Repairer = False,
     weight: float | None = None,
     label: int | None = None,
     epsilon: float | None = None,
@@ -110,6 +116,9 @@ def refine(
     energy are tried there at weights over decades, and where none is better than p > 1/2 beyond the noise, the mask is
     p > 1/2. Where p > 1/2 has no surface, it stays as it is.
 
+    With `repair` there is no law and no need of an example: a network that generated shapes have taught what networks
+    do to masks says by how much the log-odds change. An example tunes it, and says whether it helps.
+
     Parameters
     ----------
     probabilities
@@ -119,6 +128,9 @@ def refine(
     example
         The same network's probabilities for another volume, on which it was not trained, and the true mask, which is
         positive inside; or the `Calibration` by them. A file or an array is read as `probabilities` is.
+    repair
+        Whether a network repairs the mask, in place of a law; or its weights: a file of `curvafit atlas teach
+        --repair`, or what `tune_repairer` returns.
     weight
         λ, in nats per unit of F_ε, in place of an example: the first law is lowered, whether that helps or not.
     label
@@ -126,19 +138,23 @@ def refine(
     epsilon, steps, tile, store, workers, progress
         As in `segment`.
     reading
-        Options of reading a file, or the place of an array: `like`, the path of an image of the same voxels that says
+        Options of reading a file, or the place of an array: `logits`, whether the values are log-odds log p / (1 - p)
+        in place of probabilities; `like`, the path of an image of the same voxels that says
         where they are (by default one that lies beside an NPZ file and has its name, as nnU-Net's segmentations do);
         spacing, unit, channel and the others of `curvafit.load`.
 
     Raises
     ------
     ValueError, FileNotFoundError
-        If there is neither an example nor a weight, or both; if the probabilities are not within [0, 1], or the
-        example's mask lies elsewhere or has no inside or outside; or as `segment`.
+        If there is neither an example nor a weight nor a repair, or too much of them; if the probabilities are not
+        within [0, 1], or the example's mask lies elsewhere or has no inside or outside; or as `segment`.
     """
-    check_judge(example, weight)
+    check_judge(example, weight, repair, prior)
     field = load_probabilities(probabilities, **reading)
-    evidence, tiling = probability_evidence(field), Tiling.of(field, epsilon, tile)
+    evidence = probability_evidence(field)
+    if repair is not False:
+        return _repair(field, evidence, repair, example, label, reading, progress)
+    tiling = Tiling.of(field, epsilon, tile)
     gain = ""
     if example is None:
         laws, notes = laws_of(infer_law(None) if prior is None else prior, field)
@@ -160,6 +176,55 @@ def refine(
         weight=None if trial.law is None else trial.strength * BENDING / bending(trial.law),
         status=f"{gain}{flow_summary(found)}",
     )  # fmt: skip
+
+
+def _repair(
+    field: Field,
+    evidence: VoxelEvidence,
+    repair: bool | str | Path | Repairer,
+    example: tuple[Source, Source] | Calibration | None,
+    label: int | None,
+    reading: dict[str, Any],
+    progress: Progress,
+) -> Segmentation:
+    """Repair a map; an example tunes first."""
+    repairer = repair if isinstance(repair, Repairer) else Repairer.load(None if isinstance(repair, bool) else repair)
+    if isinstance(example, tuple):
+        alike = {name: value for name, value in reading.items() if name not in ("like", "crop")}
+        chances = load_probabilities(example[0], **alike)
+        check_spacing(chances, field, "the probabilities")
+        truth, tuning = _load_truth(example[1], label, alike), sub_progress(progress, 0.0, 0.7)
+        repairer = tune_repairer(chances, truth, repairer, progress=tuning)
+        progress = sub_progress(progress, 0.7, 1.0)
+    odds = repairer.repair(evidence.ratio, field.spacing, progress)
+    mask, likely = odds > 0, expit(odds)
+    changed = np.count_nonzero(mask != (evidence.level > 0)) / max(np.count_nonzero(mask), 1)
+    doubt = Uncertainty(replace(field, values=likely), repairer.error, (), expected_dice(likely, mask))
+    return Segmentation.of(
+        field, mask, np.tanh(odds / 2), None, choose_epsilon(field, None), (),
+        weight=None, uncertainty=doubt, image=field,
+        status=f"{repairer.status}: {volume_summary(float(mask.mean()))}, {100 * changed:.2g} % of that is changed",
+    )  # fmt: skip
+
+
+def tune_repairer(
+    probabilities: Source,
+    mask: Source,
+    repairer: Repairer | str | Path | None = None,
+    *,
+    label: int | None = None,
+    progress: Progress = silent,
+    **reading: Any,
+) -> Repairer:
+    """Tune the network that repairs on a network's probabilities and the true mask, for `refine(…, repair=…)`.
+
+    By default the packaged one is tuned. See `refine` for the other parameters and errors.
+    """
+    field, truth = load_probabilities(probabilities, **reading), _load_truth(mask, label, reading)
+    check_place(truth, field, "the mask", "the probabilities")
+    inside = require_labels(truth.values, "the example") > 0
+    first = repairer if isinstance(repairer, Repairer) else Repairer.load(repairer)
+    return tune_repair(first, probability_evidence(field).ratio, inside, field.spacing, progress)
 
 
 def calibrate(
@@ -207,40 +272,101 @@ def calibrate(
     return Calibration(best, best.law in laws, field, notes)
 
 
+def repair_classes(
+    probabilities: Source,
+    classes: Sequence[int],
+    *,
+    repairer: Repairer | str | Path | None = None,
+    progress: Progress = silent,
+    **reading: Any,
+) -> Segmentation:
+    """Repair several classes of a network's probabilities; a voxel that several claim goes to the one that is surest.
+
+    Parameters
+    ----------
+    probabilities
+        The path of a file of several channels, such as nnU-Net's NPZ.
+    classes
+        The channels to repair, counted from 0, which become labels; all other voxels are 0, so 0 is not among them.
+    repairer
+        Weights as in `refine`.
+    reading
+        As in `refine`.
+
+    Raises
+    ------
+    ValueError, FileNotFoundError
+        If the classes are not different numbers from 1, or as `refine`.
+    """
+    numbers = [check_int(each, "classes that are whole numbers from 1", 1, SEEDS) for each in classes]
+    if not numbers or len(set(numbers)) < len(numbers):
+        raise ScanError(f"classes must be different numbers from 1, got {quoted(list(classes))}")
+    first = repairer if isinstance(repairer, Repairer) else Repairer.load(repairer)
+    found: list[Segmentation] = []
+    for count, number in enumerate(numbers):
+        step = sub_progress(progress, count / len(numbers), (count + 1) / len(numbers))
+        found.append(refine(probabilities, repair=first, progress=step, channel=number, **reading))
+    likely = np.stack([each.uncertainty.probability.values for each in found])  # type: ignore[union-attr]
+    best, surest = likely.argmax(0), likely.max(0)
+    inside = surest > 0.5
+    field = found[0].mask
+    owner = np.where(inside, np.array(numbers)[best], 0).astype(np.min_scalar_type(max(numbers)))
+    chance = replace(field, values=np.where(inside, surest, 1 - surest))
+    dice = {number: expected_dice(p, owner == number) for number, p in zip(numbers, likely, strict=True)}
+    doubt = Uncertainty(chance, first.error, (), min(dice.values()), dice)
+    phase = np.max([each.phase.values for each in found], axis=0)
+    return replace(
+        found[0],
+        mask=replace(field, values=inside),
+        phase=replace(field, values=phase),
+        labels=replace(field, values=owner),
+        uncertainty=doubt,
+        image=None,
+        status="; ".join(f"class {number}: {each.status}" for number, each in zip(numbers, found, strict=True)),
+        notes=tuple(dict.fromkeys(note for each in found for note in each.notes)),
+    )
+
+
 class Refine:
     """A callable that refines one class of a network's probabilities, for MONAI's `Compose` after the softmax.
 
     Parameters
     ----------
-    prior, weight, epsilon, steps
+    prior, weight, repair, epsilon, steps
         As in `refine`, whose errors it raises.
     example
         Probabilities and true mask (Z, Y, X) of another volume, which are tried out now; or a `Calibration`.
     channel
         The class, counted from 0.
     spacing, unit
-        Voxel edges along the tensor's three axes, or one for all, and their unit.
+        Voxel edges along the tensor's three axes, or one for all, and their unit; by default one voxel, and where masks
+        are repaired those of MONAI's tensor.
     """
 
     def __init__(
         self,
-        prior: LawLike,
+        prior: LawLike | None = None,
         *,
         weight: float | None = None,
+        repair: bool | str | Path | Repairer = False,
         example: tuple[Source, Source] | Calibration | None = None,
         channel: int = 1,
-        spacing: Sequence[float] | float = 1.0,
-        unit: str = "voxel",
+        spacing: Sequence[float] | float | None = None,
+        unit: str | None = None,
         epsilon: float | None = None,
         steps: int = STEPS,
     ) -> None:
-        check_judge(example, weight)
+        check_judge(example, weight, repair, prior)
         self.channel = check_int(channel, "a channel that is a whole number from 0", 0, SEEDS)
         self.place = {"spacing": spacing, "unit": unit}
-        if isinstance(example, tuple):
+        if repair is not False:
+            first = repair if isinstance(repair, Repairer) else Repairer.load(None if repair is True else repair)
+            repair = tune_repairer(*example, first, **self.place) if isinstance(example, tuple) else first
+            example = None
+        elif isinstance(example, tuple):
             example = calibrate(*example, prior, epsilon=epsilon, steps=steps, **self.place)
         self.prior, self.example = prior, example
-        self.options = {"weight": weight, "epsilon": epsilon, "steps": steps}
+        self.options = {"repair": repair, "weight": weight, "epsilon": epsilon, "steps": steps}
 
     def __call__(self, probabilities: Tensor) -> Tensor:
         """Return the mask (1, Z, Y, X) of probabilities (C, Z, Y, X), 0 and 1, of their type and on their device.
@@ -252,7 +378,10 @@ class Refine:
             raise ScanError(f"probabilities must be a tensor (C, Z, Y, X), got {got}")
         if self.channel >= len(probabilities):
             raise ScanError(f"the channel must be from 0 to {len(probabilities) - 1}, got {self.channel}")
-        field = field_of(probabilities[self.channel].as_subclass(Tensor), **self.place)
+        place, edges = self.place, getattr(probabilities, "pixdim", None)
+        if place["spacing"] is None and edges is not None and self.options["repair"] is not False:
+            place = {"spacing": [float(edge) for edge in edges], "unit": "mm"}
+        field = field_of(probabilities[self.channel].as_subclass(Tensor), **place)
         found = refine(field, self.prior, example=self.example, **self.options)
         mask = torch.zeros_like(probabilities[:1])
         mask[0] = torch.from_numpy(found.mask.values)
@@ -283,9 +412,12 @@ def _pose(evidence: VoxelEvidence, trial: Trial) -> RefineProblem:
     return RefineProblem(replace(trial, law=None) if inside.all() or not inside.any() else trial, evidence)
 
 
-def check_judge(example: object, weight: float | None) -> None:
-    """Raise ScanError unless there is either an example or a weight."""
-    if (example is None) == (weight is None):
+def check_judge(example: object, weight: float | None, repair: object = False, prior: object = None) -> None:
+    """Raise ScanError unless there is an example or a weight, or a repair, which goes with an example at most."""
+    if repair is not False:
+        if weight is not None or prior is not None or isinstance(example, Calibration):
+            raise ScanError("a repair goes with neither a law nor a weight: give an example that tunes it, or nothing")
+    elif (example is None) == (weight is None):
         got = "neither" if weight is None else "both"
         raise ScanError(f"give either an example, on which law and weight are judged, or a weight, got {got}")
 
@@ -297,6 +429,7 @@ def load_probabilities(
     spacing: Sequence[float] | float | None = None,
     unit: str | None = None,
     crop: Crop | None = None,
+    logits: bool = False,
     **reading: Any,
 ) -> Field:
     """Load a network's probabilities at the place of `like`, an image of the same voxels, where there is one.
@@ -309,13 +442,18 @@ def load_probabilities(
         raise ScanError("give either an image that says where the voxels are, or a spacing and unit, got both")
     image = find_image(source) if like is None and not stated else like
     if image is None:
-        return field_of(source, spacing=spacing, unit=unit, crop=crop, **reading)
+        return _to_probabilities(field_of(source, spacing=spacing, unit=unit, crop=crop, **reading), logits)
     place = place_of(image)
     field = field_of(source, spacing=place.spacing, unit=place.unit, **reading)
     if field.shape != place.shape:
         raise ScanError(f"the probabilities must have the shape {place.shape} of {image}, got {field.shape}")
     field = replace(field, affine=place.affine, notes=(*field.notes, f"The voxels are those of {image}."))
-    return field if crop is None else field.crop(crop)
+    return _to_probabilities(field if crop is None else field.crop(crop), logits)
+
+
+def _to_probabilities(field: Field, logits: bool) -> Field:
+    """Return a field of probabilities, of one of log-odds if it is that."""
+    return replace(field, values=expit(field.values.astype(np.float32))) if logits else field
 
 
 def find_image(source: Source) -> Path | None:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from scipy import ndimage
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.data import DataLoader, Dataset, Subset
 
@@ -77,6 +77,21 @@ class Texture:
         mode = "grid-wrap" if self.periodic else "mirror"
         return ndimage.map_coordinates(self.values, points, np.float32, order=1, mode=mode, prefilter=False)
 
+    def cut(self, rng: np.random.Generator, axes: Sequence[np.ndarray], thickness: float, mix: Mix) -> np.ndarray:
+        """Return a window, bool (Z, Y, X), at places along three axes, anywhere, turned and stretched at random.
+
+        `thickness` is that of the structure in the window, in the unit of the places.
+        """
+        voxels = self.thickness / thickness
+        if rng.random() < mix.upright or not self.periodic:
+            turn = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)[:, None]
+        else:
+            turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+        matrix = turn * (voxels * np.exp(mix.stretch * rng.standard_normal(3)))
+        grid = np.stack(np.meshgrid(*axes, indexing="ij")).reshape(3, -1)
+        corner = rng.uniform(0, self.values.shape)[:, None]
+        return self.read(matrix @ grid + corner).reshape([len(axis) for axis in axes]) > 0
+
 
 @dataclass(frozen=True)
 class Mix:
@@ -111,13 +126,26 @@ class Mix:
 
 
 class Batches(Dataset):
-    """Batches of gaps to fill: `length` of them; of a window only what is `halo` pixels from its border counts."""
+    """Batches of lessons, `length` of them, and what a network is to lower on each."""
 
     length: int
-    halo: int
 
     def __len__(self) -> int:
         return self.length
+
+    def loss(self, network: nn.Module, lesson: Any) -> Tensor:
+        """Return the loss of a network on a batch."""
+        raise NotImplementedError
+
+
+class GapBatches(Batches):
+    """Batches of gaps to fill; of a window only what is `halo` pixels from its border counts."""
+
+    halo: int
+
+    def loss(self, network: nn.Module, lesson: Lesson) -> Tensor:
+        *given, truth = lesson
+        return F.binary_cross_entropy_with_logits(network(Gaps(*given))[self.inner], truth[self.inner])  # type: ignore[arg-type,index]
 
     @property
     def inner(self) -> tuple[Any, ...]:
@@ -126,7 +154,7 @@ class Batches(Dataset):
 
 
 @dataclass(frozen=True, eq=False)
-class Lessons(Batches):
+class Lessons(GapBatches):
     """Batches of gaps to fill, the same for ever for a seed: batch k depends on (seed, k) alone.
 
     Attributes
@@ -177,17 +205,10 @@ class Lessons(Batches):
         texture = textures[int(rng.integers(len(textures)))]
         low, high = self.mix.thickness
         low = min(max(low, step * (count + 1) / SLIMMEST), high)
-        voxels = texture.thickness / np.exp(rng.uniform(math.log(low), math.log(high)))
-        if rng.random() < self.mix.upright or not texture.periodic:
-            turn = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)[:, None]
-        else:
-            turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
-        matrix = turn * (voxels * np.exp(self.mix.stretch * rng.standard_normal(3)))
+        thickness = float(np.exp(rng.uniform(math.log(low), math.log(high))))
         plane = np.arange(self.edge + 2 * self.halo, dtype=np.float64)
         heights = step * np.array([-count - 1, *range(count + 2), 2 * count + 2], dtype=np.float64)
-        grid = np.stack(np.meshgrid(heights, plane, plane, indexing="ij")).reshape(3, -1)
-        corner = rng.uniform(0, texture.values.shape)[:, None]
-        return texture.read(matrix @ grid + corner).reshape(len(heights), len(plane), len(plane)) > 0
+        return texture.cut(rng, (heights, plane, plane), thickness, self.mix)
 
     def _pose(
         self, rng: np.random.Generator, window: np.ndarray, step: float
@@ -290,7 +311,7 @@ class Whole:
 
 
 @dataclass(frozen=True, eq=False)
-class WholeLessons(Batches):
+class WholeLessons(GapBatches):
     """Batches of gaps in volumes that are known whole, a batch of one volume; batch k depends on (seed, k) alone.
 
     Without evidence gaps are shorter or longer by one slice, and begin anywhere.
@@ -334,7 +355,7 @@ class WholeLessons(Batches):
 
 
 def learn(
-    filler: Filler,
+    network: nn.Module,
     lessons: Batches,
     rate: float,
     *,
@@ -342,15 +363,15 @@ def learn(
     workers: int = 1,
     progress: Progress = silent,
 ) -> list[float]:
-    """Lower the cross entropy of lessons by AdamW in one cycle of rates; return the mean loss of each hundred steps.
+    """Lower the loss of lessons by AdamW in one cycle of rates; return the mean loss of each hundred steps.
 
-    The filler learns in place. With a checkpoint, the state is written there every `SAVED` steps, and learning goes on
+    The network learns in place. With a checkpoint, the state is written there every `SAVED` steps, and learning goes on
     from it.
     """
-    total, inner = len(lessons), lessons.inner
-    optimiser = torch.optim.AdamW(filler.parameters(), rate, weight_decay=1e-4)
+    total = len(lessons)
+    optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=1e-4)
     cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=total, pct_start=0.1)
-    parts = {"filler": filler, "optimiser": optimiser, "cycle": cycle}
+    parts = {"network": network, "optimiser": optimiser, "cycle": cycle}
     begun, losses = 0, []
     if checkpoint is not None and checkpoint.exists():
         state = torch.load(checkpoint, weights_only=True)
@@ -358,15 +379,15 @@ def learn(
             part.load_state_dict(state[name])
         begun, losses = state["step"], state["losses"]
     rest = Subset(lessons, range(begun, total))
-    filler.train()
-    for step, (*given, truth) in enumerate(
-        DataLoader(rest, batch_size=None, num_workers=workers, multiprocessing_context="spawn" if workers else None),
-        begun + 1,
-    ):
-        loss = F.binary_cross_entropy_with_logits(filler(Gaps(*given))[inner], truth[inner])
+    network.train()
+    loader = DataLoader(
+        rest, batch_size=None, num_workers=workers, multiprocessing_context="spawn" if workers else None
+    )
+    for step, lesson in enumerate(loader, begun + 1):
+        loss = lessons.loss(network, lesson)
         optimiser.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(filler.parameters(), STEEPEST)
+        torch.nn.utils.clip_grad_norm_(network.parameters(), STEEPEST)
         optimiser.step()
         cycle.step()
         losses.append(float(loss.detach()))
@@ -374,8 +395,16 @@ def learn(
         if checkpoint is not None and (step % SAVED == 0 or step == total):
             state = {name: part.state_dict() for name, part in parts.items()} | {"step": step, "losses": losses}
             write_atomically(checkpoint, partial(torch.save, state))
-    filler.eval()
+    network.eval()
     return [float(np.mean(losses[k : k + 100])) for k in range(0, total, 100)]
+
+
+def hold_out(sources: Sequence[Sequence[Texture]]) -> tuple[list[list[Texture]], list[Texture]]:
+    """Return the shapes that teach, by source, and every tenth, which judges; ValueError if a source is empty."""
+    if not sources or not all(sources):
+        raise ValueError("expected sources with one shape or more to teach with")
+    held = [texture for source in sources for texture in source[HELD_OUT - 1 :: HELD_OUT]] or [sources[-1][-1]]
+    return [[texture for texture in source if texture not in held] or list(source) for source in sources], held
 
 
 def teach(
@@ -405,10 +434,7 @@ def teach(
     Raises ValueError if a source is empty, or an argument is out of range.
     """
     steps, seed = check_int(steps, "a number of steps from 1", 1, 10**7), check_seed(seed)
-    if not sources or not all(sources):
-        raise ValueError("expected sources with one shape or more to teach with")
-    held = [texture for source in sources for texture in source[HELD_OUT - 1 :: HELD_OUT]] or [sources[-1][-1]]
-    taught = [[texture for texture in source if texture not in held] or list(source) for source in sources]
+    taught, held = hold_out(sources)
     mix = mix or Mix()
     with torch.random.fork_rng():
         torch.manual_seed(seed)
@@ -424,7 +450,7 @@ def teach(
 
 
 @torch.inference_mode()
-def judge(filler: Filler, lessons: Batches) -> tuple[np.ndarray, dict[str, float], float]:
+def judge(filler: Filler, lessons: GapBatches) -> tuple[np.ndarray, dict[str, float], float]:
     """Return temperatures (2, k) by gap; the cross entropy of held-out lessons and that of the cubic alone; and the
     calibration error near surfaces, where a temperature is of another half of the lessons.
     """
@@ -440,7 +466,7 @@ def judge(filler: Filler, lessons: Batches) -> tuple[np.ndarray, dict[str, float
         halves = [rows[::2], rows[1::2]]
         parts = [(torch.cat([logits[k] for k in half]), torch.cat([truths[k] for k in half])) for half in halves]
         cooled = [fit_temperature(z.numpy(), y.numpy()) for z, y in parts]
-        errors += [_near_error(z / t, y) for (z, y), t in zip(parts, cooled[::-1], strict=True)]
+        errors += [near_error(z / t, y) for (z, y), t in zip(parts, cooled[::-1], strict=True)]
         table.append((float(np.mean([gaps[k] for k in rows])), float(np.sqrt(np.prod(cooled)))))
     cross_entropy = F.binary_cross_entropy_with_logits
     whole = {
@@ -450,7 +476,7 @@ def judge(filler: Filler, lessons: Batches) -> tuple[np.ndarray, dict[str, float
     return np.array(table).T, {f"held_out_{name}": value for name, value in whole.items()}, float(np.mean(errors))
 
 
-def _near_error(logits: Tensor, truth: Tensor) -> float:
+def near_error(logits: Tensor, truth: Tensor) -> float:
     """Return the calibration error of log-odds (N,) near surfaces."""
     near = logits.abs() < UNSURE
     return calibration_error(torch.sigmoid(logits[near]).numpy(), truth[near].numpy())
@@ -482,6 +508,6 @@ def tune(taught: Taught, example: Example, progress: Progress = silent) -> Taugh
     return replace(
         tuned if better else taught,
         temperatures=taught.temperatures * [[1.0], [temperature]],
-        error=_near_error(logits / temperature, answer),
+        error=near_error(logits / temperature, answer),
         status=f"filled by the network{', tuned on the example' if better else ''} ({scores})",
     )

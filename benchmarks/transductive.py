@@ -1,0 +1,261 @@
+"""Two annotated slices of the very volume that is to be segmented: what F_ε on the rest of it adds to a network.
+
+A shape of 64³ (two laws off the presets, `trabec`, and a block of real bone, $CURVAFIT_DATA) is blurred, under noise
+of two contrasts; slices 21 and 42 are annotated, and a small U-Net learns from them. All ways share network, patches,
+steps and their first third, which is Dice + CE alone (`plain`). `area`, `willmore`, `law` and `wrong` add the energy of
+all voxels: the law is that of another volume's mask, the wrong one another texture's. `teacher` is a mean teacher;
+`pseudo` learns what `reconstruct` fills from slices and image, each voxel as sure as it is. `refine` (the law) and
+`repair` work on what `plain` predicts. Weights are chosen for each texture and way by slice 32, on a seed of its own.
+
+Scores are those of the slices that nobody annotated. Differences pair networks by seed, with 95 % intervals of a
+bootstrap over textures and seeds; p of Holm over two contrasts, `law` less `plain` and less `willmore`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import os
+import warnings
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy import ndimage, stats
+from torch import Tensor, nn
+from torch.nn import functional
+
+from benchmarks.completion import EDGE, LAWS_TRIED, fitted, shape
+from benchmarks.harness import Cases, Figure, Values, bootstrap, dice, scores, show
+from benchmarks.networks import UNKNOWN, dice_ce
+from curvafit.inference.fit import Fit
+from curvafit.inference.infer import infer
+from curvafit.priors import CombinedLoss, CurvaturePrior
+from curvafit.priors.law import LawLike
+from curvafit.segmentation.reconstruct import reconstruct
+from curvafit.segmentation.refine import refine
+
+TEXTURES = ("draw-0", "draw-5", "trabec", "bone")
+KNOWN, JUDGE = (21, 42), 32
+NOISE, BLUR = 2.0, 0.7
+STEPS, PATCH, RATE = 240, 48, 6e-3
+#: Weights that are tried: shares of the gradient; of the teacher, times its mean square.
+WEIGHTS: dict[str, tuple[float, ...]] = {
+    "area": (0.1, 0.3, 1.0),
+    "willmore": (0.1, 0.3, 1.0),
+    "law": (0.1, 0.3, 1.0),
+    "wrong": (0.1, 0.3, 1.0),
+}
+WEIGHTS |= {"plain": (0.0,), "teacher": (1.0, 10.0), "pseudo": (0.0,)}
+#: Ways that work on what `plain` predicts.
+AFTER = ("refine", "repair")
+WAYS = ("plain", "area", "willmore", "law", "wrong", "teacher", "pseudo", *AFTER)
+#: The seed by which weights are chosen, and that of the volume that the law is read from.
+TUNING, OTHER = 100, 200
+#: Steps over which a prior grows to its weight, and the memory of a mean teacher.
+WARM, MEMORY = 24, 0.98
+
+
+# ---- volumes ---------------------------------------------------------------------------------------------------------
+
+
+def truth_of(texture: str, seed: int, cases: Cases) -> np.ndarray:
+    """Return a mask of 64³: a grown shape, or a block of bone that lies elsewhere for each seed."""
+    if texture != "bone":
+        return shape(texture, seed, cases)
+    import tifffile
+
+    path = Path(os.environ["CURVAFIT_DATA"]) / "scans" / "lhdl_trabecular_200_otsu_mask.tif"
+    whole = tifffile.imread(path) > 0
+    corners = [(z, y, x) for z in (0, 68, 136) for y in (0, 68, 136) for x in (0, 68, 136)]
+    z, y, x = corners[np.random.default_rng(7).permutation(len(corners))[{TUNING: 25, OTHER: 26}.get(seed, seed)]]
+    return whole[z : z + EDGE, y : y + EDGE, x : x + EDGE]
+
+
+def image_of(truth: np.ndarray, seed: int) -> np.ndarray:
+    """Return a noisy image of a mask, standardised."""
+    clear = ndimage.gaussian_filter(truth.astype(np.float32), BLUR, mode="nearest")
+    values = clear + NOISE * np.random.default_rng(seed).standard_normal(truth.shape, dtype=np.float32)
+    return (values - values.mean()) / values.std()
+
+
+def law_of(texture: str, cases: Cases) -> Fit:
+    """Return the law of another volume's mask."""
+    if texture != "bone":
+        return fitted(texture, OTHER, cases)
+
+    def read() -> str:
+        mask = truth_of(texture, OTHER, cases).astype(np.uint8)
+        return infer(mask, kind="mask", fast=True).fit.to_json()
+
+    return Fit.load(cases.text(f"fit-{texture}.json", read))
+
+
+def prior_of(way: str, texture: str, cases: Cases) -> LawLike:
+    if way in LAWS_TRIED:
+        return LAWS_TRIED[way]
+    other = TEXTURES[(TEXTURES.index(texture) + 1) % len(TEXTURES)]
+    return law_of(texture if way == "law" else other, cases)
+
+
+# ---- training --------------------------------------------------------------------------------------------------------
+
+
+def network() -> nn.Module:
+    from monai.networks.nets.dynunet import DynUNet
+
+    return DynUNet(3, 1, 1, [3, 3, 3], [1, 2, 2], [2, 2], filters=(8, 16, 32), norm_name="batch")
+
+
+def soft_loss(logits: Tensor, target: Tensor) -> Tensor:
+    """Dice and cross entropy of probabilities, each voxel weighed by how sure it is."""
+    sure, y = (2 * target - 1).abs(), (target > 0.5).float()
+    p = logits.sigmoid()
+    overlap = (2 * (sure * p * y).sum() + 1) / ((sure * (p + y)).sum() + 1)
+    return 1 - overlap + functional.binary_cross_entropy_with_logits(logits, y, sure)
+
+
+def train(way: str, weight: float, texture: str, seed: int, steps: int, cases: Cases) -> np.ndarray:
+    """Return the probabilities of a network that was taught two slices of a volume, for all of it."""
+    truth = truth_of(texture, seed, cases)
+    image, target = image_of(truth, seed), np.full(truth.shape, UNKNOWN, np.float32)
+    target[list(KNOWN)] = truth[list(KNOWN)]
+    criterion: Callable[[Tensor, Tensor], Tensor] = dice_ce
+    if way == "pseudo":
+        slices = np.where(target == UNKNOWN, 0, target).astype(np.uint8)
+        found = reconstruct(slices, known=KNOWN, image=image)
+        target, criterion = found.probability.values.astype(np.float32), soft_loss  # type: ignore[union-attr]
+    torch.manual_seed(seed)
+    net = network()
+    teacher = copy.deepcopy(net).requires_grad_(False)
+    adam = torch.optim.AdamW(net.parameters(), RATE)
+
+    def batch(step: int) -> tuple[Tensor, Tensor]:
+        random = np.random.default_rng([seed, step % 2**32])
+        corner = [int(random.integers(n - PATCH + 1)) for n in truth.shape]
+        box = tuple(slice(a, a + PATCH) for a in corner)
+        axes = tuple(axis for axis in range(3) if random.random() < 0.5)
+        x, y = (np.flip(each[box], axes).copy() for each in (image, target))
+        x = random.uniform(0.9, 1.1) * x + random.uniform(-0.1, 0.1)
+        return torch.from_numpy(x.astype(np.float32))[None, None], torch.from_numpy(y)[None, None]
+
+    net.train()
+    for step in range(steps):
+        if step == steps // 3 and way in ("area", "willmore", "law", "wrong"):
+            prior = CurvaturePrior(prior_of(way, texture, cases), sigmoid=True)
+            pairs = [(net(x).detach(), y) for x, y in map(batch, range(-5, 0))]
+            share = float(np.median([prior.suggest_weight(dice_ce, pair) for pair in pairs]))
+            criterion = CombinedLoss(dice_ce, prior, weight * share, WARM)
+        adam.param_groups[0]["lr"] = RATE * (1 + np.cos(np.pi * step / steps)) / 2
+        x, y = batch(step)
+        adam.zero_grad()
+        logits = net(x)
+        loss = criterion(logits, y)
+        if way == "teacher" and step >= steps // 3:
+            with torch.no_grad():
+                told = teacher(x + 0.3 * torch.randn(x.shape, generator=torch.Generator().manual_seed(step))).sigmoid()
+            loss = loss + weight * min(1.0, (step - steps // 3) / WARM) * (logits.sigmoid() - told).square().mean()
+        loss.backward()
+        nn.utils.clip_grad_norm_(net.parameters(), 5.0)
+        adam.step()
+        with torch.no_grad():
+            for kept, new in zip(teacher.state_dict().values(), net.state_dict().values(), strict=True):
+                kept.copy_(MEMORY * kept + (1 - MEMORY) * new if kept.is_floating_point() else new)
+    net.eval()
+    with torch.no_grad():
+        return net(torch.from_numpy(image)[None, None])[0, 0].sigmoid().numpy()
+
+
+def predicted(way: str, weight: float, texture: str, seed: int, steps: int, cases: Cases) -> np.ndarray:
+    """Return the probabilities of a way's network, trained once."""
+    make = partial(train, way, weight, texture, seed, steps, cases)
+    name = f"p-{texture}-{way}-{weight:g}-{seed}-{steps}"
+    return cases.array(name, lambda: make().astype(np.float16)).astype(np.float32)
+
+
+def case(way: str, weight: float, texture: str, seed: int, steps: int, cases: Cases) -> Values:
+    """Return the scores of a way on the slices that nobody annotated, and the Dice of the slice that judges."""
+    p = predicted("plain" if way in AFTER else way, 0.0 if way in AFTER else weight, texture, seed, steps, cases)
+    truth, mask, said = truth_of(texture, seed, cases), p > 0.5, ""
+    if way == "refine":
+        truths = truth_of(texture, TUNING, cases).astype(np.uint8)
+        found = refine(
+            p, law_of(texture, cases), example=(predicted("plain", 0.0, texture, TUNING, steps, cases), truths)
+        )
+        mask, said = found.mask.values > 0, found.status
+    elif way == "repair":
+        found = refine(p, repair=True)
+        mask, said = found.mask.values > 0, found.status
+    rest = np.setdiff1d(np.arange(len(truth)), [*KNOWN, JUDGE])
+    return {"dice": dice(mask[rest], truth[rest]), "betti": scores(mask, truth)["betti"], "cldice": cldice(mask, truth),
+            "judge": dice(mask[JUDGE], truth[JUDGE]), "status": said}  # fmt: skip
+
+
+def cldice(mask: np.ndarray, truth: np.ndarray) -> float:
+    from skimage.morphology import skeletonize
+
+    thin, true_thin = skeletonize(mask), skeletonize(truth)
+    parts = ((thin & truth).sum() / max(thin.sum(), 1), (true_thin & mask).sum() / max(true_thin.sum(), 1))
+    return float(2 * parts[0] * parts[1] / max(sum(parts), 1e-9))
+
+
+# ---- runs ------------------------------------------------------------------------------------------------------------
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seeds", type=int, default=4, help="networks of a way and texture; the pilot has 4")
+    parser.add_argument("--textures", default=",".join(TEXTURES))
+    parser.add_argument("--ways", default=",".join(WAYS))
+
+
+def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    torch.set_num_threads(1)
+    warnings.filterwarnings("ignore", category=UserWarning)
+    steps, seeds = (6, 1) if cases.quick else (STEPS, options.seeds)
+    ways = ["plain", "law", "repair"] if cases.quick else options.ways.split(",")
+    textures = ["trabec"] if cases.quick else options.textures.split(",")
+    found: dict[tuple[str, str], list[Values]] = {}
+
+    def scored(way: str, weight: float, texture: str, numbers: range) -> list[Values]:
+        names = {seed: f"{texture}-{way}-{weight:g}-{seed}-{steps}" for seed in numbers}
+        jobs = {name: partial(case, way, weight, texture, seed, steps, cases) for seed, name in names.items()}
+        return list(cases.all(jobs).values())
+
+    for texture in textures:
+        for way in ways:
+            tried = list(WEIGHTS.get(way, (0.0,)))
+            weight = tried[0]
+            if len(tried) > 1 and not cases.quick:
+                judged = {each: scored(way, each, texture, range(TUNING, TUNING + 1)) for each in tried}
+                if not all(judged.values()):
+                    continue
+                weight = max(tried, key=lambda each, rows=judged: rows[each][0]["judge"])
+            found[texture, way] = scored(way, weight, texture, range(seeds))
+    whole = [way for way in ways if all(len(found.get((texture, way), ())) == seeds for texture in textures)]
+    table = {way: np.array([[[row[key] for key in ("dice", "cldice", "betti")] for row in found[texture, way]]
+                            for texture in textures]) for way in whole}  # fmt: skip
+    show(["way", "Dice", "clDice", "Betti errors"], [[way, *rows.mean((0, 1)).tolist()] for way, rows in table.items()])
+    if "plain" not in table or cases.quick:
+        return {}
+    figures, rows = {}, []
+    for way in (way for way in whole if way != "plain"):
+        gains = [bootstrap((table[way] - table["plain"])[..., k].ravel(), np.mean) for k in range(3)]
+        rows.append([way, *gains])
+        figures |= {
+            f"transductive.{way}.{key}": gain for key, gain in zip(("dice", "cldice", "betti"), gains, strict=True)
+        }
+    show(["less plain", "Dice", "clDice", "Betti errors"], rows)
+    if "law" in table and "willmore" in table:
+        apart = {base: (table["law"] - table[base])[..., 0].ravel() for base in ("plain", "willmore")}
+        p = {base: float(stats.wilcoxon(each)[1]) for base, each in apart.items()}
+        least, most = sorted(p, key=p.__getitem__)
+        holm = {least: min(1.0, 2 * p[least]), most: max(min(1.0, 2 * p[least]), p[most])}
+        spread = float(np.std(apart["willmore"], ddof=1))
+        figures |= {f"transductive_p.{base}": Figure(holm[base]) for base in holm}
+        figures |= {"transductive_p.spread": Figure(spread)}
+        figures |= {"transductive_p.contrast": bootstrap(apart["willmore"], np.mean)}
+        rows = [[base, value, float(np.std(apart[base], ddof=1))] for base, value in holm.items()]
+        show(["law less", "p after Holm", "spread of differences"], rows)
+    return figures
