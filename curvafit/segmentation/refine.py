@@ -197,13 +197,14 @@ def _repair(
         repairer = tune_repairer(chances, truth, repairer, progress=tuning)
         progress = sub_progress(progress, 0.7, 1.0)
     odds = repairer.repair(evidence.ratio, field.spacing, progress)
-    mask, likely = odds > 0, expit(odds)
-    changed = np.count_nonzero(mask != (evidence.level > 0)) / max(np.count_nonzero(mask), 1)
+    threshold = repairer.threshold(odds)
+    mask, likely = odds > threshold, expit(odds)
+    changed = np.count_nonzero(mask != (evidence.level > 0)) / mask.size
     doubt = Uncertainty(replace(field, values=likely), repairer.error, (), expected_dice(likely, mask))
     return Segmentation.of(
-        field, mask, np.tanh(odds / 2), None, choose_epsilon(field, None), (),
+        field, mask, np.tanh((odds - threshold) / 2), None, choose_epsilon(field, None), (),
         weight=None, uncertainty=doubt, image=field,
-        status=f"{repairer.status}: {volume_summary(float(mask.mean()))}, {100 * changed:.2g} % of that is changed",
+        status=f"{repairer.status}: {volume_summary(float(mask.mean()))}, {100 * changed:.2f} % of it is changed",
     )  # fmt: skip
 
 
@@ -307,11 +308,12 @@ def repair_classes(
         step = sub_progress(progress, count / len(numbers), (count + 1) / len(numbers))
         found.append(refine(probabilities, repair=first, progress=step, channel=number, **reading))
     likely = np.stack([each.uncertainty.probability.values for each in found])  # type: ignore[union-attr]
-    best, surest = likely.argmax(0), likely.max(0)
-    inside = surest > 0.5
+    claimed = np.stack([each.mask.values for each in found])
+    best, inside = np.where(claimed, likely, -1).argmax(0), claimed.any(0)
     field = found[0].mask
     owner = np.where(inside, np.array(numbers)[best], 0).astype(np.min_scalar_type(max(numbers)))
-    chance = replace(field, values=np.where(inside, surest, 1 - surest))
+    own = np.take_along_axis(likely, best[None], 0)[0]
+    chance = replace(field, values=np.where(inside, own, 1 - likely.max(0)))
     dice = {number: expected_dice(p, owner == number) for number, p in zip(numbers, likely, strict=True)}
     doubt = Uncertainty(chance, first.error, (), min(dice.values()), dice)
     phase = np.max([each.phase.values for each in found], axis=0)

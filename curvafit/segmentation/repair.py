@@ -25,6 +25,7 @@ from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, silent
 from curvafit.scan.grids import centre_distance, resample
 from curvafit.segmentation.filler import plane_thickness
+from curvafit.segmentation.uncertainty import best_log_odds
 
 REPAIRER_FILE = Format("curvafit repairer", 1, "weights of a repairer", "teach them again with `atlas teach --repair`")
 #: Log-odds are cut here: what a network is surer of does not matter.
@@ -177,6 +178,12 @@ class Repairer:
         change = self._repair_cubes(cubes, progress) - cubes
         back = resample(change, [1 / s for s in scale], (0, 0, 0), odds.shape)
         return (cut + back) / np.float32(self.temperature)
+
+    def threshold(self, odds: np.ndarray) -> float:
+        """Return the log-odds above which repaired voxels are inside: those of the mask with the best expected Dice; 0
+        where nothing is repaired."""
+        inside = odds > 0
+        return best_log_odds(odds) if self.helps and inside.any() and not inside.all() else 0.0
 
     @torch.inference_mode()
     def _repair_cubes(self, odds: np.ndarray, progress: Progress) -> np.ndarray:

@@ -206,7 +206,8 @@ def tune_repair(
     ways = {"p > 1/2 is as good": rest, "repaired by the network": repairer.repair(rest, spacing)}
     ways["repaired by the network, tuned on the example"] = tuned.repair(rest, spacing)
     places = range(len(answer))
-    counts = {name: tally(found > 0, answer, places) for name, found in ways.items()}
+    levels = {name: 0.0 if name == "p > 1/2 is as good" else repairer.threshold(found) for name, found in ways.items()}
+    counts = {name: tally(found > levels[name], answer, places) for name, found in ways.items()}
     names = list(ways)
     chosen = names[0]
     for name in names[1:]:

@@ -234,7 +234,7 @@ def test_a_broken_mask_is_repaired() -> None:
     ]
     assert errors[1] < 0.3 * errors[0]
     likely = found.probability.values  # type: ignore[union-attr]
-    np.testing.assert_array_equal(likely > 0.5, after)
+    assert after[likely > 0.5].all() and (likely[after] > 0.35 - 1e-6).all()  # what has the best expected Dice
     assert found.uncertainty.calibration_error < 0.2 and "repaired by the network" in found.status  # type: ignore[union-attr]
 
 
@@ -291,7 +291,7 @@ def test_classes_become_labels(tmp_path: Path) -> None:
     assert not (found.labels.values[~alone.mask.values] == 1).any()
     np.testing.assert_array_equal(found.mask.values, found.labels.values > 0)
     likely = found.probability.values  # type: ignore[union-attr]
-    assert likely.min() >= 0.5 - 1e-6 and "class 3" in found.status and set(found.uncertainty.dice_of_labels) == {1, 3}  # type: ignore[union-attr]
+    assert likely.min() >= 0.35 - 1e-6 and "class 3" in found.status and set(found.uncertainty.dice_of_labels) == {1, 3}  # type: ignore[union-attr]
     for wrong in ([], [0, 1], [1, 1], [1.5]):
         with pytest.raises(ValueError, match="classes"):
             repair_classes(tmp_path / "case.npz", wrong)  # type: ignore[arg-type]
