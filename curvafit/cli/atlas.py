@@ -187,7 +187,7 @@ def teach_filler(
     filler: Annotated[
         Path | None, typer.Option(help="With --images: the filler to begin with; by default the packaged one.")
     ] = None,
-    repair: Annotated[bool, typer.Option("--repair", help="Teach what `refine --repair` mends masks with.")] = False,
+    repair: Annotated[bool, typer.Option("--repair", help="Teach the network of `refine --repair`.")] = False,
     steps: Annotated[
         int | None,
         typer.Option(help="Steps of teaching, by default 4500; 1500 with --images, 2600 with --repair.", min=1),

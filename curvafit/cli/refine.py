@@ -82,7 +82,7 @@ def refine(
     # Everything is read and checked before the first work, which may take minutes.
     inputs = [file for file in (*images, *images.values(), *given.values()) if file is not None]
     for _, target in files:
-        check_mask_target(target, inputs=inputs, overwrite=overwrite)
+        check_mask_target(target, inputs=inputs, overwrite=overwrite, maps=["probability"] if repair else [])
     map_reading: dict[str, Any] = {name: reading[name] for name in reading if name != "label"}
     map_reading |= {"like": like, "logits": logits}
     chances = _load_maps(list(images), numbers, map_reading, example_probabilities)

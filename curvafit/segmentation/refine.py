@@ -98,7 +98,7 @@ def refine(
     prior: LawLike | None = None,
     *,
     example: tuple[Source, Source] | Calibration | None = None,
-    repair: bool | str | Path | Repairer = False,
+    repair: bool | str | Path | Repairer | None = None,
     weight: float | None = None,
     label: int | None = None,
     epsilon: float | None = None,
@@ -116,8 +116,8 @@ def refine(
     energy are tried there at weights over decades, and where none is better than p > 1/2 beyond the noise, the mask is
     p > 1/2. Where p > 1/2 has no surface, it stays as it is.
 
-    With `repair` there is no law and no need of an example: a network that generated shapes have taught what networks
-    do to masks says by how much the log-odds change. An example tunes it, and says whether it helps.
+    With `repair`, a small network changes the log-odds; generated shapes taught it the errors that segmentation
+    networks make. It needs no law and no example. An example tunes it, and says whether it helps.
 
     Parameters
     ----------
@@ -146,13 +146,14 @@ def refine(
     Raises
     ------
     ValueError, FileNotFoundError
-        If there is neither an example nor a weight nor a repair, or too much of them; if the probabilities are not
-        within [0, 1], or the example's mask lies elsewhere or has no inside or outside; or as `segment`.
+        If there is neither an example nor a weight nor a repair, or a repair together with a law, a weight or a
+        `Calibration`; if the probabilities are not within [0, 1], or the example's mask lies elsewhere or has no inside
+        or outside; or as `segment`.
     """
     check_judge(example, weight, repair, prior)
     field = load_probabilities(probabilities, **reading)
     evidence = probability_evidence(field)
-    if repair is not False:
+    if repair is not None and repair is not False:
         return _repair(field, evidence, repair, example, label, reading, progress)
     tiling = Tiling.of(field, epsilon, tile)
     gain = ""
@@ -199,12 +200,14 @@ def _repair(
     odds = repairer.repair(evidence.ratio, field.spacing, progress)
     threshold = repairer.threshold(odds)
     mask, likely = odds > threshold, expit(odds)
-    changed = np.count_nonzero(mask != (evidence.level > 0)) / mask.size
+    inside = evidence.level > 0
+    said = repairer.status if inside.any() and not inside.all() else "p > 1/2 has no surface and stays as it is"
+    changed = np.count_nonzero(mask != inside) / mask.size
     doubt = Uncertainty(replace(field, values=likely), repairer.error, (), expected_dice(likely, mask))
     return Segmentation.of(
         field, mask, np.tanh((odds - threshold) / 2), None, choose_epsilon(field, None), (),
         weight=None, uncertainty=doubt, image=field,
-        status=f"{repairer.status}: {volume_summary(float(mask.mean()))}, {100 * changed:.2f} % of it is changed",
+        status=f"{said}: {volume_summary(float(mask.mean()))}, and {100 * changed:.2f} % of its voxels are changed",
     )  # fmt: skip
 
 
@@ -303,30 +306,28 @@ def repair_classes(
     if not numbers or len(set(numbers)) < len(numbers):
         raise ScanError(f"classes must be different numbers from 1, got {quoted(list(classes))}")
     first = repairer if isinstance(repairer, Repairer) else Repairer.load(repairer)
-    found: list[Segmentation] = []
+    field = load_probabilities(probabilities, channel=numbers[0], **reading)
+    owner, claim = np.zeros(field.shape, np.min_scalar_type(max(numbers))), np.full(field.shape, -1, np.float16)
+    most, phase = claim.copy(), np.full(field.shape, -1, np.float32)
+    likely, said, notes = [], [], []
     for count, number in enumerate(numbers):
         step = sub_progress(progress, count / len(numbers), (count + 1) / len(numbers))
-        found.append(refine(probabilities, repair=first, progress=step, channel=number, **reading))
-    likely = np.stack([each.uncertainty.probability.values for each in found])  # type: ignore[union-attr]
-    claimed = np.stack([each.mask.values for each in found])
-    best, inside = np.where(claimed, likely, -1).argmax(0), claimed.any(0)
-    field = found[0].mask
-    owner = np.where(inside, np.array(numbers)[best], 0).astype(np.min_scalar_type(max(numbers)))
-    own = np.take_along_axis(likely, best[None], 0)[0]
-    chance = replace(field, values=np.where(inside, own, 1 - likely.max(0)))
+        found = refine(probabilities, repair=first, progress=step, channel=number, **reading)
+        p = found.uncertainty.probability.values.astype(np.float16)  # type: ignore[union-attr]
+        better = found.mask.values & (p > claim)
+        owner[better], claim[better] = number, p[better]
+        most, phase = np.maximum(most, p), np.maximum(phase, found.phase.values)
+        likely.append(p)
+        said.append(f"class {number}: {found.status}")
+        notes += found.notes
+    inside = owner > 0
+    chance = replace(field, values=np.where(inside, claim, 1 - most).astype(np.float32), notes=())
     dice = {number: expected_dice(p, owner == number) for number, p in zip(numbers, likely, strict=True)}
-    doubt = Uncertainty(chance, first.error, (), min(dice.values()), dice)
-    phase = np.max([each.phase.values for each in found], axis=0)
-    return replace(
-        found[0],
-        mask=replace(field, values=inside),
-        phase=replace(field, values=phase),
-        labels=replace(field, values=owner),
-        uncertainty=doubt,
-        image=None,
-        status="; ".join(f"class {number}: {each.status}" for number, each in zip(numbers, found, strict=True)),
-        notes=tuple(dict.fromkeys(note for each in found for note in each.notes)),
-    )
+    return Segmentation.of(
+        replace(field, notes=()), inside, phase, None, choose_epsilon(field, None), tuple(dict.fromkeys(notes)),
+        weight=None, uncertainty=Uncertainty(chance, first.error, (), min(dice.values()), dice),
+        labels=replace(field, values=owner, notes=()), status="; ".join(said),
+    )  # fmt: skip
 
 
 class Refine:
@@ -350,7 +351,7 @@ class Refine:
         prior: LawLike | None = None,
         *,
         weight: float | None = None,
-        repair: bool | str | Path | Repairer = False,
+        repair: bool | str | Path | Repairer | None = None,
         example: tuple[Source, Source] | Calibration | None = None,
         channel: int = 1,
         spacing: Sequence[float] | float | None = None,
@@ -361,7 +362,11 @@ class Refine:
         check_judge(example, weight, repair, prior)
         self.channel = check_int(channel, "a channel that is a whole number from 0", 0, SEEDS)
         self.place = {"spacing": spacing, "unit": unit}
-        if repair is not False:
+        if repair is None or repair is False:
+            if prior is None and not isinstance(example, Calibration):
+                raise ScanError("give a law, or a repair")
+            repair = None
+        if repair is not None:
             first = repair if isinstance(repair, Repairer) else Repairer.load(None if repair is True else repair)
             repair = tune_repairer(*example, first, **self.place) if isinstance(example, tuple) else first
             example = None
@@ -381,7 +386,7 @@ class Refine:
         if self.channel >= len(probabilities):
             raise ScanError(f"the channel must be from 0 to {len(probabilities) - 1}, got {self.channel}")
         place, edges = self.place, getattr(probabilities, "pixdim", None)
-        if place["spacing"] is None and edges is not None and self.options["repair"] is not False:
+        if place["spacing"] is None and edges is not None and self.options["repair"] is not None:
             place = {"spacing": [float(edge) for edge in edges], "unit": "mm"}
         field = field_of(probabilities[self.channel].as_subclass(Tensor), **place)
         found = refine(field, self.prior, example=self.example, **self.options)
@@ -414,9 +419,9 @@ def _pose(evidence: VoxelEvidence, trial: Trial) -> RefineProblem:
     return RefineProblem(replace(trial, law=None) if inside.all() or not inside.any() else trial, evidence)
 
 
-def check_judge(example: object, weight: float | None, repair: object = False, prior: object = None) -> None:
+def check_judge(example: object, weight: float | None, repair: object = None, prior: object = None) -> None:
     """Raise ScanError unless there is an example or a weight, or a repair, which goes with an example at most."""
-    if repair is not False:
+    if repair is not None and repair is not False:
         if weight is not None or prior is not None or isinstance(example, Calibration):
             raise ScanError("a repair goes with neither a law nor a weight: give an example that tunes it, or nothing")
     elif (example is None) == (weight is None):

@@ -2,7 +2,7 @@
 
 It reads log-odds and the signed distance of the mask that they make, on cubes of a size that makes structures a few
 voxels thick, and says by how much the log-odds change: it closes breaks, opens false bridges, fills holes, drops specks
-and smooths staircases where what is around tells so. It sees `REACH` voxels at most.
+and smooths staircases where the surroundings show it. It sees `REACH` voxels at most.
 """
 
 from __future__ import annotations
@@ -30,16 +30,18 @@ from curvafit.segmentation.uncertainty import best_log_odds
 REPAIRER_FILE = Format("curvafit repairer", 1, "weights of a repairer", "teach them again with `atlas teach --repair`")
 #: Log-odds are cut here: what a network is surer of does not matter.
 SUREST = 8.0
-#: Signed distances are cut here, in voxels.
-FAR = 8.0
+#: Signed distances are cut here, in voxels. As far from the surface, log-odds of this size or more stay as they are.
+FAR, SURE = 8.0, 4.0
 #: Voxels beyond which nothing is seen, a multiple of 4.
 REACH = 28
 #: Interval of the mean thickness of structures, in voxels of the grid on which they are repaired.
 THICKNESS = (3.0, 14.0)
 #: Longest side of a tile that is repaired at once, in voxels, without its surroundings; a multiple of 4.
 TILE = 128
-#: Most voxels of a slice that its thickness is measured in, one of so many slices.
-SLICES = 16
+#: About so many planes across each axis say how thick a structure is.
+PLANES = 16
+#: Most voxels of the grid on which a volume is repaired: beyond, they are larger.
+MOST = 512**3
 
 
 class Block3(nn.Module):
@@ -137,6 +139,7 @@ class Repairer:
     def save(self, path: str | Path) -> None:
         """Write weights and card as one `.npz`; nothing in it runs when it is read."""
         header = {"width": self.network.width, "temperature": self.temperature, "card": self.card, "error": self.error}
+        header |= {"helps": self.helps, "status": self.status}
         REPAIRER_FILE.write(path, header, {name: value.numpy() for name, value in self.network.state_dict().items()})
 
     @classmethod
@@ -158,7 +161,9 @@ class Repairer:
             network = RepairNet(header["width"]).eval()
         network.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
         temperature = check_float(header["temperature"], "a temperature", 1e-3, 1e3)
-        return cls(network, temperature, dict(header["card"]), check_float(header["error"], "an error", 0.0, 1.0))
+        error = check_float(header["error"], "an error", 0.0, 1.0)
+        status = str(header.get("status", cls.status))
+        return cls(network, temperature, dict(header["card"]), error, bool(header.get("helps", True)), status)
 
     def repair(self, odds: np.ndarray, spacing: Sequence[float], progress: Progress = silent) -> np.ndarray:
         """Return the log-odds of the inside (Z, Y, X), float32, of the log-odds of another network.
@@ -169,6 +174,7 @@ class Repairer:
         if not self.helps or inside.all() or not inside.any():
             return odds.astype(np.float32)
         pixel = choose_pixel(inside, spacing)
+        pixel *= max(1.0, math.prod(odds.shape) * math.prod(spacing) / pixel**3 / MOST) ** (1 / 3)
         scale = [pixel / h for h in spacing]
         cut = odds.clip(-SUREST, SUREST).astype(np.float32)
         if all(abs(s - 1) < 1e-6 for s in scale):
@@ -190,30 +196,44 @@ class Repairer:
         """Return log-odds on the grid on which structures are `THICKNESS` thick, tile by tile."""
         inner = tuple(slice(n) for n in odds.shape)
         odds = np.ascontiguousarray(np.pad(odds, [(0, -n % 4) for n in odds.shape], mode="edge"), dtype=np.float32)
-        distances = centre_distance(odds > 0, (1.0, 1.0, 1.0), FAR)
         found = odds.copy()
         tiles = list(product(*(range(0, n, TILE) for n in odds.shape)))
         for number, corner in enumerate(tiles):
             progress("repairing", number / len(tiles))
             core = tuple(slice(a, min(a + TILE, n)) for a, n in zip(corner, odds.shape, strict=True))
-            seen = tuple(slice(max(c.start - REACH, 0), c.stop + REACH) for c in core)
-            if (np.abs(distances[seen]) >= FAR).all():
-                continue
-            given = (torch.from_numpy(each[seen])[None] for each in (odds, distances))
+            seen = tuple(
+                slice(max(c.start - REACH, 0), min(c.stop + REACH, n)) for c, n in zip(core, odds.shape, strict=True)
+            )
+            distances = _measure_distances(odds, seen)
             own = tuple(slice(c.start - s.start, c.stop - s.start) for c, s in zip(core, seen, strict=True))
-            found[core] = self.network(*given)[0].numpy()[own]
+            stays = (np.abs(distances[own]) >= FAR) & (np.abs(odds[core]) >= SURE)
+            if stays.all():
+                continue
+            given = (torch.from_numpy(np.ascontiguousarray(each))[None] for each in (odds[seen], distances))
+            found[core] = np.where(stays, odds[core], self.network(*given)[0].numpy()[own])
         progress("repairing", 1.0)
         return found[inner]
+
+
+def _measure_distances(odds: np.ndarray, box: tuple[slice, ...]) -> np.ndarray:
+    """Return the signed distances in a box of the mask of log-odds, cut at `FAR`."""
+    margin = math.ceil(FAR) + 1
+    wider = tuple(slice(max(s.start - margin, 0), s.stop + margin) for s in box)
+    inner = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(box, wider, strict=True))
+    return centre_distance(odds[wider] > 0, (1.0, 1.0, 1.0), FAR)[inner]
 
 
 def choose_pixel(inside: np.ndarray, spacing: Sequence[float]) -> float:
     """Return the edge of the cubes on which a structure is repaired: voxels of the finest axis, unless it is then
     thinner or thicker than `THICKNESS`."""
     finest, thick = min(spacing), []
+    if not inside.any():
+        return finest
     for axis in range(3):
         planes = np.moveaxis(inside, axis, 0)
+        planes = planes[planes.any((1, 2))]
         edges = [h for k, h in enumerate(spacing) if k != axis]
-        thick.append(plane_thickness(planes[:: max(len(planes) // SLICES, 1)], edges))
+        thick.append(plane_thickness(planes[:: max(len(planes) // PLANES, 1)], edges))
     thickness = float(np.min(thick)) / finest
     if not math.isfinite(thickness):
         return finest

@@ -203,24 +203,26 @@ def tune_repair(
     network = copy.deepcopy(repairer.network)
     learn(network, lessons, TUNING_RATE, workers=0, progress=lambda _, share: progress("tuning on the example", share))
     tuned = replace(repairer, network=network, temperature=1.0)
-    ways = {"p > 1/2 is as good": rest, "repaired by the network": repairer.repair(rest, spacing)}
-    ways["repaired by the network, tuned on the example"] = tuned.repair(rest, spacing)
-    places = range(len(answer))
-    levels = {name: 0.0 if name == "p > 1/2 is as good" else repairer.threshold(found) for name, found in ways.items()}
-    counts = {name: tally(found > levels[name], answer, places) for name, found in ways.items()}
-    names = list(ways)
-    chosen = names[0]
-    for name in names[1:]:
+    plain, learnt = "p > 1/2 is as good", "repaired by the network, tuned on the example"
+    found: dict[str, tuple[Repairer, np.ndarray, np.ndarray]] = {
+        plain: (replace(repairer, helps=False), rest, rest > 0)
+    }
+    for name, each in (("repaired by the network", repairer), (learnt, tuned)):
+        each = replace(each, helps=True)
+        repaired = each.repair(rest, spacing)
+        cooled = fit_temperature(repaired.ravel(), answer.ravel())
+        each = replace(each, temperature=cooled * each.temperature)
+        found[name] = each, repaired / cooled, repaired / cooled > each.threshold(repaired / cooled)
+    counts = {name: tally(mask, answer, range(len(answer))) for name, (_, _, mask) in found.items()}
+    chosen = plain
+    for name in list(found)[1:]:
         gain, noise = gain_of(counts[name], counts[chosen])
         chosen = name if gain > BEYOND * noise else chosen
-    found = [torch.from_numpy(np.ascontiguousarray(each, np.float32)).flatten() for each in (ways[chosen], answer)]
-    temperature = fit_temperature(found[0].numpy(), found[1].numpy())
-    before, after = (dice_of(counts[name].sum(0)) for name in (names[0], chosen))
-    best = tuned if chosen == names[2] else repairer
+    best, likely, _ = found[chosen]
+    before, after = (dice_of(counts[name].sum(0)) for name in (plain, chosen))
+    truths = torch.from_numpy(np.ascontiguousarray(answer, np.float32)).flatten()
     return replace(
         best,
-        temperature=temperature * best.temperature,
-        error=near_error(found[0] / temperature, found[1]),
-        helps=chosen != names[0],
+        error=near_error(torch.from_numpy(np.ascontiguousarray(likely, np.float32)).flatten(), truths),
         status=f"{chosen} (Dice {before:.3f} on a part of the example, {after:.3f} repaired)",
     )

@@ -77,7 +77,8 @@ def _choose_threshold(counts: np.ndarray) -> float:
 
 def expected_dice(probability: np.ndarray, mask: np.ndarray) -> float:
     """Return the Dice that a mask has, to first order on average, if voxels are inside with these probabilities."""
-    return 2 * float(probability[mask].sum()) / max(float(mask.sum() + probability.sum()), 1e-9)
+    inside, whole = (float(each.sum(dtype=np.float64)) for each in (probability[mask], probability))
+    return 2 * inside / max(float(mask.sum()) + whole, 1e-9)
 
 
 def best_log_odds(logits: np.ndarray) -> float:

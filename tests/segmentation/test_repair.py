@@ -69,6 +69,17 @@ def test_tiles_find_what_the_whole_finds(monkeypatch: pytest.MonkeyPatch) -> Non
     np.testing.assert_allclose(drawn().repair(odds, (1, 1, 1)), whole, atol=1e-4)
 
 
+def test_what_is_far_and_sure_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A rod in a large empty volume: no probability is made of background, wherever tiles are cut."""
+    odds = np.full((96, 64, 64), -SUREST, np.float32)
+    odds[:, 20:26, 20:26] = SUREST
+    odds[70, 50, 50] = -0.1  # nearly inside, far from all else
+    found = drawn().repair(odds, (1, 1, 1))
+    assert (found[:, 40:, 40:][odds[:, 40:, 40:] == -SUREST] == -SUREST).all()
+    monkeypatch.setattr(room, "TILE", 32)
+    np.testing.assert_allclose(drawn().repair(odds, (1, 1, 1)), found, atol=1e-4)
+
+
 def test_nothing_is_seen_beyond_the_reach() -> None:
     odds = torch.from_numpy(damage(rods(96)[:64, :8, :8], np.random.default_rng(0), Damage()))[None]
     other = odds.clone()
@@ -99,10 +110,12 @@ def test_what_has_no_surface_stays() -> None:
 
 
 def test_weights_come_back_from_their_file(tmp_path: Path) -> None:
-    one = replace(drawn(), temperature=1.7, error=0.03, card={"seed": 4})
+    one = replace(drawn(), temperature=1.7, error=0.03, card={"seed": 4}, helps=False, status="p > 1/2 is as good")
     one.save(tmp_path / "repairer.npz")
     other = Repairer.load(tmp_path / "repairer.npz")
     assert (other.temperature, other.error, other.card) == (1.7, 0.03, {"seed": 4})
+    assert (other.helps, other.status) == (False, "p > 1/2 is as good")
+    one, other = (replace(each, helps=True) for each in (one, other))
     odds = damage(rods(24), np.random.default_rng(0), Damage())
     np.testing.assert_array_equal(other.repair(odds, (1, 1, 1)), one.repair(odds, (1, 1, 1)))
     content = dict(np.load(tmp_path / "repairer.npz"))
