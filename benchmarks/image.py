@@ -44,8 +44,8 @@ STEPS, BATCH, PATCH, RATE = 300, 2, (24, 64, 64), 5e-3
 
 
 class Scan(NamedTuple):
-    """An image, the structure of `completion` that is its mask, a box of both, the axis across slices, and the noise
-    that is added, in contrasts."""
+    """An image, the structure of `completion` that is its mask, a box of both, the axis across slices, the noise that
+    is added, in contrasts, and the known slices if they are not every eighth."""
 
     image: str
     mask: str
@@ -53,6 +53,7 @@ class Scan(NamedTuple):
     axis: int = 0
     noise: float = 0.0
     reading: Mapping[str, Any] = {}
+    known: tuple[int, ...] = ()
 
 
 _ALL = (slice(None),) * 3
@@ -60,6 +61,7 @@ _BONE = ("lhdl_trabecular_200.tif", "bone", (slice(0, 97), slice(44, 156), slice
 _POON = "vesselNN/poon2015_BBB_noLeakage_img.tif"
 SCANS = {
     "vesselexpress": Scan("vesselexpress_000.tif", "vesselexpress", _ALL),
+    "vesselexpress-3": Scan("vesselexpress_000.tif", "vesselexpress", _ALL, known=(16, 50, 83)),
     "poon-0": Scan(_POON, "poon", (slice(None), slice(0, 249), slice(0, 240)), 1),
     "poon-1": Scan(_POON, "poon", (slice(None), slice(256, 505), slice(272, 512)), 1),
     "bone": Scan(*_BONE),
@@ -132,7 +134,8 @@ def case(name: str, way: str, cases: Cases) -> Values:
     """Return the scores of a way, and its counts in cells."""
     image, mask = read(name)
     axis, begun = SCANS[name].axis, time.perf_counter()
-    places = list(range(0, mask.shape[axis], EVERY))
+    known = SCANS[name].known
+    places = list(known or range(0, mask.shape[axis], EVERY))
     grey, truth = (np.moveaxis(each.values, axis, 0) for each in (image, mask))
     truth, status, likely = truth > 0, "", None
     edges = (mask.spacing[axis], *(h for k, h in enumerate(mask.spacing) if k != axis))
@@ -156,7 +159,7 @@ def case(name: str, way: str, cases: Cases) -> Values:
             key=lambda each: int((each == truth).sum()),
         )
     seconds = time.perf_counter() - begun
-    unknown = [n for n in range(places[-1]) if n not in places]
+    unknown = [n for n in range(len(truth) if known else places[-1]) if n not in places]
     counts = tally(inside[unknown], truth[unknown], [n // EVERY * 32 for n in unknown])
     values: Values = {"dice": float(dice_of(counts.sum(0))), "seconds": seconds, "status": status}
     if likely is not None:
