@@ -375,8 +375,11 @@ def learn(
     begun, losses = 0, []
     if checkpoint is not None and checkpoint.exists():
         state = torch.load(checkpoint, weights_only=True)
-        for name, part in parts.items():
-            part.load_state_dict(state[name])
+        try:
+            for name, part in parts.items():
+                part.load_state_dict(state[name])
+        except (KeyError, RuntimeError) as error:
+            raise ValueError(f"{checkpoint} is of another teaching: delete it, or choose another output") from error
         begun, losses = state["step"], state["losses"]
     rest = Subset(lessons, range(begun, total))
     network.train()

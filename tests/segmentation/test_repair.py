@@ -188,6 +188,8 @@ def test_learning_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.M
     losses = learn(whole, lessons(), 1e-3, workers=0)
     with pytest.raises(KeyboardInterrupt):
         learn(stopped, lessons(), 1e-3, checkpoint=tmp_path / "steps", workers=0, progress=stop)
+    with pytest.raises(ValueError, match="another teaching"):
+        learn(drawn(0, 6).network, lessons(), 1e-3, checkpoint=tmp_path / "steps", workers=0)
     assert learn(parts, lessons(), 1e-3, checkpoint=tmp_path / "steps", workers=0) == losses
     assert all(torch.equal(a, b) for a, b in zip(whole.parameters(), parts.parameters(), strict=True))
 
