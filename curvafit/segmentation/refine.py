@@ -153,8 +153,8 @@ def refine(
     check_judge(example, weight, repair, prior)
     field = load_probabilities(probabilities, **reading)
     evidence = probability_evidence(field)
-    if repair is not None and repair is not False:
-        return _repair(field, evidence, repair, example, label, reading, progress)
+    if (repairer := _repairer_of(repair)) is not None:
+        return _repair(field, evidence, repairer, example, label, reading, progress)
     tiling = Tiling.of(field, epsilon, tile)
     gain = ""
     if example is None:
@@ -179,17 +179,23 @@ def refine(
     )  # fmt: skip
 
 
+def _repairer_of(repair: bool | str | Path | Repairer | None) -> Repairer | None:
+    """Return the repairer that an option names, by default the packaged one; None where nothing is repaired."""
+    if repair is None or repair is False:
+        return None
+    return repair if isinstance(repair, Repairer) else Repairer.load(None if repair is True else repair)
+
+
 def _repair(
     field: Field,
     evidence: VoxelEvidence,
-    repair: bool | str | Path | Repairer,
+    repairer: Repairer,
     example: tuple[Source, Source] | Calibration | None,
     label: int | None,
     reading: dict[str, Any],
     progress: Progress,
 ) -> Segmentation:
     """Repair a map; an example tunes first."""
-    repairer = repair if isinstance(repair, Repairer) else Repairer.load(None if isinstance(repair, bool) else repair)
     if isinstance(example, tuple):
         alike = {name: value for name, value in reading.items() if name not in ("like", "crop")}
         chances = load_probabilities(example[0], **alike)
@@ -362,18 +368,16 @@ class Refine:
         check_judge(example, weight, repair, prior)
         self.channel = check_int(channel, "a channel that is a whole number from 0", 0, SEEDS)
         self.place = {"spacing": spacing, "unit": unit}
-        if repair is None or repair is False:
-            if prior is None and not isinstance(example, Calibration):
-                raise ScanError("give a law, or a repair")
-            repair = None
-        if repair is not None:
-            first = repair if isinstance(repair, Repairer) else Repairer.load(None if repair is True else repair)
-            repair = tune_repairer(*example, first, **self.place) if isinstance(example, tuple) else first
+        repairer = _repairer_of(repair)
+        if repairer is None and prior is None and not isinstance(example, Calibration):
+            raise ScanError("give a law, or a repair")
+        if repairer is not None:
+            repairer = tune_repairer(*example, repairer, **self.place) if isinstance(example, tuple) else repairer
             example = None
         elif isinstance(example, tuple):
             example = calibrate(*example, prior, epsilon=epsilon, steps=steps, **self.place)
         self.prior, self.example = prior, example
-        self.options = {"repair": repair, "weight": weight, "epsilon": epsilon, "steps": steps}
+        self.options = {"repair": repairer, "weight": weight, "epsilon": epsilon, "steps": steps}
 
     def __call__(self, probabilities: Tensor) -> Tensor:
         """Return the mask (1, Z, Y, X) of probabilities (C, Z, Y, X), 0 and 1, of their type and on their device.

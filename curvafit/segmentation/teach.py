@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -125,7 +126,33 @@ class Mix:
     partial: float = 0.15
 
 
-class Batches(Dataset):
+def draw_window(
+    sources: Sequence[Sequence[Texture]],
+    mix: Mix,
+    rng: np.random.Generator,
+    axes: Sequence[np.ndarray],
+    thinnest: float = 0.0,
+) -> np.ndarray:
+    """Return a window, bool (Z, Y, X), at places along three axes, of one shape or of two, or turned inside out.
+
+    Each source is drawn as often as the others. Structures are at least `thinnest`, if the mix has such thick ones.
+    """
+
+    def cut() -> np.ndarray:
+        textures = sources[int(rng.integers(len(sources)))]
+        texture = textures[int(rng.integers(len(textures)))]
+        low, high = mix.thickness
+        low = min(max(low, thinnest), high)
+        thickness = float(np.exp(rng.uniform(math.log(low), math.log(high))))
+        return texture.cut(rng, axes, thickness, mix)
+
+    inside = cut()
+    if rng.random() < mix.pairs:
+        inside |= cut()
+    return ~inside if rng.random() < mix.holes else inside
+
+
+class Batches(Dataset, ABC):
     """Batches of lessons, `length` of them, and what a network is to lower on each."""
 
     length: int
@@ -133,9 +160,9 @@ class Batches(Dataset):
     def __len__(self) -> int:
         return self.length
 
+    @abstractmethod
     def loss(self, network: nn.Module, lesson: Any) -> Tensor:
         """Return the loss of a network on a batch."""
-        raise NotImplementedError
 
 
 class GapBatches(Batches):
@@ -194,21 +221,9 @@ class Lessons(GapBatches):
 
     def _draw(self, rng: np.random.Generator, count: int, step: float) -> np.ndarray:
         """Return slices of a structure, bool (count + 4, Y, X): two known, those to fill, two known."""
-        inside = self._cut(rng, count, step)
-        if rng.random() < self.mix.pairs:
-            inside |= self._cut(rng, count, step)
-        return ~inside if rng.random() < self.mix.holes else inside
-
-    def _cut(self, rng: np.random.Generator, count: int, step: float) -> np.ndarray:
-        """Return the slices of a window of one shape."""
-        textures = self.sources[int(rng.integers(len(self.sources)))]
-        texture = textures[int(rng.integers(len(textures)))]
-        low, high = self.mix.thickness
-        low = min(max(low, step * (count + 1) / SLIMMEST), high)
-        thickness = float(np.exp(rng.uniform(math.log(low), math.log(high))))
         plane = np.arange(self.edge + 2 * self.halo, dtype=np.float64)
         heights = step * np.array([-count - 1, *range(count + 2), 2 * count + 2], dtype=np.float64)
-        return texture.cut(rng, (heights, plane, plane), thickness, self.mix)
+        return draw_window(self.sources, self.mix, rng, (heights, plane, plane), step * (count + 1) / SLIMMEST)
 
     def _pose(
         self, rng: np.random.Generator, window: np.ndarray, step: float

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,7 +18,17 @@ from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.scan.grids import centre_distance, resample
 from curvafit.segmentation.damage import Damage, damage
 from curvafit.segmentation.repair import FAR, SUREST, Repairer, RepairNet, choose_pixel
-from curvafit.segmentation.teach import RATE, TUNING_RATE, Batches, Mix, Texture, hold_out, learn, near_error
+from curvafit.segmentation.teach import (
+    RATE,
+    TUNING_RATE,
+    Batches,
+    Mix,
+    Texture,
+    draw_window,
+    hold_out,
+    learn,
+    near_error,
+)
 from curvafit.segmentation.trials import BEYOND, dice_of, gain_of, tally
 from curvafit.segmentation.uncertainty import fit_temperature
 
@@ -34,8 +43,16 @@ MIX = Mix(thickness=(2.5, 14.0), pairs=0.15, stretch=0.25)
 MapLesson = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
+class MapBatches(Batches):
+    """Batches of maps to repair."""
+
+    def loss(self, network: nn.Module, lesson: MapLesson) -> Tensor:
+        odds, distances, truth = lesson
+        return F.binary_cross_entropy_with_logits(network(odds, distances), truth)  # type: ignore[arg-type]
+
+
 @dataclass(frozen=True, eq=False)
-class MapLessons(Batches):
+class MapLessons(MapBatches):
     """Batches of damaged maps, the same for ever for a seed: batch k depends on (seed, k) alone.
 
     Attributes
@@ -57,37 +74,24 @@ class MapLessons(Batches):
     edge: int = 56
 
     def __getitem__(self, number: int) -> MapLesson:
-        rng = np.random.default_rng([self.seed, number])
-        found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        rng, places = np.random.default_rng([self.seed, number]), np.arange(self.edge, dtype=np.float64)
+        found: list[MapLesson] = []
         while len(found) < self.size:
-            mask = self._draw(rng)
+            mask = draw_window(self.sources, self.mix, rng, (places,) * 3)
             if 0.01 < mask.mean() < 0.9:
                 found.append(pose(mask, damage(mask, rng, self.how)))
-        odds, distances, truths = (np.stack(each) for each in zip(*found, strict=True))
-        return odds, distances, truths
-
-    def loss(self, network: nn.Module, lesson: MapLesson) -> Tensor:
-        odds, distances, truth = lesson
-        return F.binary_cross_entropy_with_logits(network(odds, distances), truth)  # type: ignore[arg-type]
-
-    def _draw(self, rng: np.random.Generator) -> np.ndarray:
-        """Return a window of a structure, of one shape or of two, or turned inside out."""
-        inside = self._cut(rng)
-        if rng.random() < self.mix.pairs:
-            inside |= self._cut(rng)
-        return ~inside if rng.random() < self.mix.holes else inside
-
-    def _cut(self, rng: np.random.Generator) -> np.ndarray:
-        textures = self.sources[int(rng.integers(len(self.sources)))]
-        texture = textures[int(rng.integers(len(textures)))]
-        places = np.arange(self.edge, dtype=np.float64)
-        thickness = math.exp(rng.uniform(*np.log(self.mix.thickness)))
-        return texture.cut(rng, (places,) * 3, thickness, self.mix)
+        return stack(found)
 
 
-def pose(mask: np.ndarray, odds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def pose(mask: np.ndarray, odds: np.ndarray) -> MapLesson:
     """Return log-odds, the signed distances of their mask, and the truth, float32."""
     return odds, centre_distance(odds > 0, (1.0, 1.0, 1.0), FAR), mask.astype(np.float32)
+
+
+def stack(windows: Sequence[MapLesson]) -> MapLesson:
+    """Return windows, each (Z, Y, X), as a batch."""
+    odds, distances, truths = (np.stack(each) for each in zip(*windows, strict=True))
+    return odds, distances, truths
 
 
 def teach_repair(
@@ -148,7 +152,7 @@ def judge_repair(network: RepairNet, lessons: MapLessons) -> tuple[float, float,
 
 
 @dataclass(frozen=True, eq=False)
-class ExampleLessons(Batches):
+class ExampleLessons(MapBatches):
     """Batches of windows of one map whose truth is known, mirrored at random; batch k depends on (seed, k) alone.
 
     `odds` and `truth` (Z, Y, X) are on cubes.
@@ -170,12 +174,7 @@ class ExampleLessons(Batches):
             axes = tuple(axis for axis in range(3) if rng.random() < 0.5)
             odds, mask = (np.ascontiguousarray(np.flip(each[window], axes)) for each in (self.odds, self.truth))
             found.append(pose(mask, odds))
-        odds, distances, truths = (np.stack(each) for each in zip(*found, strict=True))
-        return odds, distances, truths
-
-    def loss(self, network: nn.Module, lesson: MapLesson) -> Tensor:
-        odds, distances, truth = lesson
-        return F.binary_cross_entropy_with_logits(network(odds, distances), truth)  # type: ignore[arg-type]
+        return stack(found)
 
 
 def tune_repair(
