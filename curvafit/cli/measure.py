@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from curvafit.cli.console import print_table, resumable, say, say_notes, show_stages
+from curvafit.cli.console import command_line, print_table, resumable, say, say_notes, show_stages
 from curvafit.cli.options import FILES, OverwriteOption, Reading, Structure, command, parse_structure
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 @command(
     "curvafit measure bone.tif --spacing 0.0195 --unit mm",
     "curvafit measure mouse1.nii.gz mouse2.nii.gz mouse3.nii.gz --subjects mice.csv -o measures.csv",
+    "curvafit measure mouse*.nii.gz --subjects mice.csv --workers 4 -o measured",
     "curvafit measure femur.nii.gz --roi cortex_and_marrow.nii.gz -o compartments.csv",
     "curvafit measure mitochondria_labels.tif --labels --spacing 5 --unit nm -o mitochondria.csv",
     "curvafit measure cells.ome.zarr --channel 1 --dark --threshold 90 -o measures.parquet",
@@ -28,7 +29,10 @@ if TYPE_CHECKING:
 )
 def measure(
     scans: Annotated[list[str], typer.Argument(help=FILES)],
-    out: Annotated[Path | None, typer.Option("-o", "--output", help="Table to write: .csv .json .parquet.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Table (.csv .json .parquet), or a folder for page, figures, table."),
+    ] = None,
     roi: Annotated[
         Path | None, typer.Option(help="Region to measure, of the scan's shape; each label by itself.")
     ] = None,
@@ -40,7 +44,9 @@ def measure(
         int | None,
         typer.Option(help="Voxels a side of a tile; by default so many that a process takes a good GB.", min=32),
     ] = None,
-    workers: Annotated[int | None, typer.Option(help="Processes that measure tiles; by default one.", min=0)] = None,
+    workers: Annotated[
+        int, typer.Option(help="Processes that share scans, or one scan's tiles; 0 is this one.", min=0)
+    ] = 0,
     *,
     structure: Structure,
     reading: Reading,
@@ -53,28 +59,33 @@ def measure(
         raise ValueError("--labels measures instances, each in its own box: leave out --tile")
     if subjects is not None and out is None:
         raise ValueError("--subjects is for the table: give its name with -o")
-    store = None if out is None else out.with_name(f".{out.name}.curvafit-tiles")
+    folder = out if out is not None and (out.is_dir() or not out.suffix) else None
+    if folder is not None and labels:
+        raise ValueError("--labels measures instances, which have no page: give the name of a table with -o")
+    store = None if out is None else (place := out.absolute()).with_name(f".{place.name}.curvafit-tiles")
     with _keep_tiles(store):
         with show_stages() as progress:
-            from curvafit.scan.instances import measure_instances
-            from curvafit.scan.tiles import measure as measure_scan
             from curvafit.studies.groups import read_columns
+            from curvafit.studies.scans import check_units, measure_each
             from curvafit.studies.tables import COLUMNS, OF_PARTS, check_table, write_table
 
-            if out is not None:
-                check_table(out, [*scans, *(each for each in (roi, subjects) if each is not None)], overwrite)
+            inputs = [*scans, *(each for each in (roi, subjects) if each is not None)]
+            if folder is not None:
+                from curvafit.report.measures import check_measures, write_measures
+
+                check_measures(folder, inputs, overwrite, command_line())
+                check_units(scans, **reading)
+            elif out is not None:
+                check_table(out, inputs, overwrite)
             told = None if subjects is None else read_columns(subjects, scans, (*COLUMNS, *OF_PARTS))
-            found: list[tuple[Measures, ...]] = []
-
-            def watch(text: str, share: float) -> None:
-                progress(f"{scans[len(found)]}: {text}", (len(found) + share) / len(scans))
-
-            for scan in scans:
-                if labels:
-                    found.append(measure_instances(scan, progress=watch, **reading))
-                else:
-                    tiles = {"tile": tile, "workers": workers, "store": store and store / f"{len(found):04d}"}
-                    found.append((measure_scan(scan, roi=roi, progress=watch, **tiles, **structure, **reading),))
+            how = {} if labels else {"roi": roi, "tile": tile, "store": store, **structure}
+            found = measure_each(scans, labels=labels, workers=workers, progress=progress, **how, **reading)
+            if folder is not None:
+                progress("drawing the page", 1.0)
+                what = {"columns": told, "options": {"tile": tile} | structure | reading}
+                whole = [each for (each,) in found]
+                say(str(write_measures(whole, folder, command=command_line(), overwrite=overwrite, **what)))
+                return
         _print_found(found, labels)
         if out is not None:
             columns = None if told is None else [row for row, each in zip(told, found, strict=True) for _ in each]

@@ -36,7 +36,7 @@ def comparison_figure(comparison: Any) -> Figure:
     The outline holds the bins that differ significantly among all.
     """
     edges, (a, b) = comparison.edges, map(plain, comparison.groups)
-    limits, unit, window = (edges[0], edges[-1]), comparison.unit, _shown_window(comparison.diagrams)
+    limits, unit, window = (edges[0], edges[-1]), comparison.unit, shown_window(comparison.diagrams)
     figure = make_figure(13.2, 3.6, layout="constrained")
     panels = figure.subplots(1, 3)
     for k, (axes, name, diagram) in enumerate(zip(panels, (a, b), comparison.diagrams, strict=False)):
@@ -62,7 +62,7 @@ def _bar_on(axes: Axes, picture: QuadMesh, **options: Any) -> None:
     bar.outline.set_linewidth(0.5)
 
 
-def _shown_window(diagrams: Sequence[Any]) -> tuple[tuple[float, float], tuple[float, float]]:
+def shown_window(diagrams: Sequence[Any]) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the intervals of κ1 and of κ2 that hold 0 and `SHOWN` of each diagram's area, with a margin."""
     ends = np.zeros((2, 2))
     for diagram in diagrams:

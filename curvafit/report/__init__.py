@@ -1,4 +1,4 @@
-"""The pages that show an inference, two groups of scans, a series."""
+"""The pages that show an inference, measured scans, two groups of them, a series."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
     from curvafit.report.comparison import write_comparison as write_comparison
+    from curvafit.report.measures import write_measures as write_measures
     from curvafit.report.page import describe as describe
     from curvafit.report.page import report_html as report_html
     from curvafit.report.page import write_inference as write_inference

@@ -25,7 +25,7 @@ from curvafit.report.page import (
 )
 from curvafit.scan.measure import Measures
 from curvafit.studies.compare import BINS, LEVEL, SMOOTH, Comparison, Number
-from curvafit.studies.scans import merge_notes
+from curvafit.studies.scans import say_notes
 from curvafit.studies.tables import format_csv, plain_unit, rows_of
 from curvafit.studies.trajectory import Trajectory
 
@@ -133,12 +133,8 @@ def say_kinds(measures: Sequence[Measures]) -> str:
 
 def describe_measures(measures: Sequence[Measures]) -> list[str]:
     """Return sentences, for a paper, on what was done to scans, how their numbers are made, and what to cite."""
-    done = (
-        note if len(scans) == len(measures) else f"Of {len(scans)} of {len(measures)} scans: {note}"
-        for scans, note in merge_notes(measures)
-    )
     return [
-        *done,
+        *say_notes(measures),
         "Thickness (Tb.Th) and spacing (Tb.Sp) are mean diameters of the largest balls that fit (Hildebrand & "
         "Rüegsegger 1997); the number per length (Tb.N) is (BV/TV) / Tb.Th; connectivity is that of the Euler number "
         "(Odgaard & Gundersen 1993); the surface (BS) is that of marching cubes of the mask after a Gaussian of "

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,10 +19,12 @@ from curvafit.inference.infer import Inference, infer
 from curvafit.inference.posterior import Posterior, load_posterior
 from curvafit.inference.table import PARAMETERS
 from curvafit.inference.verdict import UNBELIEVABLE
+from curvafit.scan.instances import measure_instances
 from curvafit.scan.measure import SURE, Measures, Quantity
 from curvafit.scan.prepare import HALF
 from curvafit.scan.tiles import measure
 from curvafit.studies.groups import Case
+from curvafit.volumes.boxes import boxes_of
 from curvafit.volumes.field import ScanError
 from curvafit.volumes.read import field_of
 
@@ -54,6 +56,62 @@ def measure_scans(
     units = {each.unit for each in measures}
     notes += [] if len(units) == 1 else [f"Lengths in {', '.join(sorted(units))} were converted to {unit}."]
     return [each.convert(unit) for each in measures], notes
+
+
+def measure_each(
+    scans: Sequence[str],
+    *,
+    labels: bool = False,
+    store: Path | None = None,
+    workers: int = 0,
+    progress: Progress = silent,
+    **options: Any,
+) -> list[tuple[Measures, ...]]:
+    """Measure scans, each by itself, in this process or by several; with `labels` the instances of label images.
+
+    `options` are those of `measure`, or of `measure_instances`. Workers share the scans, or the tiles of a single one;
+    finished tiles lie in the folder `store`. Diagrams of several scans are binned finely, so that many take little
+    memory. Raises ValueError as those do.
+    """
+    options |= {} if labels else {"workers": workers if len(scans) == 1 else 0}
+    crew_size = workers if len(scans) > 1 else 0
+    found: dict[int, tuple[Measures, ...]] = {}
+    with cluster(crew_size) as crew:
+        make = partial(_measure_one, list(scans), labels, store, options, None if crew_size else progress)
+        for k, measures in collect_all(crew, ((make, Path(), [k]) for k in range(len(scans)))):
+            found[k] = measures
+            progress(f"{len(found)} of {len(scans)} scans measured", len(found) / len(scans))
+    return [found[k] for k in range(len(scans))]
+
+
+def _measure_one(
+    scans: Sequence[str], labels: bool, store: Path | None, options: dict[str, Any], watch: Progress | None,
+    folder: Path, indices: Sequence[int],
+) -> list[tuple[int, tuple[Measures, ...]]]:  # fmt: skip
+    """Measure one scan, or its instances."""
+    found = []
+    for k in indices:
+        part = silent if watch is None else sub_progress(watch, k / len(scans), (k + 1) / len(scans))
+        told, several = partial(_tell, part, scans[k]), len(scans) > 1
+        with _named(scans[k]) if several else nullcontext():
+            if labels:
+                found.append((k, measure_instances(scans[k], progress=told, **options)))
+                continue
+            tiles = None if store is None else store / f"{k:04d}"
+            whole = measure(scans[k], progress=told, store=tiles, **options)
+        found.append((k, (_bin_diagrams(whole) if several else whole,)))
+    return found
+
+
+def _tell(progress: Progress, name: str, text: str, share: float) -> None:
+    progress(f"{name}: {text}", share)
+
+
+def _bin_diagrams(measures: Measures) -> Measures:
+    """Return measures whose diagram, and those of its compartments, are binned finely."""
+    parts = {label: _bin_diagrams(each) for label, each in measures.compartments.items()}
+    fine = measures.diagram.bin(FINE / measures["thickness"].value) if measures.diagram.area > 0 else measures.diagram
+    return replace(measures, diagram=fine, compartments=parts)
 
 
 def stack_numbers(measures: Sequence[Measures]) -> tuple[np.ndarray, np.ndarray]:
@@ -88,6 +146,12 @@ def merge_notes(measures: Sequence[Measures]) -> Iterator[tuple[list[int], str]]
         yield sorted({k for k, _ in found}), _NUMBER.sub(lambda _, ranges=ranges: next(ranges), found[0][1])
 
 
+def say_notes(measures: Sequence[Measures]) -> Iterator[str]:
+    """Yield the scans' notes (`merge_notes`), each with how many have it, unless all have."""
+    for scans, note in merge_notes(measures):
+        yield note if len(scans) == len(measures) else f"Of {len(scans)} of {len(measures)} scans: {note}"
+
+
 def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progress) -> tuple[str, list[str]]:
     """Read all scans once, so that what is wrong is said before long work; return their unit, and notes."""
     units: dict[str, str] = {}
@@ -97,22 +161,32 @@ def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progr
         if isinstance(case.source, Measures):
             units.setdefault(case.source.unit, case.name)
             continue
-        with _named(case):
+        with _named(case.name):
             field = field_of(case.source, **reading)
         units.setdefault(field.unit, case.name)
         edges.setdefault(case.group, []).append(float(np.prod(field.spacing) ** (1 / 3)))
-    if len(units) > 1 and "voxel" in units:
-        other = next(name for name in units if name != "voxel")
-        raise ValueError(
-            f"expected a physical spacing in all scans or in none, got none in {units['voxel']} and {other} in "
-            f"{units[other]}: say it with --spacing and --unit"
-        )
+    _check_mixture(units)
     notes = ["Lengths are counted in voxels: compare only scans of one voxel size."] if "voxel" in units else []
     medians = [float(np.median(each)) for each in edges.values()]
     if medians and len(units) == 1 and min(medians) < (1 - ALIKE_EDGES) * max(medians):
         ends = " and ".join(format_number(end) for end in (min(medians), max(medians)))
         notes.append(f"Voxels differ, {ends} {next(iter(units))}: so does what they resolve.")
     return next(iter(units)), notes
+
+
+def check_units(scans: Sequence[str], **reading: Any) -> None:
+    """Raise ValueError where only some scans have a physical unit; of files that can be read in boxes no voxel is."""
+    _check_mixture({boxes_of(scan, **reading).frame.unit: scan for scan in scans})
+
+
+def _check_mixture(units: Mapping[str, str]) -> None:
+    """Raise ValueError where the voxel is one of several units, each with the name of a scan that has it."""
+    if len(units) > 1 and "voxel" in units:
+        other = next(name for name in units if name != "voxel")
+        raise ValueError(
+            f"expected a physical spacing in all scans or in none, got none in {units['voxel']} and {other} in "
+            f"{units[other]}: say it with --spacing and --unit"
+        )
 
 
 def _measure_all(
@@ -134,12 +208,11 @@ def _measure_case(
     case: Case, options: dict[str, Any], laws: bool, progress: Progress, folder: Path, indices: Sequence[int]
 ) -> list[tuple[int, Measures]]:
     """Measure one scan; its diagram is binned finely, so that many scans take little memory."""
-    with _named(case):
-        measures = measure(case.source, progress=lambda text, share: progress(f"{case.name}: {text}", share), **options)  # type: ignore[arg-type]
+    with _named(case.name):
+        measures = measure(case.source, progress=partial(_tell, progress, case.name), **options)  # type: ignore[arg-type]
         if laws:
             measures = add_combinations(measures, infer(case.source, fast=True, **options))  # type: ignore[arg-type]
-    diagram = measures.diagram.bin(FINE / measures["thickness"].value)
-    return [(k, replace(measures, diagram=diagram, source=measures.source or case.name)) for k in indices]
+    return [(k, replace(_bin_diagrams(measures), source=measures.source or case.name)) for k in indices]
 
 
 def add_combinations(measures: Measures, inference: Inference) -> Measures:
@@ -171,9 +244,9 @@ def _read_combinations(inference: Inference, posterior: Posterior) -> tuple[np.n
 
 
 @contextmanager
-def _named(case: Case) -> Iterator[None]:
+def _named(name: str) -> Iterator[None]:
     """Add a scan's name to what is wrong with it."""
     try:
         yield
     except ValueError as error:
-        raise error if case.name in str(error) else ScanError(f"{case.name}: {error}") from None
+        raise error if name in str(error) else ScanError(f"{name}: {error}") from None

@@ -67,11 +67,7 @@ def write_table(
     A scan with compartments has the rows of each of them. `columns` has further ones of each scan, such as its subject.
     """
     target = check_table(path, overwrite=overwrite)
-    rows = []
-    for each, more in zip(measures, columns or [{}] * len(measures), strict=True):
-        rows += [row for part in (each.compartments.values() or (each,)) for row in rows_of(part, **more)]
-    names = dict.fromkeys(name for row in rows for name in row)
-    rows = [{name: row.get(name) for name in names} for row in rows]
+    rows = list_rows(measures, columns or [{}] * len(measures))
     if target.suffix.lower() == ".parquet":
         frame = _pandas().DataFrame(rows)
         return write_atomically(target, lambda temporary: frame.to_parquet(temporary, index=False))
@@ -83,6 +79,15 @@ def write_table(
         ]
         return FORMAT.write(target, {"scans": scans, "rows": rows})
     return write_content(target, format_csv(rows))
+
+
+def list_rows(measures: Sequence[Measures], columns: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
+    """Return the rows of scans, or of their compartments, all with the same columns; `columns` has further ones."""
+    rows = []
+    for each, more in zip(measures, columns, strict=True):
+        rows += [row for part in (each.compartments.values() or (each,)) for row in rows_of(part, **more)]
+    names = dict.fromkeys(name for row in rows for name in row)
+    return [{name: row.get(name) for name in names} for row in rows]
 
 
 def format_csv(rows: Sequence[dict[str, Any]]) -> str:

@@ -1,0 +1,70 @@
+"""Pictures of many scans side by side: the curvature diagram of each, and each number with its interval."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from curvafit.core.units import power_name
+from curvafit.drawing.groups import FIRST, FIRST_SHOWN, SIGNED, plain, shown_window
+from curvafit.drawing.plot import QUIET, diagram_on, make_figure
+
+#: Diagrams in a row, and panels of numbers in a row.
+DIAGRAMS, PANELS = 5, 4
+#: Letters of a scan's name that a panel has room for.
+WORD = 22
+
+
+def diagrams_figure(names: Sequence[str], measures: Sequence[Any]) -> Figure:
+    """Return a figure of the curvature diagrams of scans of one unit, on axes that all share."""
+    across, up = shown_window([each.diagram for each in measures])
+    columns, rows = min(DIAGRAMS, len(names)), -(-len(names) // DIAGRAMS)
+    ratio = min(1.6, (up[1] - up[0]) / (across[1] - across[0]))
+    figure = make_figure(2.6 * columns, (2.1 * ratio + 0.6) * rows, layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for k, axes in enumerate(panels):
+        if k >= len(names):
+            axes.set_axis_off()
+            continue
+        limits = min(across[0], up[0]), max(across[1], up[1])
+        diagram_on(axes, measures[k].diagram, limits=limits, unit=measures[k].unit, window=(across, up))
+        axes.set_title(plain(shorten(names[k])), fontsize=9)
+        axes.tick_params(labelsize=7)
+        for label in (axes.xaxis.label, axes.yaxis.label):
+            label.set_fontsize(8)
+    return figure
+
+
+def intervals_figure(names: Sequence[str], measures: Sequence[Any]) -> Figure:
+    """Return a figure of eight numbers of scans of one unit, a row for each scan, with 95 % intervals."""
+    rows = -(-len(FIRST_SHOWN) // PANELS)
+    figure = make_figure(12.0, rows * (0.9 + 0.19 * max(len(names), 4)), layout="constrained")
+    panels = figure.subplots(rows, PANELS, sharey=True)
+    places = range(len(names), 0, -1)
+    for axes, symbol in zip(panels.ravel(), FIRST_SHOWN, strict=True):
+        found = [each[symbol] for each in measures]
+        values, halves = [each.value for each in found], [each.half for each in found]
+        low = [v - h if math.isfinite(h) else v for v, h in zip(values, halves, strict=True)]
+        low = low if symbol in SIGNED else [max(0.0, each) for each in low]
+        high = [v + h if math.isfinite(h) else v for v, h in zip(values, halves, strict=True)]
+        axes.hlines(places, low, high, color=FIRST, alpha=0.4, linewidth=1.6)
+        axes.plot(values, places, "o", color=FIRST, markersize=4, markeredgewidth=0)
+        unit = power_name(measures[0].unit, found[0].power)
+        axes.set_title(symbol + (f" ({unit})" if unit else ""), fontsize=10)
+        axes.xaxis.set_major_locator(MaxNLocator(4))
+        axes.grid(axis="y", color="#E5E7EB", linewidth=0.6)
+        axes.set_axisbelow(True)
+        axes.tick_params(length=2, labelsize=8)
+        axes.spines[:].set_color(QUIET)
+    panels[0, 0].set_yticks(places, [plain(shorten(name)) for name in names])
+    panels[0, 0].set_ylim(0.4, len(names) + 0.6)
+    return figure
+
+
+def shorten(name: str) -> str:
+    """Return a name that a panel has room for: its beginning and its end."""
+    return name if len(name) <= WORD else f"{name[: WORD // 2 - 1]}…{name[-WORD // 2 :]}"

@@ -1,0 +1,171 @@
+"""The page of many scans that are measured, its figures and its table, and a paragraph on the methods."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from curvafit.core.records import Format
+from curvafit.core.units import format_number, power_name
+from curvafit.drawing.groups import FIRST_SHOWN
+from curvafit.drawing.scans import diagrams_figure, intervals_figure
+from curvafit.report.comparison import describe_measures, say_kinds
+from curvafit.report.page import Picture, check_result_folder, picture_of, render_template, write_study
+from curvafit.scan.measure import Measures
+from curvafit.studies.scans import say_notes
+from curvafit.studies.tables import format_csv, list_rows
+
+#: `format` of the record.
+FORMAT = Format("curvafit measured scans", 1, title="the record of measured scans")
+#: What is written into the folder.
+FILES = ("measures.json", "measures.html", "measures.csv", "diagrams.svg", "diagrams.png", "numbers.svg", "numbers.png")
+#: The most scans whose diagrams and numbers are drawn.
+MOST_DIAGRAMS, MOST_ROWS = 25, 100
+
+
+def check_measures(
+    directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False, command: str = ""
+) -> Path:
+    """Return the folder if `write_measures` can write there, else raise ValueError; call it before the work."""
+    return check_result_folder(FORMAT, FILES, directory, inputs, overwrite, command)
+
+
+def write_measures(
+    measures: Sequence[Measures],
+    directory: str | Path,
+    *,
+    columns: Sequence[Mapping[str, str]] | None = None,
+    options: Mapping[str, Any] | None = None,
+    command: str = "",
+    overwrite: bool = False,
+) -> Path:
+    """Write the page, figures, table and record of scans into a folder, and return the page's path.
+
+    Lengths are in the first scan's unit. A scan with compartments has a row for each of them. The files (`FILES`) are
+    moved into the folder once all are whole; those of the same command are replaced, others are a ValueError without
+    `overwrite`. `columns` has further columns of each scan, such as its subject; `options` and `command` are for the
+    record.
+    """
+    target = check_measures(directory, overwrite=overwrite, command=command)
+    measures = [each.convert(measures[0].unit) for each in measures]
+    told = columns or [{}] * len(measures)
+    rows = [
+        (part, more)
+        for each, more in zip(measures, told, strict=True)
+        for part in each.compartments.values() or (each,)
+    ]
+    parts = [part for part, _ in rows]
+    drawn = _draw(parts)
+    record = {
+        "curvafit": version("curvafit"),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": command,
+        "unit": measures[0].unit,
+        "options": {key: str(value) for key, value in (options or {}).items()},
+        "status": describe_range(parts),
+        "scans": [{"scan": each.source, "kind": each.kind, "notes": list(each.notes)} for each in measures],
+        "notes": list(say_notes(measures)),
+        "files": list(FILES),
+    }
+    texts = {
+        "measures.csv": format_csv(list_rows(measures, told)),
+        "measures.html": _page(measures, rows, record, {key: picture for key, (_, picture) in drawn.items()}),
+    }
+    return write_study(target, FORMAT, FILES, record, texts, drawn)
+
+
+def _draw(parts: Sequence[Measures]) -> dict[str, tuple[Figure, Picture]]:
+    """Return the figures of scans and compartments, each with its picture."""
+    names = name_parts(parts)
+    figures = {
+        "diagrams": diagrams_figure(names[:MOST_DIAGRAMS], parts[:MOST_DIAGRAMS]),
+        "numbers": intervals_figure(names[:MOST_ROWS], parts[:MOST_ROWS]),
+    }
+    alts = ("The curvature diagram of each scan", "Numbers of each scan with their intervals")
+    return {key: (each, picture_of(each, alt)) for (key, each), alt in zip(figures.items(), alts, strict=True)}
+
+
+def _page(
+    measures: Sequence[Measures],
+    rows: Sequence[tuple[Measures, Mapping[str, str]]],
+    record: dict[str, Any],
+    pictures: Mapping[str, Picture],
+) -> str:
+    """Return the page of scans as text; `rows` are its table's, scans or compartments and their further columns."""
+    heads = list(dict.fromkeys(name for _, more in rows for name in more))
+    names, numbers = name_parts([part for part, _ in rows]), (measures[0][symbol] for symbol in FIRST_SHOWN)
+    return render_template(
+        "measures.html",
+        version=record["curvafit"],
+        title=f"{len(measures)} scans measured" if len(measures) > 1 else "One scan measured",
+        status=record["status"],
+        heads=heads,
+        symbols=[(each.symbol, power_name(record["unit"], each.power)) for each in numbers],
+        rows=[
+            {"name": name, "told": [more.get(head, "") for head in heads], "cells": _format_cells(part)}
+            for name, (part, more) in zip(names, rows, strict=True)
+        ],
+        left={"diagrams": max(0, len(rows) - MOST_DIAGRAMS), "numbers": max(0, len(rows) - MOST_ROWS)},
+        **pictures,
+        methods=describe_methods(measures),
+        notes=record["notes"],
+        provenance=[(name, record[name]) for name in ("command", "date") if record[name]],
+    )
+
+
+def describe_methods(measures: Sequence[Measures]) -> str:
+    """Return a paragraph, for a paper, on how scans were measured."""
+    count = f"{len(measures)} scans were" if len(measures) > 1 else "A scan was"
+    return " ".join(
+        [
+            f"{count} measured with curvafit {version('curvafit')}; {say_kinds(measures)}.",
+            "Intervals are 95 %, by a jackknife over blocks of one period of the structure: they tell how well a scan "
+            "shows the mean of the structure that it was cut from.",
+            *describe_measures(measures),
+        ]
+    )
+
+
+def describe_range(parts: Sequence[Measures]) -> str:
+    """Return what the numbers of scans of one unit span, in some sentences."""
+    said, names = [], name_parts(parts)
+    for symbol in ("BV/TV", "Tb.Th", "Tb.Sp"):
+        known = {name: part[symbol] for name, part in zip(names, parts, strict=True)}
+        known = {name: each for name, each in known.items() if math.isfinite(each.value)}
+        if not known:
+            continue
+        ends = [end(known, key=lambda name: known[name].value) for end in (min, max)]
+        least = known[ends[0]]
+        unit = power_name(parts[0].unit, least.power)
+        values = [f"{format_number(known[name].value)} {unit}".strip() for name in ends]
+        span = f"from {values[0]} ({ends[0]}) to {values[1]} ({ends[1]})" if len(known) > 1 else values[0]
+        said.append(f"{least.name[0].upper()}{least.name[1:]} {span}.")
+    return " ".join(said)
+
+
+def name_parts(parts: Sequence[Measures]) -> list[str]:
+    """Return the names of scans' files, or their paths where two have one name, with the part each is."""
+    sources: dict[str, set[str]] = {}
+    for each in parts:
+        sources.setdefault(Path(each.source).name, set()).add(each.source)
+    names = (
+        file if len(sources[file := Path(each.source).name]) == 1 and file else each.source or f"array {k}"
+        for k, each in enumerate(parts, 1)
+    )
+    return [f"{name}, {' '.join(map(str, each.part))}" if each.part else name
+            for name, each in zip(names, parts, strict=True)]  # fmt: skip
+
+
+def _format_cells(part: Measures) -> list[tuple[str, str]]:
+    """Return the numbers that the page shows, and half the widths of their intervals, as text."""
+    found = (part[symbol] for symbol in FIRST_SHOWN)
+    return [
+        (format_number(each.value), f"± {format_number(each.half, 2)}" if math.isfinite(each.half) else "")
+        for each in found
+    ]

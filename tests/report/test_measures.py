@@ -1,0 +1,90 @@
+"""The page of many measured scans: its files, its table, workers, compartments, names, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calling import call, refused
+from found import lattice
+
+from curvafit.report.measures import FILES, describe_range, name_parts
+from curvafit.scan.measure import Measures, measure
+from curvafit.volumes.field import Field
+from curvafit.volumes.write import save
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Thin rods and thick ones, in mm and in um."""
+    folder = tmp_path_factory.mktemp("scans")
+    found = []
+    for radius, edge, unit in ((4.5, 0.02, "mm"), (6.0, 20.0, "um")):
+        mask = (lattice(56, 28, radius) > 0).astype(np.uint8)
+        found.append(Path(save(Field(mask, (edge,) * 3, unit), folder / f"r{10 * radius:.0f}.nii.gz")))
+    return found
+
+
+def rows_of(file: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(file.read_text(encoding="utf-8").splitlines()))
+
+
+def test_a_folder_has_page_figures_and_table(scans: list[Path], tmp_path: Path) -> None:
+    table = tmp_path / "mice.csv"
+    table.write_text("scan,subject,group\nr45.nii.gz,m1,a\nr60.nii.gz,m2,b\n")
+    words = ("measure", *scans, "--subjects", table, "-o", tmp_path / "out")
+    result = call(*words)
+    assert result.exit_code == 0, result.output
+    assert result.stdout.splitlines()[-1] == str(tmp_path / "out" / "measures.html")
+    assert sorted(each.name for each in (tmp_path / "out").iterdir()) == sorted(FILES)
+    rows = rows_of(tmp_path / "out" / "measures.csv")
+    assert {row["group"] for row in rows} == {"a", "b"}
+    thickness = [float(row["value"]) for row in rows if row["symbol"] == "Tb.Th"]
+    alone = [measure(scan).convert("mm")["Tb.Th"].value for scan in scans]
+    assert thickness == pytest.approx(alone, rel=1e-9)
+    assert {row["unit"] for row in rows if row["symbol"] == "Tb.Th"} == {"mm"}
+    page = (tmp_path / "out" / "measures.html").read_text(encoding="utf-8")
+    assert all(word in page for word in ("2 scans measured", "r45.nii.gz", "<th>group</th>", "Hildebrand"))
+    record = json.loads((tmp_path / "out" / "measures.json").read_text(encoding="utf-8"))
+    assert [Path(each["scan"]).name for each in record["scans"]] == ["r45.nii.gz", "r60.nii.gz"]
+    assert call(*words).exit_code == 0  # the same command replaces its own
+    refused(call("measure", scans[0], "-o", tmp_path / "out"), "not free", progress=True)
+
+
+@pytest.mark.slow
+def test_workers_measure_the_same(scans: list[Path], tmp_path: Path) -> None:
+    for workers in (0, 2):
+        assert call("measure", *scans, "-o", tmp_path / f"by{workers}", "--workers", workers).exit_code == 0
+    assert rows_of(tmp_path / "by0" / "measures.csv") == rows_of(tmp_path / "by2" / "measures.csv")
+
+
+def test_compartments_have_rows(scans: list[Path], tmp_path: Path) -> None:
+    labels = np.ones((56, 56, 56), np.uint8)
+    labels[28:] = 2
+    region = save(Field(labels, (0.02,) * 3, "mm"), tmp_path / "roi.nii.gz")
+    assert call("measure", scans[0], "--roi", region, "--kind", "mask", "-o", tmp_path / "out").exit_code == 0
+    assert {row["compartment"] for row in rows_of(tmp_path / "out" / "measures.csv")} == {"1", "2"}
+    assert "r45.nii.gz, compartment 2" in (tmp_path / "out" / "measures.html").read_text(encoding="utf-8")
+
+
+def test_scans_that_do_not_go_together_are_refused(scans: list[Path], tmp_path: Path) -> None:
+    bare = tmp_path / "bare.npy"
+    np.save(bare, (lattice(56, 28, 5.0) > 0).astype(np.uint8))
+    refused(call("measure", bare, *scans, "-o", tmp_path / "out"), "physical spacing", progress=True)
+    refused(call("measure", scans[0], "--labels", "-o", tmp_path / "out"), "no page", progress=True)
+    empty = save(Field(np.zeros((40, 40, 40), np.uint8), (0.02,) * 3, "mm"), tmp_path / "empty.nii.gz")
+    refused(call("measure", scans[0], empty, "-o", tmp_path / "out"), "empty.nii.gz", progress=True)
+    assert not (tmp_path / "out").exists()
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["bare.npy", "empty.nii.gz"]
+
+
+def test_names_and_the_sentence_of_the_range(scans: list[Path]) -> None:
+    found: list[Measures] = [measure(scan).convert("mm") for scan in scans]
+    assert name_parts(found) == ["r45.nii.gz", "r60.nii.gz"]
+    said = describe_range(found)
+    assert "Thickness from 0.1" in said
+    assert said.index("r45.nii.gz") < said.index("r60.nii.gz")  # thin before thick
+    assert len(set(name_parts([measure(lattice(56, 28, 5.0)), measure(lattice(56, 28, 6.0))]))) == 2  # arrays
