@@ -14,6 +14,7 @@ from curvafit.cli.options import OverwriteOption, Reading, Structure, Volume, co
 @command(
     "curvafit windows bone.tif --spacing 0.0195 --unit mm -o maps",
     "curvafit windows bone.nii.gz --size 96 --stride 24 --clusters 3 -o maps",
+    "curvafit windows bone.nii.gz --laws -o maps",
     "curvafit windows lung.ome.zarr --size 16,64,64 --stride 8,32,32 -o maps",
 )
 def windows(
@@ -22,6 +23,10 @@ def windows(
     size: Annotated[str, typer.Option(help="Edge of a window in voxels, or Z,Y,X.")] = "64",
     stride: Annotated[str, typer.Option(help="Voxels from window to window, or Z,Y,X; divides the size.")] = "32",
     clusters: Annotated[int, typer.Option(help="Clusters of windows.")] = 2,
+    laws: Annotated[
+        bool,
+        typer.Option("--laws", help="Read each window's law too: what it tells of six combinations of parameters."),
+    ] = False,
     seed: Annotated[int, typer.Option(help="Seed of the clusters.")] = 0,
     *,
     structure: Structure,
@@ -34,8 +39,9 @@ def windows(
         from curvafit.report.windows import check_windows, write_windows
         from curvafit.studies.windows import windows as measure_windows
 
-        check_windows(out, scan, overwrite, command_line())
-        found = measure_windows(scan, *grid, clusters=clusters, seed=seed, progress=progress, **structure, **reading)
+        check_windows(out, scan, overwrite, command_line(), laws)
+        how = {"clusters": clusters, "laws": laws, "seed": seed, "progress": progress}
+        found = measure_windows(scan, *grid, **how, **structure, **reading)
         progress("drawing the page", 1.0)
         page = write_windows(found, out, command=command_line(), overwrite=overwrite)
     say_notes(found.notes)

@@ -11,6 +11,7 @@ import numpy as np
 from curvafit.core.records import Format
 from curvafit.core.units import format_number, format_percent
 from curvafit.drawing.windows import windows_figure
+from curvafit.inference.table import PARAMETERS
 from curvafit.report.comparison import name_quantity
 from curvafit.report.page import check_result_folder, picture_of, record_study, render_template, write_study
 from curvafit.studies.tables import format_csv
@@ -20,17 +21,23 @@ from curvafit.studies.windows import NAMES, Windows
 FORMAT = Format("curvafit windows", 1, title="the record of a scan measured in windows")
 #: What is written into the folder beside the maps.
 FILES = ("windows.json", "windows.html", "windows.csv", "windows.svg", "windows.png")
+#: Symbols of the combinations of a law's parameters, by which their maps and columns are named.
+COMBINATIONS = tuple(f"L{k}" for k in range(1, 1 + len(PARAMETERS)))
 
 
-def list_files(source: str | Path) -> tuple[str, ...]:
+def list_files(source: str | Path, laws: bool = False) -> tuple[str, ...]:
     """Return the names of all files: the maps of a Zarr store are Zarr stores, of any other scan NIfTI."""
     suffix = ".ome.zarr" if ".zarr" in str(source).lower() else ".nii.gz"
-    return (*FILES, *(f"{name.replace(' ', '_')}{suffix}" for name in ("clusters", *NAMES)))
+    names = ("clusters", *NAMES, *(COMBINATIONS if laws else ()))
+    return (*FILES, *(f"{name.replace(' ', '_')}{suffix}" for name in names))
 
 
-def check_windows(directory: str | Path, source: str | Path = "", overwrite: bool = False, command: str = "") -> Path:
+def check_windows(
+    directory: str | Path, source: str | Path = "", overwrite: bool = False, command: str = "", laws: bool = False
+) -> Path:
     """Return the folder if `write_windows` can write there, else raise ValueError; call it before the work."""
-    return check_result_folder(FORMAT, list_files(source), directory, [source] if source else [], overwrite, command)
+    files = list_files(source, laws)
+    return check_result_folder(FORMAT, files, directory, [source] if source else [], overwrite, command)
 
 
 def write_windows(windows: Windows, directory: str | Path, *, command: str = "", overwrite: bool = False) -> Path:
@@ -39,8 +46,8 @@ def write_windows(windows: Windows, directory: str | Path, *, command: str = "",
     The files are moved into the folder once all are whole. Those of the same command are replaced; others are a
     ValueError without `overwrite`. `command` is what the record calls the command line.
     """
-    source = windows.clusters.source
-    target, files = check_windows(directory, source, overwrite, command), list_files(source)
+    source, laws = windows.clusters.source, bool(windows.options["laws"])
+    target, files = check_windows(directory, source, overwrite, command, laws), list_files(source, laws)
     record = record_study(windows, command, files)
     record |= {"scan": source, "kind": windows.kind, "explained": windows.explained}
     figure = windows_figure(windows)
@@ -52,12 +59,14 @@ def write_windows(windows: Windows, directory: str | Path, *, command: str = "",
         status=windows.status,
         picture=picture,
         clusters=range(1, 1 + int(windows.clusters.values.max())),
-        rows=[_format_row(windows, k) for k in range(len(NAMES))],
+        rows=[_format_row(windows, k) for k in range(len(windows.quantities))],
+        laws=laws,
         notes=windows.notes,
         provenance=[(name, record[name]) for name in ("scan", "command", "date", "options") if record[name]],
     )
     texts = {"windows.html": page, "windows.csv": format_csv(list(_rows(windows)))}
-    maps = dict(zip(files[len(FILES) :], (windows.clusters, *map(windows.__getitem__, NAMES)), strict=True))
+    fields = (windows.clusters, *(windows[name] for name, *_ in windows.quantities))
+    maps = dict(zip(files[len(FILES) :], fields, strict=True))
     return write_study(target, FORMAT, files, record, texts, {"windows": (figure, picture)}, maps)
 
 
@@ -65,16 +74,19 @@ def _rows(windows: Windows) -> Iterator[dict[str, Any]]:
     """Yield a row for each window: its centre, cluster and numbers; None where a number is not known."""
     for place in np.ndindex(windows.clusters.shape):
         values, centre = windows.values[place], zip("zyx", windows.centres[place].tolist(), strict=True)
-        numbers = zip(NAMES, (each if np.isfinite(each) else None for each in values.tolist()), strict=True)
+        names = (symbol if symbol in COMBINATIONS else name for name, symbol, _ in windows.quantities)
+        numbers = zip(names, (each if np.isfinite(each) else None for each in values.tolist()), strict=True)
         yield {**dict(centre), "unit": windows.unit, "cluster": int(windows.clusters.values[place]), **dict(numbers)}
 
 
 def _format_row(windows: Windows, k: int) -> dict[str, Any]:
     """Return a row of the page's table: a number's name, range, cluster means, and share of variance between these."""
-    labels, values = windows.clusters.values, windows.values[..., k]
-    parts = [values[labels == label] for label in range(1, 1 + int(labels.max()))]
-    total = float(np.var(values[labels > 0]) * np.count_nonzero(labels)) if parts else 0.0
+    values = windows.values[..., k]
+    labels = np.where(np.isfinite(values), windows.clusters.values, 0)
+    parts = [values[labels == label] for label in range(1, 1 + int(windows.clusters.values.max()))]
+    means = [float(part.mean()) if len(part) else np.nan for part in parts]
+    total = float(np.var(values[labels > 0]) * np.count_nonzero(labels)) if labels.any() else 0.0
     ends = np.nanpercentile(values, (0, 50, 100)) if np.isfinite(values).any() else [np.nan] * 3
-    between = format_percent(1 - sum(part.var() * len(part) for part in parts) / total) if total > 0 else "–"
-    cells = (*(format_number(float(each)) for each in (*ends, *(part.mean() for part in parts))), between)
+    between = format_percent(1 - sum(part.var() * len(part) for part in parts if len(part)) / total) if total else "–"
+    cells = (*(format_number(float(each)) for each in (*ends, *means)), between)
     return {**name_quantity(*windows.quantities[k], windows.unit), "cells": cells}

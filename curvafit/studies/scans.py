@@ -216,8 +216,17 @@ def _measure_case(
 
 
 def add_combinations(measures: Measures, inference: Inference) -> Measures:
-    """Return measures with six more quantities, `L1` to `L6`: what the scan tells of the combinations of a law's
-    parameters, in deviations among laws; NaN where the packaged posterior does not know scans of its kind."""
+    """Return measures with six more quantities, those of `list_combinations`."""
+    rows, why = list_combinations(inference)
+    notes = (*measures.notes, f"No combinations of a law's parameters: {why}.") if why else measures.notes
+    return replace(measures, quantities=(*measures.quantities, *rows), notes=notes)
+
+
+def list_combinations(inference: Inference | None) -> tuple[list[Quantity], str]:
+    """Return what a scan tells of the combinations of a law's parameters, `L1` to `L6`, in deviations among laws.
+
+    They are NaN where the packaged posterior does not know scans of its kind, and a reason says why; of None too.
+    """
     posterior = load_posterior()
     values, halves, why = _read_combinations(inference, posterior)
     ends = posterior.combinations.ends
@@ -225,14 +234,14 @@ def add_combinations(measures: Measures, inference: Inference) -> Measures:
         Quantity(f"{low} to {high}", f"L{k}", float(value), float(half), 0)
         for k, ((low, high), value, half) in enumerate(zip(ends, values, halves, strict=True), 1)
     ]
-    notes = (*measures.notes, f"No combinations of a law's parameters: {why}.") if why else measures.notes
-    return replace(measures, quantities=(*measures.quantities, *rows), notes=notes)
+    return rows, why
 
 
-def _read_combinations(inference: Inference, posterior: Posterior) -> tuple[np.ndarray, np.ndarray, str]:
+def _read_combinations(inference: Inference | None, posterior: Posterior) -> tuple[np.ndarray, np.ndarray, str]:
     """Return the medians and half the widths of the `SURE` intervals of combinations, or why they are not known."""
-    fit, unknown = inference.fit, np.full(len(PARAMETERS), np.nan)
-    if fit.draws is None:
+    unknown = np.full(len(PARAMETERS), np.nan)
+    fit = None if inference is None else inference.fit
+    if inference is None or fit is None or fit.draws is None:
         return unknown, unknown, "the scan shows no texture"
     if inference.prepared.volume_fraction > HALF:
         return unknown, unknown, "the structure fills more than half of the scan"

@@ -10,12 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calling import call, refused
+from found import lattice
 
+from curvafit.inference.infer import infer
 from curvafit.report.windows import check_windows
 from curvafit.scan.measure import measure
+from curvafit.studies.scans import list_combinations
 from curvafit.studies.windows import NAMES, Windows, windows
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
+from curvafit.volumes.write import save
 
 N, SIZE, STRIDE = 96, 48, 24
 THIN, THICK = 4.0, 6.0
@@ -119,6 +123,23 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="larger"):
         windows(sparse, 24, 24)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_the_laws_of_windows_are_those_of_their_crops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("curvafit.studies.scans.UNBELIEVABLE", 0.0)  # no law makes rods
+    parts = [(lattice(56, 28, radius) > 0).astype(np.uint8) for radius in (4.5, 5.5)]
+    scan = save(Field(np.concatenate(parts), (0.02,) * 3, "mm"), tmp_path / "scan.nii.gz")
+    assert call("windows", scan, "--size", 56, "--stride", 56, "--laws", "-o", tmp_path / "out").exit_code == 0
+    rows = list(csv.DictReader((tmp_path / "out" / "windows.csv").read_text(encoding="utf-8").splitlines()))
+    told = [[float(row[f"L{k}"]) for k in range(1, 7)] for row in rows]
+    for values, part in zip(told, parts, strict=True):
+        found, why = list_combinations(infer(Field(part, (0.02,) * 3, "mm"), kind="mask", fast=True))
+        assert not why
+        assert values == pytest.approx([each.value for each in found], abs=1e-9)
+    assert told[0] != told[1]
+    maps = sorted(each.name for each in (tmp_path / "out").glob("L*"))
+    assert maps == [f"L{k}.nii.gz" for k in range(1, 7)]
 
 
 def test_windows_become_anndata(mapped: Windows) -> None:
