@@ -1,0 +1,242 @@
+"""Sets that teach: how many labelled slices a network still needs after pairs of generated shapes.
+
+Needs $CURVAFIT_DATA. One half of a scan's mask (bone; pores of sandstone) lends its fraction, thickness and law to
+sets of six shapes; the other half is what a small U-Net is to segment, in blocks of 96³, blurred, under noise of two
+contrasts. A set's shapes are scaled and cut to that thickness and fraction, and imaged alike, so that sets differ in
+shape alone: `law`, grown by the law that `infer` reads; `wrong`, by the law of a preset of layers; `cut`, level cuts of
+Gaussian fields with the mask's two-point function; `tubes`, straight ones; `real`, blocks of the lending half itself.
+A network learns a set, or nothing (`scratch`), then 0, 1, 3 or 10 labelled slices of the block; scores are those of the
+other slices. Seeds are blocks and networks. Intervals: a bootstrap over seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor, nn
+
+from benchmarks.harness import Cases, Figure, Values, bootstrap, dice, show
+from benchmarks.networks import UNKNOWN, dice_ce
+from benchmarks.nulls import level_cut
+from benchmarks.transductive import BLUR, NOISE, PATCH, cldice, network, predict
+from curvafit.generation.flow import generate
+from curvafit.geometry.morphometry import local_thickness
+from curvafit.inference.fit import Fit
+from curvafit.inference.infer import infer
+from curvafit.priors.grid import Grid
+from curvafit.priors.law import Law, LawLike
+from curvafit.volumes.read import load
+
+SCANS = {"bone": "lhdl_trabecular_200_otsu_mask.tif", "pores": "openpnm_berea_100_to_300.npz"}
+SETS = ("law", "wrong", "cut", "tubes", "real")
+#: Voxels along an edge of blocks and shapes, shapes of a set, labelled slices, and the preset whose law is wrong.
+EDGE, SHAPES, SLICES, WRONG = 96, 6, (0, 1, 3, 10), "bilayers"
+#: Steps on a set, steps on slices after it, steps on slices alone, and the greatest rate.
+TAUGHT, TUNED, ALONE, RATE = 300, 120, 300, 6e-3
+
+
+# ---- shapes ----------------------------------------------------------------------------------------------------------
+
+
+def halves(scan: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the half of a mask that lends, and the half to segment."""
+    mask = load(Path(os.environ["CURVAFIT_DATA"]) / "scans" / SCANS[scan]).values > 0
+    mask = ~mask if mask.mean() > 0.5 else mask
+    return mask[:, :, : mask.shape[2] // 2], mask[:, :, mask.shape[2] // 2 :]
+
+
+def block(mask: np.ndarray, seed: int) -> np.ndarray:
+    """Return a block of a mask at a random place."""
+    random = np.random.default_rng(seed)
+    starts = [int(random.integers(n - EDGE + 1)) for n in mask.shape]
+    return mask[tuple(slice(a, a + EDGE) for a in starts)]
+
+
+def mean_thickness(mask: np.ndarray) -> float:
+    found = local_thickness(mask, (1.0, 1.0, 1.0))
+    return float(found[mask].mean())
+
+
+def shapes(scan: str, kind: str, cases: Cases) -> np.ndarray:
+    """Return the shapes of a set, bool `(SHAPES, EDGE, EDGE, EDGE)`, made once."""
+
+    def make() -> np.ndarray:
+        lent = halves(scan)[0]
+        fraction, thickness = float(lent.mean()), mean_thickness(lent)
+        made = [like(kind, scan, number, fraction, thickness, cases) for number in range(SHAPES)]
+        return np.packbits(np.stack(made))
+
+    return np.unpackbits(cases.array(f"set-{scan}-{kind}", make)).reshape(SHAPES, *(EDGE,) * 3) > 0
+
+
+def like(kind: str, scan: str, seed: int, fraction: float, thickness: float, cases: Cases) -> np.ndarray:
+    """Return one shape of a set, of a volume fraction and a thickness in voxels."""
+    lent = halves(scan)[0]
+    if kind == "real":
+        return block(lent, 100 + seed)
+    if kind == "cut":
+        return level_cut(block(lent, 100 + seed), Grid(EDGE), seed) > 0
+    if kind == "tubes":
+        return straight(fraction, thickness / 2, seed)
+    known: LawLike = law_of(scan, cases) if kind == "law" else Law.of(WRONG)
+    grown = generate(known, grid=80, schedule="fast", seed=seed).field.numpy()
+    own = mean_thickness(grown > 0)
+    wide = np.concatenate([grown] * 2, 0)
+    wide = np.concatenate([wide] * 2, 1)
+    wide = np.concatenate([wide] * 2, 2)
+    place = np.indices((EDGE,) * 3, dtype=np.float32) * (own / thickness)
+    scaled = ndimage.map_coordinates(wide, place, order=1, mode="grid-wrap")
+    return scaled > np.quantile(scaled, 1 - fraction)
+
+
+def straight(fraction: float, radius: float, seed: int) -> np.ndarray:
+    """Return straight tubes at random places, until they fill a fraction."""
+    random, mask = np.random.default_rng(seed), np.zeros((EDGE,) * 3, dtype=bool)
+    places = np.stack(np.indices(mask.shape), -1).astype(np.float32)
+    while mask.mean() < fraction:
+        along = random.standard_normal(3)
+        away = places - random.uniform(0, EDGE, 3)
+        mask |= np.linalg.norm(np.cross(away, along / np.linalg.norm(along)), axis=-1) < radius
+    return mask
+
+
+def law_of(scan: str, cases: Cases) -> Fit:
+    """Return the law of the half that lends."""
+
+    def read() -> str:
+        return infer(halves(scan)[0].astype(np.uint8), kind="mask", fast=True).fit.to_json()
+
+    return Fit.load(cases.text(f"fit-{scan}.json", read))
+
+
+# ---- networks --------------------------------------------------------------------------------------------------------
+
+
+def image_of(mask: np.ndarray, seed: int) -> np.ndarray:
+    """Return a noisy image of a mask, standardised."""
+    clear = ndimage.gaussian_filter(mask.astype(np.float32), BLUR, mode="nearest")
+    values = clear + NOISE * np.random.default_rng(seed).standard_normal(mask.shape, dtype=np.float32)
+    return (values - values.mean()) / values.std()
+
+
+def learn(net: nn.Module, batch: Callable[[int], tuple[Tensor, Tensor]], steps: int, rate: float) -> None:
+    """Teach a network by Dice + CE."""
+    adam = torch.optim.AdamW(net.parameters(), rate)
+    net.train()
+    for step in range(steps):
+        adam.param_groups[0]["lr"] = rate * (1 + np.cos(np.pi * step / steps)) / 2
+        x, y = batch(step)
+        adam.zero_grad()
+        dice_ce(predict(net, x), y).backward()
+        nn.utils.clip_grad_norm_(net.parameters(), 5.0)
+        adam.step()
+
+
+def lessons(pairs: list[tuple[np.ndarray, np.ndarray]], seed: int) -> Callable[[int], tuple[Tensor, Tensor]]:
+    """Return patches of images and targets, turned, mirrored and with their grey values changed."""
+
+    def batch(step: int) -> tuple[Tensor, Tensor]:
+        random = np.random.default_rng([seed, step])
+        while True:
+            image, target = pairs[int(random.integers(len(pairs)))]
+            corner = [int(random.integers(n - PATCH + 1)) for n in image.shape]
+            box = tuple(slice(a, a + PATCH) for a in corner)
+            if (target[box] != UNKNOWN).any():
+                break
+        axes = tuple(axis for axis in range(3) if random.random() < 0.5)
+        x, y = (np.flip(each[box], axes).astype(np.float32) for each in (image, target))
+        x = random.uniform(0.9, 1.1) * x + random.uniform(-0.1, 0.1)
+        return torch.from_numpy(x.astype(np.float32))[None, None], torch.from_numpy(y.copy())[None, None]
+
+    return batch
+
+
+def case(scan: str, kind: str, seed: int, cases: Cases) -> Values:
+    """Return Dice and clDice of a network after a set, and after 0, 1, 3 and 10 labelled slices."""
+    taught, tuned, alone = (4, 2, 4) if cases.quick else (TAUGHT, TUNED, ALONE)
+    truth = block(halves(scan)[1], seed)
+    image = image_of(truth, seed)
+    torch.manual_seed(seed)
+    net = network().to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
+    if kind != "scratch":
+        pairs = [
+            (image_of(mask, 1000 + k), mask.astype(np.float32)) for k, mask in enumerate(shapes(scan, kind, cases))
+        ]
+        learn(net, lessons(pairs, seed), taught, RATE)
+    state = {key: value.clone() for key, value in net.state_dict().items()}
+    found: Values = {}
+    judged = np.setdiff1d(np.arange(EDGE), [each for n in SLICES for each in slices_of(n)])
+    for count in SLICES[1:] if kind == "scratch" else SLICES:
+        net.load_state_dict(state)
+        if count:
+            target = np.full(truth.shape, UNKNOWN, np.float32)
+            target[slices_of(count)] = truth[slices_of(count)]
+            fresh = kind == "scratch"
+            learn(net, lessons([(image, target)], seed), alone if fresh else tuned, RATE if fresh else RATE / 2)
+        net.eval()
+        with torch.no_grad():
+            mask = predict(net, torch.from_numpy(image)[None, None])[0, 0].numpy() > 0
+        found |= {f"dice_{count}": dice(mask[judged], truth[judged]), f"cldice_{count}": cldice(mask, truth)}
+    return found
+
+
+def slices_of(count: int) -> list[int]:
+    """Return labelled slices, evenly spread."""
+    return [round((k + 0.5) * EDGE / count) for k in range(count)]
+
+
+# ---- runs ------------------------------------------------------------------------------------------------------------
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seeds", type=int, default=8, help="blocks and networks of each set")
+    parser.add_argument("--scans", default=",".join(SCANS))
+
+
+def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    torch.set_num_threads(1)
+    names = ["bone"] if cases.quick else options.scans.split(",")
+    kinds = ("tubes", "scratch") if cases.quick else (*SETS, "scratch")
+    seeds = range(1 if cases.quick else options.seeds)
+    jobs = {f"{scan}-{kind}-{seed}": partial(case, scan, kind, seed, cases)
+            for seed in seeds for scan in names for kind in kinds}  # fmt: skip
+    found = cases.all(jobs)
+    if cases.quick or len(found) < len(jobs):
+        return {}
+    figures: dict[str, Figure] = {}
+    for scan in names:
+        table = {kind: {n: np.array([found[f"{scan}-{kind}-{seed}"][f"dice_{n}"] for seed in seeds])
+                        for n in (SLICES[1:] if kind == "scratch" else SLICES)} for kind in kinds}  # fmt: skip
+        goal, rows = table["scratch"][3].mean(), []
+        for kind, curve in table.items():
+            means = {n: bootstrap(values, np.mean) for n, values in curve.items()}
+            figures |= {f"sets_{scan}.{kind}.dice_{n}": mean for n, mean in means.items()}
+            needed = slices_needed(curve, goal)
+            figures[f"sets_{scan}.{kind}.needed"] = Figure(needed)
+            rows.append([kind, *(means.get(n, "") for n in SLICES), needed])
+        show([scan, *(f"{n} slices" for n in SLICES), "slices for what 3 reach from scratch"], rows)
+        for other in ("cut", "wrong", "tubes", "real"):
+            figures |= {f"sets_{scan}_less.{other}.at_{n}": bootstrap(table["law"][n] - table[other][n], np.mean)
+                        for n in SLICES}  # fmt: skip
+        rows = [
+            [other, *(figures[f"sets_{scan}_less.{other}.at_{n}"] for n in SLICES)]
+            for other in ("cut", "wrong", "tubes", "real")
+        ]
+        show([f"{scan}: law less", *(f"{n} slices" for n in SLICES)], rows)
+    return figures
+
+
+def slices_needed(curve: dict[int, np.ndarray], goal: float) -> float:
+    """Return how many slices the mean curve needs for a Dice, between those tried linear in log(1 + n); inf if more."""
+    counts, means = list(curve), [float(values.mean()) for values in curve.values()]
+    best = np.maximum.accumulate(means)
+    if best[-1] < goal:
+        return float("inf")
+    return float(np.expm1(np.interp(goal, best, np.log1p(counts)))) if best[0] < goal else float(counts[0])
