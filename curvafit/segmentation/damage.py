@@ -164,13 +164,13 @@ def _doubt(odds: np.ndarray, level: np.ndarray, rng: np.random.Generator) -> Non
 def _thicken_slices(odds: np.ndarray, rng: np.random.Generator, how: Damage) -> np.ndarray:
     """Return log-odds of thick slices along an axis, repeated or interpolated between."""
     axis, count = int(rng.integers(3)), int(rng.integers(how.slices[0], how.slices[1] + 1))
-    kept = np.moveaxis(odds, axis, 0)[int(rng.integers(count)) :: count]
-    places = np.arange(odds.shape[axis]) / count
+    first = int(rng.integers(count))
+    kept = np.moveaxis(odds, axis, 0)[first::count]
     if rng.random() < 0.5:
-        rows = kept[np.minimum(places.astype(int), len(kept) - 1)]
+        rows = kept[np.minimum(np.arange(odds.shape[axis]) // count, len(kept) - 1)]
     else:
+        places = ((np.arange(odds.shape[axis]) - first) / count).clip(0, len(kept) - 1)
         low = np.minimum(places.astype(int), len(kept) - 1)
-        high = np.minimum(low + 1, len(kept) - 1)
-        part = (places - low).clip(0, 1).astype(np.float32)[:, None, None]
+        high, part = np.minimum(low + 1, len(kept) - 1), (places - low).astype(np.float32)[:, None, None]
         rows = kept[low] * (1 - part) + kept[high] * part
     return np.ascontiguousarray(np.moveaxis(rows, 0, axis))
