@@ -20,8 +20,9 @@ WORD = 22
 
 
 def diagrams_figure(names: Sequence[str], measures: Sequence[Any]) -> Figure:
-    """Return a figure of the curvature diagrams of scans of one unit, on axes that all share."""
-    across, up = shown_window([each.diagram for each in measures])
+    """Return a figure of the curvature diagrams of scans of one unit, on axes that all share; of some none is known."""
+    known = [each.diagram for each in measures if each.diagram.area > 0]
+    across, up = shown_window(known) if known else ((0.0, 1.0), (0.0, 1.0))
     columns, rows = min(DIAGRAMS, len(names)), -(-len(names) // DIAGRAMS)
     ratio = min(1.6, (up[1] - up[0]) / (across[1] - across[0]))
     figure = make_figure(2.6 * columns, (2.1 * ratio + 0.6) * rows, layout="constrained")
@@ -30,9 +31,13 @@ def diagrams_figure(names: Sequence[str], measures: Sequence[Any]) -> Figure:
         if k >= len(names):
             axes.set_axis_off()
             continue
+        axes.set_title(plain(shorten(names[k])), fontsize=9)
+        if not measures[k].diagram.area > 0:
+            axes.text(0.5, 0.5, "no surface", ha="center", transform=axes.transAxes, color=QUIET)
+            axes.set(xticks=[], yticks=[])
+            continue
         limits = min(across[0], up[0]), max(across[1], up[1])
         diagram_on(axes, measures[k].diagram, limits=limits, unit=measures[k].unit, window=(across, up))
-        axes.set_title(plain(shorten(names[k])), fontsize=9)
         axes.tick_params(labelsize=7)
         for label in (axes.xaxis.label, axes.yaxis.label):
             label.set_fontsize(8)

@@ -64,9 +64,10 @@ def test_workers_measure_the_same(scans: list[Path], tmp_path: Path) -> None:
 def test_compartments_have_rows(scans: list[Path], tmp_path: Path) -> None:
     labels = np.ones((56, 56, 56), np.uint8)
     labels[28:] = 2
+    labels[24:32, :6, :6] = 3  # without structure
     region = save(Field(labels, (0.02,) * 3, "mm"), tmp_path / "roi.nii.gz")
     assert call("measure", scans[0], "--roi", region, "--kind", "mask", "-o", tmp_path / "out").exit_code == 0
-    assert {row["compartment"] for row in rows_of(tmp_path / "out" / "measures.csv")} == {"1", "2"}
+    assert {row["compartment"] for row in rows_of(tmp_path / "out" / "measures.csv")} == {"1", "2", "3"}
     assert "r45.nii.gz, compartment 2" in (tmp_path / "out" / "measures.html").read_text(encoding="utf-8")
 
 
