@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import error_console, say, say_notes
+from curvafit.cli.console import command_line, error_console, say, say_notes
 from curvafit.cli.options import Crew, Reading, command, parse_numbers, parse_whole_triple
 
 if TYPE_CHECKING:
@@ -86,6 +86,7 @@ def _build_and_preview(out: Path, spec: SetSpec, count: int, crew: Crew) -> None
     """Make the cases of a set and a picture of some, and print where they are listed and drawn."""
     from curvafit.core.checks import check_int
     from curvafit.core.files import check_folder
+    from curvafit.data_synth.card import write_card
     from curvafit.data_synth.sets import MOST, build_set, check_set, list_cases, write_preview
 
     check_int(count, "a count of at least 1 case", 1, MOST)
@@ -95,11 +96,12 @@ def _build_and_preview(out: Path, spec: SetSpec, count: int, crew: Crew) -> None
         crew.check_memory(spec.recipe.largest)
     with crew.start() as (workers, progress):
         build_set(out, spec, count, progress, workers=workers)
-    preview = write_preview(out)
+    preview, card = write_preview(out), write_card(out, command_line())
     if (total := len(list_cases(out))) > count:
         say(f"note: {out} holds {total} cases, more than --count {count}: all are listed", to=error_console())
     say(str(out / "dataset.json"))
     say(str(preview))
+    say(str(card))
 
 
 def _choose_source(laws: list[str], atlas: Path | None, filled: float | None) -> ShapeSource:

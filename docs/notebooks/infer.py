@@ -28,7 +28,7 @@ print(flow.status)
 
 # %%
 scan = curvafit.Field(flow.field.numpy(), (20.0, 20.0, 20.0), "um")
-fewer = {"simulations": 6, "rounds": 2, "twins": 2}  # shapes than by default, so that this page is made soon
+fewer = {"simulations": 4, "rounds": 1, "twins": 2}  # shapes than by default, so that this page is made soon
 inference = curvafit.infer(scan, kind="field", periodic=True, seed=1, **fewer)
 fit = inference.fit
 print(fit.status)

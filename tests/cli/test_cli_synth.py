@@ -31,7 +31,7 @@ def test_a_set_from_a_store(tmp_path, store):
     out = tmp_path / "Dataset001_S"
     result = call("synth", "-o", out, "--atlas", store, "--modality", "confocal", *QUICK)
     assert result.exit_code == 0, (result.output, result.exception)
-    assert [Path(line).name for line in result.stdout.splitlines()] == ["dataset.json", "preview.png"]
+    assert [Path(line).name for line in result.stdout.splitlines()] == ["dataset.json", "preview.png", "card.md"]
     assert listed(out)["numTraining"] == 2 and listed(out)["channel_names"] == {"0": "confocal"}
     assert (out / "preview.png").read_bytes().startswith(b"\x89PNG")
     image = load(out / "imagesTr" / "case_00001_0000.nii.gz")

@@ -13,6 +13,7 @@ import pytest
 from flat_recipe import FLAT, SHAPE, flat_recipe
 
 from curvafit.data_synth import sets
+from curvafit.data_synth.card import write_card
 from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.imaging.modality import Imaging
 from curvafit.data_synth.sets import SetSpec, build_set, make_cases, read_spec, write_preview
@@ -255,3 +256,26 @@ def test_a_damaged_record_of_a_case_is_one_sentence(tmp_path, order, text):
     (folder / "cases" / "case_00000.json").write_text(text)
     with pytest.raises(ValueError, match="case_00000.json"):
         write_preview(folder)
+
+
+def test_the_card_tells_what_a_set_is_and_spares_another_s(tmp_path, order):
+    folder = build_set(tmp_path / "set", order, 2)
+    text = write_card(folder, "curvafit synth -o set").read_text(encoding="utf-8")
+    recipe = order.recipe
+    assert "| cases | 2 |" in text
+    assert " x ".join(map(str, recipe.shape)) in text
+    assert recipe.modality.name in text and all(name in text for name in recipe.modality.ranges)
+    assert "`curvafit synth -o set`" in text
+    build_set(folder, order, 3)
+    assert "| cases | 3 |" in write_card(folder).read_text(encoding="utf-8")
+    (folder / "card.md").write_text("my own words")
+    assert write_card(folder).read_text(encoding="utf-8") == "my own words"
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"mask_fraction": 0.1}'])
+def test_a_card_of_a_damaged_record_is_one_sentence(tmp_path, order, text):
+    folder = build_set(tmp_path / "set", order, 1)
+    (folder / "cases" / "case_00000.json").write_text(text)
+    with pytest.raises(ValueError, match="case_00000.json"):
+        write_card(folder)
+    assert not (folder / "card.md").exists()

@@ -170,7 +170,7 @@ def cases(seed: int) -> Iterator[Case]:
 def _folders() -> Iterator[Case]:
     """Commands that fill a folder: what is in it already stays."""
     names = {
-        "synth": ((*_SYNTH, "-o", "home"), ("curvafit.json", "dataset.json", "preview.png",
+        "synth": ((*_SYNTH, "-o", "home"), ("curvafit.json", "dataset.json", "preview.png", "card.md",
             "imagesTr/case_00000_0000.nii.gz", "notes.txt")),
         "build": (tuple("home" if part == "OUT" else part for part in _BUILD), ("zarr.json", "draws/000000/zarr.json",
             "notes.txt", ".hidden")),
@@ -186,7 +186,7 @@ def _folders() -> Iterator[Case]:
             setup = _planting(f"home/{file}")
             yield Case(f"belongings/{name}/{file}", setup, command, quick=name not in ("infer", "map"))
         for what in ("link-to-folder", "set", "image", "store-of-shapes", "link-to-store"):
-            own = ("home/dataset.json", "home/preview.png") if (name, what) == ("synth", "set") else ()
+            own = ("home/dataset.json", "home/preview.png", "home/card.md") if (name, what) == ("synth", "set") else ()
             put = BELONGINGS[what]("home")
             yield Case(f"belongings/{name}/{what}", put, command, own, quick=name not in ("infer", "map"))
 

@@ -42,7 +42,9 @@ SCENES: dict[str, tuple[tuple[str, ...], tuple[str, ...], Setup, tuple[str, ...]
         ("atlas", "extract", "{larder}/store.zarr", "-o", "atlas.npz"), (), taking("atlas.npz"), ("atlas.npz",),
     ),
     "synth": ((*_SET, "--count", "2"), ("set", "set/*"), nothing, ()),
-    "synth-more": ((*_SET, "--count", "5"), ("set/*",), taking("set"), ("set/dataset.json", "set/preview.png")),
+    "synth-more": (
+        (*_SET, "--count", "5"), ("set/*",), taking("set"), ("set/dataset.json", "set/preview.png", "set/card.md"),
+    ),
     "sample": (("samples", "get", "synthetic", "-o", "out.nii.gz"), (), nothing, ()),
 }  # fmt: skip
 
