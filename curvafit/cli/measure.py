@@ -62,9 +62,12 @@ def measure(
     folder = out if out is not None and (out.is_dir() or not out.suffix) else None
     if folder is not None and labels:
         raise ValueError("--labels measures instances, which have no page: give the name of a table with -o")
-    store = None if out is None else (place := out.absolute()).with_name(f".{place.name}.curvafit-tiles")
+    if folder is not None and not folder.name:
+        raise ValueError(f"give the name of a table or of a folder of its own with -o, got {out}")
+    store = None if out is None else out.with_name(f".{out.name}.curvafit-tiles")
     with _keep_tiles(store):
         with show_stages() as progress:
+            from curvafit.core.runtime import sub_progress
             from curvafit.studies.groups import read_columns
             from curvafit.studies.scans import check_units, measure_each
             from curvafit.studies.tables import COLUMNS, OF_PARTS, check_table, write_table
@@ -74,7 +77,8 @@ def measure(
                 from curvafit.report.measures import check_measures, write_measures
 
                 check_measures(folder, inputs, overwrite, command_line())
-                check_units(scans, **reading)
+                check_units(scans, sub_progress(progress, 0.0, 0.05), **reading)
+                progress = sub_progress(progress, 0.05, 1.0)
             elif out is not None:
                 check_table(out, inputs, overwrite)
             told = None if subjects is None else read_columns(subjects, scans, (*COLUMNS, *OF_PARTS))
@@ -82,7 +86,7 @@ def measure(
             found = measure_each(scans, labels=labels, workers=workers, progress=progress, **how, **reading)
             if folder is not None:
                 progress("drawing the page", 1.0)
-                what = {"columns": told, "options": {"tile": tile} | structure | reading}
+                what = {"columns": told, "options": {"roi": roi, "tile": tile} | structure | reading}
                 whole = [each for (each,) in found]
                 say(str(write_measures(whole, folder, command=command_line(), overwrite=overwrite, **what)))
                 return

@@ -39,7 +39,7 @@ def windows(
         from curvafit.report.windows import check_windows, write_windows
         from curvafit.studies.windows import windows as measure_windows
 
-        check_windows(out, scan, overwrite, command_line(), laws)
+        check_windows(out, scan, overwrite, command_line())
         how = {"clusters": clusters, "laws": laws, "seed": seed, "progress": progress}
         found = measure_windows(scan, *grid, **how, **structure, **reading)
         progress("drawing the page", 1.0)

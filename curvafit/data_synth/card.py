@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,7 @@ def _card(folder: Path, spec: SetSpec, command: str) -> Iterator[str]:
     shares = [record["mask_fraction"] for record in records]
     made = records[0]["versions"] if records else {}
     yield MARK
-    yield f"# {folder.resolve().name}\n"
+    yield f"# {_quote(folder.resolve().name)}\n"
     yield "Synthetic 3D images of generated shapes, with labels that are exact because the shapes are known.\n"
     yield "![Some of the cases](preview.png)\n"
     rows = {
@@ -67,7 +68,7 @@ def _card(folder: Path, spec: SetSpec, command: str) -> Iterator[str]:
     yield "Images are simulated: a network that has seen these alone has seen no scan. A mask is where the structure"
     yield "is, not what an annotator would draw on the image. No person, animal or sample is shown."
     yield "\n## How they were made\n"
-    how = {"command": f"`{command}`" if command else "", "seed": recipe.seed}
+    how = {"command": _quote(command) if command else "", "seed": recipe.seed}
     how |= {name: made[name] for name in ("curvafit", "torch", "numpy") if name in made}
     yield from _table(("what", ""), ((name, value) for name, value in how.items() if value != ""))
     first = f"{RECORDS}/{case_name(0)}.json"
@@ -77,10 +78,13 @@ def _card(folder: Path, spec: SetSpec, command: str) -> Iterator[str]:
 def _describe_source(source: Any) -> Iterator[str]:
     """Yield the lines on where shapes come from."""
     if not isinstance(source, Generated):
-        places = ", ".join(f"`{path}`" for path in source.paths)
-        yield f"Random crops of the {source.draws} shapes of {places}, turned."
+        stores = ", ".join(_quote(path.name) for path in source.paths)
+        how = "by any angle" if source.rotate else "by the symmetries of the cube"
+        yield f"Random crops of the {source.draws} shapes of {stores}, turned {how}."
         return
-    filled = f", to a volume fraction of {format_number(source.fraction)}" if source.fraction else ""
+    filled = (
+        f", to a volume fraction of {format_number(source.fraction)} in place of the mass" if source.fraction else ""
+    )
     yield f"Grown by these laws in turn, in working units{filled}:\n"
     rows = [(name, *map(format_number, point)) for name, point in zip(source.names, source.points, strict=True)]
     yield from _table(("law", *PARAMETERS), rows[:MOST_LAWS])
@@ -96,6 +100,12 @@ def _read_records(folder: Path) -> Iterator[dict[str, Any]]:
         if not isinstance(record, dict) or not {"mask_fraction", "versions"} <= record.keys():
             raise ValueError(f"{place} is not the record of a case")
         yield record
+
+
+def _quote(text: str) -> str:
+    """Return a text as code in Markdown, whatever signs it has."""
+    fence = "`" * (1 + max((len(run) for run in re.findall("`+", text)), default=0))
+    return f"{fence} {text} {fence}" if "`" in text else f"`{text}`"
 
 
 def _range(values: Sequence[float], percent: bool = False) -> str:

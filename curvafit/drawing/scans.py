@@ -26,12 +26,12 @@ def diagrams_figure(names: Sequence[str], measures: Sequence[Any]) -> Figure:
     columns, rows = min(DIAGRAMS, len(names)), -(-len(names) // DIAGRAMS)
     ratio = min(1.6, (up[1] - up[0]) / (across[1] - across[0]))
     figure = make_figure(2.6 * columns, (2.1 * ratio + 0.6) * rows, layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    panels, words = figure.subplots(rows, columns, squeeze=False).ravel(), shorten(names)
     for k, axes in enumerate(panels):
         if k >= len(names):
             axes.set_axis_off()
             continue
-        axes.set_title(plain(shorten(names[k])), fontsize=9)
+        axes.set_title(plain(words[k]), fontsize=9)
         if not measures[k].diagram.area > 0:
             axes.text(0.5, 0.5, "no surface", ha="center", transform=axes.transAxes, color=QUIET)
             axes.set(xticks=[], yticks=[])
@@ -65,11 +65,27 @@ def intervals_figure(names: Sequence[str], measures: Sequence[Any]) -> Figure:
         axes.set_axisbelow(True)
         axes.tick_params(length=2, labelsize=8)
         axes.spines[:].set_color(QUIET)
-    panels[0, 0].set_yticks(places, [plain(shorten(name)) for name in names])
+    panels[0, 0].set_yticks(places, [plain(name) for name in shorten(names)])
     panels[0, 0].set_ylim(0.4, len(names) + 0.6)
     return figure
 
 
-def shorten(name: str) -> str:
-    """Return a name that a panel has room for: its beginning and its end."""
-    return name if len(name) <= WORD else f"{name[: WORD // 2 - 1]}…{name[-WORD // 2 :]}"
+def shorten(names: Sequence[str]) -> list[str]:
+    """Return names that a panel has room for: without what all begin and end with, where one is too long.
+
+    What is still too long keeps its beginning and its end, and a number where two would be alike.
+    """
+    if max(map(len, names), default=0) <= WORD:
+        return list(names)
+    if len(names) > 1:
+        start, stop = _count_alike(names), _count_alike([name[::-1] for name in names])
+        names = [name[start : max(len(name) - stop, start)] or name for name in names]
+    short = [name if len(name) <= WORD else f"{name[: WORD // 2 - 1]}…{name[-WORD // 2 :]}" for name in names]
+    return [name if short.count(name) == 1 else f"{k} {name}" for k, name in enumerate(short, 1)]
+
+
+def _count_alike(names: Sequence[str]) -> int:
+    """Return how many signs names begin with alike, up to the last one between words."""
+    least = min(map(len, names))
+    alike = next((k for k in range(least) if len({name[k] for name in names}) > 1), least)
+    return next((k for k in range(alike, 0, -1) if names[0][k - 1] in "/_-. ,"), 0)

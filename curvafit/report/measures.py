@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -52,6 +53,8 @@ def write_measures(
     `overwrite`. `columns` has further columns of each scan, such as its subject; `options` and `command` are for the
     record.
     """
+    if not measures:
+        raise ValueError("expected at least one scan, got none")
     target = check_measures(directory, overwrite=overwrite, command=command)
     measures = [each.convert(measures[0].unit) for each in measures]
     told = columns or [{}] * len(measures)
@@ -67,10 +70,10 @@ def write_measures(
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": command,
         "unit": measures[0].unit,
-        "options": {key: str(value) for key, value in (options or {}).items()},
+        "options": json.loads(json.dumps(dict(options or {}), default=str)),
         "status": describe_range(parts),
         "scans": [{"scan": each.source, "kind": each.kind, "notes": list(each.notes)} for each in measures],
-        "notes": list(say_notes(measures)),
+        "notes": list(say_notes(parts)),
         "files": list(FILES),
     }
     texts = {
@@ -136,15 +139,14 @@ def describe_range(parts: Sequence[Measures]) -> str:
     """Return what the numbers of scans of one unit span, in some sentences."""
     said, names = [], name_parts(parts)
     for symbol in ("BV/TV", "Tb.Th", "Tb.Sp"):
-        known = {name: part[symbol] for name, part in zip(names, parts, strict=True)}
-        known = {name: each for name, each in known.items() if math.isfinite(each.value)}
+        known = [(part[symbol], name) for name, part in zip(names, parts, strict=True)]
+        known = [each for each in known if math.isfinite(each[0].value)]
         if not known:
             continue
-        ends = [end(known, key=lambda name: known[name].value) for end in (min, max)]
-        least = known[ends[0]]
+        (least, first), (most, last) = (end(known, key=lambda each: each[0].value) for end in (min, max))
         unit = power_name(parts[0].unit, least.power)
-        values = [f"{format_number(known[name].value)} {unit}".strip() for name in ends]
-        span = f"from {values[0]} ({ends[0]}) to {values[1]} ({ends[1]})" if len(known) > 1 else values[0]
+        values = [f"{format_number(each.value)} {unit}".strip() for each in (least, most)]
+        span = f"from {values[0]} ({first}) to {values[1]} ({last})" if len(known) > 1 else values[0]
         said.append(f"{least.name[0].upper()}{least.name[1:]} {span}.")
     return " ".join(said)
 

@@ -25,19 +25,18 @@ FILES = ("windows.json", "windows.html", "windows.csv", "windows.svg", "windows.
 COMBINATIONS = tuple(f"L{k}" for k in range(1, 1 + len(PARAMETERS)))
 
 
-def list_files(source: str | Path, laws: bool = False) -> tuple[str, ...]:
-    """Return the names of all files: the maps of a Zarr store are Zarr stores, of any other scan NIfTI."""
+def list_files(source: str | Path) -> tuple[str, ...]:
+    """Return the names of all files: the maps of a Zarr store are Zarr stores, of any other scan NIfTI.
+
+    The last are the maps of combinations, which are written with laws only.
+    """
     suffix = ".ome.zarr" if ".zarr" in str(source).lower() else ".nii.gz"
-    names = ("clusters", *NAMES, *(COMBINATIONS if laws else ()))
-    return (*FILES, *(f"{name.replace(' ', '_')}{suffix}" for name in names))
+    return (*FILES, *(f"{name.replace(' ', '_')}{suffix}" for name in ("clusters", *NAMES, *COMBINATIONS)))
 
 
-def check_windows(
-    directory: str | Path, source: str | Path = "", overwrite: bool = False, command: str = "", laws: bool = False
-) -> Path:
+def check_windows(directory: str | Path, source: str | Path = "", overwrite: bool = False, command: str = "") -> Path:
     """Return the folder if `write_windows` can write there, else raise ValueError; call it before the work."""
-    files = list_files(source, laws)
-    return check_result_folder(FORMAT, files, directory, [source] if source else [], overwrite, command)
+    return check_result_folder(FORMAT, list_files(source), directory, [source] if source else [], overwrite, command)
 
 
 def write_windows(windows: Windows, directory: str | Path, *, command: str = "", overwrite: bool = False) -> Path:
@@ -47,8 +46,8 @@ def write_windows(windows: Windows, directory: str | Path, *, command: str = "",
     ValueError without `overwrite`. `command` is what the record calls the command line.
     """
     source, laws = windows.clusters.source, bool(windows.options["laws"])
-    target, files = check_windows(directory, source, overwrite, command, laws), list_files(source, laws)
-    record = record_study(windows, command, files)
+    target, files = check_windows(directory, source, overwrite, command), list_files(source)
+    record = record_study(windows, command, files if laws else files[: -len(COMBINATIONS)])
     record |= {"scan": source, "kind": windows.kind, "explained": windows.explained}
     figure = windows_figure(windows)
     picture = picture_of(figure, "The structure, coloured by clusters and by six numbers")
@@ -65,8 +64,8 @@ def write_windows(windows: Windows, directory: str | Path, *, command: str = "",
         provenance=[(name, record[name]) for name in ("scan", "command", "date", "options") if record[name]],
     )
     texts = {"windows.html": page, "windows.csv": format_csv(list(_rows(windows)))}
-    fields = (windows.clusters, *(windows[name] for name, *_ in windows.quantities))
-    maps = dict(zip(files[len(FILES) :], fields, strict=True))
+    fields = (windows.clusters, *(windows[symbol] for _, symbol, _ in windows.quantities))
+    maps = dict(zip(files[len(FILES) :], fields, strict=False))
     return write_study(target, FORMAT, files, record, texts, {"windows": (figure, picture)}, maps)
 
 

@@ -109,9 +109,9 @@ def _tell(progress: Progress, name: str, text: str, share: float) -> None:
 
 def _bin_diagrams(measures: Measures) -> Measures:
     """Return measures whose diagram, and those of its compartments, are binned finely."""
-    parts = {label: _bin_diagrams(each) for label, each in measures.compartments.items()}
-    fine = measures.diagram.bin(FINE / measures["thickness"].value) if measures.diagram.area > 0 else measures.diagram
-    return replace(measures, diagram=fine, compartments=parts)
+    width = FINE / measures["thickness"].value
+    fine = {label: replace(each, diagram=each.diagram.bin(width)) for label, each in measures.compartments.items()}
+    return replace(measures, diagram=measures.diagram.bin(width), compartments=fine)
 
 
 def stack_numbers(measures: Sequence[Measures]) -> tuple[np.ndarray, np.ndarray]:
@@ -147,7 +147,7 @@ def merge_notes(measures: Sequence[Measures]) -> Iterator[tuple[list[int], str]]
 
 
 def say_notes(measures: Sequence[Measures]) -> Iterator[str]:
-    """Yield the scans' notes (`merge_notes`), each with how many have it, unless all have."""
+    """Yield the notes of scans, or of parts of scans (`merge_notes`), each with how many have it, unless all have."""
     for scans, note in merge_notes(measures):
         yield note if len(scans) == len(measures) else f"Of {len(scans)} of {len(measures)} scans: {note}"
 
@@ -174,9 +174,14 @@ def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progr
     return next(iter(units)), notes
 
 
-def check_units(scans: Sequence[str], **reading: Any) -> None:
+def check_units(scans: Sequence[str], progress: Progress = silent, **reading: Any) -> None:
     """Raise ValueError where only some scans have a physical unit; of files that can be read in boxes no voxel is."""
-    _check_mixture({boxes_of(scan, **reading).frame.unit: scan for scan in scans})
+    units: dict[str, str] = {}
+    for k, scan in enumerate(scans):
+        progress(f"{scan}: reading", k / len(scans))
+        with _named(scan):
+            units.setdefault(boxes_of(scan, **reading).frame.unit, scan)
+    _check_mixture(units)
 
 
 def _check_mixture(units: Mapping[str, str]) -> None:

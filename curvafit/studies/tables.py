@@ -49,7 +49,9 @@ def check_table(path: str | PathLike[str], inputs: Sequence[str | Path] = (), ov
     """Return the path of a table that may be written, else raise ValueError; ImportError for Parquet without pandas."""
     target = Path(path)
     if target.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"the name of a table must end in {', '.join(SUFFIXES)}, got {target}")
+        raise ValueError(
+            f"the name of a table must end in {', '.join(SUFFIXES)}, and a folder's has no suffix, got {target}"
+        )
     if target.suffix.lower() == ".parquet":
         _pandas()
     return can_write(target, _ours, inputs=inputs, overwrite=overwrite)

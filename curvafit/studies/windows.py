@@ -130,7 +130,9 @@ class Windows(Pictured):
             var={"symbol": list(symbols), "unit": [plain_unit(self.unit, power) for power in powers]},
             obsm={"spatial": self.centres[self.known][:, ::-1].copy()},
         )
-        table.var_names = list(names)
+        table.var_names = [
+            symbol if names.count(name) > 1 else name for name, symbol in zip(names, symbols, strict=True)
+        ]
         return table
 
 

@@ -266,6 +266,7 @@ def test_the_card_tells_what_a_set_is_and_spares_another_s(tmp_path, order):
     assert " x ".join(map(str, recipe.shape)) in text
     assert recipe.modality.name in text and all(name in text for name in recipe.modality.ranges)
     assert "`curvafit synth -o set`" in text
+    assert "`` curvafit synth -o 's`t' ``" in write_card(folder, "curvafit synth -o 's`t'").read_text(encoding="utf-8")
     build_set(folder, order, 3)
     assert "| cases | 3 |" in write_card(folder).read_text(encoding="utf-8")
     (folder / "card.md").write_text("my own words")

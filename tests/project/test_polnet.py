@@ -43,12 +43,17 @@ class Factory:
 
     @classmethod
     def register(cls, name: str) -> Any:
-        return lambda kind: cls.kinds.setdefault(name, kind)
+        def keep(kind: Any) -> Any:
+            cls.kinds[name] = kind
+            return kind
+
+        return keep
 
 
 @pytest.fixture
 def made(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The generator that PolNet's factory has under the name `curvatubes`."""
+    Factory.register("curvatubes")(Generator)  # as PolNet's module does when it is imported
     for name, content in {
         "polnet": {}, "polnet.sample": {}, "polnet.sample.membranes": {},
         "polnet.sample.membranes.mb": {"MbError": Error},
@@ -61,6 +66,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Any:
     spec = importlib.util.spec_from_file_location("curvafit_membranes", FILE)
     assert spec is not None and spec.loader is not None
     spec.loader.exec_module(importlib.util.module_from_spec(spec))
+    assert Factory.kinds["curvatubes"] is not Generator
     return Factory.kinds["curvatubes"]
 
 

@@ -11,6 +11,7 @@ import pytest
 from calling import call, refused
 from found import lattice
 
+from curvafit.drawing.scans import WORD, shorten
 from curvafit.report.measures import FILES, describe_range, name_parts
 from curvafit.scan.measure import Measures, measure
 from curvafit.volumes.field import Field
@@ -65,10 +66,15 @@ def test_compartments_have_rows(scans: list[Path], tmp_path: Path) -> None:
     labels = np.ones((56, 56, 56), np.uint8)
     labels[28:] = 2
     labels[24:32, :6, :6] = 3  # without structure
+    labels[(lattice(56, 28, 6.0) > 0) & ~(lattice(56, 28, 4.5) > 0) & (labels == 2)] = 4  # a shell of background
     region = save(Field(labels, (0.02,) * 3, "mm"), tmp_path / "roi.nii.gz")
-    assert call("measure", scans[0], "--roi", region, "--kind", "mask", "-o", tmp_path / "out").exit_code == 0
-    assert {row["compartment"] for row in rows_of(tmp_path / "out" / "measures.csv")} == {"1", "2", "3"}
-    assert "r45.nii.gz, compartment 2" in (tmp_path / "out" / "measures.html").read_text(encoding="utf-8")
+    twin = tmp_path / "twin.nii.gz"
+    twin.write_bytes(scans[0].read_bytes())
+    done = call("measure", scans[0], twin, "--roi", region, "--kind", "mask", "-o", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    assert {row["compartment"] for row in rows_of(tmp_path / "out" / "measures.csv")} == {"1", "2", "3", "4"}
+    page = (tmp_path / "out" / "measures.html").read_text(encoding="utf-8")
+    assert "r45.nii.gz, compartment 2" in page and "No intervals" in page  # the note of a compartment
 
 
 def test_scans_that_do_not_go_together_are_refused(scans: list[Path], tmp_path: Path) -> None:
@@ -76,10 +82,21 @@ def test_scans_that_do_not_go_together_are_refused(scans: list[Path], tmp_path: 
     np.save(bare, (lattice(56, 28, 5.0) > 0).astype(np.uint8))
     refused(call("measure", bare, *scans, "-o", tmp_path / "out"), "physical spacing", progress=True)
     refused(call("measure", scans[0], "--labels", "-o", tmp_path / "out"), "no page", progress=True)
+    refused(call("measure", scans[0], "-o", "/"), "of its own")
+    refused(call("measure", scans[0], "-o", tmp_path / "study.v2"), "no suffix", progress=True)
     empty = save(Field(np.zeros((40, 40, 40), np.uint8), (0.02,) * 3, "mm"), tmp_path / "empty.nii.gz")
     refused(call("measure", scans[0], empty, "-o", tmp_path / "out"), "empty.nii.gz", progress=True)
     assert not (tmp_path / "out").exists()
     assert sorted(each.name for each in tmp_path.iterdir()) == ["bare.npy", "empty.nii.gz"]
+
+
+def test_names_that_are_too_long_stay_apart() -> None:
+    assert shorten(["a.tif", "b.tif"]) == ["a.tif", "b.tif"]
+    assert shorten([f"/data/study/mouse{k}/day0/scan.tif" for k in (1, 2)]) == ["mouse1", "mouse2"]
+    assert shorten([f"sub-01_ses-0{k}_T1weighted.nii.gz" for k in (1, 2)]) == ["01", "02"]
+    long = [f"{'x' * 20}{k}{'y' * 20}" for k in range(3)]
+    assert len(set(shorten(long))) == 3
+    assert max(map(len, shorten(long))) <= WORD + 2
 
 
 def test_names_and_the_sentence_of_the_range(scans: list[Path]) -> None:

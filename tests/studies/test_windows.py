@@ -7,6 +7,7 @@ import json
 import sys
 from pathlib import Path
 
+import nibabel
 import numpy as np
 import pytest
 from calling import call, refused
@@ -138,8 +139,10 @@ def test_the_laws_of_windows_are_those_of_their_crops(tmp_path: Path, monkeypatc
         assert not why
         assert values == pytest.approx([each.value for each in found], abs=1e-9)
     assert told[0] != told[1]
-    maps = sorted(each.name for each in (tmp_path / "out").glob("L*"))
-    assert maps == [f"L{k}.nii.gz" for k in range(1, 7)]
+    maps = [nibabel.load(tmp_path / "out" / f"L{k}.nii.gz").get_fdata().ravel() for k in range(1, 7)]
+    np.testing.assert_allclose(np.transpose(maps), told, rtol=1e-6)
+    assert call("windows", scan, "--size", 56, "--stride", 56, "-o", tmp_path / "out", "--overwrite").exit_code == 0
+    assert not list((tmp_path / "out").glob("L*"))
 
 
 def test_windows_become_anndata(mapped: Windows) -> None:
