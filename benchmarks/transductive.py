@@ -2,10 +2,11 @@
 
 A shape of 64³ (two laws off the presets, `trabec`, and a block of real bone, $CURVAFIT_DATA) is blurred, under noise
 of two contrasts; slices 21 and 42 are annotated, and a small U-Net learns from them. All ways share network, patches,
-steps and their first third, which is Dice + CE alone (`plain`). `area`, `willmore`, `law` and `wrong` add the energy of
-all voxels: the law is that of another volume's mask, the wrong one another texture's. `teacher` is a mean teacher;
-`pseudo` learns what `reconstruct` fills from slices and image, each voxel as sure as it is. `refine` (the law) and
-`repair` work on what `plain` predicts. Weights are chosen for each texture and way by slice 32, on a seed of its own.
+steps and their first third, which is Dice + CE alone (`plain`). `area`, `willmore`, `law` and `wrong` add the energy
+of all voxels: the law is that of another volume's mask, the wrong one another texture's. `teacher` is a mean teacher;
+`pseudo` learns what `reconstruct` fills from slices and image, each voxel as sure as it is; `filled` is that itself,
+without a network. `refine` (the law) and `repair` work on what `plain` predicts. Weights are chosen for each texture
+and way by slice 32, on a seed of its own.
 
 Scores are those of the slices that nobody annotated. Differences pair networks by seed, with 95 % intervals of a
 bootstrap over textures and seeds; p of Holm over two contrasts, `law` less `plain` and less `willmore`.
@@ -51,7 +52,7 @@ WEIGHTS: dict[str, tuple[float, ...]] = {
 WEIGHTS |= {"plain": (0.0,), "teacher": (1.0, 10.0), "pseudo": (0.0,)}
 #: Ways that work on what `plain` predicts.
 AFTER = ("refine", "repair")
-WAYS = ("plain", "area", "willmore", "law", "wrong", "teacher", "pseudo", *AFTER)
+WAYS = ("plain", "area", "willmore", "law", "wrong", "teacher", "pseudo", *AFTER, "filled")
 #: The seed by which weights are chosen, and that of the volume that the law is read from.
 TUNING, OTHER = 100, 200
 #: Steps over which a prior grows to its weight, and the memory of a mean teacher.
@@ -123,6 +124,16 @@ def soft_loss(logits: Tensor, target: Tensor) -> Tensor:
     return 1 - overlap + functional.binary_cross_entropy_with_logits(logits, y, sure)
 
 
+def filled(texture: str, seed: int, cases: Cases) -> np.ndarray:
+    """Return the probabilities that `reconstruct` gives a volume, from two slices and its image."""
+    truth = truth_of(texture, seed, cases)
+    slices = np.zeros(truth.shape, np.uint8)
+    slices[list(KNOWN)] = truth[list(KNOWN)]
+    found = reconstruct(slices, known=KNOWN, image=image_of(truth, seed))
+    assert found.probability is not None
+    return found.probability.values.astype(np.float32)
+
+
 def train(way: str, weight: float, texture: str, seed: int, steps: int, cases: Cases) -> np.ndarray:
     """Return the probabilities of a network that was taught two slices of a volume, for all of it."""
     truth = truth_of(texture, seed, cases)
@@ -130,9 +141,7 @@ def train(way: str, weight: float, texture: str, seed: int, steps: int, cases: C
     target[list(KNOWN)] = truth[list(KNOWN)]
     criterion: Callable[[Tensor, Tensor], Tensor] = dice_ce
     if way == "pseudo":
-        slices = np.where(target == UNKNOWN, 0, target).astype(np.uint8)
-        found = reconstruct(slices, known=KNOWN, image=image)
-        target, criterion = found.probability.values.astype(np.float32), soft_loss  # type: ignore[union-attr]
+        target, criterion = filled(texture, seed, cases), soft_loss
     torch.manual_seed(seed)
     net = network().to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
     teacher = copy.deepcopy(net).requires_grad_(False)
@@ -184,7 +193,10 @@ def predicted(way: str, weight: float, texture: str, seed: int, steps: int, case
 
 def case(way: str, weight: float, texture: str, seed: int, steps: int, cases: Cases) -> Values:
     """Return the scores of a way on the slices that nobody annotated, and the Dice of the slice that judges."""
-    p = predicted("plain" if way in AFTER else way, 0.0 if way in AFTER else weight, texture, seed, steps, cases)
+    if way == "filled":
+        p = filled(texture, seed, cases)
+    else:
+        p = predicted("plain" if way in AFTER else way, 0.0 if way in AFTER else weight, texture, seed, steps, cases)
     truth, mask, said = truth_of(texture, seed, cases), p > 0.5, ""
     if way == "refine":
         truths = truth_of(texture, TUNING, cases).astype(np.uint8)
