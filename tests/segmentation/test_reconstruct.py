@@ -132,8 +132,9 @@ def test_laws_are_tried_on_a_box_of_an_example(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.slow
-def test_an_example_tunes_the_network_where_that_is_better() -> None:
+def test_an_example_tunes_the_network_where_that_is_better(monkeypatch: pytest.MonkeyPatch) -> None:
     """Discs that end between slices: the network cannot know where, and learns it from others."""
+    monkeypatch.setattr("curvafit.segmentation.teach.TUNING", 90)  # lessons enough for discs
     truth, other = pancakes(1, seed=1), np.concatenate([pancakes(1, seed=k) for k in (2, 3, 4)], axis=2)
     alone, tuned = reconstruct(truth, every=8), reconstruct(truth, every=8, example=other)
     assert "tuned on the example" in tuned.status
@@ -503,7 +504,8 @@ def test_the_command_writes_labels(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_law_of_each_label_is_inferred_from_the_example(tmp_path: Path) -> None:
+def test_the_law_of_each_label_is_inferred_from_the_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("curvafit.segmentation.teach.TUNING", 20)  # the network is not what this is about
     scan, example, out = tmp_path / "labels.npy", tmp_path / "example.npy", tmp_path / "volume.npy"
     np.save(scan, organelles())
     np.save(example, organelles(3))
