@@ -57,19 +57,13 @@ def measure(
         raise ValueError("--labels states the structure: leave out --roi, --kind, --periodic, --threshold and --dark")
     if labels and tile is not None:
         raise ValueError("--labels measures instances, each in its own box: leave out --tile")
-    if subjects is not None and out is None:
-        raise ValueError("--subjects is for the table: give its name with -o")
-    folder = out if out is not None and (out.is_dir() or not out.suffix) else None
-    if folder is not None and labels:
-        raise ValueError("--labels measures instances, which have no page: give the name of a table with -o")
-    if folder is not None and not folder.name:
-        raise ValueError(f"give the name of a table or of a folder of its own with -o, got {out}")
+    folder = _choose_folder(out, labels, subjects)
     store = None if out is None else out.with_name(f".{out.name}.curvafit-tiles")
     with _keep_tiles(store):
         with show_stages() as progress:
             from curvafit.core.runtime import sub_progress
             from curvafit.studies.groups import read_columns
-            from curvafit.studies.scans import check_units, measure_each
+            from curvafit.studies.scans import check_units, count_notes, measure_each
             from curvafit.studies.tables import COLUMNS, OF_PARTS, check_table, write_table
 
             inputs = [*scans, *(each for each in (roi, subjects) if each is not None)]
@@ -88,13 +82,29 @@ def measure(
                 progress("drawing the page", 1.0)
                 what = {"columns": told, "options": {"roi": roi, "tile": tile} | structure | reading}
                 whole = [each for (each,) in found]
-                say(str(write_measures(whole, folder, command=command_line(), overwrite=overwrite, **what)))
-                return
+                written = write_measures(whole, folder, command=command_line(), overwrite=overwrite, **what)
+        if folder is not None:
+            say_notes(tuple(count_notes(whole)))
+            say(str(written))
+            return
         _print_found(found, labels)
         if out is not None:
             columns = None if told is None else [row for row, each in zip(told, found, strict=True) for _ in each]
             table = [each for measures in found for each in measures]
             say(str(write_table(table, out, columns=columns, overwrite=overwrite)))
+
+
+def _choose_folder(out: Path | None, labels: bool, subjects: Path | None) -> Path | None:
+    """Return the folder that an output names, None where it is a table; refuse what does not go with it."""
+    if subjects is not None and out is None:
+        raise ValueError("--subjects is for the table: give its name with -o")
+    if out is None or (out.suffix and not out.is_dir()):
+        return None
+    if labels:
+        raise ValueError("--labels measures instances, which have no page: give the name of a table with -o")
+    if not out.name:
+        raise ValueError(f"give the name of a table or of a folder of its own with -o, got {out}")
+    return out
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from curvafit.report.page import (
 )
 from curvafit.scan.measure import Measures
 from curvafit.studies.compare import BINS, LEVEL, SMOOTH, Comparison, Number
-from curvafit.studies.scans import say_notes
+from curvafit.studies.scans import count_notes
 from curvafit.studies.tables import format_csv, plain_unit, rows_of
 from curvafit.studies.trajectory import Trajectory
 
@@ -134,7 +134,7 @@ def say_kinds(measures: Sequence[Measures]) -> str:
 def describe_measures(measures: Sequence[Measures]) -> list[str]:
     """Return sentences, for a paper, on what was done to scans, how their numbers are made, and what to cite."""
     return [
-        *say_notes(measures),
+        *count_notes(measures),
         "Thickness (Tb.Th) and spacing (Tb.Sp) are mean diameters of the largest balls that fit (Hildebrand & "
         "Rüegsegger 1997); the number per length (Tb.N) is (BV/TV) / Tb.Th; connectivity is that of the Euler number "
         "(Odgaard & Gundersen 1993); the surface (BS) is that of marching cubes of the mask after a Gaussian of "

@@ -19,7 +19,7 @@ from curvafit.drawing.scans import diagrams_figure, intervals_figure
 from curvafit.report.comparison import describe_measures, say_kinds
 from curvafit.report.page import Picture, check_result_folder, picture_of, render_template, write_study
 from curvafit.scan.measure import Measures
-from curvafit.studies.scans import say_notes
+from curvafit.studies.scans import count_notes
 from curvafit.studies.tables import format_csv, list_rows
 
 #: `format` of the record.
@@ -73,7 +73,7 @@ def write_measures(
         "options": json.loads(json.dumps(dict(options or {}), default=str)),
         "status": describe_range(parts),
         "scans": [{"scan": each.source, "kind": each.kind, "notes": list(each.notes)} for each in measures],
-        "notes": list(say_notes(parts)),
+        "notes": list(count_notes(parts)),
         "files": list(FILES),
     }
     texts = {

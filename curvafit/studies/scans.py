@@ -146,7 +146,7 @@ def merge_notes(measures: Sequence[Measures]) -> Iterator[tuple[list[int], str]]
         yield sorted({k for k, _ in found}), _NUMBER.sub(lambda _, ranges=ranges: next(ranges), found[0][1])
 
 
-def say_notes(measures: Sequence[Measures]) -> Iterator[str]:
+def count_notes(measures: Sequence[Measures]) -> Iterator[str]:
     """Yield the notes of scans, or of parts of scans (`merge_notes`), each with how many have it, unless all have."""
     for scans, note in merge_notes(measures):
         yield note if len(scans) == len(measures) else f"Of {len(scans)} of {len(measures)} scans: {note}"
