@@ -88,7 +88,7 @@ def _outline_on(axes: Axes, edges: np.ndarray, inside: np.ndarray) -> None:
 
 
 def numbers_figure(comparison: Any) -> Figure:
-    """Return a figure of strips, one for each quantity: subjects by group, with the 95 % of their scans' own errors.
+    """Return a figure of strips, one for each quantity: subjects by group, with the 95 % intervals of their scans.
 
     A long line is a group's mean. The names of quantities that differ significantly among all are bold.
     """
@@ -104,11 +104,11 @@ def numbers_figure(comparison: Any) -> Figure:
     second = np.array([group == comparison.groups[1] for group, _ in comparison.subjects])
     for k, (axes, number) in enumerate(zip(panels, comparison.numbers, strict=True)):
         for side, colour in ((0, FIRST), (1, SECOND)):
-            values, errors = (table[second == bool(side), k] for table in (comparison.values, comparison.errors))
+            values, halves = (table[second == bool(side), k] for table in (comparison.values, comparison.halves))
             places = side + np.linspace(-0.18, 0.18, len(values))
-            low = values - 1.96 * errors
+            low = values - halves
             low = low if number.symbol in SIGNED else np.maximum(low, 0)
-            axes.vlines(places, low, values + 1.96 * errors, color=colour, alpha=0.35, linewidth=1.4)
+            axes.vlines(places, low, values + halves, color=colour, alpha=0.35, linewidth=1.4)
             axes.plot(places, values, "o", color=colour, markersize=4, markeredgewidth=0)
             axes.hlines(number.means[side], side - 0.32, side + 0.32, color=INK, linewidth=1.4)
         names = zip(comparison.groups, comparison.counts, strict=True)

@@ -70,12 +70,11 @@ def _page(comparison: Comparison, record: dict[str, Any], pictures: dict[str, Pi
     """Return the page of a comparison, with its record and its pictures, as text."""
     a, b = comparison.groups
     bins = int(comparison.significant.sum())
-    title = comparison.verdict
     region = f"The outline holds the bins that differ at a family-wise level of {LEVEL:.2g}."
     return render_template(
         "compare.html",
         version=version("curvafit"),
-        title=title[0].upper() + title[1:],
+        title=comparison.verdict,
         a=a,
         b=b,
         scans="; ".join(_count_scans(comparison)) + ".",

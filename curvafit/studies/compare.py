@@ -96,9 +96,9 @@ class Comparison(Pictured):
         Of each scan, its measures in `unit`, and its name, subject and group.
     subjects
         Group and name of each subject.
-    values, errors
-        Each subject's quantities (S, K), means over its scans, and the standard errors that the scans' own intervals
-        give them; NaN where a scan has none.
+    values, errors, halves
+        Each subject's quantities (S, K), means over its scans; the standard errors that the scans' own intervals give
+        them, and half the widths of their 95 % intervals, NaN where a scan has none.
     numbers
         A test of each quantity.
     energy, p
@@ -122,6 +122,7 @@ class Comparison(Pictured):
     subjects: tuple[tuple[str, str], ...]
     values: np.ndarray
     errors: np.ndarray
+    halves: np.ndarray
     numbers: tuple[Number, ...]
     energy: float
     p: float
@@ -289,7 +290,7 @@ def compare_measures(
     )
     alike = (second[:, None] == second) & ~np.eye(len(second), dtype=bool)
     edges, difference, p = _compare_bins(pooled, second, relabelled)
-    values, errors = _average(measures, scans)
+    values, errors, halves = _average(measures, scans)
     return Comparison(
         groups=groups,  # type: ignore[arg-type]
         unit=measures[0].unit,
@@ -298,6 +299,7 @@ def compare_measures(
         subjects=tuple(subjects),
         values=values,
         errors=errors,
+        halves=halves,
         numbers=_compare_numbers(measures[0], values, errors, second, relabelled),
         energy=float(energies[0]),
         p=float(share_beyond(energies)),
@@ -339,12 +341,12 @@ def _compare_bins(
     return edges, shares[second].mean(0) - shares[~second].mean(0), p
 
 
-def _average(measures: Sequence[Measures], scans: Sequence[Sequence[int]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return `values` and `errors` of a `Comparison`; `scans` are the numbers of each subject's."""
+def _average(measures: Sequence[Measures], scans: Sequence[Sequence[int]]) -> tuple[np.ndarray, ...]:
+    """Return `values`, `errors` and `halves` of a `Comparison`; `scans` are the numbers of each subject's."""
     values, halves = stack_numbers(measures)
-    variances = (halves / np.array([[interval_reach(scan.blocks)] for scan in measures])) ** 2
-    errors = np.sqrt([variances[own].mean(0) / len(own) for own in scans])
-    return np.stack([values[own].mean(0) for own in scans]), errors
+    errors = halves / np.array([[interval_reach(scan.blocks)] for scan in measures])
+    spread = (np.sqrt([(each[own] ** 2).mean(0) / len(own) for own in scans]) for each in (errors, halves))
+    return np.stack([values[own].mean(0) for own in scans]), *spread
 
 
 def _compare_numbers(

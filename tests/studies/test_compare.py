@@ -307,6 +307,13 @@ def test_the_methods_cite_the_program(shapes: Comparison) -> None:
         assert match and match[1] in methods
 
 
+def test_intervals_of_subjects_with_one_scan_are_those_of_their_scans(shapes: Comparison) -> None:
+    own = [[each.half for each in scan.quantities] for scan in shapes.measures]
+    np.testing.assert_allclose(shapes.halves, own, rtol=1e-12)
+    known = np.isfinite(shapes.halves) & (shapes.halves > 0)
+    assert (shapes.halves[known] > 1.9 * shapes.errors[known]).all()  # Student's t reaches further than a normal
+
+
 def test_units_are_converted(shapes: Comparison) -> None:
     radii = (5.0, 5.4, 5.8, 6.2)
     mixed = compare(fields([*map(tubes, radii)]), fields([*map(balls, radii)], 10.0, "um"), periodic=True, kind="mask")
