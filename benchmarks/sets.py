@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from benchmarks.harness import Cases, Figure, Values, dice, show
 from benchmarks.networks import UNKNOWN, dice_ce
 from benchmarks.nulls import level_cut
-from benchmarks.transductive import BLUR, NOISE, PATCH, network, predict
+from benchmarks.transductive import PATCH, image_of, network, predict
 from curvafit.generation.flow import generate
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.inference.fit import Fit
@@ -129,13 +129,6 @@ def law_of(scan: str, cases: Cases) -> Fit:
 
 
 # ---- networks --------------------------------------------------------------------------------------------------------
-
-
-def image_of(mask: np.ndarray, seed: int) -> np.ndarray:
-    """Return a noisy image of a mask, standardised."""
-    clear = ndimage.gaussian_filter(mask.astype(np.float32), BLUR, mode="nearest")
-    values = clear + NOISE * np.random.default_rng(seed).standard_normal(mask.shape, dtype=np.float32)
-    return (values - values.mean()) / values.std()
 
 
 def learn(net: nn.Module, batch: Callable[[int], tuple[Tensor, Tensor]], steps: int, rate: float) -> None:

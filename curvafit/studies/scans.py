@@ -245,8 +245,7 @@ def list_combinations(inference: Inference | None) -> tuple[list[Quantity], str]
 def _read_combinations(inference: Inference | None, posterior: Posterior) -> tuple[np.ndarray, np.ndarray, str]:
     """Return the medians and half the widths of the `SURE` intervals of combinations, or why they are not known."""
     unknown = np.full(len(PARAMETERS), np.nan)
-    fit = None if inference is None else inference.fit
-    if inference is None or fit is None or fit.draws is None:
+    if inference is None or (fit := inference.fit).draws is None:
         return unknown, unknown, "the scan shows no texture"
     if inference.prepared.volume_fraction > HALF:
         return unknown, unknown, "the structure fills more than half of the scan"
