@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from curvafit.data_synth.sources import ShapeSource
 
 _what = partial(typer.Option, rich_help_panel="Shapes: one of these")
+_show = partial(typer.Option, rich_help_panel="What an image shows")
 _image = partial(typer.Option, rich_help_panel="Images")
 _out = partial(typer.Option, rich_help_panel="Output")
 
@@ -39,6 +40,8 @@ Parts = Annotated[
 @command(
     "curvafit synth -o Dataset101_Tubes --preset tubes,sponge --modality confocal --count 200 --shape 96",
     "curvafit synth -o Dataset102_Bone --prior bone/fit.json --like bone.nii.gz --count 200 --shape 64",
+    "curvafit synth -o Dataset103_Ducts --preset tubes --wall 2 --modality two-photon --count 200 --shape 48",
+    "curvafit synth -o Dataset104_Cell --presets sponge,tubes --classes --levels 1,0.6 --modality confocal --shape 64",
     "curvafit synth -o set --atlas store.zarr --modality micro-ct --layout monai --labels distance --shape 48",
 )
 def synth(
@@ -54,6 +57,11 @@ def synth(
     visible: Annotated[str | None, _image(help="Masks as seen: where this share of light arrives, or auto.")] = None,
     voxel: Annotated[float | None, _image(help="Edge of a shape's voxel, in --unit; by default the law's.")] = None,
     calibres: Annotated[str, _image(help="LOW,HIGH: a case is thicker by a factor in between.")] = "1,1",
+    draws: Annotated[int | None, _what(help="Laws drawn from each fit's posterior, in place of its best.")] = None,
+    blend: Annotated[float, _show(help="Share of cases in which one texture gives way to another.")] = 0.0,
+    classes: Annotated[bool, _show("--classes", help="A shape of each law in every image, one class each.")] = False,
+    wall: Annotated[float | None, _show(help="Shells: thickness of a wall around a lumen, in --unit.")] = None,
+    levels: Annotated[str | None, _show(help="Light of each class: 0 as background, 1 as structure.")] = None,
     *,
     reading: Reading,
     layout: Annotated[str, _out(help="nnunet (v2, raw), monai (decathlon's list) or zarr.")] = "nnunet",
@@ -65,20 +73,24 @@ def synth(
     box = parse_whole_triple(shape, "--shape")
     unit = reading["unit"]
     if unit is not None and reading["spacing"] is None:
-        if voxel is None:
-            raise ValueError("--unit needs --spacing or --voxel")
-        reading["unit"] = None  # it is that of --voxel alone, not of --like
+        if voxel is None and wall is None:
+            raise ValueError("--unit needs --spacing, --voxel or --wall")
+        reading["unit"] = None  # it is that of --voxel and --wall, not of --like
     names = [] if laws is None else laws.split(",")
-    source = _choose_source(names, atlas, volume_fraction)
+    source = _choose_source(names, atlas, volume_fraction, draws)
     kind = _choose_modality(modality, like, like_mask, visible, reading)
     from curvafit.core.units import convert_length
     from curvafit.data_synth.case import Recipe
+    from curvafit.data_synth.composition import Composition
     from curvafit.data_synth.sets import SetSpec
     from curvafit.data_synth.sources import choose_voxel
 
     edge = choose_voxel(names, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
     low, high = parse_numbers(calibres, "--calibres", 2)
-    recipe = Recipe(source, kind, box, edge, seed, (low, high))
+    thickness = None if wall is None else convert_length(wall, unit, kind.base.unit)
+    lights = None if levels is None else tuple(parse_numbers(levels, "--levels", levels.count(",") + 1))
+    shown = Composition(blend, classes, thickness, lights)
+    recipe = Recipe(source, kind, box, edge, seed, (low, high), shown)
     _build_and_preview(out, SetSpec(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)
 
 
@@ -104,14 +116,20 @@ def _build_and_preview(out: Path, spec: SetSpec, count: int, crew: Crew) -> None
     say(str(card))
 
 
-def _choose_source(laws: list[str], atlas: Path | None, filled: float | None) -> ShapeSource:
+def _choose_source(laws: list[str], atlas: Path | None, filled: float | None, draws: int | None) -> ShapeSource:
     """Return the source of shapes that the options name."""
     if bool(laws) == (atlas is not None):
         raise ValueError(f"give either --prior (or --preset) or --atlas, got {'both' if laws else 'neither'}")
     from curvafit.data_synth.sources import Generated, Stored
 
-    if atlas is None:
+    if atlas is None and draws is None:
         return Generated.of(laws, filled)
+    if atlas is None:
+        from curvafit.inference.fit import draw_laws
+
+        return Generated.of([law for name in laws for law in draw_laws(name, int(draws or 0))], filled)
+    if draws is not None:
+        raise ValueError("--draws is for fits, not for an atlas")
     if atlas.suffix.lower() != ".npz":
         if filled is not None:
             raise ValueError("--volume-fraction is for shapes that are grown, not for those of a store")

@@ -12,6 +12,7 @@ import numpy as np
 from curvafit.core.files import write_content
 from curvafit.core.records import parse_json
 from curvafit.core.units import format_number, unit_name
+from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.design import PARAMETERS
 from curvafit.data_synth.sets import RECORDS, SetSpec, case_name, list_cases, read_spec
 from curvafit.data_synth.sources import Generated
@@ -38,7 +39,6 @@ def _card(folder: Path, spec: SetSpec, command: str) -> Iterator[str]:
     recipe, records = spec.recipe, list(_read_records(folder))
     imaging = recipe.modality.base
     edges, unit = " x ".join(format_number(each) for each in imaging.spacing), unit_name(imaging.unit, 2)
-    shares = [record["mask_fraction"] for record in records]
     made = records[0]["versions"] if records else {}
     yield MARK
     yield f"# {_quote(folder.resolve().name)}\n"
@@ -48,17 +48,20 @@ def _card(folder: Path, spec: SetSpec, command: str) -> Iterator[str]:
         "cases": len(records),
         "voxels of an image": " x ".join(map(str, recipe.shape)),
         "edges of a voxel": f"{edges} {unit}",
-        "labels": "0 background, 1 structure",
+        "labels": ", ".join(f"{number} {name}" for number, name in enumerate(("background", *recipe.classes))),
         "further labels": ", ".join(spec.parts) or "none",
-        "part of the voxels that is structure": _range(shares, percent=True),
         "layout": spec.layout,
     }
+    for number, name in enumerate(recipe.classes):
+        shares = [record["class_fractions"][number] for record in records]
+        rows[f"part of the voxels that is {name}"] = _range(shares, percent=True)
     yield from _table(("what", ""), rows.items())
     yield "\n## Shapes\n"
     yield from _describe_source(recipe.source)
     low, high = recipe.calibres
     if (low, high) != (1.0, 1.0):
         yield f"\nStructures are {format_number(low)} to {format_number(high)} times as thick, case by case."
+    yield from _describe_composition(recipe)
     yield f"\n## Images\n\n{recipe.modality.name}: {recipe.modality.about}\n"
     drawn = [(name, *(_numbers(end) for end in ends)) for name, ends in recipe.modality.ranges.items()]
     if drawn:
@@ -92,12 +95,29 @@ def _describe_source(source: Any) -> Iterator[str]:
         yield f"\nand {len(rows) - MOST_LAWS} more, in `curvafit.json`."
 
 
+def _describe_composition(recipe: Recipe) -> Iterator[str]:
+    """Yield the lines on what a case shows of its shapes."""
+    shown, names = recipe.composition, recipe.classes
+    unit = unit_name(recipe.modality.base.unit, 2)
+    if shown.classes:
+        yield "\nEvery case shows a shape of each law, one class each; an earlier law's is in front."
+    if shown.wall is not None:
+        yield f"\nThe shape is a wall of {format_number(shown.wall)} {unit} inside its surface, around a lumen."
+    if shown.blend:
+        yield f"\nIn {format_number(100 * shown.blend)} % of the cases one shape gives way to another."
+    if len(names) > 1:
+        levels = zip(names, shown.choose_levels(len(names)), strict=True)
+        told = ", ".join(f"{name} {format_number(level)}" for name, level in levels)
+        yield f"\nLight of a class, 0 as the background's and 1 as the structure's: {told}."
+        yield "Further labels are of all classes together."
+
+
 def _read_records(folder: Path) -> Iterator[dict[str, Any]]:
     """Yield the records of a set's cases."""
     for index in list_cases(folder):
         place = folder / RECORDS / f"{case_name(index)}.json"
         record = parse_json(place.read_bytes(), "a case's record", place)
-        if not isinstance(record, dict) or not {"mask_fraction", "versions"} <= record.keys():
+        if not isinstance(record, dict) or not {"class_fractions", "versions"} <= record.keys():
             raise ValueError(f"{place} is not the record of a case")
         yield record
 

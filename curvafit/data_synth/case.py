@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +12,7 @@ import torch
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_seed, check_type, quoted
 from curvafit.core.schema import encode
+from curvafit.data_synth.composition import Composition
 from curvafit.data_synth.imaging.image import field_shape, image, regrid, visible
 from curvafit.data_synth.imaging.modality import Imaging, Modality
 from curvafit.data_synth.sources import ShapeSource, decode_source
@@ -21,19 +22,22 @@ from curvafit.priors.kernels.threads import one_thread
 TRIES = 8
 #: The most voxels of a shape; and the least along each edge of a grown one, or along the longest edge of a crop.
 MOST, FEWEST = 10**9, 4
+#: What may help where a class is not seen: of one structure, of several.
+_MENDS = ("take more voxels", "take more voxels, a thinner wall, or laws that fill less")
 #: Least and greatest calibre.
 CALIBRES = (1e-3, 1e3)
 
 
 class Case(NamedTuple):
-    """An image, the phase field of what it shows and its mask, (Z, Y, X) on one grid of `spacing`.
+    """An image, the phase field of what it shows and its labels, (Z, Y, X) on one grid of `spacing`.
 
-    ε is in spacing's unit; `record` says how the case was made, in JSON's types.
+    The field is that of all classes together. Labels are uint8: 0 outside, 1, 2, … in the classes. ε is in spacing's
+    unit; `record` says how the case was made, in JSON's types.
     """
 
     image: np.ndarray
     field: np.ndarray
-    mask: np.ndarray
+    labels: np.ndarray
     spacing: tuple[float, float, float]
     unit: str
     epsilon: float
@@ -46,7 +50,7 @@ class Recipe:
 
     `shape` is the voxels (z, y, x) of the images; `voxel` is the edge of a shape's voxels in the modality's unit, which
     sets how thick structures are in the images; `calibres` are the least and the greatest factor of it, between which
-    every case draws its own.
+    every case draws its own; `composition` is what a case shows of the source's shapes.
     """
 
     source: ShapeSource
@@ -55,6 +59,7 @@ class Recipe:
     voxel: float
     seed: int = 0
     calibres: tuple[float, float] = (1.0, 1.0)
+    composition: Composition = field(default_factory=Composition)
 
     def __post_init__(self) -> None:
         check_type(self.modality, Modality, "a Modality")
@@ -65,8 +70,15 @@ class Recipe:
         object.__setattr__(self, "voxel", voxel)
         object.__setattr__(self, "seed", check_seed(self.seed))
         object.__setattr__(self, "calibres", check_calibres(self.calibres))
+        check_type(self.composition, Composition, "a Composition")
+        self.composition.names(self.source)
         for factor in self.calibres:
             check_crop(self.source.edge, self.shape, self.voxel * factor, self.modality)
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Return the names of the labels' classes 1, 2, …"""
+        return self.composition.names(self.source)
 
     @property
     def largest(self) -> tuple[int, int, int]:
@@ -74,57 +86,71 @@ class Recipe:
         return field_shape(self.shape, self.voxel * self.calibres[0], self.modality.base)
 
     def case(self, index: int) -> Case:
-        """Make case number `index`, on one thread; ValueError where no shape is seen on the image's voxels."""
+        """Make case number `index`, on one thread; ValueError where a class is not seen on the image's voxels."""
         for_shape, for_imaging, for_image = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(3)
         imaging = self.modality.draw(_draw_number(for_imaging))
         rng = np.random.default_rng(for_shape)
         voxel = draw_voxel(self.voxel, self.calibres, rng)
-        voxels = field_shape(self.shape, voxel, imaging)
+        voxels, names = field_shape(self.shape, voxel, imaging), self.classes
         seed = _draw_number(for_image)
         with one_thread():
             for _ in range(TRIES):
-                phase_field = self.source.shape(voxels, index, rng)
-                u = torch.from_numpy(phase_field.values)
-                parts = image_and_labels(u, phase_field.epsilon, voxel, imaging, seed, self.shape)
-                grey, sampled, mask = (part.numpy() for part in parts)
-                if sampled.min() <= 0 < sampled.max() and mask.any() and not mask.all():
+                layers = self.composition.draw(self.source, voxels, voxel, index, rng)
+                levels = self.composition.choose_levels(len(names))
+                parts = image_and_labels(layers.values, layers.epsilon, voxel, imaging, seed, self.shape, levels)
+                grey, sampled, labels = (part.numpy() for part in parts)
+                counts = np.bincount(labels.ravel(), minlength=len(names) + 1)
+                if sampled.min() <= 0 < sampled.max() and counts.all():
                     break
             else:
-                edges = " x ".join(map(str, self.shape))
-                raise ValueError(
-                    f"{TRIES} shapes showed no structure on {edges} voxels, or nothing else: take more voxels"
-                )
-        record = {"index": index, "source": phase_field.origin, "imaging": imaging.as_dict(), "image_seed": seed}
-        record |= {"voxel": voxel, "volume_fraction": float((sampled > 0).mean()), "mask_fraction": float(mask.mean())}
+                edges, missing = " x ".join(map(str, self.shape)), ("background", *names)[int(counts.argmin())]
+                raise ValueError(f"{TRIES} shapes showed no {missing} on {edges} voxels: {_MENDS[len(names) > 1]}")
+        record = {"index": index, "source": layers.origins, "imaging": imaging.as_dict(), "image_seed": seed}
+        shares = (counts[1:] / labels.size).tolist()
+        record |= {"voxel": voxel, "volume_fraction": float((sampled > 0).mean()), "class_fractions": shares}
         ceiling = imaging.detector.ceiling
-        counts = np.uint16 if ceiling is not None and ceiling <= np.iinfo(np.uint16).max else np.float32
-        epsilon = phase_field.epsilon * voxel
-        return Case(grey.astype(counts), sampled, mask, imaging.spacing, imaging.unit, epsilon, record)
+        kind = np.uint16 if ceiling is not None and ceiling <= np.iinfo(np.uint16).max else np.float32
+        epsilon = layers.epsilon * voxel
+        return Case(grey.astype(kind), sampled, labels, imaging.spacing, imaging.unit, epsilon, record)
 
     def as_dict(self) -> dict[str, Any]:
         """Return all of the recipe in JSON's types."""
-        return encode(vars(self) | {"source": self.source.as_dict()})
+        parts = {"source": self.source.as_dict(), "composition": self.composition.as_dict()}
+        return encode(vars(self) | parts)
 
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Recipe:
         """Return the recipe that `as_dict` wrote."""
         source, modality = decode_source(content["source"]), Modality.from_dict(content["modality"])
+        shown = Composition.from_dict(content["composition"])
         numbers = (content[name] for name in ("shape", "voxel", "seed", "calibres"))
-        return Recipe(source, modality, *numbers)
+        return Recipe(source, modality, *numbers, composition=shown)
 
 
 def image_and_labels(
-    field: torch.Tensor, epsilon: float, voxel: float, imaging: Imaging, seed: int, shape: Sequence[int]
+    fields: torch.Tensor,
+    epsilon: float,
+    voxel: float,
+    imaging: Imaging,
+    seed: int,
+    shape: Sequence[int],
+    levels: Sequence[float],
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the image of a phase field (Z, Y, X), and the field and its mask on the image's voxels, all of `shape`.
+    """Return the image of the phase fields (C, Z, Y, X) of classes, and on its voxels their union and their labels.
 
-    `epsilon` is in the field's voxels, whose edge is `voxel`. See `imaging.image` and `Imaging.visible`.
+    All three are of `shape`. A label is that of the first class that the voxel is in. `epsilon` is in the fields'
+    voxels, whose edge is `voxel`. See `imaging.image` for the levels, and `Imaging.visible`.
     """
     z, y, x = shape  # a field of whole voxels may give a few voxels more
-    grey, sampled = image(field, voxel, imaging, seed, epsilon), regrid(field, voxel, imaging)
-    mask = visible(field, voxel, imaging, epsilon) if imaging.visible else sampled > 0
-    grey, sampled, mask = (part[:z, :y, :x].contiguous() for part in (grey, sampled, mask))
-    return grey, sampled, mask
+    grey = image(fields, voxel, imaging, seed, epsilon, levels)
+    sampled = [regrid(field, voxel, imaging) for field in fields]
+    labels = torch.zeros_like(sampled[0], dtype=torch.uint8)
+    for number in range(len(fields), 0, -1):
+        field, inside = fields[number - 1], sampled[number - 1] > 0
+        labels[visible(field, voxel, imaging, epsilon) if imaging.visible else inside] = number
+    union = torch.stack(sampled).amax(0)
+    grey, union, labels = (part[:z, :y, :x].contiguous() for part in (grey, union, labels))
+    return grey, union, labels
 
 
 def check_shape(shape: Sequence[int]) -> tuple[int, int, int]:

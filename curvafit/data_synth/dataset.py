@@ -15,15 +15,12 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_choice, check_float, check_int, check_seed
 from curvafit.data_synth.case import check_calibres, check_crop, check_shape, draw_voxel, image_and_labels
+from curvafit.data_synth.composition import Layers, blend_shapes
 from curvafit.data_synth.imaging.image import field_shape
-from curvafit.data_synth.imaging.maths import correlated_field
 from curvafit.data_synth.imaging.modality import Modality, modality
 from curvafit.data_synth.sources import Generated, Pool, Stored, choose_voxel
 from curvafit.priors.law import LAW_TYPES, LawLike
 
-#: Two textures are mixed by the logistic function of a normal field, whose correlation length is this share of the
-#: crop's longest edge and whose deviation is the steepness.
-BLEND_LENGTH, BLEND_STEEPNESS = 0.5, 4.0
 #: Percentiles that `percentile` makes 0 and 1.
 PERCENTILES = (0.5, 99.5)
 #: The most shapes of a pool, and the number of voxels to a multiple of which their edge is rounded up.
@@ -156,26 +153,20 @@ class TextureDataset(IterableDataset):
         kind = self.modalities[turn]
         imaging, voxel = kind.draw(for_imaging), draw_voxel(self.voxels[turn], self.calibres, rng)
         voxels = field_shape(self.size, voxel, imaging)
-        u, epsilon, origin = self._draw_shape(voxels, rng, for_blend)
-        grey, _, mask = image_and_labels(u, epsilon, voxel, imaging, for_image, self.size)
-        record = {"number": number, "source": origin, "modality": kind.name, "imaging": imaging.as_dict()}
+        shown = self._draw_shape(voxels, rng, for_blend)
+        grey, _, mask = image_and_labels(shown.values, shown.epsilon, voxel, imaging, for_image, self.size, (1.0,))
+        record = {"number": number, "source": shown.origins, "modality": kind.name, "imaging": imaging.as_dict()}
         record |= {"image_seed": for_image, "voxel": voxel}
         image = grey[None].float()
         image = image if self.normalise is None else self.normalise(image)
-        return Sample(image, mask[None].to(torch.uint8), imaging.spacing, record)
+        return Sample(image, mask[None], imaging.spacing, record)
 
-    def _draw_shape(
-        self, voxels: Sequence[int], rng: np.random.Generator, seed: int
-    ) -> tuple[Tensor, float, list[dict[str, Any]]]:
-        """Return a phase field (Z, Y, X), its ε and origins: a crop of one shape, or of two that share the volume."""
-        blended = rng.random() < self.blend
-        one, *more = (self.source.shape(voxels, 0, rng) for _ in range(1 + blended))
-        u = torch.from_numpy(one.values)
-        if more:
-            length = BLEND_LENGTH * max(voxels)
-            share = torch.sigmoid(BLEND_STEEPNESS * correlated_field(u, (length,) * 3, seed, "blend"))
-            u = share * u + (1 - share) * torch.from_numpy(more[0].values)
-        return u, one.epsilon, [shape.origin for shape in (one, *more)]
+    def _draw_shape(self, voxels: Sequence[int], rng: np.random.Generator, seed: int) -> Layers:
+        """Return a crop of one shape, or of two that share the volume."""
+        if rng.random() < self.blend:
+            return blend_shapes(lambda turn: self.source.shape(voxels, turn, rng), seed)
+        shape = self.source.shape(voxels, 0, rng)
+        return Layers(torch.from_numpy(shape.values)[None], shape.epsilon, [shape.origin])
 
     def _make_pool(self, generated: Generated, count: int, rotate: bool) -> Pool:
         """Return a pool of shapes that are as large as the largest crop."""

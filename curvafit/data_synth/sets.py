@@ -28,7 +28,7 @@ from curvafit.volumes.field import Field
 from curvafit.volumes.read import read_values
 from curvafit.volumes.write import save
 
-SET = Format("curvafit set", 2, "a set of curvafit", remedy="begin it anew in another folder")
+SET = Format("curvafit set", 3, "a set of curvafit", remedy="begin it anew in another folder")
 #: The record of the set, the folder of its cases' records, and the list that readers of its layout look for.
 HEADER, RECORDS, LIST = "curvafit.json", "cases", "dataset.json"
 #: Cases that a set may be asked for.
@@ -39,6 +39,8 @@ PARTS = (*(name for name in NAMES if name != "mask"), "centreline")
 LISTED_EVERY = 1.0
 #: Cases in the picture, and in a row of it.
 SHOWN, ROW = 8, 4
+#: Colours of the classes' outlines, which begin again after the last (Okabe & Ito 2008).
+OUTLINES = (CONTOUR, "#56B4E9", "#CC79A7", "#009E73", "#F0E442")
 
 
 class Layout(NamedTuple):
@@ -177,13 +179,14 @@ def _write_list(folder: Path, spec: SetSpec) -> None:
     names, layout = list(map(case_name, list_cases(folder))), LAYOUTS[spec.layout]
     pairs = [{"image": layout.image.format(case=name), "label": layout.label.format(case=name)} for name in names]
     about = {"name": folder.resolve().name, "description": "synthetic; made by curvafit", "numTraining": len(names)}
-    channel = {"0": spec.recipe.modality.name}
+    channel, classes = {"0": spec.recipe.modality.name}, ("background", *spec.recipe.classes)
     if layout.nnunet:  # cases by name, since the folders may hold a killed run's temporary files too
-        listed = {"channel_names": channel, "labels": {"background": 0, "structure": 1}, "file_ending": ".nii.gz"}
+        numbers = {name: number for number, name in enumerate(classes)}
+        listed = {"channel_names": channel, "labels": numbers, "file_ending": ".nii.gz"}
         files = [{"images": [pair["image"]], "label": pair["label"]} for pair in pairs]
         listed |= {**about, "dataset": dict(zip(names, files, strict=True))}
     else:
-        labels = {"0": "background", "1": "structure"}
+        labels = {str(number): name for number, name in enumerate(classes)}
         listed = {**about, "tensorImageSize": "3D", "modality": channel, "labels": labels}
         listed |= {"numTest": 0, "training": pairs, "test": []}
     _write_json(folder / LIST, listed)
@@ -198,11 +201,10 @@ def _write_case(folder: Path, spec: SetSpec, index: int, case: Case) -> None:
     places: list[Path] = []
     try:
         known = _write_parts(folder, spec, name, case, places)
-        mask = case.mask.astype(np.uint8)
-        for values, pattern in ((mask, layout.label), (case.image, layout.image)):
+        for values, pattern in ((case.labels, layout.label), (case.image, layout.image)):
             places.append(folder / pattern.format(case=name))
             save(Field(values, case.spacing, case.unit), places[-1])
-        sums = {"image": _digest(case.image), "label": _digest(mask)}
+        sums = {"image": _digest(case.image), "label": _digest(case.labels)}
         _write_json(record, case.record | known | {"sha256": sums, "versions": versions()})
     except BaseException:
         with hold_signals():
@@ -245,7 +247,7 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
 
 def write_preview(folder: str | Path) -> Path:
     """Write `preview.png` into a set's folder: of each of the first cases the slice with most of the structure, with
-    and without the label's outline."""
+    and without the labels' outlines."""
     folder = Path(folder)
     layout = LAYOUTS[read_spec(folder).layout]
     names = [case_name(index) for index in list_cases(folder)[:SHOWN]]
@@ -262,19 +264,22 @@ def write_preview(folder: str | Path) -> Path:
         low, high = np.percentile(image[plane], (0.5, 99.5))
         for axis in (axes[row, column], axes[row + 1, column]):
             axis.imshow(image[plane], cmap="gray", vmin=low, vmax=max(high, low + 1e-6), aspect=height / width)
-        if 0 < label[plane].sum() < label[plane].size:
-            axes[row + 1, column].contour(label[plane], [0.5], colors=CONTOUR, linewidths=0.8)
+        for number in np.unique(label[label > 0]):
+            inside = label[plane] == number
+            if 0 < inside.sum() < inside.size:
+                colour = OUTLINES[(number - 1) % len(OUTLINES)]
+                axes[row + 1, column].contour(inside, [0.5], colors=colour, linewidths=0.8)
         axes[row, column].set_title(f"{name}\n{source}"[:60], fontsize=8)
     return write_picture(figure, folder / "preview.png")
 
 
 def _read_caption(path: Path) -> tuple[str, tuple[float, float]]:
-    """Return the name of a case's source and the edges (y, x) of its voxels, from its record."""
+    """Return the names of a case's sources and the edges (y, x) of its voxels, from its record."""
     try:
         record = parse_json(path.read_bytes(), "a case's record", path)
         _, height, width = map(float, record["imaging"]["spacing"])
         if not height > 0 < width:
             raise ValueError("its spacing is not positive")
-        return str(record["source"]["name"]), (height, width)
+        return " + ".join(str(each["name"]) for each in record["source"]), (height, width)
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is not the record of a case: {error}") from error

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import numpy as np
 
+from curvafit.core.checks import check_int, quoted
 from curvafit.core.files import write_content
 from curvafit.core.pictures import Pictured
 from curvafit.core.schema import Rule, decode, encode, schema_of, violation
@@ -22,7 +23,7 @@ from curvafit.inference.candidates import Candidate, Deviations, Misfit, NotNega
 from curvafit.inference.combinations import Combination
 from curvafit.priors.coefficients import NAMES, POWERS, Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
-from curvafit.priors.law import FORMAT, Law, LawLike, Mass, Positive, parse_fit, read_fit
+from curvafit.priors.law import FORMAT, Law, LawLike, Mass, Positive, parse_fit, preset_name, read_fit
 
 #: What a scan was taken for, in words.
 KINDS = {"field": "a phase field", "mask": "a mask", "image": "an image"}
@@ -284,6 +285,24 @@ def load_candidates(law: LawLike) -> tuple[Candidate, ...]:
     parts = {name: FIT_SCHEMA["properties"][name] for name in ("candidates", "format")}
     content = read_fit(law, {**FIT_SCHEMA, "required": ["format"], "properties": parts})
     return decode(get_type_hints(_File, include_extras=True)["candidates"], content.get("candidates", []))
+
+
+def draw_laws(law: LawLike, count: int) -> list[Law]:
+    """Return `count` laws of the posterior of a fit, an inference or a `fit.json`, evenly from among its draws.
+
+    Each fills the scan's volume fraction. Raises ValueError where there are no draws, or fewer.
+    """
+    named = preset_name(law) is None and isinstance(law, (str, PathLike))
+    fit = Fit.load(law) if named else getattr(law, "fit", law)  # type: ignore[arg-type]
+    if not isinstance(fit, Fit) or fit.draws is None:
+        raise ValueError(f"expected a fit with draws of a posterior, got {quoted(law)}")
+    check_int(count, f"from 1 to {len(fit.draws)} draws", 1, len(fit.draws))
+    rows = np.linspace(0, len(fit.draws) - 1, count).round().astype(int)
+    own = {"working_voxel": fit.working_voxel, "length_unit": fit.length_unit}
+    own |= {"volume_fraction": fit.morphometry.volume_fraction, "schedule": "deep"}
+    points = to_columns(fit.draws[rows, :-1]).T.tolist()
+    drawn = zip(rows, points, strict=True)
+    return [Law(Coefficients(1.0, *five), mass, f"draw {row}", **own) for row, (*five, mass) in drawn]  # type: ignore[arg-type]
 
 
 def _file_of(fit: Fit) -> _File:

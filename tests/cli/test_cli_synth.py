@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from calling import call, refused
 from exact_store import exact_store
+from found import made_fit
 
+from curvafit.inference.fit import to_columns
 from curvafit.priors.law import FORMAT
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
@@ -70,7 +72,7 @@ def test_a_set_of_inferred_shapes_like_a_scan(tmp_path, store):
     image = load(out / "imagesTr" / "case_00000_0000.nii.gz")
     assert image.spacing == pytest.approx((0.002, 0.001, 0.001)) and image.unit == "mm"
     record = json.loads((out / "cases" / "case_00000.json").read_text())
-    assert record["source"]["parameters"]["a02"] == 6 and record["voxel"] == pytest.approx(0.001)
+    assert record["source"][0]["parameters"]["a02"] == 6 and record["voxel"] == pytest.approx(0.001)
     assert 0.01 <= record["imaging"]["visible"] < 0.5
     order = json.loads((out / "curvafit.json").read_text())["order"]["recipe"]
     assert order["source"]["fraction"] == 0.2
@@ -80,7 +82,39 @@ def test_a_set_of_presets_and_of_an_atlas_file(tmp_path):
     quick = ["--count", "1", "--shape", "16", "--workers", "0", "--modality", "micro-CT"]
     out = tmp_path / "presets"
     assert call("synth", "-o", out, "--preset", "tubes,sponge", *quick).exit_code == 0
-    assert json.loads((out / "cases" / "case_00000.json").read_text())["source"]["name"] == "tubes"
+    assert json.loads((out / "cases" / "case_00000.json").read_text())["source"][0]["name"] == "tubes"
+
+
+def test_shells_around_a_lumen(tmp_path, store):
+    some = ["synth", "-o", tmp_path / "set", "--atlas", store, "--modality", "confocal", *QUICK]
+    result = call(*some, "--wall", "800", "--unit", "nm", "--levels", "1,0.2", "--voxel", "500")
+    assert result.exit_code == 0, (result.output, result.exception)
+    assert listed(tmp_path / "set")["labels"] == {"background": 0, "wall": 1, "lumen": 2}
+    recipe = json.loads((tmp_path / "set" / "curvafit.json").read_text())["order"]["recipe"]
+    assert recipe["composition"]["wall"] == pytest.approx(0.8) and recipe["voxel"] == pytest.approx(0.5)
+    other = ["--wall", "0.8", "--levels", "1,0.3"]
+    refused(call(*some, *other), "another")
+
+
+def test_classes_of_two_laws(tmp_path):
+    quick = ["--count", "1", "--shape", "16", "--workers", "0", "--modality", "micro-CT"]
+    assert call("synth", "-o", tmp_path / "s", "--presets", "sponge,tubes", "--classes", *quick).exit_code == 0
+    assert listed(tmp_path / "s")["labels"] == {"background": 0, "sponge": 1, "tubes": 2}
+
+
+def test_laws_are_drawn_from_a_posterior(tmp_path):
+    fit = made_fit()
+    fit.save(tmp_path / "fit.json")
+    quick = ["--count", "1", "--shape", "16", "--workers", "0", "--modality", "micro-CT"]
+    result = call("synth", "-o", tmp_path / "s", "--prior", tmp_path / "fit.json", "--draws", "3", *quick)
+    assert result.exit_code == 0, (result.output, result.exception)
+    source = json.loads((tmp_path / "s" / "curvafit.json").read_text())["order"]["recipe"]["source"]
+    assert len(source["points"]) == 3 and source["fraction"] == pytest.approx(0.187)
+    columns = to_columns(fit.draws)
+    for point, row in zip(source["points"], (0, 30, 59), strict=True):
+        assert point[0] == 1 and point[1:6] == pytest.approx(columns[:5, row], rel=1e-4)
+    refused(call("synth", "-o", tmp_path / "t", "--preset", "tubes", "--draws", "3", *quick), "posterior")
+    refused(call("synth", "-o", tmp_path / "t", "--prior", tmp_path / "fit.json", "--draws", "99", *quick), "60 draws")
 
 
 def test_bad_input(tmp_path, store):
@@ -105,6 +139,12 @@ def test_bad_input(tmp_path, store):
     refused(call(*some, "--like", "m.nii.gz", "--crop", "0:4"), "crop")
     refused(call(*some, *kind, "--volume-fraction", "0.2"), "--volume-fraction")
     refused(call("synth", "-o", out, "--presets", "tubes", *kind, "--volume-fraction", "2"), "volume fraction")
+    refused(call(*some, *kind, "--draws", "3"), "--draws")
+    refused(call(*some, *kind, *QUICK, "--wall", "0"), "wall")
+    refused(call(*some, *kind, *QUICK, "--wall", "1", "--blend", "0.2"), "blend")
+    refused(call(*some, *kind, *QUICK, "--classes"), "classes")
+    refused(call(*some, *kind, *QUICK, "--levels", "1,0"), "level")
+    refused(call(*some, *kind, "--unit", "um"), "--wall")
     refused(call(*some, *kind, *QUICK, "--labels", "depth"), "labels")
     refused(call(*some, *kind, *QUICK, "--layout", "bids"), "layout")
     refused(call(*some, *kind, *QUICK, "--seed", "-1"), "seed")

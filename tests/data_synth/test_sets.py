@@ -48,7 +48,7 @@ def test_nnunet_s_layout(tmp_path, order):
         assert (
             Imaging.from_dict(record["imaging"]).contrast.foreground == case.record["imaging"]["contrast"]["foreground"]
         )
-        assert set(record["source"]["parameters"]) == {"a20", "a11", "a02", "a10", "a01", "a00", "mass"}
+        assert set(record["source"][0]["parameters"]) == {"a20", "a11", "a02", "a10", "a01", "a00", "mass"}
 
 
 @pytest.mark.parametrize("layout", ["monai", "zarr"])
@@ -181,10 +181,12 @@ def test_labels_are_what_an_image_shows_where_asked(tmp_path, order):
     folder, case = build_set(tmp_path / "set", asked, 1), asked.recipe.case(0)
     inside = load(folder / "parts" / "distance" / "case_00000.nii.gz").values > 0
     label = read_values(folder / "labelsTr" / "case_00000.nii.gz") > 0
-    assert (label == case.mask).all() and label[inside].all() and label.sum() > 1.1 * inside.sum()
+    assert (label == case.labels).all() and label[inside].all() and label.sum() > 1.1 * inside.sum()
     record = json.loads((folder / "cases" / "case_00000.json").read_text())
     assert (
-        record["mask_fraction"] == label.mean() > record["volume_fraction"] > 0 and record["imaging"]["visible"] == 0.1
+        record["class_fractions"] == [label.mean()]
+        and label.mean() > record["volume_fraction"] > 0
+        and record["imaging"]["visible"] == 0.1
     )
 
 

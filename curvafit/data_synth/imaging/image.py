@@ -16,19 +16,28 @@ from curvafit.priors.grid import Bool, Float
 
 
 def image(
-    field: Volume, spacing: float, imaging: Imaging, seed: int, epsilon: float = EPSILON
+    field: Volume,
+    spacing: float,
+    imaging: Imaging,
+    seed: int,
+    epsilon: float = EPSILON,
+    levels: Sequence[float] | None = None,
 ) -> Float[torch.Tensor, "Z Y X"]:
     """Return the image of a phase field, of the field's floating type and the shape that `regrid` gives.
 
     The order is classes, blur, sampling, light, noise. `spacing` is the edge of the field's cubic voxels, in the
-    imaging's unit; ε of the field's profile is in voxels.
+    imaging's unit; ε of the field's profile is in voxels. Where `levels` are given, the field is those of several
+    classes (C, Z, Y, X), the first in front, with the light of each: 0 as the background's, 1 as the structure's.
     """
-    if field.ndim != 3 or not field.is_floating_point() or not torch.isfinite(field).all():
+    fields, lights = (field[None], (1.0,)) if levels is None else (field, levels)
+    if fields.ndim != 4 or not field.is_floating_point() or not torch.isfinite(field).all():
         raise ValueError(f"a field must be finite floats (Z, Y, X), got {field.dtype} {tuple(field.shape)}")
+    if len(fields) != len(lights):
+        raise ValueError(f"give a level for each of {len(fields)} classes, got {len(lights)}")
     if not (spacing > 0 and epsilon > 0):
         raise ValueError(f"spacing and epsilon must be positive, got {spacing} and {epsilon}")
     seed = check_seed(seed)
-    light, optics = _emit(effects.occupancy(field, epsilon), spacing, imaging, seed), imaging.optics
+    light, optics = _emit(_stain(fields, epsilon, lights), spacing, imaging, seed), imaging.optics
     if optics.growth or optics.attenuation:
         light = effects.blur_with_depth(light, spacing, optics.blur, optics.growth, optics.attenuation)
     else:
@@ -68,6 +77,15 @@ def field_shape(shape: Sequence[int], spacing: float, imaging: Imaging) -> tuple
 def _window(how: Imaging) -> Triple:
     """Return the box (z, y, x) over which a voxel averages."""
     return how.thickness, *how.spacing[1:]
+
+
+def _stain(fields: torch.Tensor, epsilon: float, lights: Sequence[float]) -> torch.Tensor:
+    """Return the share of the structure's light in each voxel of classes that lie in front of one another."""
+    stain, free = torch.zeros_like(fields[0]), torch.ones_like(fields[0])
+    for field, light in zip(fields, lights, strict=True):
+        share = free * effects.occupancy(field, epsilon)
+        stain, free = stain + light * share, free - share
+    return stain
 
 
 def _emit(occupied: torch.Tensor, spacing: float, how: Imaging, seed: int) -> torch.Tensor:

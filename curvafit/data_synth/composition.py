@@ -1,0 +1,129 @@
+"""What an image shows: one structure, several in front of one another, or a wall around a lumen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float
+from curvafit.data_synth.imaging.maths import correlated_field
+from curvafit.data_synth.labels import field_distance
+from curvafit.data_synth.sources import Generated, PhaseField, ShapeSource
+from curvafit.priors.grid import Grid
+
+#: Two textures are mixed by the logistic function of a normal field, whose correlation length is this share of the
+#: crop's longest edge and whose deviation is the steepness.
+BLEND_LENGTH, BLEND_STEEPNESS = 0.5, 4.0
+#: The brightest that a class can be, as a multiple of the structure's contrast.
+BRIGHTEST = 100.0
+#: The most classes of a set.
+MOST_CLASSES = 200
+
+
+class Layers(NamedTuple):
+    """Phase fields (C, Z, Y, X) of classes 1 to C, the first in front; their ε in voxels; the shapes' origins."""
+
+    values: Tensor
+    epsilon: float
+    origins: list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Composition:
+    """What a case shows: one structure by default.
+
+    Attributes
+    ----------
+    blend
+        Share of cases in which one texture gives way to another, as two crops or the shapes of two laws in turn.
+    classes
+        Every case shows a shape of each law, in front of those of later laws; the classes of the labels.
+    wall
+        Thickness of a wall along the surface of the shape, inside it, in the modality's unit: the labels' class 1; what
+        the wall encloses is class 2, the lumen.
+    levels
+        Light of each class: 0 is as dark as the background, 1 as bright as the structure. By default 1, the lumen 0.
+    """
+
+    blend: float = 0.0
+    classes: bool = False
+    wall: float | None = None
+    levels: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "blend", check_float(self.blend, "a share of blended cases in [0, 1]", 0, 1))
+        if self.wall is not None:
+            wall = check_float(self.wall, "a wall of positive thickness", SHORTEST, LONGEST)
+            object.__setattr__(self, "wall", wall)
+        if self.classes + (self.wall is not None) + (self.blend > 0) > 1:
+            raise ValueError("give one of blend, classes and wall")
+        if self.levels is not None:
+            levels = as_tuple(self.levels, "a level of each class")
+            checked = tuple(check_float(n, f"levels from 0 to {BRIGHTEST:g}", 0, BRIGHTEST, of=levels) for n in levels)
+            object.__setattr__(self, "levels", checked)
+
+    def names(self, source: ShapeSource) -> tuple[str, ...]:
+        """Return the names of the classes, 1, 2, …; ValueError where the source or the levels do not fit."""
+        names: tuple[str, ...] = ("structure",) if self.wall is None else ("wall", "lumen")
+        if self.classes:
+            if not isinstance(source, Generated) or not 2 <= len(source.names) <= MOST_CLASSES:
+                raise ValueError(f"classes need from 2 to {MOST_CLASSES} laws to grow shapes of, one for each class")
+            alike = len(set(source.names)) < len(source.names)
+            names = tuple(f"{name} {k}" if alike else name for k, name in enumerate(source.names, 1))
+        if self.levels is not None and len(self.levels) != len(names):
+            raise ValueError(f"give a level for each of {', '.join(names)}, got {len(self.levels)} levels")
+        return names
+
+    def choose_levels(self, count: int) -> tuple[float, ...]:
+        """Return the light of each of `count` classes."""
+        return self.levels or ((1.0,) * count if self.wall is None else (1.0, 0.0))
+
+    def draw(
+        self, source: ShapeSource, voxels: Sequence[int], voxel: float, index: int, rng: np.random.Generator
+    ) -> Layers:
+        """Return the classes of case `index` on voxels of the edge `voxel`, which is in the wall's unit."""
+        if self.classes:
+            shapes = [source.shape(voxels, k, rng) for k in range(len(self.names(source)))]
+            values = torch.from_numpy(np.stack([shape.values for shape in shapes]))
+            return Layers(values, shapes[0].epsilon, [shape.origin for shape in shapes])
+        if self.blend and rng.random() < self.blend:
+            seed = int(rng.integers(2**32))
+            return blend_shapes(lambda turn: source.shape(voxels, index + turn, rng), seed)
+        shape = source.shape(voxels, index, rng)
+        u = torch.from_numpy(shape.values)
+        fields = u[None] if self.wall is None else torch.stack([wall_of(u, shape.epsilon, self.wall / voxel), u])
+        return Layers(fields, shape.epsilon, [shape.origin])
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the composition in JSON's types."""
+        return asdict(self) | {"levels": None if self.levels is None else list(self.levels)}
+
+    @staticmethod
+    def from_dict(content: Mapping[str, Any]) -> Composition:
+        """Return the composition that `as_dict` wrote."""
+        return Composition(**content)
+
+
+def blend_shapes(draw: Callable[[int], PhaseField], seed: int) -> Layers:
+    """Return one structure whose texture gives way to another: two shapes, 0 and 1 of `draw`, that share the volume."""
+    one, other = draw(0), draw(1)
+    u = torch.from_numpy(one.values)
+    length = BLEND_LENGTH * max(u.shape)
+    share = torch.sigmoid(BLEND_STEEPNESS * correlated_field(u, (length,) * 3, seed, "blend"))
+    mixed = share * u + (1 - share) * torch.from_numpy(other.values)
+    return Layers(mixed[None], one.epsilon, [one.origin, other.origin])
+
+
+def wall_of(field: Tensor, epsilon: float, thickness: float) -> Tensor:
+    """Return the phase field of a wall inside the surface of a shape, all of them in voxels, of the shape's profile.
+
+    Where the shape is thinner than two walls, the wall fills it.
+    """
+    depth = torch.from_numpy(field_distance(field, Grid(tuple(field.shape), (1.0,) * 3, "replicate"), epsilon))  # type: ignore[arg-type]
+    return torch.tanh(torch.minimum(depth, thickness - depth) / (math.sqrt(2) * epsilon)).to(field.dtype)

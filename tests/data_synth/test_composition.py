@@ -1,0 +1,138 @@
+"""What an image shows: walls of even thickness, classes in front of one another, textures that give way."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from exact import Cylinder, Sphere, centres
+from flat_recipe import FLAT, SHAPE, flat_recipe
+
+from curvafit.data_synth.card import write_card
+from curvafit.data_synth.case import Recipe
+from curvafit.data_synth.composition import Composition, wall_of
+from curvafit.data_synth.imaging.effects import occupancy
+from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality
+from curvafit.data_synth.sets import SetSpec, build_set, read_spec, write_preview
+from curvafit.data_synth.sources import Generated
+from curvafit.priors.grid import Grid
+from curvafit.priors.profile import optimal_profile
+from curvafit.volumes.read import read_values
+
+N, EPSILON = 48, 2.0
+GRID = Grid((N, N, N), (1.0, 1.0, 1.0))
+MIDDLE = (N / 2, N / 2, N / 2)
+CLEAR = Modality("clear", "for tests", 1.0, Imaging(contrast=Contrast(10.0, 110.0)))
+LAWS = Generated.of(["tubes", "sponge"])
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Recipe:
+    return flat_recipe(tmp_path_factory.mktemp("shapes") / "s.zarr")
+
+
+@pytest.fixture(scope="module")
+def two() -> Any:
+    return Recipe(LAWS, CLEAR, (24, 24, 24), 1.0, composition=Composition(classes=True, levels=(1, 0.4))).case(0)
+
+
+@pytest.mark.parametrize("thickness", [4.0, 6.5])
+def test_the_wall_of_a_ball_is_a_shell(thickness):
+    distance = Sphere(16.0, MIDDLE).distance(centres(GRID))
+    wall = wall_of(optimal_profile(distance, EPSILON).float(), EPSILON, thickness)
+    volume = 4 / 3 * np.pi * (16**3 - (16 - thickness) ** 3)
+    assert float(occupancy(wall, EPSILON).sum()) == pytest.approx(volume, rel=0.02)
+    depth = distance.numpy()
+    assert (wall.numpy()[(depth > 0.5) & (depth < thickness - 0.5)] > 0).all()
+    assert (wall.numpy()[(depth < -0.1) | (depth > thickness + 0.5)] < 0).all()
+
+
+def test_a_wall_thicker_than_the_shape_fills_it():
+    u = optimal_profile(Cylinder(5.0, (1, 0.3, 0.2), MIDDLE).distance(centres(GRID)), EPSILON).float()
+    assert torch.equal(wall_of(u, EPSILON, 11.0) > 0, u > 0)
+
+
+def test_a_shell_has_a_bright_wall_and_a_dark_lumen(stored):
+    shell = replace(stored, composition=Composition(wall=0.8))
+    case, solid = shell.case(2), stored.case(2)
+    assert shell.classes == ("wall", "lumen") and case.labels.dtype == np.uint8
+    assert ((case.labels > 0) == (case.field > 0)).all() and set(np.unique(case.labels)) == {0, 1, 2}
+    wall, lumen, outside = (float(case.image[case.labels == k].mean()) for k in (1, 2, 0))
+    assert wall > 2 * lumen and lumen < 0.5 * solid.image[solid.labels > 0].mean() and outside < lumen
+    counts = [float((case.labels == k).mean()) for k in (1, 2)]
+    assert case.record["class_fractions"] == pytest.approx(counts) and sum(counts) < 1
+
+
+def test_classes_are_a_shape_of_each_law_the_first_in_front(two):
+    one, other = (LAWS.shape((24, 24, 24), k, np.random.default_rng(0)) for k in range(2))
+    assert (
+        [origin["name"] for origin in two.record["source"]]
+        == ["tubes", "sponge"]
+        == [
+            one.origin["name"],
+            other.origin["name"],
+        ]
+    )
+    alone = Recipe(Generated.of(["tubes"]), CLEAR, (24, 24, 24), 1.0).case(0)
+    assert ((two.labels == 1) == (alone.labels == 1)).all()  # no part of the first is hidden
+    inside = [two.image[two.labels == k] for k in range(3)]
+    assert [np.median(part) for part in inside] == pytest.approx([10, 110, 50])
+
+
+def test_levels_say_how_bright_a_class_is(two):
+    even = Recipe(LAWS, CLEAR, (24, 24, 24), 1.0, composition=Composition(classes=True)).case(0)
+    assert (even.labels == two.labels).all()
+    assert np.median(even.image[even.labels == 2]) == pytest.approx(110)
+
+
+def test_one_texture_gives_way_to_another(stored):
+    both = replace(stored, composition=Composition(blend=1))
+    case = both.case(0)
+    assert len(case.record["source"]) == 2 and set(np.unique(case.labels)) == {0, 1}
+    assert (case.image == both.case(0).image).all() and (case.image != stored.case(0).image).any()
+    shares = [len(replace(stored, composition=Composition(blend=0.5)).case(k).record["source"]) == 2 for k in range(12)]
+    assert 2 <= sum(shares) <= 10
+
+
+def test_a_set_of_shells_lists_its_classes(tmp_path, stored):
+    spec = SetSpec(replace(stored, composition=Composition(wall=0.8)), parts=("radius",))
+    folder = build_set(tmp_path / "set", spec, 2)
+    listed = json.loads((folder / "dataset.json").read_text())
+    assert listed["labels"] == {"background": 0, "wall": 1, "lumen": 2}
+    label = read_values(folder / "labelsTr" / "case_00001.nii.gz")
+    assert set(np.unique(label)) == {0, 1, 2}
+    radius = read_values(folder / "parts" / "radius" / "case_00001.nii.gz")
+    assert ((radius > 0) == (label > 0)).mean() > 0.99  # further labels are of wall and lumen together
+    assert read_spec(folder).as_dict() == spec.as_dict()
+    assert write_preview(folder).read_bytes().startswith(b"\x89PNG")
+    card = write_card(folder).read_text()
+    assert "0 background, 1 wall, 2 lumen" in card and "a wall of 0.8" in card and "that is lumen" in card
+    monai = build_set(tmp_path / "monai", replace(spec, layout="monai"), 1)
+    assert json.loads((monai / "dataset.json").read_text())["labels"]["2"] == "lumen"
+
+
+def test_laws_of_one_name_make_classes_of_two():
+    assert Composition(classes=True).names(Generated.of(["tubes", "tubes"])) == ("tubes 1", "tubes 2")
+
+
+def test_bad_input(stored):
+    with pytest.raises(ValueError, match="one of blend, classes and wall"):
+        Composition(blend=0.1, wall=2)
+    with pytest.raises(ValueError, match="positive thickness"):
+        Composition(wall=0)
+    with pytest.raises(ValueError, match="blended cases"):
+        Composition(blend=1.5)
+    with pytest.raises(ValueError, match="levels from 0"):
+        Composition(levels=(1, -1))
+    with pytest.raises(ValueError, match="a level for each of wall, lumen"):
+        replace(stored, composition=Composition(wall=1, levels=(1,)))
+    with pytest.raises(ValueError, match="classes need from 2"):
+        replace(stored, composition=Composition(classes=True))
+    with pytest.raises(ValueError, match="showed no lumen"):
+        replace(stored, composition=Composition(wall=50)).case(0)
+    with pytest.raises(ValueError, match="expected a Composition"):
+        Recipe(stored.source, FLAT, SHAPE, 0.5, composition=0.5)  # type: ignore[arg-type]
