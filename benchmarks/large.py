@@ -1,9 +1,9 @@
-"""Time and peak memory of `curvafit measure` or `reconstruct` on a volume in parts, in Zarr, as large as wanted.
+"""Time and peak memory of `curvafit measure`, `infer` or `reconstruct` on a volume in Zarr, as large as wanted.
 
-A generated shape of 64³ is repeated along each axis: for `measure` blurred, under noise of a quarter of its contrast;
-for `reconstruct` as labels, of which every eighth slice is known. The store is written chunk by chunk. The command runs
-in a process of its own with its workers; the memory is that of the largest worker times their number, and the main
-process's.
+A generated shape of 64³ is repeated along each axis: for `measure` and `infer` blurred, under noise of a quarter of its
+contrast; for `reconstruct` as labels, of which every eighth slice is known. The store is written chunk by chunk. The
+command runs in a process of its own with its workers; the memory is that of the largest worker times their number, and
+the main process's.
 """
 
 from __future__ import annotations
@@ -56,17 +56,21 @@ def timed(job: str, law: str, edge: int, workers: int, cases: Cases) -> Values:
     fills, tile = job == "reconstruct", ("--tile", 2 * EDGE) if edge <= WHOLE else ()
     path = cases.folder / f"{'labels' if fills else 'scan'}-{law}-{edge}.zarr"
     write_scan(law, edge, path, cases, labels=fills)
-    how = ("--every", EVERY, *tile, "-o", cases.folder / f"filled-{law}-{edge}.zarr") if fills else ()
-    how = how or ("-o", cases.folder / f"{law}-{edge}.csv")
+    crew = ("--workers", workers)
+    how = {
+        "measure": (*crew, "-o", cases.folder / f"{law}-{edge}.csv"),
+        "infer": ("-o", cases.folder / f"fit-{law}-{edge}"),
+        "reconstruct": (*crew, "--every", EVERY, *tile, "-o", cases.folder / f"filled-{law}-{edge}.zarr"),
+    }[job]
     remove(hidden_store(cases.folder / f"filled-{law}-{edge}.zarr"))  # of a run that was stopped
     begun = time.monotonic()
-    said = run_python("-c", PROGRAM, job, path, "--workers", workers, *how, "--overwrite")
+    said = run_python("-c", PROGRAM, job, path, *how, "--overwrite")
     main, worker = map(int, said.strip().splitlines()[-1].split())
     return {"seconds": time.monotonic() - begun, "memory": (main + max(workers, 0) * worker) * 1024 / 1e9}
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--command", choices=["measure", "reconstruct"], default="measure")
+    parser.add_argument("--command", choices=["measure", "infer", "reconstruct"], default="measure")
     parser.add_argument("--law", default="tubes")
     parser.add_argument("--edge", type=int, default=1024)
     parser.add_argument("--workers", type=int, default=2)
@@ -76,8 +80,8 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     job, edge, workers = options.command, options.edge, options.workers
     if options.quick:
         edge, workers = 64 if job == "reconstruct" else 208, 0
-    name = f"{options.law}-{edge}-{workers}" if job == "measure" else f"filled-{options.law}-{edge}-{workers}"
+    before = {"measure": "", "infer": "inferred-", "reconstruct": "filled-"}[job]
+    name = f"{before}{options.law}-{edge}-{workers}"
     found = cases.all({name: lambda: timed(job, options.law, edge, workers, cases)})
     show(["case", "seconds", "GB"], [[case, *row.values()] for case, row in found.items()])
-    row = edge if job == "measure" else f"filled-{edge}"
-    return {f"{row}.{key}": Figure(value) for each in found.values() for key, value in each.items()}
+    return {f"{before}{edge}.{key}": Figure(value) for each in found.values() for key, value in each.items()}

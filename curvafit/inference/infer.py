@@ -32,7 +32,7 @@ from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law
 from curvafit.priors.profile import phase_field
 from curvafit.scan.measure import scan_diagram
-from curvafit.scan.prepare import HALF, NOISE, Prepared, prepare, why_no_texture
+from curvafit.scan.prepare import HALF, NOISE, Prepared, prepare, read_scan, why_no_texture
 from curvafit.scan.structure import check_options, is_rounded, sample_mask
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Crop
@@ -168,14 +168,14 @@ def infer(
     progress("reading the scan", 0.0)
     atlas = atlas if isinstance(atlas, Atlas) else load_atlas(atlas)
     posterior = posterior if isinstance(posterior, Posterior) else load_posterior(posterior)
-    volume = field_of(scan, label=label, crop=crop, **reading)
+    volume, shape = read_scan(scan, label=label, crop=crop, whole=roi is not None or periodic, **reading)
     region = None if roi is None else field_of(roi)
     region = region if region is None or crop is None else region.crop(crop)
     prepared = prepare(volume, kind=kind, periodic=periodic, threshold=threshold, dark=dark, roi=region, one_scale=True)
     progress("measuring curvature", 0.05)
     measured = None if prepared.noise else scan_diagram(prepared)
     reason = NOISE if measured is None else why_no_texture(prepared, measured)
-    fit = _describe(prepared, measured, _provenance(volume, atlas, posterior, seed), reason)
+    fit = _describe(prepared, measured, _provenance(volume, shape, atlas, posterior, seed), reason)
     if measured is None or reason:
         return Inference(volume, prepared, measured, {}, fit)
     simulated = None
@@ -293,11 +293,11 @@ def _describe(prepared: Prepared, measured: Diagram | None, provenance: dict[str
     )
 
 
-def _provenance(volume: Field, atlas: Atlas, posterior: Posterior, seed: int) -> dict[str, Any]:
+def _provenance(volume: Field, shape: tuple[int, ...], atlas: Atlas, posterior: Posterior, seed: int) -> dict[str, Any]:
     return {
         "curvafit": version("curvafit"),
         "scan": str(volume.source),
-        "scan_shape": list(volume.values.shape),
+        "scan_shape": list(shape),
         "scan_spacing": list(volume.spacing),
         "seed": seed,
         "schedule": SCHEDULES[LEARNED].as_dict(),

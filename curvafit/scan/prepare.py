@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -36,7 +36,10 @@ from curvafit.scan.structure import (
     region_of_interest,
     sample_mask,
 )
+from curvafit.volumes.boxes import InMemory, boxes_of
 from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.formats.part import Crop
+from curvafit.volumes.read import Source, field_of
 
 #: Median thickness in voxels that a scan is resampled to; those of isotropic scans whose grid is kept: where a shape is
 #: measured, and where a law is read.
@@ -170,6 +173,24 @@ class Prepared:
         """Return the same scan with structure and background exchanged."""
         mask = ~self.mask if self.roi is None else ~self.mask & self.roi
         return replace(self, mask=mask, phase=-self.phase)
+
+
+def read_scan(
+    scan: Source, *, label: int | None = None, crop: Crop | None = None, whole: bool = False, **reading: Any
+) -> tuple[Field, tuple[int, int, int]]:
+    """Return a scan as `field_of`, and its shape; of a large file no more is read than `prepare` uses, unless `whole`.
+
+    A note says which part that is.
+    """
+    boxes = boxes_of(scan, crop=crop, **reading)
+    shape = boxes.frame.shape
+    if whole or isinstance(boxes, InMemory) or max(shape) <= LARGEST_SCAN:
+        field = boxes.field if isinstance(boxes, InMemory) else field_of(scan, crop=crop, **reading)
+        return field if label is None else field.label(label), shape
+    where, notes = bounding_box(shape, None, LARGEST_SCAN)
+    part = tuple(slice(edge.start + at, edge.stop + at) for edge, at in zip(where, boxes.first, strict=True))
+    field = field_of(scan, label=label, crop=part, **reading)  # type: ignore[arg-type]
+    return replace(field, notes=field.notes + notes), shape
 
 
 def prepare(

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from curvafit.priors import Grid, phase_field
 from curvafit.scan.grids import boxes_by_surface, median_thickness, remove_specks, resample
-from curvafit.scan.prepare import LARGEST_WINDOW, WORKING_THICKNESS, Prepared, is_ball, prepare
+from curvafit.scan.prepare import LARGEST_WINDOW, WORKING_THICKNESS, Prepared, is_ball, prepare, read_scan
 from curvafit.scan.structure import find_structure, is_noise
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.read import load
@@ -35,6 +35,25 @@ def threshold_of(scan: Prepared | Field) -> float:
     match = re.search(r"threshold of ([\d.]+):", " ".join(scan.notes))
     assert match is not None
     return float(match[1])
+
+
+# ---- large files -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("crop", [None, ":,4:20,:"])
+def test_of_a_large_file_the_middle_is_read(tmp_path, monkeypatch, crop) -> None:
+    monkeypatch.setattr("curvafit.scan.prepare.LARGEST_SCAN", 24)
+    mask = tube_mask((20, 24, 60), (1, 1, 1), 6)
+    grey = image_of(mask)
+    path = save(Field(grey, (1.0, 1.0, 1.0), "um"), tmp_path / "scan.zarr")
+    field, shape = read_scan(path, crop=crop)
+    rows = slice(4, 20) if crop else slice(0, 24)
+    assert shape == grey[:, rows].shape and (field.values == grey[:, rows, 18:42]).all()
+    assert field.affine is not None and field.affine[0, 3] == 18 and "the middle" in field.notes[-1]
+    assert read_scan(path, whole=True)[0].shape == (20, 24, 60)
+    assert read_scan(path, label=int(grey[9, 12, 30]))[0].values[9, 12, 12] == 1
+    packed = save(Field(grey, (1.0, 1.0, 1.0), "um"), tmp_path / "scan.nii.gz")  # cannot be read in part
+    assert read_scan(packed)[0].shape == (20, 24, 60)
 
 
 # ---- kinds -----------------------------------------------------------------------------------------------------------
