@@ -70,8 +70,8 @@ def refine(
     given = {"repairer": repairer, "example": example, "example_probabilities": example_probabilities, "like": like}
     numbers = list(parse_whole_numbers(classes, "--classes")) if classes else None
     _check_choice(prior, repair, weight, numbers, reading["channel"], given)
-    if repair and (epsilon, tile, workers) != (None, None, None):
-        raise ValueError("--epsilon, --tile and --workers go with a law, not with --repair")
+    if repair and (epsilon, tile, workers, steps) != (None, None, None, 400):
+        raise ValueError("--epsilon, --steps, --tile and --workers go with a law, not with --repair")
     files = _list_files(probabilities, out)
     if like is not None and len(files) > 1:
         raise ValueError("--like is for one file; images of a folder lie beside its NPZ files")

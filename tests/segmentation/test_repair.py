@@ -281,6 +281,7 @@ def test_the_command_repairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert result.exit_code == 0 and "on a part of the example" in result.output
     refused(call("refine", scan, "--repair", "--weight", 3, "-o", tmp_path / "no.nii.gz"), "repair")
     refused(call("refine", scan, "--repair", "--tile", 64, "-o", tmp_path / "no.nii.gz"), "--tile")
+    refused(call("refine", scan, "--repair", "--steps", 9, "-o", tmp_path / "no.nii.gz"), "--steps")
     refused(call("refine", scan, "--repairer", scan, "-o", tmp_path / "no.nii.gz"), "--repair")
     refused(call("refine", scan, "--repair", "--repairer", scan, "-o", tmp_path / "no.nii.gz"), "repairer")
     assert not (tmp_path / "no.nii.gz").exists()
