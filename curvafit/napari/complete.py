@@ -16,7 +16,7 @@ from curvafit.napari.dock import Dock
 from curvafit.napari.layers import drop_layer, field_of_layer, place_of_layer, put_layer
 from curvafit.segmentation.reconstruct import reconstruct, reconstruct_labels
 from curvafit.segmentation.result import Segmentation
-from curvafit.segmentation.slices import check_shared, labelled_slices
+from curvafit.segmentation.slices import check_shared
 from curvafit.segmentation.uncertainty import entropy
 from curvafit.volumes.field import Field, ScanError
 
@@ -47,13 +47,17 @@ class Filled:
 
 
 class Fill(NamedTuple):
-    """What is remembered of a layer's last fill: its known slices, its labels, and its values before and after."""
+    """One fill of a layer: what was known, and the values that it wrote at flat indices."""
 
     axis: int
     known: Sequence[int]
     numbers: Sequence[int]
-    before: np.ndarray
-    after: np.ndarray
+    where: np.ndarray
+    written: np.ndarray
+
+    def stands(self, values: np.ndarray) -> bool:
+        """Return whether most of what was written is there: else it was undone."""
+        return 2 * np.count_nonzero(values.flat[self.where] == self.written) >= len(self.where)
 
 
 class Complete(Dock):
@@ -66,21 +70,21 @@ class Complete(Dock):
         self.axis = ComboBox(label="across", choices=["z", "y", "x"], value="z", tooltip="The axis across the slices.")
         self.known = LineEdit(
             label="known slices",
-            tooltip="Those with labels, where this is empty; or 0,9,17; or every 8th from 0: 0::8.",
+            tooltip="Besides those that you drew on: 0,9,17, or every 8th from 0: 0::8. No others: only 0::8.",
         )
         self.suggest = SpinBox(label="suggest", value=3, min=0, max=20, tooltip="Slices to annotate next.")
         self.suggestions = Container(widgets=[], layout="horizontal", labels=False)
         choices = [self.annotated, self.image, self.which, self.axis, self.known, self.suggest]
         super().__init__(napari_viewer, choices, "Fill")
         self.append(self.suggestions)
-        #: The last fill of each layer: what is changed after it is known at the next.
-        self.fills: WeakKeyDictionary[Any, Fill] = WeakKeyDictionary()
+        #: The fills of each layer that were not undone: what they wrote is not taken for drawn.
+        self.fills: WeakKeyDictionary[Any, list[Fill]] = WeakKeyDictionary()
 
     def prepare(self) -> Callable[[Progress], Filled]:
         """Read the layers and what is known of them."""
         self.suggestions.clear()
         layer, axis = self.annotated.value, "zyx".index(self.axis.value)
-        field = field_of_layer(layer)
+        field = field_of_layer(layer, "a labels layer")
         if layer.multiscale or not isinstance(layer.data, np.ndarray):
             raise ScanError(f"expected labels that can be edited, got {layer.name}, which is no NumPy array")
         field = replace(field, values=np.array(field.values))
@@ -89,28 +93,42 @@ class Complete(Dock):
         if not np.isin(values, numbers).any():
             what = "labels" if self.which.value == _ALL else f"voxels of label {numbers[0]}"
             raise ScanError(f"expected slices with {what} in {layer.name}, got none")
-        known = self._list_known(layer, axis, values, numbers)
+        known = self._list_known(layer, axis, field.values, numbers)
         image = None if self.image.value is None else field_of_layer(self.image.value)
         suggest = min(self.suggest.value, len(values) - len(known))
         return partial(_fill, Task(layer, field, numbers, axis, known, image, suggest))
 
     def _list_known(self, layer: Any, axis: int, values: np.ndarray, numbers: Sequence[int]) -> list[int]:
-        """Return the slices that are named, or those with labels, and those that were changed after the last fill."""
-        named, last = _parse_slices(self.known.value, len(values)), self.fills.get(layer)
-        changed: list[int] = []
-        if last is not None and last.after.shape == layer.data.shape[-3:]:
-            after, before = (np.moveaxis(each, axis, 0) for each in (last.after, last.before))
-            differs, stands = ((values != each).any((1, 2)) for each in (after, before))
-            changed = np.flatnonzero(differs & stands).tolist()
-            last = last if stands.any() else None  # else it was undone
-        else:
-            last = None
-        if not named and last is not None and last.axis == axis and set(numbers) <= set(last.numbers):
-            named = list(last.known)
-        elif not named:
-            named = labelled_slices(np.isin(values, numbers))
-            check_shared(values, named, numbers)
-        return sorted({*named, *changed})
+        """Return the slices that are named and, unless no others are wanted, those that somebody drew on."""
+        count = values.shape[axis]
+        named, alone = _parse_slices(self.known.value, count)
+        if alone:
+            return named
+        fills = self.fills.setdefault(layer, [])
+        if fills and fills[-1].where.max(initial=0) >= values.size:
+            fills.clear()  # the layer got other data
+        while fills and not fills[-1].stands(values):
+            fills.pop()
+        expected, written = values.copy(), np.zeros(values.shape, dtype=bool)
+        for fill in fills:
+            expected.flat[fill.where], written.flat[fill.where] = fill.written, True
+        corrected = (values != expected) & (np.isin(values, numbers) | np.isin(expected, numbers))
+        drawn = np.where(written & (values == expected), 0, values)
+        known = {*named, *_touched(corrected, axis), *_touched(np.isin(drawn, numbers), axis)}
+        for fill in fills:
+            known |= set(fill.known) if fill.axis == axis and set(numbers) <= set(fill.numbers) else set()
+        places = sorted(known)
+        if len(places) < 2:
+            raise ScanError(f"expected two or more slices with labels in {layer.name}, got {len(places)}")
+        if np.diff(places).max() == 1:
+            raise ScanError(
+                f"no slice without labels lies between those of {layer.name}: name those to keep, as only 0::8"
+            )
+        if len(numbers) > 1 and not named:
+            drawn, whole = (np.moveaxis(each, axis, 0) for each in (drawn, values))
+            drawn[places] = whole[places]
+            check_shared(drawn, places, numbers)
+        return places
 
     def show_result(self, result: Filled) -> str:
         """Write the labels, as one step to undo, the doubt as a layer, and the slices to annotate next."""
@@ -122,8 +140,12 @@ class Complete(Dock):
             drop_layer(self.viewer, name)
         now = layer.data.reshape(result.after.shape)
         after = np.where(now == result.before, result.after, now)  # what was painted meanwhile stays
+        where = np.flatnonzero(after != now)
         write_labels(layer, after)
-        self.fills[layer] = Fill(task.axis, task.known, task.numbers, result.before, after)
+        fill = Fill(task.axis, task.known, task.numbers, where, after.flat[where])
+        self.fills.setdefault(layer, []).append(fill)
+        if layer.selected_label not in task.numbers:
+            layer.selected_label = task.numbers[0]  # the one to correct with
         assert found.uncertainty is not None
         doubt = entropy(found.uncertainty.probability.values).astype(np.float32) / np.float32(np.log(2))
         options = {"colormap": "inferno", "blending": "additive", "contrast_limits": (0.2, 1), "opacity": 0.6}
@@ -181,18 +203,24 @@ def _names(layer: Any) -> tuple[str, str]:
     return f"doubt of {layer.name}", f"suggested slices of {layer.name}"
 
 
-def _parse_slices(text: str, count: int) -> list[int]:
-    """Return the numbers of slices in a text such as `0,9,17` or `0::8`; none of an empty one."""
+def _touched(voxels: np.ndarray, axis: int) -> list[int]:
+    """Return the slices across an axis that have some of the voxels."""
+    return np.flatnonzero(np.moveaxis(voxels, axis, 0).any((1, 2))).tolist()
+
+
+def _parse_slices(text: str, count: int) -> tuple[list[int], bool]:
+    """Return the numbers of slices in a text such as `0,9,17` or `0::8`, and whether it says `only` before them."""
     found: list[int] = []
+    alone = text.strip().lower().startswith("only")
     try:
-        for part in filter(None, text.replace(" ", "").split(",")):
+        for part in filter(None, text.lower().replace("only", "", 1).replace(" ", "").split(",")):
             edges = [int(each) if each else None for each in part.split(":")]
             found += [edges[0]] if len(edges) == 1 else range(count)[slice(*edges)]  # type: ignore[list-item]
     except (ValueError, TypeError):
         found = [-1]
-    if any(not 0 <= k < count for k in found) or (text.strip() and len(set(found)) < 2):
-        raise ScanError(f"expected two or more known slices from 0 to {count - 1}, as 0,9,17 or 0::8, got {text!r}")
-    return sorted(set(found))
+    if any(not 0 <= k < count for k in found) or len(set(found)) < (2 if alone else bool(text.strip())):
+        raise ScanError(f"expected known slices from 0 to {count - 1}, as 0,9,17 or 0::8 or only 0::8, got {text!r}")
+    return sorted(set(found)), alone
 
 
 def _frame(shape: tuple[int, ...], axis: int, k: int) -> np.ndarray:

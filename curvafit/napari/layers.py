@@ -13,14 +13,14 @@ from curvafit.volumes.field import Field, ScanError
 _UNITS = {"voxel": "pixel", "nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter"}
 
 
-def field_of_layer(layer: Any) -> Field:
-    """Return the values of a layer, of its finest level, with its scale and unit; else ScanError.
+def field_of_layer(layer: Any, kind: str = "a layer") -> Field:
+    """Return the values of a layer, of its finest level, with its scale and unit; else ScanError, which names the kind.
 
     The layer has three axes, besides any of length one before them, and no colours. A turned or sheared layer is read
     on its own axes.
     """
     if layer is None:
-        raise ScanError("expected a layer, got none: add one")
+        raise ScanError(f"expected {kind}, got none: add one")
     if getattr(layer, "rgb", False):
         raise ScanError(f"expected grey levels or labels, got colours in the layer {layer.name}")
     data = layer.data[0] if layer.multiscale else layer.data

@@ -46,10 +46,12 @@ def read_image(
     Raises ImportError where scikit-learn is not installed.
     """
     known, slope, shift, told = slices.inside, 1.0, 0.0, math.nan
+    progress("learning from the image", 0.0)
     levels = ((values - values.mean()) / max(float(values.std()), 1e-12)).astype(np.float32)
     describe = partial(_features, levels, slices.spacing)
     kept = list(describe()) if values.size <= KEPT else None
     features = np.concatenate([part[np.isin(rows, slices.places)] for rows, part in kept or describe()])
+    progress("learning from the image", 0.2)
     if all(half.any() and not half.all() for half in (known[::2], known[1::2])):
         trees = _learn(features[::2], known[::2], seed)
         logits = trees.decision_function(features[1::2].reshape(-1, features.shape[-1]))
@@ -57,10 +59,11 @@ def read_image(
         slope, shift = fit_weights(logits[:, None], truth)
         loss = float(np.logaddexp(0, np.where(truth, -1, 1) * (slope * logits + shift)).mean())
         told = 1 - loss / float(entropy(truth.mean()))
+    progress("learning from the image", 0.35)
     trees = _learn(features, known, seed)
     evidence = np.empty(values.shape, dtype=np.float32)
     for rows, part in kept or describe():
-        progress("reading the image", rows[0] / len(values))
+        progress("reading the image", 0.6 + 0.4 * rows[0] / len(values))
         for row, plane in zip(rows, part, strict=True):
             logits = trees.decision_function(plane.reshape(-1, plane.shape[-1]))
             evidence[row] = (slope * logits + shift).reshape(plane.shape[:2])

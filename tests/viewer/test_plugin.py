@@ -125,9 +125,60 @@ def test_a_correction_is_known_at_the_next_fill(viewer: Any) -> None:
     assert "4 of 33 slices known" in run(widget)
     np.testing.assert_array_equal(layer.data[[0, 8, 16, 32]], truth[[0, 8, 16, 32]])
     layer.data[20] = truth[20]
-    widget.known.value = "0::16"  # what was corrected counts besides
-    assert "4 of 33 slices known" in run(widget)
+    widget.known.value = "4"  # besides what was drawn and corrected
+    assert "6 of 33 slices known" in run(widget)
     np.testing.assert_array_equal(layer.data[20], truth[20])
+    widget.known.value = "only 0::16"
+    assert "3 of 33 slices known" in run(widget)
+
+
+def test_what_was_drawn_stays_where_other_slices_are_named(viewer: Any) -> None:
+    some = sparse()
+    layer = viewer.add_labels(some.copy(), name="cells", **PLACE)
+    widget = docked(viewer, Complete)
+    widget.known.value = "0,8,12"
+    assert "6 of 33 slices known" in run(widget)
+    np.testing.assert_array_equal(layer.data[::8], some[::8])
+    assert not layer.data[12].any()  # named, and empty
+
+
+def test_a_full_layer_is_filled_anew_between_the_slices_that_are_named_alone(viewer: Any) -> None:
+    truth = rods()
+    layer = viewer.add_labels(truth.copy(), name="cells")
+    widget = docked(viewer, Complete)
+    assert "only 0::8" in run(widget)
+    widget.known.value = "only 0::8"
+    assert "5 of 33 slices known" in run(widget)
+    np.testing.assert_array_equal(layer.data[::8], truth[::8])
+
+
+def test_one_label_after_all_of_them_is_filled_from_what_was_drawn(viewer: Any) -> None:
+    layer = viewer.add_labels(sparse(), name="cells", **PLACE)
+    widget = docked(viewer, Complete)
+    run(widget)
+    widget.which.value = "the selected label"
+    for label in (3, 7):
+        layer.selected_label = label
+        assert "5 of 33 slices known" in run(widget)
+
+
+def test_after_undo_other_drawings_count(viewer: Any) -> None:
+    truth = rods()
+    layer = viewer.add_labels(sparse(16), name="cells", **PLACE)
+    widget = docked(viewer, Complete)
+    run(widget)
+    layer.undo()
+    layer.data[24] = truth[24]
+    assert "4 of 33 slices known" in run(widget)
+    layer.undo()
+    assert "4 of 33 slices known" in run(widget)
+
+
+def test_the_label_that_was_filled_is_the_one_to_correct_with(viewer: Any) -> None:
+    layer = viewer.add_labels(np.where(sparse() == 3, 255, 0), name="cells")
+    layer.selected_label = 1
+    run(docked(viewer, Complete))
+    assert layer.selected_label == 255
 
 
 def test_what_is_painted_meanwhile_stays(viewer: Any) -> None:
@@ -156,6 +207,9 @@ def test_labels_on_slices_of_their_own_are_filled_one_after_the_other(viewer: An
         layer.selected_label = label
         run(widget)
     assert dice(layer.data == 3, truth == 3) > 0.9 and dice(layer.data == 7, truth == 7) > 0.85
+    layer.selected_label = 3
+    layer.data[20] = np.where(truth[20] == 3, 3, np.where(layer.data[20] == 3, 0, layer.data[20]))
+    assert "6 of 33 slices known" in run(widget)  # five drawn, and the corrected one
 
 
 def test_an_image_and_another_axis(viewer: Any) -> None:
@@ -246,7 +300,7 @@ def test_layers_that_cannot_be_edited_or_measured_are_said(viewer: Any) -> None:
     assert "not" in run(gauge) and "finite" in gauge.status.value
 
 
-@pytest.mark.parametrize("text", ["a", "0,99", "1:2:3:4", "-1", "5:2", "3"])
+@pytest.mark.parametrize("text", ["a", "0,99", "1:2:3:4", "-1", "5:2", "only", "only 3"])
 def test_slices_that_are_none_are_said(viewer: Any, text: str) -> None:
     viewer.add_labels(rods(), name="cells")
     widget = docked(viewer, Complete)
