@@ -202,7 +202,7 @@ def slices_of(count: int) -> list[int]:
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--seeds", type=int, default=4, help="blocks of each set, and after four of them other networks"
+        "--seeds", type=int, default=8, help="blocks of each set, and after four of them other networks"
     )
     parser.add_argument("--scans", default=",".join(SCANS))
 
