@@ -80,6 +80,7 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     job, edge, workers = options.command, options.edge, options.workers
     if options.quick:
         edge, workers = 64 if job == "reconstruct" else 208, 0
+    workers = 0 if job == "infer" else workers
     before = {"measure": "", "infer": "inferred-", "reconstruct": "filled-"}[job]
     name = f"{before}{options.law}-{edge}-{workers}"
     found = cases.all({name: lambda: timed(job, options.law, edge, workers, cases)})

@@ -77,7 +77,9 @@ def synth(
             raise ValueError("--unit needs --spacing, --voxel or --wall")
         reading["unit"] = None  # it is that of --voxel and --wall, not of --like
     names = [] if laws is None else laws.split(",")
-    source = _choose_source(names, atlas, volume_fraction, draws)
+    source, sized = _choose_source(names, atlas, volume_fraction, draws)
+    if classes and draws is not None:
+        raise ValueError("--classes takes one law for each class: leave out --draws")
     kind = _choose_modality(modality, like, like_mask, visible, reading)
     from curvafit.core.units import convert_length
     from curvafit.data_synth.case import Recipe
@@ -85,7 +87,7 @@ def synth(
     from curvafit.data_synth.sets import SetSpec
     from curvafit.data_synth.sources import choose_voxel
 
-    edge = choose_voxel(names, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
+    edge = choose_voxel(sized, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
     low, high = parse_numbers(calibres, "--calibres", 2)
     thickness = None if wall is None else convert_length(wall, unit, kind.base.unit)
     lights = None if levels is None else tuple(parse_numbers(levels, "--levels", levels.count(",") + 1))
@@ -116,31 +118,46 @@ def _build_and_preview(out: Path, spec: SetSpec, count: int, crew: Crew) -> None
     say(str(card))
 
 
-def _choose_source(laws: list[str], atlas: Path | None, filled: float | None, draws: int | None) -> ShapeSource:
-    """Return the source of shapes that the options name."""
+def _choose_source(
+    laws: list[str], atlas: Path | None, filled: float | None, draws: int | None
+) -> tuple[ShapeSource, list[Any]]:
+    """Return the source of shapes that the options name, and the laws whose fits tell how large a voxel is."""
     if bool(laws) == (atlas is not None):
         raise ValueError(f"give either --prior (or --preset) or --atlas, got {'both' if laws else 'neither'}")
     from curvafit.data_synth.sources import Generated, Stored
 
     if atlas is None and draws is None:
-        return Generated.of(laws, filled)
+        return Generated.of(laws, filled), laws
     if atlas is None:
-        from curvafit.inference.fit import draw_laws
-
-        return Generated.of([law for name in laws for law in draw_laws(name, int(draws or 0))], filled)
+        return _draw_source(laws, filled, int(draws or 0))
     if draws is not None:
         raise ValueError("--draws is for fits, not for an atlas")
     if atlas.suffix.lower() != ".npz":
         if filled is not None:
             raise ValueError("--volume-fraction is for shapes that are grown, not for those of a store")
-        return Stored((atlas.resolve(),))
+        return Stored((atlas.resolve(),)), []
     from curvafit.inference.atlas import load_atlas
 
     shapes = load_atlas(atlas)
     points = tuple(
         (*map(float, row), float(mass)) for row, mass in zip(shapes.coefficients, shapes.masses, strict=True)
     )
-    return Generated(points, shapes.ids, fraction=filled)
+    return Generated(points, shapes.ids, fraction=filled), []
+
+
+def _draw_source(laws: list[str], filled: float | None, count: int) -> tuple[ShapeSource, list[Any]]:
+    """Return the source of shapes of laws from a fit's posterior, and the law with a voxel of their median edge."""
+    from statistics import median
+
+    from curvafit.data_synth.sources import Generated
+    from curvafit.inference.fit import draw_laws
+
+    if len(laws) > 1:
+        raise ValueError(f"--draws takes one fit, got {len(laws)}")
+    drawn = draw_laws(laws[0], count)
+    edges = [float(law.working_voxel or 1.0) for law in drawn]
+    scales = tuple(edge / median(edges) for edge in edges)
+    return replace(Generated.of(drawn, filled), scales=scales), [replace(drawn[0], working_voxel=median(edges))]
 
 
 def _choose_modality(

@@ -105,10 +105,11 @@ def _describe_composition(recipe: Recipe) -> Iterator[str]:
         yield f"\nThe shape is a wall of {format_number(shown.wall)} {unit} inside its surface, around a lumen."
     if shown.blend:
         yield f"\nIn {format_number(100 * shown.blend)} % of the cases one shape gives way to another."
-    if len(names) > 1:
+    if len(names) > 1 or shown.levels:
         levels = zip(names, shown.choose_levels(len(names)), strict=True)
         told = ", ".join(f"{name} {format_number(level)}" for name, level in levels)
         yield f"\nLight of a class, 0 as the background's and 1 as the structure's: {told}."
+    if len(names) > 1:
         yield "Further labels are of all classes together."
 
 

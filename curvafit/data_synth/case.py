@@ -12,8 +12,8 @@ import torch
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_seed, check_type, quoted
 from curvafit.core.schema import encode
-from curvafit.data_synth.composition import Composition
-from curvafit.data_synth.imaging.image import field_shape, image, regrid, visible
+from curvafit.data_synth.composition import Composition, Layers
+from curvafit.data_synth.imaging.image import field_shape, image, label_voxels, regrid
 from curvafit.data_synth.imaging.modality import Imaging, Modality
 from curvafit.data_synth.sources import ShapeSource, decode_source
 from curvafit.priors.kernels.threads import one_thread
@@ -72,8 +72,9 @@ class Recipe:
         object.__setattr__(self, "calibres", check_calibres(self.calibres))
         check_type(self.composition, Composition, "a Composition")
         self.composition.names(self.source)
-        for factor in self.calibres:
-            check_crop(self.source.edge, self.shape, self.voxel * factor, self.modality)
+        self.composition.check_wall(self._voxels[1], self.modality.base.unit)
+        for voxel in self._voxels:
+            check_crop(self.source.edge, self.shape, voxel, self.modality, self.composition.margin(self.source, voxel))
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -83,27 +84,35 @@ class Recipe:
     @property
     def largest(self) -> tuple[int, int, int]:
         """Return the most voxels (z, y, x) that a shape can have: those at the least calibre."""
-        return field_shape(self.shape, self.voxel * self.calibres[0], self.modality.base)
+        return field_shape(self.shape, self._voxels[0], self.modality.base)
+
+    @property
+    def _voxels(self) -> tuple[float, float]:
+        """The shortest and the longest edge that a shape's voxels can have."""
+        low, high = self.calibres
+        least, most = self.source.scales_between
+        return self.voxel * low * least, self.voxel * high * most
 
     def case(self, index: int) -> Case:
         """Make case number `index`, on one thread; ValueError where a class is not seen on the image's voxels."""
         for_shape, for_imaging, for_image = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(3)
         imaging = self.modality.draw(_draw_number(for_imaging))
         rng = np.random.default_rng(for_shape)
-        voxel = draw_voxel(self.voxel, self.calibres, rng)
+        voxel = draw_voxel(self.voxel, self.calibres, rng) * self.source.scale(index)
         voxels, names = field_shape(self.shape, voxel, imaging), self.classes
         seed = _draw_number(for_image)
         with one_thread():
             for _ in range(TRIES):
                 layers = self.composition.draw(self.source, voxels, voxel, index, rng)
                 levels = self.composition.choose_levels(len(names))
-                parts = image_and_labels(layers.values, layers.epsilon, voxel, imaging, seed, self.shape, levels)
+                parts = image_and_labels(layers, voxel, imaging, seed, self.shape, levels)
                 grey, sampled, labels = (part.numpy() for part in parts)
                 counts = np.bincount(labels.ravel(), minlength=len(names) + 1)
                 if sampled.min() <= 0 < sampled.max() and counts.all():
                     break
             else:
-                edges, missing = " x ".join(map(str, self.shape)), ("background", *names)[int(counts.argmin())]
+                edges = " x ".join(map(str, self.shape))
+                missing = "structure" if counts.all() else ("background", *names)[int(counts.argmin())]
                 raise ValueError(f"{TRIES} shapes showed no {missing} on {edges} voxels: {_MENDS[len(names) > 1]}")
         record = {"index": index, "source": layers.origins, "imaging": imaging.as_dict(), "image_seed": seed}
         shares = (counts[1:] / labels.size).tolist()
@@ -128,29 +137,23 @@ class Recipe:
 
 
 def image_and_labels(
-    fields: torch.Tensor,
-    epsilon: float,
+    layers: Layers,
     voxel: float,
     imaging: Imaging,
     seed: int,
     shape: Sequence[int],
     levels: Sequence[float],
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the image of the phase fields (C, Z, Y, X) of classes, and on its voxels their union and their labels.
+    """Return the image of some classes, and on its voxels the field of the whole and the labels, all of `shape`.
 
-    All three are of `shape`. A label is that of the first class that the voxel is in. `epsilon` is in the fields'
-    voxels, whose edge is `voxel`. See `imaging.image` for the levels, and `Imaging.visible`.
+    `voxel` is the edge of the fields' voxels. See `imaging.image` for the levels, and `label_voxels`.
     """
     z, y, x = shape  # a field of whole voxels may give a few voxels more
-    grey = image(fields, voxel, imaging, seed, epsilon, levels)
-    sampled = [regrid(field, voxel, imaging) for field in fields]
-    labels = torch.zeros_like(sampled[0], dtype=torch.uint8)
-    for number in range(len(fields), 0, -1):
-        field, inside = fields[number - 1], sampled[number - 1] > 0
-        labels[visible(field, voxel, imaging, epsilon) if imaging.visible else inside] = number
-    union = torch.stack(sampled).amax(0)
-    grey, union, labels = (part[:z, :y, :x].contiguous() for part in (grey, union, labels))
-    return grey, union, labels
+    grey = image(layers.values, voxel, imaging, seed, layers.epsilon, levels)
+    whole = regrid(layers.whole, voxel, imaging)
+    labels = label_voxels(layers.values, layers.whole, voxel, imaging, layers.epsilon)
+    grey, whole, labels = (part[:z, :y, :x].contiguous() for part in (grey, whole, labels))
+    return grey, whole, labels
 
 
 def check_shape(shape: Sequence[int]) -> tuple[int, int, int]:
@@ -178,9 +181,10 @@ def check_calibres(calibres: Sequence[float]) -> tuple[float, float]:
     return low, high
 
 
-def check_crop(longest: float, shape: Sequence[int], voxel: float, modality: Modality) -> None:
-    """Raise ValueError where images of `shape` need shapes that are too small, too large, or longer than `longest`."""
-    need = field_shape(shape, voxel, modality.base)
+def check_crop(longest: float, shape: Sequence[int], voxel: float, modality: Modality, margin: int = 0) -> None:
+    """Raise ValueError where images of `shape`, with a margin of voxels around their shapes, need shapes that are too
+    small, too large, or longer than `longest`."""
+    need = tuple(n + 2 * margin for n in field_shape(shape, voxel, modality.base))
     images, crops = " x ".join(map(str, shape)), " x ".join(map(str, need))
     if not 1 < math.prod(shape) <= MOST:
         raise ValueError(f"images must have 2 to {MOST:.0e} voxels, got {images}")

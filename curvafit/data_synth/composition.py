@@ -27,11 +27,18 @@ MOST_CLASSES = 200
 
 
 class Layers(NamedTuple):
-    """Phase fields (C, Z, Y, X) of classes 1 to C, the first in front; their ε in voxels; the shapes' origins."""
+    """Phase fields (C, Z, Y, X) of classes 1 to C, the first in front; that of the whole, of all together (Z, Y, X);
+    their ε in voxels; and the shapes' origins."""
 
     values: Tensor
+    whole: Tensor
     epsilon: float
     origins: list[dict[str, Any]]
+
+    @classmethod
+    def of(cls, field: Tensor, epsilon: float, origins: list[dict[str, Any]]) -> Layers:
+        """Return one class."""
+        return cls(field[None], field, epsilon, origins)
 
 
 @dataclass(frozen=True)
@@ -91,14 +98,27 @@ class Composition:
         if self.classes:
             shapes = [source.shape(voxels, k, rng) for k in range(len(self.names(source)))]
             values = torch.from_numpy(np.stack([shape.values for shape in shapes]))
-            return Layers(values, shapes[0].epsilon, [shape.origin for shape in shapes])
+            return Layers(values, values.amax(0), shapes[0].epsilon, [shape.origin for shape in shapes])
         if self.blend and rng.random() < self.blend:
             seed = int(rng.integers(2**32))
             return blend_shapes(lambda turn: source.shape(voxels, index + turn, rng), seed)
-        shape = source.shape(voxels, index, rng)
-        u = torch.from_numpy(shape.values)
-        fields = u[None] if self.wall is None else torch.stack([wall_of(u, shape.epsilon, self.wall / voxel), u])
-        return Layers(fields, shape.epsilon, [shape.origin])
+        margin = self.margin(source, voxel)
+        shape = source.shape([n + 2 * margin for n in voxels], index, rng)
+        u, origin = torch.from_numpy(shape.values), shape.origin | ({"margin": margin} if margin else {})
+        if self.wall is None:
+            return Layers.of(u, shape.epsilon, [origin])
+        shell = shell_of(u, shape.epsilon, self.wall / voxel, periodic=source.edge == math.inf)
+        inner = (..., *(slice(margin, margin + n) for n in voxels))
+        return Layers(shell[inner], u[inner], shape.epsilon, [origin])
+
+    def margin(self, source: ShapeSource, voxel: float) -> int:
+        """Return by how many voxels a crop is larger on every side: walls of surfaces outside reach into it."""
+        return 0 if self.wall is None or source.edge == math.inf else math.ceil(self.wall / voxel) + 2
+
+    def check_wall(self, voxel: float, unit: str) -> None:
+        """Raise ValueError where a wall is thinner than a shape's voxel."""
+        if self.wall is not None and self.wall < voxel:
+            raise ValueError(f"a wall must be at least a shape's voxel thick, {voxel:g} {unit}, got {self.wall:g}")
 
     def as_dict(self) -> dict[str, Any]:
         """Return the composition in JSON's types."""
@@ -117,13 +137,15 @@ def blend_shapes(draw: Callable[[int], PhaseField], seed: int) -> Layers:
     length = BLEND_LENGTH * max(u.shape)
     share = torch.sigmoid(BLEND_STEEPNESS * correlated_field(u, (length,) * 3, seed, "blend"))
     mixed = share * u + (1 - share) * torch.from_numpy(other.values)
-    return Layers(mixed[None], one.epsilon, [one.origin, other.origin])
+    return Layers.of(mixed, one.epsilon, [one.origin, other.origin])
 
 
-def wall_of(field: Tensor, epsilon: float, thickness: float) -> Tensor:
-    """Return the phase field of a wall inside the surface of a shape, all of them in voxels, of the shape's profile.
+def shell_of(field: Tensor, epsilon: float, thickness: float, *, periodic: bool = False) -> Tensor:
+    """Return the phase fields (2, Z, Y, X) of a wall inside the surface of a shape, and of what it encloses.
 
-    Where the shape is thinner than two walls, the wall fills it.
+    All are in voxels, of the shape's profile. Where the shape is thinner than two walls, the wall fills it.
     """
-    depth = torch.from_numpy(field_distance(field, Grid(tuple(field.shape), (1.0,) * 3, "replicate"), epsilon))  # type: ignore[arg-type]
-    return torch.tanh(torch.minimum(depth, thickness - depth) / (math.sqrt(2) * epsilon)).to(field.dtype)
+    grid = Grid(tuple(field.shape), (1.0,) * 3, "periodic" if periodic else "replicate")  # type: ignore[arg-type]
+    depth = torch.from_numpy(field_distance(field, grid, epsilon))
+    distances = torch.stack([torch.minimum(depth, thickness - depth), depth - thickness])
+    return torch.tanh(distances / (math.sqrt(2) * epsilon)).to(field.dtype)

@@ -154,7 +154,7 @@ class TextureDataset(IterableDataset):
         imaging, voxel = kind.draw(for_imaging), draw_voxel(self.voxels[turn], self.calibres, rng)
         voxels = field_shape(self.size, voxel, imaging)
         shown = self._draw_shape(voxels, rng, for_blend)
-        grey, _, mask = image_and_labels(shown.values, shown.epsilon, voxel, imaging, for_image, self.size, (1.0,))
+        grey, _, mask = image_and_labels(shown, voxel, imaging, for_image, self.size, (1.0,))
         record = {"number": number, "source": shown.origins, "modality": kind.name, "imaging": imaging.as_dict()}
         record |= {"image_seed": for_image, "voxel": voxel}
         image = grey[None].float()
@@ -166,7 +166,7 @@ class TextureDataset(IterableDataset):
         if rng.random() < self.blend:
             return blend_shapes(lambda turn: self.source.shape(voxels, turn, rng), seed)
         shape = self.source.shape(voxels, 0, rng)
-        return Layers(torch.from_numpy(shape.values)[None], shape.epsilon, [shape.origin])
+        return Layers.of(torch.from_numpy(shape.values), shape.epsilon, [shape.origin])
 
     def _make_pool(self, generated: Generated, count: int, rotate: bool) -> Pool:
         """Return a pool of shapes that are as large as the largest crop."""

@@ -52,15 +52,18 @@ class Generated:
     """Shapes grown from points of seven numbers (`PARAMETERS`, working units), in turn; each point has a name.
 
     Shapes fill a `fraction` of the volume instead of having the points' masses, where one is given; a shape's `origin`
-    says where `generate` misses it.
+    says where `generate` misses it. Points may have voxels of their own: `scales` are their edges over a set's voxel.
     """
 
     points: tuple[tuple[float, ...], ...]
     names: tuple[str, ...]
     schedule: str | Schedule = "fast"
     fraction: float | None = None
+    scales: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
+        if self.scales is not None and len(self.scales) != len(self.points):
+            raise ValueError(f"each of {len(self.points)} points needs a scale, got {len(self.scales)}")
         object.__setattr__(self, "names", as_tuple(self.names, "names"))
         if len(self.names) != len(as_tuple(self.points, "points")):
             raise ValueError(f"each of {len(self.points)} points needs a name, got {len(self.names)} names")
@@ -73,6 +76,15 @@ class Generated:
     def edge(self) -> float:
         """Return infinity: a shape is grown as large as it is wanted."""
         return math.inf
+
+    @property
+    def scales_between(self) -> tuple[float, float]:
+        """Return the least and the greatest scale of a point."""
+        return (1.0, 1.0) if self.scales is None else (min(self.scales), max(self.scales))
+
+    def scale(self, index: int) -> float:
+        """Return the edge of a shape's voxels over a set's voxel."""
+        return 1.0 if self.scales is None else self.scales[index % len(self.points)]
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
         """Return a well-formed shape, from the first of some seeds that gives one; ValueError where none does."""
@@ -123,7 +135,9 @@ class Generated:
         """Return the source in JSON's types, for a set's record; `decode_source` reads it."""
         points, plan = list(map(list, self.points)), named_schedule(self.schedule).as_dict()
         texture = {"names": list(self.names), "points": points}
-        return {"kind": "generated", **texture, "schedule": plan, "fraction": self.fraction}
+        return {"kind": "generated", **texture, "schedule": plan, "fraction": self.fraction} | (
+            {} if self.scales is None else {"scales": list(self.scales)}
+        )
 
 
 @dataclass(frozen=True)
@@ -137,6 +151,7 @@ class Stored:
     paths: tuple[Path, ...]
     draws: int | None = None
     rotate: bool = False
+    scales_between = (1.0, 1.0)
 
     def __post_init__(self) -> None:
         if self.draws is None:
@@ -161,6 +176,10 @@ class Stored:
     def as_dict(self) -> dict[str, Any]:
         """Return the source in JSON's types, for a set's record; `decode_source` reads it."""
         return {"kind": "stored", "paths": list(map(str, self.paths)), "draws": self.draws, "rotate": self.rotate}
+
+    def scale(self, index: int) -> float:
+        """Return the edge of a shape's voxels over a set's voxel."""
+        return 1.0
 
     @property
     def about(self) -> str:
@@ -210,7 +229,8 @@ def decode_source(content: dict[str, Any]) -> ShapeSource:
     if content["kind"] == "stored":
         return Stored(tuple(map(Path, content["paths"])), content["draws"], content["rotate"])
     points, plan = tuple(map(tuple, content["points"])), Schedule(**content["schedule"])
-    return Generated(points, tuple(content["names"]), plan, content["fraction"])
+    scales = tuple(content["scales"]) if "scales" in content else None
+    return Generated(points, tuple(content["names"]), plan, content["fraction"], scales)
 
 
 def choose_voxel(laws: Iterable[LawLike], kind: Modality) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from dataclasses import dataclass, fields
 from os import PathLike
@@ -290,7 +291,8 @@ def load_candidates(law: LawLike) -> tuple[Candidate, ...]:
 def draw_laws(law: LawLike, count: int) -> list[Law]:
     """Return `count` laws of the posterior of a fit, an inference or a `fit.json`, evenly from among its draws.
 
-    Each fills the scan's volume fraction. Raises ValueError where there are no draws, or fewer.
+    Each has the voxel in which its shapes are as thick as the scan's structure, and the scan's volume fraction. Raises
+    ValueError where there are no draws, or fewer.
     """
     named = preset_name(law) is None and isinstance(law, (str, PathLike))
     fit = Fit.load(law) if named else getattr(law, "fit", law)  # type: ignore[arg-type]
@@ -298,11 +300,12 @@ def draw_laws(law: LawLike, count: int) -> list[Law]:
         raise ValueError(f"expected a fit with draws of a posterior, got {quoted(law)}")
     check_int(count, f"from 1 to {len(fit.draws)} draws", 1, len(fit.draws))
     rows = np.linspace(0, len(fit.draws) - 1, count).round().astype(int)
-    own = {"working_voxel": fit.working_voxel, "length_unit": fit.length_unit}
-    own |= {"volume_fraction": fit.morphometry.volume_fraction, "schedule": "deep"}
-    points = to_columns(fit.draws[rows, :-1]).T.tolist()
-    drawn = zip(rows, points, strict=True)
-    return [Law(Coefficients(1.0, *five), mass, f"draw {row}", **own) for row, (*five, mass) in drawn]  # type: ignore[arg-type]
+    own = {"length_unit": fit.length_unit, "volume_fraction": fit.morphometry.volume_fraction, "schedule": "deep"}
+    source, laws = f" of {os.fspath(law)}" if named else "", []  # type: ignore[arg-type]
+    for row, (*five, mass, thickness) in zip(rows, to_columns(fit.draws[rows]).T.tolist(), strict=True):
+        edge, origin = fit.thickness / thickness, f"draw {row}{source}"
+        laws.append(Law(Coefficients(1.0, *five), mass, origin, working_voxel=edge, **own))  # type: ignore[arg-type]
+    return laws
 
 
 def _file_of(fit: Fit) -> _File:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -46,18 +46,43 @@ class Filled:
     found: Segmentation
 
 
-class Fill(NamedTuple):
-    """One fill of a layer: what was known, and the values that it wrote at flat indices."""
+@dataclass(frozen=True, eq=False)
+class Fill:
+    """One fill of a layer: which slices were known of which labels, and what was filled in.
+
+    Attributes
+    ----------
+    where
+        Flat indices, in values of `shape`, of what was filled in: voxels that changed and, in slices that were not
+        known, those of the labels and of earlier fills.
+    before, after
+        The values there.
+    """
 
     axis: int
     known: Sequence[int]
     numbers: Sequence[int]
+    shape: tuple[int, ...]
     where: np.ndarray
-    written: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+
+    @property
+    def empty(self) -> bool:
+        """Whether the fill changed nothing."""
+        return bool((self.before == self.after).all())
 
     def stands(self, values: np.ndarray) -> bool:
-        """Return whether most of what was written is there: else it was undone."""
-        return 2 * np.count_nonzero(values.flat[self.where] == self.written) >= len(self.where)
+        """Return whether more slices are as the fill left them than as they were before: else it was undone."""
+        changed = self.before != self.after
+        where, count = self.where[changed], self.shape[self.axis]
+        slices, now = np.unravel_index(where, self.shape)[self.axis], values.flat[where]
+        total = np.bincount(slices, minlength=count)
+        alike = [
+            np.count_nonzero((total > 0) & (np.bincount(slices[now == each[changed]], minlength=count) == total))
+            for each in (self.before, self.after)
+        ]
+        return bool(alike[1] > 0 and alike[1] >= alike[0])
 
 
 class Complete(Dock):
@@ -100,23 +125,18 @@ class Complete(Dock):
 
     def _list_known(self, layer: Any, axis: int, values: np.ndarray, numbers: Sequence[int]) -> list[int]:
         """Return the slices that are named and, unless no others are wanted, those that somebody drew on."""
-        count = values.shape[axis]
-        named, alone = _parse_slices(self.known.value, count)
+        named, alone = _parse_slices(self.known.value, values.shape[axis])
         if alone:
             return named
-        fills = self.fills.setdefault(layer, [])
-        if fills and fills[-1].where.max(initial=0) >= values.size:
-            fills.clear()  # the layer got other data
-        while fills and not fills[-1].stands(values):
-            fills.pop()
-        expected, written = values.copy(), np.zeros(values.shape, dtype=bool)
+        fills = _standing(self.fills.get(layer, []), values)
+        expected, filled = values.copy(), np.zeros(values.shape, dtype=bool)
         for fill in fills:
-            expected.flat[fill.where], written.flat[fill.where] = fill.written, True
+            expected.flat[fill.where], filled.flat[fill.where] = fill.after, True
         corrected = (values != expected) & (np.isin(values, numbers) | np.isin(expected, numbers))
-        drawn = np.where(written & (values == expected), 0, values)
+        drawn = np.where(filled & (values == expected), 0, values)
         known = {*named, *_touched(corrected, axis), *_touched(np.isin(drawn, numbers), axis)}
-        for fill in fills:
-            known |= set(fill.known) if fill.axis == axis and set(numbers) <= set(fill.numbers) else set()
+        same = (fill.known for fill in reversed(fills) if fill.axis == axis and set(numbers) <= set(fill.numbers))
+        known |= set(next(same, ()))
         places = sorted(known)
         if len(places) < 2:
             raise ScanError(f"expected two or more slices with labels in {layer.name}, got {len(places)}")
@@ -124,10 +144,11 @@ class Complete(Dock):
             raise ScanError(
                 f"no slice without labels lies between those of {layer.name}: name those to keep, as only 0::8"
             )
-        if len(numbers) > 1 and not named:
+        if len(numbers) > 1 and (shared := [k for k in places if k not in named]):
             drawn, whole = (np.moveaxis(each, axis, 0) for each in (drawn, values))
-            drawn[places] = whole[places]
-            check_shared(drawn, places, numbers)
+            changed = _touched(corrected, axis)
+            drawn[changed] = whole[changed]
+            check_shared(drawn, shared, numbers)
         return places
 
     def show_result(self, result: Filled) -> str:
@@ -140,10 +161,9 @@ class Complete(Dock):
             drop_layer(self.viewer, name)
         now = layer.data.reshape(result.after.shape)
         after = np.where(now == result.before, result.after, now)  # what was painted meanwhile stays
-        where = np.flatnonzero(after != now)
+        fills = _standing(self.fills.get(layer, []), result.before)
+        self.fills[layer] = [*fills, _remember(result, now, after, fills)]
         write_labels(layer, after)
-        fill = Fill(task.axis, task.known, task.numbers, where, after.flat[where])
-        self.fills.setdefault(layer, []).append(fill)
         if layer.selected_label not in task.numbers:
             layer.selected_label = task.numbers[0]  # the one to correct with
         assert found.uncertainty is not None
@@ -203,6 +223,32 @@ def _names(layer: Any) -> tuple[str, str]:
     return f"doubt of {layer.name}", f"suggested slices of {layer.name}"
 
 
+def _standing(fills: Sequence[Fill], values: np.ndarray) -> list[Fill]:
+    """Return the fills of a layer that were not undone, given its values (Z, Y, X)."""
+    alike = [fill for fill in fills if fill.shape == values.shape]
+    count = len(alike)
+    for k in range(len(alike) - 1, -1, -1):
+        if not alike[k].empty:
+            if alike[k].stands(values):
+                break
+            count = k
+    return alike[:count]
+
+
+def _remember(filled: Filled, before: np.ndarray, after: np.ndarray, fills: Sequence[Fill]) -> Fill:
+    """Return a fill that changes values (Z, Y, X) from what was before; what was painted meanwhile is no part of it."""
+    task, own = filled.task, np.isin(after, filled.task.numbers)
+    for fill in fills:
+        own.flat[fill.where] = True
+    own &= before == filled.before
+    unknown = np.ones(after.shape[task.axis], dtype=bool)
+    unknown[list(task.known)] = False
+    shape = [-1 if axis == task.axis else 1 for axis in range(3)]
+    where = np.flatnonzero((before != after) | (own & unknown.reshape(shape)))
+    where = where.astype(np.int32 if after.size < 2**31 else np.int64)
+    return Fill(task.axis, task.known, task.numbers, after.shape, where, before.flat[where], after.flat[where])
+
+
 def _touched(voxels: np.ndarray, axis: int) -> list[int]:
     """Return the slices across an axis that have some of the voxels."""
     return np.flatnonzero(np.moveaxis(voxels, axis, 0).any((1, 2))).tolist()
@@ -211,14 +257,15 @@ def _touched(voxels: np.ndarray, axis: int) -> list[int]:
 def _parse_slices(text: str, count: int) -> tuple[list[int], bool]:
     """Return the numbers of slices in a text such as `0,9,17` or `0::8`, and whether it says `only` before them."""
     found: list[int] = []
-    alone = text.strip().lower().startswith("only")
+    text = text.strip().lower()
+    alone = text.startswith("only")
     try:
-        for part in filter(None, text.lower().replace("only", "", 1).replace(" ", "").split(",")):
+        for part in filter(None, text.removeprefix("only").replace(" ", "").split(",")):
             edges = [int(each) if each else None for each in part.split(":")]
             found += [edges[0]] if len(edges) == 1 else range(count)[slice(*edges)]  # type: ignore[list-item]
     except (ValueError, TypeError):
         found = [-1]
-    if any(not 0 <= k < count for k in found) or len(set(found)) < (2 if alone else bool(text.strip())):
+    if any(not 0 <= k < count for k in found) or len(set(found)) < (2 if alone else bool(text)):
         raise ScanError(f"expected known slices from 0 to {count - 1}, as 0,9,17 or 0::8 or only 0::8, got {text!r}")
     return sorted(set(found)), alone
 

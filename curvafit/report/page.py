@@ -484,7 +484,9 @@ def _slice(inference: Inference, axis: int, index: int, limits: tuple[float, flo
         window=framed,
     )
     depth = format_length((row + 0.5) * scan.spacing[axis], scan.unit)
-    title, text = f"Across {_AXES[axis]}", f"Slice {row} of {scan.values.shape[axis]}, at {depth}"
+    part = list(scan.values.shape) != inference.fit.provenance.get("scan_shape", list(scan.values.shape))
+    of = " of the part that was read" if part else ""
+    title, text = f"Across {_AXES[axis]}", f"Slice {row} of {scan.values.shape[axis]}{of}, at {depth}"
     return picture_of(figure, f"Slice across {_AXES[axis]} with the surface's outline", title=title, text=text)
 
 

@@ -189,7 +189,10 @@ def read_scan(
         return field if label is None else field.label(label), shape
     where, notes = bounding_box(shape, None, LARGEST_SCAN)
     part = tuple(slice(edge.start + at, edge.stop + at) for edge, at in zip(where, boxes.first, strict=True))
-    field = field_of(scan, label=label, crop=part, **reading)  # type: ignore[arg-type]
+    try:
+        field = field_of(scan, label=label, crop=part, **reading)  # type: ignore[arg-type]
+    except ScanError as error:
+        raise ScanError(f"{error}, in the middle of this large scan: name another part with crop") from error
     return replace(field, notes=field.notes + notes), shape
 
 

@@ -36,7 +36,7 @@ from curvafit.segmentation.evidence import (
 from curvafit.segmentation.result import Segmentation, flow_summary
 from curvafit.segmentation.tiles import Problem, Tiling, lower_volume
 from curvafit.segmentation.trials import Trial, choose_by_voxels
-from curvafit.volumes.boxes import Boxes, boxes_of, check_finite, subsample
+from curvafit.volumes.boxes import Boxes, boxes_of, check_finite, check_fits, subsample
 from curvafit.volumes.field import ScanError
 from curvafit.volumes.formats.part import Box, Crop
 from curvafit.volumes.read import Source
@@ -109,6 +109,7 @@ def segment(
         such `fit.json`.
     """
     boxes = boxes_of(scan, crop=crop, **reading)
+    check_fits(boxes)
     frame = boxes.frame
     laws, notes = laws_of(prior, frame)
     tiling = Tiling.of(frame, epsilon, tile)

@@ -56,6 +56,11 @@ def boxes_of(
     return InMemory(field_of(source, label=label, **options))  # type: ignore[arg-type]
 
 
+def check_fits(boxes: Boxes) -> None:
+    """Raise ScanError where the whole of a volume does not fit into memory."""
+    check_array(boxes.frame.shape, boxes.frame.values.dtype, boxes.frame.source or "the volume")
+
+
 def read_whole(boxes: Boxes) -> Field:
     """Return the volume in memory, in its own type."""
     z, y, x = (slice(0, n) for n in boxes.frame.shape)
@@ -174,7 +179,6 @@ def _open_file(path: Path, key: str | None, options: dict[str, Any]) -> InFile:
         raise ScanError(f"{path} is not whole: {corner.gaps[0]}")
     box = resolve_box(parse_box(options["crop"]), shape, path)
     first, size = [edge.start for edge in box], [edge.stop - edge.start for edge in box]
-    check_array(size, corner.values.dtype, path)  # a mask is written from memory
     field = to_field(corner, f"{path}::{key}" if key else str(path), options["spacing"], options["unit"])
     frame = _empty(field, size)
     return InFile(frame if options["crop"] is None else frame.move_origin(first), path, reading, channel, tuple(first))

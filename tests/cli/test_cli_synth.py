@@ -111,9 +111,17 @@ def test_laws_are_drawn_from_a_posterior(tmp_path):
     source = json.loads((tmp_path / "s" / "curvafit.json").read_text())["order"]["recipe"]["source"]
     assert len(source["points"]) == 3 and source["fraction"] == pytest.approx(0.187)
     columns = to_columns(fit.draws)
+    ratios = np.array(source["scales"]) * columns[6, [0, 30, 59]]  # every shape is as thick as the scan
+    assert ratios == pytest.approx(np.full(3, ratios[0])) and min(source["scales"]) < 1 < max(source["scales"])
+    assert all("fit.json" in name for name in source["names"])
     for point, row in zip(source["points"], (0, 30, 59), strict=True):
         assert point[0] == 1 and point[1:6] == pytest.approx(columns[:5, row], rel=1e-4)
     refused(call("synth", "-o", tmp_path / "t", "--preset", "tubes", "--draws", "3", *quick), "posterior")
+    two = ["--prior", f"{tmp_path / 'fit.json'},{tmp_path / 'fit.json'}", "--draws", "3"]
+    refused(call("synth", "-o", tmp_path / "t", *two, *quick), "one fit")
+    refused(
+        call("synth", "-o", tmp_path / "t", *two[:1], tmp_path / "fit.json", *two[2:], "--classes", *quick), "--draws"
+    )
     refused(call("synth", "-o", tmp_path / "t", "--prior", tmp_path / "fit.json", "--draws", "99", *quick), "60 draws")
 
 

@@ -74,7 +74,10 @@ def test_a_shape_that_falls_between_the_slices_is_not_a_case():
     class Sheets:
         """Half sheets beside the only slice, the third one on it, if asked for."""
 
-        edge = 11.0
+        edge, scales_between = 11.0, (1.0, 1.0)
+
+        def scale(self, index):
+            return 1.0
 
         def __init__(self, third: int) -> None:
             self.asked, self.places = 0, [0, 0, third]

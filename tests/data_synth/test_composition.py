@@ -14,11 +14,12 @@ from flat_recipe import FLAT, SHAPE, flat_recipe
 
 from curvafit.data_synth.card import write_card
 from curvafit.data_synth.case import Recipe
-from curvafit.data_synth.composition import Composition, wall_of
+from curvafit.data_synth.composition import Composition, shell_of
 from curvafit.data_synth.imaging.effects import occupancy
+from curvafit.data_synth.imaging.image import share_voxels
 from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality
 from curvafit.data_synth.sets import SetSpec, build_set, read_spec, write_preview
-from curvafit.data_synth.sources import Generated
+from curvafit.data_synth.sources import Generated, PhaseField
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 from curvafit.volumes.read import read_values
@@ -41,19 +42,50 @@ def two() -> Any:
 
 
 @pytest.mark.parametrize("thickness", [4.0, 6.5])
-def test_the_wall_of_a_ball_is_a_shell(thickness):
+def test_the_wall_of_a_ball_is_a_shell_and_the_lumen_a_ball(thickness):
     distance = Sphere(16.0, MIDDLE).distance(centres(GRID))
-    wall = wall_of(optimal_profile(distance, EPSILON).float(), EPSILON, thickness)
-    volume = 4 / 3 * np.pi * (16**3 - (16 - thickness) ** 3)
-    assert float(occupancy(wall, EPSILON).sum()) == pytest.approx(volume, rel=0.02)
+    wall, lumen = shell_of(optimal_profile(distance, EPSILON).float(), EPSILON, thickness)
+    inner = 4 / 3 * np.pi * (16 - thickness) ** 3
+    assert float(occupancy(wall, EPSILON).sum()) == pytest.approx(4 / 3 * np.pi * 16**3 - inner, rel=0.02)
+    assert float(occupancy(lumen, EPSILON).sum()) == pytest.approx(inner, rel=0.03)
     depth = distance.numpy()
     assert (wall.numpy()[(depth > 0.5) & (depth < thickness - 0.5)] > 0).all()
     assert (wall.numpy()[(depth < -0.1) | (depth > thickness + 0.5)] < 0).all()
 
 
+def test_wall_and_lumen_fill_the_shape_without_a_gap():
+    u = optimal_profile(Sphere(16.3, MIDDLE).distance(centres(GRID)), EPSILON).float()
+    shares = share_voxels(shell_of(u, EPSILON, 5.0), EPSILON)
+    whole = occupancy(u, EPSILON)
+    assert float((sum(shares) - whole).abs().max()) < 0.1 and float(sum(shares).sum() / whole.sum()) == pytest.approx(
+        1, abs=1e-3
+    )
+    assert float(shares[1][whole < 1].max()) == 0  # no light of the lumen at the outer surface
+
+
 def test_a_wall_thicker_than_the_shape_fills_it():
     u = optimal_profile(Cylinder(5.0, (1, 0.3, 0.2), MIDDLE).distance(centres(GRID)), EPSILON).float()
-    assert torch.equal(wall_of(u, EPSILON, 11.0) > 0, u > 0)
+    assert torch.equal(shell_of(u, EPSILON, 11.0)[0] > 0, u > 0)
+
+
+class Slab:
+    """Half space z > -1 and its mirror image, as a source of crops: the surface lies just outside."""
+
+    edge, scales_between = 999, (1.0, 1.0)
+
+    def scale(self, index: int) -> float:
+        return 1.0
+
+    def shape(self, voxels: Any, index: int, rng: np.random.Generator) -> PhaseField:
+        margin = (voxels[0] - 12) / 2
+        z = np.arange(voxels[0])[:, None, None] - margin + 1.0
+        return PhaseField(np.tanh(z / (np.sqrt(2) * EPSILON)) * np.ones(voxels, dtype=np.float32), EPSILON, {})
+
+
+def test_a_wall_of_a_surface_outside_of_a_crop_reaches_into_it():
+    layers = Composition(wall=4.0).draw(Slab(), (12, 8, 8), 1.0, 0, np.random.default_rng(0))  # type: ignore[arg-type]
+    assert layers.values.shape == (2, 12, 8, 8)
+    assert (layers.values[0][:3] > 0).all() and (layers.values[1][4:] > 0).all() and (layers.whole > 0).all()
 
 
 def test_a_shell_has_a_bright_wall_and_a_dark_lumen(stored):
@@ -65,6 +97,24 @@ def test_a_shell_has_a_bright_wall_and_a_dark_lumen(stored):
     assert wall > 2 * lumen and lumen < 0.5 * solid.image[solid.labels > 0].mean() and outside < lumen
     counts = [float((case.labels == k).mean()) for k in (1, 2)]
     assert case.record["class_fractions"] == pytest.approx(counts) and sum(counts) < 1
+
+
+def test_where_labels_are_what_an_image_shows_a_wall_stays_one(stored):
+    wide = replace(stored.modality, base=stored.modality.base.assign({"visible": 0.2}))
+    shell = replace(stored, composition=Composition(wall=0.8))
+    exact, seen = shell.case(2), replace(shell, modality=wide).case(2)
+    outside = exact.labels == 0
+    assert set(np.unique(seen.labels[outside])) == {0, 1}  # what is seen beyond the surface is wall
+    counts = [[np.count_nonzero(case.labels == k) for k in (1, 2)] for case in (exact, seen)]
+    assert counts[1][0] > counts[0][0] and counts[1][1] > 0.5 * counts[0][1]
+
+
+def test_one_slice_has_a_wall_too(stored):
+    assert set(np.unique(replace(stored, shape=(1, 16, 16), composition=Composition(wall=0.8)).case(0).labels)) == {
+        0,
+        1,
+        2,
+    }
 
 
 def test_classes_are_a_shape_of_each_law_the_first_in_front(two):
@@ -133,6 +183,10 @@ def test_bad_input(stored):
     with pytest.raises(ValueError, match="classes need from 2"):
         replace(stored, composition=Composition(classes=True))
     with pytest.raises(ValueError, match="showed no lumen"):
-        replace(stored, composition=Composition(wall=50)).case(0)
+        Recipe(Generated.of(["tubes"]), CLEAR, (16, 16, 16), 1.0, composition=Composition(wall=15)).case(0)
+    with pytest.raises(ValueError, match="at least a shape's voxel thick, 0.5 um, got 0.4"):
+        replace(stored, composition=Composition(wall=0.4))
+    with pytest.raises(ValueError, match="larger --shape"):
+        replace(stored, composition=Composition(wall=50))
     with pytest.raises(ValueError, match="expected a Composition"):
         Recipe(stored.source, FLAT, SHAPE, 0.5, composition=0.5)  # type: ignore[arg-type]

@@ -275,7 +275,7 @@ def test_the_card_tells_what_a_set_is_and_spares_another_s(tmp_path, order):
     assert write_card(folder).read_text(encoding="utf-8") == "my own words"
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"mask_fraction": 0.1}'])
+@pytest.mark.parametrize("text", ["{", "[]", '{"class_fractions": [0.1]}'])
 def test_a_card_of_a_damaged_record_is_one_sentence(tmp_path, order, text):
     folder = build_set(tmp_path / "set", order, 1)
     (folder / "cases" / "case_00000.json").write_text(text)

@@ -52,8 +52,22 @@ def test_of_a_large_file_the_middle_is_read(tmp_path, monkeypatch, crop) -> None
     assert field.affine is not None and field.affine[0, 3] == 18 and "the middle" in field.notes[-1]
     assert read_scan(path, whole=True)[0].shape == (20, 24, 60)
     assert read_scan(path, label=int(grey[9, 12, 30]))[0].values[9, 12, 12] == 1
+    with pytest.raises(ScanError, match="in the middle of this large scan"):
+        read_scan(path, label=999)
     packed = save(Field(grey, (1.0, 1.0, 1.0), "um"), tmp_path / "scan.nii.gz")  # cannot be read in part
     assert read_scan(packed)[0].shape == (20, 24, 60)
+
+
+def test_a_file_larger_than_memory_is_read_in_its_middle(tmp_path) -> None:
+    shape = (600, 40_000, 40_000)  # a terabyte, of which nothing but the middle is on the disk
+    array = np.lib.format.open_memmap(tmp_path / "scan.npy", mode="w+", dtype=np.uint8, shape=shape)
+    array[300, 20_000, 19_990:20_010] = 7
+    array.flush()
+    del array
+    field, whole = read_scan(tmp_path / "scan.npy")
+    assert whole == shape and field.shape == (512, 512, 512) and field.values.sum() == 7 * 20
+    with pytest.raises(ScanError, match="does not fit into memory"):
+        read_scan(tmp_path / "scan.npy", whole=True)
 
 
 # ---- kinds -----------------------------------------------------------------------------------------------------------

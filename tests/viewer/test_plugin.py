@@ -174,6 +174,63 @@ def test_after_undo_other_drawings_count(viewer: Any) -> None:
     assert "4 of 33 slices known" in run(widget)
 
 
+def test_undo_reaches_through_a_fill_that_changed_nothing(viewer: Any) -> None:
+    layer = viewer.add_labels(sparse(), name="cells", **PLACE)
+    widget = docked(viewer, Complete)
+    run(widget)
+    done = layer.data.copy()
+    run(widget)
+    np.testing.assert_array_equal(layer.data, done)
+    layer.undo()
+    assert "5 of 33 slices known" in run(widget)
+
+
+def test_redo_is_no_drawing(viewer: Any) -> None:
+    layer = viewer.add_labels(sparse(), name="cells", **PLACE)
+    widget = docked(viewer, Complete)
+    run(widget)
+    layer.undo()
+    widget.known.value = "99"
+    assert "known slices" in run(widget)
+    layer.redo()
+    widget.known.value = ""
+    assert "5 of 33 slices known" in run(widget)
+
+
+def test_what_only_left_out_is_not_known_later(viewer: Any) -> None:
+    truth = rods()
+    layer = viewer.add_labels(sparse(), name="cells", **PLACE)
+    widget = docked(viewer, Complete)
+    run(widget)
+    layer.data[4] = truth[4]
+    assert "6 of 33 slices known" in run(widget)
+    widget.known.value = "only 0::16"
+    run(widget)
+    widget.known.value = ""
+    assert "3 of 33 slices known" in run(widget)
+
+
+def test_a_small_correction_of_a_small_fill_is_one(viewer: Any) -> None:
+    layer = viewer.add_labels(sparse(16), name="cells", **PLACE)
+    widget = docked(viewer, Complete)
+    run(widget)
+    before = layer.data.copy()
+    layer.data[8] = rods()[8]
+    run(widget)
+    layer.data[9] = before[9]  # as it was, and nothing else
+    assert "5 of 33 slices known" in run(widget)
+
+
+def test_other_data_forget_what_was_filled(viewer: Any) -> None:
+    layer = viewer.add_labels(sparse(), name="cells")
+    widget = docked(viewer, Complete)
+    run(widget)
+    layer.data = sparse(4)
+    assert "9 of 33 slices known" in run(widget)
+    layer.data = sparse(16)[:17]
+    assert "2 of 17 slices known" in run(widget)
+
+
 def test_the_label_that_was_filled_is_the_one_to_correct_with(viewer: Any) -> None:
     layer = viewer.add_labels(np.where(sparse() == 3, 255, 0), name="cells")
     layer.selected_label = 1
@@ -201,7 +258,10 @@ def test_labels_on_slices_of_their_own_are_filled_one_after_the_other(viewer: An
     some[4::8] = np.where(truth[4::8] == 7, 7, 0)
     layer = viewer.add_labels(some, name="cells", **PLACE)
     widget = docked(viewer, Complete)
-    assert "one after the other" in run(widget)
+    for text in ("", "16"):
+        widget.known.value = text
+        assert "one after the other" in run(widget)
+    widget.known.value = ""
     widget.which.value = "the selected label"
     for label in (3, 7):
         layer.selected_label = label
@@ -300,7 +360,7 @@ def test_layers_that_cannot_be_edited_or_measured_are_said(viewer: Any) -> None:
     assert "not" in run(gauge) and "finite" in gauge.status.value
 
 
-@pytest.mark.parametrize("text", ["a", "0,99", "1:2:3:4", "-1", "5:2", "only", "only 3"])
+@pytest.mark.parametrize("text", ["a", "0,99", "1:2:3:4", "-1", "5:2", "only", "only 3", "0::8 only", "8,only 16"])
 def test_slices_that_are_none_are_said(viewer: Any, text: str) -> None:
     viewer.add_labels(rods(), name="cells")
     widget = docked(viewer, Complete)

@@ -12,7 +12,7 @@ from curvafit.data_synth.imaging import effects
 from curvafit.data_synth.imaging.effects import EPSILON
 from curvafit.data_synth.imaging.maths import Triple, Volume
 from curvafit.data_synth.imaging.modality import Imaging
-from curvafit.priors.grid import Bool, Float
+from curvafit.priors.grid import Float
 
 
 def image(
@@ -37,7 +37,8 @@ def image(
     if not (spacing > 0 and epsilon > 0):
         raise ValueError(f"spacing and epsilon must be positive, got {spacing} and {epsilon}")
     seed = check_seed(seed)
-    light, optics = _emit(_stain(fields, epsilon, lights), spacing, imaging, seed), imaging.optics
+    stain = torch.stack([light * share for light, share in zip(lights, share_voxels(fields, epsilon), strict=True)])
+    light, optics = _emit(stain.sum(0), spacing, imaging, seed), imaging.optics
     if optics.growth or optics.attenuation:
         light = effects.blur_with_depth(light, spacing, optics.blur, optics.growth, optics.attenuation)
     else:
@@ -51,11 +52,29 @@ def regrid(field: Volume, spacing: float, imaging: Imaging) -> Float[torch.Tenso
     return effects.sample(field, spacing, imaging.spacing)
 
 
-def visible(field: Volume, spacing: float, imaging: Imaging, epsilon: float = EPSILON) -> Bool[torch.Tensor, "Z Y X"]:
-    """Return the image's voxels that a share of the structure's light reaches (`Imaging.visible`), of even stain."""
+def label_voxels(
+    fields: torch.Tensor, whole: torch.Tensor, spacing: float, imaging: Imaging, epsilon: float = EPSILON
+) -> torch.Tensor:
+    """Return the labels of the image's voxels, uint8: 0 outside, 1, 2, … in the classes of fields (C, Z, Y, X).
+
+    A voxel of the whole, the field of all classes together, is of the first class whose field is above 0 there. With
+    `Imaging.visible` labels hold the voxels that this share of the light of all classes reaches, stained alike, and a
+    voxel is of the class with most of it.
+    """
+    if imaging.visible:
+        shares = torch.stack([_sample_light(share, spacing, imaging) for share in share_voxels(fields, epsilon)])
+        return torch.where(shares.sum(0) > imaging.visible, shares.argmax(0) + 1, 0).to(torch.uint8)
+    levels = torch.stack([regrid(field, spacing, imaging) for field in fields])
+    inside = levels > 0
+    first = torch.where(inside.any(0), inside.to(torch.uint8).argmax(0), levels.argmax(0))
+    return torch.where(inside.any(0) | (regrid(whole, spacing, imaging) > 0), first + 1, 0).to(torch.uint8)
+
+
+def _sample_light(share: torch.Tensor, spacing: float, imaging: Imaging) -> torch.Tensor:
+    """Return the light of an even stain (Z, Y, X) that arrives in the image's voxels."""
     optics = imaging.optics
-    light = effects.blur_with_depth(effects.occupancy(field, epsilon), spacing, optics.blur, optics.growth)
-    return effects.sample(light, spacing, imaging.spacing, _window(imaging)) > imaging.visible
+    light = effects.blur_with_depth(share, spacing, optics.blur, optics.growth)
+    return effects.sample(light, spacing, imaging.spacing, _window(imaging))
 
 
 def annotator_threshold(imaging: Imaging) -> float:
@@ -79,13 +98,16 @@ def _window(how: Imaging) -> Triple:
     return how.thickness, *how.spacing[1:]
 
 
-def _stain(fields: torch.Tensor, epsilon: float, lights: Sequence[float]) -> torch.Tensor:
-    """Return the share of the structure's light in each voxel of classes that lie in front of one another."""
-    stain, free = torch.zeros_like(fields[0]), torch.ones_like(fields[0])
-    for field, light in zip(fields, lights, strict=True):
-        share = free * effects.occupancy(field, epsilon)
-        stain, free = stain + light * share, free - share
-    return stain
+def share_voxels(fields: torch.Tensor, epsilon: float) -> list[torch.Tensor]:
+    """Return the share of each voxel (Z, Y, X) that each class fills, of fields (C, Z, Y, X), the first in front.
+
+    A class fills what those in front of it leave, as far as it reaches: classes that meet leave no gap.
+    """
+    shares, free = [], torch.ones_like(fields[0])
+    for field in fields:
+        shares.append(torch.minimum(free, effects.occupancy(field, epsilon)))
+        free = free - shares[-1]
+    return shares
 
 
 def _emit(occupied: torch.Tensor, spacing: float, how: Imaging, seed: int) -> torch.Tensor:
