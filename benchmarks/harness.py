@@ -300,11 +300,18 @@ def paired_ratio(after: Sequence[float], before: Sequence[float]) -> Figure:
     return bootstrap(np.asarray(after) / np.asarray(before))
 
 
-def in_turns(actions: Mapping[str, Callable[[], object]], rounds: int, *, warm: int = 1) -> dict[str, np.ndarray]:
-    """Return the seconds `(rounds,)` of each action; they take turns, so that a busy machine slows all."""
+def in_turns(
+    actions: Mapping[str, Callable[[], object]], rounds: int, *, warm: int = 1, before: int = 0
+) -> dict[str, np.ndarray]:
+    """Return the seconds `(rounds,)` of each action; they take turns, so that a busy machine slows all.
+
+    The first `warm` turns do not count, nor do `before` calls ahead of each that does.
+    """
     times: dict[str, list[float]] = {name: [] for name in actions}
     for turn in range(rounds + warm):
         for name, action in actions.items():
+            for _ in range(before):
+                action()
             begun = time.perf_counter()
             action()
             if turn >= warm:

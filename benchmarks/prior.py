@@ -1,7 +1,7 @@
 """The training loss: its time beside other losses, a training step with it, its memory.
 
-Forward and backward on logits (2, 1, edge, edge, edge), by turns. Memory is what the loss takes beyond logits and
-target, in float32 fields of their size, in a process of its own. Needs monai.
+Forward and backward on logits (2, 1, edge, edge, edge), by turns, each call after one of its own as in training. Memory
+is what the loss takes beyond logits and target, in float32 fields of their size, in a process of its own. Needs monai.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def loss_times(edge: int, rounds: int) -> Values:
     """Return the seconds of each loss in each round."""
     logits, target = batch(edge)
     actions = {name: lambda loss=loss: both_ways(loss, logits, target) for name, loss in losses().items()}
-    return {name: taken.tolist() for name, taken in in_turns(actions, rounds).items()}
+    return {name: taken.tolist() for name, taken in in_turns(actions, rounds, before=1).items()}
 
 
 def training_times(edge: int, rounds: int) -> Values:
@@ -95,13 +95,13 @@ def memory(edge: int) -> Values:
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--edge", type=int, default=96)
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=15)
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     edge, rounds = (24, 1) if options.quick else (options.edge, options.rounds)
-    jobs = {f"losses-{edge}": lambda: loss_times(edge, rounds)}
-    jobs |= {f"training-{edge}": lambda: training_times(edge, rounds), f"memory-{edge}": lambda: memory(edge)}
+    jobs = {f"losses-{edge}-{rounds}": lambda: loss_times(edge, rounds)}
+    jobs |= {f"training-{edge}-{rounds}": lambda: training_times(edge, rounds), f"memory-{edge}": lambda: memory(edge)}
     times, training, fields = cases.all(jobs).values()
     ours = np.array(times["CurvaturePrior"])
     ratios = {name: bootstrap(np.array(taken) / ours) for name, taken in times.items()}
