@@ -47,7 +47,7 @@ class Finder:
         found = {} if self._folder is None else _read_found(self._folder, name, count)
         rest = [number for number in range(count) if number not in found]
         start = self._share
-        self._share = stop = max(start, self._ends.get(name, start + 0.02))
+        self._share = stop = max(start, min(self._ends.get(name, start + 0.02), 1.0))
         make = partial(_find if isinstance(self._crew, ThisProcess) else _find_on_one_thread, find)
         requests = [(make, Path(), [number]) for number in rest]
         self._progress(shown or name, start)

@@ -302,7 +302,7 @@ def fill_gaps(
     places, count = list(slices.places), len(slices.places)
     start, stop, _ = rows.indices(slices.length)
     steps = [(k, (places[(k + 1) % count] - places[k]) % slices.length) for k in range(count - (not slices.periodic))]
-    gaps = [(k, gap) for k, gap in steps if gap > 1 and places[k] < stop - 1 and places[k] + gap > start + 1]
+    gaps = [(k, gap) for k, gap in steps if gap > 1 and places[k] + 1 < stop and places[k] + gap > start]
     seen, known = raster.seen, dict[int, np.ndarray]()
     for number, (k, gap) in enumerate(gaps):
         progress("filling the gaps", number / len(gaps))

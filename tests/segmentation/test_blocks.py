@@ -17,8 +17,10 @@ from shapes import grown
 from curvafit.core.workers import cluster
 from curvafit.segmentation import blocks
 from curvafit.segmentation.blocks import fits_blocks, reconstruct_file
+from curvafit.segmentation.filler import Raster, Taught, fill_gaps
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.result import write_mask
+from curvafit.segmentation.slices import Slices
 from curvafit.volumes import Field, load, save
 from curvafit.volumes.formats.zarr import write_zarr
 
@@ -87,6 +89,19 @@ def test_blocks_equal_the_whole(labels: Path, whole: Path, tmp_path: Path, edge:
         "whole.json", "whole.png", "whole.zarr", "whole_probability.zarr",
     ]  # fmt: skip
     assert json.loads((tmp_path / "whole.json").read_text())["tile"] == edge
+
+
+@pytest.mark.parametrize("depth", [1, 2, 3])
+def test_every_slice_of_a_gap_is_filled_wherever_a_block_begins(depth: int) -> None:
+    mask, places = texture((18, 24, 24)), [0, 5, 6, 16]
+    slices = Slices.of(Field(mask), places, 0)
+    taught, raster = Taught.load(), Raster.of(slices)
+    for start in range(18 - depth + 1):
+        rows = set(range(start, start + depth))
+        filled = {
+            int(n) for numbers, _ in fill_gaps(slices, taught, raster, slice(start, start + depth)) for n in numbers
+        }
+        assert filled & rows == rows & set(range(17)) - set(places)
 
 
 @pytest.mark.parametrize("axis", [1, 2])
