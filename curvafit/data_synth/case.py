@@ -151,7 +151,7 @@ def image_and_labels(
     z, y, x = shape  # a field of whole voxels may give a few voxels more
     grey = image(layers.values, voxel, imaging, seed, layers.epsilon, levels)
     whole = regrid(layers.whole, voxel, imaging)
-    labels = label_voxels(layers.values, layers.whole, voxel, imaging, layers.epsilon)
+    labels = label_voxels(layers.values, whole, voxel, imaging, layers.epsilon)
     grey, whole, labels = (part[:z, :y, :x].contiguous() for part in (grey, whole, labels))
     return grey, whole, labels
 

@@ -69,7 +69,7 @@ def test_a_wall_thicker_than_the_shape_fills_it():
 
 
 class Slab:
-    """Half space z > -1 and its mirror image, as a source of crops: the surface lies just outside."""
+    """The half space z > -1, as a source of crops: its surface lies just outside of them."""
 
     edge, scales_between = 999, (1.0, 1.0)
 

@@ -53,21 +53,24 @@ def regrid(field: Volume, spacing: float, imaging: Imaging) -> Float[torch.Tenso
 
 
 def label_voxels(
-    fields: torch.Tensor, whole: torch.Tensor, spacing: float, imaging: Imaging, epsilon: float = EPSILON
+    fields: torch.Tensor, sampled: torch.Tensor, spacing: float, imaging: Imaging, epsilon: float = EPSILON
 ) -> torch.Tensor:
     """Return the labels of the image's voxels, uint8: 0 outside, 1, 2, … in the classes of fields (C, Z, Y, X).
 
-    A voxel of the whole, the field of all classes together, is of the first class whose field is above 0 there. With
+    `sampled` is the field of all classes together on the image's voxels (`regrid`). Where it is above 0, a voxel is of
+    the first class whose field is, too. With
     `Imaging.visible` labels hold the voxels that this share of the light of all classes reaches, stained alike, and a
     voxel is of the class with most of it.
     """
     if imaging.visible:
         shares = torch.stack([_sample_light(share, spacing, imaging) for share in share_voxels(fields, epsilon)])
         return torch.where(shares.sum(0) > imaging.visible, shares.argmax(0) + 1, 0).to(torch.uint8)
+    if len(fields) == 1:
+        return (sampled > 0).to(torch.uint8)
     levels = torch.stack([regrid(field, spacing, imaging) for field in fields])
     inside = levels > 0
     first = torch.where(inside.any(0), inside.to(torch.uint8).argmax(0), levels.argmax(0))
-    return torch.where(inside.any(0) | (regrid(whole, spacing, imaging) > 0), first + 1, 0).to(torch.uint8)
+    return torch.where(inside.any(0) | (sampled > 0), first + 1, 0).to(torch.uint8)
 
 
 def _sample_light(share: torch.Tensor, spacing: float, imaging: Imaging) -> torch.Tensor:
