@@ -13,7 +13,7 @@ from magicgui.widgets import ComboBox, Container, LineEdit, PushButton, SpinBox,
 
 from curvafit.core.runtime import Progress
 from curvafit.napari.dock import Dock
-from curvafit.napari.layers import drop_layer, field_of_layer, place_of_layer, put_layer
+from curvafit.napari.layers import drop_layer, field_of_layer, list_layers, place_of_layer, put_layer
 from curvafit.segmentation.reconstruct import reconstruct, reconstruct_labels
 from curvafit.segmentation.result import Segmentation
 from curvafit.segmentation.slices import check_shared
@@ -90,7 +90,7 @@ class Complete(Dock):
 
     def __init__(self, napari_viewer: Any) -> None:
         self.annotated = create_widget(label="labels", annotation="napari.layers.Labels")
-        self.image = create_widget(label="image", annotation="napari.layers.Image", options={"nullable": True})
+        self.image = ComboBox(label="image", choices=lambda _: list_layers(napari_viewer, "Image"), nullable=True)
         self.which = ComboBox(label="fill", choices=[_ALL, _ONE], value=_ALL)
         self.axis = ComboBox(label="across", choices=["z", "y", "x"], value="z", tooltip="The axis across the slices.")
         self.known = LineEdit(

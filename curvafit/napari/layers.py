@@ -65,6 +65,12 @@ def place_of_field(field: Field) -> dict[str, Any]:
     return {"scale": field.spacing, "units": (_UNITS[field.unit],) * 3}
 
 
+def list_layers(viewer: Any, *kinds: str) -> list[tuple[str, Any]]:
+    """Return the layers of kinds such as `"Image"`, by name, without the images that the plugin added."""
+    found = [each for each in viewer.layers if type(each).__name__ in kinds]
+    return [(each.name, each) for each in found if type(each).__name__ != "Image" or "curvafit" not in each.metadata]
+
+
 def put_layer(viewer: Any, kind: str, data: Any, name: str, **options: Any) -> Any:
     """Add a layer of a kind, such as `"labels"`, in the place of one of its name that the plugin added."""
     drop_layer(viewer, name)

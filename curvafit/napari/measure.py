@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from magicgui.widgets import CheckBox, ComboBox, FileEdit, Table
 from matplotlib.backends.backend_qtagg import FigureCanvasQTAgg
+from qtpy.QtWidgets import QSizePolicy
 
 from curvafit.core.runtime import Progress
 from curvafit.core.units import format_number, power_name
 from curvafit.drawing.plot import diagram_figure
 from curvafit.geometry.diagram import Diagram
 from curvafit.napari.dock import Dock
-from curvafit.napari.layers import field_of_layer
+from curvafit.napari.layers import field_of_layer, list_layers
 from curvafit.scan.instances import measure_instances
 from curvafit.scan.measure import Measures
 from curvafit.scan.tiles import measure as measure_scan
@@ -28,7 +29,7 @@ class Measure(Dock):
     """Measure a labels layer, by label, or an image; the table can be saved."""
 
     def __init__(self, napari_viewer: Any) -> None:
-        self.layer = ComboBox(label="layer", choices=lambda _: _list_layers(napari_viewer))
+        self.layer = ComboBox(label="layer", choices=lambda _: list_layers(napari_viewer, "Labels", "Image"))
         self.dark = CheckBox(text="dark", tooltip="Of an image: the structure is darker than what is around it.")
         self.file = FileEdit(label="save as", mode="w", filter="*.csv *.json *.parquet", nullable=True)
         super().__init__(napari_viewer, [self.layer, self.dark, self.file], "Measure")
@@ -68,6 +69,7 @@ class Measure(Dock):
         else:
             cells = [[format_number(q.value, 4), f"± {format_number(q.half, 2)}"] for q in first.quantities]
             self.table.value = {"data": cells, "columns": ["value", "95 %"], "index": names}
+        self.table.native.resizeColumnsToContents()
         self._draw(_join([each.diagram for each in result]))
         if several and type(layer).__name__ == "Labels":
             import pandas
@@ -95,12 +97,9 @@ class Measure(Dock):
             figure.set_layout_engine("tight")
             self.canvas = FigureCanvasQTAgg(figure)
             self.canvas.setMinimumHeight(280)
+            # As wide as the dock is: its own width would widen the window.
+            self.canvas.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
             self.native.layout().addWidget(self.canvas)
-
-
-def _list_layers(viewer: Any) -> list[tuple[str, Any]]:
-    """Return the layers that can be measured, by name."""
-    return [(each.name, each) for each in viewer.layers if type(each).__name__ in ("Labels", "Image")]
 
 
 def _measure_one(field: Any, options: dict[str, Any], progress: Progress) -> tuple[Measures, ...]:
