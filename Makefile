@@ -1,5 +1,5 @@
 # Needs Python 3.11 or newer, and make.
-#   make demo       install; a real CT volume of bone, filled, measured and read, on one page
+#   make demo       install; a real CT volume of a shell, filled, measured and read, on one page
 #   make test       install with the test tools; every quick test
 #   make test-all   every test, the quick part of the hostile suite and the examples too
 #   make test-hostile   damaged files, odd options, failing disks: all cases

@@ -97,7 +97,9 @@ def map_on(axes: Axes, atlas: Atlas, seen_as: str, embeddings: np.ndarray) -> np
     legend = {"fontsize": 8, "frameon": False, "handletextpad": 0, "columnspacing": 0.9}
     axes.legend(loc="lower center", ncols=6, bbox_to_anchor=(0.5, -0.15), **legend)
     share = float((spread[:2] ** 2).sum() / (spread**2).sum())
-    axes.set_title(f"its place among {len(atlas)} grown textures ({share:.0%} of their spread)", fontsize=11)
+    axes.set_title(f"its place among {len(atlas)} grown textures", fontsize=11)
+    words = f"the directions hold {share:.0%} of their spread"
+    axes.text(0.99, 0.015, words, transform=axes.transAxes, ha="right", fontsize=7.5, color="#5b616b")
     axes.spines[:].set_color("#dfe2e6")
     return own
 

@@ -76,8 +76,8 @@ def _describe_misfit(misfit: Misfit | None) -> str:
         return ""
     p = format_number(misfit.probability, 2)
     if misfit.probability >= UNBELIEVABLE:
-        return f"The scan is as its shapes are (p = {p})."
+        return f"Shapes of this law look like the scan (p = {p})."
     strangest = [name for name, own in sorted(misfit.blocks.items(), key=itemgetter(1)) if own < UNBELIEVABLE]
-    names = ", ".join(strangest) or "none by itself"
+    what = f"what differs most: {', '.join(strangest)}" if strangest else "no descriptor tells it alone"
     direction = "The scan has a direction (fabric), and the model has none." if "fabric" in strangest else ""
-    return _join(f"The scan is not as its shapes are (p = {p}); the strangest: {names}.", direction)
+    return _join(f"Shapes of this law do not look like the scan (p = {p}); {what}.", direction)

@@ -1,8 +1,8 @@
-"""A first look at the package on one page: a scan measured, filled from sparse slices, placed among textures, read."""
+"""A first look at the package on one page: a scan filled from sparse slices, measured, placed among textures, read."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -10,20 +10,22 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
+from scipy import ndimage
 
 from curvafit.atlas_map.picture import map_on
 from curvafit.core.files import write_content
 from curvafit.core.records import can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.drawing.plot import INK, diagram_on, gallery_figure, make_figure, section_on, shared_limits
+from curvafit.generation.flow import generate
+from curvafit.generation.schedule import LEARNED
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.inference.atlas import load_atlas
 from curvafit.inference.infer import infer
-from curvafit.inference.posterior import load_posterior
 from curvafit.report.page import (
     MARK,
-    SYMBOLS,
     check_report,
+    describe,
     describe_scan,
     list_strips,
     picture_of,
@@ -46,8 +48,9 @@ if TYPE_CHECKING:
 PAGE = "demo.html"
 #: Of this many slices one is kept.
 EVERY = 8
-#: A parameter is read where its 90 % interval is at most this share of the prior's, and partly read up to the second.
-_READ, _PARTLY = 0.35, 0.7
+#: How many of the nearest textures are grown, of how many voxels a side, and their names.
+SHOWN, EDGE = 3, 64
+PLACES = ("nearest", "second", "third")
 #: The symbols of the measures on the page.
 _MEASURES = ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D", "BS/BV", "DA", "H", "K")
 
@@ -64,38 +67,33 @@ class Demo(NamedTuple):
 class Completion(NamedTuple):
     """A mask, the mask filled from every `every`-th of its slices, both bool (Z, Y, X), and how well they agree.
 
-    `dice` has the Dice coefficients, on the slices left out, of the filled volume (`"curvafit"`) and of the plain
-    interpolations of `segmentation.slices.WAYS`.
+    `axis` is the one across the slices. `dice` has the Dice coefficients, on the slices left out, of the filled volume
+    (`"curvafit"`) and of the plain interpolations of `segmentation.slices.WAYS`.
     """
 
     truth: np.ndarray
     filled: np.ndarray
     every: int
+    axis: int
     dice: Mapping[str, float]
-    status: str
 
     @property
     def known(self) -> np.ndarray:
         """The known slices alone, bool (Z, Y, X)."""
+        places = (slice(None),) * self.axis + (slice(None, None, self.every),)
         mask = np.zeros_like(self.truth)
-        mask[:: self.every] = self.truth[:: self.every]
+        mask[places] = self.truth[places]
         return mask
 
 
 def write_demo(
-    scan: Field,
-    directory: str | Path,
-    *,
-    title: str,
-    seed: int = 0,
-    overwrite: bool = False,
-    progress: Progress = silent,
+    scan: Field, directory: str | Path, *, seed: int = 0, overwrite: bool = False, progress: Progress = silent
 ) -> Demo:
-    """Measure a scan, fill it from every 8th slice, infer its law, and write one page with the results into a folder.
+    """Measure a scan, fill it from every 8th slice, find textures like it, and write one page on it into a folder.
 
-    The structure is measured (`measure`). The volume is filled from the kept slices (`reconstruct`) and compared with
-    those left out. The law is inferred (`infer(fast=True)`), and the curvature diagram placed among the atlas's.
-    `fit.json` and `report.html` are written beside the page. `title` is the page's heading, plain text. Raises
+    The structure is measured (`measure`). The volume is filled from slices across its shortest axis (`reconstruct`) and
+    compared with those left out. The law is inferred (`infer(fast=True)`), the curvature diagram placed among the
+    atlas's, and the nearest textures are grown. `fit.json` and `report.html` are written beside the page. Raises
     ValueError if the scan has no structure, or as `report.page.check_report`.
     """
     folder = check_report(directory, [scan.source] if scan.source else (), overwrite)
@@ -103,31 +101,33 @@ def write_demo(
     can_write(page, lambda path: has_mark(path, MARK), overwrite=overwrite)
     progress("measuring", 0.0)
     measures = measure(scan, progress=sub_progress(progress, 0.0, 0.1))
-    atlas, posterior = load_atlas(), load_posterior()
+    atlas = load_atlas()
     reading = sub_progress(progress, 0.1, 0.3)
-    inference = infer(scan, fast=True, seed=seed, atlas=atlas, posterior=posterior, progress=reading)
+    inference = infer(scan, fast=True, seed=seed, atlas=atlas, progress=reading)
     _, signed = find_structure(scan)
-    mask = signed.values > 0
+    mask, axis = signed.values > 0, int(np.argmin(scan.shape))
     volume = Field(mask.view(np.uint8), scan.spacing, scan.unit)
-    filled = reconstruct(volume, every=EVERY, progress=sub_progress(progress, 0.3, 0.95))
-    completion = score_completion(mask, filled.mask.values, EVERY, filled.status)
+    filled = reconstruct(volume, every=EVERY, axis=axis, progress=sub_progress(progress, 0.3, 0.6))
+    completion = score_completion(mask, filled.mask.values, EVERY, axis)
+    textures = grow_nearest(inference.fit, progress=sub_progress(progress, 0.6, 0.95))
     progress("drawing the page", 0.95)
-    text = demo_page(inference, measures, completion, atlas, posterior.box, title)
+    text = demo_page(inference, measures, completion, textures, atlas)
     write_inference(inference, folder, overwrite=overwrite)
     return Demo(write_content(page, text), completion, measures, inference.fit)
 
 
-def score_completion(truth: np.ndarray, filled: np.ndarray, every: int, status: str) -> Completion:
+def score_completion(truth: np.ndarray, filled: np.ndarray, every: int, axis: int = 0) -> Completion:
     """Compare a volume filled from every `every`-th slice of a mask, and plain interpolations, with what was left out.
 
     Only slices between the first and the last known one count.
     """
-    places = tuple(range(0, len(truth), every))
-    slices = Slices(truth[::every], places, len(truth), (1.0, 1.0, 1.0))
+    known, found = (np.moveaxis(each, axis, 0) for each in (truth, filled))
+    places = tuple(range(0, len(known), every))
+    slices = Slices(known[::every], places, len(known), (1.0, 1.0, 1.0))
     left_out = slices.between
-    volumes = {"curvafit": filled, **{way: slices.level(way) > 0 for way in WAYS}}
-    scores = {name: dice(volume[left_out], truth[left_out]) for name, volume in volumes.items()}
-    return Completion(truth, filled, every, scores, status)
+    volumes = {"curvafit": found, **{way: slices.level(way) > 0 for way in WAYS}}
+    scores = {name: dice(volume[left_out], known[left_out]) for name, volume in volumes.items()}
+    return Completion(truth, filled, every, axis, scores)
 
 
 def dice(a: np.ndarray, b: np.ndarray) -> float:
@@ -136,53 +136,81 @@ def dice(a: np.ndarray, b: np.ndarray) -> float:
     return float(2 * (a & b).sum() / total) if total else 1.0
 
 
+def grow_nearest(fit: Fit, *, count: int = SHOWN, progress: Progress = silent) -> list[np.ndarray]:
+    """Grow the nearest shapes of the atlas anew: up to `count` phase fields (64, 64, 64), the nearest first."""
+    grown = []
+    for k, match in enumerate(fit.matches):
+        if len(grown) < count:
+            progress("growing the nearest textures", min(1.0, k / count))
+            flow = generate(match.coefficients, match.mass, EDGE, seed=match.seed, schedule=LEARNED)
+            if flow.viability.viable:
+                grown.append(flow.field.numpy())
+    return grown
+
+
 def demo_page(
-    inference: Inference, measures: Measures, completion: Completion, atlas: Atlas, box: np.ndarray, title: str
+    inference: Inference,
+    measures: Measures,
+    completion: Completion,
+    textures: Sequence[np.ndarray],
+    atlas: Atlas,
 ) -> str:
     """Return the page: a self-contained HTML text.
 
-    The scan is placed on the map of `atlas`; `box` (7, 2) has the bounds of the posterior's prior (a11, log a02, a10,
-    a01, a00, m₀, log thickness); `title` is the heading, plain text.
+    The scan is placed on the map of `atlas`; `textures` are the phase fields of the nearest of its shapes.
     """
     fit = inference.fit
-    shapes = {
-        f"every {completion.every}th slice": completion.known,
-        "filled between them": completion.filled,
-        "the scan, which was left out": completion.truth,
-    }
+    grown = {f"{place} texture": u for place, u in zip(PLACES, textures, strict=False)}
     return render_template(
         "demo.html",
         version=version("curvafit"),
-        title=title,
+        sentence=describe(inference),
         scan=describe_scan(inference),
-        shapes=picture_of(
-            gallery_figure(shapes, columns=3, width=1500, azimuth=122), "Known slices, the filled volume, and the scan"
-        ),
+        shapes=picture_of(_shape_figure(completion), "Known slices, the filled volume, and the scan"),
         slices=picture_of(_slice_figure(inference.scan, completion), "A left-out slice, as it is and as filled"),
         every=completion.every,
-        score=f"{completion.dice['curvafit']:.3f}",
-        rivals=", ".join(f"{way} {completion.dice[way]:.3f}" for way in WAYS),
-        filled=completion.status,
+        axis="zyx"[completion.axis],
+        scores=[(name, f"{score:.3f}") for name, score in completion.dice.items()],
         measures=_measure_rows(measures),
         blocks=_say_intervals(measures),
+        count=len(atlas),
         map=picture_of(_map_figure(inference, atlas), "The scan's curvature diagram, and its place on the atlas's map"),
+        near=picture_of(gallery_figure(grown, columns=3, width=1500), "The nearest textures") if grown else None,
         reading=fit.status,
-        parameters=_parameter_rows(fit.draws, box),
         strips=list_strips(fit),
         notes=dict.fromkeys((*inference.scan.notes, *fit.notes)),
     )
 
 
+def _shape_figure(completion: Completion) -> Figure:
+    """Return a figure of the known slices, the filled volume and the scan, cut open, the slices lying."""
+    shapes = {
+        f"every {completion.every}th slice": completion.known,
+        "filled between them": completion.filled,
+        "the scan": completion.truth,
+    }
+    shape, axis = completion.truth.shape, completion.axis
+    order = (axis, *sorted({0, 1, 2} - {axis}, key=lambda each: shape[each]))
+    turned = {name: mask.transpose(order) for name, mask in shapes.items()}
+    (box,) = ndimage.find_objects(turned["the scan"].view(np.uint8))
+    halves = {name: mask[box][:, (box[1].stop - box[1].start) // 2 :] for name, mask in turned.items()}
+    return gallery_figure(halves, columns=3, width=1500)
+
+
 def _slice_figure(scan: Field, completion: Completion) -> Figure:
     """Return the slice midway between two known ones: its grey values, and where the filled slice differs."""
-    every, n = completion.every, len(completion.truth)
-    place = (n // 2 // every) * every + every // 2
-    truth, filled = completion.truth[place], completion.filled[place]
-    figure = make_figure(10.2, 3.9, layout="constrained")
+    every, axis = completion.every, completion.axis
+    place = (scan.shape[axis] // 2 // every) * every + every // 2
+    plane, truth, filled = (
+        each.take(place, axis) for each in (np.asarray(scan.values), completion.truth, completion.filled)
+    )
+    down, across = (h for k, h in enumerate(scan.spacing) if k != axis)
+    if down * truth.shape[0] > across * truth.shape[1]:  # lying, it takes less of the page
+        plane, truth, filled, down, across = plane.T, truth.T, filled.T, across, down
+    plane, aspect = plane.astype(np.float32), down / across
+    figure = make_figure(10.2, 0.7 + 3.4 * aspect * truth.shape[0] / truth.shape[1], layout="constrained")
     axes = figure.subplots(1, 3)
-    plane = np.asarray(scan.values[place], dtype=np.float32)
     low, high = np.percentile(plane, (0.5, 99.5))
-    aspect = scan.spacing[1] / scan.spacing[2]
     for each, mask, name in ((axes[0], truth, "the slice that was left out"), (axes[1], filled, "the filled slice")):
         section_on(each, plane, mask, (low, high), aspect)
         each.set_title(name, fontsize=11)
@@ -194,7 +222,8 @@ def _slice_figure(scan: Field, completion: Completion) -> Figure:
     axes[2].set_title("missing (blue), too much (orange)", fontsize=11)
     for each in axes:
         each.set(xticks=[], yticks=[])
-    figure.suptitle(f"z = {place}, {every // 2} slices from the nearest known one", fontsize=9, color="#5b616b")
+    words = f"{'zyx'[axis]} = {place}, {every // 2} slices from the nearest known one"
+    figure.suptitle(words, fontsize=9, color="#5b616b")
     return figure
 
 
@@ -231,18 +260,8 @@ def _say_intervals(measures: Measures) -> str:
     """Return the sentence on the intervals of the measures."""
     count = int(np.prod(measures.blocks))
     if np.isfinite(measures["BV/TV"].half):
-        return f"95 % intervals, by a jackknife over {count} blocks of one thickness and one spacing each."
-    return f"No intervals: they need eight blocks of one thickness and one spacing each, and the scan holds {count}."
-
-
-def _parameter_rows(draws: np.ndarray | None, box: np.ndarray) -> list[tuple[str, str, str, str]]:
-    """Return each parameter's name, 90 % interval, the interval's share of the prior's, and whether it is read."""
-    if draws is None:
-        return []
-    rows = []
-    low, high = np.percentile(draws[:, : len(SYMBOLS)], (5, 95), axis=0)
-    shares = (high - low) / (0.9 * np.ptp(box[: len(SYMBOLS)], axis=1))
-    for name, a, b, share in zip(SYMBOLS, low, high, shares, strict=True):
-        word = "read" if share <= _READ else "partly read" if share <= _PARTLY else "not read"
-        rows.append((name, f"{a:.3g} to {b:.3g}", f"{share:.0%}", word))
-    return rows
+        return f"Right: half a 95 % interval, from {count} parts of the scan that are a thickness and a spacing wide."
+    return (
+        "No intervals: they come from eight parts of a scan that are each a thickness and a spacing wide; this one "
+        f"holds {count}."
+    )

@@ -252,6 +252,7 @@ def report_html(inference: Inference) -> str:
         fit=fit,
         sentence=describe(inference),
         scan=describe_scan(inference),
+        voxel=format_length(inference.prepared.working_voxel, fit.length_unit, 3),
         slices=_slices(inference),
         framed=_is_framed(inference),
         shapes=_shapes(inference) if inference.twins else [],
@@ -309,8 +310,7 @@ def describe_scan(inference: Inference) -> str:
     same = len({round(h / scan.spacing[0], 6) for h in scan.spacing}) == 1
     spacing = (scan.spacing[0],) if same else scan.spacing
     voxel = " × ".join(f"{h:.4g}" for h in spacing) + f" {unit_name(scan.unit, spacing[0])}"
-    line = f"{Path(scan.source).name or 'a volume'}: {kind} of {shape} voxels (z, y, x), voxel edge {voxel}."
-    return f"{line} Measured on voxels of {format_length(inference.prepared.working_voxel, fit.length_unit, 3)}."
+    return f"{Path(scan.source).name or 'a volume'}: {kind} of {shape} voxels (z, y, x), voxel edge {voxel}."
 
 
 def _bars(inference: Inference) -> list[dict[str, Any]]:
@@ -535,6 +535,8 @@ def _diagrams(inference: Inference) -> list[Picture]:
         if each.name in (inference.fit.chosen, "match"):
             grown = (twin.diagram for twin in inference.twins.get(each.name, ()) if twin.diagram)
             diagrams.append((f"{_title(each)}, regrown", next(grown, None)))
+    if not inference.twins:
+        diagrams = diagrams[:1]
     λ, unit = inference.prepared.length, inference.fit.length_unit
     limits = shared_limits([diagram for _, diagram in diagrams if diagram is not None], length=λ)
     return [

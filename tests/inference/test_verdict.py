@@ -96,7 +96,7 @@ def test_a_candidate_comes_back_from_its_json() -> None:
 def test_without_growing_the_first_is_named_and_not_checked() -> None:
     said = "Nothing was grown to check the law (--fast)."
     assert judge((law("optimum"), law("match")), None, fast=True) == ("optimum", said)
-    unusual = "The scan is not as its shapes are (p = 0.0010); the strangest: depths, gaps."
+    unusual = "Shapes of this law do not look like the scan (p = 0.0010); what differs most: depths, gaps."
     assert judge((law("optimum"),), ODD, fast=True) == ("optimum", f"{unusual} {said}")
 
 
@@ -108,7 +108,7 @@ def test_where_nothing_grew_there_is_no_law() -> None:
 
 def test_the_nearest_is_supported_where_its_twins_are_near() -> None:
     """As the test says, whatever the distances are."""
-    usual = "The scan is as its shapes are (p = 0.40)."
+    usual = "Shapes of this law look like the scan (p = 0.40)."
     near = "Supported (nearest match): its twins lie 0.9 from the scan's curvature diagram"
     assert judge((law("match", 0.9, 0.5),), USUAL) == ("match", f"{near}, 0.5 from each other. {usual}")
     assert judge((law("match", 0.9, status="Hm."),), USUAL) == ("match", f"{near}. {usual} Hm.")
@@ -130,10 +130,11 @@ def test_a_far_or_strange_one_is_named_but_not_believed() -> None:
     name, status = judge((law("simulation", 0.1, 0.5), law("match", 9.0)), ODD)
     assert name == "simulation" and status.startswith("No believable twin (nearest of the simulations): ")
     assert status.endswith(
-        "0.5 from each other. The scan is not as its shapes are (p = 0.0010); the strangest: depths, gaps."
+        "0.5 from each other. Shapes of this law do not look like the scan (p = 0.0010); "
+        "what differs most: depths, gaps."
     )
     single = dataclasses.replace(ODD, blocks={"gaps": 0.3})
-    assert judge((law("simulation", 0.1),), single)[1].endswith("(p = 0.0010); the strangest: none by itself.")
+    assert judge((law("simulation", 0.1),), single)[1].endswith("(p = 0.0010); no descriptor tells it alone.")
     aligned = dataclasses.replace(ODD, blocks={"fabric": 0.001})
     direction = "The scan has a direction (fabric), and the model has none."
     assert judge((law("simulation", 0.1),), aligned)[1].endswith(direction)

@@ -10,7 +10,6 @@ import pytest
 from found import SCALE, lattice, made_inference
 
 from curvafit.inference.atlas import load_atlas
-from curvafit.inference.posterior import load_posterior
 from curvafit.report.demo import demo_page, score_completion, write_demo
 from curvafit.scan.measure import measure
 from curvafit.segmentation.slices import WAYS
@@ -27,8 +26,8 @@ def test_scores_are_of_the_slices_left_out_alone() -> None:
     truth = cone()
     known = np.zeros_like(truth)
     known[::8] = truth[::8]
-    assert score_completion(truth, truth, 8, "").dice["curvafit"] == 1
-    completion = score_completion(truth, known, 8, "")
+    assert score_completion(truth, truth, 8).dice["curvafit"] == 1
+    completion = score_completion(truth, known, 8)
     assert completion.dice["curvafit"] == 0 and np.array_equal(completion.known, known)
     assert set(completion.dice) == {"curvafit", *WAYS}
     assert completion.dice["linear"] > 0.98 > completion.dice["nearest"]
@@ -38,24 +37,31 @@ def test_what_lies_beyond_the_last_known_slice_does_not_count() -> None:
     truth = cone(37)
     filled = truth.copy()
     filled[33:] = False
-    assert score_completion(truth, filled, 8, "").dice["curvafit"] == 1
+    assert score_completion(truth, filled, 8).dice["curvafit"] == 1
+
+
+def test_slices_across_any_axis_score_alike() -> None:
+    truth = cone()
+    filled = np.roll(truth, 1, axis=2)
+    turned = score_completion(np.moveaxis(truth, 0, 1), np.moveaxis(filled, 0, 1), 8, axis=1)
+    assert turned.dice == score_completion(truth, filled, 8).dice
+    assert np.array_equal(np.moveaxis(turned.known, 1, 0), score_completion(truth, filled, 8).known)
 
 
 def test_the_page_stands_alone_and_escapes_what_it_is_told() -> None:
     inference, mask = made_inference(), lattice(48, 24, 5.0) > 0
     measures = measure(Field(mask, (SCALE,) * 3, "mm"))
-    completion = score_completion(mask, mask, 8, "a <status>")
-    page = demo_page(inference, measures, completion, load_atlas(), load_posterior().box, "A <title>")
-    assert "A &lt;title&gt;" in page and "a &lt;status&gt;" in page and "tubes &lt;b&gt;&amp;.tif" in page
-    assert "<title>A <" not in page and page.count("data:image/png;base64,") == 3
-    assert re.findall(r'(?:src|href)="(?!data:|report\.html)', page) == []
-    assert "<b>1.000</b>" in page and "1/mm" in page
-    assert len(re.findall(r"(?:not|partly)? ?read</td>", page)) == 6
+    texture = lattice(16, 8, 2.0)
+    for textures, pictures in (([texture, texture], 4), ([], 3)):
+        page = demo_page(inference, measures, score_completion(mask, mask, 8, axis=1), textures, load_atlas())
+        assert "tubes &lt;b&gt;&amp;.tif" in page and page.count("data:image/png;base64,") == pictures
+        assert re.findall(r'(?:src|href)="(?!data:|report\.html)', page) == []
+        assert 'chosen">1.000</td>' in page and "1/mm" in page and "--axis y" in page
 
 
 def test_another_program_s_page_is_kept(tmp_path: Path) -> None:
     page = tmp_path / "demo.html"
     page.write_text("mine")
     with pytest.raises(ValueError, match="overwrite"):
-        write_demo(Field(cone(), (1.0,) * 3, "voxel"), tmp_path, title="cone")
+        write_demo(Field(cone(), (1.0,) * 3, "voxel"), tmp_path)
     assert page.read_text() == "mine" and [path.name for path in tmp_path.iterdir()] == ["demo.html"]
