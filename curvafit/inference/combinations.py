@@ -24,6 +24,8 @@ LOOKS = {
     "gaps": ("even in spacing", "uneven in spacing"),
 }
 NAMED = 2
+#: An end is described by no look whose correlation with the combination is less.
+FAINT = 0.18
 
 Share = Annotated[float, Rule(least=0, most=1)]
 
@@ -35,7 +37,7 @@ class Combination:
     Attributes
     ----------
     low, high
-        What shapes look like at its ends, in words.
+        What shapes look like at its ends, in words; empty where it hardly changes how they look.
     weights
         What is added for each parameter's distance from the laws' mean, by name (`table.PARAMETERS`).
     median, interval
@@ -54,6 +56,8 @@ class Combination:
     def __str__(self) -> str:
         low, high = (format_number(end, 2) for end in self.interval)
         value = format_number(self.median, 2) if self.known >= KNOWN else "not known"
+        if not self.low:
+            return f"A sum that hardly changes how shapes look: {value} ({low} to {high})."
         return f"From {self.low} (-2) to {self.high} (+2): {value} ({low} to {high})."
 
 
@@ -62,7 +66,7 @@ class Combinations:
     """Six sums of the parameters, uncorrelated among laws.
 
     `weights` `(6, 6)` has a row for each, `centre` `(6,)` the laws' mean; a sum's deviation among laws is 1. `ends` has
-    the words for its low and its high end.
+    the words for its low and its high end, empty where it hardly changes how shapes look.
     """
 
     weights: np.ndarray
@@ -79,7 +83,7 @@ class Combinations:
         found, of = self(draws), " (the background)" if background else ""
         ranges = np.quantile(found, (0.05, 0.5, 0.95), axis=0).T
         read = [
-            Combination(low + of, high + of, dict(zip(PARAMETERS, map(float, weights), strict=True)),
+            Combination(low and low + of, high and high + of, dict(zip(PARAMETERS, map(float, weights), strict=True)),
                         float(middle), (float(least), float(most)), float(np.clip(1 - column.var(), 0, 1)))
             for (low, high), weights, (least, middle, most), column in zip(
                 self.ends, self.weights, ranges, found.T, strict=True)
@@ -106,7 +110,7 @@ def find_combinations(errors: np.ndarray, parameters: np.ndarray, descriptors: n
     signs = np.sign(np.take_along_axis(alike, np.abs(alike).argmax(1)[:, None], 1))
     ends = []
     for row in signs * alike:
-        chosen = np.argsort(-np.abs(row))[:NAMED]
+        chosen = [k for k in np.argsort(-np.abs(row))[:NAMED] if np.abs(row[k]) >= FAINT]
         ends.append(tuple(", ".join(looks[k, int((row[k] > 0) == high)] for k in chosen) for high in (False, True)))
     return Combinations(signs * weights, centre, tuple(ends))
 

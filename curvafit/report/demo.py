@@ -16,12 +16,14 @@ from curvafit.atlas_map.picture import map_on
 from curvafit.core.files import write_content
 from curvafit.core.records import can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
+from curvafit.core.units import format_density, format_number
 from curvafit.drawing.plot import INK, diagram_on, gallery_figure, make_figure, section_on, shared_limits
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import LEARNED
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.inference.atlas import load_atlas
 from curvafit.inference.infer import infer
+from curvafit.inference.verdict import UNBELIEVABLE
 from curvafit.report.page import (
     MARK,
     check_report,
@@ -176,7 +178,9 @@ def demo_page(
         count=len(atlas),
         map=picture_of(_map_figure(inference, atlas), "The scan's curvature diagram, and its place on the atlas's map"),
         near=picture_of(gallery_figure(grown, columns=3, width=1500), "The nearest textures") if grown else None,
-        reading=fit.status,
+        misfit=fit.misfit,
+        believed=fit.misfit is not None and fit.misfit.probability >= UNBELIEVABLE,
+        number=format_number,
         strips=list_strips(fit),
         notes=dict.fromkeys((*inference.scan.notes, *fit.notes)),
     )
@@ -211,7 +215,10 @@ def _slice_figure(scan: Field, completion: Completion) -> Figure:
     figure = make_figure(10.2, 0.7 + 3.4 * aspect * truth.shape[0] / truth.shape[1], layout="constrained")
     axes = figure.subplots(1, 3)
     low, high = np.percentile(plane, (0.5, 99.5))
-    for each, mask, name in ((axes[0], truth, "the slice that was left out"), (axes[1], filled, "the filled slice")):
+    for each, mask, name in (
+        (axes[0], truth, "a slice that was left out"),
+        (axes[1], filled, "filled, on the same slice"),
+    ):
         section_on(each, plane, mask, (low, high), aspect)
         each.set_title(name, fontsize=11)
     difference = np.ones((*truth.shape, 3), np.float32)
@@ -250,9 +257,13 @@ def _measure_rows(measures: Measures) -> list[tuple[str, str, str, str]]:
     """Return name, symbol, value with its unit, and interval; no interval where the scan is too small for one."""
     rows = []
     for symbol in _MEASURES:
-        value, interval, unit = measures[symbol].format(measures.unit)
-        known = np.isfinite(measures[symbol].half)
-        rows.append((measures[symbol].name, symbol, f"{value} {unit}".rstrip(), interval if known else ""))
+        quantity = measures[symbol]
+        value, interval, unit = quantity.format(measures.unit)
+        known = np.isfinite(quantity.half)
+        text = f"{value} {unit}".rstrip()
+        if quantity.power == -3 and not known:
+            text = format_density(quantity.value, measures.unit, 3)
+        rows.append((quantity.name, symbol, text, interval if known else ""))
     return rows
 
 
@@ -260,8 +271,5 @@ def _say_intervals(measures: Measures) -> str:
     """Return the sentence on the intervals of the measures."""
     count = int(np.prod(measures.blocks))
     if np.isfinite(measures["BV/TV"].half):
-        return f"Right: half a 95 % interval, from {count} parts of the scan that are a thickness and a spacing wide."
-    return (
-        "No intervals: they come from eight parts of a scan that are each a thickness and a spacing wide; this one "
-        f"holds {count}."
-    )
+        return f"± is half a 95 % interval, from {count} parts of the scan, each a thickness and a spacing wide."
+    return "The scan is too small for intervals: it has not eight parts, each a thickness and a spacing wide."

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import version
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +86,7 @@ def write_laws(fits: dict[str, Fit], directory: str | Path, *, command: str = ""
     rows = [row for name, fit in fits.items() for row in _rows(name, fit)]
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for name, fit in fits.items():
-        for strip in list_strips(fit):
+        for strip in filter(itemgetter("low"), list_strips(fit)):
             groups.setdefault((strip["low"], strip["high"]), []).append(strip | {"scan": name})
     page = render_template(
         "laws.html", version=record["curvafit"], title=f"The laws of {len(fits)} scans", fits=fits, groups=groups,
@@ -120,7 +121,8 @@ def _is_done(folder: Path, command: str) -> bool:
 def _rows(name: str, fit: Fit) -> Iterator[dict[str, Any]]:
     """Yield a row for each number of a fit; None where it is not known."""
     columns = ("scan", "quantity", "value", "low", "high", "known", "version")
-    told = [(f"from {each.low} to {each.high}", each.median, *each.interval, each.known) for each in fit.combinations]
+    told = [(f"from {each.low} to {each.high}", each.median, *each.interval, each.known)
+            for each in fit.combinations if each.low]  # fmt: skip
     told += [(key, each["median"], *each["90"], None) for key, each in (fit.intervals() or {}).items()]
     told.append(("p of the law", None if fit.misfit is None else fit.misfit.probability, None, None, None))
     for row in told:

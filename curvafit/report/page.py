@@ -255,6 +255,7 @@ def report_html(inference: Inference) -> str:
         voxel=format_length(inference.prepared.working_voxel, fit.length_unit, 3),
         slices=_slices(inference),
         framed=_is_framed(inference),
+        windows=len(inference.prepared.windows),
         shapes=_shapes(inference) if inference.twins else [],
         diagrams=[] if inference.diagram is None else _diagrams(inference),
         bars=_bars(inference) if inference.twins else [],

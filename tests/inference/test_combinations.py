@@ -44,6 +44,7 @@ def test_ends_are_described_by_what_is_made_so(found: Combinations) -> None:
     mass = int(np.abs(found.weights[:, 5] * DEVIATION[5]).argmax())
     low, high = found.ends[mass]
     assert ("sparse" in low, "full" in high) == (True, True)
+    assert found.ends[-2:] == (("", ""), ("", ""))  # of a10, and of a difference of which no look tells
 
 
 def test_draws_tell_what_they_hold(found: Combinations) -> None:
