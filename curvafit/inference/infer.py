@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import platform
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -32,7 +33,7 @@ from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law
 from curvafit.priors.profile import phase_field
 from curvafit.scan.measure import scan_diagram
-from curvafit.scan.prepare import HALF, NOISE, Prepared, prepare, read_scan, why_no_texture
+from curvafit.scan.prepare import HALF, NOISE, Prepared, coarser_level, prepare, read_scan, why_no_texture
 from curvafit.scan.structure import check_options, is_rounded, sample_mask
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Crop
@@ -168,10 +169,10 @@ def infer(
     progress("reading the scan", 0.0)
     atlas = atlas if isinstance(atlas, Atlas) else load_atlas(atlas)
     posterior = posterior if isinstance(posterior, Posterior) else load_posterior(posterior)
-    volume, shape = read_scan(scan, label=label, crop=crop, whole=roi is not None or periodic, **reading)
     region = None if roi is None else field_of(roi)
     region = region if region is None or crop is None else region.crop(crop)
-    prepared = prepare(volume, kind=kind, periodic=periodic, threshold=threshold, dark=dark, roi=region, one_scale=True)
+    found = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark, "roi": region}
+    volume, shape, prepared = _read_and_prepare(scan, label, crop, found, reading)
     progress("measuring curvature", 0.05)
     measured = None if prepared.noise else scan_diagram(prepared)
     reason = NOISE if measured is None else why_no_texture(prepared, measured)
@@ -273,6 +274,22 @@ def _grow(
         if best is not None and len(twins[best.name]) < count:
             laws = tuple(grow(law, 0.7 + 0.3 * k / most) if law is best else law for law in laws)
     return laws, twins
+
+
+def _read_and_prepare(
+    scan: Source, label: int | None, crop: Crop | None, options: Mapping[str, Any], reading: Mapping[str, Any]
+) -> tuple[Field, tuple[int, int, int], Prepared]:
+    """Return a scan, or the middle of a large one at the level of its pyramid that suits its structure, the shape of
+    that level, and the scan prepared."""
+    whole = options["roi"] is not None or options["periodic"]
+    volume, shape = read_scan(scan, label=label, crop=crop, whole=whole, **reading)
+    prepared = prepare(volume, one_scale=True, **options)
+    if crop is None and volume.shape != shape and (level := coarser_level(scan, shape, prepared, **reading)):
+        volume, shape = read_scan(scan, label=label, **{**reading, "key": level})
+        note = f"Read at the level {level} of its pyramid, which shows more of this large scan than the finest."
+        volume = replace(volume, notes=(*volume.notes, note))
+        prepared = prepare(volume, one_scale=True, **options)
+    return volume, shape, prepared
 
 
 def _describe(prepared: Prepared, measured: Diagram | None, provenance: dict[str, Any], status: str) -> Fit:

@@ -39,7 +39,7 @@ from curvafit.scan.structure import (
 from curvafit.volumes.boxes import InMemory, boxes_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Crop
-from curvafit.volumes.read import Source, field_of
+from curvafit.volumes.read import Source, field_of, levels_of
 
 #: Median thickness in voxels that a scan is resampled to; those of isotropic scans whose grid is kept: where a shape is
 #: measured, and where a law is read.
@@ -51,6 +51,8 @@ THINNEST = 3.0
 LARGEST_WINDOW = 128
 LARGEST_BOX = 256
 LARGEST_SCAN = 512
+#: Of a large scan a coarser level is read where its structure is at least so many voxels thick there.
+SUITED = 10.0
 #: Bytes that a working voxel takes while it is made.
 WORKED = 64
 #: A structure that fills more than this part of the volume may be the wrong phase, which a note says.
@@ -194,6 +196,22 @@ def read_scan(
     except ScanError as error:
         raise ScanError(f"{error}, in the middle of this large scan: name another part with crop") from error
     return replace(field, notes=field.notes + notes), shape
+
+
+def coarser_level(
+    scan: Source, shape: tuple[int, int, int], prepared: Prepared, *, key: str | None = None, **reading: Any
+) -> str | None:
+    """Return the key of the level of a pyramid that shows more of a large scan, None where its finest level does.
+
+    `shape` and `prepared` are of the finest. A spacing of the caller's is that of one level: no other is taken.
+    """
+    if prepared.noise or reading.get("spacing") is not None:
+        return None
+    levels = levels_of(scan, key)
+    halvings = math.log2(max(1.0, prepared.thickness * min(prepared.scale) / SUITED))
+    needed = math.ceil(math.log2(max(shape) / LARGEST_SCAN))
+    level = min(int(halvings), needed, len(levels) - 1)
+    return levels[level] if level > 0 else None
 
 
 def prepare(

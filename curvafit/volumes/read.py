@@ -27,7 +27,7 @@ from curvafit.volumes.formats.nifti import read_nifti
 from curvafit.volumes.formats.part import Crop, Part, parse_box, take_part
 from curvafit.volumes.formats.scanco import read_aim, read_isq
 from curvafit.volumes.formats.tiff import SLICES, read_slices, read_tiff
-from curvafit.volumes.formats.zarr import read_zarr
+from curvafit.volumes.formats.zarr import list_levels, read_zarr
 
 #: A volume as a caller gives it.
 Source = str | os.PathLike[str] | Field | np.ndarray | torch.Tensor
@@ -242,6 +242,14 @@ def split_key(path: str | os.PathLike[str], key: str | None) -> tuple[Path, str 
         return Path(path), key
     name, separator, inner = path.rpartition("::")
     return (Path(name), key or inner or None) if separator else (Path(path), key)
+
+
+def levels_of(source: object, key: str | None = None) -> tuple[str, ...]:
+    """Return the keys of the levels of an OME-Zarr image, the finest first; none where a key names one."""
+    if not isinstance(source, str | os.PathLike):
+        return ()
+    path, key = split_key(source, key)
+    return list_levels(path, key) if path.is_dir() and pick_reader(path) is read_zarr else ()
 
 
 def _check_finite(values: np.ndarray, place: object) -> tuple[float, float]:

@@ -12,7 +12,15 @@ from scipy import ndimage
 
 from curvafit.priors import Grid, phase_field
 from curvafit.scan.grids import boxes_by_surface, median_thickness, remove_specks, resample
-from curvafit.scan.prepare import LARGEST_WINDOW, WORKING_THICKNESS, Prepared, is_ball, prepare, read_scan
+from curvafit.scan.prepare import (
+    LARGEST_WINDOW,
+    WORKING_THICKNESS,
+    Prepared,
+    coarser_level,
+    is_ball,
+    prepare,
+    read_scan,
+)
 from curvafit.scan.structure import find_structure, is_noise
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.read import load
@@ -56,6 +64,21 @@ def test_of_a_large_file_the_middle_is_read(tmp_path, monkeypatch, crop) -> None
         read_scan(path, label=999)
     packed = save(Field(grey, (1.0, 1.0, 1.0), "um"), tmp_path / "scan.nii.gz")  # cannot be read in part
     assert read_scan(packed)[0].shape == (20, 24, 60)
+
+
+@pytest.mark.parametrize(("radius", "level"), [(3, None), (12, "1"), (22, "2")])
+def test_a_coarser_level_is_chosen_where_the_structure_is_thick_there(tmp_path, monkeypatch, radius, level) -> None:
+    """24 voxels of thickness leave 12 at the first level, 44 leave 11 at the second."""
+    monkeypatch.setattr("curvafit.scan.prepare.LARGEST_SCAN", 64)
+    monkeypatch.setattr("curvafit.volumes.formats.zarr.CHUNK", 48)
+    mask = tube_mask((96, 96, 200), (1, 1, 1), radius)
+    path = save(Field(mask.astype(np.uint8), (0.5, 0.5, 0.5), "um"), tmp_path / "scan.zarr")
+    prepared = prepare(Field(mask.astype(np.uint8)), one_scale=True)
+    assert coarser_level(path, mask.shape, prepared) == level
+    assert coarser_level(path, mask.shape, prepared, spacing=(1, 1, 1)) is None  # which may be the finest's alone
+    assert (
+        coarser_level(f"{path}::0", mask.shape, prepared) is None and coarser_level(mask, mask.shape, prepared) is None
+    )
 
 
 def test_a_file_larger_than_memory_is_read_in_its_middle(tmp_path) -> None:

@@ -64,6 +64,33 @@ def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, *
     node: Any = zarr.open(path, mode="r")
     if isinstance(node, zarr.Array):
         return _read_array(node, path, _Place(*read_spacing(node.attrs.asdict(), node.ndim)), part)
+    arrays, places, name, unasked = _pick_array(node, key, path)
+    array = arrays[name]
+    if unasked:
+        _check_levels(arrays, places, path)
+    place = places.get(name)
+    if place is None:
+        place = _Place(*read_spacing({**node.attrs.asdict(), **array.attrs.asdict()}, array.ndim))
+    return _read_array(array, path / array.path, place, part)
+
+
+def list_levels(path: Path, key: str | None) -> tuple[str, ...]:
+    """Return the keys of the levels of the image that is read of a store, the finest first; none of a single array."""
+    import zarr
+
+    _check_store(path)
+    node: Any = zarr.open(path, mode="r")
+    if isinstance(node, zarr.Array):
+        return ()
+    _, places, name, _ = _pick_array(node, key, path)
+    return () if key is not None and key.strip("/") == name else tuple(places)
+
+
+def _pick_array(node: Any, key: str | None, path: Path) -> tuple[dict[str, Any], dict[str, _Place], str, bool]:
+    """Return the arrays of a group, the places of the levels of the image that is read, its array's name, and whether
+    no key named it."""
+    import zarr
+
     members = dict(node.members(max_depth=None))
     arrays = {name: member for name, member in members.items() if isinstance(member, zarr.Array)}
     images = {"": node} | {name: member for name, member in members.items() if name not in arrays}
@@ -76,14 +103,7 @@ def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, *
     elif key.strip("/") in firsts:
         key = firsts[key.strip("/")]
     name = pick_key(sorted(arrays), key, path)
-    array = arrays[name]
-    places = next((each for each in levels.values() if name in each), {})
-    if unasked:
-        _check_levels(arrays, places, path)
-    place = places.get(name)
-    if place is None:
-        place = _Place(*read_spacing({**node.attrs.asdict(), **array.attrs.asdict()}, array.ndim))
-    return _read_array(array, path / array.path, place, part)
+    return arrays, next((each for each in levels.values() if name in each), {}), name, unasked
 
 
 def _read_array(array: Any, folder: Path, place: _Place, part: Part | None) -> Raw:
