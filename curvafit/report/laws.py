@@ -24,8 +24,8 @@ from curvafit.report.page import (
     write_inference,
     write_study,
 )
+from curvafit.studies.scans import name_errors
 from curvafit.studies.tables import format_csv
-from curvafit.volumes.field import ScanError
 
 #: `format` of the record.
 FORMAT = Format("curvafit laws", 1, title="the record of many inferences")
@@ -102,10 +102,8 @@ def _infer_one(
     """Infer some of the scans, and write their reports into their folders."""
     for k in indices:
         scan, folder = jobs[k]
-        try:
+        with name_errors(scan):
             found = infer(scan, progress=silent if watch is None else partial(watch, k), **options)
-        except ValueError as error:
-            raise error if scan in str(error) else ScanError(f"{scan}: {error}") from None
         write_inference(with_command(found, command), target / folder, overwrite=overwrite)
     return list(indices)
 

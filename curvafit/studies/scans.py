@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
@@ -32,6 +32,8 @@ from curvafit.volumes.read import field_of
 FINE = 0.1
 #: Voxel edges of groups that differ by more than this part deserve a note.
 ALIKE_EDGES = 0.1
+#: What measures one scan, given its progress; a function that has a module's name.
+Task = Callable[[Progress], Any]
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
@@ -52,7 +54,11 @@ def measure_scans(
     if laws and any(isinstance(case.source, Measures) for case in cases):
         raise ValueError("expected scans whose laws can be read, got one that is measured already")
     unit, notes = _check_scans(cases, reading, sub_progress(progress, 0.0, 0.05))
-    measures = _measure_all(cases, options | reading, laws, workers, sub_progress(progress, 0.05, 1.0))
+    found = {k: case.source for k, case in enumerate(cases) if isinstance(case.source, Measures)}
+    how = options | reading
+    tasks = {k: partial(_measure_case, case, how, laws) for k, case in enumerate(cases) if k not in found}
+    names = [case.name for case in cases]
+    measures = _share_out(tasks, found, names, workers, sub_progress(progress, 0.05, 1.0))
     units = {each.unit for each in measures}
     notes += [] if len(units) == 1 else [f"Lengths in {', '.join(sorted(units))} were converted to {unit}."]
     return [each.convert(unit) for each in measures], notes
@@ -73,34 +79,43 @@ def measure_each(
     finished tiles lie in the folder `store`. Diagrams of several scans are binned finely, so that many take little
     memory. Raises ValueError as those do.
     """
-    options |= {} if labels else {"workers": workers if len(scans) == 1 else 0}
-    crew_size = workers if len(scans) > 1 else 0
-    found: dict[int, tuple[Measures, ...]] = {}
-    with cluster(crew_size) as crew:
-        make = partial(_measure_one, list(scans), labels, store, options, None if crew_size else progress)
-        for k, measures in collect_all(crew, ((make, Path(), [k]) for k in range(len(scans)))):
-            found[k] = measures
-            progress(f"{len(found)} of {len(scans)} scans measured", len(found) / len(scans))
-    return [found[k] for k in range(len(scans))]
+    several = len(scans) > 1
+    options |= {} if labels else {"workers": 0 if several else workers}
+    tasks: dict[int, Task] = {}
+    for k, scan in enumerate(scans):
+        tiles = {} if labels or store is None else {"store": store / f"{k:04d}"}
+        tasks[k] = partial(_measure_one, scan, several, labels, options | tiles)
+    return _share_out(tasks, {}, scans, workers if several else 0, progress)
 
 
 def _measure_one(
-    scans: Sequence[str], labels: bool, store: Path | None, options: dict[str, Any], watch: Progress | None,
-    folder: Path, indices: Sequence[int],
-) -> list[tuple[int, tuple[Measures, ...]]]:  # fmt: skip
+    scan: str, several: bool, labels: bool, options: dict[str, Any], progress: Progress
+) -> tuple[Measures, ...]:
     """Measure one scan, or its instances."""
-    found = []
-    for k in indices:
-        part = silent if watch is None else sub_progress(watch, k / len(scans), (k + 1) / len(scans))
-        told, several = partial(_tell, part, scans[k]), len(scans) > 1
-        with _named(scans[k]) if several else nullcontext():
-            if labels:
-                found.append((k, measure_instances(scans[k], progress=told, **options)))
-                continue
-            tiles = None if store is None else store / f"{k:04d}"
-            whole = measure(scans[k], progress=told, store=tiles, **options)
-        found.append((k, (_bin_diagrams(whole) if several else whole,)))
-    return found
+    with name_errors(scan) if several else nullcontext():
+        if labels:
+            return measure_instances(scan, progress=progress, **options)
+        whole = measure(scan, progress=progress, **options)
+    return (_bin_diagrams(whole) if several else whole,)
+
+
+def _share_out(
+    tasks: Mapping[int, Task], found: dict[int, Any], names: Sequence[str], workers: int, progress: Progress
+) -> list[Any]:
+    """Measure scans by their numbers, in this process or by several, besides those `found`; return all in order."""
+    count = len(names)
+    with cluster(workers) as crew:
+        parts = {k: sub_progress(progress, k / count, (k + 1) / count) for k in tasks}
+        tell = {k: silent if workers else partial(_tell, parts[k], names[k]) for k in tasks}
+        for k, measures in collect_all(crew, ((partial(_do, tasks[k], tell[k]), Path(), [k]) for k in tasks)):
+            found[k] = measures
+            progress(f"{len(found)} of {count} scans measured", len(found) / count)
+    return [found[k] for k in range(count)]
+
+
+def _do(task: Task, progress: Progress, folder: Path, indices: Sequence[int]) -> list[tuple[int, Any]]:
+    """Measure a scan, as a worker does."""
+    return [(k, task(progress)) for k in indices]
 
 
 def _tell(progress: Progress, name: str, text: str, share: float) -> None:
@@ -161,7 +176,7 @@ def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progr
         if isinstance(case.source, Measures):
             units.setdefault(case.source.unit, case.name)
             continue
-        with _named(case.name):
+        with name_errors(case.name):
             field = field_of(case.source, **reading)
         units.setdefault(field.unit, case.name)
         edges.setdefault(case.group, []).append(float(np.prod(field.spacing) ** (1 / 3)))
@@ -179,7 +194,7 @@ def check_units(scans: Sequence[str], progress: Progress = silent, **reading: An
     units: dict[str, str] = {}
     for k, scan in enumerate(scans):
         progress(f"{scan}: reading", k / len(scans))
-        with _named(scan):
+        with name_errors(scan):
             units.setdefault(boxes_of(scan, **reading).frame.unit, scan)
     _check_mixture(units)
 
@@ -194,30 +209,13 @@ def _check_mixture(units: Mapping[str, str]) -> None:
         )
 
 
-def _measure_all(
-    cases: Sequence[Case], options: dict[str, Any], laws: bool, workers: int, progress: Progress
-) -> list[Measures]:
-    """Measure the scans, in this process or by several, and return their measures in order."""
-    found = {k: case.source for k, case in enumerate(cases) if isinstance(case.source, Measures)}
-    left = [k for k in range(len(cases)) if k not in found]
-    with cluster(workers) as crew:
-        watches = {k: sub_progress(progress, k / len(cases), (k + 1) / len(cases)) for k in left}
-        make = {k: partial(_measure_case, cases[k], options, laws, silent if workers else watches[k]) for k in left}
-        for k, measures in collect_all(crew, ((make[k], Path(), [k]) for k in left)):
-            found[k] = measures
-            progress(f"{len(found)} of {len(cases)} scans measured", len(found) / len(cases))
-    return [found[k] for k in range(len(cases))]
-
-
-def _measure_case(
-    case: Case, options: dict[str, Any], laws: bool, progress: Progress, folder: Path, indices: Sequence[int]
-) -> list[tuple[int, Measures]]:
+def _measure_case(case: Case, options: dict[str, Any], laws: bool, progress: Progress) -> Measures:
     """Measure one scan; its diagram is binned finely, so that many scans take little memory."""
-    with _named(case.name):
-        measures = measure(case.source, progress=partial(_tell, progress, case.name), **options)  # type: ignore[arg-type]
+    with name_errors(case.name):
+        measures = measure(case.source, progress=progress, **options)  # type: ignore[arg-type]
         if laws:
             measures = add_combinations(measures, infer(case.source, fast=True, **options))  # type: ignore[arg-type]
-    return [(k, replace(_bin_diagrams(measures), source=measures.source or case.name)) for k in indices]
+    return replace(_bin_diagrams(measures), source=measures.source or case.name)
 
 
 def add_combinations(measures: Measures, inference: Inference) -> Measures:
@@ -257,7 +255,7 @@ def _read_combinations(inference: Inference | None, posterior: Posterior) -> tup
 
 
 @contextmanager
-def _named(name: str) -> Iterator[None]:
+def name_errors(name: str) -> Iterator[None]:
     """Add a scan's name to what is wrong with it."""
     try:
         yield
