@@ -10,17 +10,14 @@ import numpy as np
 from scipy import ndimage
 
 from curvafit.geometry.morphometry import local_thickness
-
-Window = tuple[slice, slice, slice]
+from curvafit.volumes.formats.part import Box
 
 #: Median thickness is measured in a box of at most this many voxels a side.
 MEASURED = 160
 _CONNECTED_26 = np.ones((3, 3, 3), dtype=bool)
 
 
-def bounding_box(
-    shape: tuple[int, int, int], region: np.ndarray | None, longest: int
-) -> tuple[Window, tuple[str, ...]]:
+def bounding_box(shape: tuple[int, int, int], region: np.ndarray | None, longest: int) -> tuple[Box, tuple[str, ...]]:
     """Return the box around a region (else all), or its middle where a side is over `longest` voxels; and notes."""
     box, notes = [slice(0, n) for n in shape], []
     if region is not None:
@@ -59,7 +56,7 @@ def surface_voxels(mask: np.ndarray) -> np.ndarray:
     return mask & ~ndimage.binary_erosion(mask, border_value=1)  # pyright: ignore[reportOperatorIssue]
 
 
-def boxes_by_surface(content: np.ndarray, size: int | Sequence[int]) -> list[Window]:
+def boxes_by_surface(content: np.ndarray, size: int | Sequence[int]) -> list[Box]:
     """Return the boxes, of at most `size` voxels a side, that cover the volume and hold content, in order of use.
 
     The first is the middle one, unless it holds less than half of what the others hold on average: then the fullest.
@@ -68,7 +65,7 @@ def boxes_by_surface(content: np.ndarray, size: int | Sequence[int]) -> list[Win
     return order_boxes(candidates, [int(np.count_nonzero(content[box])) for box in candidates])
 
 
-def candidate_boxes(shape: Sequence[int], size: int | Sequence[int]) -> list[Window]:
+def candidate_boxes(shape: Sequence[int], size: int | Sequence[int]) -> list[Box]:
     """Return the middle box of a volume, of at most `size` voxels a side, and others that cover the volume."""
     sides = [size] * 3 if isinstance(size, int) else list(size)
     middle = tuple(_middle(slice(0, n), side) for n, side in zip(shape, sides, strict=True))
@@ -76,7 +73,7 @@ def candidate_boxes(shape: Sequence[int], size: int | Sequence[int]) -> list[Win
     return [middle] + [(z, y, x) for z in tiles[0] for y in tiles[1] for x in tiles[2] if (z, y, x) != middle]  # type: ignore[list-item]
 
 
-def order_boxes(candidates: Sequence[Window], counts: Sequence[int]) -> list[Window]:
+def order_boxes(candidates: Sequence[Box], counts: Sequence[int]) -> list[Box]:
     """Return the boxes of `candidate_boxes` that hold anything, in the order of `boxes_by_surface`."""
     filled = [(count, box) for count, box in zip(counts, candidates, strict=True) if count]
     ordered = [box for _, box in sorted(filled, key=lambda pair: -pair[0])]
@@ -86,7 +83,7 @@ def order_boxes(candidates: Sequence[Window], counts: Sequence[int]) -> list[Win
     return ordered
 
 
-def box_with_most_surface(mask: np.ndarray, edge: int | Sequence[int]) -> Window:
+def box_with_most_surface(mask: np.ndarray, edge: int | Sequence[int]) -> Box:
     """Return the box, of at most `edge` voxels a side, that holds most of a mask's surface, wherever it lies.
 
     Unlike `boxes_by_surface` it slides by single voxels: for one small part of a volume, not for covering it.
@@ -205,7 +202,7 @@ def remove_specks(
 class CutOut(NamedTuple):
     """A part of a volume: its core, and whether it was cut at the low and the high end of each axis."""
 
-    core: Window
+    core: Box
     cut: Sequence[tuple[bool, bool]]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ from curvafit.scan.measure import (
 from curvafit.scan.prepare import prepare
 from curvafit.scan.structure import read_labels
 from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.formats.part import Box, grow
 from curvafit.volumes.read import Source, field_of
 
 #: Symbols of the numbers that need a volume around a structure: a body has none.
@@ -75,13 +76,15 @@ def measure_instances(labels: Source, *, progress: Progress = silent, **reading:
     return tuple(found)
 
 
-def _measure_body(field: Field, numbers: np.ndarray, number: int, box: Sequence[slice], label: int) -> Measures:
+def _measure_body(field: Field, numbers: np.ndarray, number: int, box: Box, label: int) -> Measures:
     """Return the measures of the body of a number, which lies in a box."""
-    mask = numbers[_widen(box, (3, 3, 3))] == number  # the reach of the blur before marching cubes
+    mask = numbers[grow(box, 3, numbers.shape)] == number  # the reach of the blur before marching cubes
     thickness = local_thickness(mask, field.spacing)
     around = [math.ceil(float(thickness.max()) / 2 / h) + _AROUND for h in field.spacing]
     try:
-        prepared = prepare(Field(numbers[_widen(box, around)] == number, field.spacing, field.unit), kind="mask")
+        prepared = prepare(
+            Field(numbers[grow(box, around, numbers.shape)] == number, field.spacing, field.unit), kind="mask"
+        )
         (curved, drawn), notes = measure_curvatures(prepared), prepared.notes
         drawn = drawn.thin(BIN_WIDTH / prepared.working_voxel * WORKING_SPACING, TAIL_SHARE)  # there may be thousands
     except ValueError as reason:  # too thin, or without a surface away from the image's borders
@@ -91,7 +94,7 @@ def _measure_body(field: Field, numbers: np.ndarray, number: int, box: Sequence[
     empty = np.zeros_like(thickness)
     maps = Maps(field.spacing, False, mask, thickness, empty, empty, surface, curved, drawn, "mask", notes)
     total = dict(zip(SUMS, maps.sum(Blocks(mask.shape, ((0,),) * 3))[0], strict=True))  # type: ignore[arg-type]
-    total |= {"χ": euler_number(mask), **_measure_extent(numbers[tuple(box)] == number, box, field)}
+    total |= {"χ": euler_number(mask), **_measure_extent(numbers[box] == number, box, field)}
     with np.errstate(divide="ignore", invalid="ignore"):  # without curvature
         values = [(name, symbol, float(figure(total)), math.nan, power) for name, symbol, power, figure in OF_BODIES]
     return Measures(
@@ -107,12 +110,7 @@ def _measure_body(field: Field, numbers: np.ndarray, number: int, box: Sequence[
     )
 
 
-def _widen(box: Sequence[slice], margin: Sequence[int]) -> tuple[slice, ...]:
-    """Return a box with a margin, within the image."""
-    return tuple(slice(max(s.start - m, 0), s.stop + m) for s, m in zip(box, margin, strict=True))
-
-
-def _measure_extent(body: np.ndarray, box: Sequence[slice], field: Field) -> dict[str, float]:
+def _measure_extent(body: np.ndarray, box: Box, field: Field) -> dict[str, float]:
     """Return the longest over the middle axis of the ellipsoid of a body's moments, and its area in the image's faces.
 
     A voxel's own moments count, so that a row of voxels has a width.

@@ -21,10 +21,11 @@ from curvafit.geometry.mesh import NoSurface, Surface, area_vectors
 from curvafit.geometry.morphometry import local_thickness, measure_connectivity, smooth_surface
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
-from curvafit.scan.grids import Window, median_thickness, remove_specks
+from curvafit.scan.grids import median_thickness, remove_specks
 from curvafit.scan.prepare import LARGEST_WINDOW, WORKED, Prepared, prepare, smallest_piece
 from curvafit.scan.structure import check_options, find_structure, is_rounded, read_labels, region_of_interest
 from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.formats.part import Box
 from curvafit.volumes.read import Source, field_of
 
 #: What is summed over blocks, in powers of the scan's unit; n0 to n5 are the parts zz zy zx yy yx xx of n⊗n.
@@ -496,7 +497,7 @@ def read_texture(prepared: Prepared) -> Reading | None:
     return Reading(np.array(rows), view, len(rows) * size / prepared.thickness**3) if rows else None
 
 
-def _windows(prepared: Prepared) -> list[Window]:
+def _windows(prepared: Prepared) -> list[Box]:
     """Cut the working grid into windows of one size, of `READ` voxels a side or more; one that repeats stays whole."""
     shape = prepared.grid.shape
     counts = [1 if prepared.grid.periodic else max(n // READ, 1) for n in shape]

@@ -16,7 +16,6 @@ from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.topology import betti_numbers
 from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
 from curvafit.scan.grids import (
-    Window,
     bounding_box,
     boxes_by_surface,
     centre_distance,
@@ -38,7 +37,7 @@ from curvafit.scan.structure import (
 )
 from curvafit.volumes.boxes import InMemory, boxes_of
 from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.formats.part import Crop
+from curvafit.volumes.formats.part import Box, Crop
 from curvafit.volumes.read import Source, field_of, levels_of
 
 #: Median thickness in voxels that a scan is resampled to; those of isotropic scans whose grid is kept: where a shape is
@@ -113,7 +112,7 @@ class Prepared:
     working_voxel: float
     unit: str
     thickness: float
-    windows: tuple[Window, ...]
+    windows: tuple[Box, ...]
     notes: tuple[str, ...]
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     roi: np.ndarray | None = None
@@ -164,7 +163,7 @@ class Prepared:
         share = self.volume_fraction * inside.mean() / seen
         return share if 0 < share < 1 else self.volume_fraction
 
-    def part(self, where: Window) -> Grid:
+    def part(self, where: Box) -> Grid:
         """Return the grid of a part: it is periodic only where it is all of a periodic grid."""
         z, y, x = self.mask[where].shape
         whole = (z, y, x) == self.grid.shape

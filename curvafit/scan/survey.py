@@ -6,7 +6,6 @@ third counts the structure, and where it has most surface. There the thickness i
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ import numpy as np
 from skimage.filters import threshold_otsu
 
 from curvafit.geometry.balls import ball_radii
-from curvafit.scan.grids import MEASURED, Window, candidate_boxes, order_boxes, surface_voxels, thickness_beneath
+from curvafit.scan.grids import MEASURED, candidate_boxes, order_boxes, surface_voxels, thickness_beneath
 from curvafit.scan.prepare import (
     HALF,
     MOSTLY,
@@ -41,6 +40,7 @@ from curvafit.scan.structure import (
 )
 from curvafit.volumes.boxes import Boxes, boxes_of
 from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.formats.part import Box, cut_boxes, grow, within
 from curvafit.volumes.read import Source
 
 #: Voxels that the first passes read at once.
@@ -72,7 +72,7 @@ class Volume:
         """Return the boxes of the volume."""
         return boxes_of(self.source, **self.reading)
 
-    def read(self, boxes: Boxes, box: Window) -> np.ndarray:
+    def read(self, boxes: Boxes, box: Box) -> np.ndarray:
         """Return the values of a box; of a label, where it is."""
         values = boxes.part(box)
         values = values if self.label is None else values == self.label
@@ -143,29 +143,15 @@ class Plan:
     notes: tuple[str, ...]
     working_notes: tuple[str, ...]
 
-    def levels(self, boxes: Boxes, box: Window) -> np.ndarray:
+    def levels(self, boxes: Boxes, box: Box) -> np.ndarray:
         """Return a box of the volume as float32 values that are above 0 in its structure."""
         return find_levels(self.volume, self.split, self.place, boxes, box)
 
 
-def grow(box: Window, by: Sequence[int], shape: Sequence[int]) -> Window:
-    """Return a box with more voxels on every side, as far as the volume has them."""
-    z, y, x = (
-        slice(max(0, edge.start - more), min(n, edge.stop + more)) for edge, more, n in zip(box, by, shape, strict=True)
-    )
-    return z, y, x
-
-
-def within(inner: Window, outer: Window) -> Window:
-    """Return a box in the voxels of another."""
-    z, y, x = (slice(a.start - b.start, a.stop - b.start) for a, b in zip(inner, outer, strict=True))
-    return z, y, x
-
-
-def find_levels(volume: Volume, split: Split, place: Place, boxes: Boxes, box: Window) -> np.ndarray:
+def find_levels(volume: Volume, split: Split, place: Place, boxes: Boxes, box: Box) -> np.ndarray:
     """Return a box of a volume as float32 values that are above 0 in its structure, as `structure.find_structure`."""
     if split.kind == "image":
-        around = grow(box, (SMOOTHED,) * 3, place.shape)
+        around = grow(box, SMOOTHED, place.shape)
         smooth = smooth_levels(volume.read(boxes, around), place.spacing)[within(box, around)]
         return split.level - smooth if volume.dark else smooth - split.level
     values = volume.read(boxes, box)
@@ -180,7 +166,7 @@ def survey(volume: Volume, find: Finder) -> Plan:
     boxes = volume.open()
     place = Place.of(boxes.frame)
     split, note = _find_split(volume, place, boxes.frame.values.dtype, find)
-    pieces = _cut(place.shape, [round(PIECE ** (1 / 3))] * 3)
+    pieces = cut_boxes(place.shape, round(PIECE ** (1 / 3)))
     total = _add(find("counting the structure", partial(_count_structure, volume, split, place, pieces), len(pieces)))
     if split.kind == "image":
         otsu = volume.threshold == "otsu"
@@ -239,11 +225,11 @@ def note_on_filling(share: float) -> tuple[str, ...]:
     return (MOSTLY.format(share),) if share > HALF else ()
 
 
-def _measure_thickness(plan: Plan, boxes: Boxes, order: Sequence[Window], inside: bool) -> tuple[float, float, Plan]:
+def _measure_thickness(plan: Plan, boxes: Boxes, order: Sequence[Box], inside: bool) -> tuple[float, float, Plan]:
     """Return median and 95th percentile of a phase's thickness, as `grids.median_thickness`, and the plan's reach."""
     place = plan.place
     box = order[0]
-    around = grow(box, (1, 1, 1), place.shape)
+    around = grow(box, 1, place.shape)
     mask = (plan.levels(boxes, around) > 0) == inside
     part, surface = (each[within(box, around)] for each in (mask, surface_voxels(mask)))
     median, thick = thickness_beneath(part, surface, place.spacing)
@@ -256,12 +242,6 @@ def _measure_thickness(plan: Plan, boxes: Boxes, order: Sequence[Window], inside
 def _extent(part: np.ndarray, place: Place) -> float:
     """Return half the longest side of a box."""
     return max(n * h for n, h in zip(part.shape, place.spacing, strict=True)) / 2
-
-
-def _cut(shape: Sequence[int], edges: Sequence[int]) -> list[Window]:
-    """Cut a volume into boxes of at most these edges, z slowest; the last along an axis may be smaller."""
-    axes = ([slice(a, min(a + edge, n)) for a in range(0, n, edge)] for n, edge in zip(shape, edges, strict=True))
-    return [(z, y, x) for z, y, x in itertools.product(*axes)]
 
 
 def _add(found: Iterable[Found]) -> dict[str, np.ndarray]:
@@ -280,7 +260,7 @@ def _add(found: Iterable[Found]) -> dict[str, np.ndarray]:
 def _find_split(volume: Volume, place: Place, dtype: np.dtype, find: Finder) -> tuple[Split, str]:
     """Return how structure and background are split, and a note for fields and masks."""
     side = max(1, math.isqrt(PIECE // place.shape[2]))
-    bars = _cut(place.shape, (side, side, place.shape[2]))
+    bars = cut_boxes(place.shape, (side, side, place.shape[2]))
     found = list(find("reading", partial(_look_at_values, volume, bars), len(bars)))
     total = _add({name: each[name] for name in each if name != "two"} for each in found)
     if faults := int(total["faults"]):
@@ -309,7 +289,7 @@ def _find_split(volume: Volume, place: Place, dtype: np.dtype, find: Finder) -> 
     return replace(split, level=_find_threshold(volume, bars, lowest, highest, find)), ""
 
 
-def _look_at_values(volume: Volume, bars: Sequence[Window], number: int) -> Found:
+def _look_at_values(volume: Volume, bars: Sequence[Box], number: int) -> Found:
     """Return the extremes of a bar, whether it has two values at most, and the signs of a phase field."""
     values = volume.read(volume.open(), bars[number])
     lowest, highest = values.min(), values.max()
@@ -324,7 +304,7 @@ def _look_at_values(volume: Volume, bars: Sequence[Window], number: int) -> Foun
     return {name: np.asarray(value) for name, value in found.items()}
 
 
-def _find_threshold(volume: Volume, bars: Sequence[Window], lowest: Any, highest: Any, find: Finder) -> float:
+def _find_threshold(volume: Volume, bars: Sequence[Box], lowest: Any, highest: Any, find: Finder) -> float:
     """Return the threshold of grey levels, as `structure.find_structure` finds it."""
     lowest, highest = lowest[()], highest[()]
     whole = lowest.dtype.kind in "iu"
@@ -343,7 +323,7 @@ def _find_threshold(volume: Volume, bars: Sequence[Window], lowest: Any, highest
     return float(sums[0, 1] / sums[0, 0] + sums[1, 1] / sums[1, 0]) / 2
 
 
-def _count_levels(volume: Volume, bars: Sequence[Window], lowest: Any, highest: Any, number: int) -> Found:
+def _count_levels(volume: Volume, bars: Sequence[Box], lowest: Any, highest: Any, number: int) -> Found:
     """Return a histogram of a bar: of each whole number, or of 256 bins."""
     values = volume.read(volume.open(), bars[number]).ravel()
     if values.dtype.kind in "iu":
@@ -353,7 +333,7 @@ def _count_levels(volume: Volume, bars: Sequence[Window], lowest: Any, highest: 
     return {"counts": counts}
 
 
-def _sum_sides(volume: Volume, bars: Sequence[Window], level: float, number: int) -> Found:
+def _sum_sides(volume: Volume, bars: Sequence[Box], level: float, number: int) -> Found:
     """Return the numbers and sums of the values above a level, and of the others."""
     values = volume.read(volume.open(), bars[number])
     high = values > level
@@ -364,10 +344,10 @@ def _sum_sides(volume: Volume, bars: Sequence[Window], level: float, number: int
 # ---- structure -------------------------------------------------------------------------------------------------------
 
 
-def _count_structure(volume: Volume, split: Split, place: Place, pieces: Sequence[Window], number: int) -> Found:
+def _count_structure(volume: Volume, split: Split, place: Place, pieces: Sequence[Box], number: int) -> Found:
     """Return the structure's voxels in a piece, its surface in boxes that may be measured, and pairs (see `_pairs`)."""
     core = pieces[number]
-    box = grow(core, (max(LAGS),) * 3, place.shape)
+    box = grow(core, max(LAGS), place.shape)
     levels = find_levels(volume, split, place, volume.open(), box)
     inner = within(core, box)
     found = {"lowest": levels[inner].min(), "highest": levels[inner].max()}
@@ -382,13 +362,13 @@ def _count_structure(volume: Volume, split: Split, place: Place, pieces: Sequenc
     return {name: np.asarray(value) for name, value in found.items()}
 
 
-def _overlap(one: Window, other: Window) -> Window | None:
+def _overlap(one: Box, other: Box) -> Box | None:
     """Return what two boxes share."""
     z, y, x = (slice(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(one, other, strict=True))
     return (z, y, x) if all(edge.start < edge.stop for edge in (z, y, x)) else None
 
 
-def _pairs(mask: np.ndarray, inner: Window, core: Window, shape: Sequence[int]) -> np.ndarray:
+def _pairs(mask: np.ndarray, inner: Box, core: Box, shape: Sequence[int]) -> np.ndarray:
     """Return, for each axis and each of `LAGS`, how many pairs a lag apart are inside, how many first and last ones."""
     counts = np.zeros((3, len(LAGS), 3), dtype=np.int64)
     for axis, (edge, n) in enumerate(zip(inner, shape, strict=True)):

@@ -30,7 +30,7 @@ from curvafit.geometry.morphometry import SOFTENED, soften
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread
-from curvafit.scan.grids import CutOut, Window, centre_distance, remove_specks, resample
+from curvafit.scan.grids import CutOut, centre_distance, remove_specks, resample
 from curvafit.scan.measure import (
     MOST,
     SUMS,
@@ -48,9 +48,10 @@ from curvafit.scan.pieces import open_finder
 from curvafit.scan.prepare import LARGEST_BOX, Prepared, TooLarge, smallest_piece
 from curvafit.scan.profiles import profile_mask
 from curvafit.scan.structure import check_options
-from curvafit.scan.survey import Found, Plan, Volume, grow, note_on_filling, survey, within
+from curvafit.scan.survey import Found, Plan, Volume, note_on_filling, survey
 from curvafit.volumes.boxes import Boxes, InFile, InMemory, boxes_of
 from curvafit.volumes.field import ScanError
+from curvafit.volumes.formats.part import Box, cut_boxes, grow, within
 from curvafit.volumes.read import Source, field_of
 
 #: Radius, in voxels of the finest axis, from which balls are painted on a coarser grid, and the largest ball's.
@@ -145,15 +146,13 @@ class Tiling:
     """
 
     plan: Plan
-    cores: tuple[Window, ...]
+    cores: tuple[Box, ...]
     factors: tuple[int, int] = (1, 1)
 
     @classmethod
     def of(cls, plan: Plan, edge: int | None = None) -> Tiling:
         """Cut a volume into tiles of `edge` voxels a side, by default as large as `LARGEST_TILE` leaves them."""
-        shape, edges = plan.place.shape, (edge,) * 3 if edge else _choose_edges(plan)
-        axes = ([slice(a, min(a + e, n)) for a in range(0, n, e)] for n, e in zip(shape, edges, strict=True))
-        return cls(plan, tuple(itertools.product(*axes)))  # type: ignore[arg-type]
+        return cls(plan, tuple(cut_boxes(plan.place.shape, edge or _choose_edges(plan))))
 
     @property
     def finest(self) -> Blocks:
@@ -242,7 +241,7 @@ def _measure_wide(tiling: Tiling, number: int) -> Found:
 class _Sums:
     """Sums of a core on the finest division of a volume."""
 
-    def __init__(self, finest: Blocks, core: Window) -> None:
+    def __init__(self, finest: Blocks, core: Box) -> None:
         self._finest, self._core = finest, core
         self.table = np.zeros((finest.count, len(SUMS)))
         self._where, starts = [], []
@@ -286,7 +285,7 @@ class _Balls:
         Voxels of the core around which a ball is larger than `WIDEST`.
     """
 
-    box: Window
+    box: Box
     mask: np.ndarray
     pieces: tuple[int, int]
     thickness: tuple[np.ndarray, np.ndarray]
@@ -294,7 +293,7 @@ class _Balls:
     wide: tuple[int, int]
 
 
-def _measure_balls(plan: Plan, boxes: Boxes, core: Window, factors: tuple[int, int]) -> _Balls:
+def _measure_balls(plan: Plan, boxes: Boxes, core: Box, factors: tuple[int, int]) -> _Balls:
     """Measure the thickness of both phases on a core, from as much around it as its balls reach.
 
     Where balls are wider than `COARSE` and yet to be painted on the finer grid, the thickness is left out (0).
@@ -324,7 +323,7 @@ def _measure_balls(plan: Plan, boxes: Boxes, core: Window, factors: tuple[int, i
     return _Balls(box, mask, pieces, tuple(thickness), tuple(widest), tuple(wide))  # type: ignore[arg-type]
 
 
-def _find_structure(plan: Plan, boxes: Boxes, core: Window, reach: float) -> tuple[Window, np.ndarray, tuple[int, int]]:
+def _find_structure(plan: Plan, boxes: Boxes, core: Box, reach: float) -> tuple[Box, np.ndarray, tuple[int, int]]:
     """Return a box around a core, the structure there, and how many specks and pinholes were dropped."""
     least = 2 * SOFTENED + 2
     around = grow(core, [max(math.ceil(reach / h), least) for h in plan.place.spacing], plan.place.shape)
@@ -339,12 +338,12 @@ def _find_structure(plan: Plan, boxes: Boxes, core: Window, reach: float) -> tup
     return box, mask, tuple(pieces)  # type: ignore[return-value]
 
 
-def _cut_out(core: Window, box: Window, shape: Sequence[int]) -> CutOut:
+def _cut_out(core: Box, box: Box, shape: Sequence[int]) -> CutOut:
     cut = [(edge.start > 0, edge.stop < n) for edge, n in zip(box, shape, strict=True)]
     return CutOut(within(core, box), cut)
 
 
-def _share_of_euler(mask: np.ndarray, inner: Window, core: Window, shape: Sequence[int]) -> float:
+def _share_of_euler(mask: np.ndarray, inner: Box, core: Box, shape: Sequence[int]) -> float:
     """Return what a core adds to χ of the window, as `topology.euler_of_window` counts it."""
     ends = [(edge.start == 0, edge.stop == n) for edge, n in zip(core, shape, strict=True)]
     taken = mask[tuple(slice(e.start - (not first), e.stop) for e, (first, _) in zip(inner, ends, strict=True))]
@@ -379,7 +378,7 @@ def _widen(start: int, stop: int, first: int, last: int) -> tuple[int, int]:
     return max(min(start, stop - 3), first), stop
 
 
-def _measure_surface(plan: Plan, mask: np.ndarray, box: Window, core: Window) -> tuple[np.ndarray, np.ndarray] | None:
+def _measure_surface(plan: Plan, mask: np.ndarray, box: Box, core: Box) -> tuple[np.ndarray, np.ndarray] | None:
     """Return places and columns, as `measure.measure_surface`, of the cells that begin in a core; None if there are
     none."""
     shape, spacing = plan.place.shape, plan.place.spacing
@@ -387,8 +386,8 @@ def _measure_surface(plan: Plan, mask: np.ndarray, box: Window, core: Window) ->
     if any(start >= stop for start, stop in own):
         return None
     wide = [_widen(*cells, 0, n - 1) for cells, n in zip(own, shape, strict=True)]
-    part: Window = tuple(slice(start, stop + 1) for start, stop in wide)  # type: ignore[assignment]
-    around = grow(part, (SOFTENED,) * 3, shape)
+    part: Box = tuple(slice(start, stop + 1) for start, stop in wide)  # type: ignore[assignment]
+    around = grow(part, SOFTENED, shape)
     soft = soften(mask[within(around, box)])[within(part, around)]
     try:
         mesh = surface(soft, Grid(soft.shape, spacing, "replicate"), 0.5)  # type: ignore[arg-type]
@@ -409,17 +408,17 @@ def _find_own(places: np.ndarray, own: Sequence[tuple[int, int]], wide: Sequence
     return kept
 
 
-def _around(plan: Plan, core: Window) -> tuple[Window, Window]:
+def _around(plan: Plan, core: Box) -> tuple[Box, Box]:
     """Return the working voxels that a core's curvature depends on, and those of the core."""
     owned = []
     for edge, n, scale, count in zip(core, plan.place.shape, plan.scale, plan.working, strict=True):
         start, stop = (count if at == n else min(count, round(at / scale)) for at in (edge.start, edge.stop))
         owned.append(slice(start, stop))
     z, y, x = owned
-    return grow((z, y, x), (HALO,) * 3, plan.working), (z, y, x)
+    return grow((z, y, x), HALO, plan.working), (z, y, x)
 
 
-def _measure_curvature(plan: Plan, boxes: Boxes, core: Window, sums: _Sums) -> Found:
+def _measure_curvature(plan: Plan, boxes: Boxes, core: Box, sums: _Sums) -> Found:
     """Sum the curvatures in the working cells that begin in a core; return the bins of the diagram and other counts."""
     box, owned = _around(plan, core)
     found: dict[str, Any] = {"specks": np.zeros(2, np.int64), "changed": np.int64(0), "filled": np.int64(0)}
@@ -438,7 +437,7 @@ def _measure_curvature(plan: Plan, boxes: Boxes, core: Window, sums: _Sums) -> F
     if any(start >= stop for start, stop in own) or mask.all() or not mask.any():
         return found
     wide = [_widen(*cells, MARGIN, n - 1 - MARGIN) for cells, n in zip(own, plan.working, strict=True)]
-    part: Window = tuple(slice(start - MARGIN, stop + MARGIN + 1) for start, stop in wide)  # type: ignore[assignment]
+    part: Box = tuple(slice(start - MARGIN, stop + MARGIN + 1) for start, stop in wide)  # type: ignore[assignment]
     seen = mask[within(part, box)]
     if seen.all() or not seen.any():
         return found
@@ -454,7 +453,7 @@ def _measure_curvature(plan: Plan, boxes: Boxes, core: Window, sums: _Sums) -> F
     return {**found, **_bin(plan, drawn, kept)}
 
 
-def _find_working_levels(plan: Plan, boxes: Boxes, box: Window) -> np.ndarray:
+def _find_working_levels(plan: Plan, boxes: Boxes, box: Box) -> np.ndarray:
     """Return values that are above 0 in the structure on a box of the working grid, as `prepare.prepare` makes them."""
     if plan.scale == (1.0, 1.0, 1.0):
         return plan.levels(boxes, box)
@@ -472,7 +471,7 @@ def _find_working_levels(plan: Plan, boxes: Boxes, box: Window) -> np.ndarray:
     return resample(values, plan.scale, start, shape, corner=[edge.start for edge in around])
 
 
-def _prepare_part(plan: Plan, phase: np.ndarray, mask: np.ndarray, part: Window) -> Prepared:
+def _prepare_part(plan: Plan, phase: np.ndarray, mask: np.ndarray, part: Box) -> Prepared:
     """Return a part of the working grid as if it were a scan of its own, at its place in the volume."""
     z, y, x = phase.shape
     return Prepared(

@@ -70,12 +70,11 @@ from curvafit.segmentation.tiles import check_edge
 from curvafit.segmentation.uncertainty import count_probabilities, entropy, lowest_inside, suggest_slices
 from curvafit.volumes.boxes import InFile, boxes_of
 from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.formats.part import Box
+from curvafit.volumes.formats.part import Box, cut_boxes
 from curvafit.volumes.formats.zarr import (
     CHUNK,
     cores_of,
     create_zarr,
-    cut_cores,
     halve_level,
     image_of,
     level_of,
@@ -292,7 +291,7 @@ class Job:
     @property
     def cores(self) -> list[Box]:
         """The blocks, the first axis slowest."""
-        return cut_cores(self.shape, self.edges)
+        return cut_boxes(self.shape, self.edges)
 
     def cut(self, tile: int | None) -> Job:
         """Choose the edges of blocks: `tile` rounded up to whole chunks, or as many pixels as the network fills at

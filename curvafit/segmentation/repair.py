@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from curvafit.core.runtime import Progress, silent
 from curvafit.scan.grids import centre_distance, resample
 from curvafit.segmentation.filler import plane_thickness
 from curvafit.segmentation.uncertainty import best_log_odds
+from curvafit.volumes.formats.part import Box, cut_boxes, grow, within
 
 REPAIRER_FILE = Format("curvafit repairer", 1, "weights of a repairer", "teach them again with `atlas teach --repair`")
 #: Log-odds are cut here: what a network is surer of does not matter.
@@ -197,15 +197,11 @@ class Repairer:
         inner = tuple(slice(n) for n in odds.shape)
         odds = np.ascontiguousarray(np.pad(odds, [(0, -n % 4) for n in odds.shape], mode="edge"), dtype=np.float32)
         found = odds.copy()
-        tiles = list(product(*(range(0, n, TILE) for n in odds.shape)))
-        for number, corner in enumerate(tiles):
+        tiles = cut_boxes(odds.shape, TILE)
+        for number, core in enumerate(tiles):
             progress("repairing", number / len(tiles))
-            core = tuple(slice(a, min(a + TILE, n)) for a, n in zip(corner, odds.shape, strict=True))
-            seen = tuple(
-                slice(max(c.start - REACH, 0), min(c.stop + REACH, n)) for c, n in zip(core, odds.shape, strict=True)
-            )
-            distances = _measure_distances(odds, seen)
-            own = tuple(slice(c.start - s.start, c.stop - s.start) for c, s in zip(core, seen, strict=True))
+            seen = grow(core, REACH, odds.shape)
+            distances, own = _measure_distances(odds, seen), within(core, seen)
             stays = (np.abs(distances[own]) >= FAR) & (np.abs(odds[core]) >= SURE)
             if stays.all():
                 continue
@@ -215,12 +211,10 @@ class Repairer:
         return found[inner]
 
 
-def _measure_distances(odds: np.ndarray, box: tuple[slice, ...]) -> np.ndarray:
+def _measure_distances(odds: np.ndarray, box: Box) -> np.ndarray:
     """Return the signed distances in a box of the mask of log-odds, cut at `FAR`."""
-    margin = math.ceil(FAR) + 1
-    wider = tuple(slice(max(s.start - margin, 0), s.stop + margin) for s in box)
-    inner = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(box, wider, strict=True))
-    return centre_distance(odds[wider] > 0, (1.0, 1.0, 1.0), FAR)[inner]
+    wider = grow(box, math.ceil(FAR) + 1, odds.shape)
+    return centre_distance(odds[wider] > 0, (1.0, 1.0, 1.0), FAR)[within(box, wider)]
 
 
 def choose_pixel(inside: np.ndarray, spacing: Sequence[float]) -> float:

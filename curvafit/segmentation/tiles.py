@@ -32,7 +32,7 @@ from curvafit.priors.kernels.threads import one_thread
 from curvafit.segmentation.engine import HALO, Ends, WorkingGrid, lower_energy
 from curvafit.segmentation.trials import Trial
 from curvafit.volumes.field import Field
-from curvafit.volumes.formats.part import Box
+from curvafit.volumes.formats.part import Box, within
 
 #: Working voxels beyond a tile that are lowered with it: at that distance the cut is not felt any more.
 OVERLAP = 24
@@ -73,8 +73,7 @@ class Tile:
     @property
     def inner(self) -> Box:
         """The core within the box."""
-        pairs = zip(self.core, self.box, strict=True)
-        return tuple(slice(c.start - b.start, c.stop - b.start) for c, b in pairs)  # type: ignore[return-value]
+        return within(self.core, self.box)
 
 
 def check_edge(edge: int | None) -> int | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from numbers import Integral
 from typing import Any
 
@@ -131,6 +132,26 @@ def resolve_box(box: Box | None, shape: Sequence[int], place: object) -> Box:
             raise ScanError(f"crop must lie within 0:{n} along {name} of {place}, got {start}:{stop}")
         edges.append(slice(first, last))
     return edges[0], edges[1], edges[2]
+
+
+def cut_boxes(shape: Sequence[int], edge: int | Sequence[int]) -> list[Box]:
+    """Cut a volume into boxes of an edge, or of one along each axis, z slowest; the last ones may be smaller."""
+    edges = (edge,) * 3 if isinstance(edge, int) else edge
+    axes = ([slice(a, min(a + e, n)) for a in range(0, n, e)] for n, e in zip(shape, edges, strict=True))
+    return [(z, y, x) for z, y, x in product(*axes)]
+
+
+def grow(box: Box, by: int | Sequence[int], shape: Sequence[int]) -> Box:
+    """Return a box with more voxels on every side, as far as the volume has them."""
+    more = (by,) * 3 if isinstance(by, int) else by
+    z, y, x = (slice(max(0, e.start - m), min(n, e.stop + m)) for e, m, n in zip(box, more, shape, strict=True))
+    return z, y, x
+
+
+def within(inner: Box, outer: Box) -> Box:
+    """Return a box in the voxels of another."""
+    z, y, x = (slice(a.start - b.start, a.stop - b.start) for a, b in zip(inner, outer, strict=True))
+    return z, y, x
 
 
 def _parse_slice(text: str) -> slice | None:

@@ -9,7 +9,6 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +19,7 @@ from curvafit.core.records import MARK, is_zarr
 from curvafit.core.runtime import hold_signals
 from curvafit.core.units import format_sampling, parse_unit
 from curvafit.volumes.formats.base import Damaged, Raw, ScanError, pick_key, read_spacing
-from curvafit.volumes.formats.part import Box, Part, index_of, read_part
+from curvafit.volumes.formats.part import Box, Part, cut_boxes, index_of, read_part
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
 CHUNK = 64
@@ -189,14 +188,7 @@ def level_of(group: Any, level: int) -> Any:
 def cores_of(group: Any, level: int) -> list[Box]:
     """Return the boxes of whole chunks by which `halve_level` makes a level."""
     array = group[str(level)]
-    return cut_cores(array.shape, [_HALVED * edge for edge in array.chunks])
-
-
-def cut_cores(shape: Sequence[int], edge: int | Sequence[int]) -> list[Box]:
-    """Cut a volume into boxes of an edge, or of one along each axis, z slowest; the last ones may be smaller."""
-    edges = (edge,) * 3 if isinstance(edge, int) else edge
-    axes = ([slice(a, min(a + e, n)) for a in range(0, n, e)] for n, e in zip(shape, edges, strict=True))
-    return list(product(*axes))  # type: ignore[arg-type]
+    return cut_boxes(array.shape, [_HALVED * edge for edge in array.chunks])
 
 
 def halve_level(group: Any, level: int, core: Box) -> None:
