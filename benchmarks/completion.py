@@ -39,11 +39,11 @@ from curvafit.geometry.morphometry import local_thickness
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.examples import Example
 from curvafit.segmentation.filler import Filler, Taught, fill
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.teach import RATE, Whole, WholeLessons, learn
+from curvafit.segmentation.trials import Example
 from curvafit.segmentation.uncertainty import best_log_odds, calibration_error, near_surface
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load

@@ -67,7 +67,7 @@ _FIGURES = {
     "Inference": "curvafit.report.page:inference_figure",
     "Segmentation": "curvafit.segmentation.result:segmentation_figure",
     "Trajectory": "curvafit.report.trajectory:trajectory_figure",
-    "Windows": "curvafit.drawing.windows:windows_figure",
+    "Windows": "curvafit.report.windows:windows_figure",
 }
 
 attach_lazy_names(__name__)

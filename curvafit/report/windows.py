@@ -7,10 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
+from matplotlib.ticker import MaxNLocator
 
 from curvafit.core.records import Format
-from curvafit.core.units import format_number, format_percent
-from curvafit.drawing.windows import windows_figure
+from curvafit.core.units import format_length, format_number, format_percent, power_name, unit_name
+from curvafit.drawing.plot import FAMILIAR, INK, LABELS, QUIET, make_figure, scale_on
 from curvafit.inference.table import PARAMETERS
 from curvafit.report.comparison import name_quantity
 from curvafit.report.page import check_result_folder, picture_of, record_study, render_template, write_study
@@ -23,6 +27,10 @@ FORMAT = Format("curvafit windows", 1, title="the record of a scan measured in w
 FILES = ("windows.json", "windows.html", "windows.csv", "windows.svg", "windows.png")
 #: Symbols of the combinations of a law's parameters, by which their maps and columns are named.
 COMBINATIONS = tuple(f"L{k}" for k in range(1, 1 + len(PARAMETERS)))
+#: Grey of structure whose windows are not known.
+UNKNOWN = 0.88
+#: Colours of clusters from 0 on: the strong ones of labels first.
+COLOURS = np.vstack([LABELS[:1], LABELS[1::2], LABELS[2::2]])
 
 
 def list_files(source: str | Path) -> tuple[str, ...]:
@@ -89,3 +97,111 @@ def _format_row(windows: Windows, k: int) -> dict[str, Any]:
     between = format_percent(1 - sum(part.var() * len(part) for part in parts if len(part)) / total) if total else "–"
     cells = (*(format_number(float(each)) for each in (*ends, *means)), between)
     return {**name_quantity(*windows.quantities[k], windows.unit), "cells": cells}
+
+
+# ---- the picture -----------------------------------------------------------------------------------------------------
+
+
+def windows_figure(windows: Windows) -> Figure:
+    """Return a figure of the clusters on the middle slices, and of familiar numbers where they are least and greatest.
+
+    Each voxel of the structure has the colour of the nearest window, grey where this is not known. A number's two
+    slices are across z, through the windows of its extremes, which are framed; its colours go from one to the other.
+    """
+    figure = make_figure(13.2, 13.2, layout="constrained")
+    panels = figure.subplots(4, 4)
+    structure = windows.structure
+    for axis, axes in enumerate(panels[0, :3]):
+        place = structure.shape[axis] // 2
+        plane = _colour_structure(windows, windows.clusters.values, axis, place)
+        shown = COLOURS[np.where(np.isfinite(plane), plane, 0).astype(int)]
+        shown[~np.isfinite(plane) | (plane == 0)] = 0
+        _section_on(axes, windows, shown, axis, place)
+        axes.set_title(f"clusters, {_position(windows, axis, place)}", fontsize=9.5)
+    _legend_on(panels[0, 3], windows)
+    pairs = panels[1:].reshape(len(FAMILIAR), 2)
+    familiar = [each for each in windows.quantities if each[1] in FAMILIAR]
+    for pair, (name, symbol, power) in zip(pairs, familiar, strict=True):
+        values = windows[name].values
+        label = f"{symbol} ({power_name(windows.unit, power)})" if power else symbol
+        ends = windows.extremes(name)
+        for axes, word, window in zip(pair, ("least", "greatest"), ends, strict=False):
+            low, high = (values[end] for end in ends)
+            place = _fullest_slice(windows, window)
+            plane = _colour_structure(windows, values, 0, place)
+            picture = _section_on(axes, windows, plane, 0, place, vmin=low, vmax=max(high, low + 1e-12), cmap="viridis")
+            extreme = format_number(values[window] + 0.0)  # of -0 as well
+            axes.set_title(f"{word} {symbol}: {extreme}, {_position(windows, 0, place)}", fontsize=9.5)
+            axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
+            _frame_on(axes, windows, window)
+        if not ends:
+            pair[0].set_title(f"{label} is not known", fontsize=9.5)
+            continue
+        scale_on(pair[0], 1.0, windows.unit)
+        bar = figure.colorbar(picture, ax=list(pair), label=label, ticks=MaxNLocator(5), pad=0.02, shrink=0.85)
+        bar.ax.tick_params(labelsize=8, length=2)
+        bar.outline.set_visible(False)  # type: ignore[operator]
+    return figure
+
+
+def _position(windows: Windows, axis: int, place: int) -> str:
+    """Return where a slice lies, in the scan's unit."""
+    where = place * windows.structure.spacing[axis]
+    return f"{'zyx'[axis]} = {format_number(where)} {unit_name(windows.unit, 2)}"
+
+
+def _legend_on(axes: Axes, windows: Windows) -> None:
+    """Write which colour is which cluster, with its number of windows and its thickness."""
+    labels, thickness = windows.clusters.values, windows["thickness"].values
+    marks = [Patch(color=str(UNKNOWN), label=f"not known: {(labels == 0).sum()} of {labels.size}")] * bool(
+        (labels == 0).any()
+    )
+    for k in range(1, 1 + int(labels.max())):
+        mean = format_length(float(thickness[labels == k].mean()), windows.unit)
+        marks.append(Patch(color=COLOURS[k], label=f"{k}: {(labels == k).sum()} windows, {mean} thick"))
+    axes.set_axis_off()
+    axes.legend(handles=marks, title="cluster", loc="center left", frameon=False, fontsize=9.5, alignment="left")
+
+
+def _section_on(axes: Axes, windows: Windows, plane: np.ndarray, axis: int, place: int, **colours: Any) -> Any:
+    """Draw a slice over the structure in grey, with positions in the scan's unit, and return its picture."""
+    mask, (down, across) = windows.structure.values.take(place, axis), np.delete(windows.structure.spacing, axis)
+    rows, columns = mask.shape
+    extent = (-across / 2, (columns - 0.5) * across, (rows - 0.5) * down, -down / 2)
+    axes.imshow(np.where(mask, UNKNOWN, 1.0), cmap="gray", vmin=0, vmax=1, extent=extent)
+    axes.locator_params(nbins=4)
+    axes.tick_params(length=2, labelsize=8)
+    axes.spines[:].set_color(QUIET)
+    named = [f"{name} ({unit_name(windows.unit, 2)})" for k, name in enumerate("zyx") if k != axis]
+    axes.set_ylabel(named[0], fontsize=8)
+    axes.set_xlabel(named[1], fontsize=8)
+    return axes.imshow(plane, extent=extent, interpolation="nearest", **colours)
+
+
+def _frame_on(axes: Axes, windows: Windows, window: tuple[int, ...]) -> None:
+    """Draw the frame of a window on a slice across z."""
+    edges = (np.array(windows.size) * windows.clusters.spacing / windows.stride)[1:]
+    corner = windows.centres[window][1:] - edges / 2
+    axes.add_patch(Rectangle(corner[::-1], *edges[::-1], fill=False, edgecolor=INK, linestyle=(0, (4, 3))))
+
+
+def _nearest(windows: Windows, axis: int) -> np.ndarray:
+    """Return for each plane of voxels across an axis the number of the nearest windows along it."""
+    count, step = windows.clusters.shape[axis], windows.clusters.spacing[axis]
+    places = np.arange(windows.structure.shape[axis]) * windows.structure.spacing[axis]
+    return np.clip(np.rint((places - windows.centres[0, 0, 0, axis]) / step).astype(int), 0, count - 1)
+
+
+def _fullest_slice(windows: Windows, window: tuple[int, ...]) -> int:
+    """Return the number of the slice across z that has most structure in a window's colour."""
+    near = [_nearest(windows, axis) == k for axis, k in enumerate(window)]
+    inside = windows.structure.values[np.ix_(*near)].sum((1, 2))
+    return int(np.flatnonzero(near[0])[inside.argmax()])
+
+
+def _colour_structure(windows: Windows, values: np.ndarray, axis: int, place: int) -> np.ndarray:
+    """Return each voxel's value on a slice across an axis, the nearest window's; NaN off the structure."""
+    nearest = [_nearest(windows, k) for k in range(3)]
+    rows, columns = (places for k, places in enumerate(nearest) if k != axis)
+    plane = values.take(nearest[axis][place], axis)[np.ix_(rows, columns)]
+    return np.where(windows.structure.values.take(place, axis), plane, np.nan)

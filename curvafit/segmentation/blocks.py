@@ -38,21 +38,19 @@ from curvafit.segmentation.filler import (
     sum_depths,
     thickness_of_sums,
 )
-from curvafit.segmentation.notes import (
-    describe_errors,
-    doubt_gaps,
-    doubt_labels,
-    doubt_places,
-    note_ends,
-    note_labelled,
-)
 from curvafit.segmentation.result import (
     FORMAT,
     check_mask_target,
+    describe_errors,
     describe_run,
+    doubt_gaps,
+    doubt_labels,
+    doubt_places,
     finish_mask,
     hidden_store,
     map_path,
+    note_ends,
+    note_labelled,
     volume_summary,
 )
 from curvafit.segmentation.slices import (

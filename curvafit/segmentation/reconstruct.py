@@ -25,19 +25,21 @@ from curvafit.priors.law import LawLike
 from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import profile_distance
 from curvafit.segmentation.engine import STEPS, WorkingGrid, choose_epsilon, laws_of
-from curvafit.segmentation.examples import PART, Example, crop_to_surface
 from curvafit.segmentation.filler import Taught, fill
 from curvafit.segmentation.image import find_shift, read_image
-from curvafit.segmentation.notes import (
+from curvafit.segmentation.result import (
     FEW,
+    Segmentation,
+    Uncertainty,
     describe_errors,
     doubt_gaps,
     doubt_labels,
     doubt_places,
+    flow_summary,
     note_ends,
     note_labelled,
+    volume_summary,
 )
-from curvafit.segmentation.result import Segmentation, Uncertainty, flow_summary, volume_summary
 from curvafit.segmentation.slices import (
     WHOLE,
     Slices,
@@ -53,7 +55,15 @@ from curvafit.segmentation.slices import (
 )
 from curvafit.segmentation.teach import tune
 from curvafit.segmentation.tiles import Problem, Tiling, check_edge, lower_volume
-from curvafit.segmentation.trials import Task, Trial, choose_by_masks, leave_out_slices
+from curvafit.segmentation.trials import (
+    PART,
+    Example,
+    Task,
+    Trial,
+    choose_by_masks,
+    crop_to_surface,
+    leave_out_slices,
+)
 from curvafit.segmentation.uncertainty import (
     best_log_odds,
     calibration_error,

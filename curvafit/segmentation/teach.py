@@ -29,9 +29,8 @@ from curvafit.core.files import write_atomically
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.data_synth.store import find_well_formed
 from curvafit.scan.grids import centre_distance
-from curvafit.segmentation.examples import Example
 from curvafit.segmentation.filler import FAR, SLOPE, Filler, Gaps, Raster, Taught, fill, interpolate, plane_thickness
-from curvafit.segmentation.trials import BEYOND, dice_of, gain_of, tally
+from curvafit.segmentation.trials import BEYOND, Example, dice_of, gain_of, tally
 from curvafit.segmentation.uncertainty import UNSURE, best_log_odds, calibration_error, fit_temperature
 from curvafit.volumes.read import load
 

@@ -11,8 +11,7 @@ import pytest
 from calling import call, refused
 from found import lattice
 
-from curvafit.drawing.scans import WORD, shorten
-from curvafit.report.measures import FILES, describe_range, name_parts
+from curvafit.report.measures import FILES, WORD, describe_range, name_parts, shorten
 from curvafit.scan.measure import Measures, measure
 from curvafit.volumes.field import Field
 from curvafit.volumes.write import save

@@ -18,11 +18,10 @@ from curvafit.inference.candidates import Candidate
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import preset
 from curvafit.segmentation.engine import TRUSTED, WorkingGrid, law_of, laws_of, normalise_bending
-from curvafit.segmentation.examples import Example
 from curvafit.segmentation.reconstruct import MARGIN, STIFFNESS, reconstruct, reconstruct_labels
 from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.segmentation.trials import leave_out_slices
+from curvafit.segmentation.trials import Example, leave_out_slices
 from curvafit.volumes.field import Field, ScanError
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -123,10 +122,10 @@ def test_an_example_is_cut_in_two() -> None:
 
 def test_laws_are_tried_on_a_box_of_an_example(monkeypatch: pytest.MonkeyPatch) -> None:
     mask = np.concatenate([pancakes(1, seed=2), pancakes(3, seed=3)], axis=2)
-    monkeypatch.setattr("curvafit.segmentation.examples.PART", 16)
+    monkeypatch.setattr("curvafit.segmentation.trials.PART", 16)
     part = Example.of(Field(mask.astype(np.uint8)), range(0, 33, 8), axis=0).part
     assert part.given.shape[1:] == (16, 16) and part.truth.shape == (len(part.places), 16, 16)
-    monkeypatch.setattr("curvafit.segmentation.examples.LARGEST", 32)
+    monkeypatch.setattr("curvafit.segmentation.trials.LARGEST", 32)
     smaller = Example.of(Field(mask.astype(np.uint8)), range(0, 33, 8), axis=0)
     assert smaller.notes == ("Of the example 32 x 32 x 32 voxels are read, where most of its surface is.",)
 

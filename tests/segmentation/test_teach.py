@@ -14,7 +14,6 @@ from calling import call, refused
 import curvafit.segmentation.teach as room
 from curvafit.data_synth.atlas import build
 from curvafit.generation.schedule import schedule
-from curvafit.segmentation.examples import Example
 from curvafit.segmentation.filler import FAR, Filler, Taught
 from curvafit.segmentation.teach import (
     Lessons,
@@ -27,6 +26,7 @@ from curvafit.segmentation.teach import (
     teach,
     tune,
 )
+from curvafit.segmentation.trials import Example
 from curvafit.volumes.field import Field
 from curvafit.volumes.write import save
 
