@@ -61,15 +61,6 @@ def hessian(u: Float[Tensor, "*batch z y x"], grid: Grid) -> Float[Tensor, "*bat
     return torch.stack([_second(v, i, j) / _area(grid, i, j) for i, j in HESSIAN_AXES], -4)
 
 
-def hessian_adjoint(p: Float[Tensor, "*batch 6 z y x"], grid: Grid) -> Float[Tensor, "*batch z y x"]:
-    """Apply the transpose of `hessian`: ⟨Hess u, p⟩ = ⟨u, Hessᵀp⟩ over the six stored components."""
-    _check_shape(p, grid)
-    return sum(
-        _second(pad(p.select(-4, c), grid, odd=() if i == j else (i, j)), i, j) / _area(grid, i, j)
-        for c, (i, j) in enumerate(HESSIAN_AXES)
-    )  # type: ignore[return-value]
-
-
 def gaussian_blur(u: Float[Tensor, "*batch z y x"], grid: Grid, width: float) -> Float[Tensor, "*batch z y x"]:
     """Return k ∗ u, k a separable Gaussian of standard deviation `width` (in spacing's unit), cut at four deviations.
 
