@@ -21,6 +21,9 @@ from curvafit.priors.kernels.threads import one_thread
 from curvafit.scan.survey import Found
 from curvafit.volumes.field import ScanError
 
+#: The file in a run's folder that says whose it is.
+RUN = "run.json"
+
 
 class Finder:
     """Finds something in the pieces of a volume, by workers, and keeps it in a folder, if there is one.
@@ -106,14 +109,31 @@ def open_finder(
 
 @contextmanager
 def open_store(folder: str | PathLike[str], run: Mapping[str, str]) -> Iterator[Path]:
-    """Open the folder of a run, or make it, and lock it; `run` is what runs have in common that share it.
+    """Open the folder of a run as `lock_store` does; `run` is what runs have in common that share it.
 
-    Where a ScanError is raised the folder is removed. Raises ValueError if the folder holds other things or another
-    run's, or is in use.
+    Where a ScanError is raised the folder is removed. Raises ValueError if the folder holds another run's.
+    """
+    try:
+        with lock_store(folder) as (place, other):
+            if other not in (None, run):
+                changed = ", ".join(sorted(name for name in run if other.get(name) != run[name]))
+                raise ValueError(f"the tiles in {place} are another run's, which differs in {changed}: delete them")
+            write_content(place / RUN, json.dumps(run, indent=2))
+            yield place
+    except ScanError:  # of a scan that cannot be measured nothing is of use
+        remove(Path(folder))
+        raise
+
+
+@contextmanager
+def lock_store(folder: str | PathLike[str], own: Sequence[str] = ()) -> Iterator[tuple[Path, Any]]:
+    """Make the folder of a run, if there is none, and lock it; return it, and what it says of its run, if anything.
+
+    Raises ValueError if the folder holds other things than a run's, and its `own` files, or is in use.
     """
     place = Path(folder)
     names = {path.name for path in place.iterdir()} if place.is_dir() else set()
-    if ("run.json" not in names and names - {"lock"}) or (place.exists() and not place.is_dir()):
+    if (RUN not in names and names - {"lock", *own}) or (place.exists() and not place.is_dir()):
         raise ValueError(f"tiles need a new folder, but {place} holds something else")
     place.mkdir(parents=True, exist_ok=True)
     lock = FileLock(place / "lock")
@@ -122,15 +142,6 @@ def open_store(folder: str | PathLike[str], run: Mapping[str, str]) -> Iterator[
     except Timeout:
         raise ValueError(f"the tiles in {place} are in use by another run") from None
     try:
-        other = json.loads((place / "run.json").read_bytes()) if "run.json" in names else run
-        if other != run:
-            changed = ", ".join(sorted(name for name in run if other.get(name) != run[name]))
-            raise ValueError(f"the tiles in {place} are another run's, which differs in {changed}: delete them")
-        write_content(place / "run.json", json.dumps(run, indent=2))
-        yield place
-    except ScanError:  # of a scan that cannot be measured nothing is of use
-        lock.release()
-        remove(place)
-        raise
+        yield place, json.loads((place / RUN).read_bytes()) if (place / RUN).exists() else None
     finally:
         lock.release()

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock, Timeout
 
 from curvafit.core.checks import check_int
 from curvafit.core.files import write_content
@@ -29,6 +28,7 @@ from curvafit.generation.checkpoint import identity
 from curvafit.generation.data import Data
 from curvafit.priors.grid import MOST
 from curvafit.priors.kernels.threads import one_thread
+from curvafit.scan.pieces import RUN, lock_store
 from curvafit.segmentation.engine import HALO, Ends, WorkingGrid, lower_energy
 from curvafit.segmentation.trials import Trial
 from curvafit.volumes.field import Field
@@ -40,8 +40,8 @@ OVERLAP = 24
 WHOLE, EDGE = 256**3, 192
 #: Shortest edge of a tile, in working voxels.
 SHORTEST = 8
-#: Files of a folder: what it belongs to, the volume's arrays, and the lock of the run that uses it.
-_RUN, _MASK, _PHASE, _LOCK = "run.json", "mask.npy", "phase.npy", "lock"
+#: Files of a folder besides the run's: the volume's arrays.
+_MASK, _PHASE = "mask.npy", "phase.npy"
 
 
 @dataclass(frozen=True)
@@ -182,35 +182,16 @@ def open_store(folder: str | PathLike[str], shape: tuple[int, int, int], run: Ma
     `shape` is the volume's; `run` holds what runs must have in common to share tiles, see `generation.checkpoint`.
     Raises `ValueError` if the folder holds other things or the tiles of another run, or is in use.
     """
-    place = Path(folder)
-    names = {path.name for path in place.iterdir()} if place.is_dir() else set()
-    if (_RUN not in names and names - {_MASK, _PHASE, _LOCK}) or (place.exists() and not place.is_dir()):
-        raise ValueError(f"tiles need a new folder, but {place} holds something else")
-    place.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(place / _LOCK)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        raise ValueError(f"the tiles in {place} are in use by another run") from None
-    try:
-        _prepare_folder(place, shape, identity(**run))
-        yield TileStore(shape, place)
-    finally:
-        lock.release()
-
-
-def _prepare_folder(place: Path, shape: tuple[int, int, int], run: dict[str, str]) -> None:
-    """Make the arrays of a new folder; raise ValueError where an old one is another run's."""
-    if (place / _RUN).exists():
-        other = json.loads((place / _RUN).read_bytes())
-        names = [name for name in {**other, **run} if other.get(name) != run.get(name)]
-        if names:
-            parts = "; ".join(f"{name} {other.get(name)} instead of {run.get(name)}" for name in names)
+    mine = identity(**run)
+    with lock_store(folder, (_MASK, _PHASE)) as (place, other):
+        if other is None:
+            for name, kind in ((_MASK, np.bool_), (_PHASE, np.float32)):
+                np.lib.format.open_memmap(place / name, mode="w+", dtype=kind, shape=shape).flush()
+            write_content(place / RUN, json.dumps(mine, indent=2))
+        elif names := [name for name in {**other, **mine} if other.get(name) != mine.get(name)]:
+            parts = "; ".join(f"{name} {other.get(name)} instead of {mine.get(name)}" for name in names)
             raise ValueError(f"the tiles in {place} are another run's, with {parts}: delete them to start again")
-        return
-    for name, kind in ((_MASK, np.bool_), (_PHASE, np.float32)):
-        np.lib.format.open_memmap(place / name, mode="w+", dtype=kind, shape=shape).flush()
-    write_content(place / _RUN, json.dumps(run, indent=2))
+        yield TileStore(shape, place)
 
 
 # ---- lowering --------------------------------------------------------------------------------------------------------
