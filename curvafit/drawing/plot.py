@@ -312,8 +312,7 @@ def draw_sections(rows: Mapping[str, Sections], spacing: Sequence[float], unit: 
 def scale_on(axes: Axes, edge: float, unit: str) -> None:
     """Draw a bar of a round length below a slice whose voxels are `edge` wide."""
     width = abs(np.diff(axes.get_xlim()).item())
-    power = 10.0 ** math.floor(math.log10(width * edge / 3))
-    length = max(step * power for step in (1, 2, 5) if step * power <= width * edge / 3)
+    length = round_length(width * edge / 3)
     bar = axes.get_xaxis_transform()
     axes.plot([0, length / edge], [-0.05, -0.05], color=INK, linewidth=2.5, transform=bar, clip_on=False)
     axes.text(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -34,13 +35,8 @@ FORMAT = Format("curvafit comparison", 1, title="the record of a comparison")
 #: What a comparison writes into its folder.
 FILES = ("compare.json", "compare.html", "measures.csv", "numbers.csv")
 FILES += ("difference.svg", "difference.png", "numbers.svg", "numbers.png")
-
-
-def check_comparison(
-    directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False, command: str = ""
-) -> Path:
-    """Return the folder if `write_comparison` can write there, else raise ValueError; call it before the work."""
-    return check_result_folder(FORMAT, FILES, directory, inputs, overwrite, command)
+#: Returns the folder if `write_comparison` can write there, else raises ValueError; call it before the work.
+check_comparison = partial(check_result_folder, FORMAT, FILES)
 
 
 def write_comparison(

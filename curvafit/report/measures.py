@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -27,17 +28,12 @@ from curvafit.studies.tables import format_csv, list_rows
 FORMAT = Format("curvafit measured scans", 1, title="the record of measured scans")
 #: What is written into the folder.
 FILES = ("measures.json", "measures.html", "measures.csv", "diagrams.svg", "diagrams.png", "numbers.svg", "numbers.png")
+#: Returns the folder if `write_measures` can write there, else raises ValueError; call it before the work.
+check_measures = partial(check_result_folder, FORMAT, FILES)
 #: The most scans whose diagrams and numbers are drawn.
 MOST_DIAGRAMS, MOST_ROWS = 25, 100
 #: Diagrams in a row, and panels of numbers in a row; letters of a scan's name that a panel has room for.
 DIAGRAMS, PANELS, WORD = 5, 4, 22
-
-
-def check_measures(
-    directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False, command: str = ""
-) -> Path:
-    """Return the folder if `write_measures` can write there, else raise ValueError; call it before the work."""
-    return check_result_folder(FORMAT, FILES, directory, inputs, overwrite, command)
 
 
 def write_measures(

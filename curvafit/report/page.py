@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -116,8 +117,8 @@ def check_result_folder(
     kind: Format,
     files: Sequence[str],
     directory: str | Path,
-    inputs: Iterable[str | Path],
-    overwrite: bool,
+    inputs: Iterable[str | Path] = (),
+    overwrite: bool = False,
     command: str = "",
 ) -> Path:
     """Return the folder if a result's files, the record and the page first, can be written there; else ValueError.
@@ -193,11 +194,8 @@ def write_study(
     return target / files[1]
 
 
-def check_report(
-    directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False, command: str = ""
-) -> Path:
-    """Return the folder if `write_inference` can write there, else raise ValueError; call it before the work."""
-    return check_result_folder(Format(FORMAT), FILES, directory, inputs, overwrite, command)
+#: Returns the folder if `write_inference` can write there, else raises ValueError; call it before the work.
+check_report = partial(check_result_folder, Format(FORMAT), FILES)
 
 
 def write_inference(inference: Inference, directory: str | Path, *, overwrite: bool = False) -> Path:

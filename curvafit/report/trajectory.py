@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import asdict
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -35,19 +35,14 @@ from curvafit.studies.trajectory import Change, Trajectory, say_change
 FORMAT = Format("curvafit trajectory", 1, title="the record of a series of scans")
 #: What a series writes into its folder.
 FILES = ("trajectory.json", "trajectory.html", "trajectory.csv", "path.svg", "path.png", "numbers.svg", "numbers.png")
+#: Returns the folder if `write_trajectory` can write there, else raises ValueError; call it before the work.
+check_trajectory = partial(check_result_folder, FORMAT, FILES)
 #: Colours of scans from the first to the last.
 LATER = LinearSegmentedColormap.from_list("later", ["#C4C9D1", INK])
 #: Shapes of the map that a path is shown among at the least; least step between names of families, of the panel.
 AROUND, APART = 25, 0.055
 #: Least reach of a number's axis below and above its mean, as a share of it.
 LEAST_REACH = 0.1
-
-
-def check_trajectory(
-    directory: str | Path, inputs: Iterable[str | Path] = (), overwrite: bool = False, command: str = ""
-) -> Path:
-    """Return the folder if `write_trajectory` can write there, else raise ValueError; call it before the work."""
-    return check_result_folder(FORMAT, FILES, directory, inputs, overwrite, command)
 
 
 def write_trajectory(
