@@ -18,9 +18,10 @@ from curvafit.core.files import remove, write_content
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.workers import ThisProcess, Workers, collect_all, join_workers
 from curvafit.priors.kernels.threads import one_thread
-from curvafit.scan.survey import Found
 from curvafit.volumes.field import ScanError
 
+#: Arrays and numbers that were found in a piece of a volume, by name.
+Found = Mapping[str, Any]
 #: The file in a run's folder that says whose it is.
 RUN = "run.json"
 

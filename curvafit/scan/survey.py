@@ -7,7 +7,7 @@ third counts the structure, and where it has most surface. There the thickness i
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -17,6 +17,7 @@ from skimage.filters import threshold_otsu
 
 from curvafit.geometry.balls import ball_radii
 from curvafit.scan.grids import MEASURED, candidate_boxes, order_boxes, surface_voxels, thickness_beneath
+from curvafit.scan.pieces import Finder, Found
 from curvafit.scan.prepare import (
     HALF,
     MOSTLY,
@@ -47,11 +48,6 @@ from curvafit.volumes.read import Source
 PIECE = 2**24
 #: The most grey levels of a volume of whole numbers whose threshold is found.
 _MOST_LEVELS = 2**22
-
-#: Arrays and numbers that were found in a piece of a volume, by name.
-Found = Mapping[str, Any]
-#: Finds something in the pieces of a volume, by a name and their number: in the order of the pieces.
-Finder = Callable[[str, Callable[[int], Found], int], Iterator[Found]]
 
 
 @dataclass(frozen=True)

@@ -44,11 +44,11 @@ from curvafit.scan.measure import (
     tabulate_surface,
 )
 from curvafit.scan.measure import measure as measure_in_one
-from curvafit.scan.pieces import open_finder
+from curvafit.scan.pieces import Found, open_finder
 from curvafit.scan.prepare import LARGEST_BOX, Prepared, TooLarge, smallest_piece
 from curvafit.scan.profiles import profile_mask
 from curvafit.scan.structure import check_options
-from curvafit.scan.survey import Found, Plan, Volume, note_on_filling, survey
+from curvafit.scan.survey import Plan, Volume, note_on_filling, survey
 from curvafit.volumes.boxes import Boxes, InFile, InMemory, boxes_of
 from curvafit.volumes.field import ScanError
 from curvafit.volumes.formats.part import Box, cut_boxes, grow, within

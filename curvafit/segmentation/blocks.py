@@ -23,9 +23,9 @@ from curvafit.core.checks import check_int
 from curvafit.core.files import remove
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.workers import Workers
-from curvafit.scan.pieces import Finder, open_finder
+from curvafit.scan.pieces import Finder, Found, open_finder
 from curvafit.scan.prepare import LARGEST_BOX
-from curvafit.scan.survey import Found, Volume
+from curvafit.scan.survey import Volume
 from curvafit.segmentation.engine import choose_epsilon
 from curvafit.segmentation.filler import (
     REACH,
