@@ -187,25 +187,24 @@ def check_law(
     prepared: Prepared,
     posterior: Posterior,
     *,
-    count: int = TESTED,
     seed: int = 0,
     schedule: Schedule | str = LEARNED,
     progress: Progress = silent,
 ) -> Misfit | None:
     """Compare a scan's windows with those of shapes of a law, seen as the scan is (`compare_windows`).
 
-    Returns None where the scan's descriptors cannot be measured, or fewer than `FEWEST` of `count` shapes grow.
+    Returns None where the scan's descriptors cannot be measured, or fewer than `FEWEST` of `TESTED` shapes grow.
     """
     if (found := _measure_descriptors(prepared)) is None:
         return None
     seen, reading, _ = found
     turned, rows = seen is not prepared, []
-    for k in range(count):
+    for k in range(TESTED):
         grown = twin(law, prepared, seed + k, schedule, longest=EDGE)
         if grown.seen is not None:
             own = read_texture(grown.seen.inverted if turned else grown.seen)
             rows += [] if own is None else [own.windows]
-        progress(f"testing the law: {k + 1} of {count} shapes", (k + 1) / count)
+        progress(f"testing the law: {k + 1} of {TESTED} shapes", (k + 1) / TESTED)
     return None if len(rows) < FEWEST else compare_windows(posterior, reading.windows, np.concatenate(rows))
 
 

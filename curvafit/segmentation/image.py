@@ -33,9 +33,7 @@ FURTHEST, LOCAL, NEAREST, BETTER, CLEAR = 12, 61, 2, 0.1, 5.0
 HELD, KEPT = 4_000_000, 20_000_000
 
 
-def read_image(
-    values: np.ndarray, slices: Slices, seed: int = 0, progress: Progress = silent
-) -> tuple[np.ndarray, float]:
+def read_image(values: np.ndarray, slices: Slices, progress: Progress = silent) -> tuple[np.ndarray, float]:
     """Return what an image (Z, Y, X) says of a volume of which some slices are known: log-odds, float32 (Z, Y, X), and
     the share of the entropy of slices held out that it takes away.
 
@@ -53,14 +51,14 @@ def read_image(
     features = np.concatenate([part[np.isin(rows, slices.places)] for rows, part in kept or describe()])
     progress("learning from the image", 0.2)
     if all(half.any() and not half.all() for half in (known[::2], known[1::2])):
-        trees = _learn(features[::2], known[::2], seed)
+        trees = _learn(features[::2], known[::2])
         logits = trees.decision_function(features[1::2].reshape(-1, features.shape[-1]))
         truth = known[1::2].ravel()
         slope, shift = fit_weights(logits[:, None], truth)
         loss = float(np.logaddexp(0, np.where(truth, -1, 1) * (slope * logits + shift)).mean())
         told = 1 - loss / float(entropy(truth.mean()))
     progress("learning from the image", 0.35)
-    trees = _learn(features, known, seed)
+    trees = _learn(features, known)
     evidence = np.empty(values.shape, dtype=np.float32)
     for rows, part in kept or describe():
         progress("reading the image", 0.6 + 0.4 * rows[0] / len(values))
@@ -89,15 +87,15 @@ def find_shift(values: np.ndarray, slices: Slices) -> tuple[int, int]:
     return (y, x) if max(abs(y), abs(x)) >= NEAREST and near.max() > least else (0, 0)
 
 
-def _learn(features: np.ndarray, inside: np.ndarray, seed: int) -> Any:
+def _learn(features: np.ndarray, inside: np.ndarray) -> Any:
     """Return trees that tell the inside by features (N, Y, X, F)."""
     ensemble = require("sklearn.ensemble", "image", "reading an image")
     table, truth = features.reshape(-1, features.shape[-1]), inside.ravel()
-    rows = np.random.default_rng(seed).permutation(len(table))[:LEARNT]
+    rows = np.random.default_rng(0).permutation(len(table))[:LEARNT]
     if len(np.unique(truth[rows])) == 1:
         rows = np.append(rows, np.flatnonzero(truth != truth[rows[0]]))
     options = {"max_iter": TREES, "learning_rate": RATE, "max_leaf_nodes": LEAVES, "l2_regularization": 1.0}
-    return ensemble.HistGradientBoostingClassifier(**options, early_stopping=False, random_state=seed).fit(
+    return ensemble.HistGradientBoostingClassifier(**options, early_stopping=False, random_state=0).fit(
         table[rows], truth[rows]
     )
 

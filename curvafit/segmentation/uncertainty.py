@@ -104,14 +104,14 @@ def fit_temperature(logits: np.ndarray, inside: np.ndarray) -> float:
     return float(np.exp(found.x))
 
 
-def calibration_error(probability: np.ndarray, inside: np.ndarray, bins: int = BINS) -> float:
+def calibration_error(probability: np.ndarray, inside: np.ndarray) -> float:
     """Return the expected calibration error: how far shares inside are from what probabilities say, on average.
 
     Voxels are sorted into bins of equal width by their probability; the mean over voxels is taken of the difference,
     in a voxel's bin, between the share that is inside and the mean probability. 0 where there are no voxels.
     """
-    where = np.minimum((probability * bins).astype(int), bins - 1)
-    excess = np.bincount(where, inside - probability.astype(np.float64), minlength=bins)
+    where = np.minimum((probability * BINS).astype(int), BINS - 1)
+    excess = np.bincount(where, inside - probability.astype(np.float64), minlength=BINS)
     return float(np.abs(excess).sum() / max(len(where), 1))
 
 
