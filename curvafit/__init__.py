@@ -25,9 +25,9 @@ from typing import TYPE_CHECKING
 from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
-    from curvafit.generation.batch import generate_batch as generate_batch
     from curvafit.generation.flow import descend as descend
     from curvafit.generation.flow import generate as generate
+    from curvafit.generation.flow import generate_batch as generate_batch
     from curvafit.generation.result import Flow as Flow
     from curvafit.geometry.diagram import Diagram as Diagram
     from curvafit.geometry.diagram import diagram as diagram

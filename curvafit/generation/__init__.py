@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
-    from curvafit.generation.batch import generate_batch as generate_batch
     from curvafit.generation.data import Data as Data
     from curvafit.generation.data import Evidence as Evidence
     from curvafit.generation.data import Hinge as Hinge
     from curvafit.generation.flow import descend as descend
     from curvafit.generation.flow import generate as generate
+    from curvafit.generation.flow import generate_batch as generate_batch
     from curvafit.generation.forms import white_noise as white_noise
     from curvafit.generation.result import Flow as Flow
     from curvafit.generation.result import History as History

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from curvafit.generation.batch import generate_batch
-from curvafit.generation.flow import generate
+from curvafit.generation.flow import generate, generate_batch
 from curvafit.generation.schedule import Schedule
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
