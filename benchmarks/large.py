@@ -51,7 +51,7 @@ def write_scan(law: str, edge: int, path: Path, cases: Cases, *, labels: bool = 
         array[box] = np.clip(60 + 100 * part + 25 * noise, 0, 255).astype(np.uint8)
 
 
-def timed(job: str, law: str, edge: int, workers: int, cases: Cases) -> Values:
+def timed(job: str, law: str, edge: int, workers: int, cases: Cases, flag: str = "") -> Values:
     """Return the seconds and the memory in GB of one command."""
     fills, tile = job == "reconstruct", ("--tile", 2 * EDGE) if edge <= WHOLE else ()
     path = cases.folder / f"{'labels' if fills else 'scan'}-{law}-{edge}.zarr"
@@ -59,7 +59,7 @@ def timed(job: str, law: str, edge: int, workers: int, cases: Cases) -> Values:
     crew = ("--workers", workers)
     how = {
         "measure": (*crew, "-o", cases.folder / f"{law}-{edge}.csv"),
-        "infer": ("-o", cases.folder / f"fit-{law}-{edge}"),
+        "infer": ("-o", cases.folder / f"fit-{law}-{edge}", *filter(None, [flag])),
         "reconstruct": (*crew, "--every", EVERY, *tile, "-o", cases.folder / f"filled-{law}-{edge}.zarr"),
     }[job]
     remove(hidden_store(cases.folder / f"filled-{law}-{edge}.zarr"))  # of a run that was stopped
@@ -74,6 +74,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--law", default="tubes")
     parser.add_argument("--edge", type=int, default=1024)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--of-infer", choices=["fast", "no-test"], default="", help="an option that `infer` is given")
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
@@ -82,7 +83,9 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
         edge, workers = 64 if job == "reconstruct" else 208, 0
     workers = 0 if job == "infer" else workers
     before = {"measure": "", "infer": "inferred-", "reconstruct": "filled-"}[job]
+    before += f"{options.of_infer}-" if options.of_infer else ""
+    flag = f"--{options.of_infer}" if options.of_infer else ""
     name = f"{before}{options.law}-{edge}-{workers}"
-    found = cases.all({name: lambda: timed(job, options.law, edge, workers, cases)})
+    found = cases.all({name: lambda: timed(job, options.law, edge, workers, cases, flag)})
     show(["case", "seconds", "GB"], [[case, *row.values()] for case, row in found.items()])
     return {f"{before}{edge}.{key}": Figure(value) for each in found.values() for key, value in each.items()}
