@@ -81,14 +81,15 @@ def test_a_coarser_level_is_chosen_where_the_structure_is_thick_there(tmp_path, 
     )
 
 
-def test_a_file_larger_than_memory_is_read_in_its_middle(tmp_path) -> None:
+def test_a_file_larger_than_memory_is_read_in_its_middle(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("curvafit.scan.prepare.LARGEST_SCAN", 64)
     shape = (600, 40_000, 40_000)  # a terabyte, of which nothing but the middle is on the disk
     array = np.lib.format.open_memmap(tmp_path / "scan.npy", mode="w+", dtype=np.uint8, shape=shape)
     array[300, 20_000, 19_990:20_010] = 7
     array.flush()
     del array
     field, whole = read_scan(tmp_path / "scan.npy")
-    assert whole == shape and field.shape == (512, 512, 512) and field.values.sum() == 7 * 20
+    assert whole == shape and field.shape == (64, 64, 64) and field.values.sum() == 7 * 20
     with pytest.raises(ScanError, match="does not fit into memory"):
         read_scan(tmp_path / "scan.npy", whole=True)
 
