@@ -45,6 +45,8 @@ _LAYERS = 0.5
 FAMILIES = ("spheres", "layers", "tubes", "sponge", "tubular cavities", "bubbles")
 #: Where the search for a half-thickness ends.
 _DEEPEST = 6.0
+#: Points whose area is followed inwards together.
+_TOGETHER = 4096
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -293,6 +295,10 @@ def half_thickness(diagram: Diagram, volume: float) -> float:
     plates, cylinders and balls; at most `_DEEPEST` times volume / area, where a ball's is 3.
     """
     depths = np.linspace(0, _DEEPEST * volume / diagram.area, 601)
-    left = np.clip(1 - diagram.points[:, :, None] * depths, 0, None).prod(axis=1)
-    swept = cumulative_trapezoid(diagram.weights @ left, depths, initial=0)
+    left = np.zeros_like(depths)  # of the area, by depth
+    for start in range(0, len(diagram.points), _TOGETHER):
+        part = slice(start, start + _TOGETHER)
+        shrunk = np.clip(1 - diagram.points[part, :, None] * depths, 0, None)
+        left += diagram.weights[part] @ shrunk.prod(axis=1)
+    swept = cumulative_trapezoid(left, depths, initial=0)
     return float(depths[np.searchsorted(swept, min(volume, swept[-1]) * (1 - 1e-9))])
