@@ -284,11 +284,15 @@ def _read_and_prepare(
     whole = options["roi"] is not None or options["periodic"]
     volume, shape = read_scan(scan, label=label, crop=crop, whole=whole, **reading)
     prepared = prepare(volume, one_scale=True, **options)
-    if crop is None and volume.shape != shape and (level := coarser_level(scan, shape, prepared, **reading)):
-        volume, shape = read_scan(scan, label=label, **{**reading, "key": level})
-        note = f"Read at the level {level} of its pyramid, which shows more of this large scan than the finest."
-        volume = replace(volume, notes=(*volume.notes, note))
-        prepared = prepare(volume, one_scale=True, **options)
+    if crop is None and label is None and volume.shape != shape:
+        level = coarser_level(scan, shape, prepared, **reading)
+        if level is not None:
+            other, size = read_scan(scan, **{**reading, "key": level})
+            note = f"Read at the level {level} of its pyramid, which shows more of this large scan than the finest."
+            other = replace(other, notes=(*other.notes, note))
+            coarser = prepare(other, one_scale=True, **options)
+            if coarser.kind == prepared.kind:  # the means of a mask are an image
+                return other, size, coarser
     return volume, shape, prepared
 
 

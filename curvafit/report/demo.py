@@ -38,7 +38,7 @@ from curvafit.scan.measure import measure
 from curvafit.scan.structure import find_structure
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.volumes.field import Field
+from curvafit.volumes.field import Field, ScanError
 
 if TYPE_CHECKING:
     from curvafit.inference.atlas import Atlas
@@ -106,8 +106,10 @@ def write_demo(
     atlas = load_atlas()
     reading = sub_progress(progress, 0.1, 0.3)
     inference = infer(scan, fast=True, seed=seed, atlas=atlas, progress=reading)
+    if inference.diagram is None:
+        raise ScanError(f"expected a scan with a structure: {inference.fit.status}")
     _, signed = find_structure(scan)
-    mask, axis = signed.values > 0, int(np.argmin(scan.shape))
+    mask, axis = signed.values > 0, int(np.argmin(np.array(scan.shape) * scan.spacing))
     volume = Field(mask.view(np.uint8), scan.spacing, scan.unit)
     filled = reconstruct(volume, every=EVERY, axis=axis, progress=sub_progress(progress, 0.3, 0.6))
     completion = score_completion(mask, filled.mask.values, EVERY, axis)
@@ -168,7 +170,9 @@ def demo_page(
         version=version("curvafit"),
         sentence=describe(inference),
         scan=describe_scan(inference),
-        shapes=picture_of(_shape_figure(completion), "Known slices, the filled volume, and the scan"),
+        shapes=picture_of(
+            _shape_figure(completion, inference.scan.spacing), "Known slices, the filled volume, and the scan"
+        ),
         slices=picture_of(_slice_figure(inference.scan, completion), "A left-out slice, as it is and as filled"),
         every=completion.every,
         axis="zyx"[completion.axis],
@@ -179,6 +183,7 @@ def demo_page(
         map=picture_of(_map_figure(inference, atlas), "The scan's curvature diagram, and its place on the atlas's map"),
         near=picture_of(gallery_figure(grown, columns=3, width=1500), "The nearest textures") if grown else None,
         misfit=fit.misfit,
+        status=fit.status,
         believed=fit.misfit is not None and fit.misfit.probability >= UNBELIEVABLE,
         number=format_number,
         strips=list_strips(fit),
@@ -186,7 +191,7 @@ def demo_page(
     )
 
 
-def _shape_figure(completion: Completion) -> Figure:
+def _shape_figure(completion: Completion, spacing: tuple[float, float, float]) -> Figure:
     """Return a figure of the known slices, the filled volume and the scan, cut open, the slices lying."""
     shapes = {
         f"every {completion.every}th slice": completion.known,
@@ -194,17 +199,18 @@ def _shape_figure(completion: Completion) -> Figure:
         "the scan": completion.truth,
     }
     shape, axis = completion.truth.shape, completion.axis
-    order = (axis, *sorted({0, 1, 2} - {axis}, key=lambda each: shape[each]))
+    order = (axis, *sorted({0, 1, 2} - {axis}, key=lambda each: shape[each] * spacing[each]))
     turned = {name: mask.transpose(order) for name, mask in shapes.items()}
     (box,) = ndimage.find_objects(turned["the scan"].view(np.uint8))
     halves = {name: mask[box][:, (box[1].stop - box[1].start) // 2 :] for name, mask in turned.items()}
-    return gallery_figure(halves, columns=3, width=1500)
+    return gallery_figure(halves, columns=3, width=1500, spacing=tuple(spacing[k] for k in order))
 
 
 def _slice_figure(scan: Field, completion: Completion) -> Figure:
     """Return the slice midway between two known ones: its grey values, and where the filled slice differs."""
     every, axis = completion.every, completion.axis
     place = (scan.shape[axis] // 2 // every) * every + every // 2
+    place -= every if place > (scan.shape[axis] - 1) // every * every else 0
     plane, truth, filled = (
         each.take(place, axis) for each in (np.asarray(scan.values), completion.truth, completion.filled)
     )

@@ -309,7 +309,9 @@ def describe_scan(inference: Inference) -> str:
     same = len({round(h / scan.spacing[0], 6) for h in scan.spacing}) == 1
     spacing = (scan.spacing[0],) if same else scan.spacing
     voxel = " × ".join(f"{h:.4g}" for h in spacing) + f" {unit_name(scan.unit, spacing[0])}"
-    return f"{Path(scan.source).name or 'a volume'}: {kind} of {shape} voxels (z, y, x), voxel edge {voxel}."
+    path, _, key = scan.source.partition("::")
+    name = "::".join(filter(None, (Path(path).name, key))) or "a volume"
+    return f"{name}: {kind} of {shape} voxels (z, y, x), voxel edge {voxel}."
 
 
 def _bars(inference: Inference) -> list[dict[str, Any]]:

@@ -174,7 +174,7 @@ def numbers_figure(trajectory: Trajectory) -> Figure:
         ),
     )
     for axes, change in zip(panels, trajectory.changes, strict=True):
-        values, halves = trajectory.table(change.name)
+        values, halves = trajectory.table(change.symbol)
         lows = values - halves if change.symbol in SIGNED else np.maximum(values - halves, 0)
         axes.fill_between(trajectory.times, lows, values + halves, color=FIRST, alpha=0.2, linewidth=0)
         axes.plot(trajectory.times, values, "o-", color=FIRST, markersize=4, markeredgewidth=0, linewidth=1.2)
@@ -221,7 +221,7 @@ def describe_series(trajectory: Trajectory) -> str:
 
 def _format_row(trajectory: Trajectory, change: Change) -> dict[str, Any]:
     """Return a row of the page's table."""
-    values, halves = trajectory.table(change.name)
+    values, halves = trajectory.table(change.symbol)
     texts = [f"{format_number(values[k])} ± {format_number(halves[k], 2)}" for k in (0, -1)]
     tests = (format_number(each, 2) for each in (change.correlation, change.p, change.family))
     return {

@@ -202,15 +202,21 @@ def coarser_level(
 ) -> str | None:
     """Return the key of the level of a pyramid that shows more of a large scan, None where its finest level does.
 
-    `shape` and `prepared` are of the finest. A spacing of the caller's is that of one level: no other is taken.
+    `shape` and `prepared` are of the finest. A phase field has its ε there alone, and a spacing of the caller's is that
+    of one level: no other is taken.
     """
-    if prepared.noise or reading.get("spacing") is not None:
-        return None
     levels = levels_of(scan, key)
-    halvings = math.log2(max(1.0, prepared.thickness * min(prepared.scale) / SUITED))
-    needed = math.ceil(math.log2(max(shape) / LARGEST_SCAN))
-    level = min(int(halvings), needed, len(levels) - 1)
-    return levels[level] if level > 0 else None
+    if prepared.noise or prepared.kind == "field" or reading.get("spacing") is not None or None in levels.values():
+        return None
+    edges = [(name, np.array(spacing)[-3:]) for name, spacing in levels.items()]
+    found, size = None, np.array(shape, dtype=float)
+    for name, edge in edges[1:]:
+        finest, fits = edges[0][1], size.max() <= LARGEST_SCAN
+        thickness, size = prepared.thickness * prepared.scale[0] * finest[0] / edge.max(), shape * finest / edge
+        if fits or thickness < SUITED or size.min() < FEWEST:
+            break
+        found = name
+    return found
 
 
 def prepare(

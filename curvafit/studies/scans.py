@@ -234,7 +234,7 @@ def list_combinations(inference: Inference | None) -> tuple[list[Quantity], str]
     values, halves, why = _read_combinations(inference, posterior)
     ends = posterior.combinations.ends
     rows = [
-        Quantity(f"{low} to {high}", f"L{k}", float(value), float(half), 0)
+        Quantity(f"{low} to {high}" if low else f"sum {k} of the law", f"L{k}", float(value), float(half), 0)
         for k, ((low, high), value, half) in enumerate(zip(ends, values, halves, strict=True), 1)
     ]
     return rows, why

@@ -244,12 +244,12 @@ def split_key(path: str | os.PathLike[str], key: str | None) -> tuple[Path, str 
     return (Path(name), key or inner or None) if separator else (Path(path), key)
 
 
-def levels_of(source: object, key: str | None = None) -> tuple[str, ...]:
-    """Return the keys of the levels of an OME-Zarr image, the finest first; none where a key names one."""
+def levels_of(source: object, key: str | None = None) -> dict[str, tuple[float, ...] | None]:
+    """Return the spacing of each level of an OME-Zarr image by its key, the finest first; nothing of a named level."""
     if not isinstance(source, str | os.PathLike):
-        return ()
+        return {}
     path, key = split_key(source, key)
-    return list_levels(path, key) if path.is_dir() and pick_reader(path) is read_zarr else ()
+    return list_levels(path, key) if path.is_dir() and pick_reader(path) is read_zarr else {}
 
 
 def _check_finite(values: np.ndarray, place: object) -> tuple[float, float]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -76,9 +78,24 @@ def test_a_coarser_level_is_chosen_where_the_structure_is_thick_there(tmp_path, 
     prepared = prepare(Field(mask.astype(np.uint8)), one_scale=True)
     assert coarser_level(path, mask.shape, prepared) == level
     assert coarser_level(path, mask.shape, prepared, spacing=(1, 1, 1)) is None  # which may be the finest's alone
+    assert coarser_level(path, mask.shape, replace(prepared, kind="field")) is None  # whose ε is the finest's
     assert (
         coarser_level(f"{path}::0", mask.shape, prepared) is None and coarser_level(mask, mask.shape, prepared) is None
     )
+
+
+def test_a_level_keeps_the_structure_s_voxels_and_the_slab_s(tmp_path, monkeypatch) -> None:
+    """A pyramid of fourths leaves 6 of 24 voxels, and a half of a slab of 40 slices too few slices."""
+    monkeypatch.setattr("curvafit.scan.prepare.LARGEST_SCAN", 64)
+    store = tmp_path / "scan.zarr"
+    save(Field(tube_mask((96, 96, 200), (1, 1, 1), 12).astype(np.uint8), (1.0, 1.0, 1.0), "um"), store)
+    prepared = prepare(load(store), one_scale=True)
+    for scale, shape, level in ((2, (96, 96, 200), "1"), (4, (96, 96, 200), None), (2, (40, 96, 200), None)):
+        attributes = json.loads((store / "zarr.json").read_text())
+        steps = attributes["attributes"]["ome"]["multiscales"][0]["datasets"][1]["coordinateTransformations"]
+        steps[0]["scale"] = [float(scale)] * 3
+        (store / "zarr.json").write_text(json.dumps(attributes))
+        assert coarser_level(store, shape, prepared) == level
 
 
 def test_a_file_larger_than_memory_is_read_in_its_middle(tmp_path, monkeypatch) -> None:

@@ -73,16 +73,21 @@ def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, *
     return _read_array(array, path / array.path, place, part)
 
 
-def list_levels(path: Path, key: str | None) -> tuple[str, ...]:
-    """Return the keys of the levels of the image that is read of a store, the finest first; none of a single array."""
+def list_levels(path: Path, key: str | None) -> dict[str, tuple[float, ...] | None]:
+    """Return the spacing, where it is known, of each level of the image that is read of a store, by key, in order.
+
+    There are none where a key names an array.
+    """
     import zarr
 
     _check_store(path)
     node: Any = zarr.open(path, mode="r")
     if isinstance(node, zarr.Array):
-        return ()
-    _, places, name, _ = _pick_array(node, key, path)
-    return () if key is not None and key.strip("/") == name else tuple(places)
+        return {}
+    arrays, places, name, _ = _pick_array(node, key, path)
+    if key is not None and key.strip("/") == name:
+        return {}
+    return {each: place.spacing for each, place in places.items() if each in arrays}
 
 
 def _pick_array(node: Any, key: str | None, path: Path) -> tuple[dict[str, Any], dict[str, _Place], str, bool]:
