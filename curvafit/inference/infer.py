@@ -171,8 +171,8 @@ def infer(
     posterior = posterior if isinstance(posterior, Posterior) else load_posterior(posterior)
     region = None if roi is None else field_of(roi)
     region = region if region is None or crop is None else region.crop(crop)
-    found = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark, "roi": region}
-    volume, shape, prepared = _read_and_prepare(scan, label, crop, found, reading)
+    how = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark, "roi": region}
+    volume, shape, prepared = _read_and_prepare(scan, label, crop, how, reading)
     progress("measuring curvature", 0.05)
     measured = None if prepared.noise else scan_diagram(prepared)
     reason = NOISE if measured is None else why_no_texture(prepared, measured)

@@ -50,9 +50,8 @@ if TYPE_CHECKING:
 PAGE = "demo.html"
 #: Of this many slices one is kept.
 EVERY = 8
-#: How many of the nearest textures are grown, of how many voxels a side, and their names.
-SHOWN, EDGE = 3, 64
-PLACES = ("nearest", "second", "third")
+#: The nearest textures that are grown, by name, and their voxels a side.
+PLACES, EDGE = ("nearest", "second", "third"), 64
 #: The symbols of the measures on the page.
 _MEASURES = ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D", "BS/BV", "DA", "H", "K")
 
@@ -82,9 +81,9 @@ class Completion(NamedTuple):
     @property
     def known(self) -> np.ndarray:
         """The known slices alone, bool (Z, Y, X)."""
-        places = (slice(None),) * self.axis + (slice(None, None, self.every),)
         mask = np.zeros_like(self.truth)
-        mask[places] = self.truth[places]
+        known, truth = (np.moveaxis(each, self.axis, 0) for each in (mask, self.truth))
+        known[:: self.every] = truth[:: self.every]
         return mask
 
 
@@ -113,7 +112,7 @@ def write_demo(
     volume = Field(mask.view(np.uint8), scan.spacing, scan.unit)
     filled = reconstruct(volume, every=EVERY, axis=axis, progress=sub_progress(progress, 0.3, 0.6))
     completion = score_completion(mask, filled.mask.values, EVERY, axis)
-    textures = grow_nearest(inference.fit, progress=sub_progress(progress, 0.6, 0.95))
+    textures = grow_nearest(inference.fit, sub_progress(progress, 0.6, 0.95))
     progress("drawing the page", 0.95)
     text = demo_page(inference, measures, completion, textures, atlas)
     write_inference(inference, folder, overwrite=overwrite)
@@ -140,15 +139,16 @@ def dice(a: np.ndarray, b: np.ndarray) -> float:
     return float(2 * (a & b).sum() / total) if total else 1.0
 
 
-def grow_nearest(fit: Fit, *, count: int = SHOWN, progress: Progress = silent) -> list[np.ndarray]:
-    """Grow the nearest shapes of the atlas anew: up to `count` phase fields (64, 64, 64), the nearest first."""
-    grown = []
-    for k, match in enumerate(fit.matches):
-        if len(grown) < count:
-            progress("growing the nearest textures", min(1.0, k / count))
-            flow = generate(match.coefficients, match.mass, EDGE, seed=match.seed, schedule=LEARNED)
-            if flow.viability.viable:
-                grown.append(flow.field.numpy())
+def grow_nearest(fit: Fit, progress: Progress = silent) -> list[np.ndarray]:
+    """Grow the nearest shapes of the atlas anew: phase fields (64, 64, 64), the nearest first, one for each place."""
+    grown: list[np.ndarray] = []
+    for match in fit.matches:
+        if len(grown) == len(PLACES):
+            break
+        progress("growing the nearest textures", len(grown) / len(PLACES))
+        flow = generate(match.coefficients, match.mass, EDGE, seed=match.seed, schedule=LEARNED)
+        if flow.viability.viable:
+            grown.append(flow.field.numpy())
     return grown
 
 

@@ -532,12 +532,10 @@ def scan_box(inference: Inference) -> np.ndarray:
 def _diagrams(inference: Inference) -> list[Picture]:
     """Return curvature diagrams of the scan, the chosen law and the match, with shared axes, in the scan's unit."""
     diagrams: list[tuple[str, Diagram | None]] = [("The scan", inference.diagram)]
-    for each in _chosen_first(inference):
+    for each in _chosen_first(inference) if inference.twins else ():
         if each.name in (inference.fit.chosen, "match"):
             grown = (twin.diagram for twin in inference.twins.get(each.name, ()) if twin.diagram)
             diagrams.append((f"{_title(each)}, regrown", next(grown, None)))
-    if not inference.twins:
-        diagrams = diagrams[:1]
     λ, unit = inference.prepared.length, inference.fit.length_unit
     limits = shared_limits([diagram for _, diagram in diagrams if diagram is not None], length=λ)
     return [
