@@ -2,7 +2,9 @@
 
 `--unseen STORE…` asks for laws that no choice has seen: shapes of any size, as masks and as degraded scans (or
 `--views`). Intervals are of the bootstrap over laws. `--gallery` ($CURVAFIT_DATA) asks for the author's volumes as
-masks. Errors are medians, in deviations of the box of `curvafit atlas build`.
+masks. Errors are medians, in deviations of the box of `curvafit atlas build`. `--less` asks beside the packaged
+posterior what it were without a change: of the box (trained on Experiment 4's alone), of pooling (trained on single
+shapes), of scale (scans read on their own voxels). `--part` shows a corner of each shape.
 
 Methods: `posterior`, the packaged one; `fit`, its emulator's best fit; and from a `--table` (`curvafit atlas
 describe`), by default that of the packaged posterior, `match`, the nearest shape by the curvature block, and `process`,
@@ -23,7 +25,9 @@ import re
 import warnings
 import zlib
 from collections.abc import Callable
+from dataclasses import fields
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,7 +40,7 @@ from curvafit.data_synth.design import INTERVALS
 from curvafit.data_synth.store import Store, find_well_formed, open_store
 from curvafit.geometry.diagram import FAMILIES, diagram, family_shares, half_thickness, leading_family
 from curvafit.inference.emulator import best_parameters
-from curvafit.inference.posterior import Architecture, Posterior, load_posterior
+from curvafit.inference.posterior import Architecture, Posterior, load_posterior, save_posterior
 from curvafit.inference.table import (
     PARAMETERS,
     VIEWS,
@@ -47,6 +51,7 @@ from curvafit.inference.table import (
     parameters_of,
     to_row,
 )
+from curvafit.inference.training import train_posterior
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.scan.measure import Reading, read_texture
@@ -120,6 +125,29 @@ def methods(path: Path, view: str) -> dict[str, Callable[[Table], Answers]]:
         "match": partial(match, training),
         "process": partial(process, training),
     }
+
+
+class Apart(Table):
+    """A table whose shapes are never pooled."""
+
+    @property
+    def pooled(self) -> Table:
+        return self
+
+
+def train_less(change: str, training: Table, cases: Cases) -> Posterior:
+    """Return the packaged posterior, or one that learned without a change."""
+    if change not in ("box", "pooling"):
+        return load_posterior()
+    if not (path := cases.folder / f"less-{change}.npz").exists():
+        least, most = _ENDS.T
+        within = ((least <= training.parameters) & (training.parameters <= most)).all(1)
+        if change == "box":
+            learned = training.rows(within)
+        else:
+            learned = Apart(*(getattr(training.visible, field.name) for field in fields(Table)))
+        save_posterior(train_posterior(learned), path)
+    return load_posterior(path)
 
 
 # ---- figures ---------------------------------------------------------------------------------------------------------
@@ -205,7 +233,9 @@ def report(name: str, title: str, row: Values) -> dict[str, Figure]:
     found |= {f"r2.{slug}": Figure(value) for slug, value in zip(SLUGS, shares, strict=True)}
     if inside is not None and len(np.unique(laws)) > len(PARAMETERS) * 4:
         known = combinations_known(error, truth, laws)
-        table += [["width", *np.mean(row["width"], axis=0)], ["R² of combinations", *known]]
+        widths = np.mean(row["width"], axis=0)
+        table += [["width", *widths], ["R² of combinations", *known]]
+        found |= {f"width.{slug}": Figure(value) for slug, value in zip(SLUGS, widths, strict=True)}
         found |= {f"known.{k + 1}": Figure(value) for k, value in enumerate(known)}
         found["known.tarp_p"] = Figure(row["TARP"][1])
         title += f"; TARP {row['TARP'][0]:.3f}, p {row['TARP'][1]:.3f}"
@@ -250,8 +280,11 @@ def author_table(cases: Cases, names: list[str]) -> Table:
     return Table(np.array(names), views, parameters, rows[:, -1], rows[:, :-2], rows[:, -2], {})
 
 
-def unseen_table(paths: list[Path], view: str, cases: Cases) -> tuple[Table, np.ndarray]:
-    """Return what is read of the well-formed shapes of stores in a view, and the families of the shapes."""
+def unseen_table(
+    paths: list[Path], view: str, cases: Cases, part: int = 0, one_scale: bool = True
+) -> tuple[Table, np.ndarray]:
+    """Return what is read in a view of the well-formed shapes of stores, or of a corner of `part` voxels a side of
+    each, on voxels of one scale or their own; and the families of the shapes."""
     rows, laws, names = [], [], []
 
     def measured(store: Store, index: int) -> np.ndarray:
@@ -259,9 +292,12 @@ def unseen_table(paths: list[Path], view: str, cases: Cases) -> tuple[Table, np.
         field, grid = store.field(index), Grid(store.settings.shape)
         own = diagram(torch.from_numpy(field), grid, store.settings.epsilon)
         shares = family_shares(own, half_thickness(own, float((field > 0).mean()) * grid.volume))
-        seen = VIEWS[view](field, np.random.default_rng([zlib.crc32(view.encode()), index]))
+        scan, kind, periodic = VIEWS[view](field, np.random.default_rng([zlib.crc32(view.encode()), index]))
+        if part:
+            edges = zip(scan.shape, field.shape, strict=True)
+            scan, periodic = scan.crop(",".join(f":{part * n // edge}" for n, edge in edges)), False
         try:
-            reading = read_texture(prepare(seen.scan, kind=seen.kind, periodic=seen.periodic, one_scale=True))
+            reading = read_texture(prepare(scan, kind=kind, periodic=periodic, one_scale=one_scale))
         except ScanError:
             reading = None
         amount = np.nan if reading is None else reading.amount
@@ -269,9 +305,10 @@ def unseen_table(paths: list[Path], view: str, cases: Cases) -> tuple[Table, np.
             [*to_row(reading), amount, thinner_thickness(field > 0), FAMILIES.index(leading_family(shares))]
         )
 
+    how = view + (f"-{part}" if part else "") + ("" if one_scale else "-own")
     for store, index in find_well_formed(tuple(paths)):
         names.append(f"{store.name}-{index}")
-        rows.append(cases.array(f"unseen-{names[-1]}-{view}", partial(measured, store, index)))
+        rows.append(cases.array(f"unseen-{names[-1]}-{how}", partial(measured, store, index)))
         laws.append(parameters_of(store.record(index).coefficients, store.record(index).mass))
     found = np.array(rows)
     shown, views = np.isfinite(found).all(1), np.array([view] * len(rows))
@@ -287,6 +324,25 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--gallery", action="store_true", help="the author's volumes")
     parser.add_argument("--views", default="mask,scan")
     parser.add_argument("--table", type=Path, default=TABLE, help="what `match` and `process` learn from")
+    parser.add_argument("--less", help="ask the posterior alone, and without: box,pooling,scale")
+    parser.add_argument(
+        "--part", type=int, default=0, help="with --less, a corner of so many voxels a side of each shape"
+    )
+
+
+def run_less(options: argparse.Namespace, cases: Cases, edge: int) -> dict[str, Figure]:
+    """Ask the packaged posterior of unseen laws, and what it were without each change."""
+    figures, part = {}, options.part
+    group = f"less{part or edge}"
+    for view, change in product(options.views.split(","), ("nothing", *filter(None, options.less.split(",")))):
+        queries, families = unseen_table(options.unseen, view, cases, part, one_scale=change != "scale")
+        trained = train_less(change, load_table(options.table), cases)
+        case = f"{group}-{view}-{change}"
+        row = cases.all({case: partial(judge, queries, families, partial(asked, trained))})[case]
+        for key, value in report(f"less {change}, {view}", group, row).items():
+            kind, _, column = key.partition(".")
+            figures[f"{group}_{kind}.{view}_{change}.{column}"] = value
+    return {} if options.quick else figures
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
@@ -295,6 +351,8 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
         raise SystemExit("name stores with --unseen, or the author's volumes with --gallery")
     figures: dict[str, Figure] = {}
     edge = 0 if options.gallery else open_store(options.unseen[0]).settings.shape[0]
+    if options.less is not None:
+        return run_less(options, cases, edge)
     group = "gallery" if options.gallery else "unseen" + (str(edge) if edge != UNIT else "")
     for view in ["mask"] if options.gallery else options.views.split(","):
         if options.gallery:
