@@ -139,12 +139,14 @@ class Prepared:
         if self.kind == "field":
             return prepare(Field(grown), kind="field", periodic=True, one_scale=self.one_scale)
         mask, (z, y, x) = grown > 0, self.scale
-        step = [thinner_thickness(mask) / (scale * self.thickness) for scale in self.scale]
+        thickness = thinner_thickness(mask)
+        step = [thickness / (scale * self.thickness) for scale in self.scale]
         edges = (self.working_voxel / z, self.working_voxel / y, self.working_voxel / x)
         values = sample_mask(mask, step) if self.quality is None else self.quality.image(mask, step, seed)
         values = values.astype(np.uint8 if self.quality is None else np.float32)
         scan = Field(values, edges, self.unit)
-        return prepare(scan, kind=self.kind, periodic=self.grid.periodic, one_scale=self.one_scale)
+        options = {"periodic": self.grid.periodic, "one_scale": self.one_scale, "quality": self.quality}
+        return prepare(scan, kind=self.kind, **options)
 
     @cached_property
     def true_volume_fraction(self) -> float:
@@ -229,6 +231,7 @@ def prepare(
     roi: Field | np.ndarray | str | os.PathLike[str] | None = None,
     one_scale: bool = False,
     most: int | None = None,
+    quality: Quality | None = None,
 ) -> Prepared:
     """Find the structure and put it on the working grid, where its median thickness is a known number of voxels.
 
@@ -259,6 +262,8 @@ def prepare(
     most
         Use all of the scan, or raise TooLarge where that is more than so many working voxels. By default a large scan
         is cut, and a note says so.
+    quality
+        Blur and noise of an image, where they are known; else they are measured.
     """
     check_options(kind, threshold)
     region = region_of_interest(roi, field)
@@ -269,10 +274,10 @@ def prepare(
     options = {"kind": kind, "threshold": threshold, "dark": dark}
     extremes = (field.values.min(), field.values.max())
     seen, signed = find_structure(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
-    mask, quality = signed.values > 0, None
+    mask = signed.values > 0
     noise = seen != "field" and is_noise(mask)
     prepared = _put_on_grid(_Scan(seen, signed, periodic, region, noise, one_scale), most)
-    if seen == "image":
+    if seen == "image" and quality is None:
         quality = measure_quality(-part.values if dark else part.values, mask, part.spacing)
     corner = tuple(s.start + o for s, o in zip(where, prepared.origin, strict=True))
     return replace(prepared, quality=quality, origin=corner)  # type: ignore[arg-type]
