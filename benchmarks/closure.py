@@ -4,7 +4,8 @@
 `--views`). Intervals are of the bootstrap over laws. `--gallery` ($CURVAFIT_DATA) asks for the author's volumes as
 masks. Errors are medians, in deviations of the box of `curvafit atlas build`. `--less` asks beside the packaged
 posterior what it were without a change: of the box (trained on Experiment 4's alone), of pooling (trained on single
-shapes), of scale (scans read on their own voxels). `--part` shows a corner of each shape.
+shapes), of scale (scans read on their own voxels); and what every second law had taught (`laws`). `--part` shows a
+corner of each shape.
 
 Methods: `posterior`, the packaged one; `fit`, its emulator's best fit; and from a `--table` (`curvafit atlas
 describe`), by default that of the packaged posterior, `match`, the nearest shape by the curvature block, and `process`,
@@ -136,16 +137,16 @@ class Apart(Table):
 
 
 def train_less(change: str, training: Table, cases: Cases) -> Posterior:
-    """Return the packaged posterior, or one that learned without a change."""
-    if change not in ("box", "pooling"):
+    """Return the packaged posterior, or one that learned without a change, or of every second law."""
+    if change not in ("box", "pooling", "laws"):
         return load_posterior()
     if not (path := cases.folder / f"less-{change}.npz").exists():
         least, most = _ENDS.T
-        within = ((least <= training.parameters) & (training.parameters <= most)).all(1)
+        learned = Apart(*(getattr(training.visible, field.name) for field in fields(Table)))
         if change == "box":
-            learned = training.rows(within)
-        else:
-            learned = Apart(*(getattr(training.visible, field.name) for field in fields(Table)))
+            learned = training.rows(((least <= training.parameters) & (training.parameters <= most)).all(1))
+        if change == "laws":
+            learned = training.rows(training.laws % 2 == 0)
         save_posterior(train_posterior(learned), path)
     return load_posterior(path)
 
@@ -324,7 +325,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--gallery", action="store_true", help="the author's volumes")
     parser.add_argument("--views", default="mask,scan")
     parser.add_argument("--table", type=Path, default=TABLE, help="what `match` and `process` learn from")
-    parser.add_argument("--less", help="ask the posterior alone, and without: box,pooling,scale")
+    parser.add_argument("--less", help="ask the posterior alone, and without: box,pooling,scale,laws")
     parser.add_argument(
         "--part", type=int, default=0, help="with --less, a corner of so many voxels a side of each shape"
     )
