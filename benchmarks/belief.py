@@ -26,14 +26,16 @@ LEVEL = 0.05
 
 
 def case(store: Store, index: int, cut: bool) -> Values:
-    """Return p, of all descriptors and by block, the verdict and the seconds of a shape or of its level cut."""
+    """Return p, of all descriptors and by block, the departure and the verdict of a shape or of its level cut."""
     mask, random = store.field(index) > 0, np.random.default_rng(index)
     if cut:
         mask = level_cut(mask, Grid(mask.shape), index) > 0
     opened = np.roll(mask, random.integers(mask.shape[0], size=3), (0, 1, 2))
     fit = infer(Field(opened.astype(np.uint8)), kind="mask", seed=index).fit
-    found = {} if fit.misfit is None else {"p": fit.misfit.probability, **fit.misfit.blocks}
-    return {"status": fit.status.partition(":")[0], **found}
+    found: Values = {"status": fit.status.partition(":")[0]}
+    if (misfit := fit.misfit) is not None:
+        found |= {"p": misfit.probability, "departure": misfit.departure, **misfit.blocks}
+    return found
 
 
 def options(parser: argparse.ArgumentParser) -> None:

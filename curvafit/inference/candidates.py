@@ -166,8 +166,11 @@ class Misfit:
     """The share of the model's shapes whose descriptors are as unusual as the scan's.
 
     `probability` is of all descriptors together, `blocks` of each block alone; `method` says what was compared with.
+    `departure` is how far the scan lies from shapes of the law over how far these lie from each other, in the mean;
+    None where nothing grew.
     """
 
     probability: Annotated[float, Rule(least=0, most=1)]
     blocks: dict[str, float]
     method: str
+    departure: Annotated[float | None, Rule(least=0)] = None

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.distance import cdist
+from scipy.spatial.distance import cdist, pdist
 
 from curvafit.core.permutation import measure_energy, relabel, share_beyond
 from curvafit.core.runtime import Progress, silent, sub_progress
@@ -225,11 +225,11 @@ def compare_windows(posterior: Posterior, scan: np.ndarray, twins: np.ndarray) -
 
     All descriptors are compared in the emulator's uncorrelated directions, each block in deviations of the twins.
     """
-    compress, basis = posterior.emulator.compression, posterior.emulator.basis
-    p = probability_alike(compress(scan) @ basis.T, compress(twins) @ basis.T)
+    seen, grown = (posterior.emulator.compression(rows) @ posterior.emulator.basis.T for rows in (scan, twins))
+    p, departure = probability_alike(seen, grown), float(cdist(seen, grown).mean() / pdist(grown).mean())
     blocks = {}
     for name in BLOCKS:
         own, others = columns_of(scan, [name]), columns_of(twins, [name])
         spread = others.std(0) + FAINTEST * others.std(0).mean() + 1e-12
         blocks[name] = probability_alike(own / spread, others / spread)
-    return Misfit(p, blocks, f"{len(twins)} windows of shapes of the law, {len(scan)} of the scan")
+    return Misfit(p, blocks, f"{len(twins)} windows of shapes of the law, {len(scan)} of the scan", departure)
