@@ -154,6 +154,7 @@ def test_an_image_knows_its_imaging_and_a_mask_has_none() -> None:
     assert dark.quality is not None
     assert dark.quality.blur == scan.quality.blur
     assert dark.quality.noise == pytest.approx(scan.quality.noise, rel=0.01)
+    assert scan.scan_alike(mask, 0).quality == scan.quality  # which made its grey levels
     assert prepare(Field(mask, CUBIC, "voxel"), periodic=True).quality is None
 
 
