@@ -26,7 +26,6 @@ import re
 import warnings
 import zlib
 from collections.abc import Callable
-from dataclasses import fields
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -136,18 +135,20 @@ class Apart(Table):
         return self
 
 
-def train_less(change: str, training: Table, cases: Cases) -> Posterior:
+def train_less(change: str, table: Path, cases: Cases) -> Posterior:
     """Return the packaged posterior, or one that learned without a change, or of every second law."""
     if change not in ("box", "pooling", "laws"):
         return load_posterior()
     if not (path := cases.folder / f"less-{change}.npz").exists():
+        training = load_table(table)
         least, most = _ENDS.T
-        learned = Apart(*(getattr(training.visible, field.name) for field in fields(Table)))
-        if change == "box":
-            learned = training.rows(((least <= training.parameters) & (training.parameters <= most)).all(1))
-        if change == "laws":
-            learned = training.rows(training.laws % 2 == 0)
-        save_posterior(train_posterior(learned), path)
+        if change == "pooling":
+            training = Apart(**vars(training))
+        elif change == "box":
+            training = training.rows(((least <= training.parameters) & (training.parameters <= most)).all(1))
+        else:
+            training = training.rows(training.laws % 2 == 0)
+        save_posterior(train_posterior(training), path)
     return load_posterior(path)
 
 
@@ -226,6 +227,7 @@ def report(name: str, title: str, row: Values) -> dict[str, Figure]:
         table += [[f"{part}: {key}", *values] for key, values in figures[part].items()]
     shares = 1 - np.square(error).mean(0) / truth.var(0)
     table.append(["R²", *shares])
+    title += f"; mean error {off.mean():.3f}"
     found = {
         f"{key}.{slug}": value
         for key, values in figures["all"].items()
@@ -337,7 +339,7 @@ def run_less(options: argparse.Namespace, cases: Cases, edge: int) -> dict[str, 
     group = f"less{part or edge}"
     for view, change in product(options.views.split(","), ("nothing", *filter(None, options.less.split(",")))):
         queries, families = unseen_table(options.unseen, view, cases, part, one_scale=change != "scale")
-        trained = train_less(change, load_table(options.table), cases)
+        trained = train_less(change, options.table, cases)
         case = f"{group}-{view}-{change}"
         row = cases.all({case: partial(judge, queries, families, partial(asked, trained))})[case]
         for key, value in report(f"less {change}, {view}", group, row).items():
