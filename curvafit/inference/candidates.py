@@ -43,8 +43,7 @@ Deviations = Annotated[dict[str, float], Rule(keys=tuple((name, NotNegative) for
 class Candidate:
     """A law that may have made a scan, in working units, and what grew from it.
 
-    Once twins are grown, the mass is theirs. Where it was set so that they fill the scan's volume fraction, the law's
-    own deviation of the mass is dropped.
+    Once twins of the nearest match are grown, its mass is theirs, with which they fill the scan's volume fraction.
 
     Attributes
     ----------
@@ -84,10 +83,11 @@ class Candidate:
         pairs = [one_to_many(each, diagrams[k + 1 :]) for k, each in enumerate(diagrams[:-1])]
         noise = float(np.concatenate(pairs).mean()) if pairs else None
         numbers = tuple(each.morphometry for each in twins if each.morphometry is not None)
-        mass = float(np.clip(np.mean([each.mass for each in twins if each.phase is not None]), -RARE, RARE))
-        known = {name: value for name, value in self.uncertainty.items() if name != "mass" or mass == self.mass}
+        mass = self.mass
+        if self.name == "match":
+            mass = float(np.clip(np.mean([each.mass for each in twins if each.phase is not None]), -RARE, RARE))
         thickness = float(np.mean([thinner_thickness(each.phase > 0) for each in twins if each.phase is not None]))
-        found = replace(self, mass=mass, uncertainty=known, thickness=thickness)
+        found = replace(self, mass=mass, thickness=thickness)
         return replace(found, distance=distance, seed_noise=noise, twins=numbers)
 
 
@@ -132,14 +132,14 @@ def twin(
 ) -> Twin:
     """Grow a shape of a law in a box as many thicknesses long as the scan's main window, within `EDGES` voxels.
 
-    A mask or an image does not state a mass: the shape fills as much of its box as the structure does
-    (`Prepared.true_volume_fraction`), or has the law's own mass where nothing grows so.
+    The mass of the atlas's match to a mask or an image is not the scan's: its shape fills as much of its box as the
+    structure does (`Prepared.true_volume_fraction`), or has the law's own mass where nothing grows so.
     """
     ratio = 1.0 if law.thickness is None else law.thickness / prepared.thickness
     z, y, x = (int(np.clip(ratio * (edge.stop - edge.start), EDGES[0], longest)) for edge in prepared.windows[0])
     grid = Grid((z, y, x), prepared.grid.spacing, "periodic")
     options = {"schedule": schedule, "seed": seed, "reject_early": True}
-    if prepared.kind != "field":
+    if law.name == "match" and prepared.kind != "field":
         share = prepared.true_volume_fraction
         flow = generate(law.coefficients, law.mass, grid, volume_fraction=share, **options)
         if (grown := _measure_twin(flow, prepared, seed)).phase is not None:

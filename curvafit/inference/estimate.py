@@ -90,7 +90,8 @@ def estimate_law(
         grown = simulate_draws(parameters, simulate, simulations, seed=seed, progress=part)
     if grown is None or len(grown.parameters) < FEWEST:
         left = misfits(posterior.emulator, *reading.columns, parameters[None, :STARTS])[0]
-        misfit = Misfit(tail_probability(posterior, reading.view, left), {}, "by the best fit, nothing grown")
+        p = tail_probability(posterior.misfits[reading.view], left)
+        misfit = Misfit(p, {}, "by the best fit, nothing grown")
         return replace(fit, misfit=misfit, candidates=(likely, _best_fit(posterior, *best, turn, thickness))), None
     pool = posterior.draw(reading, POOL, seed)[:, :-1]
     search = Search(posterior.emulator, reading)
@@ -176,10 +177,9 @@ def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simul
     return simulate
 
 
-def tail_probability(posterior: Posterior, view: str, misfit: float) -> float:
-    """Return the part of shapes whose best parameters leave more unexplained than a query's do (`misfit`)."""
-    usual = posterior.misfits[view]
-    return float((1 + (usual >= misfit).sum()) / (1 + len(usual)))
+def tail_probability(usual: np.ndarray, own: float) -> float:
+    """Return the probability that a number is as great as `own` where it, too, is one of such as `usual` `(n,)`."""
+    return float((1 + (usual >= own).sum()) / (1 + len(usual)))
 
 
 def check_law(
@@ -224,12 +224,17 @@ def compare_windows(posterior: Posterior, scan: np.ndarray, twins: np.ndarray) -
     """Return how probable it is that windows of a scan `(k, 351)` differ so from those of twins `(n, 351)`.
 
     All descriptors are compared in the emulator's uncorrelated directions, each block in deviations of the twins.
+    The law of the twins was found for the scan, and is not quite its own even if there is one. So the scan's departure
+    is ranked among those of shapes of the model whose laws were found in the same way (`Posterior.departures`). Where
+    these are not known, and for each block, the probability is that of a law which was named beforehand.
     """
     seen, grown = (posterior.emulator.compression(rows) @ posterior.emulator.basis.T for rows in (scan, twins))
-    p, departure = probability_alike(seen, grown), float(cdist(seen, grown).mean() / pdist(grown).mean())
+    departure, usual = float(cdist(seen, grown).mean() / pdist(grown).mean()), posterior.departures
+    p = tail_probability(usual, departure) if len(usual) else probability_alike(seen, grown)
     blocks = {}
     for name in BLOCKS:
         own, others = columns_of(scan, [name]), columns_of(twins, [name])
         spread = others.std(0) + FAINTEST * others.std(0).mean() + 1e-12
         blocks[name] = probability_alike(own / spread, others / spread)
-    return Misfit(p, blocks, f"{len(twins)} windows of shapes of the law, {len(scan)} of the scan", departure)
+    method = f"{len(twins)} windows of shapes of the law, {len(scan)} of the scan"
+    return Misfit(p, blocks, method + (f", ranked among {len(usual)} shapes" if len(usual) else ""), departure)

@@ -105,6 +105,9 @@ class Posterior:
         By view, what the emulator's best parameters leave unexplained of shapes that it did not learn from, increasing.
     combinations
         The sums of parameters that textures tell.
+    departures
+        How far shapes of the model, masks that went through all of `infer`, lay from shapes of the law that it found,
+        over how far these lay from each other; empty where that was not measured.
     """
 
     architecture: Architecture
@@ -118,6 +121,7 @@ class Posterior:
     misfits: dict[str, np.ndarray]
     combinations: Combinations
     provenance: dict[str, Any]
+    departures: np.ndarray
 
     def sample(
         self, descriptors: np.ndarray, views: np.ndarray, amount: np.ndarray, count: int = 1000, seed: int = 0
@@ -172,7 +176,7 @@ class Posterior:
 
 def save_posterior(posterior: Posterior, path: str | Path) -> None:
     """Write a posterior as one compressed `.npz`: arrays and a JSON header, nothing that runs when it is read."""
-    arrays = {name: getattr(posterior, name) for name in ("box", "centre", "spread")}
+    arrays = {name: getattr(posterior, name) for name in ("box", "centre", "spread", "departures")}
     arrays |= {name: getattr(posterior.compression, name) for name in ("mean", "scale", "basis")}
     for number, member in enumerate(posterior.members):
         arrays |= {f"{number}.{name}": value.numpy() for name, value in member.state_dict().items()}
@@ -235,6 +239,9 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
     misfits = {view: arrays[f"misfits.{view}"] for view in views}
     if any(each.ndim != 1 or not len(each) for each in misfits.values()):
         raise ValueError("misfits that are no columns of numbers")
+    departures = arrays.get("departures", np.zeros(0))
+    if departures.ndim != 1:
+        raise ValueError("departures that are no column of numbers")
     ends = tuple((str(low), str(high)) for low, high in header["ends"])
     if len(ends) != len(PARAMETERS):
         raise ValueError(f"words for {len(ends)} combinations, not {len(PARAMETERS)}")
@@ -252,6 +259,7 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
         misfits,
         Combinations(arrays["combinations.weights"], arrays["combinations.centre"], ends),
         header["provenance"],
+        departures,
     )
 
 

@@ -142,22 +142,23 @@ class Prepared:
         thickness = thinner_thickness(mask)
         step = [thickness / (scale * self.thickness) for scale in self.scale]
         edges = (self.working_voxel / z, self.working_voxel / y, self.working_voxel / x)
-        values = sample_mask(mask, step) if self.quality is None else self.quality.image(mask, step, seed)
-        values = values.astype(np.uint8 if self.quality is None else np.float32)
+        quality = self.quality
+        values = sample_mask(mask, step, keep_volume=True) if quality is None else quality.image(mask, step, seed)
+        values = values.astype(np.uint8 if quality is None else np.float32)
         scan = Field(values, edges, self.unit)
-        options = {"periodic": self.grid.periodic, "one_scale": self.one_scale, "quality": self.quality}
+        options = {"periodic": self.grid.periodic, "one_scale": self.one_scale, "quality": quality}
         return prepare(scan, kind=self.kind, **options)
 
     @cached_property
     def true_volume_fraction(self) -> float:
-        """Return the structure's volume fraction, corrected for the bias of blur and noise.
+        """Return the structure's volume fraction, corrected for the bias of blur, noise and resampling.
 
         The bias is estimated by scanning the main window's structure once more (`scan_alike`).
         """
-        if self.quality is None:
+        if self.kind == "field":
             return self.volume_fraction
-        mask = self.mask[self.windows[0]]
-        inside = centre_distance(mask, (1.0, 1.0, 1.0), 4.0) > self.quality.boundary_shift / max(self.scale)
+        shift = 0.0 if self.quality is None else self.quality.boundary_shift / max(self.scale)
+        inside = centre_distance(self.mask[self.windows[0]], (1.0, 1.0, 1.0), 4.0) > shift
         try:
             seen = self.scan_alike(inside, 0).volume_fraction
         except ScanError:

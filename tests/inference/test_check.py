@@ -33,6 +33,7 @@ class Linear:
         self.emulator = linear()
         self.compression = self.emulator.compression
         self.misfits = {"mask": np.sort(np.random.default_rng(0).chisquare(1, 400))}
+        self.departures = np.zeros(0)
 
     def sample(self, rows: np.ndarray, views: np.ndarray, amount: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
         assert set(views) == {"mask"}
@@ -76,6 +77,15 @@ def test_a_row_of_the_same_law_passes_and_another_does_not() -> None:
     assert (checked(rows).departure or 0) > 1.5
 
 
+def test_a_departure_is_ranked_among_the_models_own() -> None:
+    rows, ranked = grown(np.random.default_rng(1), 25), Linear()
+    away = checked(rows).departure or 0
+    ranked.departures = away + np.array([-0.2, -0.1, 0.1])
+    found = compare_windows(cast(Posterior, ranked), rows[:1], rows[1:])
+    assert found.probability == pytest.approx(2 / 4)
+    assert found.blocks == checked(rows).blocks
+
+
 def test_a_block_that_differs_is_named() -> None:
     rows = grown(np.random.default_rng(2), 25)
     rows[0, NAMES == "gaps"] *= 2
@@ -97,8 +107,8 @@ def test_without_simulations_the_reference_tells() -> None:
     rows = grown(np.random.default_rng(3), 2)
     rows[1, 2] += 5
     left = misfits(POSTERIOR.emulator, *seen(rows), POSTERIOR.sample(*seen(rows), STARTS)[..., :6])
-    assert tail_probability(POSTERIOR, "mask", left[0]) > 1e-2
-    assert tail_probability(POSTERIOR, "mask", left[1]) == pytest.approx(1 / 401)
+    assert tail_probability(POSTERIOR.misfits["mask"], left[0]) > 1e-2
+    assert tail_probability(POSTERIOR.misfits["mask"], left[1]) == pytest.approx(1 / 401)
 
 
 def described(parameters: np.ndarray, seed: int) -> Reading | None:

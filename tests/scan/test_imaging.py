@@ -167,5 +167,26 @@ def test_the_true_share_is_without_what_imaging_adds(blur: float, noise: float) 
     scan = prepare(Field(image(truth, blur, noise), CUBIC, "voxel"), kind="image")
     full = truth.mean()
     assert abs(scan.true_volume_fraction - full) < 0.5 * abs(scan.volume_fraction - full)
-    mask = prepare(Field(truth.astype(np.uint8), CUBIC, "voxel"))
-    assert mask.true_volume_fraction == mask.volume_fraction
+
+
+def threads(n: int = 64) -> np.ndarray:
+    """Thin threads and balls in a periodic box: a cut of a random field."""
+    field = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal((n, n, n)), 3, mode="wrap")
+    return field > np.quantile(field, 0.88)
+
+
+@pytest.mark.parametrize("step", [0.7, 0.9, 1.3])
+def test_a_mask_keeps_its_volume_on_other_voxels(step: float) -> None:
+    mask = threads()
+    kept = sample_mask(mask, [step] * 3, keep_volume=True)
+    assert kept.mean() == pytest.approx(mask.mean(), rel=0.005)
+    assert sample_mask(mask, [step] * 3).mean() < 0.99 * mask.mean()
+
+
+def test_a_grown_shape_is_read_with_the_volume_of_the_same_shape_scanned() -> None:
+    """A mask loses some of its volume on the working grid; a shape that is scanned alike must not lose it twice."""
+    mask = threads()
+    scan = prepare(Field(mask.astype(np.uint8)), kind="mask", periodic=True, one_scale=True)
+    assert scan.volume_fraction < 0.99 * mask.mean()
+    assert scan.scan_alike(mask, 0).volume_fraction == pytest.approx(scan.volume_fraction, rel=0.01)
+    assert scan.true_volume_fraction == pytest.approx(mask.mean(), rel=0.01)
