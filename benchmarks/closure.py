@@ -352,6 +352,8 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     warnings.filterwarnings("ignore", module="sklearn")
     if not options.unseen and not options.gallery:
         raise SystemExit("name stores with --unseen, or the author's volumes with --gallery")
+    if options.part and options.less is None:
+        raise SystemExit("--part shows a corner to the posterior alone: it goes with --less")
     figures: dict[str, Figure] = {}
     edge = 0 if options.gallery else open_store(options.unseen[0]).settings.shape[0]
     if options.less is not None:

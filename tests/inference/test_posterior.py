@@ -130,10 +130,12 @@ def test_descriptors_that_are_not_finite_are_refused(raw: Posterior) -> None:
 
 def test_a_file_holds_it(raw: Posterior, tmp_path: Path) -> None:
     path = tmp_path / "posterior.npz"
+    raw = dataclasses.replace(raw, departures=np.array([0.9, 1.1, 1.4]))
     save_posterior(raw, path)
     again, row = load_posterior(path), columns(table(1, seed=2).select_views(["mask"]))
     assert np.array_equal(again.sample(*row, 50), raw.sample(*row, 50))
     assert again.provenance == raw.provenance
+    assert again.departures.tolist() == [0.9, 1.1, 1.4]
     content = path.read_bytes()
     path.write_bytes(content[:1000])
     with pytest.raises(ValueError, match="damaged"):
@@ -145,6 +147,15 @@ def test_a_file_holds_it(raw: Posterior, tmp_path: Path) -> None:
             load_posterior(path)
     with pytest.raises(FileNotFoundError, match="nowhere"):
         load_posterior(tmp_path / "nowhere.npz")
+
+
+def test_a_file_without_departures_is_read(raw: Posterior, tmp_path: Path) -> None:
+    path = tmp_path / "posterior.npz"
+    save_posterior(raw, path)
+    arrays = dict(np.load(path))
+    del arrays["departures"]
+    np.savez(path, **arrays)
+    assert load_posterior(path).departures.shape == (0,)
 
 
 @pytest.mark.parametrize("name", ["mean", "basis", "box", "0.flow.transform.transforms.0.hyper.0.weight"])
