@@ -94,8 +94,8 @@ class Candidate:
 def best_candidate(candidates: Sequence[Candidate]) -> Candidate | None:
     """Return the first candidate within seed noise of the one nearest to the scan; None where nothing grew.
 
-    The noise is the distance between the nearest candidate's twins. Those behind a law that simulations have refined are
-    no rivals of it: it fits all descriptors, of which the diagram is one.
+    The noise is the distance between the nearest candidate's twins. Those behind a law that simulations have refined
+    are no rivals of it: it fits all descriptors, of which the diagram is one.
     """
     grown = [(each.distance, each) for each in candidates if each.distance is not None]
     if not grown:
