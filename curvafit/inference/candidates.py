@@ -94,15 +94,11 @@ class Candidate:
 def best_candidate(candidates: Sequence[Candidate]) -> Candidate | None:
     """Return the first candidate within seed noise of the one nearest to the scan; None where nothing grew.
 
-    The noise is the distance between the nearest candidate's twins. Those behind a law that simulations have refined
-    are no rivals of it: it fits all descriptors, of which the diagram is one.
+    The noise is the distance between the nearest candidate's twins.
     """
     grown = [(each.distance, each) for each in candidates if each.distance is not None]
     if not grown:
         return None
-    names = [each.name for _, each in grown]
-    if "refined" in names:
-        grown = grown[: names.index("refined") + 1]
     least, nearest = min(grown, key=lambda pair: pair[0])
     reach = least + (nearest.seed_noise or 0.0)
     return next(each for distance, each in grown if distance <= reach)

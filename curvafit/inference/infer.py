@@ -257,7 +257,7 @@ def _grow(
     seed: int,
     progress: Progress,
 ) -> tuple[tuple[Candidate, ...], dict[str, tuple[Twin, ...]]]:
-    """Grow a twin of each law that may be the best, and of the baseline, the match; and `count` of the best."""
+    """Grow a twin of each law, and `count` of the best: of the nearest, and of the first that is as near."""
     twins: dict[str, tuple[Twin, ...]] = {}
 
     def grow(law: Candidate, share: float) -> Candidate:
@@ -267,11 +267,8 @@ def _grow(
         twins[law.name] = (*twins.get(law.name, ()), twin(law, prepared, start, schedule))
         return law.compare(measured, twins[law.name])
 
-    begun: tuple[Candidate, ...] = ()
-    for k, law in enumerate(laws):
-        decided = any(each.name == "refined" and each.distance is not None for each in begun)
-        begun += (grow(law, 0.7 * k / len(laws)) if law.name == "match" or not decided else law,)
-    laws, most = begun, 2 * count  # another twin may make another law the best
+    laws = tuple(grow(law, 0.7 * k / len(laws)) for k, law in enumerate(laws))
+    most = 2 * count  # another twin may make another law the best
     for k in range(most):
         best = best_candidate(laws)
         if best is not None and len(twins[best.name]) < count:
