@@ -18,7 +18,6 @@ from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.scan.measure import scan_diagram
 from curvafit.scan.prepare import Prepared, thinner_thickness
-from curvafit.volumes.field import ScanError
 
 #: Greatest mass of either sign: a rare structure's field lies a little beyond ±1 in the mean.
 RARE = 1 - 1e-6
@@ -155,7 +154,7 @@ def _measure_twin(flow: Flow, prepared: Prepared, seed: int) -> Twin:
     try:
         seen = prepared.scan_alike(field, seed)
         curvature = scan_diagram(seen)
-    except (ValueError, ScanError) as error:
+    except ValueError as error:
         return Twin(None, flow.mass, None, None, str(error))
     numbers = morphometry(seen.mask, seen.working_voxel, seen.unit, periodic=seen.grid.periodic)
     return Twin(field, flow.mass, curvature, numbers, seen=seen)

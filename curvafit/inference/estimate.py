@@ -29,7 +29,6 @@ from curvafit.inference.table import (
 from curvafit.priors.grid import Grid
 from curvafit.scan.measure import Reading, read_texture
 from curvafit.scan.prepare import HALF, Prepared
-from curvafit.volumes.field import ScanError
 
 #: Draws from the posterior, and those among which more are chosen to be grown.
 DRAWS, POOL = 400, 2000
@@ -170,7 +169,7 @@ def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simul
             return None
         try:
             reading = read_texture(prepared.scan_alike(flow.field.numpy(), seed))
-        except ScanError:
+        except ValueError:  # such as of one ball, which fills its box: at the scan's thickness it is a few voxels wide
             return None
         return None if reading is None else reading._replace(view=view)
 

@@ -9,6 +9,7 @@ import pytest
 from emulated import BOX, HIGH, LOW, NOISE, linear, reading, row, seen, told
 from exact import Gyroid, centres
 
+from curvafit.generation.schedule import LEARNED
 from curvafit.geometry.descriptors import BLOCKS
 from curvafit.inference import estimate
 from curvafit.inference.candidates import Candidate, Misfit, Twin
@@ -101,6 +102,14 @@ def test_few_shapes_test_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(estimate, "twin", lambda *_, **__: Twin(None, 0.0, None, None, "one phase"))
     law = Candidate("match", Coefficients.willmore(), -0.3, {}, 8.0)
     assert estimate.check_law(law, prepared, POSTERIOR) is None
+
+
+def test_a_simulation_that_is_one_ball_is_left_out() -> None:
+    """At the thickness of the scan's structure the ball's whole box is a few voxels wide: too few to measure."""
+    mask = Gyroid(0.1).distance(centres(Grid((48, 48, 48)))).numpy() > 0
+    prepared = prepare(Field(mask.astype(np.uint8)), kind="mask", one_scale=True)
+    simulate = estimate._simulator(prepared, "mask", LEARNED)
+    assert simulate(np.array([2.35, -1.67, 182.1, -132.72, 665.43, -0.56]), 63) is None
 
 
 def test_without_simulations_the_reference_tells() -> None:
