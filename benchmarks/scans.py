@@ -1,7 +1,7 @@
 """Reports of real scans: the verdict on each, and how far the laws of a scan's halves lie apart.
 
-Needs $CURVAFIT_DATA. Of each scan by `infer`: the structure's share, thickness and spacing in working voxels; p of
-`misfit` and the blocks of descriptors that reject it; the means of the chosen law's twins over the scan; the verdict.
+Needs $CURVAFIT_DATA. Of each scan by `infer`: the structure's share, thickness and spacing in working voxels; p and departure
+of `misfit` and the blocks of descriptors that reject it; the means of the chosen law's twins over the scan; the verdict.
 Of the halves along the longest axis, by the posterior alone (`--halves`): p that both are of one law, by the difference
 of draws from their posteriors (χ² of its mean in units of its covariance), and the part of the halves of other tissues
 that are not (p at most .05).
@@ -72,7 +72,7 @@ def report(name: str) -> Values:
         for key in RATIOS if twins else ():
             values[key] = float(np.mean([getattr(each, key) for each in twins]) / getattr(own, key))
     if fit.misfit is not None:
-        values |= {"p": fit.misfit.probability}
+        values |= {"p": fit.misfit.probability, "departure": fit.misfit.departure or np.nan}
         values["rejected by"] = ", ".join(name for name, p in fit.misfit.blocks.items() if p <= 0.05)
     return values
 
@@ -110,7 +110,7 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
         found = cases.all({f"halves-{name}": lambda name=name: halves(name) for name in names})
         return compare_halves({name.removeprefix("halves-"): draws for name, draws in found.items()})
     found = cases.all({name: lambda name=name: report(name) for name in names})
-    columns = ("share", "thickness", "spacing", "p", *RATIOS, "rejected by", "verdict")
+    columns = ("share", "thickness", "spacing", "p", "departure", *RATIOS, "rejected by", "verdict")
     show(["scan", *columns], [[name, *(row.get(key, "") for key in columns)] for name, row in found.items()])
     figures = {f"scans.{name}.{key}": Figure(row[key]) for name, row in found.items()
                for key in columns[:-2] if key in row}  # fmt: skip
