@@ -1,10 +1,10 @@
 """Reports of real scans: the verdict on each, and how far the laws of a scan's halves lie apart.
 
-Needs $CURVAFIT_DATA. Of each scan by `infer`: the structure's share, thickness and spacing in working voxels; p and departure
-of `misfit` and the blocks of descriptors that reject it; the means of the chosen law's twins over the scan; the verdict.
-Of the halves along the longest axis, by the posterior alone (`--halves`): p that both are of one law, by the difference
-of draws from their posteriors (χ² of its mean in units of its covariance), and the part of the halves of other tissues
-that are not (p at most .05).
+Needs $CURVAFIT_DATA. Of each scan by `infer`: the structure's share, thickness and spacing in working voxels; p and
+departure of `misfit`, and the blocks of descriptors that reject it; the means of the chosen law's twins over the scan;
+the verdict. Of the halves along the longest axis, by the posterior alone (`--halves`): p that both are of one law, by
+the difference of draws from their posteriors (χ² of its mean in units of its covariance), and the part of the halves
+of other tissues that are not (p at most .05).
 """
 
 from __future__ import annotations
