@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
 import pytest
+import torch
 from emulated import BOX, HIGH, LOW, NOISE, linear, reading, row, seen, told
 from exact import Gyroid, centres
 
@@ -104,12 +106,14 @@ def test_few_shapes_test_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert estimate.check_law(law, prepared, POSTERIOR) is None
 
 
-def test_a_simulation_that_is_one_ball_is_left_out() -> None:
+def test_a_simulation_that_is_one_ball_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """At the thickness of the scan's structure the ball's whole box is a few voxels wide: too few to measure."""
     mask = Gyroid(0.1).distance(centres(Grid((48, 48, 48)))).numpy() > 0
     prepared = prepare(Field(mask.astype(np.uint8)), kind="mask", one_scale=True)
-    simulate = estimate._simulator(prepared, "mask", LEARNED)
-    assert simulate(np.array([2.35, -1.67, 182.1, -132.72, 665.43, -0.56]), 63) is None
+    ball = torch.tanh(24 - torch.linalg.vector_norm(torch.cartesian_prod(*[torch.arange(64.0) - 32] * 3), dim=1))
+    flow = SimpleNamespace(viability=SimpleNamespace(viable=True), field=ball.reshape(64, 64, 64))
+    monkeypatch.setattr(estimate, "generate", lambda *_, **__: flow)
+    assert estimate._simulator(prepared, "mask", LEARNED)(BOX.mean(1), 63) is None
 
 
 def test_without_simulations_the_reference_tells() -> None:
