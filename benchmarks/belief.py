@@ -63,6 +63,8 @@ def rank(found: dict[str, dict[int, float]]) -> dict[str, np.ndarray]:
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    if options.quick and options.calibrate is not None:
+        raise SystemExit("--quick makes two shapes only: no test is calibrated by them")
     found: dict[str, dict[int, float]] = {"shape": {}, "cut": {}}
     edge = 0
     for number, (store, index) in enumerate(
