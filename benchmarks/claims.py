@@ -154,7 +154,11 @@ class Ledger:
 
     def pages(self, *, write: bool) -> list[str]:
         """Return what pages print otherwise than the ledger; or rewrite their tables, and return what is left."""
-        wrong = []
+        wrong, printed = [], {(path, mark) for path, mark, _ in self.tables()}
+        for path in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md")):
+            marks = re.findall(r"^<!-- ledger: (.+) -->$", path.read_text(encoding="utf-8"), re.MULTILINE)
+            empty = [mark for mark in marks if (path, mark) not in printed]
+            wrong += [f"{path.relative_to(ROOT)}: the ledger prints no table {mark} there" for mark in empty]
         for path, mark, text in self.tables():
             page = path.read_text(encoding="utf-8") if path.exists() else ""
             begin, end = f"<!-- ledger: {mark} -->", "<!-- end -->"
