@@ -125,7 +125,7 @@ def extract_atlas(
 
 @command(
     "curvafit atlas describe store.zarr -o table.npz",
-    "curvafit atlas describe box.zarr corner.zarr -o table.npz --views mask,crop",
+    "curvafit atlas describe box.zarr corner.zarr -o table.npz --views mask,scan",
 )
 def describe_atlas(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`.")],
@@ -135,7 +135,7 @@ def describe_atlas(
     crew: Crew,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Measure each shape of stores as field, mask, crop and scan: the table that `atlas train` reads."""
+    """Measure each shape of stores as field, mask and scan: the table that `atlas train` reads."""
     from curvafit.atlas_map.extract import describe
     from curvafit.inference.table import TABLE_FILE, VIEWS
 

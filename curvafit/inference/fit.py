@@ -161,7 +161,7 @@ class Fit(Pictured):
         filled = self.morphometry.volume_fraction
         width = self.epsilon_physical * WORKING_SPACING / self.working_voxel
         own = {"working_voxel": self.working_voxel, "length_unit": self.length_unit, "volume_fraction": filled}
-        return Law(six, mass, "prior", epsilon=width, schedule="deep", **own)  # type: ignore[arg-type]
+        return Law(six, mass, "prior", epsilon=width, schedule="deep", status=self.status, **own)  # type: ignore[arg-type]
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers, strings, lists and dicts, as `fit.json` holds them."""

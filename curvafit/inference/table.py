@@ -139,7 +139,7 @@ def law_of(parameters: Sequence[float] | np.ndarray) -> tuple[Coefficients, floa
 
 
 def mirror_parameters(parameters: np.ndarray) -> np.ndarray:
-    """Return the parameters `(…, 6)` of the same shapes with inside and outside exchanged (`Coefficients.mirrored`)."""
+    """Return the parameters `(…, 6)` of the same shapes with inside and outside exchanged (`Coefficients.mirror`)."""
     a11, log_a02, a10, a01, a00, mass = np.moveaxis(np.asarray(parameters, dtype=np.float64), -1, 0)
     a02 = np.exp(log_a02)
     return np.stack([a11 / a02, -log_a02, -a01 / a02, -a10 / a02, a00 / a02, -mass], -1)

@@ -46,6 +46,8 @@ class Law:
         Share of a fit's scan inside the structure; None where it is unknown.
     source
         The publication of a preset.
+    status
+        A fit's verdict on the law.
     """
 
     coefficients: Coefficients
@@ -58,6 +60,7 @@ class Law:
     length_unit: str | None = None
     volume_fraction: float | None = None
     source: str = field(default="", compare=False)
+    status: str = field(default="", compare=False)
 
     @classmethod
     def of(cls, law: LawLike) -> Law:
@@ -96,7 +99,8 @@ class Law:
             raise ValueError(f"expected a fit with a law, got one without in {path}: {content.get('status', '')}")
         share = (file.morphometry or {}).get("volume_fraction")
         width = file.epsilon_physical * WORKING_SPACING / file.working_voxel
-        own = {"working_voxel": file.working_voxel, "length_unit": file.length_unit, "volume_fraction": share}
+        own: dict[str, Any] = {"working_voxel": file.working_voxel, "length_unit": file.length_unit}
+        own |= {"volume_fraction": share, "status": file.status}
         return cls(file.coefficients, file.mass, f"prior {os.fspath(path)}", epsilon=width, schedule="deep", **own)
 
     @property
@@ -192,6 +196,7 @@ class _LawFile:
     epsilon_physical: Positive
     working_voxel: Positive
     length_unit: Literal["voxel", *METRES]  # type: ignore[valid-type]
+    status: str = ""
     morphometry: Annotated[
         dict[str, Any] | None, Rule(keys=(("volume_fraction", Annotated[float, Rule(least=0, most=1, unknown=True)]),))
     ] = None

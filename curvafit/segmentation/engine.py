@@ -39,6 +39,8 @@ BENDING = 2.0
 Ends = tuple[tuple[bool, bool], tuple[bool, bool], tuple[bool, bool]]
 #: A law that is tried beside the prior's.
 WILLMORE = Coefficients.willmore()
+#: Said of a fit that is not supported.
+UNSURE = "The prior's fit is not `Supported`: nothing says that its law is its scan's. Compare the mask with the scan."
 #: Candidates of a fit that are laws of their own: the nearest match's destroys.
 TRUSTED = ("refined", "posterior", "simulation", "optimum")
 
@@ -129,7 +131,8 @@ def law_of(prior: LawLike, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
         note = f"The {law.origin}, at a working voxel of one scan voxel."
         return coefficients, (note,) if law.working else ()
     note = f"The prior's lengths, in {law.length_unit}, are converted to {scan.unit}."
-    return coefficients, () if law.length_unit == scan.unit else (note,)
+    notes = () if law.length_unit == scan.unit else (note,)
+    return coefficients, (*notes, UNSURE) if law.status and not law.status.startswith("Supported") else notes
 
 
 def laws_of(prior: LawLike, scan: Field) -> tuple[tuple[Coefficients, ...], tuple[str, ...]]:

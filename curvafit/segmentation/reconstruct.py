@@ -17,6 +17,7 @@ from scipy import ndimage
 from scipy.special import expit
 
 from curvafit.core.checks import SEEDS, check_float, check_int
+from curvafit.core.extras import require
 from curvafit.core.runtime import Progress, check_memory, silent, sub_progress
 from curvafit.core.workers import Workers
 from curvafit.generation import data
@@ -401,6 +402,7 @@ def _describe_gain(best: Trial, where: str) -> str:
 
 def _load_image(image: Source, volume: Field, reading: dict[str, Any]) -> Field:
     """Load the grey levels of the volume that the slices are of."""
+    require("sklearn.ensemble", "image", "reading an image")
     placed = {} if isinstance(image, Field) else {name: reading.get(name) for name in ("spacing", "unit", "crop")}
     field = field_of(image, **placed)
     check_place(field, volume, "the image", "the slices")
