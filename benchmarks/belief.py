@@ -2,15 +2,19 @@
 
 Shapes of stores (`--shapes STORE…`), laws that no choice has seen, as masks cut open, go through the whole of `infer`,
 which tests the law that it found itself. So do their level cuts: cuts of a Gaussian field with the same volume
-fraction and two-point function, which no law made. The p of each is the rank of its departure (`Misfit.departure`)
-among those of the shapes in three quarters of the laws, of which its own is none. `size` is the part of shapes with p
-at most .05, `power` the part of level cuts. `--calibrate FILE` writes the packaged posterior with the departures of
-all shapes, by which `infer` ranks a scan's.
+fraction and two-point function, which no law made. The p of each is as `infer` states it (`compare_windows`): of the
+rank of its departure (`Misfit.departure`) among those of the packaged posterior, and of the rank of its discriminant.
+`size` is the part of shapes with p at most .05, `power` that of level cuts; a cut that has not gone through `infer` is
+counted by its discriminant alone, which can only reject fewer.
+
+`--teach STORE…` learns the discriminant from shapes of other laws, as masks, and their level cuts. `--calibrate FILE`
+writes the packaged posterior with it and with the departures of all shapes; each law's is then ranked among the others.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,73 +22,139 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
+from benchmarks.closure import TABLE
 from benchmarks.harness import Cases, Figure, Values, show
 from benchmarks.nulls import level_cut
 from curvafit.data_synth.store import Store, find_well_formed
 from curvafit.inference.estimate import tail_probability
 from curvafit.inference.infer import infer
-from curvafit.inference.posterior import load_posterior, save_posterior
+from curvafit.inference.posterior import Posterior, load_posterior, save_posterior
+from curvafit.inference.table import column_names, load_table
 from curvafit.priors.grid import Grid
+from curvafit.scan.measure import read_texture
+from curvafit.scan.prepare import HALF, prepare
 from curvafit.volumes.field import Field
 
+KINDS = ("shape", "cut")
 LEVEL = 0.05
-#: Parts of the laws, each of which is ranked among the others.
-PARTS = 4
+#: Part of the mean variance of a column that is added to each, where the discriminant is learned.
+RIDGE = 0.1
+
+
+def masked(store: Store, index: int, cut: bool) -> Field:
+    """Return a shape, or its level cut, as a mask that is cut open at another place."""
+    mask, random = store.field(index) > 0, np.random.default_rng(index)
+    if cut:
+        mask = level_cut(mask, Grid(mask.shape), index) > 0
+    return Field(np.roll(mask, random.integers(mask.shape[0], size=3), (0, 1, 2)).astype(np.uint8))
 
 
 def case(store: Store, index: int, cut: bool) -> Values:
     """Return p, of all descriptors and by block, the departure and the verdict of a shape or of its level cut."""
-    mask, random = store.field(index) > 0, np.random.default_rng(index)
-    if cut:
-        mask = level_cut(mask, Grid(mask.shape), index) > 0
-    opened = np.roll(mask, random.integers(mask.shape[0], size=3), (0, 1, 2))
-    fit = infer(Field(opened.astype(np.uint8)), kind="mask", seed=index).fit
+    fit = infer(masked(store, index, cut), kind="mask", seed=index).fit
     found: Values = {"status": fit.status.partition(":")[0]}
     if (misfit := fit.misfit) is not None:
         found |= {"p": misfit.probability, "departure": misfit.departure, **misfit.blocks}
     return found
 
 
+def describe(store: Store, index: int, cut: bool) -> np.ndarray:
+    """Return the descriptors `(k, 351)` of windows of a shape, or of its level cut, as `infer` measures them."""
+    try:
+        prepared = prepare(masked(store, index, cut), kind="mask", one_scale=True)
+        reading = read_texture(prepared.inverted if prepared.volume_fraction > HALF else prepared)
+    except ValueError:  # such as of one ball, which is a few voxels wide at the thickness of the training
+        reading = None
+    return np.zeros((0, len(column_names()))) if reading is None else reading.windows
+
+
+def describe_all(shapes: Sequence[tuple[Store, int]], cases: Cases) -> dict[str, list[np.ndarray]]:
+    """Return the descriptors of windows `(k, 351)` of shapes, and of their level cuts, by kind."""
+    return {
+        kind: [
+            cases.array(
+                f"{store.settings.shape[0]}-{store.name}-{k}-{kind}", partial(describe, store, k, kind == "cut")
+            )
+            for store, k in shapes
+        ]
+        for kind in KINDS
+    }
+
+
+def teach(posterior: Posterior, rows: Mapping[str, Sequence[np.ndarray]]) -> Posterior:
+    """Return a posterior with Fisher's discriminant of windows `(k, 351)` of shapes and of their level cuts."""
+    plain = replace(posterior.compression, basis=np.eye(len(posterior.compression.mean)))
+    shapes, cuts = (np.array([plain(each).mean(0) for each in rows[kind] if len(each)]) for kind in KINDS)
+    away = np.concatenate([shapes, cuts]) - np.concatenate([shapes, cuts]).mean(0)
+    variance = away.T @ away / len(away)
+    ridge = RIDGE * np.diag(variance).mean() * np.eye(len(variance))
+    weights = np.linalg.solve(variance + ridge, shapes.mean(0) - cuts.mean(0))
+    taught = replace(posterior, discriminant=weights.astype(np.float32))
+    table = load_table(TABLE)
+    values = {view: taught.discriminate(table.rows(table.views == view).descriptors) for view in posterior.views}
+    return replace(taught, discriminants={view: np.sort(each) for view, each in values.items()})
+
+
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shapes", type=Path, nargs="+", required=True, help="stores of laws that no choice has seen")
     parser.add_argument("--count", type=int, default=100, help="shapes, and as many level cuts")
+    parser.add_argument(
+        "--teach", type=Path, nargs="+", help="stores of other laws, from which to learn what tells cuts"
+    )
     parser.add_argument("--calibrate", type=Path, help="write the packaged posterior with the departures found")
 
 
-def rank(found: dict[str, dict[int, float]]) -> dict[str, np.ndarray]:
-    """Return p by kind, of departures by kind and number of the law."""
-    laws = sorted(found["shape"].keys() | found["cut"].keys())
-    part = {law: k % PARTS for k, law in enumerate(laws)}
-    others = [np.array([d for law, d in found["shape"].items() if part[law] != k]) for k in range(PARTS)]
-    return {
-        kind: np.array([tail_probability(others[part[law]], d) for law, d in departures.items()])
-        for kind, departures in found.items()
-    }
+def level_cuts(posterior: Posterior, windows: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the parts `(n,)` of the model's shapes that look as much like level cuts as windows `(k, 351)` of n do."""
+    usual, own = -posterior.discriminants["mask"], (-posterior.discriminate(each).mean() for each in windows)
+    return np.array([tail_probability(usual, float(each)) for each in own])
+
+
+def rank(
+    usual: np.ndarray | None, departures: Mapping[str, Mapping[int, float]], cuts: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Return p by kind, of departures by kind and number of the law, and of `level_cuts` by kind `(laws,)`.
+
+    Departures are ranked among usual ones `(n,)`; where these are None, among those of the other laws' shapes. What has
+    no departure is left out if it is a shape, and if it is a cut stands with the rank of its discriminant.
+    """
+    found = {}
+    for kind, mine in departures.items():
+        own = np.full(len(cuts[kind]), 1.0 if kind == "cut" else np.nan)
+        for law, departure in mine.items():
+            others = np.array([each for other, each in departures["shape"].items() if other != law])
+            own[law] = tail_probability(others if usual is None else usual, departure)
+        p = np.minimum(1, 2 * np.minimum(own, cuts[kind]))
+        found[kind] = p[np.isfinite(p)]
+    return found
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     if options.quick and options.calibrate is not None:
         raise SystemExit("--quick makes two shapes only: no test is calibrated by them")
-    found: dict[str, dict[int, float]] = {"shape": {}, "cut": {}}
-    edge = 0
-    for number, (store, index) in enumerate(
-        find_well_formed(tuple(options.shapes))[: 2 if options.quick else options.count]
-    ):
-        edge = store.settings.shape[0]
-        for kind, departures in found.items():
+    posterior, most = load_posterior(), 2 if options.quick else None
+    if options.teach is not None:
+        posterior = teach(posterior, describe_all(find_well_formed(tuple(options.teach))[:most], cases))
+    shapes = find_well_formed(tuple(options.shapes))[: most or options.count]
+    edge, described = shapes[0][0].settings.shape[0], describe_all(shapes, cases)
+    cuts = {kind: level_cuts(posterior, windows) for kind, windows in described.items()}
+    departures: dict[str, dict[int, float]] = {kind: {} for kind in KINDS}
+    for number, (store, index) in enumerate(shapes):
+        for kind, found in departures.items():
             name = f"{edge}-{store.name}-{index}-{kind}"
             for values in cases.all({name: partial(case, store, index, kind == "cut")}, seed=index).values():
                 if "departure" in values:
-                    departures[number] = values["departure"]
-    figures, rows = {}, []
-    for (kind, p), title in zip(rank(found).items(), ("size", "power"), strict=True):
-        hits = int(np.sum(p <= LEVEL))
+                    found[number] = values["departure"]
+    usual, figures, rows = None if options.calibrate else posterior.departures, {}, []
+    for (kind, p), title in zip(rank(usual, departures, cuts).items(), ("size", "power"), strict=True):
+        hits, away = int(np.sum(p <= LEVEL)), [*departures[kind].values()]
         interval = stats.binomtest(hits, len(p)).proportion_ci(method="wilson") if len(p) else (np.nan, np.nan)
         figures[f"belief.{edge}.{title}"] = Figure(hits / max(len(p), 1), *map(float, interval))
-        middle = np.median([*found[kind].values()]) if len(p) else np.nan
-        rows.append([title, figures[f"belief.{edge}.{title}"], len(p), float(middle)])
-    show(["", f"p at most {LEVEL}", "queries", "median departure"], rows, f"{edge} voxels a side")
+        middle = float(np.median(away)) if away else np.nan
+        rows.append([title, figures[f"belief.{edge}.{title}"], len(p), len(away), middle])
+    head = ["", f"p at most {LEVEL}", "queries", "through infer", "their median departure"]
+    show(head, rows, f"{edge} voxels a side")
     if options.calibrate is not None:
-        departures = np.sort(np.array([*found["shape"].values()], dtype=np.float32))
-        save_posterior(replace(load_posterior(), departures=departures), options.calibrate)
+        away = np.sort(np.array([*departures["shape"].values()], dtype=np.float32))
+        save_posterior(replace(posterior, departures=away), options.calibrate)
     return {} if options.quick else figures

@@ -166,10 +166,12 @@ class Misfit:
 
     `probability` is of all descriptors together, `blocks` of each block alone; `method` says what was compared with.
     `departure` is how far the scan lies from shapes of the law over how far these lie from each other, in the mean;
-    None where nothing grew.
+    None where nothing grew. `level_cut` is the part of the model's shapes that look as much like a level cut of a
+    random field as the scan does; None where the posterior does not tell.
     """
 
     probability: Annotated[float, Rule(least=0, most=1)]
     blocks: dict[str, float]
     method: str
     departure: Annotated[float | None, Rule(least=0)] = None
+    level_cut: Annotated[float | None, Rule(least=0, most=1)] = None

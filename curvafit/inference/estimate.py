@@ -204,7 +204,9 @@ def check_law(
             own = read_texture(grown.seen.inverted if turned else grown.seen)
             rows += [] if own is None else [own.windows]
         progress(f"testing the law: {k + 1} of {TESTED} shapes", (k + 1) / TESTED)
-    return None if len(rows) < FEWEST else compare_windows(posterior, reading.windows, np.concatenate(rows))
+    return (
+        None if len(rows) < FEWEST else compare_windows(posterior, reading.view, reading.windows, np.concatenate(rows))
+    )
 
 
 def probability_alike(scan: np.ndarray, twins: np.ndarray, seed: int = 0) -> float:
@@ -219,21 +221,27 @@ def probability_alike(scan: np.ndarray, twins: np.ndarray, seed: int = 0) -> flo
     return float(share_beyond(measure_energy(cdist(rows, rows), choices)))
 
 
-def compare_windows(posterior: Posterior, scan: np.ndarray, twins: np.ndarray) -> Misfit:
+def compare_windows(posterior: Posterior, view: str, scan: np.ndarray, twins: np.ndarray) -> Misfit:
     """Return how probable it is that windows of a scan `(k, 351)` differ so from those of twins `(n, 351)`.
 
     All descriptors are compared in the emulator's uncorrelated directions, each block in deviations of the twins.
     The law of the twins was found for the scan, and is not quite its own even if there is one. So the scan's departure
-    is ranked among those of shapes of the model whose laws were found in the same way (`Posterior.departures`). Where
-    these are not known, and for each block, the probability is that of a law which was named beforehand.
+    is ranked among those of shapes of the model whose laws were found in the same way (`Posterior.departures`), and
+    its discriminant among those of shapes of the model in the same view. The probability is twice the less of the
+    two ranks (Bonferroni). Where departures are not known, and for each block, it is that of a law named beforehand.
     """
     seen, grown = (posterior.emulator.compression(rows) @ posterior.emulator.basis.T for rows in (scan, twins))
-    departure, usual = float(cdist(seen, grown).mean() / pdist(grown).mean()), posterior.departures
+    departure, usual, level_cut = float(cdist(seen, grown).mean() / pdist(grown).mean()), posterior.departures, None
     p = tail_probability(usual, departure) if len(usual) else probability_alike(seen, grown)
+    if len(posterior.discriminant):
+        own = float(posterior.discriminate(scan).mean())
+        level_cut = tail_probability(-posterior.discriminants[view], -own)
+        p = min(1.0, 2 * min(p, level_cut))
     blocks = {}
     for name in BLOCKS:
         own, others = columns_of(scan, [name]), columns_of(twins, [name])
         spread = others.std(0) + FAINTEST * others.std(0).mean() + 1e-12
         blocks[name] = probability_alike(own / spread, others / spread)
     method = f"{len(twins)} windows of shapes of the law, {len(scan)} of the scan"
-    return Misfit(p, blocks, method + (f", ranked among {len(usual)} shapes" if len(usual) else ""), departure)
+    method += f", ranked among {len(usual)} shapes" if len(usual) else ""
+    return Misfit(p, blocks, method, departure, level_cut)

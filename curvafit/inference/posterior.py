@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +108,10 @@ class Posterior:
     departures
         How far shapes of the model, masks that went through all of `infer`, lay from shapes of the law that it found,
         over how far these lay from each other; empty where that was not measured.
+    discriminant, discriminants
+        Weights of the descriptors by which shapes of the model are told from level cuts of Gaussian random fields with
+        the same two-point function (`discriminate`), and what it is of shapes of the model, by view, increasing; empty
+        where that was not taught.
     """
 
     architecture: Architecture
@@ -122,6 +126,8 @@ class Posterior:
     combinations: Combinations
     provenance: dict[str, Any]
     departures: np.ndarray
+    discriminant: np.ndarray
+    discriminants: dict[str, np.ndarray]
 
     def sample(
         self, descriptors: np.ndarray, views: np.ndarray, amount: np.ndarray, count: int = 1000, seed: int = 0
@@ -152,6 +158,10 @@ class Posterior:
             raise ValueError(f"expected descriptors that are finite, got {bad} of {len(descriptors)} rows with others")
         return torch.from_numpy(np.concatenate([self.compression(descriptors), seen], axis=1)).float()
 
+    def discriminate(self, descriptors: np.ndarray) -> np.ndarray:
+        """Return Fisher's discriminant `(N,)` of descriptors `(N, 351)`: least of those of level cuts."""
+        return replace(self.compression, basis=self.discriminant[None])(descriptors)[:, 0]
+
     def to_logits(self, parameters: np.ndarray) -> np.ndarray:
         """Return the logits of the parameters' places in the box: numbers without bounds."""
         low, wide = self._edges
@@ -176,7 +186,7 @@ class Posterior:
 
 def save_posterior(posterior: Posterior, path: str | Path) -> None:
     """Write a posterior as one compressed `.npz`: arrays and a JSON header, nothing that runs when it is read."""
-    arrays = {name: getattr(posterior, name) for name in ("box", "centre", "spread", "departures")}
+    arrays = {name: getattr(posterior, name) for name in ("box", "centre", "spread", "departures", "discriminant")}
     arrays |= {name: getattr(posterior.compression, name) for name in ("mean", "scale", "basis")}
     for number, member in enumerate(posterior.members):
         arrays |= {f"{number}.{name}": value.numpy() for name, value in member.state_dict().items()}
@@ -184,7 +194,8 @@ def save_posterior(posterior: Posterior, path: str | Path) -> None:
         for level, layer in enumerate(layers):
             arrays |= {f"emulator.{name}.{level}.{part}": value for part, value in layer._asdict().items()}
     arrays["emulator.basis"] = posterior.emulator.basis.astype(np.float32)
-    arrays |= {f"misfits.{view}": values.astype(np.float32) for view, values in posterior.misfits.items()}
+    for name in ("misfits", "discriminants"):
+        arrays |= {f"{name}.{view}": values.astype(np.float32) for view, values in getattr(posterior, name).items()}
     arrays |= {f"combinations.{name}": getattr(posterior.combinations, name) for name in ("weights", "centre")}
     header = {
         "architecture": asdict(posterior.architecture),
@@ -242,6 +253,11 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
     departures = arrays.get("departures", np.zeros(0))
     if departures.ndim != 1:
         raise ValueError("departures that are no column of numbers")
+    discriminant, discriminants = arrays.get("discriminant", np.zeros(0)), {}
+    if len(discriminant):
+        discriminants = {view: arrays[f"discriminants.{view}"] for view in views}
+        if discriminant.shape != (columns,) or any(each.ndim != 1 for each in discriminants.values()):
+            raise ValueError(f"a discriminant of shape {discriminant.shape}, not {(columns,)}, or no columns of them")
     ends = tuple((str(low), str(high)) for low, high in header["ends"])
     if len(ends) != len(PARAMETERS):
         raise ValueError(f"words for {len(ends)} combinations, not {len(PARAMETERS)}")
@@ -260,6 +276,8 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
         Combinations(arrays["combinations.weights"], arrays["combinations.centre"], ends),
         header["provenance"],
         departures,
+        discriminant,
+        discriminants,
     )
 
 

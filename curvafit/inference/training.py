@@ -103,7 +103,8 @@ def train_posterior(
     provenance = {"table": table.provenance, **counts, "seed": seed}
     zero, one = np.zeros(len(TARGETS)), np.ones(len(TARGETS))
     none = Combinations(np.eye(len(PARAMETERS)), zero[: len(PARAMETERS)], ())
-    posterior = Posterior(sizes, (), compression, views, box, zero, one, emulator, left, none, provenance, np.zeros(0))
+    untested = (np.zeros(0), np.zeros(0), {})
+    posterior = Posterior(sizes, (), compression, views, box, zero, one, emulator, left, none, provenance, *untested)
     logits = posterior.to_logits(table.targets)
     centre, spread = logits.mean(0), logits.std(0)
     target = torch.from_numpy((logits - centre) / spread).float()

@@ -36,7 +36,8 @@ class Linear:
         self.emulator = linear()
         self.compression = self.emulator.compression
         self.misfits = {"mask": np.sort(np.random.default_rng(0).chisquare(1, 400))}
-        self.departures = np.zeros(0)
+        self.departures = self.discriminant = np.zeros(0)
+        self.discriminants = {"mask": np.arange(99.0)}
 
     def sample(self, rows: np.ndarray, views: np.ndarray, amount: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
         assert set(views) == {"mask"}
@@ -47,6 +48,10 @@ class Linear:
         )
         found = BOX.mean(1) + (scaled + noise) * (HIGH - LOW) / np.sqrt(12)
         return np.concatenate([found, np.zeros((*found.shape[:2], 1))], 2)  # and a thickness
+
+    def discriminate(self, rows: np.ndarray) -> np.ndarray:
+        """Fisher's discriminant by one column alone."""
+        return rows[:, -1]
 
     def standardise(self, targets: np.ndarray) -> np.ndarray:
         found = (targets[..., :6] - BOX.mean(1)) / ((HIGH - LOW) / np.sqrt(12))
@@ -66,7 +71,7 @@ def grown(rng: np.random.Generator, count: int) -> np.ndarray:
 
 def checked(rows: np.ndarray) -> Misfit:
     """The comparison of the first row, the only window of a scan, with the others."""
-    return compare_windows(POSTERIOR, rows[:1], rows[1:])
+    return compare_windows(POSTERIOR, "mask", rows[:1], rows[1:])
 
 
 def test_a_row_of_the_same_law_passes_and_another_does_not() -> None:
@@ -84,9 +89,21 @@ def test_a_departure_is_ranked_among_the_models_own() -> None:
     rows, ranked = grown(np.random.default_rng(1), 25), Linear()
     away = checked(rows).departure or 0
     ranked.departures = away + np.array([-0.2, -0.1, 0.1])
-    found = compare_windows(cast(Posterior, ranked), rows[:1], rows[1:])
+    found = compare_windows(cast(Posterior, ranked), "mask", rows[:1], rows[1:])
     assert found.probability == pytest.approx(2 / 4)
     assert found.blocks == checked(rows).blocks
+    assert found.level_cut is None
+
+
+@pytest.mark.parametrize(("value", "p"), [(-1.0, 2 / 100), (0.0, 4 / 100), (90.0, 1.0)])
+def test_a_scan_that_looks_like_a_level_cut_is_not_believed(value: float, p: float) -> None:
+    """As few shapes of the model do: twice the part of those that do so as much, of 99 at 0 to 98."""
+    rows, taught = grown(np.random.default_rng(1), 25), Linear()
+    taught.discriminant, taught.departures = np.ones(1), np.full(9, 10.0)
+    rows[0, -1] = value
+    found = compare_windows(cast(Posterior, taught), "mask", rows[:1], rows[1:])
+    assert found.probability == pytest.approx(p)
+    assert found.level_cut == pytest.approx(min(value + 2, 92) / 100)
 
 
 def test_a_block_that_differs_is_named() -> None:

@@ -130,12 +130,16 @@ def test_descriptors_that_are_not_finite_are_refused(raw: Posterior) -> None:
 
 def test_a_file_holds_it(raw: Posterior, tmp_path: Path) -> None:
     path = tmp_path / "posterior.npz"
-    raw = dataclasses.replace(raw, departures=np.array([0.9, 1.1, 1.4]))
+    weights, usual = np.ones(len(raw.compression.mean), np.float32), {view: np.arange(3.0) for view in raw.views}
+    told = {"departures": np.array([0.9, 1.1, 1.4]), "discriminant": weights, "discriminants": usual}
+    raw = dataclasses.replace(raw, **told)
     save_posterior(raw, path)
     again, row = load_posterior(path), columns(table(1, seed=2).select_views(["mask"]))
     assert np.array_equal(again.sample(*row, 50), raw.sample(*row, 50))
     assert again.provenance == raw.provenance
     assert again.departures.tolist() == [0.9, 1.1, 1.4]
+    assert again.discriminants["mask"].tolist() == [0, 1, 2]
+    assert np.array_equal(again.discriminate(row[0]), raw.discriminate(row[0]))
     content = path.read_bytes()
     path.write_bytes(content[:1000])
     with pytest.raises(ValueError, match="damaged"):
@@ -149,13 +153,22 @@ def test_a_file_holds_it(raw: Posterior, tmp_path: Path) -> None:
         load_posterior(tmp_path / "nowhere.npz")
 
 
-def test_a_file_without_departures_is_read(raw: Posterior, tmp_path: Path) -> None:
+def test_a_file_of_an_older_version_is_read(raw: Posterior, tmp_path: Path) -> None:
     path = tmp_path / "posterior.npz"
     save_posterior(raw, path)
     arrays = dict(np.load(path))
-    del arrays["departures"]
+    del arrays["departures"], arrays["discriminant"]
     np.savez(path, **arrays)
-    assert load_posterior(path).departures.shape == (0,)
+    again = load_posterior(path)
+    assert again.departures.shape == again.discriminant.shape == (0,)
+
+
+def test_a_discriminant_of_other_descriptors_is_refused(raw: Posterior, tmp_path: Path) -> None:
+    path = tmp_path / "posterior.npz"
+    usual = {view: np.arange(3.0) for view in raw.views}
+    save_posterior(dataclasses.replace(raw, discriminant=np.ones(7, np.float32), discriminants=usual), path)
+    with pytest.raises(ValueError, match="discriminant of shape"):
+        load_posterior(path)
 
 
 @pytest.mark.parametrize("name", ["mean", "basis", "box", "0.flow.transform.transforms.0.hyper.0.weight"])

@@ -17,8 +17,8 @@ from curvafit.inference.verdict import UNBELIEVABLE, find_differences, verdict
 from curvafit.priors.coefficients import Coefficients
 
 LAW = Coefficients(1, 2, 6, -40, -40, 400)
-USUAL = Misfit(0.4, {"gaps": 0.3, "chords": 0.2}, "24 windows")
-ODD = Misfit(0.001, {"gaps": 0.004, "chords": 0.3, "depths": 0.0005}, "24 windows")
+USUAL = Misfit(0.4, {"gaps": 0.3, "chords": 0.2}, "24 windows", 1.1)
+ODD = Misfit(0.001, {"gaps": 0.004, "chords": 0.3, "depths": 0.0005}, "24 windows", 3.0)
 
 
 def law(name: str, distance: float | None = None, noise: float | None = None, status: str = "") -> Candidate:
@@ -98,7 +98,10 @@ def test_without_growing_the_first_is_named_and_not_checked() -> None:
     said = "Nothing was grown to check the law (--fast)."
     assert judge((law("optimum"), law("match")), None, fast=True) == ("optimum", said)
     unusual = "Shapes of this law do not look like the scan (p = 0.0010); what differs most: depths, gaps."
-    assert judge((law("optimum"),), ODD, fast=True) == ("optimum", f"{unusual} {said}")
+    odd, usual = (dataclasses.replace(each, departure=None) for each in (ODD, USUAL))
+    assert judge((law("optimum"),), odd, fast=True) == ("optimum", f"{unusual} {said}")
+    passed = "A quick reading does not rule this law out (p = 0.40)."
+    assert judge((law("optimum"),), usual, fast=True) == ("optimum", f"{passed} {said}")
 
 
 def test_where_nothing_grew_there_is_no_law() -> None:
@@ -136,6 +139,10 @@ def test_a_far_or_strange_one_is_named_but_not_believed() -> None:
     )
     single = dataclasses.replace(ODD, blocks={"gaps": 0.3})
     assert judge((law("simulation", 0.1),), single)[1].endswith("(p = 0.0010); no descriptor tells it alone.")
+    random = dataclasses.replace(single, level_cut=0.01)
+    assert judge((law("simulation", 0.1),), random)[1].endswith(
+        "It looks more like a level cut of a random field, which no law made."
+    )
     aligned = dataclasses.replace(ODD, blocks={"fabric": 0.001})
     direction = "The scan has a direction (fabric), and the model has none."
     assert judge((law("simulation", 0.1),), aligned)[1].endswith(direction)
