@@ -54,7 +54,7 @@ def _card(folder: Path, spec: SetSpec, command: str) -> Iterator[str]:
     }
     for number, name in enumerate(recipe.classes):
         shares = [record["class_fractions"][number] for record in records]
-        rows[f"part of the voxels that is {name}"] = _range(shares, percent=True)
+        rows[f"part of the voxels that is {name}"] = _percent_range(shares)
     yield from _table(("what", ""), rows.items())
     yield "\n## Shapes\n"
     yield from _describe_source(recipe.source)
@@ -129,13 +129,12 @@ def _quote(text: str) -> str:
     return f"{fence} {text} {fence}" if "`" in text else f"`{text}`"
 
 
-def _range(values: Sequence[float], percent: bool = False) -> str:
-    """Return the least and the greatest of some numbers, and their median."""
-    if not values:
+def _percent_range(shares: Sequence[float]) -> str:
+    """Return the least and the greatest of some shares, and their median, in percent."""
+    if not shares:
         return "none"
-    factor, sign = (100, " %") if percent else (1, "")
-    low, middle, high = (format_number(factor * float(each), 2) for each in np.percentile(values, (0, 50, 100)))
-    return f"{low} to {high}{sign}, median {middle}{sign}"
+    low, middle, high = (format_number(100 * float(each), 2) for each in np.percentile(shares, (0, 50, 100)))
+    return f"{low} to {high} %, median {middle} %"
 
 
 def _numbers(value: Any) -> str:

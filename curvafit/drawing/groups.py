@@ -67,10 +67,8 @@ def shown_window(diagrams: Sequence[Any]) -> tuple[tuple[float, float], tuple[fl
     ends = np.zeros((2, 2))
     for diagram in diagrams:
         for bounds, kappa in zip(ends, np.asarray(diagram.points).T, strict=True):
-            order = np.argsort(kappa)
-            area = np.cumsum(np.asarray(diagram.weights)[order])
-            tail = (1 - SHOWN) / 2 * area[-1]
-            low, high = kappa[order][np.searchsorted(area, [tail, area[-1] - tail])]
+            tails = [(1 - SHOWN) / 2, (1 + SHOWN) / 2]
+            low, high = np.quantile(kappa, tails, weights=diagram.weights, method="inverted_cdf")
             bounds[:] = min(bounds[0], low), max(bounds[1], high)
     low, high = ends.T + 0.08 * np.ptp(ends) * np.array([[-1], [1]])
     return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))

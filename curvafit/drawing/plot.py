@@ -218,10 +218,7 @@ def shared_limits(diagrams: Sequence[Diagram], *, length: float = 1.0) -> Limits
     bounds = [0.0, 0.0]
     for diagram in diagrams:
         for kappa in np.asarray(diagram.points).T / length:
-            order = np.argsort(kappa)
-            cumulated = np.cumsum(np.asarray(diagram.weights)[order])
-            cuts = np.searchsorted(cumulated, [0.006 * cumulated[-1], 0.994 * cumulated[-1]])
-            low, high = kappa[order][np.minimum(cuts, len(kappa) - 1)]
+            low, high = np.quantile(kappa, [0.006, 0.994], weights=diagram.weights, method="inverted_cdf")
             bounds = [min(bounds[0], float(low)), max(bounds[1], float(high))]
     width = max(bounds[1] - bounds[0], 1e-9)
     return bounds[0] - 0.08 * width, bounds[1] + 0.08 * width

@@ -278,4 +278,4 @@ def _say_intervals(measures: Measures) -> str:
     count = int(np.prod(measures.blocks))
     if np.isfinite(measures["BV/TV"].half):
         return f"± is half a 95 % interval, from {count} parts of the scan, each a thickness and a spacing wide."
-    return "The scan is too small for intervals: it has not eight parts, each a thickness and a spacing wide."
+    return "The scan is too small for intervals: these need eight parts, each as wide as a thickness and a spacing."

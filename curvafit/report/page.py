@@ -295,10 +295,8 @@ def family_radius(diagram: Diagram, family: str) -> float | None:
     own = own & (kappa > 0)
     if not own.any():
         return None
-    order = np.argsort(kappa[own])
-    cumulated = np.cumsum(np.asarray(diagram.weights)[own][order])
-    middle = min(int(np.searchsorted(cumulated, cumulated[-1] / 2)), len(order) - 1)
-    return float(1 / kappa[own][order][middle])
+    weights = np.asarray(diagram.weights)[own]
+    return float(1 / np.quantile(kappa[own], 0.5, weights=weights, method="inverted_cdf"))
 
 
 def describe_scan(inference: Inference) -> str:

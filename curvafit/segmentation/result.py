@@ -406,9 +406,8 @@ def note_ends(places: Sequence[int], length: int, image: bool = False) -> tuple[
     """Return sentences on the slices before the first known one and beyond the last."""
     before, beyond = places[0], length - 1 - places[-1]
     how = "told by the image alone" if image else "as that one is"
-    first = f"Before the first known slice: {before} of the volume, {how}."
-    last = f"Beyond the last known slice: {beyond} of the volume, {how}."
-    return *((first,) if before else ()), *((last,) if beyond else ())
+    ends = (("Before the first", before), ("Beyond the last", beyond))
+    return tuple(f"{where} known slice: {n} slice{'s' * (n > 1)}, {how}." for where, n in ends if n)
 
 
 def describe_errors(dice: float, error: float, suggestions: Sequence[int], tested: str) -> str:

@@ -53,22 +53,18 @@ def probability(evidence: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return expit(_with_constant(evidence) @ weights)
 
 
-def best_threshold(probability: np.ndarray) -> float:
-    """Return the probability, at most one half, above which voxels are inside in the mask with the best expected Dice.
-
-    A mask of N voxels whose probabilities add up to s has the expected Dice 2 s / (N + S), where S is the sum over all
-    voxels; its maximum leaves out what is less likely than half of it. At one half, structures that are hard to
-    predict would get lost.
-    """
-    return _choose_threshold(count_probabilities(probability))
-
-
 def count_probabilities(probability: np.ndarray) -> np.ndarray:
     """Return how many probabilities lie in each of `THRESHOLDS` equal bins from 0 to 1; the counts of parts add up."""
     return np.histogram(probability, THRESHOLDS, (0.0, 1.0))[0]
 
 
-def _choose_threshold(counts: np.ndarray) -> float:
+def best_threshold(counts: np.ndarray) -> float:
+    """Return the probability, at most one half, above which voxels are inside in the mask with the best expected Dice.
+
+    `counts` are those of `count_probabilities`. A mask of N voxels whose probabilities add up to s has the expected
+    Dice 2 s / (N + S), where S is the sum over all voxels; its maximum leaves out what is less likely than half of it.
+    At one half, structures that are hard to predict would get lost.
+    """
     edges = np.linspace(0.0, 1.0, THRESHOLDS + 1)
     sizes, sums = (np.cumsum(each[::-1]) for each in (counts, counts * (edges[1:] + edges[:-1]) / 2))
     best = int(np.argmax(sums / np.maximum(sizes + sums[-1], 1e-9)))
@@ -91,7 +87,7 @@ def best_log_odds(logits: np.ndarray) -> float:
 
 def lowest_inside(counts: np.ndarray) -> float:
     """Return the `best_threshold` of probabilities by their counts, but not less than `LEAST`."""
-    return max(_choose_threshold(counts), LEAST)
+    return max(best_threshold(counts), LEAST)
 
 
 def fit_temperature(logits: np.ndarray, inside: np.ndarray) -> float:

@@ -12,6 +12,7 @@ from curvafit.segmentation.uncertainty import (
     BINS,
     best_threshold,
     calibration_error,
+    count_probabilities,
     entropy,
     expected_dice,
     fit_temperature,
@@ -113,15 +114,16 @@ def test_the_best_threshold_has_the_best_expected_dice() -> None:
     def expected(least: float) -> float:
         return 2 * p[p > least].sum() / ((p > least).sum() + p.sum())
 
-    found = best_threshold(p)
+    found = best_threshold(count_probabilities(p))
     assert expected(found) > max(expected(least) for least in np.linspace(0, 0.5, 101)) - 1e-4
     assert found == pytest.approx(expected(found) / 2, abs=0.01)
 
 
 def test_what_is_certain_is_cut_in_the_middle_of_nothing() -> None:
     certain = np.array([0.0, 0.0, 1.0, 1.0])
-    assert 0 <= best_threshold(certain) <= 0.5 and np.array_equal(certain > best_threshold(certain), certain == 1)
-    assert best_threshold(np.zeros(4)) <= 0.5
+    found = best_threshold(count_probabilities(certain))
+    assert 0 <= found <= 0.5 and np.array_equal(certain > found, certain == 1)
+    assert best_threshold(count_probabilities(np.zeros(4))) <= 0.5
 
 
 # ---- reconstruct -----------------------------------------------------------------------------------------------------
@@ -214,7 +216,7 @@ def test_the_temperature_is_that_by_which_labels_were_drawn() -> None:
 def test_the_expected_dice_is_that_of_truths_that_are_drawn() -> None:
     random = np.random.default_rng(0)
     likely = random.beta(0.5, 1.5, 40_000)
-    mask = likely > best_threshold(likely)
+    mask = likely > best_threshold(count_probabilities(likely))
     drawn = [random.random(likely.shape) < likely for _ in range(20)]
     found = [2 * (truth & mask).sum() / (truth.sum() + mask.sum()) for truth in drawn]
     assert expected_dice(likely, mask) == pytest.approx(np.mean(found), abs=2e-3)
