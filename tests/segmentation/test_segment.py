@@ -15,7 +15,7 @@ from skimage.filters import threshold_otsu
 
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import preset
-from curvafit.segmentation.engine import WorkingGrid, law_of
+from curvafit.segmentation.engine import UNSURE, WorkingGrid, law_of
 from curvafit.segmentation.evidence import VoxelEvidence, estimate_classes, grey_evidence, grey_levels
 from curvafit.segmentation.segment import segment
 from curvafit.volumes.field import Field
@@ -108,6 +108,13 @@ def test_a_prior_comes_in_the_scan_s_unit(tmp_path: Path) -> None:
         law_of(tmp_path / "none.json", mm)
     working = law_of("tubes", um)[0].in_unit(19.5 / 0.01)
     assert working.as_dict() == pytest.approx(preset("tubes").coefficients.as_dict())
+
+
+@pytest.mark.parametrize(("status", "count"), [("Supported (refined): …", 0), ("No believable twin (refined): …", 1)])
+def test_a_prior_that_is_not_supported_is_said_to_be_so(status: str, count: int) -> None:
+    mm = Field(np.zeros((4, 4, 4)), (0.0195,) * 3, "mm")
+    fit = dataclasses.replace(made_fit(), status=status)
+    assert law_of(fit, mm)[1] == (UNSURE,) * count
 
 
 def test_axes_are_refined_and_brought_back() -> None:
