@@ -105,9 +105,12 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def level_cuts(posterior: Posterior, windows: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the parts `(n,)` of the model's shapes that look as much like level cuts as windows `(k, 351)` of n do."""
-    usual, own = -posterior.discriminants["mask"], (-posterior.discriminate(each).mean() for each in windows)
-    return np.array([tail_probability(usual, float(each)) for each in own])
+    """Return the parts `(n,)` of the model's shapes that look as much like level cuts as windows `(k, 351)` of n do.
+
+    NaN where there are no windows.
+    """
+    usual, own = -posterior.discriminants["mask"], [-posterior.discriminate(each) for each in windows]
+    return np.array([tail_probability(usual, float(each.mean())) if len(each) else np.nan for each in own])
 
 
 def rank(
@@ -115,8 +118,8 @@ def rank(
 ) -> dict[str, np.ndarray]:
     """Return p by kind, of departures by kind and number of the law, and of `level_cuts` by kind `(laws,)`.
 
-    Departures are ranked among usual ones `(n,)`; where these are None, among those of the other laws' shapes. What has
-    no departure is left out if it is a shape, and if it is a cut stands with the rank of its discriminant.
+    Departures are ranked among usual ones `(n,)`; where these are None, among those of the other laws' shapes. A shape
+    without a departure is left out; a cut without one stands with the rank of its discriminant.
     """
     found = {}
     for kind, mine in departures.items():
