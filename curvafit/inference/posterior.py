@@ -106,8 +106,8 @@ class Posterior:
     combinations
         The sums of parameters that textures tell.
     departures
-        How far shapes of the model, masks that went through all of `infer`, lay from shapes of the law that it found,
-        over how far these lay from each other; empty where that was not measured.
+        Those (`Misfit.departure`) of shapes of the model, as masks that went through all of `infer`, from shapes of the
+        law that it found; empty where that was not measured.
     discriminant, discriminants
         Weights of the descriptors by which shapes of the model are told from level cuts of Gaussian random fields with
         the same two-point function (`discriminate`), and what it is of shapes of the model, by view, increasing; empty
