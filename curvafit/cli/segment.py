@@ -89,7 +89,7 @@ def reconstruct(
         int | None, _what(help="Distance of known slices, 8: every eighth. By default those with labels are known.")
     ] = None,
     first: Annotated[int | None, _what(help="Number of the first known slice, with --every; by default 0.")] = None,
-    known: Annotated[str | None, _what("--known", "--slices", help="Or also: numbers of known slices, 0,7,15.")] = None,
+    known: Annotated[str | None, _what(help="Or also: numbers of known slices, 0,7,15.")] = None,
     ignore: Annotated[
         int | None, _what(help="Or: the label of voxels that nobody annotated; all others are known.")
     ] = None,

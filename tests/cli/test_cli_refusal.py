@@ -128,7 +128,7 @@ def test_a_set_without_any_case_is_removed(tmp_path: Path) -> None:
 
 def test_reconstruct_refuses_what_it_would_ignore(tmp_path: Path) -> None:
     save(Field(np.indices((9, 9, 9)).sum(0) // 12), tmp_path / "scan.npy")
-    words = ["reconstruct", tmp_path / "scan.npy", "--prior", "tubes", "-o", tmp_path / "out.npy", "--slices", "0,8"]
+    words = ["reconstruct", tmp_path / "scan.npy", "--prior", "tubes", "-o", tmp_path / "out.npy", "--known", "0,8"]
     refused(call(*words, "--first", "2"), "--first")
 
 

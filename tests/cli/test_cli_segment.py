@@ -143,7 +143,7 @@ def test_reconstruct_fills_what_it_is_not_told(tmp_path: Path) -> None:
     record = json.loads((tmp_path / "volume.json").read_text())
     assert (record["every"], record["axis"], record["weight"]) == (4, 2, None)
     named = tmp_path / "named.nii.gz"
-    options = ("--slices", "0,4,8,12,16", "--axis", "x")
+    options = ("--known", "0,4,8,12,16", "--axis", "x")
     assert call("reconstruct", path, *options, "-o", named).exit_code == 0
     assert np.array_equal(load(named).values, load(target).values)
     given[..., [k for k in range(17) if k % 4]] = 9

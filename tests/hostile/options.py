@@ -266,7 +266,7 @@ _SENSELESS: dict[str, tuple[str, ...]] = {
         "mask.nii.gz",
         "--every",
         "2",
-        "--slices",
+        "--known",
         "1,2",
         "--prior",
         "tubes",
