@@ -225,7 +225,7 @@ def test_a_picture_shows_the_slices(oblique: Path, tmp_path: Path) -> None:
         ("segment none.tif --prior tubes", "no such file"),
         ("reconstruct SCAN --prior tubes", "every"),
         ("reconstruct SCAN --prior tubes --every 4 --axis w", "--axis"),
-        ("reconstruct SCAN --prior tubes --slices 1,a", "--known"),
+        ("reconstruct SCAN --prior tubes --known 1,a", "--known"),
         ("reconstruct SCAN --every 4 --ignore 2", "--ignore"),
         ("reconstruct SCAN --known 0,4 --first 2", "--first"),
         ("reconstruct ball.nii --every 4 --filler fit.json", "fit.json"),
@@ -234,7 +234,7 @@ def test_a_picture_shows_the_slices(oblique: Path, tmp_path: Path) -> None:
         ("reconstruct ball.nii --prior tubes --known 6,14", "three"),
         ("reconstruct ball.nii --every 4 --example small.npy", "spacing"),
         ("reconstruct ball.nii --prior tubes --every 4 --stiffness 0", "stiffness"),
-        ("reconstruct SCAN --prior tubes --slices 3,77", "19"),
+        ("reconstruct SCAN --prior tubes --known 3,77", "19"),
     ],
 )
 def test_wrong_input_is_a_sentence(arguments, word, oblique, tmp_path, monkeypatch) -> None:
