@@ -165,8 +165,8 @@ class Misfit:
     """The share of the model's shapes whose descriptors are as unusual as the scan's.
 
     `probability` is of all descriptors together, `blocks` of each block alone; `method` says what was compared with.
-    `departure` is how far the scan's windows lie from those of shapes of the law, in the mean, over how far windows of
-    either lie from each other; None where nothing grew. `level_cut` is the part of the model's shapes that look as much
+    `departure` is how far the scan lies from shapes of the law over how far these lie from each other, in the mean;
+    None where nothing grew. `level_cut` is the part of the model's shapes that look as much
     like a level cut of a random field as the scan does; None where the posterior does not tell.
     """
 

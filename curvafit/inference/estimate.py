@@ -231,10 +231,7 @@ def compare_windows(posterior: Posterior, view: str, scan: np.ndarray, twins: np
     two ranks (Bonferroni). Where departures are not known, and for each block, it is that of a law named beforehand.
     """
     seen, grown = (posterior.emulator.compression(rows) @ posterior.emulator.basis.T for rows in (scan, twins))
-    # Windows of a large scan differ more from each other than boxes of one mass do: both kinds are what is usual.
-    # 1 - 1 / departure is the coefficient of inhomogeneity of their energy distance (Székely and Rizzo 2013).
-    within = [pdist(rows).mean() for rows in (seen, grown) if len(rows) > 1]
-    departure, usual, level_cut = float(cdist(seen, grown).mean() / np.mean(within)), posterior.departures, None
+    departure, usual, level_cut = float(cdist(seen, grown).mean() / pdist(grown).mean()), posterior.departures, None
     p = tail_probability(usual, departure) if len(usual) else probability_alike(seen, grown)
     if len(posterior.discriminant):
         own = float(posterior.discriminate(scan).mean())
