@@ -115,7 +115,7 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     figures = {f"scans.{name}.{key}": Figure(row[key]) for name, row in found.items()
                for key in columns[:-2] if key in row}  # fmt: skip
     if len(found) == len(SCANS):
-        supported = sum(row["verdict"] == "Supported" for row in found.values())
+        supported = sum(row["verdict"].startswith("Supported") for row in found.values())
         figures["scans.supported"] = Figure(float(supported))
     return figures
 
