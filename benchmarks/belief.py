@@ -26,13 +26,13 @@ from benchmarks.closure import TABLE
 from benchmarks.harness import Cases, Figure, Values, show
 from benchmarks.nulls import level_cut
 from curvafit.data_synth.store import Store, find_well_formed
-from curvafit.inference.estimate import tail_probability
+from curvafit.inference.candidates import join_tests
+from curvafit.inference.estimate import measure_descriptors, rank_level_cut, tail_probability
 from curvafit.inference.infer import infer
 from curvafit.inference.posterior import Posterior, load_posterior, save_posterior
 from curvafit.inference.table import column_names, load_table
 from curvafit.priors.grid import Grid
-from curvafit.scan.measure import read_texture
-from curvafit.scan.prepare import HALF, prepare
+from curvafit.scan.prepare import prepare
 from curvafit.volumes.field import Field
 
 KINDS = ("shape", "cut")
@@ -61,11 +61,10 @@ def case(store: Store, index: int, cut: bool) -> Values:
 def describe(store: Store, index: int, cut: bool) -> np.ndarray:
     """Return the descriptors `(k, 351)` of windows of a shape, or of its level cut, as `infer` measures them."""
     try:
-        prepared = prepare(masked(store, index, cut), kind="mask", one_scale=True)
-        reading = read_texture(prepared.inverted if prepared.volume_fraction > HALF else prepared)
+        found = measure_descriptors(prepare(masked(store, index, cut), kind="mask", one_scale=True))
     except ValueError:  # such as of one ball, which is a few voxels wide at the thickness of the training
-        reading = None
-    return np.zeros((0, len(column_names()))) if reading is None else reading.windows
+        found = None
+    return np.zeros((0, len(column_names()))) if found is None else found[1].windows
 
 
 def describe_all(shapes: Sequence[tuple[Store, int]], cases: Cases) -> dict[str, list[np.ndarray]]:
@@ -85,8 +84,7 @@ def teach(posterior: Posterior, rows: Mapping[str, Sequence[np.ndarray]]) -> Pos
     """Return a posterior with Fisher's discriminant of windows `(k, 351)` of shapes and of their level cuts."""
     plain = replace(posterior.compression, basis=np.eye(len(posterior.compression.mean)))
     shapes, cuts = (np.array([plain(each).mean(0) for each in rows[kind] if len(each)]) for kind in KINDS)
-    away = np.concatenate([shapes, cuts]) - np.concatenate([shapes, cuts]).mean(0)
-    variance = away.T @ away / len(away)
+    variance = np.cov(np.concatenate([shapes, cuts]).T, bias=True)
     ridge = RIDGE * np.diag(variance).mean() * np.eye(len(variance))
     weights = np.linalg.solve(variance + ridge, shapes.mean(0) - cuts.mean(0))
     taught = replace(posterior, discriminant=weights.astype(np.float32))
@@ -105,12 +103,8 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def level_cuts(posterior: Posterior, windows: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the parts `(n,)` of the model's shapes that look as much like level cuts as windows `(k, 351)` of n do.
-
-    NaN where there are no windows.
-    """
-    usual, own = -posterior.discriminants["mask"], [-posterior.discriminate(each) for each in windows]
-    return np.array([tail_probability(usual, float(each.mean())) if len(each) else np.nan for each in own])
+    """Return `rank_level_cut` `(n,)` of windows `(k, 351)` of n masks, NaN where there are none."""
+    return np.array([rank_level_cut(posterior, "mask", each) if len(each) else np.nan for each in windows])
 
 
 def rank(
@@ -123,12 +117,12 @@ def rank(
     """
     found = {}
     for kind, mine in departures.items():
-        own = np.full(len(cuts[kind]), 1.0 if kind == "cut" else np.nan)
+        own = {} if kind == "shape" else dict.fromkeys(range(len(cuts[kind])), 1.0)
         for law, departure in mine.items():
             others = np.array([each for other, each in departures["shape"].items() if other != law])
             own[law] = tail_probability(others if usual is None else usual, departure)
-        p = np.minimum(1, 2 * np.minimum(own, cuts[kind]))
-        found[kind] = p[np.isfinite(p)]
+        ranks = [(p, cuts[kind][law]) for law, p in own.items()]
+        found[kind] = np.array([join_tests(*each) for each in ranks if np.isfinite(each[1])])
     return found
 
 

@@ -166,8 +166,8 @@ class Misfit:
 
     `probability` is of all descriptors together, `blocks` of each block alone; `method` says what was compared with.
     `departure` is how far the scan lies from shapes of the law over how far these lie from each other, in the mean;
-    None where nothing grew. `level_cut` is the part of the model's shapes that look as much
-    like a level cut of a random field as the scan does; None where the posterior does not tell.
+    None where nothing grew. `level_cut` is the part of the model's shapes that look as much like a level cut of a
+    random field as the scan does; None where the posterior does not tell.
     """
 
     probability: Annotated[float, Rule(least=0, most=1)]
@@ -175,3 +175,8 @@ class Misfit:
     method: str
     departure: Annotated[float | None, Rule(least=0)] = None
     level_cut: Annotated[float | None, Rule(least=0, most=1)] = None
+
+
+def join_tests(*probabilities: float) -> float:
+    """Return the probability of several tests together: the least times their number, at most 1 (Bonferroni)."""
+    return min(1.0, len(probabilities) * min(probabilities))

@@ -14,7 +14,7 @@ from curvafit.generation.flow import generate
 from curvafit.generation.schedule import LEARNED, Schedule
 from curvafit.geometry.descriptors import BLOCKS
 from curvafit.inference.atlas import Match
-from curvafit.inference.candidates import Candidate, Misfit, twin
+from curvafit.inference.candidates import Candidate, Misfit, join_tests, twin
 from curvafit.inference.emulator import best_parameters, misfits
 from curvafit.inference.fit import COLUMNS, Fit, to_columns
 from curvafit.inference.posterior import Posterior
@@ -70,7 +70,7 @@ def estimate_law(
         simulations `(n, k)`; None without simulations.
     """
     progress("measuring descriptors", 0.0)
-    if (found := _measure_descriptors(prepared)) is None:
+    if (found := measure_descriptors(prepared)) is None:
         return fit, None
     # Of a structure that fills over half, the background is described: `turn` gives the law of the structure.
     seen, reading, turn = found
@@ -112,7 +112,7 @@ def refine_matches(prepared: Prepared, posterior: Posterior, matches: Sequence[M
     Levenberg and Marquardt's method, by optimistix, starts from each match, with the exact derivatives of the emulator.
     Returns one law; none where the descriptors of the scan cannot be measured.
     """
-    if (found := _measure_descriptors(prepared)) is None:
+    if (found := measure_descriptors(prepared)) is None:
         return ()
     _, reading, turn = found
     starts = turn(np.stack([parameters_of(each.coefficients, each.mass) for each in matches]))
@@ -130,7 +130,7 @@ def middle_of(parameters: np.ndarray) -> np.ndarray:
 Turn = Callable[[np.ndarray], np.ndarray]
 
 
-def _measure_descriptors(prepared: Prepared) -> tuple[Prepared, Reading, Turn] | None:
+def measure_descriptors(prepared: Prepared) -> tuple[Prepared, Reading, Turn] | None:
     """Return the phase that is described, what is read of it, and the way to the structure's law.
 
     Of a structure that fills most of the volume the background is described, as the shapes of the training were thin.
@@ -194,7 +194,7 @@ def check_law(
 
     Returns None where the scan's descriptors cannot be measured, or fewer than `FEWEST` of `TESTED` shapes grow.
     """
-    if (found := _measure_descriptors(prepared)) is None:
+    if (found := measure_descriptors(prepared)) is None:
         return None
     seen, reading, _ = found
     turned, rows = seen is not prepared, []
@@ -204,9 +204,9 @@ def check_law(
             own = read_texture(grown.seen.inverted if turned else grown.seen)
             rows += [] if own is None else [own.windows]
         progress(f"testing the law: {k + 1} of {TESTED} shapes", (k + 1) / TESTED)
-    return (
-        None if len(rows) < FEWEST else compare_windows(posterior, reading.view, reading.windows, np.concatenate(rows))
-    )
+    if len(rows) < FEWEST:
+        return None
+    return compare_windows(posterior, reading.view, reading.windows, np.concatenate(rows))
 
 
 def probability_alike(scan: np.ndarray, twins: np.ndarray, seed: int = 0) -> float:
@@ -221,6 +221,11 @@ def probability_alike(scan: np.ndarray, twins: np.ndarray, seed: int = 0) -> flo
     return float(share_beyond(measure_energy(cdist(rows, rows), choices)))
 
 
+def rank_level_cut(posterior: Posterior, view: str, windows: np.ndarray) -> float:
+    """Return the part of the model's shapes that look as much like a level cut as windows `(k, 351)` of a scan do."""
+    return tail_probability(-posterior.discriminants[view], -float(posterior.discriminate(windows).mean()))
+
+
 def compare_windows(posterior: Posterior, view: str, scan: np.ndarray, twins: np.ndarray) -> Misfit:
     """Return how probable it is that windows of a scan `(k, 351)` differ so from those of twins `(n, 351)`.
 
@@ -228,15 +233,14 @@ def compare_windows(posterior: Posterior, view: str, scan: np.ndarray, twins: np
     The law of the twins was found for the scan, and is not quite its own even if there is one. So the scan's departure
     is ranked among those of shapes of the model whose laws were found in the same way (`Posterior.departures`), and
     its discriminant among those of shapes of the model in the same view. The probability is twice the less of the
-    two ranks (Bonferroni). Where departures are not known, and for each block, it is that of a law named beforehand.
+    two ranks (`join_tests`). Where departures are not known, and for each block, it is that of a law named beforehand.
     """
     seen, grown = (posterior.emulator.compression(rows) @ posterior.emulator.basis.T for rows in (scan, twins))
     departure, usual, level_cut = float(cdist(seen, grown).mean() / pdist(grown).mean()), posterior.departures, None
     p = tail_probability(usual, departure) if len(usual) else probability_alike(seen, grown)
     if len(posterior.discriminant):
-        own = float(posterior.discriminate(scan).mean())
-        level_cut = tail_probability(-posterior.discriminants[view], -own)
-        p = min(1.0, 2 * min(p, level_cut))
+        level_cut = rank_level_cut(posterior, view, scan)
+        p = join_tests(p, level_cut)
     blocks = {}
     for name in BLOCKS:
         own, others = columns_of(scan, [name]), columns_of(twins, [name])

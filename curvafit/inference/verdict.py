@@ -10,7 +10,7 @@ import numpy as np
 
 from curvafit.core.units import format_number
 from curvafit.geometry.morphometry import Morphometry
-from curvafit.inference.candidates import TITLES, Misfit, best_candidate, seed_noise_of
+from curvafit.inference.candidates import TITLES, Misfit, best_candidate, join_tests, seed_noise_of
 from curvafit.inference.fit import Fit
 
 #: The probability below which a law is not believed to have made a scan.
@@ -82,6 +82,6 @@ def _describe_misfit(misfit: Misfit | None) -> str:
     strangest = [name for name, own in sorted(misfit.blocks.items(), key=itemgetter(1)) if own < UNBELIEVABLE]
     what = f"what differs most: {', '.join(strangest)}" if strangest else "no descriptor tells it alone"
     direction = "The scan has a direction (fabric), and the model has none." if "fabric" in strangest else ""
-    random = misfit.level_cut is not None and 2 * misfit.level_cut < UNBELIEVABLE
+    random = misfit.level_cut is not None and join_tests(1.0, misfit.level_cut) < UNBELIEVABLE
     cut = "It looks more like a level cut of a random field, which no law made." if random else ""
     return _join(f"Shapes of this law do not look like the scan (p = {p}); {what}.", direction, cut)

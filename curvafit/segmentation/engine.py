@@ -40,7 +40,7 @@ Ends = tuple[tuple[bool, bool], tuple[bool, bool], tuple[bool, bool]]
 #: A law that is tried beside the prior's.
 WILLMORE = Coefficients.willmore()
 #: Said of a fit that is not supported.
-UNSURE = "The prior's fit is not `Supported`: nothing says that its law is its scan's. Compare the mask with the scan."
+UNSURE = "The prior's fit is not `Supported`: its law may not be that of its scan. Compare the mask with the scan."
 #: Candidates of a fit that are laws of their own: the nearest match's destroys.
 TRUSTED = ("refined", "posterior", "simulation", "optimum")
 
