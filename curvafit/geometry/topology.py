@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import chain, combinations, product
 
 import numpy as np
 from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from skimage import measure
+
+#: Whether a part of a window begins, and ends, with it, along z, y and x.
+Ends = tuple[tuple[bool, bool], ...]
 
 
 def components(mask: np.ndarray, *, periodic: bool = False, connectivity: int = 26) -> tuple[np.ndarray, int]:
@@ -59,23 +62,32 @@ def euler_shares(mask: np.ndarray, *, periodic: bool = False) -> np.ndarray:
     return total
 
 
-def euler_of_window(mask: np.ndarray) -> float:
+def euler_of_window(mask: np.ndarray, ends: Ends = ((True, True),) * 3) -> float:
     """Return what a window of a larger structure adds to χ, on average over windows.
 
     From χ of the part inside, half of χ of each outer layer is subtracted, a quarter of that of each outer row added,
     and an eighth of each corner subtracted (Odgaard & Gundersen 1993; BoneJ's Δχ). On average a window of n voxels a
     side then has the share of (n - 1)³ voxels, and a structure that touches no face has its own χ.
+
+    A part of a window says along which axes it begins and ends with the window; where it does not begin with it, its
+    first layer is the one before. Sums over parts are the window's.
     """
-    total = 0.0
-    for where in product((slice(None), 0, -1), repeat=3):
-        part = mask[where]
-        if part.ndim == 0:
-            euler = float(part)
-        elif part.ndim == 1:
-            euler = float(np.count_nonzero(np.diff(part.astype(np.int8), prepend=0) == 1))
-        else:
-            euler = float(measure.euler_number(np.ascontiguousarray(part), connectivity=part.ndim))
-        total += (-0.5) ** (3 - part.ndim) * euler
+    padded, total = np.pad(mask, [(int(first), int(last)) for first, last in ends]), 0.0
+    for layers in product((None, 0, 1), repeat=3):
+        if all(layer is None or end[layer] for layer, end in zip(layers, ends, strict=True)):
+            part = padded[tuple({None: slice(None), 0: 1, 1: -2}[layer] for layer in layers)]
+            total += (-0.5) ** (3 - part.ndim) * _count_cells(part)
+    return total
+
+
+def _count_cells(mask: np.ndarray) -> int:
+    """Return χ of the closed voxels of a mask of any dimension, less what belongs to its first layers alone."""
+    total = 0
+    for axes in chain.from_iterable(combinations(range(mask.ndim), k) for k in range(mask.ndim + 1)):
+        cells = mask
+        for axis in axes:
+            cells = cells | np.roll(cells, 1, axis)
+        total += (-1) ** (mask.ndim - len(axes)) * int(np.count_nonzero(cells[(slice(1, None),) * mask.ndim]))
     return total
 
 

@@ -27,7 +27,7 @@ from curvafit.inference.table import (
     parameters_of,
 )
 from curvafit.priors.grid import Grid
-from curvafit.scan.measure import Reading, read_texture
+from curvafit.scan.measure import Reading, read_texture, windows_along
 from curvafit.scan.prepare import HALF, Prepared
 
 #: Draws from the posterior, and those among which more are chosen to be grown.
@@ -36,9 +36,9 @@ DRAWS, POOL = 400, 2000
 EDGE = 64
 #: Draws from which the best parameters are looked for.
 STARTS = 8
-#: Least simulations to go on from, and least shapes to test a law with.
+#: Least simulations to go on from, and least windows of shapes to test a law with.
 FEWEST = 6
-#: Shapes that a law is tested with, and the least deviation of a column, of the mean of its block's.
+#: Windows of shapes that a law is tested with, and the least deviation of a column, of the mean of its block's.
 TESTED, FAINTEST = 24, 0.05
 #: Most relabellings of windows that are tried; where there are fewer, all of them are.
 RELABELLED = 1999
@@ -192,21 +192,27 @@ def check_law(
 ) -> Misfit | None:
     """Compare a scan's windows with those of shapes of a law, seen as the scan is (`compare_windows`).
 
-    Returns None where the scan's descriptors cannot be measured, or fewer than `FEWEST` of `TESTED` shapes grow.
+    A shape shows as many windows as the scan's main window does: parts of a large shape differ more than small shapes,
+    each of which has the mass of the law. Shapes are grown until they show `TESTED` windows, but no more than so many.
+
+    Returns None where the scan's descriptors cannot be measured, or the shapes show fewer than `FEWEST` windows.
     """
     if (found := measure_descriptors(prepared)) is None:
         return None
     seen, reading, _ = found
-    turned, rows = seen is not prepared, []
+    across = windows_along(prepared, [edge.stop - edge.start for edge in prepared.windows[0]])
+    rows = np.zeros((0, len(column_names())))
     for k in range(TESTED):
-        grown = twin(law, prepared, seed + k, schedule, longest=EDGE)
+        if len(rows) >= TESTED:
+            break
+        progress(f"testing the law: {len(rows)} of {TESTED} windows", max(k, len(rows)) / TESTED)
+        grown = twin(law, prepared, seed + k, schedule, longest=EDGE * max(across))
         if grown.seen is not None:
-            own = read_texture(grown.seen.inverted if turned else grown.seen)
-            rows += [] if own is None else [own.windows]
-        progress(f"testing the law: {k + 1} of {TESTED} shapes", (k + 1) / TESTED)
+            own = read_texture(grown.seen if seen is prepared else grown.seen.inverted, across)
+            rows = rows if own is None else np.concatenate([rows, own.windows])
     if len(rows) < FEWEST:
         return None
-    return compare_windows(posterior, reading.view, reading.windows, np.concatenate(rows))
+    return compare_windows(posterior, reading.view, reading.windows, rows)
 
 
 def probability_alike(scan: np.ndarray, twins: np.ndarray, seed: int = 0) -> float:

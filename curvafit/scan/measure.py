@@ -483,11 +483,15 @@ class Reading(NamedTuple):
         return self.descriptors[None], np.array([self.view]), np.array([self.amount])
 
 
-def read_texture(prepared: Prepared) -> Reading | None:
+def read_texture(prepared: Prepared, across: Sequence[int] | None = None) -> Reading | None:
     """Measure a scan's descriptors in windows of one size that fill its grid, or in the largest cube within its region
-    of interest. None where that cube is smaller than `SMALLEST_CUBE` voxels, or no window shows a surface."""
+    of interest. None where that cube is smaller than `SMALLEST_CUBE` voxels, or no window shows a surface.
+
+    There are so many windows `across` the grid along each axis, by default as `windows_along` says.
+    """
     rows, view = [], _kind_of_view(prepared)
-    windows = _windows(prepared) if prepared.roi is None else [_largest_cube(prepared.roi)]
+    across = windows_along(prepared, prepared.grid.shape) if across is None else across
+    windows = _windows(prepared, across) if prepared.roi is None else [_largest_cube(prepared.roi)]
     for where in windows:
         if where is not None:
             seen = prepared.phase if view == "field" else prepared.mask
@@ -497,12 +501,17 @@ def read_texture(prepared: Prepared) -> Reading | None:
     return Reading(np.array(rows), view, len(rows) * size / prepared.thickness**3) if rows else None
 
 
-def _windows(prepared: Prepared) -> list[Box]:
-    """Cut the working grid into windows of one size, of `READ` voxels a side or more; one that repeats stays whole."""
-    shape = prepared.grid.shape
-    counts = [1 if prepared.grid.periodic else max(n // READ, 1) for n in shape]
-    edges = [n // count for n, count in zip(shape, counts, strict=True)]
-    starts = itertools.product(*(range(0, count * edge, edge) for count, edge in zip(counts, edges, strict=True)))
+def windows_along(prepared: Prepared, shape: Sequence[int]) -> list[int]:
+    """Return in how many windows, of `READ` voxels or more, each axis of a part of a scan's working grid is read; what
+    repeats, or has a region of interest, is read in one."""
+    whole = prepared.grid.periodic or prepared.roi is not None
+    return [1 if whole else max(n // READ, 1) for n in shape]
+
+
+def _windows(prepared: Prepared, across: Sequence[int]) -> list[Box]:
+    """Cut the working grid into windows of one size, so many across."""
+    edges = [n // count for n, count in zip(prepared.grid.shape, across, strict=True)]
+    starts = itertools.product(*(range(0, count * edge, edge) for count, edge in zip(across, edges, strict=True)))
     return [tuple(slice(a, a + edge) for a, edge in zip(start, edges, strict=True)) for start in starts]  # type: ignore[misc]
 
 

@@ -24,6 +24,7 @@ from skimage.filters import threshold_otsu
 from curvafit.core.checks import SEEDS, check_choice, check_float, check_int
 from curvafit.scan.grids import boxes_by_surface, centre_distance, resample, surface_voxels
 from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.formats.part import Box
 from curvafit.volumes.read import load
 
 Kind = Literal["field", "mask", "image"]
@@ -140,16 +141,37 @@ def read_labels(labels: Field, what: str) -> np.ndarray:
 
 def is_noise(mask: np.ndarray) -> bool:
     """Return whether voxels a few apart have nothing to do with each other, along each axis."""
-    share = float(mask.mean())
-    variance = share * (1 - share)
-    for axis in range(3):
-        for lag in LAGS:
-            if mask.shape[axis] <= 2 * lag:
+    z, y, x = (slice(0, n) for n in mask.shape)
+    return pairs_of_noise(mask.shape, float(mask.mean()), count_pairs(mask, (z, y, x), (z, y, x), mask.shape))
+
+
+def count_pairs(mask: np.ndarray, inner: Box, core: Box, shape: Sequence[int]) -> np.ndarray:
+    """Return, for each axis and each of `LAGS`, how many pairs a lag apart are inside, how many first and last ones.
+
+    Of a volume of a shape those are counted that begin in a core, which lies at `inner` in the mask.
+    """
+    counts = np.zeros((3, len(LAGS), 3), dtype=np.int64)
+    for axis, (edge, n) in enumerate(zip(inner, shape, strict=True)):
+        start = core[axis].start
+        for k, lag in enumerate(LAGS):
+            stop = edge.start + max(0, min(core[axis].stop, n - lag) - start)
+            here = [*inner]
+            here[axis] = slice(edge.start, stop)
+            there = [*inner]
+            there[axis] = slice(edge.start + lag, stop + lag)
+            first, last = mask[tuple(here)], mask[tuple(there)]
+            counts[axis, k] = [np.count_nonzero(first & last), np.count_nonzero(first), np.count_nonzero(last)]
+    return counts
+
+
+def pairs_of_noise(shape: Sequence[int], share: float, pairs: np.ndarray) -> bool:
+    """Return whether `count_pairs` of a volume of a shape, of which a share is inside, are those of noise."""
+    for axis, n in enumerate(shape):
+        for k, lag in enumerate(LAGS):
+            if n <= 2 * lag:
                 continue
-            lines = np.moveaxis(mask, axis, 0)
-            both = float(np.count_nonzero(lines[lag:] & lines[:-lag])) / lines[lag:].size
-            ends = float(lines[lag:].mean()) * float(lines[:-lag].mean())
-            if abs(both - ends) > UNCORRELATED * variance:
+            both, first, last = pairs[axis, k] / (math.prod(shape) / n * (n - lag))
+            if abs(both - first * last) > UNCORRELATED * share * (1 - share):
                 return False
     return True
 

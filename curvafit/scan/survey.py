@@ -33,10 +33,11 @@ from curvafit.scan.structure import (
     PLATEAU,
     PLATEAUS,
     SMOOTHED,
-    UNCORRELATED,
     Kind,
+    count_pairs,
     describe_split,
     may_be_field,
+    pairs_of_noise,
     smooth_levels,
 )
 from curvafit.volumes.boxes import Boxes, boxes_of
@@ -175,7 +176,7 @@ def survey(volume: Volume, find: Finder) -> Plan:
             start = "a structure" if one == "structure" else "background"
             raise ScanError(f"expected {start} in the scan, got none: every voxel is {other}")
     labelled = () if volume.label is None else (f"The structure is label {volume.label}.",)
-    noise = split.kind != "field" and _is_noise(place.shape, filled / size, total["pairs"])
+    noise = split.kind != "field" and pairs_of_noise(place.shape, filled / size, total["pairs"])
     plan = Plan(
         volume,
         place,
@@ -354,7 +355,7 @@ def _count_structure(volume: Volume, split: Split, place: Place, pieces: Sequenc
         shared = [_overlap(core, each) for each in candidate_boxes(place.shape, MEASURED)]
         counts = [0 if each is None else np.count_nonzero(surface[within(each, core)]) for each in shared]
         found[name] = np.array(counts, dtype=np.int64)
-    found["pairs"] = _pairs(mask, inner, core, place.shape)
+    found["pairs"] = count_pairs(mask, inner, core, place.shape)
     return {name: np.asarray(value) for name, value in found.items()}
 
 
@@ -362,31 +363,3 @@ def _overlap(one: Box, other: Box) -> Box | None:
     """Return what two boxes share."""
     z, y, x = (slice(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(one, other, strict=True))
     return (z, y, x) if all(edge.start < edge.stop for edge in (z, y, x)) else None
-
-
-def _pairs(mask: np.ndarray, inner: Box, core: Box, shape: Sequence[int]) -> np.ndarray:
-    """Return, for each axis and each of `LAGS`, how many pairs a lag apart are inside, how many first and last ones."""
-    counts = np.zeros((3, len(LAGS), 3), dtype=np.int64)
-    for axis, (edge, n) in enumerate(zip(inner, shape, strict=True)):
-        start = core[axis].start
-        for k, lag in enumerate(LAGS):
-            stop = edge.start + max(0, min(core[axis].stop, n - lag) - start)
-            here = [*inner]
-            here[axis] = slice(edge.start, stop)
-            there = [*inner]
-            there[axis] = slice(edge.start + lag, stop + lag)
-            first, last = mask[tuple(here)], mask[tuple(there)]
-            counts[axis, k] = [np.count_nonzero(first & last), np.count_nonzero(first), np.count_nonzero(last)]
-    return counts
-
-
-def _is_noise(shape: Sequence[int], share: float, pairs: np.ndarray) -> bool:
-    """Return whether voxels a few apart have nothing to do with each other, as `structure.is_noise`."""
-    for axis, n in enumerate(shape):
-        for k, lag in enumerate(LAGS):
-            if n <= 2 * lag:
-                continue
-            both, first, last = pairs[axis, k] / (math.prod(shape) / n * (n - lag))
-            if abs(both - first * last) > UNCORRELATED * share * (1 - share):
-                return False
-    return True

@@ -7,7 +7,6 @@ faces. So a scan in tiles has the numbers of the scan in one piece.
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 from collections.abc import Sequence
@@ -27,7 +26,7 @@ from curvafit.geometry.balls import NEAR, ball_radii, paint_balls, paint_coarse_
 from curvafit.geometry.diagram import BIN_WIDTH, MARGIN, Diagram
 from curvafit.geometry.mesh import NoSurface, surface
 from curvafit.geometry.morphometry import SOFTENED, soften
-from curvafit.geometry.topology import euler_shares
+from curvafit.geometry.topology import euler_of_window, euler_shares
 from curvafit.priors.grid import WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread
 from curvafit.scan.grids import CutOut, centre_distance, remove_specks, resample
@@ -215,7 +214,8 @@ def measure_tile(tiling: Tiling, number: int) -> Found:
     lower = tuple(slice(edge.start - (edge.start > 0), edge.stop) for edge in inner)
     first = tuple(slice(edge.start - part.start, None) for edge, part in zip(inner, lower, strict=True))
     sums.add("χ", euler_shares(mask[lower])[first], 1.0)
-    found = {"euler": np.float64(_share_of_euler(mask, inner, core, tiling.shape)), "pieces": np.array(balls.pieces)}
+    ends = tuple((edge.start == 0, edge.stop == n) for edge, n in zip(core, tiling.shape, strict=True))
+    found = {"euler": np.float64(euler_of_window(mask[lower], ends)), "pieces": np.array(balls.pieces)}
     found |= {"widest": np.array(balls.widest), "wide": np.array(balls.wide)}
     with_surface = _measure_surface(plan, mask, balls.box, core)
     if with_surface is not None:
@@ -341,32 +341,6 @@ def _find_structure(plan: Plan, boxes: Boxes, core: Box, reach: float) -> tuple[
 def _cut_out(core: Box, box: Box, shape: Sequence[int]) -> CutOut:
     cut = [(edge.start > 0, edge.stop < n) for edge, n in zip(box, shape, strict=True)]
     return CutOut(within(core, box), cut)
-
-
-def _share_of_euler(mask: np.ndarray, inner: Box, core: Box, shape: Sequence[int]) -> float:
-    """Return what a core adds to χ of the window, as `topology.euler_of_window` counts it."""
-    ends = [(edge.start == 0, edge.stop == n) for edge, n in zip(core, shape, strict=True)]
-    taken = mask[tuple(slice(e.start - (not first), e.stop) for e, (first, _) in zip(inner, ends, strict=True))]
-    padded = np.pad(taken, [(int(first), int(last)) for first, last in ends])
-    total = 0.0
-    for layers in itertools.product((None, 0, 1), repeat=3):
-        if all(layer is None or end[layer] for layer, end in zip(layers, ends, strict=True)):
-            part = padded[tuple({None: slice(None), 0: 1, 1: -2}[layer] for layer in layers)]
-            total += (-0.5) ** (3 - part.ndim) * _count_cells(part)
-    return total
-
-
-def _count_cells(mask: np.ndarray) -> int:
-    """Return χ of the closed voxels of a mask of any dimension, less what belongs to its first layers alone."""
-    total = 0
-    for axes in itertools.chain.from_iterable(
-        itertools.combinations(range(mask.ndim), k) for k in range(mask.ndim + 1)
-    ):
-        cells = mask
-        for axis in axes:
-            cells = cells | np.roll(cells, 1, axis)
-        total += (-1) ** (mask.ndim - len(axes)) * int(np.count_nonzero(cells[(slice(1, None),) * mask.ndim]))
-    return total
 
 
 # ---- surface and curvature -------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from curvafit.inference.simulate import simulate_draws
 from curvafit.inference.table import PARAMETERS, column_names
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
-from curvafit.scan.measure import Reading
+from curvafit.scan.measure import Reading, windows_along
 from curvafit.scan.prepare import prepare
 from curvafit.volumes.field import Field
 
@@ -113,6 +113,22 @@ def test_a_block_that_differs_is_named() -> None:
     assert list(blocks) == list(BLOCKS)
     assert blocks["gaps"] == pytest.approx(1 / 25)
     assert min(blocks[name] for name in ("chords", "depths", "clearances", "correlation")) > 1 / 25
+
+
+def test_shapes_show_as_many_windows_as_the_scan(monkeypatch: pytest.MonkeyPatch) -> None:
+    mask = Gyroid(0.1).distance(centres(Grid((40, 40, 96)))).numpy() > 0
+    prepared, lengths = prepare(Field(mask.astype(np.uint8)), kind="mask", one_scale=True), []
+    shown = windows_along(prepared, prepared.mask[prepared.windows[0]].shape)
+    assert shown == [1, 1, 2]
+
+    def grow(*_: object, longest: int, **__: object) -> Twin:
+        lengths.append(longest)
+        return Twin(None, 0.0, None, None, seen=prepared)
+
+    monkeypatch.setattr(estimate, "twin", grow)
+    found = estimate.check_law(Candidate("match", Coefficients.willmore(), -0.3, {}, 8.0), prepared, POSTERIOR)
+    assert lengths == [2 * estimate.EDGE] * (estimate.TESTED // 2)
+    assert found is not None and found.method.startswith(f"{estimate.TESTED} windows of shapes of the law, 3 of")
 
 
 def test_few_shapes_test_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
