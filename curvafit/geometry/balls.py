@@ -13,11 +13,11 @@ import numpy as np
 from numba import njit
 from skimage.measure import block_reduce
 
+from curvafit.geometry.distance_transform import square_distances
+
 #: A ball may keep a smaller one, which it nearly contains, from being painted: balls that end this many voxels, of the
 #: finest axis, before a core count there.
 NEAR = 8
-#: Columns whose distances are found together.
-_COLUMNS = 16
 
 
 def ball_radii(mask: np.ndarray, spacing: tuple[float, float, float], limit: float = math.inf) -> np.ndarray:
@@ -28,9 +28,7 @@ def ball_radii(mask: np.ndarray, spacing: tuple[float, float, float], limit: flo
     edge = float(min(spacing))
     steps = np.array(spacing, dtype=np.float32) / np.float32(edge)
     reach = min(limit / edge, 2.0 * math.hypot(*(n * h for n, h in zip(mask.shape, steps.tolist(), strict=True))))
-    squares = np.empty(mask.shape, dtype=np.float32)
-    scratch = np.empty((max(mask.shape), _COLUMNS), dtype=np.float32)
-    _square_distances(np.ascontiguousarray(mask), steps, np.float32(reach), squares, scratch)
+    squares = square_distances(mask, steps, reach)
     np.sqrt(squares, out=squares)
     squares *= np.float32(edge)
     return squares
@@ -82,55 +80,6 @@ def reaching_radius(radius: np.ndarray, spacing: Sequence[float], core: tuple[sl
     """Return the largest of the balls, of `radius` (Z, Y, X) around the voxels, that count in a core (see `NEAR`)."""
     box, near = np.array([(edge.start, edge.stop) for edge in core]), NEAR * float(min(spacing))
     return float(_find_reaching(np.ascontiguousarray(radius), np.asarray(spacing, dtype=np.float32), box, near))
-
-
-@njit(cache=True)
-def _square_distances(mask, steps, reach, squares, scratch):  # pragma: no cover
-    """Fill the squared distance of each voxel of a mask to the nearest outside, along x, then y, then z."""
-    nz, ny, nx = mask.shape
-    hz, hy, hx = steps
-    for z in range(nz):
-        for y in range(ny):
-            _fill_row(mask[z, y], hx, reach, squares[z, y])
-    for z in range(nz):
-        for first in range(0, nx, _COLUMNS):
-            _lower_columns(squares[z, :, first : first + _COLUMNS], hy, scratch)
-    for y in range(ny):
-        for first in range(0, nx, _COLUMNS):
-            _lower_columns(squares[:, y, first : first + _COLUMNS], hz, scratch)
-
-
-@njit(cache=True)
-def _fill_row(mask, step, reach, squares):  # pragma: no cover
-    """Fill the squared distances to the nearest outside within a row."""
-    n, since = len(mask), reach / step + 1
-    for x in range(n):
-        since = since + 1 if mask[x] else np.float32(0)
-        squares[x] = min((since * step) ** 2, reach * reach)
-    since = reach / step + 1
-    for x in range(n - 1, -1, -1):
-        since = since + 1 if mask[x] else np.float32(0)
-        squares[x] = min((since * step) ** 2, squares[x])
-
-
-@njit(cache=True)
-def _lower_columns(squares, step, scratch):  # pragma: no cover
-    """Lower squares, (n, columns), to the least of those at k steps along the columns, plus (k step)²."""
-    n, width = squares.shape
-    for at in range(n):
-        for i in range(width):
-            scratch[at, i] = squares[at, i]
-    for at in range(n):
-        for i in range(width):
-            best, k, cost = scratch[at, i], 1, step * step
-            while cost < best and (at - k >= 0 or at + k < n):
-                if at - k >= 0:
-                    best = min(best, scratch[at - k, i] + cost)
-                if at + k < n:
-                    best = min(best, scratch[at + k, i] + cost)
-                k += 1
-                cost = (k * step) * (k * step)
-            squares[at, i] = best
 
 
 @njit(cache=True)

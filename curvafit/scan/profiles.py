@@ -7,12 +7,10 @@ import math
 import numpy as np
 from numba import njit
 
+from curvafit.geometry.distance_transform import square_face_distances
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.kernels.cpu import gaussian_blur
 from curvafit.priors.profile import PULL, PULL_WIDTH, STAIRS, SWEEPS
-
-#: Columns whose distances are found together.
-_COLUMNS = 16
 
 
 def profile_mask(mask: np.ndarray) -> np.ndarray:
@@ -37,61 +35,8 @@ def profile_mask(mask: np.ndarray) -> np.ndarray:
 
 def _sign_distances(mask: np.ndarray, reach: float) -> np.ndarray:
     """Return the signed distance to the faces of a mask in voxels, positive inside, at most `reach`."""
-    squares = np.empty(mask.shape, dtype=np.float32)
-    scratch = np.empty((max(mask.shape), _COLUMNS), dtype=np.float32)
-    _square_distances(np.ascontiguousarray(mask), np.float32(reach**2), squares, scratch)
+    squares = square_face_distances(mask, reach)
     return np.copysign(np.sqrt(np.abs(squares)), squares)
-
-
-@njit(cache=True)
-def _square_distances(mask, most, squares, scratch):  # pragma: no cover
-    """Fill squared distances to the faces between a mask and the rest, negative outside: along x, then y, then z."""
-    nz, ny, nx = mask.shape
-    for z in range(nz):
-        for y in range(ny):
-            _fill_row(mask[z, y], most, squares[z, y])
-    for z in range(nz):
-        for first in range(0, nx, _COLUMNS):
-            _lower_columns(squares[z, :, first : first + _COLUMNS], scratch)
-    for y in range(ny):
-        for first in range(0, nx, _COLUMNS):
-            _lower_columns(squares[:, y, first : first + _COLUMNS], scratch)
-
-
-@njit(cache=True)
-def _fill_row(mask, most, squares):  # pragma: no cover
-    """Fill the squared distances within a row."""
-    n = len(mask)
-    since = np.float32(n) + np.sqrt(most)
-    for x in range(n):
-        since = np.float32(0.5) if x > 0 and mask[x] != mask[x - 1] else since + np.float32(1)
-        squares[x] = min(since * since, most)
-    since = np.float32(n) + np.sqrt(most)
-    for x in range(n - 1, -1, -1):
-        since = np.float32(0.5) if x < n - 1 and mask[x] != mask[x + 1] else since + np.float32(1)
-        square = min(since * since, squares[x])
-        squares[x] = square if mask[x] else -square
-
-
-@njit(cache=True)
-def _lower_columns(squares, scratch):  # pragma: no cover
-    """Lower squares, (n, columns), to the least that k voxels along the columns offer, plus (k - ½)²."""
-    n, width = squares.shape
-    for at in range(n):
-        for i in range(width):
-            scratch[at, i] = squares[at, i]
-    for at in range(n):
-        for i in range(width):
-            sign = np.float32(1) if scratch[at, i] > 0 else np.float32(-1)
-            best, k, cost = sign * scratch[at, i], 1, np.float32(0.25)
-            while cost < best and (at - k >= 0 or at + k < n):
-                if at - k >= 0:  # a voxel of the other side is at distance 0
-                    best = min(best, cost + max(sign * scratch[at - k, i], np.float32(0)))
-                if at + k < n:
-                    best = min(best, cost + max(sign * scratch[at + k, i], np.float32(0)))
-                k += 1
-                cost = (np.float32(k) - np.float32(0.5)) ** 2
-            squares[at, i] = sign * best
 
 
 @njit(cache=True)
