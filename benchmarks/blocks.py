@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.completion import EDGE, shape
-from benchmarks.harness import Cases, Figure, Values, dice, run_python, show
+from benchmarks.harness import Cases, Figure, Values, run_python, show
+from curvafit.segmentation.trials import dice
 
 EVERY, REST = 8, 3
 #: Edges of blocks.

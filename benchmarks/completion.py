@@ -32,7 +32,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from benchmarks.harness import Cases, Figure, Values, bootstrap, dice, scores, show
+from benchmarks.harness import Cases, Figure, Values, bootstrap, scores, show
 from curvafit.data_synth.design import design_box
 from curvafit.generation.flow import generate
 from curvafit.geometry.morphometry import local_thickness
@@ -43,7 +43,7 @@ from curvafit.segmentation.filler import Filler, Taught, fill
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.teach import RATE, Whole, WholeLessons, learn
-from curvafit.segmentation.trials import Example
+from curvafit.segmentation.trials import Example, dice
 from curvafit.segmentation.uncertainty import best_log_odds, calibration_error, near_surface
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load

@@ -319,14 +319,10 @@ def in_turns(
     return {name: np.array(taken) for name, taken in times.items()}
 
 
-def dice(mask: np.ndarray, truth: np.ndarray) -> float:
-    """Return the Dice coefficient of two masks."""
-    return 2 * float(np.count_nonzero(mask & truth)) / max(1.0, float(mask.sum() + truth.sum()))
-
-
 def scores(mask: np.ndarray, truth: np.ndarray) -> Values:
     """Return Dice, and the sum of the Betti numbers' errors."""
     from curvafit.geometry.topology import betti_numbers
+    from curvafit.segmentation.trials import dice
 
     pairs = zip(betti_numbers(mask), betti_numbers(truth), strict=True)
     return {"dice": dice(mask, truth), "betti": float(sum(abs(a - b) for a, b in pairs))}
@@ -334,6 +330,8 @@ def scores(mask: np.ndarray, truth: np.ndarray) -> Values:
 
 def best(masks: Iterator[np.ndarray], truth: np.ndarray) -> np.ndarray:
     """Return the mask with the largest Dice: the best setting in hindsight."""
+    from curvafit.segmentation.trials import dice
+
     return max(masks, key=lambda mask: dice(mask, truth))
 
 

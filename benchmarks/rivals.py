@@ -20,10 +20,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import image
-from benchmarks.completion import CHOSEN_ON, FEW, STRUCTURES, blocks, dice, interpolated, plain_ways
+from benchmarks.completion import CHOSEN_ON, FEW, STRUCTURES, blocks, interpolated, plain_ways
 from benchmarks.harness import Cases, Figure, Values, bootstrap, run_python, show
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import Slices
+from curvafit.segmentation.trials import dice
 
 EVERY = 8
 DEESSE = """

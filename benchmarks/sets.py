@@ -23,7 +23,7 @@ import torch
 from scipy import ndimage, stats
 from torch import Tensor, nn
 
-from benchmarks.harness import Cases, Figure, Values, dice, show
+from benchmarks.harness import Cases, Figure, Values, show
 from benchmarks.networks import UNKNOWN, dice_ce
 from benchmarks.nulls import level_cut
 from benchmarks.transductive import PATCH, image_of, network, predict
@@ -33,6 +33,7 @@ from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import Law, LawLike
+from curvafit.segmentation.trials import dice
 from curvafit.volumes.read import load
 
 SCANS = {"bone": "lhdl_trabecular_200_otsu_mask.tif", "pores": "openpnm_berea_100_to_300.npz"}

@@ -21,8 +21,9 @@ from itertools import product
 import numpy as np
 
 from benchmarks.completion import CHOSEN_ON, FEW, LAWS, STRUCTURES, blocks, shape
-from benchmarks.harness import Cases, Figure, Values, bootstrap, dice, show
+from benchmarks.harness import Cases, Figure, Values, bootstrap, show
 from curvafit.segmentation.reconstruct import reconstruct
+from curvafit.segmentation.trials import dice
 from curvafit.volumes.field import Field
 
 #: Slices that are added, and the shapes' seed.

@@ -17,7 +17,7 @@ from itertools import product
 import numpy as np
 from scipy import ndimage
 
-from benchmarks.completion import CHOSEN_ON, FEW, LAWS, STRUCTURES, blocks, dice, shape
+from benchmarks.completion import CHOSEN_ON, FEW, LAWS, STRUCTURES, blocks, shape
 from benchmarks.harness import Cases, Figure, Values, bootstrap, show
 from benchmarks.nulls import level_cut
 from curvafit.data_synth.atlas import build
@@ -27,6 +27,7 @@ from curvafit.priors.grid import Grid
 from curvafit.segmentation.filler import Taught, fill
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.teach import Texture, teach, tremble
+from curvafit.segmentation.trials import dice
 from curvafit.segmentation.uncertainty import best_log_odds
 
 TEACHERS = ("laws", "presets", "cuts", "capsules", "all")

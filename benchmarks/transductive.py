@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from benchmarks.completion import EDGE, LAWS_TRIED, fitted, shape
-from benchmarks.harness import Cases, Figure, Values, bootstrap, dice, scores, show
+from benchmarks.harness import Cases, Figure, Values, bootstrap, scores, show
 from benchmarks.networks import UNKNOWN, dice_ce
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer
@@ -37,6 +37,7 @@ from curvafit.priors import CombinedLoss, CurvaturePrior
 from curvafit.priors.law import LawLike
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.refine import refine
+from curvafit.segmentation.trials import dice
 
 TEXTURES = ("draw-0", "draw-5", "trabec", "bone")
 KNOWN, JUDGE = (21, 42), 32

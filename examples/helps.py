@@ -23,6 +23,7 @@ from curvafit.drawing.plot import CONTOUR, gallery_figure, write_picture
 from curvafit.generation.flow import generate
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
+from curvafit.segmentation.trials import dice
 
 #: Voxels along an edge of a shape as it is generated.
 EDGE, SMALL = 80, 32
@@ -88,10 +89,6 @@ class Filling:
         halves = [place + self.case.every // 2 for place in self.places[:-1]]
         gains = [dice(self.filled[k], self.truth[k]) - dice(plain[k], self.truth[k]) for k in halves]
         return halves[int(np.argsort(gains)[len(gains) // 2])]
-
-
-def dice(a: np.ndarray, b: np.ndarray) -> float:
-    return float(2 * (a & b).sum() / max(a.sum() + b.sum(), 1))
 
 
 def picture(fillings: list[Filling]) -> Figure:

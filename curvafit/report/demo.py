@@ -38,6 +38,7 @@ from curvafit.scan.measure import measure
 from curvafit.scan.structure import find_structure
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
+from curvafit.segmentation.trials import dice
 from curvafit.volumes.field import Field, ScanError
 
 if TYPE_CHECKING:
@@ -131,12 +132,6 @@ def score_completion(truth: np.ndarray, filled: np.ndarray, every: int, axis: in
     volumes = {"curvafit": found, **{way: slices.level(way) > 0 for way in WAYS}}
     scores = {name: dice(volume[left_out], known[left_out]) for name, volume in volumes.items()}
     return Completion(truth, filled, every, axis, scores)
-
-
-def dice(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the Dice coefficient of two masks; 1 where both are empty."""
-    total = a.sum() + b.sum()
-    return float(2 * (a & b).sum() / total) if total else 1.0
 
 
 def grow_nearest(fit: Fit, progress: Progress = silent) -> list[np.ndarray]:

@@ -224,6 +224,11 @@ def tally(masks: np.ndarray, truth: np.ndarray, places: Sequence[int]) -> np.nda
     return pair.reshape(-1, 2)
 
 
+def dice(mask: np.ndarray, truth: np.ndarray) -> float:
+    """Return the Dice coefficient of two masks of one shape; 1 where both are empty."""
+    return float(dice_of(np.array([np.count_nonzero(mask & truth), np.count_nonzero(mask) + np.count_nonzero(truth)])))
+
+
 def dice_of(counts: np.ndarray) -> np.ndarray:
     """Return the Dice coefficients of counts (..., 2), 1 where nothing is inside."""
     both, sizes = np.moveaxis(counts, -1, 0)

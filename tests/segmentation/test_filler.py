@@ -24,6 +24,7 @@ from curvafit.segmentation.filler import (
     plane_thickness,
 )
 from curvafit.segmentation.slices import Slices, annotated_slices, plane_distances
+from curvafit.segmentation.trials import dice
 from curvafit.volumes.field import ScanError
 
 EDGES = (1.0, 1.0, 1.0)
@@ -262,7 +263,3 @@ def test_the_packaged_filler_knows_tubes(shape: str) -> None:
     between = [n for n in range(33) if n % 8]
     gain = {way: dice(slices.level(way)[between] > 0, mask[between]) for way in ("spline", "linear", "nearest")}
     assert dice(fill(slices, Taught.load())[between] > 0, mask[between]) > max(gain.values()) - 0.02
-
-
-def dice(one: np.ndarray, other: np.ndarray) -> float:
-    return 2 * float((one & other).sum()) / float(one.sum() + other.sum())

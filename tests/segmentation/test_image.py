@@ -17,6 +17,7 @@ from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.teach import Texture
 from curvafit.segmentation.teach_image import ImageMix, image_shape, teach_image
+from curvafit.segmentation.trials import dice
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.write import save
 
@@ -37,10 +38,6 @@ def photograph(mask: np.ndarray, noise: float = 0.4, seed: int = 0) -> np.ndarra
 
 def known(mask: np.ndarray, spacing=(1.0, 1.0, 1.0)) -> Slices:
     return Slices(mask[::EVERY], tuple(range(0, len(mask), EVERY)), len(mask), spacing)
-
-
-def dice(mask: np.ndarray, truth: np.ndarray) -> float:
-    return 2 * float((mask & truth).sum()) / float(mask.sum() + truth.sum())
 
 
 # ---- reading ---------------------------------------------------------------------------------------------------------

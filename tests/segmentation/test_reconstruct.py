@@ -21,7 +21,7 @@ from curvafit.segmentation.engine import TRUSTED, WorkingGrid, law_of, laws_of, 
 from curvafit.segmentation.reconstruct import MARGIN, STIFFNESS, reconstruct, reconstruct_labels
 from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.segmentation.trials import Example, leave_out_slices
+from curvafit.segmentation.trials import Example, dice, leave_out_slices
 from curvafit.volumes.field import Field, ScanError
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -379,10 +379,6 @@ def organelles(shift: int = 0) -> np.ndarray:
     one = np.hypot(y - 12, x - 7 - lean) < 5
     other = np.hypot(y - 12, x - 25 + lean) < 5
     return np.where(one, 2, np.where(other, 7, 0)).astype(np.uint8)
-
-
-def dice(one: np.ndarray, other: np.ndarray) -> float:
-    return 2 * float((one & other).sum()) / float(one.sum() + other.sum())
 
 
 def test_each_label_is_completed_as_alone_and_known_slices_stay() -> None:

@@ -18,6 +18,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation import Refine, calibrate, refine
 from curvafit.segmentation.evidence import probability_evidence
 from curvafit.segmentation.refine import load_probabilities
+from curvafit.segmentation.trials import dice
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
 from curvafit.volumes.write import save
@@ -38,10 +39,6 @@ def network(truth: np.ndarray, seed: int) -> np.ndarray:
     noise = np.random.default_rng(seed).standard_normal(truth.shape)
     ratio = 5 * (2 * truth - 1) + 9 * ndimage.gaussian_filter(noise, 0.8) * 4
     return (1 / (1 + np.exp(-ratio))).astype(np.float32)
-
-
-def dice(a: np.ndarray, b: np.ndarray) -> float:
-    return 2 * float((a & b).sum()) / float(a.sum() + b.sum())
 
 
 # ---- evidence and place ----------------------------------------------------------------------------------------------

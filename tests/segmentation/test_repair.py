@@ -23,6 +23,7 @@ from curvafit.segmentation.refine import Refine
 from curvafit.segmentation.repair import REACH, SUREST, Repairer, RepairNet, choose_pixel
 from curvafit.segmentation.teach import Texture, learn
 from curvafit.segmentation.teach_repair import MIX, MapLessons, pose, teach_repair, tune_repair
+from curvafit.segmentation.trials import dice
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.read import load
 from curvafit.volumes.write import save
@@ -46,10 +47,6 @@ def drawn(seed: int = 0, width: int = 8) -> Repairer:
         for parameter in network.parameters():
             torch.nn.init.normal_(parameter, std=0.15)
     return Repairer(network, 1.0, {}, 0.02)
-
-
-def dice(a: np.ndarray, b: np.ndarray) -> float:
-    return 2 * float((a & b).sum()) / float(a.sum() + b.sum())
 
 
 # ---- the network -----------------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from curvafit.priors.law import preset
 from curvafit.segmentation.engine import UNSURE, WorkingGrid, law_of
 from curvafit.segmentation.evidence import VoxelEvidence, estimate_classes, grey_evidence, grey_levels
 from curvafit.segmentation.segment import segment
+from curvafit.segmentation.trials import dice
 from curvafit.volumes.field import Field
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -35,10 +36,6 @@ def tubes(n: int = 32) -> np.ndarray:
 def noisy(mask: np.ndarray, noise: float, **place) -> Field:
     values = 30 + 100 * mask + noise * np.random.default_rng(1).standard_normal(mask.shape)
     return Field(values.astype(np.float32), **place)
-
-
-def dice(a: np.ndarray, b: np.ndarray) -> float:
-    return 2 * float((a & b).sum()) / float(a.sum() + b.sum())
 
 
 # ---- evidence --------------------------------------------------------------------------------------------------------

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from curvafit.segmentation.trials import dice
+
 napari = pytest.importorskip("napari")
 pytest.importorskip("qtpy.QtWidgets", exc_type=ImportError)
 
@@ -70,10 +72,6 @@ def sparse(every: int = 8) -> np.ndarray:
     some = np.zeros_like(rods())
     some[::every] = rods()[::every]
     return some
-
-
-def dice(a: np.ndarray, b: np.ndarray) -> float:
-    return 2 * np.count_nonzero(a & b) / (np.count_nonzero(a) + np.count_nonzero(b))
 
 
 def test_labels_are_completed_and_it_can_be_undone(viewer: Any) -> None:
