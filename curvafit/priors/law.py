@@ -104,6 +104,11 @@ class Law:
         return cls(file.coefficients, file.mass, f"prior {os.fspath(path)}", epsilon=width, schedule="deep", **own)
 
     @property
+    def doubtful(self) -> bool:
+        """Return whether it was fitted to a scan that it may not be the law of."""
+        return bool(self.status) and not self.status.startswith("Supported")
+
+    @property
     def fitted(self) -> bool:
         """Whether the law was inferred from a scan, so that its lengths are physical too."""
         return self.working_voxel is not None

@@ -42,6 +42,7 @@ class CurvaturePrior(nn.Module):
     law
         `Coefficients` with lengths in spacing's unit; a `Law`, or a preset's name, in working units, where the smallest
         voxel edge is 0.01; the path of a `fit.json`, or a fit. Or a sequence of laws, one for each class.
+        A warning says where a fit is not `Supported`.
     sigmoid, softmax
         Whether the input is logits, to which this function is applied first. Else it is probabilities, and a warning
         says where it has other values.
@@ -364,13 +365,16 @@ def _read_weights(weight: float | Sequence[float]) -> tuple[float, ...]:
 
 
 def _read_coefficients(law: Law, edge: float, unit: str | None, epsilon: float) -> Coefficients:
-    """Return a law's coefficients with lengths in spacing's unit; warn where ε is far from the fit's."""
+    """Return a law's coefficients with lengths in spacing's unit; warn where its fit is in doubt or had another ε."""
     numbers = law.in_unit(unit, edge)
     check_strengths(numbers, epsilon)
     if law.length_unit is None:
         if unit is not None and unit not in METRES:
             raise ValueError(f"expected a unit among {', '.join(METRES)}, got {quoted(unit)}")
         return numbers
+    if law.doubtful:
+        text = f"the fit of {law.origin} is not `Supported`: its law may not be that of its scan"
+        warnings.warn(text, stacklevel=4)
     unit = unit or law.length_unit
     width = convert_length(law.epsilon_physical, law.length_unit, unit)
     if not 1 / 4 <= epsilon / width <= 4:

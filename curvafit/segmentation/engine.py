@@ -132,7 +132,7 @@ def law_of(prior: LawLike, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
         return coefficients, (note,) if law.working else ()
     note = f"The prior's lengths, in {law.length_unit}, are converted to {scan.unit}."
     notes = () if law.length_unit == scan.unit else (note,)
-    return coefficients, (*notes, UNSURE) if law.status and not law.status.startswith("Supported") else notes
+    return coefficients, (*notes, UNSURE) if law.doubtful else notes
 
 
 def laws_of(prior: LawLike, scan: Field) -> tuple[tuple[Coefficients, ...], tuple[str, ...]]:

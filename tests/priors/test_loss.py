@@ -63,6 +63,12 @@ def test_a_fit_is_in_its_own_unit_or_converted(tmp_path):
         CurvaturePrior(path, unit="voxel")
 
 
+def test_a_fit_in_doubt_warns(tmp_path):
+    with pytest.warns(UserWarning, match="is not `Supported`"):
+        CurvaturePrior(fit_file(tmp_path / "fit.json", "um", "No believable twin (refined): …"), spacing=2.0)
+    CurvaturePrior(fit_file(tmp_path / "fit.json", "um", "Supported (refined): …"), spacing=2.0)
+
+
 # ---- windows --------------------------------------------------------------------------------------------------------
 
 
