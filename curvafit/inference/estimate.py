@@ -89,8 +89,8 @@ def estimate_law(
         grown = simulate_draws(parameters, simulate, simulations, seed=seed, progress=part)
     if grown is None or len(grown.parameters) < FEWEST:
         left = misfits(posterior.emulator, *reading.columns, parameters[None, :STARTS])[0]
-        p = tail_probability(posterior.misfits[reading.view], left)
-        misfit = Misfit(p, {}, "by the best fit, nothing grown")
+        p, level_cut = _join_level_cut(tail_probability(posterior.misfits[reading.view], left), posterior, reading)
+        misfit = Misfit(p, {}, "by the best fit, nothing grown", level_cut=level_cut)
         return replace(fit, misfit=misfit, candidates=(likely, _best_fit(posterior, *best, turn, thickness))), None
     pool = posterior.draw(reading, POOL, seed)[:, :-1]
     search = Search(posterior.emulator, reading)
@@ -212,7 +212,7 @@ def check_law(
             rows = rows if own is None else np.concatenate([rows, own.windows])
     if len(rows) < FEWEST:
         return None
-    return compare_windows(posterior, reading.view, reading.windows, rows)
+    return compare_windows(posterior, reading, rows)
 
 
 def probability_alike(scan: np.ndarray, twins: np.ndarray, seed: int = 0) -> float:
@@ -232,7 +232,15 @@ def rank_level_cut(posterior: Posterior, view: str, windows: np.ndarray) -> floa
     return tail_probability(-posterior.discriminants[view], -float(posterior.discriminate(windows).mean()))
 
 
-def compare_windows(posterior: Posterior, view: str, scan: np.ndarray, twins: np.ndarray) -> Misfit:
+def _join_level_cut(p: float, posterior: Posterior, reading: Reading) -> tuple[float, float | None]:
+    """Return the probability of a test with that of `rank_level_cut`, and the latter, if the posterior tells it."""
+    if not len(posterior.discriminant):
+        return p, None
+    level_cut = rank_level_cut(posterior, reading.view, reading.windows)
+    return join_tests(p, level_cut), level_cut
+
+
+def compare_windows(posterior: Posterior, reading: Reading, twins: np.ndarray) -> Misfit:
     """Return how probable it is that windows of a scan `(k, 351)` differ so from those of twins `(n, 351)`.
 
     All descriptors are compared in the emulator's uncorrelated directions, each block in deviations of the twins.
@@ -241,12 +249,11 @@ def compare_windows(posterior: Posterior, view: str, scan: np.ndarray, twins: np
     its discriminant among those of shapes of the model in the same view. The probability is twice the less of the
     two ranks (`join_tests`). Where departures are not known, and for each block, it is that of a law named beforehand.
     """
+    scan = reading.windows
     seen, grown = (posterior.emulator.compression(rows) @ posterior.emulator.basis.T for rows in (scan, twins))
-    departure, usual, level_cut = float(cdist(seen, grown).mean() / pdist(grown).mean()), posterior.departures, None
+    departure, usual = float(cdist(seen, grown).mean() / pdist(grown).mean()), posterior.departures
     p = tail_probability(usual, departure) if len(usual) else probability_alike(seen, grown)
-    if len(posterior.discriminant):
-        level_cut = rank_level_cut(posterior, view, scan)
-        p = join_tests(p, level_cut)
+    p, level_cut = _join_level_cut(p, posterior, reading)
     blocks = {}
     for name in BLOCKS:
         own, others = columns_of(scan, [name]), columns_of(twins, [name])

@@ -71,7 +71,7 @@ def grown(rng: np.random.Generator, count: int) -> np.ndarray:
 
 def checked(rows: np.ndarray) -> Misfit:
     """The comparison of the first row, the only window of a scan, with the others."""
-    return compare_windows(POSTERIOR, "mask", rows[:1], rows[1:])
+    return compare_windows(POSTERIOR, reading(rows[0]), rows[1:])
 
 
 def test_a_row_of_the_same_law_passes_and_another_does_not() -> None:
@@ -89,7 +89,7 @@ def test_a_departure_is_ranked_among_the_models_own() -> None:
     rows, ranked = grown(np.random.default_rng(1), 25), Linear()
     away = checked(rows).departure or 0
     ranked.departures = away + np.array([-0.2, -0.1, 0.1])
-    found = compare_windows(cast(Posterior, ranked), "mask", rows[:1], rows[1:])
+    found = compare_windows(cast(Posterior, ranked), reading(rows[0]), rows[1:])
     assert found.probability == pytest.approx(2 / 4)
     assert found.blocks == checked(rows).blocks
     assert found.level_cut is None
@@ -101,7 +101,7 @@ def test_a_scan_that_looks_like_a_level_cut_is_not_believed(value: float, p: flo
     rows, taught = grown(np.random.default_rng(1), 25), Linear()
     taught.discriminant, taught.departures = np.ones(1), np.full(9, 10.0)
     rows[0, -1] = value
-    found = compare_windows(cast(Posterior, taught), "mask", rows[:1], rows[1:])
+    found = compare_windows(cast(Posterior, taught), reading(rows[0]), rows[1:])
     assert found.probability == pytest.approx(p)
     assert found.level_cut == pytest.approx(min(value + 2, 92) / 100)
 

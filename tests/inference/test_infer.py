@@ -11,6 +11,7 @@ import pytest
 import torch
 from exact import Gyroid, centres
 from found import lattice
+from scipy import ndimage
 from shapes import grown
 
 from curvafit.generation.schedule import LEARNED, SCHEDULES, schedule
@@ -132,6 +133,16 @@ def places(fit: Fit) -> np.ndarray:
 @pytest.fixture(scope="module")
 def straight(tubes: np.ndarray) -> Fit:
     return quick(tubes > 0)
+
+
+@pytest.mark.slow
+def test_a_quick_reading_tells_a_level_cut(straight: Fit) -> None:
+    grey = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal((64, 64, 64)), 4, mode="wrap")
+    cut = quick(grey > np.quantile(grey, 0.7)).misfit
+    assert cut is not None and straight.misfit is not None
+    assert cut.level_cut is not None and straight.misfit.level_cut is not None
+    assert cut.level_cut < 0.02 < straight.misfit.level_cut
+    assert cut.probability <= 2 * cut.level_cut and cut.departure is None
 
 
 @pytest.mark.slow
