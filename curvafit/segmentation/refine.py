@@ -163,9 +163,7 @@ def refine(
         trial = Trial(laws[0], strength, steps)
     else:
         if not isinstance(example, Calibration):
-            alike = {name: value for name, value in reading.items() if name not in ("like", "crop")}
-            other, truth = load_probabilities(example[0], **alike), _load_truth(example[1], label, alike)
-            check_spacing(other, field, "the probabilities")
+            other, truth = _load_example_beside(field, example, label, reading)
             trials, progress = sub_progress(progress, 0.0, TRIALS), sub_progress(progress, TRIALS, 1.0)
             example = calibrate(other, truth, prior, epsilon=epsilon, steps=steps, progress=trials)
         check_spacing(example.example, field, "the probabilities")
@@ -197,11 +195,8 @@ def _repair(
 ) -> Segmentation:
     """Repair a map; an example tunes first."""
     if isinstance(example, tuple):
-        alike = {name: value for name, value in reading.items() if name not in ("like", "crop")}
-        chances = load_probabilities(example[0], **alike)
-        check_spacing(chances, field, "the probabilities")
-        truth, tuning = _load_truth(example[1], label, alike), sub_progress(progress, 0.0, 0.7)
-        repairer = tune_repairer(chances, truth, repairer, progress=tuning)
+        chances, truth = _load_example_beside(field, example, label, reading)
+        repairer = tune_repairer(chances, truth, repairer, progress=sub_progress(progress, 0.0, 0.7))
         progress = sub_progress(progress, 0.7, 1.0)
     odds = repairer.repair(evidence.ratio, field.spacing, progress)
     threshold = repairer.threshold(odds)
@@ -230,9 +225,7 @@ def tune_repairer(
 
     By default the packaged one is tuned. See `refine` for the other parameters and errors.
     """
-    field, truth = load_probabilities(probabilities, **reading), _load_truth(mask, label, reading)
-    check_place(truth, field, "the mask", "the probabilities")
-    inside = require_labels(truth.values, "the example") > 0
+    field, _, inside = _load_example(probabilities, mask, label, reading)
     first = repairer if isinstance(repairer, Repairer) else Repairer.load(repairer)
     return tune_repair(first, probability_evidence(field).ratio, inside, field.spacing, progress)
 
@@ -252,9 +245,7 @@ def calibrate(
 
     A part of 96³ voxels that holds most of the surface is judged by Dice. See `refine` for the parameters and errors.
     """
-    field, truth = load_probabilities(probabilities, **reading), _load_truth(mask, label, reading)
-    check_place(truth, field, "the mask", "the probabilities")
-    inside = require_labels(truth.values, "the example") > 0
+    field, truth, inside = _load_example(probabilities, mask, label, reading)
     if inside.all() or not inside.any():
         state = "full" if inside.all() else "empty"
         raise ScanError(f"the example must have voxels inside and outside, but is {state}")
@@ -475,7 +466,22 @@ def find_image(source: Source) -> Path | None:
     return next((Path(stem + suffix) for suffix in IMAGES if Path(stem + suffix).is_file()), None)
 
 
-def _load_truth(mask: Source, label: int | None, reading: dict[str, Any]) -> Field:
-    """Load an example's mask with the spacing and unit of its probabilities."""
+def _load_example_beside(
+    field: Field, example: tuple[Source, Source], label: int | None, reading: dict[str, Any]
+) -> tuple[Field, Field]:
+    """Load an example of probabilities, with voxels as large as those of `field`, and its true mask."""
+    alike = {name: value for name, value in reading.items() if name not in ("like", "crop")}
+    chances, truth, _ = _load_example(*example, label, alike)
+    check_spacing(chances, field, "the probabilities")
+    return chances, truth
+
+
+def _load_example(
+    probabilities: Source, mask: Source, label: int | None, reading: dict[str, Any]
+) -> tuple[Field, Field, np.ndarray]:
+    """Load probabilities and the true mask, of their spacing and unit, and return where that is inside, too."""
+    field = load_probabilities(probabilities, **reading)
     placed = {} if isinstance(mask, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
-    return field_of(mask, label=label, **placed)
+    truth = field_of(mask, label=label, **placed)
+    check_place(truth, field, "the mask", "the probabilities")
+    return field, truth, require_labels(truth.values, "the example") > 0
