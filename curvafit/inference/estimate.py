@@ -96,14 +96,12 @@ def estimate_law(
     search = Search(posterior.emulator, reading)
     part = sub_progress(progress, 0.45, 1.0)
     likeliest, every = search.run(pool, grown, simulate, rounds=rounds, seed=seed, progress=part)
-    near = every.parameters[search.nearest(every)[0]]
-    refined, simulation = (
-        Candidate(name, *law_of(turn(each)), {}, thickness)
-        for name, each in (("refined", likeliest), ("simulation", near))
-    )
+    nearest = every.parameters[search.nearest(every)[0]]
+    laws = {"refined": likeliest} | ({} if np.array_equal(nearest, likeliest) else {"simulation": nearest})
+    refined, *others = (Candidate(name, *law_of(turn(each)), {}, thickness) for name, each in laws.items())
     names, row, rows = np.array(column_names()), reading.descriptors, grown.columns[0]
     blocks = {name: (row[names == name], rows[:, names == name]) for name in BLOCKS}
-    return replace(fit, candidates=(refined, likely, simulation)), blocks
+    return replace(fit, candidates=(refined, likely, *others)), blocks
 
 
 def refine_matches(prepared: Prepared, posterior: Posterior, matches: Sequence[Match]) -> tuple[Candidate, ...]:
