@@ -95,7 +95,7 @@ def teach(posterior: Posterior, rows: Mapping[str, Sequence[np.ndarray]]) -> Pos
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shapes", type=Path, nargs="+", required=True, help="stores of laws that no choice has seen")
-    parser.add_argument("--count", type=int, default=100, help="shapes, and as many level cuts")
+    parser.add_argument("--count", type=int, default=100, help="shapes of each store, and as many level cuts")
     parser.add_argument(
         "--teach", type=Path, nargs="+", help="stores of other laws, from which to learn what tells cuts"
     )
@@ -109,20 +109,20 @@ def level_cuts(posterior: Posterior, windows: Sequence[np.ndarray]) -> np.ndarra
 
 def rank(
     usual: np.ndarray | None, departures: Mapping[str, Mapping[int, float]], cuts: Mapping[str, np.ndarray]
-) -> dict[str, np.ndarray]:
-    """Return p by kind, of departures by kind and number of the law, and of `level_cuts` by kind `(laws,)`.
+) -> dict[str, dict[int, float]]:
+    """Return p by kind and number of the law, of departures by both and of `level_cuts` by kind `(laws,)`.
 
     Departures are ranked among usual ones `(n,)`; where these are None, among those of the other laws' shapes. A shape
     without a departure is left out; a cut without one stands with the rank of its discriminant.
     """
-    found = {}
+    found: dict[str, dict[int, float]] = {}
     for kind, mine in departures.items():
         own = {} if kind == "shape" else dict.fromkeys(range(len(cuts[kind])), 1.0)
         for law, departure in mine.items():
             others = np.array([each for other, each in departures["shape"].items() if other != law])
             own[law] = tail_probability(others if usual is None else usual, departure)
-        ranks = [(p, cuts[kind][law]) for law, p in own.items()]
-        found[kind] = np.array([join_tests(*each) for each in ranks if np.isfinite(each[1])])
+        both = {law: (p, cuts[kind][law]) for law, p in own.items()}
+        found[kind] = {law: join_tests(*each) for law, each in both.items() if np.isfinite(each[1])}
     return found
 
 
@@ -132,26 +132,29 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     posterior, most = load_posterior(), 2 if options.quick else None
     if options.teach is not None:
         posterior = teach(posterior, describe_all(find_well_formed(tuple(options.teach))[:most], cases))
-    shapes = find_well_formed(tuple(options.shapes))[: most or options.count]
-    edge, described = shapes[0][0].settings.shape[0], describe_all(shapes, cases)
-    cuts = {kind: level_cuts(posterior, windows) for kind, windows in described.items()}
+    stores = [find_well_formed((path,))[: most or options.count] for path in options.shapes]
+    shapes = [shape for store in stores for shape in store]
+    cuts = {kind: level_cuts(posterior, windows) for kind, windows in describe_all(shapes, cases).items()}
     departures: dict[str, dict[int, float]] = {kind: {} for kind in KINDS}
     for number, (store, index) in enumerate(shapes):
         for kind, found in departures.items():
-            name = f"{edge}-{store.name}-{index}-{kind}"
+            name = f"{store.settings.shape[0]}-{store.name}-{index}-{kind}"
             for values in cases.all({name: partial(case, store, index, kind == "cut")}, seed=index).values():
                 if "departure" in values:
                     found[number] = values["departure"]
+    edges = np.array([store.settings.shape[0] for store, _ in shapes])
     usual, figures, rows = None if options.calibrate else posterior.departures, {}, []
-    for (kind, p), title in zip(rank(usual, departures, cuts).items(), ("size", "power"), strict=True):
-        hits, away = int(np.sum(p <= LEVEL)), [*departures[kind].values()]
-        interval = stats.binomtest(hits, len(p)).proportion_ci(method="wilson") if len(p) else (np.nan, np.nan)
-        figures[f"belief.{edge}.{title}"] = Figure(hits / max(len(p), 1), *map(float, interval))
-        middle = float(np.median(away)) if away else np.nan
-        rows.append([title, figures[f"belief.{edge}.{title}"], len(p), len(away), middle])
-    head = ["", f"p at most {LEVEL}", "queries", "through infer", "their median departure"]
-    show(head, rows, f"{edge} voxels a side")
+    for (kind, tested), title in zip(rank(usual, departures, cuts).items(), ("size", "power"), strict=True):
+        for edge in dict.fromkeys(edges):
+            p = np.array([p for law, p in tested.items() if edges[law] == edge])
+            away = [departure for law, departure in departures[kind].items() if edges[law] == edge]
+            hits, middle = int(np.sum(p <= LEVEL)), float(np.median(away)) if away else np.nan
+            interval = stats.binomtest(hits, len(p)).proportion_ci(method="wilson") if len(p) else (np.nan, np.nan)
+            figure = Figure(hits / max(len(p), 1), *map(float, interval))
+            figures[f"belief.{edge}.{title}"] = figure
+            rows.append([f"{edge}³", title, figure, len(p), len(away), middle])
+    show(["voxels", "", f"p at most {LEVEL}", "queries", "through infer", "their median departure"], rows)
     if options.calibrate is not None:
-        away = np.sort(np.array([*departures["shape"].values()], dtype=np.float32))
-        save_posterior(replace(posterior, departures=away), options.calibrate)
+        found = np.sort(np.array([*departures["shape"].values()], dtype=np.float32))
+        save_posterior(replace(posterior, departures=found), options.calibrate)
     return {} if options.quick else figures
