@@ -126,6 +126,24 @@ def rank(
     return found
 
 
+def count_rejected(
+    tested: Mapping[str, Mapping[int, float]], departures: Mapping[str, Mapping[int, float]], edges: np.ndarray
+) -> dict[str, Figure]:
+    """Print and return the part that is rejected, by kind and edge of the laws' shapes `(laws,)`."""
+    figures, rows = {}, []
+    for (kind, found), title in zip(tested.items(), ("size", "power"), strict=True):
+        for edge in dict.fromkeys(edges):
+            p = np.array([p for law, p in found.items() if edges[law] == edge])
+            away = [departure for law, departure in departures[kind].items() if edges[law] == edge]
+            hits, middle = int(np.sum(p <= LEVEL)), float(np.median(away)) if away else np.nan
+            interval = stats.binomtest(hits, len(p)).proportion_ci(method="wilson") if len(p) else (np.nan, np.nan)
+            figure = Figure(hits / max(len(p), 1), *map(float, interval))
+            figures[f"belief.{edge}.{title}"] = figure
+            rows.append([f"{edge}³", title, figure, len(p), len(away), middle])
+    show(["voxels", "", f"p at most {LEVEL}", "queries", "through infer", "their median departure"], rows)
+    return figures
+
+
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     if options.quick and options.calibrate is not None:
         raise SystemExit("--quick makes two shapes only: no test is calibrated by them")
@@ -143,17 +161,10 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
                 if "departure" in values:
                     found[number] = values["departure"]
     edges = np.array([store.settings.shape[0] for store, _ in shapes])
-    usual, figures, rows = None if options.calibrate else posterior.departures, {}, []
-    for (kind, tested), title in zip(rank(usual, departures, cuts).items(), ("size", "power"), strict=True):
-        for edge in dict.fromkeys(edges):
-            p = np.array([p for law, p in tested.items() if edges[law] == edge])
-            away = [departure for law, departure in departures[kind].items() if edges[law] == edge]
-            hits, middle = int(np.sum(p <= LEVEL)), float(np.median(away)) if away else np.nan
-            interval = stats.binomtest(hits, len(p)).proportion_ci(method="wilson") if len(p) else (np.nan, np.nan)
-            figure = Figure(hits / max(len(p), 1), *map(float, interval))
-            figures[f"belief.{edge}.{title}"] = figure
-            rows.append([f"{edge}³", title, figure, len(p), len(away), middle])
-    show(["voxels", "", f"p at most {LEVEL}", "queries", "through infer", "their median departure"], rows)
+    if options.calibrate is not None and len(set(edges)) > 1:
+        raise SystemExit("a test is calibrated by shapes of one size: give --calibrate stores of one")
+    p = rank(None if options.calibrate else posterior.departures, departures, cuts)
+    figures = count_rejected(p, departures, edges)
     if options.calibrate is not None:
         found = np.sort(np.array([*departures["shape"].values()], dtype=np.float32))
         save_posterior(replace(posterior, departures=found), options.calibrate)

@@ -69,8 +69,8 @@ def euler_of_window(mask: np.ndarray, ends: Ends = ((True, True),) * 3) -> float
     and an eighth of each corner subtracted (Odgaard & Gundersen 1993; BoneJ's Δχ). On average a window of n voxels a
     side then has the share of (n - 1)³ voxels, and a structure that touches no face has its own χ.
 
-    A part of a window says along which axes it begins and ends with the window; where it does not begin with it, its
-    first layer is the one before. Sums over parts are the window's.
+    The `ends` of a part of a window say along which axes it begins, and ends, with the window; where it does not begin
+    with it, its first layer is the one before. Sums over parts are the window's.
     """
     padded, total = np.pad(mask, [(int(first), int(last)) for first, last in ends]), 0.0
     for layers in product((None, 0, 1), repeat=3):

@@ -129,7 +129,7 @@ class Twin:
 def twin(
     law: Candidate, prepared: Prepared, seed: int, schedule: Schedule | str = LEARNED, longest: int = EDGES[1]
 ) -> Twin:
-    """Grow a shape of a law in a box as many thicknesses long as the scan's main window, within `EDGES` voxels.
+    """Grow a shape of a law in a box as many thicknesses long as the scan's main window, of `longest` voxels at most.
 
     The mass of the atlas's match to a mask or an image is not the scan's: its shape fills as much of its box as the
     structure does (`Prepared.true_volume_fraction`), or has the law's own mass where nothing grows so.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -166,10 +167,9 @@ def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simul
         if not flow.viability.viable:
             return None
         try:
-            reading = read_texture(prepared.scan_alike(flow.field.numpy(), seed))
+            return read_texture(prepared.scan_alike(flow.field.numpy(), seed), view)
         except ValueError:  # such as of one ball, which fills its box: at the scan's thickness it is a few voxels wide
             return None
-        return None if reading is None else reading._replace(view=view)
 
     return simulate
 
@@ -191,26 +191,24 @@ def check_law(
     """Compare a scan's windows with those of shapes of a law, seen as the scan is (`compare_windows`).
 
     A shape shows as many windows as the scan's main window does: parts of a large shape differ more than small shapes,
-    each of which has the mass of the law. Shapes are grown until they show `TESTED` windows, but no more than so many.
+    each of which has the mass of the law. As many shapes are grown as show `TESTED` windows.
 
-    Returns None where the scan's descriptors cannot be measured, or the shapes show fewer than `FEWEST` windows.
+    Returns None where the scan's descriptors cannot be measured, or fewer than two shapes, or `FEWEST` windows, grow.
     """
     if (found := measure_descriptors(prepared)) is None:
         return None
     seen, reading, _ = found
     across = windows_along(prepared, [edge.stop - edge.start for edge in prepared.windows[0]])
-    rows = np.zeros((0, len(column_names())))
-    for k in range(TESTED):
-        if len(rows) >= TESTED:
-            break
-        progress(f"testing the law: {len(rows)} of {TESTED} windows", max(k, len(rows)) / TESTED)
+    count, rows = -(-TESTED // math.prod(across)), []
+    for k in range(count):
         grown = twin(law, prepared, seed + k, schedule, longest=EDGE * max(across))
         if grown.seen is not None:
-            own = read_texture(grown.seen if seen is prepared else grown.seen.inverted, across)
-            rows = rows if own is None else np.concatenate([rows, own.windows])
-    if len(rows) < FEWEST:
+            own = read_texture(grown.seen if seen is prepared else grown.seen.inverted, reading.view, across)
+            rows += [] if own is None else [own.windows]
+        progress(f"testing the law: {k + 1} of {count} shapes", (k + 1) / count)
+    if len(rows) < 2 or sum(map(len, rows)) < FEWEST:
         return None
-    return compare_windows(posterior, reading, rows)
+    return compare_windows(posterior, reading, np.concatenate(rows))
 
 
 def probability_alike(scan: np.ndarray, twins: np.ndarray, seed: int = 0) -> float:

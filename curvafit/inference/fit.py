@@ -301,6 +301,7 @@ def draw_laws(law: LawLike, count: int) -> list[Law]:
     check_int(count, f"from 1 to {len(fit.draws)} draws", 1, len(fit.draws))
     rows = np.linspace(0, len(fit.draws) - 1, count).round().astype(int)
     own = {"length_unit": fit.length_unit, "volume_fraction": fit.morphometry.volume_fraction, "schedule": "deep"}
+    own |= {"status": fit.status}
     source, laws = f" of {os.fspath(law)}" if named else "", []  # type: ignore[arg-type]
     for row, (*five, mass, thickness) in zip(rows, to_columns(fit.draws[rows]).T.tolist(), strict=True):
         edge, origin = fit.thickness / thickness, f"draw {row}{source}"

@@ -79,9 +79,11 @@ def _describe_misfit(misfit: Misfit | None) -> str:
         if misfit.departure is None:
             return f"A quick reading does not rule this law out (p = {p})."
         return f"Shapes of this law look like the scan (p = {p})."
+    random = misfit.level_cut is not None and join_tests(1.0, misfit.level_cut) < UNBELIEVABLE
+    cut = "It looks more like a level cut of a random field, which no law made." if random else ""
+    if misfit.departure is None:
+        return _join(f"A quick reading rules this law out (p = {p}).", cut)
     strangest = [name for name, own in sorted(misfit.blocks.items(), key=itemgetter(1)) if own < UNBELIEVABLE]
     what = f"what differs most: {', '.join(strangest)}" if strangest else "no descriptor tells it alone"
     direction = "The scan has a direction (fabric), and the model has none." if "fabric" in strangest else ""
-    random = misfit.level_cut is not None and join_tests(1.0, misfit.level_cut) < UNBELIEVABLE
-    cut = "It looks more like a level cut of a random field, which no law made." if random else ""
     return _join(f"Shapes of this law do not look like the scan (p = {p}); {what}.", direction, cut)

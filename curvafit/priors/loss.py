@@ -373,7 +373,7 @@ def _read_coefficients(law: Law, edge: float, unit: str | None, epsilon: float) 
             raise ValueError(f"expected a unit among {', '.join(METRES)}, got {quoted(unit)}")
         return numbers
     if law.doubtful:
-        text = f"the fit of {law.origin} is not `Supported`: its law may not be that of its scan"
+        text = f"the law ({law.origin}) is of a fit that is not `Supported`: it may not be that of its scan"
         warnings.warn(text, stacklevel=4)
     unit = unit or law.length_unit
     width = convert_length(law.epsilon_physical, law.length_unit, unit)

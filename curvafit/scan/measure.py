@@ -483,13 +483,14 @@ class Reading(NamedTuple):
         return self.descriptors[None], np.array([self.view]), np.array([self.amount])
 
 
-def read_texture(prepared: Prepared, across: Sequence[int] | None = None) -> Reading | None:
+def read_texture(prepared: Prepared, view: str | None = None, across: Sequence[int] | None = None) -> Reading | None:
     """Measure a scan's descriptors in windows of one size that fill its grid, or in the largest cube within its region
     of interest. None where that cube is smaller than `SMALLEST_CUBE` voxels, or no window shows a surface.
 
-    There are so many windows `across` the grid along each axis, by default as `windows_along` says.
+    It is read as a kind of view, by default its own; with so many windows `across` the grid along each axis, by default
+    as `windows_along` says.
     """
-    rows, view = [], _kind_of_view(prepared)
+    rows, view = [], _kind_of_view(prepared) if view is None else view
     across = windows_along(prepared, prepared.grid.shape) if across is None else across
     windows = _windows(prepared, across) if prepared.roi is None else [_largest_cube(prepared.roi)]
     for where in windows:

@@ -342,7 +342,7 @@ def _sum_sides(volume: Volume, bars: Sequence[Box], level: float, number: int) -
 
 
 def _count_structure(volume: Volume, split: Split, place: Place, pieces: Sequence[Box], number: int) -> Found:
-    """Return the structure's voxels in a piece, its surface in boxes that may be measured, and pairs (see `_pairs`)."""
+    """Return the structure's voxels in a piece, its surface in boxes that may be measured, and `count_pairs`."""
     core = pieces[number]
     box = grow(core, max(LAGS), place.shape)
     levels = find_levels(volume, split, place, volume.open(), box)

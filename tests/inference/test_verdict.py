@@ -97,7 +97,7 @@ def test_a_candidate_comes_back_from_its_json() -> None:
 def test_without_growing_the_first_is_named_and_not_checked() -> None:
     said = "Nothing was grown to check the law (--fast)."
     assert judge((law("optimum"), law("match")), None, fast=True) == ("optimum", said)
-    unusual = "Shapes of this law do not look like the scan (p = 0.0010); what differs most: depths, gaps."
+    unusual = "A quick reading rules this law out (p = 0.0010)."
     odd, usual = (dataclasses.replace(each, departure=None) for each in (ODD, USUAL))
     assert judge((law("optimum"),), odd, fast=True) == ("optimum", f"{unusual} {said}")
     passed = "A quick reading does not rule this law out (p = 0.40)."
