@@ -208,7 +208,7 @@ def can_write(
         if (place.exists() or place.is_symlink()) and not (overwrite or replaceable(place)):
             what = "folder" if place.is_dir() else "file"
             raise ValueError(
-                f"the name {place} is not free, a {what} that this command did not write is there: choose another "
+                f"the name {place} is not free, a {what} is there that would be lost: choose another "
                 "name, or replace it with --overwrite (in Python, overwrite=True)"
             )
     return target
