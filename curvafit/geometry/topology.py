@@ -44,20 +44,20 @@ def euler_number(mask: np.ndarray, *, periodic: bool = False) -> int:
 
 
 def euler_shares(mask: np.ndarray, *, periodic: bool = False) -> np.ndarray:
-    """Return what each voxel adds to χ of the union of the closed voxels (26-connected), int8 (Z, Y, X).
+    """Return what each voxel adds to χ of the union of the closed voxels (26-connected), int8 of the mask's shape.
 
-    A voxel counts itself (-1) and those of its low faces (1 each), low edges (-1 each) and low corner (1) that belong
-    to the union. In a window the first layers count nothing: their neighbours are not seen. Sums over parts are shares
-    of χ.
+    In three dimensions a voxel counts itself (-1) and those of its low faces (1 each), low edges (-1 each) and low
+    corner (1) that belong to the union. In a window the first layers count nothing: their neighbours are not seen. Sums
+    over parts are shares of χ.
     """
     total = np.zeros(mask.shape, dtype=np.int8)
-    for axes in ((), (0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)):
+    for axes in chain.from_iterable(combinations(range(mask.ndim), k) for k in range(mask.ndim + 1)):
         cells = mask
         for axis in axes:
             cells = cells | np.roll(cells, 1, axis)
-        total += ((-1) ** (3 - len(axes)) * cells.astype(np.int8)).astype(np.int8)
+        total += ((-1) ** (mask.ndim - len(axes)) * cells.astype(np.int8)).astype(np.int8)
     if not periodic:
-        for axis in range(3):
+        for axis in range(mask.ndim):
             total[(slice(None),) * axis + (0,)] = 0
     return total
 
@@ -76,18 +76,7 @@ def euler_of_window(mask: np.ndarray, ends: Ends = ((True, True),) * 3) -> float
     for layers in product((None, 0, 1), repeat=3):
         if all(layer is None or end[layer] for layer, end in zip(layers, ends, strict=True)):
             part = padded[tuple({None: slice(None), 0: 1, 1: -2}[layer] for layer in layers)]
-            total += (-0.5) ** (3 - part.ndim) * _count_cells(part)
-    return total
-
-
-def _count_cells(mask: np.ndarray) -> int:
-    """Return χ of the closed voxels of a mask of any dimension, less what belongs to its first layers alone."""
-    total = 0
-    for axes in chain.from_iterable(combinations(range(mask.ndim), k) for k in range(mask.ndim + 1)):
-        cells = mask
-        for axis in axes:
-            cells = cells | np.roll(cells, 1, axis)
-        total += (-1) ** (mask.ndim - len(axes)) * int(np.count_nonzero(cells[(slice(1, None),) * mask.ndim]))
+            total += (-0.5) ** (3 - part.ndim) * int(euler_shares(part).sum(dtype=np.int64))
     return total
 
 
