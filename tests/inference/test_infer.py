@@ -54,7 +54,9 @@ def inference(tubes: np.ndarray) -> Inference:
 def test_a_mask_is_taken_to_parameters_and_back(inference: Inference) -> None:
     fit = inference.fit
     assert fit.kind == "mask" and fit.family == "tubes"
-    assert [each.name for each in fit.candidates] == ["refined", "posterior", "simulation", "match"]
+    laws = {each.name: (tuple(each.coefficients), each.mass) for each in fit.candidates}
+    assert [*laws] in (["refined", "posterior", "simulation", "match"], ["refined", "posterior", "match"])
+    assert len({*laws.values()}) == len(fit.candidates)  # the nearest simulation only where it is another law
     assert fit.chosen in TITLES and fit.status.endswith(".")
     assert fit.best is not None and fit.best.coefficients.a20 == pytest.approx(1.0)
     assert float(fit.best.coefficients.a02) > 0 and -1 < fit.best.mass < 1
