@@ -72,7 +72,8 @@ def report(name: str) -> Values:
         for key in RATIOS if twins else ():
             values[key] = float(np.mean([getattr(each, key) for each in twins]) / getattr(own, key))
     if fit.misfit is not None:
-        values |= {"p": fit.misfit.probability, "departure": fit.misfit.departure or np.nan}
+        away = fit.misfit.departure
+        values |= {"p": fit.misfit.probability, "departure": np.nan if away is None else away}
         values["rejected by"] = ", ".join(name for name, p in fit.misfit.blocks.items() if p <= 0.05)
     return values
 

@@ -165,15 +165,15 @@ class Misfit:
     """The share of the model's shapes whose descriptors are as unusual as the scan's.
 
     `probability` is of all descriptors together, `blocks` of each block alone; `method` says what was compared with.
-    `departure` is how far the scan lies from shapes of the law over how far these lie from each other, in the mean;
-    None where nothing grew. `level_cut` is the part of the model's shapes that look as much like a level cut of a
-    random field as the scan does; None where the posterior does not tell.
+    `departure` is how much farther the scan lies from shapes of the law than these from each other, in the mean, in the
+    emulator's uncorrelated directions; None where nothing grew. `level_cut` is the part of the model's shapes that look
+    as much like a level cut of a random field as the scan does; None where the posterior does not tell.
     """
 
     probability: Annotated[float, Rule(least=0, most=1)]
     blocks: dict[str, float]
     method: str
-    departure: Annotated[float | None, Rule(least=0)] = None
+    departure: float | None = None
     level_cut: Annotated[float | None, Rule(least=0, most=1)] = None
 
 

@@ -247,7 +247,7 @@ def compare_windows(posterior: Posterior, reading: Reading, twins: np.ndarray) -
     """
     scan = reading.windows
     seen, grown = (posterior.emulator.compression(rows) @ posterior.emulator.basis.T for rows in (scan, twins))
-    departure, usual = float(cdist(seen, grown).mean() / pdist(grown).mean()), posterior.departures
+    departure, usual = float(cdist(seen, grown).mean() - pdist(grown).mean()), posterior.departures
     p = tail_probability(usual, departure) if len(usual) else probability_alike(seen, grown)
     p, level_cut = _join_level_cut(p, posterior, reading)
     blocks = {}
