@@ -64,7 +64,7 @@ def describe(store: Store, index: int, cut: bool) -> np.ndarray:
         found = measure_descriptors(prepare(masked(store, index, cut), kind="mask", one_scale=True))
     except ValueError:  # such as of one ball, which is a few voxels wide at the thickness of the training
         found = None
-    return np.zeros((0, len(column_names()))) if found is None else found[1].windows
+    return np.zeros((0, len(column_names()))) if found is None else found.reading.windows
 
 
 def describe_all(shapes: Sequence[tuple[Store, int]], cases: Cases) -> dict[str, list[np.ndarray]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.distance import cdist, pdist
@@ -45,9 +46,32 @@ TESTED, FAINTEST = 24, 0.05
 RELABELLED = 1999
 
 
+#: From parameters of the phase that is described to those of the structure.
+Turn = Callable[[np.ndarray], np.ndarray]
+
+
+class Described(NamedTuple):
+    """The phase of a scan that is described, what is read of it, and the way from its law to the structure's."""
+
+    seen: Prepared
+    reading: Reading
+    turn: Turn
+
+
+def measure_descriptors(prepared: Prepared) -> Described | None:
+    """Measure the descriptors of a scan; None where they cannot be measured.
+
+    Of a structure that fills most of the volume the background is described, as the shapes of the training were thin.
+    """
+    turned = prepared.volume_fraction > HALF
+    seen = prepared.inverted if turned else prepared
+    reading = read_texture(seen)
+    return None if reading is None else Described(seen, reading, mirror_parameters if turned else np.asarray)
+
+
 def estimate_law(
     fit: Fit,
-    prepared: Prepared,
+    described: Described | None,
     posterior: Posterior,
     *,
     seed: int,
@@ -70,12 +94,10 @@ def estimate_law(
         descriptors cannot be measured. And by block of descriptors the scan's numbers `(k,)` and those of the
         simulations `(n, k)`; None without simulations.
     """
-    progress("measuring descriptors", 0.0)
-    if (found := measure_descriptors(prepared)) is None:
+    if described is None:
         return fit, None
-    # Of a structure that fills over half, the background is described: `turn` gives the law of the structure.
-    seen, reading, turn = found
-    progress("reading the posterior", 0.1)
+    seen, reading, turn = described
+    progress("reading the posterior", 0.0)
     draws = posterior.draw(reading, DRAWS, seed)
     parameters = draws[:, :-1]
     best = best_parameters(posterior.emulator, reading, parameters[:STARTS])
@@ -105,15 +127,17 @@ def estimate_law(
     return replace(fit, candidates=(refined, likely, *others)), blocks
 
 
-def refine_matches(prepared: Prepared, posterior: Posterior, matches: Sequence[Match]) -> tuple[Candidate, ...]:
+def refine_matches(
+    described: Described | None, posterior: Posterior, matches: Sequence[Match]
+) -> tuple[Candidate, ...]:
     """Refine the parameters of the nearest matches until the emulated descriptors fit the scan's best.
 
     Levenberg and Marquardt's method, by optimistix, starts from each match, with the exact derivatives of the emulator.
     Returns one law; none where the descriptors of the scan cannot be measured.
     """
-    if (found := measure_descriptors(prepared)) is None:
+    if described is None:
         return ()
-    _, reading, turn = found
+    _, reading, turn = described
     starts = turn(np.stack([parameters_of(each.coefficients, each.mass) for each in matches]))
     best = best_parameters(posterior.emulator, reading, starts)
     return (_best_fit(posterior, *best, turn, matches[0].thickness),)
@@ -123,21 +147,6 @@ def middle_of(parameters: np.ndarray) -> np.ndarray:
     """Return the row of parameters `(n, 6)` nearest to the medians, in units of each column's range."""
     away = (parameters - np.median(parameters, 0)) / np.ptp(parameters, axis=0)
     return parameters[np.square(away).sum(1).argmin()]
-
-
-#: From parameters of the phase that is described to those of the structure.
-Turn = Callable[[np.ndarray], np.ndarray]
-
-
-def measure_descriptors(prepared: Prepared) -> tuple[Prepared, Reading, Turn] | None:
-    """Return the phase that is described, what is read of it, and the way to the structure's law.
-
-    Of a structure that fills most of the volume the background is described, as the shapes of the training were thin.
-    """
-    turned = prepared.volume_fraction > HALF
-    seen = prepared.inverted if turned else prepared
-    reading = read_texture(seen)
-    return None if reading is None else (seen, reading, mirror_parameters if turned else np.asarray)
 
 
 def _best_fit(
@@ -182,6 +191,7 @@ def tail_probability(usual: np.ndarray, own: float) -> float:
 def check_law(
     law: Candidate,
     prepared: Prepared,
+    described: Described | None,
     posterior: Posterior,
     *,
     seed: int = 0,
@@ -195,9 +205,9 @@ def check_law(
 
     Returns None where the scan's descriptors cannot be measured, or fewer than two shapes, or `FEWEST` windows, grow.
     """
-    if (found := measure_descriptors(prepared)) is None:
+    if described is None:
         return None
-    seen, reading, _ = found
+    seen, reading, _ = described
     across = windows_along(prepared, [edge.stop - edge.start for edge in prepared.windows[0]])
     count, rows = -(-TESTED // math.prod(across)), []
     for k in range(count):

@@ -23,7 +23,7 @@ from curvafit.geometry.morphometry import morphometry
 from curvafit.inference.atlas import Atlas, Match, load_atlas, mirror_match, nearest
 from curvafit.inference.candidates import TITLES, Candidate, Twin, best_candidate, twin
 from curvafit.inference.drift import drift
-from curvafit.inference.estimate import check_law, estimate_law, refine_matches
+from curvafit.inference.estimate import check_law, estimate_law, measure_descriptors, refine_matches
 from curvafit.inference.fit import KINDS, Fit
 from curvafit.inference.posterior import Posterior, load_posterior
 from curvafit.inference.simulate import ROUNDS
@@ -179,14 +179,15 @@ def infer(
     fit = _describe(prepared, measured, _provenance(volume, shape, atlas, posterior, seed), reason)
     if measured is None or reason:
         return Inference(volume, prepared, measured, {}, fit)
-    simulated = None
+    progress("measuring descriptors", 0.1)
+    described, simulated = measure_descriptors(prepared), None
     if method == "posterior":
-        part = sub_progress(progress, 0.1, 0.5)
+        part = sub_progress(progress, 0.15, 0.5)
         options = {"simulations": 0 if fast else simulations, "rounds": rounds, "schedule": schedule}
-        fit, simulated = estimate_law(fit, prepared, posterior, seed=seed, progress=part, **options)
+        fit, simulated = estimate_law(fit, described, posterior, seed=seed, progress=part, **options)
     progress("searching the atlas", 0.5)
     matches = _match(prepared, measured, atlas, exact=method == "match")
-    read = fit.candidates if method == "posterior" else refine_matches(prepared, posterior, matches)
+    read = fit.candidates if method == "posterior" else refine_matches(described, posterior, matches)
     laws, grown = _list_laws(prepared, read, matches, seed, sub_progress(progress, 0.5, 0.6)), {}
     if not fast:
         part = sub_progress(progress, 0.6, 0.8 if test else 1.0)
@@ -194,9 +195,8 @@ def infer(
     fit = replace(fit, candidates=laws, matches=matches)
     if test and not fast and (best := best_candidate(laws)) is not None:
         part = sub_progress(progress, 0.8, 1.0)
-        fit = replace(
-            fit, misfit=check_law(best, prepared, posterior, seed=seed + TWINS, schedule=schedule, progress=part)
-        )
+        options = {"seed": seed + TWINS, "schedule": schedule, "progress": part}
+        fit = replace(fit, misfit=check_law(best, prepared, described, posterior, **options))
     chosen, status = verdict(fit, fast=fast)
     fit = replace(fit, chosen=chosen, status=status)
     if prepared.kind != "field" and fit.best is not None and fit.best.thickness is not None:

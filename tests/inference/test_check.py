@@ -126,7 +126,12 @@ def test_shapes_show_as_many_windows_as_the_scan(monkeypatch: pytest.MonkeyPatch
         return Twin(None, 0.0, None, None, seen=prepared)
 
     monkeypatch.setattr(estimate, "twin", grow)
-    found = estimate.check_law(Candidate("match", Coefficients.willmore(), -0.3, {}, 8.0), prepared, POSTERIOR)
+    found = estimate.check_law(
+        Candidate("match", Coefficients.willmore(), -0.3, {}, 8.0),
+        prepared,
+        estimate.measure_descriptors(prepared),
+        POSTERIOR,
+    )
     assert lengths == [2 * estimate.EDGE] * (estimate.TESTED // 2)
     assert found is not None and found.method.startswith(f"{estimate.TESTED} windows of shapes of the law, 3 of")
 
@@ -136,7 +141,7 @@ def test_few_shapes_test_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     prepared = prepare(Field(mask.astype(np.uint8)), kind="mask", one_scale=True)
     monkeypatch.setattr(estimate, "twin", lambda *_, **__: Twin(None, 0.0, None, None, "one phase"))
     law = Candidate("match", Coefficients.willmore(), -0.3, {}, 8.0)
-    assert estimate.check_law(law, prepared, POSTERIOR) is None
+    assert estimate.check_law(law, prepared, estimate.measure_descriptors(prepared), POSTERIOR) is None
 
 
 def test_a_simulation_that_is_one_ball_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
