@@ -104,9 +104,11 @@ class Law:
         return cls(file.coefficients, file.mass, f"prior {os.fspath(path)}", epsilon=width, schedule="deep", **own)
 
     @property
-    def doubtful(self) -> bool:
-        """Return whether it was fitted to a scan that it may not be the law of."""
-        return bool(self.status) and not self.status.startswith("Supported")
+    def doubt(self) -> str:
+        """A sentence where it was fitted to a scan that it may not be the law of; else empty."""
+        if not self.status or self.status.startswith("Supported"):
+            return ""
+        return f"The law ({self.origin}) is of a fit that is not `Supported`: it may not be that of its scan."
 
     @property
     def fitted(self) -> bool:

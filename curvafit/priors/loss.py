@@ -372,9 +372,8 @@ def _read_coefficients(law: Law, edge: float, unit: str | None, epsilon: float) 
         if unit is not None and unit not in METRES:
             raise ValueError(f"expected a unit among {', '.join(METRES)}, got {quoted(unit)}")
         return numbers
-    if law.doubtful:
-        text = f"the law ({law.origin}) is of a fit that is not `Supported`: it may not be that of its scan"
-        warnings.warn(text, stacklevel=4)
+    if law.doubt:
+        warnings.warn(law.doubt, stacklevel=4)
     unit = unit or law.length_unit
     width = convert_length(law.epsilon_physical, law.length_unit, unit)
     if not 1 / 4 <= epsilon / width <= 4:

@@ -39,8 +39,6 @@ BENDING = 2.0
 Ends = tuple[tuple[bool, bool], tuple[bool, bool], tuple[bool, bool]]
 #: A law that is tried beside the prior's.
 WILLMORE = Coefficients.willmore()
-#: Said of a fit that is not supported.
-UNSURE = "The prior's fit is not `Supported`: its law may not be that of its scan. Compare the mask with the scan."
 #: Candidates of a fit that are laws of their own: the nearest match's destroys.
 TRUSTED = ("refined", "posterior", "simulation", "optimum")
 
@@ -132,7 +130,7 @@ def law_of(prior: LawLike, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
         return coefficients, (note,) if law.working else ()
     note = f"The prior's lengths, in {law.length_unit}, are converted to {scan.unit}."
     notes = () if law.length_unit == scan.unit else (note,)
-    return coefficients, (*notes, UNSURE) if law.doubtful else notes
+    return coefficients, (*notes, f"{law.doubt} Compare the mask with the scan.") if law.doubt else notes
 
 
 def laws_of(prior: LawLike, scan: Field) -> tuple[tuple[Coefficients, ...], tuple[str, ...]]:
