@@ -57,7 +57,10 @@ def generate(
     boundary: Annotated[str, _what(help="periodic, or replicate (walls, met at right angles).")] = "periodic",
     epsilon: Annotated[float | None, _what(help="Interface width in working units; by default 0.02.")] = None,
     seed: Annotated[int, _what(help="Seed of the noise that the shape grows from.")] = 0,
-    schedule: Annotated[str, _how(help="fast (1500 steps), paper (8000) or cosine (1000).")] = "fast",
+    schedule: Annotated[
+        str | None,
+        _how(help="fast (1500 steps), deep (1500, longer; a fit's default), paper (8000) or cosine (1000)."),
+    ] = None,
     steps: Annotated[int | None, _how(help="Number of steps, instead of the schedule's.")] = None,
     device: Annotated[str, _how(help="cpu, cuda, cuda:1 …")] = "cpu",
     checkpoint: Annotated[Path | None, _how(help="File to save the run in, and to resume it from.")] = None,
@@ -79,6 +82,7 @@ def generate(
         serve()
         return
     from curvafit.drawing.shapes import check_target, shape_record
+    from curvafit.generation.schedule import choose_schedule
     from curvafit.generation.schedule import schedule as named
     from curvafit.geometry.mesh import SUFFIXES
     from curvafit.priors.energy import orientation as orient
@@ -94,7 +98,7 @@ def generate(
     if orientation is not None:
         *direction, strength = parse_numbers(orientation, "--orientation", 4)
         Q = options["orientation"] = orient(direction, strength)
-    options["schedule"] = plan = named(schedule, steps)
+    options["schedule"] = plan = named(choose_schedule([law], schedule), steps)
     after = () if snapshots is None else parse_whole_numbers(snapshots, "--snapshots")
     options["snapshots"] = tuple(map(plan.check_step, after))
     options |= {"seed": seed, "device": device, **_place_checkpoint(checkpoint, checkpoint_every, out)}

@@ -23,7 +23,7 @@ from curvafit.data_synth.store import Store, find_well_formed
 from curvafit.generation.flow import generate
 from curvafit.generation.loop import first_mass
 from curvafit.generation.result import is_well_formed
-from curvafit.generation.schedule import Schedule
+from curvafit.generation.schedule import Schedule, choose_schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
@@ -117,7 +117,7 @@ class Generated:
     def of(laws: Iterable[LawLike], fraction: float | None = None) -> Generated:
         """Return the source of the shapes of one law or several.
 
-        By default the fraction is that of the scan, where the laws are fits and agree on it.
+        By default the fraction is that of the scan, where the laws are fits and agree on it. The schedule is the laws'.
         """
         stated = tuple(laws)
         known = read_laws(stated)
@@ -129,7 +129,7 @@ class Generated:
             Path(source).name if isinstance(source, (str, PathLike)) else law.origin
             for source, law in zip(stated, known, strict=True)
         )
-        return Generated(points, tuple(names), fraction=fraction)
+        return Generated(points, tuple(names), choose_schedule(known), fraction)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the source in JSON's types, for a set's record; `decode_source` reads it."""

@@ -30,7 +30,7 @@ from curvafit.generation.data import Data
 from curvafit.generation.forms import FORMS, Blur, DivergenceForm, Form, white_noise
 from curvafit.generation.loop import FlowOptions, first_mass, run
 from curvafit.generation.result import Callback, Flow
-from curvafit.generation.schedule import Schedule
+from curvafit.generation.schedule import Schedule, choose_schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.slabs import SlabStepper
 from curvafit.generation.stepper import FusedStepper, LbfgsStepper, Stepper, TorchStepper
@@ -56,7 +56,7 @@ def generate(
     grid: Grid | int | tuple[int, int, int] = 100,
     *,
     volume_fraction: float | None = None,
-    schedule: str | Schedule = "fast",
+    schedule: str | Schedule | None = None,
     seed: int = 0,
     epsilon: float | Tensor = WORKING_EPSILON,
     blur: float = WORKING_BLUR,
@@ -90,7 +90,8 @@ def generate(
         mass given as well is the one to begin with; a law may make few large bodies from one and many small from
         another.
     schedule
-        `"fast"`, `"paper"`, `"deep"`, `"cosine"` (see `SCHEDULES`), or a `Schedule`.
+        `"fast"`, `"paper"`, `"deep"`, `"cosine"` (see `SCHEDULES`), or a `Schedule`. None takes the law's: `"deep"` of
+        a fit, which was read from such shapes, else `"fast"`.
     seed
         Seed of the start. The same seed, grid and number of threads make the same field, bit for bit.
     orientation
@@ -118,7 +119,7 @@ def generate(
     mass = known.mass if mass is None and volume_fraction is None else mass
     grid, seed = grid if isinstance(grid, Grid) else Grid(grid), check_seed(seed)  # type: ignore[arg-type]
     execution = _Execution(backend, device, checkpoint, checkpoint_every, keep_checkpoint)
-    plan = named_schedule(schedule)
+    plan = choose_schedule([known], schedule)
     cost = Cost(known.coefficients, grid, epsilon, orientation, blur)
     options = FlowOptions(cost, plan, callbacks, snapshots, reject_early, volume_fraction)
     options.check_memory(device)
@@ -134,7 +135,7 @@ def generate_batch(
     grid: Grid | int | tuple[int, int, int] = 100,
     *,
     seeds: int | Sequence[int] = 0,
-    schedule: str | Schedule = "fast",
+    schedule: str | Schedule | None = None,
     epsilon: float | Tensor = WORKING_EPSILON,
     blur: float = WORKING_BLUR,
     reject_early: bool = False,
@@ -156,7 +157,8 @@ def generate_batch(
     The other arguments are those of `generate`, for all shapes. Raises ValueError at once if the sequences differ in
     length, otherwise as `generate` does, when the shape is made.
     """
-    jobs, plan = _list_jobs(laws, masses, seeds), named_schedule(schedule)
+    known = read_laws(laws)
+    jobs, plan = _list_jobs(known, masses, seeds), choose_schedule(known, schedule)
     grid = grid if isinstance(grid, Grid) else Grid(grid)  # type: ignore[arg-type]
     options = {"schedule": plan, "epsilon": epsilon, "blur": blur, "reject_early": reject_early}
     options |= {"backend": backend, "device": device}
@@ -343,10 +345,10 @@ def _count_fitting(grid: Grid, device: torch.device | str) -> int:
     return max(1, min(MOST_TOGETHER, device_memory(device) // (2 * EAGER * math.prod(grid.shape))))
 
 
-def _list_jobs(laws, masses, seeds) -> list[tuple[Coefficients, float | Tensor | None, int]]:
+def _list_jobs(laws: Sequence[Law], masses, seeds) -> list[tuple[Coefficients, float | Tensor | None, int]]:
     """Return coefficients, mass and seed of each shape."""
     columns = [
-        read_laws(laws),
+        laws,
         [masses] if masses is None or isinstance(masses, (Real, Tensor)) else as_tuple(masses, "masses"),
         [seeds] if isinstance(seeds, Real) else as_tuple(seeds, "seeds"),
     ]

@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any, Literal
 
 from curvafit.core.checks import as_tuple, check_choice, check_float, check_int, check_open_interval, check_type
+from curvafit.priors.law import Law
 
 #: The most steps that a flow may have, and the longest one.
 MOST_STEPS, LONGEST_STEP = 10**7, 1e6
@@ -159,6 +161,12 @@ def schedule(name: str | Schedule, steps: int | None = None) -> Schedule:
         check_choice(name, SCHEDULES, f"a schedule among {', '.join(SCHEDULES)}")
         name = SCHEDULES[name]
     return name if steps is None else dataclasses.replace(name, steps=steps)
+
+
+def choose_schedule(laws: Sequence[Law], stated: str | Schedule | None = None) -> Schedule:
+    """Return the stated schedule; where none is, that of the laws, and `fast` where these differ."""
+    own = {law.schedule for law in laws}
+    return schedule(stated or (own.pop() if len(own) == 1 else "fast"))
 
 
 def present_name(fields: dict[str, Any]) -> str:

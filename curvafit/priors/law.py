@@ -39,7 +39,7 @@ class Law:
     epsilon
         The ε that the coefficients are meant for, in their own unit.
     schedule
-        The name in `generation.SCHEDULES` by which shapes of this law were made; None where unknown.
+        The name in `generation.SCHEDULES` by which shapes of this law grow: a fit's was read from shapes of `deep`.
     working_voxel, length_unit
         Of a fit: the edge of a working voxel and its unit, which make the law's lengths physical. Else None.
     volume_fraction
@@ -55,7 +55,7 @@ class Law:
     origin: str = field(default="coefficients", compare=False)
     working: bool = True
     epsilon: float = WORKING_EPSILON
-    schedule: str | None = None
+    schedule: str = "fast"
     working_voxel: float | None = None
     length_unit: str | None = None
     volume_fraction: float | None = None
@@ -266,7 +266,7 @@ _PUBLISHED: dict[str, tuple[tuple[float, ...], float, str]] = {
 
 #: The published laws by name, in working units.
 PRESETS: dict[str, Law] = {
-    name: Law(Coefficients(*values), mass, f"preset {name}", schedule="paper", source=source)
+    name: Law(Coefficients(*values), mass, f"preset {name}", source=source)
     for name, (values, mass, source) in _PUBLISHED.items()
 }
 

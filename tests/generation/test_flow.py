@@ -15,7 +15,7 @@ from kernel_cases import relax, short
 from curvafit.generation.flow import descend, generate
 from curvafit.generation.forms import DivergenceForm, white_noise
 from curvafit.generation.result import RECORD_EVERY, viability
-from curvafit.generation.schedule import SCHEDULES, Phase, Schedule, present_name, schedule
+from curvafit.generation.schedule import SCHEDULES, Phase, Schedule, choose_schedule, present_name, schedule
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import energy, energy_gradient_by_autograd
 from curvafit.priors.grid import Grid
@@ -330,3 +330,9 @@ def test_a_preset_by_name_has_its_own_mass_unless_told_otherwise() -> None:
     assert generate("tubes", -0.3, (12, 10, 8), schedule=brief).mass == pytest.approx(-0.3, abs=1e-6)
     with pytest.raises(ValueError, match="preset"):
         generate("tube")
+
+
+def test_a_law_grows_by_its_own_schedule_unless_another_is_stated() -> None:
+    fit, tubes = made_fit().to_law(), preset("tubes")
+    assert [choose_schedule(laws).name for laws in ((fit, fit), (tubes,), (fit, tubes))] == ["deep", "fast", "fast"]
+    assert choose_schedule([fit], "paper").name == "paper"
