@@ -1,8 +1,6 @@
-"""Nulls: shapes and repairs that know nothing of curvature, to which what a law does is compared.
+"""A null of a texture: a level cut of a Gaussian random field with a mask's volume fraction and two-point function.
 
-`level_cut` is a null of a texture: a level cut of a Gaussian random field with a mask's volume fraction and two-point
-function. A fit that is no nearer to a query than its null says nothing. `random_repair` is a null of a repair: as many
-voxels as a repair changed are changed at random places of the same kind. What a repair gains above it is its own.
+A fit that is no nearer to a query than its null says nothing.
 """
 
 from __future__ import annotations
@@ -10,7 +8,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy import ndimage, optimize, stats
+from scipy import optimize, stats
 
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 
@@ -32,26 +30,6 @@ def level_cut(mask: np.ndarray, grid: Grid, seed: int) -> np.ndarray:
     near = np.abs(height) < slope.mean()
     voxel = grid.spacing[0]
     return np.tanh(height * voxel / (math.sqrt(2) * WORKING_EPSILON * slope[near].mean())).astype(np.float32)
-
-
-def random_repair(before: np.ndarray, after: np.ndarray, seed: int) -> np.ndarray:
-    """Return `before` with the patches that a repair added to it, or took away, at other places of its surface.
-
-    Each patch keeps its shape. Of 200 random places it takes the one where it changes the most voxels.
-    """
-    random, found = np.random.default_rng(seed), before.copy()
-    for value in (True, False):
-        changed = (after != before) & (after == value)
-        surface = ndimage.binary_dilation(before) & ~before if value else before & ~ndimage.binary_erosion(before)
-        places = np.argwhere(surface)
-        for box in ndimage.find_objects(ndimage.label(changed, np.ones((3, 3, 3)))[0]):  # type: ignore[misc]
-            patch = changed[box]
-            room = np.array(before.shape) - patch.shape
-            starts = np.clip(random.choice(places, 200) - np.array(patch.shape) // 2, 0, room)
-            boxes = [tuple(slice(a, a + n) for a, n in zip(start, patch.shape, strict=True)) for start in starts]
-            target = max(boxes, key=lambda other: np.count_nonzero(patch & (found[other] != value)))
-            found[target][patch] = value
-    return found
 
 
 def gaussian_spectrum(mask: np.ndarray) -> np.ndarray:

@@ -40,6 +40,5 @@ if TYPE_CHECKING:
     from curvafit.data_synth.store import Settings as Settings
     from curvafit.data_synth.store import Store as Store
     from curvafit.data_synth.store import open_store as open_store
-    from curvafit.geometry.diagram import diagrams as diagrams
 
 attach_lazy_names(__name__)

@@ -56,7 +56,6 @@ class Labels:
         b0 pieces, b1 tunnels, b2 cavities; see `topology.betti_numbers`.
     """
 
-    grid: Grid
     mask: np.ndarray | None = None
     distance: np.ndarray | None = None
     skeleton: np.ndarray | None = None
@@ -68,7 +67,7 @@ class Labels:
 
 
 #: Names of all labels.
-NAMES = tuple(field.name for field in fields(Labels) if field.name != "grid")
+NAMES = tuple(field.name for field in fields(Labels))
 
 
 def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Collection[str] | str = NAMES) -> Labels:
@@ -95,7 +94,7 @@ def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Col
         labels["kappa1"], labels["kappa2"] = _measure_curvatures(u, mask, grid, epsilon)
     if "betti" in wanted:
         labels["betti"] = betti_numbers(mask, periodic=grid.periodic)
-    return Labels(grid, **{name: value for name, value in ({"mask": mask} | labels).items() if name in wanted})  # type: ignore[arg-type]
+    return Labels(**{name: value for name, value in ({"mask": mask} | labels).items() if name in wanted})  # type: ignore[arg-type]
 
 
 def instances_of(distance: np.ndarray, grid: Grid) -> np.ndarray:

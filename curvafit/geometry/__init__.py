@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from curvafit.geometry.descriptors import descriptors as descriptors
     from curvafit.geometry.diagram import Diagram as Diagram
     from curvafit.geometry.diagram import diagram as diagram
-    from curvafit.geometry.diagram import diagrams as diagrams
     from curvafit.geometry.diagram import family_of as family_of
     from curvafit.geometry.diagram import family_shares as family_shares
     from curvafit.geometry.diagram import half_thickness as half_thickness

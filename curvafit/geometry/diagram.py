@@ -17,7 +17,7 @@ from curvafit.core.pictures import Pictured
 from curvafit.geometry.mesh import NoSurface, Surface, areas, surface
 from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
 from curvafit.priors.grid import Grid
-from curvafit.priors.profile import phase_field, profile_distance
+from curvafit.priors.profile import profile_distance
 
 Kind = Literal["geometric", "diffuse"]
 
@@ -194,16 +194,6 @@ def diagram(
     excluded = 1 - float(weights[known].sum() / weights.sum())
     places = centres[known] * np.array(grid.spacing)
     return Diagram(points[known], weights[known], excluded=excluded, places=places)
-
-
-def diagrams(field: Tensor, grid: Grid, epsilon: float) -> tuple[Diagram, Diagram]:
-    """Measure a phase field (Z, Y, X) and its mask {u > 0}, re-profiled as a scan's mask is: two geometric diagrams.
-
-    Both are thinned as `wasserstein` thins them, so that a distance to one is the distance to the whole diagram.
-    """
-    profile = phase_field(field > 0, grid, epsilon)
-    of_field, of_mask = (diagram(u, grid, epsilon).thin(BIN_WIDTH, TAIL_SHARE) for u in (field, profile))
-    return of_field, of_mask
 
 
 def find_resolved(slope: Tensor, kappa1: Tensor, kappa2: Tensor, grid: Grid) -> Tensor:

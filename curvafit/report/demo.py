@@ -58,12 +58,10 @@ _MEASURES = ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D", "BS/BV", "DA", "H", "K")
 
 
 class Demo(NamedTuple):
-    """The path of the page, and the results on it."""
+    """The path of the page, and how well the scan was filled."""
 
     page: Path
     completion: Completion
-    measures: Measures
-    fit: Fit
 
 
 class Completion(NamedTuple):
@@ -117,7 +115,7 @@ def write_demo(
     progress("drawing the page", 0.95)
     text = demo_page(inference, measures, completion, textures, atlas)
     write_inference(inference, folder, overwrite=overwrite)
-    return Demo(write_content(page, text), completion, measures, inference.fit)
+    return Demo(write_content(page, text), completion)
 
 
 def score_completion(truth: np.ndarray, filled: np.ndarray, every: int, axis: int = 0) -> Completion:

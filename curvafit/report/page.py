@@ -38,6 +38,7 @@ from curvafit.drawing.plot import (
     corner_figure,
     diagram_figure,
     gallery_figure,
+    grey_limits,
     png,
     shared_limits,
     slice_figure,
@@ -452,11 +453,8 @@ def picture_of(figure: Figure, alt: str, **words: str) -> Picture:
 
 def _slices(inference: Inference) -> list[Picture]:
     """Return pictures of slices across z, y and x through the main window's middle, with the surface's contour."""
-    values, prepared = inference.scan.values, inference.prepared
-    sample = np.asarray(values[:: max(1, values.shape[0] // 64)], dtype=np.float32)
-    low, high = (float(v) for v in np.percentile(sample, (0.5, 99.5)))
-    limits = (low, high) if high > low else (float(sample.min()), float(sample.max()))
-    middle = [(edge.start + edge.stop) // 2 for edge in prepared.windows[0]]
+    limits = grey_limits(inference.scan.values)
+    middle = [(edge.start + edge.stop) // 2 for edge in inference.prepared.windows[0]]
     return [_slice(inference, axis, middle[axis], limits) for axis in range(3)]
 
 

@@ -537,18 +537,16 @@ def reconstruct_labels(
     error = max(doubt.calibration_error for doubt in doubts.values())
     dice = {number: doubt.expected_dice for number, doubt in doubts.items()}
     likely = replace(volume, values=likely.astype(np.float32), notes=())
-    return Segmentation(
-        mask=replace(volume, values=values != 0, notes=()),
-        phase=replace(volume, values=np.maximum(deepest, -1), notes=()),
+    said = (text if len(of) == len(numbers) else f"{_name_labels(of)}: {text}" for text, of in notes.items())
+    return Segmentation.of(
+        volume,
+        values != 0,
+        np.maximum(deepest, -1),
+        None,
+        max(part.epsilon for part in parts.values()),
+        (*misplaced, *said),
         weight=None,
-        coefficients=None,
-        epsilon=max(part.epsilon for part in parts.values()),
         status=_describe_labels(parts, dice),
-        notes=(
-            *volume.notes,
-            *misplaced,
-            *(text if len(of) == len(numbers) else f"{_name_labels(of)}: {text}" for text, of in notes.items()),
-        ),
         labels=replace(volume, values=values, notes=()),
         image=seen,
         uncertainty=Uncertainty(likely, error, (), min(dice.values()), dice),
