@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Annotated
 
 import numpy as np
@@ -91,16 +92,17 @@ class Candidate:
 
 
 def best_candidate(candidates: Sequence[Candidate]) -> Candidate | None:
-    """Return the first candidate within seed noise of the one nearest to the scan; None where nothing grew.
+    """Return the candidate whose twins are nearest to the scan; None where nothing grew.
 
-    The noise is the distance between the nearest candidate's twins.
+    Stationarity, which reads a phase field's law off its equation, is the best one where it is nearest but for the
+    distance between two twins of the nearest.
     """
     grown = [(each.distance, each) for each in candidates if each.distance is not None]
     if not grown:
         return None
-    least, nearest = min(grown, key=lambda pair: pair[0])
+    least, nearest = min(grown, key=itemgetter(0))
     reach = least + (nearest.seed_noise or 0.0)
-    return next(each for distance, each in grown if distance <= reach)
+    return next((each for away, each in grown if each.name == "stationarity" and away <= reach), nearest)
 
 
 def seed_noise_of(candidates: Sequence[Candidate]) -> float | None:

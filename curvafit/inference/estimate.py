@@ -90,9 +90,8 @@ def estimate_law(
     Returns
     -------
     tuple
-        The fit with draws, combinations and candidates, the most trusted first; the same fit where the
-        descriptors cannot be measured. And by block of descriptors the scan's numbers `(k,)` and those of the
-        simulations `(n, k)`; None without simulations.
+        The fit with draws, combinations and candidates; the same fit where the descriptors cannot be measured. And by
+        block of descriptors the scan's numbers `(k,)` and those of the simulations `(n, k)`; None without simulations.
     """
     if described is None:
         return fit, None

@@ -227,7 +227,7 @@ def _match(prepared: Prepared, measured: Diagram, atlas: Atlas, exact: bool) -> 
 def _list_laws(
     prepared: Prepared, read: tuple[Candidate, ...], matches: tuple[Match, ...], seed: int, progress: Progress
 ) -> tuple[Candidate, ...]:
-    """Return the laws to grow, the most trusted first: of a phase field its stationarity, those that were read from the
+    """Return the laws to grow: of a phase field its stationarity, those that were read from the
     descriptors, and the nearest match."""
     laws = (*read, Candidate("match", matches[0].coefficients, matches[0].mass, {}, matches[0].thickness))
     if prepared.kind != "field" or is_rounded(prepared.phase):
@@ -257,7 +257,7 @@ def _grow(
     seed: int,
     progress: Progress,
 ) -> tuple[tuple[Candidate, ...], dict[str, tuple[Twin, ...]]]:
-    """Grow a twin of each law, and `count` of the best: of the nearest, and of the first that is as near."""
+    """Grow a twin of each law, and `count` of the best (`best_candidate`)."""
     twins: dict[str, tuple[Twin, ...]] = {}
 
     def grow(law: Candidate, share: float) -> Candidate:

@@ -35,7 +35,7 @@ print(fit.status)
 
 # %% [markdown]
 # `status` is to be read first: it names the law that is best supported, if any is. Several candidates were grown, and
-# the chosen one is the first that is as near as the nearest. A phase field gives its coefficients back by stationarity:
+# the chosen one is the nearest. A phase field gives its coefficients back by stationarity:
 
 # %%
 print("      truth  inferred     ±")
