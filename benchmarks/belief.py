@@ -5,7 +5,8 @@ which tests the law that it found itself. So do their level cuts: cuts of a Gaus
 fraction and two-point function, which no law made. The p of each is as `infer` states it (`compare_windows`): of the
 rank of its departure (`Misfit.departure`) among those of the packaged posterior, and of the rank of its discriminant.
 `size` is the part of shapes with p at most .05, `power` that of level cuts; a cut that has not gone through `infer` is
-counted by its discriminant alone, which can only reject fewer.
+counted by its discriminant alone, which can only reject fewer. `error` is how far the law that `infer` chooses lies
+from the shape's own: the mean over the six parameters and the laws, in deviations of the box of `curvafit atlas build`.
 
 `--teach STORE…` learns the discriminant from shapes of other laws, as masks, and their level cuts. `--calibrate FILE`
 writes the packaged posterior with it and with the departures of all shapes; each law's is then ranked among the others.
@@ -22,15 +23,15 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from benchmarks.closure import TABLE
-from benchmarks.harness import Cases, Figure, Values, show
+from benchmarks.closure import PRIOR, TABLE
+from benchmarks.harness import Cases, Figure, Values, bootstrap, show
 from benchmarks.nulls import level_cut
 from curvafit.data_synth.store import Store, find_well_formed
 from curvafit.inference.candidates import join_tests
 from curvafit.inference.estimate import measure_descriptors, rank_level_cut, tail_probability
 from curvafit.inference.infer import infer
 from curvafit.inference.posterior import Posterior, load_posterior, save_posterior
-from curvafit.inference.table import column_names, load_table
+from curvafit.inference.table import column_names, load_table, parameters_of
 from curvafit.priors.grid import Grid
 from curvafit.scan.prepare import prepare
 from curvafit.volumes.field import Field
@@ -53,6 +54,10 @@ def case(store: Store, index: int, cut: bool) -> Values:
     """Return p, of all descriptors and by block, the departure and the verdict of a shape or of its level cut."""
     fit = infer(masked(store, index, cut), kind="mask", seed=index).fit
     found: Values = {"status": fit.status.partition(":")[0]}
+    if not cut and (best := fit.best) is not None:
+        own = store.record(index)
+        laws = [parameters_of(each.coefficients, each.mass) for each in (best, own)]
+        found["error"] = float(np.mean(np.abs(np.subtract(*laws)) / PRIOR))
     if (misfit := fit.misfit) is not None:
         found |= {"p": misfit.probability, "departure": misfit.departure, **misfit.blocks}
     return found
@@ -126,6 +131,16 @@ def rank(
     return found
 
 
+def average_errors(errors: Mapping[int, float], edges: np.ndarray) -> dict[str, Figure]:
+    """Print and return the mean errors of the laws that `infer` chose, by edge of the laws' shapes `(laws,)`."""
+    figures = {}
+    for edge in dict.fromkeys(edges[list(errors)]):
+        found = np.array([error for law, error in errors.items() if edges[law] == edge])
+        figures[f"belief.{edge}.error"] = bootstrap(found, np.mean)
+    show(["", "of the law chosen"], [[name, figure] for name, figure in figures.items()])
+    return figures
+
+
 def count_rejected(
     tested: Mapping[str, Mapping[int, float]], departures: Mapping[str, Mapping[int, float]], edges: np.ndarray
 ) -> dict[str, Figure]:
@@ -154,15 +169,18 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     shapes = [shape for store in stores for shape in store]
     cuts = {kind: level_cuts(posterior, windows) for kind, windows in describe_all(shapes, cases).items()}
     departures: dict[str, dict[int, float]] = {kind: {} for kind in KINDS}
+    errors: dict[int, float] = {}
     for number, (store, index) in enumerate(shapes):
         for kind, found in departures.items():
             name = f"{store.settings.shape[0]}-{store.name}-{index}-{kind}"
             for values in cases.all({name: partial(case, store, index, kind == "cut")}, seed=index).values():
                 if "departure" in values:
                     found[number] = values["departure"]
+                if "error" in values:
+                    errors[number] = values["error"]
     edges = np.array([store.settings.shape[0] for store, _ in shapes])
     p = rank(None if options.calibrate else posterior.departures, departures, cuts)
-    figures = count_rejected(p, departures, edges)
+    figures = count_rejected(p, departures, edges) | average_errors(errors, edges)
     if options.calibrate is not None:
         found = np.sort(np.array([*departures["shape"].values()], dtype=np.float32))
         save_posterior(replace(posterior, departures=found), options.calibrate)
