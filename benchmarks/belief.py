@@ -5,8 +5,9 @@ which tests the law that it found itself. So do their level cuts: cuts of a Gaus
 fraction and two-point function, which no law made. The p of each is as `infer` states it (`compare_windows`): of the
 rank of its departure (`Misfit.departure`) among those of the packaged posterior, and of the rank of its discriminant.
 `size` is the part of shapes with p at most .05, `power` that of level cuts; a cut that has not gone through `infer` is
-counted by its discriminant alone, which can only reject fewer. `error` is how far the law that `infer` chooses lies
-from the shape's own: the mean over the six parameters and the laws, in deviations of the box of `curvafit atlas build`.
+counted by its discriminant alone, which can only reject fewer. `law_error` is how far the law that `infer` chooses
+lies from the shape's own, `medians_error` the posterior's medians: the mean over the six parameters and the laws, in
+deviations of the box of `curvafit atlas build`.
 
 `--teach STORE…` learns the discriminant from shapes of other laws, as masks, and their level cuts. `--calibrate FILE`
 writes the packaged posterior with it and with the departures of all shapes; each law's is then ranked among the others.
@@ -54,10 +55,10 @@ def case(store: Store, index: int, cut: bool) -> Values:
     """Return p, of all descriptors and by block, the departure and the verdict of a shape or of its level cut."""
     fit = infer(masked(store, index, cut), kind="mask", seed=index).fit
     found: Values = {"status": fit.status.partition(":")[0]}
-    if not cut and (best := fit.best) is not None:
-        own = store.record(index)
-        laws = [parameters_of(each.coefficients, each.mass) for each in (best, own)]
-        found["error"] = float(np.mean(np.abs(np.subtract(*laws)) / PRIOR))
+    if not cut and (best := fit.best) is not None and fit.draws is not None:
+        truth, law = (parameters_of(each.coefficients, each.mass) for each in (store.record(index), best))
+        for name, parameters in (("law", law), ("medians", np.median(fit.draws[:, :-1], 0))):
+            found[f"{name} error"] = float(np.mean(np.abs(parameters - truth) / PRIOR))
     if (misfit := fit.misfit) is not None:
         found |= {"p": misfit.probability, "departure": misfit.departure, **misfit.blocks}
     return found
@@ -131,13 +132,14 @@ def rank(
     return found
 
 
-def average_errors(errors: Mapping[int, float], edges: np.ndarray) -> dict[str, Figure]:
-    """Print and return the mean errors of the laws that `infer` chose, by edge of the laws' shapes `(laws,)`."""
+def average_errors(errors: Mapping[int, Values], edges: np.ndarray) -> dict[str, Figure]:
+    """Print and return the mean errors of `infer`, by name and by edge of the laws' shapes `(laws,)`."""
     figures = {}
     for edge in dict.fromkeys(edges[list(errors)]):
-        found = np.array([error for law, error in errors.items() if edges[law] == edge])
-        figures[f"belief.{edge}.error"] = bootstrap(found, np.mean)
-    show(["", "of the law chosen"], [[name, figure] for name, figure in figures.items()])
+        for name in ("law", "medians"):
+            found = [values[f"{name} error"] for law, values in errors.items() if edges[law] == edge]
+            figures[f"belief.{edge}.{name}_error"] = bootstrap(found, np.mean)
+    show(["", "mean error"], [[name, figure] for name, figure in figures.items()])
     return figures
 
 
@@ -169,15 +171,15 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     shapes = [shape for store in stores for shape in store]
     cuts = {kind: level_cuts(posterior, windows) for kind, windows in describe_all(shapes, cases).items()}
     departures: dict[str, dict[int, float]] = {kind: {} for kind in KINDS}
-    errors: dict[int, float] = {}
+    errors: dict[int, Values] = {}
     for number, (store, index) in enumerate(shapes):
         for kind, found in departures.items():
             name = f"{store.settings.shape[0]}-{store.name}-{index}-{kind}"
             for values in cases.all({name: partial(case, store, index, kind == "cut")}, seed=index).values():
                 if "departure" in values:
                     found[number] = values["departure"]
-                if "error" in values:
-                    errors[number] = values["error"]
+                if "law error" in values:
+                    errors[number] = values
     edges = np.array([store.settings.shape[0] for store, _ in shapes])
     p = rank(None if options.calibrate else posterior.departures, departures, cuts)
     figures = count_rejected(p, departures, edges) | average_errors(errors, edges)
