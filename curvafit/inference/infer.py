@@ -227,8 +227,8 @@ def _match(prepared: Prepared, measured: Diagram, atlas: Atlas, exact: bool) -> 
 def _list_laws(
     prepared: Prepared, read: tuple[Candidate, ...], matches: tuple[Match, ...], seed: int, progress: Progress
 ) -> tuple[Candidate, ...]:
-    """Return the laws to grow: of a phase field its stationarity, those that were read from the
-    descriptors, and the nearest match."""
+    """Return the laws to grow: of a phase field its stationarity, those that were read from the descriptors, and the
+    nearest match."""
     laws = (*read, Candidate("match", matches[0].coefficients, matches[0].mass, {}, matches[0].thickness))
     if prepared.kind != "field" or is_rounded(prepared.phase):
         return laws
