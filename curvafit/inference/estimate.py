@@ -200,7 +200,8 @@ def check_law(
     """Compare a scan's windows with those of shapes of a law, seen as the scan is (`compare_windows`).
 
     A shape shows as many windows as the scan's main window does: parts of a large shape differ more than small shapes,
-    each of which has the mass of the law. As many shapes are grown as show `TESTED` windows.
+    each of which has the mass of the law. As many shapes are grown as show `TESTED` windows; where some are not well
+    formed, up to as many again are tried.
 
     Returns None where the scan's descriptors cannot be measured, or fewer than two shapes, or `FEWEST` windows, grow.
     """
@@ -209,12 +210,14 @@ def check_law(
     seen, reading, _ = described
     across = windows_along(prepared, [edge.stop - edge.start for edge in prepared.windows[0]])
     count, rows = -(-TESTED // math.prod(across)), []
-    for k in range(count):
+    for k in range(2 * count):
         grown = twin(law, prepared, seed + k, schedule, longest=EDGE * max(across))
         if grown.seen is not None:
             own = read_texture(grown.seen if seen is prepared else grown.seen.inverted, reading.view, across)
             rows += [] if own is None else [own.windows]
-        progress(f"testing the law: {k + 1} of {count} shapes", (k + 1) / count)
+        progress(f"testing the law: {len(rows)} of {count} shapes", len(rows) / count)
+        if len(rows) == count:
+            break
     if len(rows) < 2 or sum(map(len, rows)) < FEWEST:
         return None
     return compare_windows(posterior, reading, np.concatenate(rows))
