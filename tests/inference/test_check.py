@@ -136,6 +136,18 @@ def test_shapes_show_as_many_windows_as_the_scan(monkeypatch: pytest.MonkeyPatch
     assert found is not None and found.method.startswith(f"{estimate.TESTED} windows of shapes of the law, 3 of")
 
 
+def test_further_shapes_are_tried_where_some_do_not_grow(monkeypatch: pytest.MonkeyPatch) -> None:
+    mask = Gyroid(0.24).distance(centres(Grid((48, 48, 48)))).numpy() > 0
+    prepared = prepare(Field(mask.astype(np.uint8)), kind="mask", one_scale=True)
+    barren, full = Twin(None, 0.0, None, None, "one phase"), Twin(None, 0.0, None, None, seen=prepared)
+    tried = iter([barren, *[full] * 30])
+    monkeypatch.setattr(estimate, "twin", lambda *_, **__: next(tried))
+    law = Candidate("match", Coefficients.willmore(), -0.3, {}, 8.0)
+    found = estimate.check_law(law, prepared, estimate.measure_descriptors(prepared), POSTERIOR)
+    assert found is not None and found.method.startswith(f"{estimate.TESTED} windows of shapes of the law")
+    assert len(list(tried)) == 30 - estimate.TESTED
+
+
 def test_few_shapes_test_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     mask = Gyroid(0.24).distance(centres(Grid((48, 48, 48)))).numpy() > 0
     prepared = prepare(Field(mask.astype(np.uint8)), kind="mask", one_scale=True)
