@@ -166,7 +166,7 @@ def schedule(name: str | Schedule, steps: int | None = None) -> Schedule:
 def choose_schedule(laws: Sequence[Law], stated: str | Schedule | None = None) -> Schedule:
     """Return the stated schedule; where none is, that of the laws, and `fast` where these differ."""
     own = {law.schedule for law in laws}
-    return schedule(stated or (own.pop() if len(own) == 1 else "fast"))
+    return schedule((own.pop() if len(own) == 1 else "fast") if stated is None else stated)
 
 
 def present_name(fields: dict[str, Any]) -> str:

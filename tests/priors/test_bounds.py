@@ -117,7 +117,7 @@ def test_wrong_seeds_are_refused(seed: Any) -> None:
         ({"checkpoint_every": math.inf}, "seconds"),
         ({"volume_fraction": math.nan, "mass": None}, "volume fraction"),
         ({"mass": "half"}, "mass"),
-        ({"schedule": None}, "schedule"),
+        ({"schedule": 5}, "schedule"),
     ],
 )
 def test_flows_refuse_what_is_out_of_range(wrong: dict[str, Any], said: str) -> None:
