@@ -94,8 +94,8 @@ class Candidate:
 def best_candidate(candidates: Sequence[Candidate]) -> Candidate | None:
     """Return the candidate whose twins are nearest to the scan; None where nothing grew.
 
-    Stationarity, which reads a phase field's law off its equation, is the best one where it is nearest but for the
-    distance between two twins of the nearest.
+    Stationarity reads a phase field's law off its equation. It is the best one where its twins are farther by no more
+    than the distance between two twins of the nearest.
     """
     grown = [(each.distance, each) for each in candidates if each.distance is not None]
     if not grown:

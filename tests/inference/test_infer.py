@@ -64,6 +64,8 @@ def test_a_mask_is_taken_to_parameters_and_back(inference: Inference) -> None:
     assert distances[fit.best.name] == min(distances.values()) < 6
     assert [match.distance for match in fit.matches] == sorted(match.distance for match in fit.matches)
     assert inference.best is not None and min(inference.best.shape) == max(inference.best.shape) >= EDGES[0]
+    refined = inference.shape_of("refined")
+    assert refined is not None and min(refined.shape) == max(refined.shape) >= 64
     assert fit.misfit is not None and set(fit.misfit.blocks) == set(BLOCKS)
     assert fit.drift is not None and 0 < fit.drift < 5
     share = fit.morphometry.volume_fraction

@@ -111,7 +111,7 @@ def test_a_prior_comes_in_the_scan_s_unit(tmp_path: Path) -> None:
 def test_a_prior_that_is_not_supported_is_said_to_be_so(status: str, count: int) -> None:
     mm = Field(np.zeros((4, 4, 4)), (0.0195,) * 3, "mm")
     fit = dataclasses.replace(made_fit(), status=status)
-    assert sum("Supported" in note for note in law_of(fit, mm)[1]) == count
+    assert law_of(fit, mm)[1] == (f"{fit.to_law().doubt} Compare the mask with the scan.",) * count
 
 
 def test_axes_are_refined_and_brought_back() -> None:
