@@ -161,7 +161,7 @@ class Fit(Pictured):
         filled = self.morphometry.volume_fraction
         width = self.epsilon_physical * WORKING_SPACING / self.working_voxel
         own = {"working_voxel": self.working_voxel, "length_unit": self.length_unit, "volume_fraction": filled}
-        return Law(six, mass, "prior", epsilon=width, schedule="deep", status=self.status, **own)  # type: ignore[arg-type]
+        return Law(six, mass, "prior", epsilon=width, status=self.status, **own)  # type: ignore[arg-type]
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers, strings, lists and dicts, as `fit.json` holds them."""
@@ -300,7 +300,7 @@ def draw_laws(law: LawLike, count: int) -> list[Law]:
         raise ValueError(f"expected a fit with draws of a posterior, got {quoted(law)}")
     check_int(count, f"from 1 to {len(fit.draws)} draws", 1, len(fit.draws))
     rows = np.linspace(0, len(fit.draws) - 1, count).round().astype(int)
-    own = {"length_unit": fit.length_unit, "volume_fraction": fit.morphometry.volume_fraction, "schedule": "deep"}
+    own = {"length_unit": fit.length_unit, "volume_fraction": fit.morphometry.volume_fraction}
     own |= {"status": fit.status}
     source, laws = f" of {os.fspath(law)}" if named else "", []  # type: ignore[arg-type]
     for row, (*five, mass, thickness) in zip(rows, to_columns(fit.draws[rows]).T.tolist(), strict=True):

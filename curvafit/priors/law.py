@@ -24,7 +24,7 @@ FORMAT = "curvafit-fit-3"
 
 @dataclass(frozen=True)
 class Law:
-    """A law that shapes of one texture are grown by: coefficients and mass, their units, and their ε and schedule.
+    """A law that shapes of one texture are grown by: coefficients and mass, their units, and their ε.
 
     Attributes
     ----------
@@ -38,8 +38,6 @@ class Law:
         Whether the coefficients are in working units.
     epsilon
         The ε that the coefficients are meant for, in their own unit.
-    schedule
-        The name in `generation.SCHEDULES` by which shapes of this law grow: a fit's was read from shapes of `deep`.
     working_voxel, length_unit
         Of a fit: the edge of a working voxel and its unit, which make the law's lengths physical. Else None.
     volume_fraction
@@ -55,7 +53,6 @@ class Law:
     origin: str = field(default="coefficients", compare=False)
     working: bool = True
     epsilon: float = WORKING_EPSILON
-    schedule: str = "fast"
     working_voxel: float | None = None
     length_unit: str | None = None
     volume_fraction: float | None = None
@@ -101,7 +98,7 @@ class Law:
         width = file.epsilon_physical * WORKING_SPACING / file.working_voxel
         own: dict[str, Any] = {"working_voxel": file.working_voxel, "length_unit": file.length_unit}
         own |= {"volume_fraction": share, "status": file.status}
-        return cls(file.coefficients, file.mass, f"prior {os.fspath(path)}", epsilon=width, schedule="deep", **own)
+        return cls(file.coefficients, file.mass, f"prior {os.fspath(path)}", epsilon=width, **own)
 
     @property
     def doubt(self) -> str:
@@ -114,6 +111,11 @@ class Law:
     def fitted(self) -> bool:
         """Whether the law was inferred from a scan, so that its lengths are physical too."""
         return self.working_voxel is not None
+
+    @property
+    def schedule(self) -> str:
+        """The name in `generation.SCHEDULES` by which shapes of this law grow: a fit was read from shapes of `deep`."""
+        return "deep" if self.fitted else "fast"
 
     @property
     def physical(self) -> Coefficients:
