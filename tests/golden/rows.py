@@ -41,7 +41,6 @@ COMMANDS = {
     "nnunet": "nnunet --prior fit.json",
     "segment": "segment scan.tif --prior tubes --steps 40 -o out.nii.gz",
     "refine": "refine probabilities.nii.gz --prior tubes --weight 0.02 -o out.nii.gz",
-    "refine-repair": "refine probabilities.nii.gz --repair -o out.nii.gz",
     "reconstruct": "reconstruct mask.nii.gz --every 5 -o out.nii.gz",
     "reconstruct-image": "reconstruct mask.nii.gz --every 5 --image scan.tif -o out.nii.gz",
     "reconstruct-labels": "reconstruct cells.tif --every 4 --labels all -o out.tif",
