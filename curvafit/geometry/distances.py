@@ -19,6 +19,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
+from curvafit.core.checks import check_type
 from curvafit.core.extras import require
 from curvafit.core.runtime import Progress, silent
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram
@@ -152,7 +153,7 @@ def wasserstein(
 
     geomloss computes it in float64; where geomloss is not installed, `one_to_many` does in float32, which is the same
     to 1e-4 of it, or 1e-5. Matches, the atlas's map and reports take `one_to_many` and `pairwise` always. Raises
-    ValueError if a diagram is empty, the units differ, or a parameter is out of range.
+    ValueError if a diagram is none or empty, the units differ, or a parameter is out of range.
 
     Parameters
     ----------
@@ -203,6 +204,7 @@ def _normalise(diagrams: Sequence[Diagram], blur: float, reach: float | None, bi
     if not blur > 0 or not (reach is None or reach > 0) or bin_width < 0:
         raise ValueError(f"expected positive blur and reach, got blur {blur}, reach {reach}, bin width {bin_width}")
     for other in diagrams:
+        check_type(other, Diagram, "curvature diagrams, which `curvafit.diagram` and `Measures.diagram` give")
         if other.unit != diagrams[0].unit:
             raise ValueError(f"expected diagrams in one unit, got {diagrams[0].unit} and {other.unit}")
     whole = (diagram.normalised for diagram in diagrams)
