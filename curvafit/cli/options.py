@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import inspect
 import math
-from collections.abc import Callable, Iterator, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +22,11 @@ if TYPE_CHECKING:
 
 #: Whether files of other programs, or of other commands, may be replaced.
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace files that another command wrote.")]
+
+
+#: Parameters of commands that are volumes to read.
+_VOLUMES = ("scan", "scans", "slices", "probabilities", "roi", "image", "example", "example_probabilities", "like",
+            "like_mask")  # fmt: skip
 
 
 # ---- commands --------------------------------------------------------------------------------------------------------
@@ -42,6 +48,7 @@ def command(*examples: str) -> Callable[[Callable[..., None]], Callable[..., Non
             with plain_errors():
                 for name, options in groups.items():
                     arguments[name] = _GROUPS[name](**{option: arguments.pop(option) for option in options})
+                _check_volumes(arguments)
                 function(**arguments)
 
         parameters = [each for name in own for each in groups.get(name, {name: own[name]}).values()]
@@ -53,6 +60,15 @@ def command(*examples: str) -> Callable[[Callable[..., None]], Callable[..., Non
         return run
 
     return decorate
+
+
+def _check_volumes(arguments: Mapping[str, Any]) -> None:
+    """Raise FileNotFoundError where a volume is missing, before libraries are imported that read it."""
+    for given in filter(None, map(arguments.get, _VOLUMES)):
+        for path in map(str, given if isinstance(given, list) else [given]):
+            file = path.rpartition("::")[0] or path
+            if not (os.path.exists(path) or os.path.exists(file)):
+                raise FileNotFoundError(f"no such file: {file}")
 
 
 def add_commands(app: typer.Typer, *functions: Callable[..., None]) -> None:
