@@ -6,8 +6,10 @@ program listens from its first line (`listen`); the library changes no signal's 
 
 from __future__ import annotations
 
+import logging
 import math
 import os
+import re
 import signal
 import sys
 import threading
@@ -25,6 +27,22 @@ Progress = Callable[[str, float], None]
 
 def silent(text: str, share: float) -> None:
     """Say nothing: the default progress."""
+
+
+def log_stages() -> Progress:
+    """Return a progress that logs each stage once at level INFO, by the logger `curvafit`.
+
+    Sentences that differ only in their numbers are one stage, and all but the first of them are of level DEBUG.
+    """
+    stages: set[str] = set()
+
+    def log(text: str, share: float) -> None:
+        stage = re.sub(r"\d+", "", text)
+        level = logging.DEBUG if stage in stages else logging.INFO
+        logging.getLogger("curvafit").log(level, "%s (%.0f %% done)", text, 100 * share)
+        stages.add(stage)
+
+    return log
 
 
 def show_share(text: str, share: float) -> None:
