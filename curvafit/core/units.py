@@ -97,10 +97,8 @@ def per_unit(unit: str, power: int) -> str:
 
 def plain_unit(unit: str, power: int) -> str:
     """Return a unit to a power in plain signs: mm, 1/mm, 1/mm^3."""
-    if power == 0:
-        return ""
     raised = unit if abs(power) == 1 else f"{unit}^{abs(power)}"
-    return raised if power > 0 else f"1/{raised}"
+    return "" if power == 0 else raised if power > 0 else f"1/{raised}"
 
 
 def power_name(unit: str, power: int) -> str:

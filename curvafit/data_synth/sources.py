@@ -204,8 +204,7 @@ class Stored:
 
 
 def _find_room() -> Path:
-    """Return the temporary folder of this process and its children, which its end deletes; no folder where it cannot be
-    made."""
+    """Return the temporary folder of this process and its children, which goes with it; none where none can be made."""
     try:
         return Path(get_temp_dir())
     except OSError:
@@ -258,7 +257,7 @@ class Pool:
             if "failure" in content:
                 raise ValueError(content["failure"])
             return PhaseField(np.asarray(np.load(values, mmap_mode="r")), content["epsilon"], content["origin"])
-        except OSError as error:
+        except (OSError, NotImplementedError) as error:  # a disk may know no locks
             warnings.warn(f"each process grows its own shapes, as they cannot be kept: {error}", stacklevel=2)
             return _grow_pool_shape(self.generated, number, self.edge)
 

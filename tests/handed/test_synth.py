@@ -50,13 +50,18 @@ def refuse_arrays_as_diagrams(folder: Path) -> None:
         curvafit.wasserstein(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
 
 
-def find_a_missing_scan_before_libraries(folder: Path) -> None:
+def refuse_inputs_before_libraries(folder: Path) -> None:
     """The command ends before torch is imported."""
     code = "import sys\nfrom curvafit.cli.app import app\ntry:\n    app(sys.argv[1:])\n"
     code += "except SystemExit as end:\n    print(end.code, 'torch' in sys.modules)"
-    for words in (["measure", "typo.tif"], ["reconstruct", "typo.h5::a", "-o", "a.tif"]):
-        run = subprocess.run([sys.executable, "-c", code, *words], cwd=folder, capture_output=True, text=True)
-        assert run.stdout.split() == ["2", "False"] and "no such file: typo" in run.stderr, run
+    for words, sentence in (
+        ("measure typo.tif", "no such file: typo.tif"),
+        ("reconstruct typo.h5::a -o a.tif", "no such file: typo.h5"),
+        ("generate --preset tubez -o a.tif", "expected a preset among"),
+        ("synth --presets tubes,spunge --modality confocal -o set", "got 'spunge'"),
+    ):
+        run = subprocess.run([sys.executable, "-c", code, *words.split()], cwd=folder, capture_output=True, text=True)
+        assert run.stdout.split() == ["2", "False"] and sentence in run.stderr, run
 
 
 def keep_formulas_out_of_a_spreadsheet(folder: Path) -> None:
@@ -107,7 +112,7 @@ CASES: dict[str, Callable[[Path], None]] = {
     "eng-12-list-of-laws": keep_every_law_of_a_list,
     "eng-12-store-of-four": say_how_many_shapes_are_well_formed,
     "eng-12-wasserstein": refuse_arrays_as_diagrams,
-    "eng-12-missing-scan": find_a_missing_scan_before_libraries,
+    "eng-12-missing-inputs": refuse_inputs_before_libraries,
     "eng-12-formulas": keep_formulas_out_of_a_spreadsheet,
     "eng-12-measures": show_measures_in_a_notebook,
     "infer-is-silent": log_the_stages_of_an_inference,
