@@ -30,17 +30,13 @@ def silent(text: str, share: float) -> None:
 
 
 def log_stages() -> Progress:
-    """Return a progress that logs each stage once at level INFO, by the logger `curvafit`.
-
-    Sentences that differ only in their numbers are one stage, and all but the first of them are of level DEBUG.
-    """
+    """Return a progress that logs each stage once, at level INFO of the logger `curvafit`; numbers make no stage."""
     stages: set[str] = set()
 
     def log(text: str, share: float) -> None:
-        stage = re.sub(r"\d+", "", text)
-        level = logging.DEBUG if stage in stages else logging.INFO
-        logging.getLogger("curvafit").log(level, "%s (%.0f %% done)", text, 100 * share)
-        stages.add(stage)
+        if (stage := re.sub(r"\d+", "", text)) not in stages:
+            stages.add(stage)
+            logging.getLogger("curvafit").info("%s (%.0f %% done)", text, 100 * share)
 
     return log
 
