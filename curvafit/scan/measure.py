@@ -32,6 +32,8 @@ from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box
 from curvafit.volumes.read import Source, field_of
 
+#: Columns of a table of measures; a CSV file begins with them.
+COLUMNS = ("scan", "quantity", "symbol", "value", "low", "high", "unit", "direction", "version")
 #: What is summed over blocks, in powers of the scan's unit; n0 to n5 are the parts zz zy zx yy yx xx of n⊗n.
 SUMS = ("volume", "inside", "thickness", "thickness²", "gap", "χ", "area", *(f"n{k}" for k in range(6)))
 SUMS += ("curved", "H", "H²", "K", "κ1", "κ2", "C", *FAMILIES)
@@ -46,8 +48,6 @@ READ = 56
 LEAST, MOST, PERIODS = 8, 6, 1.0
 #: The most labels of a region of interest.
 MOST_COMPARTMENTS = 100
-#: Columns of a table of measures; a CSV file begins with them.
-COLUMNS = ("scan", "quantity", "symbol", "value", "low", "high", "unit", "direction", "version")
 #: How sure intervals are.
 SURE = 0.95
 
