@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import dataclasses
 import logging
-import pickle
+import multiprocessing
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from exact_store import exact_field, exact_record, exact_store
-from pool_run import balls
 
 import curvafit
 from curvafit.core.runtime import log_stages
@@ -24,12 +24,13 @@ from curvafit.studies.tables import format_csv
 
 
 def grow_once_for_all_epochs(folder: Path) -> None:
-    """Copies of a set, as those in an epoch's new workers, read the shapes that the first one grew."""
-    pairs = balls(str(folder / "log"), length=4)
-    for _ in range(3):
-        list(pickle.loads(pickle.dumps(pairs)))
-    lines = (folder / "log").read_text().splitlines()
-    assert lines and len(set(lines)) == len(lines)
+    """Two workers, new ones in each of two epochs, grow no shape twice."""
+    method = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
+    log, script = folder / "log", Path(__file__).parents[1] / "pool_run.py"
+    room = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    run = subprocess.run([sys.executable, script, method, "2", "0", log], env=room, capture_output=True, text=True)
+    grown = [line.split()[0] for line in log.read_text().splitlines()]
+    assert grown and len(set(grown)) == len(grown) and run.returncode == 0, run.stderr
 
 
 def keep_every_law_of_a_list(folder: Path) -> None:
