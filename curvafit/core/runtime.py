@@ -60,6 +60,27 @@ def one_line(text: str) -> str:
     return "".join(sign if sign.isprintable() else sign.encode("unicode_escape").decode() for sign in plain)
 
 
+# ---- forks -----------------------------------------------------------------------------------------------------------
+
+
+class _Process:
+    """Whether this process was forked from one that had imported this module."""
+
+    forked = False
+
+
+def is_forked() -> bool:
+    """Return whether this process is a fork: of the process before it the memory is there, and no thread but one."""
+    return _Process.forked
+
+
+def _note_fork() -> None:
+    _Process.forked = True
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_note_fork)
+
 # ---- memory ----------------------------------------------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
@@ -23,7 +24,7 @@ from curvafit.core.checks import check_type
 from curvafit.core.extras import require
 from curvafit.core.runtime import Progress, silent
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram
-from curvafit.priors.kernels import threads
+from curvafit.priors.kernels.threads import Kernel, count_threads
 
 #: Pairs that are taken at once: a few seconds on a processor.
 BLOCK = 8192
@@ -38,7 +39,6 @@ _SERIAL = {
     "error_model": "numpy",
     "nogil": True,
 }
-_PARALLEL = {**_SERIAL, "parallel": True}
 #: A sum over the plan is trusted between these; outside, what it adds may have left float32's range.
 _LEAST, _MOST = np.float32(1e-25), np.float32(1e30)
 _LN2 = math.log(2.0)
@@ -287,8 +287,7 @@ def costs(
     ε, shares = _schedule(falls, blur)
     ρ = math.inf if reach is None else reach**2
     values = np.empty(len(first))
-    threads.start()
-    _fill_costs(clouds, first, second, ε, shares, ρ, values)
+    _fill_costs(count_threads(), clouds, first, second, ε, shares, ρ, values)
     return values
 
 
@@ -306,7 +305,7 @@ def _schedule(falls: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
     return ε, np.where(ends, 0.0, np.where(place < 0, 1.0, 0.5))
 
 
-@njit(**_PARALLEL)
+@partial(Kernel, **_SERIAL)
 def _fill_costs(clouds, first, second, ε, shares, ρ, values):
     """Write the cost of every pair into `values`."""
     for k in prange(len(first)):
