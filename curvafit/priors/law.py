@@ -15,7 +15,7 @@ from curvafit.core.checks import quoted, simplify_name
 from curvafit.core.records import parse_json
 from curvafit.core.schema import Rule, decode, schema_of, violation
 from curvafit.core.units import METRES
-from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.priors.published import PUBLISHED
 
@@ -67,7 +67,8 @@ class Law:
         Parameters
         ----------
         law
-            A `Law`, `Coefficients`, the name of a preset, the path of a `fit.json`, or a fit or an inference.
+            A `Law`, `Coefficients` or their numbers (six, a20 first, or by name), the name of a preset, the path of a
+            `fit.json`, or a fit or an inference.
 
         Raises FileNotFoundError or ValueError where the value, or the file, states no law.
         """
@@ -83,7 +84,10 @@ class Law:
             return cls.load(law)
         if isinstance(law, HasLaw):
             return law.to_law()
-        raise ValueError(f"expected a law (Coefficients, a preset or its name, a fit.json or a fit), got {quoted(law)}")
+        if (numbers := _read_numbers(law)) is not None:
+            return cls(numbers, working=False)
+        kinds = "Coefficients, their six numbers, a preset or its name, a fit.json or a fit"
+        raise ValueError(f"expected a law ({kinds}), got {quoted(law)}")
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Law:
@@ -186,8 +190,17 @@ LAW_TYPES = (Law, Coefficients, str, PathLike, HasLaw)
 
 def read_laws(laws: LawLike | Iterable[LawLike]) -> tuple[Law, ...]:
     """Return one law or several, each stated as in `Law.of`, as a tuple."""
-    single = isinstance(laws, LAW_TYPES) or not isinstance(laws, Iterable)
+    single = isinstance(laws, LAW_TYPES) or not isinstance(laws, Iterable) or _read_numbers(laws) is not None
     return (Law.of(laws),) if single else tuple(map(Law.of, laws))  # type: ignore[arg-type]
+
+
+def _read_numbers(law: object) -> Coefficients | None:
+    """Return coefficients that are stated by name, or as six numbers; None where they are not."""
+    if isinstance(law, Mapping) and {*NAMES[:3]} <= {*law} <= {*NAMES}:
+        return Coefficients(**law)
+    if isinstance(law, (tuple, list)) and len(law) == 6 and all(isinstance(a, (int, float)) for a in law):
+        return Coefficients(*law)
+    return None
 
 
 # ---- fit.json --------------------------------------------------------------------------------------------------------

@@ -98,13 +98,14 @@ def gaussian_taps(deviation: float) -> tuple[float, ...]:
 def refine_axis(u: Tensor, axis: int, times: int) -> Tensor:
     """Return `u (..., Z, Y, X)` with every voxel along `axis` (0 to 2) split into `times`; differentiable.
 
-    The interpolation is Keys' cubic convolution (a = -1/2), third-order accurate and exact for parabolas. Beyond its
-    ends the field continues with the last value.
+    The interpolation is the quintic spline through the samples, sixth-order accurate: F_ε takes second differences of
+    it. Beyond its ends the field continues as its mirror image.
     """
     if times == 1:
         return u
     dim = axis - 3
-    weights = _cubic_weights(u.shape[dim], times).to(u)
+    make = _spline_weights if torch.compiler.is_compiling() else _compute_spline_weights
+    weights = make(u.shape[dim], times).to(u)
     return torch.movedim(torch.movedim(u, dim, -1) @ weights, -1, dim).contiguous()
 
 
@@ -149,21 +150,35 @@ def _check_shape(u: Tensor, grid: Grid) -> Tensor:
 
 @lru_cache(maxsize=32)
 @torch.inference_mode(False)  # cached weights must serve a later backward pass
-def _cubic_weights(n: int, times: int) -> Tensor:
-    """Return interpolation weights `(n, n · times)`, a column for each new sample."""
-    place = (torch.arange(n * times, dtype=torch.float64) + 0.5) / times - 0.5
-    first = place.floor()
-    t = place - first
-    four = torch.stack(
-        (
-            ((2 - t) * t - 1) * t / 2,
-            ((3 * t - 5) * t * t + 2) / 2,
-            ((4 - 3 * t) * t + 1) * t / 2,
-            (t - 1) * t * t / 2,
-        )
-    )
-    weights = torch.zeros(n, n * times, dtype=torch.float64)
-    for k in range(4):
-        row = (first.long() + k - 1).clamp(0, n - 1)
-        weights[row, torch.arange(n * times)] += four[k]
-    return weights
+def _compute_spline_weights(n: int, times: int) -> Tensor:
+    """Return interpolation weights `(n, n · times)`, a column for each new sample: S V⁻¹, with V and S the quintic
+    B-spline around each old sample, and around its mirror images, at the old places and at the new ones."""
+    places = torch.arange(n, dtype=torch.float64), (torch.arange(n * times, dtype=torch.float64) + 0.5) / times - 0.5
+    values, samples = (torch.zeros(n, len(place), dtype=torch.float64) for place in places)
+    for place, basis in zip(places, (values, samples), strict=True):
+        first = place.floor().long() - 2
+        for k in range(6):
+            image = (first + k) % (2 * n)
+            spline = _quintic_spline(place - (first + k))
+            basis.index_put_((torch.where(image < n, image, 2 * n - 1 - image), torch.arange(len(place))), spline, True)
+    return torch.linalg.solve(values, samples)
+
+
+def _quintic_spline(x: Tensor) -> Tensor:
+    """Return the quintic B-spline of unit knots around 0, as its sum of powers."""
+    terms = ((-1) ** k * math.comb(6, k) / 120 * (x.abs() + 3 - k).clamp_min(0) ** 5 for k in range(7))
+    return sum(terms, start=torch.zeros_like(x))
+
+
+# Compilers and `torch.export` see an operator: what they trace with has no numbers to solve with, or to keep.
+_spline_weights = torch.library.custom_op(
+    "curvafit::spline_weights",
+    lambda n, times: _compute_spline_weights(n, times).clone(),
+    mutates_args=(),
+    schema="(SymInt n, SymInt times) -> Tensor",
+)
+
+
+@_spline_weights.register_fake
+def _(n, times):
+    return torch.empty((n, n * times), dtype=torch.float64)

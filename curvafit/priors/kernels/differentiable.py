@@ -32,7 +32,8 @@ def energies(
     compiling, fused = torch.compiler.is_compiling(), kernels.has_kernel(u.device)
     if u.dtype != torch.float32 or not (fused or (torch.is_grad_enabled() and not compiling)):
         return energy(u, coefficients, grid, epsilon, mask=mask)
-    given = u, mask.to(u).expand(u.shape), [float(value) for value in coefficients], list(grid.spacing), epsilon
+    numbers = [float(value) if isinstance(value, Tensor) else value for value in coefficients]
+    given = u, mask.to(u).expand(u.shape), numbers, list(grid.spacing), epsilon
     # A compiler sees the operator; `torch.func` transforms the function.
     return (_energies(*given) if compiling else _Energies.apply(*given))[0]  # type: ignore[index]
 
