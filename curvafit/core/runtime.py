@@ -62,24 +62,16 @@ def one_line(text: str) -> str:
 
 # ---- forks -----------------------------------------------------------------------------------------------------------
 
-
-class _Process:
-    """Whether this process was forked from one that had imported this module."""
-
-    forked = False
+#: This process, where it was forked from one that had imported this module: the memory is that one's, its threads gone.
+_FORKS: list[int] = []
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=lambda: _FORKS.append(os.getpid()))
 
 
 def is_forked() -> bool:
-    """Return whether this process is a fork: of the process before it the memory is there, and no thread but one."""
-    return _Process.forked
+    """Return whether this process was forked from one that had imported this module."""
+    return bool(_FORKS)
 
-
-def _note_fork() -> None:
-    _Process.forked = True
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_note_fork)
 
 # ---- memory ----------------------------------------------------------------------------------------------------------
 

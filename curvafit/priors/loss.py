@@ -54,7 +54,8 @@ class CurvaturePrior(nn.Module):
         Whether the target is class numbers `(B, 1, D, H, W)`.
     reduction
         `"mean"` over batch and classes; `"none"`; or `"sum"` of the energies F_ε, not normalised, so that windows that
-        overlap by 2·border voxels add up to the interior of the whole (border 2 where an axis is interpolated).
+        overlap by 2·border voxels add up to the interior of the whole (border 2 across an axis that is interpolated,
+        and along it nearly: the spline sees the whole axis).
     ignore_index
         Voxels where the target has this value do not count and get no gradient, whatever their values, NaN too. Nor do
         voxels within `border` of them count, or within 1: their neighbours are unknown, as at the input's faces.
@@ -68,8 +69,8 @@ class CurvaturePrior(nn.Module):
         ε in spacing's unit; twice the smallest edge by default. Structures thinner than twice the smallest edge do not
         survive. An axis on which ε spans fewer than two voxels, by more than a tenth, is interpolated, and a warning
         says so. Up to voxels as long as ε the energy is that of fine ones within 3 %; where they are longer by more
-        than a tenth it is larger (by half at 1.5 ε), and the warning says that. A refinement of more than 16-fold is
-        refused, and so is an ε longer than the window.
+        than a tenth it is larger (up to 1.7-fold at 1.5 ε), and the warning says that. A refinement of more than
+        16-fold is refused, and so is an ε longer than the window.
     weight
         A factor, or one for each class; classes of weight 0 are not computed.
     border
@@ -122,7 +123,7 @@ class CurvaturePrior(nn.Module):
             axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", times, strict=True) if n > 1)
             words, longest = f"ε = {self.epsilon:g} spans fewer than 2 voxels: interpolating {axes}", max(self.spacing)
             if longest > LONGEST * self.epsilon:
-                words += f"; longer voxels than ε inflate F_ε, by half at 1.5 ε: state an ε of {longest:g} or more"
+                words += f"; voxels longer than ε inflate F_ε, 1.7-fold at 1.5 ε: state an ε of {longest:g} or more"
             warnings.warn(words, stacklevel=2)
 
     def extra_repr(self) -> str:
@@ -145,8 +146,7 @@ class CurvaturePrior(nn.Module):
             if ignored is not None:  # before the activation, whose derivative of a NaN is one
                 input = torch.where(ignored, input.detach().nan_to_num(0, 0, 0), input)
             probability = self._probability(input)
-            classes, skipped = probability.shape[1], self._is_skipped(input)
-            spacing = self._spacing_of(input)
+            classes, spacing, skipped = probability.shape[1], self._spacing_of(input), self._is_skipped(input)
             times = (1, 1, 1) if skipped else choose_refinement(spacing, self.epsilon)
             options = {"normalize": self.reduction != "sum", "border": self.border}
             laws = _repeat_per_class(self.coefficients, classes, "one law")

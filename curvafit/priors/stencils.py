@@ -161,7 +161,7 @@ def _compute_spline_weights(n: int, times: int) -> Tensor:
             image = (first + k) % (2 * n)
             spline = _quintic_spline(place - (first + k))
             basis.index_put_((torch.where(image < n, image, 2 * n - 1 - image), torch.arange(len(place))), spline, True)
-    return torch.linalg.solve(values, samples)
+    return torch.linalg.solve(values, samples).contiguous()
 
 
 def _quintic_spline(x: Tensor) -> Tensor:
@@ -171,12 +171,9 @@ def _quintic_spline(x: Tensor) -> Tensor:
 
 
 # Compilers and `torch.export` see an operator: what they trace with has no numbers to solve with, or to keep.
-_spline_weights = torch.library.custom_op(
-    "curvafit::spline_weights",
-    lambda n, times: _compute_spline_weights(n, times).clone(),
-    mutates_args=(),
-    schema="(SymInt n, SymInt times) -> Tensor",
-)
+@torch.library.custom_op("curvafit::spline_weights", mutates_args=(), schema="(SymInt n, SymInt times) -> Tensor")
+def _spline_weights(n, times):
+    return _compute_spline_weights(n, times).clone()
 
 
 @_spline_weights.register_fake
