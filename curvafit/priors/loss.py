@@ -131,12 +131,10 @@ class CurvaturePrior(nn.Module):
         usual = {"sigmoid": False, "softmax": False, "include_background": True, "to_onehot_y": False}
         usual |= {"reduction": "mean", "ignore_index": None, "shape": None}
         own = [f"{name}={getattr(self, name)!r}" for name, value in usual.items() if getattr(self, name) != value]
-        known = ", ".join(
-            f"{origin} ({', '.join(f'{float(a):.6g}' for a in law)})"
-            for origin, law in zip(self._origins, self.coefficients, strict=True)
-        )
-        numbers = f"spacing={self.spacing}, epsilon={self.epsilon:g}, weight={self.weight}, border={self.border}"
-        return ", ".join((known, *own, numbers))
+        numbers = (", ".join(f"{float(a):.6g}" for a in law) for law in self.coefficients)
+        laws = [f"{origin} ({six})" for origin, six in zip(self._origins, numbers, strict=True)]
+        scale = f"spacing={self.spacing}, epsilon={self.epsilon:g}, weight={self.weight}, border={self.border}"
+        return ", ".join((*laws, *own, scale))
 
     def forward(self, input: Tensor, target: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
         """Return the loss of a batch; see the class."""
@@ -421,16 +419,9 @@ def _repeat_per_class(values: tuple, classes: int, name: str) -> tuple:
 
 
 def _measure_window(
-    probability: Tensor,
-    coefficients: Coefficients,
-    spacing: tuple[float, float, float],
-    epsilon: float,
-    times: tuple[int, int, int],
-    mask: Tensor | None,
-    *,
-    normalize: bool,
-    border: int,
-) -> Tensor:
+    probability: Tensor, coefficients: Coefficients, spacing: tuple[float, float, float], epsilon: float,
+    times: tuple[int, int, int], mask: Tensor | None, *, normalize: bool, border: int,
+) -> Tensor:  # fmt: skip
     """Compute `curvature_prior` of checked numbers, which may be a compiler's symbols."""
     shape, least = tuple(probability.shape[1:]), max(4, 2 * border + 1)
     if min(shape) < least:

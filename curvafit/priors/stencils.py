@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -151,23 +152,22 @@ def _check_shape(u: Tensor, grid: Grid) -> Tensor:
 @lru_cache(maxsize=32)
 @torch.inference_mode(False)  # cached weights must serve a later backward pass
 def _compute_spline_weights(n: int, times: int) -> Tensor:
-    """Return interpolation weights `(n, n · times)`, a column for each new sample: S V⁻¹, with V and S the quintic
+    """Return interpolation weights `(n, n · times)`, a column for each new sample: V⁻¹ S, with V and S the quintic
     B-spline around each old sample, and around its mirror images, at the old places and at the new ones."""
-    places = torch.arange(n, dtype=torch.float64), (torch.arange(n * times, dtype=torch.float64) + 0.5) / times - 0.5
-    values, samples = (torch.zeros(n, len(place), dtype=torch.float64) for place in places)
-    for place, basis in zip(places, (values, samples), strict=True):
-        first = place.floor().long() - 2
-        for k in range(6):
-            image = (first + k) % (2 * n)
-            spline = _quintic_spline(place - (first + k))
-            basis.index_put_((torch.where(image < n, image, 2 * n - 1 - image), torch.arange(len(place))), spline, True)
-    return torch.linalg.solve(values, samples).contiguous()
+    bases = []
+    for place in (np.arange(n, dtype=float), (np.arange(n * times) + 0.5) / times - 0.5):
+        basis, first = np.zeros((n, len(place))), np.floor(place).astype(int) - 2
+        for centre in (first + k for k in range(6)):
+            image = centre % (2 * n)
+            image = np.where(image < n, image, 2 * n - 1 - image)
+            basis[image, np.arange(len(place))] += _quintic_spline(place - centre)
+        bases.append(basis)
+    return torch.from_numpy(np.ascontiguousarray(np.linalg.solve(*bases)))  # of no transform that may be going on
 
 
-def _quintic_spline(x: Tensor) -> Tensor:
+def _quintic_spline(x: np.ndarray) -> np.ndarray:
     """Return the quintic B-spline of unit knots around 0, as its sum of powers."""
-    terms = ((-1) ** k * math.comb(6, k) / 120 * (x.abs() + 3 - k).clamp_min(0) ** 5 for k in range(7))
-    return sum(terms, start=torch.zeros_like(x))
+    return sum((-1) ** k * math.comb(6, k) / 120 * np.maximum(np.abs(x) + 3 - k, 0) ** 5 for k in range(7))  # type: ignore[return-value]
 
 
 # Compilers and `torch.export` see an operator: what they trace with has no numbers to solve with, or to keep.

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+import io
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -40,9 +43,14 @@ def weight_of_a_resumed_training() -> None:
     loss, x = CombinedLoss(base, prior, 0.0, warmup=2), noise(1, 1, 8, 8, 8)
     loss.weight = 7.5e-5
     loss(x, torch.zeros_like(x))
-    again = CombinedLoss(base, prior, 0.0)
+    again, whole = CombinedLoss(base, prior, 0.0), nn.ModuleDict({"loss": CombinedLoss(base, prior, 0.0)})
+    file = io.BytesIO()
+    torch.save(nn.ModuleDict({"loss": loss}).state_dict(), file)
+    file.seek(0)
     again.load_state_dict(loss.state_dict())
-    assert (again.weight, again.warmup, int(again.calls)) == (7.5e-5, 2, 1)
+    whole.load_state_dict(torch.load(file, weights_only=True))
+    for other in (again, whole["loss"], copy.deepcopy(loss), pickle.loads(pickle.dumps(loss))):
+        assert (float(other.weight), other.warmup, int(other.calls)) == (7.5e-5, 2, 1)
     older = CombinedLoss(base, prior, 0.5, warmup=3)
     older.load_state_dict({"calls": torch.tensor(4)})
     assert (older.weight, older.warmup, int(older.calls)) == (0.5, 3, 4)
