@@ -255,7 +255,7 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
         sure = result.keep_sure(least) if least else None
         result = result if sure is None else replace(result, notes=(*result.notes, *sure.notes))
         # The header is kept where it says where the voxels are; one of a file of channels is of all of them.
-        stated = ("spacing", "crop") if job.image else ("spacing", "crop", "channel")
+        stated = ("spacing", "crop") if job.image else ("spacing", "crop", "channel", "time")
         like = (job.image or job.source) if all(reading[name] is None for name in stated) else None
         content = {"command": command_line(), "prior": job.prior, **record}
         how = {"sure": sure, "like": like, "unit": reading["unit"], "record": content, "overwrite": job.overwrite}

@@ -84,11 +84,13 @@ class Field(Pictured):
 
     def label(self, label: int) -> Field:
         """Return the mask of the voxels with this value; none or all of them are a ScanError."""
-        label = check_int(label, "a label that is a whole number", -SEEDS, SEEDS)
+        label = check_int(label, "a label that is a whole number", -SEEDS, 2 * SEEDS - 1)
         mask = self.values == label
         if mask.all() or not mask.any():
             values = np.unique(self.values)
-            listed = ", ".join(f"{float(value):g}" for value in values[:12]) + (", …" if len(values) > 12 else "")
+            listed = ", ".join(
+                f"{value:g}" if values.dtype.kind == "f" else str(int(value)) for value in values[:12]
+            ) + (", …" if len(values) > 12 else "")
             fault = "is the only label" if mask.any() else "is no label"
             raise ScanError(f"label {label} {fault} of the scan, which has {listed}")
         return replace(self, values=mask, notes=(*self.notes, f"The structure is label {label}."))

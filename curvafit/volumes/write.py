@@ -8,13 +8,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from curvafit.core.files import temporary_folder, write_atomically
 from curvafit.core.records import can_write, is_own_zarr
 from curvafit.volumes.formats.arrays import write_npy
 from curvafit.volumes.formats.base import ScanError
 from curvafit.volumes.formats.medical import check_mrc, write_mrc
 from curvafit.volumes.formats.nifti import write_nifti
-from curvafit.volumes.formats.tiff import write_ome_tiff, write_tiff
+from curvafit.volumes.formats.tiff import check_ome_tiff, write_ome_tiff, write_tiff
 from curvafit.volumes.formats.zarr import add_labels, image_of, mark, store_of, write_labels, write_zarr
 from curvafit.volumes.read import Source, field_of
 
@@ -28,6 +30,12 @@ WRITERS: dict[str, Callable[[Any, Path], None]] = {
     ".npy": write_npy,
     ".mrc": write_mrc,
     **dict.fromkeys((".zarr", ".ome.zarr"), write_zarr),
+}
+
+#: Suffix -> check(unit, values), which raises ScanError where the format cannot hold them.
+_CHECKS: dict[str, Callable[[str, np.ndarray | None], None]] = {
+    ".mrc": check_mrc,
+    **dict.fromkeys((".ome.tif", ".ome.tiff"), check_ome_tiff),
 }
 
 #: Suffixes that `save` knows.
@@ -68,7 +76,7 @@ def save(
     """
     field = field_of(source, spacing=spacing, unit=unit)
     target = Path(path)
-    writer = pick_writer(target, field.unit)
+    writer = pick_writer(target, field.unit, field.values)
     can_write(target, lambda there: not there.is_dir() or is_own_zarr(there, kind), overwrite=overwrite)
 
     def write(temporary: Path) -> None:
@@ -84,13 +92,18 @@ def save(
         return add_labels(work / target.name, image, target.name)
 
 
-def pick_writer(path: Path, unit: str) -> Callable[[Any, Path], None]:
-    """Return the writer of a file by its suffix, or of labels, if the format can hold lengths in `unit`."""
+def pick_writer(path: Path, unit: str, values: np.ndarray | None = None) -> Callable[[Any, Path], None]:
+    """Return the writer of a file by its suffix, or of labels, if the format can hold lengths in `unit` and `values`.
+
+    For a check before the work, `values` may be an array of their type with the least and the greatest of them.
+    """
     if (image := image_of(path)) is not None:
         return partial(write_labels, image=image)
     suffix = next((known for known in WRITERS if path.name.lower().endswith(known)), None)
     if suffix is None:
         raise ScanError(f"a volume's name must end in one of {', '.join(WRITERS)}, got {path.name!r}")
-    if suffix == ".mrc":
-        check_mrc(unit)
+    if suffix in _CHECKS:
+        _CHECKS[suffix](unit, values)
+    if values is not None and values.dtype.itemsize > 8 and suffix != ".npy":
+        raise ScanError(f"{suffix} holds numbers of at most 64 bits, got {values.dtype}")
     return WRITERS[suffix]

@@ -15,8 +15,9 @@ from typing import IO, Any
 import numpy as np
 
 from curvafit.core.extras import require
-from curvafit.core.units import convert_length
+from curvafit.core.units import common_unit, convert_length
 from curvafit.volumes.formats.base import (
+    Axes,
     Damaged,
     Raw,
     ScanError,
@@ -52,6 +53,8 @@ _META_TYPES = {
 }
 #: What a MetaImage may write for True, and the most bytes of its header.
 _TRUE, _HEADER = ("true", "t", "1"), 1 << 16
+#: IMOD's stamp, from byte 152 on: its flags follow, the first of which says that bytes are signed.
+_IMOD = 1146047817
 #: From DICOM's and ITK's patient frame (left, posterior, superior) to NIfTI's (right, anterior, superior).
 _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -62,21 +65,27 @@ def read_nrrd(path: Path, **_: object) -> Raw:
     with path.open("rb") as file:
         header = nrrd.read_header(file)
         values = _nrrd_values(nrrd, header, file, path)
-    channels = _channel_axis(header)
-    units = header.get("space units") or header.get("units")
-    unit = next((u for u in units if u), None) if units is not None else None
+    axes = _other_axes(header)
+    units = [u or None for u in header.get("space units", header.get("units", ()))]
+    known = [u or next(filter(None, units)) for u in units] if any(units) else [None]
+    unit, factors = common_unit(known)
     if "space directions" in header:
         directions = np.asarray(header["space directions"], dtype=np.float64)
         directions = directions[~np.isnan(directions).any(axis=1)]
         affine = np.eye(4)
         affine[:3, :3] = directions.T
         affine[:3, 3] = header.get("space origin", np.zeros(3))
+        if len(factors) == 3:  # one for each axis of the world, x first
+            affine[:3] *= np.array(factors)[:, None]
         if str(header.get("space", "")).startswith("left-posterior"):
             affine = _LPS_TO_RAS @ affine
-        return Raw(values, tuple(np.linalg.norm(directions, axis=1)[::-1]), unit or "mm", affine, channels=channels)
+        spacing = tuple(np.linalg.norm(affine[:3, :3], axis=0)[::-1])
+        return Raw(values, spacing, unit or "mm", affine, axes=axes)
     if "spacings" in header:
-        return Raw(values, tuple(float(h) for h in header["spacings"])[::-1], unit, channels=channels)
-    return Raw(values, channels=channels)
+        sizes = np.array(header["spacings"], dtype=np.float64)
+        sizes *= factors if len(factors) == len(sizes) else 1.0
+        return Raw(values, tuple(sizes[::-1].tolist()), unit, axes=axes)
+    return Raw(values, axes=axes)
 
 
 def _nrrd_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path) -> np.ndarray:
@@ -105,15 +114,18 @@ def _nrrd_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path)
     return read_numbers(stream, shape, dtype, path)
 
 
-def _channel_axis(header: dict[str, Any]) -> int | None:
-    """Return the axis of the values, z first, that is not one of space; None where there is not just one."""
-    axes = int(header["dimension"])
+def _other_axes(header: dict[str, Any]) -> Axes:
+    """Return the axis of the values, z first, that is not one of space, where there is just one."""
+    count, kinds = int(header["dimension"]), [str(kind).lower() for kind in header.get("kinds", ())]
     if "space directions" in header:
         directions = np.asarray(header["space directions"], dtype=np.float64)
         other = [bool(np.isnan(each).any()) for each in directions]
     else:
-        other = [str(kind).lower() not in ("domain", "space", "none", "???") for kind in header.get("kinds", ())]
-    return axes - 1 - other.index(True) if sum(other) == 1 and len(other) == axes else None
+        other = [kind not in ("domain", "space", "none", "???") for kind in kinds]
+    if sum(other) != 1 or len(other) != count:
+        return Axes()
+    axis = other.index(True)
+    return Axes(time=count - 1 - axis) if kinds[axis : axis + 1] == ["time"] else Axes(count - 1 - axis)
 
 
 def read_metaimage(path: Path, **_: object) -> Raw:
@@ -156,7 +168,7 @@ def _meta_image(header: dict[str, str], file: IO[bytes], path: Path) -> Raw:
         affine[:3, 3] = origin[:3]
         affine = _LPS_TO_RAS @ affine
     channel_axis = axes if values.ndim > axes else 0 if axes == 4 else None
-    return Raw(values, tuple(spacing[::-1].tolist()), "mm", affine, channels=channel_axis)
+    return Raw(values, tuple(spacing[::-1].tolist()), "mm", affine, axes=Axes(channel_axis))
 
 
 def _meta_values(header: dict[str, str], shape: list[int], file: IO[bytes], path: Path) -> np.ndarray:
@@ -204,27 +216,42 @@ def read_mrc(path: Path, **_: object) -> Raw:
     with mrcfile.open(path, mode="r", header_only=True) as file:
         header, size = file.header, file.voxel_size
         shape, dtype = mrcfile.utils.data_shape_from_header(header), mrcfile.utils.data_dtype_from_header(header)
-        start = header.nbytes + int(header.nsymbt)
-    values = map_numbers(path, start, [int(n) for n in shape], dtype)
-    raw = read_part(values, None, path, channels=0 if values.ndim == 4 else None)
+        start, signed = header.nbytes + int(header.nsymbt), _signed_bytes(header)
+    values, notes = map_numbers(path, start, [int(n) for n in shape], dtype), ()
+    if dtype == np.int8 and not signed:
+        values = values.view(np.uint8)
+    if dtype == np.int8 and signed is None:
+        notes = ("The bytes are taken for numbers from 0 to 255, as the header's maximum is above 127.",)
+    raw = read_part(values, None, path, axes=Axes(0 if values.ndim == 4 else None))
     spacing = (float(size.z), float(size.y), float(size.x))
-    return raw._replace(spacing=spacing if min(spacing) > 0 else None, unit="angstrom")
+    return raw._replace(spacing=spacing if min(spacing) > 0 else None, unit="angstrom", notes=notes)
 
 
-def check_mrc(unit: str) -> None:
-    """Raise ScanError if lengths have no unit, and ImportError without the library, before `write_mrc`."""
+def _signed_bytes(header: Any) -> bool | None:
+    """Return whether an MRC file's bytes are signed: as IMOD's stamp says, or else, as is standard, True.
+
+    None is a guess that they are not, as the header's maximum is none of signed bytes.
+    """
+    stamp, flags = np.frombuffer(header.extra2.tobytes()[40:48], header.mode.dtype)
+    if stamp == _IMOD:
+        return bool(flags & 1)
+    return None if float(header.dmax) > 127 else True
+
+
+def check_mrc(unit: str, values: np.ndarray | None = None) -> None:
+    """Raise ScanError if lengths have no unit or values no type of MRC's, and ImportError without the library, before
+    `write_mrc`."""
     require("mrcfile", "io", "reading and writing MRC files")
     if unit == "voxel":
         raise ScanError("an MRC file holds voxel sizes in Å: give the unit, nm, um, mm or m")
+    if values is not None and values.dtype.kind in "iu" and values.dtype.itemsize > 2:
+        raise ScanError(f"an MRC file holds whole numbers of at most 16 bits or floats, got {values.dtype}")
 
 
 def write_mrc(field: Any, path: Path) -> None:
     """Write a volume with its voxel sizes in Å; instead of float64, bool, uint8 write float32, int8, uint16."""
-    check_mrc(field.unit)
     kind = {"bool": "int8", "float64": "float32", "uint8": "uint16"}.get(field.values.dtype.name)
     values = field.values if kind is None else field.values.astype(kind)
-    if values.dtype.name not in ("int8", "int16", "uint16", "float16", "float32"):
-        raise ScanError(f"an MRC file holds whole numbers of at most 16 bits or floats, got {values.dtype}")
     with require("mrcfile", "io", "reading and writing MRC files").new(path, values, overwrite=True) as file:
         file.voxel_size = tuple(convert_length(h, field.unit, "angstrom") for h in field.spacing[::-1])
 
@@ -232,7 +259,8 @@ def write_mrc(field: Any, path: Path) -> None:
 def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     """Read a folder of slices in the order of their positions; `key` is the UID of a series, if there are several."""
     pydicom = require("pydicom", "io", "reading DICOM folders")
-    files = sorted(p for p in path.iterdir() if p.is_file() and (is_dicom(p) or p.suffix.lower() in _DICOM))
+    inside = sorted(p for p in path.iterdir() if p.is_file() and not p.name.startswith("."))
+    files = [p for p in inside if is_dicom(p) or p.suffix.lower() in _DICOM]
     with collect_complaints("pydicom"):
         images = [image for file in files if (image := _read_slice(pydicom, file)) is not None]
     series = sorted({str(image.get("SeriesInstanceUID", "")) for image in images})
@@ -248,7 +276,7 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     affine = np.eye(4)
     affine[:3, :3] = np.column_stack([rows * x, columns * y, normal * z])
     affine[:3, 3] = origin
-    return Raw(values, (z, y, x), "mm", _LPS_TO_RAS @ affine, channels=3 if values.ndim == 4 else None)
+    return Raw(values, (z, y, x), "mm", _LPS_TO_RAS @ affine, axes=Axes(3 if values.ndim == 4 else None))
 
 
 def _read_slice(pydicom: Any, file: Path) -> Any:
