@@ -20,15 +20,11 @@ _UNITS: dict[str, tuple[str, float]] = {
     **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), ("nm", 1.0)),
     **dict.fromkeys(("a", "å", "angstrom", "angstroms", "ångström", "ångströms", "ångstrom"), ("nm", 0.1)),
     **dict.fromkeys(
-        ("um", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"),
-        ("um", 1.0),
+        ("um", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"), ("um", 1.0)
     ),
     **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), ("mm", 1.0)),
     **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), ("mm", 10.0)),
-    **dict.fromkeys(("dm", "decimeter", "decimeters", "decimetre", "decimetres"), ("m", 0.1)),
-    **dict.fromkeys(("km", "kilometer", "kilometers", "kilometre", "kilometres"), ("m", 1e3)),
     **dict.fromkeys(("inch", "inches", "in", '"'), ("mm", 25.4)),
-    **dict.fromkeys(("thou", "mil"), ("mm", 0.0254)),
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), ("m", 1.0)),
 }
 #: The page that explains words with a special meaning, each under its own anchor.

@@ -32,12 +32,6 @@ WRITERS: dict[str, Callable[[Any, Path], None]] = {
     **dict.fromkeys((".zarr", ".ome.zarr"), write_zarr),
 }
 
-#: Suffix -> check(unit, values), which raises ScanError where the format cannot hold them.
-_CHECKS: dict[str, Callable[[str, np.ndarray | None], None]] = {
-    ".mrc": check_mrc,
-    **dict.fromkeys((".ome.tif", ".ome.tiff"), check_ome_tiff),
-}
-
 #: Suffixes that `save` knows.
 WRITABLE = tuple(WRITERS)
 
@@ -57,8 +51,9 @@ def save(
     store that `save` wrote with the same `kind`, or with `overwrite`.
 
     NIfTI keeps the affine (qform and sform) and the unit. TIFF (ImageJ's or OME's metadata), MRC (in Å) and Zarr
-    (OME-Zarr 0.5, with halved copies of a large volume) keep spacing, unit and the first voxel's place. NPY keeps the
-    values only. A path `IMAGE/labels/NAME` in an image of OME-Zarr 0.4 or 0.5 gets labels on that image's voxels.
+    (OME-Zarr 0.5, with halved copies of a large volume) keep spacing and unit, Zarr the first voxel's place, too. NPY
+    keeps the values only. TIFF has 64-bit whole numbers in the least type that holds them, float16 as float32. A path
+    `IMAGE/labels/NAME` in an image of OME-Zarr 0.4 or 0.5 gets labels on that image's voxels.
 
     Raises ValueError if the suffix is unknown, the format cannot hold the values' type or needs a unit and the volume
     has none, the source is not a volume, or another folder has that name.
@@ -102,8 +97,10 @@ def pick_writer(path: Path, unit: str, values: np.ndarray | None = None) -> Call
     suffix = next((known for known in WRITERS if path.name.lower().endswith(known)), None)
     if suffix is None:
         raise ScanError(f"a volume's name must end in one of {', '.join(WRITERS)}, got {path.name!r}")
-    if suffix in _CHECKS:
-        _CHECKS[suffix](unit, values)
+    if suffix == ".mrc":
+        check_mrc(unit, values)
+    if suffix.startswith(".ome.tif") and values is not None:
+        check_ome_tiff(values)
     if values is not None and values.dtype.itemsize > 8 and suffix != ".npy":
         raise ScanError(f"{suffix} holds numbers of at most 64 bits, got {values.dtype}")
     return WRITERS[suffix]

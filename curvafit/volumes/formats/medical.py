@@ -216,26 +216,17 @@ def read_mrc(path: Path, **_: object) -> Raw:
     with mrcfile.open(path, mode="r", header_only=True) as file:
         header, size = file.header, file.voxel_size
         shape, dtype = mrcfile.utils.data_shape_from_header(header), mrcfile.utils.data_dtype_from_header(header)
-        start, signed = header.nbytes + int(header.nsymbt), _signed_bytes(header)
+        start = header.nbytes + int(header.nsymbt)
+        stamp, flags = np.frombuffer(header.extra2.tobytes()[40:48], header.mode.dtype)
     values, notes = map_numbers(path, start, [int(n) for n in shape], dtype), ()
-    if dtype == np.int8 and not signed:
+    # Bytes are signed, as is standard, unless IMOD's stamp says otherwise, or the header's maximum is above theirs.
+    if dtype == np.int8 and (not flags & 1 if stamp == _IMOD else header.dmax > 127):
         values = values.view(np.uint8)
-    if dtype == np.int8 and signed is None:
-        notes = ("The bytes are taken for numbers from 0 to 255, as the header's maximum is above 127.",)
+        guess = "The bytes are taken for numbers from 0 to 255, as the header's maximum is above 127."
+        notes = () if stamp == _IMOD else (guess,)
     raw = read_part(values, None, path, axes=Axes(0 if values.ndim == 4 else None))
     spacing = (float(size.z), float(size.y), float(size.x))
     return raw._replace(spacing=spacing if min(spacing) > 0 else None, unit="angstrom", notes=notes)
-
-
-def _signed_bytes(header: Any) -> bool | None:
-    """Return whether an MRC file's bytes are signed: as IMOD's stamp says, or else, as is standard, True.
-
-    None is a guess that they are not, as the header's maximum is none of signed bytes.
-    """
-    stamp, flags = np.frombuffer(header.extra2.tobytes()[40:48], header.mode.dtype)
-    if stamp == _IMOD:
-        return bool(flags & 1)
-    return None if float(header.dmax) > 127 else True
 
 
 def check_mrc(unit: str, values: np.ndarray | None = None) -> None:

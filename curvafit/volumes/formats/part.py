@@ -58,12 +58,6 @@ class Part:
             index[axis] = edge
         return tuple(index), tuple(space)
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences on the channel and the time."""
-        numbers = {"Channel": self.channel, "Time": self.time}
-        return tuple(f"{name} {number} is used." for name, number in numbers.items() if number is not None)
-
     def _pick(self, shape: Sequence[int], axes: Axes, place: object) -> dict[int, tuple[str, int | None]]:
         """Return the axes that are not of space, each with its name and the number that is asked for, if one is."""
         channel, time = axes
@@ -73,14 +67,17 @@ class Part:
                 channel, time = time, None
             elif len(rest := [axis for axis in long if axis != time]) == 4:
                 channel = rest[0] if shape[rest[0]] <= shape[rest[-1]] else rest[-1]
-        picked = {}
+        picked: dict[int, tuple[str, int | None]] = {}
         for name, axis, number in (("channel", channel, self.channel), ("time", time, self.time)):
-            if number is not None:
-                count = 0 if axis is None else shape[axis]
-                if axis is None:
-                    raise ScanError(f"{place} holds a single {name}, got {name} {quoted(number)}")
-                if not 0 <= check_int(number, f"a {name} that is a whole number from 0", -SEEDS, SEEDS) < count:
-                    raise ScanError(f"{name} must be from 0 to {count - 1} for {place}, got {number}")
+            if axis is None and number is not None:
+                raise ScanError(f"{place} holds a single {name}, got {name} {quoted(number)}")
+            count = 1 if axis is None else shape[axis]
+            if (
+                not 0
+                <= check_int(number or 0, f"a {name} that is a whole number from 0", -SEEDS, SEEDS)
+                < max(count, 1)
+            ):
+                raise ScanError(f"{name} must be from 0 to {count - 1} for {place}, got {number}")
             if axis is not None:
                 picked[axis] = name, number
         return picked
@@ -123,7 +120,8 @@ def take_part(raw: Raw, part: Part, place: object) -> tuple[Raw, tuple[int, ...]
     if spacing is not None and len(spacing) == len(shape):
         spacing = tuple(spacing[axis] for axis in space)
     volume = values.reshape([values.shape[axis] for axis in space])
-    notes = (*raw.notes, *part.notes)
+    numbers = {"Channel": part.channel, "Time": part.time}
+    notes = (*raw.notes, *(f"{name} {n} is used." for name, n in numbers.items() if n is not None))
     return raw._replace(values=volume, spacing=spacing, notes=notes), tuple(index[axis].start for axis in space)
 
 

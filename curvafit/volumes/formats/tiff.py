@@ -70,10 +70,9 @@ def _other_axes(series: tifffile.TiffPageSeries) -> tuple[Axes, tuple[str, ...]]
     named = [name for name in ("S" if "S" in long else "C", "T") if name in long]
     if named[-1:] in ([], ["S"]) or sum(n != 1 for n in series.shape) - len(named) != 2:
         return axes, ()
-    what = f"{series.shape[long[named[-1]]]} {'times' if named[-1] == 'T' else 'channels'}"
-    return Axes(axes.channel if len(named) == 2 else None), (
-        f"The file calls an axis of {what}: it is taken for slices.",
-    )
+    what = "times" if named[-1] == "T" else "channels"
+    note = f"The file calls an axis of {series.shape[long[named[-1]]]} {what}: it is taken for slices."
+    return Axes(axes.channel if len(named) == 2 else None), (note,)
 
 
 def _calibrate(values: np.ndarray, metadata: Mapping[str, Any]) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -105,10 +104,10 @@ def read_slices(path: Path, **_: object) -> Raw:
             )
     assert first is not None
     axes, notes = Axes(None if first.axes.channel is None else 3), first.notes
-    odd = next((k for k, plane in enumerate(slices) if plane.dtype != slices[0].dtype), None)
-    if odd is not None:
-        kinds = f"{slices[0].dtype} in {names[0].name} but {slices[odd].dtype} in {names[odd].name}"
-        notes += (f"The slices differ in type, {kinds}: their values may not be of one scale.",)
+    kinds = {str(plane.dtype): name.name for name, plane in zip(names[::-1], slices[::-1], strict=True)}
+    if len(kinds) > 1:
+        listed = ", ".join(f"{kind} in {name}" for kind, name in kinds.items())
+        notes += (f"The slices differ in type, {listed}: their values may not be of one scale.",)
     gaps = _skipped_numbers([name.stem for name in names])
     return first._replace(values=np.stack(slices), gaps=gaps, axes=axes, notes=notes)
 
@@ -184,10 +183,9 @@ def write_ome_tiff(field: Any, path: Path) -> None:
     tifffile.imwrite(path, _to_tiff(field.values), photometric="minisblack", ome=True, metadata=metadata)
 
 
-def check_ome_tiff(unit: str, values: np.ndarray | None) -> None:
+def check_ome_tiff(values: np.ndarray) -> None:
     """Raise ScanError if values are whole numbers that need 64 bits, before `write_ome_tiff`."""
-    kind = np.dtype("uint8") if values is None else _to_tiff(values).dtype
-    if kind.kind in "iu" and kind.itemsize > 4:
+    if (kind := _to_tiff(values).dtype).kind in "iu" and kind.itemsize > 4:
         raise ScanError(f"an OME-TIFF holds whole numbers of at most 32 bits, got {kind}: name it .tif")
 
 
