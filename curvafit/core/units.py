@@ -35,15 +35,14 @@ _GLUE = "\u00a0"
 
 def parse_unit(unit: str | None) -> tuple[str, float]:
     """Return this package's name of a length unit and the factor to it, or raise ValueError; `"cm"`: `("mm", 10.0)`."""
-    name = "" if unit is None else _plain_name(unit) if isinstance(unit, str) else None
-    if name not in _UNITS:
+    if not is_unit(unit):
         raise ValueError(f"expected a unit of voxel, nm, um, mm or m, got {quoted(unit)}")
-    return _UNITS[name]
+    return _UNITS[_plain_name(unit)]
 
 
 def is_unit(unit: str | None) -> bool:
     """Return whether a unit is one that `parse_unit` knows."""
-    return unit is None or (isinstance(unit, str) and _plain_name(unit) in _UNITS)
+    return isinstance(unit, str | None) and _plain_name(unit) in _UNITS
 
 
 def common_unit(units: Sequence[str | None]) -> tuple[str | None, tuple[float, ...]]:
@@ -53,13 +52,12 @@ def common_unit(units: Sequence[str | None]) -> tuple[str | None, tuple[float, .
     """
     if all(map(is_unit, units)) and len({parse_unit(unit)[0] == "voxel" for unit in units}) == 1:
         return units[-1], tuple(float(f"{convert_length(1.0, unit, units[-1]):.15g}") for unit in units)
-    names = dict.fromkeys(str(unit) for unit in units)
-    return " and ".join(names), (1.0,) * len(units)
+    return " and ".join(dict.fromkeys(map(str, units))), (1.0,) * len(units)
 
 
-def _plain_name(unit: str) -> str:
+def _plain_name(unit: str | None) -> str:
     """Return a unit's name in small letters, each with one code: that of micro has two, and Java's `\\u00B5`."""
-    text = re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), unit)
+    text = re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), unit or "")
     return unicodedata.normalize("NFKC", text.strip().casefold())
 
 

@@ -66,9 +66,8 @@ def read_nrrd(path: Path, **_: object) -> Raw:
         header = nrrd.read_header(file)
         values = _nrrd_values(nrrd, header, file, path)
     axes = _other_axes(header)
-    units = [u or None for u in header.get("space units", header.get("units", ()))]
-    known = [u or next(filter(None, units)) for u in units] if any(units) else [None]
-    unit, factors = common_unit(known)
+    units = list(header.get("space units", header.get("units", ())))
+    unit, factors = common_unit([each or next(filter(None, units), None) for each in units] or [None])
     if "space directions" in header:
         directions = np.asarray(header["space directions"], dtype=np.float64)
         directions = directions[~np.isnan(directions).any(axis=1)]

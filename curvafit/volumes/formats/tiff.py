@@ -82,9 +82,7 @@ def _calibrate(values: np.ndarray, metadata: Mapping[str, Any]) -> tuple[np.ndar
         return values, (f"ImageJ's calibration of grey values, its function {function}, is not applied.",)
     if values.dtype.kind not in "iu" or c0 is None or not c1 or (c0, c1) == (0, 1) or function == 20:
         return values, ()
-    grey = values * np.float64(c1) + float(c0)
-    if metadata.get("zeroclip"):
-        grey = np.maximum(grey, 0)
+    grey = np.maximum(values * np.float64(c1) + float(c0), 0 if metadata.get("zeroclip") else -np.inf)
     whole = float(c0).is_integer() and float(c1).is_integer()  # labels stay whole numbers
     return grey.astype(smallest_type(grey) if whole else np.float32), ()
 
