@@ -149,6 +149,43 @@ def odd_slices(folder: Path) -> None:
     assert any("s0.tif" in note and "s3.tif" in note for note in field.notes)
 
 
+def odd_dicom(folder: Path) -> None:
+    """Slices of DICOM that are tilted, turned, zoomed or many a file are refused; without positions it is said."""
+    pydicom = pytest.importorskip("pydicom")
+    from tests.volumes.test_read import write_dicom
+
+    angle = np.deg2rad(15)
+    for name, changes, refusal in (
+        ("upright", {}, None),
+        ("tilt", {"ImageOrientationPatient": [1, 0, 0, 0, np.cos(angle), -np.sin(angle)]}, "above each other"),
+        ("turned", {2: {"ImageOrientationPatient": [1, 0, 0, 0, 0, -1]}}, "one ImageOrientationPatient"),
+        ("zoomed", {3: {"PixelSpacing": [0.25, 0.3]}}, "one PixelSpacing"),
+        ("frames", {0: {"NumberOfFrames": 3}}, "a file a slice"),
+        ("unplaced", {"ImagePositionPatient": None, "ImageOrientationPatient": None}, None),
+    ):
+        (folder / name).mkdir()
+        for k, plane in enumerate(numbers((4, 6, 7), "uint16")):
+            path = folder / name / f"{9 - k}.dcm"
+            write_dicom(pydicom, path, plane, 2.5 * k)
+            image = pydicom.dcmread(path)
+            image.InstanceNumber = k
+            for key, value in {
+                **{n: v for n, v in changes.items() if isinstance(n, str)},
+                **changes.get(k, {}),
+            }.items():
+                if value is None:
+                    del image[key]
+                else:
+                    setattr(image, key, value if isinstance(value, int) else [round(float(n), 6) for n in value])
+            image.save_as(path)
+        if refusal:
+            with pytest.raises(ScanError, match=refusal):
+                load(folder / name)
+    upright, unplaced = load(folder / "upright"), load(folder / "unplaced", spacing=(2.5, 0.5, 0.25), unit="mm")
+    assert np.array_equal(unplaced.values, upright.values) and "no position" in unplaced.notes[0]
+    assert unplaced.spacing == upright.spacing and upright.notes == ()
+
+
 def units_nobody_knows(folder: Path) -> None:
     """A unit that is not known is no damage: with spacing and unit it is not read, without it is named."""
     sizes = {"PhysicalSizeX": 2.0, "PhysicalSizeY": 2.0, "PhysicalSizeZ": 2.0}
@@ -231,6 +268,7 @@ CASES: dict[str, Callable[[Path], None]] = {
     "03-imagej-calibration": a_calibration,
     "04-mrc-unsigned-bytes": mrc_bytes,
     "08-time-axis": times,
+    "09-dicom-series": odd_dicom,
     "12-appledouble": odd_slices,
     "13-unknown-unit": units_nobody_knows,
     "15-int64-tiff": types_of_tiff,
