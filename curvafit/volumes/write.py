@@ -12,8 +12,9 @@ import numpy as np
 
 from curvafit.core.files import temporary_folder, write_atomically
 from curvafit.core.records import can_write, is_own_zarr
+from curvafit.volumes.field import Field
 from curvafit.volumes.formats.arrays import write_npy
-from curvafit.volumes.formats.base import ScanError
+from curvafit.volumes.formats.base import ScanError, smallest_type
 from curvafit.volumes.formats.medical import check_mrc, write_mrc
 from curvafit.volumes.formats.nifti import write_nifti
 from curvafit.volumes.formats.tiff import check_ome_tiff, write_ome_tiff, write_tiff
@@ -104,3 +105,9 @@ def pick_writer(path: Path, unit: str, values: np.ndarray | None = None) -> Call
     if values is not None and values.dtype.itemsize > 8 and suffix != ".npy":
         raise ScanError(f"{suffix} holds numbers of at most 64 bits, got {values.dtype}")
     return WRITERS[suffix]
+
+
+def check_labels(path: str | Path, labels: Field) -> None:
+    """Raise ScanError, before the work, if a format cannot hold labels as large as these."""
+    limits = np.array([labels.values.min(), labels.values.max()])
+    pick_writer(Path(path), labels.unit, limits.astype(smallest_type(limits)))

@@ -17,7 +17,7 @@ import curvafit
 from curvafit.segmentation.reconstruct import reconstruct_labels
 from curvafit.volumes import Field, ScanError, load, save
 from curvafit.volumes.boxes import boxes_of
-from curvafit.volumes.write import pick_writer
+from curvafit.volumes.write import check_labels
 
 
 def numbers(shape: tuple[int, ...] = (4, 5, 6), dtype: str = "uint8") -> np.ndarray:
@@ -223,8 +223,8 @@ def large_ids(folder: Path) -> None:
         with pytest.raises(ScanError, match="at most"):
             save(Field(ids, 1, "um"), folder / f"refused{suffix}")
         with pytest.raises(ScanError, match="at most"):
-            pick_writer(folder / f"refused{suffix}", "um", np.array([0, 2**40]))
-        pick_writer(folder / f"mask{suffix}", "um", np.array([0, 1], bool))
+            check_labels(folder / f"refused{suffix}", Field(ids, 1, "um"))
+        check_labels(folder / f"small{suffix}", Field(ids // np.uint64(2**62), 1, "um"))
     assert not list(folder.glob("refused*"))
     # `min_scalar_type` gives the other of C's two types of 64 bits.
     values = (ids % np.uint64(7)).astype(np.min_scalar_type(2**40))
