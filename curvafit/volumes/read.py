@@ -272,6 +272,7 @@ def to_field(raw: Raw, source: str, spacing: Sequence[float] | float | None, uni
     try:
         file_unit, factor = ("voxel", 1.0) if unread else parse_unit(raw.unit)
         name, renamed = (file_unit, 1.0) if unit is None else parse_unit(unit)
+        stated = None if spacing is not None or raw.spacing is None else positive_triple(raw.spacing)
     except ValueError as reason:
         raise ScanError(f"{reason} for {source}") from None
     if spacing is not None:
@@ -280,11 +281,8 @@ def to_field(raw: Raw, source: str, spacing: Sequence[float] | float | None, uni
             unit is None and name == "voxel" and edges.min() != 1
         ):  # edges of which the finest is 1 are ratios, in voxels of that one
             raise ScanError(f"expected the unit of the spacing {quoted(spacing)} of {source}, such as mm, got none")
-    elif raw.spacing is not None:
-        try:
-            edges = factor * np.array(positive_triple(raw.spacing))
-        except ScanError as reason:
-            raise ScanError(f"{reason} in {source}: give --spacing and --unit") from None
+    elif stated is not None:
+        edges = factor * np.array(stated)
     else:
         edges = np.ones(3)
         counted = "counted in voxels" if name == "voxel" else f"those of voxels of 1 {name}"

@@ -121,10 +121,8 @@ def _other_axes(header: dict[str, Any]) -> Axes:
         other = [bool(np.isnan(each).any()) for each in directions]
     else:
         other = [kind not in ("domain", "space", "none", "???") for kind in kinds]
-    if sum(other) != 1 or len(other) != count:
-        return Axes()
-    axis = other.index(True)
-    return Axes(time=count - 1 - axis) if kinds[axis : axis + 1] == ["time"] else Axes(count - 1 - axis)
+    axis = count - 1 - other.index(True) if sum(other) == 1 and len(other) == count else None
+    return Axes(None, axis) if "time" in kinds else Axes(axis)
 
 
 def read_metaimage(path: Path, **_: object) -> Raw:
@@ -258,21 +256,13 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     slices = [image for image in images if str(image.get("SeriesInstanceUID", "")) == uid]
     if frames := next((int(n) for image in slices if (n := image.get("NumberOfFrames") or 1) > 1), None):
         raise ScanError(f"a DICOM series must have a file a slice, got {frames} frames in a file of {path}")
-    placed = all("ImagePositionPatient" in image and "ImageOrientationPatient" in image for image in slices)
-    turn = np.array(slices[0].ImageOrientationPatient if placed else [1, 0, 0, 0, 1, 0], dtype=float)
-    rows, columns = turn.reshape(2, 3)
-    normal = np.cross(rows, columns)
-    order = (
-        (lambda image: float(np.dot(image.ImagePositionPatient, normal)))
-        if placed
-        else lambda image: image.InstanceNumber
-    )
-    slices.sort(key=order)
-    with collect_complaints("pydicom"):
-        values = np.stack([_read_plane(image) for image in slices])
-    if not placed:
+    if not all("ImagePositionPatient" in image and "ImageOrientationPatient" in image for image in slices):
+        slices.sort(key=lambda image: image.InstanceNumber)
         note = "The slices state no position: they are stacked in the order of their numbers."
-        return Raw(values, notes=(note,), axes=Axes(3 if values.ndim == 4 else None))
+        return _stack_planes(slices)._replace(notes=(note,))
+    rows, columns = np.array(slices[0].ImageOrientationPatient, dtype=float).reshape(2, 3)
+    normal = np.cross(rows, columns)
+    slices.sort(key=lambda image: float(np.dot(normal, np.array(image.ImagePositionPatient, dtype=float))))
     for name in ("ImageOrientationPatient", "PixelSpacing"):
         numbers = np.array([image[name].value for image in slices], dtype=float)
         if np.ptp(numbers, axis=0).max() > 1e-3 * np.abs(numbers).max():
@@ -282,7 +272,7 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     affine = np.eye(4)
     affine[:3, :3] = np.column_stack([rows * x, columns * y, normal * z])
     affine[:3, 3] = origin
-    return Raw(values, (z, y, x), "mm", _LPS_TO_RAS @ affine, axes=Axes(3 if values.ndim == 4 else None))
+    return _stack_planes(slices)._replace(spacing=(z, y, x), unit="mm", affine=_LPS_TO_RAS @ affine)
 
 
 def _read_slice(pydicom: Any, file: Path) -> Any:
@@ -304,11 +294,16 @@ def is_dicom(path: Path) -> bool:
         return stream.read(132)[128:] == b"DICM"
 
 
-def _read_plane(image: Any) -> np.ndarray:
-    """Return a slice's pixels, with its slope and intercept applied."""
-    slope, intercept = float(image.get("RescaleSlope", 1)), float(image.get("RescaleIntercept", 0))
-    values = image.pixel_array
-    return values if (slope, intercept) == (1, 0) else (values * slope + intercept).astype(np.float32)
+def _stack_planes(slices: list[Any]) -> Raw:
+    """Return the slices' pixels, with slope and intercept applied."""
+    planes = []
+    with collect_complaints("pydicom"):
+        for image in slices:
+            slope, intercept = float(image.get("RescaleSlope", 1)), float(image.get("RescaleIntercept", 0))
+            plane = image.pixel_array
+            planes.append(plane if (slope, intercept) == (1, 0) else (plane * slope + intercept).astype(np.float32))
+    values = np.stack(planes)
+    return Raw(values, axes=Axes(3 if values.ndim == 4 else None))
 
 
 def _slice_distance(slices: list[Any], normal: np.ndarray, path: Path) -> tuple[float, np.ndarray]:
