@@ -105,9 +105,11 @@ def refine_axis(u: Tensor, axis: int, times: int) -> Tensor:
     if times == 1:
         return u
     dim = axis - 3
-    make = _spline_weights if torch.compiler.is_compiling() else _compute_spline_weights
-    weights = make(u.shape[dim], times).to(u)
-    return torch.movedim(torch.movedim(u, dim, -1) @ weights, -1, dim).contiguous()
+    if torch.compiler.is_compiling():
+        weights = _spline_weights(u.shape[dim], times)
+    else:
+        weights = torch.from_numpy(_compute_spline_weights(u.shape[dim], times))
+    return torch.movedim(torch.movedim(u, dim, -1) @ weights.to(u), -1, dim).contiguous()
 
 
 def _pad_axis(v: Tensor, grid: Grid, axis: int, width: int) -> Tensor:
@@ -150,8 +152,7 @@ def _check_shape(u: Tensor, grid: Grid) -> Tensor:
 
 
 @lru_cache(maxsize=32)
-@torch.inference_mode(False)  # cached weights must serve a later backward pass
-def _compute_spline_weights(n: int, times: int) -> Tensor:
+def _compute_spline_weights(n: int, times: int) -> np.ndarray:
     """Return interpolation weights `(n, n · times)`, a column for each new sample: V⁻¹ S, with V and S the quintic
     B-spline around each old sample, and around its mirror images, at the old places and at the new ones."""
     bases = []
@@ -162,7 +163,7 @@ def _compute_spline_weights(n: int, times: int) -> Tensor:
             image = np.where(image < n, image, 2 * n - 1 - image)
             basis[image, np.arange(len(place))] += _quintic_spline(place - centre)
         bases.append(basis)
-    return torch.from_numpy(np.ascontiguousarray(np.linalg.solve(*bases)))  # of no transform that may be going on
+    return np.ascontiguousarray(np.linalg.solve(*bases))  # no tensor, which would be of the transform that is going on
 
 
 def _quintic_spline(x: np.ndarray) -> np.ndarray:
@@ -173,7 +174,7 @@ def _quintic_spline(x: np.ndarray) -> np.ndarray:
 # Compilers and `torch.export` see an operator: what they trace with has no numbers to solve with, or to keep.
 @torch.library.custom_op("curvafit::spline_weights", mutates_args=(), schema="(SymInt n, SymInt times) -> Tensor")
 def _spline_weights(n, times):
-    return _compute_spline_weights(n, times).clone()
+    return torch.from_numpy(_compute_spline_weights(n, times).copy())
 
 
 @_spline_weights.register_fake
