@@ -66,13 +66,13 @@ def train(options):
 }
 
 
-def run(program: Path, *arguments: str, **environment: str) -> str:
-    """The last line that a program prints, which runs in a process of two threads."""
+def run(program: Path, *arguments: str, **environment: str) -> tuple[str, str]:
+    """The last line that a program prints, and all that it says beside; it runs in a process of two threads."""
     threads = {"OMP_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, str(program), *arguments]
     done = subprocess.run(command, env=os.environ | threads | environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()[-1]
+    return done.stdout.splitlines()[-1], done.stderr
 
 
 @pytest.mark.slow
@@ -87,7 +87,7 @@ def test_workers_grow_shapes_beside_the_loss(loop, start, tmp_path) -> None:
     pytest.importorskip(loop, reason=f"{loop} is not installed: pip install {loop}")
     program = tmp_path / "train.py"
     program.write_text(f"{HEAD}\n{LOOPS[loop]}\nif __name__ == '__main__':\n    main(sys.argv[1])\n")
-    assert run(program, start) == "threads 2"
+    assert run(program, start)[0] == "threads 2"
 
 
 THREADS = """
@@ -122,4 +122,63 @@ def test_several_threads_may_call_the_loss(environment, started, tmp_path) -> No
     """On numba's queue, which serves one caller at a time; and with one thread, where numba starts none."""
     program = tmp_path / "threads.py"
     program.write_text(THREADS)
-    assert run(program, **environment) == f"15 1 {started}"
+    assert run(program, **environment)[0] == f"15 1 {started}"
+
+
+FORKED = """
+import multiprocessing
+import numpy as np
+from curvafit.priors import Grid
+from curvafit.priors.kernels.cpu import fused_energy_gradient
+from curvafit.priors.kernels.threads import count_threads
+
+grid = Grid((48, 48, 48))
+u = np.random.default_rng(0).standard_normal(grid.shape).astype(np.float32)
+
+def work(queue):
+    queue.put((count_threads(), fused_energy_gradient(u, (1, 2, 6, -40, -40, 400), grid, 0.02)[0]))
+
+context = multiprocessing.get_context("fork")
+queue = context.Queue()
+work(queue)
+child = context.Process(target=work, args=(queue,))
+child.start()
+(here, value), (there, same) = queue.get(), queue.get()
+print(here, there, abs(value / same - 1) < 1e-5)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this platform has no fork")
+def test_a_forked_process_takes_one_thread(tmp_path) -> None:
+    """Whatever torch's number is there; the energies' sums have one order."""
+    program = tmp_path / "forked.py"
+    program.write_text(FORKED)
+    assert run(program)[0] == "2 1 True"
+
+
+FIRST = """
+import importlib.util, logging, sys
+if "bare" in sys.argv:
+    find = importlib.util.find_spec
+    importlib.util.find_spec = lambda name, *rest: None if name == "numba" else find(name, *rest)
+import torch
+from curvafit.priors import CurvaturePrior
+
+for _ in range(2):
+    CurvaturePrior("tubes", sigmoid=True)(torch.zeros(1, 1, 8, 8, 8, requires_grad=True)).backward()
+print("done")
+"""
+
+
+@pytest.mark.slow
+def test_what_takes_long_is_logged_once(tmp_path) -> None:
+    """That the kernels are being compiled, where no cache has them; that there are none."""
+    program, cache = tmp_path / "first.py", str(tmp_path / "cache")
+    program.write_text(FIRST)
+    said = [run(program, *bare, NUMBA_CACHE_DIR=cache)[1] for bare in ([], [], ["bare"])]
+    assert [(text.count("compiling"), text.count("numba is not installed")) for text in said] == [
+        (1, 0),
+        (0, 0),
+        (0, 1),
+    ]
