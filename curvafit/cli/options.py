@@ -208,7 +208,9 @@ def parse_whole_triple(text: str, option: str) -> tuple[int, int, int]:
 
 
 def parse_whole_numbers(text: str, option: str) -> tuple[int, ...]:
-    """Return a text as whole numbers from 0."""
+    """Return a text as whole numbers from 0, of 64 bits too."""
+    if all(part.strip().isdecimal() for part in text.split(",")):
+        return tuple(map(int, text.split(",")))
     return _round(parse_numbers(text, option, text.count(",") + 1), option)
 
 

@@ -100,6 +100,10 @@ def reconstruct(
         _what(help="Several structures that exclude each other: all, or their labels, 1,2,5; writes labels."),
     ] = None,
     image: Annotated[str | None, _what(help="The grey levels of the volume, on the same voxels.")] = None,
+    instances: Annotated[
+        bool | None,
+        _what(help="With --labels and --image: labels are instances of one kind, such as cells; by default as drawn."),
+    ] = None,
     example: Annotated[
         Path | None, _what(help="Mask of another such volume, known whole: it tunes the network for a minute.")
     ] = None,
@@ -129,8 +133,10 @@ def reconstruct(
         raise ValueError(f"--axis must be z, y or x, got {axis!r}")
     if (every is not None or known is not None) and ignore is not None:
         raise ValueError("give either --every and --known, which slices are known, or --ignore, what is not")
-    if labels is not None and (reading["label"] is not None or suggest):
-        raise ValueError("--labels is for several structures; --label and --suggest are for one")
+    if labels is not None and reading["label"] is not None:
+        raise ValueError("--labels is for several structures; --label is for one")
+    if instances is not None and None in (labels, image):
+        raise ValueError("--instances and --no-instances go with --labels and --image")
     several = None if labels in (None, "all") else list(parse_whole_numbers(labels, "--labels"))
     numbers = None if known is None else list(parse_whole_numbers(known, "--known"))
     if every is None and first is not None:
@@ -154,17 +160,18 @@ def reconstruct(
             "example": whole,
             "filler": filler,
             "steps": steps,
+            "suggest": suggest,
             "progress": progress,
             **tools,
             **place,
             **how,
         }
         if labels is None:
-            return fill(read_whole(volume), prior, suggest=suggest, **common)
-        return reconstruct_labels(read_whole(volume), prior, chosen=several, **common)
+            return fill(read_whole(volume), prior, **common)
+        return reconstruct_labels(read_whole(volume), prior, chosen=several, instances=instances, **common)
 
     record: dict[str, Any] = {"job": "reconstruct", "steps": steps, "tile": tile}
-    record |= {"labels": labels} if labels else {}
+    record |= {"labels": labels, "instances": instances} if labels else {}
     record |= {
         "image": image,
         "example": None if example is None else str(example),

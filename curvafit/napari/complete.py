@@ -15,8 +15,8 @@ from curvafit.core.runtime import Progress
 from curvafit.napari.dock import Dock
 from curvafit.napari.layers import drop_layer, field_of_layer, list_layers, place_of_layer, put_layer
 from curvafit.segmentation.reconstruct import reconstruct, reconstruct_labels
-from curvafit.segmentation.result import Segmentation
-from curvafit.segmentation.slices import check_shared
+from curvafit.segmentation.result import Segmentation, note_empty
+from curvafit.segmentation.slices import check_shared, index_labels, next_in_rhythm, require_labels
 from curvafit.segmentation.uncertainty import entropy
 from curvafit.volumes.field import Field, ScanError
 
@@ -32,6 +32,7 @@ class Task:
     numbers: Sequence[int]
     axis: int
     known: Sequence[int]
+    notes: Sequence[str]
     image: Field | None
     suggest: int
 
@@ -115,29 +116,33 @@ class Complete(Dock):
         field = replace(field, values=np.array(field.values))
         values = np.moveaxis(field.values, axis, 0)
         numbers = [int(layer.selected_label)] if self.which.value == _ONE else np.unique(values[values != 0]).tolist()
-        if not np.isin(values, numbers).any():
+        require_labels(values, f"the labels layer {layer.name}")
+        if not index_labels(values, numbers).any():
             what = "labels" if self.which.value == _ALL else f"voxels of label {numbers[0]}"
             raise ScanError(f"expected slices with {what} in {layer.name}, got none")
-        known = self._list_known(layer, axis, field.values, numbers)
+        known, empty = self._list_known(layer, axis, field.values, numbers)
         image = None if self.image.value is None else field_of_layer(self.image.value)
         suggest = min(self.suggest.value, len(values) - len(known))
-        return partial(_fill, Task(layer, field, numbers, axis, known, image, suggest))
+        return partial(_fill, Task(layer, field, numbers, axis, known, note_empty(empty), image, suggest))
 
-    def _list_known(self, layer: Any, axis: int, values: np.ndarray, numbers: Sequence[int]) -> list[int]:
-        """Return the slices that are named and, unless no others are wanted, those that somebody drew on."""
+    def _list_known(
+        self, layer: Any, axis: int, values: np.ndarray, numbers: Sequence[int]
+    ) -> tuple[list[int], list[int]]:
+        """Return the slices that are named and, unless no others are wanted, those that somebody drew on; and which of
+        them are taken for rightly empty: at a first fill for which none are named, those next in the rhythm."""
         named, alone = _parse_slices(self.known.value, values.shape[axis])
         if alone:
-            return named
+            return named, []
         fills = _standing(self.fills.get(layer, []), values)
         expected, filled = values.copy(), np.zeros(values.shape, dtype=bool)
         for fill in fills:
             expected.flat[fill.where], filled.flat[fill.where] = fill.after, True
-        corrected = (values != expected) & (np.isin(values, numbers) | np.isin(expected, numbers))
+        corrected = (values != expected) & ((index_labels(values, numbers) | index_labels(expected, numbers)) > 0)
         drawn = np.where(filled & (values == expected), 0, values)
-        known = {*named, *_touched(corrected, axis), *_touched(np.isin(drawn, numbers), axis)}
+        known = {*named, *_touched(corrected, axis), *_touched(index_labels(drawn, numbers) > 0, axis)}
         same = (fill.known for fill in reversed(fills) if fill.axis == axis and set(numbers) <= set(fill.numbers))
-        known |= set(next(same, ()))
-        places = sorted(known)
+        before = set(next(same, ()))
+        places = sorted(known | before)
         if len(places) < 2:
             raise ScanError(f"expected two or more slices with labels in {layer.name}, got {len(places)}")
         if np.diff(places).max() == 1:
@@ -149,7 +154,8 @@ class Complete(Dock):
             changed = _touched(corrected, axis)
             drawn[changed] = whole[changed]
             check_shared(drawn, shared, numbers)
-        return places
+        empty = [] if named or before else next_in_rhythm(places, values.shape[axis])
+        return sorted([*places, *empty]), empty
 
     def show_result(self, result: Filled) -> str:
         """Write the labels, as one step to undo, the doubt as a layer, and the slices to annotate next."""
@@ -172,7 +178,7 @@ class Complete(Dock):
         put_layer(self.viewer, "image", doubt, doubt_name, **options, **place_of_layer(layer))
         self._mark_suggestions(task, found.uncertainty.suggestions)
         self.viewer.layers.selection.active = layer
-        return f"{found.status} (undo: Ctrl+Z in the labels layer)."
+        return " ".join((f"{found.status} (undo: Ctrl+Z in the labels layer).", *task.notes, *found.notes))
 
     def _mark_suggestions(self, task: Task, slices: Sequence[int]) -> None:
         """Frame the suggested slices in the viewer, and give each a button that goes there."""
@@ -205,7 +211,8 @@ def write_labels(layer: Any, values: np.ndarray) -> None:
 
 def _fill(task: Task, progress: Progress) -> Filled:
     """Fill one label, which takes no voxel of another, or several."""
-    options = {"known": task.known, "axis": task.axis, "image": task.image, "progress": progress}
+    options: dict[str, Any] = {"known": task.known, "axis": task.axis, "image": task.image, "suggest": task.suggest}
+    options["progress"] = progress
     values = task.field.values
     if len(task.numbers) > 1:
         found = reconstruct_labels(task.field, chosen=task.numbers, **options)
@@ -213,9 +220,10 @@ def _fill(task: Task, progress: Progress) -> Filled:
         return Filled(task, values, found.labels.values, found)
     number = task.numbers[0]
     inside = replace(task.field, values=(values == number).astype(np.uint8))
-    found = reconstruct(inside, suggest=task.suggest, **options)
-    free = (values == 0) | (values == number)
-    return Filled(task, values, np.where(free, number * found.mask.values, values), found)
+    found, after = reconstruct(inside, **options), values.copy()
+    after[values == number] = 0
+    after[(after == 0) & found.mask.values] = number
+    return Filled(task, values, after, found)
 
 
 def _names(layer: Any) -> tuple[str, str]:
@@ -237,7 +245,7 @@ def _standing(fills: Sequence[Fill], values: np.ndarray) -> list[Fill]:
 
 def _remember(filled: Filled, before: np.ndarray, after: np.ndarray, fills: Sequence[Fill]) -> Fill:
     """Return a fill that changes values (Z, Y, X) from what was before; what was painted meanwhile is no part of it."""
-    task, own = filled.task, np.isin(after, filled.task.numbers)
+    task, own = filled.task, index_labels(after, filled.task.numbers) > 0
     for fill in fills:
         own.flat[fill.where] = True
     own &= before == filled.before

@@ -42,8 +42,9 @@ from curvafit.segmentation.result import (
     FORMAT,
     check_mask_target,
     describe_errors,
+    describe_filled,
     describe_run,
-    doubt_gaps,
+    doubt_filled,
     doubt_labels,
     doubt_places,
     finish_mask,
@@ -65,7 +66,14 @@ from curvafit.segmentation.slices import (
     turn_axes,
 )
 from curvafit.segmentation.tiles import check_edge
-from curvafit.segmentation.uncertainty import count_probabilities, entropy, lowest_inside, suggest_slices
+from curvafit.segmentation.uncertainty import (
+    count_probabilities,
+    doubt,
+    entropy,
+    lowest_inside,
+    share_by_slices,
+    suggest_slices,
+)
 from curvafit.volumes.boxes import InFile, boxes_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box, cut_boxes
@@ -187,8 +195,8 @@ def reconstruct_file(
         which: tuple[str, ...] = ()
         if places is None:
             looked = find(_LOOK, partial(look_at_slab, job), job.slabs)
-            places = choose_labelled(np.concatenate([each["there"] for each in looked]))
-            which = note_labelled(places)
+            places = choose_labelled(there := np.concatenate([each["there"] for each in looked]))
+            which = note_labelled(places, [k for k in places if not there[k]])
         job = replace(job, places=tuple(places), careful=careful, filler=filler)
         job, doubts = _read_known(job, find, every is not None)
         job = job.cut(tile)
@@ -203,12 +211,21 @@ def reconstruct_file(
         dice = 2 * both / max(told + float(filled["sum"]), 1e-9) if job.slices.between.any() else 1.0
         suggestions = suggest_slices(filled["along 0"], places, suggest)
         share = inside / math.prod(job.shape)
+        known_share = share_by_slices(job.slices.inside.mean((1, 2)), places, job.shape[0])
+        likely = float(filled["total"]) / math.prod(job.shape)
         end = describe_errors(dice, taught.error, suggestions, "generated shapes")
-        said = f"{len(places)} of {job.shape[0]} slices known, {volume_summary(share)}; {end}"
-        status = f"{taught.status}: {said}"
-        notes = (*frame.notes, *which, *doubts, *doubt_gaps(dice), *note_ends(places, job.shape[0]))
+        said = describe_filled(places, job.shape[0], volume_summary(share), known_share, likely)
+        status = f"{taught.status}: {said}; {end}"
+        doubts = (*doubts, *doubt_filled(dice, share, known_share))
+        notes = (*frame.notes, *which, *doubts, *note_ends(places, job.shape[0]))
         found: dict[str, Any] = {"coefficients": None, "epsilon": width, "weight": None, "volume_fraction": share}
-        found |= {"calibration_error": taught.error, "suggestions": suggestions, "expected_dice": dice}
+        found |= {
+            "calibration_error": taught.error,
+            "suggestions": suggestions,
+            "expected_dice": dice,
+            "known_share": known_share,
+            "mean_probability": likely,
+        }
         for name in (job.mask, job.probability):
             mark(folder / name, FORMAT.name)
             for partial_chunk in (folder / name).rglob("*.partial"):  # of a killed process
@@ -416,17 +433,23 @@ def fill_block(job: Job, number: int) -> Found:
         if here.start < here.stop:
             depth = plane_distances(slices.inside[[k]], job.spacing[1:], slices.gap * job.spacing[0])[0]
             likely[here] = expit((SLOPE / job.pixel) * depth[core[1:]].astype(np.float32))
+    far = slices.outside[rows]
+    likely[far] = np.minimum(likely[far], 0.5)
     places, inside = slices.known(core)
     likely[places] = inside
     job.write(job.probability, core, likely)
     along = [np.zeros(n) for n in likely.shape]
     for k, plane in enumerate(likely):
-        unsure = entropy(plane)
+        unsure = doubt(plane)
         along[0][k] = unsure.sum()
         along[1] += unsure.sum(1)
         along[2] += unsure.sum(0)
     told = likely[slices.between[rows]]
-    sums = {"counts": count_probabilities(told), "sum": told.sum(dtype=np.float64)}
+    sums = {
+        "counts": count_probabilities(told),
+        "sum": told.sum(dtype=np.float64),
+        "total": likely.sum(dtype=np.float64),
+    }
     return {**sums, **{f"along {k}": each for k, each in enumerate(along)}}
 
 

@@ -264,8 +264,8 @@ def fill(
     """Return calibrated log-odds of the inside of a volume between known slices, float32 (length, Y, X).
 
     In known slices, and in those before the first and beyond the last, they are `SLOPE` times the signed distance in
-    pixels from the outline in the nearest known slice; with an image, slices before the first and beyond the last have
-    its evidence.
+    pixels from the outline in the nearest known slice, but at most 0 in slices that are not filled (`Slices.outside`);
+    with an image, slices before the first and beyond the last have its evidence.
 
     Parameters
     ----------
@@ -278,6 +278,7 @@ def fill(
     """
     raster = Raster.of(slices)
     logits = (SLOPE / raster.pixel) * slices.level("nearest")
+    logits[slices.outside] = np.minimum(logits[slices.outside], 0)
     if evidence is not None and not slices.periodic:
         for outer in (slice(0, slices.places[0]), slice(slices.places[-1] + 1, None)):
             logits[outer] = evidence[outer]

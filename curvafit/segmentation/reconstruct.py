@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import product
 from os import PathLike
 from pathlib import Path
@@ -28,12 +27,14 @@ from curvafit.priors.profile import profile_distance
 from curvafit.segmentation.engine import STEPS, WorkingGrid, choose_epsilon, laws_of
 from curvafit.segmentation.filler import Taught, fill
 from curvafit.segmentation.image import find_shift, read_image
+from curvafit.segmentation.instances import are_instances, split_structure
 from curvafit.segmentation.result import (
     FEW,
     Segmentation,
     Uncertainty,
     describe_errors,
-    doubt_gaps,
+    describe_filled,
+    doubt_filled,
     doubt_labels,
     doubt_places,
     flow_summary,
@@ -42,16 +43,19 @@ from curvafit.segmentation.result import (
     volume_summary,
 )
 from curvafit.segmentation.slices import (
+    IDS,
     WHOLE,
     Slices,
     annotated_slices,
     check_place,
     check_shared,
     check_spacing,
+    choose_labelled,
     find_labelled,
+    index_labels,
     known_places,
-    labelled_slices,
     mark_known,
+    reach_of,
     require_labels,
 )
 from curvafit.segmentation.teach import tune
@@ -68,15 +72,17 @@ from curvafit.segmentation.trials import (
 from curvafit.segmentation.uncertainty import (
     best_log_odds,
     calibration_error,
-    entropy,
+    doubt,
     expected_dice,
     fit_weights,
     near_surface,
     probability,
+    share_by_slices,
     suggest_slices,
 )
 from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError, round_labels
+from curvafit.volumes.formats.base import smallest_type
 from curvafit.volumes.formats.part import Box
 from curvafit.volumes.read import Source, field_of
 
@@ -97,6 +103,10 @@ LEAST_BYTES = 30
 #: Least share of the entropy of slices held out that an image takes away: that of the structure takes half or more.
 TOLD = 0.1
 SHIFTED = "The image seems to lie off the annotated slices by {where}: it fits them better when it is moved back."
+ONCE = (
+    "The labels are read in the image as instances of one structure: where they are of several kinds, --no-instances."
+)
+APIECE = "Each label is read in the image by itself: where they are instances of one kind, such as cells, --instances."
 UNTOLD = "The image does not tell the structure in annotated slices held out: it is left out."
 #: Voxels around a label's box.
 ROOM = 16
@@ -145,7 +155,8 @@ def reconstruct(
         A law as in `segment`, to be tried; by default none. Each law that a fit trusts is tried.
     every, first
         Slices `first`, `first + every`, … along `axis` are known. Before the first known slice and beyond the last, the
-        volume goes on as that slice is, or as an image tells. By default the slices with labels are known.
+        volume goes on as that slice is for half a gap, or as an image tells. By default the slices with labels are
+        known, and where they are every n-th, three or more, the empty ones next to them in this rhythm.
     known
         The numbers of known slices, in place of `every` or besides.
     ignore
@@ -190,8 +201,7 @@ def reconstruct(
         stiffness = check_float(stiffness, "a positive stiffness", *STIFFEST)
     laws, notes = ((), ()) if prior is None else laws_of(prior, volume)
     width, tile = choose_epsilon(volume, epsilon), check_edge(tile)
-    taught, other = Taught.load(filler, image=image is not None), None
-    evidence = seen = None
+    taught, other, evidence, seen = Taught.load(filler, image=image is not None), None, None, None
     if image is not None:
         if example is not None or laws:
             raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
@@ -220,21 +230,23 @@ def reconstruct(
         tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
         problem = SlicesProblem(chosen, target, engine.level(target))
         found = lower_volume(problem, tiling, store=store, workers=workers, progress=progress)
-        mask, phase, summary = found.mask, found.phase, flow_summary(found)
+        mask, phase = target.keep_known(found.mask & ~target.outside[:, None, None]), found.phase
+        summary = flow_summary(found)
         likely = _weigh_evidence(engine, chosen, task, target, phase)
         notes = (*notes, *tiling.place.notes)
-    uncertain = _uncertainty(*likely, mask, target, volume, axis, suggest)
-    notes = (*notes, *doubt_gaps(uncertain.expected_dice))
+    uncertain = _uncertainty(*likely, mask, target, volume, axis, suggest, told=evidence is not None)
     tested = "the example" if other else "slices left out" if chosen.law else "generated shapes"
     end = describe_errors(uncertain.expected_dice, uncertain.calibration_error, uncertain.suggestions, tested)
-    said = f"{said}: {len(places)} of {volume.shape[axis]} slices known, {summary}; {end}"
+    mean = float(uncertain.probability.values.mean(dtype=np.float64))
+    filled = describe_filled(places, volume.shape[axis], summary, uncertain.known_share, mean, evidence is not None)
     return Segmentation.of(
         volume, _turn_back(axis, mask), _turn_back(axis, phase), chosen.law, width,
         (
             *which, *doubt_labels(np.unique(np.moveaxis(volume.values, axis, 0)[places]), ignore), *notes,
+            *doubt_filled(uncertain.expected_dice, float(mask.mean()), uncertain.known_share),
             *note_ends(places, volume.shape[axis], evidence is not None),
         ),
-        weight=None, status=said, uncertainty=uncertain, image=seen,
+        weight=None, status=f"{said}: {filled}; {end}", uncertainty=uncertain, image=seen,
     )  # fmt: skip
 
 
@@ -334,10 +346,10 @@ def _find_known(
     if ignore is not None:
         if every is not None or known is not None:
             raise ScanError("give either every, known or ignore")
-        return *annotated_slices(values, check_int(ignore, "a label to ignore", -SEEDS, SEEDS)), ()
+        return *annotated_slices(values, check_int(ignore, "a label to ignore", -SEEDS, IDS)), ()
     if every is None and known is None:
-        places = labelled_slices(values)
-        return places, None, note_labelled(places)
+        places = choose_labelled(there := find_labelled(values))
+        return places, None, note_labelled(places, [k for k in places if not there[k]])
     places = known_places(len(values), every, first, known)
     return places, None, () if every is None else doubt_places(find_labelled(values), places)
 
@@ -373,19 +385,32 @@ def _weigh_evidence(
     weights = fit_weights(known, task.truth.ravel())
     told, near = probability(known, weights).reshape(task.truth.shape), near_surface(tried > 0)[rows]
     values = probability(evidence(target, phase, list(range(target.length))), weights).reshape(target.shape)
+    values[target.outside] = np.minimum(values[target.outside], 0.5)
     return values, calibration_error(told[near], task.truth[near])
 
 
 def _uncertainty(
-    likely: np.ndarray, error: float, mask: np.ndarray, slices: Slices, volume: Field, axis: int, count: int
+    likely: np.ndarray,
+    error: float,
+    mask: np.ndarray,
+    slices: Slices,
+    volume: Field,
+    axis: int,
+    count: int,
+    *,
+    told: bool,
 ) -> Uncertainty:
-    """Return probabilities (Z, Y, X) as a volume, 0 or 1 where it is known, what they say of the mask, and `count`
-    slices to annotate next."""
+    """Return probabilities (Z, Y, X) as a volume, 0 or 1 where it is known, what they say of the mask, `count` slices
+    to annotate next, and the volume by known slices; `told` says whether an image tells the ends."""
     inside = slices.keep_known(np.zeros(slices.shape, dtype=bool))
     values = np.where(slices.known_voxels, inside, likely).astype(np.float32)
-    suggestions = suggest_slices(entropy(values).sum((1, 2)), slices.places, count, slices.periodic)
+    suggestions = suggest_slices(doubt(values).sum((1, 2)), slices.places, count, slices.periodic)
     dice = expected_dice(likely[slices.between], mask[slices.between]) if slices.between.any() else 1.0
-    return Uncertainty(replace(volume, values=_turn_back(axis, values), notes=()), error, suggestions, dice)
+    known = share_by_slices(
+        slices.inside.mean((1, 2)), slices.places, slices.length, periodic=slices.periodic, whole=told
+    )
+    likely_field = replace(volume, values=_turn_back(axis, values), notes=())
+    return Uncertainty(likely_field, error, suggestions, dice, known_share=known)
 
 
 def _turn_back(axis: int, values: np.ndarray) -> np.ndarray:
@@ -450,6 +475,7 @@ def reconstruct_labels(
     ignore: int | None = None,
     axis: int = 0,
     image: Source | None = None,
+    instances: bool | None = None,
     example: Source | None = None,
     store: str | PathLike[str] | None = None,
     progress: Progress = silent,
@@ -459,6 +485,9 @@ def reconstruct_labels(
 ) -> Segmentation:
     """Fill several structures between known slices, each by `reconstruct`; a voxel that two of them claim goes to the
     one with the greater phase field there.
+
+    With an image, labels that are instances, such as cells, are filled as one structure, in which each voxel has the
+    label that is nearest as filled without the image, and each label is kept in one piece.
 
     Each label is filled in the box where it may be. Where every voxel of the known slices is labelled, so is every
     voxel of the volume: an unclaimed voxel goes to the label with the largest phase value, or to the nearest. A label
@@ -474,8 +503,13 @@ def reconstruct_labels(
         The labels that are structures, by default all but 0; the others count as nothing.
     example
         Labels of another volume of the same kind, known whole, with the same values for the same structures.
+    instances
+        Whether labels are of one kind that the image tells from the background, but not from each other; else it is
+        read for each by itself. By default they are if nine in ten are one piece in each known slice and grey levels
+        vary more within them than between them. Where every voxel is labelled, or the volume repeats, each is read by
+        itself.
     every, first, known, ignore, axis, image, store, progress, spacing, unit, options
-        As in `reconstruct`, without `suggest`.
+        As in `reconstruct`.
 
     Returns
     -------
@@ -492,77 +526,157 @@ def reconstruct_labels(
     volume = field_of(slices, spacing=spacing, unit=unit)
     volume = replace(volume, values=round_labels(volume.values))
     axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
-    places, marks, misplaced = _find_known(volume, axis, every, first, known, ignore)
+    places, marks, notes = _find_known(volume, axis, every, first, known, ignore)
+    suggest = check_int(options.pop("suggest", 0), "a number of slices from 0", 0, volume.shape[axis] - len(places))
     moved = np.moveaxis(volume.values, axis, 0)
-    known_voxels = _turn_back(axis, mark_known(moved.shape, places, marks))
     numbers = find_labels(moved[places], chosen)
     if every is None and known is None and ignore is None:
         check_shared(moved, places, numbers)
-    full = bool(np.isin(moved[places], numbers).all())
+    labels = _Labels(
+        replace(volume, values=index_labels(volume.values, numbers, ignore), notes=()), places, axis,
+        _turn_back(axis, mark_known(moved.shape, places, marks)), ignore is not None, options,
+    )  # fmt: skip
     other = None if example is None else _load_example(example, volume, {"spacing": spacing, "unit": unit})
     seen = None if image is None else _load_image(image, volume, {"spacing": spacing, "unit": unit})
     laws = prior if isinstance(prior, Mapping) else dict.fromkeys(numbers, prior)
-    deepest, owner = np.full(volume.shape, -np.inf, dtype=np.float32), np.zeros(volume.shape, dtype=np.int64)
-    largest, odds = np.zeros(volume.shape, dtype=np.float32), np.zeros(volume.shape, dtype=np.float32)
-    parts: dict[int, Segmentation] = {}
-    notes: dict[str, list[int]] = {}
-    for count, number in enumerate(numbers):
-        inside = (volume.values == number) & known_voxels
-        box = WHOLE if options.get("periodic") else _box_of_label(inside, places, axis, volume.spacing)
-        mask, shown = _select_label(_cut(volume, box), number, ignore), _select_label(other, number)
-        start, stop, _ = box[axis].indices(volume.shape[axis])
-        which = {"known": [k - start for k in places if start <= k < stop]} if ignore is None else {"ignore": UNKNOWN}
-        folder = None if store is None else Path(store) / str(number)
-        step = sub_progress(progress, count / len(numbers), (count + 1) / len(numbers))
-        same = partial(reconstruct, mask, axis=axis, progress=step, **which, **options)
+    drawn, whole, alone = np.moveaxis(labels.given.values, axis, 0)[places].clip(0), None, seen
+    full, periodic = bool(drawn.all()), bool(options.get("periodic"))
+    if seen is not None and not full and not periodic:
+        if instances is None:
+            instances = are_instances(drawn, np.moveaxis(seen.values, axis, 0)[places], len(numbers))
+        notes = (*notes, ONCE if instances else APIECE)
+        if instances:
+            whole = labels.fill(None, WHOLE, image=seen, progress=sub_progress(progress, 0.0, 0.5))
+            progress, alone = sub_progress(progress, 0.5, 1.0), None
+            options.pop("filler", None)  # that one reads images
+        if whole is not None and UNTOLD in whole.notes:
+            whole, notes = None, (*notes[:-1], UNTOLD)
+    parts, said = _fill_each(labels, numbers, laws, (alone, other, store), progress)
+    far = np.moveaxis(np.ones(volume.shape, dtype=bool), axis, 0)
+    far[slice(None) if periodic or seen is not None else reach_of(places, len(moved))] = False
+    values, likely, phase, odds = _join_parts(labels, parts, full, np.moveaxis(far, 0, axis))
+    doubts = {number: part.uncertainty for number, (_, part) in zip(numbers, parts, strict=True)}
+    dice = {number: doubt.expected_dice for number, doubt in doubts.items() if doubt is not None}
+    if whole is not None:
+        values, likely, found = _split_instances(labels, parts, whole, values, odds)
+        dice, phase, said = dict(zip(numbers, found, strict=True)), whole.phase.values, whole.notes
+    likely = np.where(labels.known, 1.0, likely).astype(np.float32)
+    unsure = doubt(np.moveaxis(likely, axis, 0)).sum((1, 2))
+    error = max(doubt.calibration_error for doubt in (whole and whole.uncertainty, *doubts.values()) if doubt)
+    following = suggest_slices(unsure, places, suggest, periodic)
+    likely = replace(volume, values=likely, notes=())
+    return Segmentation.of(
+        volume, values != 0, np.maximum(phase, -1), None, max(part.epsilon for _, part in parts), (*notes, *said),
+        weight=None, status=_describe_labels(parts, dice, whole, following), image=seen,
+        labels=replace(volume, values=_restore(values, numbers, volume.values.dtype), notes=()),
+        uncertainty=Uncertainty(likely, error, following, min(dice.values()), dice),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Labels:
+    """A volume of places of labels (`index_labels`), the known slices across an axis, the known voxels, whether others
+    are marked as such, and options of `reconstruct`."""
+
+    given: Field
+    places: list[int]
+    axis: int
+    known: np.ndarray
+    marked: bool
+    options: dict[str, Any]
+
+    def fill(self, place: int | None, box: Box, law: LawLike | None = None, **more: Any) -> Segmentation:
+        """Fill one label in a box, by its place, or all as one structure."""
+        values = self.given.values[box]
+        inside = (values > 0 if place is None else values == place).astype(np.uint8)
+        start, stop, _ = box[self.axis].indices(self.given.shape[self.axis])
+        which: dict[str, Any] = {"known": [k - start for k in self.places if start <= k < stop]}
+        if self.marked:
+            inside[values < 0], which = UNKNOWN, {"ignore": UNKNOWN}
+        mask = replace(self.given, values=inside, affine=None)
+        return reconstruct(mask, law, axis=self.axis, **which, **self.options, **more)
+
+
+_Parts = list[tuple[Box, Segmentation]]
+
+
+def _fill_each(
+    labels: _Labels, numbers: Sequence[int], laws: Mapping[int, Any], tools: tuple[Any, Any, Any], progress: Progress
+) -> tuple[_Parts, Sequence[str]]:
+    """Fill each label in its box, with image, example and store as `tools`, or by the network alone where it is refused
+    so; return boxes and labels, and notes."""
+    parts, notes, (image, example, store) = [], dict[str, list[int]](), tools
+    for place, number in enumerate(numbers, 1):
+        inside = (labels.given.values == place) & labels.known
+        box = WHOLE if labels.options.get("periodic") else _box_of_label(inside, labels)
+        more = {
+            "image": image and replace(image, values=image.values[box], affine=None, notes=()),
+            "example": example and replace(example, values=(example.values == number).astype(np.uint8), notes=()),
+            "store": store and Path(store) / str(number),
+        }
+        step = sub_progress(progress, (place - 1) / len(numbers), place / len(numbers))
         try:
-            part = same(laws.get(number), image=None if seen is None else _cut(seen, box), example=shown, store=folder)
+            part = labels.fill(place, box, laws.get(number), progress=step, **more)
         except ScanError as reason:
-            part = same()
+            part = labels.fill(place, box, progress=step)
             notes[f"Filled by the network alone: {reason}."] = [number]
-        owner[box] = np.where(part.phase.values > deepest[box], number, owner[box])
+        parts.append((box, part))
+        for note in part.notes:
+            notes.setdefault(note, []).append(number)
+    return parts, [text if len(of) == len(numbers) else f"{_name_labels(of)}: {text}" for text, of in notes.items()]
+
+
+def _join_parts(labels: _Labels, parts: _Parts, full: bool, far: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the label with the greatest phase field at each voxel, by its place, 0 where there is none, and where it
+    is `far` from known slices; how likely that is; this phase field; and the sum of the labels' odds."""
+    shape = labels.given.shape
+    deepest, owner = np.full(shape, -np.inf, dtype=np.float32), np.zeros(shape, dtype=np.int16)
+    largest, odds = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+    for place, (box, part) in enumerate(parts, 1):
+        owner[box] = np.where(part.phase.values > deepest[box], place, owner[box])
         deepest[box] = np.maximum(deepest[box], part.phase.values)
         own = _odds(part)
         largest[box], odds[box] = np.maximum(largest[box], own), odds[box] + own
-        for note in part.notes:
-            notes.setdefault(note, []).append(number)
-        parts[number] = part
     if full and (unseen := np.isneginf(deepest)).any():  # in no label's box
-        near = ndimage.distance_transform_edt(unseen, volume.spacing, return_distances=False, return_indices=True)
+        spacing = labels.given.spacing
+        near = ndimage.distance_transform_edt(unseen, spacing, return_distances=False, return_indices=True)
         owner = owner[tuple(near)]  # type: ignore[arg-type]
-    values = owner if full else np.where(deepest > 0, owner, 0)
-    likely = np.where(values, largest, 1.0) / np.maximum(odds + (not full), SURE)
-    values = np.where(known_voxels, np.where(np.isin(volume.values, numbers), volume.values, 0), values)
-    likely = np.where(known_voxels, 1.0, likely)
-    values = values.astype(np.int32 if min(numbers) < 0 else np.min_scalar_type(max(numbers)))
-    doubts = {number: part.uncertainty for number, part in parts.items() if part.uncertainty is not None}
-    error = max(doubt.calibration_error for doubt in doubts.values())
-    dice = {number: doubt.expected_dice for number, doubt in doubts.items()}
-    likely = replace(volume, values=likely.astype(np.float32), notes=())
-    said = (text if len(of) == len(numbers) else f"{_name_labels(of)}: {text}" for text, of in notes.items())
-    return Segmentation.of(
-        volume,
-        values != 0,
-        np.maximum(deepest, -1),
-        None,
-        max(part.epsilon for part in parts.values()),
-        (*misplaced, *said),
-        weight=None,
-        status=_describe_labels(parts, dice),
-        labels=replace(volume, values=values, notes=()),
-        image=seen,
-        uncertainty=Uncertainty(likely, error, (), min(dice.values()), dice),
-    )
+    values = np.where(labels.known, labels.given.values, np.where((deepest > 0) | (full & ~far), owner, 0))
+    likely = np.where(values, largest, 1.0) / np.maximum(odds + ((values == 0) | (not full)), SURE)
+    return values, likely, deepest, odds
 
 
-def _cut(volume: Field, box: Box) -> Field:
-    """Crop a volume to a box, without its affine and notes."""
-    return replace(volume, values=volume.values[box], affine=None, notes=())
+def _split_instances(
+    labels: _Labels, parts: _Parts, whole: Segmentation, values: np.ndarray, odds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, list[float]]:
+    """Split what all labels fill as one structure by where each is alone; return places and their probabilities, which
+    are that of the structure times the label's share in the odds of all, and the Dice to expect of each."""
+    assert whole.probability is not None
+    values = split_structure(whole.mask.values, values, labels.known, labels.given.spacing)
+    inside, axis = whole.probability.values, labels.axis
+    likely, dice = np.where(values, inside, 1 - inside), []
+    between = np.zeros(values.shape[axis], dtype=bool)
+    between[labels.places[0] : labels.places[-1]] = True
+    between[labels.places] = False
+    for place, (box, part) in enumerate(parts, 1):
+        own, mine = inside[box] * _odds(part) / np.maximum(odds[box], SURE), values[box] == place
+        likely[box] = np.where(mine, own, likely[box])
+        own, mine = (np.moveaxis(each, axis, 0)[between[box[axis]]] for each in (own, mine))
+        dice.append(expected_dice(own, mine) if own.size else 1.0)
+    return values, likely, dice
 
 
-def _box_of_label(inside: np.ndarray, places: list[int], axis: int, spacing: Sequence[float]) -> Box:
+def _restore(values: np.ndarray, numbers: Sequence[int], given: np.dtype) -> np.ndarray:
+    """Return labels by their places, in the smallest type for them, or in the given one where that has 64 bits."""
+    table = np.array([0, *numbers], given if given.kind in "iu" else np.int64)
+    kind = smallest_type(table)
+    return table.astype(kind if kind.itemsize < 8 else table.dtype)[values]
+
+
+def _box_of_label(inside: np.ndarray, labels: _Labels) -> Box:
     """Return the box in which a label may be, given where it is known to be (Z, Y, X): along the axis up to the known
     slices without it, and across it `ROOM` voxels and two gaps beyond."""
+    places, axis, spacing = labels.places, labels.axis, labels.given.spacing
     step = 2 * max(np.diff(places)) * spacing[axis]
     box: list[slice] = []
     for k in range(3):
@@ -581,15 +695,18 @@ def _name_labels(numbers: Sequence[int]) -> str:
     return f"Label{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"
 
 
-def _describe_labels(parts: Mapping[int, Segmentation], dice: Mapping[int, float]) -> str:
-    """Say how some labels were filled, and of many how well in the median and in the worst case."""
-    if len(parts) <= FEW:
-        return "; ".join(f"label {number}: {part.status}" for number, part in parts.items())
+def _describe_labels(
+    parts: _Parts, dice: Mapping[int, float], whole: Segmentation | None, following: Sequence[int]
+) -> str:
+    """Say how some labels were filled, and of many or of instances how well in the median and in the worst case."""
+    end = f"; annotate next: {', '.join(map(str, following))}" if following else ""
+    if len(parts) <= FEW and whole is None:
+        each = zip(dice, parts, strict=True)
+        return "; ".join(f"label {number}: {part.status}" for number, (_, part) in each) + end
     worst = ", ".join(f"label {number} {dice[number]:.2f}" for number in sorted(dice, key=lambda n: dice[n])[:FEW])
-    median = float(np.median(list(dice.values())))
-    return (
-        f"{len(parts)} labels filled: expect a Dice of {median:.2f} between known slices in the median; least: {worst}"
-    )
+    median = f"expect a Dice of {np.median(list(dice.values())):.2f} between known slices in the median; least: {worst}"
+    how = "filled:" if whole is None else f"filled as instances of one structure, {whole.status}; of labels,"
+    return f"{len(parts)} labels {how} {median}{end}"
 
 
 def _odds(part: Segmentation) -> np.ndarray:
@@ -604,9 +721,9 @@ def find_labels(values: np.ndarray, chosen: Sequence[int] | None) -> list[int]:
     Raises `ScanError` if the values are grey levels, a chosen label is missing, or there is none but 0.
     """
     if chosen is not None:
-        chosen = sorted({check_int(n, "labels that are whole numbers", -SEEDS, SEEDS) for n in chosen})
+        chosen = sorted({check_int(n, "labels that are whole numbers", -SEEDS, IDS) for n in chosen})
         others = require_labels(values, "the known slices", math.inf)  # of those that are not chosen any number
-        values = np.where(np.isin(others, chosen), others, 0)
+        values = np.where(index_labels(others, chosen), others, 0)
     found = [int(value) for value in np.unique(require_labels(values, "the known slices"))]
     numbers = [number for number in found if number] if chosen is None else chosen
     listed = ", ".join(map(str, found[:12])) + (", …" if len(found) > 12 else "")
@@ -615,13 +732,3 @@ def find_labels(values: np.ndarray, chosen: Sequence[int] | None) -> list[int]:
     if missing := [number for number in numbers if number not in found]:
         raise ScanError(f"the known slices have the labels {listed}, but not {', '.join(map(str, missing))}")
     return numbers
-
-
-def _select_label(volume: Any, number: int, ignore: int | None = None) -> Any:
-    """Return the mask of the label `number` as a volume, `UNKNOWN` where the label is `ignore`; None of no volume."""
-    if volume is None:
-        return None
-    mask = (volume.values == number).astype(np.uint8)
-    if ignore is not None:
-        mask[volume.values == ignore] = UNKNOWN
-    return replace(volume, values=mask, notes=())

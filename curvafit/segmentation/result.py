@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from curvafit.core.checks import SEEDS, check_float, check_int
+from curvafit.core.checks import check_float, check_int
 from curvafit.core.files import move_together, remove, temporary_folder
 from curvafit.core.pictures import Pictured
 from curvafit.core.records import Format, can_write, is_own_zarr, sibling
 from curvafit.core.runtime import hold_signals
 from curvafit.core.units import format_sampling
 from curvafit.priors.coefficients import Coefficients
+from curvafit.segmentation.slices import IDS, reach_of
 from curvafit.segmentation.tiles import LoweredVolume
-from curvafit.segmentation.uncertainty import entropy
+from curvafit.segmentation.uncertainty import doubt
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.nifti import write_nifti_like
 from curvafit.volumes.formats.zarr import add_labels, check_place, image_of, mark, store_of, write_labels
@@ -36,6 +37,11 @@ FORMAT = Format("curvafit-mask-1", title="the record of a mask")
 MAPS = ("probability", "sure")
 #: Numbers or labels that are told one by one, and the least expected Dice of a volume that slices tell.
 FEW, HALF = 4, 0.5
+#: What is said of a mask that is no estimate of a volume.
+OFF = (
+    "The mask's volume lies off what the known slices alone tell by more than their error: for a volume take theirs. "
+    "The mask has the best Dice to expect."
+)
 _NIFTI = (".nii", ".nii.gz")
 
 
@@ -57,6 +63,8 @@ class Uncertainty:
         The Dice of the mask between known slices that the probabilities let expect; of several structures the least.
     dice_of_labels
         Of several structures: that of each label.
+    known_share
+        Of one structure: its share of the volume by the known slices alone, with its 95 % interval where there is one.
     """
 
     probability: Field
@@ -64,6 +72,7 @@ class Uncertainty:
     suggestions: tuple[int, ...]
     expected_dice: float
     dice_of_labels: Mapping[int, float] = field(default_factory=dict)
+    known_share: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -133,8 +142,15 @@ class Segmentation(Pictured):
         labels, likely = self.mask.values if self.labels is None else self.labels.values, self.probability.values
         likely = np.where(labels, likely, 1 - likely) if self.labels is None else likely
         lowest = max(int(labels.max()), 0) + 1
-        number = lowest if ignored is None else check_int(ignored, f"a label to ignore from {lowest}", lowest, SEEDS)
-        values = labels.astype(np.promote_types(labels.dtype, np.min_scalar_type(number)))
+        number = lowest if ignored is None else check_int(ignored, f"a label to ignore from {lowest}", lowest, IDS)
+        kind = np.promote_types(labels.dtype, np.min_scalar_type(number))
+        if labels.dtype.kind in "iu" and number <= np.iinfo(labels.dtype).max:
+            kind = labels.dtype  # signed and unsigned ones of 64 bits would be joined as floats
+        if kind.kind not in "iu":
+            raise ValueError(
+                f"a label to ignore must be higher than all others, but {number} is more than 64 bits hold"
+            )
+        values = labels.astype(kind)
         values[likely < least] = number
         share = 100 * float((likely < least).mean())
         note = f"{share:.3g} % of the voxels are less sure than {least:g} and have the label to ignore, {number}."
@@ -307,7 +323,7 @@ def _figure(segmentation: Segmentation, rows: Mapping[str, tuple[np.ndarray, np.
     mask, labels, probability = segmentation.mask, segmentation.labels, segmentation.probability
     if probability is None:
         return section_figure(rows, mask.spacing, mask.unit)
-    unsure = entropy(probability.values)
+    unsure = doubt(probability.values)
     places = [int(unsure.sum(tuple({0, 1, 2} - {axis})).argmax()) for axis in range(3)]
     shown: dict[str, tuple[np.ndarray, np.ndarray | None]] = {}
     if labels is not None:
@@ -315,7 +331,7 @@ def _figure(segmentation: Segmentation, rows: Mapping[str, tuple[np.ndarray, np.
     if segmentation.image is not None:
         shown = {"image, filled": (segmentation.image.values, mask.values), **shown}
     elif labels is None:
-        known = np.where(unsure == 0, 2 * mask.values.astype(np.int8) - 1, 0)
+        known = np.where(probability.values % 1 == 0, 2 * mask.values.astype(np.int8) - 1, 0)
         shown = {"known, filled": (known, mask.values)}
     shown["how unsure"] = (unsure, mask.values)
     return section_figure(shown, mask.spacing, mask.unit, places, ["filled"])
@@ -333,6 +349,9 @@ def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> di
         doubts = {name: getattr(uncertain, name) for name in ("calibration_error", "suggestions", "expected_dice")}
         if uncertain.dice_of_labels:
             doubts["dice_of_labels"] = {str(number): dice for number, dice in uncertain.dice_of_labels.items()}
+        if uncertain.known_share:
+            mean = float(uncertain.probability.values.mean(dtype=np.float64))
+            doubts |= {"known_share": uncertain.known_share, "mean_probability": mean}
     found = {
         "coefficients": None if segmentation.coefficients is None else segmentation.coefficients.as_dict(),
         "epsilon": segmentation.epsilon,
@@ -370,10 +389,17 @@ def list_numbers(numbers: Sequence[int], most: int = FEW) -> str:
     return ", ".join(map(str, numbers[:most])) + (", …" if len(numbers) > most else "")
 
 
-def note_labelled(places: Sequence[int]) -> tuple[str, ...]:
-    """Return a sentence on which slices are known where those with labels are."""
-    which = f"The {len(places)} slices with labels are known: {list_numbers(places, 24)}."
-    return (f"{which} One that is rightly empty must be named.",)
+def note_labelled(places: Sequence[int], empty: Sequence[int]) -> tuple[str, ...]:
+    """Return sentences on which slices are known where those with labels are, and `empty` ones in their rhythm."""
+    drawn = [k for k in places if k not in empty]
+    which = f"The {len(drawn)} slices with labels are known: {list_numbers(drawn, 24)}."
+    return (f"{which} One that is rightly empty must be named.", *note_empty(empty))
+
+
+def note_empty(empty: Sequence[int]) -> tuple[str, ...]:
+    """Return a sentence on slices that are taken for rightly empty."""
+    which = f"Slice{'s' * (len(empty) > 1)} {list_numbers(empty)}, next in the rhythm of those with labels,"
+    return (f"{which} are taken for rightly empty: if that is wrong, name the known slices.",) if empty else ()
 
 
 def doubt_places(there: np.ndarray, places: Sequence[int]) -> tuple[str, ...]:
@@ -396,18 +422,35 @@ def doubt_labels(values: np.ndarray, ignore: int | None = None) -> tuple[str, ..
     return (f"The known slices have {count} labels, which are filled as one structure: {how}.",) if count > 1 else ()
 
 
-def doubt_gaps(dice: float) -> tuple[str, ...]:
-    """Return a sentence where a low Dice is expected between known slices."""
+def doubt_filled(dice: float, share: float, known: Sequence[float]) -> tuple[str, ...]:
+    """Return sentences where a low Dice is expected between known slices, and where a mask's share of the volume lies
+    out of the interval of the share by the known slices alone (`share_by_slices`)."""
     low = "Known slices lie too far apart: what lies between them is more unknown than known."
-    return (low,) if dice < HALF else ()
+    off = bool(known[1:]) and not known[1] <= share <= known[2]
+    return (low,) * (dice < HALF) + (OFF,) * off
 
 
 def note_ends(places: Sequence[int], length: int, image: bool = False) -> tuple[str, ...]:
     """Return sentences on the slices before the first known one and beyond the last."""
-    before, beyond = places[0], length - 1 - places[-1]
-    how = "told by the image alone" if image else "as that one is"
-    ends = (("Before the first", before), ("Beyond the last", beyond))
-    return tuple(f"{where} known slice: {n} slice{'s' * (n > 1)}, {how}." for where, n in ends if n)
+    reach = slice(0, length) if image else reach_of(places, length)
+    how, found = "told by the image alone" if image else "as that one is", []
+    ends = ((places[0] - reach.start, reach.start), (reach.stop - 1 - places[-1], length - reach.stop))
+    for where, (count, left) in zip(("Before the first", "Beyond the last"), ends, strict=True):
+        more = f"; {left} further away {'are' if left > 1 else 'is'} not filled" if left else ""
+        if count or left:
+            found.append(f"{where} known slice: {count} slice{'s' * (count != 1)}, {how}{more}.")
+    return tuple(found)
+
+
+def describe_filled(
+    places: Sequence[int], length: int, inside: str, known: Sequence[float], likely: float, image: bool = False
+) -> str:
+    """Say how many slices are known and not filled, and what is inside by the mask, known slices and probabilities."""
+    reach = slice(0, length) if image else reach_of(places, length)
+    left = length - (reach.stop - reach.start)
+    text = f"{len(places)} of {length} slices known{f', {left} beyond them not filled' * (left > 0)}, {inside}"
+    span = f" ({100 * known[1]:.2f} to {100 * known[2]:.2f})" if known[1:] else ""
+    return f"{text}, {100 * known[0]:.2f} %{span} by known slices alone, {100 * likely:.2f} % by probabilities"
 
 
 def describe_errors(dice: float, error: float, suggestions: Sequence[int], tested: str) -> str:

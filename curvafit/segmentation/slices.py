@@ -22,6 +22,8 @@ WAYS = ("spline", "linear", "nearest")
 #: Most values of a mask; more are grey levels. So are more than `FEW` where most neighbours differ: of labels that are
 #: cut from shapes a few in a hundred do, of images of eight bits three in four.
 LABELS, FEW = 256, 16
+#: The greatest label, of 64 bits.
+IDS = 2**64 - 1
 #: Share by which the voxel sizes of two files may differ, and voxels by which their places may.
 SAME, ASTRAY = 1e-3, 0.1
 #: Share of slices with labels, between a label's first and last, that may lack it if all count as known to all.
@@ -120,6 +122,13 @@ class Slices:
         edges = zip(box, self.shape, strict=True)
         return [np.arange(edge.start, n if edge.stop is None else edge.stop) % n for edge, n in edges]
 
+    @property
+    def outside(self) -> np.ndarray:
+        """Whether each slice lies so far beyond the known ones that it is not filled (`reach_of`), bool (length,)."""
+        far = np.full(self.length, not self.periodic)
+        far[reach_of(self.places, self.length)] = False
+        return far
+
     def known(self, box: Box) -> tuple[list[int], np.ndarray]:
         """Return the positions, within a box, of its known slices, and their masks there, bool (N, Y, X)."""
         numbers, ys, xs = self.numbers(box)
@@ -189,26 +198,52 @@ def turn_axes(numbers: Sequence[Any], axis: int) -> tuple[Any, Any, Any]:
     return first, second, third
 
 
-def labelled_slices(values: np.ndarray) -> list[int]:
-    """Return the numbers of the slices (Z, Y, X) with labels, which are known where nothing else is said."""
-    return choose_labelled(find_labelled(values))
-
-
 def find_labelled(values: np.ndarray) -> np.ndarray:
     """Return whether each slice (Z, Y, X) has labels, (Z,)."""
     return np.asarray((values > 0).any((1, 2)))
 
 
 def choose_labelled(there: np.ndarray) -> list[int]:
-    """Return the numbers of the slices with labels, given whether each has some, (Z,)."""
+    """Return the numbers of the known slices, given whether each has labels, (Z,): those that have, and by their rhythm
+    (`next_in_rhythm`) the empty ones beside them."""
     places = np.flatnonzero(there)
     if len(places) < 2:
         raise ScanError(f"two or more slices must have labels, got {len(places)}; or give every or known")
     if np.diff(places).max() == 1:
         raise ScanError(
-            "no slice without labels lies between those with labels: give every or known, which slices count"
+            "no slice without labels lies between those with labels: give every or known, which slices count; slices "
+            "that nobody annotated must be there too, empty"
         )
-    return places.tolist()
+    return sorted([*places.tolist(), *next_in_rhythm(places, len(there))])
+
+
+def next_in_rhythm(places: Sequence[int] | np.ndarray, length: int) -> list[int]:
+    """Return the slices before the first and beyond the last of those with labels, if these are three or more, every
+    n-th: they are taken for rightly empty."""
+    steps = set(np.diff(places).tolist())
+    if len(places) < 3 or len(steps) > 1:
+        return []
+    step = steps.pop()
+    return [k for k in (int(places[0]) - step, int(places[-1]) + step) if 0 <= k < length]
+
+
+def index_labels(values: np.ndarray, numbers: Sequence[int], ignore: int | None = None) -> np.ndarray:
+    """Return the place of each value among some labels, from 1 on, int16; 0 of other values, -1 of `ignore`.
+
+    Labels of 64 bits are compared as they are: NumPy joins signed and unsigned ones as floats, which merges some.
+    """
+    found = np.zeros(values.shape, dtype=np.int16)
+    for place, number in enumerate(numbers, 1):
+        found[values == number] = place
+    if ignore is not None:
+        found[values == ignore] = -1
+    return found
+
+
+def reach_of(places: Sequence[int], length: int) -> slice:
+    """Return the slices that are filled: those between known ones, and beyond each end half the gap next to it."""
+    before, beyond = (places[1] - places[0]) // 2, (places[-1] - places[-2]) // 2
+    return slice(max(places[0] - before, 0), min(places[-1] + beyond + 1, length))
 
 
 def check_shared(values: np.ndarray, places: Sequence[int], labels: Sequence[int]) -> None:

@@ -187,7 +187,7 @@ def test_there_may_be_too_few_slices_to_leave_any_out() -> None:
 
 
 def test_a_straight_tube_is_filled_exactly_and_no_law_helps() -> None:
-    truth = straight()
+    truth = straight(25)
     found = reconstruct(truth, WILLMORE, every=6, steps=3)
     assert np.array_equal(found.mask.values, truth)
     assert found.status.startswith("no law helps here: Dice 1.000 on slices left out by the network")
@@ -311,10 +311,32 @@ def test_known_voxels_leave_the_profile_free() -> None:
     assert pytest.approx(np.tanh(0.5 / (2 * np.sqrt(2)))) == MARGIN
 
 
-def test_slices_beyond_the_known_ones_are_as_those_are() -> None:
+def test_slices_beyond_the_known_ones_are_as_those_are_for_half_a_gap() -> None:
     truth = leaning()
     found = reconstruct(truth.astype(np.uint8), every=8, first=3).mask.values
     assert np.array_equal(found[:3], np.stack([truth[3]] * 3)) and np.array_equal(found[-4:], np.stack([truth[27]] * 4))
+    far = reconstruct(truth.astype(np.uint8), known=[10, 14, 18])
+    assert np.array_equal(far.mask.values[8:11], np.stack([truth[10]] * 3)) and not far.mask.values[:8].any()
+    assert np.array_equal(far.mask.values[18:21], np.stack([truth[18]] * 3)) and not far.mask.values[21:].any()
+    likely = far.probability.values  # type: ignore[union-attr]
+    assert likely[:8].max() == likely[21:].max() == 0.5 and "19 beyond them not filled" in far.status
+    assert any(note.startswith("Before") and "2 slices" in note and "8 further" in note for note in far.notes)
+    full = np.where(truth, 2, 1)
+    several = reconstruct_labels(full, known=[10, 14, 18]).labels.values  # type: ignore[union-attr]
+    assert not several[:8].any() and not several[21:].any() and several[8:21].all()
+
+
+def test_empty_slices_in_the_rhythm_of_those_with_labels_are_known() -> None:
+    """A ball in slices 12 to 28, drawn on 16, 20 and 24; and the same with slices of no rhythm."""
+    truth = np.linalg.norm(np.mgrid[:41, :24, :24] - np.array([20, 12, 12])[:, None, None, None], axis=0) < 8.5
+    drawn = np.zeros(truth.shape, np.uint8)
+    drawn[[16, 20, 24]] = truth[[16, 20, 24]]
+    unasked, named = reconstruct(drawn), reconstruct(drawn, known=[12, 16, 20, 24, 28])
+    np.testing.assert_array_equal(unasked.mask.values, named.mask.values)
+    assert any("Slices 12, 28" in note and "rightly empty" in note for note in unasked.notes)
+    assert not unasked.mask.values[:12].any() and not reconstruct_labels(3 * drawn).mask.values[29:].any()
+    drawn[23], drawn[24] = truth[23], 0
+    assert not any("Slices" in note for note in reconstruct(drawn).notes)
 
 
 def test_more_slices_are_known_besides_every_so_many() -> None:
@@ -334,7 +356,7 @@ def test_labels_count_as_inside_and_what_is_extrapolated_is_said() -> None:
     assert np.array_equal(found.mask.values, plain.mask.values) and set(plain.notes) <= set(found.notes)
     assert [note for note in found.notes if "one structure" in note] and len(found.notes) == len(plain.notes) + 1
     assert any("Before" in note and "2" in note for note in found.notes)
-    assert any("Beyond" in note and "5" in note for note in found.notes)
+    assert any("Beyond" in note and "4 slices" in note and "1 further" in note for note in found.notes)
     assert "after 1 step:" in found.status
     whole = reconstruct(Field(truth), WILLMORE, known=[0, 15, 31], steps=1, stiffness=1e7)
     assert not any("Beyond" in note for note in whole.notes)
@@ -493,7 +515,7 @@ def test_the_command_writes_labels(tmp_path: Path) -> None:
     assert set(np.unique(np.asarray(written.dataobj))) == {0, 2, 7}
     assert np.array_equal(written.affine, image.affine)
     assert json.loads((tmp_path / "volume.json").read_text(encoding="utf-8"))["labels"] == "all"
-    for more in (("all", "--label", 2), ("2,5",), ("two",), ("all", "--suggest", 2)):
+    for more in (("all", "--label", 2), ("2,5",), ("two",), ("all", "--instances")):
         refused(call("reconstruct", scan, *options, "--labels", *more, "-o", tmp_path / "other.nii.gz"), "labels")
     assert not list(tmp_path.glob("other*"))
 

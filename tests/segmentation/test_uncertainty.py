@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.reconstruct import reconstruct
@@ -20,6 +21,7 @@ from curvafit.segmentation.uncertainty import (
     near_surface,
     probability,
     remaining_entropy,
+    share_by_slices,
     suggest_slices,
 )
 
@@ -103,6 +105,48 @@ def test_near_is_within_three_voxels() -> None:
         not near_surface(np.zeros((4, 4, 4), dtype=bool)).any()
         and not near_surface(np.ones((4, 4, 4), dtype=bool)).any()
     )
+
+
+# ---- the volume by known slices --------------------------------------------------------------------------------------
+
+
+def test_the_interval_of_the_known_slices_holds_the_volume() -> None:
+    """Of 60 thresholded noises, fine to coarse, every 4th to 16th slice known; and 20 balls."""
+    shapes: list[np.ndarray] = []
+    for seed in range(60):
+        noise = gaussian_filter(np.random.default_rng(seed).standard_normal((97, 32, 32)), (2, 4, 8)[seed % 3])
+        shapes.append((noise > np.quantile(noise, (0.7, 0.9)[seed % 2])).mean((1, 2)))
+    z = np.arange(97)
+    shapes += [np.clip(r**2 - (z - 45.3 - k % 7) ** 2, 0, None) / 4e3 for k, r in enumerate(np.linspace(9, 30, 20))]
+    held, wide = [], []
+    for k, areas in enumerate(shapes):
+        every = (4, 8, 16)[k // 6 % 3]
+        known, low, high = share_by_slices(areas[::every], range(0, 97, every), 97)
+        held.append(low <= areas.mean() <= high)
+        wide.append((high - low) / 2 / known)
+    # of 80 intervals of 95 %, 71 or more hold with a probability of .98; wider ones hold more often
+    assert np.mean(held) >= 71 / 80 and np.median(wide) < 0.2
+
+
+def test_the_volume_by_known_slices_is_that_of_what_is_filled() -> None:
+    flat = share_by_slices(np.full(4, 0.3), [6, 10, 14, 18], 40)
+    assert flat == pytest.approx((0.3 * 17 / 40,) * 3)  # slices 4 to 20
+    assert share_by_slices(np.full(4, 0.3), [6, 10, 14, 18], 40, whole=True) == pytest.approx((0.3,) * 3)
+    assert share_by_slices(np.full(4, 0.3), [0, 10, 20, 30], 40, periodic=True) == pytest.approx((0.3,) * 3)
+    assert share_by_slices(np.array([0.0, 1.0]), [0, 4], 5) == pytest.approx((0.5,))  # no interval of two
+
+
+def test_a_mask_that_is_no_estimate_of_a_volume_is_told() -> None:
+    """A pattern that lies elsewhere in each slice: the known ones all have the same share, which the mask misses."""
+    random = np.random.default_rng(0)
+    pattern = gaussian_filter(random.standard_normal((40, 40)), 2, mode="wrap") > 0
+    truth = np.stack([np.roll(pattern, random.integers(0, 40, 2), (0, 1)) for _ in range(17)]).astype(np.uint8)
+    found = reconstruct(truth, every=8)
+    known, low, high = found.uncertainty.known_share  # type: ignore[union-attr]
+    assert low == pytest.approx(known) == pytest.approx(high) == pytest.approx(pattern.mean())
+    assert any("volume" in note for note in found.notes) and f"{100 * known:.2f} %" in found.status
+    ball_found = reconstruct(ball(33).astype(np.uint8), every=4)
+    assert not any("volume" in note for note in ball_found.notes)
 
 
 # ---- the best threshold ----------------------------------------------------------------------------------------------

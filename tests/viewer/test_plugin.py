@@ -114,6 +114,21 @@ def test_slices_are_suggested_and_a_button_goes_there(viewer: Any) -> None:
     assert [each.name for each in viewer.layers].count("doubt of cells") == 1  # in the place of the former
 
 
+def test_empty_slices_next_in_the_rhythm_are_known_and_said(viewer: Any) -> None:
+    """Labels of 64 bits on every fourth slice from 12 to 20, and three slices to draw next."""
+    great, truth = 2**63 + 5, rods()
+    drawn = np.isin(np.arange(33), [12, 16, 20])[:, None, None] & (truth > 0)
+    some = np.where(drawn, truth.astype(np.uint64) + np.uint64(2**63), np.uint64(0))
+    layer = viewer.add_labels(some.copy(), name="cells", **PLACE)
+    widget = docked(viewer, Complete)
+    told = run(widget)
+    assert "5 of 17 slices known" in told and "Slices 8, 24" in told and "rightly empty" in told
+    assert not layer.data[:9].any() and not layer.data[24:].any() and len(widget.suggestions) == 3
+    assert np.array_equal(layer.data[16], some[16]) and set(np.unique(layer.data)) == {0, great - 2, great + 2}
+    layer.data[14] = some[16]
+    assert "6 of 17 slices known" in run(widget)
+
+
 def test_a_correction_is_known_at_the_next_fill(viewer: Any) -> None:
     truth = rods()
     layer = viewer.add_labels(sparse(16), name="cells", **PLACE)
