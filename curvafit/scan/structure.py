@@ -12,10 +12,10 @@ threshold.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import partial
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -23,9 +23,11 @@ from skimage.filters import threshold_otsu
 
 from curvafit.core.checks import SEEDS, check_choice, check_float, check_int
 from curvafit.scan.grids import boxes_by_surface, centre_distance, resample, surface_voxels
+from curvafit.volumes.boxes import boxes_of
 from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.formats.part import Box
-from curvafit.volumes.read import load
+from curvafit.volumes.formats.part import Box, Crop
+from curvafit.volumes.place import lay
+from curvafit.volumes.read import Source, field_of
 
 Kind = Literal["field", "mask", "image"]
 
@@ -54,6 +56,17 @@ _NORMAL_MEDIAN = 0.6745
 NOISY, SLICED = 0.02, 1.5
 #: The least share of neighbours with labels that have the same one.
 _ALIKE = 0.25
+#: The most values of labels, and the least share of neighbours among them that are alike; grey levels have noise.
+_FEW, _EVEN = 16, 0.75
+#: What structure is in a mask of several values.
+SEVERAL = (
+    "Taken for labels: the structure is where they are positive. A label of its own is measured by naming it (label), "
+    "and grey levels by kind image."
+)
+#: A constant is padding where it fills more than the first share of the scan, and no less than the second of it is
+#: reached from the ends of rows; where the threshold without it explains that share of the variance of other levels (of
+#: normal noise that is .64).
+PADDED, REACHED, PARTED = 0.1, 0.95, 0.7
 #: A field of a few thousand values was rounded.
 _ROUNDED_VALUES = 4096
 
@@ -67,8 +80,9 @@ def find_structure(
     region: np.ndarray | None = None,
     periodic: bool = False,
     extremes: tuple[float, float] | None = None,
+    imaged: np.ndarray | None = None,
 ) -> tuple[Kind, Field]:
-    """Return the kind of a scan, and the scan as float32 values that are above 0 in its structure, with a note on how.
+    """Return the kind of a scan, and the scan as float32 values that are above 0 in its structure, with notes on how.
 
     The parameters are as in `prepare.prepare`; `extremes` are the lowest and highest value of the whole that `field` is
     a part of: they tell a mask's two values. Raises ScanError if the threshold splits nothing or a phase is empty.
@@ -81,12 +95,15 @@ def find_structure(
         note = f"Taken for a phase field: values {values.min():.3g} to {values.max():.3g}."
         values = (-values if dark else values).astype(np.float32)
     elif seen == "mask":
-        positive = "Taken for a mask: the structure is where it is positive."
-        note = f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else positive
-        mask = values == highest if two else values > 0
+        note = f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else SEVERAL
+        mask = values == highest if two and lowest < highest else values > 0
         values = np.where(mask != dark, np.float32(1), np.float32(-1))
     else:
-        values, note = _split_image(field, threshold, dark, region, periodic)
+        padding = find_padding(values)
+        if imaged is not None and padding is not None:
+            region = imaged if region is None else imaged & region
+        values, padding, note = _split_image(field, threshold, dark, region, periodic, padding)
+        note = " ".join([*describe_padding(padding, threshold == "otsu", region is not None), note])
     counted = values > 0 if region is None else values[region] > 0
     if not counted.any():
         raise ScanError("expected a structure in the scan, got none: every voxel is background")
@@ -108,20 +125,22 @@ def check_options(kind: str, threshold: float | str, label: int | None = None) -
         raise ValueError(f"a threshold splits grey levels: leave it out for kind {kind}")
 
 
-def region_of_interest(roi: Field | np.ndarray | str | os.PathLike[str] | None, field: Field) -> np.ndarray | None:
-    """Return where the scan counts: a mask of its shape, or None for everywhere.
+def read_region(
+    roi: Source, field: Field, scan: Source | None = None, crop: Crop | None = None, **reading: Any
+) -> tuple[Field, tuple[str, ...]]:
+    """Return a region of interest on the voxels of a field, and a note on how it was laid.
 
-    Raises ScanError if the mask is empty or of another shape.
+    A field that is a crop of a scan names that, and its reading: without a place, the region is cropped alike. Raises
+    ScanError where the region is empty, and as `lay`.
     """
-    if roi is None:
-        return None
-    loaded = roi if isinstance(roi, Field | np.ndarray) else load(roi)
-    region = np.asarray(loaded.values if isinstance(loaded, Field) else loaded) != 0
-    if region.shape != field.shape:
-        raise ScanError(f"expected a region of interest of the scan's shape {field.shape}, got {region.shape}")
-    if not region.any():
+    region, on = field_of(roi), field if crop is None or scan is None else boxes_of(scan, **reading).frame
+    if region.affine is not None and on.affine is not None:
+        on, crop = field, None
+    region, notes = lay(region, on, "the region of interest", "the scan")
+    values = region.values if crop is None else region.crop(crop).values
+    if not values.any():
         raise ScanError("expected a region of interest with voxels in it, got an empty one")
-    return region
+    return replace(field, values=values, notes=notes), notes
 
 
 def read_labels(labels: Field, what: str) -> np.ndarray:
@@ -182,9 +201,9 @@ def is_rounded(u: np.ndarray) -> bool:
 
 
 def _guess_kind(values: np.ndarray, threshold: Literal["otsu"] | float, two: bool) -> Kind:
-    """Guess the kind: two values are a mask; floats from about -1 to about 1, without noise and mostly far from 0, are
-    a phase field; anything else is an image."""
-    if two:
+    """Guess the kind: two values are a mask, as are labels; floats from about -1 to about 1, without noise and mostly
+    far from 0, are a phase field; anything else is an image."""
+    if two or (threshold == "otsu" and are_labels(count_labels(values))):
         return "mask"
     if may_be_field(values.dtype, threshold, values.min(), values.max()):
         jitter = float(np.median(np.abs(np.diff(values, 3, axis=2)))) if values.shape[2] > 3 else 0.0
@@ -198,20 +217,132 @@ def may_be_field(dtype: np.dtype, threshold: Literal["otsu"] | float, lowest: fl
     return dtype.kind == "f" and threshold == "otsu" and -2 <= lowest <= -0.7 and 0.3 <= highest <= 2
 
 
-def _find_threshold(values: np.ndarray) -> float:
-    """Return the middle of the means of the two phases that Otsu's threshold splits.
+def count_labels(values: np.ndarray) -> np.ndarray:
+    """Return sums that tell labels: voxels of each value from 0 to 255 and of others, and of neighbours along the last
+    axis that are not 0, how many there are and how many are alike."""
+    counts = np.zeros(259)
+    if values.dtype.kind not in "iu" or values.min() < 0 or values.max() > 255:
+        counts[256] = values.size
+        return counts
+    left, right = values[..., :-1], values[..., 1:]
+    pairs = (left != 0) & (right != 0)
+    counts[:256] = np.bincount(values.ravel().astype(np.uint8), minlength=256)
+    counts[257:] = np.count_nonzero(pairs), np.count_nonzero(pairs & (left == right))
+    return counts
+
+
+def are_labels(counts: np.ndarray) -> bool:
+    """Return whether `count_labels` of a volume are those of labels: some few values, and most neighbours are alike."""
+    return bool(not counts[256] and 2 < np.count_nonzero(counts[:256]) <= _FEW and counts[258] >= _EVEN * counts[257])
+
+
+class Padding(NamedTuple):
+    """A constant around what was imaged.
+
+    `share` is that of the scan's voxels, `deviation` that of the other levels. Where it is not `sure`, it may be a
+    background as well.
+    """
+
+    value: float
+    share: float
+    deviation: float
+    sure: bool
+
+
+def corner_value(corners: np.ndarray) -> Any:
+    """Return the most common value of a volume's corners (2, 2, 2)."""
+    values, counts = np.unique(corners, return_counts=True)
+    return values[counts.argmax()]
+
+
+def count_constant(values: np.ndarray, value: Any) -> np.ndarray:
+    """Return sums that tell padding with a value, from whole rows (Z, Y, X): how many voxels have it, and how many in
+    runs from the ends of rows; then number, sum and sum of squares of the voxels next to those runs, and of all others.
+    """
+    constant = values == value
+    ahead = np.logical_and.accumulate(constant, axis=2)
+    behind = np.logical_and.accumulate(constant[..., ::-1], axis=2)[..., ::-1]
+    rim = np.zeros_like(constant)
+    rim[..., 1:], rim[..., :-1] = ahead[..., :-1], rim[..., :-1] | behind[..., 1:]
+    sums = [np.count_nonzero(constant), np.count_nonzero(ahead | behind)]
+    for part in (rim & ~constant, ~constant):
+        levels = values[part].astype(np.float64)
+        sums += [levels.size, levels.sum(), np.square(levels).sum()]
+    return np.array(sums, dtype=np.float64)
+
+
+def judge_padding(value: Any, counts: np.ndarray, size: int) -> Padding | None:
+    """Return the padding of a scan of so many voxels by its `count_constant`; None where there is none.
+
+    It is sure where what lies next to it is like the rest; or far from it, and it is below 0, to which no background is
+    cut. A background ends in the lower levels of blurred edges.
+    """
+    total, reached, count, *rim = counts[:5]
+    others = counts[5]
+    if total <= PADDED * size or reached < REACHED * total or not others:
+        return None
+    mean, variance = counts[6] / others, max(counts[7] / others - (counts[6] / others) ** 2, 0.0)
+    next_mean = rim[0] / max(count, 1)
+    spread = rim[1] / max(count, 1) - next_mean**2
+    alike = 4 * (next_mean - mean) ** 2 < variance < 4 * spread
+    sure = not count or alike or (value < 0 and (next_mean - float(value)) ** 2 > variance)
+    return Padding(float(value), total / size, math.sqrt(variance), bool(sure))
+
+
+def find_padding(values: np.ndarray) -> Padding | None:
+    """Return the constant around what was imaged of grey levels (Z, Y, X), None where there is none."""
+    value = corner_value(values[np.ix_(*([0, n - 1] for n in values.shape))])
+    return judge_padding(value, count_constant(values, value), values.size)
+
+
+def describe_padding(padding: Padding | None, otsu: bool, inside: bool = False) -> tuple[str, ...]:
+    """Return a note on padding; `inside` says whether Otsu's threshold is taken inside of a region."""
+    if padding is None:
+        return ()
+    told = f"{padding.share:.0%} of the voxels, reached from the borders, are exactly {padding.value:g}"
+    where = " inside the region of interest" if inside else ""
+    without = f", and the threshold is taken without them{where}" if padding.sure and otsu else ""
+    if padding.sure:
+        return (f"{told}: they count as background{without}.",)
+    if inside and otsu:
+        return (f"{told}: the threshold is taken{where}.",)
+    return (f"{told}: if nothing was imaged there, give a region of interest.",)
+
+
+def _find_threshold(values: np.ndarray) -> tuple[float, float]:
+    """Return the middle of the means of the two phases that Otsu's threshold splits, and the share of the variance that
+    it explains.
 
     Between two sharp levels all thresholds split alike and Otsu's is the lowest; else the two agree.
     """
     high = values > threshold_otsu(values)
-    return float(values[high].mean(dtype=np.float64) + values[~high].mean(dtype=np.float64)) / 2
+    above, below = (float(values[side].mean(dtype=np.float64)) for side in (high, ~high))
+    share, variance = float(high.mean()), float(values.var(dtype=np.float64))
+    return (above + below) / 2, share * (1 - share) * (above - below) ** 2 / variance
 
 
-def smooth_levels(values: np.ndarray, spacing: tuple[float, float, float], periodic: bool = False) -> np.ndarray:
-    """Return grey levels (Z, Y, X) smoothed by one voxel of the finest axis, float32; they reach `SMOOTHED` of them."""
+def smooth_levels(
+    values: np.ndarray, spacing: tuple[float, float, float], periodic: bool = False, padding: Padding | None = None
+) -> np.ndarray:
+    """Return grey levels (Z, Y, X) smoothed by one voxel of the finest axis, float32; they reach `SMOOTHED` of them.
+
+    Sure padding is left out, and NaN.
+    """
     width = [min(spacing) / h for h in spacing]
-    mode = "wrap" if periodic else "nearest"
-    return ndimage.gaussian_filter(values.astype(np.float32), width, mode=mode, truncate=3.0)
+    smooth = partial(ndimage.gaussian_filter, sigma=width, mode="wrap" if periodic else "nearest", truncate=3.0)
+    if padding is None or not padding.sure:
+        return smooth(values.astype(np.float32))
+    known = values != padding.value
+    weights = smooth(known.astype(np.float32))
+    return smooth(np.where(known, values, 0).astype(np.float32)) / np.where(known, weights, np.nan)
+
+
+def sign_levels(smooth: np.ndarray, level: float, dark: bool, padding: Padding | None) -> np.ndarray:
+    """Return smoothed levels less a threshold, above 0 in the structure; padding is background."""
+    signed = level - smooth if dark else smooth - level
+    if padding is not None and padding.sure:
+        signed[np.isnan(signed)] = -padding.deviation
+    return signed
 
 
 def describe_split(level: float, otsu: bool, dark: bool, lowest: float, highest: float) -> str:
@@ -224,17 +355,29 @@ def describe_split(level: float, otsu: bool, dark: bool, lowest: float, highest:
 
 
 def _split_image(
-    field: Field, threshold: Literal["otsu"] | float, dark: bool, region: np.ndarray | None, periodic: bool
-) -> tuple[np.ndarray, str]:
-    """Return grey levels smoothed by one voxel of the finest axis, less the raw levels' threshold, and a note.
+    field: Field,
+    threshold: Literal["otsu"] | float,
+    dark: bool,
+    region: np.ndarray | None,
+    periodic: bool,
+    padding: Padding | None,
+) -> tuple[np.ndarray, Padding | None, str]:
+    """Return grey levels smoothed by one voxel of the finest axis, less the raw levels' threshold; the padding, sure
+    only where levels without it have two phases; and a note.
 
     Smoothing lowers thin structures' grey: a threshold of the smoothed levels would sink and make them fat.
     """
-    smooth = smooth_levels(field.values, field.spacing, periodic)
-    counted, raw = (smooth, field.values) if region is None else (smooth[region], field.values[region])
-    level = _find_threshold(raw) if threshold == "otsu" else float(threshold)
-    note = describe_split(level, threshold == "otsu", dark, float(counted.min()), float(counted.max()))
-    return (level - smooth if dark else smooth - level), note
+    smooth = smooth_levels(field.values, field.spacing, periodic, padding)
+    known: Any = np.isfinite(smooth) if padding is not None and padding.sure else ...
+    counted = known if region is None else region if known is ... else known & region
+    levels, raw = smooth[counted], field.values[counted]
+    if not raw.size or raw.min() == raw.max():
+        raise ScanError("expected grey levels that differ where they count, got one of them only")
+    level, explained = _find_threshold(raw) if threshold == "otsu" else (float(threshold), 1.0)
+    if padding is not None and padding.sure and explained < PARTED:
+        return _split_image(field, threshold, dark, region, periodic, padding._replace(sure=False))
+    note = describe_split(level, threshold == "otsu", dark, float(levels.min()), float(levels.max()))
+    return sign_levels(smooth, level, dark, padding), padding, note
 
 
 @dataclass(frozen=True)

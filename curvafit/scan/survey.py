@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -30,14 +31,24 @@ from curvafit.scan.prepare import (
 from curvafit.scan.structure import (
     JITTER,
     LAGS,
+    PARTED,
     PLATEAU,
     PLATEAUS,
+    SEVERAL,
     SMOOTHED,
     Kind,
+    Padding,
+    are_labels,
+    corner_value,
+    count_constant,
+    count_labels,
     count_pairs,
+    describe_padding,
     describe_split,
+    judge_padding,
     may_be_field,
     pairs_of_noise,
+    sign_levels,
     smooth_levels,
 )
 from curvafit.volumes.boxes import Boxes, boxes_of
@@ -85,6 +96,7 @@ class Split:
     highest: float
     two: bool
     level: float = 0.0
+    padding: Padding | None = None
 
 
 class Place(NamedTuple):
@@ -149,8 +161,8 @@ def find_levels(volume: Volume, split: Split, place: Place, boxes: Boxes, box: B
     """Return a box of a volume as float32 values that are above 0 in its structure, as `structure.find_structure`."""
     if split.kind == "image":
         around = grow(box, SMOOTHED, place.shape)
-        smooth = smooth_levels(volume.read(boxes, around), place.spacing)[within(box, around)]
-        return split.level - smooth if volume.dark else smooth - split.level
+        smooth = smooth_levels(volume.read(boxes, around), place.spacing, padding=split.padding)[within(box, around)]
+        return sign_levels(smooth, split.level, volume.dark, split.padding)
     values = volume.read(boxes, box)
     if split.kind == "field":
         return (-values if volume.dark else values).astype(np.float32)
@@ -170,6 +182,7 @@ def survey(volume: Volume, find: Finder) -> Plan:
         ends = [float(e) for e in (total["lowest"], total["highest"])]
         low, high = sorted(split.level - e for e in ends) if volume.dark else [split.level + e for e in ends]
         note = describe_split(split.level, otsu, volume.dark, low, high)
+        note = " ".join([*describe_padding(split.padding, otsu), note])
     size, filled = math.prod(place.shape), int(total["filled"])
     for count, one, other in ((filled, "structure", "background"), (size - filled, "background", "structure")):
         if not count:
@@ -211,7 +224,7 @@ def _choose_grid(plan: Plan, median: float, thick: float, name: str) -> Plan:
         plan,
         thickness=median,
         scale=scale,
-        working=count_voxels(place.shape, scale),
+        working=count_voxels(place.shape, scale) if min(place.shape) > 3 else (0, 0, 0),  # no curvature
         edge=working_edge(scale, place.spacing),
         working_notes=(note, *why),
     )
@@ -246,7 +259,7 @@ def _add(found: Iterable[Found]) -> dict[str, np.ndarray]:
     total: dict[str, np.ndarray] = {}
     for each in found:
         for name, value in each.items():
-            join = {"lowest": np.minimum, "highest": np.maximum}.get(name, np.add)
+            join = {"lowest": np.minimum, "highest": np.maximum}.get(name.removeprefix("inner "), np.add)
             total[name] = join(total[name], value) if name in total else value
     return total
 
@@ -258,7 +271,9 @@ def _find_split(volume: Volume, place: Place, dtype: np.dtype, find: Finder) -> 
     """Return how structure and background are split, and a note for fields and masks."""
     side = max(1, math.isqrt(PIECE // place.shape[2]))
     bars = cut_boxes(place.shape, (side, side, place.shape[2]))
-    found = list(find("reading", partial(_look_at_values, volume, bars), len(bars)))
+    boxes, ends = volume.open(), ((slice(0, 1), slice(n - 1, n)) for n in place.shape)
+    value = corner_value(np.array([volume.read(boxes, (z, y, x)) for z, y, x in product(*ends)]))
+    found = list(find("reading", partial(_look_at_values, volume, bars, value), len(bars)))
     total = _add({name: each[name] for name in each if name != "two"} for each in found)
     if faults := int(total["faults"]):
         raise ScanError(f"a volume must be finite, got {faults} values that are not in {place.source}")
@@ -271,26 +286,45 @@ def _find_split(volume: Volume, place: Place, dtype: np.dtype, find: Finder) -> 
     two = all(bool(each["two"]) and {float(each["lowest"]), float(each["highest"])} <= ends for each in found)
     kind = volume.kind
     if kind == "auto":
-        kind = "mask" if two else "image"
-        if not two and may_be_field(dtype, volume.threshold, float(lowest), float(highest)):
+        kind = "mask" if two or (volume.threshold == "otsu" and are_labels(total["labels"])) else "image"
+        if kind == "image" and may_be_field(dtype, volume.threshold, float(lowest), float(highest)):
             steady = 2 * total["steady"] > total["steps"] or not total["steps"]
             kind = "field" if steady and total["plateau"] > PLATEAUS * math.prod(place.shape) else "image"
     split = Split(kind, float(lowest), float(highest), two)
     if kind == "field":
         return split, f"Taken for a phase field: values {float(lowest):.3g} to {float(highest):.3g}."
     if kind == "mask":
-        positive = "Taken for a mask: the structure is where it is positive."
-        return split, f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else positive
+        return split, f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else SEVERAL
+    return _split_levels(
+        volume, bars, split, judge_padding(value, total["padding"], math.prod(place.shape)), total, find
+    ), ""
+
+
+def _split_levels(
+    volume: Volume, bars: Sequence[Box], split: Split, padding: Padding | None, total: Mapping[str, Any], find: Finder
+) -> Split:
+    """Return how grey levels are split, as `structure.find_structure` does; `total` has their extremes."""
     if volume.threshold != "otsu":
-        return replace(split, level=float(volume.threshold)), ""
-    return replace(split, level=_find_threshold(volume, bars, lowest, highest, find)), ""
+        return replace(split, level=float(volume.threshold), padding=padding)
+    if padding is not None and padding.sure:
+        inner = [total[f"inner {name}"] for name in ("lowest", "highest")]
+        level, explained = _find_threshold(volume, bars, inner, find, padding)
+        if explained >= PARTED:
+            return replace(split, level=level, padding=padding)
+        padding = padding._replace(sure=False)
+    level, _ = _find_threshold(volume, bars, [total["lowest"], total["highest"]], find)
+    return replace(split, level=level, padding=padding)
 
 
-def _look_at_values(volume: Volume, bars: Sequence[Box], number: int) -> Found:
-    """Return the extremes of a bar, whether it has two values at most, and the signs of a phase field."""
+def _look_at_values(volume: Volume, bars: Sequence[Box], value: Any, number: int) -> Found:
+    """Return the extremes of a bar, with and without a value; whether it has two values at most; and what tells labels,
+    padding with that value, and a phase field."""
     values = volume.read(volume.open(), bars[number])
     lowest, highest = values.min(), values.max()
     found = {"lowest": lowest, "highest": highest, "two": np.all((values == lowest) | (values == highest))}
+    found |= {"labels": count_labels(values), "padding": count_constant(values, value)}
+    if (inner := values[values != value]).size:
+        found |= {"inner lowest": inner.min(), "inner highest": inner.max()}
     if values.dtype.kind != "f":
         return {**found, "faults": np.int64(0)}
     found["faults"] = np.int64(values.size - np.count_nonzero(np.isfinite(values)))
@@ -301,28 +335,44 @@ def _look_at_values(volume: Volume, bars: Sequence[Box], number: int) -> Found:
     return {name: np.asarray(value) for name, value in found.items()}
 
 
-def _find_threshold(volume: Volume, bars: Sequence[Box], lowest: Any, highest: Any, find: Finder) -> float:
-    """Return the threshold of grey levels, as `structure.find_structure` finds it."""
-    lowest, highest = lowest[()], highest[()]
+def _find_threshold(
+    volume: Volume, bars: Sequence[Box], extremes: Sequence[Any], find: Finder, padding: Padding | None = None
+) -> tuple[float, float]:
+    """Return the threshold of grey levels without padding, as `structure.find_structure` finds it, and the share of the
+    variance that it explains; 1 without padding."""
+    lowest, highest = (each[()] for each in extremes)
     whole = lowest.dtype.kind in "iu"
     if whole and int(highest) - int(lowest) >= _MOST_LEVELS:
         raise ScanError(f"expected at most {_MOST_LEVELS} grey levels, got {lowest} to {highest}: give a threshold")
-    name = "finding the threshold"
-    counts = _add(find(name, partial(_count_levels, volume, bars, lowest, highest), len(bars)))["counts"]
+    name, left = (
+        "finding the threshold" + " of what was imaged" * bool(padding),
+        None if padding is None else padding.value,
+    )
+    counts = _add(find(name, partial(_count_levels, volume, bars, lowest, highest, left), len(bars)))["counts"]
     if whole:
         centres = np.arange(int(lowest), int(highest) + 1)
         high = centres > threshold_otsu(hist=(counts, centres))
-        means = [np.dot(counts[side], centres[side].astype(np.float64)) / counts[side].sum() for side in (high, ~high)]
-        return float(sum(means)) / 2
-    edges = np.histogram_bin_edges(np.empty(0, lowest.dtype), 256, (lowest, highest))
-    otsu = threshold_otsu(hist=(counts, (edges[1:] + edges[:-1]) / 2))
-    sums = _add(find(f"{name}'s sides", partial(_sum_sides, volume, bars, otsu), len(bars)))["sums"]
-    return float(sums[0, 1] / sums[0, 0] + sums[1, 1] / sums[1, 0]) / 2
+        sums = np.array([[counts[k].sum(), np.dot(counts[k], centres[k].astype(np.float64))] for k in (high, ~high)])
+    else:
+        edges = np.histogram_bin_edges(np.empty(0, lowest.dtype), 256, (lowest, highest))
+        otsu = threshold_otsu(hist=(counts, (edges[1:] + edges[:-1]) / 2))
+        sums = _add(find(f"{name}'s sides", partial(_sum_sides, volume, bars, otsu, left), len(bars)))["sums"]
+    (high, above), (low, below) = ((n, total / n) for n, total in sums.tolist())
+    explained = high * low / (high + low) ** 2 * (above - below) ** 2
+    return (above + below) / 2, 1.0 if padding is None else explained / max(padding.deviation**2, 1e-300)
 
 
-def _count_levels(volume: Volume, bars: Sequence[Box], lowest: Any, highest: Any, number: int) -> Found:
+def _levels(volume: Volume, box: Box, left: float | None) -> np.ndarray:
+    """Return the values of a box, without those that are left out."""
+    values = volume.read(volume.open(), box).ravel()
+    return values if left is None else values[values != left]
+
+
+def _count_levels(
+    volume: Volume, bars: Sequence[Box], lowest: Any, highest: Any, left: float | None, number: int
+) -> Found:
     """Return a histogram of a bar: of each whole number, or of 256 bins."""
-    values = volume.read(volume.open(), bars[number]).ravel()
+    values = _levels(volume, bars[number], left)
     if values.dtype.kind in "iu":
         counts = np.bincount(values.astype(np.int64) - int(lowest), minlength=int(highest) - int(lowest) + 1)
     else:
@@ -330,9 +380,9 @@ def _count_levels(volume: Volume, bars: Sequence[Box], lowest: Any, highest: Any
     return {"counts": counts}
 
 
-def _sum_sides(volume: Volume, bars: Sequence[Box], level: float, number: int) -> Found:
+def _sum_sides(volume: Volume, bars: Sequence[Box], level: float, left: float | None, number: int) -> Found:
     """Return the numbers and sums of the values above a level, and of the others."""
-    values = volume.read(volume.open(), bars[number])
+    values = _levels(volume, bars[number], left)
     high = values > level
     sides = [(values[side].size, values[side].sum(dtype=np.float64)) for side in (high, ~high)]
     return {"sums": np.array(sides, dtype=np.float64)}

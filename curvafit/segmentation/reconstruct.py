@@ -45,7 +45,6 @@ from curvafit.segmentation.slices import (
     WHOLE,
     Slices,
     annotated_slices,
-    check_place,
     check_shared,
     check_spacing,
     find_labelled,
@@ -78,6 +77,7 @@ from curvafit.segmentation.uncertainty import (
 from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box
+from curvafit.volumes.place import lay
 from curvafit.volumes.read import Source, field_of
 
 #: Stiffness of the springs on known voxels, in working units: a tenth of it gives way, ten times as much stalls.
@@ -405,10 +405,10 @@ def _load_image(image: Source, volume: Field, reading: dict[str, Any]) -> Field:
     require("sklearn.ensemble", "image", "reading an image")
     placed = {} if isinstance(image, Field) else {name: reading.get(name) for name in ("spacing", "unit", "crop")}
     field = field_of(image, **placed)
-    check_place(field, volume, "the image", "the slices")
+    field, laid = lay(field, volume, "the image", "the slices", exact=True)
     if (count := len(np.unique(field.values.ravel()[:: -(-field.values.size // SAMPLED)]))) < GREY:
         raise ScanError(f"the image must have grey levels, but has {count} values: is it a mask?")
-    return field
+    return replace(field, notes=laid)
 
 
 def _read_evidence(
@@ -421,7 +421,7 @@ def _read_evidence(
     where = " and ".join(
         f"{voxels:+d} voxels along {name}" for voxels, name in zip(shift, names, strict=True) if voxels
     )
-    doubts = (SHIFTED.format(where=where),) if where else ()
+    doubts = (*image.notes, SHIFTED.format(where=where)) if where else image.notes
     evidence, told = read_image(levels, slices, progress=progress)
     return (None, (*doubts, UNTOLD)) if told < TOLD else (evidence, doubts)
 

@@ -34,7 +34,7 @@ from curvafit.segmentation.evidence import VoxelEvidence, probability_evidence
 from curvafit.segmentation.repair import Repairer
 from curvafit.segmentation.result import Segmentation, Uncertainty, flow_summary, volume_summary
 from curvafit.segmentation.segment import TRIALS, WEIGHTS
-from curvafit.segmentation.slices import check_place, check_spacing, require_labels
+from curvafit.segmentation.slices import check_spacing, require_labels
 from curvafit.segmentation.teach_repair import tune_repair
 from curvafit.segmentation.tiles import Problem, Tiling, lower_volume
 from curvafit.segmentation.trials import Task, Trial, choose_by_masks
@@ -42,6 +42,7 @@ from curvafit.segmentation.uncertainty import expected_dice
 from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box, Crop
+from curvafit.volumes.place import lay
 from curvafit.volumes.read import Source, field_of, place_of
 
 #: Weights that are tried, in nats of a unit of F_ε, and the first of them.
@@ -194,8 +195,10 @@ def _repair(
     progress: Progress,
 ) -> Segmentation:
     """Repair a map; an example tunes first."""
+    notes: tuple[str, ...] = ()
     if isinstance(example, tuple):
         chances, truth = _load_example_beside(field, example, label, reading)
+        notes = truth.notes
         repairer = tune_repairer(chances, truth, repairer, progress=sub_progress(progress, 0.0, 0.7))
         progress = sub_progress(progress, 0.7, 1.0)
     odds = repairer.repair(evidence.ratio, field.spacing, progress)
@@ -206,7 +209,7 @@ def _repair(
     changed = np.count_nonzero(mask != inside) / mask.size
     doubt = Uncertainty(replace(field, values=likely), repairer.error, (), expected_dice(likely, mask))
     return Segmentation.of(
-        field, mask, np.tanh((odds - threshold) / 2), None, choose_epsilon(field, None), (),
+        field, mask, np.tanh((odds - threshold) / 2), None, choose_epsilon(field, None), notes,
         weight=None, uncertainty=doubt, image=field,
         status=f"{said}: {volume_summary(float(mask.mean()))}, and {100 * changed:.2f} % of its voxels are changed",
     )  # fmt: skip
@@ -270,7 +273,7 @@ def calibrate(
 
     task = Task(probability_evidence(part), inside[where], range(part.shape[0]))
     best = choose_by_masks(task, [Trial(law, FIRST, steps) for law in tried], fill, NATS)
-    return Calibration(best, best.law in laws, field, notes)
+    return Calibration(best, best.law in laws, field, notes + truth.notes)
 
 
 def repair_classes(
@@ -483,5 +486,6 @@ def _load_example(
     field = load_probabilities(probabilities, **reading)
     placed = {} if isinstance(mask, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
     truth = field_of(mask, label=label, **placed)
-    check_place(truth, field, "the mask", "the probabilities")
+    truth, laid = lay(truth, field, "the mask", "the probabilities", exact=True)
+    truth = replace(truth, notes=truth.notes + laid)
     return field, truth, require_labels(truth.values, "the example") > 0
