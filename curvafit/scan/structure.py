@@ -56,17 +56,16 @@ _NORMAL_MEDIAN = 0.6745
 NOISY, SLICED = 0.02, 1.5
 #: The least share of neighbours with labels that have the same one.
 _ALIKE = 0.25
-#: The most values of labels, and the least share of neighbours among them that are alike; grey levels have noise.
-_FEW, _EVEN = 16, 0.75
+#: The most values of labels: grey levels of four bits have more.
+_FEW = 12
 #: What structure is in a mask of several values.
 SEVERAL = (
     "Taken for labels: the structure is where they are positive. A label of its own is measured by naming it (label), "
     "and grey levels by kind image."
 )
-#: A constant is padding where it fills more than the first share of the scan, and no less than the second of it is
-#: reached from the ends of rows; where the threshold without it explains that share of the variance of other levels (of
-#: normal noise that is .64).
-PADDED, REACHED, PARTED = 0.1, 0.95, 0.7
+#: A constant may be padding where it fills more than the first share of the scan, and the second share of it is reached
+#: from the ends of rows. Other levels have two phases from this bimodality on.
+PADDED, REACHED, TWO_PHASES = 0.1, 0.95, 0.45
 #: A field of a few thousand values was rounded.
 _ROUNDED_VALUES = 4096
 
@@ -99,10 +98,10 @@ def find_structure(
         mask = values == highest if two and lowest < highest else values > 0
         values = np.where(mask != dark, np.float32(1), np.float32(-1))
     else:
-        padding = find_padding(values)
+        padding = judge_padding(values[0, 0, 0], count_constant(values, values[0, 0, 0]))
         if imaged is not None and padding is not None:
             region = imaged if region is None else imaged & region
-        values, padding, note = _split_image(field, threshold, dark, region, periodic, padding)
+        values, note = _split_image(field, threshold, dark, region, periodic, padding)
         note = " ".join([*describe_padding(padding, threshold == "otsu", region is not None), note])
     counted = values > 0 if region is None else values[region] > 0
     if not counted.any():
@@ -203,7 +202,7 @@ def is_rounded(u: np.ndarray) -> bool:
 def _guess_kind(values: np.ndarray, threshold: Literal["otsu"] | float, two: bool) -> Kind:
     """Guess the kind: two values are a mask, as are labels; floats from about -1 to about 1, without noise and mostly
     far from 0, are a phase field; anything else is an image."""
-    if two or (threshold == "otsu" and are_labels(count_labels(values))):
+    if two or (threshold == "otsu" and are_labels(count_values(values))):
         return "mask"
     if may_be_field(values.dtype, threshold, values.min(), values.max()):
         jitter = float(np.median(np.abs(np.diff(values, 3, axis=2)))) if values.shape[2] > 3 else 0.0
@@ -217,30 +216,22 @@ def may_be_field(dtype: np.dtype, threshold: Literal["otsu"] | float, lowest: fl
     return dtype.kind == "f" and threshold == "otsu" and -2 <= lowest <= -0.7 and 0.3 <= highest <= 2
 
 
-def count_labels(values: np.ndarray) -> np.ndarray:
-    """Return sums that tell labels: voxels of each value from 0 to 255 and of others, and of neighbours along the last
-    axis that are not 0, how many there are and how many are alike."""
-    counts = np.zeros(259)
+def count_values(values: np.ndarray) -> np.ndarray:
+    """Return how many voxels have each whole number from 0 to 255, and how many others (257,)."""
     if values.dtype.kind not in "iu" or values.min() < 0 or values.max() > 255:
-        counts[256] = values.size
-        return counts
-    left, right = values[..., :-1], values[..., 1:]
-    pairs = (left != 0) & (right != 0)
-    counts[:256] = np.bincount(values.ravel().astype(np.uint8), minlength=256)
-    counts[257:] = np.count_nonzero(pairs), np.count_nonzero(pairs & (left == right))
-    return counts
+        return np.append(np.zeros(256, dtype=np.int64), values.size)
+    return np.bincount(values.ravel().astype(np.uint8), minlength=257)
 
 
 def are_labels(counts: np.ndarray) -> bool:
-    """Return whether `count_labels` of a volume are those of labels: some few values, and most neighbours are alike."""
-    return bool(not counts[256] and 2 < np.count_nonzero(counts[:256]) <= _FEW and counts[258] >= _EVEN * counts[257])
+    """Return whether `count_values` of a volume are those of labels: whole numbers of some few values."""
+    return bool(not counts[256] and 2 < np.count_nonzero(counts) <= _FEW)
 
 
 class Padding(NamedTuple):
-    """A constant around what was imaged.
+    """A constant around what was imaged, its share of the scan, and the deviation of the other levels.
 
-    `share` is that of the scan's voxels, `deviation` that of the other levels. Where it is not `sure`, it may be a
-    background as well.
+    Where it is not `sure`, it may be a background as well.
     """
 
     value: float
@@ -249,76 +240,61 @@ class Padding(NamedTuple):
     sure: bool
 
 
-def corner_value(corners: np.ndarray) -> Any:
-    """Return the most common value of a volume's corners (2, 2, 2)."""
-    values, counts = np.unique(corners, return_counts=True)
-    return values[counts.argmax()]
-
-
 def count_constant(values: np.ndarray, value: Any) -> np.ndarray:
     """Return sums that tell padding with a value, from whole rows (Z, Y, X): how many voxels have it, and how many in
-    runs from the ends of rows; then number, sum and sum of squares of the voxels next to those runs, and of all others.
-    """
+    runs from the ends of rows; then sums of powers 0 to 4 of the levels next to those runs, and of all others."""
     constant = values == value
     ahead = np.logical_and.accumulate(constant, axis=2)
     behind = np.logical_and.accumulate(constant[..., ::-1], axis=2)[..., ::-1]
     rim = np.zeros_like(constant)
     rim[..., 1:], rim[..., :-1] = ahead[..., :-1], rim[..., :-1] | behind[..., 1:]
-    sums = [np.count_nonzero(constant), np.count_nonzero(ahead | behind)]
-    for part in (rim & ~constant, ~constant):
-        levels = values[part].astype(np.float64)
-        sums += [levels.size, levels.sum(), np.square(levels).sum()]
-    return np.array(sums, dtype=np.float64)
+    levels = [values[part].astype(np.float64) for part in (rim & ~constant, ~constant)]
+    powers = [(each**power).sum() for each in levels for power in range(5)]
+    return np.array([np.count_nonzero(constant), np.count_nonzero(ahead | behind), *powers])
 
 
-def judge_padding(value: Any, counts: np.ndarray, size: int) -> Padding | None:
-    """Return the padding of a scan of so many voxels by its `count_constant`; None where there is none.
+def judge_padding(value: Any, counts: np.ndarray) -> Padding | None:
+    """Return the padding of a scan by its `count_constant`; None where there is none.
 
-    It is sure where what lies next to it is like the rest; or far from it, and it is below 0, to which no background is
-    cut. A background ends in the lower levels of blurred edges.
+    It is sure where the other levels have two phases (Sarle's coefficient; of a normal distribution it is 1/3), and
+    what lies next to it is like them; or is far from it, and it is below 0, to which no background is cut. A background
+    ends in the low levels of blurred edges.
     """
-    total, reached, count, *rim = counts[:5]
-    others = counts[5]
-    if total <= PADDED * size or reached < REACHED * total or not others:
+    total, reached, size = counts[0], counts[1], counts[0] + counts[7]
+    if total <= PADDED * size or reached < REACHED * total or total == size:
         return None
-    mean, variance = counts[6] / others, max(counts[7] / others - (counts[6] / others) ** 2, 0.0)
-    next_mean = rim[0] / max(count, 1)
-    spread = rim[1] / max(count, 1) - next_mean**2
-    alike = 4 * (next_mean - mean) ** 2 < variance < 4 * spread
-    sure = not count or alike or (value < 0 and (next_mean - float(value)) ** 2 > variance)
-    return Padding(float(value), total / size, math.sqrt(variance), bool(sure))
+    (near, spread, *_), (mean, variance, third, fourth) = map(_central_moments, (counts[2:7], counts[7:]))
+    alike = 4 * (near - mean) ** 2 < variance < 4 * spread
+    far = value < 0 and (near - float(value)) ** 2 > variance
+    phases = third**2 / variance + variance**2 > TWO_PHASES * fourth if variance else False
+    return Padding(float(value), total / size, math.sqrt(variance), bool(phases and (alike or far)))
 
 
-def find_padding(values: np.ndarray) -> Padding | None:
-    """Return the constant around what was imaged of grey levels (Z, Y, X), None where there is none."""
-    value = corner_value(values[np.ix_(*([0, n - 1] for n in values.shape))])
-    return judge_padding(value, count_constant(values, value), values.size)
+def _central_moments(powers: np.ndarray) -> tuple[float, float, float, float]:
+    """Return the mean and the central moments 2 to 4 from sums of powers 0 to 4; zeros of nothing."""
+    m, p2, p3, p4 = (powers[1:] / max(powers[0], 1)).tolist()
+    return m, max(p2 - m**2, 0.0), p3 - 3 * m * p2 + 2 * m**3, p4 - 4 * m * p3 + 6 * m**2 * p2 - 3 * m**4
 
 
 def describe_padding(padding: Padding | None, otsu: bool, inside: bool = False) -> tuple[str, ...]:
     """Return a note on padding; `inside` says whether Otsu's threshold is taken inside of a region."""
     if padding is None:
         return ()
+    ways = ("they count as background", "they may not have been imaged: a region of interest leaves them out")
+    where = f"; the threshold is taken {'without them' if padding.sure else ''}{' inside the region' if inside else ''}"
     told = f"{padding.share:.0%} of the voxels, reached from the borders, are exactly {padding.value:g}"
-    where = " inside the region of interest" if inside else ""
-    without = f", and the threshold is taken without them{where}" if padding.sure and otsu else ""
-    if padding.sure:
-        return (f"{told}: they count as background{without}.",)
-    if inside and otsu:
-        return (f"{told}: the threshold is taken{where}.",)
-    return (f"{told}: if nothing was imaged there, give a region of interest.",)
+    return (
+        f"{told}: {ways[not padding.sure]}{where if otsu and (padding.sure or inside) else ''}.".replace("  ", " "),
+    )
 
 
-def _find_threshold(values: np.ndarray) -> tuple[float, float]:
-    """Return the middle of the means of the two phases that Otsu's threshold splits, and the share of the variance that
-    it explains.
+def _find_threshold(values: np.ndarray) -> float:
+    """Return the middle of the means of the two phases that Otsu's threshold splits.
 
     Between two sharp levels all thresholds split alike and Otsu's is the lowest; else the two agree.
     """
     high = values > threshold_otsu(values)
-    above, below = (float(values[side].mean(dtype=np.float64)) for side in (high, ~high))
-    share, variance = float(high.mean()), float(values.var(dtype=np.float64))
-    return (above + below) / 2, share * (1 - share) * (above - below) ** 2 / variance
+    return float(values[high].mean(dtype=np.float64) + values[~high].mean(dtype=np.float64)) / 2
 
 
 def smooth_levels(
@@ -355,29 +331,22 @@ def describe_split(level: float, otsu: bool, dark: bool, lowest: float, highest:
 
 
 def _split_image(
-    field: Field,
-    threshold: Literal["otsu"] | float,
-    dark: bool,
-    region: np.ndarray | None,
-    periodic: bool,
-    padding: Padding | None,
-) -> tuple[np.ndarray, Padding | None, str]:
-    """Return grey levels smoothed by one voxel of the finest axis, less the raw levels' threshold; the padding, sure
-    only where levels without it have two phases; and a note.
+    field: Field, threshold: Literal["otsu"] | float, dark: bool, region: Any, periodic: bool, padding: Padding | None
+) -> tuple[np.ndarray, str]:
+    """Return grey levels smoothed by one voxel of the finest axis, less the raw levels' threshold, and a note.
 
     Smoothing lowers thin structures' grey: a threshold of the smoothed levels would sink and make them fat.
     """
     smooth = smooth_levels(field.values, field.spacing, periodic, padding)
-    known: Any = np.isfinite(smooth) if padding is not None and padding.sure else ...
-    counted = known if region is None else region if known is ... else known & region
+    counted = ... if region is None else region
+    if padding is not None and padding.sure:
+        counted = np.isfinite(smooth) & (True if region is None else region)
     levels, raw = smooth[counted], field.values[counted]
     if not raw.size or raw.min() == raw.max():
         raise ScanError("expected grey levels that differ where they count, got one of them only")
-    level, explained = _find_threshold(raw) if threshold == "otsu" else (float(threshold), 1.0)
-    if padding is not None and padding.sure and explained < PARTED:
-        return _split_image(field, threshold, dark, region, periodic, padding._replace(sure=False))
+    level = _find_threshold(raw) if threshold == "otsu" else float(threshold)
     note = describe_split(level, threshold == "otsu", dark, float(levels.min()), float(levels.max()))
-    return sign_levels(smooth, level, dark, padding), padding, note
+    return sign_levels(smooth, level, dark, padding), note
 
 
 @dataclass(frozen=True)

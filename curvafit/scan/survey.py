@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -31,7 +30,6 @@ from curvafit.scan.prepare import (
 from curvafit.scan.structure import (
     JITTER,
     LAGS,
-    PARTED,
     PLATEAU,
     PLATEAUS,
     SEVERAL,
@@ -39,10 +37,9 @@ from curvafit.scan.structure import (
     Kind,
     Padding,
     are_labels,
-    corner_value,
     count_constant,
-    count_labels,
     count_pairs,
+    count_values,
     describe_padding,
     describe_split,
     judge_padding,
@@ -271,8 +268,7 @@ def _find_split(volume: Volume, place: Place, dtype: np.dtype, find: Finder) -> 
     """Return how structure and background are split, and a note for fields and masks."""
     side = max(1, math.isqrt(PIECE // place.shape[2]))
     bars = cut_boxes(place.shape, (side, side, place.shape[2]))
-    boxes, ends = volume.open(), ((slice(0, 1), slice(n - 1, n)) for n in place.shape)
-    value = corner_value(np.array([volume.read(boxes, (z, y, x)) for z, y, x in product(*ends)]))
+    value = volume.read(volume.open(), (slice(0, 1), slice(0, 1), slice(0, 1)))[0, 0, 0]
     found = list(find("reading", partial(_look_at_values, volume, bars, value), len(bars)))
     total = _add({name: each[name] for name in each if name != "two"} for each in found)
     if faults := int(total["faults"]):
@@ -286,7 +282,7 @@ def _find_split(volume: Volume, place: Place, dtype: np.dtype, find: Finder) -> 
     two = all(bool(each["two"]) and {float(each["lowest"]), float(each["highest"])} <= ends for each in found)
     kind = volume.kind
     if kind == "auto":
-        kind = "mask" if two or (volume.threshold == "otsu" and are_labels(total["labels"])) else "image"
+        kind = "mask" if two or (volume.threshold == "otsu" and are_labels(total["counts"])) else "image"
         if kind == "image" and may_be_field(dtype, volume.threshold, float(lowest), float(highest)):
             steady = 2 * total["steady"] > total["steps"] or not total["steps"]
             kind = "field" if steady and total["plateau"] > PLATEAUS * math.prod(place.shape) else "image"
@@ -295,25 +291,14 @@ def _find_split(volume: Volume, place: Place, dtype: np.dtype, find: Finder) -> 
         return split, f"Taken for a phase field: values {float(lowest):.3g} to {float(highest):.3g}."
     if kind == "mask":
         return split, f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else SEVERAL
-    return _split_levels(
-        volume, bars, split, judge_padding(value, total["padding"], math.prod(place.shape)), total, find
-    ), ""
-
-
-def _split_levels(
-    volume: Volume, bars: Sequence[Box], split: Split, padding: Padding | None, total: Mapping[str, Any], find: Finder
-) -> Split:
-    """Return how grey levels are split, as `structure.find_structure` does; `total` has their extremes."""
-    if volume.threshold != "otsu":
-        return replace(split, level=float(volume.threshold), padding=padding)
+    padding, left, inner = judge_padding(value, total["padding"]), None, ""
     if padding is not None and padding.sure:
-        inner = [total[f"inner {name}"] for name in ("lowest", "highest")]
-        level, explained = _find_threshold(volume, bars, inner, find, padding)
-        if explained >= PARTED:
-            return replace(split, level=level, padding=padding)
-        padding = padding._replace(sure=False)
-    level, _ = _find_threshold(volume, bars, [total["lowest"], total["highest"]], find)
-    return replace(split, level=level, padding=padding)
+        left, inner = padding.value, "inner "
+    split = replace(split, padding=padding)
+    if volume.threshold != "otsu":
+        return replace(split, level=float(volume.threshold)), ""
+    ends = total[f"{inner}lowest"], total[f"{inner}highest"]
+    return replace(split, level=_find_threshold(volume, bars, *ends, left, find)), ""
 
 
 def _look_at_values(volume: Volume, bars: Sequence[Box], value: Any, number: int) -> Found:
@@ -322,7 +307,7 @@ def _look_at_values(volume: Volume, bars: Sequence[Box], value: Any, number: int
     values = volume.read(volume.open(), bars[number])
     lowest, highest = values.min(), values.max()
     found = {"lowest": lowest, "highest": highest, "two": np.all((values == lowest) | (values == highest))}
-    found |= {"labels": count_labels(values), "padding": count_constant(values, value)}
+    found |= {"counts": count_values(values), "padding": count_constant(values, value)}
     if (inner := values[values != value]).size:
         found |= {"inner lowest": inner.min(), "inner highest": inner.max()}
     if values.dtype.kind != "f":
@@ -336,30 +321,24 @@ def _look_at_values(volume: Volume, bars: Sequence[Box], value: Any, number: int
 
 
 def _find_threshold(
-    volume: Volume, bars: Sequence[Box], extremes: Sequence[Any], find: Finder, padding: Padding | None = None
-) -> tuple[float, float]:
-    """Return the threshold of grey levels without padding, as `structure.find_structure` finds it, and the share of the
-    variance that it explains; 1 without padding."""
-    lowest, highest = (each[()] for each in extremes)
+    volume: Volume, bars: Sequence[Box], lowest: Any, highest: Any, left: float | None, find: Finder
+) -> float:
+    """Return the threshold of grey levels but one that is left out, as `structure.find_structure` finds it."""
+    lowest, highest = lowest[()], highest[()]
     whole = lowest.dtype.kind in "iu"
     if whole and int(highest) - int(lowest) >= _MOST_LEVELS:
         raise ScanError(f"expected at most {_MOST_LEVELS} grey levels, got {lowest} to {highest}: give a threshold")
-    name, left = (
-        "finding the threshold" + " of what was imaged" * bool(padding),
-        None if padding is None else padding.value,
-    )
+    name = "finding the threshold"
     counts = _add(find(name, partial(_count_levels, volume, bars, lowest, highest, left), len(bars)))["counts"]
     if whole:
         centres = np.arange(int(lowest), int(highest) + 1)
         high = centres > threshold_otsu(hist=(counts, centres))
-        sums = np.array([[counts[k].sum(), np.dot(counts[k], centres[k].astype(np.float64))] for k in (high, ~high)])
-    else:
-        edges = np.histogram_bin_edges(np.empty(0, lowest.dtype), 256, (lowest, highest))
-        otsu = threshold_otsu(hist=(counts, (edges[1:] + edges[:-1]) / 2))
-        sums = _add(find(f"{name}'s sides", partial(_sum_sides, volume, bars, otsu, left), len(bars)))["sums"]
-    (high, above), (low, below) = ((n, total / n) for n, total in sums.tolist())
-    explained = high * low / (high + low) ** 2 * (above - below) ** 2
-    return (above + below) / 2, 1.0 if padding is None else explained / max(padding.deviation**2, 1e-300)
+        means = [np.dot(counts[side], centres[side].astype(np.float64)) / counts[side].sum() for side in (high, ~high)]
+        return float(sum(means)) / 2
+    edges = np.histogram_bin_edges(np.empty(0, lowest.dtype), 256, (lowest, highest))
+    otsu = threshold_otsu(hist=(counts, (edges[1:] + edges[:-1]) / 2))
+    sums = _add(find(f"{name}'s sides", partial(_sum_sides, volume, bars, otsu, left), len(bars)))["sums"]
+    return float(sums[0, 1] / sums[0, 0] + sums[1, 1] / sums[1, 0]) / 2
 
 
 def _levels(volume: Volume, box: Box, left: float | None) -> np.ndarray:

@@ -24,37 +24,28 @@ def lay(field: Field, on: Field, name: str, kind: str, *, exact: bool = False) -
     shapes are laid voxel by voxel. Messages call the volume `name`, and the other's voxels those of `kind`. Raises
     ScanError where the two do not meet, or have no place and other shapes.
     """
-    step = _find_step(field, on)
+    step, note = _find_step(field, on), f"{name[0].upper()}{name[1:]} is laid on {kind}"
     if step is None:
         if field.shape != on.shape:
             raise ScanError(f"{name} must have the shape of {kind} {on.shape}, got {field.shape} without a place in it")
-        one = field.affine is None
-        told = f"{name[0].upper()}{name[1:]} is laid on {kind} voxel by voxel: {'it' if one else kind} states no place."
-        return field, () if one and on.affine is None else (told,)
+        one, other = field.affine is None, on.affine is None
+        return field, () if one and other else (f"{note} voxel by voxel: {'it' if one else kind} states no place.",)
     matrix, offset = step
     whole, moved = np.rint(matrix), np.rint(offset)
     corners = np.array(list(product(*((0, n - 1) for n in on.shape))))
     far = np.abs(corners @ (matrix - whole).T + offset - moved).max()
     on_voxels = far < ASTRAY and np.array_equal(whole @ whole.T, np.eye(3))
+    sampling = format_sampling(field.shape, field.spacing, field.unit)
     if on_voxels and field.shape == on.shape and np.array_equal(whole, np.eye(3)) and not moved.any():
         return field, ()
-    if on_voxels:
-        matrix, offset, told = whole, moved, "by its affine: whole voxels are moved"
-    else:
-        sampling = format_sampling(field.shape, field.spacing, field.unit)
-        if exact:
-            other = format_sampling(on.shape, on.spacing, on.unit)
-            raise ScanError(
-                f"{name} must have the voxels of {kind} ({other}), got {sampling} between them: resample it"
-            )
-        told = f"by its affine: each voxel has the value of the nearest of its {sampling}"
-    laid, share = _take_nearest(field.values, matrix, offset, on.shape)
+    if exact and not on_voxels:
+        raise ScanError(f"{name} must have the voxels of {kind}, got {sampling} that lie between them: resample it")
+    laid, share = _take_nearest(field.values, *((whole, moved) if on_voxels else step), on.shape)
     if share == 0 or (exact and share < 1):
         raise ScanError(f"{name} must have the {'shape and ' * exact}place of {kind}, but covers {share:.0%} of it")
-    beyond = "" if share == 1 else f"; {1 - share:.2g} of {kind} lies beyond it, and counts as 0"
-    return replace(field, values=laid, spacing=on.spacing, unit=on.unit, affine=on.affine), (
-        f"{name[0].upper()}{name[1:]} is laid on {kind} {told}{beyond}.",
-    )
+    note += f" by its affine: {'whole voxels are moved' if on_voxels else f'the nearest of its {sampling} counts'}"
+    note += "" if share == 1 else f"; {1 - share:.2g} of {kind} lies beyond it, and counts as 0"
+    return replace(field, values=laid, spacing=on.spacing, unit=on.unit, affine=on.affine), (f"{note}.",)
 
 
 def _find_step(field: Field, on: Field) -> tuple[np.ndarray, np.ndarray] | None:
