@@ -330,7 +330,8 @@ def measure_maps(
     progress("measuring curvature", 0.1)
     try:
         prepared = prepare(field, kind=seen, most=most, **options)  # type: ignore[arg-type]
-        (curved, diagram), working = measure_curvatures(prepared), prepared.notes
+        curved, diagram = measure_curvatures(prepared)
+        working = tuple(f"Of curvature: {note}" for note in prepared.notes if note not in notes)
     except ValueError as reason:
         if isinstance(reason, TooLarge) or min(field.shape) >= FEWEST_SLICES:
             raise
@@ -348,7 +349,7 @@ def measure_maps(
         curved=curved,
         diagram=diagram,
         kind=seen,
-        notes=(f"{sampling}.", *notes, *(f"Of curvature: {note}" for note in working if note not in notes)),
+        notes=(f"{sampling}.", *notes, *working),
     )
 
 

@@ -110,6 +110,8 @@ def a_thin_stack() -> None:
         assert any("No curvature" in note for note in found.notes)
         assert curvafit.windows(rods[:count], (count, 64, 64), (count, 32, 32)).known.all()
         tiled = curvafit.measure(rods[:count], spacing=1.0, unit="um", tile=32)
+        with pytest.raises(ValueError, match="too thin"):
+            curvafit.compare([found, found], [found, found])
         assert tiled["BS/TV"].value == pytest.approx(found["BS/TV"].value, rel=1e-6)
 
 
