@@ -45,6 +45,8 @@ MOST_COMPARTMENTS = 100
 #: Slices from which on a scan without curvature is refused, and why one of fewer has the other numbers alone.
 FEWEST_SLICES = 10
 TOO_THIN = f"it needs {FEWEST_SLICES} slices or more, or a surface away from the borders of fewer"
+#: The note on specks and pinholes.
+DROPPED = "Dropped what is smaller than a ball of half the median thickness (specks: {}, pinholes: {})."
 #: How sure intervals are.
 SURE = 0.95
 
@@ -369,8 +371,7 @@ def _find_structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[n
         smallest = smallest_piece(thickness) / math.prod(field.spacing)
         mask, specks, holes = remove_specks(mask, smallest, options["periodic"])
         if specks or holes:
-            counts = f"{specks} specks, {holes} pinholes"
-            notes = (*notes, f"Dropped what is smaller than a ball of half the median thickness: {counts}.")
+            notes = (*notes, DROPPED.format(specks, holes))
     if mask.all() or not mask.any():
         raise ScanError("expected a structure and background in the scan, got one of them only")
     return mask, seen, notes

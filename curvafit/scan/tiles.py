@@ -31,6 +31,7 @@ from curvafit.priors.grid import WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread
 from curvafit.scan.grids import CutOut, centre_distance, remove_specks, resample
 from curvafit.scan.measure import (
+    DROPPED,
     FEWEST_SLICES,
     MOST,
     SUMS,
@@ -91,11 +92,11 @@ def measure(
     Volume fraction, thickness, spacing, connectivity, surface and fabric are those of the structure on the scan's own
     voxels, all of them. Curvature is that of the scan on the working grid, as `infer` reads it. Intervals are 95 %, by
     a jackknife over blocks of a period (thickness and spacing) of the structure (`errors`); a scan with fewer than
-    eight has none. A scan with a side of more than `LARGEST_BOX` voxels is measured in tiles, which have the numbers of
-    the scan in one piece; of Zarr, HDF5, NPY, RAW and uncompressed NIfTI no more than a tile is in memory. Raises
-    ValueError if the scan has no structure, or none that the voxels resolve, a region does not fit it, or a large scan
-    has a region or is periodic and does not fit into memory; or as `curvafit.load`, and FileNotFoundError if there is
-    no such file.
+    eight has none. A stack of under ten slices may have no curvature (NaN, and a note). A scan with a side of more than
+    `LARGEST_BOX` voxels is measured in tiles, which have the numbers of the scan in one piece; of Zarr, HDF5, NPY, RAW
+    and uncompressed NIfTI no more than a tile is in memory. Raises ValueError if the scan has no structure, or none
+    that the voxels resolve, a region does not fit it, or a large scan has a region or is periodic and does not fit into
+    memory; or as `curvafit.load`, and FileNotFoundError if there is no such file.
 
     Parameters
     ----------
@@ -104,8 +105,9 @@ def measure(
     kind, periodic, threshold, dark
         As in `infer`.
     roi
-        A region of the scan, nonzero where it counts; each of its labels is a compartment of its own. Structure,
-        thickness, surface and curvature are those of the whole scan, and what lies inside is summed.
+        A region of the scan, nonzero where it counts, laid on it by the affines where both have one (a note says how);
+        each of its labels is a compartment of its own. Structure, thickness, surface and curvature are those of the
+        whole scan, and what lies inside is summed.
     tile
         Voxels a side of a tile, of a scan of any size; by default a large scan's memory decides.
     workers
@@ -582,8 +584,7 @@ def _notes(tiling: Tiling, found: Sequence[Found]) -> tuple[str, ...]:
     notes = [f"{format_sampling(plan.place.shape, plan.place.spacing, plan.place.unit)}.", *plan.notes]
     specks, holes = (int(n) for n in np.sum([each["pieces"] for each in found], axis=0))
     if specks or holes:
-        counts = f"{specks} specks, {holes} pinholes"
-        notes.append(f"Dropped what is smaller than a ball of half the median thickness: {counts}.")
+        notes.append(DROPPED.format(specks, holes))
     wide = np.sum([each["wide"] for each in found], axis=0)
     for name, count in zip(("structure", "background"), wide, strict=True):
         if count:

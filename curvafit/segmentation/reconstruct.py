@@ -154,7 +154,8 @@ def reconstruct(
     axis
         The axis of the array across the slices, 0, 1 or 2, that is z, y or x.
     image
-        Grey levels of the volume, on the same voxels; needs `curvafit[image]`. It goes with neither example nor law.
+        Grey levels of the volume, on the same voxels (the affines tell their pose); needs `curvafit[image]`. It goes
+        with neither example nor law.
     example
         A mask of another volume of the same kind, known whole. A file or an array has the slices' `spacing` and `unit`.
     careful
