@@ -60,8 +60,8 @@ _ALIKE = 0.25
 _FEW = 12
 #: What structure is in a mask of several values.
 SEVERAL = (
-    "Taken for labels: the structure is where they are positive. A label of its own is measured by naming it (label), "
-    "and grey levels by kind image."
+    "Taken for a mask or labels: the structure is where they are positive. Naming a label (label) measures it alone, "
+    "and kind image splits grey levels."
 )
 #: A constant may be padding where it fills more than the first share of the scan, and the second share of it is reached
 #: from the ends of rows. Other levels have two phases from this bimodality on.
@@ -98,7 +98,9 @@ def find_structure(
         mask = values == highest if two and lowest < highest else values > 0
         values = np.where(mask != dark, np.float32(1), np.float32(-1))
     else:
-        padding = judge_padding(values[0, 0, 0], count_constant(values, values[0, 0, 0]))
+        padding, corner = None, values[0, 0, 0]
+        if np.count_nonzero(values == corner) > PADDED * values.size:
+            padding = judge_padding(corner, count_constant(values, corner))
         if imaged is not None and padding is not None:
             region = imaged if region is None else imaged & region
         values, note = _split_image(field, threshold, dark, region, periodic, padding)
@@ -249,8 +251,11 @@ def count_constant(values: np.ndarray, value: Any) -> np.ndarray:
     rim = np.zeros_like(constant)
     rim[..., 1:], rim[..., :-1] = ahead[..., :-1], rim[..., :-1] | behind[..., 1:]
     levels = [values[part].astype(np.float64) for part in (rim & ~constant, ~constant)]
-    powers = [(each**power).sum() for each in levels for power in range(5)]
-    return np.array([np.count_nonzero(constant), np.count_nonzero(ahead | behind), *powers])
+    sums = [np.count_nonzero(constant), np.count_nonzero(ahead | behind)]
+    for each in levels:
+        squares = np.square(each)
+        sums += [each.size, each.sum(), squares.sum(), np.dot(squares, each), np.dot(squares, squares)]
+    return np.array(sums, dtype=np.float64)
 
 
 def judge_padding(value: Any, counts: np.ndarray) -> Padding | None:
@@ -280,12 +285,11 @@ def describe_padding(padding: Padding | None, otsu: bool, inside: bool = False) 
     """Return a note on padding; `inside` says whether Otsu's threshold is taken inside of a region."""
     if padding is None:
         return ()
-    ways = ("they count as background", "they may not have been imaged: a region of interest leaves them out")
-    where = f"; the threshold is taken {'without them' if padding.sure else ''}{' inside the region' if inside else ''}"
     told = f"{padding.share:.0%} of the voxels, reached from the borders, are exactly {padding.value:g}"
-    return (
-        f"{told}: {ways[not padding.sure]}{where if otsu and (padding.sure or inside) else ''}.".replace("  ", " "),
-    )
+    told += ", and count as background" * padding.sure
+    told += "" if inside else ": if nothing was imaged there, a region of interest leaves them out"
+    how = " without them" * padding.sure + " inside the region" * inside
+    return (f"{told}; the threshold is taken{how}." if how and otsu else f"{told}.",)
 
 
 def _find_threshold(values: np.ndarray) -> float:

@@ -28,8 +28,8 @@ def lay(field: Field, on: Field, name: str, kind: str, *, exact: bool = False) -
     if step is None:
         if field.shape != on.shape:
             raise ScanError(f"{name} must have the shape of {kind} {on.shape}, got {field.shape} without a place in it")
-        one, other = field.affine is None, on.affine is None
-        return field, () if one and other else (f"{note} voxel by voxel: {'it' if one else kind} states no place.",)
+        neither = field.affine is None and on.affine is None
+        return field, () if neither else (f"{note} voxel by voxel: one of the two states no place.",)
     matrix, offset = step
     whole, moved = np.rint(matrix), np.rint(offset)
     corners = np.array(list(product(*((0, n - 1) for n in on.shape))))
@@ -42,7 +42,9 @@ def lay(field: Field, on: Field, name: str, kind: str, *, exact: bool = False) -
         raise ScanError(f"{name} must have the voxels of {kind}, got {sampling} that lie between them: resample it")
     laid, share = _take_nearest(field.values, *((whole, moved) if on_voxels else step), on.shape)
     if share == 0 or (exact and share < 1):
-        raise ScanError(f"{name} must have the {'shape and ' * exact}place of {kind}, but covers {share:.0%} of it")
+        raise ScanError(
+            f"{name} must have the {'shape and ' * exact}place of {kind}, but by the affines covers {share:.0%} of it"
+        )
     note += f" by its affine: {'whole voxels are moved' if on_voxels else f'the nearest of its {sampling} counts'}"
     note += "" if share == 1 else f"; {1 - share:.2g} of {kind} lies beyond it, and counts as 0"
     return replace(field, values=laid, spacing=on.spacing, unit=on.unit, affine=on.affine), (f"{note}.",)
