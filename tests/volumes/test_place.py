@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from curvafit.scan.structure import read_region
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.place import lay
 
@@ -95,3 +97,18 @@ def test_without_a_place_equal_shapes_go_voxel_by_voxel(placed: str) -> None:
 def test_a_region_that_does_not_meet_the_scan_is_refused() -> None:
     with pytest.raises(ScanError, match="covers 0%"):
         lay(world(LABELS, H * np.eye(3), AFFINE[:3, 3] + 7 * H), SCAN, "the region", "the scan")
+
+
+@pytest.mark.parametrize("placed", ["both", "scan", "region", "neither"])
+def test_a_region_of_a_cropped_scan_is_cropped_alike(placed: str) -> None:
+    """By the affines, or with the scan where one of them has none; a crop has an affine of its own."""
+    scan = replace(SCAN, affine=AFFINE if placed in ("both", "scan") else None)
+    region = Field(LABELS, H, "mm", AFFINE if placed in ("both", "region") else None)
+    if placed == "both":
+        turned = AFFINE @ np.diag([-1.0, 1, 1, 1])
+        turned[0, 3] += (SHAPE[2] - 1) * H
+        region = Field(LABELS[..., ::-1], H, "mm", turned)
+    crop = "1:4,2:,:-1"
+    laid, notes = read_region(region, scan.crop(crop), scan, crop)
+    assert (laid.values == LABELS[1:4, 2:, :-1]).all()
+    assert bool(notes) == (placed != "neither")
