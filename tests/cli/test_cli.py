@@ -119,7 +119,7 @@ def test_infer_checks_before_it_reads(tmp_path: Path, monkeypatch: pytest.Monkey
     def read(*_: object, **__: object) -> None:
         raise AssertionError("the scan was read")
 
-    monkeypatch.setattr(importlib.import_module("curvafit.inference.infer"), "field_of", read)
+    monkeypatch.setattr(importlib.import_module("curvafit.inference.infer"), "read_scan", read)
     for option in (("--seed", "-1"), ("--kind", "drawing"), ("--unit", "furlong")):
         refused(call("infer", "scan.npy", "-o", tmp_path / "out", *option), option[0].strip("-"))
     assert list(tmp_path.iterdir()) == []
