@@ -5,7 +5,7 @@ of two contrasts; slices 21 and 42 are annotated, and a small U-Net learns from 
 steps and their first third, which is Dice + CE alone (`plain`). `area`, `willmore`, `law` and `wrong` add the energy
 of all voxels: the law is that of another volume's mask, the wrong one another texture's. `teacher` is a mean teacher;
 `pseudo` learns what `reconstruct` fills from slices and image, each voxel as sure as it is; `filled` is that itself,
-without a network. `refine` (the law) and `repair` work on what `plain` predicts. Weights are chosen for each texture
+without a network. `refine` (the law) works on what `plain` predicts. Weights are chosen for each texture
 and way by slice 32, on a seed of its own.
 
 Scores are those of the slices that nobody annotated. Differences pair networks by seed, with 95 % intervals of a
@@ -52,7 +52,7 @@ WEIGHTS: dict[str, tuple[float, ...]] = {
 }
 WEIGHTS |= {"plain": (0.0,), "teacher": (1.0, 10.0), "pseudo": (0.0,)}
 #: Ways that work on what `plain` predicts.
-AFTER = ("refine", "repair")
+AFTER = ("refine",)
 WAYS = ("plain", "area", "willmore", "law", "wrong", "teacher", "pseudo", *AFTER, "filled")
 #: The seed by which weights are chosen, and that of the volume that the law is read from.
 TUNING, OTHER = 100, 200
@@ -205,9 +205,6 @@ def case(way: str, weight: float, texture: str, seed: int, steps: int, cases: Ca
             p, law_of(texture, cases), example=(predicted("plain", 0.0, texture, TUNING, steps, cases), truths)
         )
         mask, said = found.mask.values > 0, found.status
-    elif way == "repair":
-        found = refine(p, repair=True)
-        mask, said = found.mask.values > 0, found.status
     rest = np.setdiff1d(np.arange(len(truth)), [*KNOWN, JUDGE])
     return {"dice": dice(mask[rest], truth[rest]), "betti": scores(mask, truth)["betti"], "cldice": cldice(mask, truth),
             "judge": dice(mask[JUDGE], truth[JUDGE]), "status": said}  # fmt: skip
@@ -234,7 +231,7 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore", category=UserWarning)
     steps, seeds = (6, 1) if cases.quick else (STEPS, options.seeds)
-    ways = ["plain", "law", "repair"] if cases.quick else options.ways.split(",")
+    ways = ["plain", "law", "refine"] if cases.quick else options.ways.split(",")
     textures = ["trabec"] if cases.quick else options.textures.split(",")
     found: dict[tuple[str, str], list[Values]] = {}
 

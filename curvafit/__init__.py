@@ -65,6 +65,7 @@ _FIGURES = {
     "Fit": "curvafit.drawing.plot:fit_figure",
     "Flow": "curvafit.drawing.plot:flow_figure",
     "Inference": "curvafit.report.page:inference_figure",
+    "Measures": "curvafit.report.measures:measures_figure",
     "Segmentation": "curvafit.segmentation.result:segmentation_figure",
     "Trajectory": "curvafit.report.trajectory:trajectory_figure",
     "Windows": "curvafit.report.windows:windows_figure",

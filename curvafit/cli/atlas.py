@@ -176,7 +176,6 @@ def train_atlas(
     "curvafit atlas teach store.zarr -o filler.npz",
     "curvafit atlas teach presets.zarr box.zarr corner.zarr -o filler.npz",
     "curvafit atlas teach presets.zarr box.zarr corner.zarr --images 160 -o image.npz",
-    "curvafit atlas teach box.zarr --repair -o repairer.npz",
 )
 def teach_filler(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, or masks.")],
@@ -187,30 +186,22 @@ def teach_filler(
     filler: Annotated[
         Path | None, typer.Option(help="With --images: the filler to begin with; by default the packaged one.")
     ] = None,
-    repair: Annotated[bool, typer.Option("--repair", help="Teach the network of `refine --repair`.")] = False,
     steps: Annotated[
         int | None,
-        typer.Option(help="Steps of teaching, by default 4500; 1500 with --images, 2600 with --repair.", min=1),
+        typer.Option(help="Steps of teaching, by default 4500; 1500 with --images.", min=1),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the teaching.")] = 0,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Teach the network that `reconstruct` fills volumes with, or that `refine --repair` mends masks with.
-
-    The same command resumes one that was stopped.
-    """
+    """Teach the network that `reconstruct` fills volumes with. The same command resumes one that was stopped."""
     from curvafit.core.files import remove
-    from curvafit.segmentation import teach_image, teach_repair
+    from curvafit.segmentation import teach_image
     from curvafit.segmentation.filler import FILLER_FILE, Taught
-    from curvafit.segmentation.repair import REPAIRER_FILE
     from curvafit.segmentation.teach import FEW, STEPS, load_textures, teach
 
     if filler is not None and not images:
         raise ValueError("--filler goes with --images")
-    if repair and images:
-        raise ValueError("give either --images or --repair, got both")
-    kind = REPAIRER_FILE if repair else FILLER_FILE
-    _check_archive(out, kind, [*stores, *([filler] if filler else [])], overwrite)
+    _check_archive(out, FILLER_FILE, [*stores, *([filler] if filler else [])], overwrite)
     checkpoint = out.with_name(f".{out.name}.curvafit-steps")
     with resumable(), show_stages() as progress:
         plain = Taught.load(filler) if images else None
@@ -219,18 +210,15 @@ def teach_filler(
             say_notes([f"{count} shapes teach little: {FEW} or more are better"])
         card["command"] = command_line()
         how: dict[str, Any] = {"seed": seed, "checkpoint": checkpoint, "progress": progress}
-        if repair:
-            taught = teach_repair.teach_repair(sources, card, steps=steps or teach_repair.STEPS, **how)
-        elif plain is None:
+        if plain is None:
             taught = teach(sources, card, steps=steps or STEPS, **how)
         else:
             how |= {"steps": steps or teach_image.STEPS, "volumes": images}
             taught = teach_image.teach_image(sources, plain, card, **how)
     taught.save(out)
     remove(checkpoint)
-    other, name = ("damaged", "damaged masks") if repair else ("cubic", "the cubic interpolation")
-    learnt, plain_loss = (taught.card[f"held_out_{each}"] for each in ("loss", other))
-    say(f"cross entropy of shapes held out {learnt:.4f}, of {name} {plain_loss:.4f}", to=error_console())
+    learnt, cubic = (taught.card[f"held_out_{each}"] for each in ("loss", "cubic"))
+    say(f"cross entropy of shapes held out {learnt:.4f}, of the cubic interpolation {cubic:.4f}", to=error_console())
     say(str(out))
 
 

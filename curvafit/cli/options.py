@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import inspect
 import math
-from collections.abc import Callable, Iterator, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +22,12 @@ if TYPE_CHECKING:
 
 #: Whether files of other programs, or of other commands, may be replaced.
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace files that another command wrote.")]
+
+
+#: Parameters of commands that are volumes to read, and those that are laws.
+_VOLUMES = ("scan", "scans", "slices", "probabilities", "roi", "image", "example", "example_probabilities", "like",
+            "like_mask")  # fmt: skip
+_LAWS = ("preset", "prior", "laws")
 
 
 # ---- commands --------------------------------------------------------------------------------------------------------
@@ -42,6 +49,7 @@ def command(*examples: str) -> Callable[[Callable[..., None]], Callable[..., Non
             with plain_errors():
                 for name, options in groups.items():
                     arguments[name] = _GROUPS[name](**{option: arguments.pop(option) for option in options})
+                _check_inputs(arguments)
                 function(**arguments)
 
         parameters = [each for name in own for each in groups.get(name, {name: own[name]}).values()]
@@ -53,6 +61,22 @@ def command(*examples: str) -> Callable[[Callable[..., None]], Callable[..., Non
         return run
 
     return decorate
+
+
+def _check_inputs(arguments: Mapping[str, Any]) -> None:
+    """Raise an error where a volume is missing or a law is none, before libraries are imported that need it."""
+    for given in filter(None, map(arguments.get, _VOLUMES)):
+        for path in map(str, given if isinstance(given, list) else [given]):
+            file = path.rpartition("::")[0] or path
+            if not (os.path.exists(path) or os.path.exists(file)):
+                raise FileNotFoundError(f"no such file: {file}")
+    from curvafit.core.checks import quoted, simplify_name
+    from curvafit.priors.published import PUBLISHED
+
+    for given in filter(None, map(arguments.get, _LAWS)):
+        for law in [] if given.endswith(".json") else given.split(","):
+            if simplify_name(law) not in PUBLISHED and not law.endswith(".json") and not os.path.isfile(given):
+                raise ValueError(f"expected a preset among {', '.join(PUBLISHED)}, or a fit.json, got {quoted(law)}")
 
 
 def add_commands(app: typer.Typer, *functions: Callable[..., None]) -> None:

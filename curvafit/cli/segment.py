@@ -232,11 +232,11 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
 
     record, reading = job.record, job.reading
     law_file = None if preset_name(job.prior) else job.prior
-    named = ("image", "example", "example_probabilities", "filler", "repairer")
+    named = ("image", "example", "example_probabilities", "filler")
     shown = (job.image, *(record.get(name) for name in named))
     options = {"inputs": [file for file in (job.source, law_file, *shown) if file], "overwrite": job.overwrite}
     least = record.get("sure")
-    likely = record["job"] == "reconstruct" or record.get("repair")
+    likely = record["job"] == "reconstruct"
     options["maps"] = (["probability"] if likely else []) + (["sure"] if least else [])
     check_mask_target(job.out, **options)
     if job.prior is not None:

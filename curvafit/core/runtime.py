@@ -6,8 +6,10 @@ program listens from its first line (`listen`); the library changes no signal's 
 
 from __future__ import annotations
 
+import logging
 import math
 import os
+import re
 import signal
 import sys
 import threading
@@ -27,6 +29,26 @@ def silent(text: str, share: float) -> None:
     """Say nothing: the default progress."""
 
 
+def log_stages() -> Progress:
+    """Return a progress that logs each stage once, at level INFO of the logger `curvafit`; numbers make no stage."""
+    stages: set[str] = set()
+
+    def log(text: str, share: float) -> None:
+        if (stage := re.sub(r"\d+", "", text)) not in stages:
+            stages.add(stage)
+            logging.getLogger("curvafit").info("%s (%.0f %% done)", text, 100 * share)
+
+    return log
+
+
+def show_share(text: str, share: float) -> None:
+    """Show a sentence and a bar on the error stream, on one line of a terminal, which all workers write over."""
+    if sys.stderr is not None:
+        start, end = ("\r", "" if share < 1 else "\n") if sys.stderr.isatty() else ("", "\n")
+        bar = "#" * round(20 * share)
+        print(f"{start}[{bar:.<20}] {one_line(text)}", end=end, file=sys.stderr, flush=True)
+
+
 def sub_progress(progress: Progress, start: float, stop: float) -> Progress:
     """Return the progress of a part of the work, from one share of the whole to another."""
     return lambda text, share: progress(text, start + (stop - start) * share)
@@ -36,6 +58,19 @@ def one_line(text: str) -> str:
     """Return a text on one line; characters that do not show, such as a line break in a name, are escaped."""
     plain = text.replace("\u00a0", " ").replace("\u202f", " ")
     return "".join(sign if sign.isprintable() else sign.encode("unicode_escape").decode() for sign in plain)
+
+
+# ---- forks -----------------------------------------------------------------------------------------------------------
+
+#: This process, where it was forked from one that had imported this module: the memory is that one's, its threads gone.
+_FORKS: list[int] = []
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=lambda: _FORKS.append(os.getpid()))
+
+
+def is_forked() -> bool:
+    """Return whether this process was forked from one that had imported this module."""
+    return bool(_FORKS)
 
 
 # ---- memory ----------------------------------------------------------------------------------------------------------

@@ -96,6 +96,12 @@ def per_unit(unit: str, power: int) -> str:
     return f"1/{unit_name(unit)}{ {1: '', 2: '²', 3: '³'}[power] }"
 
 
+def plain_unit(unit: str, power: int) -> str:
+    """Return a unit to a power in plain signs: mm, 1/mm, 1/mm^3."""
+    raised = unit if abs(power) == 1 else f"{unit}^{abs(power)}"
+    return "" if power == 0 else raised if power > 0 else f"1/{raised}"
+
+
 def power_name(unit: str, power: int) -> str:
     """Return a unit to a power as written in text: µm, µm³, 1/µm³, or nothing for a plain number."""
     return "" if power == 0 else per_unit(unit, abs(power))[2 if power > 0 else 0 :]

@@ -20,6 +20,8 @@ from curvafit.data_synth.imaging.image import field_shape
 from curvafit.data_synth.imaging.modality import Modality, modality
 from curvafit.data_synth.sources import Generated, Pool, Stored, choose_voxel
 from curvafit.priors.law import LAW_TYPES, LawLike
+from curvafit.volumes.field import Field
+from curvafit.volumes.formats.nifti import affine_in_file
 
 #: Percentiles that `percentile` makes 0 and 1.
 PERCENTILES = (0.5, 99.5)
@@ -47,7 +49,8 @@ class TextureDataset(IterableDataset):
     ----------
     source
         Where shapes come from: folders of one or more stores of `curvafit atlas build`; or one or more laws
-        (coefficients, presets, `fit.json`s, fits), of which each process generates `shapes` shapes when first wanted.
+        (coefficients, presets, `fit.json`s, fits), of which `shapes` shapes are generated when first wanted, each once
+        for all workers and epochs, into a temporary folder.
     modalities
         The kinds of image, as `Modality` or by name, of which each sample draws one. Batches need one spacing.
     size
@@ -66,8 +69,8 @@ class TextureDataset(IterableDataset):
     rotate
         Turn shapes by any rotation (interpolated linearly), not by the symmetries of the cube alone.
     shapes, volume_fraction
-        With laws: the number of shapes, which take turns among the laws; and the share of the volume that they fill,
-        by default that of the law's mass or scan.
+        With laws: the number of shapes, which take turns among the laws, at least one of each; and the share of the
+        volume that they fill, by default that of the law's mass or scan.
     transform
         A function of each `Sample`: `as_dict`, `as_monai`, `as_subject`, or your own.
     """
@@ -173,7 +176,7 @@ class TextureDataset(IterableDataset):
         check_int(count, "a pool of at least 1 shape", 1, MOST_POOLED)
         crops = zip(self.modalities, self.voxels, strict=True)
         largest = max(max(field_shape(self.size, edge * self.calibres[0], kind.base)) for kind, edge in crops)
-        return Pool(generated, count, ROUND * -(-largest // ROUND), rotate)
+        return Pool(generated, max(count, len(generated.points)), ROUND * -(-largest // ROUND), rotate)
 
     def _check(self, sources: list[Any]) -> None:
         """Raise ValueError where an argument is missing or out of range."""
@@ -190,28 +193,37 @@ def as_dict(sample: Sample) -> dict[str, Tensor]:
 
 
 def as_monai(sample: Sample) -> dict[str, Any]:
-    """Return MONAI's dictionary: `image` and `label` as `MetaTensor` with an affine; array axes are z, y, x."""
+    """Return MONAI's dictionary: `image` and `label` as `MetaTensor` (1, X, Y, Z) with an affine.
+
+    Axes, affine and its unit are those with which `LoadImaged` reads a case that `curvafit synth` wrote as NIfTI.
+    """
     try:
         from monai.data.meta_tensor import MetaTensor
     except ImportError as error:
         raise ImportError("as_monai needs MONAI: pip install monai", name="monai") from error
-    affine = torch.diag(torch.tensor([*sample.spacing, 1.0], dtype=torch.float64))
-    return {name: MetaTensor(values, affine=affine) for name, values in as_dict(sample).items()}
+    image, label, affine = _as_in_nifti(sample)
+    return {name: MetaTensor(values, affine=affine) for name, values in (("image", image), ("label", label))}
 
 
 def as_subject(sample: Sample) -> Any:
-    """Return a TorchIO `Subject` with `image` and `label`; its array axes are x, y, z."""
+    """Return a TorchIO `Subject` with `image` and `label`, axes and affine as those of `as_monai`."""
     try:
         import torchio  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError("as_subject needs TorchIO: pip install torchio", name="torchio") from error
-    affine = np.diag([*sample.spacing[::-1], 1.0])
-    image, label = (values.permute(0, 3, 2, 1).contiguous() for values in (sample.image, sample.label))
+    image, label, affine = _as_in_nifti(sample)
     return torchio.Subject(
         image=torchio.ScalarImage(tensor=image, affine=affine),
         label=torchio.LabelMap(tensor=label, affine=affine),
         record=sample.record,
     )
+
+
+def _as_in_nifti(sample: Sample) -> tuple[Tensor, Tensor, Tensor]:
+    """Return image and label, (1, X, Y, Z), and the affine, with the digits that a NIfTI file keeps."""
+    image, label = (values.permute(0, 3, 2, 1).contiguous() for values in (sample.image, sample.label))
+    field = Field(sample.image[0].numpy(), sample.spacing, sample.record["imaging"]["unit"])
+    return image, label, torch.from_numpy(affine_in_file(field)).float().double()
 
 
 def zscore(image: Tensor) -> Tensor:

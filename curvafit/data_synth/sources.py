@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
+import os
+import warnings
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from multiprocessing.util import get_temp_dir
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
+from filelock import FileLock
 from scipy.spatial.transform import Rotation
 
 from curvafit.core.checks import as_tuple
 from curvafit.core.extras import require
+from curvafit.core.files import write_atomically, write_content
+from curvafit.core.records import parse_json
+from curvafit.core.runtime import show_share
 from curvafit.core.units import METRES, convert_length
 from curvafit.data_synth.design import PARAMETERS, Design
 from curvafit.data_synth.imaging.modality import Modality
-from curvafit.data_synth.store import Store, find_well_formed
+from curvafit.data_synth.store import Store, find_well_formed, open_store
 from curvafit.generation.flow import generate
 from curvafit.generation.loop import first_mass
 from curvafit.generation.result import is_well_formed
@@ -184,7 +193,9 @@ class Stored:
     @property
     def about(self) -> str:
         """Return the source in a few words."""
-        return f"{self.draws} shapes of {', '.join(path.name for path in self.paths)}"
+        viable = sum(store.viable(index) for store in map(open_store, self.paths) for index in store.indices())
+        most = "" if viable == self.draws else f", the well-formed ones of {viable}"
+        return f"{self.draws} shapes of {', '.join(path.name for path in self.paths)}{most}"
 
     @property
     def edge(self) -> int:
@@ -192,17 +203,28 @@ class Stored:
         return min(min(store.settings.shape) for store, _ in find_well_formed(self.paths))
 
 
+def _find_room() -> Path:
+    """Return the temporary folder of this process and its children, which goes with it; none where none can be made."""
+    try:
+        return Path(get_temp_dir())
+    except OSError:
+        return Path(os.devnull)
+
+
 @dataclass(frozen=True)
 class Pool:
     """Random crops, turned as of `Stored`, of `count` shapes with `edge` voxels along each axis.
 
-    Each process generates a shape once, when it is first wanted.
+    A shape is grown by whoever wants it first, kept in a folder of the process that made the pool, its `room`, and read
+    by all others: threads, workers, later epochs, other pools of the process. Where it cannot be kept, a warning says
+    so, and each process grows its own.
     """
 
     generated: Generated
     count: int
     edge: int
     rotate: bool = False
+    room: Path = field(default_factory=_find_room, compare=False)
 
     @property
     def about(self) -> str:
@@ -213,11 +235,52 @@ class Pool:
         """Return a crop of any of the pool's shapes that shows both structure and background."""
 
         def choose() -> tuple[np.ndarray, PhaseField]:
-            whole = _grow_pool_shape(self.generated, int(rng.integers(self.count)), self.edge)
+            whole = self.whole(int(rng.integers(self.count)))
             return whole.values, whole
 
         values, move, whole = _crop_shape(choose, voxels, rng, self.rotate)
         return PhaseField(values, whole.epsilon, whole.origin | move)
+
+    def whole(self, number: int) -> PhaseField:
+        """Return a shape by its number; ValueError, the same everywhere, where none of its seeds gives one."""
+        # The room of a pool from an old file is gone.
+        folder = self.room if self.room.is_dir() else _find_room()
+        folder /= f"shapes-{hashlib.sha256(repr((self.generated, self.edge)).encode()).hexdigest()}"
+        try:
+            folder.mkdir(exist_ok=True)
+            values, record = folder / f"{number}.npy", folder / f"{number}.json"
+            if not record.exists():
+                with FileLock(folder / f"{number}.lock"):  # the system ends the lock of a process that dies
+                    if not record.exists():
+                        self._keep(number, values, record)
+            content = parse_json(record.read_bytes(), "the record of a shape", record)
+            if "failure" in content:
+                raise ValueError(content["failure"])
+            return PhaseField(np.asarray(np.load(values, mmap_mode="r")), content["epsilon"], content["origin"])
+        except (OSError, NotImplementedError) as error:  # a disk may know no locks
+            warnings.warn(f"each process grows its own shapes, as they cannot be kept: {error}", stacklevel=2)
+            return _grow_pool_shape(self.generated, number, self.edge)
+
+    def _keep(self, number: int, values: Path, record: Path) -> None:
+        """Grow a shape and write it, its record last, or the record of its failure; show how many there are."""
+        if not any(values.parent.glob("*.json")):
+            show_share(f"0 of {self.count} shapes grown, once for all workers and epochs", 0.0)
+        try:
+            grown = _grow_pool_shape(self.generated, number, self.edge)
+            content: dict[str, Any] = {"epsilon": grown.epsilon, "origin": grown.origin}
+            write_atomically(values, lambda temporary: np.save(temporary, grown.values))
+        except ValueError as error:
+            content = {"failure": str(error)}
+        write_content(record, json.dumps(content))
+        there = sum(record.with_name(f"{k}.json").exists() for k in range(self.count))
+        if 20 * there // self.count != 20 * (there - 1) // self.count:
+            show_share(f"{there} of {self.count} shapes grown, once for all workers and epochs", there / self.count)
+
+
+@lru_cache(maxsize=256)
+def _grow_pool_shape(generated: Generated, number: int, edge: int) -> PhaseField:
+    """Return a shape of a pool by its number."""
+    return generated.shape((edge,) * 3, number, np.random.default_rng(number))
 
 
 #: Endless shapes for a set: `shape(voxels, index, rng)` depends on its arguments alone; no side is longer than `edge`.
@@ -268,12 +331,6 @@ def _crop_shape(
             return part, move, origin
     edges = " x ".join(map(str, voxels))
     raise ValueError(f"{CROPS} crops of {edges} voxels show no structure, or nothing else: take larger ones")
-
-
-@lru_cache(maxsize=256)
-def _grow_pool_shape(generated: Generated, number: int, edge: int) -> PhaseField:
-    """Return a shape of a pool by its number."""
-    return generated.shape((edge,) * 3, number, np.random.default_rng(number))
 
 
 # ---- crops -----------------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
@@ -19,10 +20,11 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
+from curvafit.core.checks import check_type
 from curvafit.core.extras import require
 from curvafit.core.runtime import Progress, silent
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram
-from curvafit.priors.kernels import threads
+from curvafit.priors.kernels.threads import Kernel, count_threads
 
 #: Pairs that are taken at once: a few seconds on a processor.
 BLOCK = 8192
@@ -37,7 +39,6 @@ _SERIAL = {
     "error_model": "numpy",
     "nogil": True,
 }
-_PARALLEL = {**_SERIAL, "parallel": True}
 #: A sum over the plan is trusted between these; outside, what it adds may have left float32's range.
 _LEAST, _MOST = np.float32(1e-25), np.float32(1e30)
 _LN2 = math.log(2.0)
@@ -152,7 +153,7 @@ def wasserstein(
 
     geomloss computes it in float64; where geomloss is not installed, `one_to_many` does in float32, which is the same
     to 1e-4 of it, or 1e-5. Matches, the atlas's map and reports take `one_to_many` and `pairwise` always. Raises
-    ValueError if a diagram is empty, the units differ, or a parameter is out of range.
+    ValueError if a diagram is none or empty, the units differ, or a parameter is out of range.
 
     Parameters
     ----------
@@ -203,6 +204,7 @@ def _normalise(diagrams: Sequence[Diagram], blur: float, reach: float | None, bi
     if not blur > 0 or not (reach is None or reach > 0) or bin_width < 0:
         raise ValueError(f"expected positive blur and reach, got blur {blur}, reach {reach}, bin width {bin_width}")
     for other in diagrams:
+        check_type(other, Diagram, "curvature diagrams, which `curvafit.diagram` and `Measures.diagram` give")
         if other.unit != diagrams[0].unit:
             raise ValueError(f"expected diagrams in one unit, got {diagrams[0].unit} and {other.unit}")
     whole = (diagram.normalised for diagram in diagrams)
@@ -285,8 +287,7 @@ def costs(
     ε, shares = _schedule(falls, blur)
     ρ = math.inf if reach is None else reach**2
     values = np.empty(len(first))
-    threads.start()
-    _fill_costs(clouds, first, second, ε, shares, ρ, values)
+    _fill_costs(count_threads(), clouds, first, second, ε, shares, ρ, values)
     return values
 
 
@@ -304,7 +305,7 @@ def _schedule(falls: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
     return ε, np.where(ends, 0.0, np.where(place < 0, 1.0, 0.5))
 
 
-@njit(**_PARALLEL)
+@partial(Kernel, **_SERIAL)
 def _fill_costs(clouds, first, second, ε, shares, ρ, values):
     """Write the cost of every pair into `values`."""
     for k in prange(len(first)):

@@ -15,7 +15,7 @@ import torch
 
 from curvafit.core.checks import SEEDS, check_choice, check_int, check_type
 from curvafit.core.pictures import Pictured
-from curvafit.core.runtime import Progress, silent, sub_progress
+from curvafit.core.runtime import Progress, log_stages, sub_progress
 from curvafit.core.units import format_number
 from curvafit.generation.schedule import LEARNED, SCHEDULES, Schedule
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, family_of
@@ -111,7 +111,7 @@ def infer(
     twins: int = 3,
     test: bool = True,
     schedule: Schedule | str = LEARNED,
-    progress: Progress = silent,
+    progress: Progress | None = None,
     **reading: Any,
 ) -> Inference:
     """Infer the generation parameters (a, m₀) of a scanned volume.
@@ -155,7 +155,7 @@ def infer(
     schedule
         Steps of each shape.
     progress
-        Called with a sentence and the share done.
+        Called with a sentence and the share done; by default the logger `curvafit` gets each stage once, at level INFO.
     reading
         Options of reading a file, or the place of an array: spacing, unit and the others of `curvafit.load`.
     """
@@ -166,6 +166,7 @@ def infer(
     if posterior is not None:
         check_type(posterior, (str, Path, Posterior), "a posterior, as the path of a file or as Posterior")
     seed = check_int(seed, "a seed that is a whole number from 0", 0, SEEDS - 2)  # and the next one
+    progress = progress or log_stages()
     progress("reading the scan", 0.0)
     atlas = atlas if isinstance(atlas, Atlas) else load_atlas(atlas)
     posterior = posterior if isinstance(posterior, Posterior) else load_posterior(posterior)

@@ -14,6 +14,7 @@ from nnunetv2.training.loss.deep_supervision import DeepSupervisionWrapper  # py
 from nnunetv2.training.nnUNetTrainer.nnUNetTrainer import nnUNetTrainer  # pyright: ignore[reportMissingImports]
 
 from curvafit.priors import CombinedLoss, CurvaturePrior
+from curvafit.priors.law import Law
 
 #: Batches over whose median the prior is balanced.
 BATCHES = 9
@@ -92,7 +93,7 @@ class nnUNetTrainerCurvafit(nnUNetTrainer):
             softmax=not regions,
             include_background=regions,
             spacing=spacing,
-            unit="mm",
+            unit="mm" if Law.of(law).fitted else None,
             epsilon=epsilon or None,
             shape=patch,
         )

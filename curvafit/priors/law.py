@@ -15,8 +15,9 @@ from curvafit.core.checks import quoted, simplify_name
 from curvafit.core.records import parse_json
 from curvafit.core.schema import Rule, decode, schema_of, violation
 from curvafit.core.units import METRES
-from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
+from curvafit.priors.published import PUBLISHED
 
 #: The format of a `fit.json`.
 FORMAT = "curvafit-fit-3"
@@ -66,7 +67,8 @@ class Law:
         Parameters
         ----------
         law
-            A `Law`, `Coefficients`, the name of a preset, the path of a `fit.json`, or a fit or an inference.
+            A `Law`, `Coefficients` or their numbers (six, a20 first, or by name), the name of a preset, the path of a
+            `fit.json`, or a fit or an inference.
 
         Raises FileNotFoundError or ValueError where the value, or the file, states no law.
         """
@@ -82,7 +84,10 @@ class Law:
             return cls.load(law)
         if isinstance(law, HasLaw):
             return law.to_law()
-        raise ValueError(f"expected a law (Coefficients, a preset or its name, a fit.json or a fit), got {quoted(law)}")
+        if (numbers := _read_numbers(law)) is not None:
+            return cls(numbers, working=False)
+        kinds = "Coefficients, their six numbers, a preset or its name, a fit.json or a fit"
+        raise ValueError(f"expected a law ({kinds}), got {quoted(law)}")
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Law:
@@ -185,8 +190,17 @@ LAW_TYPES = (Law, Coefficients, str, PathLike, HasLaw)
 
 def read_laws(laws: LawLike | Iterable[LawLike]) -> tuple[Law, ...]:
     """Return one law or several, each stated as in `Law.of`, as a tuple."""
-    single = isinstance(laws, LAW_TYPES) or not isinstance(laws, Iterable)
+    single = isinstance(laws, LAW_TYPES) or not isinstance(laws, Iterable) or _read_numbers(laws) is not None
     return (Law.of(laws),) if single else tuple(map(Law.of, laws))  # type: ignore[arg-type]
+
+
+def _read_numbers(law: object) -> Coefficients | None:
+    """Return coefficients that are stated by name, or as six numbers; None where they are not."""
+    if isinstance(law, Mapping) and {*NAMES[:3]} <= {*law} <= {*NAMES}:
+        return Coefficients(**law)
+    if isinstance(law, (tuple, list)) and len(law) == 6 and all(isinstance(a, (int, float)) for a in law):
+        return Coefficients(*law)
+    return None
 
 
 # ---- fit.json --------------------------------------------------------------------------------------------------------
@@ -239,37 +253,10 @@ def parse_fit(text: str | bytes, place: object, schema: Mapping[str, Any]) -> di
 
 # ---- presets ---------------------------------------------------------------------------------------------------------
 
-_GALLERY = "curvatubes results/gallery"
-_TABLE_3, _TABLE_4 = "paper, Table 'four shapes'", "paper, Table 'spatialized'"
-_PUBLISHED: dict[str, tuple[tuple[float, ...], float, str]] = {
-    "bilayers": ((1, 1, 1, 0, 0, 0), -0.4, _GALLERY),
-    "exp-0366": ((1, -0.238, 11.988, -175.909, -27.167, 2117.037), -0.648, _GALLERY),
-    "exp-0556": ((1, 3.225, 10.87, -146.309, 143.487, -2920.302), -0.499, _GALLERY),
-    "exp-0625": ((1, 2.869, 9.711, -116.933, 61.261, 577.676), -0.657, _GALLERY),
-    "exp-0830": ((1, 3.725, 0.649, -39.994, 64.093, 2758.058), -0.568, _GALLERY),
-    "metatubes": ((0.924, 1.352, 2.932, 8.29, 61.066, 297.722), -0.53, _GALLERY),
-    "pearls": ((1, 3.55, 1, -56, -56, 784), -0.77, _GALLERY),
-    "sieve": ((0.946, 3.959, 1.942, 18.329, 28.008, 113.771), -0.534, _GALLERY),
-    "sponge": ((1, 2.8, 2, -10, -10, 25), -0.25, _GALLERY),
-    "trabec": ((2, 1.823, 12, -166, -14, 3548), -0.512, _GALLERY),
-    "tubes": ((1, 2, 6, -40, -40, 400), -0.6, _GALLERY),
-    "weird": ((1, 0.396, 1.095, -28.64, 190.906, 2062.082), -0.598, _GALLERY),
-    "flow": ((1, 2.4, 9, 30, 170, -195), -0.66, "paper, Fig. 'cvg_1'"),
-    "seeds": ((1, -0.35, 1.02, -40, 100, 1600), -0.69, "paper, Fig. 'var_1'"),
-    "bilinear-layers": ((2, 2, 2, 0, 0, 0), -0.3, _TABLE_3),
-    "bilinear-spheres": ((2, 2, 2, -75, -75, 937.5), -0.6, _TABLE_3),
-    "bilinear-tubes": ((2, 2, 11, -100, -50, 1250), -0.7, _TABLE_3),
-    "bilinear-sponges": ((1, 2.8, 2, -10, -10, 25), -0.25, _TABLE_3),
-    "spatial-1": ((2, 2, 2, 0, 0, 0), -0.4, _TABLE_4),
-    "spatial-2": ((1, 2, 6, -40, -40, 400), -0.6, _TABLE_4),
-    "spatial-3": ((2, 2, 2, -75, -75, 937.5), -0.7, _TABLE_4),
-    "spatial-4": ((2, 2, 11, -180, -90, 4050), -0.7, _TABLE_4),
-}
-
 #: The published laws by name, in working units.
 PRESETS: dict[str, Law] = {
     name: Law(Coefficients(*values), mass, f"preset {name}", source=source)
-    for name, (values, mass, source) in _PUBLISHED.items()
+    for name, (values, mass, source) in PUBLISHED.items()
 }
 
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from curvafit.core.checks import check_choice, check_float, check_int, quoted
 from curvafit.core.units import METRES, convert_length
-from curvafit.priors.coefficients import Coefficients, check_strengths
+from curvafit.priors.coefficients import POWERS, Coefficients, check_strengths
 from curvafit.priors.grid import WORKING_EPSILON, Float, Grid
 from curvafit.priors.kernels.differentiable import energies
 from curvafit.priors.law import Law, LawLike, read_laws
@@ -20,6 +20,8 @@ from curvafit.priors.stencils import refine_axis
 
 #: Voxels that ε spans; an axis on which it spans fewer, by more than a tenth, is refined, at most `FINEST`-fold.
 RESOLVED, FINEST = 2, 16
+#: Voxels are at most so many ε long if their energy, interpolated, is to be that of fine ones within some per cent.
+LONGEST = 1.1
 #: The greatest ε in voxels of the smallest edge; no window is longer.
 COARSEST = 10_000
 #: The greatest weight, or value of a mask, whose products float32 holds.
@@ -52,18 +54,23 @@ class CurvaturePrior(nn.Module):
         Whether the target is class numbers `(B, 1, D, H, W)`.
     reduction
         `"mean"` over batch and classes; `"none"`; or `"sum"` of the energies F_ε, not normalised, so that windows that
-        overlap by 2·border voxels add up to the interior of the whole (border 2 where an axis is interpolated).
+        overlap by 2·border voxels add up to the interior of the whole (border 2 across an axis that is interpolated,
+        and along it nearly: the spline sees the whole axis).
     ignore_index
-        Voxels where the target has this value do not count.
+        Voxels where the target has this value do not count and get no gradient, whatever their values, NaN too. Nor do
+        voxels within `border` of them count, or within 1: their neighbours are unknown, as at the input's faces.
     spacing
         Voxel edges (z, y, x), or one edge for all axes.
     unit
         Spacing's unit (nm, um, mm or m) where the `fit.json` has another one; the fit is then converted. A warning says
-        where ε differs from the fit's by more than a factor of four.
+        where ε differs from the fit's by more than a factor of four, and where a unit changes nothing: a preset has no
+        lengths of its own.
     epsilon
         ε in spacing's unit; twice the smallest edge by default. Structures thinner than twice the smallest edge do not
         survive. An axis on which ε spans fewer than two voxels, by more than a tenth, is interpolated, and a warning
-        says so. A refinement of more than 16-fold is refused, and so is an ε longer than the window.
+        says so. Up to voxels as long as ε the energy is that of fine ones within 3 %; where they are longer by more
+        than a tenth it is larger (up to 1.7-fold at 1.5 ε), and the warning says that. A refinement of more than
+        16-fold is refused, and so is an ε longer than the window.
     weight
         A factor, or one for each class; classes of weight 0 are not computed.
     border
@@ -105,33 +112,51 @@ class CurvaturePrior(nn.Module):
         self.border = check_int(border, "a border of whole voxels from 0", 0, 2**31)
         self._warned: set[str] = set()
         self.weight = _read_weights(weight)
-        self.coefficients = tuple(_read_coefficients(known, edge, unit, self.epsilon) for known in read_laws(law))
+        laws = read_laws(law)
+        self.coefficients = tuple(_read_coefficients(known, edge, unit, self.epsilon) for known in laws)
+        self._origins = tuple(known.origin for known in laws)
+        presets = [known.origin for known in laws if known.working]
+        if unit is not None and presets and not any(known.fitted for known in laws):
+            warnings.warn(f"a unit changes nothing for {presets[0]}: its lengths follow the voxel edge", stacklevel=2)
         times = choose_refinement(self.spacing, self.epsilon)
         if max(times) > 1:
             axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", times, strict=True) if n > 1)
-            warnings.warn(f"ε = {self.epsilon:g} spans fewer than 2 voxels: interpolating {axes}", stacklevel=2)
+            words, longest = f"ε = {self.epsilon:g} spans fewer than 2 voxels: interpolating {axes}", max(self.spacing)
+            if longest > LONGEST * self.epsilon:
+                words += f"; voxels longer than ε inflate F_ε, 1.7-fold at 1.5 ε: state an ε of {longest:g} or more"
+            warnings.warn(words, stacklevel=2)
 
     def extra_repr(self) -> str:
-        """Return the settings that `repr` shows."""
-        return f"spacing={self.spacing}, epsilon={self.epsilon:g}, weight={self.weight}, border={self.border}"
+        """Return the settings that `repr` shows: the laws, what is not the default, spacing, ε, weights, border."""
+        usual = {"sigmoid": False, "softmax": False, "include_background": True, "to_onehot_y": False}
+        usual |= {"reduction": "mean", "ignore_index": None, "shape": None}
+        own = [f"{name}={getattr(self, name)!r}" for name, value in usual.items() if getattr(self, name) != value]
+        numbers = (", ".join(f"{float(a):.6g}" for a in law) for law in self.coefficients)
+        laws = [f"{origin} ({six})" for origin, six in zip(self._origins, numbers, strict=True)]
+        scale = f"spacing={self.spacing}, epsilon={self.epsilon:g}, weight={self.weight}, border={self.border}"
+        return ", ".join((*laws, *own, scale))
 
     def forward(self, input: Tensor, target: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
         """Return the loss of a batch; see the class."""
         input, target, mask = _strip_subclass(input), _strip_subclass(target), _strip_subclass(mask)
         with torch.autocast(input.device.type, enabled=False):
-            probability, voxels = self._probability(input), self._voxel_weights(input, target, mask)
-            classes, spacing = probability.shape[1], self._spacing_of(input)
+            voxels, ignored = self._voxel_weights(input, target, mask)
+            if ignored is not None:  # before the activation, whose derivative of a NaN is one
+                input = torch.where(ignored, input.detach().nan_to_num(0, 0, 0), input)
+            probability = self._probability(input)
+            classes, spacing, skipped = probability.shape[1], self._spacing_of(input), self._is_skipped(input)
+            times = (1, 1, 1) if skipped else choose_refinement(spacing, self.epsilon)
+            options = {"normalize": self.reduction != "sum", "border": self.border}
             laws = _repeat_per_class(self.coefficients, classes, "one law")
             weights = _repeat_per_class(self.weight, classes, "one weight")
-            skipped, columns = self._is_skipped(input), []
+            columns = []
             for channel, (law, weight) in enumerate(zip(laws, weights, strict=True)):
                 field = probability[:, channel]
                 if weight == 0 or skipped:
                     columns.append(field.sum((-3, -2, -1)) * 0)
                     continue
                 seen = None if voxels is None else voxels[:, min(channel, voxels.shape[1] - 1)]
-                options = {"mask": seen, "normalize": self.reduction != "sum", "border": self.border}
-                columns.append(weight * curvature_prior(field, law, spacing, self.epsilon, **options))
+                columns.append(weight * _measure_window(field, law, spacing, self.epsilon, times, seen, **options))
             values = torch.stack(columns, 1)
             if self.reduction == "none":
                 return values[..., None, None, None]
@@ -177,8 +202,11 @@ class CurvaturePrior(nn.Module):
             values = values.softmax(1)
         return values if self.include_background else values[:, 1:]
 
-    def _voxel_weights(self, input: Tensor, target: Tensor | None, mask: Tensor | None) -> Tensor | None:
-        """Return the mask (B or 1, classes that count or 1, D, H, W) with zeros on ignored voxels, or None."""
+    def _voxel_weights(
+        self, input: Tensor, target: Tensor | None, mask: Tensor | None
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """Return the mask (B or 1, classes that count or 1, D, H, W) with zeros on ignored voxels and on those that
+        have them for neighbours, and the ignored voxels (B, 1, D, H, W); None where all count, or none is ignored."""
         batch, classes = input.shape[:2]
         space = tuple(input.shape[2:])
         if mask is not None:
@@ -196,11 +224,12 @@ class CurvaturePrior(nn.Module):
             if not fits or (numbers and target.shape[1] != 1):
                 raise ValueError(f"expected a target of shape {(batch, 1, *space)}, got {tuple(target.shape)}")
         if self.ignore_index is None:
-            return mask
+            return mask, None
         if target is None:
             raise ValueError(f"ignore_index needs a target with label {self.ignore_index} on ignored voxels, got none")
-        valid = target != self.ignore_index
-        return valid if mask is None else mask * valid
+        ignored, reach = target == self.ignore_index, max(1, self.border)
+        valid = nn.functional.max_pool3d(ignored.float(), 2 * reach + 1, 1, reach) == 0
+        return (valid if mask is None else mask * valid), ignored
 
     def _spacing_of(self, input: Tensor) -> tuple[float, float, float]:
         """Return the voxel edges of an input, which are larger than the patch's where the input has fewer voxels."""
@@ -238,6 +267,9 @@ class CurvaturePrior(nn.Module):
 class CombinedLoss(nn.Module):
     """base(input, target) + weight × prior(input, target), where the prior's weight grows over the first calls.
 
+    Weight, warm-up and the number of calls are part of the state: a resumed training goes on with them. An older
+    checkpoint, which has the calls alone, leaves the other two as they are.
+
     Parameters
     ----------
     base
@@ -248,7 +280,7 @@ class CombinedLoss(nn.Module):
         See `CurvaturePrior.suggest_weight`.
     warmup
         Number of calls over which the weight grows linearly to its full value. Calls in evaluation mode or without a
-        gradient do not count. The count is a buffer, so that a resumed training goes on from it.
+        gradient do not count.
 
     Attributes
     ----------
@@ -268,6 +300,19 @@ class CombinedLoss(nn.Module):
         self.base, self.prior = base, prior
         self.parts: dict[str, Tensor] = {}
         self.register_buffer("calls", torch.zeros((), dtype=torch.int64))
+
+    def get_extra_state(self) -> Tensor:
+        """Return weight and warm-up, for `state_dict`."""
+        return torch.tensor([float(self.weight), self.warmup], dtype=torch.float64)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Take weight and warm-up, from `load_state_dict`."""
+        self.weight, self.warmup = float(state[0]), int(state[1])
+
+    def _load_from_state_dict(self, state_dict, prefix, *options) -> None:
+        """Load a state, also one of before these two were part of it."""
+        state_dict.setdefault(f"{prefix}_extra_state", self.get_extra_state())
+        super()._load_from_state_dict(state_dict, prefix, *options)
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
         """Return the weighted sum; `mask` is passed to the prior."""
@@ -300,7 +345,7 @@ def curvature_prior(
     law
         `Coefficients` in spacing's unit, a preset's name, or a fit or its path, as in `CurvaturePrior`.
     spacing, epsilon
-        Voxel edges (z, y, x), and ε in their unit. An axis whose voxels are longer than .55 ε is refined by cubic
+        Voxel edges (z, y, x), and ε in their unit. An axis whose voxels are longer than .55 ε is refined by spline
         interpolation until they are ε / 2 or shorter.
     mask
         Weights of the energy's density.
@@ -312,26 +357,10 @@ def curvature_prior(
     Raises ValueError where the window is too small for its border or ε, a coefficient is too large for float32, or an
     axis would be refined more than 16-fold.
     """
-    shape, least = tuple(probability.shape[1:]), max(4, 2 * border + 1)
-    if min(shape) < least:
-        raise ValueError(f"expected at least {least} voxels along each axis, got {shape}, which has no interior")
     times = choose_refinement(spacing, epsilon)
-    longest = max(n * h for n, h in zip(shape, spacing, strict=True))
-    if epsilon > longest:
-        raise ValueError(f"expected an ε of at most the window's longest side, {longest:g}, got {epsilon:g}")
     coefficients = Law.of(law).in_unit(None, min(spacing))
     check_strengths(coefficients, epsilon)
-    unit = epsilon / WORKING_EPSILON
-    u, weights = 2 * probability - 1, _make_window_mask(probability, mask, border)
-    for axis, n in enumerate(times):
-        if n > 1:
-            u, weights = refine_axis(u, axis, n), weights.repeat_interleave(n, axis - 3)
-    grid = Grid(tuple(u.shape[1:]), tuple(h / n / unit for h, n in zip(spacing, times, strict=True)), "replicate")  # type: ignore[arg-type]
-    total = energies(u, coefficients.in_unit(unit), grid, WORKING_EPSILON, weights)
-    if not normalize:
-        return total
-    volume = weights.sum((-3, -2, -1)) * (grid.voxel_volume / WORKING_EPSILON**3)
-    return total / volume.clamp_min(torch.finfo(volume.dtype).tiny)
+    return _measure_window(probability, coefficients, spacing, epsilon, times, mask, normalize=normalize, border=border)
 
 
 def choose_refinement(spacing: Sequence[float], epsilon: float) -> tuple[int, int, int]:
@@ -389,17 +418,48 @@ def _repeat_per_class(values: tuple, classes: int, name: str) -> tuple:
     return values * classes if len(values) == 1 else values
 
 
+def _measure_window(
+    probability: Tensor, coefficients: Coefficients, spacing: tuple[float, float, float], epsilon: float,
+    times: tuple[int, int, int], mask: Tensor | None, *, normalize: bool, border: int,
+) -> Tensor:  # fmt: skip
+    """Compute `curvature_prior` of checked numbers, which may be a compiler's symbols."""
+    shape, least = tuple(probability.shape[1:]), max(4, 2 * border + 1)
+    if min(shape) < least:
+        raise ValueError(f"expected at least {least} voxels along each axis, got {shape}, which has no interior")
+    longest = max(n * h for n, h in zip(shape, spacing, strict=True))
+    if epsilon > longest:
+        raise ValueError(f"expected an ε of at most the window's longest side, {longest:g}, got {epsilon:g}")
+    u, weights = 2 * probability - 1, _make_window_mask(probability, mask, border)
+    for axis, n in enumerate(times):
+        if n > 1:
+            u, weights = refine_axis(u, axis, n), weights.repeat_interleave(n, axis - 3)
+    unit = epsilon / WORKING_EPSILON
+    edges = tuple(h / n / unit for h, n in zip(spacing, times, strict=True))
+    grid = Grid.trusted(tuple(u.shape[1:]), edges, "replicate")
+    scaled = (a * unit**power for a, power in zip(coefficients, POWERS.values(), strict=True))
+    total = energies(u, scaled, grid, WORKING_EPSILON, weights)
+    if not normalize:
+        return total
+    volume = weights.sum((-3, -2, -1)) * (grid.voxel_volume / WORKING_EPSILON**3)
+    return total / volume.clamp_min(torch.finfo(volume.dtype).tiny)
+
+
 def _make_window_mask(probability: Tensor, mask: Tensor | None, border: int) -> Tensor:
     """Return the mask `(1 or batch, z, y, x)` with zeros at the border."""
     inside = probability.new_zeros(probability.shape[1:])
     z, y, x = (slice(border, n - border) for n in inside.shape)
-    inside[z, y, x] = 1
+    inside[z, y, x].fill_(1)
     return inside[None] if mask is None else inside * mask.to(inside)
 
 
 def _strip_subclass(values: _Values) -> _Values:
-    """Return a tensor without its subclass (MONAI's `MetaTensor`)."""
-    return values if values is None or type(values) is Tensor else values.as_subclass(Tensor)  # type: ignore[return-value]
+    """Return a tensor without its subclass (MONAI's `MetaTensor`), but not without that by which `export` traces it."""
+    if not (values is None or isinstance(values, Tensor)):
+        raise TypeError(f"expected a torch tensor, got {type(values).__name__}: torch.from_numpy makes one of an array")
+    exporting = torch.compiler.is_compiling() and not torch.compiler.is_dynamo_compiling()
+    if values is None or type(values) is Tensor or exporting:
+        return values
+    return values.as_subclass(Tensor)  # type: ignore[return-value]
 
 
 def _read_number(value: Tensor) -> float | None:

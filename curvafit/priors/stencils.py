@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -98,13 +99,14 @@ def gaussian_taps(deviation: float) -> tuple[float, ...]:
 def refine_axis(u: Tensor, axis: int, times: int) -> Tensor:
     """Return `u (..., Z, Y, X)` with every voxel along `axis` (0 to 2) split into `times`; differentiable.
 
-    The interpolation is Keys' cubic convolution (a = -1/2), third-order accurate and exact for parabolas. Beyond its
-    ends the field continues with the last value.
+    The interpolation is the quintic spline through the samples, sixth-order accurate: F_ε takes second differences of
+    it. Beyond its ends the field continues as its mirror image.
     """
     if times == 1:
         return u
     dim = axis - 3
-    weights = _cubic_weights(u.shape[dim], times).to(u)
+    make = _spline_weights if torch.compiler.is_compiling() else _compute_spline_weights
+    weights = make(u.shape[dim], times).to(u)
     return torch.movedim(torch.movedim(u, dim, -1) @ weights, -1, dim).contiguous()
 
 
@@ -149,21 +151,31 @@ def _check_shape(u: Tensor, grid: Grid) -> Tensor:
 
 @lru_cache(maxsize=32)
 @torch.inference_mode(False)  # cached weights must serve a later backward pass
-def _cubic_weights(n: int, times: int) -> Tensor:
-    """Return interpolation weights `(n, n · times)`, a column for each new sample."""
-    place = (torch.arange(n * times, dtype=torch.float64) + 0.5) / times - 0.5
-    first = place.floor()
-    t = place - first
-    four = torch.stack(
-        (
-            ((2 - t) * t - 1) * t / 2,
-            ((3 * t - 5) * t * t + 2) / 2,
-            ((4 - 3 * t) * t + 1) * t / 2,
-            (t - 1) * t * t / 2,
-        )
-    )
-    weights = torch.zeros(n, n * times, dtype=torch.float64)
-    for k in range(4):
-        row = (first.long() + k - 1).clamp(0, n - 1)
-        weights[row, torch.arange(n * times)] += four[k]
-    return weights
+def _compute_spline_weights(n: int, times: int) -> Tensor:
+    """Return interpolation weights `(n, n · times)`, a column for each new sample: V⁻¹ S, with V and S the quintic
+    B-spline around each old sample, and around its mirror images, at the old places and at the new ones."""
+    bases = []
+    for place in (np.arange(n, dtype=float), (np.arange(n * times) + 0.5) / times - 0.5):
+        basis, first = np.zeros((n, len(place))), np.floor(place).astype(int) - 2
+        for centre in (first + k for k in range(6)):
+            image = centre % (2 * n)
+            image = np.where(image < n, image, 2 * n - 1 - image)
+            basis[image, np.arange(len(place))] += _quintic_spline(place - centre)
+        bases.append(basis)
+    return torch.from_numpy(np.ascontiguousarray(np.linalg.solve(*bases)))  # of no transform that may be going on
+
+
+def _quintic_spline(x: np.ndarray) -> np.ndarray:
+    """Return the quintic B-spline of unit knots around 0, as its sum of powers."""
+    return sum((-1) ** k * math.comb(6, k) / 120 * np.maximum(np.abs(x) + 3 - k, 0) ** 5 for k in range(7))  # type: ignore[return-value]
+
+
+# Compilers and `torch.export` see an operator: what they trace with has no numbers to solve with, or to keep.
+@torch.library.custom_op("curvafit::spline_weights", mutates_args=(), schema="(SymInt n, SymInt times) -> Tensor")
+def _spline_weights(n, times):
+    return _compute_spline_weights(n, times).clone()
+
+
+@_spline_weights.register_fake
+def _(n, times):
+    return torch.empty((n, n * times), dtype=torch.float64)

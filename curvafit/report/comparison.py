@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.records import Format
-from curvafit.core.units import format_number, format_percent, per_unit, power_name
+from curvafit.core.units import format_number, format_percent, per_unit, plain_unit, power_name
 from curvafit.drawing.groups import comparison_figure, numbers_figure
 from curvafit.geometry.distances import DIRECTIONS, QUANTILES
 from curvafit.report.page import (
@@ -27,7 +27,7 @@ from curvafit.report.page import (
 from curvafit.scan.measure import Measures
 from curvafit.studies.compare import BINS, LEVEL, SMOOTH, Comparison, Number
 from curvafit.studies.scans import count_notes
-from curvafit.studies.tables import format_csv, plain_unit, rows_of
+from curvafit.studies.tables import format_csv
 from curvafit.studies.trajectory import Trajectory
 
 #: `format` of a comparison's record.
@@ -179,7 +179,7 @@ def name_quantity(name: str, symbol: str, power: int, unit: str) -> dict[str, st
 def _measure_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
     """Yield the rows of `curvafit measure`'s table, with subject and group."""
     for measures, case in zip(comparison.measures, comparison.cases, strict=True):
-        yield from rows_of(measures, subject=case.subject, group=case.group)
+        yield from measures.rows(subject=case.subject, group=case.group)
 
 
 def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:

@@ -175,6 +175,12 @@ def _format_cells(part: Measures) -> list[tuple[str, str]]:
 # ---- figures ---------------------------------------------------------------------------------------------------------
 
 
+def measures_figure(measures: Measures) -> Figure:
+    """Return a figure of the curvature diagram of a scan, or of each of its compartments."""
+    parts = list(measures.compartments.values()) or [measures]
+    return diagrams_figure(name_parts(parts), parts)
+
+
 def diagrams_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figure:
     """Return a figure of the curvature diagrams of scans of one unit, on axes that all share; of some none is known."""
     known = [each.diagram for each in measures if each.diagram.area > 0]

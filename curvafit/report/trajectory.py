@@ -17,7 +17,7 @@ from matplotlib.patheffects import withStroke
 
 from curvafit.atlas_map.picture import FAMILY_COLOURS, map_on
 from curvafit.core.records import Format
-from curvafit.core.units import format_number, per_unit
+from curvafit.core.units import format_number, per_unit, plain_unit
 from curvafit.drawing.groups import FIRST, SIGNED, keep_sign, number_panels, plain
 from curvafit.drawing.plot import INK, QUIET, make_figure
 from curvafit.geometry.diagram import FAMILIES
@@ -28,7 +28,7 @@ from curvafit.report.comparison import describe_measures, known, name_quantity, 
 from curvafit.report.page import check_result_folder, picture_of, record_study, render_template, write_study
 from curvafit.scan.prepare import WORKING_THICKNESS
 from curvafit.studies.compare import LEVEL
-from curvafit.studies.tables import format_csv, plain_unit, rows_of
+from curvafit.studies.tables import format_csv
 from curvafit.studies.trajectory import Change, Trajectory, say_change
 
 #: `format` of a series' record.
@@ -76,7 +76,7 @@ def write_trajectory(
     rows = [
         row
         for measures, time in zip(trajectory.measures, trajectory.times, strict=True)
-        for row in rows_of(measures, time=time, unit_of_time=trajectory.unit_of_time)
+        for row in measures.rows(time=time, unit_of_time=trajectory.unit_of_time)
     ]
     texts = {"trajectory.html": page, "trajectory.csv": format_csv(rows)}
     return write_study(target, FORMAT, FILES, record, texts, drawn)

@@ -8,13 +8,17 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as default
+from html import escape
+from importlib.metadata import version
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from scipy import ndimage, stats
 
+from curvafit.core.extras import require
+from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, check_memory, memory, silent
-from curvafit.core.units import convert_length, format_number, format_sampling, power_name
+from curvafit.core.units import convert_length, format_number, format_sampling, plain_unit, power_name
 from curvafit.geometry.descriptors import descriptors
 from curvafit.geometry.diagram import FAMILIES, MARGIN, Diagram, diagram, families
 from curvafit.geometry.mesh import NoSurface, Surface, area_vectors
@@ -28,6 +32,8 @@ from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box
 from curvafit.volumes.read import Source, field_of
 
+#: Columns of a table of measures; a CSV file begins with them.
+COLUMNS = ("scan", "quantity", "symbol", "value", "low", "high", "unit", "direction", "version")
 #: What is summed over blocks, in powers of the scan's unit; n0 to n5 are the parts zz zy zx yy yx xx of n⊗n.
 SUMS = ("volume", "inside", "thickness", "thickness²", "gap", "χ", "area", *(f"n{k}" for k in range(6)))
 SUMS += ("curved", "H", "H²", "K", "κ1", "κ2", "C", *FAMILIES)
@@ -105,7 +111,7 @@ QUANTITIES: tuple[tuple[str, str, int, Callable[[Sums], np.ndarray]], ...] = (
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Measures:
+class Measures(Pictured):
     """What a scan measures.
 
     Attributes
@@ -140,6 +146,40 @@ class Measures:
     def __repr__(self) -> str:
         some = ", ".join(f"{each.symbol} {each.value:.4g}" for each in self.quantities[:4])
         return f"Measures({some}, in {self.unit}, of {self.source or 'an array'})"
+
+    def _repr_html_(self) -> str:
+        """Return a table, with a column of values for each compartment where there are some."""
+        parts = [*self.compartments.values()] or [self]
+        heads = [" ".join(map(str, part.part or ("value",))) for part in parts]
+        rows = [("", "", *heads, "")]
+        for same in zip(*(part.quantities for part in parts), strict=True):
+            texts = [each.format(self.unit) for each in same]
+            rows.append((same[0].name, same[0].symbol, *(f"{value} {half}" for value, half, _ in texts), texts[0][2]))
+        lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
+        return f"<code>{escape(repr(self))}</code><table><tr>{'</tr><tr>'.join(lines)}</tr></table>"
+
+    def to_frame(self) -> Any:
+        """Return the numbers as a pandas data frame, as tables have them; ImportError where pandas is missing."""
+        rows = [row for part in self.compartments.values() or (self,) for row in part.rows()]
+        return require("pandas", "tables", "a data frame").DataFrame(rows)
+
+    def rows(self, **more: str | float) -> list[dict[str, Any]]:
+        """Return a row for each quantity, as values by column; None where a number is not known.
+
+        A compartment or an instance has its label in a column of that name. `more` are further columns with the same
+        value in each row.
+        """
+        release, (z, y, x) = version("curvafit"), self.direction
+        more = dict([self.part] if self.part else []) | more
+        rows = []
+        for each in self.quantities:
+            ends = (each.value, each.value - each.half, each.value + each.half)
+            value, low, high = (end if math.isfinite(end) else None for end in ends)
+            axis = f"{z:.4f} {y:.4f} {x:.4f}" if each.symbol == "DA" and math.isfinite(z) else ""
+            unit = plain_unit(self.unit, each.power)
+            cells = (self.source, each.name, each.symbol, value, low, high, unit, axis, release)
+            rows.append(dict(zip(COLUMNS, cells, strict=True)) | more)
+        return rows
 
     def __getitem__(self, name: str) -> Quantity:
         """Return the quantity of a name or a symbol; raise KeyError where there is none."""

@@ -13,9 +13,6 @@ if TYPE_CHECKING:
     from curvafit.segmentation.refine import Refine as Refine
     from curvafit.segmentation.refine import calibrate as calibrate
     from curvafit.segmentation.refine import refine as refine
-    from curvafit.segmentation.refine import repair_classes as repair_classes
-    from curvafit.segmentation.refine import tune_repairer as tune_repairer
-    from curvafit.segmentation.repair import Repairer as Repairer
     from curvafit.segmentation.result import Segmentation as Segmentation
     from curvafit.segmentation.segment import segment as segment
     from curvafit.segmentation.transforms import FillSlicesd as FillSlicesd

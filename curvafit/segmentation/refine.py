@@ -25,20 +25,16 @@ from curvafit.segmentation.engine import (
     WorkingGrid,
     add_willmore,
     bending,
-    choose_epsilon,
     infer_law,
     laws_of,
     likelihood,
 )
 from curvafit.segmentation.evidence import VoxelEvidence, probability_evidence
-from curvafit.segmentation.repair import Repairer
-from curvafit.segmentation.result import Segmentation, Uncertainty, flow_summary, volume_summary
+from curvafit.segmentation.result import Segmentation, flow_summary
 from curvafit.segmentation.segment import TRIALS, WEIGHTS
 from curvafit.segmentation.slices import check_spacing, require_labels
-from curvafit.segmentation.teach_repair import tune_repair
 from curvafit.segmentation.tiles import Problem, Tiling, lower_volume
 from curvafit.segmentation.trials import Task, Trial, choose_by_masks
-from curvafit.segmentation.uncertainty import expected_dice
 from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box, Crop
@@ -99,7 +95,6 @@ def refine(
     prior: LawLike | None = None,
     *,
     example: tuple[Source, Source] | Calibration | None = None,
-    repair: bool | str | Path | Repairer | None = None,
     weight: float | None = None,
     label: int | None = None,
     epsilon: float | None = None,
@@ -117,9 +112,6 @@ def refine(
     energy are tried there at weights over decades, and where none is better than p > 1/2 beyond the noise, the mask is
     p > 1/2. Where p > 1/2 has no surface, it stays as it is.
 
-    With `repair`, a small network changes the log-odds; generated shapes taught it the errors that segmentation
-    networks make. It needs no law and no example. An example tunes it, and says whether it helps.
-
     Parameters
     ----------
     probabilities
@@ -129,9 +121,6 @@ def refine(
     example
         The same network's probabilities for another volume, on which it was not trained, and the true mask, which is
         positive inside; or the `Calibration` by them. A file or an array is read as `probabilities` is.
-    repair
-        Whether a network repairs the mask, in place of a law; or its weights: a file of `curvafit atlas teach
-        --repair`, or what `tune_repairer` returns.
     weight
         λ, in nats per unit of F_ε, in place of an example: the first law is lowered, whether that helps or not.
     label
@@ -147,15 +136,12 @@ def refine(
     Raises
     ------
     ValueError, FileNotFoundError
-        If there is neither an example nor a weight nor a repair, or a repair together with a law, a weight or a
-        `Calibration`; if the probabilities are not within [0, 1], or the example's mask lies elsewhere or has no inside
-        or outside; or as `segment`.
+        If there is neither an example nor a weight, or both; if the probabilities are not within [0, 1], or the
+        example's mask lies elsewhere or has no inside or outside; or as `segment`.
     """
-    check_judge(example, weight, repair, prior)
+    check_judge(example, weight)
     field = load_probabilities(probabilities, **reading)
     evidence = probability_evidence(field)
-    if (repairer := _repairer_of(repair)) is not None:
-        return _repair(field, evidence, repairer, example, label, reading, progress)
     tiling = Tiling.of(field, epsilon, tile)
     gain = ""
     if example is None:
@@ -176,61 +162,6 @@ def refine(
         weight=None if trial.law is None else trial.strength * BENDING / bending(trial.law),
         status=f"{gain}{flow_summary(found)}",
     )  # fmt: skip
-
-
-def _repairer_of(repair: bool | str | Path | Repairer | None) -> Repairer | None:
-    """Return the repairer that an option names, by default the packaged one; None where nothing is repaired."""
-    if repair is None or repair is False:
-        return None
-    return repair if isinstance(repair, Repairer) else Repairer.load(None if repair is True else repair)
-
-
-def _repair(
-    field: Field,
-    evidence: VoxelEvidence,
-    repairer: Repairer,
-    example: tuple[Source, Source] | Calibration | None,
-    label: int | None,
-    reading: dict[str, Any],
-    progress: Progress,
-) -> Segmentation:
-    """Repair a map; an example tunes first."""
-    notes: tuple[str, ...] = ()
-    if isinstance(example, tuple):
-        chances, truth = _load_example_beside(field, example, label, reading)
-        notes = truth.notes
-        repairer = tune_repairer(chances, truth, repairer, progress=sub_progress(progress, 0.0, 0.7))
-        progress = sub_progress(progress, 0.7, 1.0)
-    odds = repairer.repair(evidence.ratio, field.spacing, progress)
-    threshold = repairer.threshold(odds)
-    mask, likely = odds > threshold, expit(odds)
-    inside = evidence.level > 0
-    said = repairer.status if inside.any() and not inside.all() else "p > 1/2 has no surface and stays as it is"
-    changed = np.count_nonzero(mask != inside) / mask.size
-    doubt = Uncertainty(replace(field, values=likely), repairer.error, (), expected_dice(likely, mask))
-    return Segmentation.of(
-        field, mask, np.tanh((odds - threshold) / 2), None, choose_epsilon(field, None), notes,
-        weight=None, uncertainty=doubt, image=field,
-        status=f"{said}: {volume_summary(float(mask.mean()))}, and {100 * changed:.2f} % of its voxels are changed",
-    )  # fmt: skip
-
-
-def tune_repairer(
-    probabilities: Source,
-    mask: Source,
-    repairer: Repairer | str | Path | None = None,
-    *,
-    label: int | None = None,
-    progress: Progress = silent,
-    **reading: Any,
-) -> Repairer:
-    """Tune the network that repairs on a network's probabilities and the true mask, for `refine(…, repair=…)`.
-
-    By default the packaged one is tuned. See `refine` for the other parameters and errors.
-    """
-    field, _, inside = _load_example(probabilities, mask, label, reading)
-    first = repairer if isinstance(repairer, Repairer) else Repairer.load(repairer)
-    return tune_repair(first, probability_evidence(field).ratio, inside, field.spacing, progress)
 
 
 def calibrate(
@@ -276,74 +207,19 @@ def calibrate(
     return Calibration(best, best.law in laws, field, notes + truth.notes)
 
 
-def repair_classes(
-    probabilities: Source,
-    classes: Sequence[int],
-    *,
-    repairer: Repairer | str | Path | None = None,
-    progress: Progress = silent,
-    **reading: Any,
-) -> Segmentation:
-    """Repair several classes of a network's probabilities; a voxel that several claim goes to the one that is surest.
-
-    Parameters
-    ----------
-    probabilities
-        The path of a file of several channels, such as nnU-Net's NPZ.
-    classes
-        The channels to repair, counted from 0, which become labels; all other voxels are 0, so 0 is not among them.
-    repairer
-        Weights as in `refine`.
-    reading
-        As in `refine`.
-
-    Raises
-    ------
-    ValueError, FileNotFoundError
-        If the classes are not different numbers from 1, or as `refine`.
-    """
-    numbers = [check_int(each, "classes that are whole numbers from 1", 1, SEEDS) for each in classes]
-    if not numbers or len(set(numbers)) < len(numbers):
-        raise ScanError(f"classes must be different numbers from 1, got {quoted(list(classes))}")
-    first = repairer if isinstance(repairer, Repairer) else Repairer.load(repairer)
-    field = load_probabilities(probabilities, channel=numbers[0], **reading)
-    owner, claim = np.zeros(field.shape, np.min_scalar_type(max(numbers))), np.full(field.shape, -1, np.float16)
-    most, phase = claim.copy(), np.full(field.shape, -1, np.float32)
-    likely, said, notes = [], [], []
-    for count, number in enumerate(numbers):
-        step = sub_progress(progress, count / len(numbers), (count + 1) / len(numbers))
-        found = refine(probabilities, repair=first, progress=step, channel=number, **reading)
-        p = found.uncertainty.probability.values.astype(np.float16)  # type: ignore[union-attr]
-        better = found.mask.values & (p > claim)
-        owner[better], claim[better] = number, p[better]
-        most, phase = np.maximum(most, p), np.maximum(phase, found.phase.values)
-        likely.append(p)
-        said.append(f"class {number}: {found.status}")
-        notes += found.notes
-    inside = owner > 0
-    chance = replace(field, values=np.where(inside, claim, 1 - most).astype(np.float32), notes=())
-    dice = {number: expected_dice(p, owner == number) for number, p in zip(numbers, likely, strict=True)}
-    return Segmentation.of(
-        replace(field, notes=()), inside, phase, None, choose_epsilon(field, None), tuple(dict.fromkeys(notes)),
-        weight=None, uncertainty=Uncertainty(chance, first.error, (), min(dice.values()), dice),
-        labels=replace(field, values=owner, notes=()), status="; ".join(said),
-    )  # fmt: skip
-
-
 class Refine:
     """A callable that refines one class of a network's probabilities, for MONAI's `Compose` after the softmax.
 
     Parameters
     ----------
-    prior, weight, repair, epsilon, steps
+    prior, weight, epsilon, steps
         As in `refine`, whose errors it raises.
     example
         Probabilities and true mask (Z, Y, X) of another volume, which are tried out now; or a `Calibration`.
     channel
         The class, counted from 0.
     spacing, unit
-        Voxel edges along the tensor's three axes, or one for all, and their unit; by default one voxel, and where masks
-        are repaired those of MONAI's tensor.
+        Voxel edges along the tensor's three axes, or one for all, and their unit; by default one voxel.
     """
 
     def __init__(
@@ -351,7 +227,6 @@ class Refine:
         prior: LawLike | None = None,
         *,
         weight: float | None = None,
-        repair: bool | str | Path | Repairer | None = None,
         example: tuple[Source, Source] | Calibration | None = None,
         channel: int = 1,
         spacing: Sequence[float] | float | None = None,
@@ -359,19 +234,15 @@ class Refine:
         epsilon: float | None = None,
         steps: int = STEPS,
     ) -> None:
-        check_judge(example, weight, repair, prior)
+        check_judge(example, weight)
         self.channel = check_int(channel, "a channel that is a whole number from 0", 0, SEEDS)
         self.place = {"spacing": spacing, "unit": unit}
-        repairer = _repairer_of(repair)
-        if repairer is None and prior is None and not isinstance(example, Calibration):
-            raise ScanError("give a law, or a repair")
-        if repairer is not None:
-            repairer = tune_repairer(*example, repairer, **self.place) if isinstance(example, tuple) else repairer
-            example = None
-        elif isinstance(example, tuple):
+        if prior is None and not isinstance(example, Calibration):
+            raise ScanError("give a law, or a calibration")
+        if isinstance(example, tuple):
             example = calibrate(*example, prior, epsilon=epsilon, steps=steps, **self.place)
         self.prior, self.example = prior, example
-        self.options = {"repair": repairer, "weight": weight, "epsilon": epsilon, "steps": steps}
+        self.options = {"weight": weight, "epsilon": epsilon, "steps": steps}
 
     def __call__(self, probabilities: Tensor) -> Tensor:
         """Return the mask (1, Z, Y, X) of probabilities (C, Z, Y, X), 0 and 1, of their type and on their device.
@@ -383,10 +254,7 @@ class Refine:
             raise ScanError(f"probabilities must be a tensor (C, Z, Y, X), got {got}")
         if self.channel >= len(probabilities):
             raise ScanError(f"the channel must be from 0 to {len(probabilities) - 1}, got {self.channel}")
-        place, edges = self.place, getattr(probabilities, "pixdim", None)
-        if place["spacing"] is None and edges is not None and self.options["repair"] is not None:
-            place = {"spacing": [float(edge) for edge in edges], "unit": "mm"}
-        field = field_of(probabilities[self.channel].as_subclass(Tensor), **place)
+        field = field_of(probabilities[self.channel].as_subclass(Tensor), **self.place)
         found = refine(field, self.prior, example=self.example, **self.options)
         mask = torch.zeros_like(probabilities[:1])
         mask[0] = torch.from_numpy(found.mask.values)
@@ -417,12 +285,9 @@ def _pose(evidence: VoxelEvidence, trial: Trial) -> RefineProblem:
     return RefineProblem(replace(trial, law=None) if inside.all() or not inside.any() else trial, evidence)
 
 
-def check_judge(example: object, weight: float | None, repair: object = None, prior: object = None) -> None:
-    """Raise ScanError unless there is an example or a weight, or a repair, which goes with an example at most."""
-    if repair is not None and repair is not False:
-        if weight is not None or prior is not None or isinstance(example, Calibration):
-            raise ScanError("a repair goes with neither a law nor a weight: give an example that tunes it, or nothing")
-    elif (example is None) == (weight is None):
+def check_judge(example: object, weight: float | None) -> None:
+    """Raise ScanError unless there is either an example or a weight."""
+    if (example is None) == (weight is None):
         got = "neither" if weight is None else "both"
         raise ScanError(f"give either an example, on which law and weight are judged, or a weight, got {got}")
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-import math
+import re
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -14,35 +13,16 @@ from typing import Any
 from curvafit.core.extras import require
 from curvafit.core.files import write_atomically, write_content
 from curvafit.core.records import Format, can_write, has_mark
-from curvafit.scan.measure import Measures
+from curvafit.scan.measure import COLUMNS, Measures
 
 #: Suffixes of the files that are written.
 SUFFIXES = (".csv", ".json", ".parquet")
-#: Columns of a table; a CSV file begins with them.
-COLUMNS = ("scan", "quantity", "symbol", "value", "low", "high", "unit", "direction", "version")
 #: Columns that rows of a part of a scan have besides.
 OF_PARTS = ("compartment", "instance")
+#: The start of a formula: a sign but for that of numbers.
+_FORMULA = re.compile(r"[=@\t\r]|[-+](?![\d.eE\s-]*$)")
 #: `format` of a JSON table.
 FORMAT = Format("curvafit measures 1", title="a table of measures")
-
-
-def rows_of(measures: Measures, **more: str | float) -> list[dict[str, Any]]:
-    """Return a row for each quantity of a scan, as values by column; None where a number is not known.
-
-    A compartment or an instance has its label in a column of that name.
-    `more` are further columns with the same value in each row.
-    """
-    release, z, y, x = version("curvafit"), *measures.direction
-    more = dict([measures.part] if measures.part else []) | more
-    rows = []
-    for each in measures.quantities:
-        ends = (each.value, each.value - each.half, each.value + each.half)
-        value, low, high = (end if math.isfinite(end) else None for end in ends)
-        axis = f"{z:.4f} {y:.4f} {x:.4f}" if each.symbol == "DA" and math.isfinite(z) else ""
-        unit = plain_unit(measures.unit, each.power)
-        cells = (measures.source, each.name, each.symbol, value, low, high, unit, axis, release)
-        rows.append(dict(zip(COLUMNS, cells, strict=True)) | more)
-    return rows
 
 
 def check_table(path: str | PathLike[str], inputs: Sequence[str | Path] = (), overwrite: bool = False) -> Path:
@@ -87,17 +67,21 @@ def list_rows(measures: Sequence[Measures], columns: Sequence[Mapping[str, str]]
     """Return the rows of scans, or of their compartments, all with the same columns; `columns` has further ones."""
     rows = []
     for each, more in zip(measures, columns, strict=True):
-        rows += [row for part in (each.compartments.values() or (each,)) for row in rows_of(part, **more)]
+        rows += [row for part in (each.compartments.values() or (each,)) for row in part.rows(**more)]
     names = dict.fromkeys(name for row in rows for name in row)
     return [{name: row.get(name) for name in names} for row in rows]
 
 
 def format_csv(rows: Sequence[dict[str, Any]]) -> str:
-    """Return rows of the same columns as CSV; None is an empty cell."""
+    """Return rows of the same columns as CSV; None is an empty cell.
+
+    A text that a spreadsheet would run as a formula, such as a scan's name, begins with an apostrophe.
+    """
     text = io.StringIO(newline="")
-    writer = csv.writer(text)
-    writer.writerow(rows[0])
-    writer.writerows(row.values() for row in rows)
+    cells = (rows[0], *(row.values() for row in rows))
+    csv.writer(text).writerows(
+        [f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) else cell for cell in row] for row in cells
+    )
     return text.getvalue()
 
 
@@ -106,14 +90,6 @@ def _ours(target: Path) -> bool:
     if target.suffix.lower() == ".csv":
         return has_mark(target, ",".join(COLUMNS))
     return target.suffix.lower() == ".json" and FORMAT.owns(target)
-
-
-def plain_unit(unit: str, power: int) -> str:
-    """Return a unit to a power in plain signs: mm, 1/mm, 1/mm^3."""
-    if power == 0:
-        return ""
-    raised = unit if abs(power) == 1 else f"{unit}^{abs(power)}"
-    return raised if power > 0 else f"1/{raised}"
 
 
 def _pandas() -> Any:

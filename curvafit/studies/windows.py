@@ -15,12 +15,11 @@ from curvafit.core.checks import as_tuple, check_int, check_seed
 from curvafit.core.extras import require
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.units import format_length, format_number, format_percent, unit_name
+from curvafit.core.units import format_length, format_number, format_percent, plain_unit, unit_name
 from curvafit.inference.infer import infer
 from curvafit.scan.measure import QUANTITIES, Blocks, combine, measure_maps
 from curvafit.scan.structure import check_options
 from curvafit.studies.scans import list_combinations
-from curvafit.studies.tables import plain_unit
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.read import Source, field_of
 

@@ -61,7 +61,9 @@ def finding(monkeypatch: pytest.MonkeyPatch, undrawn: None) -> dict[str, Any]:
 
 
 def test_infer_writes_three_files_and_says_what_it_found(tmp_path: Path, finding: dict[str, Any]) -> None:
-    result = call("infer", "scan.h5::raw", "-o", tmp_path / "out", "--spacing", "2,1,1", "--unit", "um", "--dark")
+    (tmp_path / "scan.h5").touch()
+    scan = f"{tmp_path / 'scan.h5'}::raw"
+    result = call("infer", scan, "-o", tmp_path / "out", "--spacing", "2,1,1", "--unit", "um", "--dark")
     assert result.exit_code == 0, (result.output, result.exception)
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == ["fit.json", "regenerated.nii.gz", "report.html"]
@@ -70,17 +72,20 @@ def test_infer_writes_three_files_and_says_what_it_found(tmp_path: Path, finding
     assert re.search(r"a11 +1\.80 +0\.40 +\S+ to \S+ +1\.80", result.stdout)
     assert re.search(r"a10 +-38\.5 +6\.0 +\S+ to \S+ +-19\.7 1/mm", result.stdout)
     assert "[  0 %] reading the scan" in result.stderr
-    assert finding["scan"] == "scan.h5::raw" and finding["spacing"] == (2.0, 1.0, 1.0)
+    assert finding["scan"] == scan and finding["spacing"] == (2.0, 1.0, 1.0)
     assert finding["unit"] == "um" and finding["dark"] is True and finding["threshold"] == "otsu"
 
 
 def test_infer_hands_every_option_on(tmp_path: Path, finding: dict[str, Any]) -> None:
     options = "--kind mask --periodic --threshold -12.5 --label 3 --raw-shape 4,5,6 --dtype u1 --key k --seed 9"
     options += " --channel 2 --crop 1:3,:,-4: --method match"
-    result = call("infer", "a.raw", "-o", tmp_path, *options.split(), "--spacing", "0.5", "--roi", "r.npy")
+    scan, roi = tmp_path / "a.raw", tmp_path / "r.npy"
+    for file in (scan, roi):
+        file.touch()
+    result = call("infer", scan, "-o", tmp_path / "out", *options.split(), "--spacing", "0.5", "--roi", roi)
     assert result.exit_code == 0, (result.output, result.exception)
     wanted = {"kind": "mask", "periodic": True, "threshold": -12.5, "label": 3, "raw_shape": (4, 5, 6), "dtype": "u1"}
-    wanted |= {"key": "k", "seed": 9, "spacing": (0.5, 0.5, 0.5), "roi": Path("r.npy"), "atlas": None}
+    wanted |= {"key": "k", "seed": 9, "spacing": (0.5, 0.5, 0.5), "roi": roi, "atlas": None}
     wanted |= {"channel": 2, "crop": "1:3,:,-4:", "method": "match"}
     assert {name: finding[name] for name in wanted} == wanted
 
@@ -120,9 +125,11 @@ def test_infer_checks_before_it_reads(tmp_path: Path, monkeypatch: pytest.Monkey
         raise AssertionError("the scan was read")
 
     monkeypatch.setattr(importlib.import_module("curvafit.inference.infer"), "read_scan", read)
+    scan = tmp_path / "scan.npy"
+    scan.touch()
     for option in (("--seed", "-1"), ("--kind", "drawing"), ("--unit", "furlong")):
-        refused(call("infer", "scan.npy", "-o", tmp_path / "out", *option), option[0].strip("-"))
-    assert list(tmp_path.iterdir()) == []
+        refused(call("infer", scan, "-o", tmp_path / "out", *option), option[0].strip("-"))
+    assert list(tmp_path.iterdir()) == [scan]
 
 
 BAD_VOLUMES: dict[str, Any] = {
@@ -147,7 +154,7 @@ def test_infer_refuses_missing_unknown_and_truncated_files(tmp_path: Path) -> No
     (tmp_path / "cut.npy").write_bytes((tmp_path / "cut.npy").read_bytes()[:900])
     for name, word in (("none.tif", "no such file"), ("scan.xyz", "scan.xyz"), ("cut.npy", "cut.npy")):
         refused(call("infer", tmp_path / name, "-o", tmp_path / "out"), word, progress=True)
-    refused(call("infer", tmp_path / "none.tif", "-o", tmp_path / "scan.xyz"), "folder")
+    refused(call("infer", tmp_path / "cut.npy", "-o", tmp_path / "scan.xyz"), "folder")
     assert not (tmp_path / "out").exists()
 
 

@@ -25,7 +25,7 @@ def run(folder: Path, name: str, *words: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_bundle_learns_from_slices_and_writes_masks_that_are_repaired(tmp_path: Path) -> None:
+def test_the_bundle_learns_from_slices_and_writes_masks(tmp_path: Path) -> None:
     for package in ("fire", "ignite"):
         pytest.importorskip(package)
     folder = tmp_path / "bundle"

@@ -16,7 +16,7 @@ from curvafit.geometry.morphometry import morphometry
 from curvafit.geometry.topology import euler_number, euler_shares
 from curvafit.scan.measure import LEAST, QUANTITIES, Blocks, Measures, errors, measure, measure_maps
 from curvafit.studies import tables
-from curvafit.studies.tables import COLUMNS, rows_of, write_table
+from curvafit.studies.tables import COLUMNS, write_table
 from curvafit.volumes.field import Field
 
 N = 48
@@ -202,7 +202,7 @@ def test_tables_are_tidy(measures: Measures, tmp_path: Path) -> None:
     assert float(rows[1]["high"]) - float(rows[1]["low"]) == pytest.approx(2 * measures["Tb.Th"].half)
     assert [rows[k]["unit"] for k in (0, 1, 4, 5, 7)] == ["", "um", "1/um", "1/um^3", "1/um"]
     content = json.loads(write_table([measures], tmp_path / "table.json").read_text(encoding="utf-8"))
-    assert content["rows"] == rows_of(measures)
+    assert content["rows"] == measures.rows()
     assert write_table([measures], path) == path  # its own file
 
 
@@ -231,7 +231,7 @@ def test_parquet_has_the_same_rows(measures: Measures, tmp_path: Path) -> None:
     pytest.importorskip("pyarrow", reason="the extra 'tables' is not installed")
     frame = pandas.read_parquet(write_table([measures], tmp_path / "table.parquet"))
     assert list(frame.columns) == list(COLUMNS)
-    assert frame["value"].tolist() == [row["value"] for row in rows_of(measures)]
+    assert frame["value"].tolist() == [row["value"] for row in measures.rows()]
 
 
 def test_parquet_without_pandas_names_the_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -327,7 +327,7 @@ def test_a_compartment_without_structure_has_none(cut: np.ndarray) -> None:
     found = measure(np.where(labels == 7, 0, cut), roi=labels, kind="mask").compartments[7]
     assert found["BV/TV"].value == 0
     assert math.isnan(found["Tb.Th"].value)
-    assert rows_of(found)[1]["value"] is None
+    assert found.rows()[1]["value"] is None
 
 
 def test_the_command_writes_a_row_set_for_each_compartment(rods: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from curvafit.priors.curvature import ROOT_FLOOR, ROOT_ROUNDING, XI
 from curvafit.priors.grid import Grid
 from curvafit.priors.kernels import loops
 from curvafit.priors.kernels.loops import ALL, EDGE, ENDS, MOVE, SLACK, TAPS, TOGETHER, WIDE
-from curvafit.priors.kernels.threads import count_threads, limit_threads
+from curvafit.priors.kernels.threads import count_threads
 from curvafit.priors.stencils import gaussian_taps
 
 #: The least voxels for which another thread saves more than its start costs.
@@ -175,12 +175,11 @@ class FusedFlow:
 
     def _adam_step(self, phase: int, adam: np.ndarray) -> None:
         """Run the last pass, or a part of it."""
-        with limit_threads(self._threads):
-            loops.adam_step(
-                phase, self._between, self._vector, self._first, self._second, self._keep, self._gradient,
-                self._blur.rows, self._rings, self._slopes, self._fluxes, self._sums, self._highest,
-                self._half, adam, self.grid.shape, self.grid.periodic, self._index_z, self._blur.planes,
-            )  # fmt: skip
+        loops.adam_step(
+            self._threads, phase, self._between, self._vector, self._first, self._second, self._keep, self._gradient,
+            self._blur.rows, self._rings, self._slopes, self._fluxes, self._sums, self._highest,
+            self._half, adam, self.grid.shape, self.grid.periodic, self._index_z, self._blur.planes,
+        )  # fmt: skip
 
 
 class _Blur:
@@ -206,15 +205,12 @@ class _Blur:
     def along_z(self, source: np.ndarray, out: np.ndarray, shift: float, base: np.ndarray) -> None:
         """Blur along z, and add a number and, where it is not empty, a field."""
         Z, *plane = self._grid.shape
-        with limit_threads(self._threads):
-            loops.blur_z(
-                source, out, base, self._threads, Z, loops.pitch(*plane), self._index, self._taps, np.float32(shift)
-            )
+        size, number = loops.pitch(*plane), np.float32(shift)
+        loops.blur_z(self._threads, source, out, base, self._threads, Z, size, self._index, self._taps, number)
 
     def in_planes(self, source: np.ndarray, out: np.ndarray) -> None:
         """Blur along y and x."""
-        with limit_threads(self._threads):
-            loops.blur_in_planes(source, out, self.rows, self._grid.shape, self.planes)
+        loops.blur_in_planes(self._threads, source, out, self.rows, self._grid.shape, self.planes)
 
 
 class _Density:
@@ -249,11 +245,10 @@ class _Density:
 
     def __call__(self, u: np.ndarray, gradient: np.ndarray, planes: slice = slice(None)) -> float:
         """Fill the gradient; return the energy of some planes."""
-        with limit_threads(self._threads):
-            loops.fill_gradient(
-                u, gradient, self._energies, self._rings, self._sums, self._inside, self._constants, *self._general,
-                self._index, self._block, self._tile, *self._grid.shape,
-            )  # fmt: skip
+        loops.fill_gradient(
+            self._threads, u, gradient, self._energies, self._rings, self._sums, self._inside, self._constants,
+            *self._general, self._index, self._block, self._tile, *self._grid.shape,
+        )  # fmt: skip
         return float(self._energies[:, planes].sum())
 
 
@@ -262,7 +257,8 @@ _NO_FIELD = np.empty(0, np.float32)
 
 def _choose_threads(grid: Grid) -> int:
     """Return how many threads a grid is worth, of those that numba may use."""
-    return max(1, min(count_threads(), math.prod(grid.shape) // _WORTH, grid.shape[0] // TOGETHER))
+    worth = min(math.prod(grid.shape) // _WORTH, grid.shape[0] // TOGETHER)
+    return min(count_threads(), worth) if worth > 1 else 1
 
 
 def _make_scratch(threads: int, size: int) -> np.ndarray:

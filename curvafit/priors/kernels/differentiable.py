@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -10,6 +12,8 @@ from torch import Tensor
 from curvafit.priors import kernels
 from curvafit.priors.energy import energy, energy_gradient
 from curvafit.priors.grid import Float, Grid
+
+_LOG = logging.getLogger("curvafit")
 
 
 def energies(
@@ -32,18 +36,32 @@ def energies(
     compiling, fused = torch.compiler.is_compiling(), kernels.has_kernel(u.device)
     if u.dtype != torch.float32 or not (fused or (torch.is_grad_enabled() and not compiling)):
         return energy(u, coefficients, grid, epsilon, mask=mask)
-    given = u, mask.to(u).expand(u.shape), [float(value) for value in coefficients], list(grid.spacing), epsilon
+    numbers = [float(value) if isinstance(value, Tensor) else value for value in coefficients]
+    given = u, mask.to(u).expand(u.shape), numbers, list(grid.spacing), epsilon
     # A compiler sees the operator; `torch.func` transforms the function.
     return (_energies(*given) if compiling else _Energies.apply(*given))[0]  # type: ignore[index]
 
 
 def _compute(u, mask, a, spacing, epsilon) -> tuple[Tensor, Tensor]:
     """Return the energies and their gradient."""
+    _say_what_takes_long(u.device.type)
     grid = Grid(tuple(u.shape[1:]), tuple(spacing), "replicate")
     values, slopes = u.new_empty((u.shape[0],)), torch.empty_like(u, memory_format=torch.contiguous_format)
     for k in range(len(u)):
         values[k], slopes[k] = energy_gradient(u[k].detach(), a, grid, epsilon, mask=mask[k].detach())
     return values, slopes
+
+
+@cache
+def _say_what_takes_long(device: str) -> None:
+    """Log, once, what makes the first call slow on a processor, or every call."""
+    if device == "cpu" and not kernels.has_kernel(device):
+        _LOG.warning("numba is not installed: on a processor the loss takes some 25 times as long (pip install numba)")
+    elif device == "cpu":
+        from curvafit.priors.kernels.loops import fill_gradient
+
+        if not fill_gradient.is_compiled():
+            _LOG.warning("compiling the loss for this processor, once: some ten seconds")
 
 
 def _save(ctx, inputs, output) -> None:

@@ -53,6 +53,7 @@ from __future__ import annotations
 
 import math
 import operator
+from functools import partial
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -62,6 +63,8 @@ from numba import config, njit, prange, types
 from numba.core.imputils import lower_builtin
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, models, register_model
+
+from curvafit.priors.kernels.threads import Kernel
 
 #: Fast-math without the assumption that no value is NaN or infinite: a diverged flow must show.
 _FLAGS = {"contract", "arcp", "nsz", "afn"}
@@ -73,7 +76,7 @@ _SUMS = {"fastmath": _FLAGS | {"reassoc"}}
 _SERIAL: dict[str, Any] = {**_PART, **_SUMS}
 _SUMMING: dict[str, Any] = {**_INLINE, **_SUMS}
 _COUNTING: dict[str, Any] = {**_PLAIN, "forceinline": True, "cache": True}
-_PARALLEL: dict[str, Any] = {**_PLAIN, **_SUMS, "parallel": True, "cache": True}
+_PARALLEL: dict[str, Any] = {**_PLAIN, **_SUMS, "cache": True}
 
 
 #: The processor's features that numba compiles for: the host's, unless numba's settings give others.
@@ -512,7 +515,7 @@ def _fill_gradient_chunk(
             energies[z] = energy
 
 
-@njit(**_PARALLEL)
+@partial(Kernel, **_PARALLEL)
 def fill_gradient(u, out, energies, rings, sums, inside, k, ratios, orient, local, places, index, block, tile, Z, Y, X):
     """Compute the energies of tiles of rows in planes, and the gradient."""
     chunks = rings.shape[0]
@@ -584,7 +587,7 @@ def _blur_z(chunk, chunks, source, out, base, Z, plane, index, taps, shift):
                         out[_at(row + i)] += base[_at(row + i)]
 
 
-@njit(**_PARALLEL)
+@partial(Kernel, **_PARALLEL)
 def blur_z(source, out, base, chunks, Z, plane, index, taps, shift):
     """Blur along z, and add a number and, where it is not empty, a field; four planes of a strip at a time.
 
@@ -668,7 +671,7 @@ def _blur_in_planes(chunk, chunks, source, out, rows, shape, blur):
         _blur_plane(source, o, stride, rows[chunk], out, o, 0, Y, X, blur)
 
 
-@njit(**_PARALLEL)
+@partial(Kernel, **_PARALLEL)
 def blur_in_planes(source, out, rows, shape, blur):
     """Blur along y and x."""
     chunks = rows.shape[0]
@@ -802,7 +805,7 @@ def _adam_chunk(
                 )
 
 
-@njit(**_PARALLEL)
+@partial(Kernel, **_PARALLEL)
 def adam_step(
     phase, g, A, m, v, keep, out, rows, rings, slopes, fluxes, sums, highest, half, adam, shape, periodic, index_z, blur
 ):

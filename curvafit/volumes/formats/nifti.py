@@ -89,8 +89,7 @@ def write_nifti(field: Any, path: Path) -> None:
     if values.dtype == np.float16:
         values = values.astype(np.float32)
     unit, factor = _TO_FILE[field.unit]
-    affine = np.diag([*field.spacing[::-1], 1.0]) if field.affine is None else field.affine.copy()
-    affine[:3] *= factor
+    affine = affine_in_file(field)
     image = nibabel.Nifti1Image(values.T, affine, dtype=values.dtype)
     image.header.set_xyzt_units(unit)
     image.header.set_zooms([h * factor for h in field.spacing[::-1]])
@@ -99,6 +98,13 @@ def write_nifti(field: Any, path: Path) -> None:
     if field.unit in ("voxel", "nm"):
         image.header["descrip"] = f"curvafit unit={field.unit}".encode()
     _save(image, path)
+
+
+def affine_in_file(field: Any) -> np.ndarray:
+    """Return the affine (x, y, z) that a field has in a NIfTI file, in the file's unit."""
+    affine = np.diag([*field.spacing[::-1], 1.0]) if field.affine is None else field.affine.copy()
+    affine[:3] *= _TO_FILE[field.unit][1]
+    return affine
 
 
 def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | None = None) -> None:

@@ -1,0 +1,50 @@
+"""Every command and public call gives what it gave. A number that is to change is frozen anew, by a commit that says
+why: `python -m tests.golden freeze ROW`. Left out are `demo`, which fetches its scan, `atlas map`, whose picture is
+another library's, and the teaching of networks, which takes hours."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import pytest
+
+from tests.golden.frozen import STRAY, compare, read, volume
+from tests.golden.inputs import tubes
+from tests.golden.rows import ROWS, closeness, run
+
+KEPT = read()
+#: Megabytes that the corpus may take.
+MOST = 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ROWS)
+def test_a_row_gives_what_it_gave(name: str, tmp_path: Path) -> None:
+    assert not (said := compare(KEPT[name], run(name, tmp_path), close=closeness(name))), said
+
+
+def test_the_corpus_is_small_and_has_a_record_of_each_row() -> None:
+    assert list(KEPT) == list(ROWS)
+    assert sum(path.stat().st_size for path in Path(__file__).parent.rglob("*") if path.is_file()) < MOST * 2**20
+
+
+def test_a_difference_is_noticed() -> None:
+    kept = {"a": [[1.0, 250.0], ["Tb.Th", 0.1234]], "b": {"shape": [3], "n": 7}}
+    assert compare(kept, copy.deepcopy(kept)) == []
+    for change in (
+        {"a": [[1.0, 251.0], ["Tb.Th", 0.1234]]},
+        {"b": {"shape": [3], "n": 8}},
+        {"b": {"shape": [3]}},
+        {"c": 1},
+    ):
+        assert len(compare(kept, kept | change)) == 1
+    assert compare(kept, kept | {"a": [[1.0, 250.1], ["Tb.Th", 0.1235]]}) == []  # a last digit
+
+
+def test_a_mask_may_differ_in_stray_voxels_alone() -> None:
+    mask = tubes((12, 13, 14), 9, 2.5) > 0
+    for count, alike in ((int(STRAY * mask.size), True), (int(STRAY * mask.size) + 1, False)):
+        other = mask.copy()
+        other.flat[:count] ^= True
+        assert (compare(volume(mask), volume(other)) == []) is alike

@@ -1,0 +1,125 @@
+"""Cases that were wrong once: training sets on the fly, and small doors."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import logging
+import multiprocessing
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from exact_store import exact_field, exact_record, exact_store
+
+import curvafit
+from curvafit.core.runtime import log_stages
+from curvafit.data_synth import TextureDataset
+from curvafit.scan.measure import COLUMNS
+from curvafit.studies.tables import format_csv
+
+
+def grow_once_for_all_epochs(folder: Path) -> None:
+    """Two workers, new ones in each of two epochs, grow no shape twice."""
+    method = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
+    log, script = folder / "log", Path(__file__).parents[1] / "pool_run.py"
+    room = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    run = subprocess.run([sys.executable, script, method, "2", "0", log], env=room, capture_output=True, text=True)
+    grown = [line.split()[0] for line in log.read_text().splitlines()]
+    assert grown and len(set(grown)) == len(grown) and run.returncode == 0, run.stderr
+
+
+def keep_every_law_of_a_list(folder: Path) -> None:
+    pairs = TextureDataset(["tubes", "sponge"], "micro-ct", 16, shapes=1)
+    assert "2 shapes of tubes, sponge" in repr(pairs)
+
+
+def say_how_many_shapes_are_well_formed(folder: Path) -> None:
+    """A viable shape that reaches |u| = 7 is a fragment, and is not cropped."""
+    store, record = exact_store(folder / "s.zarr", 4), exact_record(4)
+    torn = dataclasses.replace(record, viability=dataclasses.replace(record.viability, highest=7.0))
+    store.write(torn, exact_field(4))
+    assert "3 shapes of s.zarr, the well-formed ones of 4;" in repr(TextureDataset(store.path, "micro-ct", 12))
+
+
+def refuse_arrays_as_diagrams(folder: Path) -> None:
+    with pytest.raises(ValueError, match="diagram"):
+        curvafit.wasserstein(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
+
+
+def refuse_inputs_before_libraries(folder: Path) -> None:
+    """The command ends before torch is imported."""
+    code = "import sys\nfrom curvafit.cli.app import app\ntry:\n    app(sys.argv[1:])\n"
+    code += "except SystemExit as end:\n    print(end.code, 'torch' in sys.modules)"
+    for words, sentence in (
+        ("measure typo.tif", "no such file: typo.tif"),
+        ("reconstruct typo.h5::a -o a.tif", "no such file: typo.h5"),
+        ("generate --preset tubez -o a.tif", "expected a preset among"),
+        ("synth --presets tubes,spunge --modality confocal -o set", "got 'spunge'"),
+    ):
+        run = subprocess.run([sys.executable, "-c", code, *words.split()], cwd=folder, capture_output=True, text=True)
+        assert run.stdout.split() == ["2", "False"] and sentence in run.stderr, run
+
+
+def keep_formulas_out_of_a_spreadsheet(folder: Path) -> None:
+    odd = {"=1+1": "@SUM(A1)", "b": "-x", "c": "+1.5", "d": "-0.5 0.1 -1e-05", "e": -2.5, "f": "-1+cmd|' /C calc'!A0"}
+    head, row = csv.reader(format_csv([odd]).splitlines())
+    assert head[:2] == ["'=1+1", "b"]
+    assert row == ["'@SUM(A1)", "'-x", "+1.5", "-0.5 0.1 -1e-05", "-2.5", "'-1+cmd|' /C calc'!A0"]
+
+
+def show_measures_in_a_notebook(folder: Path) -> None:
+    """A table of all numbers, of each compartment; a data frame with the columns of a file; a figure."""
+    phase = np.indices((32, 32, 32)).sum(0) % 16 < 8
+    halves = np.ones(phase.shape, np.uint8)
+    halves[16:] = 2
+    whole, parted = curvafit.measure(phase), curvafit.measure(phase, roi=halves)
+    for found, columns in ((whole, 1), (parted, 2)):
+        table = found._repr_html_()
+        assert all(each.symbol in table for each in found.quantities)
+        assert table.count("<td>") == (len(found.quantities) + 1) * (3 + columns)
+        assert len(found.plot().axes) >= columns
+        frame = found.to_frame()
+        assert tuple(frame)[: len(COLUMNS)] == COLUMNS and len(frame) == columns * len(found.quantities)
+
+
+def log_the_stages_of_an_inference(folder: Path) -> None:
+    records: list[logging.LogRecord] = []
+    logger, handler = logging.getLogger("curvafit"), logging.Handler(logging.INFO)
+    handler.emit = records.append  # type: ignore[method-assign, assignment]
+    logger.addHandler(handler)
+    level = logger.level
+    logger.setLevel(logging.INFO)
+    try:
+        curvafit.infer(
+            np.indices((48, 48, 48)).sum(0) % 16 < 5, fast=True
+        )  # layers: told at once that they have no law
+        log = log_stages()
+        for share in (0.5, 0.6):
+            log(f"shape {share}", share)
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+    said = [record.getMessage() for record in records]
+    assert said == ["reading the scan (0 % done)", "measuring curvature (5 % done)", "shape 0.5 (50 % done)"]
+
+
+CASES: dict[str, Callable[[Path], None]] = {
+    "eng-10-pool-regrown-each-epoch": grow_once_for_all_epochs,
+    "eng-12-list-of-laws": keep_every_law_of_a_list,
+    "eng-12-store-of-four": say_how_many_shapes_are_well_formed,
+    "eng-12-wasserstein": refuse_arrays_as_diagrams,
+    "eng-12-missing-inputs": refuse_inputs_before_libraries,
+    "eng-12-formulas": keep_formulas_out_of_a_spreadsheet,
+    "eng-12-measures": show_measures_in_a_notebook,
+    "infer-is-silent": log_the_stages_of_an_inference,
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_handed(case, tmp_path):
+    CASES[case](tmp_path)

@@ -1,0 +1,125 @@
+"""The loss beside kernels elsewhere: in a loader's workers by every start method, and in several Python threads."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+#: A loss on two of numba's threads, and data whose shapes workers grow.
+HEAD = """
+import sys
+import torch
+from curvafit.data_synth import TextureDataset, as_dict, as_monai
+from curvafit.priors import CurvaturePrior
+
+prior = CurvaturePrior("tubes", sigmoid=True)
+
+def make(transform):
+    return TextureDataset("tubes", "micro-ct", 24, length=2, shapes=1, transform=transform)
+
+def look(batch, scale=1.0):
+    return prior(scale * torch.randn(1, 1, 48, 48, 48, requires_grad=True)) + batch["image"].mean()
+
+def main(start):
+    for workers, persistent in ((1, False), (2, True)):
+        options = {"num_workers": workers, "persistent_workers": persistent, "multiprocessing_context": start}
+        look({"image": torch.zeros(1)}).backward()
+        train(options)
+    from curvafit.priors.kernels.threads import count_threads
+    print("threads", count_threads())
+"""
+PLAIN = """
+def train(options):
+    loader = DataLoader(make(TRANSFORM), batch_size=1, **options)
+    for epoch in range(2):
+        for batch in loader:
+            look(batch).backward()
+"""
+LOOPS = {
+    "torch": "from torch.utils.data import DataLoader" + PLAIN.replace("TRANSFORM", "as_dict"),
+    "monai": "from monai.data import DataLoader" + PLAIN.replace("TRANSFORM", "as_monai"),
+    "lightning": """
+import lightning
+
+class Segmenter(lightning.LightningModule):
+    def __init__(self):
+        super().__init__()
+        self.scale = torch.nn.Parameter(torch.ones(()))
+
+    def training_step(self, batch, _):
+        return look(batch, self.scale)
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), 1e-3)
+
+def train(options):
+    quiet = dict.fromkeys(("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
+    loader = torch.utils.data.DataLoader(make(as_dict), batch_size=1, **options)
+    lightning.Trainer(max_epochs=2, accelerator="cpu", **quiet).fit(Segmenter(), loader)
+""",
+}
+
+
+def run(program: Path, *arguments: str, **environment: str) -> str:
+    """The last line that a program prints, which runs in a process of two threads."""
+    threads = {"OMP_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(program), *arguments]
+    done = subprocess.run(command, env=os.environ | threads | environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("loop", "start"),
+    [("torch", "fork"), ("torch", "spawn"), ("torch", "forkserver"), ("monai", "fork"), ("lightning", "fork")],
+)
+def test_workers_grow_shapes_beside_the_loss(loop, start, tmp_path) -> None:
+    """One worker, and two that persist, two epochs each; the main process keeps its threads."""
+    if start not in multiprocessing.get_all_start_methods():
+        pytest.skip(f"this platform has no {start}")
+    pytest.importorskip(loop, reason=f"{loop} is not installed: pip install {loop}")
+    program = tmp_path / "train.py"
+    program.write_text(f"{HEAD}\n{LOOPS[loop]}\nif __name__ == '__main__':\n    main(sys.argv[1])\n")
+    assert run(program, start) == "threads 2"
+
+
+THREADS = """
+import threading, torch, numba
+from curvafit.priors import CurvaturePrior
+
+prior, values = CurvaturePrior("tubes", sigmoid=True), []
+x = torch.randn(1, 1, 48, 48, 48, generator=torch.Generator().manual_seed(0))
+
+def work():
+    for _ in range(5):
+        leaf = x.clone().requires_grad_()
+        value = prior(leaf)
+        value.backward()
+        values.append((float(value.detach()), float(leaf.grad.double().norm())))
+
+crew = [threading.Thread(target=work) for _ in range(3)]
+[each.start() for each in crew]
+[each.join() for each in crew]
+started = getattr(numba.np.ufunc.parallel, "_is_initialized")
+print(len(values), len(set(values)), started)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("environment", "started"),
+    [({"NUMBA_THREADING_LAYER": "workqueue"}, True), ({"OMP_NUM_THREADS": "1"}, False)],
+    ids=["one caller at a time", "torchrun's"],
+)
+def test_several_threads_may_call_the_loss(environment, started, tmp_path) -> None:
+    """On numba's queue, which serves one caller at a time; and with one thread, where numba starts none."""
+    program = tmp_path / "threads.py"
+    program.write_text(THREADS)
+    assert run(program, **environment) == f"15 1 {started}"
