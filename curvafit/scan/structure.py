@@ -249,12 +249,14 @@ def count_constant(values: np.ndarray, value: Any) -> np.ndarray:
     ahead = np.logical_and.accumulate(constant, axis=2)
     behind = np.logical_and.accumulate(constant[..., ::-1], axis=2)[..., ::-1]
     rim = np.zeros_like(constant)
-    rim[..., 1:], rim[..., :-1] = ahead[..., :-1], rim[..., :-1] | behind[..., 1:]
+    rim[..., 1:] = ahead[..., :-1]
+    rim[..., :-1] |= behind[..., 1:]
     levels = [values[part].astype(np.float64) for part in (rim & ~constant, ~constant)]
     sums = [np.count_nonzero(constant), np.count_nonzero(ahead | behind)]
-    for each in levels:
-        squares = np.square(each)
-        sums += [each.size, each.sum(), squares.sum(), np.dot(squares, each), np.dot(squares, squares)]
+    with np.errstate(all="ignore"):  # huge numbers tell nothing
+        for each in levels:
+            squares = np.square(each)
+            sums += [each.size, each.sum(), squares.sum(), np.dot(squares, each), np.dot(squares, squares)]
     return np.array(sums, dtype=np.float64)
 
 
@@ -268,17 +270,14 @@ def judge_padding(value: Any, counts: np.ndarray) -> Padding | None:
     total, reached, size = counts[0], counts[1], counts[0] + counts[7]
     if total <= PADDED * size or reached < REACHED * total or total == size:
         return None
-    (near, spread, *_), (mean, variance, third, fourth) = map(_central_moments, (counts[2:7], counts[7:]))
-    alike = 4 * (near - mean) ** 2 < variance < 4 * spread
-    far = value < 0 and (near - float(value)) ** 2 > variance
-    phases = third**2 / variance + variance**2 > TWO_PHASES * fourth if variance else False
+    near, m, (p2, p3, p4) = counts[3] / max(counts[2], 1), counts[8] / counts[7], counts[9:] / counts[7]
+    with np.errstate(all="ignore"):
+        spread, variance = counts[4] / max(counts[2], 1) - near**2, max(p2 - m**2, 0.0)
+        third, fourth = p3 - 3 * m * p2 + 2 * m**3, p4 - 4 * m * p3 + 6 * m**2 * p2 - 3 * m**4
+        alike = 4 * (near - m) ** 2 < variance < 4 * spread
+        far = value < 0 and (near - float(value)) ** 2 > variance
+        phases = third**2 + variance**3 > TWO_PHASES * fourth * variance
     return Padding(float(value), total / size, math.sqrt(variance), bool(phases and (alike or far)))
-
-
-def _central_moments(powers: np.ndarray) -> tuple[float, float, float, float]:
-    """Return the mean and the central moments 2 to 4 from sums of powers 0 to 4; zeros of nothing."""
-    m, p2, p3, p4 = (powers[1:] / max(powers[0], 1)).tolist()
-    return m, max(p2 - m**2, 0.0), p3 - 3 * m * p2 + 2 * m**3, p4 - 4 * m * p3 + 6 * m**2 * p2 - 3 * m**4
 
 
 def describe_padding(padding: Padding | None, otsu: bool, inside: bool = False) -> tuple[str, ...]:
