@@ -96,7 +96,8 @@ Reading = dict[str, Any]
 def parse_reading(
     spacing: Annotated[str | None, _read(help="Voxel edges Z,Y,X, or one number for all; overrides the file.")] = None,
     unit: Annotated[str | None, _read(help="Unit of lengths: nm, um, mm or m; overrides the file.")] = None,
-    channel: Annotated[int | None, _read(help="Channel to read, counted from 0, of several (colours, times).")] = None,
+    channel: Annotated[int | None, _read(help="Channel to read, counted from 0, of several (colours).")] = None,
+    time: Annotated[int | None, _read(help="Time to read, counted from 0, of several.")] = None,
     label: Annotated[int | None, _read(help="Label of the structure: the voxels with this value.")] = None,
     crop: Annotated[str | None, _read(help="Box of voxels from 0: z0:z1,y0:y1,x0:x1; : is a whole axis.")] = None,
     raw_shape: Annotated[str | None, _read(help="Voxels Z,Y,X of a RAW file.")] = None,
@@ -117,6 +118,7 @@ def parse_reading(
         "spacing": None if spacing is None else parse_triple(spacing, "--spacing"),
         "unit": unit,
         "channel": channel,
+        "time": time,
         "label": label,
         "crop": crop,
         "raw_shape": None if raw_shape is None else parse_whole_triple(raw_shape, "--raw-shape"),

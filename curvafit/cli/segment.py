@@ -229,6 +229,7 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
     from curvafit.segmentation.result import check_mask_target, hidden_store, write_mask
     from curvafit.segmentation.tiles import Tiling
     from curvafit.volumes.boxes import boxes_of, check_fits, read_whole
+    from curvafit.volumes.write import check_labels
 
     record, reading = job.record, job.reading
     law_file = None if preset_name(job.prior) else job.prior
@@ -246,6 +247,8 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
         boxes = boxes_of(job.source, **reading) if read is None else boxes_of(read(job.source, **reading))
         check_fits(boxes)  # the mask is written from memory
         check_mask_target(job.out, boxes.frame, **options)  # again, as a format may not hold the unit
+        if record.get("labels"):
+            check_labels(job.out, read_whole(boxes))
         tiling = Tiling.of(boxes.frame, record["epsilon"], record["tile"], periodic=record.get("periodic", False))
         store = hidden_store(job.out)
         tiles = tiling.count > 1 and (not likely or job.prior is not None)
@@ -255,7 +258,7 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
         sure = result.keep_sure(least) if least else None
         result = result if sure is None else replace(result, notes=(*result.notes, *sure.notes))
         # The header is kept where it says where the voxels are; one of a file of channels is of all of them.
-        stated = ("spacing", "crop") if job.image else ("spacing", "crop", "channel")
+        stated = ("spacing", "crop") if job.image else ("spacing", "crop", "channel", "time")
         like = (job.image or job.source) if all(reading[name] is None for name in stated) else None
         content = {"command": command_line(), "prior": job.prior, **record}
         how = {"sure": sure, "like": like, "unit": reading["unit"], "record": content, "overwrite": job.overwrite}

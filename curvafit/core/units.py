@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+import unicodedata
 from collections.abc import Sequence
 
 from curvafit.core.checks import quoted
@@ -11,16 +13,18 @@ from curvafit.core.checks import quoted
 METRES = {"nm": 1e-9, "um": 1e-6, "mm": 1e-3, "m": 1.0}
 #: Name of a unit in a file -> (our name, factor to it).
 _UNITS: dict[str, tuple[str, float]] = {
-    **dict.fromkeys(("", "voxel", "voxels", "pixel", "pixels", "px", "unknown", "none", "null"), ("voxel", 1.0)),
-    **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), ("nm", 1.0)),
-    **dict.fromkeys(("a", "å", "angstrom", "angstroms", "ångström"), ("nm", 0.1)),
     **dict.fromkeys(
-        ("um", "µm", "μm", "\\u00b5m", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"),
-        ("um", 1.0),
+        ("", "voxel", "voxels", "pixel", "pixels", "px", "unknown", "none", "null", "reference frame"), ("voxel", 1.0)
+    ),
+    **dict.fromkeys(("pm", "picometer", "picometers", "picometre", "picometres"), ("nm", 1e-3)),
+    **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), ("nm", 1.0)),
+    **dict.fromkeys(("a", "å", "angstrom", "angstroms", "ångström", "ångströms", "ångstrom"), ("nm", 0.1)),
+    **dict.fromkeys(
+        ("um", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"), ("um", 1.0)
     ),
     **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), ("mm", 1.0)),
     **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), ("mm", 10.0)),
-    **dict.fromkeys(("inch", "inches", "in"), ("mm", 25.4)),
+    **dict.fromkeys(("inch", "inches", "in", '"'), ("mm", 25.4)),
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), ("m", 1.0)),
 }
 #: The page that explains words with a special meaning, each under its own anchor.
@@ -31,10 +35,30 @@ _GLUE = "\u00a0"
 
 def parse_unit(unit: str | None) -> tuple[str, float]:
     """Return this package's name of a length unit and the factor to it, or raise ValueError; `"cm"`: `("mm", 10.0)`."""
-    name = "" if unit is None else unit.strip().casefold() if isinstance(unit, str) else None
-    if name not in _UNITS:
+    if not is_unit(unit):
         raise ValueError(f"expected a unit of voxel, nm, um, mm or m, got {quoted(unit)}")
-    return _UNITS[name]
+    return _UNITS[_plain_name(unit)]
+
+
+def is_unit(unit: str | None) -> bool:
+    """Return whether a unit is one that `parse_unit` knows."""
+    return isinstance(unit, str | None) and _plain_name(unit) in _UNITS
+
+
+def common_unit(units: Sequence[str | None]) -> tuple[str | None, tuple[float, ...]]:
+    """Return the last of several units of length, and the factor of each to it.
+
+    Where they have none in common, since one is not known or just some are voxels, all are named, with factors of 1.
+    """
+    if all(map(is_unit, units)) and len({parse_unit(unit)[0] == "voxel" for unit in units}) == 1:
+        return units[-1], tuple(float(f"{convert_length(1.0, unit, units[-1]):.15g}") for unit in units)
+    return " and ".join(dict.fromkeys(map(str, units))), (1.0,) * len(units)
+
+
+def _plain_name(unit: str | None) -> str:
+    """Return a unit's name in small letters, each with one code: that of micro has two, and Java's `\\u00B5`."""
+    text = re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), unit or "")
+    return unicodedata.normalize("NFKC", text.strip().casefold())
 
 
 def convert_length(length: float, unit: str | None, to: str | None) -> float:

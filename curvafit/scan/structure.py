@@ -24,7 +24,7 @@ from skimage.filters import threshold_otsu
 from curvafit.core.checks import SEEDS, check_choice, check_float, check_int
 from curvafit.scan.grids import boxes_by_surface, centre_distance, resample, surface_voxels
 from curvafit.volumes.boxes import boxes_of
-from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.field import Field, ScanError, round_labels
 from curvafit.volumes.formats.part import Box, Crop
 from curvafit.volumes.place import lay
 from curvafit.volumes.read import Source, field_of
@@ -119,7 +119,7 @@ def check_options(kind: str, threshold: float | str, label: int | None = None) -
     otsu = isinstance(threshold, str) and threshold == "otsu"
     level = "otsu" if otsu else check_float(threshold, "a threshold that is a number or 'otsu'")
     if label is not None:
-        check_int(label, "a label that is a whole number", -SEEDS, SEEDS)
+        check_int(label, "a label that is a whole number", -SEEDS, 2 * SEEDS - 1)
         if kind in ("field", "image") or level != "otsu":
             raise ValueError("a label states the structure: leave out kind and threshold, got both")
     if kind in ("field", "mask") and level != "otsu":
@@ -146,15 +146,14 @@ def read_region(
 
 def read_labels(labels: Field, what: str) -> np.ndarray:
     """Return a volume's labels, whole numbers (Z, Y, X); ScanError if all are 0, or the values are grey levels."""
-    values = labels.values
-    if values.dtype.kind == "f":
-        values = values.astype(np.int64)
+    rounded = round_labels(labels.values)
+    values = rounded.astype(np.int64) if rounded.dtype.kind == "f" else rounded
     left, right = values[..., :-1], values[..., 1:]
     pairs = (left != 0) & (right != 0)
     if not values.any():
         raise ScanError(f"expected {what}, got none: every voxel is 0")
     alike = np.count_nonzero(pairs & (left == right)) >= _ALIKE * np.count_nonzero(pairs)
-    if not alike or (values != labels.values).any():
+    if not alike or (values != rounded).any():
         raise ScanError(f"expected {what}, whole numbers that neighbours share, got grey levels")
     return values
 

@@ -21,6 +21,8 @@ TAILS = (0.1, 99.9)
 QUIET, WIDTHS = 1 / 16, (0.7, 3.0)
 #: Least noise, as a share of the contrast; least distance of a probability from 0 and 1.
 LEAST_NOISE, CERTAIN = 0.05, 1e-4
+#: Probabilities may lie so far beyond 0 and 1.
+_STRAY = 1e-3
 #: Contrast, in units of the noise, below which the classes of Otsu's threshold may be noise.
 FAINT = 1.0
 
@@ -111,15 +113,15 @@ def grey_evidence(values: np.ndarray, scan: Field, classes: Classes, known: np.n
 def probability_evidence(probability: Field) -> VoxelEvidence:
     """Return the evidence of probabilities (Z, Y, X): r = log p / (1 - p), and p - 1/2 as level.
 
-    Raises `ScanError` if a value lies outside [0, 1].
+    Values within 1e-3 of [0, 1], as resampling leaves them, are cut to it; raises `ScanError` if one lies farther off.
     """
     values = probability.values.astype(np.float32)
     lowest, highest = float(values.min()), float(values.max())
-    if not 0 <= lowest <= highest <= 1:
+    if not -_STRAY <= lowest <= highest <= 1 + _STRAY:
         source = f" in {probability.source}" if probability.source else ""
         raise ScanError(f"probabilities must lie in [0, 1], got {lowest:g} to {highest:g}{source}")
     p = values.clip(CERTAIN, 1 - CERTAIN)
-    return VoxelEvidence(np.log(p / (1 - p)), values - np.float32(0.5))
+    return VoxelEvidence(np.log(p / (1 - p)), values.clip(0, 1) - np.float32(0.5))
 
 
 def _smooth(values: np.ndarray, scan: Field, width: float) -> np.ndarray:

@@ -75,7 +75,7 @@ from curvafit.segmentation.uncertainty import (
     suggest_slices,
 )
 from curvafit.volumes.boxes import digest_of
-from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.field import Field, ScanError, round_labels
 from curvafit.volumes.formats.part import Box
 from curvafit.volumes.place import lay
 from curvafit.volumes.read import Source, field_of
@@ -181,6 +181,7 @@ def reconstruct(
         If an image is given, and scikit-learn is not installed.
     """
     volume = field_of(slices, **reading)
+    volume = replace(volume, values=round_labels(volume.values))
     check_memory(volume.shape, LEAST_BYTES, "a volume that is filled at once, not in blocks into Zarr,")
     axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
     places, marks, which = _find_known(volume, axis, every, first, known, ignore)
@@ -490,6 +491,7 @@ def reconstruct_labels(
         As `reconstruct`, if it refuses all labels; or if the known slices do not have a label, or none but 0.
     """
     volume = field_of(slices, spacing=spacing, unit=unit)
+    volume = replace(volume, values=round_labels(volume.values))
     axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
     places, marks, misplaced = _find_known(volume, axis, every, first, known, ignore)
     moved = np.moveaxis(volume.values, axis, 0)

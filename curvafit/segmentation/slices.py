@@ -13,7 +13,7 @@ from curvafit.core.checks import check_int
 from curvafit.core.units import format_sampling
 from curvafit.priors.grid import MOST
 from curvafit.scan.grids import centre_distance
-from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.field import Field, ScanError, round_labels
 from curvafit.volumes.formats.part import Box
 
 #: Plain interpolations, the usual one first: signed distances on a cubic spline and on lines; the nearest slice.
@@ -281,6 +281,7 @@ def plane_distances(masks: np.ndarray, spacing: Sequence[float], gap: float) -> 
 def require_labels(values: np.ndarray, name: str, most: float = LABELS) -> np.ndarray:
     """Return the values, or raise ScanError where they are grey levels, or more than `most`; the message calls them
     `name`."""
+    values = round_labels(values)
     if values.dtype.kind == "f" and not np.array_equal(values, np.round(values)):
         raise ScanError(f"{name} must be a mask or labels, got values that are not whole numbers")
     if values.dtype.itemsize > 1 and (count := len(np.unique(values))) > most:

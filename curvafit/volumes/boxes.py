@@ -135,13 +135,14 @@ class InMemory:
 class InFile:
     """The boxes of a volume in a file, as `InMemory` offers them.
 
-    `frame` has zeros for values; `options` are those of reading, and `first` is the volume's first voxel in the file.
+    `frame` has zeros for values; `options` are those of reading, `place` is the channel and the
+    time, and `first` the volume's first voxel in the file.
     """
 
     frame: Field
     path: Path
     options: dict[str, Any]
-    channel: int | None
+    place: Part
     first: tuple[int, ...]
 
     @property
@@ -153,12 +154,12 @@ class InFile:
         files = [path for path in self.path.rglob("*") if path.is_file()] if self.path.is_dir() else [self.path]
         states = [path.stat() for path in files]
         size, time = sum(state.st_size for state in states), max(state.st_mtime_ns for state in states)
-        return f"{self.path.resolve()} {self.channel} {self.first} {self.options}: {size} bytes at {time}"
+        return f"{self.path.resolve()} {self.place} {self.first} {self.options}: {size} bytes at {time}"
 
     def part(self, box: Box) -> np.ndarray:
         """Return the values (Z, Y, X) of a box of voxels."""
         z, y, x = (slice(edge.start + n, edge.stop + n) for edge, n in zip(box, self.first, strict=True))
-        values = _read(self.path, self.options, Part(self.channel, (z, y, x)))[0].values
+        values = _read(self.path, self.options, replace(self.place, crop=(z, y, x)))[0].values
         return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("="))
 
 
@@ -174,15 +175,15 @@ def _empty(field: Field, shape: Sequence[int]) -> Field:
 def _open_file(path: Path, key: str | None, options: dict[str, Any]) -> InFile:
     """Return the boxes of a file; the first voxel is read to know the volume's place."""
     reading = {"key": key, "raw_shape": options.get("raw_shape"), "dtype": options.get("dtype")}
-    channel = options.get("channel")
-    corner, shape = _read(path, reading, Part(channel, _CORNER))
+    place = Part(options.get("channel"), options.get("time"))
+    corner, shape = _read(path, reading, replace(place, crop=_CORNER))
     if options.get("strict") and corner.gaps:
         raise ScanError(f"{path} is not whole: {corner.gaps[0]}")
     box = resolve_box(parse_box(options["crop"]), shape, path)
     first, size = [edge.start for edge in box], [edge.stop - edge.start for edge in box]
     field = to_field(corner, f"{path}::{key}" if key else str(path), options["spacing"], options["unit"])
     frame = _empty(field, size)
-    return InFile(frame if options["crop"] is None else frame.move_origin(first), path, reading, channel, tuple(first))
+    return InFile(frame if options["crop"] is None else frame.move_origin(first), path, reading, place, tuple(first))
 
 
 def _read(path: Path, reading: dict[str, Any], part: Part) -> tuple[Any, tuple[int, ...]]:
@@ -190,5 +191,5 @@ def _read(path: Path, reading: dict[str, Any], part: Part) -> tuple[Any, tuple[i
     read = read_file(path, part=part, **reading)
     assert read.whole is not None
     shape = read.whole
-    space = part.index(shape, read.channels, path)[1]
+    space = part.index(shape, read.axes, path)[1]
     return take_part(read, part, path)[0], tuple(shape[axis] for axis in space)

@@ -84,11 +84,11 @@ class Field(Pictured):
 
     def label(self, label: int) -> Field:
         """Return the mask of the voxels with this value; none or all of them are a ScanError."""
-        label = check_int(label, "a label that is a whole number", -SEEDS, SEEDS)
-        mask = self.values == label
+        label = check_int(label, "a label that is a whole number", -SEEDS, 2 * SEEDS - 1)
+        mask = round_labels(self.values) == label
         if mask.all() or not mask.any():
             values = np.unique(self.values)
-            listed = ", ".join(f"{float(value):g}" for value in values[:12]) + (", …" if len(values) > 12 else "")
+            listed = ", ".join(map(str, values[:12].tolist())) + (", …" if len(values) > 12 else "")
             fault = "is the only label" if mask.any() else "is no label"
             raise ScanError(f"label {label} {fault} of the scan, which has {listed}")
         return replace(self, values=mask, notes=(*self.notes, f"The structure is label {label}."))
@@ -99,6 +99,12 @@ class Field(Pictured):
         affine[:3, 3] += affine[:3, :3] @ np.array(start[::-1], dtype=np.float64)
         ends = (f"{first}:{first + n}" for first, n in zip(start, self.shape, strict=True))
         return replace(self, affine=affine, notes=(*self.notes, f"Voxels {', '.join(ends)} (z, y, x) are used."))
+
+
+def round_labels(values: np.ndarray) -> np.ndarray:
+    """Return floats within 1e-3 of whole numbers, as resampled labels are, as whole ones; all else as it is."""
+    whole = np.rint(values) if values.dtype.kind == "f" else values
+    return whole if whole is values or np.allclose(values, whole, rtol=0, atol=1e-3) else values
 
 
 def positive_triple(spacing: object) -> tuple[float, float, float]:

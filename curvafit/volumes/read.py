@@ -19,7 +19,7 @@ import torch
 
 from curvafit.core.checks import quoted
 from curvafit.core.runtime import one_line
-from curvafit.core.units import parse_unit
+from curvafit.core.units import is_unit, parse_unit
 from curvafit.volumes.field import Field, positive_triple
 from curvafit.volumes.formats.arrays import read_hdf5, read_imaris, read_npy, read_npz, read_raw
 from curvafit.volumes.formats.base import Damaged, Raw, ScanError, check_regular, collect_complaints
@@ -63,6 +63,7 @@ def load(
     spacing: Sequence[float] | float | None = None,
     unit: str | None = None,
     channel: int | None = None,
+    time: int | None = None,
     label: int | None = None,
     crop: Crop | None = None,
     raw_shape: Sequence[int] | None = None,
@@ -83,9 +84,9 @@ def load(
     spacing, unit
         Voxel edges (z, y, x), or one for all, and nm, um, mm or m, in place of what the file says. A `unit` alone
         renames the file's numbers; it does not convert them.
-    channel
-        The channel to read, counted from 0, from a file of several. Colours, times and components of vectors are
-        channels too.
+    channel, time
+        The channel and the time to read, counted from 0, from a file of several. Colours and components of vectors are
+        channels, and so are times in a file without channels.
     label
         The voxels that have this value, as a mask.
     crop
@@ -98,7 +99,7 @@ def load(
         slices that a folder's numbers skip. Without `strict` a note tells of such parts.
     """
     location, key = split_key(path, key)
-    part = Part(channel, parse_box(crop))
+    part = Part(channel, time, parse_box(crop))
     read = read_file(location, key, raw_shape, dtype, None if part == Part() else part)
     raw, start = take_part(read, part, location)
     if strict and raw.gaps:
@@ -273,9 +274,13 @@ def _check_finite(values: np.ndarray, place: object) -> tuple[float, float]:
 def to_field(raw: Raw, source: str, spacing: Sequence[float] | float | None, unit: str | None) -> Field:
     """Return the values in native byte order, with the spacing and unit of the caller or, by default, of the file."""
     notes = [*raw.gaps, *raw.notes, *(() if spacing is not None or unit is not None else raw.guesses)]
+    if unit is None and not is_unit(raw.unit):
+        raise ScanError(f"{source} states lengths in {quoted(raw.unit)}, which is not known: give --spacing and --unit")
+    unread = unit is not None and (spacing is not None or not is_unit(raw.unit))
     try:
-        file_unit, factor = ("voxel", 1.0) if spacing is not None and unit is not None else parse_unit(raw.unit)
+        file_unit, factor = ("voxel", 1.0) if unread else parse_unit(raw.unit)
         name, renamed = (file_unit, 1.0) if unit is None else parse_unit(unit)
+        stated = None if spacing is not None or raw.spacing is None else positive_triple(raw.spacing)
     except ValueError as reason:
         raise ScanError(f"{reason} for {source}") from None
     if spacing is not None:
@@ -284,8 +289,8 @@ def to_field(raw: Raw, source: str, spacing: Sequence[float] | float | None, uni
             unit is None and name == "voxel" and edges.min() != 1
         ):  # edges of which the finest is 1 are ratios, in voxels of that one
             raise ScanError(f"expected the unit of the spacing {quoted(spacing)} of {source}, such as mm, got none")
-    elif raw.spacing is not None:
-        edges = factor * np.array(positive_triple(raw.spacing))
+    elif stated is not None:
+        edges = factor * np.array(stated)
     else:
         edges = np.ones(3)
         counted = "counted in voxels" if name == "voxel" else f"those of voxels of 1 {name}"

@@ -8,13 +8,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from curvafit.core.files import temporary_folder, write_atomically
 from curvafit.core.records import can_write, is_own_zarr
+from curvafit.volumes.field import Field
 from curvafit.volumes.formats.arrays import write_npy
-from curvafit.volumes.formats.base import ScanError
+from curvafit.volumes.formats.base import ScanError, smallest_type
 from curvafit.volumes.formats.medical import check_mrc, write_mrc
 from curvafit.volumes.formats.nifti import write_nifti
-from curvafit.volumes.formats.tiff import write_ome_tiff, write_tiff
+from curvafit.volumes.formats.tiff import check_ome_tiff, write_ome_tiff, write_tiff
 from curvafit.volumes.formats.zarr import add_labels, image_of, mark, store_of, write_labels, write_zarr
 from curvafit.volumes.read import Source, field_of
 
@@ -49,8 +52,9 @@ def save(
     store that `save` wrote with the same `kind`, or with `overwrite`.
 
     NIfTI keeps the affine (qform and sform) and the unit. TIFF (ImageJ's or OME's metadata), MRC (in Å) and Zarr
-    (OME-Zarr 0.5, with halved copies of a large volume) keep spacing, unit and the first voxel's place. NPY keeps the
-    values only. A path `IMAGE/labels/NAME` in an image of OME-Zarr 0.4 or 0.5 gets labels on that image's voxels.
+    (OME-Zarr 0.5, with halved copies of a large volume) keep spacing and unit, Zarr the first voxel's place, too. NPY
+    keeps the values only. TIFF has 64-bit whole numbers in the least type that holds them, float16 as float32. A path
+    `IMAGE/labels/NAME` in an image of OME-Zarr 0.4 or 0.5 gets labels on that image's voxels.
 
     Raises ValueError if the suffix is unknown, the format cannot hold the values' type or needs a unit and the volume
     has none, the source is not a volume, or another folder has that name.
@@ -68,7 +72,7 @@ def save(
     """
     field = field_of(source, spacing=spacing, unit=unit)
     target = Path(path)
-    writer = pick_writer(target, field.unit)
+    writer = pick_writer(target, field.unit, field.values)
     can_write(target, lambda there: not there.is_dir() or is_own_zarr(there, kind), overwrite=overwrite)
 
     def write(temporary: Path) -> None:
@@ -84,13 +88,26 @@ def save(
         return add_labels(work / target.name, image, target.name)
 
 
-def pick_writer(path: Path, unit: str) -> Callable[[Any, Path], None]:
-    """Return the writer of a file by its suffix, or of labels, if the format can hold lengths in `unit`."""
+def pick_writer(path: Path, unit: str, values: np.ndarray | None = None) -> Callable[[Any, Path], None]:
+    """Return the writer of a file by its suffix, or of labels, if the format can hold lengths in `unit` and `values`.
+
+    For a check before the work, `values` may be an array of their type with the least and the greatest of them.
+    """
     if (image := image_of(path)) is not None:
         return partial(write_labels, image=image)
     suffix = next((known for known in WRITERS if path.name.lower().endswith(known)), None)
     if suffix is None:
         raise ScanError(f"a volume's name must end in one of {', '.join(WRITERS)}, got {path.name!r}")
     if suffix == ".mrc":
-        check_mrc(unit)
+        check_mrc(unit, values)
+    if suffix.startswith(".ome.tif") and values is not None:
+        check_ome_tiff(values)
+    if values is not None and values.dtype.itemsize > 8 and suffix != ".npy":
+        raise ScanError(f"{suffix} holds numbers of at most 64 bits, got {values.dtype}")
     return WRITERS[suffix]
+
+
+def check_labels(path: str | Path, labels: Field) -> None:
+    """Raise ScanError, before the work, if a format cannot hold labels as large as these."""
+    limits = np.array([labels.values.min(), labels.values.max()])
+    pick_writer(Path(path), labels.unit, limits.astype(smallest_type(limits)))

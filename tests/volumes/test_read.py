@@ -327,6 +327,7 @@ def test_dicom_slices_are_ordered_by_position(tmp_path: Path) -> None:
     pydicom = pytest.importorskip("pydicom")
     for number in (0, 1, 2, 3):
         write_dicom(pydicom, tmp_path / f"{9 - number}.dcm", ramp(dtype="uint16")[number], 2.5 * number)
+    (tmp_path / "._9.dcm").write_bytes(bytes(300))  # the Finder's
     field = load(tmp_path)
     assert np.array_equal(field.values, ramp() * 2 - 10)
     assert (field.spacing, field.unit) == ((2.5, 0.5, 0.25), "mm")

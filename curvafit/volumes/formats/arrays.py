@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -13,6 +14,7 @@ import numpy as np
 from curvafit.core.checks import quoted
 from curvafit.core.records import read_member
 from curvafit.volumes.formats.base import (
+    UNNAMED,
     Damaged,
     Raw,
     ScanError,
@@ -22,7 +24,7 @@ from curvafit.volumes.formats.base import (
     pick_key,
     read_spacing,
 )
-from curvafit.volumes.formats.part import Part, read_part
+from curvafit.volumes.formats.part import Part, name_axes, read_part
 
 #: Attributes that may state a spacing or its unit.
 _ATTRIBUTES = ("element_size_um", "spacing", "voxel_size", "unit", "units")
@@ -51,7 +53,7 @@ def read_npz(path: Path, *, key: str | None = None, **_: object) -> Raw:
 
 
 def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
-    """Read a dataset, with the spacing and unit of its attributes (`element_size_um`, or `spacing` and `unit`)."""
+    """Read a dataset, with spacing and unit (`element_size_um`, or `spacing` and `unit`) and ilastik's axes."""
     import h5py
 
     with h5py.File(path, "r") as file:
@@ -60,7 +62,9 @@ def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, *
         attributes = {name: dataset.attrs[name] for name in _ATTRIBUTES if name in dataset.attrs}
         spacing, unit = read_spacing(attributes, dataset.ndim)
         gaps = tuple(_gaps(dataset, path))
-        return read_part(dataset, part, path)._replace(spacing=spacing, unit=unit, gaps=gaps)
+        tags = json.loads(dataset.attrs["axistags"])["axes"] if "axistags" in dataset.attrs else []
+        axes = name_axes([tag["key"] for tag in tags], path) if len(tags) == dataset.ndim else UNNAMED
+        return read_part(dataset, part, path, axes)._replace(spacing=spacing, unit=unit, gaps=gaps)
 
 
 def read_imaris(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
@@ -81,7 +85,7 @@ def read_imaris(path: Path, *, key: str | None = None, part: Part | None = None,
         ends = [[float(_read_text(image, f"Ext{end}{k}")) for k in (2, 1, 0)] for end in ("Min", "Max")]
         if len(dataset.shape) != 3 or not all(0 < n <= stored for n, stored in zip(shape, dataset.shape, strict=True)):
             raise Damaged(f"{shape} voxels by its header, {list(dataset.shape)} in the file")
-        index = (part or Part()).index(shape, None, path)[0]
+        index = (part or Part()).index(shape, UNNAMED, path)[0]
         check_array([edge.stop - edge.start for edge in index], dataset.dtype, path)
         spacing = tuple((last - first) / n for first, last, n in zip(*ends, shape, strict=True))
         unit = _read_text(image, "Unit") if "Unit" in image.attrs else "um"

@@ -31,13 +31,24 @@ class Damaged(Exception):
     """A fault of a file; `read_file` makes a sentence of it that names the file."""
 
 
+class Axes(NamedTuple):
+    """The axes of channels and of times of a file's array, where the file names them."""
+
+    channel: int | None = None
+    time: int | None = None
+
+
+#: No axis has a name.
+UNNAMED = Axes()
+
+
 class Raw(NamedTuple):
     """The content of a file: an array with z first, and spacing, unit and affine where the file states them.
 
     `spacing` has one number per axis of `values`, or three for (z, y, x). `guesses` are sentences on a spacing or unit
     that the file does not state; they do not hold where the caller states them. `gaps` are sentences on values that the
-    file lacks and that were filled in. `channels` is the axis of channels, where the file names one. Where `values` are
-    only a part of the file's array, `whole` is the shape of the array, which has as many axes.
+    file lacks and that were filled in. `axes` are those of channels and times. Where `values` are only a part of the
+    file's array, `whole` is the shape of the array, which has as many axes.
     """
 
     values: np.ndarray
@@ -47,7 +58,7 @@ class Raw(NamedTuple):
     notes: tuple[str, ...] = ()
     guesses: tuple[str, ...] = ()
     gaps: tuple[str, ...] = ()
-    channels: int | None = None
+    axes: Axes = UNNAMED
     whole: tuple[int, ...] | None = None
 
 
@@ -119,6 +130,13 @@ def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype, place: obje
         held = size if size < values.nbytes else "more"
         raise Damaged(f"{values.nbytes} bytes of values by its header, {held} in the file")
     return values.reshape(shape)
+
+
+def smallest_type(values: np.ndarray) -> np.dtype:
+    """Return the smallest type of whole numbers that holds those of an array."""
+    low, high = int(values.min(initial=0)), int(values.max(initial=0))
+    kinds = map(np.dtype, ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64"))
+    return next((kind for kind in kinds if np.iinfo(kind).min <= low and high <= np.iinfo(kind).max), np.dtype("int64"))
 
 
 def map_numbers(path: Path, start: int, shape: Sequence[int], dtype: np.dtype, tail: bool = False) -> np.ndarray:

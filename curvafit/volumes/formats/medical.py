@@ -15,8 +15,9 @@ from typing import IO, Any
 import numpy as np
 
 from curvafit.core.extras import require
-from curvafit.core.units import convert_length
+from curvafit.core.units import common_unit, convert_length
 from curvafit.volumes.formats.base import (
+    Axes,
     Damaged,
     Raw,
     ScanError,
@@ -52,6 +53,8 @@ _META_TYPES = {
 }
 #: What a MetaImage may write for True, and the most bytes of its header.
 _TRUE, _HEADER = ("true", "t", "1"), 1 << 16
+#: IMOD's stamp, from byte 152 on: its flags follow, the first of which says that bytes are signed.
+_IMOD = 1146047817
 #: From DICOM's and ITK's patient frame (left, posterior, superior) to NIfTI's (right, anterior, superior).
 _LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -62,21 +65,26 @@ def read_nrrd(path: Path, **_: object) -> Raw:
     with path.open("rb") as file:
         header = nrrd.read_header(file)
         values = _nrrd_values(nrrd, header, file, path)
-    channels = _channel_axis(header)
-    units = header.get("space units") or header.get("units")
-    unit = next((u for u in units if u), None) if units is not None else None
+    axes = _other_axes(header)
+    units = list(header.get("space units", header.get("units", ())))
+    unit, factors = common_unit([each or next(filter(None, units), None) for each in units] or [None])
     if "space directions" in header:
         directions = np.asarray(header["space directions"], dtype=np.float64)
         directions = directions[~np.isnan(directions).any(axis=1)]
         affine = np.eye(4)
         affine[:3, :3] = directions.T
         affine[:3, 3] = header.get("space origin", np.zeros(3))
+        if len(factors) == 3:  # one for each axis of the world, x first
+            affine[:3] *= np.array(factors)[:, None]
         if str(header.get("space", "")).startswith("left-posterior"):
             affine = _LPS_TO_RAS @ affine
-        return Raw(values, tuple(np.linalg.norm(directions, axis=1)[::-1]), unit or "mm", affine, channels=channels)
+        spacing = tuple(np.linalg.norm(affine[:3, :3], axis=0)[::-1])
+        return Raw(values, spacing, unit or "mm", affine, axes=axes)
     if "spacings" in header:
-        return Raw(values, tuple(float(h) for h in header["spacings"])[::-1], unit, channels=channels)
-    return Raw(values, channels=channels)
+        sizes = np.array(header["spacings"], dtype=np.float64)
+        sizes *= factors if len(factors) == len(sizes) else 1.0
+        return Raw(values, tuple(sizes[::-1].tolist()), unit, axes=axes)
+    return Raw(values, axes=axes)
 
 
 def _nrrd_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path) -> np.ndarray:
@@ -105,15 +113,16 @@ def _nrrd_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path)
     return read_numbers(stream, shape, dtype, path)
 
 
-def _channel_axis(header: dict[str, Any]) -> int | None:
-    """Return the axis of the values, z first, that is not one of space; None where there is not just one."""
-    axes = int(header["dimension"])
+def _other_axes(header: dict[str, Any]) -> Axes:
+    """Return the axis of the values, z first, that is not one of space, where there is just one."""
+    count, kinds = int(header["dimension"]), [str(kind).lower() for kind in header.get("kinds", ())]
     if "space directions" in header:
         directions = np.asarray(header["space directions"], dtype=np.float64)
         other = [bool(np.isnan(each).any()) for each in directions]
     else:
-        other = [str(kind).lower() not in ("domain", "space", "none", "???") for kind in header.get("kinds", ())]
-    return axes - 1 - other.index(True) if sum(other) == 1 and len(other) == axes else None
+        other = [kind not in ("domain", "space", "none", "???") for kind in kinds]
+    axis = count - 1 - other.index(True) if sum(other) == 1 and len(other) == count else None
+    return Axes(None, axis) if "time" in kinds else Axes(axis)
 
 
 def read_metaimage(path: Path, **_: object) -> Raw:
@@ -156,7 +165,7 @@ def _meta_image(header: dict[str, str], file: IO[bytes], path: Path) -> Raw:
         affine[:3, 3] = origin[:3]
         affine = _LPS_TO_RAS @ affine
     channel_axis = axes if values.ndim > axes else 0 if axes == 4 else None
-    return Raw(values, tuple(spacing[::-1].tolist()), "mm", affine, channels=channel_axis)
+    return Raw(values, tuple(spacing[::-1].tolist()), "mm", affine, axes=Axes(channel_axis))
 
 
 def _meta_values(header: dict[str, str], shape: list[int], file: IO[bytes], path: Path) -> np.ndarray:
@@ -205,26 +214,32 @@ def read_mrc(path: Path, **_: object) -> Raw:
         header, size = file.header, file.voxel_size
         shape, dtype = mrcfile.utils.data_shape_from_header(header), mrcfile.utils.data_dtype_from_header(header)
         start = header.nbytes + int(header.nsymbt)
-    values = map_numbers(path, start, [int(n) for n in shape], dtype)
-    raw = read_part(values, None, path, channels=0 if values.ndim == 4 else None)
+        stamp, flags = np.frombuffer(header.extra2.tobytes()[40:48], header.mode.dtype)
+    values, notes = map_numbers(path, start, [int(n) for n in shape], dtype), ()
+    # Bytes are signed, as is standard, unless IMOD's stamp says otherwise, or the header's maximum is above theirs.
+    if dtype == np.int8 and (not flags & 1 if stamp == _IMOD else header.dmax > 127):
+        values = values.view(np.uint8)
+        guess = "The bytes are taken for numbers from 0 to 255, as the header's maximum is above 127."
+        notes = () if stamp == _IMOD else (guess,)
+    raw = read_part(values, None, path, axes=Axes(0 if values.ndim == 4 else None))
     spacing = (float(size.z), float(size.y), float(size.x))
-    return raw._replace(spacing=spacing if min(spacing) > 0 else None, unit="angstrom")
+    return raw._replace(spacing=spacing if min(spacing) > 0 else None, unit="angstrom", notes=notes)
 
 
-def check_mrc(unit: str) -> None:
-    """Raise ScanError if lengths have no unit, and ImportError without the library, before `write_mrc`."""
+def check_mrc(unit: str, values: np.ndarray | None = None) -> None:
+    """Raise ScanError if lengths have no unit or values no type of MRC's, and ImportError without the library, before
+    `write_mrc`."""
     require("mrcfile", "io", "reading and writing MRC files")
     if unit == "voxel":
         raise ScanError("an MRC file holds voxel sizes in Å: give the unit, nm, um, mm or m")
+    if values is not None and values.dtype.kind in "iu" and values.dtype.itemsize > 2:
+        raise ScanError(f"an MRC file holds whole numbers of at most 16 bits or floats, got {values.dtype}")
 
 
 def write_mrc(field: Any, path: Path) -> None:
     """Write a volume with its voxel sizes in Å; instead of float64, bool, uint8 write float32, int8, uint16."""
-    check_mrc(field.unit)
     kind = {"bool": "int8", "float64": "float32", "uint8": "uint16"}.get(field.values.dtype.name)
     values = field.values if kind is None else field.values.astype(kind)
-    if values.dtype.name not in ("int8", "int16", "uint16", "float16", "float32"):
-        raise ScanError(f"an MRC file holds whole numbers of at most 16 bits or floats, got {values.dtype}")
     with require("mrcfile", "io", "reading and writing MRC files").new(path, values, overwrite=True) as file:
         file.voxel_size = tuple(convert_length(h, field.unit, "angstrom") for h in field.spacing[::-1])
 
@@ -232,23 +247,32 @@ def write_mrc(field: Any, path: Path) -> None:
 def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     """Read a folder of slices in the order of their positions; `key` is the UID of a series, if there are several."""
     pydicom = require("pydicom", "io", "reading DICOM folders")
-    files = sorted(p for p in path.iterdir() if p.is_file() and (is_dicom(p) or p.suffix.lower() in _DICOM))
+    inside = sorted(p for p in path.iterdir() if p.is_file() and not p.name.startswith("."))
+    files = [p for p in inside if is_dicom(p) or p.suffix.lower() in _DICOM]
     with collect_complaints("pydicom"):
         images = [image for file in files if (image := _read_slice(pydicom, file)) is not None]
     series = sorted({str(image.get("SeriesInstanceUID", "")) for image in images})
     uid = pick_key(series, key, path)
     slices = [image for image in images if str(image.get("SeriesInstanceUID", "")) == uid]
+    if frames := next((int(n) for image in slices if (n := image.get("NumberOfFrames") or 1) > 1), None):
+        raise ScanError(f"a DICOM series must have a file a slice, got {frames} frames in a file of {path}")
+    if not all("ImagePositionPatient" in image and "ImageOrientationPatient" in image for image in slices):
+        slices.sort(key=lambda image: image.InstanceNumber)
+        note = "The slices state no position: they are stacked in the order of their numbers."
+        return _stack_planes(slices)._replace(notes=(note,))
     rows, columns = np.array(slices[0].ImageOrientationPatient, dtype=float).reshape(2, 3)
     normal = np.cross(rows, columns)
     slices.sort(key=lambda image: float(np.dot(normal, np.array(image.ImagePositionPatient, dtype=float))))
-    with collect_complaints("pydicom"):
-        values = np.stack([_read_plane(image) for image in slices])
+    for name in ("ImageOrientationPatient", "PixelSpacing"):
+        numbers = np.array([image[name].value for image in slices], dtype=float)
+        if np.ptp(numbers, axis=0).max() > 1e-3 * np.abs(numbers).max():
+            raise ScanError(f"DICOM slices must have one {name}, got several in {path}")
     z, origin = _slice_distance(slices, normal, path)
     y, x = (float(h) for h in slices[0].PixelSpacing)
     affine = np.eye(4)
     affine[:3, :3] = np.column_stack([rows * x, columns * y, normal * z])
     affine[:3, 3] = origin
-    return Raw(values, (z, y, x), "mm", _LPS_TO_RAS @ affine, channels=3 if values.ndim == 4 else None)
+    return _stack_planes(slices)._replace(spacing=(z, y, x), unit="mm", affine=_LPS_TO_RAS @ affine)
 
 
 def _read_slice(pydicom: Any, file: Path) -> Any:
@@ -270,11 +294,16 @@ def is_dicom(path: Path) -> bool:
         return stream.read(132)[128:] == b"DICM"
 
 
-def _read_plane(image: Any) -> np.ndarray:
-    """Return a slice's pixels, with its slope and intercept applied."""
-    slope, intercept = float(image.get("RescaleSlope", 1)), float(image.get("RescaleIntercept", 0))
-    values = image.pixel_array
-    return values if (slope, intercept) == (1, 0) else (values * slope + intercept).astype(np.float32)
+def _stack_planes(slices: list[Any]) -> Raw:
+    """Return the slices' pixels, with slope and intercept applied."""
+    planes = []
+    with collect_complaints("pydicom"):
+        for image in slices:
+            slope, intercept = float(image.get("RescaleSlope", 1)), float(image.get("RescaleIntercept", 0))
+            plane = image.pixel_array
+            planes.append(plane if (slope, intercept) == (1, 0) else (plane * slope + intercept).astype(np.float32))
+    values = np.stack(planes)
+    return Raw(values, axes=Axes(3 if values.ndim == 4 else None))
 
 
 def _slice_distance(slices: list[Any], normal: np.ndarray, path: Path) -> tuple[float, np.ndarray]:
@@ -286,4 +315,8 @@ def _slice_distance(slices: list[Any], normal: np.ndarray, path: Path) -> tuple[
     if steps.min() <= 0 or np.ptp(steps) > 0.05 * steps.mean():
         range_text = f"steps of {steps.min():.4g} to {steps.max():.4g} mm"
         raise ScanError(f"DICOM slices must be evenly spaced, got {range_text} in {path}")
+    # A shear of 2 % turns normals by a degree; rounded positions differ by far less.
+    aside = float(np.linalg.norm(np.cross(positions[-1] - positions[0], normal)))
+    if aside > 0.02 * np.ptp(positions @ normal):
+        raise ScanError(f"DICOM slices must lie above each other, the last is {aside:.3g} mm aside in {path} (a tilt)")
     return float(steps.mean()), positions[0]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.units import parse_unit
-from curvafit.volumes.formats.base import Raw, ScanError, collect_complaints, map_numbers, read_numbers
+from curvafit.volumes.formats.base import Axes, Raw, ScanError, collect_complaints, map_numbers, read_numbers
 from curvafit.volumes.formats.part import Part, read_part
 
 #: Bytes of one member of a compressed file.
@@ -68,15 +68,18 @@ def _values(image: Any, path: Path, part: Part | None) -> Raw:
 
     proxy, compression = image.dataobj, path.name.lower().endswith(".gz")
     shape = proxy.shape[::-1]
-    # NIfTI does not name its axes: one beyond space, of more than one entry, is that of channels.
+    # Of axes beyond space NIfTI's fourth is time, but programs use it for channels: it is that of channels where no
+    # other has more than one entry, unless the header has a unit of time.
     long = [axis for axis, n in enumerate(shape[:-3]) if n != 1]
-    channels = long[0] if len(long) == 1 else None
+    timed = len(long) > 1 or image.header.get_xyzt_units()[1] in ("sec", "msec", "usec")
+    time = long[-1] if long and long[-1] == len(shape) - 4 and timed else None
+    axes = Axes(next((axis for axis in long if axis != time), None), time)
     if part is not None and not compression:
-        raw = read_part(map_numbers(path, proxy.offset, shape, proxy.dtype), part, path, channels)
+        raw = read_part(map_numbers(path, proxy.offset, shape, proxy.dtype), part, path, axes)
     else:
         with gzip.open(path) if compression else path.open("rb") as stream:
             stream.seek(proxy.offset)
-            raw = Raw(read_numbers(stream, shape, proxy.dtype, path), channels=channels)
+            raw = Raw(read_numbers(stream, shape, proxy.dtype, path), axes=axes)
     values = apply_read_scaling(raw.values, np.asanyarray(proxy.slope), np.asanyarray(proxy.inter))
     return raw._replace(values=values)
 

@@ -1,4 +1,4 @@
-"""A part of a file's array: one channel of several, and a box of voxels."""
+"""A part of a file's array: one channel and one time of several, and a box of voxels."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.checks import SEEDS, check_int, quoted
-from curvafit.volumes.formats.base import Raw, ScanError, check_array
+from curvafit.volumes.formats.base import UNNAMED, Axes, Raw, ScanError, check_array
 
 #: A box of voxels along (z, y, x).
 Box = tuple[slice, slice, slice]
@@ -22,72 +22,90 @@ Crop = str | Sequence[slice]
 
 @dataclass(frozen=True)
 class Part:
-    """A channel, counted from 0, and a box of a file's array; None stands for all."""
+    """A channel and a time, counted from 0, and a box of a file's array; None stands for all."""
 
     channel: int | None = None
+    time: int | None = None
     crop: Box | None = None
 
-    def index(
-        self, shape: Sequence[int], channels: int | None, place: object
-    ) -> tuple[tuple[slice, ...], tuple[int, ...]]:
+    def index(self, shape: Sequence[int], axes: Axes, place: object) -> tuple[tuple[slice, ...], tuple[int, ...]]:
         """Return the slices, one per axis, that take this part of an array in a file, and the axes z, y and x.
 
         Parameters
         ----------
         shape
             Shape of the whole array, z before y before x.
-        channels
-            The axis of channels, if the file names it. Among four axes without names, it is the shorter one of the
-            first and the last.
+        axes
+            The axes of channels and times, if the file names them. Among four axes without names, that of channels is
+            the shorter one of the first and the last.
         """
-        long = [axis for axis, n in enumerate(shape) if n != 1]
-        channels = self._channel_axis(shape, channels, long, place)
-        space = [axis for axis in long if axis != channels]
+        picked = self._pick(shape, axes, place)
+        space = [axis for axis, n in enumerate(shape) if n != 1 and axis not in picked]
         if len(space) != 3:
             got = "no values" if 0 in shape else f"{len(space)}D of shape {tuple(shape)}"
-            hint = "; a channel, counted from 0, picks one volume of several" if len(space) == 4 == len(long) else ""
+            hint = "; a channel, counted from 0, picks one volume of several" if len(space) == 4 and not picked else ""
             raise ScanError(f"a volume must be 3D, got {got} in {place}{hint}")
+        missing = {name: shape[axis] for axis, (name, number) in picked.items() if number is None and shape[axis] > 1}
+        if missing:
+            held = " of ".join(f"{count} {name}s" for name, count in missing.items())
+            asked = " and ".join(f"a {name} from 0 to {count - 1}" for name, count in missing.items())
+            raise ScanError(f"{place} holds {held}: choose {asked}")
         index = [slice(0, n) for n in shape]
-        if channels is not None and self.channel is not None:
-            index[channels] = slice(self.channel, self.channel + 1)
+        for axis, (_, number) in picked.items():
+            index[axis] = slice(number or 0, (number or 0) + 1)
         box = resolve_box(self.crop, [shape[axis] for axis in space], place)
         for axis, edge in zip(space, box, strict=True):
             index[axis] = edge
         return tuple(index), tuple(space)
 
-    def _channel_axis(
-        self, shape: Sequence[int], channels: int | None, long: Sequence[int], place: object
-    ) -> int | None:
-        """Return the axis of channels, or None; raise ScanError if the channel does not fit it."""
-        if self.channel is None:
-            if channels in long:
-                count = shape[channels]  # type: ignore[index]
-                raise ScanError(f"{place} holds {count} channels: choose a channel from 0 to {count - 1}")
-            return channels
-        if channels is None and len(long) == 4:
-            channels = long[0] if shape[long[0]] <= shape[long[-1]] else long[-1]
-        if channels is None:
-            raise ScanError(f"{place} holds a single channel, got channel {quoted(self.channel)}")
-        count = shape[channels]
-        if not 0 <= check_int(self.channel, "a channel that is a whole number from 0", -SEEDS, SEEDS) < count:
-            raise ScanError(f"channel must be from 0 to {count - 1} for {place}, got {self.channel}")
-        return channels
+    def _pick(self, shape: Sequence[int], axes: Axes, place: object) -> dict[int, tuple[str, int | None]]:
+        """Return the axes that are not of space, each with its name and the number that is asked for, if one is."""
+        channel, time = axes
+        long = [axis for axis, n in enumerate(shape) if n != 1]
+        if channel is None and self.channel is not None:
+            if time is not None and self.time is None:  # the channels are the times
+                channel, time = time, None
+            elif len(rest := [axis for axis in long if axis != time]) == 4:
+                channel = rest[0] if shape[rest[0]] <= shape[rest[-1]] else rest[-1]
+        picked: dict[int, tuple[str, int | None]] = {}
+        for name, axis, number in (("channel", channel, self.channel), ("time", time, self.time)):
+            if axis is None and number is not None:
+                raise ScanError(f"{place} holds a single {name}, got {name} {quoted(number)}")
+            count = 1 if axis is None else shape[axis]
+            if (
+                not 0
+                <= check_int(number or 0, f"a {name} that is a whole number from 0", -SEEDS, SEEDS)
+                < max(count, 1)
+            ):
+                raise ScanError(f"{name} must be from 0 to {count - 1} for {place}, got {number}")
+            if axis is not None:
+                picked[axis] = name, number
+        return picked
 
 
-def read_part(array: Any, part: Part | None, place: object, channels: int | None = None) -> Raw:
+def name_axes(names: Sequence[str], place: object) -> Axes:
+    """Return the axes `c` and `t` of an array whose axes have names; ScanError where x, y and z are in other order."""
+    space = [name for name in names if name in ("z", "y", "x")]
+    if space != sorted(space, reverse=True):
+        raise ScanError(f"axes must be in the order z, y, x, got {''.join(names)[:20]} in {place}")
+    channel, time = (names.index(name) if name in names else None for name in "ct")
+    return Axes(channel, time)
+
+
+def read_part(array: Any, part: Part | None, place: object, axes: Axes = UNNAMED) -> Raw:
     """Read an array that is not in memory (a dataset, a mapped file), or a part of it."""
-    values = array[index_of(array, part, place, channels)]
+    values = array[index_of(array, part, place, axes)]
     if isinstance(values, np.memmap):
         values = np.array(values)
-    return Raw(np.asarray(values), channels=channels, whole=None if part is None else tuple(array.shape))
+    return Raw(np.asarray(values), axes=axes, whole=None if part is None else tuple(array.shape))
 
 
-def index_of(array: Any, part: Part | None, place: object, channels: int | None = None) -> Any:
+def index_of(array: Any, part: Part | None, place: object, axes: Axes = UNNAMED) -> Any:
     """Return the index of a part of an array, or of the whole; raise ScanError if it does not fit into memory."""
     if part is None:
         check_array(array.shape, array.dtype, place)
         return ...
-    index, _ = part.index(array.shape, channels, place)
+    index, _ = part.index(array.shape, axes, place)
     check_array([edge.stop - edge.start for edge in index], array.dtype, place)
     return index
 
@@ -97,12 +115,13 @@ def take_part(raw: Raw, part: Part, place: object) -> tuple[Raw, tuple[int, ...]
     if raw.values.dtype.kind not in "biuf":
         raise ScanError(f"a volume must hold real numbers, got values of type {raw.values.dtype} in {place}")
     shape = raw.values.shape if raw.whole is None else raw.whole
-    index, space = part.index(shape, raw.channels, place)
+    index, space = part.index(shape, raw.axes, place)
     values, spacing = raw.values[index] if raw.whole is None else raw.values, raw.spacing
     if spacing is not None and len(spacing) == len(shape):
         spacing = tuple(spacing[axis] for axis in space)
     volume = values.reshape([values.shape[axis] for axis in space])
-    notes = raw.notes if part.channel is None else (*raw.notes, f"Channel {part.channel} is used.")
+    numbers = {"Channel": part.channel, "Time": part.time}
+    notes = (*raw.notes, *(f"{name} {n} is used." for name, n in numbers.items() if n is not None))
     return raw._replace(values=volume, spacing=spacing, notes=notes), tuple(index[axis].start for axis in space)
 
 

@@ -4,15 +4,24 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 import numpy as np
 
-from curvafit.core.units import convert_length, parse_unit
-from curvafit.volumes.formats.base import Damaged, Raw, ScanError, check_array, check_regular, collect_complaints
+from curvafit.core.units import common_unit, is_unit, parse_unit
+from curvafit.volumes.formats.base import (
+    Axes,
+    Damaged,
+    Raw,
+    ScanError,
+    check_array,
+    check_regular,
+    collect_complaints,
+    smallest_type,
+)
 
 if TYPE_CHECKING:
     import tifffile
@@ -43,49 +52,69 @@ def read_tiff(path: Path, **_: object) -> Raw:
         _check_pages(file, series)
         values = np.asarray(series.asarray())
         spacing, unit, guesses = _read_spacing(file)
-        channels, guess = _channel_axis(series)
+        axes, guess = _other_axes(series)
+        values, calibration = _calibrate(values, file.imagej_metadata or {})
         count = len(file.series)
     tags = [text for text in messages if text.startswith("<TiffTag")]
     if losses := [text for text in messages if text not in tags and _LOST.search(text)]:
         raise Damaged(losses[0])
     notes = (f"The file holds {count} images: the first is used.",) if count > 1 else ()
     notes += (f"{len(tags)} of the file's tags cannot be read: what they state is not known.",) if tags else ()
-    return Raw(values, spacing, unit, notes=(*notes, *guess), guesses=guesses, channels=channels)
+    return Raw(values, spacing, unit, notes=(*notes, *guess, *calibration), guesses=guesses, axes=axes)
 
 
-def _channel_axis(series: tifffile.TiffPageSeries) -> tuple[int | None, tuple[str, ...]]:
-    """Return the axis of colours or channels, and a note. In a series of three axes channels are taken for slices."""
-    channel_axes = [axis for axis, name in enumerate(series.axes) if name in "SC" and series.shape[axis] != 1]
-    axis = channel_axes[-1] if channel_axes else None
-    if axis is None or series.axes[axis] == "S" or sum(n != 1 for n in series.shape) != 3:
-        return axis, ()
-    return None, (f"The file calls an axis of {series.shape[axis]} channels: it is taken for slices.",)
+def _other_axes(series: tifffile.TiffPageSeries) -> tuple[Axes, tuple[str, ...]]:
+    """Return the axes of colours or channels and of times. In a series of three axes they are taken for slices."""
+    long = {name: axis for axis, name in enumerate(series.axes) if series.shape[axis] != 1}
+    axes = Axes(long.get("S", long.get("C")), long.get("T"))
+    named = [name for name in ("S" if "S" in long else "C", "T") if name in long]
+    if named[-1:] in ([], ["S"]) or sum(n != 1 for n in series.shape) - len(named) != 2:
+        return axes, ()
+    what = "times" if named[-1] == "T" else "channels"
+    note = f"The file calls an axis of {series.shape[long[named[-1]]]} {what}: it is taken for slices."
+    return Axes(axes.channel if len(named) == 2 else None), (note,)
+
+
+def _calibrate(values: np.ndarray, metadata: Mapping[str, Any]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Apply ImageJ's straight calibration of grey values, c0 + c1 v, as it does; a note tells of a curved one."""
+    function, c0, c1 = metadata.get("cf", 0), metadata.get("c0"), metadata.get("c1")
+    if function not in (0, 20):  # 20 is none
+        return values, (f"ImageJ's calibration of grey values, its function {function}, is not applied.",)
+    if values.dtype.kind not in "iu" or c0 is None or not c1 or (c0, c1) == (0, 1) or function == 20:
+        return values, ()
+    grey = np.maximum(values * np.float64(c1) + float(c0), 0 if metadata.get("zeroclip") else -np.inf)
+    whole = float(c0).is_integer() and float(c1).is_integer()  # labels stay whole numbers
+    return grey.astype(smallest_type(grey) if whole else np.float32), ()
 
 
 def read_slices(path: Path, **_: object) -> Raw:
     """Read a folder of 2D slices in the natural order of their names, with the pixel size of the first slice."""
-    names = sorted((p for p in path.iterdir() if p.suffix.lower() in SLICES), key=lambda p: natural_key(p.name))
+    files = (p for p in path.iterdir() if p.suffix.lower() in SLICES and not p.name.startswith("."))
+    names = sorted(files, key=lambda p: natural_key(p.name))
     first, slices = None, []
     for name in names:
         raw = read_tiff(check_regular(name))
         first, plane = first or raw, _squeeze_plane(raw)
         slices.append(plane)
-        if plane.ndim != 2 + (raw.channels is not None) or plane.shape != slices[0].shape:
+        if plane.ndim != 2 + (raw.axes.channel is not None) or plane.shape != slices[0].shape:
             raise ScanError(
                 f"slices must be 2D and of one shape {slices[0].shape}, got {plane.shape} in {name.name} of {path}"
             )
     assert first is not None
-    channels = None if first.channels is None else 3
-    return first._replace(
-        values=np.stack(slices), gaps=_skipped_numbers([name.stem for name in names]), channels=channels
-    )
+    axes, notes = Axes(None if first.axes.channel is None else 3), first.notes
+    kinds = {str(plane.dtype): name.name for name, plane in zip(names[::-1], slices[::-1], strict=True)}
+    if len(kinds) > 1:
+        listed = ", ".join(f"{kind} in {name}" for kind, name in kinds.items())
+        notes += (f"The slices differ in type, {listed}: their values may not be of one scale.",)
+    gaps = _skipped_numbers([name.stem for name in names])
+    return first._replace(values=np.stack(slices), gaps=gaps, axes=axes, notes=notes)
 
 
 def _squeeze_plane(raw: Raw) -> np.ndarray:
     """Return a slice (Y, X), or (Y, X, channels)."""
-    if raw.channels is None:
+    if raw.axes.channel is None:
         return np.squeeze(raw.values)
-    values = np.moveaxis(raw.values, raw.channels, -1)
+    values = np.moveaxis(raw.values, raw.axes.channel, -1)
     return values.reshape([*(n for n in values.shape[:-1] if n != 1), values.shape[-1]])
 
 
@@ -123,10 +152,11 @@ def _check_pages(file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> No
 
 
 def write_tiff(field: Any, path: Path) -> None:
-    """Write a TIFF with ImageJ's metadata, or with OME's where ImageJ lacks the type or cannot hold the size."""
+    """Write a TIFF with ImageJ's metadata, with OME's where ImageJ lacks the type or cannot hold the size, or plainly
+    where OME lacks the type, too."""
     import tifffile
 
-    values, (z, y, x) = _to_tiff(field), field.spacing
+    values, (z, y, x) = _to_tiff(field.values), field.spacing
     fits = values.nbytes < _IMAGEJ_LIMIT and max(1 / x, 1 / y) < _RESOLUTION_LIMIT
     if values.dtype in (np.uint8, np.uint16, np.float32) and fits:
         exact = {"curvafit_spacing": f"{z!r},{y!r},{x!r}", "curvafit_unit": field.unit}
@@ -135,8 +165,10 @@ def write_tiff(field: Any, path: Path) -> None:
         tifffile.imwrite(
             path, values, photometric="minisblack", imagej=True, resolution=(1 / x, 1 / y), metadata=metadata
         )
-    else:
+    elif values.dtype.kind == "f" or values.dtype.itemsize < 8:
         write_ome_tiff(field, path)
+    else:
+        tifffile.imwrite(path, values, photometric="minisblack", metadata={"spacing": (z, y, x), "unit": field.unit})
 
 
 def write_ome_tiff(field: Any, path: Path) -> None:
@@ -146,12 +178,22 @@ def write_ome_tiff(field: Any, path: Path) -> None:
     sizes = {f"PhysicalSize{axis}": h for axis, h in zip("ZYX", field.spacing, strict=True)}
     units = {f"PhysicalSize{axis}Unit": {"um": "µm", "voxel": "pixel"}.get(field.unit, field.unit) for axis in "ZYX"}
     metadata = {"axes": "ZYX", **sizes, **units}
-    tifffile.imwrite(path, _to_tiff(field), photometric="minisblack", ome=True, metadata=metadata)
+    tifffile.imwrite(path, _to_tiff(field.values), photometric="minisblack", ome=True, metadata=metadata)
 
 
-def _to_tiff(field: Any) -> np.ndarray:
-    """Return the values as a TIFF holds them: bytes for a mask."""
-    return field.values.view(np.uint8) if field.values.dtype == bool else field.values
+def check_ome_tiff(values: np.ndarray) -> None:
+    """Raise ScanError if values are whole numbers that need 64 bits, before `write_ome_tiff`."""
+    if (kind := _to_tiff(values).dtype).kind in "iu" and kind.itemsize > 4:
+        raise ScanError(f"an OME-TIFF holds whole numbers of at most 32 bits, got {kind}: name it .tif")
+
+
+def _to_tiff(values: np.ndarray) -> np.ndarray:
+    """Return values as a TIFF holds them: bytes for a mask, float32 for float16, the least type for 64-bit numbers."""
+    if values.dtype == bool:
+        return values.view(np.uint8)
+    if values.dtype.kind in "iu" and values.dtype.itemsize > 4:
+        return values.astype(smallest_type(values))
+    return values.astype(np.float32) if values.dtype == np.float16 else values
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
@@ -162,13 +204,13 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
 def _read_spacing(file: tifffile.TiffFile) -> _Spacing:
     """Return spacing, unit and notes on what is assumed, from the description or, without one, the tags."""
     if file.is_ome and file.ome_metadata:
-        return _from_ome(file.ome_metadata)
+        nodes = ElementTree.fromstring(file.ome_metadata).iter()
+        return _from_sizes(next((node.attrib for node in nodes if node.tag.endswith("Pixels")), {}))
     description: dict[str, Any] = dict(file.imagej_metadata or (file.shaped_metadata or ({},))[0])
     if "curvafit_spacing" in description:
         return tuple(float(h) for h in description["curvafit_spacing"].split(",")), description["curvafit_unit"], ()
     if "PhysicalSizeX" in description:
-        sizes = tuple(float(description.get(f"PhysicalSize{axis}", description["PhysicalSizeX"])) for axis in "ZYX")
-        return sizes, description.get("unit", description.get("PhysicalSizeXUnit", "um")), ()
+        return _from_sizes(description)
     if file.is_imagej:
         return _from_imagej(file, description)
     return _from_description(description) if "spacing" in description else _from_tags(file)
@@ -184,33 +226,35 @@ def _from_description(description: dict[str, Any]) -> _Spacing:
     return sizes[:1] * 3, unit, (note,)
 
 
-def _from_ome(text: str) -> _Spacing:
-    """Return spacing and unit of OME's XML; an axis without a size has that of x."""
-    pixels = next((node for node in ElementTree.fromstring(text).iter() if node.tag.endswith("Pixels")), None)
-    if pixels is None or "PhysicalSizeX" not in pixels.attrib:
+def _from_sizes(pixels: Mapping[str, Any]) -> _Spacing:
+    """Return spacing, unit and a note from OME's sizes, where 0 is not known; an axis without a size has that of x."""
+    sizes = {axis: float(pixels.get(f"PhysicalSize{axis}", 0)) for axis in "ZYX"}
+    if not sizes["X"]:
         return None, None, ()
-    unit = pixels.get("PhysicalSizeXUnit", "um")
-    sizes = []
-    for axis in "ZYX":
-        source = axis if f"PhysicalSize{axis}" in pixels.attrib else "X"
-        size = float(pixels.attrib[f"PhysicalSize{source}"])
-        sizes.append(convert_length(size, pixels.get(f"PhysicalSize{source}Unit", "um"), unit))
-    return tuple(sizes), unit, ()
+    axes = [axis if sizes[axis] else "X" for axis in "ZYX"]
+    names = [pixels.get("unit", pixels.get(f"PhysicalSize{axis}Unit", "um")) for axis in axes]
+    unit, factors = common_unit(names)
+    guesses = (_NO_DISTANCE,) if not sizes["Z"] and int(pixels.get("SizeZ", 1)) > 1 else ()
+    if "reference frame" in names:
+        guesses += ("The file states sizes in a reference frame, not in a unit of length: they are taken for voxels.",)
+    return tuple(f * sizes[axis] for f, axis in zip(factors, axes, strict=True)), unit, guesses
 
 
 def _from_imagej(file: tifffile.TiffFile, description: dict[str, Any]) -> _Spacing:
     """Return spacing, unit and a note from ImageJ's description.
 
-    `spacing` is the distance of slices, and the resolution tags count pixels per `unit`. Without a unit only the
-    proportions have a meaning: lengths are then in pixels along x.
+    `spacing` is the distance of slices in `zunit`, and the resolution tags count pixels per `unit`, or `yunit`. Without
+    a unit only the proportions have a meaning: lengths are then in pixels along x.
     """
     y, x = _pixels_per_unit(file)
-    unit = description.get("unit")
-    if parse_unit(unit)[0] == "voxel":
-        sizes = (abs(float(description.get("spacing", 1 / x))) * x, x / y, 1.0)
+    z = abs(float(description.get("spacing") or 0))
+    units = [description.get(f"{axis}unit", description.get("unit")) for axis in "zyx"]
+    unit, (fz, fy, fx) = common_unit(units if z else [units[2], *units[1:]])
+    sizes = (fz * (z or 1 / x), fy / y, fx / x)
+    if is_unit(unit) and parse_unit(unit)[0] == "voxel":
+        sizes = (sizes[0] * x, x / y, 1.0)
         return (None if np.allclose(sizes, 1) else sizes), None, ()
-    z = abs(float(description.get("spacing", 1 / x)))
-    return (z, 1 / y, 1 / x), unit, () if "spacing" in description else (_NO_DISTANCE,)
+    return sizes, unit, () if z else (_NO_DISTANCE,)
 
 
 def _from_tags(file: tifffile.TiffFile) -> _Spacing:

@@ -18,8 +18,8 @@ from curvafit.core.files import move_into_place, write_content
 from curvafit.core.records import MARK, is_zarr
 from curvafit.core.runtime import hold_signals
 from curvafit.core.units import format_sampling, parse_unit
-from curvafit.volumes.formats.base import Damaged, Raw, ScanError, pick_key, read_spacing
-from curvafit.volumes.formats.part import Box, Part, cut_boxes, index_of, read_part
+from curvafit.volumes.formats.base import UNNAMED, Axes, Damaged, Raw, ScanError, pick_key, read_spacing
+from curvafit.volumes.formats.part import Box, Part, cut_boxes, index_of, name_axes, read_part
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
 CHUNK = 64
@@ -34,11 +34,11 @@ _FORMATS = {"0.4": 2, "0.5": 3}
 
 
 class _Place(NamedTuple):
-    """Where an array's voxels lie: spacing and first voxel along all axes, unit and axis of channels, where known."""
+    """Where an array's voxels lie: spacing and first voxel along all axes, unit and named axes, where known."""
 
     spacing: tuple[Any, ...] | None = None
     unit: Any = None
-    channels: int | None = None
+    axes: Axes = UNNAMED
     first: tuple[float, ...] | None = None
 
     @property
@@ -112,9 +112,9 @@ def _pick_array(node: Any, key: str | None, path: Path) -> tuple[dict[str, Any],
 
 def _read_array(array: Any, folder: Path, place: _Place, part: Part | None) -> Raw:
     """Return the values of an array in a folder, with a sentence on chunks that are not stored."""
-    index_of(array, part, folder, place.channels)  # before chunks are counted: a header may claim any number of them
+    index_of(array, part, folder, place.axes)  # before chunks are counted: a header may claim any number of them
     gaps = _missing_chunks(array, folder)
-    raw = read_part(array, part, folder, place.channels)
+    raw = read_part(array, part, folder, place.axes)
     return raw._replace(spacing=place.spacing, unit=place.unit, affine=place.affine, gaps=gaps)
 
 
@@ -171,7 +171,7 @@ def create_zarr(
         group.create_array(
             str(k),
             shape=shape,
-            dtype=dtype.newbyteorder("="),
+            dtype=np.dtype(dtype.newbyteorder("=").str),  # of the two 64-bit types of C, Zarr knows one
             chunks=tuple(min(chunk, n) for n in shape),
             **naming,
         )
@@ -331,7 +331,8 @@ def _levels(name: str, attributes: Mapping[str, Any]) -> dict[str, _Place]:
     image = next(iter(attributes.get("ome", attributes).get("multiscales") or []), {})
     axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", [])]
     unit = axes[-1].get("unit") if axes else None
-    channels = next((k for k, axis in enumerate(axes) if axis.get("type", axis.get("name")) in ("channel", "c")), None)
+    letters = {"channel": "c", "time": "t"}
+    kinds = name_axes([letters.get(str(axis.get("type")), str(axis.get("name"))) for axis in axes], name or "the image")
     places: dict[str, _Place] = {}
     for level in image.get("datasets", []):
         scale, first = None, None
@@ -343,7 +344,7 @@ def _levels(name: str, attributes: Mapping[str, Any]) -> dict[str, _Place]:
             elif step.get("type") == "translation":
                 first = np.array(step["translation"], dtype=np.float64) + (0.0 if first is None else first)
         spacing, corner = (None if each is None else tuple(each.tolist()) for each in (scale, first))
-        places[f"{name}/{level['path']}".strip("/")] = _Place(spacing, unit, channels, corner)
+        places[f"{name}/{level['path']}".strip("/")] = _Place(spacing, unit, kinds, corner)
     return places
 
 
