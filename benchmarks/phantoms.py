@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from functools import cache, partial
@@ -31,7 +32,7 @@ from benchmarks.rivals import run_elsewhere
 from curvafit.generation.flow import generate
 from curvafit.geometry.diagram import Diagram, family_shares
 from curvafit.geometry.morphometry import local_thickness
-from curvafit.scan.measure import measure
+from curvafit.scan.measure import measure, measure_surface
 from curvafit.scan.prepare import prepare
 from curvafit.volumes.field import Field
 
@@ -41,6 +42,9 @@ PLACES = {4: 3, 5: 1, 6: 3, 8: 1, 16: 1}
 OBLIQUE = np.array([1, 2, 2]) / 3
 #: Families whose shares are compared.
 SHOWN = ("spheres", "layers", "tubes")
+#: Windows of a texture, and the deviations of the Gaussians that make textures, in voxels.
+WINDOWS = {"cubes_16": (16, 16, 16), "cubes_32": (32, 32, 32), "slices_8": (8, 96, 96), "slices_16": (16, 96, 96)}
+WIDTHS = {"fine": 1.8, "middle": 2.5, "coarse": 4.0}
 #: Area of the nodal gyroid in the box, by marching cubes on 160³ points.
 GYROID_AREA = 3.0919 * EDGE**2
 #: A package's module, and how its map of thickness, or its numbers, come from a mask.
@@ -187,6 +191,31 @@ def shares(thickness: int) -> Values:
     return found
 
 
+def windows(width: float) -> Values:
+    """Return the surface density of windows over that of all, means over windows and four textures, by their shape.
+
+    Textures of 96³ voxels are level sets of smoothed noise that fill 31 % and do not repeat.
+    """
+    found: dict[str, list[float]] = {name: [] for name in WINDOWS}
+    for seed in range(4):
+        noise = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal((108,) * 3), width)[
+            (slice(6, -6),) * 3
+        ]
+        mask = noise > np.quantile(noise, 0.69)
+        whole = surface_density(mask)
+        for name, shape in WINDOWS.items():
+            parts = itertools.product(*(range(0, 96, n) for n in shape))
+            boxes = (tuple(slice(a, a + n) for a, n in zip(part, shape, strict=True)) for part in parts)
+            found[name].append(float(np.mean([surface_density(mask[box]) for box in boxes]) / whole))
+    return {name: float(np.mean(values)) for name, values in found.items()}
+
+
+def surface_density(mask: np.ndarray) -> float:
+    if mask.all() or not mask.any():
+        return 0.0
+    return float(measure_surface(mask, (1.0, 1.0, 1.0), False)[1][:, 0].sum()) / mask.size
+
+
 def truths(name: str) -> Values:
     """Return volume, area, χ and ∫H dA of a phantom in the box; of the sheet by Steiner, with ∫K dA = -16π."""
     A, R, r, L, π = GYROID_AREA, 1.5, 0.5, 3 * EDGE, math.pi
@@ -312,6 +341,7 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
             for thickness in PLACES for column in ("curvafit", "bonej", *(name for name in PACKAGES if packages[name]))
             if thickness == 8 or column not in AT_EIGHT}  # fmt: skip
     by_family = cases.all({f"shares-{thickness}": partial(shares, thickness) for thickness in (8, 16)})
+    in_windows = cases.all({f"windows-{name}": partial(windows, width) for name, width in WIDTHS.items()})
     tables = cases.all(dict(list(jobs.items())[:2]) if options.quick else jobs)
     failed = {name: f"no interpreter has {PACKAGES[name][0]}" for name in PACKAGES if not packages[name]}
     failed |= {name: values["failed"] for name, values in tables.items() if "failed" in values}
@@ -319,6 +349,8 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
                for name, found in by_family.items() for phantom, pairs in found.items()
                for family, pair in zip(SHOWN, pairs, strict=True)
                for column in ("truth", f"at_{name.removeprefix('shares-')}")}  # fmt: skip
+    figures |= {f"phantom_windows.{shape}.{name.removeprefix('windows-')}": Figure(share)
+                for name, found in in_windows.items() for shape, share in found.items()}  # fmt: skip
     for name, values in tables.items():
         column, _, thickness = name.partition("-")
         for phantom in {} if name in failed else values:

@@ -30,7 +30,7 @@ def infer(
     method: Annotated[str, typer.Option(help="posterior, or match: the nearest shape, refined.")] = "posterior",
     fast: Annotated[bool, typer.Option("--fast", help="Seconds, not minutes: nothing is grown or checked.")] = False,
     test: Annotated[bool, typer.Option(help="Grow shapes to test whether the law can have made the scan.")] = True,
-    roi: Annotated[Path | None, typer.Option(help="Mask of the region to measure, of the scan's shape.")] = None,
+    roi: Annotated[Path | None, typer.Option(help="Mask of the region to measure, placed by its affine.")] = None,
     *,
     structure: Structure,
     reading: Reading,

@@ -34,7 +34,7 @@ def measure(
         typer.Option("-o", "--output", help="Table (.csv .json .parquet), or a folder for page, figures, table."),
     ] = None,
     roi: Annotated[
-        Path | None, typer.Option(help="Region to measure, of the scan's shape; each label by itself.")
+        Path | None, typer.Option(help="Region to measure, placed by its affine; each label by itself.")
     ] = None,
     labels: Annotated[bool, typer.Option("--labels", help="Scans are label images: measure each instance.")] = False,
     subjects: Annotated[

@@ -88,7 +88,8 @@ def format_number(value: float | None, digits: int = 3) -> str:
 def format_sampling(shape: Sequence[int], spacing: Sequence[float], unit: str = "") -> str:
     """Return the number and the size of voxels (z, y, x) as text; three equal edges are written once."""
     edges = " x ".join(f"{h:.4g}" for h in spacing[: 1 if len(set(spacing)) == 1 else 3])
-    return f"{' x '.join(map(str, shape))} voxels of {edges} {unit}".rstrip()
+    size = "" if (edges, unit) == ("1", "voxel") else f" of {edges} {unit}".rstrip()
+    return f"{' x '.join(map(str, shape))} voxels{size}"
 
 
 def format_percent(share: float) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,12 +54,15 @@ def surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Surface:
     nowhere crosses the level.
     """
     values = _as_volume(u, grid)
-    if grid.periodic:
-        values = np.pad(values, (0, 1), mode="wrap")
+    return march(np.pad(values, (0, 1), mode="wrap") if grid.periodic else values, grid.spacing, level)
+
+
+def march(values: np.ndarray, spacing: Sequence[float], level: float = 0.0) -> Surface:
+    """Return the level set of finite values (Z, Y, X), two or more along each axis, as `surface` does of a window."""
     low, high = float(values.min()), float(values.max())
     if not low < level < high:
         raise NoSurface(f"expected a field that crosses {level:g}, got values from {low:g} to {high:g}")
-    vertices, faces, _, _ = marching_cubes(values, level, spacing=grid.spacing, gradient_direction="descent")
+    vertices, faces, _, _ = marching_cubes(values, level, spacing=spacing, gradient_direction="descent")
     return Surface(vertices.astype(np.float64), faces.astype(np.int64))
 
 

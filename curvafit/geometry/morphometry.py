@@ -9,6 +9,7 @@ radius is left out.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -17,12 +18,14 @@ from scipy import ndimage
 
 from curvafit.core.schema import Rule
 from curvafit.geometry.balls import ball_radii, paint_balls, paint_coarse_balls
-from curvafit.geometry.mesh import Surface, areas, surface
+from curvafit.geometry.mesh import Surface, areas, march
 from curvafit.geometry.topology import euler_number, euler_of_window
-from curvafit.priors.grid import Grid
 
 #: Voxels that the Gaussian reaches which smooths a mask's stairs.
 SOFTENED = 3
+#: The part of a mask's slope with which it goes on beyond a window's faces. Windows of 16³ voxels of Gaussian level
+#: sets then have the whole's area to 0.5 %; with none 1.5 % less.
+SLOPE = 0.6
 #: How far a periodic box is continued before distances are taken, in voxels: at first, and where balls are wider.
 _WRAPPED = (16, 32)
 
@@ -57,8 +60,8 @@ def morphometry(
     and its Euler number is its share of the whole's (`topology.euler_of_window`).
 
     Of the result, `euler` is 26-connected, and a window's share rounded; `surface_to_volume` is the area by marching
-    cubes over the structure's volume, in 1/unit; `connectivity_density` is (1 - χ) over the box's volume, or over that
-    between the centres of a window's outer voxels, in 1/unit³.
+    cubes (`border_weights`) over the structure's volume, in 1/unit; `connectivity_density` is (1 - χ) over the box's
+    volume, or over that between the centres of a window's outer voxels, in 1/unit³.
     """
     mask = np.asarray(mask, dtype=bool)
     edges = (spacing, spacing, spacing) if isinstance(spacing, (int, float)) else spacing
@@ -70,6 +73,8 @@ def morphometry(
     voxel = math.prod(edges)
     thickness = local_thickness(mask, edges, periodic=periodic)[mask]
     gap = local_thickness(~mask, edges, periodic=periodic)[~mask]
+    mesh = smooth_surface(mask, edges, periodic=periodic)
+    weights = 1.0 if periodic else border_weights(mesh.barycentres / np.array(edges), mask.shape)
     euler, connectivity = measure_connectivity(mask, edges, periodic=periodic)
     return Morphometry(
         volume_fraction=filled / mask.size,
@@ -78,7 +83,7 @@ def morphometry(
         spacing_mean=float(gap.mean(dtype=np.float64)),
         connectivity_density=connectivity,
         euler=round(euler),
-        surface_to_volume=float(areas(smooth_surface(mask, edges, periodic=periodic)).sum()) / (filled * voxel),
+        surface_to_volume=float((areas(mesh) * weights).sum()) / (filled * voxel),
         unit=unit,
     )
 
@@ -133,9 +138,30 @@ def smooth_surface(mask: np.ndarray, spacing: tuple[float, float, float], *, per
     soft = soften(mask, periodic)
     if not soft.min() < 0.5 < soft.max():
         soft = mask.astype(np.float32)
-    return surface(soft, Grid(mask.shape, spacing, "periodic" if periodic else "replicate"), 0.5)  # type: ignore[arg-type]
+    return march(np.pad(soft, (0, 1), mode="wrap") if periodic else soft, spacing, 0.5)
 
 
 def soften(mask: np.ndarray, periodic: bool = False) -> np.ndarray:
-    """Return a mask after the Gaussian of `smooth_surface`, float32; it reaches `SOFTENED` voxels."""
-    return ndimage.gaussian_filter(mask.astype(np.float32), 0.7, mode="wrap" if periodic else "nearest")
+    """Return a mask after the Gaussian of `smooth_surface`, float32; it reaches `SOFTENED` voxels.
+
+    Beyond a window's faces the mask goes on with a part of its slope there (`SLOPE`): without, the surface would meet
+    the faces upright.
+    """
+    mask = mask.astype(np.float32)
+    if periodic:
+        return ndimage.gaussian_filter(mask, 0.7, mode="wrap")
+    flat, steep = np.pad(mask, SOFTENED, "edge"), np.pad(mask, SOFTENED, "reflect", reflect_type="odd")
+    inner = tuple(slice(SOFTENED, SOFTENED + n) for n in mask.shape)
+    return np.ascontiguousarray(ndimage.gaussian_filter(flat + SLOPE * (steep - flat), 0.7)[inner])
+
+
+def border_weights(places: np.ndarray, shape: Sequence[int]) -> np.ndarray:
+    """Return how much triangles at places (M, 3), in voxels from the first centre, count in a window of a shape.
+
+    A mesh ends at the centres of the outer voxels. What lies between those and the next ones stands for the half voxel
+    beyond, too: so the area is that of all voxels, on average over windows.
+    """
+    weights = np.ones(len(places))
+    for at, n in zip(places.T, shape, strict=True):
+        weights *= 1 + 0.5 * (at < 1) + 0.5 * (at > n - 2)
+    return weights

@@ -34,10 +34,10 @@ from curvafit.priors.law import Law
 from curvafit.priors.profile import phase_field
 from curvafit.scan.measure import scan_diagram
 from curvafit.scan.prepare import HALF, NOISE, Prepared, coarser_level, prepare, read_scan, why_no_texture
-from curvafit.scan.structure import check_options, is_rounded, sample_mask
+from curvafit.scan.structure import check_options, is_rounded, read_region, sample_mask
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Crop
-from curvafit.volumes.read import Source, field_of
+from curvafit.volumes.read import Source
 
 #: Number of nearest shapes, and of those from which stationarity starts.
 MATCHES, STARTS = 5, 3
@@ -170,9 +170,7 @@ def infer(
     progress("reading the scan", 0.0)
     atlas = atlas if isinstance(atlas, Atlas) else load_atlas(atlas)
     posterior = posterior if isinstance(posterior, Posterior) else load_posterior(posterior)
-    region = None if roi is None else field_of(roi)
-    region = region if region is None or crop is None else region.crop(crop)
-    how = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark, "roi": region}
+    how = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark, "roi": roi}
     volume, shape, prepared = _read_and_prepare(scan, label, crop, how, reading)
     progress("measuring curvature", 0.05)
     measured = None if prepared.noise else scan_diagram(prepared)
@@ -284,6 +282,9 @@ def _read_and_prepare(
     that level, and the scan prepared."""
     whole = options["roi"] is not None or options["periodic"]
     volume, shape = read_scan(scan, label=label, crop=crop, whole=whole, **reading)
+    if (roi := options["roi"]) is not None:
+        region, laid = read_region(roi, volume, scan, crop, **reading)
+        volume, options = replace(volume, notes=volume.notes + laid), {**options, "roi": region}
     prepared = prepare(volume, one_scale=True, **options)
     if crop is None and label is None and volume.shape != shape:
         level = coarser_level(scan, shape, prepared, **reading)

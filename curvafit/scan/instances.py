@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from curvafit.core.runtime import Progress, silent
-from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram
+from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.geometry.topology import euler_number
 from curvafit.priors.grid import WORKING_SPACING
@@ -25,6 +25,7 @@ from curvafit.scan.measure import (
     find_direction,
     measure_curvatures,
     measure_surface,
+    no_curvature,
 )
 from curvafit.scan.prepare import prepare
 from curvafit.scan.structure import read_labels
@@ -88,8 +89,7 @@ def _measure_body(field: Field, numbers: np.ndarray, number: int, box: Box, labe
         (curved, drawn), notes = measure_curvatures(prepared), prepared.notes
         drawn = drawn.thin(BIN_WIDTH / prepared.working_voxel * WORKING_SPACING, TAIL_SHARE)  # there may be thousands
     except ValueError as reason:  # too thin, or without a surface away from the image's borders
-        curved = np.zeros((0, 3)), np.zeros((0, len(SUMS) - SUMS.index("curved")))
-        drawn, notes = Diagram(np.zeros((0, 2)), np.zeros(0), f"1/{field.unit}"), (f"No curvature: {reason}.",)
+        curved, drawn, notes = no_curvature(field.unit, reason)
     surface = measure_surface(mask, field.spacing, False)
     empty = np.zeros_like(thickness)
     maps = Maps(field.spacing, False, mask, thickness, empty, empty, surface, curved, drawn, "mask", notes)

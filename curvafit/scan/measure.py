@@ -22,12 +22,12 @@ from curvafit.core.units import convert_length, format_number, format_sampling, 
 from curvafit.geometry.descriptors import descriptors
 from curvafit.geometry.diagram import FAMILIES, MARGIN, Diagram, diagram, families
 from curvafit.geometry.mesh import NoSurface, Surface, area_vectors
-from curvafit.geometry.morphometry import local_thickness, measure_connectivity, smooth_surface
+from curvafit.geometry.morphometry import border_weights, local_thickness, measure_connectivity, smooth_surface
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.scan.grids import median_thickness, remove_specks
-from curvafit.scan.prepare import LARGEST_WINDOW, WORKED, Prepared, prepare, smallest_piece
-from curvafit.scan.structure import check_options, find_structure, is_rounded, read_labels, region_of_interest
+from curvafit.scan.prepare import LARGEST_WINDOW, WORKED, Prepared, TooLarge, prepare, smallest_piece
+from curvafit.scan.structure import check_options, find_structure, is_rounded, read_labels, read_region
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box
 from curvafit.volumes.read import Source, field_of
@@ -48,6 +48,11 @@ READ = 56
 LEAST, MOST, PERIODS = 8, 6, 1.0
 #: The most labels of a region of interest.
 MOST_COMPARTMENTS = 100
+#: Slices from which on a scan without curvature is refused, and why one of fewer has the other numbers alone.
+FEWEST_SLICES = 10
+TOO_THIN = f"it needs {FEWEST_SLICES} slices or more, or a surface away from the borders of fewer"
+#: The note on specks and pinholes.
+DROPPED = "Dropped what is smaller than a ball of half the median thickness (specks: {}, pinholes: {})."
 #: How sure intervals are.
 SURE = 0.95
 
@@ -231,7 +236,9 @@ def measure(
     field = field_of(scan, **reading)
     options = {"threshold": threshold, "dark": dark, "periodic": periodic}
     check_memory(field.shape, WORKED, "a scan in one piece")
-    labels = None if roi is None else _read_compartments(roi, field, reading.get("crop"))
+    labels, laid = (None, ()) if roi is None else _read_compartments(roi, field, scan, **reading)
+    field = replace(field, notes=(*field.notes, *laid))
+    options["imaged"] = None if labels is None else labels != 0
     maps = measure_maps(field, kind, options, progress, memory() // WORKED)
     blocks = maps.divide()
     if labels is None:
@@ -243,15 +250,15 @@ def measure(
     return replace(summarise(field, maps, replace(blocks, region=labels != 0)), compartments=parts)
 
 
-def _read_compartments(roi: Source, field: Field, crop: Any) -> np.ndarray:
-    """Return the labels of a region, of the scan's shape, or raise ScanError."""
-    region = field_of(roi)
-    region = region if crop is None else region.crop(crop)
-    region_of_interest(region, field)
+def _read_compartments(
+    roi: Source, field: Field, scan: Source, label: int | None = None, **reading: Any
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the labels of a region on the scan's voxels, and a note on how it was laid, or raise ScanError."""
+    region, notes = read_region(roi, field, scan, **reading)
     labels = read_labels(region, "a region of interest with labels")
     if (count := len(np.unique(labels))) > MOST_COMPARTMENTS:
         raise ScanError(f"expected at most {MOST_COMPARTMENTS} labels in a region of interest, got {count}")
-    return labels
+    return labels, notes
 
 
 def summarise(field: Field, maps: Maps, blocks: Blocks, part: tuple[str, int] | None = None) -> Measures:
@@ -352,7 +359,8 @@ class Maps(NamedTuple):
 def measure_maps(
     field: Field, kind: str, options: dict[str, Any], progress: Progress = silent, most: int | None = None
 ) -> Maps:
-    """Measure what is summed of a scan; `options` are the threshold, dark and periodic of `measure`, as are errors.
+    """Measure what is summed of a scan; `options` are the threshold, dark and periodic of `measure`, as are errors, and
+    where a padded scan was `imaged`.
 
     Curvature is that of all of the scan if it has at most `most` working voxels, else TooLarge is raised; by default a
     large scan's curvature is that of a part (`prepare.prepare`).
@@ -362,8 +370,14 @@ def measure_maps(
     mask, seen, notes = _find_structure(field, kind, options)
     sampling = format_sampling(field.shape, field.spacing, field.unit)
     progress("measuring curvature", 0.1)
-    prepared = prepare(field, kind=seen, most=most, **options)  # type: ignore[arg-type]
-    curved, diagram = measure_curvatures(prepared)
+    try:
+        prepared = prepare(field, kind=seen, most=most, **options)  # type: ignore[arg-type]
+        curved, diagram = measure_curvatures(prepared)
+        working = tuple(f"Of curvature: {note}" for note in prepared.notes if note not in notes)
+    except ValueError as reason:
+        if isinstance(reason, TooLarge) or min(field.shape) >= FEWEST_SLICES:
+            raise
+        curved, diagram, working = no_curvature(field.unit, TOO_THIN)
     progress("measuring thickness", 0.5)
     thickness, gap = (local_thickness(each, field.spacing, periodic=periodic) for each in (mask, ~mask))
     return Maps(
@@ -376,9 +390,16 @@ def measure_maps(
         surface=measure_surface(mask, field.spacing, periodic),
         curved=curved,
         diagram=diagram,
-        kind=prepared.kind,
-        notes=(f"{sampling}.", *notes, *(f"Of curvature: {note}" for note in prepared.notes if note not in notes)),
+        kind=seen,
+        notes=(f"{sampling}.", *notes, *working),
     )
+
+
+def no_curvature(unit: str, reason: object) -> tuple[tuple[np.ndarray, np.ndarray], Diagram, tuple[str, ...]]:
+    """Return what stands for curvatures that are not known, as `Maps.curved` and a diagram, and a note on why."""
+    columns = np.zeros((0, len(SUMS) - SUMS.index("curved")))
+    drawn = Diagram(np.zeros((0, 2)), np.zeros(0), f"1/{unit}", places=np.zeros((0, 3)))
+    return (np.zeros((0, 3)), columns), drawn, (f"No curvature: {reason}.",)
 
 
 def _find_structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[np.ndarray, str, tuple[str, ...]]:
@@ -390,8 +411,7 @@ def _find_structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[n
         smallest = smallest_piece(thickness) / math.prod(field.spacing)
         mask, specks, holes = remove_specks(mask, smallest, options["periodic"])
         if specks or holes:
-            counts = f"{specks} specks, {holes} pinholes"
-            notes = (*notes, f"Dropped what is smaller than a ball of half the median thickness: {counts}.")
+            notes = (*notes, DROPPED.format(specks, holes))
     if mask.all() or not mask.any():
         raise ScanError("expected a structure and background in the scan, got one of them only")
     return mask, seen, notes
@@ -400,12 +420,16 @@ def _find_structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[n
 def measure_surface(
     mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangles' places in voxels, their areas, and n⊗n dA in the upper triangle's order (z, y, x)."""
-    return tabulate_surface(smooth_surface(mask, spacing, periodic=periodic), spacing)
+    """Return the triangles' places in voxels, their areas, and n⊗n dA in the upper triangle's order (z, y, x).
+
+    Those at a window's faces count for what lies beyond the outer voxels' centres, too (`border_weights`).
+    """
+    places, columns = tabulate_surface(smooth_surface(mask, spacing, periodic=periodic), spacing)
+    return places, columns if periodic else columns * border_weights(places, mask.shape)[:, None]
 
 
 def tabulate_surface(mesh: Surface, spacing: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return what `measure_surface` does, of a mesh."""
+    """Return what `measure_surface` does of a mesh, unweighted."""
     normals = area_vectors(mesh)[:, ::-1]
     area = np.linalg.norm(normals, axis=1)
     parts = normals[:, _UPPER[0]] * normals[:, _UPPER[1]] / np.where(area > 0, area, 1)[:, None]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -32,7 +31,7 @@ from curvafit.scan.structure import (
     find_structure,
     is_noise,
     measure_quality,
-    region_of_interest,
+    read_region,
     sample_mask,
 )
 from curvafit.volumes.boxes import InMemory, boxes_of
@@ -229,10 +228,11 @@ def prepare(
     periodic: bool = False,
     threshold: Literal["otsu"] | float = "otsu",
     dark: bool = False,
-    roi: Field | np.ndarray | str | os.PathLike[str] | None = None,
+    roi: Source | None = None,
     one_scale: bool = False,
     most: int | None = None,
     quality: Quality | None = None,
+    imaged: np.ndarray | None = None,
 ) -> Prepared:
     """Find the structure and put it on the working grid, where its median thickness is a known number of voxels.
 
@@ -257,7 +257,7 @@ def prepare(
     dark
         The structure is the dark phase (of a mask: its lower value; of a field: where it is negative).
     roi
-        Nonzero where the scan counts (array, field or file of the scan's shape).
+        Nonzero where the scan counts (array, field or file): see `volumes.place.lay`.
     one_scale
         Keep no grid but a phase field's: laws are read where structures are of one thickness in voxels.
     most
@@ -265,14 +265,18 @@ def prepare(
         is cut, and a note says so.
     quality
         Blur and noise of an image, where they are known; else they are measured.
+    imaged
+        Where the grey levels of a padded scan set the threshold, bool of its shape; by default wherever it counts.
     """
     check_options(kind, threshold)
-    region = region_of_interest(roi, field)
+    region, laid = (None, ()) if roi is None else read_region(roi, field)
+    region = None if region is None else region.values != 0
     where, notes = bounding_box(field.shape, region, LARGEST_SCAN if most is None else max(field.shape))
     region = None if region is None else region[where]
-    part = replace(field, values=field.values[where], affine=None, notes=field.notes + notes)
+    part = replace(field, values=field.values[where], affine=None, notes=field.notes + laid + notes)
     periodic = periodic and part.shape == field.shape
     options = {"kind": kind, "threshold": threshold, "dark": dark}
+    options["imaged"] = None if imaged is None else imaged[where]
     extremes = (field.values.min(), field.values.max())
     seen, signed = find_structure(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
     mask = signed.values > 0

@@ -12,10 +12,10 @@ threshold.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import partial
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -23,9 +23,11 @@ from skimage.filters import threshold_otsu
 
 from curvafit.core.checks import SEEDS, check_choice, check_float, check_int
 from curvafit.scan.grids import boxes_by_surface, centre_distance, resample, surface_voxels
+from curvafit.volumes.boxes import boxes_of
 from curvafit.volumes.field import Field, ScanError, round_labels
-from curvafit.volumes.formats.part import Box
-from curvafit.volumes.read import load
+from curvafit.volumes.formats.part import Box, Crop
+from curvafit.volumes.place import lay
+from curvafit.volumes.read import Source, field_of
 
 Kind = Literal["field", "mask", "image"]
 
@@ -54,6 +56,16 @@ _NORMAL_MEDIAN = 0.6745
 NOISY, SLICED = 0.02, 1.5
 #: The least share of neighbours with labels that have the same one.
 _ALIKE = 0.25
+#: The most values of labels: grey levels of four bits have more.
+_FEW = 12
+#: What structure is in a mask of several values.
+SEVERAL = (
+    "Taken for a mask or labels: the structure is where they are positive. Naming a label (label) measures it alone, "
+    "and kind image splits grey levels."
+)
+#: A constant may be padding where it fills more than the first share of the scan, and the second share of it is reached
+#: from the ends of rows. Other levels have two phases from this bimodality on.
+PADDED, REACHED, TWO_PHASES = 0.1, 0.95, 0.45
 #: A field of a few thousand values was rounded.
 _ROUNDED_VALUES = 4096
 
@@ -67,8 +79,9 @@ def find_structure(
     region: np.ndarray | None = None,
     periodic: bool = False,
     extremes: tuple[float, float] | None = None,
+    imaged: np.ndarray | None = None,
 ) -> tuple[Kind, Field]:
-    """Return the kind of a scan, and the scan as float32 values that are above 0 in its structure, with a note on how.
+    """Return the kind of a scan, and the scan as float32 values that are above 0 in its structure, with notes on how.
 
     The parameters are as in `prepare.prepare`; `extremes` are the lowest and highest value of the whole that `field` is
     a part of: they tell a mask's two values. Raises ScanError if the threshold splits nothing or a phase is empty.
@@ -81,12 +94,17 @@ def find_structure(
         note = f"Taken for a phase field: values {values.min():.3g} to {values.max():.3g}."
         values = (-values if dark else values).astype(np.float32)
     elif seen == "mask":
-        positive = "Taken for a mask: the structure is where it is positive."
-        note = f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else positive
-        mask = values == highest if two else values > 0
+        note = f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else SEVERAL
+        mask = values == highest if two and lowest < highest else values > 0
         values = np.where(mask != dark, np.float32(1), np.float32(-1))
     else:
-        values, note = _split_image(field, threshold, dark, region, periodic)
+        padding, corner = None, values[0, 0, 0]
+        if np.count_nonzero(values == corner) > PADDED * values.size:
+            padding = judge_padding(corner, count_constant(values, corner))
+        if imaged is not None and padding is not None:
+            region = imaged if region is None else imaged & region
+        values, note = _split_image(field, threshold, dark, region, periodic, padding)
+        note = " ".join([*describe_padding(padding, threshold == "otsu", region is not None), note])
     counted = values > 0 if region is None else values[region] > 0
     if not counted.any():
         raise ScanError("expected a structure in the scan, got none: every voxel is background")
@@ -108,20 +126,22 @@ def check_options(kind: str, threshold: float | str, label: int | None = None) -
         raise ValueError(f"a threshold splits grey levels: leave it out for kind {kind}")
 
 
-def region_of_interest(roi: Field | np.ndarray | str | os.PathLike[str] | None, field: Field) -> np.ndarray | None:
-    """Return where the scan counts: a mask of its shape, or None for everywhere.
+def read_region(
+    roi: Source, field: Field, scan: Source | None = None, crop: Crop | None = None, **reading: Any
+) -> tuple[Field, tuple[str, ...]]:
+    """Return a region of interest on the voxels of a field, and a note on how it was laid.
 
-    Raises ScanError if the mask is empty or of another shape.
+    A field that is a crop of a scan names that, and its reading: without a place, the region is cropped alike. Raises
+    ScanError where the region is empty, and as `lay`.
     """
-    if roi is None:
-        return None
-    loaded = roi if isinstance(roi, Field | np.ndarray) else load(roi)
-    region = np.asarray(loaded.values if isinstance(loaded, Field) else loaded) != 0
-    if region.shape != field.shape:
-        raise ScanError(f"expected a region of interest of the scan's shape {field.shape}, got {region.shape}")
-    if not region.any():
+    region, on = field_of(roi), field if crop is None or scan is None else boxes_of(scan, **reading).frame
+    if region.affine is not None and on.affine is not None:
+        on, crop = field, None
+    region, notes = lay(region, on, "the region of interest", "the scan")
+    values = region.values if crop is None else region.crop(crop).values
+    if not values.any():
         raise ScanError("expected a region of interest with voxels in it, got an empty one")
-    return region
+    return replace(field, values=values, notes=notes), notes
 
 
 def read_labels(labels: Field, what: str) -> np.ndarray:
@@ -181,9 +201,9 @@ def is_rounded(u: np.ndarray) -> bool:
 
 
 def _guess_kind(values: np.ndarray, threshold: Literal["otsu"] | float, two: bool) -> Kind:
-    """Guess the kind: two values are a mask; floats from about -1 to about 1, without noise and mostly far from 0, are
-    a phase field; anything else is an image."""
-    if two:
+    """Guess the kind: two values are a mask, as are labels; floats from about -1 to about 1, without noise and mostly
+    far from 0, are a phase field; anything else is an image."""
+    if two or (threshold == "otsu" and are_labels(count_values(values))):
         return "mask"
     if may_be_field(values.dtype, threshold, values.min(), values.max()):
         jitter = float(np.median(np.abs(np.diff(values, 3, axis=2)))) if values.shape[2] > 3 else 0.0
@@ -197,6 +217,79 @@ def may_be_field(dtype: np.dtype, threshold: Literal["otsu"] | float, lowest: fl
     return dtype.kind == "f" and threshold == "otsu" and -2 <= lowest <= -0.7 and 0.3 <= highest <= 2
 
 
+def count_values(values: np.ndarray) -> np.ndarray:
+    """Return how many voxels have each whole number from 0 to 255, and how many others (257,)."""
+    if values.dtype.kind not in "iu" or values.min() < 0 or values.max() > 255:
+        return np.append(np.zeros(256, dtype=np.int64), values.size)
+    return np.bincount(values.ravel().astype(np.uint8), minlength=257)
+
+
+def are_labels(counts: np.ndarray) -> bool:
+    """Return whether `count_values` of a volume are those of labels: whole numbers of some few values."""
+    return bool(not counts[256] and 2 < np.count_nonzero(counts) <= _FEW)
+
+
+class Padding(NamedTuple):
+    """A constant around what was imaged, its share of the scan, and the deviation of the other levels.
+
+    Where it is not `sure`, it may be a background as well.
+    """
+
+    value: float
+    share: float
+    deviation: float
+    sure: bool
+
+
+def count_constant(values: np.ndarray, value: Any) -> np.ndarray:
+    """Return sums that tell padding with a value, from whole rows (Z, Y, X): how many voxels have it, and how many in
+    runs from the ends of rows; then sums of powers 0 to 4 of the levels next to those runs, and of all others."""
+    constant = values == value
+    ahead = np.logical_and.accumulate(constant, axis=2)
+    behind = np.logical_and.accumulate(constant[..., ::-1], axis=2)[..., ::-1]
+    rim = np.zeros_like(constant)
+    rim[..., 1:] = ahead[..., :-1]
+    rim[..., :-1] |= behind[..., 1:]
+    levels = [values[part].astype(np.float64) for part in (rim & ~constant, ~constant)]
+    sums = [np.count_nonzero(constant), np.count_nonzero(ahead | behind)]
+    with np.errstate(all="ignore"):  # huge numbers tell nothing
+        for each in levels:
+            squares = np.square(each)
+            sums += [each.size, each.sum(), squares.sum(), np.dot(squares, each), np.dot(squares, squares)]
+    return np.array(sums, dtype=np.float64)
+
+
+def judge_padding(value: Any, counts: np.ndarray) -> Padding | None:
+    """Return the padding of a scan by its `count_constant`; None where there is none.
+
+    It is sure where the other levels have two phases (Sarle's coefficient; of a normal distribution it is 1/3), and
+    what lies next to it is like them; or is far from it, and it is below 0, to which no background is cut. A background
+    ends in the low levels of blurred edges.
+    """
+    total, reached, size = counts[0], counts[1], counts[0] + counts[7]
+    if total <= PADDED * size or reached < REACHED * total or total == size:
+        return None
+    near, m, (p2, p3, p4) = counts[3] / max(counts[2], 1), counts[8] / counts[7], counts[9:] / counts[7]
+    with np.errstate(all="ignore"):
+        spread, variance = counts[4] / max(counts[2], 1) - near**2, max(p2 - m**2, 0.0)
+        third, fourth = p3 - 3 * m * p2 + 2 * m**3, p4 - 4 * m * p3 + 6 * m**2 * p2 - 3 * m**4
+        alike = 4 * (near - m) ** 2 < variance < 4 * spread
+        far = value < 0 and (near - float(value)) ** 2 > variance
+        phases = third**2 + variance**3 > TWO_PHASES * fourth * variance
+    return Padding(float(value), total / size, math.sqrt(variance), bool(phases and (alike or far)))
+
+
+def describe_padding(padding: Padding | None, otsu: bool, inside: bool = False) -> tuple[str, ...]:
+    """Return a note on padding; `inside` says whether Otsu's threshold is taken inside of a region."""
+    if padding is None:
+        return ()
+    told = f"{padding.share:.0%} of the voxels, reached from the borders, are exactly {padding.value:g}"
+    told += ", and count as background" * padding.sure
+    told += "" if inside else ": if nothing was imaged there, a region of interest leaves them out"
+    how = " without them" * padding.sure + " inside the region" * inside
+    return (f"{told}; the threshold is taken{how}." if how and otsu else f"{told}.",)
+
+
 def _find_threshold(values: np.ndarray) -> float:
     """Return the middle of the means of the two phases that Otsu's threshold splits.
 
@@ -206,11 +299,28 @@ def _find_threshold(values: np.ndarray) -> float:
     return float(values[high].mean(dtype=np.float64) + values[~high].mean(dtype=np.float64)) / 2
 
 
-def smooth_levels(values: np.ndarray, spacing: tuple[float, float, float], periodic: bool = False) -> np.ndarray:
-    """Return grey levels (Z, Y, X) smoothed by one voxel of the finest axis, float32; they reach `SMOOTHED` of them."""
+def smooth_levels(
+    values: np.ndarray, spacing: tuple[float, float, float], periodic: bool = False, padding: Padding | None = None
+) -> np.ndarray:
+    """Return grey levels (Z, Y, X) smoothed by one voxel of the finest axis, float32; they reach `SMOOTHED` of them.
+
+    Sure padding is left out, and NaN.
+    """
     width = [min(spacing) / h for h in spacing]
-    mode = "wrap" if periodic else "nearest"
-    return ndimage.gaussian_filter(values.astype(np.float32), width, mode=mode, truncate=3.0)
+    smooth = partial(ndimage.gaussian_filter, sigma=width, mode="wrap" if periodic else "nearest", truncate=3.0)
+    if padding is None or not padding.sure:
+        return smooth(values.astype(np.float32))
+    known = values != padding.value
+    weights = smooth(known.astype(np.float32))
+    return smooth(np.where(known, values, 0).astype(np.float32)) / np.where(known, weights, np.nan)
+
+
+def sign_levels(smooth: np.ndarray, level: float, dark: bool, padding: Padding | None) -> np.ndarray:
+    """Return smoothed levels less a threshold, above 0 in the structure; padding is background."""
+    signed = level - smooth if dark else smooth - level
+    if padding is not None and padding.sure:
+        signed[np.isnan(signed)] = -padding.deviation
+    return signed
 
 
 def describe_split(level: float, otsu: bool, dark: bool, lowest: float, highest: float) -> str:
@@ -223,17 +333,22 @@ def describe_split(level: float, otsu: bool, dark: bool, lowest: float, highest:
 
 
 def _split_image(
-    field: Field, threshold: Literal["otsu"] | float, dark: bool, region: np.ndarray | None, periodic: bool
+    field: Field, threshold: Literal["otsu"] | float, dark: bool, region: Any, periodic: bool, padding: Padding | None
 ) -> tuple[np.ndarray, str]:
     """Return grey levels smoothed by one voxel of the finest axis, less the raw levels' threshold, and a note.
 
     Smoothing lowers thin structures' grey: a threshold of the smoothed levels would sink and make them fat.
     """
-    smooth = smooth_levels(field.values, field.spacing, periodic)
-    counted, raw = (smooth, field.values) if region is None else (smooth[region], field.values[region])
+    smooth = smooth_levels(field.values, field.spacing, periodic, padding)
+    counted = ... if region is None else region
+    if padding is not None and padding.sure:
+        counted = np.isfinite(smooth) & (True if region is None else region)
+    levels, raw = smooth[counted], field.values[counted]
+    if not raw.size or raw.min() == raw.max():
+        raise ScanError("expected grey levels that differ where they count, got one of them only")
     level = _find_threshold(raw) if threshold == "otsu" else float(threshold)
-    note = describe_split(level, threshold == "otsu", dark, float(counted.min()), float(counted.max()))
-    return (level - smooth if dark else smooth - level), note
+    note = describe_split(level, threshold == "otsu", dark, float(levels.min()), float(levels.max()))
+    return sign_levels(smooth, level, dark, padding), note
 
 
 @dataclass(frozen=True)

@@ -32,12 +32,20 @@ from curvafit.scan.structure import (
     LAGS,
     PLATEAU,
     PLATEAUS,
+    SEVERAL,
     SMOOTHED,
     Kind,
+    Padding,
+    are_labels,
+    count_constant,
     count_pairs,
+    count_values,
+    describe_padding,
     describe_split,
+    judge_padding,
     may_be_field,
     pairs_of_noise,
+    sign_levels,
     smooth_levels,
 )
 from curvafit.volumes.boxes import Boxes, boxes_of
@@ -85,6 +93,7 @@ class Split:
     highest: float
     two: bool
     level: float = 0.0
+    padding: Padding | None = None
 
 
 class Place(NamedTuple):
@@ -149,8 +158,8 @@ def find_levels(volume: Volume, split: Split, place: Place, boxes: Boxes, box: B
     """Return a box of a volume as float32 values that are above 0 in its structure, as `structure.find_structure`."""
     if split.kind == "image":
         around = grow(box, SMOOTHED, place.shape)
-        smooth = smooth_levels(volume.read(boxes, around), place.spacing)[within(box, around)]
-        return split.level - smooth if volume.dark else smooth - split.level
+        smooth = smooth_levels(volume.read(boxes, around), place.spacing, padding=split.padding)[within(box, around)]
+        return sign_levels(smooth, split.level, volume.dark, split.padding)
     values = volume.read(boxes, box)
     if split.kind == "field":
         return (-values if volume.dark else values).astype(np.float32)
@@ -170,6 +179,7 @@ def survey(volume: Volume, find: Finder) -> Plan:
         ends = [float(e) for e in (total["lowest"], total["highest"])]
         low, high = sorted(split.level - e for e in ends) if volume.dark else [split.level + e for e in ends]
         note = describe_split(split.level, otsu, volume.dark, low, high)
+        note = " ".join([*describe_padding(split.padding, otsu), note])
     size, filled = math.prod(place.shape), int(total["filled"])
     for count, one, other in ((filled, "structure", "background"), (size - filled, "background", "structure")):
         if not count:
@@ -211,7 +221,7 @@ def _choose_grid(plan: Plan, median: float, thick: float, name: str) -> Plan:
         plan,
         thickness=median,
         scale=scale,
-        working=count_voxels(place.shape, scale),
+        working=count_voxels(place.shape, scale) if min(place.shape) > 3 else (0, 0, 0),  # no curvature
         edge=working_edge(scale, place.spacing),
         working_notes=(note, *why),
     )
@@ -246,7 +256,7 @@ def _add(found: Iterable[Found]) -> dict[str, np.ndarray]:
     total: dict[str, np.ndarray] = {}
     for each in found:
         for name, value in each.items():
-            join = {"lowest": np.minimum, "highest": np.maximum}.get(name, np.add)
+            join = {"lowest": np.minimum, "highest": np.maximum}.get(name.removeprefix("inner "), np.add)
             total[name] = join(total[name], value) if name in total else value
     return total
 
@@ -258,7 +268,8 @@ def _find_split(volume: Volume, place: Place, dtype: np.dtype, find: Finder) -> 
     """Return how structure and background are split, and a note for fields and masks."""
     side = max(1, math.isqrt(PIECE // place.shape[2]))
     bars = cut_boxes(place.shape, (side, side, place.shape[2]))
-    found = list(find("reading", partial(_look_at_values, volume, bars), len(bars)))
+    value = volume.read(volume.open(), (slice(0, 1), slice(0, 1), slice(0, 1)))[0, 0, 0]
+    found = list(find("reading", partial(_look_at_values, volume, bars, value), len(bars)))
     total = _add({name: each[name] for name in each if name != "two"} for each in found)
     if faults := int(total["faults"]):
         raise ScanError(f"a volume must be finite, got {faults} values that are not in {place.source}")
@@ -271,26 +282,34 @@ def _find_split(volume: Volume, place: Place, dtype: np.dtype, find: Finder) -> 
     two = all(bool(each["two"]) and {float(each["lowest"]), float(each["highest"])} <= ends for each in found)
     kind = volume.kind
     if kind == "auto":
-        kind = "mask" if two else "image"
-        if not two and may_be_field(dtype, volume.threshold, float(lowest), float(highest)):
+        kind = "mask" if two or (volume.threshold == "otsu" and are_labels(total["counts"])) else "image"
+        if kind == "image" and may_be_field(dtype, volume.threshold, float(lowest), float(highest)):
             steady = 2 * total["steady"] > total["steps"] or not total["steps"]
             kind = "field" if steady and total["plateau"] > PLATEAUS * math.prod(place.shape) else "image"
     split = Split(kind, float(lowest), float(highest), two)
     if kind == "field":
         return split, f"Taken for a phase field: values {float(lowest):.3g} to {float(highest):.3g}."
     if kind == "mask":
-        positive = "Taken for a mask: the structure is where it is positive."
-        return split, f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else positive
+        return split, f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else SEVERAL
+    padding, left, inner = judge_padding(value, total["padding"]), None, ""
+    if padding is not None and padding.sure:
+        left, inner = padding.value, "inner "
+    split = replace(split, padding=padding)
     if volume.threshold != "otsu":
         return replace(split, level=float(volume.threshold)), ""
-    return replace(split, level=_find_threshold(volume, bars, lowest, highest, find)), ""
+    ends = total[f"{inner}lowest"], total[f"{inner}highest"]
+    return replace(split, level=_find_threshold(volume, bars, *ends, left, find)), ""
 
 
-def _look_at_values(volume: Volume, bars: Sequence[Box], number: int) -> Found:
-    """Return the extremes of a bar, whether it has two values at most, and the signs of a phase field."""
+def _look_at_values(volume: Volume, bars: Sequence[Box], value: Any, number: int) -> Found:
+    """Return the extremes of a bar, with and without a value; whether it has two values at most; and what tells labels,
+    padding with that value, and a phase field."""
     values = volume.read(volume.open(), bars[number])
     lowest, highest = values.min(), values.max()
     found = {"lowest": lowest, "highest": highest, "two": np.all((values == lowest) | (values == highest))}
+    found |= {"counts": count_values(values), "padding": count_constant(values, value)}
+    if (inner := values[values != value]).size:
+        found |= {"inner lowest": inner.min(), "inner highest": inner.max()}
     if values.dtype.kind != "f":
         return {**found, "faults": np.int64(0)}
     found["faults"] = np.int64(values.size - np.count_nonzero(np.isfinite(values)))
@@ -301,14 +320,16 @@ def _look_at_values(volume: Volume, bars: Sequence[Box], number: int) -> Found:
     return {name: np.asarray(value) for name, value in found.items()}
 
 
-def _find_threshold(volume: Volume, bars: Sequence[Box], lowest: Any, highest: Any, find: Finder) -> float:
-    """Return the threshold of grey levels, as `structure.find_structure` finds it."""
+def _find_threshold(
+    volume: Volume, bars: Sequence[Box], lowest: Any, highest: Any, left: float | None, find: Finder
+) -> float:
+    """Return the threshold of grey levels but one that is left out, as `structure.find_structure` finds it."""
     lowest, highest = lowest[()], highest[()]
     whole = lowest.dtype.kind in "iu"
     if whole and int(highest) - int(lowest) >= _MOST_LEVELS:
         raise ScanError(f"expected at most {_MOST_LEVELS} grey levels, got {lowest} to {highest}: give a threshold")
     name = "finding the threshold"
-    counts = _add(find(name, partial(_count_levels, volume, bars, lowest, highest), len(bars)))["counts"]
+    counts = _add(find(name, partial(_count_levels, volume, bars, lowest, highest, left), len(bars)))["counts"]
     if whole:
         centres = np.arange(int(lowest), int(highest) + 1)
         high = centres > threshold_otsu(hist=(counts, centres))
@@ -316,13 +337,21 @@ def _find_threshold(volume: Volume, bars: Sequence[Box], lowest: Any, highest: A
         return float(sum(means)) / 2
     edges = np.histogram_bin_edges(np.empty(0, lowest.dtype), 256, (lowest, highest))
     otsu = threshold_otsu(hist=(counts, (edges[1:] + edges[:-1]) / 2))
-    sums = _add(find(f"{name}'s sides", partial(_sum_sides, volume, bars, otsu), len(bars)))["sums"]
+    sums = _add(find(f"{name}'s sides", partial(_sum_sides, volume, bars, otsu, left), len(bars)))["sums"]
     return float(sums[0, 1] / sums[0, 0] + sums[1, 1] / sums[1, 0]) / 2
 
 
-def _count_levels(volume: Volume, bars: Sequence[Box], lowest: Any, highest: Any, number: int) -> Found:
+def _levels(volume: Volume, box: Box, left: float | None) -> np.ndarray:
+    """Return the values of a box, without those that are left out."""
+    values = volume.read(volume.open(), box).ravel()
+    return values if left is None else values[values != left]
+
+
+def _count_levels(
+    volume: Volume, bars: Sequence[Box], lowest: Any, highest: Any, left: float | None, number: int
+) -> Found:
     """Return a histogram of a bar: of each whole number, or of 256 bins."""
-    values = volume.read(volume.open(), bars[number]).ravel()
+    values = _levels(volume, bars[number], left)
     if values.dtype.kind in "iu":
         counts = np.bincount(values.astype(np.int64) - int(lowest), minlength=int(highest) - int(lowest) + 1)
     else:
@@ -330,9 +359,9 @@ def _count_levels(volume: Volume, bars: Sequence[Box], lowest: Any, highest: Any
     return {"counts": counts}
 
 
-def _sum_sides(volume: Volume, bars: Sequence[Box], level: float, number: int) -> Found:
+def _sum_sides(volume: Volume, bars: Sequence[Box], level: float, left: float | None, number: int) -> Found:
     """Return the numbers and sums of the values above a level, and of the others."""
-    values = volume.read(volume.open(), bars[number])
+    values = _levels(volume, bars[number], left)
     high = values > level
     sides = [(values[side].size, values[side].sum(dtype=np.float64)) for side in (high, ~high)]
     return {"sums": np.array(sides, dtype=np.float64)}

@@ -24,20 +24,24 @@ from curvafit.core.units import format_sampling
 from curvafit.core.workers import Workers
 from curvafit.geometry.balls import NEAR, ball_radii, paint_balls, paint_coarse_balls, reaching_radius
 from curvafit.geometry.diagram import BIN_WIDTH, MARGIN, Diagram
-from curvafit.geometry.mesh import NoSurface, surface
-from curvafit.geometry.morphometry import SOFTENED, soften
+from curvafit.geometry.mesh import NoSurface, march
+from curvafit.geometry.morphometry import SOFTENED, border_weights, soften
 from curvafit.geometry.topology import euler_of_window, euler_shares
 from curvafit.priors.grid import WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread
 from curvafit.scan.grids import CutOut, centre_distance, remove_specks, resample
 from curvafit.scan.measure import (
+    DROPPED,
+    FEWEST_SLICES,
     MOST,
     SUMS,
+    TOO_THIN,
     Blocks,
     Measures,
     Summed,
     measure_curvatures,
     measure_maps,
+    no_curvature,
     summarise,
     summarise_sums,
     tabulate_surface,
@@ -88,11 +92,11 @@ def measure(
     Volume fraction, thickness, spacing, connectivity, surface and fabric are those of the structure on the scan's own
     voxels, all of them. Curvature is that of the scan on the working grid, as `infer` reads it. Intervals are 95 %, by
     a jackknife over blocks of a period (thickness and spacing) of the structure (`errors`); a scan with fewer than
-    eight has none. A scan with a side of more than `LARGEST_BOX` voxels is measured in tiles, which have the numbers of
-    the scan in one piece; of Zarr, HDF5, NPY, RAW and uncompressed NIfTI no more than a tile is in memory. Raises
-    ValueError if the scan has no structure, or none that the voxels resolve, a region does not fit it, or a large scan
-    has a region or is periodic and does not fit into memory; or as `curvafit.load`, and FileNotFoundError if there is
-    no such file.
+    eight has none. A stack of under ten slices may have no curvature (NaN, and a note). A scan with a side of more than
+    `LARGEST_BOX` voxels is measured in tiles, which have the numbers of the scan in one piece; of Zarr, HDF5, NPY, RAW
+    and uncompressed NIfTI no more than a tile is in memory. Raises ValueError if the scan has no structure, or none
+    that the voxels resolve, a region does not fit it, or a large scan has a region or is periodic and does not fit into
+    memory; or as `curvafit.load`, and FileNotFoundError if there is no such file.
 
     Parameters
     ----------
@@ -101,8 +105,9 @@ def measure(
     kind, periodic, threshold, dark
         As in `infer`.
     roi
-        A region of the scan, nonzero where it counts; each of its labels is a compartment of its own. Structure,
-        thickness, surface and curvature are those of the whole scan, and what lies inside is summed.
+        A region of the scan, nonzero where it counts, laid on it by the affines where both have one (a note says how);
+        each of its labels is a compartment of its own. Structure, thickness, surface and curvature are those of the
+        whole scan, and what lies inside is summed.
     tile
         Voxels a side of a tile, of a scan of any size; by default a large scan's memory decides.
     workers
@@ -359,18 +364,16 @@ def _measure_surface(plan: Plan, mask: np.ndarray, box: Box, core: Box) -> tuple
     own = [(edge.start, min(edge.stop, n - 1)) for edge, n in zip(core, shape, strict=True)]
     if any(start >= stop for start, stop in own):
         return None
-    wide = [_widen(*cells, 0, n - 1) for cells, n in zip(own, shape, strict=True)]
-    part: Box = tuple(slice(start, stop + 1) for start, stop in wide)  # type: ignore[assignment]
+    part: Box = tuple(slice(start, stop + 1) for start, stop in own)  # type: ignore[assignment]
     around = grow(part, SOFTENED, shape)
     soft = soften(mask[within(around, box)])[within(part, around)]
     try:
-        mesh = surface(soft, Grid(soft.shape, spacing, "replicate"), 0.5)  # type: ignore[arg-type]
+        mesh = march(soft, spacing, 0.5)
     except NoSurface:
         return None
     places, columns = tabulate_surface(mesh, spacing)
     places = places + [edge.start for edge in part]
-    kept = _find_own(places, own, wide)
-    return places[kept], columns[kept]
+    return places, columns * border_weights(places, shape)[:, None]
 
 
 def _find_own(places: np.ndarray, own: Sequence[tuple[int, int]], wide: Sequence[tuple[int, int]]) -> np.ndarray:
@@ -396,7 +399,7 @@ def _measure_curvature(plan: Plan, boxes: Boxes, core: Box, sums: _Sums) -> Foun
     """Sum the curvatures in the working cells that begin in a core; return the bins of the diagram and other counts."""
     box, owned = _around(plan, core)
     found: dict[str, Any] = {"specks": np.zeros(2, np.int64), "changed": np.int64(0), "filled": np.int64(0)}
-    if any(edge.start >= edge.stop for edge in owned):
+    if min(plan.working) < FEWEST_SLICES or any(edge.start >= edge.stop for edge in owned):
         return found
     values = _find_working_levels(plan, boxes, box)
     mask, inner = values > 0, within(owned, box)
@@ -530,7 +533,7 @@ def _choose_factors(tiling: Tiling, found: Sequence[Found]) -> tuple[int, int]:
 
 def _summarise(tiling: Tiling, found: Sequence[Found], again: Sequence[Found], stated: str) -> Measures:
     """Return the measures of a volume from what was found in its tiles."""
-    plan, finest = tiling.plan, tiling.finest
+    plan, finest, shape = tiling.plan, tiling.finest, tiling.shape
     table = np.zeros((finest.count, len(SUMS)))
     for each in found:
         table[each["rows"]] += each["sums"]
@@ -542,17 +545,16 @@ def _summarise(tiling: Tiling, found: Sequence[Found], again: Sequence[Found], s
     total = dict(zip(SUMS, table.sum(0), strict=True))
     if not 0 < total["inside"] < total["volume"]:
         raise ScanError("expected a structure and background in the scan, got one of them only")
-    if not total["curved"] > 0:
+    curved = total["curved"] > 0
+    if not curved and min(shape) >= FEWEST_SLICES:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
     period = total["thickness"] / total["inside"] + total["gap"] / (total["volume"] - total["inside"])
-    blocks = Blocks.divide(plan.place.shape, plan.place.spacing, period)
-    shape = plan.place.shape
+    blocks = Blocks.divide(shape, plan.place.spacing, period)
     χ = float(sum(each["euler"] for each in found))
     sampled = math.prod(max(n - 1, 1) for n in shape) * math.prod(plan.place.spacing)
-    notes = (*_notes(tiling, found), f"Measured in {stated[0].lower()}{stated[1:]}")
-    summed = Summed(
-        plan.split.kind, blocks, _merge(table, finest, blocks), (χ, (1 - χ) / sampled), _draw(plan, found), notes
-    )
+    drawn, why = (_draw(plan, found), ()) if curved else no_curvature(plan.place.unit, TOO_THIN)[1:]
+    notes = (*_notes(tiling, found), *why, f"Measured in {stated[0].lower()}{stated[1:]}")
+    summed = Summed(plan.split.kind, blocks, _merge(table, finest, blocks), (χ, (1 - χ) / sampled), drawn, notes)
     return summarise_sums(plan.place.frame, summed)
 
 
@@ -582,14 +584,13 @@ def _notes(tiling: Tiling, found: Sequence[Found]) -> tuple[str, ...]:
     notes = [f"{format_sampling(plan.place.shape, plan.place.spacing, plan.place.unit)}.", *plan.notes]
     specks, holes = (int(n) for n in np.sum([each["pieces"] for each in found], axis=0))
     if specks or holes:
-        counts = f"{specks} specks, {holes} pinholes"
-        notes.append(f"Dropped what is smaller than a ball of half the median thickness: {counts}.")
+        notes.append(DROPPED.format(specks, holes))
     wide = np.sum([each["wide"] for each in found], axis=0)
     for name, count in zip(("structure", "background"), wide, strict=True):
         if count:
             share = f"around {count / math.prod(plan.place.shape):.2g} of the voxels, in the {name}"
             notes.append(f"Balls wider than {2 * WIDEST} voxels count as that wide: {share}.")
-    working, count = [*plan.working_notes], math.prod(plan.working)
+    working, count = [*plan.working_notes], max(1, math.prod(plan.working))
     specks, holes = (int(n) for n in np.sum([each["specks"] for each in found], axis=0))
     if specks or holes:
         counts = (

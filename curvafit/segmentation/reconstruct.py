@@ -47,7 +47,6 @@ from curvafit.segmentation.slices import (
     WHOLE,
     Slices,
     annotated_slices,
-    check_place,
     check_shared,
     check_spacing,
     choose_labelled,
@@ -84,6 +83,7 @@ from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError, round_labels
 from curvafit.volumes.formats.base import smallest_type
 from curvafit.volumes.formats.part import Box
+from curvafit.volumes.place import lay
 from curvafit.volumes.read import Source, field_of
 
 #: Stiffness of the springs on known voxels, in working units: a tenth of it gives way, ten times as much stalls.
@@ -165,7 +165,8 @@ def reconstruct(
     axis
         The axis of the array across the slices, 0, 1 or 2, that is z, y or x.
     image
-        Grey levels of the volume, on the same voxels; needs `curvafit[image]`. It goes with neither example nor law.
+        Grey levels of the volume, on the same voxels (the affines tell their pose); needs `curvafit[image]`. It goes
+        with neither example nor law.
     example
         A mask of another volume of the same kind, known whole. A file or an array has the slices' `spacing` and `unit`.
     careful
@@ -431,10 +432,10 @@ def _load_image(image: Source, volume: Field, reading: dict[str, Any]) -> Field:
     require("sklearn.ensemble", "image", "reading an image")
     placed = {} if isinstance(image, Field) else {name: reading.get(name) for name in ("spacing", "unit", "crop")}
     field = field_of(image, **placed)
-    check_place(field, volume, "the image", "the slices")
+    field, laid = lay(field, volume, "the image", "the slices", exact=True)
     if (count := len(np.unique(field.values.ravel()[:: -(-field.values.size // SAMPLED)]))) < GREY:
         raise ScanError(f"the image must have grey levels, but has {count} values: is it a mask?")
-    return field
+    return replace(field, notes=laid)
 
 
 def _read_evidence(
@@ -447,7 +448,7 @@ def _read_evidence(
     where = " and ".join(
         f"{voxels:+d} voxels along {name}" for voxels, name in zip(shift, names, strict=True) if voxels
     )
-    doubts = (SHIFTED.format(where=where),) if where else ()
+    doubts = (*image.notes, SHIFTED.format(where=where)) if where else image.notes
     evidence, told = read_image(levels, slices, progress=progress)
     return (None, (*doubts, UNTOLD)) if told < TOLD else (evidence, doubts)
 

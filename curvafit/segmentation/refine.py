@@ -32,12 +32,13 @@ from curvafit.segmentation.engine import (
 from curvafit.segmentation.evidence import VoxelEvidence, probability_evidence
 from curvafit.segmentation.result import Segmentation, flow_summary
 from curvafit.segmentation.segment import TRIALS, WEIGHTS
-from curvafit.segmentation.slices import check_place, check_spacing, require_labels
+from curvafit.segmentation.slices import check_spacing, require_labels
 from curvafit.segmentation.tiles import Problem, Tiling, lower_volume
 from curvafit.segmentation.trials import Task, Trial, choose_by_masks
 from curvafit.volumes.boxes import digest_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box, Crop
+from curvafit.volumes.place import lay
 from curvafit.volumes.read import Source, field_of, place_of
 
 #: Weights that are tried, in nats of a unit of F_ε, and the first of them.
@@ -203,7 +204,7 @@ def calibrate(
 
     task = Task(probability_evidence(part), inside[where], range(part.shape[0]))
     best = choose_by_masks(task, [Trial(law, FIRST, steps) for law in tried], fill, NATS)
-    return Calibration(best, best.law in laws, field, notes)
+    return Calibration(best, best.law in laws, field, notes + truth.notes)
 
 
 class Refine:
@@ -350,5 +351,6 @@ def _load_example(
     field = load_probabilities(probabilities, **reading)
     placed = {} if isinstance(mask, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
     truth = field_of(mask, label=label, **placed)
-    check_place(truth, field, "the mask", "the probabilities")
+    truth, laid = lay(truth, field, "the mask", "the probabilities", exact=True)
+    truth = replace(truth, notes=truth.notes + laid)
     return field, truth, require_labels(truth.values, "the example") > 0

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline, make_interp_spline
 
 from curvafit.core.checks import check_int
-from curvafit.core.units import METRES, format_sampling
+from curvafit.core.units import format_sampling
 from curvafit.priors.grid import MOST
 from curvafit.scan.grids import centre_distance
 from curvafit.volumes.field import Field, ScanError, round_labels
@@ -24,8 +23,8 @@ WAYS = ("spline", "linear", "nearest")
 LABELS, FEW = 256, 16
 #: The greatest label, of 64 bits.
 IDS = 2**64 - 1
-#: Share by which the voxel sizes of two files may differ, and voxels by which their places may.
-SAME, ASTRAY = 1e-3, 0.1
+#: Share by which the voxel sizes of two files may differ.
+SAME = 1e-3
 #: Share of slices with labels, between a label's first and last, that may lack it if all count as known to all.
 APART = 1 / 3
 #: The box that is all of a volume.
@@ -344,18 +343,3 @@ def check_spacing(example: Field, volume: Field, name: str) -> None:
     if example.unit != volume.unit or not np.allclose(example.spacing, volume.spacing, rtol=SAME):
         expected, given = (format_sampling(field.shape, field.spacing, field.unit) for field in (volume, example))
         raise ScanError(f"the example must have the spacing of {name} ({expected}), got {given}")
-
-
-def check_place(field: Field, other: Field, name: str, kind: str) -> None:
-    """Raise ScanError where a field has other voxels than another, by shape and, where both exist, affine; the message
-    calls the first `name`, and the voxels those of the `kind`."""
-    if field.shape != other.shape:
-        raise ScanError(f"{name} must have the shape of {kind} {other.shape}, got {field.shape}")
-    if field.affine is None or other.affine is None:
-        return
-    factor = METRES[field.unit] / METRES[other.unit] if {field.unit, other.unit} <= METRES.keys() else 1.0
-    corners = np.array(list(product(*((0, n - 1) for n in field.shape[::-1]))))
-    one, two = (corners @ affine[:3, :3].T + affine[:3, 3] for affine in (other.affine, field.affine))
-    far = float(np.linalg.norm(factor * two - one, axis=1).max()) / min(other.spacing)
-    if not far < ASTRAY:
-        raise ScanError(f"{name} must have the affine of {kind}, but lies {far:.3g} voxels away")

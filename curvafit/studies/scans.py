@@ -59,6 +59,10 @@ def measure_scans(
     tasks = {k: partial(_measure_case, case, how, laws) for k, case in enumerate(cases) if k not in found}
     names = [case.name for case in cases]
     measures = _share_out(tasks, found, names, workers, sub_progress(progress, 0.05, 1.0))
+    if flat := [case.name for case, each in zip(cases, measures, strict=True) if not each.diagram.area > 0]:
+        raise ValueError(
+            f"{flat[0]}: expected a scan with curvature, got a stack too thin for it: measure has its numbers"
+        )
     units = {each.unit for each in measures}
     notes += [] if len(units) == 1 else [f"Lengths in {', '.join(sorted(units))} were converted to {unit}."]
     return [each.convert(unit) for each in measures], notes

@@ -237,8 +237,8 @@ def _sum_windows(table: np.ndarray, field: Field, size: Sequence[int], stride: S
     for axis in range(3):
         table = np.lib.stride_tricks.sliding_window_view(table, size[axis] // stride[axis], axis).sum(-1)
     values = combine(table)
-    # A layer across a window has two faces of it: with less surface there is no period to measure.
-    edge = min(n * h for n, h in zip(size, field.spacing, strict=True))
+    # A layer across a window has two faces of it: with less surface there is no period to measure along any edge.
+    edge = max(n * h for n, h in zip(size, field.spacing, strict=True))
     values[~(values[..., NAMES.index("surface density")] * edge >= 2)] = np.nan
     if np.isnan(values[..., 0]).all():
         raise ValueError(
@@ -269,16 +269,20 @@ def _read_laws(
 def _cluster(values: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, float]:
     """Return labels (nz, ny, nx) uint8, and the part of the variance between clusters, of windows that are all known.
 
-    χ is left out: with Conn.D it would count twice.
+    χ is left out, as with Conn.D it would count twice, and so is what no window has.
     """
-    known = np.isfinite(values).all(-1)
-    labels, rows = np.zeros(known.shape, dtype=np.uint8), np.delete(values[known], NAMES.index("Euler number"), axis=1)
+    columns = np.logical_or.reduce(np.isfinite(values.reshape(-1, len(NAMES))))  # a thin stack has no curvature
+    thickness = int(columns[: NAMES.index("thickness")].sum())
+    columns[NAMES.index("Euler number")] = False
+    rows = values[..., columns]
+    known = np.isfinite(rows).all(-1)
+    labels, rows = np.zeros(known.shape, dtype=np.uint8), rows[known]
     if not len(rows):
         return labels, 0.0
     deviation = rows.std(0)
     scaled = (rows - rows.mean(0)) / np.where(deviation > 0, deviation, 1)
     centres, _ = kmeans(scaled, min(count, len(rows)), seed=np.random.default_rng(seed))  # type: ignore[call-arg]
-    centres = centres[np.argsort(centres[:, NAMES.index("thickness")])]
+    centres = centres[np.argsort(centres[:, thickness])]
     numbers, away = vq(scaled, centres)
     labels[known] = numbers + 1
     return labels, float(1 - (away**2).sum() / max((scaled**2).sum(), 1e-30))

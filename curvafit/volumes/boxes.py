@@ -19,7 +19,7 @@ from curvafit.volumes.formats.base import check_array
 from curvafit.volumes.formats.nifti import read_nifti
 from curvafit.volumes.formats.part import Box, Crop, Part, parse_box, resolve_box, take_part
 from curvafit.volumes.formats.zarr import read_zarr
-from curvafit.volumes.read import Source, field_of, pick_reader, read_file, split_key, to_field
+from curvafit.volumes.read import Source, check_reading, field_of, pick_reader, read_file, split_key, to_field
 
 #: Readers that read a box alone.
 _BY_BOX = (read_zarr, read_hdf5, read_npy, read_raw, read_nifti)
@@ -45,6 +45,7 @@ def boxes_of(
     From Zarr, HDF5, NPY, RAW and uncompressed NIfTI, boxes are read where they are asked for. Other sources are wholly
     in memory, in the file's type. Arguments and errors are those of `field_of`; boxes are returned as they are.
     """
+    check_reading(reading)
     if isinstance(source, Boxes):
         return source
     options: dict[str, Any] = {"spacing": spacing, "unit": unit, "crop": crop, **reading}

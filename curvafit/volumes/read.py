@@ -5,11 +5,12 @@ The suffix of a file chooses its reader. Any fault of a file becomes one sentenc
 
 from __future__ import annotations
 
+import inspect
 import math
 import os
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -138,6 +139,7 @@ def field_of(
     reading
         Options of reading a file: see `load`.
     """
+    check_reading(reading)
     if isinstance(source, str | os.PathLike):
         return load(source, spacing=spacing, unit=unit, label=label, crop=crop, **reading)
     if isinstance(source, Field):
@@ -152,6 +154,12 @@ def field_of(
         raise ScanError(f"a volume must be the path of a file, a Field, an array or a tensor, got {quoted(source)}")
     field = field if crop is None else field.crop(crop)
     return field if label is None else field.label(label)
+
+
+def check_reading(reading: Mapping[str, Any]) -> None:
+    """Raise TypeError where an option of reading is none of `load`."""
+    for name in reading.keys() - inspect.signature(load).parameters.keys():
+        raise TypeError(f"got an unexpected keyword argument {name!r}: it is no option, and none of reading (load)")
 
 
 def place_of(path: str | os.PathLike[str]) -> Field:

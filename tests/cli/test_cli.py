@@ -124,7 +124,7 @@ def test_infer_checks_before_it_reads(tmp_path: Path, monkeypatch: pytest.Monkey
     def read(*_: object, **__: object) -> None:
         raise AssertionError("the scan was read")
 
-    monkeypatch.setattr(importlib.import_module("curvafit.inference.infer"), "field_of", read)
+    monkeypatch.setattr(importlib.import_module("curvafit.inference.infer"), "read_scan", read)
     scan = tmp_path / "scan.npy"
     scan.touch()
     for option in (("--seed", "-1"), ("--kind", "drawing"), ("--unit", "furlong")):

@@ -1,0 +1,200 @@
+"""Cases that were handed in: regions elsewhere, surfaces of windows, padding, thin stacks, empty masks, label maps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+import curvafit
+from curvafit.volumes.field import Field
+
+
+def level_set(shape: Sequence[int], width: float, share: float, seed: int = 0) -> np.ndarray:
+    """A window of a level set of a Gaussian field, bool: it does not repeat."""
+    field = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal([n + 12 for n in shape]), width)
+    field = field[6:-6, 6:-6, 6:-6]
+    return field > np.quantile(field, 1 - share)
+
+
+def a_region_elsewhere() -> None:
+    """A region that is stored with x reversed has the numbers of the one that is not."""
+    mask = np.concatenate([level_set((24, 32, 20), width, 0.3) for width in (1.8, 3.0)], axis=2)
+    labels = np.zeros(mask.shape, np.uint8)
+    labels[..., :18], labels[..., 22:] = 1, 2
+    affine = np.diag([0.02, 0.02, 0.02, 1.0])
+    affine[:3, 3] = 1, 2, 3
+    turned = affine @ np.diag([-1.0, 1.0, 1.0, 1.0])
+    turned[0, 3] += 39 * 0.02
+    scan = Field(mask.astype(np.uint8), 0.02, "mm", affine)
+    same = curvafit.measure(scan, roi=Field(labels, 0.02, "mm", affine))
+    flipped = curvafit.measure(scan, roi=Field(labels[..., ::-1], 0.02, "mm", turned))
+    for label in (1, 2):
+        values = [each.compartments[label]["Tb.Th"].value for each in (same, flipped)]
+        assert values[0] == pytest.approx(values[1], rel=1e-12)
+    assert any("laid on the scan" in note for note in flipped.notes)
+    assert not any("laid on the scan" in note for note in same.notes)
+
+
+def surfaces_of_parts() -> None:
+    """Parts of 16 voxels and more average to the whole within 1 %, of a texture that does not repeat.
+
+    Of 216 windows of 16³ the areas' deviation is .16 of their mean, and neighbours share edges: their mean is the
+    whole's to some .4 %, on average over textures to .1 % (measured).
+    """
+    mask = level_set((96, 96, 96), 2.5, 0.31)
+    whole = surface(mask)
+    for edge in (16, 32):
+        starts = range(0, 96, edge)
+        parts = [
+            surface(mask[i : i + edge, j : j + edge, k : k + edge]) for i in starts for j in starts for k in starts
+        ]
+        assert np.mean(parts, axis=0)[0] == pytest.approx(whole[0], rel=0.01)
+    slabs = np.mean([surface(mask[k : k + 16]) for k in range(0, 96, 16)], axis=0)
+    assert slabs == pytest.approx(whole, rel=0.01)
+    z, y, x = np.mgrid[:16, :64, :64]
+    rods = (((y % 32) - 15.5) ** 2 + ((x % 32) - 15.5) ** 2 < 36) & (z >= 0)
+    assert surface(rods)[0] == pytest.approx(surface(np.concatenate([rods] * 4))[0], rel=1e-3)
+
+
+def surface(mask: np.ndarray) -> np.ndarray:
+    """The surface density, and surface to volume."""
+    from curvafit.scan.measure import measure_surface
+
+    area = measure_surface(mask, (1.0, 1.0, 1.0), False)[1][:, 0].sum()
+    return np.array([area / mask.size, area / mask.sum()])
+
+
+def grey(mask: np.ndarray, low: float = 700.0, high: float = 1500.0, noise: float = 60.0) -> np.ndarray:
+    """Blurred grey levels of a mask, with noise, int16."""
+    levels = ndimage.gaussian_filter(np.where(mask, high, low), 0.6)
+    return (levels + np.random.default_rng(1).normal(0, noise, mask.shape)).astype(np.int16)
+
+
+def circle(n: int) -> np.ndarray:
+    y, x = np.indices((n, n)) - (n - 1) / 2
+    return np.broadcast_to(y**2 + x**2 < (n / 2 - 0.5) ** 2, (n, n, n))
+
+
+def a_padded_scan() -> None:
+    """What a scanner writes outside of its circle sets no threshold: with the region BV/TV is the mask's.
+
+    Smoothing by a voxel takes 5 % of the volume of structures that are 4 voxels thick.
+    """
+    inside, mask = circle(48), level_set((48, 48, 48), 2.6, 0.2)
+    scan = np.where(inside, grey(mask), -1000).astype(np.int16)
+    whole, within = curvafit.measure(scan), curvafit.measure(scan, roi=inside.astype(np.uint8))
+    assert within["BV/TV"].value == pytest.approx(mask[inside].mean(), rel=0.1)
+    assert whole["BV/TV"].value == pytest.approx(mask[inside].mean() * inside.mean(), rel=0.1)
+    assert any("exactly -1000" in note and "inside the region" in note for note in within.notes)
+    assert any("exactly -1000" in note and "without them" in note for note in whole.notes)
+    tiled = curvafit.measure(scan, tile=32)
+    assert [each.value for each in tiled.quantities] == pytest.approx(
+        [each.value for each in whole.quantities], rel=1e-5
+    )
+    assert next(note for note in whole.notes if "exactly" in note) in tiled.notes
+
+
+def a_thin_stack() -> None:
+    z, y, x = np.mgrid[:16, :64, :64]
+    rods = ((((y % 32) - 15.5) ** 2 + ((x % 32) - 15.5) ** 2 < 36) & (z >= 0)).astype(np.uint8)
+    for count in (3, 5, 8):
+        found = curvafit.measure(rods[:count], spacing=1.0, unit="um")
+        assert found["BV/TV"].value == rods[0].mean()
+        assert found["Tb.Th"].value == pytest.approx(11.5, abs=1)  # up to a voxel too little on tubes
+        assert found["BS/TV"].value == pytest.approx(4 * np.pi * 12 / 64**2, rel=0.01)
+        assert np.isfinite([found[symbol].value for symbol in ("Tb.Sp", "Tb.N", "Conn.D", "BS/BV", "DA")]).all()
+        assert np.isnan([found[symbol].value for symbol in ("H", "K", "share of tubes")]).all()
+        assert any("No curvature" in note for note in found.notes)
+        assert curvafit.windows(rods[:count], (count, 64, 64), (count, 32, 32)).known.all()
+        tiled = curvafit.measure(rods[:count], spacing=1.0, unit="um", tile=32)
+        with pytest.raises(ValueError, match="too thin"):
+            curvafit.compare([found, found], [found, found])
+        assert tiled["BS/TV"].value == pytest.approx(found["BS/TV"].value, rel=1e-6)
+
+
+def an_empty_mask() -> None:
+    empty = np.zeros((20, 20, 20))
+    for dtype in (bool, np.uint8, np.float32):
+        with pytest.raises(ValueError, match="structure in the scan, got none"):
+            curvafit.measure(empty.astype(dtype))
+        with pytest.raises(ValueError, match="background in the scan, got none"):
+            curvafit.measure((empty + 1).astype(dtype))
+
+
+def labels_without_a_name() -> None:
+    """Whole numbers of a few values are labels: their union is measured, and a note says so; kind image splits them."""
+    labels = level_set((40, 40, 40), 2.5, 0.3).astype(np.int64)
+    labels[20:] *= 3
+    labels[:, 20:] *= 2
+    found = curvafit.measure(labels)
+    assert (found.kind, found["BV/TV"].value) == ("mask", (labels > 0).mean())
+    assert any("labels" in note for note in found.notes)
+    assert any("labels" in note for note in curvafit.measure(labels, tile=32).notes)
+    assert curvafit.measure(labels, kind="image").kind == "image"
+    few = np.clip(np.random.default_rng(0).normal(np.where(labels > 0, 11, 4), 1.5), 0, 15).astype(np.uint8)
+    assert curvafit.measure(few).kind == "image"  # of 4 bits, with noise
+
+
+def unknown_keywords() -> None:
+    for call in (curvafit.measure, curvafit.windows, curvafit.measure_instances, curvafit.infer):
+        for scan in (np.eye(3), "none.npy"):
+            with pytest.raises(TypeError, match="nonsense"):
+                call(scan, nonsense=1)
+
+
+CASES: dict[str, Callable[[], None]] = {
+    "02-roi-elsewhere": a_region_elsewhere,
+    "06-surface-density": surfaces_of_parts,
+    "07-fov-padding": a_padded_scan,
+    "17-thin-stack": a_thin_stack,
+    "eng-07-empty-mask-message": an_empty_mask,
+    "eng-07-labels": labels_without_a_name,
+    "eng-07-nonsense": unknown_keywords,
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_handed(case: str) -> None:
+    CASES[case]()
+
+
+# ---- backgrounds that are no padding ---------------------------------------------------------------------------------
+
+
+def blobs(count: int, n: int = 48) -> np.ndarray:
+    """Bright balls without a background: levels that fall to exactly 0."""
+    places = np.random.default_rng(0).uniform(0.25 * n, 0.75 * n, (count, 3))
+    grid = np.moveaxis(np.indices((n, n, n)), 0, -1)
+    near = np.min([np.linalg.norm(grid - place, axis=-1) for place in places], axis=0)
+    levels = 200 * ndimage.gaussian_filter((near < 8).astype(np.float32), 1.5)
+    return np.clip(levels + np.random.default_rng(1).normal(0, 4, near.shape) - 15, 0, 255).astype(np.uint8)
+
+
+def porous_body() -> np.ndarray:
+    """A bright ball with pores, in air that is exactly 0 (all within the ball is the scan of a bone)."""
+    near = np.linalg.norm(np.moveaxis(np.indices((48,) * 3), 0, -1) - 23.5, axis=-1) < 20
+    return np.where(near & ~level_set((48, 48, 48), 2.5, 0.3), grey(near, 0, 1500), 0).clip(0).astype(np.uint16)
+
+
+@pytest.mark.parametrize(
+    "scan",
+    [
+        blobs(1),
+        blobs(6),
+        porous_body(),
+        np.where(level_set((48, 48, 48), 2.5, 0.3), grey(np.ones((48,) * 3, bool)), 0),
+        grey(level_set((48, 48, 48), 2.5, 0.3), 0, 1500, 200).clip(0),
+    ],
+    ids=["one blob", "blobs", "porous body", "masked levels", "cut noise"],
+)
+def test_a_background_of_one_value_stays_a_background(scan: np.ndarray) -> None:
+    """The threshold is Otsu's of all voxels."""
+    from skimage.filters import threshold_otsu
+
+    found = curvafit.measure(scan)
+    high = scan > threshold_otsu(scan)
+    level = (scan[high].mean() + scan[~high].mean()) / 2
+    assert any(f"threshold of {level:.4g}" in note for note in found.notes), found.notes
