@@ -73,7 +73,7 @@ def _check_inputs(arguments: Mapping[str, Any]) -> None:
     from curvafit.core.checks import quoted, simplify_name
     from curvafit.priors.published import PUBLISHED
 
-    for given in filter(None, map(arguments.get, _LAWS)):
+    for given in (each for each in map(arguments.get, _LAWS) if each and isinstance(each, str)):  # `--laws` is a flag
         for law in [] if given.endswith(".json") else given.split(","):
             if simplify_name(law) not in PUBLISHED and not law.endswith(".json") and not os.path.isfile(given):
                 raise ValueError(f"expected a preset among {', '.join(PUBLISHED)}, or a fit.json, got {quoted(law)}")

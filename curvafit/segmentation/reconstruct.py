@@ -208,7 +208,7 @@ def reconstruct(
             raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
         seen = _load_image(image, volume, reading)
         evidence, doubts = _read_evidence(seen, target, axis, sub_progress(progress, 0.0, 0.5))
-        taught, notes = taught if evidence is not None else Taught.load(), (*notes, *doubts)
+        taught, notes = taught if evidence is not None else Taught.load(), (*notes, *seen.notes, *doubts)
     if example is not None:
         other = Example.of(_load_example(example, volume, reading), places, axis)
         taught = tune(taught, other, sub_progress(progress, 0.0, 0.5))
@@ -545,7 +545,7 @@ def reconstruct_labels(
     if seen is not None and not full and not periodic:
         if instances is None:
             instances = are_instances(drawn, np.moveaxis(seen.values, axis, 0)[places], len(numbers))
-        notes = (*notes, ONCE if instances else APIECE)
+        notes = (*notes, *seen.notes, ONCE if instances else APIECE)
         if instances:
             whole = labels.fill(None, WHOLE, image=seen, progress=sub_progress(progress, 0.0, 0.5))
             progress, alone = sub_progress(progress, 0.5, 1.0), None
