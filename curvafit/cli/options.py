@@ -27,7 +27,7 @@ OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace file
 #: Parameters of commands that are volumes to read, and those that are laws.
 _VOLUMES = ("scan", "scans", "slices", "probabilities", "roi", "image", "example", "example_probabilities", "like",
             "like_mask")  # fmt: skip
-_LAWS = ("preset", "prior", "laws")
+_LAWS = {"preset": "preset", "prior": "prior", "laws": "preset"}
 
 
 # ---- commands --------------------------------------------------------------------------------------------------------
@@ -73,10 +73,14 @@ def _check_inputs(arguments: Mapping[str, Any]) -> None:
     from curvafit.core.checks import quoted, simplify_name
     from curvafit.priors.published import PUBLISHED
 
-    for given in (each for each in map(arguments.get, _LAWS) if each and isinstance(each, str)):  # `--laws` is a flag
+    for argument, name in _LAWS.items():
+        given = arguments.get(argument)
+        if not isinstance(given, str):  # compare's `laws` is a flag
+            continue
         for law in [] if given.endswith(".json") else given.split(","):
             if simplify_name(law) not in PUBLISHED and not law.endswith(".json") and not os.path.isfile(given):
-                raise ValueError(f"expected a preset among {', '.join(PUBLISHED)}, or a fit.json, got {quoted(law)}")
+                names = ", ".join(PUBLISHED)
+                raise ValueError(f"--{name} takes a preset among {names}, or a fit.json, got {quoted(law)}")
 
 
 def add_commands(app: typer.Typer, *functions: Callable[..., None]) -> None:

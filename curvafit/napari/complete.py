@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -116,7 +117,8 @@ class Complete(Dock):
         field = replace(field, values=np.array(field.values))
         values = np.moveaxis(field.values, axis, 0)
         numbers = [int(layer.selected_label)] if self.which.value == _ONE else np.unique(values[values != 0]).tolist()
-        require_labels(values, f"the labels layer {layer.name}")
+        most = {"most": math.inf} if self.which.value == _ONE else {}
+        require_labels(values, f"the labels layer {layer.name}", **most)
         if not index_labels(values, numbers).any():
             what = "labels" if self.which.value == _ALL else f"voxels of label {numbers[0]}"
             raise ScanError(f"expected slices with {what} in {layer.name}, got none")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from numbers import Real
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol, runtime_checkable
@@ -198,7 +199,7 @@ def _read_numbers(law: object) -> Coefficients | None:
     """Return coefficients that are stated by name, or as six numbers; None where they are not."""
     if isinstance(law, Mapping) and {*NAMES[:3]} <= {*law} <= {*NAMES}:
         return Coefficients(**law)
-    if isinstance(law, (tuple, list)) and len(law) == 6 and all(isinstance(a, (int, float)) for a in law):
+    if isinstance(law, (tuple, list)) and len(law) == 6 and all(isinstance(a, Real) for a in law):
         return Coefficients(*law)
     return None
 

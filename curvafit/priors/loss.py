@@ -142,7 +142,7 @@ class CurvaturePrior(nn.Module):
         with torch.autocast(input.device.type, enabled=False):
             voxels, ignored = self._voxel_weights(input, target, mask)
             if ignored is not None:  # before the activation, whose derivative of a NaN is one
-                input = torch.where(ignored, input.detach().nan_to_num(0, 0, 0), input)
+                input = torch.where(ignored, 0.0 if self.sigmoid or self.softmax else 0.5, input)
             probability = self._probability(input)
             classes, spacing, skipped = probability.shape[1], self._spacing_of(input), self._is_skipped(input)
             times = (1, 1, 1) if skipped else choose_refinement(spacing, self.epsilon)

@@ -58,6 +58,8 @@ NOISY, SLICED = 0.02, 1.5
 _ALIKE = 0.25
 #: The most values of labels: grey levels of four bits have more.
 _FEW = 12
+#: About so many voxels tell, first, whether a volume has more values.
+_SAMPLED = 4096
 #: What structure is in a mask of several values.
 SEVERAL = (
     "Taken for a mask or labels: the structure is where they are positive. Naming a label (label) measures it alone, "
@@ -203,7 +205,7 @@ def is_rounded(u: np.ndarray) -> bool:
 def _guess_kind(values: np.ndarray, threshold: Literal["otsu"] | float, two: bool) -> Kind:
     """Guess the kind: two values are a mask, as are labels; floats from about -1 to about 1, without noise and mostly
     far from 0, are a phase field; anything else is an image."""
-    if two or (threshold == "otsu" and are_labels(count_values(values))):
+    if two or (threshold == "otsu" and are_labels(list_values(values))):
         return "mask"
     if may_be_field(values.dtype, threshold, values.min(), values.max()):
         jitter = float(np.median(np.abs(np.diff(values, 3, axis=2)))) if values.shape[2] > 3 else 0.0
@@ -217,16 +219,15 @@ def may_be_field(dtype: np.dtype, threshold: Literal["otsu"] | float, lowest: fl
     return dtype.kind == "f" and threshold == "otsu" and -2 <= lowest <= -0.7 and 0.3 <= highest <= 2
 
 
-def count_values(values: np.ndarray) -> np.ndarray:
-    """Return how many voxels have each whole number from 0 to 255, and how many others (257,)."""
-    if values.dtype.kind not in "iu" or values.min() < 0 or values.max() > 255:
-        return np.append(np.zeros(256, dtype=np.int64), values.size)
-    return np.bincount(values.ravel().astype(np.uint8), minlength=257)
+def list_values(values: np.ndarray) -> np.ndarray:
+    """Return the values of a volume, ascending, or some of them where they are more than labels have."""
+    some = np.unique(values.ravel()[:: 1 + values.size // _SAMPLED])
+    return (some if len(some) > _FEW else np.unique(values))[: _FEW + 1]
 
 
-def are_labels(counts: np.ndarray) -> bool:
-    """Return whether `count_values` of a volume are those of labels: whole numbers of some few values."""
-    return bool(not counts[256] and 2 < np.count_nonzero(counts) <= _FEW)
+def are_labels(found: np.ndarray) -> bool:
+    """Return whether `list_values` of a volume are those of labels: few whole numbers from 0."""
+    return 2 < len(found) <= _FEW and bool(found[0] >= 0 and (found == np.rint(found)).all())
 
 
 class Padding(NamedTuple):

@@ -39,10 +39,10 @@ from curvafit.scan.structure import (
     are_labels,
     count_constant,
     count_pairs,
-    count_values,
     describe_padding,
     describe_split,
     judge_padding,
+    list_values,
     may_be_field,
     pairs_of_noise,
     sign_levels,
@@ -270,7 +270,7 @@ def _find_split(volume: Volume, place: Place, dtype: np.dtype, find: Finder) -> 
     bars = cut_boxes(place.shape, (side, side, place.shape[2]))
     value = volume.read(volume.open(), (slice(0, 1), slice(0, 1), slice(0, 1)))[0, 0, 0]
     found = list(find("reading", partial(_look_at_values, volume, bars, value), len(bars)))
-    total = _add({name: each[name] for name in each if name != "two"} for each in found)
+    total = _add({name: each[name] for name in each if name not in ("two", "values")} for each in found)
     if faults := int(total["faults"]):
         raise ScanError(f"a volume must be finite, got {faults} values that are not in {place.source}")
     lowest, highest = total["lowest"], total["highest"]
@@ -280,9 +280,9 @@ def _find_split(volume: Volume, place: Place, dtype: np.dtype, find: Finder) -> 
         raise ScanError(f"every voxel of {place.source} is {lowest}: a volume must vary")
     ends = {float(lowest), float(highest)}
     two = all(bool(each["two"]) and {float(each["lowest"]), float(each["highest"])} <= ends for each in found)
-    kind = volume.kind
+    kind, values = volume.kind, np.unique(np.concatenate([each["values"] for each in found]))
     if kind == "auto":
-        kind = "mask" if two or (volume.threshold == "otsu" and are_labels(total["counts"])) else "image"
+        kind = "mask" if two or (volume.threshold == "otsu" and are_labels(values)) else "image"
         if kind == "image" and may_be_field(dtype, volume.threshold, float(lowest), float(highest)):
             steady = 2 * total["steady"] > total["steps"] or not total["steps"]
             kind = "field" if steady and total["plateau"] > PLATEAUS * math.prod(place.shape) else "image"
@@ -307,7 +307,7 @@ def _look_at_values(volume: Volume, bars: Sequence[Box], value: Any, number: int
     values = volume.read(volume.open(), bars[number])
     lowest, highest = values.min(), values.max()
     found = {"lowest": lowest, "highest": highest, "two": np.all((values == lowest) | (values == highest))}
-    found |= {"counts": count_values(values), "padding": count_constant(values, value)}
+    found |= {"values": list_values(values), "padding": count_constant(values, value)}
     if (inner := values[values != value]).size:
         found |= {"inner lowest": inner.min(), "inner highest": inner.max()}
     if values.dtype.kind != "f":

@@ -448,7 +448,7 @@ def fill_block(job: Job, number: int) -> Found:
     sums = {
         "counts": count_probabilities(told),
         "sum": told.sum(dtype=np.float64),
-        "total": likely.sum(dtype=np.float64),
+        "total": likely[~far].sum(dtype=np.float64),
     }
     return {**sums, **{f"along {k}": each for k, each in enumerate(along)}}
 

@@ -103,10 +103,8 @@ LEAST_BYTES = 30
 #: Least share of the entropy of slices held out that an image takes away: that of the structure takes half or more.
 TOLD = 0.1
 SHIFTED = "The image seems to lie off the annotated slices by {where}: it fits them better when it is moved back."
-ONCE = (
-    "The labels are read in the image as instances of one structure: where they are of several kinds, --no-instances."
-)
-APIECE = "Each label is read in the image by itself: where they are instances of one kind, such as cells, --instances."
+ONCE = "The labels are read in the image as instances of one structure (--no-instances reads each by itself)."
+APIECE = "Each label is read in the image by itself (--instances reads those of one kind, such as cells, as one)."
 UNTOLD = "The image does not tell the structure in annotated slices held out: it is left out."
 #: Voxels around a label's box.
 ROOM = 16
@@ -208,7 +206,7 @@ def reconstruct(
             raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
         seen = _load_image(image, volume, reading)
         evidence, doubts = _read_evidence(seen, target, axis, sub_progress(progress, 0.0, 0.5))
-        taught, notes = taught if evidence is not None else Taught.load(), (*notes, *seen.notes, *doubts)
+        taught, notes = taught if evidence is not None else Taught.load(), (*notes, *doubts)
     if example is not None:
         other = Example.of(_load_example(example, volume, reading), places, axis)
         taught = tune(taught, other, sub_progress(progress, 0.0, 0.5))
@@ -238,14 +236,14 @@ def reconstruct(
     uncertain = _uncertainty(*likely, mask, target, volume, axis, suggest, told=evidence is not None)
     tested = "the example" if other else "slices left out" if chosen.law else "generated shapes"
     end = describe_errors(uncertain.expected_dice, uncertain.calibration_error, uncertain.suggestions, tested)
-    mean = float(uncertain.probability.values.mean(dtype=np.float64))
-    filled = describe_filled(places, volume.shape[axis], summary, uncertain.known_share, mean, evidence is not None)
+    shares, to_ends = (uncertain.known_share, uncertain.mean_probability), evidence is not None or periodic
+    filled = describe_filled(places, volume.shape[axis], summary, *shares, to_ends)
     return Segmentation.of(
         volume, _turn_back(axis, mask), _turn_back(axis, phase), chosen.law, width,
         (
             *which, *doubt_labels(np.unique(np.moveaxis(volume.values, axis, 0)[places]), ignore), *notes,
             *doubt_filled(uncertain.expected_dice, float(mask.mean()), uncertain.known_share),
-            *note_ends(places, volume.shape[axis], evidence is not None),
+            *(() if periodic else note_ends(places, volume.shape[axis], evidence is not None)),
         ),
         weight=None, status=f"{said}: {filled}; {end}", uncertainty=uncertain, image=seen,
     )  # fmt: skip
@@ -411,7 +409,8 @@ def _uncertainty(
         slices.inside.mean((1, 2)), slices.places, slices.length, periodic=slices.periodic, whole=told
     )
     likely_field = replace(volume, values=_turn_back(axis, values), notes=())
-    return Uncertainty(likely_field, error, suggestions, dice, known_share=known)
+    mean = float(values[slice(None) if told else ~slices.outside].sum(dtype=np.float64)) / values.size
+    return Uncertainty(likely_field, error, suggestions, dice, known_share=known, mean_probability=mean)
 
 
 def _turn_back(axis: int, values: np.ndarray) -> np.ndarray:
@@ -491,7 +490,7 @@ def reconstruct_labels(
     label that is nearest as filled without the image, and each label is kept in one piece.
 
     Each label is filled in the box where it may be. Where every voxel of the known slices is labelled, so is every
-    voxel of the volume: an unclaimed voxel goes to the label with the largest phase value, or to the nearest. A label
+    voxel that is filled: an unclaimed voxel goes to the label with the largest phase value, or to the nearest. A label
     for which slices or example are too few for what is asked is filled by the network alone, and a note says why.
 
     Parameters
@@ -547,7 +546,8 @@ def reconstruct_labels(
             instances = are_instances(drawn, np.moveaxis(seen.values, axis, 0)[places], len(numbers))
         notes = (*notes, *seen.notes, ONCE if instances else APIECE)
         if instances:
-            whole = labels.fill(None, WHOLE, image=seen, progress=sub_progress(progress, 0.0, 0.5))
+            bare = replace(seen, affine=None, notes=())
+            whole = labels.fill(None, WHOLE, image=bare, progress=sub_progress(progress, 0.0, 0.5))
             progress, alone = sub_progress(progress, 0.5, 1.0), None
             options.pop("filler", None)  # that one reads images
         if whole is not None and UNTOLD in whole.notes:
@@ -642,7 +642,7 @@ def _join_parts(labels: _Labels, parts: _Parts, full: bool, far: np.ndarray) -> 
         spacing = labels.given.spacing
         near = ndimage.distance_transform_edt(unseen, spacing, return_distances=False, return_indices=True)
         owner = owner[tuple(near)]  # type: ignore[arg-type]
-    values = np.where(labels.known, labels.given.values, np.where((deepest > 0) | (full & ~far), owner, 0))
+    values = np.where(labels.known, labels.given.values, np.where(((deepest > 0) | full) & ~far, owner, 0))
     likely = np.where(values, largest, 1.0) / np.maximum(odds + ((values == 0) | (not full)), SURE)
     return values, likely, deepest, odds
 

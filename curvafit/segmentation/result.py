@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -37,10 +38,12 @@ FORMAT = Format("curvafit-mask-1", title="the record of a mask")
 MAPS = ("probability", "sure")
 #: Numbers or labels that are told one by one, and the least expected Dice of a volume that slices tell.
 FEW, HALF = 4, 0.5
+#: Least relative difference of two shares of a volume that is told.
+LITTLE = 0.01
 #: What is said of a mask that is no estimate of a volume.
 OFF = (
-    "The mask's volume lies off what the known slices alone tell by more than their error: for a volume take theirs. "
-    "The mask has the best Dice to expect."
+    "The mask's share of the volume is not within the interval by the known slices alone: for a volume take theirs. "
+    "The mask is the one with the best Dice to expect, which may be too large or too small."
 )
 _NIFTI = (".nii", ".nii.gz")
 
@@ -65,6 +68,8 @@ class Uncertainty:
         Of several structures: that of each label.
     known_share
         Of one structure: its share of the volume by the known slices alone, with its 95 % interval where there is one.
+    mean_probability
+        Of one structure: its share of the volume by the probabilities, 0 in slices that are not filled.
     """
 
     probability: Field
@@ -73,6 +78,7 @@ class Uncertainty:
     expected_dice: float
     dice_of_labels: Mapping[int, float] = field(default_factory=dict)
     known_share: tuple[float, ...] = ()
+    mean_probability: float = math.nan
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -350,8 +356,7 @@ def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> di
         if uncertain.dice_of_labels:
             doubts["dice_of_labels"] = {str(number): dice for number, dice in uncertain.dice_of_labels.items()}
         if uncertain.known_share:
-            mean = float(uncertain.probability.values.mean(dtype=np.float64))
-            doubts |= {"known_share": uncertain.known_share, "mean_probability": mean}
+            doubts |= {"known_share": uncertain.known_share, "mean_probability": uncertain.mean_probability}
     found = {
         "coefficients": None if segmentation.coefficients is None else segmentation.coefficients.as_dict(),
         "epsilon": segmentation.epsilon,
@@ -393,13 +398,13 @@ def note_labelled(places: Sequence[int], empty: Sequence[int]) -> tuple[str, ...
     """Return sentences on which slices are known where those with labels are, and `empty` ones in their rhythm."""
     drawn = [k for k in places if k not in empty]
     which = f"The {len(drawn)} slices with labels are known: {list_numbers(drawn, 24)}."
-    return (f"{which} One that is rightly empty must be named.", *note_empty(empty))
+    return (f"{which} Another one that is rightly empty must be named.", *note_empty(empty))
 
 
 def note_empty(empty: Sequence[int]) -> tuple[str, ...]:
     """Return a sentence on slices that are taken for rightly empty."""
-    which = f"Slice{'s' * (len(empty) > 1)} {list_numbers(empty)}, next in the rhythm of those with labels,"
-    return (f"{which} are taken for rightly empty: if that is wrong, name the known slices.",) if empty else ()
+    which = f"Taken for rightly empty, as next in the rhythm of those with labels: {list_numbers(empty)}."
+    return (f"{which} If that is wrong, name the known slices.",) if empty else ()
 
 
 def doubt_places(there: np.ndarray, places: Sequence[int]) -> tuple[str, ...]:
@@ -424,9 +429,9 @@ def doubt_labels(values: np.ndarray, ignore: int | None = None) -> tuple[str, ..
 
 def doubt_filled(dice: float, share: float, known: Sequence[float]) -> tuple[str, ...]:
     """Return sentences where a low Dice is expected between known slices, and where a mask's share of the volume lies
-    out of the interval of the share by the known slices alone (`share_by_slices`)."""
+    out of the interval of the share by the known slices alone (`share_by_slices`), and off that by 1 % of it."""
     low = "Known slices lie too far apart: what lies between them is more unknown than known."
-    off = bool(known[1:]) and not known[1] <= share <= known[2]
+    off = bool(known[1:]) and not known[1] <= share <= known[2] and abs(share / known[0] - 1) > LITTLE
     return (low,) * (dice < HALF) + (OFF,) * off
 
 

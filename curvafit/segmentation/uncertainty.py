@@ -119,7 +119,7 @@ def entropy(probability: np.ndarray) -> np.ndarray:
 
 
 def doubt(probability: np.ndarray) -> np.ndarray:
-    """Return the entropy of each probability; none where it is one half to the bit, as where nothing was filled."""
+    """Return the entropy of each probability; 0 of exactly one half, which stands where nothing was filled."""
     return entropy(np.where(probability == 0.5, 0, probability))
 
 
@@ -153,7 +153,7 @@ def share_by_slices(
     ends = np.maximum([at[0] - reach.start, reach.stop - 1 - at[-1]], 0)
     walked = (gaps * (gaps**2 - 1) / 12).sum() + (ends * (ends + 1) * (2 * ends + 1) / 6).sum()
     half = float(student.ppf(0.975, len(off)) * np.sqrt(steps * walked + jumps * weights @ weights)) / length
-    return known, max(known - half, 0.0), known + half
+    return known, max(known - half, 0.0), min(known + half, 1.0)
 
 
 def _with_constant(evidence: np.ndarray) -> np.ndarray:

@@ -29,7 +29,9 @@ def lay(field: Field, on: Field, name: str, kind: str, *, exact: bool = False) -
         if field.shape != on.shape:
             raise ScanError(f"{name} must have the shape of {kind} {on.shape}, got {field.shape} without a place in it")
         neither = field.affine is None and on.affine is None
-        return field, () if neither else (f"{note} voxel by voxel: one of the two states no place.",)
+        both = field.affine is not None and on.affine is not None
+        why = "their units do not convert" if both else "one of the two states no place"
+        return field, () if neither else (f"{note} voxel by voxel: {why}.",)
     matrix, offset = step
     whole, moved = np.rint(matrix), np.rint(offset)
     corners = np.array(list(product(*((0, n - 1) for n in on.shape))))

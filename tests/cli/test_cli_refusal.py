@@ -32,7 +32,7 @@ SYNTH = ["--presets", "tubes", "--modality", "confocal", "--workers", "0", "--co
         ("synth -o set --count many", "(see curvafit synth --help)"),
         ("samples get", "(see curvafit samples get --help)"),
         ("presets all", "argument"),
-        ("refine p.npy --repair -o mask.npy", "gone"),
+        (f"refine {__file__} --repair -o mask.npy", "gone"),
     ],
 )
 def test_wrong_use_is_one_line(arguments: str, word: str) -> None:

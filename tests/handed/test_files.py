@@ -134,7 +134,7 @@ def times(folder: Path) -> None:
                 load(folder / name, **wrong)
     with pytest.raises(ScanError, match="order z, y, x"):
         load(folder / "t.h5::turned", time=1)
-    with pytest.raises(ScanError, match="single time"):
+    with pytest.raises(ScanError, match="no axis of times"):
         load(save(Field(numbers()), folder / "plain.tif"), time=0)
 
 

@@ -58,7 +58,7 @@ def refuse_inputs_before_libraries(folder: Path) -> None:
     for words, sentence in (
         ("measure typo.tif", "no such file: typo.tif"),
         ("reconstruct typo.h5::a -o a.tif", "no such file: typo.h5"),
-        ("generate --preset tubez -o a.tif", "expected a preset among"),
+        ("generate --preset tubez -o a.tif", "takes a preset among"),
         ("synth --presets tubes,spunge --modality confocal -o set", "got 'spunge'"),
     ):
         run = subprocess.run([sys.executable, "-c", code, *words.split()], cwd=folder, capture_output=True, text=True)

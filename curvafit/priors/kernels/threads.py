@@ -29,10 +29,10 @@ _ONE_CALLER = threading.Lock()
 
 
 class Kernel:
-    """A loop whose `prange` runs over chunks, compiled on demand for numba's threads, and for the caller alone.
+    """Run a loop over chunks on numba's threads, or on none of them: two forms of one function, compiled on demand.
 
-    One thread, and any call in a forked process, takes the second: numba's threads do not survive a fork. Both have
-    the same body, whose arguments do not overlap.
+    A call for one thread takes the serial form, and so does every call in a forked process, as numba's threads do not
+    survive a fork. Arrays among the arguments must not overlap.
     """
 
     def __init__(self, function: Callable[..., None], **options: Any) -> None:

@@ -256,7 +256,10 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     slices = [image for image in images if str(image.get("SeriesInstanceUID", "")) == uid]
     if frames := next((int(n) for image in slices if (n := image.get("NumberOfFrames") or 1) > 1), None):
         raise ScanError(f"a DICOM series must have a file a slice, got {frames} frames in a file of {path}")
-    if not all("ImagePositionPatient" in image and "ImageOrientationPatient" in image for image in slices):
+    placed = ["ImagePositionPatient" in image and "ImageOrientationPatient" in image for image in slices]
+    if any(placed) and not all(placed):
+        raise ScanError(f"DICOM slices must all state a position, got {placed.count(False)} without one in {path}")
+    if not any(placed):
         slices.sort(key=lambda image: image.InstanceNumber)
         note = "The slices state no position: they are stacked in the order of their numbers."
         return _stack_planes(slices)._replace(notes=(note,))

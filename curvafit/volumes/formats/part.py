@@ -70,7 +70,8 @@ class Part:
         picked: dict[int, tuple[str, int | None]] = {}
         for name, axis, number in (("channel", channel, self.channel), ("time", time, self.time)):
             if axis is None and number is not None:
-                raise ScanError(f"{place} holds a single {name}, got {name} {quoted(number)}")
+                other = " (a channel picks one of several without names)" if name == "time" and len(long) == 4 else ""
+                raise ScanError(f"{place} names no axis of {name}s, got {name} {quoted(number)}{other}")
             count = 1 if axis is None else shape[axis]
             if (
                 not 0
