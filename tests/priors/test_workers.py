@@ -68,10 +68,10 @@ def train(options):
 
 def run(program: Path, *arguments: str, **environment: str) -> tuple[str, str]:
     """The last line that a program prints, and all that it says beside; it runs in a process of two threads."""
-    kinds = ("OMP", "NUMBA", "MKL")  # torch follows MKL's number, which dask sets
-    threads = dict.fromkeys((f"{kind}_NUM_THREADS" for kind in kinds), "2") | {"PYTHONPATH": str(ROOT)}
+    threads = {"OMP_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2", "PYTHONPATH": str(ROOT)} | environment
+    threads["MKL_NUM_THREADS"] = threads["OMP_NUM_THREADS"]  # torch follows MKL's number, which dask sets to 1
     command = [sys.executable, str(program), *arguments]
-    done = subprocess.run(command, env=os.environ | threads | environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, env=os.environ | threads, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()[-1], done.stderr
 
