@@ -1,7 +1,8 @@
 """What all tiles of a volume must have in common: its kind, threshold, noise and thickness, found box by box.
 
-Three passes read the volume. The first finds its extremes and kind; the second, of images alone, Otsu's threshold; the
-third counts the structure, and where it has most surface. There the thickness is measured that sets the working grid.
+Three passes read the volume. The first finds its extremes and kind; the second, of images alone, Otsu's threshold, and
+before it padding where one value fills much of them; the third counts the structure, and where it has most surface.
+There the thickness is measured that sets the working grid.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from curvafit.scan.prepare import (
 from curvafit.scan.structure import (
     JITTER,
     LAGS,
+    PADDED,
     PLATEAU,
     PLATEAUS,
     SEVERAL,
@@ -256,7 +258,7 @@ def _add(found: Iterable[Found]) -> dict[str, np.ndarray]:
     total: dict[str, np.ndarray] = {}
     for each in found:
         for name, value in each.items():
-            join = {"lowest": np.minimum, "highest": np.maximum}.get(name.removeprefix("inner "), np.add)
+            join = {"lowest": np.minimum, "highest": np.maximum}.get(name, np.add)
             total[name] = join(total[name], value) if name in total else value
     return total
 
@@ -291,25 +293,33 @@ def _find_split(volume: Volume, place: Place, dtype: np.dtype, find: Finder) -> 
         return split, f"Taken for a phase field: values {float(lowest):.3g} to {float(highest):.3g}."
     if kind == "mask":
         return split, f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else SEVERAL
-    padding, left, inner = judge_padding(value, total["padding"]), None, ""
-    if padding is not None and padding.sure:
-        left, inner = padding.value, "inner "
-    split = replace(split, padding=padding)
+    size = math.prod(place.shape)
+    return _split_image(volume, bars, split, total, value, size, find), ""
+
+
+def _split_image(
+    volume: Volume, bars: Sequence[Box], split: Split, total: Found, value: Any, size: int, find: Finder
+) -> Split:
+    """Return the split with the padding and the threshold of an image of so many voxels, of which `total` is known."""
+    left, ends = None, (total["lowest"], total["highest"])
+    if total["constant"] > PADDED * size:
+        counted = _add(find("looking for padding", partial(_count_padding, volume, bars, value), len(bars)))
+        split = replace(split, padding=judge_padding(value, counted["padding"]))
+        if split.padding is not None and split.padding.sure:
+            left, ends = split.padding.value, (counted["lowest"], counted["highest"])
     if volume.threshold != "otsu":
-        return replace(split, level=float(volume.threshold)), ""
-    ends = total[f"{inner}lowest"], total[f"{inner}highest"]
-    return replace(split, level=_find_threshold(volume, bars, *ends, left, find)), ""
+        return replace(split, level=float(volume.threshold))
+    return replace(split, level=_find_threshold(volume, bars, *ends, left, find))
 
 
 def _look_at_values(volume: Volume, bars: Sequence[Box], value: Any, number: int) -> Found:
-    """Return the extremes of a bar, with and without a value; whether it has two values at most; and what tells labels,
-    padding with that value, and a phase field."""
+    """Return the extremes of a bar, how many voxels have a value, whether it has two values at most, and what tells
+    labels and a phase field."""
     values = volume.read(volume.open(), bars[number])
     lowest, highest = values.min(), values.max()
     found = {"lowest": lowest, "highest": highest, "two": np.all((values == lowest) | (values == highest))}
-    found |= {"values": list_values(values), "padding": count_constant(values, value)}
-    if (inner := values[values != value]).size:
-        found |= {"inner lowest": inner.min(), "inner highest": inner.max()}
+    found["values"] = np.array([lowest, highest]) if found["two"] else list_values(values)
+    found["constant"] = np.int64(np.count_nonzero(values == value))
     if values.dtype.kind != "f":
         return {**found, "faults": np.int64(0)}
     found["faults"] = np.int64(values.size - np.count_nonzero(np.isfinite(values)))
@@ -318,6 +328,13 @@ def _look_at_values(volume: Volume, bars: Sequence[Box], value: Any, number: int
         found |= {"steady": np.count_nonzero(steps < JITTER), "steps": np.int64(steps.size)}
         found["plateau"] = np.count_nonzero(np.abs(values) > PLATEAU)
     return {name: np.asarray(value) for name, value in found.items()}
+
+
+def _count_padding(volume: Volume, bars: Sequence[Box], value: Any, number: int) -> Found:
+    """Return what tells padding with a value in a bar, and the extremes of the other values."""
+    values = volume.read(volume.open(), bars[number])
+    found, others = {"padding": count_constant(values, value)}, values[values != value]
+    return found | {"lowest": others.min(), "highest": others.max()} if others.size else found
 
 
 def _find_threshold(
