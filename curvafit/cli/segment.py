@@ -255,7 +255,8 @@ def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., 
         check_fits(boxes)  # the mask is written from memory
         check_mask_target(job.out, boxes.frame, **options)  # again, as a format may not hold the unit
         if record.get("labels"):
-            check_labels(job.out, read_whole(boxes))
+            boxes = boxes_of(whole := read_whole(boxes))
+            check_labels(job.out, whole)
         tiling = Tiling.of(boxes.frame, record["epsilon"], record["tile"], periodic=record.get("periodic", False))
         store = hidden_store(job.out)
         tiles = tiling.count > 1 and (not likely or job.prior is not None)
