@@ -196,7 +196,7 @@ def reconstruct_file(
         if places is None:
             looked = find(_LOOK, partial(look_at_slab, job), job.slabs)
             places = choose_labelled(there := np.concatenate([each["there"] for each in looked]))
-            which = note_labelled(places, [k for k in places if not there[k]])
+            which = note_labelled(places, there)
         job = replace(job, places=tuple(places), careful=careful, filler=filler)
         job, doubts = _read_known(job, find, every is not None)
         job = job.cut(tile)

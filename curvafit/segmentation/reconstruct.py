@@ -348,7 +348,7 @@ def _find_known(
         return *annotated_slices(values, check_int(ignore, "a label to ignore", -SEEDS, IDS)), ()
     if every is None and known is None:
         places = choose_labelled(there := find_labelled(values))
-        return places, None, note_labelled(places, [k for k in places if not there[k]])
+        return places, None, note_labelled(places, there)
     places = known_places(len(values), every, first, known)
     return places, None, () if every is None else doubt_places(find_labelled(values), places)
 

@@ -394,9 +394,10 @@ def list_numbers(numbers: Sequence[int], most: int = FEW) -> str:
     return ", ".join(map(str, numbers[:most])) + (", …" if len(numbers) > most else "")
 
 
-def note_labelled(places: Sequence[int], empty: Sequence[int]) -> tuple[str, ...]:
-    """Return sentences on which slices are known where those with labels are, and `empty` ones in their rhythm."""
-    drawn = [k for k in places if k not in empty]
+def note_labelled(places: Sequence[int], there: np.ndarray) -> tuple[str, ...]:
+    """Return sentences on the known slices at `places`: those with labels, where `there`, and empty ones in their
+    rhythm."""
+    drawn, empty = ([k for k in places if there[k] == full] for full in (True, False))
     which = f"The {len(drawn)} slices with labels are known: {list_numbers(drawn, 24)}."
     return (f"{which} Another one that is rightly empty must be named.", *note_empty(empty))
 
