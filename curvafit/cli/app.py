@@ -25,7 +25,7 @@ from curvafit.cli import (
 )
 from curvafit.cli.atlas import atlas_app
 from curvafit.cli.console import Commands, say
-from curvafit.cli.options import add_commands
+from curvafit.cli.options import add_commands, add_gone
 
 app = typer.Typer(
     help="Shape texture of tubes and membranes in 3D: a scan in, its parameters out; parameters in, shapes out.",
@@ -44,6 +44,11 @@ add_commands(app, generate.generate, generate.presets, nnunet.nnunet)
 add_commands(app, segment.segment, refine.refine, segment.reconstruct, synth.synth)
 app.add_typer(samples.samples_app, name="samples")
 app.add_typer(atlas_app, name="atlas")
+
+#: Commands that are gone, and what to type in their place; to be deleted after one release.
+GONE: dict[str, str] = {}
+for _name, _instead in GONE.items():
+    add_gone(app, _name, _instead)
 
 
 def main() -> None:

@@ -89,6 +89,15 @@ def add_commands(app: typer.Typer, *functions: Callable[..., None]) -> None:
         app.command(function.__name__.partition("_")[0], epilog=getattr(function, "examples", None))(function)
 
 
+def add_gone(app: typer.Typer, name: str, instead: str) -> None:
+    """Add a hidden command that refuses whatever is typed, and says what to type instead."""
+
+    @app.command(name, hidden=True, context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+    @command()
+    def _refuse() -> None:
+        raise ValueError(f"`curvafit {name}` is gone: {instead}")
+
+
 _read = partial(typer.Option, rich_help_panel="How to read the file")
 
 FILES = "NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr …"
