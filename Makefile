@@ -1,8 +1,8 @@
 # Needs Python 3.11 or newer, and make.
 #   make demo       install; a real CT volume of a shell, filled, measured and read, on one page
 #   make test       install with the test tools; every quick test
-#   make test-all   every test, the quick part of the hostile suite and the examples too
-#   make test-hostile   damaged files, odd options, failing disks: all cases
+#   make test-all   every test, the examples too
+#   make test-nightly   damaged files and odd options on the command line, many more of them
 #   make lint       ruff and the type checker
 #   make docs       the documentation, into site/ (open site/index.html); every warning is an error
 # A CPU-only torch, several GB smaller on Linux: make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu
@@ -15,7 +15,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constr
 # Modules stay whole on one worker, so that what they share is made once. Workers with several threads wait for each other.
 PYTEST := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} NUMBA_NUM_THREADS=$${NUMBA_NUM_THREADS:-1} $(BIN)/python -m pytest -q -n 2 --dist loadscope
 
-.PHONY: demo test test-all test-hostile lint docs clean
+.PHONY: demo test test-all test-nightly lint docs clean
 
 demo: .venv/installed
 	@$(BIN)/curvafit demo -o demo_out
@@ -26,26 +26,30 @@ test: .venv/installed-dev
 test-all: .venv/installed-dev
 	$(PYTEST) --durations=25
 
-test-hostile: .venv/installed-dev
-	$(BIN)/python -m tests.hostile
+test-nightly: .venv/installed-dev
+	$(PYTEST) tests/hostile --hypothesis-profile nightly
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+# The notebooks run, and become pages with what they show.
 docs: .venv/installed-dev
+	PYTHONWARNINGS=ignore $(BIN)/jupytext --quiet --to ipynb --execute docs/notebooks/*.py
+	$(BIN)/jupyter nbconvert --log-level WARN --to markdown docs/notebooks/*.ipynb
 	NO_MKDOCS_2_WARNING=1 PYTHONWARNINGS=ignore $(BIN)/python -m mkdocs build --strict --quiet
 
 clean:
 	rm -rf .venv demo_out build dist site
 
-.venv/installed: EXTRAS := [infer]
-.venv/installed-dev: EXTRAS := [dev]
+.venv/installed: WHAT := --editable ".[infer]"
+.venv/installed-dev: WHAT := --editable ".[all]" --group dev
 .venv/installed .venv/installed-dev: pyproject.toml constraints.txt | $(BIN)/python
-	@echo "installing curvafit$(EXTRAS) into .venv (some minutes the first time)"
+	@echo "installing $(WHAT) into .venv (some minutes the first time)"
+	@$(PIP) --upgrade "pip>=25.1"
 	@$(if $(TORCH_INDEX),$(PIP) --index-url $(TORCH_INDEX) --no-deps torch)
-	@$(PIP) --editable ".$(EXTRAS)"
+	@$(PIP) $(WHAT)
 	@touch $@
 
 $(BIN)/python:
