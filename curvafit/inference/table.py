@@ -187,15 +187,14 @@ def load_table(path: str | Path) -> Table:
 
 
 def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Table:
-    """Return the table of a file's header and arrays."""
+    """Return the table of a file's header and arrays; each column may be float16 between its ends (`scaled`)."""
     shapes, views = (np.array(each, dtype=str) for each in json.loads(arrays["names"].tobytes()))
     if not np.isfinite(arrays["parameters"]).all():
         raise ValueError("parameters that are not finite")
-    if arrays["descriptors"].dtype.kind != "f" or not isinstance(header["provenance"], dict):
+    found = arrays["scaled"] * arrays["span"] + arrays["least"] if "scaled" in arrays else arrays["descriptors"]
+    if found.dtype.kind != "f" or not isinstance(header["provenance"], dict):
         raise ValueError("descriptors that are no numbers, or no provenance")
-    parameters, thickness, found, amount = (
-        arrays[name] for name in ("parameters", "thickness", "descriptors", "amount")
-    )
+    parameters, thickness, amount = (arrays[name] for name in ("parameters", "thickness", "amount"))
     return Table(shapes, views, parameters, thickness, found, amount, header["provenance"])
 
 
