@@ -52,7 +52,7 @@ def run(topic: str, arguments: list[str]) -> None:
     kind = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(f"python -m benchmarks {topic}", description=module.__doc__, formatter_class=kind)
     parser.add_argument("--quick", action="store_true", help="the smallest case, to see that it runs")
-    parser.add_argument("--fresh", action="store_true", help="compute cases of older code again")
+    parser.add_argument("--fresh", action="store_true", help="compute cases of other commits again")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no case after that")
     parser.add_argument("--record", action="store_true", help="write the figures into the ledger")
     module.options(parser)

@@ -4,7 +4,7 @@
 are group.row.column. What a claim does not say its group says: `topic`, `command`, `format`, `bar`, `chosen_on`,
 `reported_on`, `processor`, `note`; and of a value that was measured before the ledger was, `at`, its commit, and
 `then`, the command there if today's is another or none. `record` writes a value that was measured since into
-`benchmarks/results/TOPIC.json`, which has the last word.
+`benchmarks/results/TOPIC.jsonl`, which has the last word.
 
 A `page` prints its group between the marks `<!-- ledger: GROUP -->` and `<!-- end -->`; a `list` prints claims of
 several groups so. `prose` are sentences of pages with figures in them, which are compared and never rewritten.
@@ -12,17 +12,16 @@ several groups so. `prose` are sentences of pages with figures in them, which ar
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
-from benchmarks.harness import RESULTS, ROOT, Figure, markdown, provenance, show, sources_hash, write_whole
+from benchmarks.harness import RESULTS, ROOT, Figure, append_lines, markdown, provenance, read_lines, show, write_whole
 
 LEDGER = ROOT / "benchmarks" / "claims.toml"
 #: What a claim takes from its group where it does not say it.
@@ -47,7 +46,6 @@ class Claim:
     processor: str = ""
     note: str = ""
     commit: str = ""
-    sources: str = ""
 
     @property
     def state(self) -> str:
@@ -55,11 +53,7 @@ class Claim:
         if self.figure is None:
             return "not run"
         state = "stated" if not self.bar else "met" if meets(self.figure.value, self.bar) else "missed"
-        if self.at:
-            return f"{state}, not re-run"
-        if self.sources and (ROOT / f"benchmarks/{self.topic}.py").exists():
-            return state if self.sources == sources_hash(f"benchmarks.{self.topic}") else f"{state}, older code"
-        return state
+        return f"{state}, not re-run" if self.at else state
 
     @property
     def text(self) -> str:
@@ -189,16 +183,15 @@ class Ledger:
         if unknown := [name for name in figures if name not in self.claims]:
             raise SystemExit(f"no such claim: {', '.join(unknown)}; python -m benchmarks claims lists them")
         for topic in {self.claims[name].topic for name in figures}:
-            path = RESULTS / f"{topic}.json"
-            content = _recorded(topic)
             mine = {name: figure for name, figure in figures.items() if self.claims[name].topic == topic}
-            about = provenance(topic) if (ROOT / f"benchmarks/{topic}.py").exists() else provenance("house")
-            for name, figure in mine.items():
-                content[name] = figure._asdict() | about | ({"note": note} if note else {})
-            lines = (f" {json.dumps(name)}: {json.dumps(content[name])}" for name in sorted(content))
-            text = "{\n" + ",\n".join(lines) + "\n}\n"
-            write_whole(path, lambda temporary, text=text: temporary.write_text(text, encoding="utf-8"))
-            print(f"recorded {len(mine)} values in {path.relative_to(ROOT)}")
+            about = provenance() | ({"note": note} if note else {})
+            lines = [{"figure": name} | _given(figure) | about for name, figure in mine.items()]
+            append_lines(RESULTS / f"{topic}.jsonl", lines)
+            print(f"recorded {len(mine)} values of {topic}")
+
+
+def _given(figure: Figure) -> dict[str, float]:
+    return {key: value for key, value in figure._asdict().items() if value is not None}
 
 
 def _claims_of(group: Mapping[str, Any]) -> Iterator[Claim]:
@@ -217,15 +210,15 @@ def _claims_of(group: Mapping[str, Any]) -> Iterator[Claim]:
 def _claim(name: str, says: str, value: Any, rest: dict[str, Any]) -> Claim:
     recorded = _recorded(rest["topic"]).get(name)
     if recorded is not None:
-        rest = rest | {key: recorded[key] for key in ("commit", "processor", "sources", "note") if recorded.get(key)}
-        return Claim(name, says, Figure(*(recorded[key] for key in Figure._fields)), **rest | {"at": ""})
+        rest = rest | {key: recorded[key] for key in ("commit", "processor", "note") if recorded.get(key)}
+        return Claim(name, says, Figure(*(recorded.get(key) for key in Figure._fields)), **rest | {"at": ""})
     figure = None if value in (None, "?") else Figure(*value) if isinstance(value, list) else Figure(value)
     return Claim(name, says, figure, **rest)
 
 
+@lru_cache
 def _recorded(topic: str) -> dict[str, Any]:
-    path = RESULTS / f"{topic}.json"
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return read_lines(RESULTS / f"{topic}.jsonl", "figure")
 
 
 def _listed(head: str, claims: list[Claim]) -> str:

@@ -1,17 +1,14 @@
-"""What all benchmarks share: cases that a killed run keeps, intervals, timing in turns, tables.
+"""What all benchmarks share: cases that a killed run keeps, intervals, timing in turns, scores, tables.
 
-A case is one unit of work (one shape by one way, one training), and its file is small JSON: values, seed, commit, hash
-of the sources, processor, threads, seconds, date. Case files lie in an ignored folder; those of a run that took more
-than ten minutes in all are moved to `benchmarks/results/`, to be committed. A case that is there is not computed again,
-so that a killed run goes on. A case is stale if the code that it used has changed since: the benchmark says so and
-still takes it, unless it is run with `--fresh`. `--quick` runs the smallest case, in a folder of its own, to see that
-the code runs; its figures are never recorded.
+A case is one unit of work (one shape by one way, one training), and one line of `benchmarks/results/TOPIC.jsonl`:
+values, seed, commit, processor, threads, seconds, date. Lines are appended as cases end, so that a killed run loses
+only the case it was at; the last line of a name counts. A case that is there is not computed again, unless it is of
+another commit and `--fresh` was asked for. Lines of figures (`claims`) stand in the same file. `--quick` runs the
+smallest case, in an ignored folder, to see that the code runs; its figures are never recorded.
 """
 
 from __future__ import annotations
 
-import ast
-import hashlib
 import json
 import os
 import re
@@ -29,10 +26,6 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 CACHE = ROOT / ".cache" / "benchmarks"
-#: Seconds of a run above which its cases are committed.
-LONG = 600.0
-#: Modules whose changes make no case stale.
-FRAME = ("benchmarks.harness", "benchmarks.claims", "benchmarks.__main__")
 
 Values = dict[str, Any]
 #: Shared files that this process has made.
@@ -47,6 +40,30 @@ class Figure(NamedTuple):
     high: float | None = None
 
 
+# ---- lines of results ------------------------------------------------------------------------------------------------
+
+
+def read_lines(path: Path, kind: str) -> dict[str, Values]:
+    """Return the lines of a kind (`case`, `figure`) by name; the last of a name counts, and one cut short does not."""
+    found: dict[str, Values] = {}
+    for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+        try:
+            line = json.loads(text)
+        except json.JSONDecodeError:
+            continue
+        if kind in line:
+            found[line[kind]] = line
+    return found
+
+
+def append_lines(path: Path, lines: Sequence[Values]) -> None:
+    """Append lines; one that a killed run cut short ends first."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cut = path.exists() and path.stat().st_size > 0 and not path.read_bytes().endswith(b"\n")
+    with path.open("a", encoding="utf-8") as file:
+        file.write("\n" * cut + "".join(json.dumps(line, ensure_ascii=False) + "\n" for line in lines))
+
+
 # ---- cases -----------------------------------------------------------------------------------------------------------
 
 
@@ -57,26 +74,28 @@ class Cases:
         self.topic, self.quick, self.fresh = topic, quick, fresh
         self.folder = CACHE / "quick" / topic if quick else CACHE / topic
         self.folder.mkdir(parents=True, exist_ok=True)
+        self.path = self.folder / "cases.jsonl" if quick else RESULTS / f"{topic}.jsonl"
         self.end = time.monotonic() + seconds
-        self.used: dict[str, Values] = {}
+        lines = {} if quick else read_lines(self.path, "case")
+        self.kept = {name: line for name, line in lines.items() if not fresh or line["commit"] == commit()}
         self.left: list[str] = []
-        self.stale: list[str] = []
 
     def all(self, jobs: Mapping[str, Callable[[], Values]], seed: int | None = None) -> dict[str, Values]:
         """Return the values of the cases by name, in order; without those that the time did not reach."""
-        found: dict[str, Values] = {}
         for name, make in jobs.items():
-            record = self._read(name)
-            if record is None and time.monotonic() > self.end:
+            if name in self.kept:
+                continue
+            if time.monotonic() > self.end:
                 self.left.append(name)
                 continue
-            if record is None:
-                record = self._make(name, make, seed)
-                said = ", ".join(f"{key} {_short(value)}" for key, value in record["values"].items())
-                print(f"  {name}: {said[:160]} ({record['seconds']:.0f} s)", flush=True)
-            self.used[name] = record
-            found[name] = record["values"]
-        return found
+            begun = time.perf_counter()
+            line = {"case": name, "values": make(), "seed": seed} | provenance()
+            line["seconds"] = round(time.perf_counter() - begun, 2)
+            append_lines(self.path, [line])
+            self.kept[name] = line
+            shown = ", ".join(f"{key} {_short(value)}" for key, value in line["values"].items())
+            print(f"  {name}: {shown[:160]} ({line['seconds']:.0f} s)", flush=True)
+        return {name: self.kept[name]["values"] for name in jobs if name in self.kept}
 
     def of(self, topic: str) -> Cases:
         """Return the cases of another topic, whose arrays and texts are shared."""
@@ -99,49 +118,10 @@ class Cases:
             _RENEWED.add(path)
         return path
 
-    @property
-    def seconds(self) -> float:
-        """What the cases took when they were computed."""
-        return sum(record["seconds"] for record in self.used.values())
-
     def close(self) -> None:
-        """Move the cases of a long run to the committed folder, and say what is stale and what is left to do."""
-        if not self.quick and self.seconds > LONG:
-            for name in self.used:
-                if (path := self._cached(name)).exists():
-                    target = self._committed(name)
-                    target.parent.mkdir(parents=True, exist_ok=True)
-                    path.replace(target)
-        if self.stale:
-            print(f"{len(self.stale)} of {len(self.used)} cases are stale, of older code (--fresh computes them again)")
+        """Say what is left to do."""
         if self.left:
             print(f"{len(self.left)} cases left: run the same command again")
-
-    def _read(self, name: str) -> Values | None:
-        for path in (self._cached(name), self._committed(name)):
-            if path.exists() and not (self.quick and path == self._committed(name)):
-                record = json.loads(path.read_text(encoding="utf-8"))
-                if record["sources"] == sources_hash(f"benchmarks.{self.topic}"):
-                    return record
-                if not self.fresh:
-                    self.stale.append(name)
-                    return record
-        return None
-
-    def _make(self, name: str, make: Callable[[], Values], seed: int | None) -> Values:
-        begun = time.perf_counter()
-        values = make()
-        record = {"topic": self.topic, "name": name, "values": values, "seed": seed}
-        record |= provenance(self.topic) | {"seconds": round(time.perf_counter() - begun, 2)}
-        text = json.dumps(record, ensure_ascii=False) + "\n"
-        write_whole(self._cached(name), lambda temporary: temporary.write_text(text, encoding="utf-8"))
-        return record
-
-    def _cached(self, name: str) -> Path:
-        return self.folder / f"{name}.json"
-
-    def _committed(self, name: str) -> Path:
-        return RESULTS / self.topic / f"{name}.json"
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
@@ -161,31 +141,21 @@ def run_python(*words: object, python: str | Path = sys.executable, **environmen
     return done.stdout
 
 
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-# ---- what a figure holds for -----------------------------------------------------------------------------------------
-
-
-def provenance(topic: str) -> Values:
-    """Return commit, hash of the sources, processor, threads and date of a figure that is measured now."""
+def provenance() -> Values:
+    """Return commit, processor, threads and date of a figure that is measured now."""
     import torch
 
-    return {
-        "commit": commit(),
-        "sources": sources_hash(f"benchmarks.{topic}"),
-        "processor": processor(),
-        "threads": torch.get_num_threads(),
-        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
-    }
+    date = datetime.now(UTC).strftime("%Y-%m-%d")
+    return {"commit": commit(), "processor": processor(), "threads": torch.get_num_threads(), "date": date}
 
 
 @lru_cache
 def commit() -> str:
-    """Return the short name of the commit, with + where files differ from it."""
-    asked = ["git", "-C", str(ROOT), "describe", "--always", "--abbrev=7", "--dirty=+"]
-    return subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
+    """Return the short name of the commit, with + where files other than results differ from it."""
+    git = ("git", "-C", str(ROOT))
+    name = subprocess.run([*git, "rev-parse", "--short=7", "HEAD"], capture_output=True, text=True, check=False)
+    changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", ".", ":!benchmarks/results"], check=False)
+    return name.stdout.strip() + "+" * (changed.returncode == 1) or "unknown"
 
 
 @lru_cache
@@ -201,83 +171,8 @@ def processor() -> str:
     return f"{name[1] if name else 'unknown'}{zen}, {vectors}"
 
 
-@lru_cache
-def sources_hash(module: str) -> str:
-    """Return the hash of the code of a module and of all that it imports from the package or from other benchmarks.
-
-    Comments, docstrings and the layout do not count.
-    """
-    found = hashlib.sha256()
-    for name in sorted(reached(module)):
-        found.update(name.encode() + _code(name).encode())
-    return found.hexdigest()[:16]
-
-
-def reached(module: str) -> set[str]:
-    """Return the names of a module and of all modules of ours that it imports, directly or not."""
-    found, waiting = set[str](), [module]
-    while waiting:
-        name = waiting.pop()
-        if name not in found and name not in FRAME:
-            found.add(name)
-            waiting += _imports(name)
-    return found
-
-
-@lru_cache
-def _path(module: str) -> Path | None:
-    if module.partition(".")[0] not in ("curvafit", "benchmarks"):
-        return None
-    base = ROOT.joinpath(*module.split("."))
-    return next((path for path in (base.with_suffix(".py"), base / "__init__.py") if path.is_file()), None)
-
-
-@lru_cache
-def _tree(module: str) -> ast.Module:
-    path = _path(module)
-    assert path is not None, module
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
-@lru_cache
-def _code(module: str) -> str:
-    tree = ast.parse(ast.unparse(_tree(module)))
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if (
-            isinstance(body, list)
-            and body
-            and isinstance(body[0], ast.Expr)
-            and isinstance(body[0].value, ast.Constant)
-        ):
-            body[0].value = ast.Constant(None)
-    return ast.dump(tree)
-
-
-@lru_cache
-def _imports(module: str) -> list[str]:
-    """Return the modules that a module imports; a name that a package only passes on counts as its module's."""
-    found: list[str] = []
-    for node in ast.walk(_tree(module)):
-        if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names if _path(alias.name)]
-        elif isinstance(node, ast.ImportFrom) and node.module and _path(node.module):
-            found += [_home(node.module, alias.name) for alias in node.names]
-    return found
-
-
-@lru_cache
-def _home(module: str, name: str) -> str:
-    if _path(f"{module}.{name}"):
-        return f"{module}.{name}"
-    path = _path(module)
-    if path is not None and path.name == "__init__.py":
-        for node in ast.walk(_tree(module)):
-            if not (isinstance(node, ast.ImportFrom) and node.module and _path(node.module)):
-                continue
-            if any(name == (alias.asname or alias.name) for alias in node.names):
-                return _home(node.module, name)
-    return module
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 # ---- statistics and time ---------------------------------------------------------------------------------------------

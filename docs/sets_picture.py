@@ -26,7 +26,8 @@ TITLES = {"bone": "bone", "pores": "pores of sandstone"}
 
 
 def main() -> None:
-    figures = json.loads((ROOT / "benchmarks/results/sets.json").read_text(encoding="utf-8"))
+    lines = map(json.loads, (ROOT / "benchmarks/results/sets.jsonl").read_text(encoding="utf-8").splitlines())
+    figures = {line["figure"]: line for line in lines if "figure" in line}
     scans = [scan for scan in TITLES if f"sets_{scan}.law.dice_0" in figures]
     figure = make_figure(5.2 * len(scans), 4.0, layout="constrained")
     for axes, scan in zip(np.atleast_1d(figure.subplots(1, len(scans))), scans, strict=True):
