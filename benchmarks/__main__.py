@@ -4,6 +4,7 @@
     python -m benchmarks TOPIC [--quick] [--fresh] [--seconds N] [--record] [options of its own]
     python -m benchmarks claims [--topic TOPIC] [--markdown] [--check-docs | --write-docs]
     python -m benchmarks record CLAIM VALUE [--interval LOW HIGH] [--note TEXT]
+    python -m benchmarks sentinel [TOPIC…] [--record]   # do the figures stand?
 
 `--record` writes what was measured into the ledger. Some topics need outside files: CURVAFIT_DATA names a folder that
 holds `gallery/` and `scans/`.
@@ -17,16 +18,14 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+from benchmarks import sentinel
 from benchmarks.claims import Ledger
 from benchmarks.harness import Cases, Figure, show
-
-#: Modules that are no benchmarks.
-FRAME = ("__init__", "__main__", "claims", "harness", "nulls")
 
 
 def topics() -> list[str]:
     paths = sorted(Path(__file__).parent.glob("*.py"))
-    return [path.stem for path in paths if path.stem not in FRAME and "\ndef options(" in path.read_text("utf-8")]
+    return [path.stem for path in paths if "\ndef options(" in path.read_text("utf-8")]
 
 
 def main(arguments: list[str]) -> None:
@@ -35,6 +34,8 @@ def main(arguments: list[str]) -> None:
         claims(arguments[1:])
     elif name == "record":
         record(arguments[1:])
+    elif name == "sentinel":
+        sentinel.main(arguments[1:])
     elif name in topics():
         run(name, arguments[1:])
     else:

@@ -1,10 +1,12 @@
 """The ledger: each figure that README or docs print, and each bar of the work at hand, is a claim, and data.
 
-`claims.toml` holds groups of claims. A group has `claims`, a list, or `columns` and `rows`, a table of them, whose ids
-are group.row.column. What a claim does not say its group says: `topic`, `command`, `format`, `bar`, `chosen_on`,
-`reported_on`, `processor`, `note`; and of a value that was measured before the ledger was, `at`, its commit, and
-`then`, the command there if today's is another or none. `record` writes a value that was measured since into
-`benchmarks/results/TOPIC.jsonl`, which has the last word.
+`claims.toml` holds groups of claims. A group has `claims`, a list, or `columns` and `rows`, a table of them. What a
+claim does not say its group says: `topic`, `command`, `format`, `bar`, `chosen_on`, `reported_on`, `note`. A row is a
+key, a label and its cells, by default the claims `group.row.column`: `row.column` where the row's key begins with `=`,
+and the column's key with the row's in place of `*`. A cell may be text instead, or `@` and the name of a claim.
+
+Values are the last lines of figures in `benchmarks/results/TOPIC.jsonl`, which `record` appends. They stand while the
+topic's sentinel does (`sentinel`): one measured before it changed says so.
 
 A `page` prints its group between the marks `<!-- ledger: GROUP -->` and `<!-- end -->`; a `list` prints claims of
 several groups so. `prose` are sentences of pages with figures in them, which are compared and never rewritten.
@@ -21,11 +23,13 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
-from benchmarks.harness import RESULTS, ROOT, Figure, append_lines, markdown, provenance, read_lines, show, write_whole
+from benchmarks.harness import RESULTS, ROOT, Figure, Values, append_lines, markdown, provenance, read_lines, show
+from benchmarks.harness import write_whole as write_page
+from benchmarks.sentinel import changed
 
 LEDGER = ROOT / "benchmarks" / "claims.toml"
 #: What a claim takes from its group where it does not say it.
-INHERITED = ("topic", "command", "then", "at", "format", "bar", "chosen_on", "reported_on", "processor", "note")
+INHERITED = ("topic", "command", "format", "bar", "chosen_on", "reported_on", "note")
 
 
 @dataclass(frozen=True)
@@ -37,23 +41,23 @@ class Claim:
     figure: Figure | None
     topic: str
     command: str = ""
-    then: str = ""
-    at: str = ""
     format: str = "{:g}"
     bar: str = ""
     chosen_on: str = ""
     reported_on: str = ""
-    processor: str = ""
     note: str = ""
     commit: str = ""
+    processor: str = ""
+    date: str = ""
 
     @property
     def state(self) -> str:
-        """`not run`, `met` or `missed`, `stated` where there is no bar; and what is to be known of the value."""
+        """`not run`, `sentinel disagrees`, `met` or `missed`, or `stated` where there is no bar."""
         if self.figure is None:
             return "not run"
-        state = "stated" if not self.bar else "met" if meets(self.figure.value, self.bar) else "missed"
-        return f"{state}, not re-run" if self.at else state
+        if self.date < changed().get(self.topic, ""):
+            return "sentinel disagrees"
+        return "stated" if not self.bar else "met" if meets(self.figure.value, self.bar) else "missed"
 
     @property
     def text(self) -> str:
@@ -65,15 +69,14 @@ class Claim:
         if low is not None and high is not None:
             number = re.sub(r".*(\{.*\}).*", r"\1", self.format)
             span = f"{_signed(number.format(low))} to {_signed(number.format(high))}"
-        if math.isnan(value):
-            return f"{_signed(number.format(low))} to {_signed(self.format.format(high))}"
+            if math.isnan(value):
+                return f"{_signed(number.format(low))} to {_signed(self.format.format(high))}"
         text = f"**{text}**" if self.bar and not meets(value, self.bar) else text
         return f"{text} ({span})" if span else text
 
     @property
     def call(self) -> str:
-        """The command of today, or the one of the commit at which there was one."""
-        return f"`{self.command}`" if self.command else f"`{self.then}` at {self.at}" if self.then else ""
+        return f"`{self.command}`" if self.command else ""
 
 
 def meets(value: float, bar: str) -> bool:
@@ -97,29 +100,28 @@ class Ledger:
     @cached_property
     def claims(self) -> dict[str, Claim]:
         found: dict[str, Claim] = {}
+        borrowed: dict[str, Claim] = {}
         for group in self.content["group"]:
-            for claim in _claims_of(group):
-                if claim.id in found:
+            for claim, own in _claims_of(group):
+                if own and claim.id in found:
                     raise SystemExit(f"two claims are called {claim.id}: rename one in {LEDGER.name}")
-                found[claim.id] = claim
-        return found
-
-    def of(self, topic: str | None) -> list[Claim]:
-        return [claim for claim in self.claims.values() if topic in (None, claim.topic)]
+                (found if own else borrowed).setdefault(claim.id, claim)
+        return borrowed | found
 
     def print(self, topic: str | None, as_markdown: bool) -> None:
         """Print the ledger, or what concerns one topic."""
+        chosen = [claim for claim in self.claims.values() if topic in (None, claim.topic)]
         columns = ["claim", "value", "bar", "state", "command"]
-        rows = [[c.id, c.text, c.bar, c.state, c.call] for c in self.of(topic)]
+        rows = [[c.id, c.text, c.bar, c.state, c.call] for c in chosen]
         if as_markdown:
             columns += ["what", "chosen on", "reported on", "commit, processor"]
-            more = [[c.says, c.chosen_on, c.reported_on, _origin(c)] for c in self.of(topic)]
+            origins = [", ".join(filter(None, (c.commit, c.processor, c.note))) for c in chosen]
+            more = [[c.says, c.chosen_on, c.reported_on, origin] for c, origin in zip(chosen, origins, strict=True)]
             print(markdown(columns, [a + b for a, b in zip(rows, more, strict=True)]))
         else:
             show(columns, [[cell[:70] for cell in row] for row in rows])
-        states = [claim.state for claim in self.of(topic)]
-        counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
-        print(f"\n{len(states)} claims: {counts}")
+        states = [claim.state for claim in chosen]
+        print(f"\n{len(states)} claims:", ", ".join(f"{states.count(each)} {each}" for each in dict.fromkeys(states)))
 
     # ---- pages -------------------------------------------------------------------------------------------------------
 
@@ -135,16 +137,14 @@ class Ledger:
     def _table(self, group: Mapping[str, Any]) -> str:
         if "columns" not in group:
             return _listed(group.get("head", "what"), [self.claims[claim["id"]] for claim in group["claims"]])
-        rows, formats = [], group.get("formats", ["{}"] * len(group["keys"]))
-        for key, label, *cells in group["rows"]:
-            claims = [self.claims.get(f"{group['id']}.{key}.{column}") for column in group["keys"]]
-            parts = zip(claims, cells, formats, strict=True)
-            texts = [cell if claim is None else replace(claim, format=form).text for claim, cell, form in parts]
-            rows.append([label, *texts])
-        first = next(claim for claim in claims if claim is not None)
-        since = f"not run again since {first.at}" if first.at and first.command else ""
-        told = "; ".join(filter(None, (first.call, since, group.get("reported_on"), group.get("note"))))
-        return markdown([group.get("head", ""), *group["columns"]], rows) + (f"\n\n*{told}.*" if told else "")
+        formats, rows = group["formats"], []
+        for row in group["rows"]:
+            cells = zip(cells_of(group, row), formats, strict=True)
+            texts = [replace(self.claims[name], format=form).text if name else text for (name, text, _), form in cells]
+            rows.append([row[1], *texts])
+        command = f"`{group['command']}`" if "command" in group else ""
+        below = "; ".join(filter(None, (command, group.get("reported_on"), group.get("note"))))
+        return markdown([group.get("head", ""), *group["columns"]], rows) + (f"\n\n*{below}.*" if below else "")
 
     def pages(self, *, write: bool) -> list[str]:
         """Return what pages print otherwise than the ledger; or rewrite their tables, and return what is left."""
@@ -156,22 +156,20 @@ class Ledger:
         for path, mark, text in self.tables():
             page = path.read_text(encoding="utf-8") if path.exists() else ""
             begin, end = f"<!-- ledger: {mark} -->", "<!-- end -->"
-            pattern = re.compile(rf"{re.escape(begin)}\n(.*?){end}", re.DOTALL)
-            found = pattern.search(page)
+            found = re.compile(rf"{re.escape(begin)}\n(.*?){end}", re.DOTALL).search(page)
             wanted = f"\n{text}\n\n" if text else ""
             if found is None:
                 wrong.append(f"{path.relative_to(ROOT)}: no mark {begin}")
             elif found[1] != wanted and write:
                 page = page[: found.start()] + f"{begin}\n{wanted}{end}" + page[found.end() :]
-                write_whole(path, lambda temporary, page=page: temporary.write_text(page, encoding="utf-8"))
+                write_page(path, lambda temporary, page=page: temporary.write_text(page, encoding="utf-8"))
             elif found[1] != wanted:
                 wrong.append(f"{path.relative_to(ROOT)}: table {mark} differs from the ledger")
-        return wrong + [said for part in self.content.get("prose", []) for said in self._missing(part)]
+        return wrong + [text for part in self.content.get("prose", []) for text in self._missing(part)]
 
     def _missing(self, part: Mapping[str, Any]) -> Iterator[str]:
-        claims = [self.claims[name].figure for name in part["claims"]]
-        values = [figure.value if figure is not None else float("nan") for figure in claims]
-        sentence = part["text"].format(*values)
+        figures = [self.claims[name].figure for name in part["claims"]]
+        sentence = part["text"].format(*(math.nan if figure is None else figure.value for figure in figures))
         page = (ROOT / part["page"]).read_text(encoding="utf-8")
         if " ".join(sentence.split()) not in " ".join(page.replace("\N{MINUS SIGN}", "-").split()):
             yield f"{part['page']}: expected the words {sentence!r}"
@@ -179,46 +177,52 @@ class Ledger:
     # ---- recording ---------------------------------------------------------------------------------------------------
 
     def record(self, figures: Mapping[str, Figure], note: str = "") -> None:
-        """Write the values of claims into the committed files of their topics."""
+        """Append the values of claims to the results of their topics."""
         if unknown := [name for name in figures if name not in self.claims]:
             raise SystemExit(f"no such claim: {', '.join(unknown)}; python -m benchmarks claims lists them")
+        about = provenance() | ({"note": note} if note else {})
         for topic in {self.claims[name].topic for name in figures}:
-            mine = {name: figure for name, figure in figures.items() if self.claims[name].topic == topic}
-            about = provenance() | ({"note": note} if note else {})
-            lines = [{"figure": name} | _given(figure) | about for name, figure in mine.items()]
+            lines = [{"figure": name} | {key: v for key, v in figure._asdict().items() if v is not None} | about
+                     for name, figure in figures.items() if self.claims[name].topic == topic]  # fmt: skip
             append_lines(RESULTS / f"{topic}.jsonl", lines)
-            print(f"recorded {len(mine)} values of {topic}")
+            print(f"recorded {len(lines)} values of {topic}")
 
 
-def _given(figure: Figure) -> dict[str, float]:
-    return {key: value for key, value in figure._asdict().items() if value is not None}
+def cells_of(group: Mapping[str, Any], row: list[str]) -> Iterator[tuple[str, str, bool]]:
+    """Yield of each cell of a row the claim's name, or none and the cell's text; and whether the claim is the row's."""
+    head = row[0][1:] if row[0].startswith("=") else f"{group['id']}.{row[0]}"
+    for k, key in enumerate(group["keys"]):
+        cell = row[2 + k] if len(row) > 2 else "?"
+        name = key.replace("*", row[0]) if "*" in key else f"{head}.{key}"
+        yield (name, "", True) if cell == "?" else (cell[1:], "", False) if cell[:1] == "@" else ("", cell, False)
 
 
-def _claims_of(group: Mapping[str, Any]) -> Iterator[Claim]:
+def _claims_of(group: Mapping[str, Any]) -> Iterator[tuple[Claim, bool]]:
+    """Yield the claims of a group, and whether each is its own; of another's that its table prints no bar is known."""
     common = {key: group[key] for key in INHERITED if key in group}
     for row in group.get("claims", []):
-        value = row.get("value")
-        yield _claim(row["id"], row["says"], value, common | {key: row[key] for key in INHERITED if key in row})
-    for key, label, *cells in group.get("rows", []):
-        for k, (cell, column) in enumerate(zip(cells, group["keys"], strict=True)):
-            own = {name: group[f"{name}s"][k] for name in ("format", "bar") if f"{name}s" in group}
-            if not isinstance(cell, str) or cell == "?":
-                says = ", ".join(filter(None, (group.get("title", ""), label, group["columns"][k])))
-                yield _claim(f"{group['id']}.{key}.{column}", says, cell, common | own)
+        yield _claim(row["id"], row["says"], common | {key: row[key] for key in INHERITED if key in row}), True
+    for row in group.get("rows", []):
+        for k, (name, _, own) in enumerate(cells_of(group, row)):
+            if name:
+                says = ", ".join(filter(None, (group.get("title", ""), row[1], group["columns"][k])))
+                bar = {"bar": group["bars"][k]} if own and "bars" in group else {}
+                yield _claim(name, says, common | {"format": group["formats"][k]} | bar), own
 
 
-def _claim(name: str, says: str, value: Any, rest: dict[str, Any]) -> Claim:
-    recorded = _recorded(rest["topic"]).get(name)
-    if recorded is not None:
-        rest = rest | {key: recorded[key] for key in ("commit", "processor", "note") if recorded.get(key)}
-        return Claim(name, says, Figure(*(recorded.get(key) for key in Figure._fields)), **rest | {"at": ""})
-    figure = None if value in (None, "?") else Figure(*value) if isinstance(value, list) else Figure(value)
-    return Claim(name, says, figure, **rest)
+def _claim(name: str, says: str, rest: dict[str, Any]) -> Claim:
+    line = _recorded().get(name)
+    if line is None:
+        return Claim(name, says, None, **rest)
+    rest |= {key: line[key] for key in ("commit", "processor", "note", "date", "topic") if line.get(key)}
+    return Claim(name, says, Figure(line["value"], line.get("low"), line.get("high")), **rest)
 
 
 @lru_cache
-def _recorded(topic: str) -> dict[str, Any]:
-    return read_lines(RESULTS / f"{topic}.jsonl", "figure")
+def _recorded() -> dict[str, Values]:
+    """Return the last line of each figure, with its topic."""
+    return {name: line | {"topic": path.stem} for path in sorted(RESULTS.glob("*.jsonl"))
+            for name, line in read_lines(path, "figure").items()}  # fmt: skip
 
 
 def _listed(head: str, claims: list[Claim]) -> str:
@@ -227,7 +231,3 @@ def _listed(head: str, claims: list[Claim]) -> str:
     if len({row[2] for row in rows}) == 1:
         return markdown([head, "figure"], [row[:2] for row in rows]) + f"\n\n*{rows[0][2]}.*"
     return markdown([head, "figure", "command"], rows) if rows else ""
-
-
-def _origin(claim: Claim) -> str:
-    return ", ".join(filter(None, (claim.commit, claim.processor, claim.note)))

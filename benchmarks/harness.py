@@ -43,17 +43,20 @@ class Figure(NamedTuple):
 # ---- lines of results ------------------------------------------------------------------------------------------------
 
 
-def read_lines(path: Path, kind: str) -> dict[str, Values]:
-    """Return the lines of a kind (`case`, `figure`) by name; the last of a name counts, and one cut short does not."""
-    found: dict[str, Values] = {}
+def all_lines(path: Path, kind: str) -> Iterator[Values]:
+    """Yield the lines of a kind (`case`, `figure`, `sentinel`) but for one that a killed run cut short."""
     for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
         try:
             line = json.loads(text)
         except json.JSONDecodeError:
             continue
         if kind in line:
-            found[line[kind]] = line
-    return found
+            yield line
+
+
+def read_lines(path: Path, kind: str) -> dict[str, Values]:
+    """Return the last line of each name of a kind."""
+    return {line[kind]: line for line in all_lines(path, kind)}
 
 
 def append_lines(path: Path, lines: Sequence[Values]) -> None:

@@ -27,7 +27,7 @@ import torch
 
 from benchmarks.completion import STRUCTURES, mask_of
 from benchmarks.harness import Cases, Figure, Values, show
-from benchmarks.networks import UNKNOWN, dice_ce
+from benchmarks.unets import UNKNOWN, dice_ce
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.image import read_image
 from curvafit.segmentation.reconstruct import reconstruct

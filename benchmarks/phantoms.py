@@ -1,4 +1,4 @@
-"""Thickness, surface, connectivity and curvature of exact phantoms, beside what other packages say of them.
+"""Thickness of exact phantoms, beside what other packages say of it.
 
 Phantoms are periodic in a box of six thicknesses, at 4, 6, 8 and 16 voxels of thickness (a slab also at 5): slabs with
 gaps of their own thickness, upright and oblique; an oblique rod; a ball; a torus; a sheet around the gyroid; and a
@@ -7,7 +7,7 @@ places, from 8 voxels at one. `measure` sees the box as periodic; the others see
 side, and their maps are averaged inside.
 
 - `--packages PYTHON,…`: interpreters that have `localthickness`, `porespy`, `bone_microarchitecture`, `ormir_xct`,
-  `itk` with `itk-bonemorphometry`, or `pykarambola`. Some are under the GPL: each is run in its own environment.
+  or `itk` with `itk-bonemorphometry`. Some are under the GPL: each is run in its own environment.
 
 BoneJ is a plugin of a Java program; the rule of its source is rewritten here (`bonej_thickness`).
 """
@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from functools import cache, partial
@@ -25,28 +24,16 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 from scipy import ndimage
-from scipy.spatial.transform import Rotation
 
 from benchmarks.harness import Cases, Figure, Values, run_python, show
-from benchmarks.rivals import run_elsewhere
 from curvafit.generation.flow import generate
-from curvafit.geometry.diagram import Diagram, family_shares
 from curvafit.geometry.morphometry import local_thickness
-from curvafit.scan.measure import measure, measure_surface
-from curvafit.scan.prepare import prepare
-from curvafit.volumes.field import Field
+from curvafit.scan.measure import measure
 
 #: Edge of the box in thicknesses; positions of each phantom by its thickness in voxels.
 EDGE = 6
 PLACES = {4: 3, 5: 1, 6: 3, 8: 1, 16: 1}
 OBLIQUE = np.array([1, 2, 2]) / 3
-#: Families whose shares are compared.
-SHOWN = ("spheres", "layers", "tubes")
-#: Windows of a texture, and the deviations of the Gaussians that make textures, in voxels.
-WINDOWS = {"cubes_16": (16, 16, 16), "cubes_32": (32, 32, 32), "slices_8": (8, 96, 96), "slices_16": (16, 96, 96)}
-WIDTHS = {"fine": 1.8, "middle": 2.5, "coarse": 4.0}
-#: Area of the nodal gyroid in the box, by marching cubes on 160³ points.
-GYROID_AREA = 3.0919 * EDGE**2
 #: A package's module, and how its map of thickness, or its numbers, come from a mask.
 PACKAGES = {
     "localthickness": ("localthickness", "2 * module.local_thickness(mask)"),
@@ -59,15 +46,7 @@ PACKAGES = {
         "module.compute_local_thickness_from_mask(mask, 1.0, oversample=False)",
     ),
     "itk": ("itk", "stereology(mask).GetTbTh()"),
-    "bone_number": (
-        "bone_microarchitecture.thickness",
-        "module.trabecular_number_map(mask, mask | ~mask, (1, 1, 1), backend='cpu')",
-    ),
-    "itk_number": ("itk", "stereology(mask).GetTbN()"),
-    "pykarambola": ("pykarambola", "minkowski(mask)"),
 }
-#: Columns of numbers other than thickness.
-AT_EIGHT = ("bone_number", "itk_number", "pykarambola")
 PROGRAM = """
 import sys
 import numpy as np
@@ -77,9 +56,6 @@ def stereology(mask):
     found = module.BoneMorphometryFeaturesFilter[type(image)].New(image, Threshold=0.5)
     found.Update()
     return found
-def minkowski(mask):
-    w = module.minkowski_tensors_from_label_image(mask.astype(int), compute=["w100", "w200", "w300"])[1]
-    return [3 * w["w100"], w["w200"] / w["w100"], 3 * w["w300"] / (4 * np.pi)]
 given, numbers = np.load(sys.argv[1]), []
 for name in given.files[1:]:
     mask = given[name]
@@ -144,92 +120,6 @@ PHANTOMS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-#: Semi-axes of ellipsoids, in thicknesses.
-ELLIPSOIDS = {"rod_like": (0.5, 0.5, 1.5), "plate_like": (0.5, 1.5, 1.5), "between": (0.5, 1.0, 2.0)}
-
-
-def ellipsoid(axes: tuple[float, float, float], thickness: int) -> np.ndarray:
-    """Return an ellipsoid, turned, in a box of `EDGE` thicknesses."""
-    turn = Rotation.from_rotvec([0.4, 0.7, -0.3]).as_matrix()
-    points = (np.moveaxis(np.indices((EDGE * thickness,) * 3), 0, -1) + 0.5) / thickness - EDGE / 2
-    return np.square((points @ turn) / np.array(axes)).sum(-1) < 1
-
-
-def exact_diagram(name: str) -> Diagram:
-    """Return the curvature diagram of a torus or an ellipsoid, in thicknesses, of 400² patches."""
-    φ, θ = np.meshgrid((np.arange(400) + 0.5) * 2 * np.pi / 400, (np.arange(400) + 0.5) * np.pi / 400)
-    if name == "torus":
-        R, r = 1.5, 0.5
-        around = np.cos(2 * θ)
-        κ1, κ2, area = np.full_like(θ, 1 / r), around / (R + r * around), R + r * around
-    else:
-        a, b, c = ELLIPSOIDS[name]
-        x, y, z = a * np.sin(θ) * np.cos(φ), b * np.sin(θ) * np.sin(φ), c * np.cos(θ)
-        p = np.sqrt(x**2 / a**4 + y**2 / b**4 + z**2 / c**4)
-        K, H = (a * b * c * p**2) ** -2, (a**2 + b**2 + c**2 - x**2 - y**2 - z**2) / (2 * (a * b * c) ** 2 * p**3)
-        root = np.sqrt(np.maximum(H**2 - K, 0))
-        κ1, κ2, area = H + root, H - root, a * b * c * p * np.sin(θ)
-    area = area * {"torus": 4 * np.pi**2 * 1.5 * 0.5 / area.sum()}.get(name, 2 * np.pi**2 / 400**2)
-    return Diagram(np.column_stack([κ1.ravel(), κ2.ravel()]), area.ravel())
-
-
-def shares(thickness: int) -> Values:
-    """Return the shares of families of phantoms: of exact curvatures, at the measured thickness; by `measure`."""
-    points = (np.moveaxis(np.indices((EDGE * thickness,) * 3), 0, -1) + 0.5) / thickness
-    given = {"oblique": slabs(points, OBLIQUE) > 0, "rod": rod(points) > 0, "ball": ball(points) > 0}
-    exact: dict[str, dict[str, float]] = {"oblique": {"layers": 1}, "rod": {"tubes": 1}, "ball": {"spheres": 1}}
-    given["torus"] = torus(points) > 0
-    given |= {name: ellipsoid(axes, thickness) for name, axes in ELLIPSOIDS.items()}
-    found = {}
-    for name, mask in given.items():
-        measured = measure(mask.astype(np.uint8), kind="mask", periodic=True)
-        if name not in exact:
-            prepared = prepare(Field(mask), kind="mask", periodic=True)
-            radius = prepared.thickness * prepared.working_voxel / 2 / thickness
-            exact[name] = family_shares(exact_diagram(name), radius)
-        found[name] = [[exact[name].get(family, 0.0), measured[f"share of {family}"].value] for family in SHOWN]
-    return found
-
-
-def windows(width: float) -> Values:
-    """Return the surface density of windows over that of all, means over windows and four textures, by their shape.
-
-    Textures of 96³ voxels are level sets of smoothed noise that fill 31 % and do not repeat.
-    """
-    found: dict[str, list[float]] = {name: [] for name in WINDOWS}
-    for seed in range(4):
-        noise = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal((108,) * 3), width)[
-            (slice(6, -6),) * 3
-        ]
-        mask = noise > np.quantile(noise, 0.69)
-        whole = surface_density(mask)
-        for name, shape in WINDOWS.items():
-            parts = itertools.product(*(range(0, 96, n) for n in shape))
-            boxes = (tuple(slice(a, a + n) for a, n in zip(part, shape, strict=True)) for part in parts)
-            found[name].append(float(np.mean([surface_density(mask[box]) for box in boxes]) / whole))
-    return {name: float(np.mean(values)) for name, values in found.items()}
-
-
-def surface_density(mask: np.ndarray) -> float:
-    if mask.all() or not mask.any():
-        return 0.0
-    return float(measure_surface(mask, (1.0, 1.0, 1.0), False)[1][:, 0].sum()) / mask.size
-
-
-def truths(name: str) -> Values:
-    """Return volume, area, χ and ∫H dA of a phantom in the box; of the sheet by Steiner, with ∫K dA = -16π."""
-    A, R, r, L, π = GYROID_AREA, 1.5, 0.5, 3 * EDGE, math.pi
-    volume, area, χ, bend = {
-        "slab": (EDGE**3 / 2, EDGE**3, 0, 0),
-        "oblique": (EDGE**3 / 2, EDGE**3, 0, 0),
-        "rod": (π * r**2 * L, 2 * π * r * L, 0, π * L),
-        "ball": (π / 6, π, 1, 2 * π),
-        "torus": (2 * π**2 * R * r**2, 4 * π**2 * R * r, 0, 2 * π**2 * R),
-        "gyroid": (A - 4 * π / 3, 2 * A - 8 * π, -8, -16 * π),
-    }[name]
-    return {"fraction": volume / EDGE**3, "surface": area / EDGE**3, "euler": χ, "bend": bend / area}
-
-
 def masks(thickness: int, cases: Cases) -> dict[str, np.ndarray]:
     """Return the phantoms at a thickness in voxels, `NAME-PLACE`; at an odd one the slab alone."""
     random, found = np.random.default_rng(thickness), {}
@@ -287,21 +177,22 @@ def paint_balls(square):
     return found
 
 
-def ours(mask: np.ndarray) -> list[float]:
-    found = measure(mask.astype(np.uint8), kind="mask", periodic=True)
-    return [found[symbol].value for symbol in ("Tb.Th", "Tb.N", "BV/TV", "BS/TV", "χ", "H")]
+def run_elsewhere(python: Path, program: str, folder: Path, **arrays: np.ndarray) -> np.ndarray:
+    """Return what a program makes of arrays in another interpreter."""
+    given, found = folder / "given.npz", folder / "found.npy"
+    np.savez(given, allow_pickle=False, **arrays)
+    run_python("-c", program, given, found, python=python)
+    return np.load(found)
 
 
 def case(column: str, thickness: int, python: Path | None, cases: Cases) -> Values:
-    """Return the numbers of each phantom by a package, means over places; or why there are none."""
+    """Return the mean thickness of each phantom by a package, means over places; or why there is none."""
     given = masks(thickness, cases)
     continued = {name: np.pad(mask, thickness, mode="wrap") for name, mask in given.items()}
-    if column == "pykarambola":
-        given = {name: mask for name, mask in given.items() if name.startswith(("ball", "torus"))}
-        continued = {name: np.roll(mask, EDGE * thickness // 2, (0, 1, 2)) for name, mask in given.items()}
     inner = (slice(thickness, -thickness),) * 3
     if column == "curvafit":
-        numbers = [ours(mask) for mask in given.values()]
+        found = (measure(mask.astype(np.uint8), kind="mask", periodic=True) for mask in given.values())
+        numbers = [each["thickness"].value for each in found]
     elif column == "bonej":
         numbers = [bonej_thickness(mask)[inner].sum() / mask[inner].sum() for mask in continued.values()]
     else:
@@ -309,13 +200,12 @@ def case(column: str, thickness: int, python: Path | None, cases: Cases) -> Valu
         program = PROGRAM.replace("MODULE", module).replace("EXPRESSION", expression)
         try:
             assert python is not None
-            numbers, _ = run_elsewhere(python, program, cases.folder, margin=np.array(thickness), **continued)
+            numbers = run_elsewhere(python, program, cases.folder, margin=np.array(thickness), **continued)
         except SystemExit as error:
             return {"failed": str(error).strip().splitlines()[-1]}
-    table = np.asarray(numbers, dtype=float).reshape(len(given), -1)
-    names = [name.partition("-")[0] for name in given]
-    means = {name: table[[other == name for other in names]].mean(0).tolist() for name in dict.fromkeys(names)}
-    if "grown" in means and "number" not in column:
+    table, names = np.asarray(numbers, dtype=float), [name.partition("-")[0] for name in given]
+    means = {name: [float(table[[other == name for other in names]].mean())] for name in dict.fromkeys(names)}
+    if "grown" in means:
         exact = grown_thickness(cases) * len(given["grown-0"])
         means["grown"][0] += thickness - exact  # its box is a whole number of voxels
     return means
@@ -338,42 +228,14 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     pythons = [Path(each) for each in options.packages.split(",") if each]
     packages = {column: interpreter(module, pythons) for column, (module, _) in PACKAGES.items()}
     jobs = {f"{column}-{thickness}": partial(case, column, thickness, packages.get(column), cases)
-            for thickness in PLACES for column in ("curvafit", "bonej", *(name for name in PACKAGES if packages[name]))
-            if thickness == 8 or column not in AT_EIGHT}  # fmt: skip
-    by_family = cases.all({f"shares-{thickness}": partial(shares, thickness) for thickness in (8, 16)})
-    in_windows = cases.all({f"windows-{name}": partial(windows, width) for name, width in WIDTHS.items()})
+            for thickness in PLACES
+            for column in ("curvafit", "bonej", *(n for n in PACKAGES if packages[n]))}  # fmt: skip
     tables = cases.all(dict(list(jobs.items())[:2]) if options.quick else jobs)
     failed = {name: f"no interpreter has {PACKAGES[name][0]}" for name in PACKAGES if not packages[name]}
     failed |= {name: values["failed"] for name, values in tables.items() if "failed" in values}
-    figures = {f"phantom_shares.{phantom}_{family}.{column}": Figure(pair[column != "truth"])
-               for name, found in by_family.items() for phantom, pairs in found.items()
-               for family, pair in zip(SHOWN, pairs, strict=True)
-               for column in ("truth", f"at_{name.removeprefix('shares-')}")}  # fmt: skip
-    figures |= {f"phantom_windows.{shape}.{name.removeprefix('windows-')}": Figure(share)
-                for name, found in in_windows.items() for shape, share in found.items()}  # fmt: skip
-    for name, values in tables.items():
-        column, _, thickness = name.partition("-")
-        for phantom in {} if name in failed else values:
-            if thickness == "8" and phantom != "grown":
-                figures |= other_numbers(column, phantom, values[phantom])
-            if column not in AT_EIGHT:
-                figures[f"phantoms.{phantom}_{thickness}.{column}"] = Figure(values[phantom][0])
+    figures = {f"phantoms.{phantom}_{name.partition('-')[2]}.{name.partition('-')[0]}": Figure(found[0])
+               for name, values in tables.items() if name not in failed
+               for phantom, found in values.items()}  # fmt: skip
     show(["case", "why there is none"], list(failed.items()))
-    show(["number", "found"], list(figures.items()))
+    show(["thickness", "found"], list(figures.items()))
     return figures
-
-
-def other_numbers(column: str, phantom: str, found: Sequence[float]) -> dict[str, Figure]:
-    """Return numbers at 8 voxels in thicknesses: surface over the true one, mean curvature, χ and Tb.N."""
-    truth, t, head = truths(phantom), 8, f"phantom_numbers.{phantom}"
-    if column == "curvafit":
-        _, number, fraction, surface, euler, bend = found
-        numbers = {"number": number * t, "fraction": fraction / truth["fraction"], "euler": euler}
-        numbers |= {"surface": surface * t / truth["surface"], "bend": bend * t}
-    elif column == "pykarambola":
-        area, bend, euler = found
-        area /= (EDGE * t) ** 3
-        numbers = {"surface": area * t / truth["surface"], "bend": bend * t, "euler": euler}
-    else:
-        numbers = {"number": found[0] * t} if column.endswith("number") else {}
-    return {f"{head}_{key}.{column.removesuffix('_number')}": Figure(float(value)) for key, value in numbers.items()}

@@ -14,19 +14,16 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from scipy import ndimage, stats
-from torch import Tensor, nn
 
 from benchmarks.harness import Cases, Figure, Values, show
-from benchmarks.networks import UNKNOWN, dice_ce
 from benchmarks.nulls import level_cut
-from benchmarks.transductive import PATCH, image_of, network, predict
+from benchmarks.unets import annotated, image_of, learn, lessons, network, predict_whole
 from curvafit.generation.flow import generate
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.inference.fit import Fit
@@ -132,63 +129,23 @@ def law_of(scan: str, cases: Cases) -> Fit:
 # ---- networks --------------------------------------------------------------------------------------------------------
 
 
-def learn(net: nn.Module, batch: Callable[[int], tuple[Tensor, Tensor]], steps: int, rate: float) -> None:
-    """Teach a network by Dice + CE."""
-    adam = torch.optim.AdamW(net.parameters(), rate)
-    net.train()
-    for step in range(steps):
-        adam.param_groups[0]["lr"] = rate * (1 + np.cos(np.pi * step / steps)) / 2
-        x, y = batch(step)
-        adam.zero_grad()
-        dice_ce(predict(net, x), y).backward()
-        nn.utils.clip_grad_norm_(net.parameters(), 5.0)
-        adam.step()
-
-
-def lessons(pairs: list[tuple[np.ndarray, np.ndarray]], seed: int) -> Callable[[int], tuple[Tensor, Tensor]]:
-    """Return patches of images and targets, turned, mirrored and with their grey values changed."""
-
-    def batch(step: int) -> tuple[Tensor, Tensor]:
-        random = np.random.default_rng([seed, step])
-        while True:
-            image, target = pairs[int(random.integers(len(pairs)))]
-            corner = [int(random.integers(n - PATCH + 1)) for n in image.shape]
-            box = tuple(slice(a, a + PATCH) for a in corner)
-            if (target[box] != UNKNOWN).any():
-                break
-        axes = tuple(axis for axis in range(3) if random.random() < 0.5)
-        x, y = (np.flip(each[box], axes).astype(np.float32) for each in (image, target))
-        x = random.uniform(0.9, 1.1) * x + random.uniform(-0.1, 0.1)
-        return torch.from_numpy(x.astype(np.float32))[None, None], torch.from_numpy(y.copy())[None, None]
-
-    return batch
-
-
 def case(scan: str, kind: str, seed: int, cases: Cases) -> Values:
     """Return the Dice of a network after a set, and after 0, 1, 3 and 10 labelled slices."""
     taught, tuned, alone = (4, 2, 4) if cases.quick else (TAUGHT, TUNED, ALONE)
-    truth = block(halves(scan)[1], seed % BLOCKS)
-    image = image_of(truth, seed)
-    torch.manual_seed(seed)
-    net = network().to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
-    if kind != "scratch":
-        pairs = [
-            (image_of(mask, 1000 + k), mask.astype(np.float32)) for k, mask in enumerate(shapes(scan, kind, cases))
-        ]
-        learn(net, lessons(pairs, seed), taught, RATE)
+    truth, net = block(halves(scan)[1], seed % BLOCKS), network(seed)
+    image, fresh = image_of(truth, seed), kind == "scratch"
+    if not fresh:
+        made = enumerate(shapes(scan, kind, cases))
+        learn(net, lessons([(image_of(m, 1000 + k), m.astype(np.float32)) for k, m in made], seed), taught, RATE)
     state = {key: value.clone() for key, value in net.state_dict().items()}
     found: Values = {}
     judged = np.setdiff1d(np.arange(EDGE), [each for n in SLICES for each in slices_of(n)])
-    for count in SLICES[1:] if kind == "scratch" else SLICES:
+    for count in SLICES[1:] if fresh else SLICES:
         net.load_state_dict(state)
         if count:
-            target = np.full(truth.shape, UNKNOWN, np.float32)
-            target[slices_of(count)] = truth[slices_of(count)]
-            fresh = kind == "scratch"
-            learn(net, lessons([(image, target)], seed), alone if fresh else tuned, RATE if fresh else RATE / 2)
-        net.eval()
-        with torch.no_grad():
-            mask = predict(net, torch.from_numpy(image)[None, None])[0, 0].numpy() > 0
+            batch = lessons([(image, annotated(truth, slices_of(count)))], seed)
+            learn(net, batch, alone if fresh else tuned, RATE if fresh else RATE / 2)
+        mask = predict_whole(net, image).numpy() > 0
         found[f"dice_{count}"] = dice(mask[judged], truth[judged])
     return found
 
@@ -222,22 +179,11 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     for scan in names:
         table = {kind: {n: np.array([found[f"{scan}-{kind}-{seed}"][f"dice_{n}"] for seed in seeds])
                         for n in (SLICES[1:] if kind == "scratch" else SLICES)} for kind in kinds}  # fmt: skip
-        goal, rows = table["scratch"][3].mean(), []
-        for kind, curve in table.items():
-            means = {n: over_blocks(values) for n, values in curve.items()}
-            figures |= {f"sets_{scan}.{kind}.dice_{n}": mean for n, mean in means.items()}
-            needed = slices_needed(curve, goal)
-            figures[f"sets_{scan}.{kind}.needed"] = Figure(needed)
-            rows.append([kind, *(means.get(n, "") for n in SLICES), needed])
-        show([scan, *(f"{n} slices" for n in SLICES), "slices for what 3 reach from scratch"], rows)
-        for other in ("cut", "wrong", "tubes", "real"):
-            figures |= {f"sets_{scan}_less.{other}.at_{n}": over_blocks(table["law"][n] - table[other][n])
-                        for n in SLICES}  # fmt: skip
-        rows = [
-            [other, *(figures[f"sets_{scan}_less.{other}.at_{n}"] for n in SLICES)]
-            for other in ("cut", "wrong", "tubes", "real")
-        ]
-        show([f"{scan}: law less", *(f"{n} slices" for n in SLICES)], rows)
+        figures |= {f"sets_{scan}.{kind}.dice_{n}": over_blocks(values)
+                    for kind, curve in table.items() for n, values in curve.items()}  # fmt: skip
+        figures |= {f"sets_{scan}_less.{other}.at_{n}": over_blocks(table["law"][n] - table[other][n])
+                    for other in kinds if other not in ("law", "scratch") for n in SLICES}  # fmt: skip
+    show(["Dice, and that of the law's shapes less that of others", "mean over blocks"], list(figures.items()))
     return figures
 
 
@@ -246,12 +192,3 @@ def over_blocks(values: np.ndarray) -> Figure:
     means = np.array([values[k::BLOCKS].mean() for k in range(min(BLOCKS, len(values)))])
     half = stats.t.ppf(0.975, len(means) - 1) * means.std(ddof=1) / np.sqrt(len(means)) if len(means) > 1 else np.nan
     return Figure(float(means.mean()), float(means.mean() - half), float(means.mean() + half))
-
-
-def slices_needed(curve: dict[int, np.ndarray], goal: float) -> float:
-    """Return how many slices the mean curve needs for a Dice, between those tried linear in log(1 + n); inf if more."""
-    counts, means = list(curve), [float(values.mean()) for values in curve.values()]
-    best = np.maximum.accumulate(means)
-    if best[-1] < goal:
-        return float("inf")
-    return float(np.expm1(np.interp(goal, best, np.log1p(counts)))) if best[0] < goal else float(counts[0])

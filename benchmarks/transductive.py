@@ -18,19 +18,18 @@ import argparse
 import copy
 import os
 import warnings
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from scipy import ndimage, stats
-from torch import Tensor, nn
+from scipy import stats
+from torch import Tensor
 from torch.nn import functional
 
 from benchmarks.completion import EDGE, LAWS_TRIED, fitted, shape
 from benchmarks.harness import Cases, Figure, Values, bootstrap, scores, show
-from benchmarks.networks import UNKNOWN, dice_ce
+from benchmarks.unets import Loss, annotated, dice_ce, image_of, learn, lessons, network, predict, predict_whole
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer
 from curvafit.priors import CombinedLoss, CurvaturePrior
@@ -41,16 +40,9 @@ from curvafit.segmentation.trials import dice
 
 TEXTURES = ("draw-0", "draw-5", "trabec", "bone")
 KNOWN, JUDGE = (21, 42), 32
-NOISE, BLUR = 2.0, 0.7
-STEPS, PATCH, RATE = 240, 48, 6e-3
+STEPS, RATE = 240, 6e-3
 #: Weights that are tried: shares of the gradient; of the teacher, times its mean square.
-WEIGHTS: dict[str, tuple[float, ...]] = {
-    "area": (0.1, 0.3, 1.0),
-    "willmore": (0.1, 0.3, 1.0),
-    "law": (0.1, 0.3, 1.0),
-    "wrong": (0.1, 0.3, 1.0),
-}
-WEIGHTS |= {"plain": (0.0,), "teacher": (1.0, 10.0), "pseudo": (0.0,)}
+WEIGHTS = dict.fromkeys(("area", "willmore", "law", "wrong"), (0.1, 0.3, 1.0)) | {"teacher": (1.0, 10.0)}
 #: Ways that work on what `plain` predicts.
 AFTER = ("refine",)
 WAYS = ("plain", "area", "willmore", "law", "wrong", "teacher", "pseudo", *AFTER, "filled")
@@ -76,13 +68,6 @@ def truth_of(texture: str, seed: int, cases: Cases) -> np.ndarray:
     return whole[z : z + EDGE, y : y + EDGE, x : x + EDGE]
 
 
-def image_of(truth: np.ndarray, seed: int) -> np.ndarray:
-    """Return a noisy image of a mask, standardised."""
-    clear = ndimage.gaussian_filter(truth.astype(np.float32), BLUR, mode="nearest")
-    values = clear + NOISE * np.random.default_rng(seed).standard_normal(truth.shape, dtype=np.float32)
-    return (values - values.mean()) / values.std()
-
-
 def law_of(texture: str, cases: Cases) -> Fit:
     """Return the law of another volume's mask."""
     if texture != "bone":
@@ -105,20 +90,8 @@ def prior_of(way: str, texture: str, cases: Cases) -> LawLike:
 # ---- training --------------------------------------------------------------------------------------------------------
 
 
-def network() -> nn.Module:
-    from monai.networks.nets.dynunet import DynUNet
-
-    return DynUNet(3, 1, 1, [3, 3, 3], [1, 2, 2], [2, 2], filters=(8, 16, 32), norm_name="batch")
-
-
-def predict(net: nn.Module, x: Tensor) -> Tensor:
-    """Return logits in single precision, of convolutions in half: on processors that have them they take a seventh."""
-    with torch.autocast("cpu", torch.bfloat16):
-        return net(x).float()
-
-
-def soft_loss(logits: Tensor, target: Tensor) -> Tensor:
-    """Dice and cross entropy of probabilities, each voxel weighed by how sure it is."""
+def soft_loss(logits: Tensor, x: Tensor, target: Tensor) -> Tensor:
+    """Return Dice and cross-entropy of probabilities, each voxel weighed by how sure it is."""
     sure, y = (2 * target - 1).abs(), (target > 0.5).float()
     p = logits.sigmoid()
     overlap = (2 * (sure * p * y).sum() + 1) / ((sure * (p + y)).sum() + 1)
@@ -137,52 +110,40 @@ def filled(texture: str, seed: int, cases: Cases) -> np.ndarray:
 
 def train(way: str, weight: float, texture: str, seed: int, steps: int, cases: Cases) -> np.ndarray:
     """Return the probabilities of a network that was taught two slices of a volume, for all of it."""
-    truth = truth_of(texture, seed, cases)
-    image, target = image_of(truth, seed), np.full(truth.shape, UNKNOWN, np.float32)
-    target[list(KNOWN)] = truth[list(KNOWN)]
-    criterion: Callable[[Tensor, Tensor], Tensor] = dice_ce
+    truth, net = truth_of(texture, seed, cases), network(seed)
+    image, target = image_of(truth, seed), annotated(truth, KNOWN)
     if way == "pseudo":
-        target, criterion = filled(texture, seed, cases), soft_loss
-    torch.manual_seed(seed)
-    net = network().to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
-    teacher = copy.deepcopy(net).requires_grad_(False)
-    adam = torch.optim.AdamW(net.parameters(), RATE)
+        target = filled(texture, seed, cases)
+    batch, teacher, begun = lessons([(image, target)], seed), copy.deepcopy(net).requires_grad_(False), steps // 3
+    losses: list[CombinedLoss] = []
 
-    def batch(step: int) -> tuple[Tensor, Tensor]:
-        random = np.random.default_rng([seed, step % 2**32])
-        corner = [int(random.integers(n - PATCH + 1)) for n in truth.shape]
-        box = tuple(slice(a, a + PATCH) for a in corner)
-        axes = tuple(axis for axis in range(3) if random.random() < 0.5)
-        x, y = (np.flip(each[box], axes).copy() for each in (image, target))
-        x = random.uniform(0.9, 1.1) * x + random.uniform(-0.1, 0.1)
-        return torch.from_numpy(x.astype(np.float32))[None, None], torch.from_numpy(y)[None, None]
-
-    net.train()
-    for step in range(steps):
-        if step == steps // 3 and way in ("area", "willmore", "law", "wrong"):
+    def loss_at(step: int) -> Loss:
+        if way == "pseudo":
+            return soft_loss
+        if step == begun and way in ("area", "willmore", "law", "wrong"):
             prior = CurvaturePrior(prior_of(way, texture, cases), sigmoid=True)
             pairs = [(predict(net, x).detach(), y) for x, y in map(batch, range(-5, 0))]
             share = float(np.median([prior.suggest_weight(dice_ce, pair) for pair in pairs]))
-            criterion = CombinedLoss(dice_ce, prior, weight * share, WARM)
-        adam.param_groups[0]["lr"] = RATE * (1 + np.cos(np.pi * step / steps)) / 2
-        x, y = batch(step)
-        adam.zero_grad()
-        logits = predict(net, x)
-        loss = criterion(logits, y)
-        if way == "teacher" and step >= steps // 3:
+            losses.append(CombinedLoss(dice_ce, prior, weight * share, WARM))
+
+        def loss(logits: Tensor, x: Tensor, y: Tensor) -> Tensor:
+            if way != "teacher" or step < begun:
+                return (losses[0] if losses else dice_ce)(logits, y)
             with torch.no_grad():
                 noise = 0.3 * torch.randn(x.shape, generator=torch.Generator().manual_seed(step))
-                told = predict(teacher, x + noise).sigmoid()
-            loss = loss + weight * min(1.0, (step - steps // 3) / WARM) * (logits.sigmoid() - told).square().mean()
-        loss.backward()
-        nn.utils.clip_grad_norm_(net.parameters(), 5.0)
-        adam.step()
+                taught = predict(teacher, x + noise).sigmoid()
+            share = weight * min(1.0, (step - begun) / WARM)
+            return dice_ce(logits, y) + share * (logits.sigmoid() - taught).square().mean()
+
+        return loss
+
+    def remember() -> None:
         with torch.no_grad():
             for kept, new in zip(teacher.state_dict().values(), net.state_dict().values(), strict=True):
                 kept.copy_(MEMORY * kept + (1 - MEMORY) * new if kept.is_floating_point() else new)
-    net.eval()
-    with torch.no_grad():
-        return predict(net, torch.from_numpy(image)[None, None])[0, 0].sigmoid().numpy()
+
+    learn(net, batch, steps, RATE, loss_at, remember)
+    return predict_whole(net, image).sigmoid().numpy()
 
 
 def predicted(way: str, weight: float, texture: str, seed: int, steps: int, cases: Cases) -> np.ndarray:
