@@ -8,9 +8,8 @@ curvatures at constant volume.
 - Prior: `segment(scan, law)`, `refine(probabilities, law)` and `reconstruct(labels, law)` give a mask;
   `curvafit.priors` has the loss for networks.
 - Files: `load(path)` and `save(volume, path)` read and write volumes with their spacing and unit.
-- Compare: `compare(group_a, group_b)` tells whether two groups of scans differ, and in what.
+- Compare: `compare(*groups)` or `compare(table, by="age")` tells whether scans differ by group or number, in what.
 - Map: `windows(scan)` measures a scan in windows: where its texture differs, in maps and clusters.
-- Follow: `trajectory(scans, times)` tells what a series of scans of one thing does over time.
 - Measure: `measure(scan)`, `measure_instances(labels)`, `diagram(u, grid, epsilon)` and `wasserstein(a, b)`; more in
   `curvafit.geometry`.
 
@@ -47,8 +46,6 @@ if TYPE_CHECKING:
     from curvafit.segmentation.segment import segment as segment
     from curvafit.studies.compare import Comparison as Comparison
     from curvafit.studies.compare import compare as compare
-    from curvafit.studies.trajectory import Trajectory as Trajectory
-    from curvafit.studies.trajectory import trajectory as trajectory
     from curvafit.studies.windows import Windows as Windows
     from curvafit.studies.windows import windows as windows
     from curvafit.volumes.field import Field as Field
@@ -67,7 +64,6 @@ _FIGURES = {
     "Inference": "curvafit.report.page:inference_figure",
     "Measures": "curvafit.report.measures:measures_figure",
     "Segmentation": "curvafit.segmentation.result:segmentation_figure",
-    "Trajectory": "curvafit.report.trajectory:trajectory_figure",
     "Windows": "curvafit.report.windows:windows_figure",
 }
 

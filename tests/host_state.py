@@ -215,7 +215,6 @@ class Calls:
             "measure_instances": lambda: curvafit.measure_instances(self.ball.astype(np.uint8)),
             "windows": lambda: curvafit.windows((np.indices((24, 24, 36))[2] % 12 < 6).astype(np.uint8), 24, 12),
             "compare": lambda: curvafit.compare(*[[np.roll(self.ball, k, 0).astype(np.uint8) for k in (0, 1)]] * 2),
-            "trajectory": lambda: curvafit.trajectory([self.ball.astype(np.uint8)] * 2),
             "read_laws": lambda: priors.read_laws(["tubes", self.a, self.folder / "fit.json"]),
         }
 

@@ -20,7 +20,6 @@ from curvafit.cli import (
     samples,
     segment,
     synth,
-    trajectory,
     windows,
 )
 from curvafit.cli.atlas import atlas_app
@@ -38,14 +37,16 @@ app = typer.Typer(
     cls=Commands,
 )
 add_commands(app, samples.demo, infer.infer, measure.measure, windows.windows)
-add_commands(app, compare.compare, trajectory.trajectory)
+add_commands(app, compare.compare)
 add_commands(app, generate.generate, generate.presets, nnunet.nnunet)
 add_commands(app, segment.segment, refine.refine, segment.reconstruct, synth.synth)
 app.add_typer(samples.samples_app, name="samples")
 app.add_typer(atlas_app, name="atlas")
 
 #: Commands that are gone, and what to type in their place; to be deleted after one release.
-GONE: dict[str, str] = {}
+GONE: dict[str, str] = {
+    "trajectory": "`curvafit compare SCAN… --by 0,7,14 -o DIR` does that, with a time for each scan",
+}
 for _name, _instead in GONE.items():
     add_gone(app, _name, _instead)
 

@@ -1,4 +1,4 @@
-"""The command that compares two groups of scans."""
+"""The command that compares scans by group or by a number."""
 
 from __future__ import annotations
 
@@ -13,14 +13,24 @@ from curvafit.cli.options import OverwriteOption, Reading, Structure, command
 
 @command(
     "curvafit compare control/ treated/ --spacing 0.0195 --unit mm -o compared",
-    "curvafit compare control/ treated/ --subjects mice.csv -o compared",
-    "curvafit compare --subjects study.csv -o compared",
+    "curvafit compare control/ low/ high/ --subjects mice.csv -o compared",
+    "curvafit compare before/ after/ --paired -o compared",
+    "curvafit compare study.csv --by age -o compared",
+    "curvafit compare study.csv --by treatment --paired -o compared",
+    "curvafit compare day0.tif day7.tif day14.tif day28.tif day56.tif --by 0,7,14,28,56 -o healing",
 )
 def compare(
+    scans: Annotated[
+        list[Path], typer.Argument(help="Two folders of scans or more; or a CSV: scan, group (or --by), subject.")
+    ],
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for compare.html, figures and tables.")],
-    group_a: Annotated[Path | None, typer.Argument(help="Folder of scans.")] = None,
-    group_b: Annotated[Path | None, typer.Argument(help="Folder of the other scans.")] = None,
-    subjects: Annotated[Path | None, typer.Option(help="CSV: scan, subject; without folders scan, group.")] = None,
+    by: Annotated[
+        str | None, typer.Option(help="Column of the CSV: groups, or numbers (dose, age); or 0,7,14 for three scans.")
+    ] = None,
+    paired: Annotated[
+        bool, typer.Option("--paired", help="Compare within subjects of one name (of a file, or in the CSV).")
+    ] = False,
+    subjects: Annotated[Path | None, typer.Option(help="CSV for folders, or scans: scan, subject.")] = None,
     *,
     structure: Structure,
     reading: Reading,
@@ -33,25 +43,28 @@ def compare(
     workers: Annotated[int, typer.Option(help="Processes that measure; 0 is this one.")] = 0,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Tell whether two groups of scans differ, in which direction of curvature, and by how much."""
+    """Tell whether groups of scans differ, or what goes with a number: in which curvature, and by how much."""
     with show_stages() as progress:
         from curvafit.report.comparison import check_comparison, write_comparison
-        from curvafit.studies.compare import compare as compare_groups
+        from curvafit.studies.compare import compare as compare_scans
 
-        inputs = [place for place in (group_a, group_b, subjects) if place is not None]
-        check_comparison(out, inputs, overwrite, command_line())
-        how = {"laws": laws, "primary": primary, "permutations": permutations, "seed": seed}
-        how |= {"workers": workers, "progress": progress}
-        comparison = compare_groups(group_a, group_b, subjects=subjects, **structure, **how, **reading)
+        check_comparison(out, [*scans, *([] if subjects is None else [subjects])], overwrite, command_line())
+        how = {"laws": laws, "primary": primary, "permutations": permutations, "seed": seed, "subjects": subjects}
+        how |= {"workers": workers, "progress": progress, "paired": paired}
+        labels = by.split(",") if by is not None and "," in by else by
+        groups = scans if labels is by else [scans]
+        comparison = compare_scans(*groups, by=labels, **structure, **how, **reading)
         progress("drawing the page", 1.0)
         page = write_comparison(comparison, out, command=command_line(), overwrite=overwrite)
     say_notes(comparison.notes)
     say(comparison.status, style="bold")
     from curvafit.core.units import format_number
 
-    rows = [
-        (each.name, each.symbol, *(format_number(value) for value in (*each.means, each.effect, each.p, each.family)))
-        for each in comparison.numbers
-    ]
-    print_table(("", "", *comparison.groups, "Hedges' g", "p", "family-wise p"), rows, right=range(2, 7))
+    middle = comparison.groups or ("slope",)
+    rows = []
+    for each in comparison.numbers:
+        values = (*(each.means or (each.difference,)), each.effect, each.p, each.family)
+        rows.append((each.name, each.symbol, *map(format_number, values)))
+    head = ("", "", *middle, comparison.effect, "p", "family-wise p")
+    print_table(head, rows, right=range(2, len(head)))
     say(str(page))

@@ -1,4 +1,4 @@
-"""The pages that show an inference, measured scans, two groups of them, a series."""
+"""The pages that show an inference, measured scans, a comparison of them."""
 
 from __future__ import annotations
 
@@ -13,6 +13,5 @@ if TYPE_CHECKING:
     from curvafit.report.page import report_html as report_html
     from curvafit.report.page import write_inference as write_inference
     from curvafit.report.page import write_report as write_report
-    from curvafit.report.trajectory import write_trajectory as write_trajectory
 
 attach_lazy_names(__name__)

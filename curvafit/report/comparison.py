@@ -1,4 +1,4 @@
-"""The page of two groups that are compared, its figures and tables, and a paragraph on the methods."""
+"""The page of scans that are compared, its figures and tables, and a paragraph on the methods."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from string import ascii_lowercase
 from typing import Any
 
 import numpy as np
@@ -25,13 +26,20 @@ from curvafit.report.page import (
     write_study,
 )
 from curvafit.scan.measure import Measures
-from curvafit.studies.compare import BINS, LEVEL, SMOOTH, Comparison, Number
+from curvafit.studies.compare import BINS, LEVEL, SMOOTH, Comparison, Number, join_names
 from curvafit.studies.scans import count_notes
 from curvafit.studies.tables import format_csv
-from curvafit.studies.trajectory import Trajectory
 
 #: `format` of a comparison's record.
 FORMAT = Format("curvafit comparison", 1, title="the record of a comparison")
+#: How the effect of each quantity is told, by its name.
+EFFECTS = {
+    "g": "g: Hedges' g, the difference over the deviation within groups, or of pairs over that of their differences.",
+    "η": "η: the correlation ratio, the root of the part of the variance that lies between groups.",
+    "r": "Slope: the change a unit. r: the correlation with the number's rank.",
+}
+#: The tests of each quantity as the page's table heads them.
+TESTS = ("p", "family-wise", "Holm", "BH")
 #: What a comparison writes into its folder.
 FILES = ("compare.json", "compare.html", "measures.csv", "numbers.csv")
 FILES += ("difference.svg", "difference.png", "numbers.svg", "numbers.png")
@@ -51,7 +59,7 @@ def write_comparison(
     difference, numbers = comparison_figure(comparison), numbers_figure(comparison)
     drawn = {
         "difference": (difference, picture_of(difference, "Mean curvature diagrams and their difference")),
-        "numbers": (numbers, picture_of(numbers, "Each number by group")),
+        "numbers": (numbers, picture_of(numbers, f"Each number by {comparison.by}")),
     }
     record = _record(comparison, command)
     texts = {
@@ -64,23 +72,30 @@ def write_comparison(
 
 def _page(comparison: Comparison, record: dict[str, Any], pictures: dict[str, Picture]) -> str:
     """Return the page of a comparison, with its record and its pictures, as text."""
-    a, b = comparison.groups
-    bins = int(comparison.significant.sum())
+    c, bins = comparison, int(comparison.significant.sum())
     region = f"The outline holds the bins that differ at a family-wise level of {LEVEL:.2g}."
+    what = "between the least number and the greatest: orange where there is more with it, blue where less"
+    if len(c.groups) == 2:
+        what = f"of the two: blue where {c.groups[0]} has more, orange where {c.groups[1]} has"
+    elif c.groups:
+        what = "of each from all: orange where it has more, blue where less"
     return render_template(
         "compare.html",
         version=version("curvafit"),
-        title=comparison.verdict,
-        a=a,
-        b=b,
-        scans="; ".join(_count_scans(comparison)) + ".",
-        status=comparison.status,
+        title=c.verdict,
+        scans="; ".join(_count_scans(c)) + ".",
+        status=c.status,
+        difference_text=what,
         region=region if bins else f"No bin differs at a family-wise level of {LEVEL:.2g}.",
-        rows=[_format_row(number, comparison.unit) for number in comparison.numbers],
+        head=[*c.groups, "difference" if c.groups else "slope", c.effect, "95 %", *TESTS, "known error"],
+        rows=[_format_row(number, c) for number in c.numbers],
+        count=len(c.groups),
+        effect=f"Mean ± standard deviation of subjects. {EFFECTS[c.effect]}" if c.groups else EFFECTS[c.effect],
+        line="the group's mean" if c.groups else "the slope",
         level=f"{LEVEL:.2g}",
         **pictures,
         methods=record["methods"],
-        notes=comparison.notes,
+        notes=c.notes,
         provenance=[(name, record[name]) for name in ("command", "date", "seed", "permutations") if record[name] != ""],
     )
 
@@ -88,35 +103,50 @@ def _page(comparison: Comparison, record: dict[str, Any], pictures: dict[str, Pi
 def describe_methods(comparison: Comparison) -> str:
     """Return a paragraph, for a paper, on what was done and what came of it."""
     c, unit = comparison, per_unit(comparison.unit, 1)
-    tried = f"{c.permutations} permutations"
-    tried = f"all {tried}" if c.exact else f"{tried} (random, seed {c.options['seed']})"
+    tried = f"all {c.permutations}" if c.exact else f"{c.permutations} random (seed {c.options['seed']})"
+    tried += f" permutations of {'groups' if c.groups else c.by}{' within subjects' * (c.blocks is not None)}"
     differ = [each for each in c.numbers if each.family <= LEVEL]
-    found = ", ".join(f"{each.symbol} (g = {format_number(each.effect, 2)})" for each in differ)
+    found = ", ".join(f"{each.symbol} ({c.effect} = {format_number(each.effect, 2)})" for each in differ)
     found = f"{len(differ)} of them differ{f': {found}' if differ else ''}."
-    tested = int(np.isfinite(c.bins_p).sum())
-    named = (
-        [f"Named beforehand and tested alone was {c.primary.symbol}: p = {format_number(c.primary.p, 2)}."]
-        if c.primary
-        else []
-    )
+    named = "Named beforehand and tested alone was {0.symbol}: p = {1}."
+    statistic = format_number(c.statistic, 3)
+    over = f"the sliced Wasserstein distance of subjects' diagrams ({DIRECTIONS} directions, {QUANTILES} quantiles)"
+    tests = {
+        "g": (
+            f"the energy distance (Székely & Rizzo 2004) of the groups, over {over}: E = {statistic} {unit}",
+            "the difference of means" if c.blocks is None else "the mean difference of pairs",
+            "Effect sizes are Hedges' g, with 95 % intervals of the noncentral t distribution (normal subjects).",
+        ),
+        "η": (
+            f"the dispersion between groups (Rizzo & Székely 2010) over {over}: E = {statistic} {unit}",
+            "the variance between groups",
+            "Effect sizes are correlation ratios.",
+        ),
+        "r": (
+            f"the distance correlation (Székely, Rizzo & Bakirov 2007) with the rank of {c.by}, over {over}: R = "
+            f"{statistic}",
+            f"the correlation with the rank of {c.by}",
+            "Effect sizes are correlations, with 95 % intervals by Fisher's z (normal subjects).",
+        ),
+    }
+    diagrams, numbers, effects = tests[c.effect]
     return " ".join(
         [
-            f"Scans of two groups, {' and '.join(_count_scans(c))}, were measured with curvafit {version('curvafit')}; "
+            f"Scans of {join_names(_count_scans(c))} were measured with curvafit {version('curvafit')}; "
             f"{say_kinds(c.measures)}.",
             *describe_measures(c.measures),
             "Scans of a subject were averaged; subjects are what all tests count.",
-            "Diagrams were compared by the energy distance (Székely & Rizzo 2004) of the groups, over the sliced "
-            f"Wasserstein distance of subjects' diagrams ({DIRECTIONS} directions, {QUANTILES} quantiles): "
-            f"E = {format_number(c.energy, 3)} {unit}, p = {format_number(c.p, 2)}, the share of {tried} of subjects "
-            "with at least that distance.",
-            f"Each of {len(c.numbers)} numbers was tested by the difference of means over the same permutations, and "
-            "corrected for all of them by the greatest correlation with the group in each permutation (Westfall & "
-            "Young 1993), besides the corrections of Holm and of Benjamini and Hochberg.",
+            f"Diagrams were compared by {diagrams}, p = {format_number(c.p, 2)}, the share of {tried} with at least as "
+            "much.",
+            f"Each of {len(c.numbers)} numbers was tested by {numbers} over the same permutations, and corrected for "
+            "all of them by the greatest correlation with the label in each permutation (Westfall & Young 1993), "
+            "besides the corrections of Holm and of Benjamini and Hochberg.",
             f"At a family-wise level of {LEVEL:.2g}, {found}",
-            *named,
-            "Effect sizes are Hedges' g, with 95 % intervals of the noncentral t distribution (normal subjects).",
+            *([named.format(c.primary, format_number(c.primary.p, 2))] if c.primary else []),
+            effects,
             f"The difference of the mean diagrams, over {BINS} × {BINS} bins and smoothed by a Gaussian of {SMOOTH:g} "
-            f"bins, was tested in the {tested} with area, corrected likewise; {int(c.significant.sum())} differ.",
+            f"bins, was tested in the {int(np.isfinite(c.bins_p).sum())} with area, corrected likewise; "
+            f"{int(c.significant.sum())} differ.",
         ]
     )
 
@@ -145,25 +175,26 @@ def describe_measures(measures: Sequence[Measures]) -> list[str]:
 
 
 def _count_scans(comparison: Comparison) -> list[str]:
-    """Return each group's name with the numbers of its scans and subjects."""
-    groups = Counter(case.group for case in comparison.cases)
+    """Return each part's name with the numbers of its scans and subjects."""
+    side = dict(zip(comparison.subjects, comparison.sides.tolist(), strict=True))
+    scans = Counter(side[case.label, case.subject] for case in comparison.cases)
     return [
-        f"{name} ({groups[name]} scans of {count} subjects)"
-        for name, count in zip(comparison.groups, comparison.counts, strict=True)
+        f"{name} ({scans[k]} scans of {count} subjects)"
+        for k, (name, count) in enumerate(zip(comparison.parts, comparison.counts, strict=True))
     ]
 
 
-def _format_row(number: Number, unit: str) -> dict[str, Any]:
+def _format_row(number: Number, comparison: Comparison) -> dict[str, Any]:
     """Return a row of the page's table."""
-    means = (
+    means = [
         f"{format_number(mean)} ± {format_number(sd, 2)}"
         for mean, sd in zip(number.means, number.deviations, strict=True)
-    )
+    ]
+    interval = "–" if math.isnan(number.low) else f"{format_number(number.low, 2)} to {format_number(number.high, 2)}"
     ps = (format_number(each, 2) for each in (number.p, number.family, number.holm, number.discovery))
-    interval = f"{format_number(number.low, 2)} to {format_number(number.high, 2)}"
     known = "–" if math.isnan(number.known) else "all" if number.known >= 1 else format_percent(number.known)
+    named = name_quantity(number.name, number.symbol, number.power, comparison.unit)
     cells = (*means, format_number(number.difference), format_number(number.effect, 2), interval, *ps, known)
-    named = name_quantity(number.name, number.symbol, number.power, unit)
     return {**named, "cells": cells, "chosen": number.family <= LEVEL}
 
 
@@ -177,49 +208,48 @@ def name_quantity(name: str, symbol: str, power: int, unit: str) -> dict[str, st
 
 
 def _measure_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
-    """Yield the rows of `curvafit measure`'s table, with subject and group."""
+    """Yield the rows of `curvafit measure`'s table, with each scan's subject and its group or number."""
     for measures, case in zip(comparison.measures, comparison.cases, strict=True):
-        yield from measures.rows(subject=case.subject, group=case.group)
+        yield from measures.rows(subject=case.subject, **{"group" if comparison.groups else "number": case.label})
 
 
 def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
     """Yield a row for each test: the diagrams', then each number's; None where there is no value."""
-    columns = ("quantity", "symbol", "unit", "mean_a", "mean_b", "sd_a", "sd_b", "difference", "g", "g_low", "g_high")
-    columns += ("p", "p_family", "p_holm", "p_bh", "known_error")
-    empty = dict.fromkeys(columns)
-    whole = {"quantity": "curvature diagram", "symbol": "E", "unit": plain_unit(comparison.unit, -1)}
-    yield empty | whole | {"difference": comparison.energy, "p": comparison.p}
-    for each in comparison.numbers:
-        cells = (each.name, each.symbol, plain_unit(comparison.unit, each.power), *each.means, *each.deviations)
+    c, letters = comparison, ascii_lowercase[: len(comparison.groups)]
+    columns = ["quantity", "symbol", "unit", *(f"mean_{each}" for each in letters), *(f"sd_{each}" for each in letters)]
+    effect = {"g": "g", "η": "eta", "r": "r"}[c.effect]
+    columns += ["slope" if c.effect == "r" else "difference", effect, f"{effect}_low", f"{effect}_high"]
+    columns += ["p", "p_family", "p_holm", "p_bh", "known_error"]
+    whole = {"quantity": "curvature diagram", "symbol": "E", "unit": plain_unit(c.unit, -1)}
+    statistic = {"difference": c.statistic} if c.groups else {"symbol": "R", "unit": "", "r": c.statistic}
+    yield dict.fromkeys(columns) | whole | statistic | {"p": c.p}
+    for each in c.numbers:
+        cells = (each.name, each.symbol, plain_unit(c.unit, each.power), *each.means, *each.deviations)
         cells += (each.difference, each.effect, each.low, each.high)
         cells += (each.p, each.family, each.holm, each.discovery, each.known)
-        yield {name: known(cell) for name, cell in zip(columns, cells, strict=True)}
+        known = (None if isinstance(cell, float) and not math.isfinite(cell) else cell for cell in cells)
+        yield dict(zip(columns, known, strict=True))
 
 
 def _record(comparison: Comparison, command: str) -> dict[str, Any]:
     """Return the content of `compare.json`."""
+    c, label = comparison, "group" if comparison.groups else "number"
     return {
-        **record_study(comparison, command, FILES),
-        **record_test(comparison),
-        "groups": list(comparison.groups),
+        **record_study(c, command, FILES),
+        "seed": c.options["seed"],
+        "permutations": c.permutations,
+        "exact": c.exact,
+        "p": c.p,
+        "least_p": c.least,
+        "by": c.by,
+        "groups": list(c.groups),
         "scans": [
-            {"scan": each.source, "subject": case.subject, "group": case.group, "kind": each.kind, "notes": each.notes}
-            for each, case in zip(comparison.measures, comparison.cases, strict=True)
+            {"scan": each.source, "subject": case.subject, label: case.label, "kind": each.kind, "notes": each.notes}
+            for each, case in zip(c.measures, c.cases, strict=True)
         ],
-        "energy": comparison.energy,
-        "apart": comparison.apart,
-        "within": comparison.within,
-        "tests": list(_test_rows(comparison)),
-        "methods": describe_methods(comparison),
+        "energy" if c.groups else "distance_correlation": c.statistic,
+        "apart": c.apart,
+        "within": c.within,
+        "tests": list(_test_rows(c)),
+        "methods": describe_methods(c),
     }
-
-
-def record_test(study: Comparison | Trajectory) -> dict[str, Any]:
-    """Return what the records of studies with a test by permutation hold of it."""
-    more = {"permutations": study.permutations, "exact": study.exact, "p": known(study.p)}
-    return {"seed": study.options["seed"], **more}
-
-
-def known(cell: Any) -> Any:
-    """Return a cell, None where it is a number that is not finite."""
-    return None if isinstance(cell, float) and not math.isfinite(cell) else cell

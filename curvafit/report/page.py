@@ -58,7 +58,6 @@ if TYPE_CHECKING:
     from curvafit.inference.fit import Fit
     from curvafit.inference.infer import Inference
     from curvafit.studies.compare import Comparison
-    from curvafit.studies.trajectory import Trajectory
     from curvafit.studies.windows import Windows
 
 #: The mark by which a page is known as this program's.
@@ -156,7 +155,7 @@ def fill_folder(target: Path, files: Sequence[str]) -> Iterator[Path]:
             move_together(sorted(work.iterdir()), target)
 
 
-def record_study(study: Comparison | Trajectory | Windows, command: str, files: Sequence[str]) -> dict[str, Any]:
+def record_study(study: Comparison | Windows, command: str, files: Sequence[str]) -> dict[str, Any]:
     """Return what the records of all studies hold."""
     return {
         "curvafit": version("curvafit"),

@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from curvafit.studies.compare import Number as Number
     from curvafit.studies.compare import compare as compare
     from curvafit.studies.tables import write_table as write_table
-    from curvafit.studies.trajectory import Change as Change
-    from curvafit.studies.trajectory import Trajectory as Trajectory
-    from curvafit.studies.trajectory import trajectory as trajectory
     from curvafit.studies.windows import Windows as Windows
     from curvafit.studies.windows import windows as windows
 

@@ -1,4 +1,4 @@
-"""Do two groups of scans differ, in which direction of curvature, and by how much?"""
+"""Do groups of scans differ, or does a number such as time or dose matter: in which curvature, and by how much?"""
 
 from __future__ import annotations
 
@@ -10,16 +10,19 @@ from typing import Any, Literal
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
-from scipy.spatial.distance import cdist
-from scipy.stats import false_discovery_control
+from scipy.spatial.distance import cdist, pdist
+from scipy.stats import false_discovery_control, rankdata
 
 from curvafit.core.checks import check_choice, check_int, check_seed
 from curvafit.core.permutation import (
+    center,
     correct_by_most,
     correct_holm,
     correlate,
+    measure_dependence,
     measure_effect,
     measure_energy,
+    measure_slope,
     relabel,
     share_beyond,
 )
@@ -32,9 +35,9 @@ from curvafit.geometry.distances import sliced_embedding
 from curvafit.scan.measure import QUANTITIES, SURE, Measures, find_quantity, interval_reach
 from curvafit.scan.structure import check_options
 from curvafit.studies.groups import Case, Group, list_cases
-from curvafit.studies.scans import gather_notes, measure_scans, stack_numbers
+from curvafit.studies.scans import gather_notes, measure_scans
 
-#: Permutations of subjects that are tried: all where there are no more.
+#: Arrangements of the labels that are tried: all where there are no more.
 PERMUTATIONS = 9999
 #: What p must not exceed for a difference that is shown.
 LEVEL = 1 - SURE
@@ -48,31 +51,32 @@ LEAST_SHARE = 0.02
 
 @dataclass(frozen=True)
 class Number:
-    """How one quantity differs between the groups, in the scans' unit to `power`.
+    """How one quantity goes with the labels, in the scans' unit to `power`; NaN, and no means, where there is none.
 
     Attributes
     ----------
     means, deviations
-        Of the subjects of the first group and of the second.
+        Of the subjects of each group.
     difference
-        The second mean less the first.
+        Of two groups the second mean less the first; by a number the slope over it, of pairs within subjects.
     effect, low, high
-        Hedges' g of that difference, and its 95 % interval.
+        Of two groups Hedges' g, of pairs that of the differences; by a number the correlation r with its rank; with a
+        95 % interval. Of more groups the correlation ratio η.
     p
-        Share of permutations that differ at least as much.
+        Share of arrangements of the labels with at least that effect.
     family, holm, discovery
-        p corrected for all quantities. The first two hold the chance of any false finding: by the most of |r| over all
-        quantities in each permutation, and by Holm, whose p cannot be small with few subjects. The third, by Benjamini
-        and Hochberg, holds the share of false findings.
+        p corrected for all quantities. The first two hold the chance of any false finding: by the most of the effects
+        of all quantities in each arrangement, and by Holm, whose p cannot be small with few subjects. The third, by
+        Benjamini and Hochberg, holds the share of false findings.
     known
-        The part of the variance within groups that the scans' own intervals explain.
+        The part of the variance that the labels leave which the scans' own intervals explain.
     """
 
     name: str
     symbol: str
     power: int
-    means: tuple[float, float]
-    deviations: tuple[float, float]
+    means: tuple[float, ...]
+    deviations: tuple[float, ...]
     difference: float
     effect: float
     low: float
@@ -86,51 +90,61 @@ class Number:
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Comparison(Pictured):
-    """How two groups of scans differ.
+    """How groups of scans differ, or what goes with a number.
+
+    A *subject* here is a subject in one group, or at one number.
 
     Attributes
     ----------
-    groups
-        Names of the first group and the second.
+    by, groups
+        What subjects are compared by, and the names of the groups; none where it is a number.
     measures, cases
-        Of each scan, its measures in `unit`, and its name, subject and group.
-    subjects
-        Group and name of each subject.
+        Of each scan, its measures in `unit`, and its name, subject and label.
+    subjects, labels, blocks
+        Label and name of each subject; the number of its group, or its number, (S,); and where subjects are paired the
+        number of its name, (S,), else None.
     values, errors, halves
         Each subject's quantities (S, K), means over its scans; the standard errors that the scans' own intervals give
         them, and half the widths of their 95 % intervals, NaN where a scan has none.
     numbers
         A test of each quantity.
-    energy, p
-        Energy distance of the groups' curvature diagrams, in 1 / `unit`, and the share of permutations with at least as
-        much.
+    statistic, p, least
+        Energy distance of the groups' curvature diagrams, in 1 / `unit`, or the diagrams' distance correlation with the
+        number's rank; the share of arrangements with at least as much, and the least that it could be.
+    sides, diagrams
+        The part of the subjects, (S,), that each is in: its group, or the lower and the upper half of the numbers; and
+        the mean diagram of each part, of total area 1.
     apart, within
-        Sliced Wasserstein distance of the groups' mean diagrams, and the mean one of two subjects of a group.
-    diagrams
-        The mean diagram of each group, of total area 1.
-    edges, difference, bins_p
-        Edges (B + 1,) of bins in κ1 and κ2, the second mean diagram less the first over them (κ2, κ1) `(B, B)`, and the
+        Sliced Wasserstein distance of the parts' mean diagrams, the greatest, and the mean one of two subjects of one.
+    edges, differences, bins_p
+        Edges (B + 1,) of bins in κ1 and κ2; over them (κ2, κ1) the second group's mean diagram less the first's, or
+        each group's less that of all, or the slope from the least number to the greatest, `(M, B, B)`; and the
         family-wise p of each bin, NaN where there is too little area to test.
     permutations, exact
-        How many permutations of subjects were tried, and whether they are all.
+        How many arrangements were tried, and whether they are all.
     """
 
-    groups: tuple[str, str]
+    by: str
+    groups: tuple[str, ...]
     unit: str
     cases: tuple[Case, ...]
     measures: tuple[Measures, ...]
-    subjects: tuple[tuple[str, str], ...]
+    subjects: tuple[tuple[str | float, str], ...]
+    labels: np.ndarray
+    blocks: np.ndarray | None
     values: np.ndarray
     errors: np.ndarray
     halves: np.ndarray
     numbers: tuple[Number, ...]
-    energy: float
+    statistic: float
     p: float
+    least: float
+    sides: np.ndarray
+    diagrams: tuple[Diagram, ...]
     apart: float
     within: float
-    diagrams: tuple[Diagram, Diagram]
     edges: np.ndarray
-    difference: np.ndarray
+    differences: np.ndarray
     bins_p: np.ndarray
     permutations: int
     exact: bool
@@ -138,17 +152,28 @@ class Comparison(Pictured):
     notes: tuple[str, ...]
 
     def __repr__(self) -> str:
-        return f"Comparison({self.groups[0]!r}, {self.groups[1]!r}, p {self.p:.3g}, {len(self.cases)} scans)"
+        what = ", ".join(map(repr, self.groups)) or f"by {self.by!r}"
+        return f"Comparison({what}, p {self.p:.3g}, {len(self.cases)} scans)"
 
     def __getitem__(self, name: str) -> Number:
         """Return the test of a quantity by its name or symbol; raise KeyError where there is none."""
         return find_quantity(self.numbers, name)
 
     @property
-    def counts(self) -> tuple[int, int]:
-        """Return the number of subjects of each group."""
-        a, b = (sum(group == name for group, _ in self.subjects) for name in self.groups)
-        return a, b
+    def parts(self) -> tuple[str, ...]:
+        """Return the names of the parts of the subjects: the groups, or the halves of the numbers."""
+        low, high = self.labels[self.sides == 0].max(), self.labels[self.sides == 1].min()
+        return self.groups or (f"{self.by} up to {low:g}", f"{self.by} from {high:g}")
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Return the number of subjects of each part."""
+        return tuple(np.bincount(self.sides).tolist())
+
+    @property
+    def effect(self) -> str:
+        """Return the name of the numbers' effect: g, η or r."""
+        return "r" if not self.groups else "g" if len(self.groups) == 2 else "η"
 
     @property
     def level(self) -> float:
@@ -163,22 +188,25 @@ class Comparison(Pictured):
     @property
     def status(self) -> str:
         """Return the answer in a sentence or a few: whether, by how much, in which direction."""
-        (a, b), unit = self.groups, per_unit(self.unit, 1)
-        least = (1 + (self.counts[0] == self.counts[1])) / self.permutations
+        unit = per_unit(self.unit, 1)
         most = max((self[name] for name in FAMILIAR), key=lambda each: abs(np.nan_to_num(each.effect)))
-        lines = [f"So few subjects cannot give a p below {format_number(least, 2)}."] if least > LEVEL else []
+        few = f"So few subjects cannot give a p below {format_number(self.least, 2)}: nothing can be shown to differ."
+        lines = [few] if self.least > LEVEL else []
         if self.primary:
             lines.append(f"{self.verdict}, named beforehand: {self._say(self.primary)}.")
         lines += [
             f"{self._judge(self.p, 'curvature diagrams')}: p = {format_number(self.p, 2)}.",
             f"Of the familiar numbers the one that differs most: {self._say(most)}, "
             f"{format_number(most.family, 2)} among all {len(self.numbers)} numbers.",
-            f"In curvature the groups' mean diagrams lie {format_number(self.apart, 2)} {unit} apart, those of two "
-            f"subjects of a group {format_number(self.within, 2)} {unit} on average (sliced Wasserstein distance).",
+            f"In curvature the mean diagrams of {join_names(self.parts)} lie "
+            f"{'up to ' * (len(self.parts) > 2)}{format_number(self.apart, 2)} {unit} apart, those of two subjects of "
+            f"one of them {format_number(self.within, 2)} {unit} on average (sliced Wasserstein distance).",
         ]
-        shifts = sorted((self[f"share of {name}"].difference, name) for name in FAMILIES)
-        (fall, loser), (rise, winner) = shifts[0], shifts[-1]
-        if self.p <= LEVEL:
+        if self.p <= LEVEL and len(self.groups) <= 2:
+            low, high = (f"{self.by} {end:g}" for end in (self.labels.min(), self.labels.max()))
+            a, b, span = (*self.groups, 1.0) if self.groups else (low, high, float(np.ptp(self.labels)))
+            shifts = sorted((span * self[f"share of {name}"].difference, name) for name in FAMILIES)
+            (fall, loser), (rise, winner) = shifts[0], shifts[-1]
             lines.append(
                 f"From {a} to {b} the share of {loser} falls by {format_percent(-fall)} "
                 f"of the surface, and that of {winner} rises by {format_percent(rise)}."
@@ -193,27 +221,35 @@ class Comparison(Pictured):
 
     @property
     def verdict(self) -> str:
-        """Return whether the groups differ, in a few words: in the number named beforehand, or in their diagrams."""
+        """Return whether subjects differ, in a few words: in the number named beforehand, or in their diagrams."""
         if self.primary:
             return self._judge(self.primary.p, self.primary.name)
         return self._judge(self.p, "curvature diagrams")
 
     def _judge(self, p: float, what: str) -> str:
-        return f"{' and '.join(self.groups)} {'differ' if p <= LEVEL else 'are not told apart'} by their {what}"
+        if not self.groups:
+            return f"With {self.by} subjects {'differ' if p <= LEVEL else 'are not seen to differ'} by their {what}"
+        return f"{join_names(self.groups)} {'differ' if p <= LEVEL else 'are not told apart'} by their {what}"
 
     def _say(self, number: Number) -> str:
-        """Return a number with both means and its p as text."""
-        means = " to ".join(format_number(mean) for mean in number.means)
+        """Return a number with its means or its slope, and its p, as text."""
         unit = power_name(self.unit, number.power)
-        return f"{number.name} ({number.symbol}) goes from {means} {unit}".rstrip() + (
-            f", p = {format_number(number.p, 2)} alone"
-        )
+        if self.groups:
+            change = f"goes from {' to '.join(map(format_number, number.means))} {unit}".rstrip()
+        else:
+            change = f"changes by {format_number(number.difference)} {unit}".rstrip() + f" a unit of {self.by}"
+        return f"{number.name} ({number.symbol}) {change}, p = {format_number(number.p, 2)} alone"
+
+
+def join_names(names: Sequence[str]) -> str:
+    """Return names as text: a, b and c."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def compare(
-    group_a: Group | None = None,
-    group_b: Group | None = None,
-    *,
+    *groups: Group,
+    by: str | Sequence[Any] | None = None,
+    paired: bool = False,
     subjects: str | PathLike[str] | None = None,
     kind: Literal["auto", "field", "mask", "image"] = "auto",
     periodic: bool = False,
@@ -227,21 +263,29 @@ def compare(
     progress: Progress = silent,
     **reading: Any,
 ) -> Comparison:
-    """Compare two groups of scans: curvature diagrams, and each quantity of `measure`, by permutation of subjects.
+    """Compare scans by group or by a number: curvature diagrams, and each quantity of `measure`, by permutation.
 
-    Each scan is measured (`curvafit.measure`). Scans of a subject are averaged: the subject is what counts. The groups'
-    diagrams are compared by the energy distance of the subjects' diagrams, each number by the difference of means, each
-    bin of the diagram by its correlation with the group, all over the same choices of subjects for the second group.
-    Raises ValueError where there are not two groups of at least two subjects, they share a scan or a subject, or only
-    some scans have a physical unit; and as `measure`, with the scan's name.
+    Each scan is measured (`curvafit.measure`). Scans of a subject are averaged: the subject is what counts. Diagrams of
+    groups are compared by the energy distance of the subjects' diagrams, by a number by their distance correlation with
+    its rank; each quantity, and each bin of the diagram, by its correlation with the labels: all over the same
+    arrangements of the labels. Raises ValueError where labels cannot be exchanged (fewer than two groups of two
+    subjects, fewer than three numbers, a subject with several labels that is not `paired`, or with one that is), scans
+    are there twice, or only some have a physical unit; and as `measure`, with the scan's name.
 
     Parameters
     ----------
-    group_a, group_b
-        Folders of scans; or sequences of scans, paths or `Measures`; or such sequences by subject.
+    groups
+        Two or more: folders of scans; or sequences of scans, paths or `Measures`; or such sequences by subject. Or one
+        CSV table of the columns scan, group and optionally subject, with paths relative to it. Or one sequence, with
+        `by`.
+    by
+        The table's column to compare by; or a label for each scan of one sequence. Where all are numbers, such as times
+        or doses, what goes with the number is tested; else they name groups.
+    paired
+        Compare within subjects, each of which is in every group, or at several numbers: in a table, of one name in the
+        column subject; in folders, of one name of a file; in sequences, at one place.
     subjects
-        A CSV table: with two groups, of the columns scan and subject; alone, of scan, group and optionally subject.
-        Paths are relative to the table. Without it each scan is a subject.
+        A CSV table of the columns scan and subject, for groups. Without it each scan is a subject.
     kind, periodic, threshold, dark
         As in `measure`.
     laws
@@ -249,9 +293,9 @@ def compare(
     primary
         The symbol or name of the one number that was chosen before the scans were seen: its p needs no correction.
     permutations
-        Most permutations of subjects to try; where there are fewer, all are.
+        Most arrangements of the labels to try; where there are fewer, all are.
     seed
-        Of the permutations, where not all are tried.
+        Of the arrangements, where not all are tried.
     workers
         Processes that measure (needs `curvafit[synth]`); 0 is this one.
     reading
@@ -263,57 +307,76 @@ def compare(
     if primary is not None:
         names = {each for name, symbol, *_ in QUANTITIES for each in (name, symbol)}
         check_choice(primary, names, f"a primary number of {', '.join(symbol for _, symbol, *_ in QUANTITIES)}")
-    cases, notes = list_cases(group_a, group_b, subjects)
+    cases, notes = list_cases(groups, by, subjects, paired)
     options = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark}
     measures, more = measure_scans(cases, options, reading, workers, sub_progress(progress, 0.0, 0.97), laws)
     progress("comparing", 0.97)
-    parameters = {**options, **reading, "primary": primary, "permutations": permutations, "seed": seed}
-    return compare_measures(measures, cases, parameters, [*notes, *more])
+    name = by if isinstance(by, str) else "group" if isinstance(cases[0].label, str) else "the number"
+    parameters = {**options, **reading, "by": name, "paired": paired, "primary": primary}
+    parameters |= {"permutations": permutations, "seed": seed}
+    return _compare_measures(measures, cases, parameters, [*notes, *more])
 
 
-def compare_measures(
-    measures: Sequence[Measures], cases: Sequence[Case], options: dict[str, Any], notes: Sequence[str] = ()
+def _compare_measures(
+    measures: Sequence[Measures], cases: Sequence[Case], options: dict[str, Any], notes: Sequence[str]
 ) -> Comparison:
-    """Compare scans that are measured, in one unit, as `compare` does; `options` has `permutations` and `seed`."""
-    groups = tuple(dict.fromkeys(case.group for case in cases))
-    keys = [(case.group, case.subject) for case in cases]
+    """Compare scans that are measured, in one unit, by their labels."""
+    keys = [(case.label, case.subject) for case in cases]
     subjects = list(dict.fromkeys(keys))
     scans = [[k for k, key in enumerate(keys) if key == subject] for subject in subjects]
-    second = np.array([group == groups[1] for group, _ in subjects])
-    relabelled, exact = relabel(second, options["permutations"], options["seed"])
+    groups = tuple(dict.fromkeys(label for label, _ in subjects if isinstance(label, str)))
+    labels = np.array([groups.index(label) if isinstance(label, str) else label for label, _ in subjects])
+    blocks = np.unique([name for _, name in subjects], return_inverse=True)[1] if options["paired"] else None
+    # What goes with a number may go straight or level off: its rank loses little of the first and sees the second.
+    tested = labels if groups else rankdata(labels)
+    arranged, exact = relabel(tested, options["permutations"], options["seed"], blocks)
+    test = measure_energy if groups else measure_dependence
     pooled = [_pool([measures[k].diagram for k in own]) for own in scans]
     rows = np.stack([sliced_embedding(each) for each in pooled])
     away = cdist(rows, rows)
-    energies = measure_energy(away, relabelled)
+    statistics = test(away, arranged, blocks)
+    ideal = np.abs(np.subtract.outer(tested, tested))  # distances that follow the labels as well as any can
+    sides = labels if groups else _halve(labels)
     means = tuple(
-        _pool([each for each, there in zip(pooled, second, strict=True) if there == side]) for side in (False, True)
+        _pool([each for each, own in zip(pooled, sides, strict=True) if own == side]) for side in np.unique(sides)
     )
-    alike = (second[:, None] == second) & ~np.eye(len(second), dtype=bool)
-    edges, difference, p = _compare_bins(pooled, second, relabelled)
+    alike = (sides[:, None] == sides) & ~np.eye(len(sides), dtype=bool)
+    edges, differences, p = _compare_bins(pooled, labels, arranged, blocks)
     values, errors, halves = _average(measures, scans)
     return Comparison(
-        groups=groups,  # type: ignore[arg-type]
+        by=options["by"],
+        groups=groups,
         unit=measures[0].unit,
         cases=tuple(cases),
         measures=tuple(measures),
         subjects=tuple(subjects),
+        labels=labels,
+        blocks=blocks,
         values=values,
         errors=errors,
         halves=halves,
-        numbers=_compare_numbers(measures[0], values, errors, second, relabelled),
-        energy=float(energies[0]),
-        p=float(share_beyond(energies)),
-        apart=float(np.linalg.norm(np.subtract(*map(sliced_embedding, means)))),
+        numbers=_compare_numbers(measures[0], values, errors, labels, arranged, blocks),
+        statistic=float(statistics[0]),
+        p=float(share_beyond(statistics)),
+        least=float(share_beyond(test(np.minimum(ideal, 1) if groups else ideal, arranged, blocks))),
+        sides=sides,
+        diagrams=means,
+        apart=float(pdist(np.stack([sliced_embedding(each) for each in means])).max()),
         within=float(away[alike].mean()),
-        diagrams=means,  # type: ignore[arg-type]
         edges=edges,
-        difference=difference,
+        differences=differences,
         bins_p=p,
-        permutations=len(relabelled),
+        permutations=len(arranged),
         exact=exact,
         options=options,
         notes=(*notes, *gather_notes(measures, cases)),
     )
+
+
+def _halve(numbers: np.ndarray) -> np.ndarray:
+    """Return which numbers are in the upper half, 0 or 1; neither half is empty."""
+    middle = np.median(numbers)
+    return (numbers > middle if middle < numbers.max() else numbers >= middle).astype(int)
 
 
 def _pool(diagrams: Sequence[Diagram]) -> Diagram:
@@ -324,9 +387,9 @@ def _pool(diagrams: Sequence[Diagram]) -> Diagram:
 
 
 def _compare_bins(
-    pooled: Sequence[Diagram], second: np.ndarray, choices: np.ndarray
+    pooled: Sequence[Diagram], labels: np.ndarray, arranged: np.ndarray, blocks: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `edges`, `difference` and `bins_p` of a `Comparison`."""
+    """Return `edges`, `differences` and `bins_p` of a `Comparison`."""
     edges = np.linspace(*shared_limits(pooled), BINS + 1)
     shares = np.stack(
         [
@@ -337,47 +400,65 @@ def _compare_bins(
     mean = shares.mean(0)
     tested = (mean >= LEAST_SHARE * mean.max()) & (edges[1:, None] <= edges[None, 1:])
     p = np.full(mean.shape, np.nan)
-    p[tested] = correct_by_most(shares[:, tested], choices)
-    return edges, shares[second].mean(0) - shares[~second].mean(0), p
+    p[tested] = correct_by_most(shares[:, tested], arranged, blocks)
+    if np.issubdtype(labels.dtype, np.floating):
+        x = center(labels, blocks)
+        return edges, np.ptp(labels) * np.tensordot(x, shares, 1)[None] / (x @ x), p
+    means = np.stack([shares[labels == group].mean(0) for group in np.unique(labels)])
+    return edges, means[1:] - means[:1] if len(means) == 2 else means - mean, p
 
 
 def _average(measures: Sequence[Measures], scans: Sequence[Sequence[int]]) -> tuple[np.ndarray, ...]:
     """Return `values`, `errors` and `halves` of a `Comparison`; `scans` are the numbers of each subject's."""
-    values, halves = stack_numbers(measures)
+    values, halves = (
+        np.array([[getattr(each, name) for each in scan.quantities] for scan in measures]) for name in ("value", "half")
+    )
     errors = halves / np.array([[interval_reach(scan.blocks)] for scan in measures])
     spread = (np.sqrt([(each[own] ** 2).mean(0) / len(own) for own in scans]) for each in (errors, halves))
     return np.stack([values[own].mean(0) for own in scans]), *spread
 
 
 def _compare_numbers(
-    scan: Measures, values: np.ndarray, errors: np.ndarray, second: np.ndarray, choices: np.ndarray
+    scan: Measures,
+    values: np.ndarray,
+    errors: np.ndarray,
+    labels: np.ndarray,
+    arranged: np.ndarray,
+    blocks: np.ndarray | None,
 ) -> tuple[Number, ...]:
     """Test each quantity of subjects' values (S, K); `scan` has the quantities' names."""
-    told = np.asarray(np.isfinite(values).all(0))
-    p, family, holm, discovery = np.full((4, len(told)), np.nan)
-    p[told] = share_beyond(correlate(values[:, told], choices))
-    holm[told], discovery[told] = correct_holm(p[told]), false_discovery_control(p[told])
-    family[told] = correct_by_most(values[:, told], choices)
-    rows = []
-    for k, quantity in enumerate(scan.quantities):
-        parts = values[~second, k], values[second, k]
-        a, b = (float(part.mean()) for part in parts)
-        effect = measure_effect(*parts) if told[k] else (math.nan, math.nan, math.nan)
-        spread = sum(((part - part.mean()) ** 2).sum() for part in parts) / (len(second) - 2)
-        rows.append(
-            Number(
-                quantity.name,
-                quantity.symbol,
-                quantity.power,
-                (a, b),
-                tuple(float(part.std(ddof=1)) for part in parts),  # type: ignore[arg-type]
-                b - a,
-                *effect,
-                p=float(p[k]),
-                family=float(family[k]),
-                holm=float(holm[k]),
-                discovery=float(discovery[k]),
-                known=float((errors[:, k] ** 2).mean() / spread) if math.isfinite(effect[0]) else math.nan,
-            )
-        )
+    known = np.asarray(np.isfinite(values).all(0))
+    p, family, holm, discovery = np.full((4, len(known)), np.nan)
+    p[known] = share_beyond(correlate(values[:, known], arranged, blocks))
+    holm[known], discovery[known] = correct_holm(p[known]), false_discovery_control(p[known])
+    family[known] = correct_by_most(values[:, known], arranged, blocks)
+    rows, corrected = [], np.stack([p, family, holm, discovery], axis=1).tolist()
+    for quantity, own, error, tested in zip(scan.quantities, values.T, errors.T, corrected, strict=True):
+        means, deviations, difference, effect, left = _measure_change(own, labels, arranged[0], blocks)
+        share = float((error**2).mean() / left) if left > 0 else math.nan
+        named = quantity.name, quantity.symbol, quantity.power
+        rows.append(Number(*named, means, deviations, difference, *effect, *tested, share))  # type: ignore[call-arg]
     return tuple(rows)
+
+
+def _measure_change(
+    values: np.ndarray, labels: np.ndarray, ranks: np.ndarray, blocks: np.ndarray | None
+) -> tuple[tuple[float, ...], tuple[float, ...], float, tuple[float, float, float], float]:
+    """Return means, deviations, difference and effect with its interval of a `Number`, and the variance left over."""
+    if np.issubdtype(labels.dtype, np.floating):
+        parts, freed = [], 1
+        difference, effect = measure_slope(values, labels, blocks)[0], measure_slope(values, ranks, blocks)[1]
+        share = effect[0]
+    else:
+        order = np.arange(len(labels)) if blocks is None else np.argsort(blocks, kind="stable")
+        parts = [values[order][labels[order] == group] for group in np.unique(labels)]
+        freed, two = len(parts) - 1, len(parts) == 2
+        share = float(correlate(values[:, None], labels[None], blocks)[0, 0])
+        difference = float(parts[1].mean() - parts[0].mean()) if two else math.nan
+        effect = measure_effect(*parts, paired=blocks is not None) if two else (share, math.nan, math.nan)
+    squares = float((center(values, blocks) ** 2).sum())
+    freedom = len(labels) - (1 if blocks is None else len(np.unique(blocks))) - freed
+    effect = effect if squares > 0 else (math.nan, math.nan, math.nan)
+    left = squares * (1 - share**2) / freedom if freedom > 0 and math.isfinite(effect[0]) else math.nan
+    means = tuple(float(part.mean()) for part in parts)
+    return means, tuple(float(part.std(ddof=1)) for part in parts), difference, effect, left

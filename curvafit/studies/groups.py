@@ -1,11 +1,13 @@
-"""Which scans are in which group, and of which subject: from folders, from sequences, or from a table."""
+"""Which scans are of which subject, in which group or at which number: from folders, sequences, or a table."""
 
 from __future__ import annotations
 
 import csv
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from os import PathLike, fspath
+from itertools import permutations
+from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,84 +23,130 @@ FEWEST = 2
 
 
 class Case(NamedTuple):
-    """A scan, its name, the subject it is of, and its group."""
+    """A scan, its name, the subject it is of, and its label: the name of its group, or a number."""
 
     source: Source | Measures
     name: str
     subject: str
-    group: str
+    label: str | float
 
 
 def list_cases(
-    first: Group | None, second: Group | None, table: str | PathLike[str] | None
+    groups: Sequence[Group], by: str | Sequence[Any] | None, table: str | PathLike[str] | None, paired: bool
 ) -> tuple[list[Case], list[str]]:
-    """Return the scans of two groups, those of the first group first, and notes on what was assumed.
+    """Return the scans of a study, those of one group together, and notes on what was assumed.
 
-    Raises ValueError where there are not two groups of at least two subjects each, or one shares a scan or a subject
-    with the other; FileNotFoundError where a folder, the table, or a scan that the table names is not there.
+    They are those of several groups; of a single sequence, with a label for each in `by`; or of a single table, with
+    labels in its column `by`. Raises ValueError where labels cannot be exchanged between subjects; FileNotFoundError
+    where a folder, a table, or a scan that it names is not there.
     """
     notes: list[str] = []
-    if first is None and second is None and table is not None:
-        cases = _read_groups(Path(table))
-    elif first is None or second is None:
-        raise ValueError("expected two groups, or a table with the columns scan and group")
+    if len(groups) == 1 and isinstance(groups[0], str | PathLike):
+        if not isinstance(by, str | None) or table is not None:
+            raise ValueError("expected a table alone, or scans with a label for each, or two groups or more")
+        cases = _read_cases(Path(groups[0]), by or "group", paired)
     else:
-        names = _name_groups(first, second)
-        rows = None if table is None else _read_subjects(Path(table))
-        cases = [
-            case for group, name in zip((first, second), names, strict=True) for case in _gather(group, name, notes)
-        ]
-        if rows is not None:
-            file = Path(fspath(table or ""))
-            cases = [case._replace(subject=_find_row(case.source, case.name, rows, file)) for case in cases]
-        elif not any(isinstance(group, Mapping) for group in (first, second)):
+        cases = _list_labelled(groups[0], by) if len(groups) == 1 else _list_groups(groups, by, paired, notes)
+        if table is not None:
+            rows = _read_subjects(Path(table))
+            cases = [case._replace(subject=_find_row(case.source, case.name, rows, Path(table))) for case in cases]
+        elif not paired and not any(isinstance(group, Mapping) for group in groups):
             notes.append("Each scan counts as a subject; a table (--subjects) tells if several are of one.")
-            both = set.intersection(*({case.subject for case in cases if case.group == name} for name in names))
-            notes += [f"The groups have {len(both)} names in common: they count as different subjects."] if both else []
-            cases = [case._replace(subject=f"{case.group}/{case.subject}") for case in cases] if both else cases
-    _check(cases)
+            names = Counter(subject for subject, _ in {(case.subject, case.label) for case in cases})
+            if both := sum(count > 1 for count in names.values()):
+                notes.append(f"The groups have {both} names in common: they count as different subjects.")
+                cases = [case._replace(subject=f"{case.label}/{case.subject}") for case in cases]
+    cases = _name_labels(cases, by)
+    _check(cases, paired)
     return cases, notes
 
 
-def list_series(scans: Sequence[Source | Measures]) -> list[Case]:
-    """Return the scans of a series, each a group of its own."""
-    return [case._replace(group=case.subject) for case in _gather(as_tuple(scans, "scans"), "scan ", [])]
+def _name_labels(cases: Sequence[Case], by: Any) -> list[Case]:
+    """Return cases with numbers where all labels that `by` gives are; else with names, each group together."""
+    found = [None if by is None else _parse(case.label) for case in cases]
+    if None not in found:
+        return [case._replace(label=number) for case, number in zip(cases, found, strict=True)]  # type: ignore[arg-type]
+    names = [str(case.label) for case in cases]
+    if any(number is not None for number in found):
+        odd = quoted(names[found.index(None)])
+        raise ValueError(f"expected finite numbers, or names of groups, to compare by, got {odd} beside numbers")
+    order = sorted(range(len(cases)), key=lambda k: names.index(names[k]))
+    return [cases[k]._replace(label=names[k]) for k in order]
 
 
-def _check(cases: Sequence[Case]) -> None:
-    """Raise ValueError if a group has too few subjects, or both have one subject or one scan."""
+def _parse(label: Any) -> float | None:
+    """Return a label as a finite number; None of others."""
+    try:
+        number = float(label)
+    except (TypeError, ValueError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _check(cases: Sequence[Case], paired: bool) -> None:
+    """Raise ValueError if a scan is there twice, or labels cannot be exchanged."""
     places = Counter(Path(str(case.source)).resolve() for case in cases if isinstance(case.source, str | PathLike))
     if places and (most := places.most_common(1)[0])[1] > 1:
         raise ValueError(f"expected each scan once, got {most[0]} {most[1]} times")
-    subjects = {
-        name: {case.subject for case in cases if case.group == name}
-        for name in dict.fromkeys(case.group for case in cases)
-    }
-    for name, there in subjects.items():
-        if len(there) < FEWEST:
-            raise ValueError(f"expected at least {FEWEST} subjects in each group, got {len(there)} in {name}")
-    if both := set.intersection(*subjects.values()):
-        raise ValueError(f"expected groups of different subjects, got {quoted(min(both))} in both")
+    pairs = list(dict.fromkeys((case.subject, case.label) for case in cases))
+    counts = Counter(label for _, label in pairs)
+    groups = isinstance(pairs[0][1], str)
+    if len(counts) < 2 or (not groups and len(pairs) <= FEWEST):
+        expected = "two groups or more" if groups else f"more than {FEWEST} numbers that are not all the same"
+        raise ValueError(f"expected {expected}, got {quoted(list(counts))}")
+    name, least = counts.most_common()[-1]
+    if groups and least < FEWEST:
+        raise ValueError(f"expected at least {FEWEST} subjects in each group, got {least} in {name}")
+    needed = len(counts) if groups else FEWEST
+    for subject, count in Counter(subject for subject, _ in pairs).items():
+        if paired and count < needed:
+            raise ValueError(f"expected {subject} in each group, or at {FEWEST} numbers or more, to pair what is its")
+        if not paired and count > 1:
+            both = ", ".join(str(label) for name, label in pairs if name == subject)
+            raise ValueError(f"expected one group or number of {subject}, got {both}: --paired compares within it")
 
 
 # ---- folders and sequences -------------------------------------------------------------------------------------------
 
 
-def _name_groups(first: Group, second: Group) -> tuple[str, str]:
-    """Return the names of two groups: those of their folders, or A and B."""
-    if not all(isinstance(group, str | PathLike) for group in (first, second)):
-        return "A", "B"
-    folders = [Path(group) for group in (first, second)]  # type: ignore[arg-type]
+def _list_labelled(scans: Any, by: Any) -> list[Case]:
+    """Return the scans of a sequence, with a label for each."""
+    if by is None or isinstance(by, str) or isinstance(scans, Mapping):
+        raise ValueError("expected two groups or more, a table, or scans with a label for each")
+    labels, cases = as_tuple(by, "labels"), _gather(as_tuple(scans, "scans"), "scan ", [])
+    if len(labels) != len(cases):
+        raise ValueError(f"expected a label for each of {len(cases)} scans (--by), got {len(labels)}")
+    return [case._replace(label=label) for case, label in zip(cases, labels, strict=True)]
+
+
+def _list_groups(groups: Sequence[Group], by: Any, paired: bool, notes: list[str]) -> list[Case]:
+    """Return the scans of groups; where they are paired, a scan's subject is its file's name or its place."""
+    if by is not None or len(groups) < 2:
+        raise ValueError("expected two groups or more, and by only with a table or with one sequence of scans")
+    cases = []
+    for group, name in zip(groups, _name_groups(groups), strict=True):
+        listed = _gather(group, name, notes)
+        if paired and not isinstance(group, str | PathLike | Mapping):
+            listed = [case._replace(subject=str(k)) for k, case in enumerate(listed, 1)]
+        cases += listed
+    return cases
+
+
+def _name_groups(groups: Sequence[Group]) -> list[str]:
+    """Return the names of groups: those of their folders, or A, B, C."""
+    if not all(isinstance(group, str | PathLike) for group in groups):
+        return [chr(ord("A") + k) for k in range(len(groups))]
+    folders = [Path(group) for group in groups]  # type: ignore[arg-type]
     for folder in folders:
         if not folder.exists():
             raise FileNotFoundError(f"no such folder: {folder}")
         if not folder.is_dir():
-            raise ValueError(f"expected a folder of scans, got the file {folder}")
-    one, other = (folder.resolve() for folder in folders)
-    if one == other or one.is_relative_to(other) or other.is_relative_to(one):
-        raise ValueError(f"expected two folders apart from each other, got {folders[0]} and {folders[1]}")
-    names = (one.name, other.name)
-    return names if names[0] != names[1] else (str(folders[0]), str(folders[1]))
+            raise ValueError(f"expected a folder of scans, got the file {folder}; single scans need --by")
+    for one, other in permutations((folder.resolve() for folder in folders), 2):
+        if one.is_relative_to(other):
+            raise ValueError(f"expected folders apart from each other, got {one} and {other}")
+    names = [folder.resolve().name for folder in folders]
+    return names if len(set(names)) == len(names) else list(map(str, folders))
 
 
 def _gather(group: Group, name: str, notes: list[str]) -> list[Case]:
@@ -141,19 +189,21 @@ def _list_folder(folder: Path, group: str, notes: list[str]) -> list[Case]:
 # ---- tables ----------------------------------------------------------------------------------------------------------
 
 
-def _read_groups(table: Path) -> list[Case]:
-    """Return the scans that a table names, with their groups."""
-    rows = _read_table(table, ("scan", "group"))
-    groups = list(dict.fromkeys(row["group"] for row in rows))
-    if len(groups) != 2:
-        raise ValueError(f"expected two groups in {table}, got {len(groups)}: {quoted(groups)}")
+def _read_cases(table: Path, by: str, paired: bool) -> list[Case]:
+    """Return the scans that a table names, with their labels, each group together."""
+    if table.is_dir():
+        raise ValueError(f"expected two folders or more, or a table, got the folder {table} alone")
+    if not table.exists():
+        raise FileNotFoundError(f"no such file: {table}")
+    by = by.strip().casefold()
+    rows = _read_table(table, ("scan", by, *["subject"] * paired))
     cases = []
-    for row in sorted(rows, key=lambda row: groups.index(row["group"])):
+    for row in rows:
         place = table.parent / row["scan"]
         place = place if Path(str(place).partition("::")[0]).exists() else Path(row["scan"])
         if not Path(str(place).partition("::")[0]).exists():
             raise FileNotFoundError(f"no such file: {row['scan']}, which {table} names")
-        cases.append(Case(str(place), place.name, row.get("subject") or row["scan"], row["group"]))
+        cases.append(Case(str(place), place.name, row.get("subject") or row["scan"], row[by]))
     return cases
 
 

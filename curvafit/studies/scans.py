@@ -110,7 +110,9 @@ def _share_out(
     count = len(names)
     with cluster(workers) as crew:
         parts = {k: sub_progress(progress, k / count, (k + 1) / count) for k in tasks}
-        tell = {k: silent if workers else partial(_tell, parts[k], names[k]) for k in tasks}
+        tell = {
+            k: silent if workers else lambda text, share, k=k: parts[k](f"{names[k]}: {text}", share) for k in tasks
+        }
         for k, measures in collect_all(crew, ((partial(_do, tasks[k], tell[k]), Path(), [k]) for k in tasks)):
             found[k] = measures
             progress(f"{len(found)} of {count} scans measured", len(found) / count)
@@ -122,23 +124,11 @@ def _do(task: Task, progress: Progress, folder: Path, indices: Sequence[int]) ->
     return [(k, task(progress)) for k in indices]
 
 
-def _tell(progress: Progress, name: str, text: str, share: float) -> None:
-    progress(f"{name}: {text}", share)
-
-
 def _bin_diagrams(measures: Measures) -> Measures:
     """Return measures whose diagram, and those of its compartments, are binned finely."""
     width = FINE / measures["thickness"].value
     fine = {label: replace(each, diagram=each.diagram.bin(width)) for label, each in measures.compartments.items()}
     return replace(measures, diagram=measures.diagram.bin(width), compartments=fine)
-
-
-def stack_numbers(measures: Sequence[Measures]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the quantities of N scans, and half the widths of their intervals, both (N, K)."""
-    values, halves = (
-        np.array([[getattr(each, name) for each in scan.quantities] for scan in measures]) for name in ("value", "half")
-    )
-    return values, halves
 
 
 def gather_notes(measures: Sequence[Measures], cases: Sequence[Case]) -> Iterator[str]:
@@ -174,7 +164,7 @@ def count_notes(measures: Sequence[Measures]) -> Iterator[str]:
 def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progress) -> tuple[str, list[str]]:
     """Read all scans once, so that what is wrong is said before long work; return their unit, and notes."""
     units: dict[str, str] = {}
-    edges: dict[str, list[float]] = {}
+    edges: dict[str | float, list[float]] = {}
     for k, case in enumerate(cases):
         progress(f"{case.name}: reading", k / len(cases))
         if isinstance(case.source, Measures):
@@ -183,7 +173,7 @@ def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progr
         with name_errors(case.name):
             field = field_of(case.source, **reading)
         units.setdefault(field.unit, case.name)
-        edges.setdefault(case.group, []).append(float(np.prod(field.spacing) ** (1 / 3)))
+        edges.setdefault(case.label, []).append(float(np.prod(field.spacing) ** (1 / 3)))
     _check_mixture(units)
     notes = ["Lengths are counted in voxels: compare only scans of one voxel size."] if "voxel" in units else []
     medians = [float(np.median(each)) for each in edges.values()]

@@ -18,7 +18,7 @@ import curvafit
 from curvafit import priors
 
 #: Types and tables whose makers, or users, are among the calls.
-PASSIVE = {"Comparison", "Fit", "Flow", "Inference", "Measures", "Segmentation", "Trajectory", "Windows"}
+PASSIVE = {"Comparison", "Fit", "Flow", "Inference", "Measures", "Segmentation", "Windows"}
 PASSIVE |= {"Law", "LawLike", "PRESETS", "SIGMA", "WORKING_EPSILON", "WORKING_SPACING"}
 NAMES = list(host_state.calls(Path(tempfile.gettempdir())))
 

@@ -144,15 +144,8 @@ COMMANDS: dict[str, Command] = {
     ),
     "compare": Command(
         ("compare", "first", "second", "-o", "out"),
-        "kind threshold spacing subjects permutations seed workers",
+        "by kind threshold spacing subjects permutations seed workers",
         "permutations workers",
-        _take_groups,
-        each=2,
-    ),
-    "trajectory": Command(
-        ("trajectory", "first/a.nii.gz", "first/b.nii.gz", "-o", "out"),
-        "times unit-of-time threshold permutations seed",
-        "permutations",
         _take_groups,
         each=2,
     ),
@@ -228,7 +221,7 @@ def _without(arguments: tuple[str, ...], option: str) -> tuple[str, ...]:
 
 def _short(name: str) -> bool:
     return name not in ("build", "synth-grown") and not name.startswith(
-        ("compare", "infer", "synth-like", "synth-channels", "trajectory")
+        ("compare", "infer", "synth-like", "synth-channels")
     )
 
 

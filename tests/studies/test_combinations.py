@@ -13,7 +13,6 @@ from curvafit.inference.infer import Inference, infer
 from curvafit.scan.measure import Measures, measure
 from curvafit.studies.compare import compare
 from curvafit.studies.scans import add_combinations
-from curvafit.studies.trajectory import trajectory
 from curvafit.volumes.field import Field
 
 MASK = Field((lattice(56, 28, 5.0) > 0).astype(np.uint8), (0.02,) * 3, "mm")
@@ -54,7 +53,9 @@ def test_of_the_background_nothing_is_told() -> None:
 
 
 def test_a_study_has_them_beside_its_numbers() -> None:
-    series = [MASK, replace(MASK, values=np.roll(MASK.values, 3, 0))]
-    assert [each.symbol for each in trajectory(series, laws=True).changes][-6:] == [f"L{k}" for k in range(1, 7)]
+    series = [replace(MASK, values=np.roll(MASK.values, k, 0)) for k in range(3)]
+    assert [each.symbol for each in compare(series, by=range(3), laws=True).numbers][-6:] == [
+        f"L{k}" for k in range(1, 7)
+    ]
     with pytest.raises(ValueError, match="measured already"):
-        compare([measure(each) for each in series], series, laws=True)
+        compare([measure(each) for each in series], by=range(3), laws=True)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,117 +15,144 @@ from typing import Any
 import numpy as np
 import pytest
 from calling import call, refused
-from scipy import ndimage, stats
+from scipy import stats
+from scipy.spatial.distance import cdist
 
 import curvafit
 from curvafit.core.permutation import (
     correct_by_most,
     correct_holm,
     correlate,
+    measure_dependence,
     measure_effect,
     measure_energy,
+    measure_slope,
     relabel,
     share_beyond,
 )
 from curvafit.drawing.groups import numbers_figure
 from curvafit.geometry.diagram import Diagram
-from curvafit.report.comparison import FILES, check_comparison, describe_methods, write_comparison
+from curvafit.report.comparison import FILES, check_comparison, describe_methods
 from curvafit.scan.measure import QUANTITIES, Measures, Quantity, interval_reach
 from curvafit.studies.compare import Comparison, compare
 from curvafit.studies.scans import merge_notes
 from curvafit.volumes.field import Field
 
 N = 32
+#: Labels of nine values: numbers, three groups, and pairs with the blocks that they are exchanged in.
+NUMBERS = np.array([0.0, 1, 1, 2, 5])
+THREE = np.array([0, 0, 1, 1, 2, 2])
+PAIRS, BLOCKS = np.array([0, 0, 0, 0, 1, 1, 1, 1]), np.array([0, 1, 2, 3, 0, 1, 2, 3])
 
 
 def drawn(random: np.random.Generator, shift: float = 0.0) -> Measures:
     """A subject's measures without a scan: a cloud of curvatures about a random centre, and normal numbers."""
     points = random.standard_normal((60, 2)) + 0.5 * random.standard_normal(2) + shift
     diagram = Diagram(np.sort(points)[:, ::-1], random.random(60), unit="1/mm")
-    numbers = random.standard_normal(len(QUANTITIES)) + shift
-    rows = zip(QUANTITIES, numbers, strict=True)
+    rows = zip(QUANTITIES, random.standard_normal(len(QUANTITIES)) + shift, strict=True)
     quantities = tuple(Quantity(name, symbol, float(value), 0.1, power) for (name, symbol, power, _), value in rows)
     return Measures("", "mm", "mask", quantities, (1.0, 0.0, 0.0), diagram, (2, 2, 2), ())
 
 
-def study(seed: int, counts: tuple[int, int], shift: float = 0.0, **options: int) -> Comparison:
+def study(seed: int, counts: Sequence[int], shift: float = 0.0, **options: Any) -> Comparison:
+    """Groups, each further shifted than the one before."""
     random = np.random.default_rng(seed)
-    first, second = ([drawn(random, own) for _ in range(n)] for n, own in zip(counts, (0.0, shift), strict=True))
-    return compare(first, second, **options)  # type: ignore[arg-type]
+    return compare(*([drawn(random, k * shift) for _ in range(n)] for k, n in enumerate(counts)), **options)
 
 
-# ---- the tests' own truths -------------------------------------------------------------------------------------------
+def dose(seed: int, numbers: Sequence[float], shift: float = 0.0) -> Comparison:
+    random = np.random.default_rng(seed)
+    return compare([drawn(random, shift * number) for number in numbers], by=numbers)
 
 
-@pytest.fixture(scope="module")
-def null() -> list[Comparison]:
-    return [study(seed, (4, 4)) for seed in range(200)]
+def pairs(seed: int, count: int, shift: float = 0.0, spread: float = 2.0, paired: bool = True) -> Comparison:
+    """Subjects that differ much, each before and after."""
+    random = np.random.default_rng(seed)
+    own = spread * random.standard_normal(count)
+    return compare([drawn(random, x) for x in own], [drawn(random, x + shift) for x in own], paired=paired)
 
 
-def test_p_is_uniform_under_the_null(null: Sequence[Comparison]) -> None:
-    """35 values are as likely each; 200 studies tell a share to ±.035 at the most, and 4 of these are allowed."""
-    for p in ([each.p for each in null], [each.numbers[3].p for each in null]):
-        assert np.allclose(np.array(p) * 35, np.rint(np.array(p) * 35))
-        for level in (7 / 35, 14 / 35, 21 / 35, 28 / 35):
-            share = np.mean(np.array(p) <= level + 1e-9)
-            assert share == pytest.approx(level, abs=4 * math.sqrt(level * (1 - level) / len(p)))
+# ---- arrangements and statistics -------------------------------------------------------------------------------------
 
 
-def test_corrections_hold_the_chance_of_any_false_finding(null: Sequence[Comparison]) -> None:
-    """At most .05 of null studies find any; 200 tell that to ±.0154, and 3 of these are allowed."""
-    for any_found in (
-        [min(number.family for number in each.numbers) <= each.level for each in null],
-        [min(number.holm for number in each.numbers) <= each.level for each in null],
-        [bool(each.significant.any()) for each in null],
-    ):
-        assert np.mean(any_found) <= 0.05 + 3 * math.sqrt(0.05 * 0.95 / len(null))
-
-
-def test_power_grows_with_the_difference() -> None:
-    found = [np.mean([study(seed, (5, 5), shift).p <= 0.05 for seed in range(12)]) for shift in (0.0, 0.5, 1.5)]
-    assert found[0] <= 0.25 and found[0] < found[1] < found[2] == 1
-
-
-@pytest.mark.parametrize(("counts", "least"), [((3, 3), 2 / 20), ((3, 4), 1 / 35), ((2, 2), 2 / 6)])
-def test_groups_that_are_apart_have_the_least_exact_p(counts: tuple[int, int], least: float) -> None:
-    found = study(0, counts, 50.0)
-    assert found.exact and found.permutations == math.comb(sum(counts), counts[1])
-    assert found.p == pytest.approx(least)
-    assert [each.p for each in found.numbers] == pytest.approx([least] * len(QUANTITIES))
-    assert ("few subjects" in found.status) == (least > 0.05)
-
-
-def test_many_subjects_are_permuted_at_random() -> None:
-    found = study(0, (6, 6), permutations=99)
-    assert not found.exact and found.permutations == 100
-    assert found.p * 100 == pytest.approx(round(found.p * 100)) and found.p >= 0.01
-    assert study(0, (6, 6), permutations=99).p == found.p
-
-
-def test_choices_are_distinct_and_begin_with_the_given_one() -> None:
-    second = np.array([True, False, True, False, False])
-    choices, exact = relabel(second, 10)
-    assert exact and len(np.unique(choices, axis=0)) == len(choices) == 10
-    assert (choices.sum(1) == 2).all() and (choices[0] == second).all()
-    some, exact = relabel(second, 9)
-    assert not exact and len(some) == 10 and (some[0] == second).all() and (some.sum(1) == 2).all()
+@pytest.mark.parametrize(("labels", "blocks"), [(NUMBERS, None), (THREE, None), (PAIRS, None), (PAIRS, BLOCKS)])
+def test_all_distinct_arrangements_are_tried_the_given_one_first(labels: np.ndarray, blocks: np.ndarray | None) -> None:
+    """Counted by hand: of all orders of the labels, those that leave each block its own labels."""
+    every = set(itertools.permutations(labels.tolist()))
+    parts = [] if blocks is None else [blocks == k for k in np.unique(blocks)]
+    every = {row for row in every if all(sorted(np.array(row)[part]) == sorted(labels[part]) for part in parts)}
+    arranged, exact = relabel(labels, len(every), blocks=blocks)
+    assert exact and {tuple(row) for row in arranged.tolist()} == every and len(arranged) == len(every)
+    assert (arranged[0] == labels).all()
+    some, exact = relabel(labels, len(every) - 1, 3, blocks)
+    assert not exact and len(some) == len(every) and {tuple(row) for row in some.tolist()} <= every
+    assert (some[0] == labels).all() and (relabel(labels, len(every) - 1, 3, blocks)[0] == some).all()
 
 
 def test_the_energy_distance_of_points_on_a_line() -> None:
     """2 E|X - Y| - E|X - X'| - E|Y - Y'| by hand: {0, 2} and {3} give 2 · 2 - 1 - 0 = 3."""
-    x = np.array([0.0, 2.0, 3.0])
-    away = np.abs(x[:, None] - x)
+    away = np.abs(np.subtract.outer([0.0, 2.0, 3.0], [0.0, 2.0, 3.0]))
     assert measure_energy(away, np.array([[False, False, True]])) == pytest.approx([3.0])
     both = np.abs(np.subtract.outer([0.0, 2.0, 0.0, 2.0], [0.0, 2.0, 0.0, 2.0]))
     assert measure_energy(both, np.array([[False, False, True, True]])) == pytest.approx([0.0])
 
 
-def test_correlation_orders_as_students_t_does() -> None:
-    values = np.random.default_rng(1).standard_normal((7, 1))
-    choices, _ = relabel(np.arange(7) > 3, 99)
-    t = [abs(stats.ttest_ind(values[each, 0], values[~each, 0]).statistic) for each in choices]
-    assert (np.argsort(t) == np.argsort(correlate(values, choices)[:, 0])).all()
-    assert (correlate(np.ones((7, 1)), choices) == 0).all()
+def test_the_energy_of_more_groups_is_the_mean_of_their_pairs() -> None:
+    """Weighted by the numbers of pairs of subjects: the between-sample dispersion of DISCO, to a constant."""
+    labels, points = np.array([0, 0, 0, 1, 1, 2, 2, 2, 2]), np.random.default_rng(0).standard_normal((9, 3))
+    away, weights, energies = cdist(points, points), [], []
+    for a, b in itertools.combinations(range(3), 2):
+        own = np.isin(labels, (a, b))
+        energies.append(measure_energy(away[np.ix_(own, own)], (labels[own] == b)[None])[0])
+        weights.append((labels == a).sum() * (labels == b).sum())
+    assert measure_energy(away, labels[None]) == pytest.approx([np.average(energies, weights=weights)])
+
+
+def test_distance_correlation_is_its_definition() -> None:
+    """By the double centring of Székely, Rizzo & Bakirov; 1 of what is the number itself."""
+    random = np.random.default_rng(1)
+    points, numbers = random.standard_normal((7, 2)), random.standard_normal(7)
+    a, b = (cdist(each, each) for each in (points, numbers[:, None]))
+    a, b = (each - each.mean(0) - each.mean(1)[:, None] + each.mean() for each in (a, b))
+    expected = math.sqrt((a * b).mean() / math.sqrt((a * a).mean() * (b * b).mean()))
+    away = cdist(points, points)
+    assert measure_dependence(away, numbers[None]) == pytest.approx([expected])
+    assert measure_dependence(np.abs(np.subtract.outer(numbers, numbers)), numbers[None]) == pytest.approx([1.0])
+    assert measure_dependence(np.zeros((7, 7)), numbers[None]) == [0.0]
+
+
+def test_what_differs_between_blocks_changes_nothing() -> None:
+    """Pairs are told by their differences: subjects may be as far apart as they like."""
+    random, arranged = np.random.default_rng(2), relabel(PAIRS, 99, blocks=BLOCKS)[0]
+    values = random.standard_normal((8, 2))
+    moved = values + 40 * random.standard_normal((4, 2))[BLOCKS]
+    one, other = (correlate(each, arranged, BLOCKS) for each in (values, moved))
+    assert other == pytest.approx(one)
+    assert measure_effect(moved[:4, 0], moved[4:, 0], paired=True) == pytest.approx(
+        measure_effect(values[:4, 0], values[4:, 0], paired=True), rel=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("kind", "labels", "blocks", "statistic"),
+    [
+        ("independent", PAIRS, None, lambda *x: abs(stats.ttest_ind(*x).statistic)),
+        ("independent", THREE, None, lambda *x: stats.f_oneway(*x).statistic),
+        ("samples", PAIRS, BLOCKS, lambda a, b: abs((b - a).mean())),
+        ("pairings", NUMBERS, None, lambda x: abs(np.corrcoef(x, NUMBERS)[0, 1])),
+    ],
+)
+def test_p_is_scipy_s_by_the_familiar_statistic(
+    kind: Any, labels: np.ndarray, blocks: np.ndarray | None, statistic: Callable[..., float]
+) -> None:
+    """Student's t, Fisher's F, the mean difference of pairs, Pearson's r, over all permutations."""
+    values = np.random.default_rng(3).standard_normal((len(labels), 3)) + 0.5 * labels[:, None]
+    arranged, exact = relabel(labels, 9999, 0, blocks)
+    assert exact
+    for x, p in zip(values.T, share_beyond(correlate(values, arranged, blocks)), strict=True):
+        parts = (x,) if kind == "pairings" else tuple(x[labels == k] for k in np.unique(labels))
+        how = {"permutation_type": kind, "n_resamples": np.inf, "alternative": "greater", "vectorized": False}
+        assert p == pytest.approx(stats.permutation_test(parts, statistic, **how).pvalue)
 
 
 def test_correction_by_the_most_of_one_number_is_its_p() -> None:
@@ -134,12 +162,11 @@ def test_correction_by_the_most_of_one_number_is_its_p() -> None:
     assert correct_by_most(values[:, :1], choices) == pytest.approx(p[:1])
     assert (corrected >= p - 1e-12).all() and (corrected <= np.minimum(3 * p, 1) + 1e-12).all()
     assert correct_by_most(np.repeat(values[:, :1], 9, axis=1), choices) == pytest.approx([p[0]] * 9)  # Holm: 9 p
+    assert (correlate(np.ones((8, 1)), choices) == 0).all()
 
 
 def test_holm_and_benjamini_hochberg_on_known_values() -> None:
-    p = np.array([0.01, 0.04, 0.03, 0.005])
-    assert correct_holm(p) == pytest.approx([0.03, 0.06, 0.06, 0.02])
-    assert stats.false_discovery_control(p) == pytest.approx([0.02, 0.04, 0.04, 0.02])
+    assert correct_holm(np.array([0.01, 0.04, 0.03, 0.005])) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     found = study(3, (5, 5), 1.0)
     own = np.array([each.p for each in found.numbers])
     assert [each.holm for each in found.numbers] == pytest.approx(correct_holm(own))
@@ -156,13 +183,72 @@ def test_the_effect_size_of_known_groups() -> None:
     assert all(map(math.isnan, measure_effect(np.ones(3), np.ones(3))))
 
 
-def test_intervals_of_the_effect_size_hold_as_often_as_they_say() -> None:
-    """1000 draws tell .95 to ±.007; the correction for few moves the interval by less than .02 of it."""
-    random, held = np.random.default_rng(4), 0
+def test_intervals_of_effects_hold_as_often_as_they_say() -> None:
+    """1000 draws tell .95 to ±.007; corrections for few move intervals by less than .02 of it."""
+    random, held = np.random.default_rng(4), np.zeros(3)
     for _ in range(1000):
-        _, low, high = measure_effect(random.standard_normal(5), 1 + random.standard_normal(6))
-        held += low <= 1 <= high
+        x, y, z = random.standard_normal((3, 8))
+        for k, (true, (_, low, high)) in enumerate((
+            (1.0, measure_effect(x[:5], 1 + y[:6])),
+            (1.0, measure_effect(9 * z, 9 * z + 1 + y, paired=True)),
+            (0.6, measure_slope(0.6 * x + 0.8 * y, x)[1]),
+        )):  # fmt: skip
+            held[k] += low <= true <= high
     assert held / 1000 == pytest.approx(0.95, abs=0.03)
+
+
+# ---- sizes and powers ------------------------------------------------------------------------------------------------
+
+
+MAKE: dict[str, Callable[[int, float], Comparison]] = {
+    "two": lambda seed, shift: study(seed, (5, 5), shift, permutations=199),
+    "three": lambda seed, shift: study(seed, (3, 3, 4), shift, permutations=199),
+    "pairs": lambda seed, shift: pairs(seed, 7, shift),
+    "number": lambda seed, shift: dose(seed, (0, 1, 2, 3, 4), shift),
+}
+
+
+@pytest.mark.parametrize("name", MAKE)
+def test_any_false_finding_is_as_rare_as_said_and_power_grows(name: str) -> None:
+    """At most .05 of null studies find any; 80 tell that to ±.0244, of which 3 are allowed."""
+    found = [MAKE[name](seed, 0.0) for seed in range(80)]
+    most = 0.05 + 3 * math.sqrt(0.05 * 0.95 / len(found))
+    for any_found in (
+        [each.p <= each.level for each in found],
+        [min(number.family for number in each.numbers) <= each.level for each in found],
+        [min(number.holm for number in each.numbers) <= each.level for each in found],
+        [bool(each.significant.any()) for each in found],
+    ):
+        assert np.mean(any_found) <= most
+    shares = [np.mean([MAKE[name](seed, shift).p <= 0.05 for seed in range(8)]) for shift in (0.4, 3.0)]
+    assert np.mean([each.p <= 0.05 for each in found]) < shares[0] + 0.01 and shares[1] == 1
+
+
+def test_pairs_find_what_groups_of_the_same_scans_do_not() -> None:
+    both = [[pairs(seed, 7, 2.5, 5.0, paired).p <= 0.05 for seed in range(10)] for paired in (True, False)]
+    assert sum(both[0]) > 5 and sum(both[1]) == 0
+
+
+@pytest.mark.parametrize(
+    ("make", "labels", "count", "least"),
+    [
+        (study, (3, 3), 20, 2 / 20),
+        (study, (3, 4), 35, 1 / 35),
+        (study, (2, 2, 2), 90, 6 / 90),
+        (study, (2, 2, 3), 210, 2 / 210),
+        (pairs, 6, 64, 2 / 64),
+        (dose, (0, 1, 2, 3, 4), 120, 2 / 120),
+        (dose, (0, 1, 2, 3), 24, 2 / 24),
+        (dose, (0, 1, 10, 90, 90), 60, 1 / 60),
+    ],
+)
+def test_what_is_apart_has_the_least_exact_p(make: Any, labels: Any, count: int, least: float) -> None:
+    """Counted by hand: groups of one size may change their names, different numbers may be turned round."""
+    found = make(0, labels, 90.0)
+    assert found.exact and found.permutations == count
+    assert found.p == pytest.approx(least) == found.least
+    assert found.numbers[0].family == pytest.approx(least)
+    assert ("few subjects" in found.status) == (least > 0.05)
 
 
 def test_known_error_is_the_scans_own_share_of_the_variance() -> None:
@@ -170,6 +256,7 @@ def test_known_error_is_the_scans_own_share_of_the_variance() -> None:
     error = (0.1 / interval_reach((2, 2, 2))) ** 2
     for number in found.numbers:
         assert number.known == pytest.approx(error / np.mean(np.square(number.deviations)))
+    np.testing.assert_allclose(found.halves, 0.1, rtol=1e-12)  # of subjects with one scan
 
 
 def test_a_number_that_a_subject_lacks_is_not_tested() -> None:
@@ -177,11 +264,15 @@ def test_a_number_that_a_subject_lacks_is_not_tested() -> None:
     scans = [drawn(random) for _ in range(6)]
     first, *others = scans[0].quantities
     scans[0] = replace(scans[0], quantities=(replace(first, value=math.nan), *others))
-    found = compare(scans[:3], scans[3:])
-    number, *tested = found.numbers
-    assert all(map(math.isnan, (number.p, number.holm, number.effect, number.known)))
-    own = np.array([each.p for each in tested])
-    assert [each.holm for each in tested] == pytest.approx(correct_holm(own))
+    for found in (
+        compare(scans[:3], scans[3:]),
+        compare(scans[::2], scans[1::2], paired=True),
+        compare(scans, by=range(6)),
+    ):
+        number, *tested = found.numbers
+        assert all(map(math.isnan, (number.p, number.holm, number.effect, number.known)))
+        own = np.array([each.p for each in tested])
+        assert [each.holm for each in tested] == pytest.approx(correct_holm(own))
     assert sum(axes.axison for axes in numbers_figure(found).axes) == len(QUANTITIES)
 
 
@@ -204,33 +295,41 @@ def test_the_number_named_beforehand_leads_by_its_own_p() -> None:
 # ---- subjects --------------------------------------------------------------------------------------------------------
 
 
-def by_subject(scans: Mapping[str, Sequence[Measures]], *names: str) -> dict[str, Sequence[Measures]]:
-    return {name: scans[name] for name in names}
-
-
 def test_scans_of_a_subject_are_never_parted() -> None:
     """Alike scans of a subject count once: neither their number nor their order changes any p."""
     random = np.random.default_rng(6)
     single = {name: [drawn(random, 0.8 * (name > "c"))] for name in "abcdef"}
     several = {name: scans * k for k, (name, scans) in enumerate(single.items(), 1)}
-    once, often = (compare(by_subject(s, *"abc"), by_subject(s, *"def")) for s in (single, several))
+    once, often = (compare(*({n: s[n] for n in part} for part in ("abc", "def"))) for s in (single, several))
     assert often.counts == once.counts == (3, 3) and often.permutations == 20 and len(often.cases) == 21
     assert often.p == once.p
-    assert often.energy == pytest.approx(once.energy, rel=0.01)  # quantiles interpolate from point to point, of 60
+    assert often.statistic == pytest.approx(once.statistic, rel=0.01)  # quantiles interpolate between 60 points
     assert [each.p for each in often.numbers] == pytest.approx([each.p for each in once.numbers])
     assert np.nan_to_num(often.bins_p) == pytest.approx(np.nan_to_num(once.bins_p))
     apart = compare(*([scan for name in names for scan in several[name]] for names in ("abc", "def")))
     assert apart.p < once.p  # as if 21 scans were 21 subjects
 
 
-def test_the_order_of_groups_turns_signs_only() -> None:
-    random = np.random.default_rng(7)
-    first, second = [drawn(random) for _ in range(4)], [drawn(random, 0.5) for _ in range(5)]
-    one, other = compare(first, second), compare(second, first)
-    assert (one.p, one.energy, one.apart) == pytest.approx((other.p, other.energy, other.apart))
-    assert other.difference == pytest.approx(-one.difference)
+def test_relabelling_changes_what_it_should_and_no_more() -> None:
+    """Two numbers are two groups; another unit or origin of a number scales slopes; names of groups say nothing."""
+    random = np.random.default_rng(8)
+    scans = [drawn(random, 0.3 * k) for k in range(6)]
+    groups, numbers = compare(scans[:3], scans[3:]), compare(scans, by=[7, 7, 7, 9, 9, 9])
+    for a, b in zip(groups.numbers, numbers.numbers, strict=True):
+        assert (a.p, a.family, a.difference) == pytest.approx((b.p, b.family, 2 * b.difference))
+    assert groups.p == numbers.p and groups.bins_p == pytest.approx(numbers.bins_p, nan_ok=True)
+    one, other = (compare(scans, by=[a + b * k for k in (0, 1, 2, 4, 8, 9)]) for a, b in ((0, 1), (100, -7)))
+    assert (other.p, other.statistic) == pytest.approx((one.p, one.statistic))
     for a, b in zip(one.numbers, other.numbers, strict=True):
-        assert (a.difference, a.effect, a.low, a.p) == pytest.approx((-b.difference, -b.effect, -b.high, b.p), rel=1e-4)
+        assert (a.p, a.family, a.difference, a.effect) == pytest.approx((b.p, b.family, -7 * b.difference, -b.effect))
+    named = [compare(scans, by=names) for names in (list("aabbcc"), list("zzqqxx"))]
+    shuffled = compare([scans[k] for k in (4, 0, 2, 5, 1, 3)], by=list("cabcab"))
+    assert {each.p for each in (*named, shuffled)} == {named[0].p} and named[0].groups == ("a", "b", "c")
+    turned = compare(scans[3:], scans[:3])
+    assert (turned.p, turned.apart) == (groups.p, pytest.approx(groups.apart))
+    assert turned.differences == pytest.approx(-groups.differences)
+    for a, b in zip(groups.numbers, turned.numbers, strict=True):
+        assert (a.effect, a.low, a.p) == pytest.approx((-b.effect, -b.high, b.p), rel=1e-4)
 
 
 # ---- shapes ----------------------------------------------------------------------------------------------------------
@@ -250,10 +349,12 @@ def fields(shapes: Sequence[np.ndarray], edge: float = 0.01, unit: str = "mm") -
     return [Field(shape, (edge,) * 3, unit) for shape in shapes]
 
 
+RADII = (5.0, 5.4, 5.8, 6.2)
+
+
 @pytest.fixture(scope="module")
 def shapes() -> Comparison:
-    radii = (5.0, 5.4, 5.8, 6.2)
-    return compare(fields([*map(tubes, radii)]), fields([*map(balls, radii)]), periodic=True, kind="mask")
+    return compare(fields([*map(tubes, RADII)]), fields([*map(balls, RADII)]), periodic=True, kind="mask")
 
 
 def test_tubes_and_balls_differ_in_the_direction_that_they_do(shapes: Comparison) -> None:
@@ -262,35 +363,35 @@ def test_tubes_and_balls_differ_in_the_direction_that_they_do(shapes: Comparison
     assert shapes["share of spheres"].difference > 0.9 and shapes["share of tubes"].difference < -0.9
     assert shapes["κ2"].low > 0 and shapes["share of spheres"].family == pytest.approx(2 / 70)
     κ2, κ1 = np.meshgrid(*[(shapes.edges[1:] + shapes.edges[:-1]) / 2] * 2, indexing="ij")
-    more, less = shapes.significant & (shapes.difference > 0), shapes.significant & (shapes.difference < 0)
+    more, less = shapes.significant & (shapes.differences[0] > 0), shapes.significant & (shapes.differences[0] < 0)
     assert more.any() and less.any()
     assert np.median(κ2[less]) < 0.5 * np.median(κ1[less])  # tubes: κ2 is 0
     assert np.median(κ2[more]) > 0.5 * np.median(κ1[more])  # balls: κ2 is κ1
 
 
-def test_windows_of_one_texture_are_not_told_apart() -> None:
-    random = np.random.default_rng(8)
-    field = ndimage.gaussian_filter(random.standard_normal((2 * N, 2 * N, 2 * N)), 2.0, mode="wrap")
-    mask = (field > np.quantile(field, 0.7)).astype(np.uint8)
-    windows = [mask[z : z + N, y : y + N, x : x + N] for z in (0, N) for y in (0, N) for x in (0, N)]
-    found = compare(windows[::2], windows[1::2])
-    assert found.p > 0.1 and "not told apart" in found.status  # .9 here, which other processors move little
-    assert any("counted in voxels" in note for note in found.notes)
-    assert any("No intervals" in note for note in found.notes)
+def test_tubes_that_grow_go_with_time_and_in_another_order_do_not() -> None:
+    """A circle of voxels has the radius of its area, and κ1 is its inverse to 5 %."""
+    radii = (4.0, 4.5, 5.0, 5.5, 6.0)
+    grown = compare(fields([*map(tubes, radii)]), by=(0, 7, 14, 28, 56), periodic=True, kind="mask")
+    found = 0.16 * np.sqrt(grown.values[:, 0] / math.pi)
+    assert found == pytest.approx(0.01 * np.array(radii), abs=0.005)
+    assert grown.values[:, [each.symbol for each in grown.numbers].index("κ1")] == pytest.approx(1 / found, rel=0.05)
+    assert grown.p == grown["BV/TV"].p == grown["κ1"].p == pytest.approx(2 / 120)
+    assert grown["BV/TV"].effect > 0.9 and grown["κ1"].effect < -0.9
+    other = compare([grown.measures[k] for k in (2, 0, 4, 1, 3)], by=range(5))
+    assert other.p > 0.1 and not any(each.p <= 0.05 for each in other.numbers)
+    same = compare([grown.measures[1]] * 5, by=range(5))
+    assert same.p == 1 and {each.p for each in same.numbers} == {1.0}
 
 
-@pytest.mark.slow
-def test_each_scans_threshold_is_told(tmp_path: Path) -> None:
-    """Grey levels 20 and 20 + c split half way: each scan's threshold is in the record, their range in the methods."""
+def test_each_scans_threshold_is_told() -> None:
+    """Grey levels 20 and 20 + c split half way: each scan's threshold is in its notes, their range in the methods."""
     contrasts = (100.0, 110.0, 120.0, 140.0)
     scans = fields([20 + c * tubes(5.0) for c in contrasts])
     found = compare(scans[:2], scans[2:], kind="image", periodic=True)
-    write_comparison(found, tmp_path / "out")
-    record = json.loads((tmp_path / "out" / "compare.json").read_text(encoding="utf-8"))
-    for scan, contrast in zip(record["scans"], contrasts, strict=True):
-        assert any(f"threshold of {20 + contrast / 2:g}:" in note for note in scan["notes"])
-    assert "70–90" in record["methods"] and "0.01 mm" in record["methods"]
-    assert any("70–90" in note for note in found.notes)
+    for scan, contrast in zip(found.measures, contrasts, strict=True):
+        assert any(f"threshold of {20 + contrast / 2:g}:" in note for note in scan.notes)
+    assert "70–90" in describe_methods(found) and any("70–90" in note for note in found.notes)
 
 
 def test_notes_that_differ_in_numbers_are_one_with_their_ranges() -> None:
@@ -301,24 +402,15 @@ def test_notes_that_differ_in_numbers_are_one_with_their_ranges() -> None:
 
 def test_the_methods_cite_the_program(shapes: Comparison) -> None:
     cited = (Path(__file__).parents[2] / "CITATION.cff").read_text(encoding="utf-8")
-    methods = describe_methods(shapes)
     for name in ("version", "- name", "doi", "journal", "- family-names"):
         match = re.search(rf"^\s*{name}: (.+)$", cited, re.MULTILINE)
-        assert match and match[1] in methods
-
-
-def test_intervals_of_subjects_with_one_scan_are_those_of_their_scans(shapes: Comparison) -> None:
-    own = [[each.half for each in scan.quantities] for scan in shapes.measures]
-    np.testing.assert_allclose(shapes.halves, own, rtol=1e-12)
-    known = np.isfinite(shapes.halves) & (shapes.halves > 0)
-    assert (shapes.halves[known] > 1.9 * shapes.errors[known]).all()  # Student's t reaches further than a normal
+        assert match and match[1] in describe_methods(shapes)
 
 
 def test_units_are_converted(shapes: Comparison) -> None:
-    radii = (5.0, 5.4, 5.8, 6.2)
-    mixed = compare(fields([*map(tubes, radii)]), fields([*map(balls, radii)], 10.0, "um"), periodic=True, kind="mask")
+    mixed = compare(fields([*map(tubes, RADII)]), fields([*map(balls, RADII)], 10.0, "um"), periodic=True, kind="mask")
     assert mixed.unit == "mm" and mixed.p == shapes.p
-    assert mixed.energy == pytest.approx(shapes.energy, rel=1e-4)
+    assert mixed.statistic == pytest.approx(shapes.statistic, rel=1e-4)
     for one, other in zip(mixed.numbers, shapes.numbers, strict=True):
         assert one.means == pytest.approx(other.means, rel=5e-4, abs=1e-5), one.name  # float32's distances
     assert any("converted" in note for note in mixed.notes)
@@ -328,161 +420,136 @@ def test_units_are_converted(shapes: Comparison) -> None:
 
 
 @pytest.fixture
-def folders(tmp_path: Path) -> tuple[Path, Path]:
-    """Two folders of three tiny scans each, without spacing."""
-    pair = tmp_path / "control", tmp_path / "treated"
-    for folder, make in zip(pair, (tubes, balls), strict=True):
-        folder.mkdir()
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the test stands: two folders of three tiny scans each, without spacing, of files with the same names."""
+    for name, make in (("control", tubes), ("treated", balls)):
+        (tmp_path / name).mkdir()
         for k, radius in enumerate((5.0, 5.5, 6.0)):
-            np.save(folder / f"{folder.name[0]}{k}.npy", make(radius))
-    return pair
+            np.save(tmp_path / name / f"m{k}.npy", make(radius))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+SCANS = [f"{group}/m{k}.npy" for group in ("control", "treated") for k in range(3)]
 
 
 @pytest.mark.slow
-def test_the_command_writes_a_folder(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    (folders[0] / "notes.txt").write_text("mine", encoding="utf-8")
-    result = call("compare", *folders, "--spacing", 0.01, "--unit", "mm", "--periodic", "-o", tmp_path / "out")
+@pytest.mark.parametrize(
+    ("words", "labels", "permutations", "columns"),
+    [
+        ("control treated", {"control", "treated"}, 20, ["mean_a", "g"]),
+        (" ".join(SCANS) + " --by 0,1,2,3,4,5", {"0.0", "1.0", "2.0", "3.0", "4.0", "5.0"}, 720, ["slope", "r"]),
+        (" ".join(SCANS) + " --by a,a,b,b,$c,$c", {"a", "b", "$c"}, 90, ["mean_c", "eta"]),  # no formula
+    ],
+)
+def test_the_command_writes_a_folder(
+    home: Path, words: str, labels: set[str], permutations: int, columns: list[str]
+) -> None:
+    (home / "control" / "notes.txt").write_text("mine", encoding="utf-8")
+    arguments = ("compare", *words.split(), "--spacing", 0.01, "--unit", "mm", "--periodic", "-o", "out")
+    result = call(*arguments)
     assert result.exit_code == 0, (result.output, result.exception)
-    assert "control" in result.stdout and "notes.txt" in result.stderr
-    assert {path.name for path in (tmp_path / "out").iterdir()} == set(FILES)
-    page = (tmp_path / "out" / "compare.html").read_text(encoding="utf-8")
+    assert "p =" in result.stdout and ("notes.txt" in result.stderr) == ("control treated" in words)
+    assert {path.name for path in (home / "out").iterdir()} == set(FILES)
+    page = (home / "out" / "compare.html").read_text(encoding="utf-8")
     assert not re.search(r'(src|href)="(?!data:)', page)
-    record = json.loads((tmp_path / "out" / "compare.json").read_text(encoding="utf-8"))
-    assert record["p"] == pytest.approx(0.1) and record["permutations"] == 20 and record["exact"]
-    assert record["methods"].split(";")[0] in page and "all 20 permutations" in record["methods"]
-    rows = list(csv.DictReader((tmp_path / "out" / "measures.csv").read_text(encoding="utf-8").splitlines()))
-    assert len(rows) == 6 * len(QUANTITIES) and {row["group"] for row in rows} == {"control", "treated"}
-    tests = list(csv.DictReader((tmp_path / "out" / "numbers.csv").read_text(encoding="utf-8").splitlines()))
+    record = json.loads((home / "out" / "compare.json").read_text(encoding="utf-8"))
+    assert record["permutations"] == permutations and record["exact"] and f"all {permutations} " in record["methods"]
+    assert record["methods"].split(";")[0] in page
+    rows = list(csv.DictReader((home / "out" / "measures.csv").read_text(encoding="utf-8").splitlines()))
+    assert len(rows) == 6 * len(QUANTITIES) and {row.get("group") or row["number"] for row in rows} == labels
+    tests = list(csv.DictReader((home / "out" / "numbers.csv").read_text(encoding="utf-8").splitlines()))
     assert [row["quantity"] for row in tests] == ["curvature diagram", *(name for name, *_ in QUANTITIES)]
-    assert check_comparison(tmp_path / "out", command=record["command"]) == tmp_path / "out"  # its own files
+    assert set(columns) <= set(tests[0])
+    assert check_comparison(home / "out", command=record["command"]) == home / "out"  # its own files
+    (home / "out" / FILES[0]).write_text("mine", encoding="utf-8")
+    with pytest.raises(ValueError, match="free"):
+        check_comparison(home / "out", command=record["command"])
 
 
-def test_a_table_names_groups_and_subjects(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    scans = [
-        (path, f"{path.stem[0]}{int(path.stem[1]) % 2}") for folder in folders for path in sorted(folder.iterdir())
-    ]
-    table, mice = tmp_path / "study.csv", tmp_path / "mice.csv"
-    lines = [f"{path.relative_to(tmp_path)};{path.parent.name};{subject}" for path, subject in scans]
-    table.write_text("\n".join(["\ufeffScan;Group;Subject", *lines]), encoding="utf-8")
-    found = compare(subjects=table, periodic=True)
+def test_a_table_names_groups_subjects_and_numbers(home: Path) -> None:
+    """As folders with a table of subjects do; two animals at three times have their times exchanged, 36 ways."""
+    study, mice = home / "study.csv", home / "mice.csv"
+    lines = [f"{path};{path[:7]};{path[0]}{k % 3 % 2};{path[0]};{k % 3 * 7};{k}" for k, path in enumerate(SCANS)]
+    study.write_text("\n".join(["\ufeffScan;Group;Subject;Animal;Day;Dose", *lines]), encoding="utf-8")
+    found = compare(study, periodic=True)
     assert found.groups == ("control", "treated") and found.counts == (2, 2) and len(found.cases) == 6
-    mice.write_text(
-        "\n".join(["scan,subject", *(f"{path.name},{subject}" for path, subject in scans)]), encoding="utf-8"
-    )
-    again = curvafit.compare(*folders, subjects=mice, periodic=True)
+    assert any("counted in voxels" in note for note in found.notes)
+    mice.write_text("\n".join(["scan,subject", *(f"{path},{path[0]}{k % 3 % 2}" for k, path in enumerate(SCANS))]))
+    again = curvafit.compare("control", "treated", subjects=mice, periodic=True)
     assert again.subjects == found.subjects and again.p == found.p
+    dose = compare(study, by="animal", periodic=True)
+    assert dose.groups == ("c", "t") and dose.by == "animal"
+    study.write_text(study.read_text().replace("Subject", "Mouse").replace("Animal", "Subject"), encoding="utf-8")
+    times = compare(study, by="Day", paired=True, periodic=True)
+    assert times.groups == () and times.permutations == 36 and times.labels.tolist() == [0, 7, 14] * 2
+    slopes = [np.polyfit([0, 7, 14], times.values[k : k + 3, 0], 1)[0] for k in (0, 3)]
+    assert times["BV/TV"].difference == pytest.approx(np.mean(slopes))
 
 
 @pytest.mark.slow
-def test_workers_measure_the_same(folders: tuple[Path, Path]) -> None:
+def test_workers_measure_the_same(home: Path) -> None:
     pytest.importorskip("distributed", reason="the extra 'synth' is not installed")
-    alone, crew = (compare(*folders, periodic=True, workers=workers) for workers in (0, 2))
+    alone, crew = (compare("control", "treated", periodic=True, workers=workers) for workers in (0, 2))
     assert crew.p == alone.p and [each.source for each in crew.measures] == [each.source for each in alone.measures]
     assert crew.values == pytest.approx(alone.values)
-    tiny(*folders)
+    SPOIL["tiny"](home / "treated")
     with pytest.raises(ValueError, match="t0.npy"):
-        compare(*folders, periodic=True, workers=2)
+        compare("control", "treated", periodic=True, workers=2)
 
 
-@pytest.mark.slow
-def test_a_comparison_draws_and_writes_itself(shapes: Comparison, tmp_path: Path) -> None:
-    assert len(shapes.plot().axes) >= 3
-    page = write_comparison(shapes, tmp_path / "out")
-    assert page.is_file() and "4 scans of 4 subjects" in describe_methods(shapes)
-    foreign = tmp_path / "mine"
-    foreign.mkdir()
-    (foreign / "numbers.csv").write_text("a\n1\n", encoding="utf-8")
-    with pytest.raises(ValueError, match="free"):
-        write_comparison(shapes, foreign)
-    assert [path.name for path in foreign.iterdir()] == ["numbers.csv"]
-
-
-def flat(first: Path, second: Path) -> None:
-    np.save(second / "t0.npy", np.eye(16, dtype=np.uint8))
-
-
-def empty(first: Path, second: Path) -> None:
-    np.save(second / "t0.npy", np.zeros((N, N, N), dtype=np.uint8))
-
-
-def tiny(first: Path, second: Path) -> None:
-    np.save(second / "t0.npy", np.indices((4, 4, 4)).sum(0) > 8)
-
-
-def one(first: Path, second: Path) -> None:
-    for path in list(second.iterdir())[1:]:
-        path.unlink()
-
-
-def none(first: Path, second: Path) -> None:
-    for path in second.iterdir():
-        path.unlink()
-
-
-def mixed(first: Path, second: Path) -> None:
-    curvafit.save(Field(balls(5.0), (0.01,) * 3, "mm"), second / "t9.nii.gz")
-
-
-def hole(first: Path, second: Path) -> None:
-    curvafit.save(Field(balls(5.0)), second / "t9.zarr")
-    next(path for path in (second / "t9.zarr").rglob("c/*/*/*") if path.is_file()).unlink()
-
-
-def inside(first: Path, second: Path) -> None:
-    second.rename(first / "treated")
+#: What spoils the folder `treated`.
+SPOIL: dict[str, Callable[[Path], Any]] = {
+    "tiny": lambda folder: np.save(folder / "t0.npy", np.indices((4, 4, 4)).sum(0) > 8),
+    "one": lambda folder: [path.unlink() for path in sorted(folder.iterdir())[1:]],
+    "none": lambda folder: [path.unlink() for path in folder.iterdir()],
+    "mixed": lambda folder: curvafit.save(Field(balls(5.0), (0.01,) * 3, "mm"), folder / "t9.nii.gz"),
+    "inside": lambda folder: folder.rename(folder.parent / "control" / "treated"),
+}
+TIMES = "".join(f"{path},{path[:7]},{path[:7]},{k}\n" for k, path in enumerate(SCANS))
 
 
 @pytest.mark.parametrize(
-    ("damage", "arguments", "word"),
+    ("spoil", "arguments", "table", "word"),
     [
-        (one, "control treated", "2 subjects"),
-        (none, "control treated", "none that can be read"),
-        (None, "control nothing", "no such folder"),
-        (None, "control treated/t0.npy", "folder"),
-        (None, "control control", "apart"),
-        (inside, "control control/treated", "apart"),
-        (None, "control", "two groups"),
-        (flat, "control treated", "t0.npy"),
-        (empty, "control treated", "vary"),
-        (tiny, "control treated", "t0.npy"),
-        (mixed, "control treated", "spacing"),
-        (hole, "control treated --strict", "t9.zarr"),
-        (None, "control treated --permutations 5", "permutations"),
-        (None, "control treated --output control", "write over"),
+        ("one", "control treated", "", "2 subjects"),
+        ("mixed", "control treated --paired", "", "t9"),
+        ("none", "control treated", "", "none that can be read"),
+        ("inside", "control control/treated", "", "apart"),
+        ("tiny", "control treated", "", "t0.npy"),
+        ("mixed", "control treated", "", "spacing"),
+        ("", "control nothing", "", "nothing"),
+        ("", "control treated/m0.npy", "", "folder"),
+        ("", "control control", "", "apart"),
+        ("", "control", "", "two folders"),
+        ("", "control treated --by age", "", "by"),
+        ("", "control treated --permutations 5", "", "permutations"),
+        ("", "control treated --output control", "", "write over"),
+        ("", "control/m0.npy control/m1.npy --by 0,1", "", "more than 2"),
+        ("", " ".join(SCANS) + " --by 0,1", "", "label"),
+        ("", " ".join(SCANS) + " --by 1,1,1,1,1,1", "", "same"),
+        ("", " ".join(SCANS) + " --by a,a,a,b,b,nan", "", "subjects"),
+        ("", " ".join(SCANS) + " --by 1,2,3,4,5,inf", "", "finite"),
+        ("", " ".join(SCANS) + " --by 1,2,3,4,5,6 --paired", "", "pair"),
+        ("", " ".join(SCANS) + " --by 1,2,3,4,5,b", "", "beside numbers"),
+        ("", "table.csv", "scan,group\ncontrol/m0.npy,a\ncontrol/m0.npy,b\n", "each scan once"),
+        ("", "table.csv", "scan,group\nnowhere.npy,1\ncontrol/m0.npy,2\n", "nowhere.npy"),
+        ("", "table.csv", "scan,mouse\ncontrol/m0.npy,1\n", "group"),
+        ("", "table.csv", "scan,group\ncontrol/m0.npy,a\ncontrol/m1.npy,a\n", "two groups"),
+        ("", "table.csv", "", "columns"),
+        ("", "table.csv --by time", "scan,subject,group,time\n" + TIMES, "--paired"),
+        ("", "table.csv --by time", "scan,subject,group,time\n" + TIMES.replace(",5", ","), "row without"),
+        ("", "control treated --subjects table.csv", "scan,subject\nm0.npy,1\n", "row for each scan"),
+        ("", "control treated --subjects table.csv", "scan,subject,group\nm0.npy,1,a\n", "groups once"),
+        ("", "control treated --subjects table.csv", "scan,subject\nm0.npy,1\nm1.npy,2\nm2.npy,3\n", "--paired"),
     ],
 )
 def test_bad_input_is_one_sentence_and_nothing_is_written(
-    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, damage: Any, arguments: str, word: str
+    home: Path, spoil: str, arguments: str, table: str, word: str
 ) -> None:
-    home = folders[0].parent
-    monkeypatch.chdir(home)
-    if damage is not None:
-        damage(*folders)
+    (home / "table.csv").write_text(table, encoding="utf-8")
+    if spoil:
+        SPOIL[spoil](home / "treated")
     before = sorted(home.rglob("*"))
     refused(call("compare", "--output", "out", *arguments.split()), word, progress=True)
-    assert sorted(home.rglob("*")) == before
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text", "word"),
-    [
-        ("", "scan,group\ncontrol/c0.npy,a\ncontrol/c0.npy,b\n", "each scan once"),
-        ("", "scan,group\na,1\nb,2\nc,3\n", "two groups"),
-        ("", "scan,group\nnowhere.npy,1\ncontrol/c0.npy,2\n", "nowhere.npy"),
-        ("", "scan,mouse\ncontrol/c0.npy,1\n", "group"),
-        ("", "", "columns"),
-        ("control treated", "scan,subject\nc0.npy,1\n", "row for each scan"),
-        ("control treated", "scan,subject\nc0.npy,\n", "row without"),
-        ("control treated", "scan,subject,group\nc0.npy,1,a\n", "groups once"),
-        ("control treated", "scan,subject\n" + "".join(f"{g}{k}.npy,{k}\n" for g in "ct" for k in range(3)), "in both"),
-    ],
-)
-def test_a_bad_table_is_one_sentence(
-    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, arguments: str, text: str, word: str
-) -> None:
-    home = folders[0].parent
-    monkeypatch.chdir(home)
-    (home / "table.csv").write_text(text, encoding="utf-8")
-    before = sorted(home.rglob("*"))
-    refused(call("compare", *arguments.split(), "--subjects", "table.csv", "-o", "out"), word, progress=True)
     assert sorted(home.rglob("*")) == before
