@@ -1,28 +1,29 @@
-"""Whether `compare` tells groups apart that differ, and only those; its time from the shell.
+"""Whether `compare` finds what differs, and only that: two groups, three, pairs, a number.
 
-`--on scans` ($CURVAFIT_DATA): windows of 50³ of the real masks of `completion`, lengths in voxels. A thousand times two
-groups of 8 are drawn from the windows of bone: their p should be uniform. Then all windows of bone are compared, half
-by half, and with those of other structures. Windows of one volume are no subjects: a small p says that two volumes
-differ, not that two tissues do.
+`--on scans` ($CURVAFIT_DATA): windows of 50³ of the real masks of `completion`, lengths in voxels. A thousand times the
+subjects of each design are drawn from the windows of bone: their p should be uniform. Then all windows of bone are
+compared, half by half, and with those of other structures. Windows of one volume are no subjects: a small p says that
+two volumes differ, not that two tissues do.
 
 `--on shapes`: 20 shapes of 64³ of the preset tubes, and as many of that law with one coefficient lower by a part of the
 prior's standard deviation, measured as masks. Groups of 4, 6 and 10 are drawn from them without replacement: 200 times
-two laws, 1000 times one. A study finds a difference by
+two laws, 1000 times one.
+
+`--on path`: 12 shapes of 64³ at each of five places between tubes and that law with a lower a01. Of 200 studies two
+groups of 6 are from the ends; three also from the middle; 8 pairs from places two apart, wherever the first is; ten
+subjects from all places, the number. A study finds a difference by
 
 - `diagrams`: p of the curvature diagrams;
 - `numbers`: the least family-wise p of all numbers;
-- `familiar`: Student's t-tests of BV/TV, Tb.Th and Tb.Sp, the least p by Holm.
+- `familiar`: F-tests (of two groups Student's t) of BV/TV, Tb.Th and Tb.Sp, the least p by Holm.
 
 Studies are made by the parts of `compare`, of numbers that were measured once; the first of each kind by `compare` as
 well, which must give the same p.
-
-`--on command`: 20 noisy scans of 128³ measured, compared and drawn from the shell, by two workers.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -30,12 +31,20 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy import ndimage, stats
+from scipy import stats
 from scipy.spatial.distance import cdist
 
-from benchmarks.completion import shape, sides
-from benchmarks.harness import Cases, Figure, Values, run_python, show
-from curvafit.core.permutation import correct_by_most, correct_holm, measure_energy, relabel, share_beyond
+from benchmarks.completion import sides
+from benchmarks.harness import Cases, Figure, Values, show
+from curvafit.core.permutation import (
+    correct_by_most,
+    correct_holm,
+    correlate,
+    measure_dependence,
+    measure_energy,
+    relabel,
+    share_beyond,
+)
 from curvafit.data_synth.design import INTERVALS
 from curvafit.generation.flow import generate
 from curvafit.geometry.diagram import Diagram
@@ -49,19 +58,13 @@ from curvafit.volumes.field import Field, ScanError
 WINDOW, EDGE, SUBJECTS = 50, 64, 20
 BASE, SHIFTED, SHIFTS = "tubes", ("a10", "a01"), (0.25, 0.5, 0.1)
 LAWS = (BASE, *(f"{name}-{shift:g}" for name, shift in product(SHIFTED, SHIFTS)))
+PATH, PLACED = (BASE, "a01-0.0625", "a01-0.125", "a01-0.1875", "a01-0.25"), 12
+#: Subjects with a label, and the place on the path of each label's law, or how far it is from the pair's first.
+DESIGNS = {"two": (6, (0, 4)), "three": (6, (0, 2, 4)), "pairs": (8, (0, 2)), "number": (2, (0, 1, 2, 3, 4))}
 COUNTS, STUDIES, NULLS, PERMUTATIONS = (4, 6, 10), 200, 1000, 499
 OTHERS = ("mitochondria-32", "felt", "vesselexpress")
 TESTS = ("diagrams", "numbers", "familiar")
 FAMILIAR = [k for k, (_, symbol, *_) in enumerate(QUANTITIES) if symbol in ("BV/TV", "Tb.Th", "Tb.Sp")]
-#: Runs the command line, and prints the peak memory of this process and of its greatest worker, in KiB.
-PROGRAM = """
-from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
-from curvafit.cli.app import app
-try:
-    app()
-finally:
-    print(*(getrusage(each).ru_maxrss for each in (RUSAGE_SELF, RUSAGE_CHILDREN)))
-"""
 
 
 # ---- subjects --------------------------------------------------------------------------------------------------------
@@ -97,8 +100,8 @@ def windows(name: str, side: int, cases: Cases) -> list[Measures]:
     return found
 
 
-def shapes(law: str, cases: Cases) -> list[Measures]:
-    """Return the measures of the shapes of a law; no two laws grow from one noise."""
+def shapes(law: str, cases: Cases, count: int = SUBJECTS, schedule: str = "deep") -> list[Measures]:
+    """Return the measures of shapes of a law; no two laws grow from one noise."""
     known, (name, _, shift) = Law.of(BASE), law.partition("-")
     coefficients = known.coefficients
     if shift:
@@ -106,37 +109,48 @@ def shapes(law: str, cases: Cases) -> list[Measures]:
         coefficients = replace(coefficients, **{name: getattr(coefficients, name) - float(shift) * deviation})
 
     def mask(seed: int) -> Field:
-        grown = generate(coefficients, known.mass, EDGE, schedule="deep", seed=seed)
+        grown = generate(coefficients, known.mass, EDGE, schedule=schedule, seed=seed)
         assert grown.viability.viable, (law, grown.status)
         return Field((grown.field.numpy() > 0).astype(np.uint8))
 
-    seeds = 100 * LAWS.index(law) + np.arange(SUBJECTS)
+    start = 100 * LAWS.index(law) if schedule == "deep" else 1000 + 100 * PATH.index(law)
+    seeds = start + np.arange(count)
     return [each for seed in seeds for each in subject(f"{law}-{seed}", partial(mask, int(seed)), True, cases)]
 
 
 # ---- studies ---------------------------------------------------------------------------------------------------------
 
 
-def studies(pools: Sequence[Sequence[Measures]], count: int, times: int) -> Values:
-    """Return by each test the p of studies of `count` subjects a group, drawn from each pool, or twice from one."""
-    random, found = np.random.default_rng(count), []
+def studies(pools: Sequence[Sequence[Measures]], times: int, design: str, count: int = 0) -> Values:
+    """Return by each test the p of studies of a design, of subjects from the pools on the path, or from fewer."""
+    usual, steps = DESIGNS[design]
+    count, random, found = count or usual, np.random.default_rng(count or usual), []
     subjects, ends = [each for pool in pools for each in pool], np.cumsum([len(pool) for pool in pools])
     embedded = np.stack([sliced_embedding(each.diagram) for each in subjects])
     values = np.array([[each.value for each in scan.quantities] for scan in subjects])
+    labels = np.repeat(np.arange(len(steps), dtype=float if design == "number" else int), count)
+    blocks = np.tile(np.arange(count), 2) if design == "pairs" else None
+    test = measure_dependence if design == "number" else measure_energy
+    q = 1 if design == "number" else len(steps) - 1
+    free = len(labels) - q - (1 if blocks is None else count)
     for seed in range(times):
-        drawn = [
-            random.permutation(part)[: 2 * count // len(pools)] for part in np.split(np.arange(ends[-1]), ends[:-1])
-        ]
-        chosen = np.concatenate(drawn)
+        first = random.integers(len(PATH) - 2, size=count) if design == "pairs" and len(pools) > 1 else 0
+        places = np.concatenate([np.zeros(count, dtype=int) + first + step for step in steps])
+        places, chosen = np.minimum(places, len(pools) - 1), np.empty(len(labels), dtype=int)
+        for place, part in enumerate(np.split(np.arange(ends[-1]), ends[:-1])):
+            chosen[places == place] = random.permutation(part)[: (places == place).sum()]
         rows, numbers = embedded[chosen], values[chosen]
-        choices, _ = relabel(np.arange(2 * count) >= count, PERMUTATIONS, seed)
-        p = [share_beyond(measure_energy(cdist(rows, rows), choices)), correct_by_most(numbers, choices).min()]
+        arranged, _ = relabel(labels, PERMUTATIONS, seed, blocks)
+        p = [share_beyond(test(cdist(rows, rows), arranged, blocks)), correct_by_most(numbers, arranged, blocks).min()]
         if seed == 0:
-            scans = [subjects[k] for k in chosen]
-            whole = compare(scans[:count], scans[count:], permutations=PERMUTATIONS, seed=seed)
+            scans, how = [subjects[k] for k in chosen], {"permutations": PERMUTATIONS, "paired": blocks is not None}
+            by = labels if design == "number" else [f"group {label}" for label in labels]
+            groups = [scans[k : k + count] for k in range(0, len(scans), count)]
+            whole = compare(scans, by=by, **how) if blocks is None else compare(*groups, **how)
             assert np.allclose(p, (whole.p, min(each.family for each in whole.numbers)))
-        t: Any = stats.ttest_ind(numbers[:count, FAMILIAR], numbers[count:, FAMILIAR])
-        found.append([*map(float, p), float(correct_holm(t.pvalue).min())])
+        squares = correlate(numbers[:, FAMILIAR], arranged[:1], blocks)[0] ** 2
+        f: Any = stats.f.sf(squares / (1 - squares) * free / q, q, free)
+        found.append([*map(float, p), float(correct_holm(f).min())])
     return {test: np.round(p, 4).tolist() for test, p in zip(TESTS, np.transpose(found), strict=True)}
 
 
@@ -148,20 +162,24 @@ def share(p: Sequence[float]) -> Figure:
 
 
 def on_scans(quick: bool, cases: Cases) -> dict[str, Figure]:
-    def against(first: Sequence[Measures], second: Sequence[Measures]) -> Values:
-        found = compare(first, second)
-        return {"p": found.p, "energy": found.energy, "windows": len(second)}
+    def against(name: str) -> Values:
+        second = windows("bone", 1, cases) if name == "halves" else both(name)
+        found = compare(windows("bone", 0, cases) if name == "halves" else both("bone"), second)
+        return {"p": found.p, "energy": found.statistic, "windows": len(second)}
 
     def both(name: str) -> list[Measures]:
         return [*windows(name, 0, cases), *windows(name, 1, cases)]
 
-    jobs = {"bone": lambda: studies([both("bone")], 8, 10 if quick else NULLS)}
-    jobs["halves"] = lambda: against(windows("bone", 0, cases), windows("bone", 1, cases))
-    jobs |= {name: lambda name=name: against(both("bone"), both(name)) for name in OTHERS}
-    null, *others = (found := cases.all(jobs)).values()
-    figures = {"groups.windows": share(null["diagrams"])}
-    figures["groups.uniform"] = Figure(float(stats.kstest(null["diagrams"], "uniform").statistic))
-    figures |= {f"groups_scans.{name}.{key}": Figure(row[key]) for name, row in zip([*found][1:], others, strict=True)
+    def null(design: str) -> Values:
+        return studies([both("bone")], 10 if quick else NULLS, design, 8 if design == "two" else 0)
+
+    jobs = {f"null-{design}": partial(null, design) for design in DESIGNS}
+    found = cases.all(jobs | {name: partial(against, name) for name in ("halves", *OTHERS)})
+    figures = {"groups.windows": share(found["null-two"]["diagrams"])}
+    figures["groups.uniform"] = Figure(float(stats.kstest(found["null-two"]["diagrams"], "uniform").statistic))
+    figures |= {f"groups_size.{design}.{test}": share(found[f"null-{design}"][test])
+                for design, test in product(DESIGNS, TESTS[:2])}  # fmt: skip
+    figures |= {f"groups_scans.{name}.{key}": Figure(found[name][key]) for name in ("halves", *OTHERS)
                 for key in ("windows", "p", "energy")}  # fmt: skip
     show(["", "figure"], list(figures.items()), "windows of bone")
     return figures
@@ -170,7 +188,7 @@ def on_scans(quick: bool, cases: Cases) -> dict[str, Figure]:
 def on_shapes(quick: bool, cases: Cases) -> dict[str, Figure]:
     def job(law: str, count: int) -> Values:
         times = 4 if quick else NULLS if law == BASE else STUDIES
-        return studies([shapes(each, cases) for each in dict.fromkeys((BASE, law))], count, times)
+        return studies([shapes(each, cases) for each in dict.fromkeys((BASE, law))], times, "two", count)
 
     laws, figures = LAWS[:2] if quick else LAWS, dict[str, Figure]()
     found = cases.all({f"{law}-{count}": partial(job, law, count) for law, count in product(laws, COUNTS)})
@@ -185,33 +203,22 @@ def on_shapes(quick: bool, cases: Cases) -> dict[str, Figure]:
     return figures
 
 
-def on_command(quick: bool, cases: Cases) -> dict[str, Figure]:
-    def timed() -> Values:
-        folder, random = cases.folder / "command", np.random.default_rng(0)
-        for number in range(4 if quick else 20):
-            place = folder / ("first", "second")[number % 2] / f"{number}.npy"
-            place.parent.mkdir(parents=True, exist_ok=True)
-            mask = np.roll(
-                np.tile(shape("tubes", number % 2, cases), (2, 2, 2)), random.integers(0, EDGE, 3), (0, 1, 2)
-            )
-            noise = random.standard_normal(mask.shape, dtype=np.float32)
-            np.save(place, ndimage.gaussian_filter(mask.astype(np.float32), 1.0) + 0.3 * noise)
-        begun, words = time.monotonic(), ("compare", folder / "first", folder / "second", "--workers", 2)
-        said = run_python("-c", PROGRAM, *words, "-o", folder / "compared", "--overwrite")
-        own, worker = map(int, said.split()[-2:])
-        return {"seconds": time.monotonic() - begun, "memory": (own + 2 * worker) * 1024 / 1e9}
+def on_path(quick: bool, cases: Cases) -> dict[str, Figure]:
+    def job(design: str) -> Values:
+        pools = [shapes(law, cases, PLACED, "fast") for law in PATH]
+        return studies(pools, 4 if quick else STUDIES, design)
 
-    found = cases.all({"command": timed})
-    figures = {f"groups.{key}": Figure(value) for row in found.values() for key, value in row.items()}
-    show(["from the shell", ""], list(figures.items()))
+    found = cases.all({f"path-{design}": partial(job, design) for design in DESIGNS})
+    figures = {f"groups_path.{name[5:]}.{test}": share(row[test]) for name, row in found.items() for test in TESTS}
+    show(["", "figure"], list(figures.items()), "significant studies")
     return figures
 
 
-PARTS = {"scans": on_scans, "shapes": on_shapes, "command": on_command}
+PARTS = {"scans": on_scans, "shapes": on_shapes, "path": on_path}
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--on", default="scans,shapes", help="scans, shapes, command")
+    parser.add_argument("--on", default="scans,shapes,path", help="scans, shapes, path")
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
