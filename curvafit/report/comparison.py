@@ -32,12 +32,6 @@ from curvafit.studies.tables import format_csv
 
 #: `format` of a comparison's record.
 FORMAT = Format("curvafit comparison", 1, title="the record of a comparison")
-#: How the effect of each quantity is told, by its name.
-EFFECTS = {
-    "g": "g: Hedges' g, the difference over the deviation within groups, or of pairs over that of their differences.",
-    "η": "η: the correlation ratio, the root of the part of the variance that lies between groups.",
-    "r": "Slope: the change a unit. r: the correlation with the number's rank.",
-}
 #: The tests of each quantity as the page's table heads them.
 TESTS = ("p", "family-wise", "Holm", "BH")
 #: What a comparison writes into its folder.
@@ -72,26 +66,18 @@ def write_comparison(
 
 def _page(comparison: Comparison, record: dict[str, Any], pictures: dict[str, Picture]) -> str:
     """Return the page of a comparison, with its record and its pictures, as text."""
-    c, bins = comparison, int(comparison.significant.sum())
-    region = f"The outline holds the bins that differ at a family-wise level of {LEVEL:.2g}."
-    what = "between the least number and the greatest: orange where there is more with it, blue where less"
-    if len(c.groups) == 2:
-        what = f"of the two: blue where {c.groups[0]} has more, orange where {c.groups[1]} has"
-    elif c.groups:
-        what = "of each from all: orange where it has more, blue where less"
+    c = comparison
     return render_template(
         "compare.html",
         version=version("curvafit"),
         title=c.verdict,
         scans="; ".join(_count_scans(c)) + ".",
         status=c.status,
-        difference_text=what,
-        region=region if bins else f"No bin differs at a family-wise level of {LEVEL:.2g}.",
+        groups=c.groups,
+        effect=c.effect,
+        differs=bool(c.significant.any()),
         head=[*c.groups, "difference" if c.groups else "slope", c.effect, "95 %", *TESTS, "known error"],
         rows=[_format_row(number, c) for number in c.numbers],
-        count=len(c.groups),
-        effect=f"Mean ± standard deviation of subjects. {EFFECTS[c.effect]}" if c.groups else EFFECTS[c.effect],
-        line="the group's mean" if c.groups else "the slope",
         level=f"{LEVEL:.2g}",
         **pictures,
         methods=record["methods"],
