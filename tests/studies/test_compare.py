@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from calling import call, refused
+from found import lattice
 from scipy import stats
 from scipy.spatial.distance import cdist
 
@@ -32,10 +33,12 @@ from curvafit.core.permutation import (
 )
 from curvafit.drawing.groups import numbers_figure
 from curvafit.geometry.diagram import Diagram
+from curvafit.inference.candidates import Misfit
+from curvafit.inference.infer import Inference, infer
 from curvafit.report.comparison import FILES, check_comparison, describe_methods
-from curvafit.scan.measure import QUANTITIES, Measures, Quantity, interval_reach
+from curvafit.scan.measure import QUANTITIES, Measures, Quantity, interval_reach, measure
 from curvafit.studies.compare import Comparison, compare
-from curvafit.studies.scans import merge_notes
+from curvafit.studies.scans import add_combinations, merge_notes
 from curvafit.volumes.field import Field
 
 N = 32
@@ -416,6 +419,36 @@ def test_units_are_converted(shapes: Comparison) -> None:
     assert any("converted" in note for note in mixed.notes)
 
 
+# ---- laws ------------------------------------------------------------------------------------------------------------
+
+MASK = Field((lattice(56, 28, 5.0) > 0).astype(np.uint8), (0.02,) * 3, "mm")
+
+
+def combinations(measures: Measures, inference: Inference, p: float | None = None) -> np.ndarray:
+    """What a scan tells of its law, if shapes of it are as far from the scan with probability `p`."""
+    if p is not None:
+        inference = replace(inference, fit=replace(inference.fit, misfit=Misfit(p, {}, "nothing")))
+    return np.array([[each.value, each.half] for each in add_combinations(measures, inference).quantities[-6:]])
+
+
+def test_combinations_are_those_of_the_fit_where_a_law_makes_such_scans() -> None:
+    measures, inference = measure(MASK), infer(MASK, fast=True)
+    found = combinations(measures, inference, 0.5)
+    assert sorted(found[:, 0]) == pytest.approx(sorted(each.median for each in inference.fit.combinations))
+    # A 95 % interval is wider than the fit's 90 % one.
+    assert found[:, 1].sum() > sum(np.ptp(each.interval) / 2 for each in inference.fit.combinations)
+    assert np.isnan(combinations(measures, inference, 0.01)).all()
+    noise = Field((np.random.default_rng(0).random((32, 32, 32)) > 0.7).astype(np.uint8))
+    mostly = replace(MASK, values=1 - MASK.values)  # the background
+    for other in (noise, mostly):
+        assert np.isnan(combinations(measures, infer(other, fast=True))).all()
+    series = [replace(MASK, values=np.roll(MASK.values, k, 0)) for k in range(3)]
+    symbols = [each.symbol for each in compare(series, by=range(3), laws=True).numbers]
+    assert symbols[-6:] == [f"L{k}" for k in range(1, 7)]
+    with pytest.raises(ValueError, match="measured already"):
+        compare([measures] * 3, by=range(3), laws=True)
+
+
 # ---- files and the command -------------------------------------------------------------------------------------------
 
 
@@ -485,17 +518,6 @@ def test_a_table_names_groups_subjects_and_numbers(home: Path) -> None:
     assert times.groups == () and times.permutations == 36 and times.labels.tolist() == [0, 7, 14] * 2
     slopes = [np.polyfit([0, 7, 14], times.values[k : k + 3, 0], 1)[0] for k in (0, 3)]
     assert times["BV/TV"].difference == pytest.approx(np.mean(slopes))
-
-
-@pytest.mark.slow
-def test_workers_measure_the_same(home: Path) -> None:
-    pytest.importorskip("distributed", reason="the extra 'synth' is not installed")
-    alone, crew = (compare("control", "treated", periodic=True, workers=workers) for workers in (0, 2))
-    assert crew.p == alone.p and [each.source for each in crew.measures] == [each.source for each in alone.measures]
-    assert crew.values == pytest.approx(alone.values)
-    SPOIL["tiny"](home / "treated")
-    with pytest.raises(ValueError, match="t0.npy"):
-        compare("control", "treated", periodic=True, workers=2)
 
 
 #: What spoils the folder `treated`.
