@@ -29,7 +29,7 @@ from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.profile import profile_distance
 from curvafit.volumes.field import Field
-from curvafit.volumes.write import WRITABLE, pick_writer, save
+from curvafit.volumes.write import WRITERS, pick_writer, save
 
 #: What a record beside a shape says that it is.
 FORMAT = Format("curvafit-shape-1", title="the record of a shape")
@@ -89,7 +89,7 @@ def check_target(
     written are a ValueError.
     """
     target = Path(path)
-    known = (*WRITABLE, *SUFFIXES)
+    known = (*WRITERS, *SUFFIXES)
     if not target.name.lower().endswith(known):
         raise ValueError(f"the name of a shape must end in one of {', '.join(known)}, got {target.name!r}")
     if not target.name.lower().endswith(SUFFIXES):

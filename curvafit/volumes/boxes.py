@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +17,12 @@ from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.arrays import read_hdf5, read_npy, read_raw
 from curvafit.volumes.formats.base import check_array
 from curvafit.volumes.formats.nifti import read_nifti
-from curvafit.volumes.formats.part import Box, Crop, Part, parse_box, resolve_box, take_part
+from curvafit.volumes.formats.part import Box, Crop, Part, cut_boxes, parse_box, resolve_box, take_part
 from curvafit.volumes.formats.zarr import read_zarr
 from curvafit.volumes.read import Source, check_reading, field_of, pick_reader, read_file, split_key, to_field
 
 #: Readers that read a box alone.
 _BY_BOX = (read_zarr, read_hdf5, read_npy, read_raw, read_nifti)
-#: The first voxel.
-_CORNER = (slice(0, 1), slice(0, 1), slice(0, 1))
 #: Voxels that `check_finite` reads at once.
 _SLAB = 2**24
 #: A sample has at most so many runs of neighbouring voxels along each axis, each so long.
@@ -70,13 +68,9 @@ def read_whole(boxes: Boxes) -> Field:
 
 def check_finite(boxes: Boxes) -> None:
     """Read all of a volume, some slices at once, and raise ScanError where values are not finite."""
-    faults = 0
-    depth, rows, columns = boxes.frame.shape
-    thick = max(1, _SLAB // max(1, rows * columns))
-    for z in range(0, depth, thick):
-        values = boxes.part((slice(z, min(z + thick, depth)), slice(0, rows), slice(0, columns)))
-        faults += np.count_nonzero(~np.isfinite(values)) if values.dtype.kind == "f" else 0
-    if faults:
+    shape = boxes.frame.shape
+    slabs = cut_boxes(shape, (max(1, _SLAB // max(1, shape[1] * shape[2])), *shape[1:]))
+    if faults := sum(np.count_nonzero(~np.isfinite(boxes.part(slab))) for slab in slabs):
         raise ScanError(f"a volume must be finite, got {faults} values that are not")
 
 
@@ -87,10 +81,10 @@ def subsample(boxes: Boxes) -> tuple[Field, list[Box]]:
     equal parts; along a shorter one it has all voxels.
     """
     runs = [_sample_runs(n) for n in boxes.frame.shape]
-    # The runs lie end to end in the sample.
-    ends = [np.cumsum([0, *(run.stop - run.start for run in axis)]).tolist() for axis in runs]
-    sample = np.empty([axis[-1] for axis in ends], boxes.frame.values.dtype)
-    places = [(z, y, x) for z, y, x in product(*([slice(a, b) for a, b in pairwise(axis)] for axis in ends))]
+    # The runs, which are of one length along an axis, lie end to end in the sample.
+    shape = [sum(run.stop - run.start for run in axis) for axis in runs]
+    sample = np.empty(shape, boxes.frame.values.dtype)
+    places = cut_boxes(shape, [axis[0].stop - axis[0].start for axis in runs])
     for place, (z, y, x) in zip(places, product(*runs), strict=True):
         sample[place] = boxes.part((z, y, x))
     return replace(boxes.frame, values=sample, affine=None), places
@@ -133,11 +127,7 @@ class InMemory:
 
 @dataclass(frozen=True, eq=False)
 class InFile:
-    """The boxes of a volume in a file, as `InMemory` offers them.
-
-    `frame` has zeros for values; `options` are those of reading, `place` is the channel and the
-    time, and `first` the volume's first voxel in the file.
-    """
+    """The boxes of a volume in a file, at its channel and time, from its first voxel in the file on."""
 
     frame: Field
     path: Path
@@ -147,10 +137,7 @@ class InFile:
 
     @property
     def digest(self) -> str:
-        """A text that changes with the content, without reading it: path, options, size and time of change.
-
-        Of a folder these are the total size, and the latest time.
-        """
+        """A text that changes with the content, without reading it: of a folder the total size and latest time."""
         files = [path for path in self.path.rglob("*") if path.is_file()] if self.path.is_dir() else [self.path]
         states = [path.stat() for path in files]
         size, time = sum(state.st_size for state in states), max(state.st_mtime_ns for state in states)
@@ -176,7 +163,7 @@ def _open_file(path: Path, key: str | None, options: dict[str, Any]) -> InFile:
     """Return the boxes of a file; the first voxel is read to know the volume's place."""
     reading = {"key": key, "raw_shape": options.get("raw_shape"), "dtype": options.get("dtype")}
     place = Part(options.get("channel"), options.get("time"))
-    corner, shape = _read(path, reading, replace(place, crop=_CORNER))
+    corner, shape = _read(path, reading, replace(place, crop=(slice(0, 1),) * 3))
     if options.get("strict") and corner.gaps:
         raise ScanError(f"{path} is not whole: {corner.gaps[0]}")
     box = resolve_box(parse_box(options["crop"]), shape, path)
@@ -188,8 +175,6 @@ def _open_file(path: Path, key: str | None, options: dict[str, Any]) -> InFile:
 
 def _read(path: Path, reading: dict[str, Any], part: Part) -> tuple[Any, tuple[int, ...]]:
     """Return a part of a file's content, with three axes, and the shape of the whole (z, y, x)."""
-    read = read_file(path, part=part, **reading)
-    assert read.whole is not None
-    shape = read.whole
-    space = part.index(shape, read.axes, path)[1]
-    return take_part(read, part, path)[0], tuple(shape[axis] for axis in space)
+    raw = read_file(path, part=part, **reading)
+    shape = raw.whole or raw.values.shape
+    return take_part(raw, part, path)[0], tuple(shape[axis] for axis in part.index(shape, raw.axes, path)[1])

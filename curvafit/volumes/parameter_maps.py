@@ -35,7 +35,11 @@ def read_maps(path: str | Path, shape: tuple[int, int, int] | None = None) -> di
     place = Path(path)
     if not place.exists():
         raise FileNotFoundError(f"no such file or folder of maps: {place}")
-    arrays = _from_folder(place) if place.is_dir() else _from_npz(place)
+    try:
+        arrays = None if place.is_dir() else read_archive(place)
+    except (ValueError, OSError) as reason:
+        raise ValueError(f"{place} is neither an NPZ file nor a folder of maps") from reason
+    arrays = _read_folder(place) if arrays is None else arrays
     unknown = sorted(arrays.keys() - set(PARAMETERS))
     if unknown or not arrays:
         listed = ", ".join(unknown) or "none"
@@ -60,15 +64,7 @@ def map_shape(maps: Mapping[str, float | Tensor]) -> tuple[int, int, int] | None
     return shapes[0] if shapes else None  # type: ignore[return-value]
 
 
-def _from_npz(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an NPZ file by name."""
-    try:
-        return read_archive(path)
-    except (ValueError, OSError) as reason:
-        raise ValueError(f"{path} is neither an NPZ file nor a folder of maps") from reason
-
-
-def _from_folder(path: Path) -> dict[str, np.ndarray]:
+def _read_folder(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays of a folder's volume files by name; files of other names are not read, and get empty arrays."""
     suffixes = tuple(READERS)
     files = [p for p in sorted(path.iterdir()) if p.name.lower().endswith(suffixes) and not p.name.startswith(".")]

@@ -37,9 +37,9 @@ def lay(field: Field, on: Field, name: str, kind: str, *, exact: bool = False) -
     corners = np.array(list(product(*((0, n - 1) for n in on.shape))))
     far = np.abs(corners @ (matrix - whole).T + offset - moved).max()
     on_voxels = far < ASTRAY and np.array_equal(whole @ whole.T, np.eye(3))
-    sampling = format_sampling(field.shape, field.spacing, field.unit)
     if on_voxels and field.shape == on.shape and np.array_equal(whole, np.eye(3)) and not moved.any():
         return field, ()
+    sampling = format_sampling(field.shape, field.spacing, field.unit)
     if exact and not on_voxels:
         raise ScanError(f"{name} must have the voxels of {kind}, got {sampling} that lie between them: resample it")
     laid, share = _take_nearest(field.values, *((whole, moved) if on_voxels else step), on.shape)

@@ -33,9 +33,6 @@ WRITERS: dict[str, Callable[[Any, Path], None]] = {
     **dict.fromkeys((".zarr", ".ome.zarr"), write_zarr),
 }
 
-#: Suffixes that `save` knows.
-WRITABLE = tuple(WRITERS)
-
 
 def save(
     source: Source,

@@ -54,6 +54,12 @@ def image(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, str]:
     return path, request.param
 
 
+def tube_of(path: Path, **part: Any) -> Field:
+    """The mask of the tube, on the voxels of the image or a part of it."""
+    field = load(path, channel=1, **part)
+    return Field(field.values > 110, field.spacing, field.unit, field.affine)
+
+
 def test_steps_of_all_levels_place_each(image: tuple[Path, str]) -> None:
     field = load(image[0], channel=1)
     assert (field.shape, field.spacing, field.unit) == (SHAPE, SPACING, "um")
@@ -66,11 +72,9 @@ def test_steps_of_all_levels_place_each(image: tuple[Path, str]) -> None:
 
 def test_labels_lie_on_the_image_and_are_listed(image: tuple[Path, str]) -> None:
     path, version = image
-    before, field = files(path), load(path, channel=1)
-    mask = Field(field.values > 110, field.spacing, field.unit, field.affine)
+    before, mask, part = files(path), tube_of(path), tube_of(path, crop="4:14,:,:")
     assert save(mask, path / "labels/tube") == path / "labels/tube"
-    part = load(path, channel=1, crop="4:14,:,:")
-    save(Field((part.values > 110).astype(np.uint16) * 700, part.spacing, part.unit, part.affine), path / "labels/part")
+    save(Field(part.values.astype(np.uint16) * 700, part.spacing, part.unit, part.affine), path / "labels/part")
     assert {name: data for name, data in files(path).items() if not name.startswith("labels")} == before
     assert content(path / "labels", version)["labels"] == ["tube", "part"]
     own = content(path / "labels/tube", version)
@@ -82,37 +86,25 @@ def test_labels_lie_on_the_image_and_are_listed(image: tuple[Path, str]) -> None
         assert scale["scale"] == [2**k * h for h in SPACING] and first["translation"] == [3, 2, 1]
     back = load(f"{path}::labels/tube")
     assert back.values.dtype == np.uint8 and np.array_equal(back.values, mask.values)
-    np.testing.assert_array_equal(back.affine, field.affine)
+    np.testing.assert_array_equal(back.affine, mask.affine)
     low = load(f"{path}::labels/part")
     assert low.values.max() == 700 and low.affine is not None and low.affine[:3, 3].tolist() == [1, 2, 5]
     assert load(path, channel=1).shape == SHAPE  # the image is still what the store is read as
+    np.testing.assert_allclose(load(save(part, path.parent / "part.zarr")).affine, part.affine)
 
 
-def test_a_crop_keeps_its_place_in_a_store_of_its_own(image: tuple[Path, str], tmp_path: Path) -> None:
-    part = load(image[0], channel=1, crop="4:14,8:,:")
-    back = load(save(part, tmp_path / "part.zarr"))
-    np.testing.assert_allclose(back.affine, part.affine)
-
-
-def test_labels_are_replaced_by_what_wrote_them_alone(image: tuple[Path, str]) -> None:
+def test_labels_are_replaced_by_what_wrote_them_alone_and_a_consolidated_store_shows_them(image) -> None:
     path, version = image
-    field = load(path, channel=1)
-    mask = Field(field.values > 110, field.spacing, field.unit, field.affine)
-    for _ in range(2):
-        save(mask, path / "labels/tube", kind="ours")
-    assert content(path / "labels", version)["labels"] == ["tube"]
-    with pytest.raises(ValueError, match="not free"):
-        save(mask, path / "labels/tube", kind="other")
-
-
-def test_a_consolidated_store_shows_its_labels(image: tuple[Path, str]) -> None:
-    path = image[0]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         zarr.consolidate_metadata(path)
-    field = load(path, channel=1)
-    save(Field(field.values > 110, field.spacing, field.unit, field.affine), path / "labels/tube")
+    mask = tube_of(path)
+    for _ in range(2):
+        save(mask, path / "labels/tube", kind="ours")
+    assert content(path / "labels", version)["labels"] == ["tube"]
     assert "labels/tube/0" in dict(zarr.open_group(path, mode="r").members(max_depth=None))
+    with pytest.raises(ValueError, match="not free"):
+        save(mask, path / "labels/tube", kind="other")
 
 
 @pytest.mark.parametrize(
@@ -135,12 +127,14 @@ def test_other_voxels_are_refused(image: tuple[Path, str], change: dict[str, Any
 
 
 def test_an_image_of_another_version_or_none_is_refused(tmp_path: Path) -> None:
-    group = zarr.open_group(tmp_path / "scan.zarr", mode="w")
-    with pytest.raises(ScanError, match="no image of OME-Zarr"):
-        save(Field(np.eye(4, dtype=bool)[None] | np.zeros((4, 4, 4), bool)), tmp_path / "scan.zarr/labels/a")
-    group.attrs["ome"] = {"version": "0.6", "multiscales": [{}]}
-    with pytest.raises(ScanError, match=r"OME-Zarr 0\.6"):
-        save(Field(np.eye(4, dtype=bool)[None] | np.zeros((4, 4, 4), bool)), tmp_path / "scan.zarr/labels/a")
+    group, mask = zarr.open_group(tmp_path / "scan.zarr", mode="w"), Field(np.indices((4, 4, 4))[0] > 1)
+    for attributes, words in (
+        ({}, "no image of OME-Zarr"),
+        ({"version": "0.6", "multiscales": [{}]}, r"OME-Zarr 0\.6"),
+    ):
+        group.attrs["ome"] = attributes
+        with pytest.raises(ScanError, match=words):
+            save(mask, tmp_path / "scan.zarr/labels/a")
 
 
 def test_levels_that_disagree_are_said_and_one_can_be_named(image: tuple[Path, str]) -> None:
@@ -160,8 +154,7 @@ def test_levels_that_disagree_are_said_and_one_can_be_named(image: tuple[Path, s
 
 def test_an_interrupted_writing_is_made_whole_by_the_next(image: tuple[Path, str], monkeypatch) -> None:
     path, version = image
-    field = load(path, channel=1)
-    mask = Field(field.values > 110, field.spacing, field.unit, field.affine)
+    mask = tube_of(path)
     with monkeypatch.context() as patch:
         patch.setattr("curvafit.volumes.formats.zarr.write_content", lambda *_: (_ for _ in ()).throw(OSError("full")))
         with pytest.raises(OSError, match="full"):
@@ -186,12 +179,7 @@ def test_a_command_writes_labels_and_the_rest_beside_the_store(image: tuple[Path
     truth = load(path, channel=1).values > 110
     assert (load(f"{path}::labels/tube").values == truth).mean() > 0.97
     before = files(path.parent)
-    refused(
-        call(*command, "--spacing", 0.3, "--unit", "um", "-o", "scan.zarr/labels/tube"),
-        "voxels of a level",
-        progress=True,
-    )
-    refused(
-        call("segment", "scan.zarr::labels/tube", *command[4:], "-o", "scan.zarr/labels/tube"), "write over the input"
-    )
+    target = ("-o", "scan.zarr/labels/tube")
+    refused(call(*command, "--spacing", 0.3, "--unit", "um", *target), "voxels of a level", progress=True)
+    refused(call("segment", "scan.zarr::labels/tube", *command[4:], *target), "write over the input")
     assert files(path.parent) == before

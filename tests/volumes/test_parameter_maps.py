@@ -28,18 +28,15 @@ def test_an_npz_and_a_folder_say_the_same(tmp_path: Path) -> None:
         assert torch.equal(maps["mass"], torch.from_numpy((-RAMP / 4).astype(np.float32)))
 
 
-def test_one_number_holds_everywhere(tmp_path: Path) -> None:
+def test_one_number_holds_everywhere_and_a_folder_may_hold_constants(tmp_path: Path) -> None:
     np.savez(tmp_path / "maps.npz", a11=-3, epsilon=np.array([0.02]))
     maps = read_maps(tmp_path / "maps.npz", (9, 9, 9))
     assert maps == {"a11": -3.0, "epsilon": 0.02} and map_shape(maps) is None
-
-
-def test_a_folder_may_hold_constants_and_single_numbers(tmp_path: Path) -> None:
-    np.save(tmp_path / "a20.npy", np.full((4, 5, 6), 2.0))
-    np.save(tmp_path / "mass.npy", np.full((1, 1, 1), -0.5))
-    maps = read_maps(tmp_path)
-    assert map_shape(maps) == (4, 5, 6) and bool((maps["a20"] == 2).all())
-    assert maps["mass"] == -0.5
+    folder = tmp_path / "maps"
+    save(np.full((4, 5, 6), 2.0), folder / "a20.npy")
+    save(np.full((1, 1, 1), -0.5), folder / "mass.npy")
+    maps = read_maps(folder)
+    assert map_shape(maps) == (4, 5, 6) and bool((maps["a20"] == 2).all()) and maps["mass"] == -0.5
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,57 +27,36 @@ TURNED = np.array([[0, -0.2, 0, 5.0], [0.1, 0, 0, -7.0], [0, 0, 0.3, 11.0], [0, 
 # ---- channels --------------------------------------------------------------------------------------------------------
 
 
-def write_ome_tiff(path: Path) -> None:
-    tifffile.imwrite(path, CHANNELS, ome=True, photometric="minisblack", metadata={"axes": "CZYX"})
+LAST = np.moveaxis(CHANNELS, 0, -1)
 
 
-def write_imagej(path: Path) -> None:
-    values = np.moveaxis(CHANNELS, 0, 1)
-    tifffile.imwrite(path, values, imagej=True, photometric="minisblack", metadata={"axes": "ZCYX"})
-
-
-def write_rgb(path: Path) -> None:
-    tifffile.imwrite(path, np.moveaxis(CHANNELS, 0, -1).astype(np.uint16), photometric="rgb")
+def tiff(values: np.ndarray, axes: str | None = None, **options: object) -> Callable[[Path], None]:
+    options = {"photometric": "minisblack", **options, **({"metadata": {"axes": axes}} if axes else {})}
+    return lambda path: tifffile.imwrite(path, values, **options)  # type: ignore[arg-type]
 
 
 def write_rgb_slices(path: Path) -> None:
     path.mkdir()
-    for z, plane in enumerate(np.moveaxis(CHANNELS, 0, -1).astype(np.uint16)):
-        tifffile.imwrite(path / f"{z}.tif", plane, photometric="rgb")
+    for z, plane in enumerate(LAST.astype(np.uint16)):
+        tiff(plane, photometric="rgb")(path / f"{z}.tif")
 
 
-def write_nifti(path: Path) -> None:
-    nibabel.save(nibabel.Nifti1Image(CHANNELS.T, np.diag([0.1, 0.2, 0.3, 1])), path)
+def nifti(values: np.ndarray) -> Callable[[Path], None]:
+    return lambda path: nibabel.save(nibabel.Nifti1Image(values.T, np.diag([0.1, 0.2, 0.3, 1])), path)
 
 
-def write_vector_nifti(path: Path) -> None:
-    nibabel.save(nibabel.Nifti1Image(CHANNELS[:, None].T, np.diag([0.1, 0.2, 0.3, 1])), path)
+def nrrd(values: np.ndarray, **header: object) -> Callable[[Path], None]:
+    return lambda path: pytest.importorskip("nrrd").write(str(path), values, header, index_order="C")
 
 
-def write_nrrd(path: Path) -> None:
-    nrrd = pytest.importorskip("nrrd")
-    directions = np.array([[np.nan] * 3, [0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]])
-    header = {"space": "right-anterior-superior", "space directions": directions, "space origin": [0, 0, 0]}
-    nrrd.write(
-        str(path), np.moveaxis(CHANNELS, 0, -1), {**header, "kinds": ["vector", *["domain"] * 3]}, index_order="C"
-    )
+def metaimage(values: np.ndarray, vector: bool, edges: tuple[float, ...]) -> Callable[[Path], None]:
+    def write(path: Path) -> None:
+        itk = pytest.importorskip("SimpleITK")
+        image = itk.GetImageFromArray(values, isVector=vector)
+        image.SetSpacing(edges)
+        itk.WriteImage(image, str(path))
 
-
-def write_kinds_nrrd(path: Path) -> None:
-    nrrd = pytest.importorskip("nrrd")
-    nrrd.write(str(path), CHANNELS, {"kinds": [*["domain"] * 3, "list"]}, index_order="C")
-
-
-def write_mha(path: Path) -> None:
-    itk = pytest.importorskip("SimpleITK")
-    image = itk.GetImageFromArray(np.moveaxis(CHANNELS, 0, -1), isVector=True)
-    image.SetSpacing((0.1, 0.2, 0.3))
-    itk.WriteImage(image, str(path))
-
-
-def write_times_mha(path: Path) -> None:
-    itk = pytest.importorskip("SimpleITK")
-    itk.WriteImage(itk.GetImageFromArray(CHANNELS, isVector=False), str(path))
+    return write
 
 
 def write_ome_zarr(path: Path) -> None:
@@ -91,26 +69,28 @@ def write_ome_zarr(path: Path) -> None:
 
 def write_hdf5(path: Path) -> None:
     with h5py.File(path, "w") as file:
-        file["raw"] = np.moveaxis(CHANNELS, 0, -1)
+        file["raw"] = LAST
 
 
+DIRECTIONS = np.array([[np.nan] * 3, [0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]])
+PLACED = {"space": "right-anterior-superior", "space directions": DIRECTIONS, "space origin": [0, 0, 0]}
 CHANNELLED: dict[str, tuple[str, Callable[[Path], None]]] = {
-    "ome-tiff": ("scan.ome.tif", write_ome_tiff),
-    "imagej": ("scan.tif", write_imagej),
-    "rgb": ("rgb.tif", write_rgb),
+    "ome-tiff": ("scan.ome.tif", tiff(CHANNELS, "CZYX", ome=True)),
+    "imagej": ("scan.tif", tiff(np.moveaxis(CHANNELS, 0, 1), "ZCYX", imagej=True)),
+    "rgb": ("rgb.tif", tiff(LAST.astype(np.uint16), photometric="rgb")),
     "rgb slices": ("slices", write_rgb_slices),
-    "nifti": ("scan.nii", write_nifti),
-    "nifti.gz": ("scan.nii.gz", write_nifti),
-    "vector nifti": ("scan.nii", write_vector_nifti),
-    "nrrd": ("scan.nrrd", write_nrrd),
-    "nrrd kinds": ("scan.nrrd", write_kinds_nrrd),
-    "mha": ("scan.mha", write_mha),
-    "mha times": ("scan.mha", write_times_mha),
+    "nifti": ("scan.nii", nifti(CHANNELS)),
+    "nifti.gz": ("scan.nii.gz", nifti(CHANNELS)),
+    "vector nifti": ("scan.nii", nifti(CHANNELS[:, None])),
+    "nrrd": ("scan.nrrd", nrrd(LAST, **PLACED, kinds=["vector", *["domain"] * 3])),
+    "nrrd kinds": ("scan.nrrd", nrrd(CHANNELS, kinds=[*["domain"] * 3, "list"])),
+    "mha": ("scan.mha", metaimage(LAST, True, (0.1, 0.2, 0.3))),
+    "mha times": ("scan.mha", metaimage(CHANNELS, False, (1.0,) * 4)),
     "ome-zarr": ("scan.ome.zarr", write_ome_zarr),
     "hdf5": ("scan.h5", write_hdf5),
     "npy": ("scan.npy", lambda path: np.save(path, CHANNELS)),
     "npy, fortran": ("scan.npy", lambda path: np.save(path, np.asfortranarray(CHANNELS))),
-    "npz": ("scan.npz", lambda path: np.savez(path, np.moveaxis(CHANNELS, 0, -1))),
+    "npz": ("scan.npz", lambda path: np.savez(path, LAST)),
 }
 
 
@@ -174,7 +154,7 @@ def written(path: Path) -> tuple[Path, dict]:
 
 
 @pytest.mark.parametrize("name", WRITTEN)
-def test_a_crop_is_where_it_was_in_the_whole(tmp_path: Path, name: str) -> None:
+def test_a_crop_is_where_it_was_in_the_whole_or_refused(tmp_path: Path, name: str) -> None:
     path, options = written(tmp_path / name)
     whole = load(path, **options)
     box = (slice(2, 5), slice(1, 4), slice(3, None))
@@ -186,6 +166,9 @@ def test_a_crop_is_where_it_was_in_the_whole(tmp_path: Path, name: str) -> None:
         full = nibabel.load(save(whole, tmp_path / "whole.nii"))
         assert image.affine @ [0, 1, 2, 1] == pytest.approx(full.affine @ [3, 2, 4, 1], rel=1e-5)
         assert np.asanyarray(image.dataobj)[0, 1, 2] == np.asanyarray(full.dataobj)[3, 2, 4]
+    for crop in ("0:7,:,:", ":,3:3,:", ":,:,5:2", ":,:,-9:"):
+        with pytest.raises(ScanError, match="crop"):
+            load(path, crop=crop, **options)
 
 
 edges = st.integers(-9, 9) | st.none()
@@ -214,16 +197,8 @@ def test_what_is_no_crop_is_refused() -> None:
             field_of(VALUES, crop=crop)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("name", WRITTEN)
-def test_a_crop_outside_is_refused(tmp_path: Path, name: str) -> None:
-    path, options = written(tmp_path / name)
-    for crop in ("0:7,:,:", ":,3:3,:", ":,:,5:2", ":,:,-9:"):
-        with pytest.raises(ScanError, match="crop"):
-            load(path, crop=crop, **options)
-
-
 @pytest.mark.parametrize("name", ["scan.nii", "scan.npy", "scan.raw", "scan.zarr", "scan.h5"])
-def test_no_more_than_the_crop_needs_memory(tmp_path: Path, name: str, monkeypatch) -> None:
+def test_no_more_than_the_crop_needs_memory_and_a_cut_file_is_refused(tmp_path: Path, name: str, monkeypatch) -> None:
     path, options = written(tmp_path / name)
     monkeypatch.setattr("curvafit.volumes.formats.base.memory", lambda: VALUES.nbytes // 2)
     part = load(path, crop="0:2,:,:", **options)
@@ -231,38 +206,32 @@ def test_no_more_than_the_crop_needs_memory(tmp_path: Path, name: str, monkeypat
     if name != "scan.raw":
         with pytest.raises(ScanError, match="memory"):
             load(path, **options)
-
-
-@pytest.mark.parametrize("name", ["scan.nii", "scan.npy", "scan.raw"])
-def test_a_truncated_file_is_refused_whatever_the_crop(tmp_path: Path, name: str) -> None:
-    path, options = written(tmp_path / name)
-    path.write_bytes(path.read_bytes()[:-8])
-    with pytest.raises(ScanError, match="cannot be read|bytes"):
-        load(path, crop="0:2,:,:", **options)
+    if path.suffix in (".nii", ".npy", ".raw"):  # a file that is cut is refused whatever the crop
+        path.write_bytes(path.read_bytes()[:-8])
+        with pytest.raises(ScanError, match="cannot be read|bytes"):
+            load(path, crop="0:2,:,:", **options)
 
 
 # ---- labels ----------------------------------------------------------------------------------------------------------
 
 
-@given(st.integers(0, 3))
-@settings(max_examples=8, deadline=None)
-def test_a_label_is_a_mask(label: int) -> None:
+@pytest.mark.parametrize("label", range(4))
+def test_a_label_is_a_mask(tmp_path: Path, label: int) -> None:
     labels = np.random.default_rng(0).integers(0, 4, SHAPE).astype(np.uint8)
-    with tempfile.TemporaryDirectory() as folder:
-        path = save(labels, Path(folder) / "labels.nii.gz")
-        for mask in (load(path, label=label), field_of(labels, label=label), Field(labels).label(label)):
-            assert mask.values.dtype == bool and np.array_equal(mask.values, labels == label)
-            assert f"The structure is label {label}." in mask.notes
+    path = save(labels, tmp_path / "labels.nii.gz")
+    for mask in (load(path, label=label), field_of(labels, label=label), Field(labels).label(label)):
+        assert mask.values.dtype == bool and np.array_equal(mask.values, labels == label)
+        assert f"The structure is label {label}." in mask.notes
 
 
 def test_a_label_that_is_not_there_is_told_those_that_are() -> None:
     labels = np.where(VALUES > 200, 7, 3)
     labels[0] = 0
-    with pytest.raises(ScanError, match="0, 3, 7"):
-        field_of(labels, label=5)
-    with pytest.raises(ScanError, match="0, 3"):
-        field_of(labels, label=7, crop=":3,:,:")
-    with pytest.raises(ScanError, match="label"):
-        field_of(labels, label=0, crop=":1,:,:")
-    with pytest.raises(ValueError, match="label"):
-        field_of(labels, label=0.5)  # type: ignore[arg-type]
+    for label, crop, word in (
+        (5, None, "0, 3, 7"),
+        (7, ":3,:,:", "0, 3"),
+        (0, ":1,:,:", "label"),
+        (0.5, None, "label"),
+    ):
+        with pytest.raises(ValueError, match=word):
+            field_of(labels, label=label, crop=crop)  # type: ignore[arg-type]

@@ -51,6 +51,8 @@ def test_a_shift_leaves_zeros_beyond_and_a_unit_converts() -> None:
         assert "beyond" in note
         with pytest.raises(ScanError, match="covers"):
             lay(field, SCAN, "the image", "the slices", exact=True)
+    with pytest.raises(ScanError, match="covers 0%"):
+        lay(world(LABELS, H * np.eye(3), AFFINE[:3, 3] + 7 * H), SCAN, "the region", "the scan")
 
 
 @pytest.mark.parametrize("factor", [2, 0.5])
@@ -92,11 +94,6 @@ def test_without_a_place_equal_shapes_go_voxel_by_voxel(placed: str) -> None:
     assert ["voxel by voxel" in note for note in notes] == [True] * (placed != "neither")
     with pytest.raises(ScanError, match="shape"):
         lay(Field(LABELS[1:], field.spacing, field.unit, field.affine), scan, "the region", "the scan")
-
-
-def test_a_region_that_does_not_meet_the_scan_is_refused() -> None:
-    with pytest.raises(ScanError, match="covers 0%"):
-        lay(world(LABELS, H * np.eye(3), AFFINE[:3, 3] + 7 * H), SCAN, "the region", "the scan")
 
 
 @pytest.mark.parametrize("placed", ["both", "scan", "region", "neither"])

@@ -20,7 +20,7 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from curvafit import infer, refine, segment
+from curvafit import infer, segment
 from curvafit.core.units import parse_unit
 from curvafit.volumes import Field, ScanError, field_of, load, save
 from curvafit.volumes.formats.tiff import natural_key
@@ -28,6 +28,7 @@ from curvafit.volumes.read import READERS
 
 UNITS = ("voxel", "nm", "um", "mm", "m")
 VALUES = (np.random.default_rng(0).random((9, 10, 11)) * 200 + 1).astype(np.uint16)
+BALL = (np.linalg.norm(np.indices((10, 11, 12)).T - (4.5, 5.0, 5.5), axis=-1).T < 4).astype(np.float32)
 
 
 def ramp(shape: tuple[int, ...] = (4, 5, 6), dtype: str = "float32") -> np.ndarray:
@@ -38,6 +39,13 @@ def ramp(shape: tuple[int, ...] = (4, 5, 6), dtype: str = "float32") -> np.ndarr
 def refused(path: Path | str, said: str, **options: object) -> None:
     with pytest.raises(ScanError, match=rf"^[^\n]*{said}[^\n]*$"):
         load(path, **options)  # type: ignore[arg-type]
+
+
+def hdf5(path: Path, **datasets: object) -> Path:
+    with h5py.File(path, "w") as file:
+        for name, values in datasets.items():
+            file[name] = values
+    return path
 
 
 lengths = st.floats(1e-3, 1e3, allow_nan=False).map(lambda h: float(f"{h:.6g}"))
@@ -52,15 +60,11 @@ def test_every_kind_of_source_is_one_field(tmp_path: Path) -> None:
     path = save(field, tmp_path / "scan.nii.gz")
     at = {"spacing": (3.0, 2.0, 1.0), "unit": "um"}
     assert field_of(field) is field
-    for source in (
-        field_of(str(path)),
-        field_of(path),
-        field_of(ramp(), **at),
-        field_of(torch.from_numpy(ramp()), **at),
-    ):
+    tensor = torch.from_numpy(ramp())
+    for source in (field_of(str(path)), field_of(path), field_of(ramp(), **at), field_of(tensor, **at)):
         assert np.array_equal(source.values, ramp())
         assert (source.spacing, source.unit) == ((3, 2, 1), "um")
-    bare = field_of(torch.from_numpy(ramp()).bfloat16().requires_grad_())
+    bare = field_of(tensor.bfloat16().requires_grad_())
     assert (bare.spacing, bare.unit, bare.values.dtype) == ((1, 1, 1), "voxel", np.float32)
 
 
@@ -77,6 +81,7 @@ def test_every_kind_of_source_is_one_field(tmp_path: Path) -> None:
         (np.where(ramp() == 7, np.nan, ramp()), {}, "NaN"),
         (ramp() * 1j, {}, "complex"),
         ([[[1.0]]], {}, "volume"),
+        *((ramp().astype(kind), {}, "real numbers") for kind in (str, complex, object)),
     ],
 )
 def test_sources_and_options_that_do_not_fit_are_refused(source, options: dict, word: str) -> None:
@@ -84,28 +89,13 @@ def test_sources_and_options_that_do_not_fit_are_refused(source, options: dict, 
         field_of(source, **options)
 
 
-@pytest.mark.parametrize(
-    "job", [infer, lambda *a, **o: segment(*a, "tubes", **o), lambda *a, **o: refine(*a, "tubes", weight=1, **o)]
-)
+@pytest.mark.parametrize("job", [infer, lambda *a, **o: segment(*a, "tubes", **o)])
 def test_no_job_drops_an_option_in_silence(job) -> None:
-    ball = (np.linalg.norm(np.indices((10, 11, 12)).T - (4.5, 5.0, 5.5), axis=-1).T < 4).astype(np.float32)
     for options, word in (({"spacing": 2}, "spacing"), ({"unit": "mm"}, "unit"), ({"strict": True}, "strict")):
         with pytest.raises(ScanError, match=word):
-            job(Field(ball), **options)
+            job(Field(BALL), **options)
     with pytest.raises(ScanError, match="volume"):
         job(None)
-
-
-def test_segment_takes_each_source(tmp_path: Path) -> None:
-    ball = (np.linalg.norm(np.indices((10, 11, 12)).T - (4.5, 5.0, 5.5), axis=-1).T < 4).astype(np.float32)
-    at = {"spacing": (3.0, 2.0, 2.0), "unit": "um"}
-    scan = Field(100 * ball + np.random.default_rng(0).normal(0, 20, ball.shape).astype(np.float32), **at)
-    wanted = segment(scan, "tubes", steps=2)
-    path = save(scan, tmp_path / "scan.nii.gz")
-    for source, options in ((path, {}), (scan.values, at), (torch.from_numpy(scan.values), at)):
-        found = segment(source, "tubes", steps=2, **options)
-        assert np.array_equal(found.mask.values, wanted.mask.values)
-        assert (found.mask.spacing, found.mask.unit) == (scan.spacing, "um")
 
 
 def test_a_field_is_one_line_and_equals_itself() -> None:
@@ -118,23 +108,15 @@ def test_a_field_is_one_line_and_equals_itself() -> None:
 # ---- what files say --------------------------------------------------------------------------------------------------
 
 
-def test_nifti_without_unit_is_taken_for_millimetres_and_said(tmp_path: Path) -> None:
-    nibabel.save(nibabel.Nifti1Image(ramp(), np.diag([0.1, 0.2, 0.3, 1])), tmp_path / "scan.nii")
-    field = load(tmp_path / "scan.nii")
-    assert (field.spacing, field.unit) == ((0.3, 0.2, 0.1), "mm")
-    assert field.notes == ("The file names no unit of length: mm is assumed.",)
-    assert load(tmp_path / "scan.nii", unit="um").notes == ()
-
-
-def test_nifti_scaling_and_singleton_axes(tmp_path: Path) -> None:
-    image = nibabel.Nifti1Image(ramp((4, 5, 6, 1), "int16"), np.diag([1, 2, 3, 1]))
+def test_nifti_scaling_singleton_axes_and_a_unit_that_is_not_named(tmp_path: Path) -> None:
+    image = nibabel.Nifti1Image(ramp((4, 5, 6, 1), "int16"), np.diag([0.1, 0.2, 0.3, 1]))
     image.header.set_slope_inter(2, 5)
-    image.header.set_xyzt_units("mm")
     nibabel.save(image, tmp_path / "scan.nii")
     field = load(tmp_path / "scan.nii")
-    assert field.shape == (6, 5, 4)
-    assert field.spacing == (3, 2, 1)
+    assert (field.shape, field.spacing, field.unit) == ((6, 5, 4), (0.3, 0.2, 0.1), "mm")
     assert field.values.max() > 119  # scaled by what the header says on reading
+    assert field.notes == ("The file names no unit of length: mm is assumed.",)
+    assert load(tmp_path / "scan.nii", unit="um").notes == ()
 
 
 def imagej(**metadata: object) -> dict:
@@ -169,16 +151,18 @@ def test_tiff_states_its_spacing_in_many_ways(tmp_path: Path, options: dict, spa
     assert (given.spacing, given.unit, given.notes) == ((3, 2, 1), "nm", ())
 
 
-def test_a_folder_of_slices_is_sorted_naturally(tmp_path: Path) -> None:
+def test_a_folder_of_slices_is_sorted_naturally_and_says_what_is_skipped(tmp_path: Path) -> None:
     for number, plane in enumerate(ramp((12, 5, 6), "uint8")):
         tifffile.imwrite(tmp_path / f"slice{number}.tif", plane, resolution=(1000, 1000), resolutionunit="CENTIMETER")
-    field = load(tmp_path)
+    field = load(tmp_path, strict=True)
     assert np.array_equal(field.values, ramp((12, 5, 6), "uint8"))
     assert field.spacing == pytest.approx((0.01, 0.01, 0.01))
     assert any("distance of slices" in note for note in field.notes)
+    (tmp_path / "slice5.tif").unlink()
+    assert any("skip some, after slice4 for one" in note for note in load(tmp_path).notes)
+    refused(tmp_path, "skip some", strict=True)
     tifffile.imwrite(tmp_path / "slice12.tif", np.zeros((5, 7), np.uint8))
-    with pytest.raises(ScanError, match="slice12.tif"):
-        load(tmp_path)
+    refused(tmp_path, "slice12.tif")
 
 
 @given(st.lists(st.integers(0, 10**6), min_size=2, max_size=8, unique=True))
@@ -188,11 +172,11 @@ def test_natural_order_is_that_of_the_numbers(numbers: list[int]) -> None:
 
 
 def test_hdf5_and_npz_keys(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "scan.h5", "w") as file:
-        file["group/raw"] = ramp()
+    path = hdf5(tmp_path / "scan.h5", **{"group/raw": ramp()})
+    with h5py.File(path, "a") as file:
         file["group/raw"].attrs["element_size_um"] = [3.0, 2.0, 1.0]
-    assert load(tmp_path / "scan.h5").spacing == (3, 2, 1)
-    with h5py.File(tmp_path / "scan.h5", "a") as file:
+    assert load(path).spacing == (3, 2, 1)
+    with h5py.File(path, "a") as file:
         file["label"] = ramp(dtype="uint16")
         file["label"].attrs.update({"spacing": 0.5, "unit": "mm"})
     np.savez(tmp_path / "scan.npz", raw=ramp(), label=ramp(dtype="uint16"))
@@ -200,27 +184,31 @@ def test_hdf5_and_npz_keys(tmp_path: Path) -> None:
         labels = load(f"{tmp_path / name}::label")
         assert labels.values.dtype == np.uint16
         assert np.array_equal(load(tmp_path / name, key="label").values, labels.values)
-        with pytest.raises(ScanError, match="label"):
-            load(tmp_path / name)
-        with pytest.raises(ScanError, match="label"):
-            load(f"{tmp_path / name}::no")
+        refused(tmp_path / name, "label")
+        refused(f"{tmp_path / name}::no", "label")
     field = load(tmp_path / "scan.h5::label")
     assert (field.spacing, field.unit, field.source) == ((0.5, 0.5, 0.5), "mm", f"{tmp_path / 'scan.h5'}::label")
 
 
+@pytest.mark.parametrize("unit", [b"um", ["um"], np.array([b"um"])])
+def test_a_unit_in_bytes_or_in_a_list_of_one(tmp_path: Path, unit) -> None:
+    path = hdf5(tmp_path / "a.h5", raw=VALUES)
+    with h5py.File(path, "a") as file:
+        file["raw"].attrs.update({"spacing": np.array([2]), "unit": unit})
+    assert (load(path).spacing, load(path).unit) == ((2, 2, 2), "um")
+
+
 @pytest.mark.parametrize("dtype", ["uint8", ">u2", "<f4"])
 def test_raw_files(tmp_path: Path, dtype: str) -> None:
-    ramp(dtype="uint8").astype(dtype).tofile(tmp_path / "scan.raw")
-    field = load(tmp_path / "scan.raw", raw_shape=(4, 5, 6), dtype=dtype)
+    path = tmp_path / "scan.raw"
+    ramp(dtype="uint8").astype(dtype).tofile(path)
+    field = load(path, raw_shape=(4, 5, 6), dtype=dtype)
     assert np.array_equal(field.values, ramp())
     assert field.values.dtype.isnative
-    with pytest.raises(ScanError, match="bytes"):
-        load(tmp_path / "scan.raw", raw_shape=(4, 5, 7), dtype=dtype)
-    with pytest.raises(ScanError, match="raw-shape"):
-        load(tmp_path / "scan.raw")
+    refused(path, "bytes", raw_shape=(4, 5, 7), dtype=dtype)
+    refused(path, "raw-shape")
     if dtype != "uint8":
-        with pytest.raises(ScanError, match="dtype"):
-            load(tmp_path / "scan.raw", raw_shape=(4, 5, 6))
+        refused(path, "dtype", raw_shape=(4, 5, 6))
 
 
 @given(spacings, spacings, st.sampled_from(UNITS), st.sampled_from((*UNITS, "cm", "µm", None)))
@@ -239,43 +227,24 @@ def test_arguments_override_the_file_and_the_affine_follows(stated, given_spacin
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("µm", ("um", 1)),
-        ("Micron", ("um", 1)),
-        ("\\u00B5m", ("um", 1)),
-        ("Å", ("nm", 0.1)),
-        ("cm", ("mm", 10)),
-        ("meter", ("m", 1)),
-        (None, ("voxel", 1)),
+        ("µm", ("um", 1)), ("Micron", ("um", 1)), ("\\u00B5m", ("um", 1)), ("Å", ("nm", 0.1)), ("cm", ("mm", 10)),
+        ("meter", ("m", 1)), (None, ("voxel", 1)),
     ],
-)
+)  # fmt: skip
 def test_units_have_one_name(name: str | None, expected: tuple[str, float]) -> None:
     assert parse_unit(name) == expected
 
 
 @pytest.mark.parametrize("compression", ["lzw", "deflate", "adobe_deflate", "packbits", "zstd", "jpeg2000"])
-@pytest.mark.parametrize("predictor", [False, True])
-def test_compressed_tiffs_and_slices_are_read(tmp_path: Path, compression: str, predictor: bool) -> None:
-    options: dict = {"photometric": "minisblack", "compression": compression}
-    if predictor and compression not in ("packbits", "jpeg2000"):
-        options["predictor"] = True
-    tifffile.imwrite(tmp_path / "scan.tif", VALUES, imagej=True, metadata={"axes": "ZYX", "spacing": 2}, **options)
-    assert np.array_equal(load(tmp_path / "scan.tif").values, VALUES)
-    (tmp_path / "slices").mkdir()
-    for number, plane in enumerate(VALUES):
-        tifffile.imwrite(tmp_path / "slices" / f"{number}.tif", plane, rowsperstrip=3, **options)
-    assert np.array_equal(load(tmp_path / "slices").values, VALUES)
-
-
-def test_strips_and_pages_that_are_not_there_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "scan.tif"
-    tifffile.imwrite(path, VALUES, photometric="minisblack", compression="lzw", rowsperstrip=3, metadata=None)
-    with tifffile.TiffFile(path) as file:
-        tag = file.pages[4].tags["StripByteCounts"]  # type: ignore[union-attr]
-        place, count = tag.valueoffset, tag.count
-    content = bytearray(path.read_bytes())
-    content[place : place + 2 * count] = bytes(2 * count)
-    path.write_bytes(content)
-    refused(path, "page 4")
+def test_compressed_tiffs_and_slices_are_read(tmp_path: Path, compression: str) -> None:
+    for predictor in (False, True) if compression not in ("packbits", "jpeg2000") else (False,):
+        options: dict = {"photometric": "minisblack", "compression": compression, "predictor": predictor}
+        tifffile.imwrite(tmp_path / "scan.tif", VALUES, imagej=True, metadata={"axes": "ZYX", "spacing": 2}, **options)
+        assert np.array_equal(load(tmp_path / "scan.tif").values, VALUES)
+        (tmp_path / "slices").mkdir(exist_ok=True)
+        for number, plane in enumerate(VALUES):
+            tifffile.imwrite(tmp_path / "slices" / f"{number}.tif", plane, rowsperstrip=3, **options)
+        assert np.array_equal(load(tmp_path / "slices").values, VALUES)
 
 
 # ---- the extra formats -----------------------------------------------------------------------------------------------
@@ -283,12 +252,8 @@ def test_strips_and_pages_that_are_not_there_are_refused(tmp_path: Path) -> None
 
 def test_nrrd(tmp_path: Path) -> None:
     nrrd = pytest.importorskip("nrrd")
-    header = {
-        "space": "left-posterior-superior",
-        "space directions": np.diag([1.0, 2.0, 3.0]),
-        "space units": ["mm"] * 3,
-    }
-    nrrd.write(str(tmp_path / "scan.nrrd"), ramp().T, header)
+    header = {"space": "left-posterior-superior", "space directions": np.diag([1.0, 2.0, 3.0])}
+    nrrd.write(str(tmp_path / "scan.nrrd"), ramp().T, {**header, "space units": ["mm"] * 3})
     field = load(tmp_path / "scan.nrrd")
     assert np.array_equal(field.values, ramp())
     assert (field.spacing, field.unit) == ((3, 2, 1), "mm")
@@ -296,48 +261,38 @@ def test_nrrd(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_metaimages_lie_where_itk_puts_them(tmp_path: Path, packed: bool) -> None:
+@pytest.mark.parametrize("suffix", [".mha", ".mhd"])
+def test_metaimages_lie_where_itk_puts_them(tmp_path: Path, packed: bool, suffix: str) -> None:
     itk = pytest.importorskip("SimpleITK")
     turned, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
-    for suffix in (".mha", ".mhd"):
-        for dtype in ("uint8", "int16", "uint32", "int64", "float32", "float64"):
-            image = itk.GetImageFromArray(VALUES.astype(dtype))
-            image.SetDirection(turned.ravel().tolist())
-            image.SetSpacing((1, 2, 3))
-            image.SetOrigin((5, 6, 7))
-            itk.WriteImage(image, str(tmp_path / f"scan{suffix}"), packed)
-            field = load(tmp_path / f"scan{suffix}")
-            assert field.values.dtype == dtype and np.array_equal(field.values, VALUES)
-            corner = image.TransformIndexToPhysicalPoint((10, 9, 8))
-            flipped = np.array([-1, -1, 1]) * corner
-            assert (field.affine @ [10, 9, 8, 1])[:3] == pytest.approx(flipped)
-
-
-def test_mrc_is_in_nanometres(tmp_path: Path) -> None:
-    mrcfile = pytest.importorskip("mrcfile")
-    with mrcfile.new(tmp_path / "scan.mrc", ramp()) as file:
-        file.voxel_size = (10, 20, 30)
-    field = load(tmp_path / "scan.mrc")
-    assert np.array_equal(field.values, ramp())
-    assert field.unit == "nm"
-    assert field.spacing == pytest.approx((3, 2, 1))
+    for dtype in ("uint8", "int16", "uint32", "int64", "float32", "float64"):
+        image = itk.GetImageFromArray(VALUES.astype(dtype))
+        image.SetDirection(turned.ravel().tolist())
+        image.SetSpacing((1, 2, 3))
+        image.SetOrigin((5, 6, 7))
+        itk.WriteImage(image, str(tmp_path / f"scan{suffix}"), packed)
+        field = load(tmp_path / f"scan{suffix}")
+        assert field.values.dtype == dtype and np.array_equal(field.values, VALUES)
+        flipped = np.array([-1, -1, 1]) * image.TransformIndexToPhysicalPoint((10, 9, 8))
+        assert (field.affine @ [10, 9, 8, 1])[:3] == pytest.approx(flipped)
 
 
 def test_dicom_slices_are_ordered_by_position(tmp_path: Path) -> None:
-    pydicom = pytest.importorskip("pydicom")
+    pytest.importorskip("pydicom")
     for number in (0, 1, 2, 3):
-        write_dicom(pydicom, tmp_path / f"{9 - number}.dcm", ramp(dtype="uint16")[number], 2.5 * number)
+        write_dicom(tmp_path / f"{9 - number}.dcm", ramp(dtype="uint16")[number], 2.5 * number)
     (tmp_path / "._9.dcm").write_bytes(bytes(300))  # the Finder's
     field = load(tmp_path)
     assert np.array_equal(field.values, ramp() * 2 - 10)
     assert (field.spacing, field.unit) == ((2.5, 0.5, 0.25), "mm")
     assert field.affine == pytest.approx(np.diag([-0.25, -0.5, 2.5, 1]))
-    write_dicom(pydicom, tmp_path / "far.dcm", ramp(dtype="uint16")[0], 50)
-    with pytest.raises(ScanError, match="evenly"):
-        load(tmp_path)
+    write_dicom(tmp_path / "far.dcm", ramp(dtype="uint16")[0], 50)
+    refused(tmp_path, "evenly")
 
 
-def write_dicom(pydicom, path: Path, plane: np.ndarray, position: float) -> None:
+def write_dicom(path: Path, plane: np.ndarray, position: float) -> None:
+    import pydicom
+
     image = pydicom.Dataset()
     image.file_meta = pydicom.dataset.FileMetaDataset()
     image.file_meta.TransferSyntaxUID = pydicom.uid.ExplicitVRLittleEndian
@@ -353,6 +308,42 @@ def write_dicom(pydicom, path: Path, plane: np.ndarray, position: float) -> None
     image.BitsAllocated, image.BitsStored, image.HighBit, image.PixelRepresentation = 16, 16, 15, 0
     image.PixelData = plane.tobytes()
     image.save_as(path, enforce_file_format=True)
+
+
+IMARIS = np.random.default_rng(0).integers(1, 60000, (2, 5, 6, 7)).astype(np.uint16)
+
+
+def write_imaris(path: Path, channels: int, voxels: int | None = None) -> None:
+    """An Imaris file: chunks that reach beyond the image, attributes of single characters."""
+
+    def characters(text: object) -> np.ndarray:
+        return np.frombuffer(str(text).encode(), "S1")
+
+    with h5py.File(path, "w") as file:
+        for c in range(channels):
+            group = file.create_group(f"DataSet/ResolutionLevel 0/TimePoint 0/Channel {c}")
+            stored = np.pad(IMARIS[c], [(0, 3), (0, 2), (0, 1)])
+            group.create_dataset("Data", data=stored, chunks=(4, 4, 4), compression="gzip")
+            group.create_dataset("Histogram", data=np.zeros(256, np.uint64))
+            for axis, n in zip("ZYX", IMARIS.shape[1:], strict=True):
+                group.attrs[f"ImageSize{axis}"] = characters(voxels or n)
+            file.create_dataset(f"DataSet/ResolutionLevel 1/TimePoint 0/Channel {c}/Data", data=stored[::2, ::2, ::2])
+        image = file.create_group("DataSetInfo/Image")
+        image.attrs["Unit"] = "um"  # other programs write a plain string
+        for k, (n, edge) in enumerate(zip(IMARIS.shape[:0:-1], (0.1, 0.2, 0.3), strict=True)):
+            image.attrs[f"ExtMin{k}"], image.attrs[f"ExtMax{k}"] = characters(5.5), characters(5.5 + n * edge)
+
+
+def test_voxels_and_edges_of_imaris_are_the_image_s(tmp_path: Path) -> None:
+    write_imaris(tmp_path / "one.ims", 1)
+    write_imaris(tmp_path / "two.ims", 2)
+    one, two = load(tmp_path / "one.ims"), load(tmp_path / "two.ims", key="TimePoint 0/Channel 1")
+    for field, values in ((one, IMARIS[0]), (two, IMARIS[1])):
+        assert np.array_equal(field.values, values) and field.unit == "um"
+        assert field.spacing == pytest.approx((0.3, 0.2, 0.1))
+    part = load(tmp_path / "one.ims", crop="1:-1,2:,:4")
+    assert np.array_equal(part.values, IMARIS[0, 1:-1, 2:, :4])
+    refused(tmp_path / "two.ims", "Channel 1")
 
 
 @pytest.mark.parametrize(("suffix", "module"), [(".nrrd", "nrrd"), (".mrc", "mrcfile")])
@@ -376,11 +367,120 @@ def test_streams_of_several_parts_are_read_whole(tmp_path: Path) -> None:
         flipped = bytearray(path.read_bytes())
         flipped[-len(parts[1]) // 2] ^= 4
         path.write_bytes(flipped)
-        with pytest.raises(ScanError, match="cannot be read"):
-            load(path)
+        refused(path, "cannot be read")
 
 
-# ---- what is not there, and odd contents -----------------------------------------------------------------------------
+# ---- what cannot be used: format and fault ---------------------------------------------------------------------------
+
+
+def npy(values: np.ndarray) -> Callable[[Path], object]:
+    return lambda path: np.save(path, values)
+
+
+def npz(values: np.ndarray) -> Callable[[Path], object]:
+    return lambda path: np.savez(path, values)
+
+
+def dataset(**options: object) -> Callable[[Path], object]:
+    """An HDF5 file with a dataset of these options."""
+
+    def write(path: Path) -> None:
+        with h5py.File(path, "w") as file:
+            file.create_dataset("raw", **options)  # type: ignore[arg-type]
+
+    return write
+
+
+def outer(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["raw"] = h5py.ExternalLink("nowhere.h5", "raw")
+
+
+def stated(**attributes: object) -> Callable[[Path], object]:
+    """An HDF5 file with a dataset of these attributes."""
+
+    def write(path: Path) -> None:
+        with h5py.File(hdf5(path, raw=VALUES), "a") as file:
+            file["raw"].attrs.update(attributes)
+
+    return write
+
+
+def lose_strips(path: Path) -> None:
+    """Set the sizes of a page's strips to 0."""
+    tifffile.imwrite(path, VALUES, photometric="minisblack", compression="lzw", rowsperstrip=3, metadata=None)
+    with tifffile.TiffFile(path) as file:
+        tag = file.pages[4].tags["StripByteCounts"]  # type: ignore[union-attr]
+        place, count = tag.valueoffset, tag.count
+    content = bytearray(path.read_bytes())
+    content[place : place + 2 * count] = bytes(2 * count)
+    path.write_bytes(content)
+
+
+RECORDS = np.zeros((2, 3, 4), np.dtype([("a", "f4"), ("ö", "i2")]))
+BARE = {"spacing": "abc"}, {"spacing": (1, 0, 1)}, {"spacing": (1, -1, 1)}, {"spacing": (1, 1)}, {"spacing": 0.0}
+BARE += ({"spacing": (1, 2, 3, 4)}, {"spacing": (1, float("nan"), 1)})
+REFUSED: list[tuple[str, Callable[[Path], object], dict, str]] = [
+    ("a.npy", npy(ramp((5, 6))), {}, "2D"),
+    ("a.npy", npy(ramp((1, 5, 6))), {}, "2D"),
+    ("a.npy", npy(ramp((2, 3, 4, 5))), {}, "4D"),
+    ("a.npy", npy(np.zeros((0, 5, 6))), {}, "no values"),
+    ("a.npy", npy(np.where(ramp() == 7, np.nan, ramp())), {}, "NaN"),
+    ("a.npy", npy(np.where(ramp() < 2, np.inf, ramp())), {}, "infinite"),
+    ("a.npy", npy(np.full((4, 5, 6), 3)), {}, "vary"),
+    ("a.npy", npy(VALUES), {"key": "raw"}, "key"),
+    ("a.npy", lambda path: hdf5(path, raw=VALUES), {}, "cannot be read"),
+    *(("a.npy", npy(ramp()), options, "spacing") for options in BARE),
+    *((name, write(values), {}, "")
+      for values in (np.array([None]), RECORDS, np.array(["a"]), VALUES * 1j, np.float64(3))
+      for name, write in (("a.npy", npy), ("a.npz", npz))),
+    *(("a.h5", dataset(data=values), {}, "")
+      for values in (3.0, "abc", np.zeros((0, 3, 4)), h5py.Empty("f4"), np.array([b"a", b"b"]), VALUES * 1j,
+                     np.zeros((2, 3, 4), np.dtype([("a", "f4"), ("b", "i2")])))),
+    ("a.h5", dataset(shape=(2,), dtype=h5py.vlen_dtype(np.int32)), {}, ""),
+    ("a.h5", dataset(shape=(10**4,) * 3, dtype="f8", chunks=(100,) * 3), {}, "memory"),
+    ("a.h5", dataset(shape=(8, 8, 8), dtype="u1", external=[("bytes", 0, 512)]), {}, "other files"),
+    ("a.h5", outer, {}, ""),
+    ("a.h5", stated(element_size_um=[0.0, 0.2, 0.2]), {}, "spacing"),
+    ("a.tif", lose_strips, {}, "page 4"),
+    ("a.ims", lambda path: hdf5(path, raw=VALUES), {}, "no arrays"),
+    ("a.ims", lambda path: write_imaris(path, 1, voxels=900), {}, "900"),
+    ("a.nowhere", lambda path: path.write_bytes(b"x"), {}, "must end"),
+    ("folder", lambda path: path.mkdir(), {}, "folder"),
+    *((f"a{suffix}", lambda path: path.write_bytes(b"not a volume at all"), {"raw_shape": (4, 5, 6)}, "")
+      for suffix in READERS),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "write", "options", "word"), REFUSED)
+def test_what_cannot_be_used_is_refused_in_one_sentence(tmp_path: Path, name: str, write, options, word: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        write(tmp_path / name)
+    refused(tmp_path / name, word, **options)
+
+
+def test_what_is_not_there_is_no_file(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        load(tmp_path / "scan.nii")
+
+
+STATED: list[dict[str, object]] = [
+    *({"spacing": wrong} for wrong in ([1.0, 2.0], [], "wide", [1.0, np.nan, 1.0], b"abc")),
+    *({"spacing": 1.0, "unit": wrong} for wrong in (3.0, b"\xff\xfe")),
+    {"element_size_um": [[1.0, 2.0], [3.0, 4.0]]},
+    {"voxel_size": "x" * 30_000},
+]
+
+
+@pytest.mark.parametrize("attributes", STATED)
+def test_odd_attributes_are_refused_or_overridden(tmp_path: Path, attributes: dict) -> None:
+    path = tmp_path / "scan.h5"
+    stated(**attributes)(path)
+    with pytest.raises(ScanError, match=r"(?s)^(?=.{1,400}$)[^\n]*(spacing|unit)"):
+        load(path)
+    field = load(path, spacing=(3, 2, 1), unit="um")
+    assert (field.spacing, field.unit) == ((3, 2, 1), "um")
 
 
 def test_hdf5_without_all_its_chunks_or_any_value(tmp_path: Path) -> None:
@@ -392,90 +492,10 @@ def test_hdf5_without_all_its_chunks_or_any_value(tmp_path: Path) -> None:
         layout = h5py.VirtualLayout((8, 8, 8), "f4")
         layout[:4] = h5py.VirtualSource("gone.h5", "raw", (4, 8, 8))
         file.create_virtual_dataset("virtual", layout, fillvalue=0)
-        file.create_dataset("outside", (8, 8, 8), "u1", external=[(str(tmp_path / "bytes"), 0, 512)])
     note = "4 of 8 chunks are not stored: their voxels have the fill value 3.0."
     assert note in load(path, key="some").notes
-    refused(path, note, key="some", strict=True)
-    refused(path, "No values are stored", key="none", strict=True)
-    refused(path, "gone.h5", key="virtual", strict=True)
-    refused(path, "other files", key="outside")
-
-
-def test_numbers_that_slices_skip_are_said(tmp_path: Path) -> None:
-    for number in (0, 5, 10, 20, 25):
-        tifffile.imwrite(tmp_path / f"s{number:03d}.tif", VALUES[number % 9])
-    assert any("skip some, after s010 for one" in note for note in load(tmp_path).notes)
-    refused(tmp_path, "skip some", strict=True)
-    tifffile.imwrite(tmp_path / "s015.tif", VALUES[3])
-    assert load(tmp_path, strict=True).shape == (6, 10, 11)
-
-
-def test_odd_datasets_are_one_sentence(tmp_path: Path) -> None:
-    path = tmp_path / "scan.h5"
-    with h5py.File(path, "w") as file:
-        file["scalar"], file["text"], file["empty"] = 3.0, "abc", np.zeros((0, 3, 4))
-        file["null"] = h5py.Empty("f4")
-        file["texts"] = np.array([b"a", b"b"])
-        file["records"] = np.zeros((2, 3, 4), np.dtype([("a", "f4"), ("b", "i2")]))
-        file["complex"] = VALUES * 1j
-        file.create_dataset("lists", (2,), h5py.vlen_dtype(np.int32))
-        file["outer"] = h5py.ExternalLink("nowhere.h5", "raw")
-        file.create_dataset("moon", (10**4, 10**4, 10**4), "f8", chunks=(100, 100, 100))
-    for key in ("scalar", "text", "empty", "null", "texts", "records", "complex", "lists", "outer", "moon", "none"):
-        refused(f"{path}::{key}", "")
-    refused(f"{path}::moon", "memory")
-
-
-@pytest.mark.parametrize(
-    "attributes",
-    [
-        {"spacing": [1.0, 2.0]},
-        {"spacing": []},
-        {"spacing": "wide"},
-        {"spacing": [1.0, np.nan, 1.0]},
-        {"spacing": b"abc"},
-        {"spacing": 1.0, "unit": 3.0},
-        {"spacing": 1.0, "unit": ["um", "mm", "nm"][1:]},
-        {"spacing": 1.0, "unit": b"\xff\xfe"},
-        {"element_size_um": [[1.0, 2.0], [3.0, 4.0]]},
-        {"voxel_size": "x" * 30_000},
-    ],
-)
-def test_odd_attributes_are_refused_or_overridden(tmp_path: Path, attributes: dict) -> None:
-    path = tmp_path / "scan.h5"
-    with h5py.File(path, "w") as file:
-        file["raw"] = VALUES
-        file["raw"].attrs.update(attributes)
-    if attributes != {"spacing": 1.0, "unit": ["mm", "nm"]}:
-        with pytest.raises(ScanError, match=r"(?s)^(?=.{1,400}$)[^\n]*(spacing|unit)"):
-            load(path)
-    field = load(path, spacing=(3, 2, 1), unit="um")
-    assert (field.spacing, field.unit) == ((3, 2, 1), "um")
-
-
-def test_a_unit_in_bytes_or_in_a_list_of_one(tmp_path: Path) -> None:
-    for number, unit in enumerate((b"um", ["um"], np.array([b"um"]))):
-        path = tmp_path / f"{number}.h5"
-        with h5py.File(path, "w") as file:
-            file["raw"] = VALUES
-            file["raw"].attrs.update({"spacing": np.array([2]), "unit": unit})
-        assert (load(path).spacing, load(path).unit) == ((2, 2, 2), "um")
-
-
-def test_odd_numpy_files_are_one_sentence(tmp_path: Path) -> None:
-    records = np.zeros((2, 3, 4), np.dtype([("a", "f4"), ("ö", "i2")]))
-    for values in (np.array([None]), records, np.array(["a"]), VALUES * 1j, np.float64(3)):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            np.save(tmp_path / "a.npy", values)
-            np.savez(tmp_path / "a.npz", values)
-        refused(tmp_path / "a.npy", "")
-        refused(tmp_path / "a.npz", "")
-    np.save(tmp_path / "order.npy", np.asfortranarray(VALUES))
-    assert np.array_equal(load(tmp_path / "order.npy").values, VALUES)
-    refused(f"{tmp_path / 'order.npy'}::raw", "key")
-    (tmp_path / "order.npy").write_bytes((tmp_path / "a.npz").read_bytes())
-    refused(tmp_path / "order.npy", "cannot be read")
+    for key, said in (("some", note), ("none", "No values are stored"), ("virtual", "gone.h5")):
+        refused(path, said, key=key, strict=True)
 
 
 def test_reading_leaves_loggers_and_warnings_as_they_were(tmp_path: Path) -> None:
@@ -491,73 +511,19 @@ def test_reading_leaves_loggers_and_warnings_as_they_were(tmp_path: Path) -> Non
     assert warnings.filters[:] == filters
 
 
-@pytest.mark.parametrize(
-    ("values", "word"),
-    [
-        (ramp((5, 6)), "2D"),
-        (ramp((1, 5, 6)), "2D"),
-        (ramp((2, 3, 4, 5)), "4D"),
-        (np.zeros((0, 5, 6)), "no values"),
-        (np.where(ramp() == 7, np.nan, ramp()), "NaN"),
-        (np.where(ramp() < 2, np.inf, ramp()), "infinite"),
-        (np.full((4, 5, 6), 3), "vary"),
-        (ramp() * 1j, "complex64"),
-    ],
-)
-def test_unusable_values_are_refused(tmp_path: Path, values: np.ndarray, word: str) -> None:
-    np.save(tmp_path / "scan.npy", values)
-    refused(tmp_path / "scan.npy", word)
-
-
-def test_bad_spacing_is_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "scan.npy", ramp())
-    for spacing in ((1, 0, 1), (1, -1, 1), (1, 1), (1, 2, 3, 4), (1, float("nan"), 1), "abc", 0.0):
-        refused(tmp_path / "scan.npy", "spacing", spacing=spacing)
-    with h5py.File(tmp_path / "scan.h5", "w") as file:
-        file["raw"] = ramp()
-        file["raw"].attrs["element_size_um"] = [0.0, 0.2, 0.2]
-    refused(tmp_path / "scan.h5", "spacing")
-    assert load(tmp_path / "scan.h5", spacing=1).spacing == (1, 1, 1)
-
-
-def test_bad_names_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no such file"):
-        load(tmp_path / "scan.nii")
-    refused(tmp_path, "folder")
-    (tmp_path / "scan.xyz").write_bytes(b"x")
-    refused(tmp_path / "scan.xyz", "must end")
-    for kind in (str, complex, object):
-        with pytest.raises(ValueError, match="real numbers"):
-            Field(ramp().astype(kind))
-    for suffix in READERS:
-        path = tmp_path / f"scan{suffix}"
-        path.write_bytes(b"not a volume at all")
-        refused(path, "", raw_shape=(4, 5, 6))
-
-
-def write_npz(path: Path) -> None:
-    np.savez(path, raw=ramp((20, 20, 20)))
-
-
-def write_hdf5(path: Path) -> None:
-    with h5py.File(path, "w") as file:
-        file["raw"] = ramp((20, 20, 20))
-
-
-@pytest.mark.parametrize("suffix", [".nii", ".nii.gz", ".tif", ".npy", ".npz", ".h5"])
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz", ".tif", ".npy", ".npz", ".h5", ".ims"])
 @pytest.mark.parametrize("kept", [0.0, 0.01, 0.6, 0.99])
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_truncated_files_are_refused(tmp_path: Path, suffix: str, kept: float, dtype: str) -> None:
-    path = tmp_path / f"scan{suffix}"
-    writers: dict[str, Callable[[Path], object]] = {".npz": write_npz, ".h5": write_hdf5}
-    writers.get(suffix, lambda p: save(Field(ramp((20, 20, 20), dtype)), p))(path)
+def test_truncated_files_are_refused(tmp_path: Path, suffix: str, kept: float) -> None:
+    path, values = tmp_path / f"scan{suffix}", ramp((20, 20, 20), "float64")
+    writers: dict[str, Callable[[Path], object]] = {".npz": npz(values), ".h5": lambda path: hdf5(path, raw=values)}
+    writers[".ims"] = lambda path: write_imaris(path, 1)
+    writers.get(suffix, lambda path: save(Field(values), path))(path)
     whole = path.read_bytes()
     path.write_bytes(whole[: int(kept * len(whole))])
     if suffix == ".tif" and kept == 0.99:  # its values precede the directories of its last pages
-        assert np.array_equal(load(path).values, ramp((20, 20, 20), dtype))
-        return
-    with pytest.raises(ScanError, match="cannot be read"):
-        load(path)
+        assert np.array_equal(load(path).values, values)
+    else:
+        refused(path, "cannot be read")
 
 
 # ---- real files ------------------------------------------------------------------------------------------------------
@@ -579,8 +545,7 @@ def test_real_scans(data: Path, name: str, options: dict, shape, spacing, unit: 
 
 
 def test_a_spacing_needs_a_unit_unless_it_is_a_ratio(tmp_path: Path) -> None:
-    np.save(tmp_path / "scan.npy", np.arange(24, dtype=np.uint8).reshape(2, 3, 4))
-    with pytest.raises(ScanError, match="unit of the spacing"):
-        load(tmp_path / "scan.npy", spacing=0.0195)
+    np.save(tmp_path / "scan.npy", ramp(dtype="uint8"))
+    refused(tmp_path / "scan.npy", "unit of the spacing", spacing=0.0195)
     assert load(tmp_path / "scan.npy", spacing=(2.5, 1, 1)).unit == "voxel"
     assert load(tmp_path / "scan.npy", spacing=0.0195, unit="mm").spacing == pytest.approx((0.0195,) * 3)

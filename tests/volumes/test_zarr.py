@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from calling import call
 
 from curvafit.volumes import Field, ScanError, load, save
 from curvafit.volumes.read import read_values
@@ -57,11 +56,14 @@ def test_halved_levels_lie_where_the_whole_one_does(tmp_path: Path, dtype: str) 
     assert back.spacing == (2.0, 1.0, 0.5) and back.unit == "um" and back.notes == ()
 
 
-def test_a_store_replaces_a_longer_one(tmp_path: Path) -> None:
+def test_a_store_replaces_a_longer_one_and_has_all_its_chunks(tmp_path: Path) -> None:
     save(Field(np.random.default_rng(0).random((130, 8, 8))), tmp_path / "scan.zarr")
-    path = save(Field(np.arange(60.0).reshape(3, 4, 5)), tmp_path / "scan.zarr")
-    assert sorted(p.name for p in path.iterdir()) == ["0", "zarr.json"]
+    mask = np.zeros((70, 70, 70), np.uint8)
+    mask[:5] = 1
+    path = save(Field(mask[:, :, :50], 1.0, "um"), tmp_path / "scan.zarr")
+    assert sorted(p.name for p in path.iterdir()) == ["0", "1", "zarr.json"]
     assert [p.name for p in tmp_path.iterdir()] == ["scan.zarr"]
+    assert load(path, strict=True).notes == ()
 
 
 def test_groups_and_scales_are_read(tmp_path: Path) -> None:
@@ -117,26 +119,5 @@ def test_chunks_that_a_shard_lacks_are_counted(tmp_path: Path) -> None:
     values = VALUES.copy()
     values[:4, :5, :6] = 0  # Zarr leaves out what is its fill value
     zarr.create_array(tmp_path / "a.zarr", data=values, chunks=(4, 5, 6), shards=(8, 10, 12))
-    assert load(tmp_path / "a.zarr", spacing=1.0).notes == (
-        "1 of 12 chunks are not stored: their voxels have the fill value 0.",
-    )
-
-
-def test_what_is_saved_has_all_its_chunks(tmp_path: Path) -> None:
-    mask = np.zeros((70, 70, 70), np.uint8)
-    mask[:5] = 1
-    assert load(save(Field(mask, 1.0, "um"), tmp_path / "mask.zarr"), strict=True).notes == ()
-
-
-def test_the_command_line_says_it_and_takes_strict(tmp_path: Path) -> None:
-    z, y, x = np.indices((24, 24, 24)) - 11.5
-    ball = np.where(z**2 + y**2 + x**2 < 60, 200, 20).astype(np.uint8)
-    ball[3, 3, 3] = 21
-    path = tmp_path / "scan.zarr"
-    zarr.create_array(path, data=ball, chunks=(12, 12, 12), fill_value=20, attributes={"spacing": 1.0, "unit": "um"})
-    (path / "c" / "0" / "0" / "0").unlink()
-    options = ("--prior", "tubes", "--steps", "1", "-o", tmp_path / "mask.npy")
-    result = call("segment", path, *options)
-    assert result.exit_code == 0 and "1 of 8 chunks are not stored" in result.output
-    result = call("segment", path, *options, "--strict")
-    assert result.exit_code == 2 and result.stdout == "" and "chunks" in result.stderr
+    (note,) = load(tmp_path / "a.zarr", spacing=1.0).notes
+    assert note == "1 of 12 chunks are not stored: their voxels have the fill value 0."

@@ -68,10 +68,7 @@ def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, *
 
 
 def read_imaris(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
-    """Read a channel of an Imaris file at full resolution, without the voxels that fill up its last chunks.
-
-    The key names one channel of several, as in `TimePoint 0/Channel 1`.
-    """
+    """Read a channel (key `TimePoint 0/Channel 1`) of an Imaris file, without voxels that fill up its last chunks."""
     import h5py
 
     level = "DataSet/ResolutionLevel 0/"

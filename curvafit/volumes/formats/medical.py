@@ -39,18 +39,9 @@ _NRRD_ENCODINGS: dict[str, Callable[[Any], Any]] = {
     **dict.fromkeys(("bzip2", "bz2"), bz2.open),
 }
 #: MetaImage's types -> numpy's.
-_META_TYPES = {
-    "MET_CHAR": "i1",
-    "MET_UCHAR": "u1",
-    "MET_SHORT": "i2",
-    "MET_USHORT": "u2",
-    **dict.fromkeys(("MET_INT", "MET_LONG"), "i4"),
-    **dict.fromkeys(("MET_UINT", "MET_ULONG"), "u4"),
-    "MET_LONG_LONG": "i8",
-    "MET_ULONG_LONG": "u8",
-    "MET_FLOAT": "f4",
-    "MET_DOUBLE": "f8",
-}
+_META_TYPES = {"MET_CHAR": "i1", "MET_SHORT": "i2", "MET_INT": "i4", "MET_LONG": "i4", "MET_LONG_LONG": "i8"}
+_META_TYPES |= {name.replace("MET_", "MET_U"): f"u{kind[1]}" for name, kind in _META_TYPES.items()}
+_META_TYPES |= {"MET_FLOAT": "f4", "MET_DOUBLE": "f8"}
 #: What a MetaImage may write for True, and the most bytes of its header.
 _TRUE, _HEADER = ("true", "t", "1"), 1 << 16
 #: IMOD's stamp, from byte 152 on: its flags follow, the first of which says that bytes are signed.
@@ -88,10 +79,8 @@ def read_nrrd(path: Path, **_: object) -> Raw:
 
 
 def _nrrd_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path) -> np.ndarray:
-    """Return the values, z first, from an NRRD file open at the end of its header, or from the file that it names.
-
-    pynrrd reads only the first part of a compressed stream, and not the checksum at its end.
-    """
+    """Return the values, z first, from an NRRD file open at the end of its header, or from the file that it names."""
+    # pynrrd reads only the first part of a compressed stream, and not the checksum at its end.
     name = header.pop("data file", None) or header.pop("datafile", None)
     if name is not None:
         with check_regular(path.parent / str(name)).open("rb") as data:
@@ -146,10 +135,7 @@ def _meta_header(file: IO[bytes]) -> dict[str, str]:
 
 
 def _meta_image(header: dict[str, str], file: IO[bytes], path: Path) -> Raw:
-    """Return a MetaImage where ITK places it, with the values from the file's position to its end.
-
-    Channels are an axis after those that `NDims` counts, or else the first of four.
-    """
+    """Return a MetaImage where ITK places it; channels are an axis after `NDims`, or else the first of four."""
     shape = [int(n) for n in header["DimSize"].split()]
     axes, channels = len(shape), int(header.get("ElementNumberOfChannels", 1))
     if header.get("ObjectType", "Image") != "Image" or str(axes) != header["NDims"] or min(shape) < 1:
@@ -169,10 +155,8 @@ def _meta_image(header: dict[str, str], file: IO[bytes], path: Path) -> Raw:
 
 
 def _meta_values(header: dict[str, str], shape: list[int], file: IO[bytes], path: Path) -> np.ndarray:
-    """Return the values from the file's position to its end.
-
-    SimpleITK could read them, but it compares no checksum of a compressed file, and prints warnings itself.
-    """
+    """Return the values from the file's position to its end."""
+    # SimpleITK could read them, but it compares no checksum of a compressed file, and prints warnings itself.
     kind = header.get("ElementType", "")
     if kind not in _META_TYPES:
         raise ScanError(f"{path} has the element type {kind[:40]!r}, none of {', '.join(_META_TYPES)}")

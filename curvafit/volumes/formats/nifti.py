@@ -18,13 +18,8 @@ from curvafit.volumes.formats.part import Part, read_part
 #: Bytes of one member of a compressed file.
 MEMBER = 2**28
 #: Our unit -> (NIfTI's, factor to it).
-_TO_FILE = {
-    "voxel": ("unknown", 1.0),
-    "nm": ("micron", 1e-3),
-    "um": ("micron", 1.0),
-    "mm": ("mm", 1.0),
-    "m": ("meter", 1.0),
-}
+_TO_FILE = {"voxel": ("unknown", 1.0), "nm": ("micron", 1e-3), "um": ("micron", 1.0)}
+_TO_FILE |= {"mm": ("mm", 1.0), "m": ("meter", 1.0)}
 
 
 def read_nifti(path: Path, *, part: Part | None = None, **_: object) -> Raw:
@@ -60,10 +55,7 @@ def read_nifti(path: Path, *, part: Part | None = None, **_: object) -> Raw:
 
 
 def _values(image: Any, path: Path, part: Part | None) -> Raw:
-    """Return the scaled values, z first, or the part of them from a file that is not compressed.
-
-    The file must end with its values, where the checksum of a compressed one is compared.
-    """
+    """Return the scaled values, z first, or the part of them from a file that is not compressed."""
     from nibabel.volumeutils import apply_read_scaling
 
     proxy, compression = image.dataobj, path.name.lower().endswith(".gz")
@@ -133,10 +125,7 @@ def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | Non
 
 
 def _save(image: Any, path: Path) -> None:
-    """Write an image; if the name ends in .gz, by libdeflate, which is three times as fast as zlib.
-
-    A large file has several members, as gzip allows, so that compression needs little memory.
-    """
+    """Write an image; a .gz by libdeflate, three times as fast as zlib, in members so that it needs little memory."""
     from imagecodecs import gzip_encode
 
     buffer = io.BytesIO()

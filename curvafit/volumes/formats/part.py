@@ -31,13 +31,7 @@ class Part:
     def index(self, shape: Sequence[int], axes: Axes, place: object) -> tuple[tuple[slice, ...], tuple[int, ...]]:
         """Return the slices, one per axis, that take this part of an array in a file, and the axes z, y and x.
 
-        Parameters
-        ----------
-        shape
-            Shape of the whole array, z before y before x.
-        axes
-            The axes of channels and times, if the file names them. Among four axes without names, that of channels is
-            the shorter one of the first and the last.
+        Among four axes that the file does not name, that of channels is the shorter one of the first and the last.
         """
         picked = self._pick(shape, axes, place)
         space = [axis for axis, n in enumerate(shape) if n != 1 and axis not in picked]
@@ -73,11 +67,8 @@ class Part:
                 other = " (a channel picks one of several without names)" if name == "time" and len(long) == 4 else ""
                 raise ScanError(f"{place} names no axis of {name}s, got {name} {quoted(number)}{other}")
             count = 1 if axis is None else shape[axis]
-            if (
-                not 0
-                <= check_int(number or 0, f"a {name} that is a whole number from 0", -SEEDS, SEEDS)
-                < max(count, 1)
-            ):
+            number_or_first = check_int(number or 0, f"a {name} that is a whole number from 0", -SEEDS, SEEDS)
+            if not 0 <= number_or_first < max(count, 1):
                 raise ScanError(f"{name} must be from 0 to {count - 1} for {place}, got {number}")
             if axis is not None:
                 picked[axis] = name, number
@@ -131,11 +122,7 @@ def parse_box(crop: Crop | None) -> Box | None:
     if crop is None:
         return None
     parts: Any = list(map(_parse_slice, crop.split(","))) if isinstance(crop, str) else crop
-    if (
-        not isinstance(parts, Sequence)
-        or len(parts) != 3
-        or not all(isinstance(part, slice) and _is_plain(part) for part in parts)
-    ):
+    if not isinstance(parts, Sequence) or len(parts) != 3 or not all(map(_is_plain, parts)):
         raise ScanError(f'crop must be "z0:z1,y0:y1,x0:x1" or three slices, got {quoted(crop)}')
     return parts[0], parts[1], parts[2]
 
@@ -180,7 +167,10 @@ def _parse_slice(text: str) -> slice | None:
     return slice(*(None if edge is None else int(edge) for edge in match.groups())) if match else None
 
 
-def _is_plain(edge: slice) -> bool:
-    """Return whether a slice has whole numbers, or nothing, as ends, and no step."""
-    ends = (end for end in (edge.start, edge.stop) if end is not None)
-    return edge.step in (None, 1) and all(isinstance(end, Integral) and not isinstance(end, bool) for end in ends)
+def _is_plain(edge: Any) -> bool:
+    """Return whether this is a slice that has whole numbers, or nothing, as ends, and no step."""
+    if not isinstance(edge, slice) or edge.step not in (None, 1):
+        return False
+    return all(
+        end is None or (isinstance(end, Integral) and not isinstance(end, bool)) for end in (edge.start, edge.stop)
+    )

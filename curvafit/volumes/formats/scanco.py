@@ -17,14 +17,8 @@ from curvafit.volumes.formats.base import Damaged, Raw, ScanError, check_array, 
 from curvafit.volumes.formats.part import Part, read_part
 
 #: AIM's types -> numpy's.
-_AIM_TYPES = {
-    0x00010001: "i1",
-    **dict.fromkeys((0x00160001, 0x000D0001), "u1"),
-    0x00020002: "<i2",
-    0x00170002: "<u2",
-    0x00030004: "<i4",
-    0x001A0004: "<f4",
-}
+_AIM_TYPES = {0x00010001: "i1", 0x00160001: "u1", 0x000D0001: "u1", 0x00020002: "<i2"}
+_AIM_TYPES |= {0x00170002: "<u2", 0x00030004: "<i4", 0x001A0004: "<f4"}
 #: AIM's types of masks: run lengths of two values in turn, and pairs of a run length and a value.
 _TWO_VALUES, _PAIRS = 0x00150001, 0x00080002
 

@@ -213,13 +213,10 @@ def _read_spacing(file: tifffile.TiffFile) -> _Spacing:
         return _from_sizes(description)
     if file.is_imagej:
         return _from_imagej(file, description)
-    return _from_description(description) if "spacing" in description else _from_tags(file)
-
-
-def _from_description(description: dict[str, Any]) -> _Spacing:
-    """Return spacing, unit and a note from tifffile's JSON, where `spacing` is three numbers or one for all axes."""
-    sizes = tuple(float(h) for h in np.atleast_1d(description["spacing"]))
-    unit = description.get("unit")
+    if "spacing" not in description:
+        return _from_tags(file)
+    # tifffile's JSON has three numbers, or one for all axes
+    sizes, unit = tuple(float(h) for h in np.atleast_1d(description["spacing"])), description.get("unit")
     if len(sizes) == 3:
         return sizes, unit, ()
     note = f"The file states one voxel size, {sizes[0]:g} {unit or ''}".rstrip() + ": it is taken for all three axes."
@@ -241,11 +238,8 @@ def _from_sizes(pixels: Mapping[str, Any]) -> _Spacing:
 
 
 def _from_imagej(file: tifffile.TiffFile, description: dict[str, Any]) -> _Spacing:
-    """Return spacing, unit and a note from ImageJ's description.
-
-    `spacing` is the distance of slices in `zunit`, and the resolution tags count pixels per `unit`, or `yunit`. Without
-    a unit only the proportions have a meaning: lengths are then in pixels along x.
-    """
+    """Return spacing, unit and a note from ImageJ's description: the distance of slices in `zunit`, and by the tags
+    pixels per `unit` or `yunit`. Without a unit only proportions have a meaning: lengths are in pixels along x."""
     y, x = _pixels_per_unit(file)
     z = abs(float(description.get("spacing") or 0))
     units = [description.get(f"{axis}unit", description.get("unit")) for axis in "zyx"]

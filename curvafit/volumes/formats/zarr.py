@@ -74,10 +74,7 @@ def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, *
 
 
 def list_levels(path: Path, key: str | None) -> dict[str, tuple[float, ...] | None]:
-    """Return the spacing, where it is known, of each level of the image that is read of a store, by key, in order.
-
-    There are none where a key names an array.
-    """
+    """Return the known spacing of each level of the image that is read of a store, by key; none of an array."""
     import zarr
 
     _check_store(path)
@@ -154,11 +151,8 @@ def create_zarr(
         if any(first):
             transforms += [{"type": "translation", "translation": first}]
         datasets.append({"path": str(k), "coordinateTransformations": transforms})
-    image = {
-        "name": path.name if labels else "volume",
-        "axes": [{"name": name, **kind} for name in "zyx"],
-        "datasets": datasets,
-    }
+    axes = [{"name": name, **kind} for name in "zyx"]
+    image = {"name": path.name if labels else "volume", "axes": axes, "datasets": datasets}
     old = _FORMATS[version] == 2
     content: dict[str, Any] = {"multiscales": [image | {"version": version} if old else image]}
     if labels:
@@ -381,10 +375,7 @@ def _check_store(folder: Path) -> None:
 
 
 def _missing_chunks(array: Any, folder: Path) -> tuple[str, ...]:
-    """Return a sentence on the chunks of an array that are not stored, if there are any.
-
-    Zarr's own `nchunks_initialized` does not look into shards.
-    """
+    """Return a sentence on the chunks that are not stored; Zarr's `nchunks_initialized` does not look into shards."""
     outer, chunks = array.shards or array.chunks, math.prod(_counts(array.shape, array.chunks))
     if chunks > _MOST:
         raise ScanError(f"a Zarr array may have at most {_MOST:,} chunks, got {chunks:,} in {folder}")
@@ -421,10 +412,7 @@ def _counts(shape: Sequence[int], edges: Sequence[int]) -> list[int]:
 
 
 def _missing_within(array: Any, shard: Path, inside: Sequence[int]) -> int:
-    """Return how many chunks a shard's index lacks, of those `inside` the array.
-
-    An index of another kind than the usual one (little-endian, then a CRC32C) is not looked at.
-    """
+    """Return how many chunks a shard's index, if of the usual kind, lacks of those `inside` the array."""
     codec: Any = next((each for each in array.metadata.codecs if hasattr(each, "index_codecs")), None)
     if [type(each).__name__ for each in getattr(codec, "index_codecs", ())] != ["BytesCodec", "Crc32cCodec"]:
         return 0
