@@ -58,7 +58,6 @@ def synth(
     voxel: Annotated[float | None, _image(help="Edge of a shape's voxel, in --unit; by default the law's.")] = None,
     calibres: Annotated[str, _image(help="LOW,HIGH: a case is thicker by a factor in between.")] = "1,1",
     draws: Annotated[int | None, _what(help="Laws drawn from each fit's posterior, in place of its best.")] = None,
-    blend: Annotated[float, _show(help="Share of cases in which one texture gives way to another.")] = 0.0,
     classes: Annotated[bool, _show("--classes", help="A shape of each law in every image, one class each.")] = False,
     wall: Annotated[float | None, _show(help="Shells: thickness of a wall around a lumen, in --unit.")] = None,
     levels: Annotated[str | None, _show(help="Light of each class: 0 as background, 1 as structure.")] = None,
@@ -91,7 +90,7 @@ def synth(
     low, high = parse_numbers(calibres, "--calibres", 2)
     thickness = None if wall is None else convert_length(wall, unit, kind.base.unit)
     lights = None if levels is None else tuple(parse_numbers(levels, "--levels", levels.count(",") + 1))
-    shown = Composition(blend, classes, thickness, lights)
+    shown = Composition(classes, thickness, lights)
     recipe = Recipe(source, kind, box, edge, seed, (low, high), shown)
     _build_and_preview(out, SetSpec(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)
 

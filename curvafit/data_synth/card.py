@@ -103,8 +103,6 @@ def _describe_composition(recipe: Recipe) -> Iterator[str]:
         yield "\nEvery case shows a shape of each law, one class each; an earlier law's is in front."
     if shown.wall is not None:
         yield f"\nThe shape is a wall of {format_number(shown.wall)} {unit} inside its surface, around a lumen."
-    if shown.blend:
-        yield f"\nIn {format_number(100 * shown.blend)} % of the cases one shape gives way to another."
     if len(names) > 1 or shown.levels:
         levels = zip(names, shown.choose_levels(len(names)), strict=True)
         told = ", ".join(f"{name} {format_number(level)}" for name, level in levels)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -12,14 +12,10 @@ import torch
 from torch import Tensor
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float
-from curvafit.data_synth.imaging.maths import correlated_field
 from curvafit.data_synth.labels import field_distance
-from curvafit.data_synth.sources import Generated, PhaseField, ShapeSource
+from curvafit.data_synth.sources import Generated, ShapeSource
 from curvafit.priors.grid import Grid
 
-#: Two textures are mixed by the logistic function of a normal field, whose correlation length is this share of the
-#: crop's longest edge and whose deviation is the steepness.
-BLEND_LENGTH, BLEND_STEEPNESS = 0.5, 4.0
 #: The brightest that a class can be, as a multiple of the structure's contrast.
 BRIGHTEST = 100.0
 #: The most classes of a set.
@@ -47,8 +43,6 @@ class Composition:
 
     Attributes
     ----------
-    blend
-        Share of cases in which one texture gives way to another, as two crops or the shapes of two laws in turn.
     classes
         Every case shows a shape of each law, in front of those of later laws; the classes of the labels.
     wall
@@ -58,18 +52,16 @@ class Composition:
         Light of each class: 0 is as dark as the background, 1 as bright as the structure. By default 1, the lumen 0.
     """
 
-    blend: float = 0.0
     classes: bool = False
     wall: float | None = None
     levels: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "blend", check_float(self.blend, "a share of blended cases in [0, 1]", 0, 1))
         if self.wall is not None:
             wall = check_float(self.wall, "a wall of positive thickness", SHORTEST, LONGEST)
             object.__setattr__(self, "wall", wall)
-        if self.classes + (self.wall is not None) + (self.blend > 0) > 1:
-            raise ValueError("give one of blend, classes and wall")
+        if self.classes and self.wall is not None:
+            raise ValueError("give either classes or a wall, not both")
         if self.levels is not None:
             levels = as_tuple(self.levels, "a level of each class")
             checked = tuple(check_float(n, f"levels from 0 to {BRIGHTEST:g}", 0, BRIGHTEST, of=levels) for n in levels)
@@ -99,9 +91,6 @@ class Composition:
             shapes = [source.shape(voxels, k, rng) for k in range(len(self.names(source)))]
             values = torch.from_numpy(np.stack([shape.values for shape in shapes]))
             return Layers(values, values.amax(0), shapes[0].epsilon, [shape.origin for shape in shapes])
-        if self.blend and rng.random() < self.blend:
-            seed = int(rng.integers(2**32))
-            return blend_shapes(lambda turn: source.shape(voxels, index + turn, rng), seed)
         margin = self.margin(source, voxel)
         shape = source.shape([n + 2 * margin for n in voxels], index, rng)
         u, origin = torch.from_numpy(shape.values), shape.origin | ({"margin": margin} if margin else {})
@@ -126,18 +115,10 @@ class Composition:
 
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Composition:
-        """Return the composition that `as_dict` wrote."""
-        return Composition(**content)
-
-
-def blend_shapes(draw: Callable[[int], PhaseField], seed: int) -> Layers:
-    """Return one structure whose texture gives way to another: two shapes, 0 and 1 of `draw`, that share the volume."""
-    one, other = draw(0), draw(1)
-    u = torch.from_numpy(one.values)
-    length = BLEND_LENGTH * max(u.shape)
-    share = torch.sigmoid(BLEND_STEEPNESS * correlated_field(u, (length,) * 3, seed, "blend"))
-    mixed = share * u + (1 - share) * torch.from_numpy(other.values)
-    return Layers.of(mixed, one.epsilon, [one.origin, other.origin])
+        """Return the composition that `as_dict` wrote, maybe with a `blend` of 0."""
+        if content.get("blend"):
+            raise ValueError("it blends textures, which curvafit does not do: it cannot be continued, begin another")
+        return Composition(**{name: value for name, value in content.items() if name != "blend"})
 
 
 def shell_of(field: Tensor, epsilon: float, thickness: float, *, periodic: bool = False) -> Tensor:

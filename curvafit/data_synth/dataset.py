@@ -1,4 +1,4 @@
-"""Training pairs without end: random crops of generated shapes, turned, blended and imaged on demand."""
+"""Training pairs without end: random crops of generated shapes, turned and imaged on demand."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_choice, check_float, check_int, check_seed
 from curvafit.data_synth.case import check_calibres, check_crop, check_shape, draw_voxel, image_and_labels
-from curvafit.data_synth.composition import Layers, blend_shapes
+from curvafit.data_synth.composition import Layers
 from curvafit.data_synth.imaging.image import field_shape
 from curvafit.data_synth.imaging.modality import Modality, modality
 from curvafit.data_synth.sources import Generated, Pool, Stored, choose_voxel
@@ -57,8 +57,6 @@ class TextureDataset(IterableDataset):
         Voxels (z, y, x) of an image, or one number for a cube.
     length
         Samples of an epoch, over all ranks.
-    blend
-        Share of samples in which one texture gives way to another.
     voxel
         Edge of a shape's voxels in the modalities' unit; by default the fits', else each modality's own.
     calibres
@@ -83,7 +81,6 @@ class TextureDataset(IterableDataset):
         *,
         length: int = 1000,
         seed: int = 0,
-        blend: float = 0.2,
         voxel: float | None = None,
         calibres: tuple[float, float] = (1.0, 1.0),
         normalise: str | Callable[[Tensor], Tensor] | None = None,
@@ -95,7 +92,7 @@ class TextureDataset(IterableDataset):
         kinds = [modalities] if isinstance(modalities, (str, Modality)) else list(modalities)
         self.modalities = [modality(kind) if isinstance(kind, str) else kind for kind in kinds]
         self.size = check_shape((size,) * 3 if isinstance(size, (int, Real)) else size)
-        self.length, self.seed, self.blend = int(length), check_seed(seed), blend
+        self.length, self.seed = int(length), check_seed(seed)
         self.calibres, self.normalise, self.transform = calibres, _choose_normalisation(normalise), transform
         sources: list[Any] = [source] if isinstance(source, LAW_TYPES) else list(as_tuple(source, "laws or stores"))
         self._check(sources)
@@ -151,25 +148,19 @@ class TextureDataset(IterableDataset):
     def sample(self, number: int) -> Sample:
         """Return sample `number`, from 0, before the transform."""
         words = np.random.SeedSequence(self.seed, spawn_key=(number,))
-        rng, (for_imaging, for_image, for_blend) = np.random.default_rng(words), map(int, words.generate_state(3))
+        rng, (for_imaging, for_image) = np.random.default_rng(words), map(int, words.generate_state(2))
         turn = int(rng.integers(len(self.modalities)))
         kind = self.modalities[turn]
         imaging, voxel = kind.draw(for_imaging), draw_voxel(self.voxels[turn], self.calibres, rng)
         voxels = field_shape(self.size, voxel, imaging)
-        shown = self._draw_shape(voxels, rng, for_blend)
+        shape = self.source.shape(voxels, 0, rng)
+        shown = Layers.of(torch.from_numpy(shape.values), shape.epsilon, [shape.origin])
         grey, _, mask = image_and_labels(shown, voxel, imaging, for_image, self.size, (1.0,))
         record = {"number": number, "source": shown.origins, "modality": kind.name, "imaging": imaging.as_dict()}
         record |= {"image_seed": for_image, "voxel": voxel}
         image = grey[None].float()
         image = image if self.normalise is None else self.normalise(image)
         return Sample(image, mask[None], imaging.spacing, record)
-
-    def _draw_shape(self, voxels: Sequence[int], rng: np.random.Generator, seed: int) -> Layers:
-        """Return a crop of one shape, or of two that share the volume."""
-        if rng.random() < self.blend:
-            return blend_shapes(lambda turn: self.source.shape(voxels, turn, rng), seed)
-        shape = self.source.shape(voxels, 0, rng)
-        return Layers.of(torch.from_numpy(shape.values), shape.epsilon, [shape.origin])
 
     def _make_pool(self, generated: Generated, count: int, rotate: bool) -> Pool:
         """Return a pool of shapes that are as large as the largest crop."""
@@ -182,8 +173,8 @@ class TextureDataset(IterableDataset):
         """Raise ValueError where an argument is missing or out of range."""
         if not (sources and self.modalities):
             raise ValueError(f"give a source and a modality, got {len(sources)} and {len(self.modalities)}")
-        if self.length < 1 or not 0 <= self.blend <= 1:
-            raise ValueError(f"length must be above 0 and blend in [0, 1], got {self.length} and {self.blend}")
+        if self.length < 1:
+            raise ValueError(f"length must be above 0, got {self.length}")
         check_calibres(self.calibres)
 
 

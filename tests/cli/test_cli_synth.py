@@ -151,7 +151,7 @@ def test_bad_input(tmp_path, store):
     refused(call("synth", "-o", out, "--presets", "tubes", *kind, "--volume-fraction", "2"), "volume fraction")
     refused(call(*some, *kind, "--draws", "3"), "--draws")
     refused(call(*some, *kind, *QUICK, "--wall", "0"), "wall")
-    refused(call(*some, *kind, *QUICK, "--wall", "1", "--blend", "0.2"), "blend")
+    refused(call(*some, *kind, *QUICK, "--wall", "1", "--classes"), "classes")
     refused(call(*some, *kind, *QUICK, "--classes"), "classes")
     refused(call(*some, *kind, *QUICK, "--levels", "1,0"), "level")
     refused(call(*some, *kind, "--unit", "um"), "--wall")

@@ -1,4 +1,4 @@
-"""What an image shows: walls of even thickness, classes in front of one another, textures that give way."""
+"""What an image shows: walls of even thickness, classes in front of one another."""
 
 from __future__ import annotations
 
@@ -139,15 +139,6 @@ def test_levels_say_how_bright_a_class_is(two):
     assert np.median(even.image[even.labels == 2]) == pytest.approx(110)
 
 
-def test_one_texture_gives_way_to_another(stored):
-    both = replace(stored, composition=Composition(blend=1))
-    case = both.case(0)
-    assert len(case.record["source"]) == 2 and set(np.unique(case.labels)) == {0, 1}
-    assert (case.image == both.case(0).image).all() and (case.image != stored.case(0).image).any()
-    shares = [len(replace(stored, composition=Composition(blend=0.5)).case(k).record["source"]) == 2 for k in range(12)]
-    assert 2 <= sum(shares) <= 10
-
-
 def test_a_set_of_shells_lists_its_classes(tmp_path, stored):
     spec = SetSpec(replace(stored, composition=Composition(wall=0.8)), parts=("radius",))
     folder = build_set(tmp_path / "set", spec, 2)
@@ -170,12 +161,10 @@ def test_laws_of_one_name_make_classes_of_two():
 
 
 def test_bad_input(stored):
-    with pytest.raises(ValueError, match="one of blend, classes and wall"):
-        Composition(blend=0.1, wall=2)
+    with pytest.raises(ValueError, match="classes or a wall"):
+        Composition(classes=True, wall=2)
     with pytest.raises(ValueError, match="positive thickness"):
         Composition(wall=0)
-    with pytest.raises(ValueError, match="blended cases"):
-        Composition(blend=1.5)
     with pytest.raises(ValueError, match="levels from 0"):
         Composition(levels=(1, -1))
     with pytest.raises(ValueError, match="a level for each of wall, lumen"):

@@ -44,7 +44,7 @@ def numbers(samples: Iterable[str]) -> list[int]:
 
 
 def test_a_pair_is_a_crop_of_a_shape_and_its_image(store):
-    dataset = TextureDataset(store, QUIET, SHAPE, blend=0.0)
+    dataset = TextureDataset(store, QUIET, SHAPE)
     for number in range(4):
         image, label, spacing, record = dataset[number]
         assert image.shape == label.shape == (1, *SHAPE)
@@ -114,19 +114,6 @@ def test_samples_of_many_calibres(store):
         TextureDataset(store, QUIET, SHAPE, calibres=(0.0, 1.0))
 
 
-def test_a_blend_holds_both_textures(store):
-    dataset = TextureDataset(store, QUIET, (16, 16, 16), blend=1.0)
-    sample = dataset[0]
-    assert len(sample.record["source"]) == 2
-    fields = []
-    for origin in sample.record["source"]:
-        whole = apply_symmetry(open_store(store).field(int(origin["name"].split()[-1])), origin["symmetry"])
-        fields.append(crop_periodic(whole, origin["corner"], (16, 16, 16)) > 0)
-    label = sample.label[0].numpy() > 0
-    assert (label[fields[0] & fields[1]]).all() and not label[~fields[0] & ~fields[1]].any()
-    assert (label != fields[0]).any() and (label != fields[1]).any()
-
-
 def test_modalities_take_turns_at_random(store):
     loud = Modality("loud", "for tests", 1.0, Imaging(contrast=Contrast(foreground=1000.0)))
     names = {TextureDataset(store, [QUIET, loud], SHAPE)[k].record["modality"] for k in range(12)}
@@ -178,7 +165,7 @@ def test_images_are_normalised_as_asked(store):
 
 
 def test_shapes_turned_by_any_angle(store):
-    dataset = TextureDataset(store, QUIET, SHAPE, blend=0.0, rotate=True)
+    dataset = TextureDataset(store, QUIET, SHAPE, rotate=True)
     image, label, _, record = dataset[3]
     (origin,) = record["source"]
     whole = apply_symmetry(open_store(store).field(int(origin["name"].split()[-1])), origin["symmetry"])
@@ -254,7 +241,5 @@ def test_bad_input(store, tmp_path):
         TextureDataset(tmp_path / "missing.zarr", QUIET, SHAPE)
     with pytest.raises(ValueError, match="modality"):
         TextureDataset(store, [], SHAPE)
-    with pytest.raises(ValueError, match="blend"):
-        TextureDataset(store, QUIET, SHAPE, blend=1.5)
     with pytest.raises(ValueError, match="length"):
         TextureDataset(store, QUIET, SHAPE, length=0)

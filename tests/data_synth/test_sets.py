@@ -236,6 +236,19 @@ def test_what_others_began_is_left_alone(tmp_path, order):
     assert (folder / "curvafit.json").read_text() == "{}"
 
 
+@pytest.mark.parametrize("blend", [0, 0.2])
+def test_a_set_that_states_a_blend_goes_on_where_it_is_none(tmp_path, order, blend):
+    folder = build_set(tmp_path / "set", order, 1)
+    header = json.loads((folder / "curvafit.json").read_text())
+    header["order"]["recipe"]["composition"]["blend"] = blend
+    (folder / "curvafit.json").write_text(json.dumps(header))
+    if blend:
+        with pytest.raises(ValueError, match="blends textures"):
+            build_set(folder, order, 2)
+    else:
+        assert len(sums(build_set(folder, order, 2))) == 2
+
+
 def test_a_damaged_header_is_one_sentence(tmp_path, order):
     folder = build_set(tmp_path / "set", order, 1)
     header = json.loads((folder / "curvafit.json").read_text())
