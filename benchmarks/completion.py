@@ -1,18 +1,17 @@
 """The volume between known slices: plain interpolations, the network and laws, on generated shapes and real structures.
 
-`--on shapes`: a shape of 64³ is known at every so many slices, as a crop (not told to repeat) and as a box that
-repeats; the law is inferred by `infer --fast` from the mask of another seed, the example. `--on scans`
-($CURVAFIT_DATA): blocks of real masks; law and example are of the other volume, or of the other half.
+`--on shapes`: a shape of 64³, cut out of what does not repeat, is known at every so many slices; the law is inferred by
+`infer --fast` from the mask of another seed, the example. `--on scans` ($CURVAFIT_DATA): blocks of real masks; law and
+example are of the other volume, or of the other half.
 
 - `spline`, `linear`, `nearest`, `ITK` (its morphological contour interpolation, where its package is installed): plain
   interpolations. Gains are held to the best of them *in hindsight*, case by case.
-- `offset`: the spline with the threshold that is best on the example; `scratch`: the network that it alone taught.
-- `filler`: `reconstruct` without an example; `careful`: with all mirror images. `tuned`: with an example; `law`,
-  `willmore`, `area`: with one, and its law, the Willmore energy or the area tried.
+- `scratch`: the network that the example alone taught; `filler`: `reconstruct` without an example; `tuned`: with one;
+  `law`, `willmore`: with one, and its law or the Willmore energy tried.
 
 Dice and the calibration error within 3 voxels of the surface count the unknown slices between the first and the last
-known one; the sum of the Betti numbers' errors and the error of the mean thickness, in voxels, count all between them.
-Choices were made on the structures of `CHOSEN_ON`; the others are run once.
+known one; the sum of the Betti numbers' errors counts all between them. Choices were made on the structures of
+`CHOSEN_ON`; the others are run once.
 """
 
 from __future__ import annotations
@@ -35,7 +34,6 @@ from scipy import ndimage
 from benchmarks.harness import Cases, Figure, Values, bootstrap, scores, show
 from curvafit.data_synth.design import design_box
 from curvafit.generation.flow import generate
-from curvafit.geometry.morphometry import local_thickness
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer
 from curvafit.priors.coefficients import Coefficients
@@ -58,12 +56,12 @@ ITK = "ITK"
 #: Laws that are tried where not the example's own. The area alone would let surfaces crumple: it has a twentieth of
 #: Willmore's energy, and costs twenty times as much as that of tubes 8 voxels thick.
 LAWS_TRIED = {"willmore": Coefficients.willmore(), "area": Coefficients(0.05, 0.1, 0.05, 0, 0, 1 / 16)}
-#: Ways of `reconstruct`, and others that need an example: neither is a plain interpolation.
-OURS, TAUGHT = ("filler", "careful", "tuned", "law", *LAWS_TRIED), ("offset", "scratch")
+#: Ways that are no plain interpolation.
+OURS = ("filler", "tuned", "law", "willmore", "scratch")
 #: Steps of the network that an example alone teaches.
 SCRATCH = 600
 #: What is kept of each case.
-FIGURES = ("dice", "betti", "thickness", "calibration", "seconds")
+FIGURES = ("dice", "betti", "calibration")
 #: Sides of structures on which the network's mix and the threshold were chosen.
 CHOSEN_ON = {"vesselexpress": (0, 1), "felt": (0, 1), "mitochondria-32": (0,), "mitochondria-16": (0,)}
 #: Slices of a block along its first axis below which those along the second are known.
@@ -95,18 +93,6 @@ def interpolated(slices: Slices, way: str) -> np.ndarray:
     mask = itk.array_from_image(interpolator.GetOutput()) > 0
     mask[list(slices.places)] = slices.inside
     return mask
-
-
-def by_example(slices: Slices, way: str, example: Field, axis: int) -> np.ndarray:
-    """Return the mask of a way that an example alone tells: the spline's best threshold, or a network from nothing."""
-    other = Example.of(example, slices.places, axis)
-    given, truth, places = other.task.given, other.task.truth, list(other.task.places)
-    if way == "offset":
-        level = given.level("spline")[places]
-        least = max(np.quantile(level, np.linspace(0.3, 0.999, 200)), key=lambda least: dice(level > least, truth))
-        return slices.keep_known(slices.level("spline") > least)
-    logits = fill(slices, Taught(scratch(example, slices.places, axis), np.array([[2.0, 20.0], [1.0, 1.0]]), {}, 0.0))
-    return slices.keep_known(logits > best_log_odds(logits[slices.between]))
 
 
 @cache
@@ -146,53 +132,45 @@ def fitted(law: str, seed: int, cases: Cases) -> Fit:
 
 
 def filled(
-    way: str, truth: Field, places: range, axis: int, prior: Callable[[], Any], example: Callable[[], Any], **told: Any
+    way: str, truth: Field, places: range, axis: int, prior: Callable[[], Any], example: Callable[[], Any]
 ) -> Values:
     """Return the scores of a way to fill a mask of which some slices are known."""
-    begun, first = time.perf_counter(), np.moveaxis(truth.values > 0, axis, 0)
-    likely = None
-    if way in OURS:
-        with_law = prior() if way == "law" else LAWS_TRIED.get(way)
-        shown, begun = None if way in ("filler", "careful") else example(), time.perf_counter()
-        found = reconstruct(truth, with_law, known=places, axis=axis, example=shown, careful=way == "careful", **told)
+    begun, first, status = time.perf_counter(), np.moveaxis(truth.values > 0, axis, 0), ""
+    slices, likely = Slices.of(truth, places, axis), None
+    if way == "scratch":
+        taught = Taught(scratch(example(), slices.places, axis), np.array([[2.0, 20.0], [1.0, 1.0]]), {}, 0.0)
+        logits = fill(slices, taught)
+        mask = slices.keep_known(logits > best_log_odds(logits[slices.between]))
+    elif way in OURS:
+        law, shown = prior() if way == "law" else LAWS_TRIED.get(way), None if way == "filler" else example()
+        found = reconstruct(truth, law, known=places, axis=axis, example=shown)
         mask, likely = (np.moveaxis(each.values, axis, 0) for each in (found.mask, found.probability))
         status = found.status
     else:
-        slices = Slices.of(truth, places, axis, told.get("periodic", False))
-        mask = by_example(slices, way, example(), axis) if way in TAUGHT else interpolated(slices, way)
-        status = ""
-    seconds, last = time.perf_counter() - begun, places[-1] + 1
+        mask = interpolated(slices, way)
+    last = places[-1] + 1
     unknown = [k for k in range(last) if k not in places]
-    edges = tuple(h / min(truth.spacing) for h in np.roll(truth.spacing, -axis))
-    thickness = [float(local_thickness(each[:last], edges)[each[:last]].mean()) for each in (mask, first)]
     values = {**scores(mask[:last], first[:last]), "dice": dice(mask[unknown], first[unknown]), "status": status}
     if likely is not None:
         near = near_surface(mask)[unknown]
         values["calibration"] = calibration_error(likely[unknown][near], first[unknown][near])
-    return {**values, "thickness": abs(thickness[0] - thickness[1]), "seconds": seconds}
+    return {**values, "seconds": time.perf_counter() - begun}
 
 
-def shape_case(way: str, law: str, seed: int, every: int, periodic: bool, cases: Cases) -> Values:
+def shape_case(way: str, law: str, seed: int, every: int, cases: Cases) -> Values:
     truth, other = (Field(shape(law, k, cases).astype(np.uint8)) for k in (seed, seed + 1))
-    prior, example = partial(fitted, law, seed + 1, cases), lambda: other
-    return filled(way, truth, range(0, EDGE, every), 0, prior, example, periodic=periodic)
+    return filled(way, truth, range(0, EDGE, every), 0, partial(fitted, law, seed + 1, cases), lambda: other)
 
 
-def on_shapes(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
-    ways = [*plain_ways(), *(way for way in options.ways.split(",") if way in OURS + TAUGHT)]
+def on_shapes(options: argparse.Namespace, ways: list[str], cases: Cases) -> dict[str, Figure]:
     laws, every, seed = options.laws.split(","), options.every, options.target
     group, laws = ("drawn", DRAWN) if laws == ["drawn"] else ("shapes", laws)
     if options.quick:
         laws, ways = laws[:1], ["spline", "filler"]
-    figures: dict[str, Figure] = {}
-    for kind in options.kinds.split(",")[: 1 if options.quick else None]:
-        names = {(law, way): f"{kind}-{way}-{law}-{seed}-{every}" for law, way in product(laws, ways)}
-        jobs = {
-            name: partial(shape_case, way, law, seed, every, kind == "box", cases) for (law, way), name in names.items()
-        }
-        figures |= gains(
-            f"{kind}s, every {every}", names, cases.all(jobs, seed), ways, f"{group}.{{way}}.{kind}_{{key}}"
-        )
+    names = {(law, way): f"crop-{way}-{law}-{seed}-{every}" for law, way in product(laws, ways)}
+    jobs = {name: partial(shape_case, way, law, seed, every, cases) for (law, way), name in names.items()}
+    found = cases.all(jobs, seed)
+    figures = gains(f"every {every}", names, found, ways, f"{group}.{{way}}.crop_{{key}}")
     return figures if (every, seed) == (8, 2) else {}
 
 
@@ -207,7 +185,7 @@ def gains(
     rows = {t: {w: cases[names[t, w]] for w in ways} for t in things if all(names[t, w] in cases for w in ways)}
     if not rows:
         return {}
-    best = np.array([max(row[way]["dice"] for way in ways if way not in OURS + TAUGHT) for row in rows.values()])
+    best = np.array([max(row[way]["dice"] for way in ways if way not in OURS) for row in rows.values()])
     table, figures = [], {key.format(way="best", key="plain"): bootstrap(best)}
     for way in ways:
         mine = {figure: np.array([row[way].get(figure, np.nan) for row in rows.values()]) for figure in FIGURES}
@@ -308,35 +286,28 @@ def scan_case(name: str, side: int, block: int, every: int, way: str, cases: Cas
     return filled(way, target, range(0, target.shape[axis], every), axis, prior, lambda: sides(name)[1 - side])
 
 
-def on_scans(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+def on_scans(options: argparse.Namespace, ways: list[str], cases: Cases) -> dict[str, Figure]:
     if "CURVAFIT_DATA" not in os.environ:
         raise SystemExit("set CURVAFIT_DATA to the folder that holds scans/")
-    ways, every = [*plain_ways(), *(way for way in options.ways.split(",") if way in OURS + TAUGHT)], options.every
+    every, names = options.every, options.only.split(",")
     figures: dict[str, Figure] = {}
-    group = "filled" if options.set == "report" else options.set
-    for name in options.only.split(","):
-        shown = [
-            side
-            for side in (0, 1)
-            if options.set == "all" or (side in CHOSEN_ON.get(name, ())) == (options.set == "chosen")
-        ]
+    for name in names:
+        shown = [side for side in (0, 1) if side not in CHOSEN_ON.get(name, ())]
         parts = [f"{side}-{block}" for side, block in product(shown, range(STRUCTURES[name].targets))]
         if options.quick:
             parts, ways = parts[:1], ["spline"]
-        names = {(each, way): f"{name}-{each}-{every}-{way}" for each, way in product(parts, ways)}
+        named = {(each, way): f"{name}-{each}-{every}-{way}" for each, way in product(parts, ways)}
         jobs = {case: partial(scan_case, name, *map(int, each.split("-")), every, way, cases)
-                for (each, way), case in names.items()}  # fmt: skip
-        figures |= gains(f"{name}, every {every}", names, cases.all(jobs), ways, f"{group}.{name}.{{way}}_{{key}}")
-    if group != "filled" or "," not in options.only:
-        return figures if every == 8 else {}
+                for (each, way), case in named.items()}  # fmt: skip
+        figures |= gains(f"{name}, every {every}", named, cases.all(jobs), ways, f"filled.{name}.{{way}}_{{key}}")
     whole: dict[str, Figure] = {}
-    for way in ways:
+    for way in ways if len(names) == len(STRUCTURES) else ():
         each = {key: [figure.value for name, figure in figures.items() if name.endswith(f".{way.lower()}_{key}")]
                 for key in ("gain", "least", *FIGURES)}  # fmt: skip
         whole |= {f"gaps.{every}.{way.lower()}_{key}": bootstrap(values) for key, values in each.items()}
         whole[f"gaps.{every}.{way.lower()}_least"] = Figure(min(each["least"]))
-    names = {"filler_gain": "all", "filler_least": "least", "tuned_gain": "tuned_all", "tuned_least": "tuned_least"}
-    whole |= {f"filled.{name}": whole[f"gaps.8.{key}"] for key, name in names.items() if f"gaps.8.{key}" in whole}
+    summary = {"filler_gain": "all", "filler_least": "least", "tuned_gain": "tuned_all", "tuned_least": "tuned_least"}
+    whole |= {f"filled.{name}": whole[f"gaps.8.{key}"] for key, name in summary.items() if f"gaps.8.{key}" in whole}
     return whole | (figures if every == 8 else {})
 
 
@@ -346,13 +317,12 @@ def on_scans(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--on", choices=("shapes", "scans"), default="shapes")
     parser.add_argument("--laws", default=",".join(LAWS), help="of shapes, or drawn: twenty random ones")
-    parser.add_argument("--kinds", default="crop,box", help="of shapes")
     parser.add_argument("--only", default=",".join(STRUCTURES), help="structures of scans")
     parser.add_argument("--every", type=int, default=8)
     parser.add_argument("--target", type=int, default=2, help="seed of the shapes; their laws are of the next")
-    parser.add_argument("--ways", default="filler,tuned", help="besides the interpolations: filler, tuned, law")
-    parser.add_argument("--set", choices=("all", "chosen", "report"), default="report", help="sides of structures")
+    parser.add_argument("--ways", default="filler,tuned", help=f"besides the interpolations: {', '.join(OURS)}")
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
-    return on_scans(options, cases) if options.on == "scans" else on_shapes(options, cases)
+    ways = [*plain_ways(), *(way for way in options.ways.split(",") if way in OURS)]
+    return (on_scans if options.on == "scans" else on_shapes)(options, ways, cases)

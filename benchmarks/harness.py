@@ -193,11 +193,6 @@ def bootstrap(
     return Figure(float(statistic(rows, axis=0)), float(low), float(high))
 
 
-def paired_ratio(after: Sequence[float], before: Sequence[float]) -> Figure:
-    """Return the median of the ratios of pairs, after over before, with its interval."""
-    return bootstrap(np.asarray(after) / np.asarray(before))
-
-
 def in_turns(
     actions: Mapping[str, Callable[[], object]], rounds: int, *, warm: int = 1, before: int = 0
 ) -> dict[str, np.ndarray]:

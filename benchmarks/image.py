@@ -1,11 +1,9 @@
-"""The volume between annotated slices of a real image, every eighth known: the filler with the image, and its rivals.
+"""The volume between annotated slices of a real image, every eighth known: the filler with the image, and its rival.
 
-Needs $CURVAFIT_DATA, scikit-learn and monai. All ways know the same slices, and the image of the whole volume.
+Needs $CURVAFIT_DATA, and scikit-learn. All ways know the same slices, and the image of the whole volume.
 
 - `ours`: `reconstruct(image=…)`; `alone`: without the image; `trees`: its reading of the image, at log-odds of 0.
-- `forest`: a random forest of 60 trees on smoothed levels, edges and Hessian eigenvalues, as ilastik
-  has them; `refined`: `refine` on its map, Willmore, at the best of `WEIGHTS` *in hindsight*.
-- `U-Net`: a small 3D one by Dice and cross-entropy of the known slices, the rest ignored.
+- `forest`: a random forest of 60 trees on smoothed levels, edges and Hessian eigenvalues, as ilastik has them.
 
 Dice counts unknown slices alone. Intervals: a jackknife over slabs between slices times 32² pixels. VesselExpress and
 shapes chose features and mix; the others are run once.
@@ -23,24 +21,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from benchmarks.completion import STRUCTURES, mask_of
 from benchmarks.harness import Cases, Figure, Values, show
-from benchmarks.unets import UNKNOWN, dice_ce
-from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.image import read_image
 from curvafit.segmentation.reconstruct import reconstruct
-from curvafit.segmentation.refine import refine
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.trials import dice_of, gain_of, tally
 from curvafit.segmentation.uncertainty import calibration_error, near_surface
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
 
-WAYS = ("ours", "alone", "trees", "forest", "refined", "U-Net")
-EVERY, WEIGHTS = 8, (1.0, 5.0)
-STEPS, BATCH, PATCH, RATE = 300, 2, (24, 64, 64), 5e-3
+WAYS = ("ours", "alone", "trees", "forest")
+EVERY = 8
 
 
 class Scan(NamedTuple):
@@ -98,74 +91,33 @@ def forest(grey: np.ndarray, truth: np.ndarray, places: list[int]) -> np.ndarray
     )
 
 
-def u_net(grey: np.ndarray, truth: np.ndarray, places: list[int]) -> np.ndarray:
-    """Return the probabilities of a 3D network that learns from the known slices."""
-    from monai.inferers.utils import sliding_window_inference
-    from monai.networks.nets.unet import UNet
-
-    torch.manual_seed(0)
-    values = torch.from_numpy((grey - grey.mean()) / grey.std())
-    target = torch.full(grey.shape, UNKNOWN, dtype=torch.uint8)
-    target[places] = torch.from_numpy(truth[places]).to(torch.uint8)
-    size = [min(n // 4 * 4, edge) for n, edge in zip(grey.shape, PATCH, strict=True)]
-    net = UNet(3, 1, 1, (12, 24, 48), (2, 2), num_res_units=1, norm="batch")
-    adam = torch.optim.AdamW(net.parameters(), RATE)
-    cycle = torch.optim.lr_scheduler.OneCycleLR(adam, RATE, total_steps=STEPS)
-    random = np.random.default_rng(0)
-    for _ in range(STEPS):
-        pairs = []
-        for _ in range(BATCH):
-            starts = [int(random.integers(n - edge + 1)) for n, edge in zip(grey.shape, size, strict=True)]
-            window = tuple(slice(a, a + edge) for a, edge in zip(starts, size, strict=True))
-            flips = [axis for axis in range(3) if random.random() < 0.5]
-            pairs.append([each[window].flip(flips)[None] for each in (values, target)])
-        x, y = (torch.stack(each) for each in zip(*pairs, strict=True))
-        adam.zero_grad()
-        dice_ce(net(x), y.float()).backward()
-        adam.step()
-        cycle.step()
-    net.eval()
-    with torch.inference_mode():
-        found = sliding_window_inference(values[None, None], size, 2, net, overlap=0.5, mode="gaussian")
-    return torch.sigmoid(found)[0, 0].numpy()  # type: ignore[index]
-
-
-def case(name: str, way: str, cases: Cases) -> Values:
+def case(name: str, way: str) -> Values:
     """Return the scores of a way, and its counts in cells."""
-    image, mask = read(name)
-    axis, begun = SCANS[name].axis, time.perf_counter()
-    known = SCANS[name].known
-    places = list(known or range(0, mask.shape[axis], EVERY))
+    (image, mask), axis, known = read(name), SCANS[name].axis, SCANS[name].known
+    begun, places = time.perf_counter(), list(known or range(0, mask.shape[axis], EVERY))
     grey, truth = (np.moveaxis(each.values, axis, 0) for each in (image, mask))
-    truth, status, likely = truth > 0, "", None
-    edges = (mask.spacing[axis], *(h for k, h in enumerate(mask.spacing) if k != axis))
+    truth, status = truth > 0, ""
     if way in ("ours", "alone"):
         found = reconstruct(mask, known=places, axis=axis, image=image if way == "ours" else None)
         inside, likely = (np.moveaxis(each.values, axis, 0) for each in (found.mask, found.probability))
         inside, status = inside > 0, found.status
     else:
-        if way in ("forest", "refined"):
-            likely = cases.array(f"forest-{name}", lambda: forest(grey, truth, places))
-        elif way == "trees":
+        if way == "forest":
+            likely = forest(grey, truth, places)
+        else:
+            edges = (mask.spacing[axis], *(h for k, h in enumerate(mask.spacing) if k != axis))
             slices = Slices(truth[places], tuple(places), len(truth), edges, mask.unit)
             likely = 1 / (1 + np.exp(-read_image(grey, slices)[0]))
-        else:
-            likely = u_net(grey, truth, places)
         inside = likely > 0.5
-    if way == "refined":
-        volume, likely = Field(likely.astype(np.float32), edges, mask.unit), None
-        inside = max(
-            (refine(volume, Coefficients.willmore(), weight=weight).mask.values > 0 for weight in WEIGHTS),
-            key=lambda each: int((each == truth).sum()),
-        )
-    seconds = time.perf_counter() - begun
     unknown = [n for n in range(len(truth) if known else places[-1]) if n not in places]
-    counts = tally(inside[unknown], truth[unknown], [n // EVERY * 32 for n in unknown])
-    values: Values = {"dice": float(dice_of(counts.sum(0))), "seconds": seconds, "status": status}
-    if likely is not None:
-        near = near_surface(inside)[unknown]
-        values["calibration"] = calibration_error(likely[unknown][near], truth[unknown][near])
-    return {**values, "counts": counts.tolist()}
+    counts, near = tally(inside[unknown], truth[unknown], [n // EVERY * 32 for n in unknown]), near_surface(inside)
+    return {
+        "dice": float(dice_of(counts.sum(0))),
+        "seconds": time.perf_counter() - begun,
+        "status": status,
+        "calibration": calibration_error(likely[unknown][near[unknown]], truth[unknown][near[unknown]]),
+        "counts": counts.tolist(),
+    }
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -179,24 +131,18 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     names, ways = options.only.split(","), options.ways.split(",")
     if options.quick:
         names, ways = names[:1], ["ours", "trees"]
-    jobs = {f"{name}-{way}": partial(case, name, way, cases) for name, way in product(names, ways)}
-    found = cases.all(jobs)
+    jobs = {f"{name}-{way}": partial(case, name, way) for name, way in product(names, ways)}
+    found, figures = cases.all(jobs), dict[str, Figure]()
     groups = {"poon": [name for name in names if name.startswith("poon")]} | {n: [n] for n in names if n[:4] != "poon"}
-    figures, table = {}, []
     for group, members in groups.items():
         if not members or any(f"{name}-{way}" not in found for name, way in product(members, ways)):
             continue
         counts = {way: np.concatenate([found[f"{name}-{way}"]["counts"] for name in members]) for way in ways}
-        for way in ways:
-            figures[f"image.{group}.{way.lower()}"] = Figure(float(dice_of(counts[way].sum(0))))
-        row = [group, *(figures[f"image.{group}.{way.lower()}"].value for way in ways)]
-        if "ours" in ways:
-            rival = max((way for way in ways if way not in ("ours", "trees")), key=lambda way: row[1 + ways.index(way)])
-            gain, noise = (100 * each for each in gain_of(counts["ours"], counts[rival]))
+        figures |= {f"image.{group}.{way}": Figure(float(dice_of(counts[way].sum(0)))) for way in ways}
+        if "ours" in ways and "forest" in ways:
+            gain, noise = (100 * each for each in gain_of(counts["ours"], counts["forest"]))
             figures[f"image.{group}.gain"] = Figure(gain, gain - 1.96 * noise, gain + 1.96 * noise)
             errors = [found[f"{name}-ours"]["calibration"] for name in members]
             figures[f"image.{group}.calibration"] = Figure(float(np.mean(errors)))
-            row += [f"{rival}", figures[f"image.{group}.gain"], np.mean(errors)]
-        table.append([*row, *[""] * (len(ways) + 4 - len(row))])
-    show(["scan", *ways, "best rival", "gain on it, points", "calibration"], table, f"every {EVERY}")
+    show(["scan", "figure"], list(figures.items()), f"every {EVERY}")
     return figures

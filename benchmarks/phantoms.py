@@ -1,10 +1,9 @@
 """Thickness of exact phantoms, beside what other packages say of it.
 
 Phantoms are periodic in a box of six thicknesses, at 4, 6, 8 and 16 voxels of thickness (a slab also at 5): slabs with
-gaps of their own thickness, upright and oblique; an oblique rod; a ball; a torus; a sheet around the gyroid; and a
-grown shape, whose thickness is extrapolated from two fine grids. All but the upright slab are drawn at three random
-places, from 8 voxels at one. `measure` sees the box as periodic; the others see it continued by a thickness on each
-side, and their maps are averaged inside.
+gaps of their own thickness, upright and oblique; an oblique rod; a ball; a torus. All but the upright slab are drawn at
+three random places, from 8 voxels at one. `measure` sees the box as periodic; the others see it continued by a
+thickness on each side, and their maps are averaged inside.
 
 - `--packages PYTHON,…`: interpreters that have `localthickness`, `porespy`, `bone_microarchitecture`, `ormir_xct`,
   or `itk` with `itk-bonemorphometry`. Some are under the GPL: each is run in its own environment.
@@ -18,7 +17,7 @@ import argparse
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +25,6 @@ from numba import njit
 from scipy import ndimage
 
 from benchmarks.harness import Cases, Figure, Values, run_python, show
-from curvafit.generation.flow import generate
-from curvafit.geometry.morphometry import local_thickness
 from curvafit.scan.measure import measure
 
 #: Edge of the box in thicknesses; positions of each phantom by its thickness in voxels.
@@ -96,31 +93,15 @@ def torus(points: np.ndarray) -> np.ndarray:
     return 0.5 - np.hypot(np.hypot(y, x) - 1.5, z)
 
 
-def gyroid_sheet(points: np.ndarray) -> np.ndarray:
-    """Return 0.5 less the distance to the nodal gyroid: foot points by Newton's steps along its normals."""
-    q = points * 2 * np.pi / EDGE
-    foot = q.copy()
-    for _ in range(30):
-        (s, c), (s2, c2), (s3, c3) = ((np.sin(part), np.cos(part)) for part in np.moveaxis(foot, -1, 0))
-        value = s * c2 + s2 * c3 + s3 * c
-        slope = np.stack([c * c2 - s3 * s, c2 * c3 - s * s2, c3 * c - s2 * s3], axis=-1)
-        square = (slope**2).sum(-1, keepdims=True)
-        foot = foot - slope * value[..., None] / square
-        offset = q - foot
-        foot = foot + 0.5 * (offset - slope * (offset * slope).sum(-1, keepdims=True) / square)
-    return 0.5 - np.linalg.norm(q - foot, axis=-1) * EDGE / (2 * np.pi)
-
-
 PHANTOMS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "oblique": partial(slabs, normal=OBLIQUE),
     "rod": rod,
     "ball": ball,
     "torus": torus,
-    "gyroid": gyroid_sheet,
 }
 
 
-def masks(thickness: int, cases: Cases) -> dict[str, np.ndarray]:
+def masks(thickness: int) -> dict[str, np.ndarray]:
     """Return the phantoms at a thickness in voxels, `NAME-PLACE`; at an odd one the slab alone."""
     random, found = np.random.default_rng(thickness), {}
     points = (np.moveaxis(np.indices((EDGE * thickness,) * 3), 0, -1) + 0.5) / thickness
@@ -128,25 +109,7 @@ def masks(thickness: int, cases: Cases) -> dict[str, np.ndarray]:
     for name, distance in PHANTOMS.items() if thickness % 2 == 0 else ():
         for place in range(PLACES[thickness]):
             found[f"{name}-{place}"] = distance(points + random.random(3)) > 0
-    if thickness % 2 == 0:
-        found["grown-0"] = grown(round(thickness / grown_thickness(cases)), cases)
     return found
-
-
-def grown(edge: int, cases: Cases) -> np.ndarray:
-    """Return a grown shape, periodic, on `edge` voxels."""
-    field = cases.array("grown", lambda: generate("trabec", grid=48, seed=1).field.numpy())
-    return np.asarray(ndimage.zoom(field, edge / len(field), order=3, mode="grid-wrap", grid_mode=True)) > 0
-
-
-@cache
-def grown_thickness(cases: Cases) -> float:
-    """Return the grown shape's thickness in edges of its box: of two grids, extrapolated to voxels of no size."""
-    coarse, fine = (
-        float(local_thickness(mask, (1 / n,) * 3, periodic=True)[mask].mean(dtype=np.float64))
-        for n, mask in ((n, grown(n, cases)) for n in (72, 144))
-    )
-    return 2 * fine - coarse
 
 
 # ---- what is measured ------------------------------------------------------------------------------------------------
@@ -187,7 +150,7 @@ def run_elsewhere(python: Path, program: str, folder: Path, **arrays: np.ndarray
 
 def case(column: str, thickness: int, python: Path | None, cases: Cases) -> Values:
     """Return the mean thickness of each phantom by a package, means over places; or why there is none."""
-    given = masks(thickness, cases)
+    given = masks(thickness)
     continued = {name: np.pad(mask, thickness, mode="wrap") for name, mask in given.items()}
     inner = (slice(thickness, -thickness),) * 3
     if column == "curvafit":
@@ -205,9 +168,6 @@ def case(column: str, thickness: int, python: Path | None, cases: Cases) -> Valu
             return {"failed": str(error).strip().splitlines()[-1]}
     table, names = np.asarray(numbers, dtype=float), [name.partition("-")[0] for name in given]
     means = {name: [float(table[[other == name for other in names]].mean())] for name in dict.fromkeys(names)}
-    if "grown" in means:
-        exact = grown_thickness(cases) * len(given["grown-0"])
-        means["grown"][0] += thickness - exact  # its box is a whole number of voxels
     return means
 
 

@@ -36,7 +36,6 @@ def losses() -> dict[str, Loss]:
         "CurvaturePrior": CurvaturePrior("tubes", sigmoid=True),
         "DiceCELoss": DiceCELoss(sigmoid=True),
         "SoftclDiceLoss, 3": lambda x, y: SoftclDiceLoss(iter_=3)(y, x.sigmoid()),
-        "SoftclDiceLoss, 10": lambda x, y: SoftclDiceLoss(iter_=10)(y, x.sigmoid()),
     }
 
 
@@ -105,21 +104,13 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     times, training, fields = cases.all(jobs).values()
     ours = np.array(times["CurvaturePrior"])
     ratios = {name: bootstrap(np.array(taken) / ours) for name, taken in times.items()}
-    show(
-        ["loss", "least ms", "over the prior's"],
-        [[name, 1e3 * min(times[name]), ratio] for name, ratio in ratios.items()],
-        f"forward and backward, (2, 1, {edge}³), {torch.get_num_threads()} threads",
-    )
     more = bootstrap(100 * (np.array(training["with"]) / np.array(training["without"]) - 1))
-    show(
-        ["what", "figure"],
-        [["a U-Net's step with the prior, % more", more], ["float32 fields of memory", fields["fields"]]],
-    )
+    rows = [[f"{name}, over the prior's", ratio] for name, ratio in ratios.items()]
+    rows += [["a U-Net's step with the prior, % more", more], ["float32 fields of memory", fields["fields"]]]
+    show(["what", "figure"], rows, f"forward and backward, (2, 1, {edge}³), {torch.get_num_threads()} threads")
     return {
         "prior.cldice_3": ratios["SoftclDiceLoss, 3"],
-        "prior.cldice_10": ratios["SoftclDiceLoss, 10"],
         "prior.dice_ce": ratios["DiceCELoss"],
-        "prior.ms": Figure(1e3 * float(ours.min())),
         "prior.training": more,
         "prior.memory": Figure(fields["fields"]),
     }

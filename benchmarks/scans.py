@@ -1,10 +1,7 @@
-"""Reports of real scans: the verdict on each, and how far the laws of a scan's halves lie apart.
+"""Reports of real scans: what `infer` says of each.
 
-Needs $CURVAFIT_DATA. Of each scan by `infer`: the structure's share, thickness and spacing in working voxels; p and
-departure of `misfit`, and the blocks of descriptors that reject it; the means of the chosen law's twins over the scan;
-the verdict. Of the halves along the longest axis, by the posterior alone (`--halves`): p that both are of one law, by
-the difference of draws from their posteriors (χ² of its mean in units of its covariance), and the part of the halves
-of other tissues that are not (p at most .05).
+Needs $CURVAFIT_DATA. Of each scan the structure's share, thickness and spacing in working voxels; p and departure of
+`misfit`, and the blocks of descriptors that reject it; the means of the chosen law's twins over the scan; the verdict.
 """
 
 from __future__ import annotations
@@ -16,12 +13,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from benchmarks.harness import Cases, Figure, Values, show
 from curvafit.inference.infer import infer
-from curvafit.inference.posterior import load_posterior
-from curvafit.inference.table import PARAMETERS
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.read import load
 
@@ -78,38 +72,14 @@ def report(name: str) -> Values:
     return values
 
 
-def halves(name: str) -> Values:
-    """Return draws from the posteriors of a scan's two halves, without bounds."""
-    field, posterior = field_of(name), load_posterior()
-    axis = int(np.argmax([n * h for n, h in zip(field.shape, field.spacing, strict=True)]))
-    middle, found = field.shape[axis] // 2, {}
-    for k, part in enumerate((slice(None, middle), slice(middle, None))):
-        box = tuple(part if axis == n else slice(None) for n in range(3))
-        fit = infer(field.crop(box), kind=SCANS[name].kind, fast=True).fit  # type: ignore[arg-type]
-        if fit.draws is not None:
-            found[str(k)] = posterior.standardise(fit.draws)[:, : len(PARAMETERS)].round(4).tolist()
-    return found
-
-
-def same_law(one: list[list[float]], other: list[list[float]]) -> float:
-    """Return p that two posteriors are of one law, by draws `(n, 6)`."""
-    first, second = np.array(one), np.array(other)
-    away, spread = first.mean(0) - second.mean(0), np.cov(first.T) + np.cov(second.T)
-    return float(stats.chi2.sf(away @ np.linalg.solve(spread, away), len(away)))
-
-
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", default=",".join(SCANS))
-    parser.add_argument("--halves", action="store_true", help="the halves in place of whole reports")
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     if "CURVAFIT_DATA" not in os.environ:
         raise SystemExit("set CURVAFIT_DATA to the folder that holds scans/")
     names = ["capillaries"] if options.quick else options.only.split(",")
-    if options.halves or options.quick:
-        found = cases.all({f"halves-{name}": lambda name=name: halves(name) for name in names})
-        return compare_halves({name.removeprefix("halves-"): draws for name, draws in found.items()})
     found = cases.all({name: lambda name=name: report(name) for name in names})
     columns = ("share", "thickness", "spacing", "p", "departure", *RATIOS, "rejected by", "verdict")
     show(["scan", *columns], [[name, *(row.get(key, "") for key in columns)] for name, row in found.items()])
@@ -118,21 +88,4 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     if len(found) == len(SCANS):
         supported = sum(row["verdict"].startswith("Supported") for row in found.values())
         figures["scans.supported"] = Figure(float(supported))
-    return figures
-
-
-def compare_halves(draws: Mapping[str, Values]) -> dict[str, Figure]:
-    rows, figures = [], {}
-    for name, mine in draws.items():
-        if len(mine) < 2:
-            continue
-        own = same_law(mine["0"], mine["1"])
-        foreign = [each for other, each in draws.items() if SCANS[other].tissue != SCANS[name].tissue]
-        others = [same_law(a, b) <= 0.05 for each in foreign for a in mine.values() for b in each.values()]
-        figures[f"halves.{name}.alike"] = Figure(own)
-        rows.append([name, own, ""])
-        if others:
-            figures[f"halves.{name}.others"] = Figure(float(np.mean(others)))
-            rows[-1][-1] = float(np.mean(others))
-    show(["halves of", "p of one law", "halves of other tissues told apart"], rows)
     return figures

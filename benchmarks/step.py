@@ -1,16 +1,16 @@
-"""A step of the H⁻¹ flow: fused against plain torch, the time of each pass, memory.
+"""A step of the H⁻¹ flow: fused against plain torch, and the floor that its bytes set.
 
-The two programs take turns, so that a busy machine slows both. Plain torch is measured under the default allocator,
-which gives large arrays back to the system at each step, and under one that keeps them. The floor is the time that the
-bytes which the fused step must move take at the bandwidth of a plain copy, the best seen in the same rounds: from main
-memory no step is faster than that.
+The two programs take turns, so that a busy machine slows both, in a process of their own, under the allocator's
+defaults, which give large arrays back to the system at each step. The floor is the time that the bytes which the fused
+step must move take at the bandwidth of a plain copy, the best seen in the same rounds: from main memory no step is
+faster than that.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import tracemalloc
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -30,13 +30,8 @@ COPIED = 2**26
 PLAIN = 200
 #: Voxels that a measurement steps through, about: larger cubes get fewer rounds.
 WORK = 10**8
-#: Bytes a voxel that each pass must move: floats read and written.
-PASSES = {"blur z": 4 * 2, "energy": 4 * 2, "gradient's blur z": 4 * 2, "Adam and blurs": 4 * (1 + 2 * 9 + 1)}
-#: Allocators: what glibc is told.
-ALLOCATORS = {
-    "default": {},
-    "kept": {"MALLOC_MMAP_THRESHOLD_": "4000000000", "MALLOC_TRIM_THRESHOLD_": "8000000000"},
-}
+#: Bytes a voxel that a step must move: floats read and written by the blur, the energy, its blur, Adam and blurs.
+BYTES = 4 * (2 + 2 + 2 + 20)
 
 
 def fused_flow(size: int) -> FusedFlow:
@@ -55,37 +50,29 @@ def plain_stepper(size: int) -> TorchStepper:
 
 
 def measure(size: int, rounds: int) -> dict[str, float]:
-    """Return milliseconds (medians, and `least`) of both programs and of each pass; GB/s of a copy; bytes a voxel."""
+    """Return the median milliseconds of both programs, and GB/s of a copy."""
 
     def step(flow: FusedFlow) -> None:
         flow.evaluate()
         flow.update(1e-3)
 
     step(fused_flow(8))
-    tracemalloc.start()
-    fused = fused_flow(size)
-    step(fused)
-    peak = (tracemalloc.get_traced_memory()[1] + fused.vector.nbytes) / size**3
-    tracemalloc.stop()
-    source = torch.ones(COPIED)
+    fused, source = fused_flow(size), torch.ones(COPIED)
     target = source.clone()
-    passes = (fused.blur_along_z, fused.fill_gradient, fused.blur_gradient_along_z, lambda: fused.blur_adam(1e-3))
-    actions = {"fused": lambda: step(fused), "copy": lambda: target.copy_(source)}
-    actions |= dict(zip(PASSES, passes, strict=True))
+    actions: dict[str, Callable[[], object]] = {"fused": lambda: step(fused), "copy": lambda: target.copy_(source)}
     if size <= PLAIN:
         plain = plain_stepper(size)
         # A plain step leaves the caches full: the fused one before the measured one fills them anew.
         actions = {"plain": lambda: plain.step(1e-3), "again": actions["fused"], **actions}
     times = in_turns(actions, max(2, min(rounds, WORK // size**3)))
-    found = {name: 1e3 * float(np.median(taken)) for name, taken in times.items() if name not in ("copy", "again")}
-    found |= {f"{name}, least": 1e3 * float(times[name].min()) for name in ("fused", "plain") if name in times}
-    return found | {"GB/s": 2e-9 * source.nbytes / float(times["copy"].min()), "bytes a voxel": peak}
+    found = {name: 1e3 * float(np.median(times[name])) for name in ("fused", "plain") if name in times}
+    return found | {"GB/s": 2e-9 * source.nbytes / float(times["copy"].min())}
 
 
-def apart(size: int, rounds: int, allocator: str) -> dict[str, float]:
-    """Measure in a process of its own, under an allocator."""
+def apart(size: int, rounds: int) -> dict[str, float]:
+    """Measure in a process of its own."""
     script = f"import json; from benchmarks.step import measure; print(json.dumps(measure({size}, {rounds})))"
-    return json.loads(run_python("-c", script, **ALLOCATORS[allocator]).splitlines()[-1])
+    return json.loads(run_python("-c", script).splitlines()[-1])
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -95,24 +82,12 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     sizes = [32] if options.quick else [int(size) for size in options.sizes.split(",")]
-    jobs = {
-        f"{size}-{name}": lambda s=size, a=name: apart(s, options.rounds, a) for size in sizes for name in ALLOCATORS
-    }
-    found = cases.all(jobs)
-    rows, figures = [], {}
+    found = cases.all({f"{size}-default": lambda size=size: apart(size, options.rounds) for size in sizes})
+    figures: dict[str, Figure] = {}
     for name, ms in found.items():
-        voxels = int(name.split("-")[0]) ** 3
-        floor = sum(PASSES.values()) * voxels / ms["GB/s"] / 1e6
-        ratio = Figure(ms["plain"] / ms["fused"]) if "plain" in ms else None
-        least = ms["plain, least"] / ms["fused, least"] if ratio else ""
-        rows.append(
-            [name, ms.get("plain", ""), ms["fused"], ratio or "", least, ms["fused"] / floor, ms["bytes a voxel"]]
-        )
-        if ratio:
-            figures[f"step.ratio.{name}"] = ratio
-        figures[f"step.floor.{name}"] = Figure(ms["fused"] / floor)
-        figures[f"step.ms.{name}"] = Figure(ms["fused"])
-    columns = ["size, allocator", "plain ms", "fused ms", "ratio", "of the least", "over floor", "bytes a voxel"]
-    show(columns, rows, f"a step, {torch.get_num_threads()} threads")
-    show(["size, allocator", *PASSES], [[name, *(ms[part] for part in PASSES)] for name, ms in found.items()])
+        floor = BYTES * int(name.partition("-")[0]) ** 3 / ms["GB/s"] / 1e6
+        figures |= {f"step.ms.{name}": Figure(ms["fused"]), f"step.floor.{name}": Figure(ms["fused"] / floor)}
+        if "plain" in ms:
+            figures[f"step.ratio.{name}"] = Figure(ms["plain"] / ms["fused"])
+    show(["a step", "figure"], list(figures.items()), f"{torch.get_num_threads()} threads")
     return figures

@@ -3,10 +3,10 @@
 A shape of 64³ (two laws off the presets, `trabec`, and a block of real bone, $CURVAFIT_DATA) is blurred, under noise
 of two contrasts; slices 21 and 42 are annotated, and a small U-Net learns from them. All ways share network, patches,
 steps and their first third, which is Dice + CE alone (`plain`). `area`, `willmore`, `law` and `wrong` add the energy
-of all voxels: the law is that of another volume's mask, the wrong one another texture's. `teacher` is a mean teacher;
-`pseudo` learns what `reconstruct` fills from slices and image, each voxel as sure as it is; `filled` is that itself,
-without a network. `refine` (the law) works on what `plain` predicts. Weights are chosen for each texture
-and way by slice 32, on a seed of its own.
+of all voxels: the law is that of another volume's mask, the wrong one another texture's. `pseudo` learns what
+`reconstruct` fills from slices and image, each voxel as sure as it is; `filled` is that itself, without a network.
+`refine` (the law) works on what `plain` predicts. Weights are chosen for each texture and way by slice 32, on a seed of
+its own.
 
 Scores are those of the slices that nobody annotated. Differences pair networks by seed, with 95 % intervals of a
 bootstrap over textures and seeds; p of Holm over two contrasts, `law` less `plain` and less `willmore`.
@@ -15,7 +15,6 @@ bootstrap over textures and seeds; p of Holm over two contrasts, `law` less `pla
 from __future__ import annotations
 
 import argparse
-import copy
 import os
 import warnings
 from functools import partial
@@ -41,15 +40,14 @@ from curvafit.segmentation.trials import dice
 TEXTURES = ("draw-0", "draw-5", "trabec", "bone")
 KNOWN, JUDGE = (21, 42), 32
 STEPS, RATE = 240, 6e-3
-#: Weights that are tried: shares of the gradient; of the teacher, times its mean square.
-WEIGHTS = dict.fromkeys(("area", "willmore", "law", "wrong"), (0.1, 0.3, 1.0)) | {"teacher": (1.0, 10.0)}
-#: Ways that work on what `plain` predicts.
-AFTER = ("refine",)
-WAYS = ("plain", "area", "willmore", "law", "wrong", "teacher", "pseudo", *AFTER, "filled")
+#: Weights that are tried, as shares of the gradient.
+WEIGHTS = dict.fromkeys(("area", "willmore", "law", "wrong"), (0.1, 0.3, 1.0))
+WAYS = ("plain", "area", "willmore", "law", "wrong", "pseudo", "refine", "filled")
 #: The seed by which weights are chosen, and that of the volume that the law is read from.
 TUNING, OTHER = 100, 200
-#: Steps over which a prior grows to its weight, and the memory of a mean teacher.
-WARM, MEMORY = 24, 0.98
+#: Steps over which a prior grows to its weight.
+WARM = 24
+KEYS = ("dice", "cldice", "betti")
 
 
 # ---- volumes ---------------------------------------------------------------------------------------------------------
@@ -90,7 +88,7 @@ def prior_of(way: str, texture: str, cases: Cases) -> LawLike:
 # ---- training --------------------------------------------------------------------------------------------------------
 
 
-def soft_loss(logits: Tensor, x: Tensor, target: Tensor) -> Tensor:
+def soft_loss(logits: Tensor, target: Tensor) -> Tensor:
     """Return Dice and cross-entropy of probabilities, each voxel weighed by how sure it is."""
     sure, y = (2 * target - 1).abs(), (target > 0.5).float()
     p = logits.sigmoid()
@@ -114,35 +112,19 @@ def train(way: str, weight: float, texture: str, seed: int, steps: int, cases: C
     image, target = image_of(truth, seed), annotated(truth, KNOWN)
     if way == "pseudo":
         target = filled(texture, seed, cases)
-    batch, teacher, begun = lessons([(image, target)], seed), copy.deepcopy(net).requires_grad_(False), steps // 3
-    losses: list[CombinedLoss] = []
+    batch, losses = lessons([(image, target)], seed), list[CombinedLoss]()
 
     def loss_at(step: int) -> Loss:
         if way == "pseudo":
             return soft_loss
-        if step == begun and way in ("area", "willmore", "law", "wrong"):
+        if step == steps // 3 and way in WEIGHTS:
             prior = CurvaturePrior(prior_of(way, texture, cases), sigmoid=True)
             pairs = [(predict(net, x).detach(), y) for x, y in map(batch, range(-5, 0))]
             share = float(np.median([prior.suggest_weight(dice_ce, pair) for pair in pairs]))
             losses.append(CombinedLoss(dice_ce, prior, weight * share, WARM))
+        return losses[0] if losses else dice_ce
 
-        def loss(logits: Tensor, x: Tensor, y: Tensor) -> Tensor:
-            if way != "teacher" or step < begun:
-                return (losses[0] if losses else dice_ce)(logits, y)
-            with torch.no_grad():
-                noise = 0.3 * torch.randn(x.shape, generator=torch.Generator().manual_seed(step))
-                taught = predict(teacher, x + noise).sigmoid()
-            share = weight * min(1.0, (step - begun) / WARM)
-            return dice_ce(logits, y) + share * (logits.sigmoid() - taught).square().mean()
-
-        return loss
-
-    def remember() -> None:
-        with torch.no_grad():
-            for kept, new in zip(teacher.state_dict().values(), net.state_dict().values(), strict=True):
-                kept.copy_(MEMORY * kept + (1 - MEMORY) * new if kept.is_floating_point() else new)
-
-    learn(net, batch, steps, RATE, loss_at, remember)
+    learn(net, batch, steps, RATE, loss_at)
     return predict_whole(net, image).sigmoid().numpy()
 
 
@@ -155,10 +137,8 @@ def predicted(way: str, weight: float, texture: str, seed: int, steps: int, case
 
 def case(way: str, weight: float, texture: str, seed: int, steps: int, cases: Cases) -> Values:
     """Return the scores of a way on the slices that nobody annotated, and the Dice of the slice that judges."""
-    if way == "filled":
-        p = filled(texture, seed, cases)
-    else:
-        p = predicted("plain" if way in AFTER else way, 0.0 if way in AFTER else weight, texture, seed, steps, cases)
+    taught = "plain" if way == "refine" else way
+    p = filled(texture, seed, cases) if way == "filled" else predicted(taught, weight, texture, seed, steps, cases)
     truth, mask, said = truth_of(texture, seed, cases), p > 0.5, ""
     if way == "refine":
         truths = truth_of(texture, TUNING, cases).astype(np.uint8)
@@ -183,57 +163,40 @@ def cldice(mask: np.ndarray, truth: np.ndarray) -> float:
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seeds", type=int, default=4, help="networks of a way and texture; the pilot has 4")
-    parser.add_argument("--textures", default=",".join(TEXTURES))
-    parser.add_argument("--ways", default=",".join(WAYS))
+    parser.add_argument("--seeds", type=int, default=4, help="networks of a way and texture")
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore", category=UserWarning)
     steps, seeds = (6, 1) if cases.quick else (STEPS, options.seeds)
-    ways = ["plain", "law", "refine"] if cases.quick else options.ways.split(",")
-    textures = ["trabec"] if cases.quick else options.textures.split(",")
-    found: dict[tuple[str, str], list[Values]] = {}
+    ways, textures = (("plain", "law", "refine"), ("trabec",)) if cases.quick else (WAYS, TEXTURES)
 
     def scored(way: str, weight: float, texture: str, numbers: range) -> list[Values]:
-        names = {seed: f"{texture}-{way}-{weight:g}-{seed}-{steps}" for seed in numbers}
-        jobs = {name: partial(case, way, weight, texture, seed, steps, cases) for seed, name in names.items()}
+        jobs = {f"{texture}-{way}-{weight:g}-{seed}-{steps}": partial(case, way, weight, texture, seed, steps, cases)
+                for seed in numbers}  # fmt: skip
         return list(cases.all(jobs).values())
 
-    for texture in textures:
-        for way in ways:
-            tried = list(WEIGHTS.get(way, (0.0,)))
-            weight = tried[0]
-            if len(tried) > 1 and not cases.quick:
-                judged = {each: scored(way, each, texture, range(TUNING, TUNING + 1)) for each in tried}
-                if not all(judged.values()):
-                    continue
-                weight = max(tried, key=lambda each, rows=judged: rows[each][0]["judge"])
-            found[texture, way] = scored(way, weight, texture, range(seeds))
-    whole = [way for way in ways if all(len(found.get((texture, way), ())) == seeds for texture in textures)]
-    table = {way: np.array([[[row[key] for key in ("dice", "cldice", "betti")] for row in found[texture, way]]
-                            for texture in textures]) for way in whole}  # fmt: skip
-    show(["way", "Dice", "clDice", "Betti errors"], [[way, *rows.mean((0, 1)).tolist()] for way, rows in table.items()])
-    if "plain" not in table or cases.quick:
+    def chosen(way: str, texture: str) -> float:
+        if way not in WEIGHTS or cases.quick:
+            return WEIGHTS.get(way, (0.0,))[0]
+        judged = {weight: scored(way, weight, texture, range(TUNING, TUNING + 1)) for weight in WEIGHTS[way]}
+        return max(judged, key=lambda weight: judged[weight][0]["judge"] if judged[weight] else -1.0)
+
+    found = {(way, texture): scored(way, chosen(way, texture), texture, range(seeds))
+             for texture in textures for way in ways}  # fmt: skip
+    if cases.quick or any(len(rows) < seeds for rows in found.values()):
         return {}
-    figures, rows = {}, []
-    for way in (way for way in whole if way != "plain"):
-        gains = [bootstrap((table[way] - table["plain"])[..., k].ravel(), np.mean) for k in range(3)]
-        rows.append([way, *gains])
-        figures |= {
-            f"transductive.{way}.{key}": gain for key, gain in zip(("dice", "cldice", "betti"), gains, strict=True)
-        }
-    show(["less plain", "Dice", "clDice", "Betti errors"], rows)
-    if "law" in table and "willmore" in table:
-        apart = {base: (table["law"] - table[base])[..., 0].ravel() for base in ("plain", "willmore")}
-        p = {base: float(stats.wilcoxon(each)[1]) for base, each in apart.items()}
-        least, most = sorted(p, key=p.__getitem__)
-        holm = {least: min(1.0, 2 * p[least]), most: max(min(1.0, 2 * p[least]), p[most])}
-        spread = float(np.std(apart["willmore"], ddof=1))
-        figures |= {f"transductive_p.{base}": Figure(holm[base]) for base in holm}
-        figures |= {"transductive_p.spread": Figure(spread)}
-        figures |= {"transductive_p.contrast": bootstrap(apart["willmore"], np.mean)}
-        rows = [[base, value, float(np.std(apart[base], ddof=1))] for base, value in holm.items()]
-        show(["law less", "p after Holm", "spread of differences"], rows)
+    table = {way: np.array([[[row[key] for key in KEYS] for row in found[way, texture]] for texture in textures])
+             for way in ways}  # fmt: skip
+    show(["way", *KEYS], [[way, *rows.mean((0, 1)).tolist()] for way, rows in table.items()])
+    figures = {f"transductive.{way}.{key}": bootstrap((table[way] - table["plain"])[..., k].ravel(), np.mean)
+               for way in ways[1:] for k, key in enumerate(KEYS)}  # fmt: skip
+    apart = {base: (table["law"] - table[base])[..., 0].ravel() for base in ("plain", "willmore")}
+    p = {base: float(stats.wilcoxon(each)[1]) for base, each in apart.items()}
+    least, most = sorted(p, key=p.__getitem__)
+    figures[f"transductive_p.{least}"] = Figure(min(1.0, 2 * p[least]))  # Holm
+    figures[f"transductive_p.{most}"] = Figure(max(min(1.0, 2 * p[least]), p[most]))
+    figures["transductive_p.contrast"] = bootstrap(apart["willmore"], np.mean)
+    show(["less plain; p", ""], list(figures.items()))
     return figures

@@ -14,7 +14,7 @@ from torch.nn import functional
 UNKNOWN, PATCH = 2, 48
 #: Noise of an image in contrasts, and its blur in voxels.
 NOISE, BLUR = 2.0, 0.7
-Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
+Loss = Callable[[Tensor, Tensor], Tensor]
 
 
 def image_of(truth: np.ndarray, seed: int) -> np.ndarray:
@@ -85,18 +85,16 @@ def learn(
     batch: Callable[[int], tuple[Tensor, Tensor]],
     steps: int,
     rate: float,
-    loss_at: Callable[[int], Loss] | None = None,
-    after: Callable[[], None] = lambda: None,
+    loss_at: Callable[[int], Loss] = lambda step: dice_ce,
 ) -> None:
-    """Teach a network by Dice + CE, or by the loss of logits, image and target at each step; its rate falls to 0."""
+    """Teach a network by the loss of logits and target at each step; the rate falls to 0."""
     adam = torch.optim.AdamW(net.parameters(), rate)
     net.train()
     for step in range(steps):
-        loss = (lambda z, x, y: dice_ce(z, y)) if loss_at is None else loss_at(step)
+        loss = loss_at(step)
         adam.param_groups[0]["lr"] = rate * (1 + np.cos(np.pi * step / steps)) / 2
         x, y = batch(step)
         adam.zero_grad()
-        loss(predict(net, x), x, y).backward()
+        loss(predict(net, x), y).backward()
         nn.utils.clip_grad_norm_(net.parameters(), 5.0)
         adam.step()
-        after()
