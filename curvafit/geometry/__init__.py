@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from curvafit.geometry.diagram import half_thickness as half_thickness
     from curvafit.geometry.distances import one_to_many as one_to_many
     from curvafit.geometry.distances import pairwise as pairwise
-    from curvafit.geometry.distances import sinkhorn_divergence as sinkhorn_divergence
     from curvafit.geometry.distances import sliced_embedding as sliced_embedding
     from curvafit.geometry.distances import wasserstein as wasserstein
     from curvafit.geometry.mesh import NoSurface as NoSurface

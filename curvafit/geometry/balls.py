@@ -78,33 +78,21 @@ def paint_balls(
 
 def reaching_radius(radius: np.ndarray, spacing: Sequence[float], core: tuple[slice, ...]) -> float:
     """Return the largest of the balls, of `radius` (Z, Y, X) around the voxels, that count in a core (see `NEAR`)."""
-    box, near = np.array([(edge.start, edge.stop) for edge in core]), NEAR * float(min(spacing))
-    return float(_find_reaching(np.ascontiguousarray(radius), np.asarray(spacing, dtype=np.float32), box, near))
+    steps, near, largest = np.asarray(spacing, dtype=np.float32), NEAR * float(min(spacing)), 0.0
+    places = [(np.arange(n), edge) for n, edge in zip(radius.shape, core, strict=True)]
+    z, y, x = (
+        np.maximum(at - edge.stop + 1, edge.start - at).clip(0) * h for (at, edge), h in zip(places, steps, strict=True)
+    )
+    for dz, balls in zip(z, radius, strict=True):
+        reach = dz**2 + y[:, None] ** 2 + x**2 <= (balls + near) ** 2
+        largest = max(largest, float(balls[reach].max(initial=0)))
+    return largest
 
 
 @njit(cache=True)
 def _gap(at, low, high):  # pragma: no cover
     """Return how many voxels a place lies outside of a stretch of an axis."""
     return low - at if at < low else at - high + 1 if at >= high else 0
-
-
-@njit(cache=True)
-def _find_reaching(radius, steps, box, near):  # pragma: no cover
-    """Return the largest radius of a ball that reaches a box, or ends near it."""
-    nz, ny, nx = radius.shape
-    hz, hy, hx = steps
-    largest = 0.0
-    for z in range(nz):
-        dz = _gap(z, box[0, 0], box[0, 1]) * hz
-        for y in range(ny):
-            dy = _gap(y, box[1, 0], box[1, 1]) * hy
-            for x in range(nx):
-                if radius[z, y, x] > largest:
-                    dx = _gap(x, box[2, 0], box[2, 1]) * hx
-                    r = radius[z, y, x] + near
-                    if dz * dz + dy * dy + dx * dx <= r * r:
-                        largest = radius[z, y, x]
-    return largest
 
 
 @njit(cache=True)

@@ -122,11 +122,9 @@ def descriptors(shape: np.ndarray | Tensor, grid: Grid, epsilon: float = WORKING
 
 
 def _chord_quantiles(phase: np.ndarray, periodic: bool) -> np.ndarray:
-    """Return quantiles, in voxels, of the lengths of the runs of a phase along the three axes.
-
-    In a window a run counts once for each end that is seen: with its length where the other end is seen too, else as
-    longer than the part that is seen. Quantiles are at most `LONGEST`, as a small window shows no longer runs.
-    """
+    """Return quantiles, in voxels and at most `LONGEST`, of the lengths of the runs of a phase along the three axes."""
+    # In a window a run counts once for each end that is seen: with its length where the other end is seen too, else as
+    # longer than the part that is seen.
     longest = max(phase.shape)
     events, runs = np.zeros((2, longest + 1))
     for axis in range(3):
@@ -155,11 +153,9 @@ def _find_runs(lines: np.ndarray, periodic: bool) -> tuple[np.ndarray, np.ndarra
 
 
 def _depth_quantiles(inside: Tensor, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Return quantiles, in voxels, of the distances of the voxels inside, and outside, to the surface.
-
-    A distance beyond `DEPTH`, or beyond the window's nearest face, counts as longer than that. Quantiles are read at
-    whole voxels, since distances between voxels come in steps.
-    """
+    """Return quantiles, in voxels, of the distances of the voxels inside, and outside, to the surface."""
+    # A distance beyond `DEPTH`, or beyond the window's nearest face, counts as longer than that. Quantiles are read at
+    # whole voxels, since distances between voxels come in steps.
     voxels = Grid(grid.shape, (1.0, 1.0, 1.0), grid.boundary)
     distance = signed_distance(inside, voxels, limit=DEPTH + 1).numpy(force=True)
     reach = np.full(grid.shape, DEPTH) if grid.periodic else _distance_to_faces(grid.shape)
@@ -181,10 +177,7 @@ def _distance_to_faces(shape: tuple[int, int, int]) -> np.ndarray:
 
 
 def _estimate_shares(events: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return the share of lengths up to each bin by Kaplan & Meier's estimate.
-
-    `events` counts the lengths that end in each bin, `counts` also those that are lost from sight there.
-    """
+    """Return the share of lengths up to each bin (Kaplan & Meier), of `counts` of which `events` do not leave sight."""
     risk = np.cumsum(counts[::-1])[::-1]
     return 1 - np.cumprod(1 - events / np.maximum(risk, 1))
 

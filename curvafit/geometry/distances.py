@@ -1,7 +1,7 @@
 """Distances between curvature diagrams: Sinkhorn's divergence of two, of one and many, of every pair.
 
-`sinkhorn_divergence` is geomloss's and differentiable. Many distances at once are numba's loops over the same steps in
-float32; `wasserstein` needs geomloss for float64 and takes these loops where geomloss is not installed.
+Many distances at once are numba's loops over geomloss's steps in float32; `wasserstein` is geomloss's in float64, and
+takes these loops where geomloss is not installed.
 """
 
 from __future__ import annotations
@@ -18,10 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numba import njit, prange
-from torch import Tensor
 
 from curvafit.core.checks import check_type
-from curvafit.core.extras import require
 from curvafit.core.runtime import Progress, silent
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram
 from curvafit.priors.kernels.threads import Kernel, count_threads
@@ -116,11 +114,9 @@ def _pack_diagrams(diagrams: Sequence[Diagram], blur: float, reach: float | None
 
 
 def _iterate_distances(clouds: Clouds, first: np.ndarray, second: np.ndarray, **options: Any) -> Iterator[np.ndarray]:
-    """Yield the debiased Sinkhorn distances √(cost(a, b) - cost(a, a) / 2 - cost(b, b) / 2) of the pairs, by blocks.
-
-    A cloud's cost with itself depends on how often the pair's blur is halved: it is computed once for each cloud and
-    number of halvings, of which a cloud meets two or three.
-    """
+    """Yield the debiased Sinkhorn distances √(cost(a, b) - cost(a, a) / 2 - cost(b, b) / 2) of the pairs, by blocks."""
+    # A cloud's cost with itself depends on how often the pair's blur is halved: it is computed once for each cloud and
+    # number of halvings, of which a cloud meets two or three.
     halved = pair_halvings(clouds, first, second, options["blur"])
     keys = np.concatenate([np.stack([ends, halved], axis=1) for ends in (first, second)])
     distinct, places = np.unique(keys, axis=0, return_inverse=True)
@@ -167,33 +163,15 @@ def wasserstein(
     first, second = _normalise([a, b], blur, reach, bin_width)
     if find_spec("geomloss") is None:
         return float(one_to_many(first, [second], blur=blur, reach=reach, bin_width=0)[0])
-    tensors = (torch.from_numpy(part) for d in (first, second) for part in (d.points, d.weights))
+    from geomloss import SamplesLoss
+
+    clouds = pack([first.points, second.points], [first.weights, second.weights])
+    falls = pair_halvings(clouds, np.array([0]), np.array([1]), blur)[0]
+    options = {"blur": blur, "reach": reach, "diameter": blur * 2.0 ** (float(falls) - 0.5)}
+    loss = SamplesLoss("sinkhorn", p=2, debias=True, backend="tensorized", **options)
     with torch.no_grad():
-        return math.sqrt(max(0.0, float(sinkhorn_divergence(*tensors, blur=blur, reach=reach))))
-
-
-def sinkhorn_divergence(
-    points_a: Tensor, weights_a: Tensor, points_b: Tensor, weights_b: Tensor, *, blur: float, reach: float | None
-) -> Tensor:
-    """Return the debiased unbalanced Sinkhorn divergence of two clouds, cost ½|x - y|²: a scalar tensor.
-
-    Its square root is `wasserstein`; descend the divergence itself, as the root's slope is infinite at 0. It is
-    differentiable once in points and weights. The gradient is geomloss's, that of the last step with the potentials
-    before it held, which would be exact at convergence (unbalanced: to blur² / 2 reach² of it). The steps stop short of
-    that, so that the gradient leads down but its length may differ from the value's own slope by a third.
-
-    Points are `(N, 2)` and `(M, 2)`, of one floating-point type; differences of near clouds want float64. Weights are
-    `(N,)` and `(M,)`, of at least 0, each with a total of 1. Blur and reach are as in `wasserstein`, in the points'
-    unit.
-    """
-    boxes = [points[weights > 0].detach().float().double().cpu().numpy() for points, weights in
-             ((points_a, weights_a), (points_b, weights_b))]  # fmt: skip
-    falls = halvings(np.ptp(np.concatenate(boxes), axis=0), blur)
-    diameter = blur * 2.0 ** (float(falls) - 0.5)
-    SamplesLoss = require("geomloss", "infer", "a divergence with a gradient").SamplesLoss
-    loss = SamplesLoss("sinkhorn", p=2, blur=blur, reach=reach, diameter=diameter, debias=True, backend="tensorized")
-    with torch.set_grad_enabled(torch.is_grad_enabled()):  # geomloss leaves it switched on
-        return loss(weights_a, points_a, weights_b, points_b)
+        parts = (torch.from_numpy(part) for d in (first, second) for part in (d.weights, d.points))
+        return math.sqrt(max(0.0, float(loss(*parts))))
 
 
 def _normalise(diagrams: Sequence[Diagram], blur: float, reach: float | None, bin_width: float) -> list[Diagram]:
@@ -292,10 +270,8 @@ def costs(
 
 
 def _schedule(falls: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return ε of every step of every pair, and the share of its potentials that a step keeps, both `(K, T)`.
-
-    The share is 1 before a pair begins, 0 at its first step and its last, ½ between.
-    """
+    """Return ε of every step of every pair, and the share of its potentials that a step keeps, both `(K, T)`."""
+    # The share is 1 before a pair begins, 0 at its first step and its last, ½ between.
     falls = np.asarray(falls, dtype=np.int64)[:, None]
     steps = falls + 4
     longest = int(steps.max(initial=0))

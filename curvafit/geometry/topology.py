@@ -125,10 +125,8 @@ def _graph(pairs: np.ndarray, count: int) -> coo_array:
 
 
 def _count_directions(mask: np.ndarray) -> int:
-    """Return in how many independent directions a 6-connected phase goes around the torus.
-
-    Its pieces within the box are laid out along spanning trees; contacts that then do not fit are loops around it.
-    """
+    """Return in how many independent directions a 6-connected phase goes around the torus."""
+    # Pieces within the box are laid out along spanning trees; contacts that then do not fit are loops around it.
     labels, count = _label_pieces(mask, corners=False)
     seams = _find_seams(labels, False)
     one, other, steps = seams[:, 0] - 1, seams[:, 1] - 1, np.eye(3, dtype=np.int64)[seams[:, 2]]

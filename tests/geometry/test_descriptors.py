@@ -6,12 +6,10 @@ import math
 
 import numpy as np
 import pytest
-import torch
 from exact import Cylinder, Gyroid, Shape, Sphere, centres, profile
 from scipy import ndimage
 
 from curvafit.geometry.descriptors import BLOCKS, LEVELS, RADII, Descriptors, descriptors
-from curvafit.geometry.mesh import NoSurface
 from curvafit.geometry.topology import euler_number
 from curvafit.priors.grid import Grid
 
@@ -48,6 +46,9 @@ def test_a_ball(seen_as: str) -> None:
     near = RADIUS * 0.01 < 2 * (0.24 - R)  # further on, a ball sees its neighbours in the repeated box
     assert seen.correlation[near] == pytest.approx(((f * share - f**2) / (f * (1 - f)))[near], abs=0.02)
     assert seen.fabric == pytest.approx(1 / 3, abs=0.005)
+    assert [len(getattr(seen, name)) for name in BLOCKS] == list(BLOCKS.values())
+    assert len(seen.vector()) == sum(BLOCKS.values())
+    assert seen.vector()[[288, -3, -2, -1]] == pytest.approx([*seen.fraction, *seen.fabric], abs=0)
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -135,18 +136,3 @@ def test_crops_estimate_the_whole() -> None:
             assert mean == pytest.approx(block, abs=0.05)
         else:
             assert mean == pytest.approx(block, rel=0.08, abs=0.03 * np.abs(block).max()), name
-
-
-def test_vector_holds_the_blocks_in_order() -> None:
-    seen = measured(Sphere(0.1, (0.16,) * 3), Grid((32, 32, 32)), "mask")
-    assert [len(getattr(seen, name)) for name in BLOCKS] == list(BLOCKS.values())
-    assert len(seen.vector()) == sum(BLOCKS.values())
-    assert seen.vector()[[288, -3, -2, -1]] == pytest.approx([*seen.fraction, *seen.fabric], abs=0)
-
-
-def test_refusals() -> None:
-    with pytest.raises(ValueError, match="cubic"):
-        descriptors(random_mask(16), Grid((16, 16, 16), (1.0, 1.0, 2.0)))
-    for full in (torch.ones((16, 16, 16)), np.zeros((16, 16, 16), dtype=bool)):
-        with pytest.raises(NoSurface, match="inside"):
-            descriptors(full, Grid((16, 16, 16)))

@@ -11,7 +11,7 @@ from exact import Cylinder, Gyroid, Shape, Sphere, Torus, centres, profile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.diagram import Diagram, diagram, family_of, family_shares, half_thickness
 from curvafit.geometry.distances import wasserstein
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import phase_field
@@ -55,13 +55,9 @@ def test_diffuse_curvatures_are_far_more_biased(name: str, least: float) -> None
     diffuse, geometric = (errors(name, 2, kind).mean() for kind in ("diffuse", "geometric"))
     assert diffuse > 10 * geometric
     assert diffuse > least
-
-
-def test_diffuse_sphere_opens_up() -> None:
-    """The direction: κ1 too large, κ2 too small, as measured on the published program's fields."""
-    mean = diagram(*octant("sphere", 2), 1.0, curvature="diffuse", margin=0).mean() * 8
-    assert mean[0] == pytest.approx(1.21, abs=0.05)
-    assert mean[1] == pytest.approx(0.79, abs=0.05)
+    if name == "sphere":  # the direction, as measured on the published program's fields
+        mean = diagram(*octant(name, 2), 1.0, curvature="diffuse", margin=0).mean() * 8
+        assert mean == pytest.approx([1.21, 0.79], abs=0.05)
 
 
 def test_gauss_bonnet() -> None:
@@ -107,8 +103,6 @@ def test_margins_keep_borders_out() -> None:
     spoilt, clean = diagram(u, grid, 2.0, margin=0), diagram(u, grid, 2.0)
     assert np.abs(clean.points * 6 - (1, 0)).max() < 0.05
     assert np.abs(spoilt.points * 6 - (1, 0)).max() > 0.2
-    with pytest.raises(ValueError, match="30 voxels"):
-        diagram(u, grid, 2.0, margin=13)
 
 
 def test_anisotropic_voxels() -> None:
@@ -126,8 +120,6 @@ def test_only_where_asked() -> None:
     parts = [diagram(u, grid, 1.0, margin=0, where=where).area for where in (lower, ~lower)]
     assert sum(parts) == pytest.approx(diagram(u, grid, 1.0, margin=0).area, rel=1e-12)
     assert min(parts) > 0
-    with pytest.raises(ValueError, match="part"):
-        diagram(u, grid, 1.0, margin=0, where=np.zeros(grid.shape, dtype=bool))
 
 
 def test_what_is_not_resolved_is_left_out_and_counted() -> None:
@@ -148,23 +140,6 @@ def test_flat_noise_never_gives_nan() -> None:
     u = 1e-7 * torch.randn(10, 10, 10, generator=torch.Generator().manual_seed(0))
     with pytest.raises(ValueError, match="resolves"):
         diagram(u, grid, 0.02)
-
-
-def test_bad_input_is_one_sentence() -> None:
-    u, grid = octant("sphere", 2)
-    with pytest.raises(ValueError, match="geometric"):
-        diagram(u, grid, 1.0, curvature="mean")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="crosses"):
-        diagram(u.abs() + 0.1, grid, 1.0)
-    with pytest.raises(ValueError, match="weights"):
-        Diagram(np.zeros((3, 2)), np.ones(2))
-    with pytest.raises(ValueError, match="finite"):
-        Diagram(np.full((1, 2), np.nan), np.ones(1))
-    with pytest.raises(ValueError, match="empty"):
-        Diagram(np.zeros((0, 2)), np.zeros(0)).mean()
-    for bad in (0.0, -1.0):
-        with pytest.raises(ValueError, match="width"):
-            Diagram(np.zeros((1, 2)), np.ones(1)).bin(bad)
 
 
 def cloud(seed: int, count: int = 500) -> Diagram:
@@ -213,3 +188,54 @@ def test_masks_stay_near_their_fields(data, name: str) -> None:
     assert wasserstein(of_field, of_mask) < 1.0
     assert of_mask.area == pytest.approx(of_field.area, rel=0.01)
     assert of_field.excluded == of_mask.excluded == 0
+
+
+RADIUS = 0.04
+
+
+def at(*points: tuple[float, float]) -> Diagram:
+    return Diagram(np.array(points) / RADIUS, np.ones(len(points)))
+
+
+@pytest.mark.parametrize(
+    ("points", "name"),
+    [
+        ([(1.0, 1.0)], "spheres"),
+        ([(1.0, 0.1)], "tubes"),
+        ([(1.0, -0.9)], "sponge"),
+        ([(0.05, -0.05)], "layers"),
+        ([(0.1, -1.0)], "tubular cavities"),
+        ([(-1.0, -1.1)], "bubbles"),
+        ([(1, 0), (0.01, 0), (0.01, 0)], "layers"),
+        ([(1, 0), (1, 0), (0.01, 0)], "tubes"),
+    ],
+)
+def test_ideal_shapes_are_named(points: list[tuple[float, float]], name: str) -> None:
+    """By where the area lies, whatever the unit of length; a flat half makes layers."""
+    assert family_of(at(*points), RADIUS) == name
+    assert family_of(Diagram(at(*points).points / 7, np.ones(len(points))), 7 * RADIUS) == name
+    assert sum(family_shares(at(*points), RADIUS).values()) == pytest.approx(1)
+
+
+R, OUTER, INNER = RADIUS, 0.11, 0.05
+
+
+@pytest.mark.parametrize(
+    ("points", "areas", "volume", "thickness"),
+    [
+        ([(0.0, 0.0)], [2.0], 2 * R, R),
+        ([(1 / R, 0.0)], [2 * np.pi * R], np.pi * R**2, R),
+        ([(1 / R, 1 / R)], [4 * np.pi * R**2], 4 / 3 * np.pi * R**3, R),
+        ([(1 / R, -1 / R)], [1.0], 2 / 3 * R, R),
+        (
+            [(1 / OUTER,) * 2, (-1 / INNER,) * 2],
+            [4 * np.pi * OUTER**2, 4 * np.pi * INNER**2],
+            4 / 3 * np.pi * (OUTER**3 - INNER**3),
+            (OUTER - INNER) / 2,
+        ),
+    ],
+    ids=["plate", "cylinder", "ball", "saddle", "thick shell"],
+)
+def test_volume_and_curvatures_tell_how_thick_plates_cylinders_and_balls_are(points, areas, volume, thickness) -> None:
+    several = Diagram(np.array(points), 3 * np.array(areas))
+    assert half_thickness(several, 3 * volume) == pytest.approx(thickness, rel=0.02)

@@ -1,39 +1,36 @@
-"""Surfaces: seams, orientation, caps, topology."""
+"""Surfaces: seams, orientation, caps, topology; and in files, as other programs read them."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from disk import vtk_array
 from exact import Gyroid, Sphere, Torus, centres
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from curvafit.geometry.mesh import (
-    NoSurface,
-    Surface,
-    areas,
-    capped_surface,
-    solid_surface,
-    surface,
-    volume,
-)
+from curvafit.geometry.mesh import Surface, areas, capped_surface, solid_surface, surface, volume, write_surface
 from curvafit.priors.grid import Grid
 
 SPACING = (0.1, 0.08, 0.12)
+BALL, CENTRE = Sphere(1.0, (1.4, 1.36, 1.44)), (1.4, 1.36, 1.44)
+HALF = torch.tensor(SPACING, dtype=torch.float64) / 2  # from the box's corner to the first voxel's centre
 
 
 def field(shape, grid: Grid) -> torch.Tensor:
     return shape.distance(centres(grid))
 
 
-def ball(radius: float = 1.0) -> tuple[torch.Tensor, Grid]:
+def ball() -> tuple[torch.Tensor, Grid]:
     grid = Grid((28, 34, 24), SPACING, "replicate")
-    return field(Sphere(radius, (1.4, 1.36, 1.44)), grid), grid
+    return field(BALL, grid), grid
 
 
 def euler_characteristic(mesh: Surface, grid: Grid) -> int:
@@ -50,31 +47,23 @@ def euler_characteristic(mesh: Surface, grid: Grid) -> int:
     return len(np.unique(faces)) - len(np.unique(edges, axis=0)) + len(faces)
 
 
-def test_a_balls_area_and_volume_from_below() -> None:
-    """Vertices lie on a sphere (nearly), triangles inside it."""
-    mesh = surface(*ball())
-    assert 0.98 * 4 * math.pi < areas(mesh).sum() < 4 * math.pi
-    assert 0.98 * 4 / 3 * math.pi < volume(mesh) < 4 / 3 * math.pi
-
-
-def test_vertices_lie_on_the_level_set_in_the_grids_unit() -> None:
-    """Linear interpolation of a distance errs by at most h² κ / 8 along an edge: 0.0023 at the smaller ball."""
+def test_a_ball_s_area_and_volume_from_below_and_its_triangles_outwards() -> None:
+    """Vertices lie on a sphere (nearly), triangles inside. Linear interpolation of a distance errs by at most h² κ / 8
+    along an edge: 0.0023 at the smaller ball."""
     u, grid = ball()
-    corner = torch.tensor(grid.spacing, dtype=torch.float64) / 2
+    mesh = surface(u, grid)
+    assert 0.98 * 4 * math.pi < areas(mesh).sum() < 4 * math.pi
+    assert 0.98 * 4 / 3 * math.pi < volume(mesh) < 4 / 3 * math.pi and volume(surface(-u, grid)) < 0
     for level in (0.0, 0.2):
-        mesh = surface(u, grid, level)
-        found = Sphere(1.0, (1.4, 1.36, 1.44)).distance(torch.from_numpy(mesh.vertices) + corner)
-        assert float((found - level).abs().max()) < 0.0023
-
-
-def test_triangles_face_outwards() -> None:
-    mesh = surface(*ball())
+        away = BALL.distance(torch.from_numpy(surface(u, grid, level).vertices) + HALF) - level
+        assert float(away.abs().max()) < 0.0023
     corners = mesh.vertices[mesh.faces][:, :, ::-1]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    out = corners.mean(1) - corners.mean((0, 1))
-    large = areas(mesh) > 1e-6
+    out, large = corners.mean(1) - corners.mean((0, 1)), areas(mesh) > 1e-6
     assert ((normals * out).sum(1)[large] > 0).all()
-    assert volume(surface(-ball()[0], ball()[1])) < 0
+    known = Surface(np.array([[0.0, 0, 0], [0, 3, 0], [0, 0, 4]]), np.array([[0, 1, 2]]))
+    np.testing.assert_allclose(areas(known), [6.0])
+    np.testing.assert_allclose(known.barycentres, [[0, 1, 4 / 3]])
 
 
 @settings(deadline=None, max_examples=8)
@@ -104,6 +93,8 @@ def test_euler_characteristics() -> None:
     gyroid = surface(Gyroid(1.0).level(centres(box)), box)
     assert euler_characteristic(gyroid, box) == -8
     assert areas(gyroid).sum() == pytest.approx(3.0915, rel=0.01)  # the minimal surface's, which it approximates
+    capped = capped_surface(Gyroid(1.0).level(centres(box)), box)
+    assert closed(capped) and volume(capped) == pytest.approx(0.5, abs=0.002)
 
 
 def closed(mesh: Surface) -> bool:
@@ -159,49 +150,51 @@ def test_caps_of_opposite_faces_fit() -> None:
         np.testing.assert_allclose(np.unique(low[:, others], axis=0), np.unique(high[:, others], axis=0), atol=1e-9)
 
 
-def test_capped_gyroid_is_watertight_and_holds_half_the_box() -> None:
-    box = Grid((20, 20, 20), (1 / 20,) * 3)
-    mesh = capped_surface(Gyroid(1.0).level(centres(box)), box)
-    assert closed(mesh)
-    assert volume(mesh) == pytest.approx(0.5, abs=0.002)
-
-
 def test_a_solid_has_the_volume_of_its_voxels() -> None:
     """Those of a small ball lack 0.8 % of its volume, triangles 0.6 %: the solid follows the voxels, and stays within
     0.05 voxels of the level set."""
     _, grid = ball()
-    u = torch.tanh(10 * field(Sphere(1.0, (1.4, 1.36, 1.44)), grid))
+    u = torch.tanh(10 * field(BALL, grid))
     wanted = float((u > 0).sum()) * grid.voxel_volume
     mesh = solid_surface(u, grid)
     assert closed(mesh)
     assert volume(capped_surface(u, grid)) > 1.001 * wanted
     assert volume(mesh) == pytest.approx(wanted, rel=2e-4)
-    corner = torch.tensor(grid.spacing, dtype=torch.float64) / 2
-    away = Sphere(1.0, (1.4, 1.36, 1.44)).distance(torch.from_numpy(mesh.vertices) + corner)
-    assert float(away.abs().max()) < 0.05 * max(SPACING)
-
-
-def test_a_solid_without_a_surface_is_the_box_or_refused() -> None:
-    grid = Grid((6, 5, 4), (1.0, 1.0, 1.0))
+    assert float(BALL.distance(torch.from_numpy(mesh.vertices) + HALF).abs().max()) < 0.05 * max(SPACING)
+    grid = Grid((6, 5, 4), (1.0, 1.0, 1.0))  # a box without a surface, and half of it
     assert volume(solid_surface(np.ones(grid.shape), grid)) == pytest.approx(120)
     half = np.where(np.arange(4) < 2, 1.0, -1.0) + np.zeros(grid.shape)
     assert volume(solid_surface(half, grid)) == pytest.approx(60, rel=1e-4)
-    with pytest.raises(NoSurface, match="exceeds"):
-        solid_surface(-np.ones(grid.shape), grid)
 
 
-def test_bad_input_is_one_sentence() -> None:
-    u, grid = ball()
-    with pytest.raises(NoSurface, match="crosses"):
-        surface(u - 5, grid)
-    with pytest.raises(ValueError, match="shape"):
-        surface(torch.zeros(4, 4, 4), grid)
-    u[3, 3, 3] = math.nan
-    with pytest.raises(ValueError, match="finite"):
-        surface(u, grid)
+@pytest.mark.parametrize("suffix", [".stl", ".ply", ".PLY"])
+def test_files_are_read_back_by_another_program(tmp_path: Path, suffix: str) -> None:
+    """In x, y, z order, closed, with the volume's sign kept; a surface replaces the one before."""
+    mesh, path = capped_surface(*ball()), tmp_path / f"ball{suffix}"
+    write_surface(Surface(mesh.vertices * 2, mesh.faces), path)
+    found = trimesh.load_mesh(write_surface(mesh, path, unit="mm"))
+    assert found.is_watertight
+    assert found.volume == pytest.approx(volume(mesh), rel=1e-5) and found.volume > 4
+    np.testing.assert_allclose(found.bounds.mean(0), (np.array(CENTRE) - HALF.numpy())[::-1], atol=0.01)
+    assert b"lengths in mm" in path.read_bytes()[:200] and [p.name for p in tmp_path.iterdir()] == [path.name]
+    if suffix == ".stl":
+        assert path.stat().st_size == 84 + 50 * len(mesh.faces)
 
 
-def test_areas_of_a_known_triangle() -> None:
-    mesh = Surface(np.array([[0.0, 0, 0], [0, 3, 0], [0, 0, 4]]), np.array([[0, 1, 2]]))
-    np.testing.assert_allclose(areas(mesh), [6.0])
-    np.testing.assert_allclose(mesh.barycentres, [[0, 1, 4 / 3]])
+def test_vtp_is_poly_data_as_vtk_describes_it_and_ply_carries_numbers(tmp_path: Path) -> None:
+    mesh = capped_surface(*ball())
+    kappa = np.arange(len(mesh.vertices)) / 7
+    root = ElementTree.parse(write_surface(mesh, tmp_path / "ball.vtp", unit="um", data={"kappa1": kappa})).getroot()
+    assert (root.tag, root.attrib["type"], root.attrib["byte_order"]) == ("VTKFile", "PolyData", "LittleEndian")
+    assert root.attrib["header_type"] == "UInt64"
+    (piece,) = root.findall("PolyData/Piece")
+    counts = {name: int(piece.attrib[f"NumberOf{name}"]) for name in ("Points", "Polys", "Verts", "Lines", "Strips")}
+    assert counts == {"Points": len(mesh.vertices), "Polys": len(mesh.faces), "Verts": 0, "Lines": 0, "Strips": 0}
+    arrays = {node.attrib["Name"]: vtk_array(node) for node in piece.iter("DataArray")}
+    np.testing.assert_array_equal(arrays["Points"], mesh.vertices[:, ::-1].astype("f4"))
+    np.testing.assert_array_equal(arrays["connectivity"].reshape(-1, 3), mesh.faces)
+    np.testing.assert_array_equal(arrays["offsets"].ravel(), 3 * np.arange(1, len(mesh.faces) + 1))
+    np.testing.assert_array_equal(arrays["kappa1"].ravel(), kappa.astype("f4"))
+    ply = trimesh.load(write_surface(mesh, tmp_path / "ball.ply", data={"kappa2": kappa}), process=False)
+    np.testing.assert_array_equal(ply.metadata["_ply_raw"]["vertex"]["data"]["kappa2"], kappa.astype("f4"))
+    np.testing.assert_allclose(ply.vertices, mesh.vertices[:, ::-1], atol=1e-6)
