@@ -1,9 +1,9 @@
 """Whether `compare` finds what differs, and only that: two groups, three, pairs, a number.
 
-`--on scans` ($CURVAFIT_DATA): windows of 50³ of the real masks of `completion`, lengths in voxels. A thousand times the
-subjects of each design are drawn from the windows of bone: their p should be uniform. Then all windows of bone are
-compared, half by half, and with those of other structures. Windows of one volume are no subjects: a small p says that
-two volumes differ, not that two tissues do.
+`--on scans` ($CURVAFIT_DATA): windows of 50³ of the real masks of `completion`, lengths in voxels. A thousand times two
+groups of 8 are drawn from the windows of bone: their p should be uniform. Then all windows of bone are compared, half
+by half, and with those of other structures. Windows of one volume are no subjects: a small p says that two volumes
+differ, not that two tissues do.
 
 `--on shapes`: 20 shapes of 64³ of the preset tubes, and as many of that law with one coefficient lower by a part of the
 prior's standard deviation, measured as masks. Groups of 4, 6 and 10 are drawn from them without replacement: 200 times
@@ -11,7 +11,8 @@ two laws, 1000 times one.
 
 `--on path`: 12 shapes of 64³ at each of five places between tubes and that law with a lower a01. Of 200 studies two
 groups of 6 are from the ends; three also from the middle; 8 pairs from places two apart, wherever the first is; ten
-subjects from all places, the number. A study finds a difference by
+subjects from all places, the number. A thousand times the same designs are drawn from all shapes, wherever they are. A
+study finds a difference by
 
 - `diagrams`: p of the curvature diagrams;
 - `numbers`: the least family-wise p of all numbers;
@@ -36,15 +37,7 @@ from scipy.spatial.distance import cdist
 
 from benchmarks.completion import sides
 from benchmarks.harness import Cases, Figure, Values, show
-from curvafit.core.permutation import (
-    correct_by_most,
-    correct_holm,
-    correlate,
-    measure_dependence,
-    measure_energy,
-    relabel,
-    share_beyond,
-)
+from curvafit.core import permutation as tests
 from curvafit.data_synth.design import INTERVALS
 from curvafit.generation.flow import generate
 from curvafit.geometry.diagram import Diagram
@@ -130,7 +123,7 @@ def studies(pools: Sequence[Sequence[Measures]], times: int, design: str, count:
     values = np.array([[each.value for each in scan.quantities] for scan in subjects])
     labels = np.repeat(np.arange(len(steps), dtype=float if design == "number" else int), count)
     blocks = np.tile(np.arange(count), 2) if design == "pairs" else None
-    test = measure_dependence if design == "number" else measure_energy
+    test = tests.measure_dependence if design == "number" else tests.measure_energy
     q = 1 if design == "number" else len(steps) - 1
     free = len(labels) - q - (1 if blocks is None else count)
     for seed in range(times):
@@ -140,17 +133,20 @@ def studies(pools: Sequence[Sequence[Measures]], times: int, design: str, count:
         for place, part in enumerate(np.split(np.arange(ends[-1]), ends[:-1])):
             chosen[places == place] = random.permutation(part)[: (places == place).sum()]
         rows, numbers = embedded[chosen], values[chosen]
-        arranged, _ = relabel(labels, PERMUTATIONS, seed, blocks)
-        p = [share_beyond(test(cdist(rows, rows), arranged, blocks)), correct_by_most(numbers, arranged, blocks).min()]
+        arranged, _ = tests.relabel(labels, PERMUTATIONS, seed, blocks)
+        p = [
+            tests.share_beyond(test(cdist(rows, rows), arranged, blocks)),
+            tests.correct_by_most(numbers, arranged, blocks).min(),
+        ]
         if seed == 0:
             scans, how = [subjects[k] for k in chosen], {"permutations": PERMUTATIONS, "paired": blocks is not None}
             by = labels if design == "number" else [f"group {label}" for label in labels]
             groups = [scans[k : k + count] for k in range(0, len(scans), count)]
             whole = compare(scans, by=by, **how) if blocks is None else compare(*groups, **how)
             assert np.allclose(p, (whole.p, min(each.family for each in whole.numbers)))
-        squares = correlate(numbers[:, FAMILIAR], arranged[:1], blocks)[0] ** 2
+        squares = tests.correlate(numbers[:, FAMILIAR], arranged[:1], blocks)[0] ** 2
         f: Any = stats.f.sf(squares / (1 - squares) * free / q, q, free)
-        found.append([*map(float, p), float(correct_holm(f).min())])
+        found.append([*map(float, p), float(tests.correct_holm(f).min())])
     return {test: np.round(p, 4).tolist() for test, p in zip(TESTS, np.transpose(found), strict=True)}
 
 
@@ -163,22 +159,17 @@ def share(p: Sequence[float]) -> Figure:
 
 def on_scans(quick: bool, cases: Cases) -> dict[str, Figure]:
     def against(name: str) -> Values:
-        second = windows("bone", 1, cases) if name == "halves" else both(name)
-        found = compare(windows("bone", 0, cases) if name == "halves" else both("bone"), second)
-        return {"p": found.p, "energy": found.statistic, "windows": len(second)}
+        pair = [windows("bone", k, cases) for k in (0, 1)] if name == "halves" else [both("bone"), both(name)]
+        found = compare(*pair)
+        return {"p": found.p, "energy": found.statistic, "windows": len(pair[1])}
 
     def both(name: str) -> list[Measures]:
         return [*windows(name, 0, cases), *windows(name, 1, cases)]
 
-    def null(design: str) -> Values:
-        return studies([both("bone")], 10 if quick else NULLS, design, 8 if design == "two" else 0)
-
-    jobs = {f"null-{design}": partial(null, design) for design in DESIGNS}
+    jobs = {"bone": lambda: studies([both("bone")], 10 if quick else NULLS, "two", 8)}
     found = cases.all(jobs | {name: partial(against, name) for name in ("halves", *OTHERS)})
-    figures = {"groups.windows": share(found["null-two"]["diagrams"])}
-    figures["groups.uniform"] = Figure(float(stats.kstest(found["null-two"]["diagrams"], "uniform").statistic))
-    figures |= {f"groups_size.{design}.{test}": share(found[f"null-{design}"][test])
-                for design, test in product(DESIGNS, TESTS[:2])}  # fmt: skip
+    figures = {"groups.windows": share(found["bone"]["diagrams"])}
+    figures["groups.uniform"] = Figure(float(stats.kstest(found["bone"]["diagrams"], "uniform").statistic))
     figures |= {f"groups_scans.{name}.{key}": Figure(found[name][key]) for name in ("halves", *OTHERS)
                 for key in ("windows", "p", "energy")}  # fmt: skip
     show(["", "figure"], list(figures.items()), "windows of bone")
@@ -197,19 +188,20 @@ def on_shapes(quick: bool, cases: Cases) -> dict[str, Figure]:
         figures |= {f"groups_power.{law}.{test}_{count}": Figure(share(row[test]).value) for test in TESTS}
         if law == BASE:
             figures[f"groups.null_{count}"] = share(row["diagrams"])
-    columns = [f"{test}_{count}" for count, test in product(COUNTS, TESTS)]
-    rows = [[law, *(figures.get(f"groups_power.{law}.{column}", "") for column in columns)] for law in laws]
-    show(["law", *columns], rows, "significant studies")
+    show(["", "figure"], list(figures.items()), "significant studies")
     return figures
 
 
 def on_path(quick: bool, cases: Cases) -> dict[str, Figure]:
-    def job(design: str) -> Values:
+    def job(design: str, null: bool) -> Values:
         pools = [shapes(law, cases, PLACED, "fast") for law in PATH]
-        return studies(pools, 4 if quick else STUDIES, design)
+        pools = [[each for pool in pools for each in pool]] if null else pools
+        return studies(pools, 4 if quick else NULLS if null else STUDIES, design)
 
-    found = cases.all({f"path-{design}": partial(job, design) for design in DESIGNS})
-    figures = {f"groups_path.{name[5:]}.{test}": share(row[test]) for name, row in found.items() for test in TESTS}
+    kinds = product(DESIGNS, {"path": False, "size": True}.items())
+    found = cases.all({f"{kind}-{design}": partial(job, design, null) for design, (kind, null) in kinds})
+    figures = {f"groups_{name.replace('-', '.')}.{test}": share(row[test])
+               for name, row in found.items() for test in TESTS}  # fmt: skip
     show(["", "figure"], list(figures.items()), "significant studies")
     return figures
 
