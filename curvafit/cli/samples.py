@@ -14,9 +14,6 @@ from curvafit.cli.options import OverwriteOption, add_commands, command
 
 #: The sample of the first look.
 _FIRST = "shell"
-#: The sample that needs no network, and its line in the list.
-_SYNTHETIC = "synthetic"
-_ABOUT = ("a generated trabecular shape, imaged with blur and noise", "MIT", "made on the spot")
 
 samples_app = typer.Typer(help="Sample volumes, with their licences.", invoke_without_command=True)
 
@@ -26,7 +23,9 @@ samples_app = typer.Typer(help="Sample volumes, with their licences.", invoke_wi
 def list_samples(context: typer.Context) -> None:
     """List sample volumes, or fetch one with `get`."""
     if context.invoked_subcommand is None:
-        print_table(("name", "what", "licence", "source"), [(name, *about) for name, about in _list_samples().items()])
+        from curvafit.data_synth.samples import list_samples
+
+        print_table(("name", "what", "licence", "source"), [(name, *about) for name, about in list_samples().items()])
 
 
 @command("curvafit infer $(curvafit samples get bone) -o bone")
@@ -36,12 +35,12 @@ def get_sample(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Download a sample once, check it, and print its path."""
-    about = _list_samples()
-    if name not in about:
-        raise ValueError(f"the samples are {', '.join(about)}, got {name!r}")
-    what, licence, source = about[name]
-    say(f"{name}: {what}; licence {licence}; {source}", to=error_console())
-    path = _fetch_or_make(name)
+    from curvafit.data_synth.samples import fetch, list_samples
+
+    if name in (about := list_samples()):
+        what, licence, source = about[name]
+        say(f"{name}: {what}; licence {licence}; {source}", to=error_console())
+    path = fetch(name)
     say(str(path if out is None else _copy_to(path, out, overwrite)))
 
 
@@ -57,43 +56,24 @@ def demo(
 ) -> None:
     """Fill a real scan from every 8th slice, measure it, and find textures like it: one page, in a minute."""
     with show_stages() as progress:
-        from curvafit.data_synth.samples import SampleUnavailable
+        from curvafit.data_synth.samples import SYNTHETIC, SampleUnavailable, fetch
         from curvafit.report.demo import write_demo
         from curvafit.volumes.read import load
 
         name = sample or _FIRST
         progress(f"fetching {name}", 0.0)
         try:
-            path = _fetch_or_make(name)
+            path = fetch(name)
         except SampleUnavailable as error:
             if sample is not None:
                 raise
             say(f"{error}; taking the synthetic scan", to=error_console())
-            name = _SYNTHETIC
-            path = _fetch_or_make(name)
+            path = fetch(SYNTHETIC)
         found = write_demo(load(path), out, seed=seed, overwrite=overwrite, progress=progress)
     dice, every = found.completion.dice, found.completion.every
     plain = max(value for way, value in dice.items() if way != "curvafit")
     say(f"Filled from every {every}th slice: Dice {dice['curvafit']:.3f}; by the best plain interpolation {plain:.3f}.")
     say(str(found.page))
-
-
-def _list_samples() -> dict[str, tuple[str, str, str]]:
-    """Return description, licence and source of each sample by name."""
-    from curvafit.data_synth.samples import SAMPLES
-
-    about = {each.name: (each.description, each.licence, each.source) for each in SAMPLES.values()}
-    return about | {_SYNTHETIC: _ABOUT}
-
-
-def _fetch_or_make(name: str) -> Path:
-    """Return the path of a sample, which is downloaded, or of the synthetic scan, which is made; both once."""
-    from curvafit.data_synth.samples import cache_folder, fetch, synthetic_scan
-
-    if name != _SYNTHETIC:
-        return fetch(name)
-    path = cache_folder() / "synthetic.nii.gz"
-    return path if path.is_file() else synthetic_scan(path)
 
 
 def _copy_to(path: Path, target: Path, overwrite: bool) -> Path:

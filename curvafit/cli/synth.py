@@ -14,8 +14,6 @@ from curvafit.cli.console import command_line, error_console, say, say_notes
 from curvafit.cli.options import Crew, Reading, command, parse_numbers, parse_whole_triple
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from curvafit.data_synth.imaging.modality import Modality
     from curvafit.data_synth.sets import SetSpec
     from curvafit.data_synth.sources import ShapeSource
@@ -81,8 +79,7 @@ def synth(
         raise ValueError("--classes takes one law for each class: leave out --draws")
     kind = _choose_modality(modality, like, like_mask, visible, reading)
     from curvafit.core.units import convert_length
-    from curvafit.data_synth.case import Recipe
-    from curvafit.data_synth.composition import Composition
+    from curvafit.data_synth.case import Composition, Recipe
     from curvafit.data_synth.sets import SetSpec
     from curvafit.data_synth.sources import choose_voxel
 
@@ -99,8 +96,7 @@ def _build_and_preview(out: Path, spec: SetSpec, count: int, crew: Crew) -> None
     """Make the cases of a set and a picture of some, and print where they are listed and drawn."""
     from curvafit.core.checks import check_int
     from curvafit.core.files import check_folder
-    from curvafit.data_synth.card import write_card
-    from curvafit.data_synth.sets import MOST, build_set, check_set, list_cases, write_preview
+    from curvafit.data_synth.sets import MOST, build_set, check_set, list_cases, write_card, write_preview
 
     check_int(count, "a count of at least 1 case", 1, MOST)
     check_folder(out)
@@ -109,12 +105,10 @@ def _build_and_preview(out: Path, spec: SetSpec, count: int, crew: Crew) -> None
         crew.check_memory(spec.recipe.largest)
     with crew.start() as (workers, progress):
         build_set(out, spec, count, progress, workers=workers)
-    preview, card = write_preview(out), write_card(out, command_line())
     if (total := len(list_cases(out))) > count:
         say(f"note: {out} holds {total} cases, more than --count {count}: all are listed", to=error_console())
-    say(str(out / "dataset.json"))
-    say(str(preview))
-    say(str(card))
+    for path in (out / "dataset.json", write_preview(out), write_card(out, command_line())):
+        say(str(path))
 
 
 def _choose_source(
@@ -175,34 +169,31 @@ def _choose_modality(
             raise ValueError(f"--{extras[0].replace('_', '-')} needs --like")
         from curvafit.data_synth.imaging.modality import modality
 
-        return _with_visible(modality(str(name)), visible)
+        kind = modality(str(name))
+    else:
+        kind = _fit_to_scan(like, mask, reading)
+    if visible is None:
+        return kind
+    from curvafit.data_synth.imaging.image import annotator_threshold
+
+    share = annotator_threshold(kind.base) if visible == "auto" else parse_numbers(visible, "--visible", 1)[0]
+    return replace(kind, base=replace(kind.base, visible=share))
+
+
+def _fit_to_scan(like: str, mask: str | None, reading: dict[str, Any]) -> Modality:
+    """Return a modality fitted to a scan, by a mask of two values if there is one."""
+    import numpy as np
+
     from curvafit.data_synth.imaging.like import fit_modality
     from curvafit.volumes.read import load
 
     if reading["label"] is not None and mask is None:
         raise ValueError("--label needs --like-mask: it is a value of that mask")
-    scan = load(like, **{**reading, "label": None})
+    scan, inside = load(like, **{**reading, "label": None}), None
     say_notes(scan.notes)
-    place = {name: reading[name] for name in ("spacing", "unit", "label", "crop", "strict")}
-    inside = None if mask is None else _split_mask(load(mask, **place).values)
-    return _with_visible(fit_modality(scan, inside), visible)
-
-
-def _split_mask(values: np.ndarray) -> np.ndarray:
-    """Return where a volume of two values has the greater one."""
-    import numpy as np
-
-    kinds = len(np.unique(values))
-    if kinds != 2:
-        raise ValueError(f"--like-mask must have two values, got {kinds}: choose one with --label")
-    return values > values.min()
-
-
-def _with_visible(kind: Modality, share_text: str | None) -> Modality:
-    """Return a kind of image whose masks end where a share of the light arrives, if the option is given."""
-    if share_text is None:
-        return kind
-    from curvafit.data_synth.imaging.image import annotator_threshold
-
-    share = annotator_threshold(kind.base) if share_text == "auto" else parse_numbers(share_text, "--visible", 1)[0]
-    return replace(kind, base=replace(kind.base, visible=share))
+    if mask is not None:
+        values = load(mask, **{name: reading[name] for name in ("spacing", "unit", "label", "crop", "strict")}).values
+        if (kinds := len(np.unique(values))) != 2:
+            raise ValueError(f"--like-mask must have two values, got {kinds}: choose one with --label")
+        inside = values > values.min()
+    return fit_modality(scan, inside)

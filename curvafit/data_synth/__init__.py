@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from curvafit.data_synth.dataset import TextureDataset as TextureDataset
     from curvafit.data_synth.dataset import as_dict as as_dict
     from curvafit.data_synth.dataset import as_monai as as_monai
-    from curvafit.data_synth.dataset import as_subject as as_subject
     from curvafit.data_synth.design import INTERVALS as INTERVALS
     from curvafit.data_synth.design import Design as Design
     from curvafit.data_synth.design import Draw as Draw
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
     from curvafit.data_synth.imaging.modality import Optics as Optics
     from curvafit.data_synth.imaging.modality import Specimen as Specimen
     from curvafit.data_synth.imaging.modality import modality as modality
-    from curvafit.data_synth.labels import Labels as Labels
     from curvafit.data_synth.labels import labels_of as labels_of
     from curvafit.data_synth.store import Record as Record
     from curvafit.data_synth.store import Settings as Settings

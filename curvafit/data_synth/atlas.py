@@ -30,9 +30,6 @@ from curvafit.priors.kernels.threads import one_thread
 BARREN = 200
 
 
-# ---- build -----------------------------------------------------------------------------------------------------------
-
-
 def build(
     store_path: str | Path,
     count: int,
@@ -112,9 +109,6 @@ def _fill(store: Store, count: int, workers: Workers, progress: Progress) -> Sto
     return store
 
 
-# ---- draws -----------------------------------------------------------------------------------------------------------
-
-
 def make_draws(path: str | Path, indices: Sequence[int]) -> list[Record]:
     """Make the missing draws among `indices`, a worker's part of `build`, and return the records of all.
 
@@ -171,9 +165,6 @@ def versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             found[name] = "not installed"
     return found
-
-
-# ---- look ------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

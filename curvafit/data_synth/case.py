@@ -1,4 +1,4 @@
-"""One case of a training set: an image, the shape that it shows on the image's own voxels, and how both were made."""
+"""One case of a training set: what it shows, its image, the shape on the image's own voxels, and how they were made."""
 
 from __future__ import annotations
 
@@ -9,23 +9,106 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_seed, check_type, quoted
 from curvafit.core.schema import encode
-from curvafit.data_synth.composition import Composition, Layers
 from curvafit.data_synth.imaging.image import field_shape, image, label_voxels, regrid
 from curvafit.data_synth.imaging.modality import Imaging, Modality
-from curvafit.data_synth.sources import ShapeSource, decode_source
+from curvafit.data_synth.labels import field_distance
+from curvafit.data_synth.sources import Generated, ShapeSource, decode_source
+from curvafit.priors.grid import Grid
 from curvafit.priors.kernels.threads import one_thread
 
 #: Shapes that are tried for a case until one is seen on the image's voxels, which may be coarse.
 TRIES = 8
 #: The most voxels of a shape; and the least along each edge of a grown one, or along the longest edge of a crop.
 MOST, FEWEST = 10**9, 4
-#: What may help where a class is not seen: of one structure, of several.
-_MENDS = ("take more voxels", "take more voxels, a thinner wall, or laws that fill less")
 #: Least and greatest calibre.
 CALIBRES = (1e-3, 1e3)
+#: The brightest that a class can be, as a multiple of the structure's contrast; and the most classes of a set.
+BRIGHTEST, MOST_CLASSES = 100.0, 200
+
+
+class Layers(NamedTuple):
+    """Phase fields (C, Z, Y, X) of classes 1 to C, the first in front; that of the whole, of all together (Z, Y, X);
+    their ε in voxels; and the shapes' origins."""
+
+    values: Tensor
+    whole: Tensor
+    epsilon: float
+    origins: list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Composition:
+    """What a case shows: one structure by default.
+
+    Attributes
+    ----------
+    classes
+        Every case shows a shape of each law, in front of those of later laws; the classes of the labels.
+    wall
+        Thickness of a wall along the surface of the shape, inside it, in the modality's unit: the labels' class 1; what
+        the wall encloses is class 2, the lumen.
+    levels
+        Light of each class: 0 is as dark as the background, 1 as bright as the structure. By default 1, the lumen 0.
+    """
+
+    classes: bool = False
+    wall: float | None = None
+    levels: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.wall is not None:
+            wall = check_float(self.wall, "a wall of positive thickness", SHORTEST, LONGEST)
+            object.__setattr__(self, "wall", wall)
+        if self.classes and self.wall is not None:
+            raise ValueError("give either classes or a wall, not both")
+        if self.levels is not None:
+            levels = as_tuple(self.levels, "a level of each class")
+            checked = tuple(check_float(n, f"levels from 0 to {BRIGHTEST:g}", 0, BRIGHTEST, of=levels) for n in levels)
+            object.__setattr__(self, "levels", checked)
+
+    def names(self, source: ShapeSource) -> tuple[str, ...]:
+        """Return the names of the classes, 1, 2, …; ValueError where the source or the levels do not fit."""
+        names: tuple[str, ...] = ("structure",) if self.wall is None else ("wall", "lumen")
+        if self.classes:
+            if not isinstance(source, Generated) or not 2 <= len(source.names) <= MOST_CLASSES:
+                raise ValueError(f"classes need from 2 to {MOST_CLASSES} laws to grow shapes of, one for each class")
+            alike = len(set(source.names)) < len(source.names)
+            names = tuple(f"{name} {k}" if alike else name for k, name in enumerate(source.names, 1))
+        if self.levels is not None and len(self.levels) != len(names):
+            raise ValueError(f"give a level for each of {', '.join(names)}, got {len(self.levels)} levels")
+        return names
+
+    def draw(
+        self, source: ShapeSource, voxels: Sequence[int], voxel: float, index: int, rng: np.random.Generator
+    ) -> Layers:
+        """Return the classes of case `index` on voxels of the edge `voxel`, which is in the wall's unit."""
+        if self.classes:
+            shapes = [source.shape(voxels, k, rng) for k in range(len(self.names(source)))]
+            values = torch.from_numpy(np.stack([shape.values for shape in shapes]))
+            return Layers(values, values.amax(0), shapes[0].epsilon, [shape.origin for shape in shapes])
+        margin = self.margin(source, voxel)
+        shape = source.shape([n + 2 * margin for n in voxels], index, rng)
+        u, origin = torch.from_numpy(shape.values), shape.origin | ({"margin": margin} if margin else {})
+        if self.wall is None:
+            return Layers(u[None], u, shape.epsilon, [origin])
+        shell = shell_of(u, shape.epsilon, self.wall / voxel, periodic=source.edge == math.inf)
+        inner = (..., *(slice(margin, margin + n) for n in voxels))
+        return Layers(shell[inner], u[inner], shape.epsilon, [origin])
+
+    def margin(self, source: ShapeSource, voxel: float) -> int:
+        """Return by how many voxels a crop is larger on every side: walls of surfaces outside reach into it."""
+        return 0 if self.wall is None or source.edge == math.inf else math.ceil(self.wall / voxel) + 2
+
+    @staticmethod
+    def from_dict(content: Mapping[str, Any]) -> Composition:
+        """Return the composition that `core.schema.encode` wrote, maybe with a `blend` of 0."""
+        if content.get("blend"):
+            raise ValueError("it blends textures, which curvafit does not do: it cannot be continued, begin another")
+        return Composition(**{name: value for name, value in content.items() if name != "blend"})
 
 
 class Case(NamedTuple):
@@ -72,7 +155,10 @@ class Recipe:
         object.__setattr__(self, "calibres", check_calibres(self.calibres))
         check_type(self.composition, Composition, "a Composition")
         self.composition.names(self.source)
-        self.composition.check_wall(self._voxels[1], self.modality.base.unit)
+        wall, thickest = self.composition.wall, self._voxels[1]
+        if wall is not None and wall < thickest:
+            words = f"{thickest:g} {self.modality.base.unit}, got {wall:g}"
+            raise ValueError(f"a wall must be at least a shape's voxel thick, {words}")
         for voxel in self._voxels:
             check_crop(self.source.edge, self.shape, voxel, self.modality, self.composition.margin(self.source, voxel))
 
@@ -90,21 +176,21 @@ class Recipe:
     def _voxels(self) -> tuple[float, float]:
         """The shortest and the longest edge that a shape's voxels can have."""
         low, high = self.calibres
-        least, most = self.source.scales_between
+        least, most = (end(self.source.scales, default=1.0) for end in (min, max))
         return self.voxel * low * least, self.voxel * high * most
 
     def case(self, index: int) -> Case:
         """Make case number `index`, on one thread; ValueError where a class is not seen on the image's voxels."""
-        for_shape, for_imaging, for_image = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(3)
-        imaging = self.modality.draw(_draw_number(for_imaging))
-        rng = np.random.default_rng(for_shape)
-        voxel = draw_voxel(self.voxel, self.calibres, rng) * self.source.scale(index)
+        words = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(3)
+        rng, (for_imaging, seed) = np.random.default_rng(words[0]), (int(one.generate_state(1)[0]) for one in words[1:])
+        imaging = self.modality.draw(for_imaging)
+        scales = self.source.scales or (1.0,)
+        voxel = draw_voxel(self.voxel, self.calibres, rng) * scales[index % len(scales)]
         voxels, names = field_shape(self.shape, voxel, imaging), self.classes
-        seed = _draw_number(for_image)
+        levels = self.composition.levels or ((1.0,) * len(names) if self.composition.wall is None else (1.0, 0.0))
         with one_thread():
             for _ in range(TRIES):
                 layers = self.composition.draw(self.source, voxels, voxel, index, rng)
-                levels = self.composition.choose_levels(len(names))
                 parts = image_and_labels(layers, voxel, imaging, seed, self.shape, levels)
                 grey, sampled, labels = (part.numpy() for part in parts)
                 counts = np.bincount(labels.ravel(), minlength=len(names) + 1)
@@ -113,19 +199,17 @@ class Recipe:
             else:
                 edges = " x ".join(map(str, self.shape))
                 missing = "structure" if counts.all() else ("background", *names)[int(counts.argmin())]
-                raise ValueError(f"{TRIES} shapes showed no {missing} on {edges} voxels: {_MENDS[len(names) > 1]}")
+                mend = "take more voxels" + (", a thinner wall, or laws that fill less" if len(names) > 1 else "")
+                raise ValueError(f"{TRIES} shapes showed no {missing} on {edges} voxels: {mend}")
         record = {"index": index, "source": layers.origins, "imaging": imaging.as_dict(), "image_seed": seed}
         shares = (counts[1:] / labels.size).tolist()
         record |= {"voxel": voxel, "volume_fraction": float((sampled > 0).mean()), "class_fractions": shares}
-        ceiling = imaging.detector.ceiling
-        kind = np.uint16 if ceiling is not None and ceiling <= np.iinfo(np.uint16).max else np.float32
-        epsilon = layers.epsilon * voxel
-        return Case(grey.astype(kind), sampled, labels, imaging.spacing, imaging.unit, epsilon, record)
+        grey = grey.astype(np.uint16 if (imaging.detector.ceiling or math.inf) < 2**16 else np.float32)
+        return Case(grey, sampled, labels, imaging.spacing, imaging.unit, layers.epsilon * voxel, record)
 
     def as_dict(self) -> dict[str, Any]:
         """Return all of the recipe in JSON's types."""
-        parts = {"source": self.source.as_dict(), "composition": self.composition.as_dict()}
-        return encode(vars(self) | parts)
+        return encode(vars(self) | {"source": self.source.as_dict()})
 
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Recipe:
@@ -136,6 +220,17 @@ class Recipe:
         return Recipe(source, modality, *numbers, composition=shown)
 
 
+def shell_of(u: Tensor, epsilon: float, thickness: float, *, periodic: bool = False) -> Tensor:
+    """Return the phase fields (2, Z, Y, X) of a wall inside the surface of a shape, and of what it encloses.
+
+    All are in voxels, of the shape's profile. Where the shape is thinner than two walls, the wall fills it.
+    """
+    grid = Grid(tuple(u.shape), (1.0,) * 3, "periodic" if periodic else "replicate")  # type: ignore[arg-type]
+    depth = torch.from_numpy(field_distance(u, grid, epsilon))
+    distances = torch.stack([torch.minimum(depth, thickness - depth), depth - thickness])
+    return torch.tanh(distances / (math.sqrt(2) * epsilon)).to(u.dtype)
+
+
 def image_and_labels(
     layers: Layers,
     voxel: float,
@@ -143,14 +238,14 @@ def image_and_labels(
     seed: int,
     shape: Sequence[int],
     levels: Sequence[float],
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return the image of some classes, and on its voxels the field of the whole and the labels, all of `shape`.
 
     `voxel` is the edge of the fields' voxels. See `imaging.image` for the levels, and `label_voxels`.
     """
     z, y, x = shape  # a field of whole voxels may give a few voxels more
-    grey = image(layers.values, voxel, imaging, seed, layers.epsilon, levels)
     whole = regrid(layers.whole, voxel, imaging)
+    grey = image(layers.values, voxel, imaging, seed, layers.epsilon, levels)
     labels = label_voxels(layers.values, whole, voxel, imaging, layers.epsilon)
     grey, whole, labels = (part[:z, :y, :x].contiguous() for part in (grey, whole, labels))
     return grey, whole, labels
@@ -198,8 +293,3 @@ def check_crop(longest: float, shape: Sequence[int], voxel: float, modality: Mod
             f"the stored shapes have {longest} voxels along an edge, but images of {images} voxels of {modality.name} "
             f"need {crops}: take smaller images, or build a store with a larger --shape"
         )
-
-
-def _draw_number(words: np.random.SeedSequence) -> int:
-    """Return a whole number below 2³², the first of a sequence."""
-    return int(words.generate_state(1)[0])

@@ -40,9 +40,6 @@ CORNERS = ((_STEPS.max(2) == 1) @ _BITS) & ~(1 << MIDDLE)
 SIDES = ((_STEPS.sum(2) == 1) @ _BITS) & EIGHTEEN
 
 
-# ---- skeleton --------------------------------------------------------------------------------------------------------
-
-
 def skeleton_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
     """Return one-voxel wide curves in the middle of {distance > 0}, bool (Z, Y, X), with the mask's topology.
 
@@ -120,9 +117,6 @@ def _is_connected(bits, wanted, touching):  # pragma: no cover
     return wanted & ~piece == 0
 
 
-# ---- graph -----------------------------------------------------------------------------------------------------------
-
-
 def centreline(skeleton: np.ndarray, distance: np.ndarray, spacing: Sequence[float]) -> nx.MultiGraph:
     """Return the graph of a crop's skeleton of one-voxel wide lines (26 neighbours), with radii.
 
@@ -183,8 +177,10 @@ def _trace(skeleton: np.ndarray, distance: np.ndarray) -> nx.MultiGraph:
     node = {i: k for k, members in enumerate(groups) for i in members}
     for k, members in enumerate(groups):
         cloud = places[members]
-        radius = float(distance[tuple(cloud.T)].max())
-        graph.add_node(k, place=cloud.mean(0), radius=radius, rings=_count_rings(cloud))
+        block = np.zeros(np.ptp(cloud, axis=0) + 1, dtype=bool)
+        block[tuple((cloud - cloud.min(0)).T)] = True
+        rings = betti_numbers(block)[1] if len(cloud) > 3 else 0
+        graph.add_node(k, place=cloud.mean(0), radius=float(distance[tuple(cloud.T)].max()), rings=rings)
     visited: set[int] = set()
     for i, k in node.items():
         for first in sorted(voxels[i]):
@@ -197,13 +193,6 @@ def _trace(skeleton: np.ndarray, distance: np.ndarray) -> nx.MultiGraph:
             ends = [graph.nodes[node[j]]["place"] for j in (i, path[-1])]
             _add_edge(graph, k, node[path[-1]], np.stack([ends[0], *places[path[1:-1]], ends[1]]))
     return graph
-
-
-def _count_rings(cloud: np.ndarray) -> int:
-    """Return the number of tunnels among a junction's voxels, at places (N, 3)."""
-    voxels = np.zeros(np.ptp(cloud, axis=0) + 1, dtype=bool)
-    voxels[tuple((cloud - cloud.min(0)).T)] = True
-    return betti_numbers(voxels)[1] if len(cloud) > 3 else 0
 
 
 def _add_edge(graph: nx.MultiGraph, one: int, other: int, line: np.ndarray) -> None:
@@ -246,19 +235,13 @@ def _dissolve(graph: nx.MultiGraph, node: int) -> None:
 
 
 def _move_to_axis(graph: nx.MultiGraph, distance: np.ndarray, steps: np.ndarray) -> None:
-    """Move each line sideways to the middle of its tube, and each node by the mean move of its lines' ends.
-
-    Half the difference of the distances one voxel to either side is how far a point is off the axis. A line starts at
-    its node with the lower number.
-    """
+    """Move each line sideways to the middle of its tube, and each node by the mean move of its lines' ends."""
     moves: dict[int, list[np.ndarray]] = defaultdict(list)
     for one, other, of in graph.edges(data=True):
         line = of["line"] = _smooth(of["line"]).copy()
         along = _tangents(line, steps)
-        push = (
-            np.stack([_interpolate(distance, line + e) - _interpolate(distance, line - e) for e in np.eye(3)], axis=1)
-            / 2
-        )
+        # Half the difference of the distances one voxel to either side is how far a point is off the axis.
+        push = np.stack([_interpolate(distance, line + e) - _interpolate(distance, line - e) for e in np.eye(3)], 1) / 2
         push -= (push * along).sum(1, keepdims=True) * along
         line += push / steps
         moves[min(one, other)].append(push[0] / steps)
@@ -276,17 +259,14 @@ def _tangents(line: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def _measure_radii(distance: np.ndarray, line: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Return radii (N,) at the points of a line (N, 3) in voxels.
-
-    The axis of a tube misses the voxels, whose distance is then too small by how far they are off the line. A radius is
-    the mean of the sum of both over the 8 voxels around a point.
-    """
+    """Return radii (N,) at the points of a line (N, 3) in voxels: the mean over the 8 voxels around a point."""
     low, along, radii = np.floor(line).astype(int), _tangents(line, steps), np.zeros(len(line))
     for corner in product((0, 1), repeat=3):
         weight = np.prod(np.where(corner, line - low, 1 - line + low), axis=1)
         off = (low + corner - line) * steps
         off -= (off * along).sum(1, keepdims=True) * along
         voxel = np.clip(low + corner, 0, np.array(distance.shape) - 1)
+        # The axis of a tube misses the voxels, whose distance is too small by how far they are off the line.
         radii += weight * (distance[tuple(voxel.T)] + np.linalg.norm(off, axis=1))
     return np.maximum(radii, 0)
 

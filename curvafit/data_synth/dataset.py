@@ -14,8 +14,7 @@ from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_choice, check_float, check_int, check_seed
-from curvafit.data_synth.case import check_calibres, check_crop, check_shape, draw_voxel, image_and_labels
-from curvafit.data_synth.composition import Layers
+from curvafit.data_synth.case import Layers, check_calibres, check_crop, check_shape, draw_voxel, image_and_labels
 from curvafit.data_synth.imaging.image import field_shape
 from curvafit.data_synth.imaging.modality import Modality, modality
 from curvafit.data_synth.sources import Generated, Pool, Stored, choose_voxel
@@ -70,7 +69,7 @@ class TextureDataset(IterableDataset):
         With laws: the number of shapes, which take turns among the laws, at least one of each; and the share of the
         volume that they fill, by default that of the law's mass or scan.
     transform
-        A function of each `Sample`: `as_dict`, `as_monai`, `as_subject`, or your own.
+        A function of each `Sample`: `as_dict`, `as_monai`, or your own.
     """
 
     def __init__(
@@ -92,21 +91,33 @@ class TextureDataset(IterableDataset):
         kinds = [modalities] if isinstance(modalities, (str, Modality)) else list(modalities)
         self.modalities = [modality(kind) if isinstance(kind, str) else kind for kind in kinds]
         self.size = check_shape((size,) * 3 if isinstance(size, (int, Real)) else size)
-        self.length, self.seed = int(length), check_seed(seed)
-        self.calibres, self.normalise, self.transform = calibres, _choose_normalisation(normalise), transform
+        self.length, self.seed, self.transform = int(length), check_seed(seed), transform
+        self.calibres = check_calibres(calibres)
         sources: list[Any] = [source] if isinstance(source, LAW_TYPES) else list(as_tuple(source, "laws or stores"))
-        self._check(sources)
+        if not (sources and self.modalities):
+            raise ValueError(f"give a source and a modality, got {len(sources)} and {len(self.modalities)}")
+        if self.length < 1:
+            raise ValueError(f"length must be above 0, got {self.length}")
+        if not callable(normalise) and normalise is not None:
+            names = f"a normalisation among {', '.join(NORMALISATIONS)}, a function or None"
+            check_choice(normalise, NORMALISATIONS, names)
+            normalise = NORMALISATIONS[normalise]
+        self.normalise = normalise
         stores = all(map(_is_store, sources))
         edge = None if voxel is None else check_float(voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
         self.voxels = [edge or choose_voxel([] if stores else sources, kind) for kind in self.modalities]
+        thinnest = [(kind, edge * self.calibres[0]) for kind, edge in zip(self.modalities, self.voxels, strict=True)]
         if stores:
             if volume_fraction is not None:
                 raise ValueError("volume_fraction applies to laws only; the source is a store of shapes")
             self.source = Stored(tuple(map(Path, sources)), rotate=rotate)
         else:
-            self.source = self._make_pool(Generated.of(sources, volume_fraction), shapes, rotate)
-        for kind, edge in zip(self.modalities, self.voxels, strict=True):
-            check_crop(self.source.edge, self.size, edge * calibres[0], kind)
+            generated = Generated.of(sources, volume_fraction)
+            check_int(shapes, "a pool of at least 1 shape", 1, MOST_POOLED)
+            largest = max(max(field_shape(self.size, voxel, kind.base)) for kind, voxel in thinnest)
+            self.source = Pool(generated, max(shapes, len(generated.points)), ROUND * -(-largest // ROUND), rotate)
+        for kind, voxel in thinnest:
+            check_crop(self.source.edge, self.size, voxel, kind)
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
 
     def __repr__(self) -> str:
@@ -154,28 +165,14 @@ class TextureDataset(IterableDataset):
         imaging, voxel = kind.draw(for_imaging), draw_voxel(self.voxels[turn], self.calibres, rng)
         voxels = field_shape(self.size, voxel, imaging)
         shape = self.source.shape(voxels, 0, rng)
-        shown = Layers.of(torch.from_numpy(shape.values), shape.epsilon, [shape.origin])
+        u = torch.from_numpy(shape.values)
+        shown = Layers(u[None], u, shape.epsilon, [shape.origin])
         grey, _, mask = image_and_labels(shown, voxel, imaging, for_image, self.size, (1.0,))
         record = {"number": number, "source": shown.origins, "modality": kind.name, "imaging": imaging.as_dict()}
         record |= {"image_seed": for_image, "voxel": voxel}
         image = grey[None].float()
         image = image if self.normalise is None else self.normalise(image)
         return Sample(image, mask[None], imaging.spacing, record)
-
-    def _make_pool(self, generated: Generated, count: int, rotate: bool) -> Pool:
-        """Return a pool of shapes that are as large as the largest crop."""
-        check_int(count, "a pool of at least 1 shape", 1, MOST_POOLED)
-        crops = zip(self.modalities, self.voxels, strict=True)
-        largest = max(max(field_shape(self.size, edge * self.calibres[0], kind.base)) for kind, edge in crops)
-        return Pool(generated, max(count, len(generated.points)), ROUND * -(-largest // ROUND), rotate)
-
-    def _check(self, sources: list[Any]) -> None:
-        """Raise ValueError where an argument is missing or out of range."""
-        if not (sources and self.modalities):
-            raise ValueError(f"give a source and a modality, got {len(sources)} and {len(self.modalities)}")
-        if self.length < 1:
-            raise ValueError(f"length must be above 0, got {self.length}")
-        check_calibres(self.calibres)
 
 
 def as_dict(sample: Sample) -> dict[str, Tensor]:
@@ -192,29 +189,10 @@ def as_monai(sample: Sample) -> dict[str, Any]:
         from monai.data.meta_tensor import MetaTensor
     except ImportError as error:
         raise ImportError("as_monai needs MONAI: pip install monai", name="monai") from error
-    image, label, affine = _as_in_nifti(sample)
-    return {name: MetaTensor(values, affine=affine) for name, values in (("image", image), ("label", label))}
-
-
-def as_subject(sample: Sample) -> Any:
-    """Return a TorchIO `Subject` with `image` and `label`, axes and affine as those of `as_monai`."""
-    try:
-        import torchio  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ImportError("as_subject needs TorchIO: pip install torchio", name="torchio") from error
-    image, label, affine = _as_in_nifti(sample)
-    return torchio.Subject(
-        image=torchio.ScalarImage(tensor=image, affine=affine),
-        label=torchio.LabelMap(tensor=label, affine=affine),
-        record=sample.record,
-    )
-
-
-def _as_in_nifti(sample: Sample) -> tuple[Tensor, Tensor, Tensor]:
-    """Return image and label, (1, X, Y, Z), and the affine, with the digits that a NIfTI file keeps."""
     image, label = (values.permute(0, 3, 2, 1).contiguous() for values in (sample.image, sample.label))
     field = Field(sample.image[0].numpy(), sample.spacing, sample.record["imaging"]["unit"])
-    return image, label, torch.from_numpy(affine_in_file(field)).float().double()
+    affine = torch.from_numpy(affine_in_file(field)).float().double()  # the digits that a file keeps
+    return {name: MetaTensor(values, affine=affine) for name, values in (("image", image), ("label", label))}
 
 
 def zscore(image: Tensor) -> Tensor:
@@ -234,10 +212,3 @@ NORMALISATIONS: dict[str, Callable[[Tensor], Tensor]] = {"zscore": zscore, "perc
 
 def _is_store(source: Any) -> bool:
     return isinstance(source, (str, PathLike)) and (Path(source).is_dir() or Path(source).suffix == ".zarr")
-
-
-def _choose_normalisation(normalise: str | Callable[[Tensor], Tensor] | None) -> Callable[[Tensor], Tensor] | None:
-    if normalise is None or callable(normalise):
-        return normalise
-    check_choice(normalise, NORMALISATIONS, f"a normalisation among {', '.join(NORMALISATIONS)}, a function or None")
-    return NORMALISATIONS[normalise]

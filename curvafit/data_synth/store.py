@@ -166,10 +166,8 @@ class Store:
             return _publish(partial / place.name, place)
 
     def _describe_damage(self, part: str, index: int, error: Exception) -> ValueError:
-        return ValueError(
-            f"the {part} of draw {index} in {self.path} is damaged ({quoted(str(error))}): "
-            "`curvafit atlas verify` lists such draws"
-        )
+        what = f"the {part} of draw {index} in {self.path} is damaged ({quoted(str(error))})"
+        return ValueError(f"{what}: `curvafit atlas verify` lists such draws")
 
     def _require(self, index: int) -> dict[str, Any]:
         """Return a draw's attributes, or raise KeyError."""
@@ -269,8 +267,7 @@ def _create(path: Path, settings: Settings) -> None:
 
 @hold_signals()  # Zarr writes in threads of its own, which would go on beside what cleans up
 def _write_draw(folder: Path, record: Record, field: np.ndarray | None) -> None:
-    attributes = dataclasses.asdict(record) | {"coefficients": record.coefficients.as_dict()}
-    attributes = _to_json(attributes | {"viability": _to_json(attributes["viability"])})
+    attributes = _to_json(dataclasses.asdict(record) | {"coefficients": record.coefficients.as_dict()})
     zarr.create_group(store=str(folder), attributes=attributes | {"sha256": _digest(attributes, field)})
     if field is None:
         return
@@ -318,10 +315,12 @@ def _digest(attributes: dict[str, Any], field: np.ndarray | None) -> str:
     return checksum.hexdigest()
 
 
-def _to_json(values: dict[str, Any]) -> dict[str, Any]:
-    """Return values as JSON holds them: NumPy's numbers as Python's, and None for NaN and infinity."""
-    plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
-    return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in plain.items()}
+def _to_json(value: Any) -> Any:
+    """Return a value as JSON holds it: NumPy's numbers as Python's, and None for NaN and infinity."""
+    if isinstance(value, dict):
+        return {name: _to_json(item) for name, item in value.items()}
+    plain = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(plain, float) and not math.isfinite(plain) else plain
 
 
 def _decode(attributes: dict[str, Any]) -> Record:

@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 import torch
 from exact import Cylinder, Sphere, centres
-from flat_recipe import FLAT, SHAPE, flat_recipe
+from flat_recipe import flat_recipe
 
-from curvafit.data_synth.card import write_card
-from curvafit.data_synth.case import Recipe
-from curvafit.data_synth.composition import Composition, shell_of
+from curvafit.data_synth.case import Case, Composition, Recipe, shell_of
 from curvafit.data_synth.imaging.effects import occupancy
 from curvafit.data_synth.imaging.image import share_voxels
 from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality
-from curvafit.data_synth.sets import SetSpec, build_set, read_spec, write_preview
+from curvafit.data_synth.sets import SetSpec, build_set, read_spec, write_card, write_preview
 from curvafit.data_synth.sources import Generated, PhaseField
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
@@ -31,14 +29,23 @@ CLEAR = Modality("clear", "for tests", 1.0, Imaging(contrast=Contrast(10.0, 110.
 LAWS = Generated.of(["tubes", "sponge"])
 
 
+def recipe_of(source: Generated, **options: Any) -> Recipe:
+    return Recipe(source, CLEAR, (16, 16, 16), 1.0, composition=Composition(**options))
+
+
 @pytest.fixture(scope="module")
-def stored(tmp_path_factory: pytest.TempPathFactory) -> Recipe:
+def solid(tmp_path_factory: pytest.TempPathFactory) -> Recipe:
     return flat_recipe(tmp_path_factory.mktemp("shapes") / "s.zarr")
 
 
 @pytest.fixture(scope="module")
-def two() -> Any:
-    return Recipe(LAWS, CLEAR, (24, 24, 24), 1.0, composition=Composition(classes=True, levels=(1, 0.4))).case(0)
+def shell(solid: Recipe) -> Recipe:
+    return replace(solid, composition=Composition(wall=0.8))
+
+
+@pytest.fixture(scope="module")
+def two() -> Case:
+    return recipe_of(LAWS, classes=True, levels=(1, 0.4)).case(0)
 
 
 @pytest.mark.parametrize("thickness", [4.0, 6.5])
@@ -55,11 +62,9 @@ def test_the_wall_of_a_ball_is_a_shell_and_the_lumen_a_ball(thickness):
 
 def test_wall_and_lumen_fill_the_shape_without_a_gap():
     u = optimal_profile(Sphere(16.3, MIDDLE).distance(centres(GRID)), EPSILON).float()
-    shares = share_voxels(shell_of(u, EPSILON, 5.0), EPSILON)
-    whole = occupancy(u, EPSILON)
-    assert float((sum(shares) - whole).abs().max()) < 0.1 and float(sum(shares).sum() / whole.sum()) == pytest.approx(
-        1, abs=1e-3
-    )
+    shares, whole = share_voxels(shell_of(u, EPSILON, 5.0), EPSILON), occupancy(u, EPSILON)
+    assert float((sum(shares) - whole).abs().max()) < 0.1
+    assert float(sum(shares).sum() / whole.sum()) == pytest.approx(1, abs=1e-3)
     assert float(shares[1][whole < 1].max()) == 0  # no light of the lumen at the outer surface
 
 
@@ -71,14 +76,10 @@ def test_a_wall_thicker_than_the_shape_fills_it():
 class Slab:
     """The half space z > -1, as a source of crops: its surface lies just outside of them."""
 
-    edge, scales_between = 999, (1.0, 1.0)
-
-    def scale(self, index: int) -> float:
-        return 1.0
+    edge = 999
 
     def shape(self, voxels: Any, index: int, rng: np.random.Generator) -> PhaseField:
-        margin = (voxels[0] - 12) / 2
-        z = np.arange(voxels[0])[:, None, None] - margin + 1.0
+        z = np.arange(voxels[0])[:, None, None] - (voxels[0] - 12) / 2 + 1.0
         return PhaseField(np.tanh(z / (np.sqrt(2) * EPSILON)) * np.ones(voxels, dtype=np.float32), EPSILON, {})
 
 
@@ -88,94 +89,48 @@ def test_a_wall_of_a_surface_outside_of_a_crop_reaches_into_it():
     assert (layers.values[0][:3] > 0).all() and (layers.values[1][4:] > 0).all() and (layers.whole > 0).all()
 
 
-def test_a_shell_has_a_bright_wall_and_a_dark_lumen(stored):
-    shell = replace(stored, composition=Composition(wall=0.8))
-    case, solid = shell.case(2), stored.case(2)
+def test_a_shell_has_a_bright_wall_and_a_dark_lumen(solid, shell):
+    case, whole = shell.case(2), solid.case(2)
     assert shell.classes == ("wall", "lumen") and case.labels.dtype == np.uint8
     assert ((case.labels > 0) == (case.field > 0)).all() and set(np.unique(case.labels)) == {0, 1, 2}
     wall, lumen, outside = (float(case.image[case.labels == k].mean()) for k in (1, 2, 0))
-    assert wall > 2 * lumen and lumen < 0.5 * solid.image[solid.labels > 0].mean() and outside < lumen
+    assert wall > 2 * lumen and lumen < 0.5 * whole.image[whole.labels > 0].mean() and outside < lumen
     counts = [float((case.labels == k).mean()) for k in (1, 2)]
     assert case.record["class_fractions"] == pytest.approx(counts) and sum(counts) < 1
+    one_slice = replace(shell, shape=(1, 16, 16)).case(0)
+    assert set(np.unique(one_slice.labels)) == {0, 1, 2}
 
 
-def test_where_labels_are_what_an_image_shows_a_wall_stays_one(stored):
-    wide = replace(stored.modality, base=stored.modality.base.assign({"visible": 0.2}))
-    shell = replace(stored, composition=Composition(wall=0.8))
+def test_where_labels_are_what_an_image_shows_a_wall_stays_one(solid, shell):
+    wide = replace(solid.modality, base=solid.modality.base.assign({"visible": 0.2}))
     exact, seen = shell.case(2), replace(shell, modality=wide).case(2)
-    outside = exact.labels == 0
-    assert set(np.unique(seen.labels[outside])) == {0, 1}  # what is seen beyond the surface is wall
+    assert set(np.unique(seen.labels[exact.labels == 0])) == {0, 1}  # what is seen beyond the surface is wall
     counts = [[np.count_nonzero(case.labels == k) for k in (1, 2)] for case in (exact, seen)]
     assert counts[1][0] > counts[0][0] and counts[1][1] > 0.5 * counts[0][1]
 
 
-def test_one_slice_has_a_wall_too(stored):
-    assert set(np.unique(replace(stored, shape=(1, 16, 16), composition=Composition(wall=0.8)).case(0).labels)) == {
-        0,
-        1,
-        2,
-    }
-
-
 def test_classes_are_a_shape_of_each_law_the_first_in_front(two):
-    one, other = (LAWS.shape((24, 24, 24), k, np.random.default_rng(0)) for k in range(2))
-    assert (
-        [origin["name"] for origin in two.record["source"]]
-        == ["tubes", "sponge"]
-        == [
-            one.origin["name"],
-            other.origin["name"],
-        ]
-    )
-    alone = Recipe(Generated.of(["tubes"]), CLEAR, (24, 24, 24), 1.0).case(0)
+    assert [origin["name"] for origin in two.record["source"]] == ["tubes", "sponge"]
+    alone = recipe_of(Generated.of(["tubes"])).case(0)
     assert ((two.labels == 1) == (alone.labels == 1)).all()  # no part of the first is hidden
-    inside = [two.image[two.labels == k] for k in range(3)]
-    assert [np.median(part) for part in inside] == pytest.approx([10, 110, 50])
+    assert [np.median(two.image[two.labels == k]) for k in range(3)] == pytest.approx([10, 110, 50])
+    assert Composition(classes=True).names(Generated.of(["tubes", "tubes"])) == ("tubes 1", "tubes 2")
 
 
 def test_levels_say_how_bright_a_class_is(two):
-    even = Recipe(LAWS, CLEAR, (24, 24, 24), 1.0, composition=Composition(classes=True)).case(0)
+    even = recipe_of(LAWS, classes=True).case(0)
     assert (even.labels == two.labels).all()
     assert np.median(even.image[even.labels == 2]) == pytest.approx(110)
 
 
-def test_a_set_of_shells_lists_its_classes(tmp_path, stored):
-    spec = SetSpec(replace(stored, composition=Composition(wall=0.8)), parts=("radius",))
-    folder = build_set(tmp_path / "set", spec, 2)
-    listed = json.loads((folder / "dataset.json").read_text())
-    assert listed["labels"] == {"background": 0, "wall": 1, "lumen": 2}
-    label = read_values(folder / "labelsTr" / "case_00001.nii.gz")
+def test_a_set_of_shells_lists_its_classes(tmp_path, shell):
+    spec = SetSpec(shell, "monai", ("radius",))
+    folder = build_set(tmp_path / "set", spec, 1)
+    assert json.loads((folder / "dataset.json").read_text())["labels"] == {"0": "background", "1": "wall", "2": "lumen"}
+    label = read_values(folder / "labelsTr" / "case_00000.nii.gz")
     assert set(np.unique(label)) == {0, 1, 2}
-    radius = read_values(folder / "parts" / "radius" / "case_00001.nii.gz")
+    radius = read_values(folder / "parts" / "radius" / "case_00000.nii.gz")
     assert ((radius > 0) == (label > 0)).mean() > 0.99  # further labels are of wall and lumen together
     assert read_spec(folder).as_dict() == spec.as_dict()
     assert write_preview(folder).read_bytes().startswith(b"\x89PNG")
-    card = write_card(folder).read_text()
-    assert "0 background, 1 wall, 2 lumen" in card and "a wall of 0.8" in card and "that is lumen" in card
-    monai = build_set(tmp_path / "monai", replace(spec, layout="monai"), 1)
-    assert json.loads((monai / "dataset.json").read_text())["labels"]["2"] == "lumen"
-
-
-def test_laws_of_one_name_make_classes_of_two():
-    assert Composition(classes=True).names(Generated.of(["tubes", "tubes"])) == ("tubes 1", "tubes 2")
-
-
-def test_bad_input(stored):
-    with pytest.raises(ValueError, match="classes or a wall"):
-        Composition(classes=True, wall=2)
-    with pytest.raises(ValueError, match="positive thickness"):
-        Composition(wall=0)
-    with pytest.raises(ValueError, match="levels from 0"):
-        Composition(levels=(1, -1))
-    with pytest.raises(ValueError, match="a level for each of wall, lumen"):
-        replace(stored, composition=Composition(wall=1, levels=(1,)))
-    with pytest.raises(ValueError, match="classes need from 2"):
-        replace(stored, composition=Composition(classes=True))
-    with pytest.raises(ValueError, match="showed no lumen"):
-        Recipe(Generated.of(["tubes"]), CLEAR, (16, 16, 16), 1.0, composition=Composition(wall=15)).case(0)
-    with pytest.raises(ValueError, match="at least a shape's voxel thick, 0.5 um, got 0.4"):
-        replace(stored, composition=Composition(wall=0.4))
-    with pytest.raises(ValueError, match="larger --shape"):
-        replace(stored, composition=Composition(wall=50))
-    with pytest.raises(ValueError, match="expected a Composition"):
-        Recipe(stored.source, FLAT, SHAPE, 0.5, composition=0.5)  # type: ignore[arg-type]
+    assert "0 background, 1 wall, 2 lumen" in write_card(folder).read_text()

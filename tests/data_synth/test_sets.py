@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import errno
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import nibabel
 import numpy as np
 import pytest
-from flat_recipe import FLAT, SHAPE, flat_recipe
+from flat_recipe import SHAPE, flat_recipe
 
 from curvafit.data_synth import sets
-from curvafit.data_synth.card import write_card
-from curvafit.data_synth.case import Recipe
-from curvafit.data_synth.imaging.modality import Imaging
-from curvafit.data_synth.sets import SetSpec, build_set, make_cases, read_spec, write_preview
+from curvafit.data_synth.sets import SetSpec, build_set, make_cases, read_spec, write_card
 from curvafit.volumes.read import load, read_values
 
 
@@ -29,50 +27,27 @@ def sums(folder: Path) -> dict[str, dict[str, str]]:
     return {path.stem: json.loads(path.read_text())["sha256"] for path in sorted((folder / "cases").glob("*.json"))}
 
 
-def test_nnunet_s_layout(tmp_path, order):
-    folder = build_set(tmp_path / "Dataset007_Flat", order, 3)
-    listed = json.loads((folder / "dataset.json").read_text())
-    assert listed["numTraining"] == 3 and listed["labels"] == {"background": 0, "structure": 1}
-    assert listed["channel_names"] == {"0": "flat"} and listed["file_ending"] == ".nii.gz"
-    for index in range(3):
-        image = nibabel.load(folder / "imagesTr" / f"case_{index:05d}_0000.nii.gz")
-        label = nibabel.load(folder / "labelsTr" / f"case_{index:05d}.nii.gz")
-        assert image.shape == label.shape == SHAPE[::-1]
-        assert image.header.get_zooms() == label.header.get_zooms() == (0.5, 0.5, 1.0)
-        assert (image.affine == label.affine).all() and image.header.get_xyzt_units()[0] == "micron"
-        values = np.asanyarray(label.dataobj)
-        assert set(np.unique(values)) == {0, 1}
-        case = order.recipe.case(index)
-        assert ((case.field > 0) == values.T).all() and (case.image == np.asanyarray(image.dataobj).T).all()
-        record = json.loads((folder / "cases" / f"case_{index:05d}.json").read_text())
-        assert (
-            Imaging.from_dict(record["imaging"]).contrast.foreground == case.record["imaging"]["contrast"]["foreground"]
-        )
-        assert set(record["source"][0]["parameters"]) == {"a20", "a11", "a02", "a10", "a01", "a00", "mass"}
-
-
-@pytest.mark.parametrize("layout", ["monai", "zarr"])
-def test_decathlon_s_list(tmp_path, order, layout):
+@pytest.mark.parametrize("layout", ["nnunet", "monai", "zarr"])
+def test_a_layout_holds_the_cases(tmp_path, order, layout):
+    """Images, labels, spacing and unit as a reader of the layout finds them, in the list that it looks for."""
     folder = build_set(tmp_path / "set", SetSpec(order.recipe, layout), 2)
     listed = json.loads((folder / "dataset.json").read_text())
-    assert listed["numTraining"] == len(listed["training"]) == 2
-    for index, pair in enumerate(listed["training"]):
-        image, label = load(folder / pair["image"]), load(folder / pair["label"])
-        case = order.recipe.case(index)
-        assert image.spacing == label.spacing == case.spacing and image.unit == "um"
+    assert listed["numTraining"] == 2
+    if layout == "nnunet":
+        assert listed["labels"] == {"background": 0, "structure": 1}
+        assert listed["channel_names"] == {"0": "flat"} and listed["file_ending"] == ".nii.gz"
+        pairs = [(f"imagesTr/case_{k:05d}_0000.nii.gz", f"labelsTr/case_{k:05d}.nii.gz") for k in range(2)]
+        header = nibabel.load(folder / pairs[0][0]).header
+        assert header.get_zooms() == (0.5, 0.5, 1.0) and header.get_xyzt_units()[0] == "micron"
+    else:
+        pairs = [(pair["image"], pair["label"]) for pair in listed["training"]]
+    for index, (image, label) in enumerate(pairs):
+        case, image, label = order.recipe.case(index), load(folder / image), load(folder / label)
+        assert image.spacing == label.spacing == case.spacing and image.unit == label.unit == "um"
         assert (image.values == case.image).all() and (label.values == (case.field > 0)).all()
-
-
-@pytest.mark.filterwarnings("ignore:NvImgCodec")
-def test_monai_reads_it(tmp_path, order):
-    data = pytest.importorskip("monai.data", reason="needs MONAI")
-    from monai.transforms import LoadImaged
-
-    folder = build_set(tmp_path / "set", SetSpec(order.recipe, "monai"), 2)
-    pairs = data.load_decathlon_datalist(str(folder / "dataset.json"), data_list_key="training")
-    read = LoadImaged(keys=("image", "label"))(pairs[1])
-    assert read["image"].shape == read["label"].shape == SHAPE[::-1]
-    assert np.abs(np.diag(read["image"].affine.numpy()))[:3].tolist() == [0.5, 0.5, 1.0]
+    record = json.loads((folder / "cases" / "case_00001.json").read_text())
+    assert record["imaging"]["contrast"]["foreground"] == case.record["imaging"]["contrast"]["foreground"]
+    assert set(record["source"][0]["parameters"]) == {"a20", "a11", "a02", "a10", "a01", "a00", "mass"}
 
 
 def test_a_set_goes_on_and_ends_the_same(tmp_path, order):
@@ -160,138 +135,91 @@ def test_a_run_that_is_stopped_leaves_the_case_that_another_completed(tmp_path, 
     assert len(sums(folder)) == 1 and (folder / "imagesTr" / "case_00000_0000.nii.gz").exists()
 
 
-def test_labels_besides_the_mask(tmp_path, order):
-    asked = SetSpec(order.recipe, parts=("distance", "instances", "kappa1", "betti", "centreline"))
-    folder = build_set(tmp_path / "set", asked, 1)
-    case = asked.recipe.case(0)
-    distance = load(folder / "parts" / "distance" / "case_00000.nii.gz")
-    assert distance.values.dtype == np.float32 and distance.spacing == case.spacing
-    assert ((distance.values > 0) == (case.field > 0)).all()
-    pieces = read_values(folder / "parts" / "instances" / "case_00000.nii.gz")
-    assert ((pieces > 0) == (case.field > 0)).all()
-    record = json.loads((folder / "cases" / "case_00000.json").read_text())
-    assert len(record["betti"]) == 3 and record["betti"][0] >= 1
-    assert {path.suffix for path in (folder / "parts" / "centreline").iterdir()} == {".graphml"}
+@pytest.mark.filterwarnings("ignore:NvImgCodec")
+def test_monai_reads_it(folder):
+    data = pytest.importorskip("monai.data", reason="needs MONAI")
+    from monai.transforms import LoadImaged
+
+    pairs = data.load_decathlon_datalist(str(folder / "dataset.json"), data_list_key="training")
+    read = LoadImaged(keys=("image", "label"))(pairs[0])
+    assert read["image"].shape == read["label"].shape == SHAPE[::-1]
+    assert np.abs(np.diag(read["image"].affine.numpy()))[:3].tolist() == [0.5, 0.5, 1.0]
 
 
-def test_labels_are_what_an_image_shows_where_asked(tmp_path, order):
+@pytest.fixture(scope="module")
+def wide(order: SetSpec) -> SetSpec:
+    """A set with further labels, whose masks are what an image shows."""
     modality = order.recipe.modality
-    wide = replace(modality, base=modality.base.assign({"optics.blur": (1.5, 1.5, 1.5), "visible": 0.1}))
-    asked = SetSpec(replace(order.recipe, modality=wide), parts=("distance",))
-    folder, case = build_set(tmp_path / "set", asked, 1), asked.recipe.case(0)
-    inside = load(folder / "parts" / "distance" / "case_00000.nii.gz").values > 0
+    seen = replace(modality, base=modality.base.assign({"optics.blur": (1.5, 1.5, 1.5), "visible": 0.1}))
+    parts = ("distance", "instances", "kappa1", "betti", "centreline")
+    return SetSpec(replace(order.recipe, modality=seen), "monai", parts)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, wide: SetSpec) -> Path:
+    return build_set(tmp_path_factory.mktemp("wide") / "set", wide, 1)
+
+
+def test_labels_besides_the_mask_are_of_the_structure_itself(folder, wide):
+    """Masks are what an image shows where asked, and wider."""
+    case, parts = wide.recipe.case(0), folder / "parts"
+    distance = load(parts / "distance" / "case_00000.nii.gz")
+    assert distance.values.dtype == np.float32 and distance.spacing == case.spacing
+    inside = case.field > 0
+    assert ((distance.values > 0) == inside).all()
+    assert ((read_values(parts / "instances" / "case_00000.nii.gz") > 0) == inside).all()
+    assert {path.suffix for path in (parts / "centreline").iterdir()} == {".graphml"}
     label = read_values(folder / "labelsTr" / "case_00000.nii.gz") > 0
     assert (label == case.labels).all() and label[inside].all() and label.sum() > 1.1 * inside.sum()
     record = json.loads((folder / "cases" / "case_00000.json").read_text())
-    assert (
-        record["class_fractions"] == [label.mean()]
-        and label.mean() > record["volume_fraction"] > 0
-        and record["imaging"]["visible"] == 0.1
-    )
+    assert len(record["betti"]) == 3 and record["betti"][0] >= 1
+    assert record["class_fractions"] == [label.mean()] and label.mean() > record["volume_fraction"] > 0
+    assert record["imaging"]["visible"] == 0.1
 
 
-def test_bad_input(tmp_path, order):
-    recipe = order.recipe
-    with pytest.raises(ValueError, match="count"):
-        build_set(tmp_path / "none", order, 0)
-    assert not (tmp_path / "none").exists()
-    with pytest.raises(ValueError, match="24 voxels"):
-        Recipe(recipe.source, FLAT, (32, 16, 16), 0.5)
-    with pytest.raises(ValueError, match="voxels"):
-        Recipe(recipe.source, FLAT, (8, 0, 8), 0.5)
-    with pytest.raises(ValueError, match="voxel"):
-        Recipe(recipe.source, FLAT, SHAPE, 0)
-    with pytest.raises(ValueError, match="layout"):
-        SetSpec(recipe, "bids")
-    with pytest.raises(ValueError, match="depth"):
-        SetSpec(recipe, parts=("depth",))
-    (tmp_path / "taken").mkdir()
-    (tmp_path / "taken" / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match="folder"):
-        build_set(tmp_path / "taken", order, 1)
-    with pytest.raises(ValueError, match="taken"):
-        read_spec(tmp_path / "taken")
-    folder = build_set(tmp_path / "set", order, 1)
-    other = SetSpec(Recipe(recipe.source, FLAT, SHAPE, 0.5, seed=5))
-    with pytest.raises(ValueError, match="seed"):
-        build_set(folder, other, 1)
-    with pytest.raises(ValueError, match="nowhere"):
-        make_cases(tmp_path / "nowhere", [0])
-
-
-def test_what_others_began_is_left_alone(tmp_path, order):
+def test_what_others_began_is_left_alone(tmp_path, folder, wide):
     """A set whose first case is still being made may be another process's."""
-    folder, other = build_set(tmp_path / "set", order, 1), SetSpec(replace(order.recipe, seed=5))
-    (folder / "cases" / "case_00000.json").unlink()
+    begun = tmp_path / "set"
+    begun.mkdir()
+    shutil.copy(folder / "curvafit.json", begun)
     with pytest.raises(ValueError, match="seed"):
-        build_set(folder, other, 1)
-    assert read_spec(folder) == order
+        build_set(begun, replace(wide, recipe=replace(wide.recipe, seed=5)), 1)
+    assert read_spec(begun) == wide and [each.name for each in begun.iterdir()] == ["curvafit.json"]
+
+
+#: Headers and records that are refused: as whole texts, or as entries in place of those that are there.
+TORN = ("{", "null", "[]", "NaN", "[" * 100_000, '{"version": ' + "9" * 5000 + "}", '{"version": NaN}', "{}")
+HEADERS = ({"version": 1}, *({"order": each} for each in ({"recipe": 7}, {"layout": "cubes"}, {"parts": None},
+           {"recipe": {"source": []}}, {"recipe": {"composition": {"blend": 0.2}}})))  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", [*TORN, *HEADERS])
+def test_a_damaged_header_is_one_sentence(tmp_path, folder, wide, wrong):
+    """And is left alone; so is that of a set that blends textures."""
+    file = tmp_path / "curvafit.json"
     header = json.loads((folder / "curvafit.json").read_text())
-    (folder / "curvafit.json").write_text(json.dumps(header | {"version": 1}))
-    with pytest.raises(ValueError, match="version 1"):
-        build_set(folder, order, 1)
-    (folder / "curvafit.json").write_text("{}")
+    if isinstance(wrong, dict):
+        order, recipe = header["order"], wrong.get("order", {}).get("recipe")
+        mended = {"recipe": order["recipe"] | recipe} if isinstance(recipe, dict) else {}
+        wrong = header | wrong | {"order": order | wrong.get("order", {}) | mended}
+    text = wrong if isinstance(wrong, str) else json.dumps(wrong)
+    file.write_text(text)
     with pytest.raises(ValueError, match="curvafit.json"):
-        build_set(folder, other, 1)
-    assert (folder / "curvafit.json").read_text() == "{}"
+        build_set(tmp_path, wide, 1)
+    assert file.read_text() == text
 
 
-@pytest.mark.parametrize("blend", [0, 0.2])
-def test_a_set_that_states_a_blend_goes_on_where_it_is_none(tmp_path, order, blend):
-    folder = build_set(tmp_path / "set", order, 1)
+def test_a_set_that_states_a_blend_of_none_goes_on(tmp_path, folder, wide):
     header = json.loads((folder / "curvafit.json").read_text())
-    header["order"]["recipe"]["composition"]["blend"] = blend
-    (folder / "curvafit.json").write_text(json.dumps(header))
-    if blend:
-        with pytest.raises(ValueError, match="blends textures"):
-            build_set(folder, order, 2)
-    else:
-        assert len(sums(build_set(folder, order, 2))) == 2
+    header["order"]["recipe"]["composition"]["blend"] = 0
+    (tmp_path / "curvafit.json").write_text(json.dumps(header))
+    assert read_spec(tmp_path) == wide
 
 
-def test_a_damaged_header_is_one_sentence(tmp_path, order):
-    folder = build_set(tmp_path / "set", order, 1)
-    header = json.loads((folder / "curvafit.json").read_text())
-    for where, value in (("recipe", 7), ("layout", "cubes"), ("parts", None), ("recipe", {"source": []})):
-        broken = header | {"order": header["order"] | {where: value}}
-        (folder / "curvafit.json").write_text(json.dumps(broken))
-        with pytest.raises(ValueError, match="curvafit.json"):
-            read_spec(folder)
-    for bomb in ("[" * 100_000, '{"version": ' + "9" * 5000 + "}", '{"version": NaN}'):
-        (folder / "curvafit.json").write_text(bomb)
-        with pytest.raises(ValueError, match="curvafit.json"):
-            read_spec(folder)
-
-
-@pytest.mark.parametrize(
-    "text", ["{", "null", "[]", '{"imaging": {"spacing": [1, 2]}, "source": {"name": "x"}}', "NaN"]
-)
-def test_a_damaged_record_of_a_case_is_one_sentence(tmp_path, order, text):
-    folder = build_set(tmp_path / "set", order, 1)
-    (folder / "cases" / "case_00000.json").write_text(text)
-    with pytest.raises(ValueError, match="case_00000.json"):
-        write_preview(folder)
-
-
-def test_the_card_tells_what_a_set_is_and_spares_another_s(tmp_path, order):
-    folder = build_set(tmp_path / "set", order, 2)
-    text = write_card(folder, "curvafit synth -o set").read_text(encoding="utf-8")
-    recipe = order.recipe
-    assert "| cases | 2 |" in text
-    assert " x ".join(map(str, recipe.shape)) in text
-    assert recipe.modality.name in text and all(name in text for name in recipe.modality.ranges)
-    assert "`curvafit synth -o set`" in text
-    assert "`` curvafit synth -o 's`t' ``" in write_card(folder, "curvafit synth -o 's`t'").read_text(encoding="utf-8")
-    build_set(folder, order, 3)
-    assert "| cases | 3 |" in write_card(folder).read_text(encoding="utf-8")
-    (folder / "card.md").write_text("my own words")
-    assert write_card(folder).read_text(encoding="utf-8") == "my own words"
-
-
-@pytest.mark.parametrize("text", ["{", "[]", '{"class_fractions": [0.1]}'])
-def test_a_card_of_a_damaged_record_is_one_sentence(tmp_path, order, text):
-    folder = build_set(tmp_path / "set", order, 1)
-    (folder / "cases" / "case_00000.json").write_text(text)
-    with pytest.raises(ValueError, match="case_00000.json"):
-        write_card(folder)
-    assert not (folder / "card.md").exists()
+def test_the_card_tells_what_a_set_is_and_spares_another_s(tmp_path, folder, wide):
+    whole = shutil.copytree(folder, tmp_path / "set")
+    text = write_card(whole, "curvafit synth -o set").read_text(encoding="utf-8")
+    for part in ("cases: 1", "8 x 16 x 16", "flat: for tests", *wide.recipe.modality.ranges, "curvafit synth -o set"):
+        assert part in text
+    (whole / "card.md").write_text("my own words")
+    assert write_card(whole).read_text(encoding="utf-8") == "my own words"

@@ -1,12 +1,9 @@
-"""Cases that were wrong once: training sets on the fly, and small doors."""
+"""Cases that were wrong once: small doors."""
 
 from __future__ import annotations
 
 import csv
-import dataclasses
 import logging
-import multiprocessing
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,41 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exact_store import exact_field, exact_record, exact_store
 
 import curvafit
 from curvafit.core.runtime import log_stages
-from curvafit.data_synth import TextureDataset
 from curvafit.scan.measure import COLUMNS
 from curvafit.studies.tables import format_csv
-
-
-def grow_once_for_all_epochs(folder: Path) -> None:
-    """Two workers, new ones in each of two epochs, grow no shape twice."""
-    method = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
-    log, script = folder / "log", Path(__file__).parents[1] / "pool_run.py"
-    room = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    run = subprocess.run([sys.executable, script, method, "2", "0", log], env=room, capture_output=True, text=True)
-    grown = [line.split()[0] for line in log.read_text().splitlines()]
-    assert grown and len(set(grown)) == len(grown) and run.returncode == 0, run.stderr
-
-
-def keep_every_law_of_a_list(folder: Path) -> None:
-    pairs = TextureDataset(["tubes", "sponge"], "micro-ct", 16, shapes=1)
-    assert "2 shapes of tubes, sponge" in repr(pairs)
-
-
-def say_how_many_shapes_are_well_formed(folder: Path) -> None:
-    """A viable shape that reaches |u| = 7 is a fragment, and is not cropped."""
-    store, record = exact_store(folder / "s.zarr", 4), exact_record(4)
-    torn = dataclasses.replace(record, viability=dataclasses.replace(record.viability, highest=7.0))
-    store.write(torn, exact_field(4))
-    assert "3 shapes of s.zarr, the well-formed ones of 4;" in repr(TextureDataset(store.path, "micro-ct", 12))
-
-
-def refuse_arrays_as_diagrams(folder: Path) -> None:
-    with pytest.raises(ValueError, match="diagram"):
-        curvafit.wasserstein(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
 
 
 def refuse_inputs_before_libraries(folder: Path) -> None:
@@ -109,10 +76,6 @@ def log_the_stages_of_an_inference(folder: Path) -> None:
 
 
 CASES: dict[str, Callable[[Path], None]] = {
-    "eng-10-pool-regrown-each-epoch": grow_once_for_all_epochs,
-    "eng-12-list-of-laws": keep_every_law_of_a_list,
-    "eng-12-store-of-four": say_how_many_shapes_are_well_formed,
-    "eng-12-wasserstein": refuse_arrays_as_diagrams,
     "eng-12-missing-inputs": refuse_inputs_before_libraries,
     "eng-12-formulas": keep_formulas_out_of_a_spreadsheet,
     "eng-12-measures": show_measures_in_a_notebook,

@@ -7,10 +7,8 @@ from collections.abc import Sequence
 
 import torch
 
-from curvafit.core.checks import check_seed
 from curvafit.data_synth.imaging import effects
-from curvafit.data_synth.imaging.effects import EPSILON
-from curvafit.data_synth.imaging.maths import Triple, Volume
+from curvafit.data_synth.imaging.effects import EPSILON, Triple, Volume
 from curvafit.data_synth.imaging.modality import Imaging
 from curvafit.priors.grid import Float
 
@@ -30,13 +28,6 @@ def image(
     classes (C, Z, Y, X), the first in front, with the light of each: 0 as the background's, 1 as the structure's.
     """
     fields, lights = (field[None], (1.0,)) if levels is None else (field, levels)
-    if fields.ndim != 4 or not field.is_floating_point() or not torch.isfinite(field).all():
-        raise ValueError(f"a field must be finite floats (Z, Y, X), got {field.dtype} {tuple(field.shape)}")
-    if len(fields) != len(lights):
-        raise ValueError(f"give a level for each of {len(fields)} classes, got {len(lights)}")
-    if not (spacing > 0 and epsilon > 0):
-        raise ValueError(f"spacing and epsilon must be positive, got {spacing} and {epsilon}")
-    seed = check_seed(seed)
     stain = torch.stack([light * share for light, share in zip(lights, share_voxels(fields, epsilon), strict=True)])
     light, optics = _emit(stain.sum(0), spacing, imaging, seed), imaging.optics
     if optics.growth or optics.attenuation:

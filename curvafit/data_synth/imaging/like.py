@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -64,21 +63,21 @@ def fit_modality(scan: Field, mask: np.ndarray | None = None) -> Modality:
     """Return a modality whose images look like a scan: its spacing, levels, textures, blur, noise and uneven light.
 
     The scan is taken to have two classes, a Gaussian blur of one width in the plane and one along z, and noise whose
-    variance is a line over the mean (`measure_noise`). Growth with depth, stripes, rings, lost stain and clutter stay
+    variance is a line over the mean. Growth with depth, stripes, rings, lost stain and clutter stay
     0. The blur is the one that makes the mask, times a local brightness, most like the scan. Whole numbers from 0 are
     taken as counts that saturate at the highest of their type.
 
-    The mask is the structure's voxels, (Z, Y, X); by default `find_bright`. The modality's `base` holds the estimates,
+    The mask is the structure's voxels, (Z, Y, X); by default what is bright. The modality's `base` holds the estimates,
     its `ranges` their surroundings (`SPREAD`), and its `voxel` is the finest edge of the scan's.
     """
     values, given = _crop_middle(scan, mask)
     steps = np.array(scan.spacing)
-    inside = find_bright(values, steps) if given is None else given
+    inside = _find_bright(values, steps) if given is None else given
     if not inside.any() or inside.all():
         raise ValueError("the mask must have voxels inside and outside, got an empty or a full one")
-    ground = measure_background(values, inside, steps)
+    ground = _measure_background(values, inside, steps)
     structure = _measure_structure(values, inside, steps, ground.level)
-    noise = measure_noise(values, inside, ground, steps, ground.level + structure.contrast)
+    noise = _measure_noise(values, inside, ground, steps, ground.level + structure.contrast)
     base = _to_imaging(scan, structure, ground, noise)
     known = {name: np.asarray(base[name]) for name in SPREAD if np.any(base[name])}
     ranges = {name: tuple((end * value).tolist() for end in SPREAD[name]) for name, value in known.items()}
@@ -138,14 +137,11 @@ def _crop_middle(scan: Field, mask: np.ndarray | None) -> tuple[np.ndarray, np.n
     return values, None if mask is None else np.asarray(mask)[box].astype(bool)
 
 
-def find_bright(values: np.ndarray, steps: np.ndarray | Sequence[float]) -> np.ndarray:
-    """Guess the structure's voxels in grey values (Z, Y, X) on voxels of edges `steps`.
-
-    A voxel is the structure's where its contrast is above half of the local one: the mean, weighted by brightness, over
-    nearby voxels above Otsu's threshold. So the place of an edge does not depend on the structure's brightness. The
-    threshold is found among square roots, which shows dim structures.
-    """
-    steps = np.asarray(steps, dtype=float)
+def _find_bright(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Guess the structure's voxels in grey values (Z, Y, X) on voxels of edges `steps`."""
+    # A voxel is the structure's where its contrast is above half of the local one: the mean, weighted by brightness,
+    # over nearby voxels above Otsu's threshold. So an edge does not depend on the structure's brightness. The threshold
+    # is found among square roots, which shows dim structures.
     finest = steps.min() / steps
     smooth = ndimage.gaussian_filter(values, SMOOTH * finest)
     root = np.sqrt(np.maximum(smooth - np.quantile(smooth, 0.001), 0))
@@ -183,17 +179,14 @@ def _measure_structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray
 
 
 def _measure_texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
-    """Return the deviation and the correlation length, in voxels of the finest edge, of the brightness inside.
-
-    Both come from the covariance, in the plane, of the brightness's logarithm. The average over `WINDOW` lengthens the
-    correlation, and lessens the deviation along a tube; both are corrected. Voxels darker than `DIMMEST` are left out,
-    since they would decide the logarithm's variance.
-    """
+    """Return the deviation and the correlation length, in voxels of the finest edge, of the brightness inside."""
+    # Both come from the covariance, in the plane, of the logarithm, whose variance voxels under `DIMMEST` would decide.
+    # The average over `WINDOW` lengthens the correlation, and lessens the deviation along a tube.
     bright_part = inside & (relative > DIMMEST)
     logs = np.log(np.where(bright_part, relative, 1.0))
     weight = bright_part.astype(np.float32)
     rest = (logs - logs[bright_part].mean()) * weight
-    first, second = (autocovariance(rest, weight, axis) for axis in (1, 2))
+    first, second = (_autocovariance(rest, weight, axis) for axis in (1, 2))
     covariances = np.concatenate([first, second])
     lags = np.concatenate([np.arange(len(first)) * steps[1], np.arange(len(second)) * steps[2]]) / steps.min()
     share = covariances / max(covariances[0], 1e-12)
@@ -201,9 +194,6 @@ def _measure_texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray
     width = float(BRIGHTNESS_LENGTHS[int(np.argmin(misfit))])
     length = math.sqrt(max(width**2 - 2 * WINDOW**2, WINDOW**2))
     return math.sqrt(math.expm1(float(covariances[0]) * max(width / length, 1.0))), length
-
-
-# ---- noise and background --------------------------------------------------------------------------------------------
 
 
 class Background(NamedTuple):
@@ -227,7 +217,7 @@ class NoiseLine(NamedTuple):
     offset: float
 
 
-def measure_background(values: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> Background:
+def _measure_background(values: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> Background:
     """Return the background's level and correlations, measured some voxels away from the structure."""
     finest = steps.min() / steps
     away = ndimage.distance_transform_edt(~inside, sampling=steps) > 4 * steps.min()
@@ -237,26 +227,28 @@ def measure_background(values: np.ndarray, inside: np.ndarray, steps: np.ndarray
     level = float(values[where].mean())
     weight = where.astype(np.float32)
     rest = (values - level) * weight
-    covariances = [autocovariance(rest, weight, axis) for axis in range(3)]
+    covariances = [_autocovariance(rest, weight, axis) for axis in range(3)]
     lags = min(map(len, covariances[1:]))
     plane = (covariances[1][:lags] + covariances[2][:lags]) / 2
     noise, lateral, texture, length = _split_covariance(plane)
     _, axial, _, _ = _split_covariance(covariances[0])
-    bias = _measure_bias(rest, weight, level, values.shape)
-    width = axial, lateral, lateral
+    widths = [n / 8 for n in values.shape]
+    slow = ndimage.gaussian_filter(rest, widths) / np.maximum(ndimage.gaussian_filter(weight, widths), 1e-3)
+    low, high = np.quantile(slow, (0.01, 0.99))
+    bias, width = float(high - low) / 2 / max(abs(level), 1e-9), (axial, lateral, lateral)
     return Background(where, level, noise, width, math.sqrt(texture), length * float(steps[2]), bias)
 
 
-def measure_noise(
+def _measure_noise(
     values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray, high: float
 ) -> NoiseLine:
     """Return the line of variance over mean through the background and the residuals' bins over the structure.
 
-    A line gain · mean + constant does not tell offset from read noise: a negative constant is taken as an offset, a
-    positive one as read noise. The slope is limited so that the offset is no brighter than the background's darkest
-    voxels, since fine structure may pass for noise. Where the variance hardly rises towards the level `high`, the gain
-    is 0 and the noise is the background's everywhere.
+    Where the variance hardly rises towards the level `high`, the gain is 0 and the noise is the background's.
     """
+    # A line gain · mean + constant does not tell offset from read noise: a negative constant is taken as an offset, a
+    # positive one as read noise. The slope is limited so that the offset is no brighter than the background's darkest
+    # voxels, since fine structure may pass for noise.
     lines = _measure_bins(values, inside, ground, steps)
     gain = 0.0
     if len(lines) > 2:
@@ -274,11 +266,8 @@ def measure_noise(
     return NoiseLine(gain, math.sqrt(max(constant, 0.0)), offset)
 
 
-def autocovariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
-    """Return the autocovariance along an axis, at lags from 0, over pairs of voxels whose `weight` is 1.
-
-    `rest` is the residual times the weight, which is 1 or 0.
-    """
+def _autocovariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
+    """Return the autocovariance along an axis, at lags from 0, of a residual times its `weight`, which is 1 or 0."""
     a, w = np.moveaxis(rest, axis, 0), np.moveaxis(weight, axis, 0)
     lags = min(LAGS, len(a) // 3)
     sums = [(float((a[: len(a) - k] * a[k:]).sum()), float((w[: len(w) - k] * w[k:]).sum())) for k in range(lags + 1)]
@@ -286,10 +275,7 @@ def autocovariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarra
 
 
 def _split_covariance(covariances: np.ndarray) -> tuple[float, float, float, float]:
-    """Return variance and width of the noise, and variance and length of the texture, in voxels.
-
-    Their covariances over the lag are short and long; non-negative least squares finds the shares of both.
-    """
+    """Return variance and width of the noise, whose covariance is short, and variance and length of the texture."""
     lag = np.arange(len(covariances))
     short = [np.exp(-((lag / (2 * w)) ** 2)) if w else (lag == 0).astype(float) for w in GRAINS]
     long = [np.exp(-0.5 * (lag / length) ** 2) for length in TEXTURE_LENGTHS]
@@ -300,14 +286,6 @@ def _split_covariance(covariances: np.ndarray) -> tuple[float, float, float, flo
     width = float(noise @ GRAINS / total) if total else 0.0
     length = float(texture @ TEXTURE_LENGTHS / spread) if spread else TEXTURE_LENGTHS[0]
     return total, width, spread, length
-
-
-def _measure_bias(rest: np.ndarray, weight: np.ndarray, level: float, shape: tuple[int, ...]) -> float:
-    """Return half the range of the background's slow variation, relative to its level."""
-    widths = [n / 8 for n in shape]
-    slow = ndimage.gaussian_filter(rest, widths) / np.maximum(ndimage.gaussian_filter(weight, widths), 1e-3)
-    low, high = np.quantile(slow, (0.01, 0.99))
-    return float(high - low) / 2 / max(abs(level), 1e-9)
 
 
 def _measure_bins(

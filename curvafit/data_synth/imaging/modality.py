@@ -9,7 +9,7 @@ from functools import cache
 from importlib.resources import files
 from operator import attrgetter
 from types import NoneType
-from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
 
 import numpy as np
 import yaml
@@ -17,22 +17,15 @@ import yaml
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_seed, quoted, simplify_name
 from curvafit.core.schema import encode
 from curvafit.core.units import METRES
-from curvafit.data_synth.imaging.maths import Triple
+from curvafit.data_synth.imaging.effects import Triple
 
-
-class Range(NamedTuple):
-    """The numbers that a parameter may be, in words and as bounds."""
-
-    words: str
-    least: float
-    most: float = math.inf
-
-
-FINITE = Range("a finite number", -math.inf)
-FROM_ZERO = Range("a number from 0", 0.0)
-ABOVE_ZERO = Range("a number above 0", math.ulp(0.0))
-SHARE = Range("a share", 0.0, 1.0)
-PARTIAL = Range("a share below 1", 0.0, math.nextafter(1.0, 0.0))
+#: What a parameter may be, in words, and the least and the greatest number.
+Range = tuple[str, float, float]
+FINITE: Range = ("a finite number", -math.inf, math.inf)
+FROM_ZERO: Range = ("a number from 0", 0.0, math.inf)
+ABOVE_ZERO: Range = ("a number above 0", math.ulp(0.0), math.inf)
+SHARE: Range = ("a share", 0.0, 1.0)
+PARTIAL: Range = ("a share below 1", 0.0, math.nextafter(1.0, 0.0))
 
 
 class Checked:
@@ -47,19 +40,20 @@ class Checked:
 def _ranges(part: type) -> dict[str, tuple[Any, Range]]:
     """Return the type and the range of each parameter of a class."""
     hints = {name: get_args(hint) for name, hint in get_type_hints(part, include_extras=True).items()}
-    return {name: (hint[0], hint[1]) for name, hint in hints.items() if len(hint) == 2 and isinstance(hint[1], Range)}
+    return {name: (hint[0], hint[1]) for name, hint in hints.items() if len(hint) == 2 and isinstance(hint[1], tuple)}
 
 
 def _number(name: str, value: Any, kind: Any, allowed: Range) -> Any:
     """Return the value as a float or a triple of floats; None where the kind allows it."""
+    words, least, most = allowed
     if value is None and NoneType in get_args(kind):
         return None
     if kind is not Triple:
-        return check_float(value, f"{name} as {allowed.words}", allowed.least, allowed.most)
-    words = f"{name} as 3 numbers (z, y, x), each {allowed.words}"
+        return check_float(value, f"{name} as {words}", least, most)
     values = as_tuple(value, f"3 numbers for {name}")
     values = values if len(values) == 3 else (None,)  # which no number is
-    return tuple(check_float(number, words, allowed.least, allowed.most, of=value) for number in values)
+    words = f"{name} as 3 numbers (z, y, x), each {words}"
+    return tuple(check_float(number, words, least, most, of=value) for number in values)
 
 
 @dataclass(frozen=True)
