@@ -1,18 +1,14 @@
-"""A small store of exact periodic shapes, in turn layers, tubes, spheres and sponges, and a quick map of it."""
+"""A small store of exact periodic shapes, in turn layers, tubes, spheres and sponges."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-import pytest
-from scipy.spatial.distance import cdist
 
-import curvafit.atlas_map.files as atlas_files
 from curvafit.data_synth.design import design_box
 from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.generation.result import Viability
-from curvafit.geometry.distances import sliced_embedding
 from curvafit.priors.coefficients import Coefficients
 
 SHAPE = 24
@@ -51,20 +47,3 @@ def exact_store(path: Path, count: int, first: int = 0) -> Store:
         viable = index % 7 != 2
         store.write(exact_record(index, viable), exact_field(index) if viable else None)
     return store
-
-
-def quick_map(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sliced distances for Wasserstein ones, principal axes for UMAP: what takes long is tested by itself."""
-
-    def apart(diagrams, **options):
-        rows = np.stack([sliced_embedding(diagram) for diagram in diagrams])
-        return cdist(rows, rows)
-
-    def flattened(distances):
-        n = len(distances)
-        centred = np.eye(n) - 1 / n
-        values, vectors = np.linalg.eigh(-centred @ distances**2 @ centred / 2)
-        return vectors[:, -2:] * np.sqrt(np.maximum(values[-2:], 0))
-
-    monkeypatch.setattr(atlas_files, "diagram_distances", apart)
-    monkeypatch.setattr("curvafit.atlas_map.layout.embed", flattened)

@@ -20,7 +20,6 @@ from curvafit.cli import (
     samples,
     segment,
     synth,
-    windows,
 )
 from curvafit.cli.atlas import atlas_app
 from curvafit.cli.console import Commands, say
@@ -36,7 +35,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     cls=Commands,
 )
-add_commands(app, samples.demo, infer.infer, measure.measure, windows.windows)
+add_commands(app, samples.demo, infer.infer, measure.measure)
 add_commands(app, compare.compare)
 add_commands(app, generate.generate, generate.presets, nnunet.nnunet)
 add_commands(app, segment.segment, refine.refine, segment.reconstruct, synth.synth)
@@ -46,6 +45,7 @@ app.add_typer(atlas_app, name="atlas")
 #: Commands that are gone, and what to type in their place; to be deleted after one release.
 GONE: dict[str, str] = {
     "trajectory": "`curvafit compare SCAN… --by 0,7,14 -o DIR` does that, with a time for each scan",
+    "windows": "type `curvafit measure SCAN --windows 64 --stride 32 -o DIR`",
 }
 for _name, _instead in GONE.items():
     add_gone(app, _name, _instead)

@@ -112,7 +112,7 @@ def extract_atlas(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure the shapes of stores, and write the atlas that `infer --atlas` reads."""
-    from curvafit.atlas_map.extract import extract
+    from curvafit.data_synth.extract import extract
     from curvafit.inference.atlas import ATLAS_FILE, save_atlas
 
     _check_archive(out, ATLAS_FILE, stores, overwrite)
@@ -136,7 +136,7 @@ def describe_atlas(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure each shape of stores as field, mask and scan: the table that `atlas train` reads."""
-    from curvafit.atlas_map.extract import describe
+    from curvafit.data_synth.extract import describe
     from curvafit.inference.table import TABLE_FILE, VIEWS
 
     _check_archive(out, TABLE_FILE, stores, overwrite)
@@ -222,19 +222,23 @@ def teach_filler(
     say(str(out))
 
 
-@command("curvafit atlas map store.zarr -o map", "curvafit atlas map box.zarr corner.zarr -o map")
+@command(
+    "curvafit atlas map store.zarr -o map.html",
+    "curvafit atlas map box.zarr corner.zarr --fit bone/fit.json --fit lung/fit.json -o map.html",
+)
 def map_atlas(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, of one grid.")],
-    out: Annotated[Path, typer.Option("-o", "--output", help="Folder for atlas.html, atlas.png and a cache.")],
+    out: Annotated[Path, typer.Option("-o", "--output", help="The page (.html) to write.")],
+    fit: Annotated[list[Path] | None, typer.Option(help="fit.json of a scan to place among the shapes.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Draw a map of the shapes of stores: a picture, and a page to explore the shapes and to place scans."""
-    with resumable(), show_stages() as progress:
-        from curvafit.atlas_map.files import write_map
+    """Draw a map of the shapes of stores, with scans among them: a page to look at them, and to turn each."""
+    with show_stages() as progress:
+        from curvafit.report.atlas import write_map
 
-        files = write_map(stores, out, command=command_line(), overwrite=overwrite, progress=progress)
-    for path in files:
-        say(str(path))
+        how = {"fits": fit or (), "command": command_line(), "overwrite": overwrite, "progress": progress}
+        page = write_map(stores, out, **how)
+    say(str(page))
 
 
 add_commands(atlas_app, build_atlas, extend_atlas, info_atlas, verify_atlas)

@@ -7,12 +7,20 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from curvafit.cli.console import command_line, print_table, resumable, say, say_notes, show_stages
-from curvafit.cli.options import FILES, OverwriteOption, Reading, Structure, command, parse_structure
+from curvafit.cli.options import (
+    FILES,
+    OverwriteOption,
+    Reading,
+    Structure,
+    command,
+    parse_structure,
+    parse_whole_triple,
+)
 
 if TYPE_CHECKING:
     from curvafit.scan.measure import Measures
@@ -26,6 +34,8 @@ if TYPE_CHECKING:
     "curvafit measure mitochondria_labels.tif --labels --spacing 5 --unit nm -o mitochondria.csv",
     "curvafit measure cells.ome.zarr --channel 1 --dark --threshold 90 -o measures.parquet",
     "curvafit measure lung_2048.ome.zarr --workers 2 -o lung.csv",
+    "curvafit measure bone.tif --windows 64 --stride 32 -o maps",
+    "curvafit measure lung.ome.zarr --windows 16,64,64 --stride 8,32,32 --clusters 3 -o maps",
 )
 def measure(
     scans: Annotated[list[str], typer.Argument(help=FILES)],
@@ -40,6 +50,15 @@ def measure(
     subjects: Annotated[
         Path | None, typer.Option(help="CSV: scan, and columns for the table, such as subject, group, time.")
     ] = None,
+    windows: Annotated[
+        str | None,
+        typer.Option(help="Map the numbers over windows of so many voxels, or Z,Y,X, into a folder: -o.", metavar="N"),
+    ] = None,
+    stride: Annotated[
+        str | None,
+        typer.Option(help="Voxels from window to window, by default half of one; divides --windows.", metavar="N"),
+    ] = None,
+    clusters: Annotated[int | None, typer.Option(help="Clusters of windows, by default 2.")] = None,
     tile: Annotated[
         int | None,
         typer.Option(help="Voxels a side of a tile; by default so many that a process takes a good GB.", min=32),
@@ -53,11 +72,18 @@ def measure(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure scans in seconds: morphometry, fabric and curvature in physical units, with 95 % intervals."""
-    if labels and (roi is not None or structure != parse_structure()):
-        raise ValueError("--labels states the structure: leave out --roi, --kind, --periodic, --threshold and --dark")
-    if labels and tile is not None:
-        raise ValueError("--labels measures instances, each in its own box: leave out --tile")
     folder = _choose_folder(out, labels, subjects)
+    if labels and (roi is not None or tile is not None or structure != parse_structure()):
+        raise ValueError(
+            "--labels states the structure of instances, each in a box of its own: leave out --roi, --tile, --kind, "
+            "--periodic, --threshold and --dark"
+        )
+    if windows is not None or stride is not None or clusters is not None:
+        plain = not (labels or workers or roi or subjects or tile)
+        grid = _parse_grid(windows, stride, plain and len(scans) == 1 and folder is not None)
+        how = {"clusters": 2 if clusters is None else clusters, **structure, **reading}
+        _map_windows(scans[0], folder or Path(), grid, overwrite, how)
+        return
     store = None if out is None else out.with_name(f".{out.name}.curvafit-tiles")
     with _keep_tiles(store):
         with show_stages() as progress:
@@ -92,6 +118,37 @@ def measure(
             columns = None if told is None else [row for row, each in zip(told, found, strict=True) for _ in each]
             table = [each for measures in found for each in measures]
             say(str(write_table(table, out, columns=columns, overwrite=overwrite)))
+
+
+def _parse_grid(windows: str | None, stride: str | None, alone: bool) -> tuple[tuple[int, int, int], ...]:
+    """Return the size and the stride of windows; refuse what does not go with them."""
+    if windows is None:
+        raise ValueError("--stride and --clusters go with --windows")
+    if not alone:
+        raise ValueError(
+            "--windows maps one scan as a whole into a folder: give one scan, and a name without a suffix with -o; "
+            "leave out --labels, --roi, --subjects, --tile and --workers"
+        )
+    size = parse_whole_triple(windows, "--windows")
+    halves = tuple(n if n % 2 else n // 2 for n in size)
+    return size, halves if stride is None else parse_whole_triple(stride, "--stride")  # type: ignore[return-value]
+
+
+def _map_windows(
+    scan: str, folder: Path, grid: tuple[tuple[int, int, int], ...], overwrite: bool, how: dict[str, Any]
+) -> None:
+    """Measure a scan in windows, and write its maps."""
+    with show_stages() as progress:
+        from curvafit.report.windows import check_windows, write_windows
+        from curvafit.studies.windows import windows as measure_windows
+
+        check_windows(folder, scan, overwrite, command_line())
+        found = measure_windows(scan, *grid, progress=progress, **how)
+        progress("drawing the page", 1.0)
+        page = write_windows(found, folder, command=command_line(), overwrite=overwrite)
+    say_notes(found.notes)
+    say(found.status, style="bold")
+    say(str(page))
 
 
 def _choose_folder(out: Path | None, labels: bool, subjects: Path | None) -> Path | None:

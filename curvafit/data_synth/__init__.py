@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from curvafit.data_synth.design import design_around as design_around
     from curvafit.data_synth.design import design_box as design_box
     from curvafit.data_synth.design import read_design as read_design
+    from curvafit.data_synth.extract import describe as describe
+    from curvafit.data_synth.extract import extract as extract
     from curvafit.data_synth.imaging.modality import MODALITIES as MODALITIES
     from curvafit.data_synth.imaging.modality import Contrast as Contrast
     from curvafit.data_synth.imaging.modality import Detector as Detector

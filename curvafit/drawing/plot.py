@@ -33,6 +33,15 @@ from curvafit.volumes.field import Field
 
 #: Colours that stay apart for the colour-blind (Okabe & Ito 2008).
 CONTOUR, DIAGONAL, INK = "#E69F00", "#C8372D", "#22262B"
+#: Of the families, from the same.
+FAMILY_COLOURS = {
+    "spheres": "#0072B2",
+    "layers": "#E69F00",
+    "tubes": "#009E73",
+    "sponge": "#CC79A7",
+    "tubular cavities": "#56B4E9",
+    "bubbles": "#D55E00",
+}
 #: Area density in a diagram: light where little, dark where much.
 DENSITY = LinearSegmentedColormap.from_list(
     "density", ["#E3ECF5", "#A9CBE3", "#5AA2CB", "#2B6FA8", "#1B3F7A", "#16193F"]
@@ -110,10 +119,8 @@ def slice_figure(
     """
     left, right, bottom, top = extent
     ratio = min(max(abs(top - bottom) / abs(right - left), 0.25), 2.0)
-    inner, strip = 3.9, 0.36
-    figure = make_figure(4.2, inner * ratio + strip + 0.04)
-    height = figure.get_figheight()
-    axes = figure.add_axes((1 - (inner + 0.02) / 4.2, 0.03 / height, inner / 4.2, inner * ratio / height))
+    figure = make_figure(4.2, 3.9 * ratio + 0.4, layout="constrained")
+    axes = figure.subplots()
     axes.spines[:].set_color(QUIET)
     axes.imshow(image, cmap="gray", vmin=limits[0], vmax=limits[1], extent=image_extent, interpolation="nearest")
     rows, columns = structure.shape
@@ -128,19 +135,9 @@ def slice_figure(
         axes.add_patch(box)
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
     axes.set_ylabel(axes_names[0], rotation=0, labelpad=6)
-    _scale_bar(figure, axes, right - left, unit, axes_names[1])
+    axes.set_xlabel(axes_names[1], labelpad=2)
+    scale_on(axes, 1.0, unit)
     return figure
-
-
-def _scale_bar(figure: Figure, axes: Axes, length: float, unit: str, name: str) -> None:
-    """Draw a bar of a round length above the slice, with the horizontal axis's name."""
-    bar = round_length(0.3 * abs(length))
-    share = bar / abs(length)
-    above = 1 + 0.19 / (axes.get_position().height * figure.get_figheight())
-    axes.plot([1 - share, 1], [above, above], transform=axes.transAxes, color=INK, linewidth=2.5, clip_on=False)
-    label = f"{bar:g} {unit_name(unit, bar)}"
-    axes.text(1 - share - 0.02, above, label, transform=axes.transAxes, ha="right", va="center")
-    axes.text(0.0, above, f"{name} →", transform=axes.transAxes, ha="left", va="center")
 
 
 def round_length(length: float) -> float:
@@ -308,13 +305,12 @@ def draw_sections(rows: Mapping[str, Sections], spacing: Sequence[float], unit: 
 
 def scale_on(axes: Axes, edge: float, unit: str) -> None:
     """Draw a bar of a round length below a slice whose voxels are `edge` wide."""
-    width = abs(np.diff(axes.get_xlim()).item())
-    length = round_length(width * edge / 3)
-    bar = axes.get_xaxis_transform()
-    axes.plot([0, length / edge], [-0.05, -0.05], color=INK, linewidth=2.5, transform=bar, clip_on=False)
-    axes.text(
-        length / edge + 0.02 * width, -0.05, format_length(length, unit, 1), transform=bar, va="center", fontsize=8
-    )
+    left, right = axes.get_xlim()
+    length = round_length(abs(right - left) * edge / 3)
+    end, bar = left + length / edge, axes.get_xaxis_transform()
+    axes.plot([left, end], [-0.05, -0.05], color=INK, linewidth=2.5, transform=bar, clip_on=False)
+    words = {"transform": bar, "va": "center", "fontsize": 8}
+    axes.text(end + 0.02 * (right - left), -0.05, format_length(length, unit, 1), **words)
 
 
 def section_on(axes: Axes, plane: np.ndarray, outline: np.ndarray | None, limits: Limits, aspect: float) -> None:

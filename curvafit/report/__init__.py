@@ -1,4 +1,4 @@
-"""The pages that show an inference, measured scans, a comparison of them."""
+"""The pages that show an inference, an atlas, measured scans, a comparison of them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
+    from curvafit.report.atlas import write_map as write_map
     from curvafit.report.comparison import write_comparison as write_comparison
     from curvafit.report.measures import write_measures as write_measures
     from curvafit.report.page import describe as describe

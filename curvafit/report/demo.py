@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from scipy import ndimage
 
-from curvafit.atlas_map.picture import map_on
 from curvafit.core.files import write_content
 from curvafit.core.records import can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
@@ -24,6 +23,7 @@ from curvafit.geometry.distances import sliced_embedding
 from curvafit.inference.atlas import load_atlas
 from curvafit.inference.infer import infer
 from curvafit.inference.verdict import UNBELIEVABLE
+from curvafit.report.atlas import map_on
 from curvafit.report.page import (
     MARK,
     check_report,

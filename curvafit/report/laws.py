@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import version
 from operator import itemgetter
@@ -20,6 +19,7 @@ from curvafit.report.page import (
     check_result_folder,
     list_strips,
     render_template,
+    start_record,
     with_command,
     write_inference,
     write_study,
@@ -81,8 +81,7 @@ def name_folders(scans: Sequence[str]) -> list[str]:
 def write_laws(fits: dict[str, Fit], directory: str | Path, *, command: str = "", overwrite: bool = False) -> Path:
     """Write page, table and record of fits, by the names of their folders, and return the page's path."""
     target = check_result_folder(FORMAT, FILES, directory, (), overwrite, command)
-    record = {"curvafit": version("curvafit"), "date": datetime.now(UTC).isoformat(timespec="seconds")}
-    record |= {"command": command, "scans": {name: fit.provenance.get("scan", "") for name, fit in fits.items()}}
+    record = start_record(command, scans={name: fit.provenance.get("scan", "") for name, fit in fits.items()})
     rows = [row for name, fit in fits.items() for row in _rows(name, fit)]
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for name, fit in fits.items():

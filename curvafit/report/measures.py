@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -19,7 +18,14 @@ from curvafit.core.units import format_number, power_name
 from curvafit.drawing.groups import FIRST, FIRST_SHOWN, SIGNED, plain, shown_window
 from curvafit.drawing.plot import QUIET, diagram_on, make_figure
 from curvafit.report.comparison import describe_measures, say_kinds
-from curvafit.report.page import Picture, check_result_folder, picture_of, render_template, write_study
+from curvafit.report.page import (
+    Picture,
+    check_result_folder,
+    picture_of,
+    render_template,
+    start_record,
+    write_study,
+)
 from curvafit.scan.measure import Measures
 from curvafit.studies.scans import count_notes
 from curvafit.studies.tables import format_csv, list_rows
@@ -64,17 +70,15 @@ def write_measures(
     ]
     parts = [part for part, _ in rows]
     drawn = _draw(parts)
-    record = {
-        "curvafit": version("curvafit"),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": command,
-        "unit": measures[0].unit,
-        "options": json.loads(json.dumps(dict(options or {}), default=str)),
-        "status": describe_range(parts),
-        "scans": [{"scan": each.source, "kind": each.kind, "notes": list(each.notes)} for each in measures],
-        "notes": list(count_notes(parts)),
-        "files": list(FILES),
-    }
+    record = start_record(
+        command,
+        unit=measures[0].unit,
+        options=json.loads(json.dumps(dict(options or {}), default=str)),
+        status=describe_range(parts),
+        scans=[{"scan": each.source, "kind": each.kind, "notes": list(each.notes)} for each in measures],
+        notes=list(count_notes(parts)),
+        files=list(FILES),
+    )
     texts = {
         "measures.csv": format_csv(list_rows(measures, told)),
         "measures.html": _page(measures, rows, record, {key: picture for key, (_, picture) in drawn.items()}),
@@ -233,21 +237,6 @@ def intervals_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figu
 
 
 def shorten(names: Sequence[str]) -> list[str]:
-    """Return names that a panel has room for: without what all begin and end with, where one is too long.
-
-    What is still too long keeps its beginning and its end, and a number where two would be alike.
-    """
-    if max(map(len, names), default=0) <= WORD:
-        return list(names)
-    if len(names) > 1:
-        start, stop = _count_alike(names), _count_alike([name[::-1] for name in names])
-        names = [name[start : max(len(name) - stop, start)] or name for name in names]
-    short = [name if len(name) <= WORD else f"{name[: WORD // 2 - 1]}…{name[-WORD // 2 :]}" for name in names]
+    """Return names that a panel has room for: of a long one its end, with a number where two would be alike."""
+    short = [name if len(name) <= WORD else f"…{name[1 - WORD :]}" for name in names]
     return [name if short.count(name) == 1 else f"{k} {name}" for k, name in enumerate(short, 1)]
-
-
-def _count_alike(names: Sequence[str]) -> int:
-    """Return how many signs names begin with alike, up to the last one between words."""
-    least = min(map(len, names))
-    alike = next((k for k in range(least) if len({name[k] for name in names}) > 1), least)
-    return next((k for k in range(alike, 0, -1) if names[0][k - 1] in "/_-. ,"), 0)

@@ -155,18 +155,17 @@ def fill_folder(target: Path, files: Sequence[str]) -> Iterator[Path]:
             move_together(sorted(work.iterdir()), target)
 
 
+def start_record(command: str, **more: Any) -> dict[str, Any]:
+    """Return what every record begins with: version, date and command line."""
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"curvafit": version("curvafit"), "date": date, "command": command, **more}
+
+
 def record_study(study: Comparison | Windows, command: str, files: Sequence[str]) -> dict[str, Any]:
     """Return what the records of all studies hold."""
-    return {
-        "curvafit": version("curvafit"),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": command,
-        "unit": study.unit,
-        "options": json.loads(json.dumps(study.options, default=str)),
-        "status": study.status,
-        "notes": list(study.notes),
-        "files": list(files),
-    }
+    options = json.loads(json.dumps(study.options, default=str))
+    more = {"unit": study.unit, "options": options, "status": study.status, "notes": list(study.notes)}
+    return start_record(command, **more, files=list(files))
 
 
 def write_study(

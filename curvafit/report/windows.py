@@ -15,7 +15,6 @@ from matplotlib.ticker import MaxNLocator
 from curvafit.core.records import Format
 from curvafit.core.units import format_length, format_number, format_percent, power_name, unit_name
 from curvafit.drawing.plot import FAMILIAR, INK, LABELS, QUIET, make_figure, scale_on
-from curvafit.inference.table import PARAMETERS
 from curvafit.report.comparison import name_quantity
 from curvafit.report.page import check_result_folder, picture_of, record_study, render_template, write_study
 from curvafit.studies.tables import format_csv
@@ -25,8 +24,6 @@ from curvafit.studies.windows import NAMES, Windows
 FORMAT = Format("curvafit windows", 1, title="the record of a scan measured in windows")
 #: What is written into the folder beside the maps.
 FILES = ("windows.json", "windows.html", "windows.csv", "windows.svg", "windows.png")
-#: Symbols of the combinations of a law's parameters, by which their maps and columns are named.
-COMBINATIONS = tuple(f"L{k}" for k in range(1, 1 + len(PARAMETERS)))
 #: Grey of structure whose windows are not known.
 UNKNOWN = 0.88
 #: Colours of clusters from 0 on: the strong ones of labels first.
@@ -34,12 +31,9 @@ COLOURS = np.vstack([LABELS[:1], LABELS[1::2], LABELS[2::2]])
 
 
 def list_files(source: str | Path) -> tuple[str, ...]:
-    """Return the names of all files: the maps of a Zarr store are Zarr stores, of any other scan NIfTI.
-
-    The last are the maps of combinations, which are written with laws only.
-    """
+    """Return the names of all files: the maps of a Zarr store are Zarr stores, of any other scan NIfTI."""
     suffix = ".ome.zarr" if ".zarr" in str(source).lower() else ".nii.gz"
-    return (*FILES, *(f"{name.replace(' ', '_')}{suffix}" for name in ("clusters", *NAMES, *COMBINATIONS)))
+    return (*FILES, *(f"{name.replace(' ', '_')}{suffix}" for name in ("clusters", *NAMES)))
 
 
 def check_windows(directory: str | Path, source: str | Path = "", overwrite: bool = False, command: str = "") -> Path:
@@ -53,9 +47,9 @@ def write_windows(windows: Windows, directory: str | Path, *, command: str = "",
     The files are moved into the folder once all are whole. Those of the same command are replaced; others are a
     ValueError without `overwrite`. `command` is what the record calls the command line.
     """
-    source, laws = windows.clusters.source, bool(windows.options["laws"])
+    source = windows.clusters.source
     target, files = check_windows(directory, source, overwrite, command), list_files(source)
-    record = record_study(windows, command, files if laws else files[: -len(COMBINATIONS)])
+    record = record_study(windows, command, files)
     record |= {"scan": source, "kind": windows.kind, "explained": windows.explained}
     figure = windows_figure(windows)
     picture = picture_of(figure, "The structure, coloured by clusters and by six numbers")
@@ -67,13 +61,12 @@ def write_windows(windows: Windows, directory: str | Path, *, command: str = "",
         picture=picture,
         clusters=range(1, 1 + int(windows.clusters.values.max())),
         rows=[_format_row(windows, k) for k in range(len(windows.quantities))],
-        laws=laws,
         notes=windows.notes,
         provenance=[(name, record[name]) for name in ("scan", "command", "date", "options") if record[name]],
     )
     texts = {"windows.html": page, "windows.csv": format_csv(list(_rows(windows)))}
     fields = (windows.clusters, *(windows[symbol] for _, symbol, _ in windows.quantities))
-    maps = dict(zip(files[len(FILES) :], fields, strict=False))
+    maps = dict(zip(files[len(FILES) :], fields, strict=True))
     return write_study(target, FORMAT, files, record, texts, {"windows": (figure, picture)}, maps)
 
 
@@ -81,8 +74,7 @@ def _rows(windows: Windows) -> Iterator[dict[str, Any]]:
     """Yield a row for each window: its centre, cluster and numbers; None where a number is not known."""
     for place in np.ndindex(windows.clusters.shape):
         values, centre = windows.values[place], zip("zyx", windows.centres[place].tolist(), strict=True)
-        names = (symbol if symbol in COMBINATIONS else name for name, symbol, _ in windows.quantities)
-        numbers = zip(names, (each if np.isfinite(each) else None for each in values.tolist()), strict=True)
+        numbers = zip(NAMES, (each if np.isfinite(each) else None for each in values.tolist()), strict=True)
         yield {**dict(centre), "unit": windows.unit, "cluster": int(windows.clusters.values[place]), **dict(numbers)}
 
 

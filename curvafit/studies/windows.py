@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -12,15 +11,12 @@ import numpy as np
 from scipy.cluster.vq import kmeans, vq
 
 from curvafit.core.checks import as_tuple, check_int, check_seed
-from curvafit.core.extras import require
 from curvafit.core.pictures import Pictured
-from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.units import format_length, format_number, format_percent, plain_unit, unit_name
-from curvafit.inference.infer import infer
+from curvafit.core.runtime import Progress, silent
+from curvafit.core.units import format_length, format_number, format_percent, unit_name
 from curvafit.scan.measure import QUANTITIES, Blocks, combine, measure_maps
 from curvafit.scan.structure import check_options
-from curvafit.studies.scans import list_combinations
-from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.field import Field
 from curvafit.volumes.read import Source, field_of
 
 NAMES = tuple(name for name, *_ in QUANTITIES)
@@ -40,8 +36,7 @@ class Windows(Pictured):
         Of the windows, in voxels (z, y, x).
     values
         The numbers of `measure` in each window, `(nz, ny, nx, Q)` in the scan's unit; NaN in a window with less surface
-        than a layer across it has, and where a scan is too large for its curvature. With laws, six more, what the
-        window tells of the combinations of a law's parameters; NaN where it tells nothing.
+        than a layer across it has, and where a scan is too large for its curvature.
     quantities
         The name, symbol and power of length of each number.
     clusters
@@ -120,20 +115,6 @@ class Windows(Pictured):
             tuple(map(int, np.unravel_index(end(values), values.shape))) for end in (np.nanargmin, np.nanargmax)
         )
 
-    def to_anndata(self) -> Any:
-        """Return the known windows as `anndata.AnnData`; `obsm["spatial"]` has their centres (x, y, z)."""
-        names, symbols, powers = zip(*self.quantities, strict=True)
-        table = require("anndata", "", "a table of windows as AnnData").AnnData(
-            X=self.values[self.known],
-            obs={"cluster": self.clusters.values[self.known].astype(str)},
-            var={"symbol": list(symbols), "unit": [plain_unit(self.unit, power) for power in powers]},
-            obsm={"spatial": self.centres[self.known][:, ::-1].copy()},
-        )
-        table.var_names = [
-            symbol if names.count(name) > 1 else name for name, symbol in zip(names, symbols, strict=True)
-        ]
-        return table
-
 
 def windows(
     scan: Source,
@@ -141,7 +122,6 @@ def windows(
     stride: int | Sequence[int] = 32,
     *,
     clusters: int = 2,
-    laws: bool = False,
     seed: int = 0,
     kind: Literal["auto", "field", "mask", "image"] = "auto",
     periodic: bool = False,
@@ -162,9 +142,6 @@ def windows(
         Of the windows, in voxels: one number, or three (z, y, x).
     clusters
         How many clusters; there always are so many where there are as many windows, however alike these are.
-    laws
-        Whether the law of each window is read too, which takes some seconds each: what it tells of six combinations of
-        parameters (`L1` to `L6`) are further numbers, which clusters do not count.
     seed
         Of k-means, which keeps the best of 20 starts.
     kind, periodic, threshold, dark, reading
@@ -177,15 +154,10 @@ def windows(
     sizes, strides = _check_grid(field.shape, size, stride)
     starts = tuple(tuple(range(0, n, step)) for n, step in zip(field.shape, strides, strict=True))
     options = {"threshold": threshold, "dark": dark, "periodic": periodic}
-    measured = sub_progress(progress, 0, 0.1) if laws else progress
-    maps, blocks = measure_maps(field, kind, options, measured), Blocks(field.shape, starts)  # type: ignore[arg-type]
+    maps, blocks = measure_maps(field, kind, options, progress), Blocks(field.shape, starts)  # type: ignore[arg-type]
     values = _sum_windows(maps.sum(blocks).reshape(*blocks.counts, -1), field, sizes, strides)
     labels, explained = _cluster(values, clusters, seed)
     quantities = tuple((name, symbol, power) for name, symbol, power, _ in QUANTITIES)
-    if laws:
-        structure = replace(field, values=maps.mask.astype(np.uint8), affine=None)
-        more, told = _read_laws(structure, np.isfinite(values[..., 0]), sizes, strides, sub_progress(progress, 0.1, 1))
-        values, quantities = np.concatenate([values, told], -1), quantities + more
     corner = field.move_origin([(n - 1) / 2 for n in sizes]).affine
     assert corner is not None
     spacing = tuple(h * step for h, step in zip(field.spacing, strides, strict=True))
@@ -205,7 +177,7 @@ def windows(
         structure=replace(
             field, values=shown, spacing=tuple(h * n for h, n in zip(field.spacing, thin, strict=True)), affine=None
         ),
-        options={"size": sizes, "stride": strides, "clusters": clusters, "laws": laws, "seed": seed, "kind": kind}
+        options={"size": sizes, "stride": strides, "clusters": clusters, "seed": seed, "kind": kind}
         | options
         | reading,
         notes=(*maps.notes, *([left] if any(rest) else [])),
@@ -246,24 +218,6 @@ def _sum_windows(table: np.ndarray, field: Field, size: Sequence[int], stride: S
             "choose a larger size"
         )
     return values
-
-
-def _read_laws(
-    structure: Field, full: np.ndarray, size: Sequence[int], stride: Sequence[int], progress: Progress
-) -> tuple[tuple[tuple[str, str, int], ...], np.ndarray]:
-    """Return the combinations of a law's parameters, and what each window of a mask tells of them (nz, ny, nx, 6).
-
-    They are NaN where `full` is False, and where a window has no texture that a law makes.
-    """
-    rows, _ = list_combinations(None)
-    told, places = np.full((*full.shape, len(rows)), np.nan), np.argwhere(full).tolist()
-    for count, place in enumerate(places):
-        progress(f"reading the law of window {count + 1} of {len(places)}", count / len(places))
-        box = tuple(slice(k * step, k * step + n) for k, step, n in zip(place, stride, size, strict=True))
-        with suppress(ScanError):
-            found, _ = list_combinations(infer(structure.crop(box), kind="mask", fast=True))
-            told[tuple(place)] = [each.value for each in found]
-    return tuple((each.name, each.symbol, 0) for each in rows), told
 
 
 def _cluster(values: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, float]:

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from calling import QUICK, call, made, refused
 from disk import tree
-from exact_store import exact_store, quick_map
+from exact_store import exact_store
 from found import made_inference
 
-from curvafit.atlas_map.files import check_map, write_map
 from curvafit.data_synth.store import open_store
 from curvafit.report.page import FILES, write_inference
 from curvafit.volumes.field import Field
@@ -118,29 +117,16 @@ def test_infer_leaves_other_peoples_files(tmp_path: Path, monkeypatch: pytest.Mo
         refused(call(*again), "input")
 
 
-def test_atlases_leave_other_peoples_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_atlases_leave_other_peoples_files(tmp_path: Path) -> None:
     store, folder = tmp_path / "store.zarr", thesis(tmp_path / "home.zarr")
     exact_store(store, 7)
     (tmp_path / "atlas.npz").write_text("mine")
     before = tree(tmp_path)
     refused(call("atlas", "build", folder, "--count", 1, "--workers", 0), "store")
     refused(call("atlas", "extract", store, "-o", tmp_path / "atlas.npz"), TAKEN)
-    refused(call("atlas", "map", store, "-o", store), "input")
-    for name in ("atlas.html", "atlas.png"):
-        there = thesis(tmp_path / name.replace(".", ""))
-        (there / name).write_text("mine")
-        refused(call("atlas", "map", store, "-o", there), TAKEN)
-        assert tree(there) == {"thesis.txt": b"mine", name: b"mine"}
-    thesis(tmp_path / "mine" / "cache")
-    refused(call("atlas", "map", store, "-o", tmp_path / "mine"), TAKEN)
     assert before.items() <= tree(tmp_path).items()
     for _ in range(2):
         assert call("atlas", "extract", store, "-o", tmp_path / "new.npz").exit_code == 0
-    quick_map(monkeypatch)
-    monkeypatch.setattr("curvafit.atlas_map.files.map_picture", lambda mapped, field, path: path.write_bytes(b""))
-    for _ in range(2):
-        write_map([store], tmp_path / "map")
-    check_map(tmp_path / "map", [store])
 
 
 def test_a_store_may_begin_in_an_empty_folder(tmp_path: Path) -> None:

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
-import pytest
 from matplotlib.figure import Figure
 
-import curvafit
 from curvafit import Field, segment
 from curvafit.drawing.plot import section_figure
 
@@ -28,16 +24,6 @@ def test_the_three_middle_slices_are_drawn_in_proportion() -> None:
     assert [axes.get_title()[:5] for axes in figure.axes] == ["z = 2", "y = 3", "x = 3"]
 
 
-def test_a_notebook_shows_a_line_and_a_small_picture() -> None:
-    picture = r'<img src="data:image/png;base64,[\w+/=]{100,}" width="320"'
-    for field in (Field(VALUES), Field(VALUES > 9), Field(VALUES[:1])):
-        assert re.search(picture, field._repr_html_())
-    shown = Field(np.full((4, 4, 4), np.nan))._repr_html_()
-    assert "<img" not in shown and "4 x 4 x 4 voxels" in shown
-    with pytest.raises(ValueError, match="finite"):
-        Field(np.zeros((0, 4, 4))).plot()
-
-
 def test_a_segmentation_shows_its_outline() -> None:
     scan = np.where(np.indices((8, 9, 10)).sum(0) > 12, 1.0, 0.0).astype(np.float32)
     found = segment(scan, "tubes", steps=2)
@@ -53,7 +39,3 @@ def test_each_row_has_its_values_and_its_outline() -> None:
     assert [text.get_text() for text in figure.axes[3].texts] == ["2\xa0µm"]
     assert [len(axes.collections) for axes in figure.axes[:3]] == [0, 0, 0]
     assert sum(len(axes.collections) for axes in figure.axes[3:]) >= 1
-
-
-def test_what_draws_them_is_named_at_the_door() -> None:
-    assert {"Field", "Segmentation"} <= curvafit._FIGURES.keys()

@@ -27,7 +27,7 @@ COMMANDS = {
     "measure-labels": "measure cells.tif --labels -o out.csv",
     "measure-tiles": "measure mask.nii.gz --tile 32 -o out.csv",
     "measure-many": "measure control/0.nii.gz treated/0.nii.gz -o out",
-    "windows": "windows mask.nii.gz --size 16 --stride 8 -o out",
+    "measure-windows": "measure mask.nii.gz --windows 16 --stride 8 -o out",
     "compare": "compare control treated -o out",
     "compare-number": "compare control/0.nii.gz control/2.nii.gz treated/1.nii.gz --by 0,7,14 -o out",
     "compare-paired": "compare control treated --paired -o out",

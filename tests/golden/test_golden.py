@@ -1,5 +1,5 @@
 """Every command and public call gives what it gave. A number that is to change is frozen anew, by a commit that says
-why: `python -m tests.golden freeze ROW`. Left out are `demo`, which fetches its scan, `atlas map`, whose picture is
+why: `python -m tests.golden freeze ROW`. Left out are `demo`, which fetches its scan, `atlas map`, whose page is
 another library's, and the teaching of networks, which takes hours."""
 
 from __future__ import annotations

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import torch
 
-from curvafit.atlas_map.extract import extract
 from curvafit.data_synth import atlas as building
 from curvafit.data_synth.design import INTERVALS, Design, design_box
+from curvafit.data_synth.extract import extract
 from curvafit.data_synth.store import open_store
 from curvafit.generation.result import Viability
 from curvafit.generation.schedule import LEARNED, present_name, schedule

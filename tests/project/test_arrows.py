@@ -19,7 +19,6 @@ FLOORS = (
     ("inference",),
     ("data_synth",),
     ("segmentation",),
-    ("atlas_map",),
     ("studies",),
     ("report",),
     ("cli", "napari", "nnunet"),

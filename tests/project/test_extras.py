@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-EXTRAS = "jax jaxlib optimistix equinox zuko geomloss kornia dask distributed networkx sklearn umap pandas pyarrow"
+EXTRAS = "jax jaxlib optimistix equinox zuko geomloss kornia dask distributed networkx sklearn plotly pandas pyarrow"
 
 SCRIPT = f"""
 import json, sys

@@ -6,7 +6,6 @@ import dataclasses
 import importlib
 import re
 
-import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
@@ -14,7 +13,6 @@ from matplotlib.figure import Figure
 import curvafit
 from curvafit.core.pictures import Pictured
 from curvafit.generation import Schedule, generate
-from curvafit.priors import WORKING_EPSILON, Grid, preset
 
 BRIEF = Schedule("brief", 60, 1e-2, 1e-3, "constant")
 
@@ -38,28 +36,6 @@ def test_a_flow_is_one_line(flow) -> None:
     text = repr(flow)
     assert "\n" not in text and len(text) < 300
     assert "16 x 16 x 16 voxels of 0.01" in text and flow.status in text and "viable" in text
-
-
-def test_a_flow_says_what_it_lowered(flow) -> None:
-    assert flow.coefficients == preset("tubes").coefficients and flow.epsilon == WORKING_EPSILON
-
-
-def test_a_flow_is_compared_without_complaint(flow) -> None:
-    assert flow == flow and flow != dataclasses.replace(flow) and len({flow, flow}) == 1
-    history = dataclasses.replace(flow.history)
-    assert history != flow.history and history == history
-
-
-def test_a_flow_says_every_edge_of_its_voxels(flow) -> None:
-    long = dataclasses.replace(flow, grid=Grid((16, 16, 16), (0.01, 0.02, 0.03)))
-    assert "voxels of 0.01 x 0.02 x 0.03," in repr(long)
-
-
-def test_a_type_of_one_s_own_keeps_the_picture() -> None:
-    class Own(curvafit.Field):
-        pass
-
-    assert "<img" in Own(np.arange(27.0).reshape(3, 3, 3))._repr_html_()
 
 
 def test_a_picture_of_a_shape_and_none_of_what_is_not_finite(flow) -> None:

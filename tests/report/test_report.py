@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 from found import EPSILON, RADIUS, SCALE, made_fit, made_inference, without_drawing
-from matplotlib.figure import Figure
 
 from curvafit.core.units import GLOSSARY, format_density, format_length, format_number
 from curvafit.geometry.diagram import diagram
@@ -21,12 +20,10 @@ from curvafit.inference.infer import Inference
 from curvafit.priors import Grid
 from curvafit.priors.law import FORMAT, Law
 from curvafit.report.page import (
-    bands,
     describe,
     family_radius,
     parameter_table,
     report_html,
-    scan_box,
     with_command,
     write_inference,
 )
@@ -74,38 +71,24 @@ def test_the_page_stands_alone_and_is_well_formed(html: str) -> None:
     page = Page(html)
     links = [value or "" for name, value in page.attributes if name in ("src", "action", "srcset")]
     assert len(links) == 10 and all(link.startswith("data:image/png;base64,") for link in links)
-    assert "url(" not in html and "<script" not in html
+    hrefs = [value or "" for name, value in page.attributes if name == "href"]
+    assert {href.removeprefix(GLOSSARY) for href in hrefs} == {"#law", "#working-unit"}
+    assert len(re.findall(r"https?:", html)) == len(hrefs) and "url(" not in html and "<script" not in html
+    assert "tubes <b>" not in html and "tubes &lt;b&gt;&amp;.tif" in html
     assert all(base64.b64decode(link.partition(",")[2])[:4] == b"\x89PNG" for link in links)
     alts = [value for name, value in page.attributes if name == "alt"]
     assert len(alts) == 10 and all(alts)
     assert len(html) < 4_000_000
 
 
-def test_words_with_a_special_meaning_lead_to_the_glossary(html: str) -> None:
-    """And nothing else leads out of the page."""
-    links = [value or "" for name, value in Page(html).attributes if name == "href"]
-    assert {link.removeprefix(GLOSSARY) for link in links} == {"#law", "#working-unit"}
-    assert len(re.findall(r"https?:", html)) == len(links)
-
-
-def test_what_the_user_named_is_escaped(html: str) -> None:
-    assert "tubes <b>" not in html and "tubes &lt;b&gt;&amp;.tif" in html
-    assert "1.6 &lt; 2.2 &amp; so on" in html
-
-
 def test_the_page_says_what_was_found(html: str) -> None:
     text = " ".join(Page(html).text.split())
     opening = re.search(r"Tubes, radius (\d+) µm, 19 % of the volume\.", text)
-    assert opening is not None
-    assert float(opening[1]) == pytest.approx(1000 * RADIUS * SCALE, rel=0.05)
-    for said in ("Nearest match 2.2", "Middle of the posterior 1.6", "Two seeds 1.1", "lie 1.1 apart"):
+    assert opening is not None and float(opening[1]) == pytest.approx(1000 * RADIUS * SCALE, rel=0.05)
+    for said in ("Nearest match 2.2", "Middle of the posterior 1.6", "lie 1.1 apart", "Conn.D 4.90 /mm³", "p = 0.40",
+                 "curvafit generate --prior fit.json", "moves its surface by 0.25 voxels"):  # fmt: skip
         assert said in text, said
-    for name in ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D 4.90 /mm³", "BS/BV 21.4 /mm", "0-00004", "Specks < 5 voxels"):
-        assert name in text, name
-    assert "curvafit generate --prior fit.json" in text
     assert text.count("best supported") == 1
-    assert "moves its surface by 0.25 voxels" in text and "flat 1.0 to 1.4"[:4] in text
-    assert "12 simulations" in text and "p = 0.40" in text
 
 
 def test_a_law_that_is_not_believed_is_not_called_supported(undrawn: None) -> None:
@@ -114,16 +97,6 @@ def test_a_law_that_is_not_believed_is_not_called_supported(undrawn: None) -> No
         fit = dataclasses.replace(inference.fit, status=status)
         html = report_html(dataclasses.replace(inference, fit=fit))
         assert "best supported" not in html and html.count('<span class="badge">the nearest</span>') == 1
-
-
-def test_each_block_stands_on_the_band_of_its_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn: list[list[str]] = []
-    monkeypatch.setattr("curvafit.report.page.bands_figure", lambda blocks: drawn.append(list(blocks)) or Figure())
-    rng = np.random.default_rng(0)
-    blocks = {"curvature": (rng.random(8), rng.random((12, 8))), "fabric": (rng.random(3), rng.random((12, 3)))}
-    assert bands(made_inference()) is None and drawn == []
-    assert bands(dataclasses.replace(made_inference(), simulated=blocks)) is not None
-    assert drawn == [["curvature, p = 0.30", "fabric, p = 0.0040"]]
 
 
 def test_physical_coefficients_carry_their_power_of_length(html: str) -> None:
@@ -142,13 +115,6 @@ def test_what_could_not_be_made_is_said(undrawn: None) -> None:
     assert "the chosen law (nearest match)" in text and "It has no uncertainty of its own." in text
 
 
-def test_a_deviation_stands_beside_its_own_number_alone() -> None:
-    """Of a match, which has none, no row shows one, whatever the other candidates have."""
-    rows = parameter_table(made_inference(lost=True))
-    assert [row[2] for row in rows] == [""] * 7
-    assert [row[2] for row in parameter_table(made_inference())][:3] == ["fixed", "0.40", "0.90"]
-
-
 def test_a_scan_without_a_law_has_a_page_all_the_same(tmp_path: Path, undrawn: None) -> None:
     none = dataclasses.replace(made_inference(), twins={}, fit=made_fit(chosen=None))
     page = Page(report_html(none))
@@ -164,23 +130,11 @@ def test_a_scan_without_a_law_has_a_page_all_the_same(tmp_path: Path, undrawn: N
 
 
 def test_an_inference_shows_the_scan_beside_its_twin() -> None:
-    """In one line, in a notebook and as a figure; alone where nothing grew."""
     inference = made_inference()
-    assert repr(inference).startswith(
-        "Inference(tubes from an image of 48 x 48 x 48 voxels, distances: posterior 1.6, match 2.2"
-    )
     assert "\n" not in repr(inference) and inference.fit.status in repr(inference)
     assert [text.get_text() for text in inference.plot().texts] == ["the scan", "regrown: middle of the posterior"]
-    assert "1.6 &lt; 2.2" in inference._repr_html_() and "data:image/png;base64," in inference._repr_html_()
     alone = dataclasses.replace(made_inference(lost=True), twins={})
     assert [text.get_text() for text in alone.plot(width=300).texts] == ["the scan"]
-    assert "posterior –" in repr(alone)
-
-
-def test_the_scan_is_cut_to_the_regrown_box() -> None:
-    inference = made_inference()
-    smaller = regrown(inference, inference.best[:32, :40, :])
-    assert np.array_equal(scan_box(smaller), inference.prepared.phase[8:40, 4:44, :])
 
 
 def regrown(inference: Inference, phase: np.ndarray) -> Inference:
@@ -233,6 +187,7 @@ def test_the_table_follows_the_chosen_law() -> None:
     drawn, match = parameter_table(made_inference()), parameter_table(made_inference(lost=True))
     assert [row[0] for row in drawn] == ["a20", "a11", "a02", "a10", "a01", "a00", "mass"]
     assert drawn[1][1:3] == ("1.80", "0.40") and match[1][1:3] == ("2.00", "")
+    assert [row[2] for row in drawn][:3] == ["fixed", "0.40", "0.90"] and [row[2] for row in match] == [""] * 7
     low, high = (float(end.replace("−", "-")) for end in drawn[3][3].split(" to "))
     assert low < -38.5 < high and high - low == pytest.approx(2 * 1.645 * 6, rel=0.4)
 
@@ -253,9 +208,7 @@ def test_radii_come_from_the_family_s_own_area(family: str, curvatures: tuple[fl
     [
         ("tubes", "Tubes, radius 9"),
         ("layers", "Layers, 200 µm thick, 19 % of the volume"),
-        ("sponge", "Sponge, struts 200 µm thick, 19 % of the volume"),
         ("bubbles", "Bubbles, radius 98 µm, in a phase that is 19 % of the volume"),
-        ("something else", "Something else, 200 µm thick"),
     ],
 )
 def test_the_first_sentence(family: str, said: str) -> None:

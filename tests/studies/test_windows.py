@@ -1,26 +1,20 @@
-"""`windows`: maps and clusters of a volume of two textures, sums that agree with the whole's, files, refusals."""
+"""`measure --windows`: maps and clusters of a volume of two textures, sums that agree with the whole, refusals."""
 
 from __future__ import annotations
 
 import csv
 import json
-import sys
 from pathlib import Path
 
-import nibabel
 import numpy as np
 import pytest
 from calling import call, refused
-from found import lattice
 
-from curvafit.inference.infer import infer
 from curvafit.report.windows import check_windows
 from curvafit.scan.measure import measure
-from curvafit.studies.scans import list_combinations
 from curvafit.studies.windows import NAMES, Windows, windows
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
-from curvafit.volumes.write import save
 
 N, SIZE, STRIDE = 96, 48, 24
 THIN, THICK = 4.0, 6.0
@@ -88,7 +82,7 @@ def test_windows_without_structure_are_unknown(halves: Field) -> None:
 def test_the_command_writes_maps_table_and_page(halves: Field, mapped: Windows, tmp_path: Path) -> None:
     scan, out = tmp_path / "scan.npy", tmp_path / "maps"
     np.save(scan, halves.values)
-    arguments = ("windows", scan, "--size", SIZE, "--stride", STRIDE, "--spacing", 0.5, "--unit", "um", "-o", out)
+    arguments = ("measure", scan, "--windows", SIZE, "--spacing", 0.5, "--unit", "um", "-o", out)
     result = call(*arguments)
     assert result.exit_code == 0, result.output
     labels, thickness = load(out / "clusters.nii.gz"), load(out / "thickness.nii.gz")
@@ -103,57 +97,31 @@ def test_the_command_writes_maps_table_and_page(halves: Field, mapped: Windows, 
     assert {path.name for path in out.iterdir()} == set(record["files"])
     assert check_windows(out, scan, command=record["command"]) == out  # its own files
     with pytest.raises(ValueError, match="free"):
-        check_windows(out, scan, command="curvafit windows another.npy -o maps")
+        check_windows(out, scan, command="curvafit measure another.npy -o maps")
     (out / "windows.json").write_text("{}", encoding="utf-8")
     refused(call(*arguments), "free")
 
 
 def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
-    for name, values in (("scan", rods(THICK, 24)), ("flat", np.eye(64)), ("empty", rods(0.6, 96))):
+    for name, values in (("scan", rods(THICK, 24)), ("flat", np.eye(64))):
         np.save(tmp_path / f"{name}.npy", values.astype(np.uint8))
-    for name, options, word in (
-        ("scan", ("--size", 32, "--stride", 48), "stride"),
-        ("scan", ("--size", 32, "--stride", 12), "divides"),
-        ("scan", ("--size", 64), "fit into"),
-        ("scan", ("--size", 32, "--clusters", 0), "clusters"),
-        ("flat", (), "3D"),
+    scan, flat, out = tmp_path / "scan.npy", tmp_path / "flat.npy", ("-o", tmp_path / "out")
+    for words, said in (
+        ((scan, "--windows", 32, "--stride", 48, *out), "stride"),
+        ((scan, "--windows", 32, "--stride", 12, *out), "divides"),
+        ((scan, "--windows", 64, *out), "fit into"),
+        ((scan, "--windows", 32, "--clusters", 0, *out), "clusters"),
+        ((flat, "--windows", 64, *out), "3D"),
+        ((scan, "--stride", 32, *out), "--windows"),
+        ((scan, "--windows", 32), "folder"),
+        ((scan, "--windows", 32, "-o", tmp_path / "maps.csv"), "folder"),
+        ((scan, flat, "--windows", 32, *out), "one scan"),
+        ((scan, "--windows", 32, "--tile", 32, *out), "--tile"),
     ):
-        refused(call("windows", tmp_path / f"{name}.npy", *options, "-o", tmp_path / "out"), word, progress=True)
+        refused(call("measure", *words), said, progress=True)
+    refused(call("windows", scan, "--size", 32, *out), "--windows 64")
     sparse = np.zeros((48, 48, 48), dtype=np.uint8)
     sparse[20:28, 20:28, 20:28] = 1
     with pytest.raises(ValueError, match="larger"):
         windows(sparse, 24, 24)
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.slow
-def test_the_laws_of_windows_are_those_of_their_crops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("curvafit.studies.scans.UNBELIEVABLE", 0.0)  # no law makes rods
-    parts = [(lattice(56, 28, radius) > 0).astype(np.uint8) for radius in (4.5, 5.5)]
-    scan = save(Field(np.concatenate(parts), (0.02,) * 3, "mm"), tmp_path / "scan.nii.gz")
-    assert call("windows", scan, "--size", 56, "--stride", 56, "--laws", "-o", tmp_path / "out").exit_code == 0
-    rows = list(csv.DictReader((tmp_path / "out" / "windows.csv").read_text(encoding="utf-8").splitlines()))
-    told = [[float(row[f"L{k}"]) for k in range(1, 7)] for row in rows]
-    for values, part in zip(told, parts, strict=True):
-        found, why = list_combinations(infer(Field(part, (0.02,) * 3, "mm"), kind="mask", fast=True))
-        assert not why
-        assert values == pytest.approx([each.value for each in found], abs=1e-9)
-    assert told[0] != told[1]
-    maps = [nibabel.load(tmp_path / "out" / f"L{k}.nii.gz").get_fdata().ravel() for k in range(1, 7)]
-    np.testing.assert_allclose(np.transpose(maps), told, rtol=1e-6)
-    assert call("windows", scan, "--size", 56, "--stride", 56, "-o", tmp_path / "out", "--overwrite").exit_code == 0
-    assert not list((tmp_path / "out").glob("L*"))
-
-
-def test_windows_become_anndata(mapped: Windows) -> None:
-    pytest.importorskip("anndata", reason="anndata is not installed")
-    table = mapped.to_anndata()
-    assert table.shape == (27, len(NAMES))
-    assert list(table.obs["cluster"][:9]) == ["1"] * 9
-    assert table.obsm["spatial"][1] - table.obsm["spatial"][0] == pytest.approx([12, 0, 0])
-
-
-def test_anndata_that_is_absent_is_named(mapped: Windows, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "anndata", None)
-    with pytest.raises(ImportError, match="pip install anndata"):
-        mapped.to_anndata()

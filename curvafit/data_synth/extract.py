@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,18 +36,6 @@ PAUSE = 60.0
 
 #: A row of a table: its columns in their order.
 Row = tuple[str, str, np.ndarray, float, np.ndarray, float]
-#: A draw of a store.
-Drawn = tuple[Store, Record]
-
-
-class Measured(NamedTuple):
-    """What is measured of a shape: the volume fraction of {u > 0}, its thickness in voxels, and the diagrams of the
-    field, and of its mask as that of a scan is measured."""
-
-    fraction: float
-    thickness: float
-    field: Diagram
-    mask: Diagram
 
 
 # ---- atlases ---------------------------------------------------------------------------------------------------------
@@ -59,17 +47,7 @@ def extract(stores: Sequence[str | Path | Store], command: Sequence[str] = (), p
     `command` is command lines for the provenance, after those that make the stores. Raises FileNotFoundError or
     ValueError where a store is missing or of another version or grid, two have one name, or none holds such a shape.
     """
-    draws, shapes = read_draws(stores)
-    measures = []
-    for done, (store, record) in enumerate(shapes):
-        progress(f"measuring {len(shapes)} shapes", done / len(shapes))
-        measures.append(measure_shape(store, record))
-    return to_atlas(draws, shapes, measures, command)
-
-
-def read_draws(stores: Sequence[str | Path | Store]) -> tuple[list[Drawn], list[Drawn]]:
-    """Return the draws of stores of one grid and ε, and those of the draws that are well-formed shapes."""
-    sources = _open_all(stores)
+    sources = open_all(stores)
     grids = {(store.settings.shape, store.settings.spacing, store.settings.epsilon) for store in sources}
     if len(grids) > 1:
         sizes = ", ".join(" x ".join(map(str, shape)) for shape, _, _ in sorted(grids))
@@ -79,40 +57,13 @@ def read_draws(stores: Sequence[str | Path | Store]) -> tuple[list[Drawn], list[
     if not shapes:
         places = " or ".join(str(store.path) for store in sources)
         raise ValueError(f"no well-formed shape in {places}, of {len(draws)} draws")
-    return draws, shapes
-
-
-def _open_all(stores: Sequence[str | Path | Store]) -> list[Store]:
-    """Open stores; raise ValueError where two have one name."""
-    sources = [store if isinstance(store, Store) else open_store(store) for store in stores]
-    names = [store.name for store in sources]
-    if len(set(names)) < len(names):
-        raise ValueError(f"stores must have different names, got {', '.join(names)}")
-    return sources
-
-
-def shape_id(store: Store, record: Record) -> str:
-    """Return the name of a draw in an atlas: the store's name and the index of the draw."""
-    return f"{store.name}-{record.index:05d}"
-
-
-def measure_shape(store: Store, record: Record) -> Measured:
-    """Return the volume fraction of {u > 0}, its thickness, and the diagrams of field and mask, of one viable draw."""
-    field = store.field(record.index)
-    grid, epsilon = Grid(store.settings.shape, store.settings.spacing), store.settings.epsilon
-    mask = prepare(Field((field > 0).astype(np.uint8)), kind="mask", periodic=True, one_scale=True)
-    both = (diagram(torch.from_numpy(field), grid, epsilon), scan_diagram(mask))
-    thinned = (each.thin(BIN_WIDTH, TAIL_SHARE) for each in both)
-    return Measured(float((field > 0).mean()), thinner_thickness(field > 0), *thinned)
-
-
-def to_atlas(
-    draws: Sequence[Drawn], shapes: Sequence[Drawn], measures: Sequence[Measured], command: Sequence[str] = ()
-) -> Atlas:
-    """Return the atlas of measured shapes, which are some of the draws."""
-    fractions, thicknesses, field_diagrams, mask_diagrams = zip(*measures, strict=True)
+    measured = []
+    for done, (store, record) in enumerate(shapes):
+        progress(f"measuring {len(shapes)} shapes", done / len(shapes))
+        measured.append(_measure_shape(store, record))
+    fractions, thicknesses, field_diagrams, mask_diagrams = zip(*measured, strict=True)
     return Atlas(
-        ids=tuple(shape_id(store, record) for store, record in shapes),
+        ids=tuple(shape_id(store, record.index) for store, record in shapes),
         coefficients=np.array([list(record.coefficients) for _, record in shapes], dtype=np.float64),
         masses=np.array([record.mass for _, record in shapes]),
         seeds=np.array([record.seed for _, record in shapes], dtype=np.int64),
@@ -124,10 +75,44 @@ def to_atlas(
     )
 
 
-def _provenance(draws: Sequence[Drawn], command: Sequence[str]) -> dict[str, Any]:
+def open_all(stores: Sequence[str | Path | Store]) -> list[Store]:
+    """Open stores; raise ValueError where two have one name."""
+    sources = [store if isinstance(store, Store) else open_store(store) for store in stores]
+    names = [store.name for store in sources]
+    if len(set(names)) < len(names):
+        raise ValueError(f"stores must have different names, got {', '.join(names)}")
+    return sources
+
+
+def shape_id(store: Store, index: int) -> str:
+    """Return the name of a draw in an atlas: the store's name and the index of the draw."""
+    return f"{store.name}-{index:05d}"
+
+
+def _measure_shape(store: Store, record: Record) -> tuple[float, float, Diagram, Diagram]:
+    """Return the volume fraction of {u > 0}, its thickness in voxels, and the diagrams of the field, and of its mask as
+    that of a scan is measured."""
+    field = store.field(record.index)
+    grid, epsilon = Grid(store.settings.shape, store.settings.spacing), store.settings.epsilon
+    mask = prepare(Field((field > 0).astype(np.uint8)), kind="mask", periodic=True, one_scale=True)
+    both = (diagram(torch.from_numpy(field), grid, epsilon), scan_diagram(mask))
+    as_field, as_mask = (each.thin(BIN_WIDTH, TAIL_SHARE) for each in both)
+    return float((field > 0).mean()), thinner_thickness(field > 0), as_field, as_mask
+
+
+def _provenance(draws: Sequence[tuple[Store, Record]], command: Sequence[str]) -> dict[str, Any]:
     """Return how an atlas was made."""
     stores = list({store.name: store for store, _ in draws}.values())
-    accounts = {store.name: _account(store, [record for own, record in draws if own is store]) for store in stores}
+    accounts = {}
+    for store in stores:
+        records = [record for own, record in draws if own is store]
+        generators = sorted({json.dumps(record.versions, sort_keys=True) for record in records})
+        accounts[store.name] = {
+            "draws": len(records),
+            "viable": sum(record.viability.viable for record in records),
+            "settings": dataclasses.asdict(store.settings),
+            "generated_with": [json.loads(text) for text in generators],
+        }
     builds = (_build_command(store, accounts[store.name]["viable"]) for store in stores)
     return {
         "command": [*builds, *command],
@@ -137,17 +122,6 @@ def _provenance(draws: Sequence[Drawn], command: Sequence[str]) -> dict[str, Any
         "stores": accounts,
         "diagrams": {"curvature": "geometric", "bin_width": BIN_WIDTH, "tail_share": TAIL_SHARE, "unit": Diagram.unit},
         "measured_with": versions(),
-    }
-
-
-def _account(store: Store, records: Sequence[Record]) -> dict[str, Any]:
-    """Return how a store was made."""
-    generators = sorted({json.dumps(record.versions, sort_keys=True) for record in records})
-    return {
-        "draws": len(records),
-        "viable": sum(record.viability.viable for record in records),
-        "settings": dataclasses.asdict(store.settings),
-        "generated_with": [json.loads(text) for text in generators],
     }
 
 
@@ -189,7 +163,7 @@ def describe(
     unknown = [name for name in views if name not in VIEWS]
     if unknown or not views:
         raise ValueError(f"views must be some of {', '.join(VIEWS)}, got {', '.join(unknown) or 'none'}")
-    sources, path = _open_all(stores), Path(out)
+    sources, path = open_all(stores), Path(out)
     begun = load_table(path) if path.exists() and not overwrite else None
     provenance, rows = _table_provenance(begun, sources, command), []
     if begun is not None:

@@ -12,9 +12,9 @@ from exact_store import exact_record, exact_store
 from scipy import ndimage
 from typer.testing import CliRunner
 
-from curvafit.atlas_map.extract import describe
 from curvafit.cli.app import app
 from curvafit.core.workers import cluster
+from curvafit.data_synth.extract import describe
 from curvafit.geometry.descriptors import BLOCKS, descriptors
 from curvafit.inference.table import (
     BLUR,
@@ -240,16 +240,6 @@ def test_the_command_refuses_in_one_sentence(
     assert result.exit_code == 2
     assert words in " ".join(result.stderr.split())
     assert not (tmp_path / "table.npz").exists()
-
-
-def test_the_command_writes_a_table(tmp_path: Path) -> None:
-    exact_store(tmp_path / "store.zarr", 2)
-    out = tmp_path / "new" / "table.npz"
-    options = ["-o", str(out), "--views", "mask", "--workers", "0"]
-    result = CliRunner().invoke(app, ["atlas", "describe", str(tmp_path / "store.zarr"), *options])
-    assert result.exit_code == 0, result.stderr
-    assert result.stdout.strip() == str(out)
-    assert len(load_table(out)) == 2
 
 
 def test_another_store_of_the_same_name_is_not_taken_for_the_first(tmp_path: Path) -> None:
