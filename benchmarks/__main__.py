@@ -18,26 +18,23 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-from benchmarks import sentinel
 from benchmarks.claims import Ledger
 from benchmarks.harness import Cases, Figure, show
 
 
 def topics() -> list[str]:
     paths = sorted(Path(__file__).parent.glob("*.py"))
-    return [path.stem for path in paths if "\ndef options(" in path.read_text("utf-8")]
+    return [path.stem for path in paths if "\ndef run(options" in path.read_text("utf-8")]
 
 
 def main(arguments: list[str]) -> None:
-    name = arguments[0] if arguments else ""
-    if name == "claims":
-        claims(arguments[1:])
-    elif name == "record":
-        record(arguments[1:])
+    name, *others = arguments or [""]
+    if name in ("claims", "record"):
+        {"claims": claims, "record": record}[name](others)
     elif name == "sentinel":
-        sentinel.main(arguments[1:])
+        import_module("benchmarks.sentinel").main(others)
     elif name in topics():
-        run(name, arguments[1:])
+        run(name, others)
     else:
         print(__doc__)
         for topic in topics():
@@ -56,7 +53,7 @@ def run(topic: str, arguments: list[str]) -> None:
     parser.add_argument("--fresh", action="store_true", help="compute cases of other commits again")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no case after that")
     parser.add_argument("--record", action="store_true", help="write the figures into the ledger")
-    module.options(parser)
+    getattr(module, "options", lambda parser: None)(parser)
     options = parser.parse_args(arguments)
     cases = Cases(topic, quick=options.quick, fresh=options.fresh, seconds=options.seconds)
     figures: dict[str, Figure] = module.run(options, cases)

@@ -77,15 +77,12 @@ def describe(store: Store, index: int, cut: bool) -> np.ndarray:
 
 def describe_all(shapes: Sequence[tuple[Store, int]], cases: Cases) -> dict[str, list[np.ndarray]]:
     """Return the descriptors of windows `(k, 351)` of shapes, and of their level cuts, by kind."""
-    return {
-        kind: [
-            cases.array(
-                f"{store.settings.shape[0]}-{store.name}-{k}-{kind}", partial(describe, store, k, kind == "cut")
-            )
-            for store, k in shapes
-        ]
-        for kind in KINDS
-    }
+    return {kind: [cases.array(name_of(*each, kind), partial(describe, *each, kind == "cut")) for each in shapes]
+            for kind in KINDS}  # fmt: skip
+
+
+def name_of(store: Store, index: int, kind: str) -> str:
+    return f"{store.settings.shape[0]}-{store.name}-{index}-{kind}"
 
 
 def teach(posterior: Posterior, rows: Mapping[str, Sequence[np.ndarray]]) -> Posterior:
@@ -134,32 +131,21 @@ def rank(
     return found
 
 
-def average_errors(errors: Mapping[int, Values], edges: np.ndarray) -> dict[str, Figure]:
-    """Print and return the mean errors of `infer`, by name and by edge of the laws' shapes `(laws,)`."""
-    figures = {}
-    for edge in dict.fromkeys(edges[list(errors)]):
-        for name in ("law", "medians"):
-            found = [values[f"{name} error"] for law, values in errors.items() if edges[law] == edge]
-            figures[f"belief.{edge}.{name}_error"] = bootstrap(found, np.mean)
-    show(["", "mean error"], [[name, figure] for name, figure in figures.items()])
-    return figures
-
-
-def count_rejected(
-    tested: Mapping[str, Mapping[int, float]], departures: Mapping[str, Mapping[int, float]], edges: np.ndarray
+def figures_of(
+    tested: Mapping[str, Mapping[int, float]], errors: Mapping[int, Values], edges: np.ndarray
 ) -> dict[str, Figure]:
-    """Print and return the part that is rejected, by kind and edge of the laws' shapes `(laws,)`."""
-    figures, rows = {}, []
-    for (kind, found), title in zip(tested.items(), ("size", "power"), strict=True):
-        for edge in dict.fromkeys(edges):
+    """Return the part that is rejected, by kind, and mean errors of `infer`, by edge of the laws' shapes `(laws,)`."""
+    figures = {}
+    for edge in dict.fromkeys(edges):
+        for (_, found), title in zip(tested.items(), ("size", "power"), strict=True):
             p = np.array([p for law, p in found.items() if edges[law] == edge])
-            away = [departure for law, departure in departures[kind].items() if edges[law] == edge]
-            hits, middle = int(np.sum(p <= LEVEL)), float(np.median(away)) if away else np.nan
+            hits = int(np.sum(p <= LEVEL))
             interval = stats.binomtest(hits, len(p)).proportion_ci(method="wilson") if len(p) else (np.nan, np.nan)
-            figure = Figure(hits / max(len(p), 1), *map(float, interval))
-            figures[f"belief.{edge}.{title}"] = figure
-            rows.append([f"{edge}³", title, figure, len(p), len(away), middle])
-    show(["voxels", "", f"p at most {LEVEL}", "queries", "through infer", "their median departure"], rows)
+            figures[f"belief.{edge}.{title}"] = Figure(hits / max(len(p), 1), *map(float, interval))
+        for name in ("law", "medians"):
+            away = [values[f"{name} error"] for law, values in errors.items() if edges[law] == edge]
+            figures |= {f"belief.{edge}.{name}_error": bootstrap(away, np.mean)} if away else {}
+    show([f"part with p at most {LEVEL}; mean errors", ""], list(figures.items()))
     return figures
 
 
@@ -176,15 +162,15 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     errors: dict[int, Values] = {}
     for number, (store, index) in enumerate(shapes):
         for kind, found in departures.items():
-            name = f"{store.settings.shape[0]}-{store.name}-{index}-{kind}"
-            for values in cases.all({name: partial(case, store, index, kind == "cut")}, seed=index).values():
+            job = partial(case, store, index, kind == "cut")
+            for values in cases.all({name_of(store, index, kind): job}, seed=index).values():
                 if "departure" in values:
                     found[number] = values["departure"]
                 if "law error" in values:
                     errors[number] = values
     edges = np.array([store.settings.shape[0] for store, _ in shapes])
     p = rank(None if options.calibrate else posterior.departures, departures, cuts)
-    figures = count_rejected(p, departures, edges) | average_errors(errors, edges)
+    figures = figures_of(p, errors, edges)
     if options.calibrate is not None:
         found = np.sort(np.array([*departures["shape"].values()], dtype=np.float32))
         save_posterior(replace(posterior, departures=found), options.calibrate)

@@ -23,9 +23,19 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
-from benchmarks.harness import RESULTS, ROOT, Figure, Values, append_lines, markdown, provenance, read_lines, show
-from benchmarks.harness import write_whole as write_page
-from benchmarks.sentinel import changed
+from benchmarks.harness import (
+    RESULTS,
+    ROOT,
+    SENTINEL,
+    Figure,
+    Values,
+    all_lines,
+    append_lines,
+    markdown,
+    provenance,
+    read_lines,
+    show,
+)
 
 LEDGER = ROOT / "benchmarks" / "claims.toml"
 #: What a claim takes from its group where it does not say it.
@@ -162,7 +172,7 @@ class Ledger:
                 wrong.append(f"{path.relative_to(ROOT)}: no mark {begin}")
             elif found[1] != wanted and write:
                 page = page[: found.start()] + f"{begin}\n{wanted}{end}" + page[found.end() :]
-                write_page(path, lambda temporary, page=page: temporary.write_text(page, encoding="utf-8"))
+                path.write_text(page, encoding="utf-8")
             elif found[1] != wanted:
                 wrong.append(f"{path.relative_to(ROOT)}: table {mark} differs from the ledger")
         return wrong + [text for part in self.content.get("prose", []) for text in self._missing(part)]
@@ -223,6 +233,17 @@ def _recorded() -> dict[str, Values]:
     """Return the last line of each figure, with its topic."""
     return {name: line | {"topic": path.stem} for path in sorted(RESULTS.glob("*.jsonl"))
             for name, line in read_lines(path, "figure").items()}  # fmt: skip
+
+
+@lru_cache
+def changed() -> dict[str, str]:
+    """Return since when a topic's sentinel gives what it gives, of topics where it once gave something else."""
+    first: dict[str, Values] = {}
+    found: dict[str, str] = {}
+    for line in all_lines(SENTINEL, "sentinel"):
+        if first.setdefault(line["sentinel"], line["values"]) != line["values"]:
+            found |= dict.fromkeys(line["sentinel"].split(), line["date"])
+    return found
 
 
 def _listed(head: str, claims: list[Claim]) -> str:

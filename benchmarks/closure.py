@@ -4,9 +4,9 @@
 `--views`). Errors are medians, in deviations of the box of `curvafit atlas build`; R² is 1 - mean square error /
 variance of a parameter; intervals are of the bootstrap over laws.
 
-Methods: `posterior`, the packaged one; `fit`, its emulator's best fit; and from a `--table` (`curvafit atlas
-describe`), by default that of the packaged posterior, `match`, the nearest shape by the curvature block, and `process`,
-a Gaussian process for each parameter on principal components.
+Methods: `posterior`, the packaged one; and from a `--table` (`curvafit atlas describe`), by default that of the
+packaged posterior, `match`, the nearest shape by the curvature block, and `process`, a Gaussian process for each
+parameter on principal components.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ import numpy as np
 from benchmarks.harness import RESULTS, Cases, Figure, Values, show
 from curvafit.data_synth.design import INTERVALS
 from curvafit.data_synth.store import Store, find_well_formed, open_store
-from curvafit.inference.emulator import best_parameters
 from curvafit.inference.posterior import Architecture, Posterior, load_posterior
 from curvafit.inference.table import (
     PARAMETERS,
@@ -36,11 +35,11 @@ from curvafit.inference.table import (
     parameters_of,
     to_row,
 )
-from curvafit.scan.measure import Reading, read_texture
+from curvafit.scan.measure import read_texture
 from curvafit.scan.prepare import prepare, thinner_thickness
 from curvafit.volumes.field import ScanError
 
-DRAWS, STARTS = 400, 16
+DRAWS = 400
 #: What the packaged posterior was trained on; its columns are float16 between their ends (`load_table`).
 TABLE = RESULTS / "table.npz"
 #: Edge of the shapes that posteriors learn from, in voxels.
@@ -86,22 +85,11 @@ def asked(trained: Posterior, queries: Table) -> Answers:
     return Answers(np.median(draws, axis=1), draws)
 
 
-def best_fits(trained: Posterior, queries: Table) -> Answers:
-    """Return the emulator's best parameters."""
-    best = []
-    for row in zip(queries.descriptors[:, None], queries.views.tolist(), queries.amount, strict=True):
-        reading = Reading(*row)
-        starts = trained.draw(reading, STARTS)[:, : len(PARAMETERS)]
-        best.append(best_parameters(trained.emulator, reading, starts)[0])
-    return Answers(np.array(best), None)
-
-
 def methods(path: Path, view: str) -> dict[str, Callable[[Table], Answers]]:
     """Return the methods by name; the last two learn from a table."""
     trained, training = load_posterior(), load_table(path).visible.select_views([view])
     return {
         "posterior": partial(asked, trained),
-        "fit": partial(best_fits, trained),
         "match": partial(match, training),
         "process": partial(process, training),
     }

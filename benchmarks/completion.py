@@ -6,8 +6,8 @@ example are of the other volume, or of the other half.
 
 - `spline`, `linear`, `nearest`, `ITK` (its morphological contour interpolation, where its package is installed): plain
   interpolations. Gains are held to the best of them *in hindsight*, case by case.
-- `scratch`: the network that the example alone taught; `filler`: `reconstruct` without an example; `tuned`: with one;
-  `law`, `willmore`: with one, and its law or the Willmore energy tried.
+- `filler`: `reconstruct` without an example; `tuned`: with one; `law`, `willmore`: with one, and its law or the
+  Willmore energy tried.
 
 Dice and the calibration error within 3 voxels of the surface count the unknown slices between the first and the last
 known one; the sum of the Betti numbers' errors counts all between them. Choices were made on the structures of
@@ -17,32 +17,27 @@ known one; the sum of the Betti numbers' errors counts all between them. Choices
 from __future__ import annotations
 
 import argparse
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from importlib.util import find_spec
 from itertools import product
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from scipy import ndimage
 
-from benchmarks.harness import Cases, Figure, Values, bootstrap, scores, show
+from benchmarks.harness import Cases, Figure, Values, bootstrap, data, scores, show
 from curvafit.data_synth.design import design_box
 from curvafit.generation.flow import generate
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.filler import Filler, Taught, fill
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.segmentation.teach import RATE, Whole, WholeLessons, learn
-from curvafit.segmentation.trials import Example, dice
-from curvafit.segmentation.uncertainty import best_log_odds, calibration_error, near_surface
+from curvafit.segmentation.trials import dice
+from curvafit.segmentation.uncertainty import calibration_error, near_surface
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
 
@@ -51,15 +46,14 @@ LAWS = ("tubes", "trabec", "sponge", "metatubes", "pearls", "sieve", "flow", "bi
 #: first twenty that grow shapes.
 SOBOL = 4100
 DRAWN = tuple(f"draw-{k}" for k in (0, 1, 2, 5, 6, 9, 11, 12, 13, 20, 21, 22, 24, 26, 29, 34, 37, 38, 44, 45))
-EDGE = 64
+#: Edge of shapes in voxels, and the seed that is reported; laws and examples are of the next.
+EDGE, SEED = 64, 2
 ITK = "ITK"
 #: Laws that are tried where not the example's own. The area alone would let surfaces crumple: it has a twentieth of
 #: Willmore's energy, and costs twenty times as much as that of tubes 8 voxels thick.
 LAWS_TRIED = {"willmore": Coefficients.willmore(), "area": Coefficients(0.05, 0.1, 0.05, 0, 0, 1 / 16)}
 #: Ways that are no plain interpolation.
-OURS = ("filler", "tuned", "law", "willmore", "scratch")
-#: Steps of the network that an example alone teaches.
-SCRATCH = 600
+OURS = ("filler", "tuned", "law", "willmore")
 #: What is kept of each case.
 FIGURES = ("dice", "betti", "calibration")
 #: Sides of structures on which the network's mix and the threshold were chosen.
@@ -95,16 +89,6 @@ def interpolated(slices: Slices, way: str) -> np.ndarray:
     return mask
 
 
-@cache
-def scratch(example: Field, places: tuple[int, ...], axis: int) -> Filler:
-    """Return the network that an example alone taught; blocks of one side have one."""
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        filler = Filler()
-    learn(filler, WholeLessons([Whole.of(Example.of(example, places, axis))], SCRATCH), RATE, workers=0)
-    return filler
-
-
 # ---- generated shapes ------------------------------------------------------------------------------------------------
 
 
@@ -136,18 +120,14 @@ def filled(
 ) -> Values:
     """Return the scores of a way to fill a mask of which some slices are known."""
     begun, first, status = time.perf_counter(), np.moveaxis(truth.values > 0, axis, 0), ""
-    slices, likely = Slices.of(truth, places, axis), None
-    if way == "scratch":
-        taught = Taught(scratch(example(), slices.places, axis), np.array([[2.0, 20.0], [1.0, 1.0]]), {}, 0.0)
-        logits = fill(slices, taught)
-        mask = slices.keep_known(logits > best_log_odds(logits[slices.between]))
-    elif way in OURS:
+    likely = None
+    if way in OURS:
         law, shown = prior() if way == "law" else LAWS_TRIED.get(way), None if way == "filler" else example()
         found = reconstruct(truth, law, known=places, axis=axis, example=shown)
         mask, likely = (np.moveaxis(each.values, axis, 0) for each in (found.mask, found.probability))
         status = found.status
     else:
-        mask = interpolated(slices, way)
+        mask = interpolated(Slices.of(truth, places, axis), way)
     last = places[-1] + 1
     unknown = [k for k in range(last) if k not in places]
     values = {**scores(mask[:last], first[:last]), "dice": dice(mask[unknown], first[unknown]), "status": status}
@@ -163,7 +143,7 @@ def shape_case(way: str, law: str, seed: int, every: int, cases: Cases) -> Value
 
 
 def on_shapes(options: argparse.Namespace, ways: list[str], cases: Cases) -> dict[str, Figure]:
-    laws, every, seed = options.laws.split(","), options.every, options.target
+    laws, every, seed = options.laws.split(","), options.every, SEED
     group, laws = ("drawn", DRAWN) if laws == ["drawn"] else ("shapes", laws)
     if options.quick:
         laws, ways = laws[:1], ["spline", "filler"]
@@ -171,7 +151,7 @@ def on_shapes(options: argparse.Namespace, ways: list[str], cases: Cases) -> dic
     jobs = {name: partial(shape_case, way, law, seed, every, cases) for (law, way), name in names.items()}
     found = cases.all(jobs, seed)
     figures = gains(f"every {every}", names, found, ways, f"{group}.{{way}}.crop_{{key}}")
-    return figures if (every, seed) == (8, 2) else {}
+    return figures if every == 8 else {}
 
 
 def gains(
@@ -239,8 +219,7 @@ STRUCTURES = {
 def sides(name: str) -> tuple[Field, Field]:
     """Return the masks of a structure's two sides."""
     structure = STRUCTURES[name]
-    folder = Path(os.environ["CURVAFIT_DATA"]) / "scans"
-    volumes = [mask_of(load(folder / file, **structure.reading), structure) for file in structure.files]
+    volumes = [mask_of(load(data("scans", file), **structure.reading), structure) for file in structure.files]
     if len(volumes) == 1:
         (whole,) = volumes
         middle, margin = whole.shape[2] // 2, structure.gap // 2
@@ -287,8 +266,6 @@ def scan_case(name: str, side: int, block: int, every: int, way: str, cases: Cas
 
 
 def on_scans(options: argparse.Namespace, ways: list[str], cases: Cases) -> dict[str, Figure]:
-    if "CURVAFIT_DATA" not in os.environ:
-        raise SystemExit("set CURVAFIT_DATA to the folder that holds scans/")
     every, names = options.every, options.only.split(",")
     figures: dict[str, Figure] = {}
     for name in names:
@@ -319,7 +296,6 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--laws", default=",".join(LAWS), help="of shapes, or drawn: twenty random ones")
     parser.add_argument("--only", default=",".join(STRUCTURES), help="structures of scans")
     parser.add_argument("--every", type=int, default=8)
-    parser.add_argument("--target", type=int, default=2, help="seed of the shapes; their laws are of the next")
     parser.add_argument("--ways", default="filler,tuned", help=f"besides the interpolations: {', '.join(OURS)}")
 
 

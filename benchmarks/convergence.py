@@ -35,10 +35,6 @@ def sweep(kind: str, count: int) -> Values:
     return {"pairs": pairs, "errors": errors.tolist(), "orders": orders.tolist()}
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    del parser
-
-
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     count = 2 if options.quick else 4
     found = cases.all({f"{kind}-{count}": lambda kind=kind: sweep(kind, count) for kind in SWEEPS})

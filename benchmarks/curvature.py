@@ -58,12 +58,8 @@ def mask_errors(kind: str, radius: int, seeds: int) -> Values:
     return {"bias": float(np.mean(sums)), "error": math.sqrt(np.mean(squares))}
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--centres", type=int, default=5)
-
-
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
-    radii, seeds = (RADII[:1], 1) if options.quick else (RADII, options.centres)
+    radii, seeds = (RADII[:1], 1) if options.quick else (RADII, 5)
     exact = cases.all({"exact": lambda: exact_errors(2)})["exact"]
     jobs = {
         f"{kind}-{radius}-{seeds}": lambda k=kind, r=radius: mask_errors(k, r, seeds)

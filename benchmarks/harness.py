@@ -26,6 +26,8 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 CACHE = ROOT / ".cache" / "benchmarks"
+#: What sentinels gave.
+SENTINEL = RESULTS / "sentinel.jsonl"
 
 Values = dict[str, Any]
 #: Shared files that this process has made.
@@ -125,6 +127,13 @@ class Cases:
         """Say what is left to do."""
         if self.left:
             print(f"{len(self.left)} cases left: run the same command again")
+
+
+def data(*parts: str) -> Path:
+    """Return a path in the folder of outside files."""
+    if "CURVAFIT_DATA" not in os.environ:
+        raise SystemExit("set CURVAFIT_DATA to the folder that holds gallery/ and scans/")
+    return Path(os.environ["CURVAFIT_DATA"]).joinpath(*parts)
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:

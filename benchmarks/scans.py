@@ -7,14 +7,12 @@ Needs $CURVAFIT_DATA. Of each scan the structure's share, thickness and spacing 
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.harness import Cases, Figure, Values, show
+from benchmarks.harness import Cases, Figure, Values, data, show
 from curvafit.inference.infer import infer
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.read import load
@@ -49,7 +47,7 @@ SCANS = {
 
 
 def field_of(name: str) -> Field:
-    return load(Path(os.environ["CURVAFIT_DATA"]) / "scans" / SCANS[name].file, **SCANS[name].reading)
+    return load(data("scans", SCANS[name].file), **SCANS[name].reading)
 
 
 def report(name: str) -> Values:
@@ -72,14 +70,8 @@ def report(name: str) -> Values:
     return values
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--only", default=",".join(SCANS))
-
-
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
-    if "CURVAFIT_DATA" not in os.environ:
-        raise SystemExit("set CURVAFIT_DATA to the folder that holds scans/")
-    names = ["capillaries"] if options.quick else options.only.split(",")
+    names = ["capillaries"] if options.quick else [*SCANS]
     found = cases.all({name: lambda name=name: report(name) for name in names})
     columns = ("share", "thickness", "spacing", "p", "departure", *RATIOS, "rejected by", "verdict")
     show(["scan", *columns], [[name, *(row.get(key, "") for key in columns)] for name, row in found.items()])

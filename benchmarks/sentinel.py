@@ -1,4 +1,4 @@
-"""Sentinels: one cheap case of each topic, whose values are kept with the tolerance that any processor holds.
+"""Sentinels: one cheap case of each topic, whose values are kept, with tolerances that any processor holds.
 
     python -m benchmarks sentinel [TOPIC…] [--record]
 
@@ -14,31 +14,34 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
-from functools import cache, lru_cache
+from functools import cache
 
 import numpy as np
+import torch
 from scipy import ndimage
 
-from benchmarks.harness import RESULTS, all_lines, append_lines, provenance, read_lines, show
+from benchmarks import belief, completion, convergence, curvature, prior, step, transductive
+from benchmarks.harness import SENTINEL, append_lines, provenance, read_lines, show
+from curvafit.geometry.diagram import diagram
+from curvafit.geometry.distances import wasserstein
+from curvafit.inference.estimate import measure_descriptors
+from curvafit.inference.posterior import load_posterior
+from curvafit.priors import CurvaturePrior
+from curvafit.priors.coefficients import Coefficients
+from curvafit.priors.energy import energy
+from curvafit.priors.grid import Grid
+from curvafit.priors.profile import SIGMA, phase_field
+from curvafit.scan.measure import measure
+from curvafit.scan.prepare import prepare
+from curvafit.segmentation.reconstruct import reconstruct, reconstruct_labels
+from curvafit.segmentation.segment import segment
+from curvafit.segmentation.trials import dice
+from curvafit.studies.compare import compare
+from curvafit.volumes.field import Field
+from tests.exact import Sphere, centres, profile
 
-PATH = RESULTS / "sentinel.jsonl"
 #: Values with the differences that are allowed.
 Checked = dict[str, tuple[float, float]]
-
-
-@lru_cache
-def changed() -> dict[str, str]:
-    """Return since when a topic's sentinel gives what it gives, of topics where it once gave something else."""
-    first: dict[str, dict[str, float]] = {}
-    found: dict[str, str] = {}
-    for line in all_lines(PATH, "sentinel"):
-        topic, values = line["sentinel"], line["values"]
-        if first.setdefault(topic, values) != values:
-            found[topic], first[topic] = line["date"], values
-    return found
-
-
-# ---- what is measured ------------------------------------------------------------------------------------------------
 
 
 @cache
@@ -48,218 +51,145 @@ def texture(size: int = 48, width: float = 3.0, seed: int = 0) -> np.ndarray:
     return (noise > np.quantile(noise, 0.7)).astype(np.uint8)
 
 
-def step() -> Checked:
-    from benchmarks.step import fused_flow, plain_stepper
-
-    fused, plain = fused_flow(24), plain_stepper(24)
+def check_step() -> Checked:
+    flow = step.fused_flow(24)
     for _ in range(3):
-        energy = fused.evaluate()
-        fused.update(1e-3)
-        plain.step(1e-3)
-    return {"energy": (float(np.sum(energy)), 1e-3 * abs(float(np.sum(energy))))}
+        flow.evaluate()
+        flow.update(1e-3)
+    return relative(1e-3, energy=float(np.sum(flow.evaluate())))
 
 
-def prior() -> Checked:
-    from benchmarks.prior import batch
-    from curvafit.priors import CurvaturePrior
-
-    logits, _ = batch(24)
-    leaf = logits.double().requires_grad_()
+def check_prior() -> Checked:
+    leaf = prior.batch(24)[0].requires_grad_()
     loss = CurvaturePrior("tubes", sigmoid=True)(leaf)
-    loss.backward()
-    assert leaf.grad is not None
-    slope = float(leaf.grad.norm())
-    return {"loss": (float(loss), 1e-3 * abs(float(loss))), "slope": (slope, 1e-3 * slope)}
+    (slope,) = torch.autograd.grad(loss, leaf)
+    return relative(1e-3, loss=float(loss), slope=float(slope.norm()))
 
 
-def convergence() -> Checked:
-    from benchmarks.convergence import sweep
-
-    orders = sweep("limit", [1 / 4, 1 / 6])["orders"]
-    return {"least": (min(orders), 1e-3), "most": (max(orders), 1e-3)}
-
-
-def curvature() -> Checked:
-    from benchmarks.curvature import mask_errors
-
-    found = mask_errors("sphere", 4, 2)
-    return {"bias": (found["bias"], 2e-3), "error": (found["error"], 2e-3)}
-
-
-def examples() -> Checked:
-    """Willmore energy of a sphere's exact profile, over 16 π."""
-    import torch
-
-    from curvafit.priors.coefficients import Coefficients
-    from curvafit.priors.energy import energy
-    from curvafit.priors.grid import Grid
-    from curvafit.priors.profile import SIGMA
-    from tests.exact import Sphere, centres, profile
-
+def check_examples() -> Checked:
+    """Check the Willmore energy of a sphere's exact profile, of 16 π."""
     grid = Grid((56,) * 3, (1 / 56,) * 3, "replicate")
     field = profile(Sphere(0.3, (0.5, 0.5, 0.5)), centres(grid), 0.05)
-    found = float(energy(field.to(torch.float64), Coefficients.willmore(), grid, 0.05)) / SIGMA / (16 * np.pi)
-    return {"of 16 π": (found, 1e-3)}
+    return relative(1e-3, ratio=float(energy(field, Coefficients.willmore(), grid, 0.05)) / SIGMA / (16 * np.pi))
 
 
-def texture_distance() -> Checked:
-    import torch
+def check_convergence() -> Checked:
+    orders = convergence.sweep("limit", 2)["orders"]
+    return relative(1e-3, least=min(orders), most=max(orders))
 
-    from curvafit.geometry.diagram import diagram
-    from curvafit.geometry.distances import wasserstein
-    from curvafit.priors.grid import Grid
-    from curvafit.priors.profile import phase_field
 
+def check_curvature() -> Checked:
+    return {name: (value, 2e-3) for name, value in curvature.mask_errors("sphere", 4, 2).items()}
+
+
+def check_texture() -> Checked:
     grid = Grid((48,) * 3, (1.0, 1.0, 1.0))
-    masks = (texture(width=width) > 0 for width in (2.5, 4.0))
-    one, other = (diagram(phase_field(torch.from_numpy(mask), grid, 2.0), grid, 2.0) for mask in masks)
-    return {"distance": (wasserstein(one, other), 5e-3)}
+    fields = (phase_field(torch.from_numpy(texture(width=width) > 0), grid, 2.0) for width in (2.5, 4.0))
+    return {"distance": (wasserstein(*(diagram(field, grid, 2.0) for field in fields)), 5e-3)}
 
 
-@cache
-def reading() -> Checked:
-    """What the posterior reads from a texture, and how much that looks like a level cut, which it is."""
-    from benchmarks.belief import level_cuts
-    from curvafit.inference.estimate import measure_descriptors
-    from curvafit.inference.posterior import load_posterior
-    from curvafit.scan.prepare import prepare
-    from curvafit.volumes.field import Field
-
-    found = measure_descriptors(prepare(Field(texture(64)), kind="mask", one_scale=True))
+def check_reading() -> Checked:
+    """Check what the posterior reads from a texture, and how much that looks like a level cut, which it is."""
+    found, posterior = measure_descriptors(prepare(Field(texture(64)), kind="mask", one_scale=True)), load_posterior()
     assert found is not None
-    posterior = load_posterior()
     medians = np.median(posterior.standardise(posterior.draw(found.reading, 2000)), axis=0)[:6]
     checked = {f"parameter {k + 1}": (float(value), 0.1) for k, value in enumerate(medians)}
-    return checked | {"rank of level cuts": (float(level_cuts(posterior, [found.reading.windows])[0]), 0.02)}
+    return checked | {"rank": (float(belief.level_cuts(posterior, [found.reading.windows])[0]), 0.02)}
 
 
-def completion() -> Checked:
-    from benchmarks.completion import filled
-    from curvafit.volumes.field import Field
-
-    truth = Field(texture())
-    ways = {way: filled(way, truth, range(0, 48, 8), 0, lambda: None, lambda: None) for way in ("spline", "filler")}
-    checked = {f"Dice, {way}": (row["dice"], 0.003) for way, row in ways.items()}
-    return checked | {"calibration": (ways["filler"]["calibration"], 0.003)}
+def check_completion() -> Checked:
+    ways = {
+        way: completion.filled(way, Field(texture()), range(0, 48, 8), 0, dict, dict) for way in ("spline", "filler")
+    }
+    return {way: (row["dice"], 0.003) for way, row in ways.items()}
 
 
-def image() -> Checked:
-    from benchmarks.unets import image_of
-    from curvafit.segmentation.reconstruct import reconstruct
-    from curvafit.segmentation.trials import dice
-    from curvafit.volumes.field import Field
-
+def check_image() -> Checked:
     truth = texture(32, 2.5)
-    found = reconstruct(Field(truth), every=8, image=Field(image_of(truth, 0)))
+    found = reconstruct(Field(truth), every=8, image=Field(transductive.image_of(truth, 0)))
     return {"Dice": (dice(found.mask.values > 0, truth > 0), 0.02)}
 
 
-def instances() -> Checked:
-    from curvafit.segmentation.reconstruct import reconstruct_labels
-
-    labels = np.asarray(ndimage.label(texture(48, 4.0))[0])  # type: ignore[index]
-    cells = np.where(labels % 4 < 3, labels, 0).astype(np.uint16)
+def check_instances() -> Checked:
+    number = np.asarray(ndimage.label(texture(48, 4.0))[0])  # type: ignore[index]
+    cells = np.where(number % 4 < 3, number, 0).astype(np.uint16)
     found = reconstruct_labels(cells, every=8).labels
     assert found is not None
     return {"voxels that agree": (float((found.values == cells).mean()), 0.005)}
 
 
-def measures() -> Checked:
-    from curvafit.scan.measure import measure
-
+def check_measures() -> Checked:
     found = measure(texture(), kind="mask", periodic=True)
-    names = ("thickness", "spacing", "surface density", "mean curvature")
-    return {name: (found[name].value, 0.002 * abs(found[name].value)) for name in names}
+    return relative(2e-3, **{name: found[name].value for name in ("thickness", "spacing", "surface density")})
 
 
-def windows() -> Checked:
-    from benchmarks.windows import case
-
-    return {"R² of thickness": (case("graded", 0)["thickness"], 0.02)}
-
-
-def groups() -> Checked:
-    from curvafit.studies.compare import compare
-
+def check_groups() -> Checked:
     one, other = ([texture(32, width, seed) for seed in range(3)] for width in (2.0, 2.3))
     return {"p": (compare(one, other).p, 1e-6)}
 
 
-def noise() -> Checked:
-    from curvafit.priors.coefficients import Coefficients
-    from curvafit.segmentation.segment import segment
-    from curvafit.segmentation.trials import dice
-    from curvafit.volumes.field import Field
-
+def check_noise() -> Checked:
     truth = texture(32)
     scan = truth + np.random.default_rng(0).standard_normal(truth.shape)
     found = segment(Field(scan.astype(np.float32)), Coefficients.willmore())
     return {"Dice": (dice(found.mask.values > 0, truth > 0), 0.01)}
 
 
-def networks() -> Checked:
-    import torch
-
-    from benchmarks.unets import annotated, dice_ce, image_of, learn, lessons, network, predict
-
-    torch.set_num_threads(1)
-    truth = texture(56, 4.0)
-    net, batch = network(0), lessons([(image_of(truth, 0), annotated(truth, (21, 42)))], 0)
-    learn(net, batch, 4, 6e-3)
+def check_networks() -> Checked:
+    truth, net = texture(56, 4.0), transductive.network(0)
+    batch = transductive.lessons(transductive.image_of(truth, 0), transductive.annotated(truth, (21, 42)), 0)
+    transductive.learn(net, batch, 4, 6e-3)
     x, y = batch(99)
     with torch.no_grad():
-        return {"loss": (float(dice_ce(predict(net, x), y)), 0.05)}
+        return {"loss": (float(transductive.dice_ce(transductive.predict(net, x), y)), 0.05)}
 
 
-#: What stands for a topic; one case stands for several.
+def relative(share: float, **values: float) -> Checked:
+    return {name: (value, share * abs(value)) for name, value in values.items()}
+
+
+#: What stands for topics.
 SENTINELS: dict[str, Callable[[], Checked]] = {
-    "step": step,
-    "prior": prior,
-    "examples": examples,
-    "convergence": convergence,
-    "curvature": curvature,
-    "texture": texture_distance,
-    "closure": reading,
-    "belief": reading,
-    "scans": reading,
-    "completion": completion,
-    "image": image,
-    "instances": instances,
-    "phantoms": measures,
-    "large": measures,
-    "windows": windows,
-    "groups": groups,
-    "noise": noise,
-    "refine": noise,
-    "transductive": networks,
-    "sets": networks,
+    "step": check_step,
+    "prior": check_prior,
+    "examples": check_examples,
+    "convergence": check_convergence,
+    "curvature": check_curvature,
+    "texture": check_texture,
+    "closure belief scans": check_reading,
+    "completion": check_completion,
+    "image": check_image,
+    "instances": check_instances,
+    "phantoms large windows": check_measures,
+    "groups": check_groups,
+    "noise refine": check_noise,
+    "transductive": check_networks,
 }
 
 
 def main(arguments: list[str]) -> None:
     """Run sentinels, and compare them with what is kept; exit with 1 where one disagrees."""
-    parser = argparse.ArgumentParser("python -m benchmarks sentinel")
-    parser.add_argument("topics", nargs="*", choices=[[], *SENTINELS], help="all, where none is named")
+    parser = argparse.ArgumentParser("python -m benchmarks sentinel", description=__doc__)
+    parser.add_argument("topics", nargs="*", help="all, where none is named")
     parser.add_argument("--record", action="store_true", help="keep the values: figures from before them stand no more")
     options = parser.parse_args(arguments)
     warnings.simplefilter("ignore")
-    kept, rows, wrong, cached = read_lines(PATH, "sentinel"), [], [], dict[Callable[[], Checked], Checked]()
-    for topic in options.topics or SENTINELS:
-        begun, function = time.process_time(), SENTINELS[topic]
-        found = cached.setdefault(function, {}) or function()
-        cached[function] = found
-        before = kept.get(topic, {}).get("values", {})
-        off = [name for name, (value, most) in found.items() if abs(value - before.get(name, np.inf)) > most]
-        off += sorted(before.keys() - found.keys())
-        wrong += [topic] * bool(off)
-        for name, (value, most) in found.items():
-            rows.append([f"{topic}: {name}", value, before.get(name, ""), f"{most:.2g}", "*" * (name in off)])
-        rows[-1].append(f"{time.process_time() - begun:.1f} s")
-        if options.record and off:
-            values = {name: round(value, 6) for name, (value, _) in found.items()}
-            append_lines(PATH, [{"sentinel": topic, "values": values} | provenance()])
-    columns = ["sentinel", "now", "kept", "allowed", ""]
-    show([*columns, "processor time"], [[*row, ""][:6] for row in rows])
+    torch.set_num_threads(1)
+    kept, wrong = read_lines(SENTINEL, "sentinel"), []
+    for topics, check in SENTINELS.items():
+        if options.topics and not set(options.topics) & set(topics.split()):
+            continue
+        begun, found, before = time.process_time(), check(), kept.get(topics, {}).get("values", {})
+        seconds = f"{time.process_time() - begun:.1f} s"
+        off = {name for name, (value, most) in found.items() if not abs(value - before.get(name, np.nan)) <= most}
+        rows = [[name, f"{value:.6g}", str(before.get(name, "")), f"{most:.1g}", "disagrees" * (name in off)]
+                for name, (value, most) in found.items()]  # fmt: skip
+        show([topics, "now", "kept", "allowed", seconds], rows)
+        if off | (before.keys() - found.keys()):
+            wrong.append(topics)
+            if options.record:
+                values = {name: round(value, 6) for name, (value, _) in found.items()}
+                append_lines(SENTINEL, [{"sentinel": topics, "values": values} | provenance()])
     if wrong and not options.record:
-        print(f"figures of {', '.join(wrong)} stand no more: measure them again, or mend what changed them")
-    sys.exit(bool(wrong) and not options.record)
+        print(f"\nfigures of {', '.join(wrong)} stand no more: measure them again, or mend what changed them")
+        sys.exit(1)

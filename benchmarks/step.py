@@ -28,8 +28,8 @@ BLUR = 0.02
 COPIED = 2**26
 #: The largest cube for plain torch, which takes some 0.3 µs and 700 bytes a voxel.
 PLAIN = 200
-#: Voxels that a measurement steps through, about: larger cubes get fewer rounds.
-WORK = 10**8
+#: Rounds, and voxels that a measurement steps through, about: larger cubes get fewer rounds.
+ROUNDS, WORK = 10, 10**8
 #: Bytes a voxel that a step must move: floats read and written by the blur, the energy, its blur, Adam and blurs.
 BYTES = 4 * (2 + 2 + 2 + 20)
 
@@ -77,12 +77,11 @@ def apart(size: int, rounds: int) -> dict[str, float]:
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sizes", default="64,100")
-    parser.add_argument("--rounds", type=int, default=10)
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     sizes = [32] if options.quick else [int(size) for size in options.sizes.split(",")]
-    found = cases.all({f"{size}-default": lambda size=size: apart(size, options.rounds) for size in sizes})
+    found = cases.all({f"{size}-default": lambda size=size: apart(size, ROUNDS) for size in sizes})
     figures: dict[str, Figure] = {}
     for name, ms in found.items():
         floor = BYTES * int(name.partition("-")[0]) ** 3 / ms["GB/s"] / 1e6

@@ -14,6 +14,7 @@ import argparse
 import hashlib
 import math
 import os
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 
@@ -79,13 +80,12 @@ def pooled(diagrams: list[Diagram]) -> Diagram:
     return Diagram(np.concatenate([d.points for d in parts]), np.concatenate([d.weights for d in parts]))
 
 
-def compare(name: str, options: argparse.Namespace, cases: Cases) -> Values:
+def compare(name: str, seeds: range, edge: int, cases: Cases) -> Values:
     """Compare shapes by `fast` with those by `paper`, and with the author's volume."""
-    seeds = range(options.first, options.first + options.seeds)
-    paper, other = ([diagram_of(name, plan, seed, options.edge, cases) for seed in seeds] for plan in ("paper", "fast"))
+    paper, other = ([diagram_of(name, plan, seed, edge, cases) for seed in seeds] for plan in ("paper", "fast"))
     found = {"noise": seed_noise_of(paper), "own_noise": seed_noise_of(other)}
     found["bias"] = wasserstein(pooled(other), pooled(paper)) / found["noise"]
-    if options.edge == EDGE and name in author_volumes():
+    if edge == EDGE and name in author_volumes():
         author = diagram(author_field(name), Grid((EDGE,) * 3), WORKING_EPSILON)
         for key, mine, noise in (("paper", paper, found["noise"]), ("excess", other, found["own_noise"])):
             distance = float(np.mean([wasserstein(author, each) for each in mine]))
@@ -94,25 +94,21 @@ def compare(name: str, options: argparse.Namespace, cases: Cases) -> Values:
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--presets", default=",".join(PRESETS))
-    parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first", type=int, default=10)
-    parser.add_argument("--edge", type=int, default=EDGE)
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
-    if options.quick:
-        options.presets, options.edge, options.seeds = "tubes", 32, 2
-    names, first = options.presets.split(","), options.first
-    plan = f"{options.edge}-{first}-{options.seeds}"
-    found = cases.all({f"{name}-{plan}": lambda name=name: compare(name, options, cases) for name in names}, seed=first)
+    names, edge, count = (("tubes",), 32, 2) if options.quick else (PRESETS, EDGE, 3)
+    first = options.first
+    jobs = {f"{n}-{edge}-{first}-{count}": partial(compare, n, range(first, first + count), edge, cases) for n in names}
+    found = cases.all(jobs, first)
     keys = ("noise", "bias", "paper", "excess")
     show(["preset", "noise", "bias / noise", "author: paper", "author: fast"],
          [[name, *(row.get(key, "") for key in keys)] for name, row in found.items()])  # fmt: skip
     within = {key: float(sum(row.get(key, 2) <= 1 for row in found.values())) for key in keys[1:]}
     if first == 20:
         return {"author_fresh.within": Figure(within["excess"])}
-    if len(found) < len(PRESETS) or options.edge != EDGE:
+    if len(found) < len(PRESETS):
         return {}
     most = max(row["bias"] for row in found.values())
     return {"texture.within": Figure(within["bias"]), "texture.most": Figure(most),

@@ -15,20 +15,18 @@ bootstrap over textures and seeds; p of Holm over two contrasts, `law` less `pla
 from __future__ import annotations
 
 import argparse
-import os
 import warnings
+from collections.abc import Callable, Iterable
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import torch
-from scipy import stats
-from torch import Tensor
+from scipy import ndimage, stats
+from torch import Tensor, nn
 from torch.nn import functional
 
 from benchmarks.completion import EDGE, LAWS_TRIED, fitted, shape
-from benchmarks.harness import Cases, Figure, Values, bootstrap, scores, show
-from benchmarks.unets import Loss, annotated, dice_ce, image_of, learn, lessons, network, predict, predict_whole
+from benchmarks.harness import Cases, Figure, Values, bootstrap, data, scores, show
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer
 from curvafit.priors import CombinedLoss, CurvaturePrior
@@ -39,7 +37,7 @@ from curvafit.segmentation.trials import dice
 
 TEXTURES = ("draw-0", "draw-5", "trabec", "bone")
 KNOWN, JUDGE = (21, 42), 32
-STEPS, RATE = 240, 6e-3
+STEPS, RATE, SEEDS = 240, 6e-3, 4
 #: Weights that are tried, as shares of the gradient.
 WEIGHTS = dict.fromkeys(("area", "willmore", "law", "wrong"), (0.1, 0.3, 1.0))
 WAYS = ("plain", "area", "willmore", "law", "wrong", "pseudo", "refine", "filled")
@@ -48,6 +46,9 @@ TUNING, OTHER = 100, 200
 #: Steps over which a prior grows to its weight.
 WARM = 24
 KEYS = ("dice", "cldice", "betti")
+#: A voxel without a label, voxels along an edge of a patch; noise of an image in contrasts, and its blur in voxels.
+UNKNOWN, PATCH, NOISE, BLUR = 2, 48, 2.0, 0.7
+Loss = Callable[[Tensor, Tensor], Tensor]
 
 
 # ---- volumes ---------------------------------------------------------------------------------------------------------
@@ -59,11 +60,24 @@ def truth_of(texture: str, seed: int, cases: Cases) -> np.ndarray:
         return shape(texture, seed, cases)
     import tifffile
 
-    path = Path(os.environ["CURVAFIT_DATA"]) / "scans" / "lhdl_trabecular_200_otsu_mask.tif"
-    whole = tifffile.imread(path) > 0
+    whole = tifffile.imread(data("scans", "lhdl_trabecular_200_otsu_mask.tif")) > 0
     corners = [(z, y, x) for z in (0, 68, 136) for y in (0, 68, 136) for x in (0, 68, 136)]
     z, y, x = corners[np.random.default_rng(7).permutation(len(corners))[{TUNING: 25, OTHER: 26}.get(seed, seed)]]
     return whole[z : z + EDGE, y : y + EDGE, x : x + EDGE]
+
+
+def image_of(truth: np.ndarray, seed: int) -> np.ndarray:
+    """Return a noisy image of a mask, standardised."""
+    clear = ndimage.gaussian_filter(truth.astype(np.float32), BLUR, mode="nearest")
+    values = clear + NOISE * np.random.default_rng(seed).standard_normal(truth.shape, dtype=np.float32)
+    return (values - values.mean()) / values.std()
+
+
+def annotated(truth: np.ndarray, slices: Iterable[int]) -> np.ndarray:
+    """Return the labels of some slices, `UNKNOWN` elsewhere."""
+    target = np.full(truth.shape, UNKNOWN, np.float32)
+    target[list(slices)] = truth[list(slices)]
+    return target
 
 
 def law_of(texture: str, cases: Cases) -> Fit:
@@ -86,6 +100,71 @@ def prior_of(way: str, texture: str, cases: Cases) -> LawLike:
 
 
 # ---- training --------------------------------------------------------------------------------------------------------
+
+
+def network(seed: int) -> nn.Module:
+    from monai.networks.nets.dynunet import DynUNet
+
+    torch.manual_seed(seed)
+    net = DynUNet(3, 1, 1, [3, 3, 3], [1, 2, 2], [2, 2], filters=(8, 16, 32), norm_name="batch")
+    return net.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
+
+
+def predict(net: nn.Module, x: Tensor) -> Tensor:
+    """Return logits in single precision, of convolutions in half: on processors that have them they take a seventh."""
+    with torch.autocast("cpu", torch.bfloat16):
+        return net(x).float()
+
+
+def predict_whole(net: nn.Module, image: np.ndarray) -> Tensor:
+    """Return the logits of a whole image."""
+    net.eval()
+    with torch.no_grad():
+        return predict(net, torch.from_numpy(image)[None, None])[0, 0]
+
+
+def dice_ce(logits: Tensor, target: Tensor) -> Tensor:
+    """Return soft Dice and cross-entropy of the labelled voxels."""
+    known = target != UNKNOWN
+    z, y = logits[known], target[known]
+    p = z.sigmoid()
+    overlap = (2 * (p * y).sum() + 1) / (p.sum() + y.sum() + 1)
+    return 1 - overlap + functional.binary_cross_entropy_with_logits(z, y)
+
+
+def lessons(image: np.ndarray, target: np.ndarray, seed: int) -> Callable[[int], tuple[Tensor, Tensor]]:
+    """Return patches of an image and its target by step, turned, mirrored and with their grey values changed."""
+
+    def batch(step: int) -> tuple[Tensor, Tensor]:
+        random = np.random.default_rng([seed, step % 2**32])
+        corner = [int(random.integers(n - PATCH + 1)) for n in image.shape]
+        box = tuple(slice(a, a + PATCH) for a in corner)
+        axes = tuple(axis for axis in range(3) if random.random() < 0.5)
+        x, y = (np.flip(each[box], axes).astype(np.float32) for each in (image, target))
+        x = random.uniform(0.9, 1.1) * x + random.uniform(-0.1, 0.1)
+        return torch.from_numpy(x.astype(np.float32))[None, None], torch.from_numpy(y.copy())[None, None]
+
+    return batch
+
+
+def learn(
+    net: nn.Module,
+    batch: Callable[[int], tuple[Tensor, Tensor]],
+    steps: int,
+    rate: float,
+    loss_at: Callable[[int], Loss] = lambda step: dice_ce,
+) -> None:
+    """Teach a network by the loss of logits and target at each step; the rate falls to 0."""
+    adam = torch.optim.AdamW(net.parameters(), rate)
+    net.train()
+    for step in range(steps):
+        loss = loss_at(step)
+        adam.param_groups[0]["lr"] = rate * (1 + np.cos(np.pi * step / steps)) / 2
+        x, y = batch(step)
+        adam.zero_grad()
+        loss(predict(net, x), y).backward()
+        nn.utils.clip_grad_norm_(net.parameters(), 5.0)
+        adam.step()
 
 
 def soft_loss(logits: Tensor, target: Tensor) -> Tensor:
@@ -112,7 +191,7 @@ def train(way: str, weight: float, texture: str, seed: int, steps: int, cases: C
     image, target = image_of(truth, seed), annotated(truth, KNOWN)
     if way == "pseudo":
         target = filled(texture, seed, cases)
-    batch, losses = lessons([(image, target)], seed), list[CombinedLoss]()
+    batch, losses = lessons(image, target, seed), list[CombinedLoss]()
 
     def loss_at(step: int) -> Loss:
         if way == "pseudo":
@@ -162,14 +241,10 @@ def cldice(mask: np.ndarray, truth: np.ndarray) -> float:
 # ---- runs ------------------------------------------------------------------------------------------------------------
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seeds", type=int, default=4, help="networks of a way and texture")
-
-
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore", category=UserWarning)
-    steps, seeds = (6, 1) if cases.quick else (STEPS, options.seeds)
+    steps, seeds = (6, 1) if cases.quick else (STEPS, SEEDS)
     ways, textures = (("plain", "law", "refine"), ("trabec",)) if cases.quick else (WAYS, TEXTURES)
 
     def scored(way: str, weight: float, texture: str, numbers: range) -> list[Values]:

@@ -48,10 +48,6 @@ def case(kind: str, seed: int) -> Values:
     }
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    del parser
-
-
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     seeds = range(1 if options.quick else SEEDS)
     found = cases.all({f"{kind}-{seed}": partial(case, kind, seed) for kind in ("graded", "halves") for seed in seeds})
