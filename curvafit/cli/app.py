@@ -10,17 +10,7 @@ from typing import Annotated
 
 import typer
 
-from curvafit.cli import (
-    compare,
-    generate,
-    infer,
-    measure,
-    nnunet,
-    refine,
-    samples,
-    segment,
-    synth,
-)
+from curvafit.cli import compare, generate, infer, measure, refine, samples, segment, synth
 from curvafit.cli.atlas import atlas_app
 from curvafit.cli.console import Commands, say
 from curvafit.cli.options import add_commands, add_gone
@@ -35,16 +25,16 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     cls=Commands,
 )
-add_commands(app, samples.demo, infer.infer, measure.measure)
-add_commands(app, compare.compare)
-add_commands(app, generate.generate, generate.presets, nnunet.nnunet)
-add_commands(app, segment.segment, refine.refine, segment.reconstruct, synth.synth)
+add_commands(app, samples.demo, infer.infer, measure.measure, compare.compare)
+add_commands(app, generate.generate, generate.presets, synth.synth)
+add_commands(app, segment.segment, refine.refine, segment.reconstruct)
 app.add_typer(samples.samples_app, name="samples")
 app.add_typer(atlas_app, name="atlas")
 
 #: Commands that are gone, and what to type in their place; to be deleted after one release.
-GONE: dict[str, str] = {
-    "trajectory": "`curvafit compare SCAN… --by 0,7,14 -o DIR` does that, with a time for each scan",
+GONE = {
+    "nnunet": "`python -m curvafit.nnunet PRIOR` prints the variables to set",
+    "trajectory": "type `curvafit compare SCAN… --by 0,7,14 -o DIR`, with a time for each scan",
     "windows": "type `curvafit measure SCAN --windows 64 --stride 32 -o DIR`",
 }
 for _name, _instead in GONE.items():

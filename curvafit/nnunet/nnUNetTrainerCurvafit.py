@@ -1,6 +1,6 @@
 """nnU-Net v2's trainer with the curvature prior beside its loss, found through `nnUNet_extTrainer`.
 
-`curvafit nnunet --prior fit.json` prints the lines to set; then
+`python -m curvafit.nnunet fit.json` prints the lines to set; then
 `nnUNetv2_train DATASET 3d_fullres FOLD -tr nnUNetTrainerCurvafit`.
 """
 
@@ -23,22 +23,22 @@ BATCHES = 9
 class nnUNetTrainerCurvafit(nnUNetTrainer):
     """Dice + cross-entropy + weight × F_ε of the predicted foreground classes, at every level of deep supervision.
 
-    Read from the environment: `CURVAFIT_PRIOR` (a preset's name or a `fit.json`); `CURVAFIT_SHARE` or
-    `CURVAFIT_WEIGHT`; and, where they are set, `CURVAFIT_EPSILON` in mm and `CURVAFIT_WARMUP` in epochs. A weight grows
-    to its full value over the warm-up. With a share there is no prior until then; then the weight is set once, to what
-    gives the prior that share of the gradient of Dice + cross-entropy. A training that is continued warms up no second
-    time, and is balanced anew. The prior acts on all of a patch, on what nnU-Net's ignore label hides too.
+    Read from the environment: `CURVAFIT_PRIOR` (a preset's name or a `fit.json`) and, where they are set,
+    `CURVAFIT_WEIGHT`, or `CURVAFIT_SHARE` (0.1), `CURVAFIT_WARMUP` in epochs (50) and `CURVAFIT_EPSILON` in mm. A
+    weight grows to its full value over the warm-up. With a share there is no prior until then; then the weight is set
+    once, to what gives the prior that share of the gradient of Dice + cross-entropy. A training that is continued warms
+    up no second time, and is balanced anew. The prior acts on all of a patch, on what nnU-Net's ignore label hides too.
 
     Raises
     ------
     ValueError
-        If the prior or its weight is not set, or the configuration is two-dimensional.
+        If the prior is not set, a number is none, or the configuration is two-dimensional.
     """
 
     def _build_loss(self):
         loss, self._own = super()._build_loss(), self._prior()
-        self._share, epochs = _number("CURVAFIT_SHARE", 0.0), _number("CURVAFIT_WARMUP", 0.0)
-        weight = 0.0 if self._share else _number("CURVAFIT_WEIGHT")
+        weight, epochs = _number("CURVAFIT_WEIGHT", 0.0), _number("CURVAFIT_WARMUP", 50.0)
+        self._share = 0.0 if weight else _number("CURVAFIT_SHARE", 0.1)
         deep = isinstance(loss, DeepSupervisionWrapper)
         levels = sum(factor != 0 for factor in loss.weight_factors) if deep else 1
         warmup = 0 if self._share else int(epochs * self.num_iterations_per_epoch) * levels
@@ -85,7 +85,9 @@ class nnUNetTrainerCurvafit(nnUNetTrainer):
             )
         law, epsilon = os.environ.get("CURVAFIT_PRIOR"), _number("CURVAFIT_EPSILON", 0.0)
         if not law:
-            raise ValueError("CURVAFIT_PRIOR must be a preset or a fit.json, but it is not set: see `curvafit nnunet`")
+            raise ValueError(
+                "CURVAFIT_PRIOR must be a preset or a fit.json, but it is not set: see `python -m curvafit.nnunet`"
+            )
         regions = self.label_manager.has_regions
         return CurvaturePrior(
             law,
@@ -99,14 +101,12 @@ class nnUNetTrainerCurvafit(nnUNetTrainer):
         )
 
 
-def _number(name: str, missing: float | None = None) -> float:
-    text = os.environ.get(name, "")
-    if not text and missing is not None:
-        return missing
+def _number(name: str, missing: float) -> float:
+    text = os.environ.get(name) or missing
     try:
         value = float(text)
     except ValueError:
         value = -1.0
     if not 0 <= value < float("inf"):
-        raise ValueError(f"{name} must be a number from 0, got {text!r}: see `curvafit nnunet`")
+        raise ValueError(f"{name} must be a number from 0, got {text!r}")
     return value

@@ -122,7 +122,6 @@ def test_generate_refuses_a_prior_of_another_kind(tmp_path: Path) -> None:
         ("segment", "scan.npy", "--prior", "fit.json", "-o", "out.npy"),
         ("reconstruct", "scan.npy", "--prior", "fit.json", "--every", "4", "-o", "out.npy"),
         ("synth", "--prior", "fit.json", "--modality", "confocal", "-o", "out"),
-        ("nnunet", "--prior", "fit.json"),
         ("atlas", "build", "out.zarr", "--around", "fit.json", "--count", "1"),
     ],
 )

@@ -39,7 +39,6 @@ COMMANDS = {
     "generate-mesh": "generate --prior fit.json --shape 20 --steps 40 -o out.stl",
     "presets": "presets",
     "samples": "samples",
-    "nnunet": "nnunet --prior fit.json",
     "segment": "segment scan.tif --prior tubes --steps 40 -o out.nii.gz",
     "refine": "refine probabilities.nii.gz --prior tubes --weight 0.02 -o out.nii.gz",
     "reconstruct": "reconstruct mask.nii.gz --every 5 -o out.nii.gz",

@@ -1,4 +1,4 @@
-"""nnU-Net's trainer: what the command prints, and the trainer inside the real package where that is installed."""
+"""nnU-Net's trainer: the variables by which it is found, and the trainer in the real package where there is one."""
 
 from __future__ import annotations
 
@@ -6,53 +6,13 @@ import importlib.util
 import os
 import subprocess
 import sys
-import textwrap
 from pathlib import Path
 
 import pytest
-from calling import call, refused
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "curvafit" / "nnunet"
 
-
-# ---- the command -----------------------------------------------------------------------------------------------------
-
-
-def test_the_command_prints_lines_that_a_shell_takes(tmp_path):
-    done = call("nnunet", "--prior", "tubes", "--weight", "0.01", "--epsilon", "0.5")
-    assert done.exit_code == 0, done.stderr
-    names = ["nnUNet_extTrainer", *(f"CURVAFIT_{name}" for name in ("PRIOR", "WEIGHT", "EPSILON", "WARMUP"))]
-    script = done.stdout + '\necho "' + "|".join(f"${name}" for name in names) + '"'
-    for before in (None, "/elsewhere"):
-        env = {"PATH": os.environ["PATH"]} | ({} if before is None else {"nnUNet_extTrainer": before})
-        said = subprocess.run(["bash", "-c", script], env=env, capture_output=True, text=True, check=True)
-        folder, *rest = said.stdout.strip().split("|")
-        assert folder.split(os.pathsep) == [str(FOLDER), *([before] if before else [])]
-        assert rest == ["tubes", "0.01", "0.5", "50"]
-        assert "unset CURVAFIT_SHARE" in script
-    shared = call("nnunet", "--prior", "Bilinear_Tubes").stdout.splitlines()
-    assert "export CURVAFIT_PRIOR=bilinear-tubes" in shared
-    assert "export CURVAFIT_SHARE=0.1" in shared and "unset CURVAFIT_WEIGHT" in shared
-
-
-@pytest.mark.parametrize(
-    ("options", "word"),
-    [
-        ("--prior tubs --weight 1", "--prior"),
-        ("--prior none.json --weight 1", "none.json"),
-        ("--prior tubes --weight -1", "--weight"),
-        ("--prior tubes --share nan", "--share"),
-        ("--prior tubes --epsilon inf", "--epsilon"),
-        ("--prior tubes --warmup nan", "--warmup"),
-        ("--prior tubes --share 1 --weight 1", "--share"),
-    ],
-)
-def test_wrong_options_are_said(options, word):
-    refused(call("nnunet", *options.split()), word)
-
-
-# ---- the trainer -----------------------------------------------------------------------------------------------------
 
 PROGRAM = """
 import copy, json, os, sys
@@ -60,6 +20,7 @@ import torch
 from nnunetv2.utilities.find_objects import recursive_find_trainer_class_by_name
 from nnunetv2.training.loss.deep_supervision import DeepSupervisionWrapper
 
+os.environ.setdefault("CURVAFIT_WEIGHT", "0.01")
 kind = recursive_find_trainer_class_by_name("nnUNetTrainerCurvafit")
 labels, ignore = {"background": 0, "vessel": 1, "ignore": 2}, 2
 dataset = {"channel_names": {"0": "CT"}, "labels": labels, "numTraining": 1, "file_ending": ".nii.gz"}
@@ -107,7 +68,7 @@ assert int(combined.calls) == made
 trainer.current_epoch = 3
 trainer.on_train_epoch_start()
 assert int(combined.calls) == 3 * 250 * made
-os.environ["CURVAFIT_SHARE"] = "0.2"
+del os.environ["CURVAFIT_WEIGHT"]
 shared = kind(copy.deepcopy(plans), "3d_fullres", 0, dataset, device=torch.device("cpu"))
 shared.initialize()
 shared.dataloader_train = iter([{"data": image, "target": [t.clone() for t in target]}] * 20)
@@ -118,26 +79,41 @@ for epoch in (1, 2):
 combined = shared.loss.loss
 leaf = shared.network(image)[0].detach().float().requires_grad_()
 slopes = [torch.autograd.grad(part(leaf, target[0]), leaf)[0].norm() for part in (combined.base, combined.prior)]
-assert abs(float(combined.weight * slopes[1] / slopes[0]) - 0.2) < 1e-3
+assert abs(float(combined.weight * slopes[1] / slopes[0]) - 0.1) < 1e-3
 assert shared.train_step({"data": image, "target": target})["loss"] < 1e3
 print("done")
 """
+
+
+def variables(*words: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "curvafit.nnunet", *words]
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+
+
+def test_a_shell_takes_the_variables_that_are_printed():
+    script = variables("Bilinear_Tubes").stdout + 'echo "$nnUNet_extTrainer|$CURVAFIT_PRIOR"'
+    for env, rest in (({}, ""), ({"nnUNet_extTrainer": "/elsewhere"}, ":/elsewhere")):
+        said = subprocess.run(["bash", "-c", script], env=env, capture_output=True, text=True, check=True)
+        assert said.stdout == f"{FOLDER}{rest}|bilinear-tubes\n"
+    for words in ((), ("tubs",), ("none.json",)):
+        done = variables(*words)
+        assert done.returncode == 2 and done.stderr.count("\n") == 1 and "prior" in done.stderr and not done.stdout
 
 
 @pytest.mark.skipif(
     importlib.util.find_spec("nnunetv2") is None, reason="nnunetv2 is not installed: pip install nnunetv2"
 )
 def test_the_trainer_in_the_real_package(tmp_path):
-    env = {"nnUNet_extTrainer": str(FOLDER), "CURVAFIT_PRIOR": "tubes", "CURVAFIT_WEIGHT": "0.01"}
-    env |= {"CURVAFIT_WARMUP": "2", "PYTHONPATH": str(ROOT), "nnUNet_compile": "f"}
+    env = {"nnUNet_extTrainer": str(FOLDER), "CURVAFIT_PRIOR": "tubes", "nnUNet_compile": "f"}
+    env |= {"CURVAFIT_WARMUP": "2", "PYTHONPATH": os.pathsep.join((str(ROOT), os.environ.get("PYTHONPATH", "")))}
     for name in ("raw", "preprocessed", "results"):
-        (tmp_path / name).mkdir()
         env[f"nnUNet_{name}"] = str(tmp_path / name)
-    (tmp_path / "preprocessed" / "Dataset001_X" / "x").mkdir(parents=True)
+        (tmp_path / name / "Dataset001_X" / "x").mkdir(parents=True)
     (tmp_path / "preprocessed" / "Dataset001_X" / "x" / "case.npz").touch()  # tells how data are stored
-    command = [sys.executable, "-c", textwrap.dedent(PROGRAM)]
-    done = subprocess.run(command, env=os.environ | env, capture_output=True, text=True, check=False)
-    assert done.returncode == 0 and done.stdout.rstrip().endswith("done"), done.stderr
-    del env["CURVAFIT_WEIGHT"]
-    done = subprocess.run(command, env=os.environ | env, capture_output=True, text=True, check=False)
-    assert "CURVAFIT_WEIGHT" in done.stderr
+    for more, word in (({}, ""), ({"CURVAFIT_WEIGHT": "nan"}, "CURVAFIT_WEIGHT"), ({"CURVAFIT_PRIOR": ""}, "not set")):
+        command = [sys.executable, "-c", PROGRAM]
+        done = subprocess.run(command, env=os.environ | env | more, capture_output=True, text=True, check=False)
+        assert (done.returncode == 0 and done.stdout.endswith("done\n")) if not word else word in done.stderr, (
+            done.stderr
+        )
