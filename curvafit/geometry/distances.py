@@ -6,11 +6,8 @@ takes these loops where geomloss is not installed.
 
 from __future__ import annotations
 
-import hashlib
-import itertools
 import math
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, NamedTuple
@@ -20,14 +17,11 @@ import torch
 from numba import njit, prange
 
 from curvafit.core.checks import check_type
-from curvafit.core.runtime import Progress, silent
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram
 from curvafit.priors.kernels.threads import Kernel, count_threads
 
 #: Pairs that are taken at once: a few seconds on a processor.
 BLOCK = 8192
-#: Seconds between two saves.
-EVERY = 30.0
 #: Lines on which a sliced embedding projects a diagram, and quantiles of each.
 DIRECTIONS, QUANTILES = 12, 24
 #: All of fast-math but the leave to assume that no value is NaN or infinite.
@@ -52,44 +46,19 @@ def pairwise(
     blur: float = 1.0,
     reach: float | None = 20.0,
     bin_width: float = BIN_WIDTH,
-    known: np.ndarray | None = None,
-    save: Callable[[np.ndarray], object] | None = None,
-    progress: Progress = silent,
 ) -> np.ndarray:
     """Return `wasserstein` of every pair of N diagrams: `(N, N)` float64, symmetric, with a zero diagonal.
 
     `wasserstein` is met to 1e-4 of itself, or 1e-5 where that is less than 0.1: the steps are the same, in float32. A
     pair takes half a millisecond, on numba's threads. Options and errors are those of `wasserstein`.
-
-    Parameters
-    ----------
-    known
-        Distances of before, NaN where there is none: only these are computed.
-    save
-        Called with the distances so far, NaN where there is none yet: first, about every `EVERY` seconds, and at the
-        end, even after an exception.
     """
     clouds = _pack_diagrams(diagrams, blur, reach, bin_width)
-    distances = np.full((len(diagrams),) * 2, np.nan) if known is None else known.copy()
-    np.fill_diagonal(distances, 0)
-    first, second = np.nonzero(np.triu(np.isnan(distances)))
+    distances = np.zeros((len(diagrams),) * 2)
+    first, second = np.triu_indices(len(diagrams), 1)
     order = np.random.default_rng(0).permutation(len(first))  # so that threads get pairs of like sizes
     first, second = first[order], second[order]
-    total = len(distances) * (len(distances) - 1) // 2
-    save = save or (lambda distances: None)
-    save(distances)
-    saved = time.monotonic()
     blocks = _iterate_distances(clouds, first, second, blur=blur, reach=reach)
-    try:
-        for start, block in zip(range(0, len(first), BLOCK), blocks, strict=True):
-            i, j = first[start : start + BLOCK], second[start : start + BLOCK]
-            distances[i, j] = distances[j, i] = block
-            progress(f"comparing {total} pairs", (total - len(first) + start + len(block)) / total)
-            if time.monotonic() - saved > EVERY:
-                save(distances)
-                saved = time.monotonic()
-    finally:
-        save(distances)
+    distances[first, second] = distances[second, first] = np.concatenate([np.empty(0), *blocks])
     return distances
 
 
@@ -126,16 +95,6 @@ def _iterate_distances(clouds: Clouds, first: np.ndarray, second: np.ndarray, **
         block = slice(start, start + BLOCK)
         divergence = costs(clouds, first[block], second[block], halved[block], **options) - bias[block]
         yield np.sqrt(np.maximum(divergence, 0))
-
-
-def digests(
-    diagrams: Sequence[Diagram], *, blur: float = 1.0, reach: float | None = 20.0, bin_width: float = BIN_WIDTH
-) -> list[str]:
-    """Return a hash of each diagram as `pairwise` sees it: equal where binned points and weights are equal."""
-    clouds = _pack_diagrams(diagrams, blur, reach, bin_width)
-    rows = np.stack([clouds.x, clouds.y, clouds.log2], axis=1)
-    parts = (rows[start:end] for start, end in itertools.pairwise(clouds.bounds))
-    return [hashlib.sha256(part.tobytes()).hexdigest() for part in parts]
 
 
 def wasserstein(

@@ -178,20 +178,3 @@ def test_a_distance_is_the_pair_s_own_whoever_else_is_there() -> None:
     a = CLOUDS[0]
     more = Diagram(np.concatenate([a.points, [[500.0, 0.0]]]), np.append(a.weights, 0.0))
     assert one_to_many(a, [more], bin_width=0)[0] == 0
-
-
-def test_known_distances_are_not_computed_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What an interrupted run saved is taken by the next, and a longer list costs its new rows."""
-    monkeypatch.setattr(module, "BLOCK", 2)
-    truth, saved, shares = pairwise(CLOUDS), [], []
-
-    def interrupt(text: str, share: float) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        pairwise(CLOUDS[:4], save=lambda distances: saved.append(distances.copy()), progress=interrupt)
-    assert np.isnan(saved[0]).sum() == 12 and np.isnan(saved[-1]).sum() == 8
-    resumed = pairwise(CLOUDS[:4], known=saved[-1], progress=lambda text, share: shares.append(share))
-    assert shares == pytest.approx([4 / 6, 1])
-    np.testing.assert_allclose(resumed, truth[:4, :4], rtol=1e-5)
-    np.testing.assert_array_equal(pairwise(CLOUDS[:4], known=resumed, progress=interrupt), resumed)
