@@ -14,19 +14,7 @@ from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.geometry.topology import euler_number
 from curvafit.priors.grid import WORKING_SPACING
-from curvafit.scan.measure import (
-    QUANTITIES,
-    SUMS,
-    Blocks,
-    Maps,
-    Measures,
-    Quantity,
-    Sums,
-    find_direction,
-    measure_curvatures,
-    measure_surface,
-    no_curvature,
-)
+from curvafit.scan import measure
 from curvafit.scan.prepare import prepare
 from curvafit.scan.structure import read_labels
 from curvafit.volumes.field import Field, ScanError
@@ -38,17 +26,17 @@ _OF_TEXTURES = ("BV/TV", "Tb.Sp", "Tb.N", "Conn.D", "BS/TV")
 #: Background around a body, in voxels beyond half its thickness, that the working grid's borders take.
 _AROUND = 5
 #: Name, symbol and power of each number of a body, and how it comes from sums.
-OF_BODIES: tuple[tuple[str, str, int, Callable[[Sums], np.ndarray]], ...] = (
+OF_BODIES: tuple[tuple[str, str, int, Callable[[measure.Sums], np.ndarray]], ...] = (
     ("volume", "V", 3, lambda s: s["inside"]),
     ("surface", "S", 2, lambda s: s["area"]),
     ("sphericity", "Ψ", 0, lambda s: math.pi ** (1 / 3) * (6 * s["inside"]) ** (2 / 3) / (s["area"] + s["cut"])),
     ("elongation", "E", 0, lambda s: s["elongation"]),
     ("area at the border", "S.cut", 2, lambda s: s["cut"]),
-    *(each for each in QUANTITIES if each[1] not in _OF_TEXTURES),
+    *(each for each in measure.QUANTITIES if each[1] not in _OF_TEXTURES),
 )
 
 
-def measure_instances(labels: Source, *, progress: Progress = silent, **reading: Any) -> tuple[Measures, ...]:
+def measure_instances(labels: Source, *, progress: Progress = silent, **reading: Any) -> tuple[measure.Measures, ...]:
     """Measure each body of a label image by itself, whatever it touches.
 
     The values but 0 are the bodies' labels, `part` of the result is `("instance", label)`, and intervals are NaN. What
@@ -77,7 +65,7 @@ def measure_instances(labels: Source, *, progress: Progress = silent, **reading:
     return tuple(found)
 
 
-def _measure_body(field: Field, numbers: np.ndarray, number: int, box: Box, label: int) -> Measures:
+def _measure_body(field: Field, numbers: np.ndarray, number: int, box: Box, label: int) -> measure.Measures:
     """Return the measures of the body of a number, which lies in a box."""
     mask = numbers[grow(box, 3, numbers.shape)] == number  # the reach of the blur before marching cubes
     thickness = local_thickness(mask, field.spacing)
@@ -86,23 +74,23 @@ def _measure_body(field: Field, numbers: np.ndarray, number: int, box: Box, labe
         prepared = prepare(
             Field(numbers[grow(box, around, numbers.shape)] == number, field.spacing, field.unit), kind="mask"
         )
-        (curved, drawn), notes = measure_curvatures(prepared), prepared.notes
+        (curved, drawn), notes = measure.measure_curvatures(prepared), prepared.notes
         drawn = drawn.thin(BIN_WIDTH / prepared.working_voxel * WORKING_SPACING, TAIL_SHARE)  # there may be thousands
     except ValueError as reason:  # too thin, or without a surface away from the image's borders
-        curved, drawn, notes = no_curvature(field.unit, reason)
-    surface = measure_surface(mask, field.spacing, False)
+        curved, drawn, notes = measure.no_curvature(field.unit, reason)
+    surface = measure.measure_surface(mask, field.spacing, False)
     empty = np.zeros_like(thickness)
-    maps = Maps(field.spacing, False, mask, thickness, empty, empty, surface, curved, drawn, "mask", notes)
-    total = dict(zip(SUMS, maps.sum(Blocks(mask.shape, ((0,),) * 3))[0], strict=True))  # type: ignore[arg-type]
+    maps = measure.Maps(field.spacing, False, mask, thickness, empty, empty, surface, curved, drawn, "mask", notes)
+    total = dict(zip(measure.SUMS, maps.sum(measure.Blocks(mask.shape, ((0,),) * 3))[0], strict=True))  # type: ignore[arg-type]
     total |= {"χ": euler_number(mask), **_measure_extent(numbers[box] == number, box, field)}
     with np.errstate(divide="ignore", invalid="ignore"):  # without curvature
         values = [(name, symbol, float(figure(total)), math.nan, power) for name, symbol, power, figure in OF_BODIES]
-    return Measures(
+    return measure.Measures(
         source=field.source,
         unit=field.unit,
         kind="mask",
-        quantities=tuple(Quantity(*each) for each in values),
-        direction=find_direction(total),
+        quantities=tuple(measure.Quantity(*each) for each in values),
+        direction=measure.find_direction(total),
         diagram=drawn,
         blocks=(1, 1, 1),
         notes=notes,
@@ -111,10 +99,8 @@ def _measure_body(field: Field, numbers: np.ndarray, number: int, box: Box, labe
 
 
 def _measure_extent(body: np.ndarray, box: Box, field: Field) -> dict[str, float]:
-    """Return the longest over the middle axis of the ellipsoid of a body's moments, and its area in the image's faces.
-
-    A voxel's own moments count, so that a row of voxels has a width.
-    """
+    """Return the longest over the middle axis of a body's ellipsoid of moments, and its area in the image's faces."""
+    # A voxel's own moments count, so that a row of voxels has a width.
     edges = np.array(field.spacing)
     places = np.argwhere(body) * edges
     moments = np.cov(places.T, bias=True) + np.diag(edges**2) / 12

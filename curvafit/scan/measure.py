@@ -87,12 +87,7 @@ class Quantity:
 QUANTITIES: tuple[tuple[str, str, int, Callable[[Sums], np.ndarray]], ...] = (
     ("volume fraction", "BV/TV", 0, lambda s: s["inside"] / s["volume"]),
     ("thickness", "Tb.Th", 1, lambda s: s["thickness"] / s["inside"]),
-    (
-        "thickness deviation",
-        "Tb.Th.SD",
-        1,
-        lambda s: _deviation(s["thickness"] / s["inside"], s["thickness²"] / s["inside"]),
-    ),
+    ("thickness deviation", "Tb.Th.SD", 1, lambda s: _deviation(s, "thickness", "thickness²", "inside")),
     ("spacing", "Tb.Sp", 1, lambda s: s["gap"] / (s["volume"] - s["inside"])),
     ("number per length", "Tb.N", -1, lambda s: s["inside"] ** 2 / s["volume"] / s["thickness"]),  # (BV/TV) / Tb.Th
     ("connectivity density", "Conn.D", -3, lambda s: -s["χ"] / s["volume"]),
@@ -101,7 +96,7 @@ QUANTITIES: tuple[tuple[str, str, int, Callable[[Sums], np.ndarray]], ...] = (
     ("surface density", "BS/TV", -1, lambda s: s["area"] / s["volume"]),
     ("anisotropy", "DA", 0, lambda s: _anisotropy(s)),
     ("mean curvature", "H", -1, lambda s: s["H"] / s["curved"]),
-    ("mean curvature deviation", "H.SD", -1, lambda s: _deviation(s["H"] / s["curved"], s["H²"] / s["curved"])),
+    ("mean curvature deviation", "H.SD", -1, lambda s: _deviation(s, "H", "H²", "curved")),
     ("Gaussian curvature", "K", -2, lambda s: s["K"] / s["curved"]),
     ("greater curvature", "κ1", -1, lambda s: s["κ1"] / s["curved"]),
     ("smaller curvature", "κ2", -1, lambda s: s["κ2"] / s["curved"]),
@@ -192,19 +187,12 @@ class Measures(Pictured):
         if "voxel" in (unit, self.unit):
             raise ValueError(f"expected lengths in a unit that converts to {unit}, got {self.unit}")
         factor = convert_length(1.0, self.unit, unit)
-        quantities = (
-            replace(each, value=each.value * factor**each.power, half=each.half * factor**each.power)
-            for each in self.quantities
-        )
+        scaled = ((each, factor**each.power) for each in self.quantities)
+        quantities = (replace(each, value=each.value * by, half=each.half * by) for each, by in scaled)
         old = self.diagram
-        diagram = replace(
-            old,
-            points=old.points / factor,
-            weights=old.weights * factor**2,
-            unit=f"1/{unit}",
-            spread=old.spread / factor,
-            places=None if old.places is None else old.places * factor,
-        )
+        places = None if old.places is None else old.places * factor
+        diagram = replace(old, points=old.points / factor, weights=old.weights * factor**2, places=places)
+        diagram = replace(diagram, unit=f"1/{unit}", spread=old.spread / factor)
         parts = {label: each.convert(unit) for label, each in self.compartments.items()}
         return replace(self, unit=unit, quantities=tuple(quantities), diagram=diagram, compartments=parts)
 
@@ -271,24 +259,22 @@ def summarise(field: Field, maps: Maps, blocks: Blocks, part: tuple[str, int] | 
         drawn = replace(
             drawn, points=drawn.points[inside], weights=drawn.weights[inside], places=np.asarray(drawn.places)[inside]
         )
-    return summarise_sums(field, Summed(maps.kind, blocks, table, connectivity, drawn, maps.notes), part)
+    return summarise_sums(field, maps.kind, blocks, table, connectivity, drawn, maps.notes, part=part)
 
 
-class Summed(NamedTuple):
-    """What is summed of a scan: a row of `SUMS` for each block; χ and connectivity density of all of it, None of a
-    region; the areas over (κ1, κ2); and notes."""
-
-    kind: str
-    blocks: Blocks
-    table: np.ndarray
-    connectivity: tuple[float, float] | None
-    diagram: Diagram
-    notes: tuple[str, ...]
-
-
-def summarise_sums(frame: Field, summed: Summed, part: tuple[str, int] | None = None) -> Measures:
-    """Return the measures that follow from sums over blocks; of `frame` the source and the unit count."""
-    _, blocks, table, connectivity, _, notes = summed
+def summarise_sums(
+    frame: Field,
+    kind: str,
+    blocks: Blocks,
+    table: np.ndarray,
+    connectivity: tuple[float, float] | None,
+    drawn: Diagram,
+    notes: tuple[str, ...],
+    *,
+    part: tuple[str, int] | None = None,
+) -> Measures:
+    """Return the measures that follow from a row of `SUMS` for each block, χ and connectivity density of the whole scan
+    (None of a region), and areas over (κ1, κ2); of `frame` the source and the unit count."""
     total, volumes = table.sum(0), table[:, SUMS.index("volume")]
     values, names = combine(total), [name for name, *_ in QUANTITIES]
     if connectivity is not None:
@@ -299,18 +285,16 @@ def summarise_sums(frame: Field, summed: Summed, part: tuple[str, int] | None = 
     halves = errors(table, blocks, combine, weights) if count >= LEAST else np.full(len(values), np.nan)
     if count < LEAST:
         where = "scan" if connectivity is not None else " ".join(map(str, part or ("region",)))
-        notes = (
-            *notes,
-            f"No intervals: they need {LEAST} blocks of a period (thickness and spacing), and the {where} has {count}.",
-        )
+        why = f"they need {LEAST} blocks of a period (thickness and spacing), and the {where} has {count}"
+        notes = (*notes, f"No intervals: {why}.")
     rows = zip(QUANTITIES, values, halves, strict=True)
     return Measures(
         source=frame.source,
         unit=frame.unit,
-        kind=summed.kind,
+        kind=kind,
         quantities=tuple(Quantity(name, symbol, float(v), float(h), power) for (name, symbol, power, _), v, h in rows),
         direction=find_direction(dict(zip(SUMS, total, strict=True))),
-        diagram=summed.diagram,
+        diagram=drawn,
         blocks=blocks.counts,
         notes=notes,
         part=part,
@@ -344,27 +328,18 @@ class Maps(NamedTuple):
 
     def sum(self, blocks: Blocks) -> np.ndarray:
         """Return sums (N, C): a row for each block, a column for each of `SUMS`."""
-        volumes = (
-            blocks.sums(np.ones(self.mask.shape, dtype=bool)),
-            blocks.sums(self.mask),
-            blocks.sums(self.thickness),
-            blocks.sums(np.square(self.thickness)),
-            blocks.sums(self.gap),
-        )
-        voxel, euler = math.prod(self.spacing), blocks.sums(self.euler)
+        ones = np.ones(self.mask.shape, dtype=bool)
+        volumes = (ones, self.mask, self.thickness, np.square(self.thickness), self.gap)
+        sums = (math.prod(self.spacing) * blocks.sums(each) for each in volumes)
         surfaces = (blocks.gather(*each) for each in (self.surface, self.curved))
-        return np.column_stack([*(voxel * each for each in volumes), euler, *surfaces])
+        return np.column_stack([*sums, blocks.sums(self.euler), *surfaces])
 
 
 def measure_maps(
     field: Field, kind: str, options: dict[str, Any], progress: Progress = silent, most: int | None = None
 ) -> Maps:
-    """Measure what is summed of a scan; `options` are the threshold, dark and periodic of `measure`, as are errors, and
-    where a padded scan was `imaged`.
-
-    Curvature is that of all of the scan if it has at most `most` working voxels, else TooLarge is raised; by default a
-    large scan's curvature is that of a part (`prepare.prepare`).
-    """
+    """Measure what is summed of a scan; `options` are the threshold, dark and periodic of `measure`, and where a padded
+    scan was `imaged`; `most` as in `prepare.prepare`, which raises TooLarge."""
     periodic: bool = options["periodic"]
     progress("finding the structure", 0.0)
     mask, seen, notes = _find_structure(field, kind, options)
@@ -420,10 +395,8 @@ def _find_structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[n
 def measure_surface(
     mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangles' places in voxels, their areas, and n⊗n dA in the upper triangle's order (z, y, x).
-
-    Those at a window's faces count for what lies beyond the outer voxels' centres, too (`border_weights`).
-    """
+    """Return the triangles' places in voxels, their areas, and n⊗n dA in the upper triangle's order (z, y, x); those at
+    a window's faces count for what lies beyond the outer voxels' centres, too (`border_weights`)."""
     places, columns = tabulate_surface(smooth_surface(mask, spacing, periodic=periodic), spacing)
     return places, columns if periodic else columns * border_weights(places, mask.shape)[:, None]
 
@@ -443,11 +416,8 @@ def measure_curvatures(prepared: Prepared) -> tuple[tuple[np.ndarray, np.ndarray
     physical = replace(
         working, points=working.points / length, weights=working.weights * length**2, unit=f"1/{prepared.unit}"
     )
-    voxels = (
-        (np.asarray(working.places) / WORKING_SPACING + 0.5) * np.array(prepared.scale)
-        - 0.5
-        + np.array(prepared.origin)
-    )
+    corners = (np.asarray(working.places) / WORKING_SPACING + 0.5) * np.array(prepared.scale)
+    voxels = corners - 0.5 + np.array(prepared.origin)
     κ1, κ2 = physical.points.T
     H = (κ1 + κ2) / 2
     kinds = np.eye(len(FAMILIES))[families(working.points, prepared.thickness / 2 * WORKING_SPACING)]
@@ -462,8 +432,8 @@ def combine(sums: np.ndarray) -> np.ndarray:
         return np.stack([figure(named) for *_, figure in QUANTITIES], axis=-1)
 
 
-def _deviation(mean: np.ndarray, square: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.maximum(square - mean**2, 0))
+def _deviation(sums: Sums, values: str, squares: str, counted: str) -> np.ndarray:
+    return np.sqrt(np.maximum(sums[squares] / sums[counted] - (sums[values] / sums[counted]) ** 2, 0))
 
 
 def _tensor(sums: Sums) -> np.ndarray:
@@ -492,10 +462,8 @@ def find_direction(sums: Sums) -> tuple[float, float, float]:
 
 
 def scan_diagram(prepared: Prepared) -> Diagram:
-    """Measure the geometric curvature diagram of a prepared scan; of a large one tile by tile, each cell in one tile.
-
-    Places are in working units from the centre of the grid's first voxel.
-    """
+    """Measure the geometric curvature diagram of a prepared scan, of a large one tile by tile, each cell in one tile;
+    places are in working units from the centre of the grid's first voxel."""
     grid = prepared.grid
     cuts = [[slice(None)] if grid.periodic else _cut_axis(n) for n in grid.shape]
     parts: list[Diagram] = []
@@ -674,10 +642,8 @@ def errors(
 
 
 def interval_reach(counts: Sequence[int]) -> float:
-    """Return how many standard errors an interval of `errors` reaches to either side, from the blocks along axes.
-
-    NaN of a single block, which has no error.
-    """
+    """Return how many standard errors an interval of `errors` reaches to either side, from the blocks along axes; NaN
+    of one."""
     if math.prod(counts) == 1:
         return math.nan
     form, _ = _neighbour_forms(counts, np.ones(math.prod(counts)))

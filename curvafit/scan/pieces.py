@@ -27,19 +27,8 @@ RUN = "run.json"
 
 
 class Finder:
-    """Finds something in the pieces of a volume, by workers, and keeps it in a folder, if there is one.
-
-    Parameters
-    ----------
-    crew
-        Who finds: workers do on one thread each, as they share the cores.
-    folder
-        Where what was found stays; None for nowhere.
-    progress
-        Called with what is being found, and the share of the whole that is done.
-    ends
-        The share that is done after a pass, by the pass's name; the others take a fiftieth each.
-    """
+    """Finds something in the pieces of a volume, by workers of one thread each, and keeps it in a folder, if there is
+    one; `ends` has the share that is done after a pass, by the pass's name: the others take a fiftieth each."""
 
     def __init__(self, crew: Workers, folder: Path | None, progress: Progress, ends: Mapping[str, float]) -> None:
         self.processes = 1 if isinstance(crew, ThisProcess) else max(1, crew.places // 2)
@@ -52,7 +41,7 @@ class Finder:
         rest = [number for number in range(count) if number not in found]
         start = self._share
         self._share = stop = max(start, min(self._ends.get(name, start + 0.02), 1.0))
-        make = partial(_find if isinstance(self._crew, ThisProcess) else _find_on_one_thread, find)
+        make = partial(_find, find, not isinstance(self._crew, ThisProcess))
         requests = [(make, Path(), [number]) for number in rest]
         self._progress(shown or name, start)
         for done, (number, each) in enumerate(collect_all(self._crew, requests), count - len(rest) + 1):
@@ -63,14 +52,10 @@ class Finder:
         return iter([found[number] for number in range(count)])
 
 
-def _find(find: Any, _: Path, numbers: Sequence[int]) -> list[tuple[int, Found]]:
-    """Find something in pieces by their numbers."""
-    return [(number, find(number)) for number in numbers]
-
-
-def _find_on_one_thread(find: Any, _: Path, numbers: Sequence[int]) -> list[tuple[int, Found]]:
-    with one_thread():
-        return _find(find, _, numbers)
+def _find(find: Any, alone: bool, _: Path, numbers: Sequence[int]) -> list[tuple[int, Found]]:
+    """Find something in pieces by their numbers; on one thread where workers share the cores."""
+    with one_thread() if alone else nullcontext():
+        return [(number, find(number)) for number in numbers]
 
 
 def _file_of(folder: Path, name: str, number: int) -> Path:
@@ -110,10 +95,7 @@ def open_finder(
 
 @contextmanager
 def open_store(folder: str | PathLike[str], run: Mapping[str, str]) -> Iterator[Path]:
-    """Open the folder of a run as `lock_store` does; `run` is what runs have in common that share it.
-
-    Where a ScanError is raised the folder is removed. Raises ValueError if the folder holds another run's.
-    """
+    """Open the folder of a run, which is removed where a ScanError is raised; ValueError if it holds another run's."""
     try:
         with lock_store(folder) as (place, other):
             if other not in (None, run):

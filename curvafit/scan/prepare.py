@@ -13,17 +13,17 @@ import torch
 
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.topology import betti_numbers
-from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
+from curvafit.priors import WORKING_EPSILON, Grid, phase_field
 from curvafit.scan.grids import (
     bounding_box,
     boxes_by_surface,
     centre_distance,
     median_thickness,
+    profile_mask,
     remove_specks,
     resample,
     surface_voxels,
 )
-from curvafit.scan.profiles import profile_mask
 from curvafit.scan.structure import (
     Kind,
     Quality,
@@ -120,21 +120,13 @@ class Prepared:
     one_scale: bool = False
 
     @property
-    def length(self) -> float:
-        """Return a working length of 1 in `unit`."""
-        return self.working_voxel / WORKING_SPACING
-
-    @property
     def volume_fraction(self) -> float:
         """Return the part of the scan, or of its region of interest, that is structure."""
         return float((self.mask if self.roi is None else self.mask[self.roi]).mean())
 
     def scan_alike(self, grown: np.ndarray, seed: int) -> Prepared:
-        """Scan a grown shape as this scan was made, and prepare it alike: its phase field if this is one, else its mask
-        `(Z, Y, X)`, a period of it, at this scan's thickness in voxels; an image as blurred and noisy as this one.
-
-        Raises ScanError as `prepare`.
-        """
+        """Scan a period of a grown shape as this scan was made, and prepare it alike: its phase field if this is one,
+        else its mask `(Z, Y, X)` at this scan's thickness in voxels; an image as blurred and noisy as this one."""
         if self.kind == "field":
             return prepare(Field(grown), kind="field", periodic=True, one_scale=self.one_scale)
         mask, (z, y, x) = grown > 0, self.scale
@@ -181,10 +173,8 @@ class Prepared:
 def read_scan(
     scan: Source, *, label: int | None = None, crop: Crop | None = None, whole: bool = False, **reading: Any
 ) -> tuple[Field, tuple[int, int, int]]:
-    """Return a scan as `field_of`, and its shape; of a large file no more is read than `prepare` uses, unless `whole`.
-
-    A note says which part that is.
-    """
+    """Return a scan as `field_of`, and its shape; of a large file no more is read than `prepare` uses, which a note
+    says, unless `whole`."""
     boxes = boxes_of(scan, crop=crop, **reading)
     shape = boxes.frame.shape
     if whole or isinstance(boxes, InMemory) or max(shape) <= LARGEST_SCAN:
@@ -202,12 +192,10 @@ def read_scan(
 def coarser_level(
     scan: Source, shape: tuple[int, int, int], prepared: Prepared, *, key: str | None = None, **reading: Any
 ) -> str | None:
-    """Return the key of the level of a pyramid that shows more of a large scan, None where its finest level does.
-
-    `shape` and `prepared` are of the finest. A phase field has its ε there alone, and a spacing of the caller's is that
-    of one level: no other is taken.
-    """
+    """Return the key of the level of a pyramid that shows more of a large scan, None where its finest level does, of
+    which `shape` and `prepared` are."""
     levels = levels_of(scan, key)
+    # A phase field has its ε at the finest level alone, and a spacing of the caller's is that of one level.
     if prepared.noise or prepared.kind == "field" or reading.get("spacing") is not None or None in levels.values():
         return None
     edges = [(name, np.array(spacing)[-3:]) for name, spacing in levels.items()]
@@ -325,27 +313,29 @@ class _Scan:
 
 def _put_on_grid(scan: _Scan, most: int | None) -> Prepared:
     """Choose the working voxel, move the scan to it, drop specks, profile the mask, choose windows."""
-    thickness, notes = _measure_thickness(scan)
+    phase, name = scan.thinner
+    thickness, thick = median_thickness(phase, scan.field.spacing, scan.periodic)
+    note = judge_thickness(name, thickness, thick, scan.field.spacing, scan.keeps_grid)
     scale, why = _choose_scale(scan, thickness)
     start, shape, cut = _choose_box(scan, scale, most)
     edge = working_edge(scale, scan.field.spacing)
     values, region = _move(scan, scale, start, shape)
-    grid = Grid(
-        shape,
-        (WORKING_SPACING, WORKING_SPACING, WORKING_SPACING),
-        "periodic" if scan.periodic and not cut else "replicate",
-    )
+    grid = Grid(shape, boundary="periodic" if scan.periodic and not cut else "replicate")
     mask, dropped = _clean_mask(scan.kind, values, region, thickness / edge, grid.periodic)
     windows = boxes_by_surface(surface_voxels(mask), LARGEST_WINDOW)
     filled = float((mask if region is None else mask[region]).mean())
     inverted = (MOSTLY.format(filled),) if filled > HALF else ()
     if not windows:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
+
+    def profile(mask: np.ndarray) -> np.ndarray:
+        return phase_field(torch.from_numpy(mask), grid, WORKING_EPSILON).numpy()
+
     if scan.kind != "field":
         # the profile of `measure`, whose scans may be large: the same to some 1e-7
-        phase = _profile(mask, grid) if most is None or grid.periodic else profile_mask(mask)
+        phase = profile(mask) if most is None or grid.periodic else profile_mask(mask)
     else:
-        phase = values if region is None or region.all() else np.minimum(values, _profile(region, grid))
+        phase = values if region is None or region.all() else np.minimum(values, profile(region))
     return Prepared(
         kind=scan.kind,
         phase=np.ascontiguousarray(phase, dtype=np.float32),
@@ -356,19 +346,12 @@ def _put_on_grid(scan: _Scan, most: int | None) -> Prepared:
         unit=scan.field.unit,
         thickness=thickness / edge,
         windows=tuple(windows),
-        notes=scan.field.notes + notes + why + cut + dropped + inverted,
+        notes=(*scan.field.notes, note, *why, *cut, *dropped, *inverted),
         origin=tuple(a * s for a, s in zip(start, scale, strict=True)),  # type: ignore[arg-type]
         roi=region,
         noise=scan.noise,
         one_scale=scan.one_scale,
     )
-
-
-def _measure_thickness(scan: _Scan) -> tuple[float, tuple[str, ...]]:
-    """Return the median thickness in the scan's unit, and a note; refuse what is too thin to have a shape."""
-    phase, name = scan.thinner
-    median, thick = median_thickness(phase, scan.field.spacing, scan.periodic)
-    return median, (judge_thickness(name, median, thick, scan.field.spacing, scan.keeps_grid),)
 
 
 def judge_thickness(
@@ -485,10 +468,6 @@ def thinner_thickness(mask: np.ndarray) -> float:
 def smallest_piece(thickness: float) -> float:
     """Return the volume of a ball of half a thickness: what is smaller is no structure."""
     return math.pi / 6 * (thickness / 2) ** 3
-
-
-def _profile(mask: np.ndarray, grid: Grid) -> np.ndarray:
-    return phase_field(torch.from_numpy(mask), grid, WORKING_EPSILON).numpy()
 
 
 def _join_sides(shape: Iterable[int]) -> str:

@@ -167,10 +167,8 @@ def is_noise(mask: np.ndarray) -> bool:
 
 
 def count_pairs(mask: np.ndarray, inner: Box, core: Box, shape: Sequence[int]) -> np.ndarray:
-    """Return, for each axis and each of `LAGS`, how many pairs a lag apart are inside, how many first and last ones.
-
-    Of a volume of a shape those are counted that begin in a core, which lies at `inner` in the mask.
-    """
+    """Return, for each axis and each of `LAGS`, how many pairs a lag apart, that begin in a core of a volume, are
+    inside, how many first and last ones; the core lies at `inner` in the mask."""
     counts = np.zeros((3, len(LAGS), 3), dtype=np.int64)
     for axis, (edge, n) in enumerate(zip(inner, shape, strict=True)):
         start = core[axis].start
@@ -231,10 +229,8 @@ def are_labels(found: np.ndarray) -> bool:
 
 
 class Padding(NamedTuple):
-    """A constant around what was imaged, its share of the scan, and the deviation of the other levels.
-
-    Where it is not `sure`, it may be a background as well.
-    """
+    """A constant around what was imaged, its share of the scan, the deviation of the other levels, and whether it is
+    `sure` that it is no background."""
 
     value: float
     share: float
@@ -292,10 +288,8 @@ def describe_padding(padding: Padding | None, otsu: bool, inside: bool = False) 
 
 
 def _find_threshold(values: np.ndarray) -> float:
-    """Return the middle of the means of the two phases that Otsu's threshold splits.
-
-    Between two sharp levels all thresholds split alike and Otsu's is the lowest; else the two agree.
-    """
+    """Return the middle of the means of the two phases that Otsu's threshold splits."""
+    # Between two sharp levels all thresholds split alike and Otsu's is the lowest; else the two agree.
     high = values > threshold_otsu(values)
     return float(values[high].mean(dtype=np.float64) + values[~high].mean(dtype=np.float64)) / 2
 
@@ -303,10 +297,7 @@ def _find_threshold(values: np.ndarray) -> float:
 def smooth_levels(
     values: np.ndarray, spacing: tuple[float, float, float], periodic: bool = False, padding: Padding | None = None
 ) -> np.ndarray:
-    """Return grey levels (Z, Y, X) smoothed by one voxel of the finest axis, float32; they reach `SMOOTHED` of them.
-
-    Sure padding is left out, and NaN.
-    """
+    """Return grey levels (Z, Y, X) smoothed by one voxel of the finest axis, float32; sure padding is NaN."""
     width = [min(spacing) / h for h in spacing]
     smooth = partial(ndimage.gaussian_filter, sigma=width, mode="wrap" if periodic else "nearest", truncate=3.0)
     if padding is None or not padding.sure:
@@ -336,10 +327,8 @@ def describe_split(level: float, otsu: bool, dark: bool, lowest: float, highest:
 def _split_image(
     field: Field, threshold: Literal["otsu"] | float, dark: bool, region: Any, periodic: bool, padding: Padding | None
 ) -> tuple[np.ndarray, str]:
-    """Return grey levels smoothed by one voxel of the finest axis, less the raw levels' threshold, and a note.
-
-    Smoothing lowers thin structures' grey: a threshold of the smoothed levels would sink and make them fat.
-    """
+    """Return grey levels smoothed by one voxel of the finest axis, less the raw levels' threshold, and a note."""
+    # Smoothing lowers thin structures' grey: a threshold of the smoothed levels would sink and make them fat.
     smooth = smooth_levels(field.values, field.spacing, periodic, padding)
     counted = ... if region is None else region
     if padding is not None and padding.sure:
@@ -401,10 +390,8 @@ class Quality:
 def sample_mask(
     mask: np.ndarray, step: Sequence[float], periodic: bool = True, *, keep_volume: bool = False
 ) -> np.ndarray:
-    """Return a mask `(Z, Y, X)` on voxels of `step` of its own (z, y, x), by signed distances.
-
-    A thin structure loses some per cent of its volume, unless `keep_volume` moves its surface outwards by as much.
-    """
+    """Return a mask `(Z, Y, X)` on voxels of `step` of its own (z, y, x), by signed distances: a thin structure loses
+    some per cent of its volume, unless `keep_volume` moves its surface outwards by as much."""
     distance = centre_distance(mask, (1.0, 1.0, 1.0), 4 * max(1.0, *step), periodic)
     sampled = resample(distance, step, (0, 0, 0), sampled_shape(mask.shape, step), periodic=periodic)
     return sampled > (np.quantile(sampled, 1 - mask.mean()) if keep_volume else 0)

@@ -17,39 +17,9 @@ import numpy as np
 from skimage.filters import threshold_otsu
 
 from curvafit.geometry.balls import ball_radii
+from curvafit.scan import prepare, structure
 from curvafit.scan.grids import MEASURED, candidate_boxes, order_boxes, surface_voxels, thickness_beneath
 from curvafit.scan.pieces import Finder, Found
-from curvafit.scan.prepare import (
-    HALF,
-    MOSTLY,
-    choose_scale,
-    count_voxels,
-    judge_thickness,
-    smallest_piece,
-    working_edge,
-)
-from curvafit.scan.structure import (
-    JITTER,
-    LAGS,
-    PADDED,
-    PLATEAU,
-    PLATEAUS,
-    SEVERAL,
-    SMOOTHED,
-    Kind,
-    Padding,
-    are_labels,
-    count_constant,
-    count_pairs,
-    describe_padding,
-    describe_split,
-    judge_padding,
-    list_values,
-    may_be_field,
-    pairs_of_noise,
-    sign_levels,
-    smooth_levels,
-)
 from curvafit.volumes.boxes import Boxes, boxes_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box, cut_boxes, grow, within
@@ -63,10 +33,7 @@ _MOST_LEVELS = 2**22
 
 @dataclass(frozen=True)
 class Volume:
-    """A volume of which boxes are read, and what the caller says of its structure: see `measure.measure`.
-
-    `source` is a path, which each process opens for itself, or boxes in memory.
-    """
+    """A volume (a path, which each process opens for itself, or boxes in memory), and what the caller says of it."""
 
     source: Source | Boxes
     reading: Mapping[str, Any]
@@ -90,12 +57,12 @@ class Volume:
 class Split:
     """How a volume's structure is told from its background: the kind, the extremes, and the threshold of an image."""
 
-    kind: Kind
+    kind: structure.Kind
     lowest: float
     highest: float
     two: bool
     level: float = 0.0
-    padding: Padding | None = None
+    padding: structure.Padding | None = None
 
 
 class Place(NamedTuple):
@@ -122,34 +89,23 @@ class Place(NamedTuple):
 class Plan:
     """What the tiles of a volume have in common.
 
-    Attributes
-    ----------
-    noise
-        Whether voxels have nothing to do with those a few voxels away.
-    smallest
-        The fewest voxels of a piece of an image's structure that is no speck; 0 where all pieces count.
-    thickness
-        Median thickness of the phase that fills less, in `place.unit`.
-    scale, working
-        Working voxel in the volume's voxels, and how many there are, along (z, y, x).
-    edge
-        Edge of a working voxel in `place.unit`.
-    reach
-        Radius of the largest ball where the thickness was measured, in `place.unit`.
+    `smallest` is the fewest voxels of a piece of an image's structure that is no speck, 0 where all pieces count; a
+    working voxel has `scale` of the volume's voxels and the edge `edge`, and there are `working` along (z, y, x);
+    `reach` is the radius of the largest ball where the thickness was measured. Lengths are in `place.unit`.
     """
 
     volume: Volume
     place: Place
     split: Split
     noise: bool
-    smallest: float
-    thickness: float
-    scale: tuple[float, float, float]
-    working: tuple[int, int, int]
-    edge: float
-    reach: float
     notes: tuple[str, ...]
-    working_notes: tuple[str, ...]
+    smallest: float = 0.0
+    thickness: float = 0.0
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    working: tuple[int, int, int] = (0, 0, 0)
+    edge: float = 1.0
+    reach: float = 0.0
+    working_notes: tuple[str, ...] = ()
 
     def levels(self, boxes: Boxes, box: Box) -> np.ndarray:
         """Return a box of the volume as float32 values that are above 0 in its structure."""
@@ -159,9 +115,11 @@ class Plan:
 def find_levels(volume: Volume, split: Split, place: Place, boxes: Boxes, box: Box) -> np.ndarray:
     """Return a box of a volume as float32 values that are above 0 in its structure, as `structure.find_structure`."""
     if split.kind == "image":
-        around = grow(box, SMOOTHED, place.shape)
-        smooth = smooth_levels(volume.read(boxes, around), place.spacing, padding=split.padding)[within(box, around)]
-        return sign_levels(smooth, split.level, volume.dark, split.padding)
+        around = grow(box, structure.SMOOTHED, place.shape)
+        smooth = structure.smooth_levels(volume.read(boxes, around), place.spacing, padding=split.padding)[
+            within(box, around)
+        ]
+        return structure.sign_levels(smooth, split.level, volume.dark, split.padding)
     values = volume.read(boxes, box)
     if split.kind == "field":
         return (-values if volume.dark else values).astype(np.float32)
@@ -180,34 +138,21 @@ def survey(volume: Volume, find: Finder) -> Plan:
         otsu = volume.threshold == "otsu"
         ends = [float(e) for e in (total["lowest"], total["highest"])]
         low, high = sorted(split.level - e for e in ends) if volume.dark else [split.level + e for e in ends]
-        note = describe_split(split.level, otsu, volume.dark, low, high)
-        note = " ".join([*describe_padding(split.padding, otsu), note])
+        note = structure.describe_split(split.level, otsu, volume.dark, low, high)
+        note = " ".join([*structure.describe_padding(split.padding, otsu), note])
     size, filled = math.prod(place.shape), int(total["filled"])
     for count, one, other in ((filled, "structure", "background"), (size - filled, "background", "structure")):
         if not count:
             start = "a structure" if one == "structure" else "background"
             raise ScanError(f"expected {start} in the scan, got none: every voxel is {other}")
     labelled = () if volume.label is None else (f"The structure is label {volume.label}.",)
-    noise = split.kind != "field" and pairs_of_noise(place.shape, filled / size, total["pairs"])
-    plan = Plan(
-        volume,
-        place,
-        split,
-        noise,
-        0.0,
-        0.0,
-        (1.0, 1.0, 1.0),
-        place.shape,
-        1.0,
-        0.0,
-        (*place.notes, *labelled, note),
-        (),
-    )
-    thinner = filled <= HALF * size
+    noise = split.kind != "field" and structure.pairs_of_noise(place.shape, filled / size, total["pairs"])
+    plan = Plan(volume, place, split, noise, (*place.notes, *labelled, note))
+    thinner = filled <= prepare.HALF * size
     candidates = candidate_boxes(place.shape, MEASURED)
     median, thick, plan = _measure_thickness(plan, boxes, order_boxes(candidates, total["surface"].tolist()), True)
     if split.kind == "image":
-        plan = replace(plan, smallest=smallest_piece(median) / math.prod(place.spacing))
+        plan = replace(plan, smallest=prepare.smallest_piece(median) / math.prod(place.spacing))
     if not thinner:
         order = order_boxes(candidates, total["other surface"].tolist())
         median, thick, plan = _measure_thickness(plan, boxes, order, False)
@@ -217,21 +162,21 @@ def survey(volume: Volume, find: Finder) -> Plan:
 def _choose_grid(plan: Plan, median: float, thick: float, name: str) -> Plan:
     """Return the plan with its working grid, as `prepare.prepare` chooses it."""
     kind, place = plan.split.kind, plan.place
-    note = judge_thickness(name, median, thick, place.spacing, kind == "field" or plan.noise)
-    scale, why = choose_scale(kind, place.frame, plan.noise, median)
+    note = prepare.judge_thickness(name, median, thick, place.spacing, kind == "field" or plan.noise)
+    scale, why = prepare.choose_scale(kind, place.frame, plan.noise, median)
     return replace(
         plan,
         thickness=median,
         scale=scale,
-        working=count_voxels(place.shape, scale) if min(place.shape) > 3 else (0, 0, 0),  # no curvature
-        edge=working_edge(scale, place.spacing),
+        working=prepare.count_voxels(place.shape, scale) if min(place.shape) > 3 else (0, 0, 0),  # no curvature
+        edge=prepare.working_edge(scale, place.spacing),
         working_notes=(note, *why),
     )
 
 
 def note_on_filling(share: float) -> tuple[str, ...]:
     """Return a note where the structure fills more than the background, as `prepare.prepare` gives it."""
-    return (MOSTLY.format(share),) if share > HALF else ()
+    return (prepare.MOSTLY.format(share),) if share > prepare.HALF else ()
 
 
 def _measure_thickness(plan: Plan, boxes: Boxes, order: Sequence[Box], inside: bool) -> tuple[float, float, Plan]:
@@ -242,15 +187,9 @@ def _measure_thickness(plan: Plan, boxes: Boxes, order: Sequence[Box], inside: b
     mask = (plan.levels(boxes, around) > 0) == inside
     part, surface = (each[within(box, around)] for each in (mask, surface_voxels(mask)))
     median, thick = thickness_beneath(part, surface, place.spacing)
-    finite = [
-        float(ball_radii(each, place.spacing, _extent(part, place)).max()) for each in (part, ~part) if each.any()
-    ]
+    half = max(n * h for n, h in zip(part.shape, place.spacing, strict=True)) / 2
+    finite = [float(ball_radii(each, place.spacing, half).max()) for each in (part, ~part) if each.any()]
     return median, thick, replace(plan, reach=max(plan.reach, *finite))
-
-
-def _extent(part: np.ndarray, place: Place) -> float:
-    """Return half the longest side of a box."""
-    return max(n * h for n, h in zip(part.shape, place.spacing, strict=True)) / 2
 
 
 def _add(found: Iterable[Found]) -> dict[str, np.ndarray]:
@@ -284,15 +223,18 @@ def _find_split(volume: Volume, place: Place, dtype: np.dtype, find: Finder) -> 
     two = all(bool(each["two"]) and {float(each["lowest"]), float(each["highest"])} <= ends for each in found)
     kind, values = volume.kind, np.unique(np.concatenate([each["values"] for each in found]))
     if kind == "auto":
-        kind = "mask" if two or (volume.threshold == "otsu" and are_labels(values)) else "image"
-        if kind == "image" and may_be_field(dtype, volume.threshold, float(lowest), float(highest)):
+        kind = "mask" if two or (volume.threshold == "otsu" and structure.are_labels(values)) else "image"
+        if kind == "image" and structure.may_be_field(dtype, volume.threshold, float(lowest), float(highest)):
             steady = 2 * total["steady"] > total["steps"] or not total["steps"]
-            kind = "field" if steady and total["plateau"] > PLATEAUS * math.prod(place.shape) else "image"
+            kind = "field" if steady and total["plateau"] > structure.PLATEAUS * math.prod(place.shape) else "image"
     split = Split(kind, float(lowest), float(highest), two)
     if kind == "field":
         return split, f"Taken for a phase field: values {float(lowest):.3g} to {float(highest):.3g}."
     if kind == "mask":
-        return split, f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else SEVERAL
+        return (
+            split,
+            f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else structure.SEVERAL,
+        )
     size = math.prod(place.shape)
     return _split_image(volume, bars, split, total, value, size, find), ""
 
@@ -302,9 +244,9 @@ def _split_image(
 ) -> Split:
     """Return the split with the padding and the threshold of an image of so many voxels, of which `total` is known."""
     left, ends = None, (total["lowest"], total["highest"])
-    if total["constant"] > PADDED * size:
+    if total["constant"] > structure.PADDED * size:
         counted = _add(find("looking for padding", partial(_count_padding, volume, bars, value), len(bars)))
-        split = replace(split, padding=judge_padding(value, counted["padding"]))
+        split = replace(split, padding=structure.judge_padding(value, counted["padding"]))
         if split.padding is not None and split.padding.sure:
             left, ends = split.padding.value, (counted["lowest"], counted["highest"])
     if volume.threshold != "otsu":
@@ -318,22 +260,22 @@ def _look_at_values(volume: Volume, bars: Sequence[Box], value: Any, number: int
     values = volume.read(volume.open(), bars[number])
     lowest, highest = values.min(), values.max()
     found = {"lowest": lowest, "highest": highest, "two": np.all((values == lowest) | (values == highest))}
-    found["values"] = np.array([lowest, highest]) if found["two"] else list_values(values)
+    found["values"] = np.array([lowest, highest]) if found["two"] else structure.list_values(values)
     found["constant"] = np.int64(np.count_nonzero(values == value))
     if values.dtype.kind != "f":
         return {**found, "faults": np.int64(0)}
     found["faults"] = np.int64(values.size - np.count_nonzero(np.isfinite(values)))
     if volume.kind == "auto" and not found["faults"] and lowest >= -2 and highest <= 2:
         steps = np.abs(np.diff(values, 3, axis=2)) if values.shape[2] > 3 else np.empty(0)
-        found |= {"steady": np.count_nonzero(steps < JITTER), "steps": np.int64(steps.size)}
-        found["plateau"] = np.count_nonzero(np.abs(values) > PLATEAU)
+        found |= {"steady": np.count_nonzero(steps < structure.JITTER), "steps": np.int64(steps.size)}
+        found["plateau"] = np.count_nonzero(np.abs(values) > structure.PLATEAU)
     return {name: np.asarray(value) for name, value in found.items()}
 
 
 def _count_padding(volume: Volume, bars: Sequence[Box], value: Any, number: int) -> Found:
     """Return what tells padding with a value in a bar, and the extremes of the other values."""
     values = volume.read(volume.open(), bars[number])
-    found, others = {"padding": count_constant(values, value)}, values[values != value]
+    found, others = {"padding": structure.count_constant(values, value)}, values[values != value]
     return found | {"lowest": others.min(), "highest": others.max()} if others.size else found
 
 
@@ -390,7 +332,7 @@ def _sum_sides(volume: Volume, bars: Sequence[Box], level: float, left: float | 
 def _count_structure(volume: Volume, split: Split, place: Place, pieces: Sequence[Box], number: int) -> Found:
     """Return the structure's voxels in a piece, its surface in boxes that may be measured, and `count_pairs`."""
     core = pieces[number]
-    box = grow(core, max(LAGS), place.shape)
+    box = grow(core, max(structure.LAGS), place.shape)
     levels = find_levels(volume, split, place, volume.open(), box)
     inner = within(core, box)
     found = {"lowest": levels[inner].min(), "highest": levels[inner].max()}
@@ -401,7 +343,7 @@ def _count_structure(volume: Volume, split: Split, place: Place, pieces: Sequenc
         shared = [_overlap(core, each) for each in candidate_boxes(place.shape, MEASURED)]
         counts = [0 if each is None else np.count_nonzero(surface[within(each, core)]) for each in shared]
         found[name] = np.array(counts, dtype=np.int64)
-    found["pairs"] = count_pairs(mask, inner, core, place.shape)
+    found["pairs"] = structure.count_pairs(mask, inner, core, place.shape)
     return {name: np.asarray(value) for name, value in found.items()}
 
 

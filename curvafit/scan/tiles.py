@@ -29,7 +29,7 @@ from curvafit.geometry.morphometry import SOFTENED, border_weights, soften
 from curvafit.geometry.topology import euler_of_window, euler_shares
 from curvafit.priors.grid import WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread
-from curvafit.scan.grids import CutOut, centre_distance, remove_specks, resample
+from curvafit.scan.grids import CutOut, centre_distance, profile_mask, remove_specks, resample
 from curvafit.scan.measure import (
     DROPPED,
     FEWEST_SLICES,
@@ -38,7 +38,6 @@ from curvafit.scan.measure import (
     TOO_THIN,
     Blocks,
     Measures,
-    Summed,
     measure_curvatures,
     measure_maps,
     no_curvature,
@@ -49,7 +48,6 @@ from curvafit.scan.measure import (
 from curvafit.scan.measure import measure as measure_in_one
 from curvafit.scan.pieces import Found, open_finder
 from curvafit.scan.prepare import LARGEST_BOX, Prepared, TooLarge, smallest_piece
-from curvafit.scan.profiles import profile_mask
 from curvafit.scan.structure import check_options
 from curvafit.scan.survey import Plan, Volume, note_on_filling, survey
 from curvafit.volumes.boxes import Boxes, InFile, InMemory, boxes_of
@@ -66,7 +64,6 @@ HALO = 32
 LARGEST_TILE, SHORTEST = 224**3, 32
 #: Bytes that a voxel of a tile with its surroundings takes, and those of the program itself.
 _EACH, _PROGRAM = 100, 300 * 2**20
-_SPACING = (WORKING_SPACING, WORKING_SPACING, WORKING_SPACING)
 #: Bins of the stored curvature diagram, in `diagram.BIN_WIDTH`.
 _BIN = 0.25
 #: Names of the passes over tiles.
@@ -123,19 +120,16 @@ def measure(
     options = {"kind": kind, "threshold": threshold, "dark": dark}
     if roi is not None or periodic:
         if tile is not None:
-            raise ValueError(
-                "a scan with a region of interest or a periodic one is measured in one piece: leave out tile"
-            )
+            raise ValueError("a scan with a region or a periodic one is measured in one piece: leave out tile")
         return measure_in_one(scan, periodic=periodic, roi=roi, progress=progress, **options, **reading)  # type: ignore[arg-type]
     label = reading.pop("label", None)
     boxes = boxes_of(scan, **reading)
     if tile is None and max(boxes.frame.shape) <= LARGEST_BOX:
         field = boxes.field if isinstance(boxes, InMemory) else field_of(scan, **reading)
         field = field if label is None else field.label(label)
+        how = {"threshold": threshold, "dark": dark, "periodic": False}
         with suppress(TooLarge):
-            maps = measure_maps(
-                field, kind, {"threshold": threshold, "dark": dark, "periodic": False}, progress, LARGEST_BOX**3
-            )
+            maps = measure_maps(field, kind, how, progress, LARGEST_BOX**3)
             return summarise(field, maps, maps.divide())
     path = isinstance(boxes, InFile) and isinstance(scan, str | PathLike)
     volume = Volume(os.fspath(scan) if path else boxes, reading if path else {}, label, **options)  # type: ignore[arg-type]
@@ -144,10 +138,7 @@ def measure(
 
 @dataclass(frozen=True)
 class Tiling:
-    """The cores of a volume's tiles, and the division of the volume that tiles are summed on.
-
-    `factors` are those of the coarser grids on which balls of the structure and of the background are painted.
-    """
+    """The cores of a volume's tiles, and the factors of the coarser grids on which balls of both phases are painted."""
 
     plan: Plan
     cores: tuple[Box, ...]
@@ -209,13 +200,9 @@ def measure_tile(tiling: Tiling, number: int) -> Found:
     balls = _measure_balls(plan, boxes, core, tiling.factors)
     mask, inner = balls.mask, within(core, balls.box)
     voxel = math.prod(plan.place.spacing)
-    thickness, gap = balls.thickness
-    sums.add("volume", np.ones(thickness.shape, dtype=bool), voxel)
+    sums.add("volume", np.ones(mask[inner].shape, dtype=bool), voxel)
     sums.add("inside", mask[inner], voxel)
-    sums.add("thickness", thickness, voxel)
-    sums.add("thickness²", np.square(thickness), voxel)
-    sums.add("gap", gap, voxel)
-    del thickness, gap
+    sums.add_thickness(balls.thickness, voxel)
     lower = tuple(slice(edge.start - (edge.start > 0), edge.stop) for edge in inner)
     first = tuple(slice(edge.start - part.start, None) for edge, part in zip(inner, lower, strict=True))
     sums.add("χ", euler_shares(mask[lower])[first], 1.0)
@@ -233,13 +220,8 @@ def measure_tile(tiling: Tiling, number: int) -> Found:
 def _measure_wide(tiling: Tiling, number: int) -> Found:
     """Return the sums over a tile's core that balls on a coarser grid change."""
     plan, core = tiling.plan, tiling.cores[number]
-    sums, voxel = _Sums(tiling.finest, core), math.prod(plan.place.spacing)
-    thickness, gap = _measure_balls(plan, plan.volume.open(), core, tiling.factors).thickness
-    if tiling.factors[0] > 1:
-        sums.add("thickness", thickness, voxel)
-        sums.add("thickness²", np.square(thickness), voxel)
-    if tiling.factors[1] > 1:
-        sums.add("gap", gap, voxel)
+    sums, balls = _Sums(tiling.finest, core), _measure_balls(plan, plan.volume.open(), core, tiling.factors)
+    sums.add_thickness(balls.thickness, math.prod(plan.place.spacing), *(factor > 1 for factor in tiling.factors))
     return sums.rows
 
 
@@ -262,6 +244,14 @@ class _Sums:
         column = self.table[:, SUMS.index(name)].reshape(self._finest.counts)
         column[tuple(self._where)] += each * self._local.sums(values).reshape(self._local.counts)
 
+    def add_thickness(self, of: Sequence[np.ndarray], each: float, structure: bool = True, gaps: bool = True) -> None:
+        """Add the thickness of structure and background on the core, or of one of them."""
+        if structure:
+            self.add("thickness", of[0], each)
+            self.add("thickness²", np.square(of[0]), each)
+        if gaps:
+            self.add("gap", of[1], each)
+
     def gather(self, name: str, places: np.ndarray, columns: np.ndarray) -> None:
         """Add columns, of which the first is `name`, at places in voxels from the volume's first centre."""
         first = SUMS.index(name)
@@ -276,19 +266,8 @@ class _Sums:
 
 @dataclass(frozen=True)
 class _Balls:
-    """The structure around a core, and the thickness of both phases on the core.
-
-    Attributes
-    ----------
-    box, mask
-        What was read, and the structure there.
-    pieces
-        Specks and pinholes that were dropped.
-    widest
-        Radius of the largest ball around a voxel of the core, of structure and background.
-    wide
-        Voxels of the core around which a ball is larger than `WIDEST`.
-    """
+    """The structure in what was read around a core, specks and pinholes that were dropped, and of both phases the
+    thickness on the core, the largest ball's radius, and the voxels around which it is larger than `WIDEST`."""
 
     box: Box
     mask: np.ndarray
@@ -299,10 +278,8 @@ class _Balls:
 
 
 def _measure_balls(plan: Plan, boxes: Boxes, core: Box, factors: tuple[int, int]) -> _Balls:
-    """Measure the thickness of both phases on a core, from as much around it as its balls reach.
-
-    Where balls are wider than `COARSE` and yet to be painted on the finer grid, the thickness is left out (0).
-    """
+    """Measure the thickness of both phases on a core, from as much around it as its balls reach; it is left out (0)
+    where balls are wider than `COARSE` and yet to be painted on the finer grid."""
     spacing, finest = plan.place.spacing, min(plan.place.spacing)
     reach = min(_reach(plan.reach, finest), _reach(WIDEST * finest, finest))
     while True:
@@ -455,7 +432,7 @@ def _prepare_part(plan: Plan, phase: np.ndarray, mask: np.ndarray, part: Box) ->
         kind=plan.split.kind,
         phase=np.ascontiguousarray(phase, dtype=np.float32),
         mask=mask,
-        grid=Grid((z, y, x), _SPACING, "replicate"),
+        grid=Grid((z, y, x), boundary="replicate"),
         scale=plan.scale,
         working_voxel=plan.edge,
         unit=plan.place.unit,
@@ -469,7 +446,7 @@ def _prepare_part(plan: Plan, phase: np.ndarray, mask: np.ndarray, part: Box) ->
 def _bin(plan: Plan, drawn: Diagram, kept: np.ndarray) -> Found:
     """Return the bins of a diagram's points that are kept: their place, and area times 1, κ1, κ2 and κ1² + κ2²."""
     points, weights = drawn.points[kept], drawn.weights[kept]
-    bins = np.floor(points / _bin_width(plan)).astype(np.int64)
+    bins = np.floor(points / (_BIN * BIN_WIDTH * WORKING_SPACING / plan.edge)).astype(np.int64)
     first = bins.min(0, initial=0)
     across = int(bins[:, 1].max(initial=0) - first[1]) + 1
     numbers = (bins - first) @ np.array([across, 1])
@@ -478,11 +455,6 @@ def _bin(plan: Plan, drawn: Diagram, kept: np.ndarray) -> Found:
     held = np.flatnonzero(areas[:, 0])
     bins = np.stack(np.divmod(held, across), axis=1) + first
     return {"bins": bins, "areas": areas[held], "lost": np.float64(drawn.excluded * weights.sum())}
-
-
-def _bin_width(plan: Plan) -> float:
-    """Return the edge of a bin in the volume's unit."""
-    return _BIN * BIN_WIDTH * WORKING_SPACING / plan.edge
 
 
 # ---- all tiles -------------------------------------------------------------------------------------------------------
@@ -496,19 +468,7 @@ def measure_tiles(
     store: str | PathLike[str] | None = None,
     progress: Progress = silent,
 ) -> Measures:
-    """Measure a volume in tiles, as `measure.measure` does in one piece; raise as it does.
-
-    Parameters
-    ----------
-    volume
-        What is measured.
-    edge
-        Voxels a side of a tile's core; by default as many as 224³ voxels with the surroundings leave.
-    workers
-        Workers, or a number of processes, of a volume that is in a file; by default this process measures.
-    store
-        A folder where what was found stays, so that a killed run goes on; by default there is none.
-    """
+    """Measure a volume in tiles of `edge` voxels a side, as `measure` says; raise as it does."""
     digest = volume.open().digest
     run = {"scan": digest, "label": volume.label, "kind": volume.kind, "threshold": volume.threshold}
     run |= {"dark": volume.dark, "tile": edge}
@@ -526,9 +486,8 @@ def measure_tiles(
 def _choose_factors(tiling: Tiling, found: Sequence[Found]) -> tuple[int, int]:
     """Return the factors of the grids on which balls are painted, as `morphometry.local_thickness` chooses them."""
     finest = min(tiling.plan.place.spacing)
-    widest = np.max([each["widest"] for each in found], axis=0)
-    one, other = (max(1, math.ceil(radius / finest / COARSE)) for radius in widest)
-    return one, other
+    one, other = np.max([each["widest"] for each in found], axis=0)
+    return max(1, math.ceil(one / finest / COARSE)), max(1, math.ceil(other / finest / COARSE))
 
 
 def _summarise(tiling: Tiling, found: Sequence[Found], again: Sequence[Found], stated: str) -> Measures:
@@ -554,8 +513,8 @@ def _summarise(tiling: Tiling, found: Sequence[Found], again: Sequence[Found], s
     sampled = math.prod(max(n - 1, 1) for n in shape) * math.prod(plan.place.spacing)
     drawn, why = (_draw(plan, found), ()) if curved else no_curvature(plan.place.unit, TOO_THIN)[1:]
     notes = (*_notes(tiling, found), *why, f"Measured in {stated[0].lower()}{stated[1:]}")
-    summed = Summed(plan.split.kind, blocks, _merge(table, finest, blocks), (χ, (1 - χ) / sampled), drawn, notes)
-    return summarise_sums(plan.place.frame, summed)
+    table, connectivity = _merge(table, finest, blocks), (χ, (1 - χ) / sampled)
+    return summarise_sums(plan.place.frame, plan.split.kind, blocks, table, connectivity, drawn, notes)
 
 
 def _merge(table: np.ndarray, finest: Blocks, blocks: Blocks) -> np.ndarray:
@@ -593,9 +552,8 @@ def _notes(tiling: Tiling, found: Sequence[Found]) -> tuple[str, ...]:
     working, count = [*plan.working_notes], max(1, math.prod(plan.working))
     specks, holes = (int(n) for n in np.sum([each["specks"] for each in found], axis=0))
     if specks or holes:
-        counts = (
-            f"specks: {specks}, pinholes: {holes}, {sum(int(e['changed']) for e in found) / count:.2g} of the volume"
-        )
+        changed = sum(int(each["changed"]) for each in found) / count
+        counts = f"specks: {specks}, pinholes: {holes}, {changed:.2g} of the volume"
         working.append(f"Dropped what is smaller than a ball of half the median thickness ({counts}).")
     working.extend(note_on_filling(sum(int(each["filled"]) for each in found) / count))
     return (*notes, *(f"Of curvature: {note}" for note in working))

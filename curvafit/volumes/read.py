@@ -190,10 +190,7 @@ def read_file(
     dtype: str | None = None,
     part: Part | None = None,
 ) -> Raw:
-    """Return the content of a file or a folder, by the reader that `pick_reader` chooses.
-
-    From some formats only the part is read: see `Raw.whole`. What a library raises at a damaged file is a ScanError.
-    """
+    """Return the content of a file or a folder, or the part of it; what a library raises at damage is a ScanError."""
     if not path.exists():
         raise FileNotFoundError(one_line(f"no such file: {path}"))
     reader = pick_reader(check_regular(path), raw_shape is not None)

@@ -59,6 +59,7 @@ def test_noise_is_read_on_slices_that_are_thicker(spacing: tuple[float, float, f
     quality = measure_quality(image(mask, 0.7, 0.2), mask, spacing)
     assert quality.noise == pytest.approx(0.2, rel=0.15)
     assert quality.grain <= 0.5
+    assert Quality(0.5, 0.02, 0.0, 0.0, spacing).degraded == (spacing != CUBIC)  # worse than a mask
 
 
 @pytest.mark.parametrize("grain", [0.7, 1.2])
@@ -76,9 +77,8 @@ def test_a_mask_that_is_too_fat_is_known_as_such(fat: int) -> None:
     """And does not lower the contrast, by which the noise would seem too great."""
     mask = bodies()
     quality = measure_quality(image(mask, 1.0, 0.2), ndimage.binary_dilation(mask, iterations=fat), CUBIC)
-    assert quality.boundary_shift == pytest.approx(
-        min(0.8 * fat, 1.5), abs=0.5
-    )  # of faces' neighbours: less than a voxel in the mean
+    # of faces' neighbours: less than a voxel in the mean
+    assert quality.boundary_shift == pytest.approx(min(0.8 * fat, 1.5), abs=0.5)
     assert quality.noise == pytest.approx(0.2, rel=0.15)
 
 
@@ -86,11 +86,6 @@ def test_thin_structures_have_their_noise_read_from_differences() -> None:
     mask = np.zeros((32, 32, 32), dtype=bool)
     mask[::6] = mask[1::6] = True
     assert measure_quality(image(mask, 0.5, 0.1), mask, CUBIC).noise == pytest.approx(0.1, rel=0.2)
-
-
-def test_thick_slices_are_worse_than_a_mask() -> None:
-    assert Quality(0.5, 0.02, 0.0, 0.0, (2.0, 1.0, 1.0)).degraded
-    assert not Quality(0.5, 0.02, 0.0, 0.0, CUBIC).degraded
 
 
 def shown(quality: Quality, mask: np.ndarray, seed: int = 0, slices: int = 1) -> np.ndarray:
@@ -124,25 +119,20 @@ def test_what_a_scan_without_noise_shows_moves_with_the_shape(slices: int) -> No
         assert difference.mean() < 1e-4  # ties at the threshold
 
 
-def test_voxelised_on_the_same_voxels_is_the_mask() -> None:
-    assert np.array_equal(sample_mask(bodies(), CUBIC), bodies())
-
-
-def test_thick_slices_lose_a_thin_plate() -> None:
+def test_voxelised_on_the_same_voxels_is_the_mask_and_thick_slices_lose_a_thin_plate() -> None:
     mask = bodies()
+    assert np.array_equal(sample_mask(mask, CUBIC), mask)
     mask[3] = True
-    kept = sample_mask(mask, (4.0, 1.0, 1.0))
-    assert not kept[0].all()
+    assert not sample_mask(mask, (4.0, 1.0, 1.0))[0].all()
 
 
 def test_two_sharp_levels_are_split_in_their_middle() -> None:
     """Otsu's threshold lies anywhere between two sharp levels; at the lower one the structure would be a voxel fat."""
     mask = bodies()
-    prepared = prepare(Field(image(mask, 0.0, 0.005), CUBIC, "voxel"), kind="image", periodic=True)
-    split = re.search(r"threshold of (\d+)", " ".join(prepared.notes))
+    found = find_structure(Field(image(mask, 0.0, 0.005), CUBIC, "voxel"), kind="image", periodic=True)[1]
+    split = re.search(r"threshold of (\d+)", " ".join(found.notes))
     assert split is not None and float(split[1]) == pytest.approx(125, abs=2)
-    found = find_structure(Field(image(mask, 0.0, 0.005), CUBIC, "voxel"), kind="image", periodic=True)[1].values > 0
-    assert found.mean() == pytest.approx(mask.mean(), rel=0.03)
+    assert np.mean(found.values > 0) == pytest.approx(mask.mean(), rel=0.03)
 
 
 def test_an_image_knows_its_imaging_and_a_mask_has_none() -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
@@ -79,9 +80,8 @@ def test_a_coarser_level_is_chosen_where_the_structure_is_thick_there(tmp_path, 
     assert coarser_level(path, mask.shape, prepared) == level
     assert coarser_level(path, mask.shape, prepared, spacing=(1, 1, 1)) is None  # which may be the finest's alone
     assert coarser_level(path, mask.shape, replace(prepared, kind="field")) is None  # whose ε is the finest's
-    assert (
-        coarser_level(f"{path}::0", mask.shape, prepared) is None and coarser_level(mask, mask.shape, prepared) is None
-    )
+    for other in (f"{path}::0", mask):
+        assert coarser_level(other, mask.shape, prepared) is None
 
 
 def test_a_level_keeps_the_structure_s_voxels_and_the_slab_s(tmp_path, monkeypatch) -> None:
@@ -114,28 +114,30 @@ def test_a_file_larger_than_memory_is_read_in_its_middle(tmp_path, monkeypatch) 
 # ---- kinds -----------------------------------------------------------------------------------------------------------
 
 
+TUBE = tube_mask((32, 32, 32), (1, 1, 1), 6)
+FIELD = phase_field(torch.from_numpy(TUBE.copy()), Grid(TUBE.shape), 0.02).numpy()
+
+
 def test_kinds_are_told_apart() -> None:
-    mask = tube_mask((32, 32, 32), (1, 1, 1), 6)
-    field = phase_field(_tensor(mask), Grid(mask.shape), 0.02).numpy()
-    assert prepare(Field(mask)).kind == "mask"
-    assert prepare(Field(np.where(mask, np.float32(1), np.float32(-1)))).kind == "mask"
-    assert prepare(Field(field)).kind == "field"
-    assert prepare(Field(image_of(mask))).kind == "image"
-    scaled = 2 * image_of(mask).astype(np.float32) / 255 - 1
-    assert prepare(Field(scaled)).kind == "image"
-    assert prepare(Field(field), threshold=0.5).kind == "image"
-    for kind in ("field", "mask", "image"):
-        assert prepare(Field(field), kind=kind).kind == kind
+    scaled = 2 * image_of(TUBE).astype(np.float32) / 255 - 1
+    for values, options, kind in (
+        (TUBE, {}, "mask"),
+        (np.where(TUBE, np.float32(1), np.float32(-1)), {}, "mask"),
+        (FIELD, {}, "field"),
+        (image_of(TUBE), {}, "image"),
+        (scaled, {}, "image"),
+        (FIELD, {"threshold": 0.5}, "image"),
+        *((FIELD, {"kind": kind}, kind) for kind in ("field", "mask", "image")),
+    ):
+        assert prepare(Field(values), **options).kind == kind
 
 
 def test_a_phase_field_stays_as_it_is() -> None:
-    mask = tube_mask((24, 28, 32), (1, 1, 1), 6)
-    field = phase_field(_tensor(mask), Grid(mask.shape), 0.02).numpy()
-    prepared = prepare(Field(field, 0.5, "um"), periodic=True)
-    assert np.array_equal(prepared.phase, field)
-    assert prepared.grid == Grid(mask.shape, boundary="periodic")
+    prepared = prepare(Field(FIELD, 0.5, "um"), periodic=True)
+    assert np.array_equal(prepared.phase, FIELD)
+    assert prepared.grid == Grid(TUBE.shape, boundary="periodic")
     assert (prepared.scale, prepared.working_voxel, prepared.unit) == ((1, 1, 1), 0.5, "um")
-    assert np.array_equal(prepare(Field(field), dark=True).mask, ~(field >= 0))
+    assert np.array_equal(prepare(Field(FIELD), dark=True).mask, ~(FIELD >= 0))
 
 
 def test_a_mask_is_profiled_as_the_atlas_profiles_its_masks() -> None:
@@ -143,7 +145,7 @@ def test_a_mask_is_profiled_as_the_atlas_profiles_its_masks() -> None:
     prepared = prepare(Field(mask))
     assert prepared.grid.boundary == "replicate"
     assert np.array_equal(prepared.mask, mask)
-    assert np.array_equal(prepared.phase, phase_field(_tensor(mask), prepared.grid, 0.02).numpy())
+    assert np.array_equal(prepared.phase, phase_field(torch.from_numpy(mask.copy()), prepared.grid, 0.02).numpy())
     assert prepared.phase.dtype == np.float32
 
 
@@ -158,19 +160,6 @@ def test_the_image_of_a_mask_gives_the_mask_back() -> None:
     assert "the given threshold of 100" in " ".join(given.notes)
 
 
-def test_labels() -> None:
-    labels = np.zeros((32, 32, 32), np.uint16)
-    labels[tube_mask(labels.shape, (1, 1, 1), 4)] = 7
-    labels[:6] = 3
-    assert np.array_equal(prepare(Field(labels).label(7)).mask, labels == 7)
-    assert np.array_equal(prepare(Field(labels), kind="mask").mask, labels != 0)
-    with pytest.raises(ScanError, match="label"):
-        Field(labels).label(5)
-
-
-# ---- size and place --------------------------------------------------------------------------------------------------
-
-
 # ---- the other phase -------------------------------------------------------------------------------------------------
 
 
@@ -182,17 +171,11 @@ def test_a_structure_and_its_background_get_one_working_grid(radius: float) -> N
     assert (own.scale, own.grid, own.thickness) == (other.scale, other.grid, other.thickness)
     assert np.array_equal(own.mask, ~other.mask)
     assert own.volume_fraction == pytest.approx(1 - other.volume_fraction) and own.volume_fraction < 0.5
-    assert [note for note in other.notes if "--dark" in note] == [
-        f"The structure fills {other.volume_fraction:.0%} of the volume: "
-        "if the other phase was meant, turn the two round (--dark)."
-    ]
+    (note,) = (note for note in other.notes if "--dark" in note)
+    assert f"fills {other.volume_fraction:.0%} of the volume" in note
     assert not any("--dark" in note for note in own.notes)
     turned = prepare(Field(~mask), kind="mask", dark=True)
     assert np.array_equal(turned.mask, own.mask) and not any("--dark" in note for note in turned.notes)
-
-
-def test_a_scan_turned_round_twice_is_itself() -> None:
-    own = prepare(Field(tube_mask((24, 24, 24), (1, 1, 1), 5)))
     assert np.array_equal(own.inverted.mask, ~own.mask) and np.array_equal(own.inverted.phase, -own.phase)
     assert np.array_equal(own.inverted.inverted.mask, own.mask) and own.inverted.grid == own.grid
 
@@ -268,20 +251,14 @@ def test_resampled_to_a_known_thickness_at_the_right_place(shape, spacing, radiu
     assert area == pytest.approx(np.pi * radius**2, rel=0.25 if radius < 3 * min(spacing) else 0.12)
 
 
-@pytest.mark.parametrize(("radius", "kept"), [(1.8, False), (4, True), (7, True), (12, False)])
-def test_the_grid_is_kept_from_5_to_16_voxels(radius: float, kept: bool) -> None:
-    side = 32 if radius < 3 else 48
-    prepared = prepare(Field(tube_mask((side, side, side), (1, 1, 1), radius)))
-    assert (prepared.scale == (1, 1, 1)) is kept
-    assert any("grid is kept" in note for note in prepared.notes) is kept
-
-
-@pytest.mark.parametrize(("radius", "kept"), [(1.8, False), (4.4, True), (7, False), (11, False)])
-def test_laws_are_read_at_8_voxels(radius: float, kept: bool) -> None:
+@pytest.mark.parametrize(("radius", "measured", "law"), [(1.8, 0, 0), (4.4, 1, 1), (7, 1, 0), (11, 0, 0)])
+def test_the_grid_is_kept_from_5_to_16_voxels_and_laws_are_read_at_8(radius: float, measured: int, law: int) -> None:
     side = 32 if radius < 3 else 72
-    prepared = prepare(Field(tube_mask((side, side, side), (1, 1, 1), radius)), one_scale=True)
-    assert prepared.thickness == pytest.approx(WORKING_THICKNESS, rel=0.03)
-    assert (prepared.scale == (1, 1, 1)) is kept
+    scan = Field(tube_mask((side, side, side), (1, 1, 1), radius))
+    for one_scale, kept in ((False, measured), (True, law)):
+        prepared = prepare(scan, one_scale=one_scale)
+        assert (prepared.scale == (1, 1, 1)) == any("grid is kept" in note for note in prepared.notes) == bool(kept)
+        assert not one_scale or prepared.thickness == pytest.approx(WORKING_THICKNESS, rel=0.03)
 
 
 @given(st.tuples(*[st.floats(0.4, 3)] * 3), st.tuples(*[st.integers(0, 3)] * 3), st.tuples(*[st.floats(-2, 2)] * 3))
@@ -371,33 +348,28 @@ def test_the_middle_comes_first_unless_it_is_poor() -> None:
 # ---- refusals --------------------------------------------------------------------------------------------------------
 
 
-def test_what_has_no_shape_is_refused() -> None:
-    thin = np.zeros((32, 32, 32), np.uint8)
-    thin[16, 10:12] = 1
-    full = np.ones((32, 32, 32), np.uint8)
-    image = image_of(tube_mask((32, 32, 32), (1, 1, 1), 5))
-    with pytest.raises(ScanError, match="thick"):
-        prepare(Field(thin))
-    with pytest.raises(ScanError, match="background"):
-        tube = tube_mask((32, 32, 32), (1, 1, 1), 5)
-        prepare(Field(tube), roi=np.broadcast_to(np.arange(32) < 8, (32, 32, 32)).T)
-    with pytest.raises(ScanError, match="every voxel is structure"):
-        prepare(Field(full), kind="mask")
-    with pytest.raises(ScanError, match="400"):
-        prepare(Field(image), threshold=400.0)
-    with pytest.raises(ValueError, match="otsu"):
-        prepare(Field(image), threshold="li")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="kind"):
-        prepare(Field(image), kind="tube")  # type: ignore[arg-type]
-    with pytest.raises(ScanError, match="at least 4"):
-        prepare(Field(image[15:18]))
+THIN, AT = np.zeros((32, 32, 32), np.uint8), np.broadcast_to(np.arange(32) < 8, (32, 32, 32)).T
+THIN[16, 10:12] = 1
+FLAT = np.full((16, 16, 16), -0.9, np.float32)
+FLAT[3, 3, 3] = -0.8
 
 
-def test_a_field_without_surface_is_refused() -> None:
-    values = np.full((16, 16, 16), -0.9, np.float32)
-    values[3, 3, 3] = -0.8
-    with pytest.raises(ScanError, match="background"):
-        find_structure(Field(values), kind="field")
+@pytest.mark.parametrize(
+    ("values", "options", "word"),
+    [
+        (THIN, {}, "thick"),
+        (tube_mask((32, 32, 32), (1, 1, 1), 5), {"roi": AT}, "background"),
+        (np.ones((32, 32, 32), np.uint8), {"kind": "mask"}, "every voxel is structure"),
+        (FLAT, {"kind": "field"}, "background"),
+        (image_of(TUBE), {"threshold": 400.0}, "400"),
+        (image_of(TUBE), {"threshold": "li"}, "otsu"),
+        (image_of(TUBE), {"kind": "tube"}, "kind"),
+        (image_of(TUBE)[15:18], {}, "at least 4"),
+    ],
+)
+def test_what_has_no_shape_is_refused(values: np.ndarray, options: dict, word: str) -> None:
+    with pytest.raises(ValueError, match=word):
+        prepare(Field(values), **options)
 
 
 # ---- real scans ------------------------------------------------------------------------------------------------------
@@ -417,9 +389,8 @@ def test_bone_is_kept_on_its_grid(data) -> None:
     scan = load(data / "scans" / "lhdl_trabecular_200.tif")
     truth = load(data / "scans" / "lhdl_trabecular_200_otsu_mask.tif").values > 0
     inner = (slice(60, 140),) * 3
-    assert threshold_of(find_structure(scan)[1]) == pytest.approx(
-        84, abs=0.5
-    )  # as the mask's README states, between whole levels
+    # as the mask's README states, between whole levels
+    assert threshold_of(find_structure(scan)[1]) == pytest.approx(84, abs=0.5)
     prepared = prepare(Field(scan.values[inner], scan.spacing, scan.unit), threshold=84)
     check(prepared)
     assert (prepared.kind, prepared.scale, prepared.working_voxel, prepared.unit) == ("image", (1, 1, 1), 19.5, "um")
@@ -452,9 +423,3 @@ def test_gallery_fields_are_known_as_such(data, name: str) -> None:
         check(prepared)
         assert np.array_equal(prepared.phase, field.values)
         assert (prepared.scale, prepared.grid.boundary) == ((1, 1, 1), "periodic")
-
-
-def _tensor(mask: np.ndarray):
-    import torch
-
-    return torch.from_numpy(np.ascontiguousarray(mask))

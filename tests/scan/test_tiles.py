@@ -67,20 +67,24 @@ def check_alike(found: Measures, whole: Measures) -> None:
 # ---- tiles are the whole ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "edge"), [("mask", 48), ("image", 33), ("slices", 32), ("dark levels", 51)])
-def test_tiles_equal_the_whole(name: str, edge: int) -> None:
+@pytest.mark.parametrize(
+    ("name", "edge", "shape"),
+    [
+        ("mask", 48, SMALL),
+        ("image", 33, SMALL),
+        ("slices", 32, SMALL),
+        ("dark levels", 51, SMALL),
+        *(
+            pytest.param(name, edge, LARGE, marks=pytest.mark.slow)
+            for name in ("mask", "image", "field", "slices", "slices of an image")
+            for edge in (33, 47, 64, 96)
+        ),
+    ],
+)
+def test_tiles_of_any_size_equal_the_whole(name: str, edge: int, shape: tuple[int, int, int]) -> None:
     """An edge of 48 leaves a last tile of 3 voxels along y, one of 51 along x, and 32 one of 1 voxel along z of 33."""
-    scan = scans()[name]
-    dark = name.startswith("dark")
+    scan, dark = scans(shape)[name], name.startswith("dark")
     check_alike(measure(scan, tile=edge, dark=dark), measure_in_one(scan, dark=dark))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("edge", [33, 47, 64, 96])
-@pytest.mark.parametrize("name", ["mask", "image", "field", "slices", "slices of an image"])
-def test_tiles_of_any_size_equal_the_whole(name: str, edge: int) -> None:
-    scan = scans(LARGE)[name]
-    check_alike(measure(scan, tile=edge), measure_in_one(scan))
 
 
 def test_wide_balls_are_those_of_the_whole() -> None:

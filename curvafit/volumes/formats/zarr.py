@@ -191,11 +191,8 @@ def cores_of(group: Any, level: int) -> list[Box]:
 
 
 def halve_level(group: Any, level: int, core: Box) -> None:
-    """Write a core of whole chunks of a level, from the level before it.
-
-    Floats are means of 2³ voxels (the last voxels count twice where the number is odd). Whole numbers, which may be
-    labels, are every second value.
-    """
+    """Write a core of whole chunks of a level: of floats means of 2³ voxels of the level before it (the last voxels
+    count twice where the number is odd), of whole numbers, which may be labels, every second value."""
     finer = group[str(level - 1)]
     values = finer[tuple(slice(2 * e.start, min(2 * e.stop, n)) for e, n in zip(core, finer.shape, strict=True))]
     if values.dtype.kind == "f":
