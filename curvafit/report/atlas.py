@@ -153,7 +153,10 @@ def write_map(
     embeddings = np.stack([sliced_embedding(each) for each in diagrams])
     plane = find_plane(embeddings[:n])
     places = plane.place(embeddings)
-    near, distances = _find_nearest(embeddings, n)
+    away = cdist(embeddings, embeddings[:n])
+    np.fill_diagonal(away, np.inf)
+    near = np.argsort(away, axis=1, kind="stable")[:, :NEIGHBOURS]
+    distances = np.take_along_axis(away, near, axis=1)
     usual = float(np.quantile(distances[:n, 0], 0.95))
     ends = np.array([shared_limits([each]) for each in diagrams])
     limits = float(np.quantile(ends[:, 0], 0.05)), float(np.quantile(ends[:, 1], 0.95))
@@ -221,14 +224,6 @@ def farthest_points(places: np.ndarray, count: int) -> np.ndarray:
         sample.append(int(away.argmax()))
         away = np.minimum(away, np.linalg.norm(places - places[sample[-1]], axis=1))
     return np.array(sample)
-
-
-def _find_nearest(embeddings: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers of each one's nearest others among the first `n`, nearest first, and their distances."""
-    away = cdist(embeddings, embeddings[:n])
-    np.fill_diagonal(away, np.inf)
-    near = np.argsort(away, axis=1, kind="stable")[:, :NEIGHBOURS]
-    return near, np.take_along_axis(away, near, axis=1)
 
 
 def _columns(atlas: Atlas) -> dict[str, np.ndarray]:

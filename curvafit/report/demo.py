@@ -15,7 +15,7 @@ from scipy import ndimage
 from curvafit.core.files import write_content
 from curvafit.core.records import can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.units import format_density, format_number
+from curvafit.core.units import format_number
 from curvafit.drawing.plot import INK, diagram_on, gallery_figure, make_figure, section_on, shared_limits
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import LEARNED
@@ -170,8 +170,8 @@ def demo_page(
         every=completion.every,
         axis="zyx"[completion.axis],
         scores=[(name, f"{score:.3f}") for name, score in completion.dice.items()],
-        measures=_measure_rows(measures),
-        blocks=_say_intervals(measures),
+        measures=[(measures[symbol].name, symbol, *measures[symbol].format(measures.unit)) for symbol in _MEASURES],
+        blocks=int(np.prod(measures.blocks)) if np.isfinite(measures["BV/TV"].half) else 0,
         count=len(atlas),
         map=picture_of(_map_figure(inference, atlas), "The scan's curvature diagram, and its place on the atlas's map"),
         near=picture_of(gallery_figure(grown, columns=3, width=1500), "The nearest textures") if grown else None,
@@ -250,25 +250,3 @@ def _map_figure(inference: Inference, atlas: Atlas) -> Figure:
         path_effects=[withStroke(linewidth=3, foreground="white")],
     )  # fmt: skip
     return figure
-
-
-def _measure_rows(measures: Measures) -> list[tuple[str, str, str, str]]:
-    """Return name, symbol, value with its unit, and interval; no interval where the scan is too small for one."""
-    rows = []
-    for symbol in _MEASURES:
-        quantity = measures[symbol]
-        value, interval, unit = quantity.format(measures.unit)
-        known = np.isfinite(quantity.half)
-        text = f"{value} {unit}".rstrip()
-        if quantity.power == -3 and not known:
-            text = format_density(quantity.value, measures.unit, 3)
-        rows.append((quantity.name, symbol, text, interval if known else ""))
-    return rows
-
-
-def _say_intervals(measures: Measures) -> str:
-    """Return the sentence on the intervals of the measures."""
-    count = int(np.prod(measures.blocks))
-    if np.isfinite(measures["BV/TV"].half):
-        return f"± is half a 95 % interval, from {count} parts of the scan, each a thickness and a spacing wide."
-    return "The scan is too small for intervals: these need eight parts, each as wide as a thickness and a spacing."
