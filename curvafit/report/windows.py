@@ -17,6 +17,7 @@ from curvafit.core.units import format_length, format_number, format_percent, po
 from curvafit.drawing.plot import FAMILIAR, INK, LABELS, QUIET, make_figure, scale_on
 from curvafit.report.comparison import name_quantity
 from curvafit.report.page import check_result_folder, picture_of, record_study, render_template, write_study
+from curvafit.scan.measure import QUANTITIES
 from curvafit.studies.tables import format_csv
 from curvafit.studies.windows import NAMES, Windows
 
@@ -60,12 +61,12 @@ def write_windows(windows: Windows, directory: str | Path, *, command: str = "",
         status=windows.status,
         picture=picture,
         clusters=range(1, 1 + int(windows.clusters.values.max())),
-        rows=[_format_row(windows, k) for k in range(len(windows.quantities))],
+        rows=[_format_row(windows, k) for k in range(len(NAMES))],
         notes=windows.notes,
         provenance=[(name, record[name]) for name in ("scan", "command", "date", "options") if record[name]],
     )
     texts = {"windows.html": page, "windows.csv": format_csv(list(_rows(windows)))}
-    fields = (windows.clusters, *(windows[symbol] for _, symbol, _ in windows.quantities))
+    fields = (windows.clusters, *map(windows.__getitem__, NAMES))
     maps = dict(zip(files[len(FILES) :], fields, strict=True))
     return write_study(target, FORMAT, files, record, texts, {"windows": (figure, picture)}, maps)
 
@@ -88,7 +89,7 @@ def _format_row(windows: Windows, k: int) -> dict[str, Any]:
     ends = np.nanpercentile(values, (0, 50, 100)) if np.isfinite(values).any() else [np.nan] * 3
     between = format_percent(1 - sum(part.var() * len(part) for part in parts if len(part)) / total) if total else "–"
     cells = (*(format_number(float(each)) for each in (*ends, *means)), between)
-    return {**name_quantity(*windows.quantities[k], windows.unit), "cells": cells}
+    return {**name_quantity(*QUANTITIES[k][:3], windows.unit), "cells": cells}
 
 
 # ---- the picture -----------------------------------------------------------------------------------------------------
@@ -112,8 +113,8 @@ def windows_figure(windows: Windows) -> Figure:
         axes.set_title(f"clusters, {_position(windows, axis, place)}", fontsize=9.5)
     _legend_on(panels[0, 3], windows)
     pairs = panels[1:].reshape(len(FAMILIAR), 2)
-    familiar = [each for each in windows.quantities if each[1] in FAMILIAR]
-    for pair, (name, symbol, power) in zip(pairs, familiar, strict=True):
+    familiar = [each for each in QUANTITIES if each[1] in FAMILIAR]
+    for pair, (name, symbol, power, _) in zip(pairs, familiar, strict=True):
         values = windows[name].values
         label = f"{symbol} ({power_name(windows.unit, power)})" if power else symbol
         ends = windows.extremes(name)

@@ -37,8 +37,6 @@ class Windows(Pictured):
     values
         The numbers of `measure` in each window, `(nz, ny, nx, Q)` in the scan's unit; NaN in a window with less surface
         than a layer across it has, and where a scan is too large for its curvature.
-    quantities
-        The name, symbol and power of length of each number.
     clusters
         On the grid of windows, with its spacing, affine and unit: 1 to K from the thinnest structure to the thickest,
         0 where a number is not known.
@@ -52,7 +50,6 @@ class Windows(Pictured):
     size: tuple[int, int, int]
     stride: tuple[int, int, int]
     values: np.ndarray
-    quantities: tuple[tuple[str, str, int], ...]
     clusters: Field
     explained: float
     structure: Field
@@ -65,10 +62,10 @@ class Windows(Pictured):
 
     def __getitem__(self, name: str) -> Field:
         """Return the map of a quantity by name or symbol, float32; raise KeyError where there is none."""
-        for k, (word, symbol, _) in enumerate(self.quantities):
+        for k, (word, symbol, *_) in enumerate(QUANTITIES):
             if name in (word, symbol):
                 return replace(self.clusters, values=self.values[..., k].astype(np.float32))
-        raise KeyError(f"expected one of {', '.join(word for word, *_ in self.quantities)}, got {name!r}")
+        raise KeyError(f"expected one of {', '.join(NAMES)}, got {name!r}")
 
     @property
     def unit(self) -> str:
@@ -157,7 +154,6 @@ def windows(
     maps, blocks = measure_maps(field, kind, options, progress), Blocks(field.shape, starts)  # type: ignore[arg-type]
     values = _sum_windows(maps.sum(blocks).reshape(*blocks.counts, -1), field, sizes, strides)
     labels, explained = _cluster(values, clusters, seed)
-    quantities = tuple((name, symbol, power) for name, symbol, power, _ in QUANTITIES)
     corner = field.move_origin([(n - 1) / 2 for n in sizes]).affine
     assert corner is not None
     spacing = tuple(h * step for h, step in zip(field.spacing, strides, strict=True))
@@ -171,7 +167,6 @@ def windows(
         size=sizes,
         stride=strides,
         values=values,
-        quantities=quantities,
         clusters=grid,
         explained=explained,
         structure=replace(
