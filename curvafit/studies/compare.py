@@ -335,7 +335,6 @@ def _compare_measures(
     rows = np.stack([sliced_embedding(each) for each in pooled])
     away = cdist(rows, rows)
     statistics = test(away, arranged, blocks)
-    ideal = np.abs(np.subtract.outer(tested, tested))  # distances that follow the labels as well as any can
     sides = labels if groups else _halve(labels)
     means = tuple(
         _pool([each for each, own in zip(pooled, sides, strict=True) if own == side]) for side in np.unique(sides)
@@ -358,7 +357,7 @@ def _compare_measures(
         numbers=_compare_numbers(measures[0], values, errors, labels, arranged, blocks),
         statistic=float(statistics[0]),
         p=float(share_beyond(statistics)),
-        least=float(share_beyond(test(np.minimum(ideal, 1) if groups else ideal, arranged, blocks))),
+        least=float(share_beyond(correlate(tested[:, None], arranged, blocks))[0]),  # of a number that is the label
         sides=sides,
         diagrams=means,
         apart=float(pdist(np.stack([sliced_embedding(each) for each in means])).max()),

@@ -100,7 +100,8 @@ def _check(cases: Sequence[Case], paired: bool) -> None:
     needed = len(counts) if groups else FEWEST
     for subject, count in Counter(subject for subject, _ in pairs).items():
         if paired and count < needed:
-            raise ValueError(f"expected {subject} in each group, or at {FEWEST} numbers or more, to pair what is its")
+            where = "in each group" if groups else f"at {FEWEST} numbers or more"
+            raise ValueError(f"expected {subject} {where}, to be paired with itself")
         if not paired and count > 1:
             both = ", ".join(str(label) for name, label in pairs if name == subject)
             raise ValueError(f"expected one group or number of {subject}, got {both}: --paired compares within it")
