@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli.console import command_line, error_console, print_table, resumable, say, say_notes, show_stages
-from curvafit.cli.options import OverwriteOption, command, parse_numbers, parse_whole_numbers, parse_whole_triple
+from curvafit.cli.options import OverwriteOption, command, parse_numbers, parse_whole_triple
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -39,7 +39,7 @@ _out = partial(typer.Option, rich_help_panel="What to write")
     "curvafit generate --coefficients 1,2,6,-40,-40,400 --mass -0.6 --orientation 0,0,1,50 -o lying.vtp",
     "curvafit generate --prior bone/fit.json --shape 128 --seed 3 -o more_bone.tif",
     "curvafit generate --preset tubes --maps maps.npz -o graded.nii.gz",
-    "curvafit generate --preset tubes --shape 300 --checkpoint run.pt --snapshots 10,100,1000 -o large.nii.gz",
+    "curvafit generate --preset tubes --shape 300 --checkpoint run.pt -o large.nii.gz",
     "torchrun --nproc-per-node 2 -m curvafit generate --preset tubes --shape 512 -o larger.zarr",
 )
 def generate(
@@ -68,11 +68,7 @@ def generate(
     spacing: Annotated[str | None, _out(help="Edge of a voxel, in --unit; by default 1, or the prior's.")] = None,
     unit: Annotated[str | None, _out(help="nm, um, mm or m; needs --spacing.")] = None,
     tile: Annotated[str | None, _out(help="Repeat a periodic box N or Z,Y,X times.")] = None,
-    cap: Annotated[
-        bool | None, _out("--cap/--no-cap", help="Close a surface on the box's faces (the default), or leave it open.")
-    ] = None,
     picture: Annotated[bool, _out("--picture/--no-picture", help="Draw a picture (.png), or do not.")] = True,
-    snapshots: Annotated[str | None, _out(help="Also write the field after these steps: 10,100,1000.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make a shape from parameters, with a record (.json) and a picture (.png) beside it."""
@@ -84,7 +80,6 @@ def generate(
     from curvafit.drawing.shapes import check_target, shape_record
     from curvafit.generation.schedule import choose_schedule
     from curvafit.generation.schedule import schedule as named
-    from curvafit.geometry.mesh import SUFFIXES
     from curvafit.priors.energy import orientation as orient
     from curvafit.priors.grid import Grid
     from curvafit.volumes.parameter_maps import map_shape, read_maps
@@ -98,21 +93,17 @@ def generate(
     if orientation is not None:
         *direction, strength = parse_numbers(orientation, "--orientation", 4)
         Q = options["orientation"] = orient(direction, strength)
-    options["schedule"] = plan = named(choose_schedule([law], schedule), steps)
-    after = () if snapshots is None else parse_whole_numbers(snapshots, "--snapshots")
-    options["snapshots"] = tuple(map(plan.check_step, after))
+    options["schedule"] = named(choose_schedule([law], schedule), steps)
     options |= {"seed": seed, "device": device, **_place_checkpoint(checkpoint, checkpoint_every, out)}
-    output = _plan_output(law, grid, spacing, unit, tile, cap)
-    if cap is not None and not out.name.lower().endswith(SUFFIXES):
-        raise ValueError(f"--cap and --no-cap are for surfaces ({', '.join(SUFFIXES)}), got {out.name!r}")
+    output = _plan_output(law, grid, spacing, unit, tile)
     law_file = None if not law.fitted else prior or preset
     inputs = [str(path) for path in (law_file, maps) if path is not None]
     writing = {"picture": picture, "overwrite": overwrite}
-    check_target(out, output, steps=options["snapshots"], inputs=inputs, **writing)
+    check_target(out, output, inputs=inputs, **writing)
     flow = _grow(options)
     more = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
     more |= {"origin": law.origin, "wanted_volume_fraction": volume_fraction, "command": command_line()}
-    record = shape_record(flow, mass=options["mass"], output=output, snapshots=list(flow.snapshots), **more)
+    record = shape_record(flow, mass=options["mass"], output=output, **more)
     _write(flow, out, record, output=output, **writing)
     _remove(options["checkpoint"])
 
@@ -177,9 +168,7 @@ def _place_checkpoint(file: Path | None, every: float | None, out: Path) -> dict
     return {"checkpoint": place} | ({} if every is None else {"checkpoint_every": every})
 
 
-def _plan_output(
-    law: Law, grid: Grid, spacing: str | None, unit: str | None, tile: str | None, cap: bool | None
-) -> Output:
+def _plan_output(law: Law, grid: Grid, spacing: str | None, unit: str | None, tile: str | None) -> Output:
     """Return how to write the shape: voxels as large as the options say, else as the fit's."""
     from curvafit.drawing.shapes import Output
 
@@ -187,7 +176,7 @@ def _plan_output(
         raise ValueError("--unit needs --spacing")
     edge = law.working_voxel or 1.0 if spacing is None else parse_numbers(spacing, "--spacing", 1)[0]
     repeats = (1, 1, 1) if tile is None else parse_whole_triple(tile, "--tile")
-    output = Output(edge, unit or law.length_unit or "voxel", repeats, cap is not False)
+    output = Output(edge, unit or law.length_unit or "voxel", repeats)
     output.shape(grid)
     return output
 
@@ -225,11 +214,10 @@ def _remove(checkpoint: Path | None) -> None:
 
 def _write(flow: Flow, out: Path, record: dict[str, Any], **how: Any) -> None:
     """Write the files, and print the flow's status and the paths."""
-    from curvafit.drawing.shapes import step_path, write_shape
+    from curvafit.drawing.shapes import write_shape
 
     files = write_shape(flow, out, record=record, **how)
     say_notes([] if flow.viability.viable else [flow.status])
-    say_notes(f"no surface after {step} steps" for step in flow.snapshots if step_path(out, step) not in files)
     say(f"{flow.status}; {100 * record['volume_fraction']:.2f} % of the volume")
     for path in files:
         say(str(path))

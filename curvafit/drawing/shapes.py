@@ -6,7 +6,6 @@ import dataclasses
 import datetime
 import warnings
 from collections.abc import Iterable
-from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from curvafit.core.runtime import FILE, check_memory, hold_signals
 from curvafit.core.units import parse_unit
 from curvafit.drawing.render import surface_picture
 from curvafit.generation.flow import Flow
-from curvafit.geometry.mesh import SUFFIXES, NoSurface, Surface, solid_surface, surface, write_surface
+from curvafit.geometry.mesh import SUFFIXES, Surface, solid_surface, write_surface
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
@@ -41,14 +40,13 @@ MOST = 10**6
 class Output:
     """How a field becomes a file: the edge of a voxel and its unit, for spacing or vertices; ValueError for others.
 
-    A periodic box is repeated `tile` times along z, y, x. With `cap`, a surface is closed on the box's faces,
-    watertight around the volume of {u > 0}.
+    A periodic box is repeated `tile` times along z, y, x. A surface is closed on the box's faces, watertight around the
+    volume of {u > 0}.
     """
 
     voxel: float = 1.0
     unit: str = "voxel"
     tile: tuple[int, int, int] = (1, 1, 1)
-    cap: bool = True
 
     def __post_init__(self) -> None:
         check_type(self.unit, str, "a unit as text")
@@ -77,16 +75,14 @@ def check_target(
     path: str | Path,
     output: Output | None = None,
     *,
-    steps: Iterable[int] = (),
     picture: bool = True,
     inputs: Iterable[str | Path] = (),
     overwrite: bool = False,
 ) -> Path:
-    """Return the path if a shape can be written there, with its record, picture and snapshots; call it before the work.
+    """Return the path if a shape can be written there, with its record and picture; call it before the work.
 
-    `steps` are those of the snapshots; `inputs` are files that are read, and so never written over; `overwrite` allows
-    to replace files of another origin. An unknown suffix, a unit that the format cannot hold, and a name that cannot be
-    written are a ValueError.
+    `inputs` are files that are read, and so never written over; `overwrite` allows to replace files of another origin.
+    An unknown suffix, a unit that the format cannot hold, and a name that cannot be written are a ValueError.
     """
     target = Path(path)
     known = (*WRITERS, *SUFFIXES)
@@ -94,15 +90,8 @@ def check_target(
         raise ValueError(f"the name of a shape must end in one of {', '.join(known)}, got {target.name!r}")
     if not target.name.lower().endswith(SUFFIXES):
         pick_writer(target, (output or Output()).unit)
-    more = [sibling(target, ".json"), *(step_path(target, step) for step in steps)]
-    more += [sibling(target, ".png")] if picture else []
+    more = [sibling(target, ".json"), *([sibling(target, ".png")] if picture else [])]
     return can_write(target, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
-
-
-def step_path(path: str | Path, step: int) -> Path:
-    """Return where a snapshot goes: `tubes_step00100.nii.gz` beside `tubes.nii.gz`."""
-    suffix = Path(path).name.removeprefix(sibling(path, "").name)
-    return sibling(path, f"_step{step:05d}{suffix}")
 
 
 def write_shape(
@@ -116,21 +105,18 @@ def write_shape(
 ) -> tuple[Path, ...]:
     """Write a flow's field as a volume or a surface, by suffix, with a record and a picture of one period.
 
-    Return the paths of the shape, the record (`.json`, see `shape_record`), the flow's snapshots (not those without a
-    surface, if surfaces are written), and the picture (`.png`). All files are made in a temporary folder, then moved
-    together. If the picture cannot be drawn, a warning says so. The picture of a shape that is replaced is deleted,
-    also where none is drawn now. Raises ValueError as `check_target` does, or if the field has no surface.
+    Return the paths of the shape, the record (`.json`, see `shape_record`) and the picture (`.png`). All files are made
+    in a temporary folder, then moved together. If the picture cannot be drawn, a warning says so. The picture of a
+    shape that is replaced is deleted, also where none is drawn now. Raises ValueError as `check_target` does, or if the
+    field has no surface.
     """
-    target = check_target(path, output, steps=flow.snapshots, picture=picture, overwrite=overwrite)
+    target = check_target(path, output, picture=picture, overwrite=overwrite)
     image = sibling(target, ".png")
     former = picture or image.name in FORMAT.companions(target)
     with temporary_folder(target) as work:
         shape = write_field(flow.field, flow.grid, work / target.name, output)
         note = sibling(shape, ".json")
         parts = [shape, note]
-        for step, field in flow.snapshots.items():
-            with suppress(NoSurface):
-                parts.append(write_field(field, flow.grid, step_path(shape, step), output))
         if picture:
             try:
                 surface_picture(flow.field.numpy(), work / image.name)
@@ -157,12 +143,11 @@ def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | No
     if not target.name.lower().endswith(SUFFIXES):
         return save(Field(values, edges, how.unit), target, kind=FORMAT.name)
     box = Grid(values.shape, edges, grid.boundary)
-    mesh = solid_surface(values, box) if how.cap else surface(values, box)
+    mesh = solid_surface(values, box)
     data = None
     if target.suffix.lower() == ".vtp":
         data = _vertex_curvatures(mesh, field, Grid(grid.shape, edges, grid.boundary))
-        on_caps = how.cap & _vertices_on_faces(mesh, box)
-        data = {name: np.where(on_caps, 0, κ) for name, κ in data.items()}
+        data = {name: np.where(_vertices_on_faces(mesh, box), 0, κ) for name, κ in data.items()}
     return write_surface(mesh, target, unit=how.unit, data=data)
 
 

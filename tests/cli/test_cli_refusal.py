@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calling import LAW, call, refused
+from calling import call, refused
 from exact_store import exact_store
 
 from curvafit.cli.console import LONGEST, error_console, sentence, show_stages, writable
@@ -44,35 +44,6 @@ def test_wrong_use_is_one_line(arguments: str, word: str) -> None:
 def test_without_a_command_help_is_shown(group: list[str]) -> None:
     result = call(*group)
     assert "Usage:" in result.output and "error:" not in result.output
-
-
-@pytest.mark.parametrize(
-    ("arguments", "word"),
-    [
-        (["--coefficients", "1e300,0,1e300,0,0,0", "--mass", "0"], "a20"),
-        ([*LAW, "--epsilon", "1e30"], "epsilon"),
-        ([*LAW, "--steps", str(10**18)], "steps"),
-        ([*LAW, "--seed", str(2**64)], "seed"),
-        ([*LAW, "--shape", "1e9"], "memory"),
-        ([*LAW, "--shape", "8", "--tile", "1e6,1e6,1"], "memory"),
-        ([*LAW, "--spacing", "1e300"], "1e+12"),
-        ([*LAW, "--spacing", "1e-300"], "1e-12"),
-        ([*LAW, "--orientation", "0,0,1,1e30"], "orientation"),
-        ([*LAW, "--snapshots", "1e300"], "snapshots"),
-        ([*LAW, "--checkpoint", "c.pt", "--checkpoint-every", "nan"], "seconds"),
-        ([*LAW[:2], "--volume-fraction", "nan"], "volume fraction"),
-        ([*LAW, "--checkpoint-every", "5"], "--checkpoint"),
-        ([*LAW, "--no-cap"], "--no-cap"),
-        (["--preset", "x" * 5000], "preset"),
-        (["--preset", "tu\nbes\x1b[31m\u202e"], r"\x1b[31m\u202e"),
-    ],
-)
-def test_generate_refuses_magnitudes_and_what_it_would_ignore(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], word: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    refused(call("generate", *arguments, "-o", "out.npy"), word)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

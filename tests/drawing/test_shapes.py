@@ -13,7 +13,7 @@ from exact import Sphere, centres
 from torch import Tensor
 
 from curvafit.core.records import sibling
-from curvafit.drawing.shapes import Output, step_path, write_field
+from curvafit.drawing.shapes import Output, write_field
 from curvafit.priors.grid import Grid
 from curvafit.volumes.read import load
 
@@ -64,5 +64,3 @@ def test_a_unit_is_named_and_converted_once(tmp_path: Path) -> None:
 
 def test_names_beside_a_shape() -> None:
     assert sibling("a/b.c.nii.gz", ".json") == Path("a/b.c.json")
-    assert step_path("a/b.c.nii.gz", 10) == Path("a/b.c_step00010.nii.gz")
-    assert step_path("b.STL", 120000) == Path("b_step120000.STL")
