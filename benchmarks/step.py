@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from benchmarks.harness import Cases, Figure, in_turns, run_python, show
+from curvafit.generation.cost import Cost
 from curvafit.generation.forms import DivergenceForm, white_noise
 from curvafit.generation.schedule import SCHEDULES
 from curvafit.generation.stepper import ADAM_EPS, TorchStepper
@@ -46,7 +47,8 @@ def plain_stepper(size: int) -> TorchStepper:
     """Return the same flow in plain torch."""
     grid, shape = Grid((size, size, size)), preset("tubes")
     form, betas = DivergenceForm(grid, BLUR, shape.mass), SCHEDULES["fast"].betas_at(0)
-    return TorchStepper(white_noise(grid, 0), form, shape.coefficients, WORKING_EPSILON, betas, None, "cpu")
+    cost = Cost(shape.coefficients, grid, WORKING_EPSILON, None, BLUR)
+    return TorchStepper(white_noise(grid, 0), form, cost, betas, None, "cpu")
 
 
 def measure(size: int, rounds: int) -> dict[str, float]:

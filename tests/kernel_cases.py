@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from curvafit.generation.flow import WORKING_BLUR, descend
@@ -29,11 +30,28 @@ def smooth_field(grid: Grid, seed: int = 0, rms: float = 0.8) -> torch.Tensor:
     return field * rms / field.std() - 0.3
 
 
-def torch_gradient(u: torch.Tensor, a: Coefficients, grid: Grid, ε=EPSILON, Q=None) -> tuple[float, torch.Tensor]:
+def rough(grid: Grid, seed: int = 0, *batch: int) -> torch.Tensor:
+    """A blurred noise with values of order one, `(*batch, Z, Y, X)` float64."""
+    noise = torch.randn(*batch, *grid.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    u = gaussian_blur(noise, grid, 1.2 * max(grid.spacing))
+    return 0.7 * u / u.std()
+
+
+def torch_gradient(u: torch.Tensor, a: Coefficients, grid: Grid, ε=EPSILON, Q=None, mask=None) -> tuple:
     free = u.clone().requires_grad_()
-    value = energy(free, a, grid, ε, Q)
+    value = energy(free, a, grid, ε, Q, mask)
     (slope,) = torch.autograd.grad(value, free)
     return float(value.detach()), slope.double()
+
+
+def assert_same(one: Flow, other: Flow) -> None:
+    """Two flows are one, bit for bit."""
+    assert torch.equal(one.field, other.field)
+    for name in ("step", "energy", "gradient_max", "gradient_mean", "mass"):
+        np.testing.assert_array_equal(getattr(one.history, name), getattr(other.history, name))
+    assert (one.seed, one.status, one.schedule, one.grid) == (other.seed, other.status, other.schedule, other.grid)
+    assert one.mass == other.mass and one.snapshots.keys() == other.snapshots.keys()
+    assert all(torch.equal(one.snapshots[step], other.snapshots[step]) for step in one.snapshots)
 
 
 def relax(field: torch.Tensor, law: Coefficients, grid: Grid, schedule: Schedule, **options) -> Flow:

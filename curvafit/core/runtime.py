@@ -90,7 +90,7 @@ def memory() -> int:
 FIELD, FILE = 4, 8
 #: The least bytes that a voxel of a flow takes. Compiled: A, Adam's two moments and the start, three float32 numbers
 #: each; u, the gradient, and the field between two passes of the blur. In plain torch autograd stores more.
-FLOW, EAGER = 60, 400
+FLOW = 60
 
 
 def check_memory(voxels: Sequence[int], each: int, what: str, device: Any = "cpu") -> None:

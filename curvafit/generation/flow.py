@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -17,13 +16,11 @@ from curvafit.core.checks import (
     as_tuple,
     check_choice,
     check_float,
-    check_int,
     check_open_interval,
     check_seed,
     check_type,
     quoted,
 )
-from curvafit.core.runtime import EAGER, check_memory, device_memory
 from curvafit.generation.checkpoint import Checkpoint, identity
 from curvafit.generation.cost import Cost, check_shape
 from curvafit.generation.data import Data
@@ -35,7 +32,6 @@ from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.slabs import SlabStepper
 from curvafit.generation.stepper import FusedStepper, LbfgsStepper, Stepper, TorchStepper
 from curvafit.priors import kernels, stencils
-from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Bool, Float, Grid
 from curvafit.priors.law import Law, LawLike, read_laws
 
@@ -46,8 +42,6 @@ CHECKPOINT_EVERY = 60.0
 #: The ways to run a flow: see `generate`.
 Backend = Literal["auto", "torch", "fused", "compiled", "slabs"]
 BACKENDS = get_args(Backend)
-#: The most shapes that a device makes together by default.
-MOST_TOGETHER = 64
 
 
 def generate(
@@ -126,7 +120,7 @@ def generate(
     base = choose_base(mass, volume_fraction, grid)
     form = DivergenceForm.of(grid, cost.blur, base, execution.blur)
     stepper = execution.stepper(white_noise(grid, seed), form, options)
-    return run(stepper, [options], [seed], execution.checkpoint_file(stepper, options, seed=seed, mass=base))[0]
+    return run(stepper, options, seed, execution.checkpoint_file(stepper, options, seed=seed, mass=base))
 
 
 def generate_batch(
@@ -139,7 +133,6 @@ def generate_batch(
     epsilon: float | Tensor = WORKING_EPSILON,
     blur: float = WORKING_BLUR,
     reject_early: bool = False,
-    together: int | None = None,
     backend: Backend = "auto",
     device: torch.device | str = "cpu",
 ) -> Iterator[Flow]:
@@ -150,28 +143,27 @@ def generate_batch(
     laws, masses, seeds
         A law, a mass and a seed for all shapes, or sequences of one length with one for each shape. None takes the
         laws' masses. A mass that is a tensor varies in space, for all shapes.
-    together
-        Number of shapes that advance in the same steps, where there is no fused step; None takes as many as fit into
-        half of the device's memory, at most 64, and one on a processor.
 
     The other arguments are those of `generate`, for all shapes. Raises ValueError at once if the sequences differ in
     length, otherwise as `generate` does, when the shape is made.
     """
     known = read_laws(laws)
-    jobs, plan = _list_jobs(known, masses, seeds), choose_schedule(known, schedule)
-    grid = grid if isinstance(grid, Grid) else Grid(grid)  # type: ignore[arg-type]
-    options = {"schedule": plan, "epsilon": epsilon, "blur": blur, "reject_early": reject_early}
-    options |= {"backend": backend, "device": device}
+    columns = [
+        known,
+        [masses] if masses is None or isinstance(masses, (Real, Tensor)) else as_tuple(masses, "masses"),
+        [seeds] if isinstance(seeds, Real) else as_tuple(seeds, "seeds"),
+    ]
+    lengths = {len(column) for column in columns} - {1}
+    if len(lengths) > 1 or 0 in lengths:
+        counts = ", ".join(str(len(column)) for column in columns)
+        raise ValueError(f"laws, masses and seeds must be of one length, or one for all, got {counts}")
     backends = [name for name in BACKENDS if name != "slabs"]  # which are of one shape
     check_choice(backend, backends, f"a backend among {', '.join(backends)}")
-    check_device(device)
-    size = 1
-    if backend in ("torch", "compiled") or not kernels.has_kernel(device):
-        size = _count_fitting(grid, device) if together is None else together
-    if check_int(size, "at least one shape at a time", 1, 10**6) == 1:
-        return (generate(law, mass, grid, seed=seed, **options) for law, mass, seed in jobs)
-    groups = [jobs[first : first + size] for first in range(0, len(jobs), size)]
-    return (flow for group in groups for flow in _generate_together(group, grid, options))
+    options = {"schedule": choose_schedule(known, schedule), "epsilon": epsilon, "blur": blur}
+    options |= {"reject_early": reject_early, "backend": backend, "device": device}
+    count = max(lengths, default=1)
+    rows = zip(*([*column] * (count // len(column)) for column in columns), strict=True)
+    return (generate(law, mass, grid, seed=seed, **options) for law, mass, seed in rows)
 
 
 def descend(
@@ -242,7 +234,7 @@ def descend(
     form, start = FORMS[flow].start_at(field, grid, cost.blur, execution.blur)
     stepper = execution.stepper(start, form, options, optimiser, frozen)
     checkpoint_file = execution.checkpoint_file(stepper, options, flow=flow, field=field, frozen=frozen)
-    return run(stepper, [options], [None], checkpoint_file)[0]
+    return run(stepper, options, None, checkpoint_file)
 
 
 def _check_voxels(name: str, values: Tensor, grid: Grid) -> None:
@@ -292,10 +284,9 @@ class _Execution:
         fusible = optimiser == "adam" and cost.data is None and not self.plain
         if fusible and has_kernel and isinstance(form, DivergenceForm):
             return FusedStepper(start, form, cost, betas, frozen)
-        return (LbfgsStepper if optimiser == "lbfgs" else TorchStepper)(
-            start, form, cost.coefficients, cost.epsilon, betas, frozen, self.device,
-            orientation=cost.orientation, fused=not self.plain, compiled=self.backend == "compiled", data=cost.data,
-        )  # fmt: skip
+        kind = LbfgsStepper if optimiser == "lbfgs" else TorchStepper
+        how = {"fused": not self.plain, "compiled": self.backend == "compiled"}
+        return kind(start, form, cost, betas, frozen, self.device, **how)
 
     def checkpoint_file(self, stepper: Stepper, options: FlowOptions, **start: object) -> Checkpoint | None:
         """Return the checkpoint of a run from a start, or None where the run has none."""
@@ -333,57 +324,3 @@ def choose_base(mass: float | Tensor | None, share: float | None, grid: Grid) ->
     if not bool((mass.abs() < 1).all()):
         raise ValueError(f"the mass must be in (-1, 1), got {float(mass.min())} to {float(mass.max())}")
     return mass.detach().to("cpu", torch.float32).expand(grid.shape).contiguous()
-
-
-# ---- several shapes --------------------------------------------------------------------------------------------------
-
-
-def _count_fitting(grid: Grid, device: torch.device | str) -> int:
-    """Return how many shapes fit into half of a device's memory; one on a processor, where threads share a shape."""
-    if torch.device(device).type == "cpu":
-        return 1
-    return max(1, min(MOST_TOGETHER, device_memory(device) // (2 * EAGER * math.prod(grid.shape))))
-
-
-def _list_jobs(laws: Sequence[Law], masses, seeds) -> list[tuple[Coefficients, float | Tensor | None, int]]:
-    """Return coefficients, mass and seed of each shape."""
-    columns = [
-        laws,
-        [masses] if masses is None or isinstance(masses, (Real, Tensor)) else as_tuple(masses, "masses"),
-        [seeds] if isinstance(seeds, Real) else as_tuple(seeds, "seeds"),
-    ]
-    lengths = {len(column) for column in columns} - {1}
-    if len(lengths) > 1 or 0 in lengths:
-        counts = ", ".join(str(len(column)) for column in columns)
-        raise ValueError(f"laws, masses and seeds must be of one length, or one for all, got {counts}")
-    count = max(lengths, default=1)
-    rows = zip(*([*column] * (count // len(column)) for column in columns), strict=True)
-    return [(law.coefficients, law.mass if mass is None else mass, seed) for law, mass, seed in rows]
-
-
-def _generate_together(jobs: list[tuple], grid: Grid, options: dict[str, Any]) -> list[Flow]:
-    """Make shapes in the same steps."""
-    plan, device, blur = options["schedule"], options["device"], options["blur"]
-    check_memory((len(jobs), *grid.shape), EAGER, "a batch", device)
-    laws, masses, seeds = zip(*jobs, strict=True)
-    costs = [Cost(law, grid, options["epsilon"], None, blur) for law in laws]
-    bases = [DivergenceForm.of(grid, blur, choose_base(mass, None, grid)).base for mass in masses]
-    stepper = TorchStepper(
-        torch.stack([white_noise(grid, seed) for seed in seeds]),
-        DivergenceForm(grid, costs[0].blur, _stack(bases)),
-        Coefficients(*map(_stack, zip(*laws, strict=True))),
-        costs[0].epsilon,
-        plan.betas_at(0),
-        None,
-        device,
-        compiled=options["backend"] == "compiled",
-        count=len(jobs),
-    )
-    return run(stepper, [FlowOptions(cost, plan, reject_early=options["reject_early"]) for cost in costs], seeds)
-
-
-def _stack(values: Sequence[float | Tensor]) -> Tensor:
-    """Return one number or field `(Z, Y, X)` for each shape, as `(count, 1, 1, 1)` or `(count, Z, Y, X)`."""
-    fields = torch.broadcast_tensors(*(torch.as_tensor(value, dtype=torch.float32) for value in values))
-    stack = torch.stack(fields)
-    return stack.reshape(len(fields), *(1,) * (4 - stack.dim()), *stack.shape[1:])

@@ -1,4 +1,4 @@
-"""The loop of all flows: step and record until a reason to stop. Shapes that share a stepper share the loop."""
+"""The loop of all flows: step and record until a reason to stop."""
 
 from __future__ import annotations
 
@@ -69,148 +69,133 @@ class FlowOptions:
         return min(mark for mark in marks if mark > steps)
 
 
-def run(
-    stepper: Stepper, options: Sequence[FlowOptions], seeds: Sequence[int | None], checkpoint: Checkpoint | None = None
-) -> list[Flow]:
-    """Step the shapes of a stepper, which share a plan, until the plan ends or every shape has stopped.
+def run(stepper: Stepper, options: FlowOptions, seed: int | None, checkpoint: Checkpoint | None = None) -> Flow:
+    """Step a shape until the plan ends, or it stops.
 
-    A shape stops earlier where its energy, gradient or field is not finite, or where a callback or a check stops it.
-    All shapes stop where the optimiser stalls. At the end the checkpoint is closed, or saved where a callback stopped
-    the flow.
+    It stops earlier where its energy, gradient or field is not finite, where a callback or a check stops it, and where
+    the optimiser stalls. At the end the checkpoint is closed, or saved where a callback stopped the flow.
     """
-    runs = [_ShapeRun(stepper, k, *parts) for k, parts in enumerate(zip(options, seeds, strict=True))]
     with nullcontext() if checkpoint is None else checkpoint.lock():
-        _advance(stepper, runs, options, checkpoint)
-    return [shape.flow() for shape in runs]
+        shape = _Run(stepper, options, seed)
+        shape.advance(checkpoint)
+    return shape.flow()
 
 
-def _advance(
-    stepper: Stepper, runs: list[_ShapeRun], options: Sequence[FlowOptions], checkpoint: Checkpoint | None
-) -> None:
-    """Step until the plan ends or every shape has stopped, and save checkpoints."""
-    plan, steps = options[0].plan, _resume(stepper, runs, checkpoint)
-    betas = plan.betas_at(0)
-    while True:
-        if steps < plan.steps and plan.betas_at(steps) != betas:
-            betas = plan.betas_at(steps)
-            stepper.set_betas(betas)
-        last = steps == plan.steps or stepper.stalled
-        stepper.step(None if last else plan.rate(steps))
-        shifts = [shape.set_fraction() for shape in runs] if last else []
-        if any(shifts):
-            stepper.step(None)
-        for shape in runs:
-            shape.observe(steps, last, stepper.stalled)
-        if last or all(shape.stop for shape in runs):
-            break
-        mark = min(option.next_mark(steps) for option in options)
-        steps += 1 + stepper.run([plan.rate(step) for step in range(steps + 1, mark)])
-        if checkpoint is not None and checkpoint.is_due():
-            checkpoint.save(_pack_state(stepper, runs, steps))
-    if checkpoint is not None:
-        if any(shape.stopped_by_callback for shape in runs) and not last:
-            checkpoint.save(_pack_state(stepper, runs, steps + 1))
-        else:
-            checkpoint.close()
+class _Run:
+    """The run of a shape: its records, its snapshots, and the reason why it stopped."""
 
-
-def _resume(stepper: Stepper, runs: list[_ShapeRun], checkpoint: Checkpoint | None) -> int:
-    """Restore the checkpoint's state, if there is one, and return its number of steps, else 0."""
-    content = checkpoint.load() if checkpoint else None
-    if content is None:
-        return 0
-    stepper.restore(content["stepper"])
-    for shape, (rows, snapshots) in zip(runs, content["lanes"], strict=True):
-        shape.rows, shape.snapshots = rows, snapshots
-    return content["made"]
-
-
-def _pack_state(stepper: Stepper, runs: list[_ShapeRun], steps: int) -> dict[str, Any]:
-    """Return the content of a checkpoint."""
-    return {"made": steps, "lanes": [(shape.rows, shape.snapshots) for shape in runs], "stepper": stepper.state()}
-
-
-class _ShapeRun:
-    """The run of one shape: its records, its snapshots, and the reason why it stopped."""
-
-    def __init__(self, stepper: Stepper, k: int, options: FlowOptions, seed: int | None) -> None:
-        self._stepper, self._k, self._options, self._seed = stepper, k, options, seed
-        self.rows: list[list[float]] = []
-        self.snapshots: dict[int, Tensor] = {}
+    def __init__(self, stepper: Stepper, options: FlowOptions, seed: int | None) -> None:
+        self._stepper, self._options, self._seed = stepper, options, seed
+        self._rows: list[list[float]] = []
+        self._snapshots: dict[int, Tensor] = {}
         #: The reason for a stop before the plan's end, and whether a callback is the reason.
-        self.stop, self.stopped_by_callback = "", False
-        self._shortfall, self._failure, self._stalled = "", "", False
-        self._field, self._mass = torch.empty(0), math.nan
+        self._stop, self._stopped_by_callback = "", False
+        self._shortfall, self._failure = "", ""
 
-    def set_fraction(self) -> bool:
+    def advance(self, checkpoint: Checkpoint | None) -> None:
+        """Step until the plan ends or the shape stops, and save checkpoints."""
+        stepper, plan = self._stepper, self._options.plan
+        steps, betas = self._resume(checkpoint), plan.betas_at(0)
+        while True:
+            if steps < plan.steps and plan.betas_at(steps) != betas:
+                betas = plan.betas_at(steps)
+                stepper.set_betas(betas)
+            last = steps == plan.steps or stepper.stalled
+            stepper.step(None if last else plan.rate(steps))
+            if last and self._set_fraction():
+                stepper.step(None)
+            self._observe(steps, last)
+            if last or self._stop:
+                break
+            mark = self._options.next_mark(steps)
+            steps += 1 + stepper.run([plan.rate(step) for step in range(steps + 1, mark)])
+            if checkpoint is not None and checkpoint.is_due():
+                checkpoint.save(self._pack_state(steps))
+        if checkpoint is not None:
+            if self._stopped_by_callback and not last:
+                checkpoint.save(self._pack_state(steps + 1))
+            else:
+                checkpoint.close()
+
+    def _resume(self, checkpoint: Checkpoint | None) -> int:
+        """Restore the checkpoint's state, if there is one, and return its number of steps, else 0."""
+        content = checkpoint.load() if checkpoint else None
+        if content is None:
+            return 0
+        self._stepper.restore(content["stepper"])
+        ((self._rows, self._snapshots),) = content["lanes"]
+        return content["made"]
+
+    def _pack_state(self, steps: int) -> dict[str, Any]:
+        """Return the content of a checkpoint."""
+        return {"made": steps, "lanes": [(self._rows, self._snapshots)], "stepper": self._stepper.state()}
+
+    def _set_fraction(self) -> bool:
         """Add the constant that makes the share of volume exact, if it is small; return whether it was added."""
         share = self._options.volume_fraction
-        if share is None or self.stop:
+        if share is None:
             return False
-        u = self._stepper.field(self._k)
+        u = self._stepper.field()
         shift, end = last_shift(u, share), self._viability(u)
         if end.viable and abs(shift) <= FRACTION_LAST:
-            self._stepper.shift(shift, self._k)
+            self._stepper.shift(shift)
             return True
         self._shortfall = f"; volume fraction {float((u > 0).double().mean()):.4f} instead of {share:.4f}"
         return False
 
-    def observe(self, steps: int, last: bool, stalled: bool) -> None:
-        """Take the snapshot, record and check that are due after `steps` steps, and the field if the shape stops."""
-        if self.stop:
-            return
-        options, stepper, k, total = self._options, self._stepper, self._k, self._options.plan.steps
+    def _observe(self, steps: int, last: bool) -> None:
+        """Take the snapshot, record and check that are due after `steps` steps."""
+        options, total = self._options, self._options.plan.steps
         if steps in options.snapshots:
-            self.snapshots[steps] = stepper.field(k)
+            self._snapshots[steps] = self._stepper.field()
         if last or steps % RECORD_EVERY == 0:
             self._record(steps, last)
-        if not self.stop and options.reject_early and steps in options.plan.checks:
-            check = self._viability(stepper.field(k))
-            self.stop = "" if check.viable else f"stopped after {steps} of {total} steps: {check.reason}"
-        if last or self.stop:
-            self._field, self._mass, self._stalled = stepper.field(k), stepper.mass(k), stalled
+        if not self._stop and options.reject_early and steps in options.plan.checks:
+            check = self._viability(self._stepper.field())
+            self._stop = "" if check.viable else f"stopped after {steps} of {total} steps: {check.reason}"
 
     def flow(self) -> Flow:
         """Return the result of a run that has stopped."""
-        options, cost, end = self._options, self._options.cost, self._viability(self._field)
+        options, cost, field = self._options, self._options.cost, self._stepper.field()
+        end = self._viability(field)
         if self._failure:
             end = dataclasses.replace(end, viable=False, reason=self._failure)
-        history = History(*np.array(self.rows, dtype=np.float64).T)
+        history = History(*np.array(self._rows, dtype=np.float64).T)
         status = self._describe_end(end, history)
         return Flow(
-            self._field, history, status, cost.grid, end, options.plan, self._seed, self._mass, self.snapshots,
+            field, history, status, cost.grid, end, options.plan, self._seed, self._stepper.mass(), self._snapshots,
             cost.coefficients, cost.epsilon,
         )  # fmt: skip
 
     def _record(self, steps: int, last: bool) -> None:
         """Add a row to the history, stop where a figure is not finite, call the callbacks, and correct the mass."""
-        options, stepper, k, total = self._options, self._stepper, self._k, self._options.plan.steps
-        statistics, mass = stepper.statistics(k), stepper.mass(k)
-        self.rows.append([steps, *statistics, mass])
+        options, stepper, total = self._options, self._stepper, self._options.plan.steps
+        statistics, mass = stepper.statistics(), stepper.mass()
+        self._rows.append([steps, *statistics, mass])
         if subject := _find_infinite(statistics, mass):
             self._failure = f"{subject} is not finite"
-            self.stop = f"stopped after {steps} of {total} steps: {self._failure}"
+            self._stop = f"stopped after {steps} of {total} steps: {self._failure}"
             return
         if options.callbacks:
-            state = State(stepper.field(k), *statistics, mass)
+            state = State(stepper.field(), *statistics, mass)
             answers = [bool(callback(steps, total, state)) for callback in options.callbacks]
             if any(answers):
-                self.stop, self.stopped_by_callback = f"stopped by a callback after {steps} of {total} steps", True
+                self._stop, self._stopped_by_callback = f"stopped by a callback after {steps} of {total} steps", True
         share = options.volume_fraction
         if share is not None and not last and steps >= FRACTION_BEGIN * total:
-            stepper.shift(correct_mass(stepper.field(k), share, mass, total), k)
+            stepper.shift(correct_mass(stepper.field(), share, mass, total))
 
     def _viability(self, u: Tensor) -> Viability:
         return viability(u, self._options.cost.grid, self._options.cost.epsilon)
 
     def _describe_end(self, end: Viability, history: History) -> str:
         """Return the sentence that says how the flow ended."""
-        if self.stop:
-            return self.stop
+        if self._stop:
+            return self._stop
         steps = int(history.step[-1])
         if not end.viable:
             return f"no shape after {steps} steps: {end.reason}{self._shortfall}"
-        if self._stalled:
+        if self._stepper.stalled:
             return f"stopped after {steps} steps: the line search finds no lower energy{self._shortfall}"
         before = history.energy[np.searchsorted(history.step, 0.9 * steps, side="right") - 1]
         fall = (before - history.energy[-1]) / max(abs(before), 1e-30)

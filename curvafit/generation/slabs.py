@@ -168,16 +168,16 @@ class SlabStepper(Stepper):
     def set_betas(self, betas: tuple[float, float]) -> None:
         self._all("set_betas", betas)
 
-    def statistics(self, k: int = 0) -> Statistics:
+    def statistics(self) -> Statistics:
         return self._all("statistics")
 
-    def field(self, k: int = 0) -> Tensor:
+    def field(self) -> Tensor:
         return torch.from_numpy(self._all("field"))
 
-    def mass(self, k: int = 0) -> float:
+    def mass(self) -> float:
         return self._all("mass")
 
-    def shift(self, amount: float, k: int = 0) -> None:
+    def shift(self, amount: float) -> None:
         self._all("shift", amount)
 
     def state(self) -> dict[str, Any]:

@@ -11,10 +11,8 @@ import torch
 from torch import Tensor
 
 from curvafit.generation.cost import Cost
-from curvafit.generation.data import Data
 from curvafit.generation.forms import DivergenceForm, Form
 from curvafit.priors import kernels
-from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import energy_gradient, energy_gradient_by_autograd
 
 #: The number that Adam adds to the root, as published instead of the usual 1e-8; shapes depend on it.
@@ -36,7 +34,7 @@ class Statistics(NamedTuple):
 
 
 class Stepper(Protocol):
-    """The state of the flows of one or more shapes, stepped in place; `k` is the number of a shape, from 0."""
+    """The state of a flow, stepped in place."""
 
     #: Whether the optimiser found no lower point and therefore stopped.
     stalled: bool = False
@@ -57,19 +55,19 @@ class Stepper(Protocol):
         """Set Adam's decay rates (momentum, memory) from the next step on."""
         ...
 
-    def statistics(self, k: int = 0) -> Statistics:
+    def statistics(self) -> Statistics:
         """Return the statistics before the last `step` moved the shape."""
         ...
 
-    def field(self, k: int = 0) -> Tensor:
+    def field(self) -> Tensor:
         """Return the last u, float32 `(Z, Y, X)` on the processor, in a tensor that no step overwrites."""
         ...
 
-    def mass(self, k: int = 0) -> float:
+    def mass(self) -> float:
         """Return the mean of the last u, computed in float64."""
         ...
 
-    def shift(self, amount: float, k: int = 0) -> None:
+    def shift(self, amount: float) -> None:
         """Add a constant to u from the next step on."""
         ...
 
@@ -105,16 +103,16 @@ class FusedStepper(Stepper):
     def set_betas(self, betas: tuple[float, float]) -> None:
         self._flow.betas = betas
 
-    def statistics(self, k: int = 0) -> Statistics:
+    def statistics(self) -> Statistics:
         return self._statistics
 
-    def field(self, k: int = 0) -> Tensor:
+    def field(self) -> Tensor:
         return torch.from_numpy(self._flow.field.copy())
 
-    def mass(self, k: int = 0) -> float:
+    def mass(self) -> float:
         return float(self._flow.field.mean(dtype="float64"))
 
-    def shift(self, amount: float, k: int = 0) -> None:
+    def shift(self, amount: float) -> None:
         self._flow.shift(amount)
 
     def state(self) -> dict[str, Any]:
@@ -142,41 +140,27 @@ def step_by_adam(
 class TorchStepper(Stepper):
     """Adam on the parameters of a form, on any device, where its whole state stays.
 
-    With a `count`, `start` holds the parameters of that many shapes along a first axis, and the form's base and the
-    coefficients broadcast with `(count, Z, Y, X)`. `fused` takes the energy's gradient from a fused kernel where there
-    is one, instead of from autograd; `compiled` passes the step through `torch.compile`. `frozen` are the voxels
-    `(Z, Y, X)` whose parameters stay.
+    `fused` takes the energy's gradient from a fused kernel where there is one, instead of from autograd; `compiled`
+    passes the step through `torch.compile`. `frozen` are the voxels `(Z, Y, X)` whose parameters stay.
     """
 
     def __init__(
-        self,
-        start: Tensor,
-        form: Form,
-        coefficients: Coefficients,
-        epsilon: float | Tensor,
-        betas: tuple[float, float],
-        frozen: Tensor | None,
-        device: torch.device | str,
-        *,
-        orientation: Tensor | None = None,
-        fused: bool = False,
-        compiled: bool = False,
-        data: Data | None = None,
-        count: int | None = None,
-    ) -> None:
+        self, start: Tensor, form: Form, cost: Cost, betas: tuple[float, float], frozen: Tensor | None,
+        device: torch.device | str, *, fused: bool = False, compiled: bool = False,
+    ) -> None:  # fmt: skip
         def move(value):
             return value.to(device, torch.float32) if isinstance(value, Tensor) and value.dim() > 0 else value
 
-        self._form, self._betas, self._count = form.to(device), betas, count
-        self._data = None if data is None else data.to(device)
-        self._cost = [*map(move, coefficients)], form.grid, move(epsilon), move(orientation)
+        self._form, self._betas = form.to(device), betas
+        self._data = None if cost.data is None else cost.data.to(device)
+        self._cost = [*map(move, cost.coefficients)], cost.grid, move(cost.epsilon), move(cost.orientation)
         self._energy_gradient = energy_gradient if fused else energy_gradient_by_autograd
         self._free = None if frozen is None else ~torch.as_tensor(frozen, dtype=torch.bool, device=device)
         self._parameters = start.to(device).clone()
         self._value: Tensor | float = 0.0
         self._u = self._slope = self._parameters
-        self._offset = torch.zeros((count, 1, 1, 1) if count else (), device=device)
-        self._statistics: list[Statistics] | None = None
+        self._offset = torch.zeros((), device=device)
+        self._statistics: Statistics | None = None
         self._evaluate, self._adam = self._evaluate_plainly, step_by_adam
         if compiled:
             compile_ = _Compiler()
@@ -219,25 +203,22 @@ class TorchStepper(Stepper):
     def set_betas(self, betas: tuple[float, float]) -> None:
         self._betas = betas
 
-    def statistics(self, k: int = 0) -> Statistics:
-        if self._statistics is None:  # of all shapes at once, as each reading waits for the device
-            size = self._slope.abs().reshape(self._count or 1, -1)
-            free = self._slope[0] if self._count else self._slope
-            count = free.numel() if self._free is None else int(self._free.expand_as(free).sum())
-            means = size.sum(1, dtype=torch.float64) / max(1, count)
-            columns = torch.as_tensor(self._value).reshape(-1).tolist(), size.amax(1).tolist(), means.tolist()
-            self._statistics = [Statistics(*row) for row in zip(*columns, strict=True)]
-        return self._statistics[k]
+    def statistics(self) -> Statistics:
+        if self._statistics is None:
+            size = self._slope.abs()
+            count = size.numel() if self._free is None else int(self._free.expand_as(size).sum())
+            mean = float(size.sum(dtype=torch.float64)) / max(1, count)
+            self._statistics = Statistics(float(self._value), float(size.amax()), mean)
+        return self._statistics
 
-    def field(self, k: int = 0) -> Tensor:
-        return self._u[k].to("cpu", torch.float32, copy=True) if self._count else self._u.to("cpu", torch.float32)
+    def field(self) -> Tensor:
+        return self._u.to("cpu", torch.float32)
 
-    def mass(self, k: int = 0) -> float:
-        return float((self._u[k] if self._count else self._u).mean(dtype=torch.float64))
+    def mass(self) -> float:
+        return float(self._u.mean(dtype=torch.float64))
 
-    def shift(self, amount: float, k: int = 0) -> None:
-        self._offset = self._offset.clone()
-        self._offset.view(-1)[k] += amount
+    def shift(self, amount: float) -> None:
+        self._offset = self._offset + amount
 
     def state(self) -> dict[str, Any]:
         point = {"parameters": self._parameters, "offset": self._offset, "stalled": self.stalled}
@@ -322,8 +303,8 @@ class LbfgsStepper(TorchStepper):
         value, _, self._parameters.grad = self._evaluate_once()
         return float(value)
 
-    def shift(self, amount: float, k: int = 0) -> None:
-        super().shift(amount, k)
+    def shift(self, amount: float) -> None:
+        super().shift(amount)
         self._cached = None
 
     def state(self) -> dict[str, Any]:

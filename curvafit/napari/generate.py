@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from magicgui.widgets import CheckBox, ComboBox, FloatSpinBox, SpinBox
+from magicgui.widgets import ComboBox, FloatSpinBox, SpinBox
 from scipy import ndimage
 
 from curvafit.core.runtime import Progress
@@ -31,8 +31,7 @@ class Generate(Dock):
         self.steps = SpinBox(label="steps", value=1000, min=1, max=20000, tooltip="More give a smoother shape.")
         self.spacing = FloatSpinBox(label="voxel edge", value=1.0, min=1e-6, max=1e6, step=0.1)
         self.unit = ComboBox(label="unit", choices=["voxel", *METRES], value="voxel")
-        self.phase = CheckBox(text="add the phase field", value=False)
-        choices = [self.preset, self.edge, self.seed, self.steps, self.spacing, self.unit, self.phase]
+        choices = [self.preset, self.edge, self.seed, self.steps, self.spacing, self.unit]
         super().__init__(napari_viewer, choices, "Grow")
 
     def prepare(self) -> Callable[[Progress], Flow]:
@@ -41,15 +40,11 @@ class Generate(Dock):
         return partial(_grow, self.preset.value, options)
 
     def show_result(self, result: Flow) -> str:
-        """Add the shape, and its phase field if it is wanted."""
-        values = result.field.numpy()
+        """Add the shape."""
         edge = 1.0 if self.unit.value == "voxel" else self.spacing.value
-        field = Field(values, (edge, edge, edge), self.unit.value)
+        shape = Field((result.field.numpy() > 0).astype(np.uint8), (edge, edge, edge), self.unit.value)
         name = f"{self.preset.value}, seed {self.seed.value}"
-        put_layer(self.viewer, "labels", (values > 0).astype(np.uint8), name, **place_of_field(field))
-        if self.phase.value:
-            options = {"visible": False, "colormap": "gray", **place_of_field(field)}
-            put_layer(self.viewer, "image", values, f"phase field of {name}", **options)
+        put_layer(self.viewer, "labels", shape.values, name, **place_of_field(shape))
         return f"{result.status}."
 
 

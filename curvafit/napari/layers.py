@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.core.units import convert_length, parse_unit
+from curvafit.core.units import convert_length, is_unit, parse_unit
 from curvafit.volumes.field import Field, ScanError
 
 #: Our unit -> napari's.
@@ -35,18 +35,15 @@ def field_of_layer(layer: Any, kind: str = "a layer") -> Field:
 
 def _lengths(layer: Any) -> tuple[tuple[float, float, float], str]:
     """Return voxel edges (z, y, x) and their unit, that of the last axis."""
-    found = []
-    for each in layer.units[-3:]:
-        try:
-            found.append(parse_unit(str(each))[0])
-        except ValueError:
-            raise ScanError(f"expected lengths along the axes of {layer.name}, got the unit {each}") from None
-    unit = found[-1]
-    if any((name == "voxel") != (unit == "voxel") for name in found):
+    names = [str(each) for each in layer.units[-3:]]
+    if wrong := next((name for name in names if not is_unit(name)), None):
+        raise ScanError(f"expected lengths along the axes of {layer.name}, got the unit {wrong}")
+    found = [parse_unit(name)[0] for name in names]
+    if 0 < found.count("voxel") < 3:
         raise ScanError(f"expected one kind of unit along the axes of {layer.name}, got pixels and lengths")
-    pairs = zip(layer.scale[-3:], layer.units[-3:], strict=True)
-    z, y, x = (convert_length(abs(float(length)), str(own), unit) for length, own in pairs)
-    return (z, y, x), unit
+    pairs = zip(layer.scale[-3:], names, strict=True)
+    z, y, x = (convert_length(abs(float(length)), own, found[-1]) for length, own in pairs)
+    return (z, y, x), found[-1]
 
 
 def place_of_layer(layer: Any) -> dict[str, Any]:

@@ -61,7 +61,9 @@ class Measure(Dock):
         """Fill the table, draw the diagram, write the file, and let napari show a label's numbers beneath the mouse."""
         self.measures, first, layer = result, result[0], self.layer.value
         several = first.part is not None
-        names = [_heading(each, first.unit) for each in first.quantities]
+        powers = [power_name(first.unit, each.power) for each in first.quantities]
+        pairs = zip(first.quantities, powers, strict=True)
+        names = [f"{each.symbol} ({power})" if power else each.symbol for each, power in pairs]
         if several:
             labels = [each.part[1] for each in result if each.part]
             cells = [[format_number(q.value, 4) for q in each.quantities] for each in result]
@@ -106,16 +108,8 @@ def _measure_one(field: Any, options: dict[str, Any], progress: Progress) -> tup
     return (measure_scan(field, progress=progress, **options),)
 
 
-def _heading(quantity: Any, unit: str) -> str:
-    """Return a column's head: symbol and unit."""
-    power = power_name(unit, quantity.power)
-    return f"{quantity.symbol} ({power})" if power else quantity.symbol
-
-
 def _join(diagrams: Sequence[Diagram]) -> Diagram:
     """Return the diagram of several surfaces together."""
-    if len(diagrams) == 1:
-        return diagrams[0]
     total = sum(float(each.weights.sum()) for each in diagrams)
     lost = sum(each.excluded * float(each.weights.sum()) for each in diagrams) / total if total else math.nan
     points, weights = (np.concatenate([getattr(each, name) for each in diagrams]) for name in ("points", "weights"))

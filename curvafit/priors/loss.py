@@ -372,14 +372,14 @@ def choose_refinement(spacing: Sequence[float], epsilon: float) -> tuple[int, in
         most = COARSEST * min(spacing)
         raise ValueError(f"ε must be above 0 and at most {most:g} for voxels of {tuple(spacing)}, got {epsilon:g}")
     ratios = [RESOLVED * h / epsilon for h in spacing]
-    times = tuple(1 if ratio <= 1.1 else math.ceil(ratio - 1e-3) for ratio in ratios)
-    if max(times) > FINEST:
+    if max(ratios) > FINEST + 1e-3:
         least = RESOLVED * max(spacing) / FINEST
         raise ValueError(
             f"expected an ε of at least {least:g} for voxels of {tuple(spacing)}, got {epsilon:g}, for which an axis "
-            f"is refined {max(times)}-fold: state ε in spacing's unit, or a larger ε"
+            f"is refined more than {FINEST}-fold: state ε in spacing's unit, or a larger ε"
         )
-    return times  # type: ignore[return-value]
+    z, y, x = (1 if ratio <= 1.1 else math.ceil(ratio - 1e-3) for ratio in ratios)
+    return z, y, x
 
 
 def _read_weights(weight: float | Sequence[float]) -> tuple[float, ...]:
@@ -429,7 +429,9 @@ def _measure_window(
     longest = max(n * h for n, h in zip(shape, spacing, strict=True))
     if epsilon > longest:
         raise ValueError(f"expected an ε of at most the window's longest side, {longest:g}, got {epsilon:g}")
-    u, weights = 2 * probability - 1, _make_window_mask(probability, mask, border)
+    u, inside = 2 * probability - 1, probability.new_zeros(shape)
+    inside[tuple(slice(border, n - border) for n in shape)].fill_(1)
+    weights = inside[None] if mask is None else inside * mask.to(inside)
     for axis, n in enumerate(times):
         if n > 1:
             u, weights = refine_axis(u, axis, n), weights.repeat_interleave(n, axis - 3)
@@ -442,14 +444,6 @@ def _measure_window(
         return total
     volume = weights.sum((-3, -2, -1)) * (grid.voxel_volume / WORKING_EPSILON**3)
     return total / volume.clamp_min(torch.finfo(volume.dtype).tiny)
-
-
-def _make_window_mask(probability: Tensor, mask: Tensor | None, border: int) -> Tensor:
-    """Return the mask `(1 or batch, z, y, x)` with zeros at the border."""
-    inside = probability.new_zeros(probability.shape[1:])
-    z, y, x = (slice(border, n - border) for n in inside.shape)
-    inside[z, y, x].fill_(1)
-    return inside[None] if mask is None else inside * mask.to(inside)
 
 
 def _strip_subclass(values: _Values) -> _Values:

@@ -1,9 +1,9 @@
-"""What is written is whole or not there, and takes nobody else's place."""
+"""What is written is whole or not there, and takes nobody else's place; a record comes back as it was written."""
 
 from __future__ import annotations
 
+import io
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from curvafit.core.files import (
     write_atomically,
     write_content,
 )
-from curvafit.core.records import Format, can_write, has_mark
+from curvafit.core.records import Format, can_write, has_mark, parse_json, sibling
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
 from curvafit.volumes.write import save
@@ -48,16 +48,15 @@ def test_a_staged_folder_goes_with_what_was_not_moved(tmp_path: Path) -> None:
         (work / "half").write_text("")
         raise KeyboardInterrupt
     assert tree(tmp_path) == {"a": b"a", "b": b"b"}
-    assert [path.name for path in (tmp_path / "deep").iterdir()] == []
+    assert list((tmp_path / "deep").iterdir()) == []
 
 
 def test_a_link_is_replaced_and_not_what_it_leads_to(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "thesis").write_text("mine")
-    (tmp_path / "link").symlink_to(tmp_path / "folder")
+    for name in ("link", "other"):
+        (tmp_path / name).symlink_to(tmp_path / "folder")
     write_content(tmp_path / "link", "new")
-    assert tree(tmp_path) == {"folder/thesis": b"mine", "link": b"new"}
-    (tmp_path / "other").symlink_to(tmp_path / "folder")
     remove(tmp_path / "other")
     assert tree(tmp_path) == {"folder/thesis": b"mine", "link": b"new"}
 
@@ -72,9 +71,13 @@ def test_what_a_killed_process_left_is_swept(tmp_path: Path) -> None:
 # ---- whose a place is ------------------------------------------------------------------------------------------------
 
 
+def nobodys(path: Path) -> bool:
+    return False
+
+
 @pytest.mark.parametrize("what", ["file", "folder", "hidden", "link to a file", "link to a folder"])
 def test_a_place_that_is_taken_is_refused(what: str, tmp_path: Path) -> None:
-    place, mine = tmp_path / "out", tmp_path / "elsewhere"
+    new, place, mine = (tmp_path / name for name in ("new", "out", "elsewhere"))
     mine.mkdir()
     (mine / "thesis").write_text("mine")
     if what == "file":
@@ -86,9 +89,9 @@ def test_a_place_that_is_taken_is_refused(what: str, tmp_path: Path) -> None:
         (place / (".thesis" if what == "hidden" else "thesis")).write_text("mine")
     before = tree(tmp_path)
     with pytest.raises(ValueError, match="overwrite"):
-        can_write(tmp_path / "new", lambda path: False, more=[place])
-    can_write(tmp_path / "new", lambda path: path == place, more=[place])
-    can_write(tmp_path / "new", lambda path: False, more=[place], overwrite=True)
+        can_write(new, nobodys, more=[place])
+    can_write(new, lambda path: path == place, more=[place])
+    can_write(new, nobodys, more=[place], overwrite=True)
     assert tree(tmp_path) == before
 
 
@@ -100,41 +103,35 @@ def test_nothing_is_free_and_an_empty_folder_where_a_folder_goes(tmp_path: Path)
         can_write(tmp_path / "none", is_empty, more=[tmp_path / "link"])
 
 
-def test_devices_and_pipes_are_never_written_over(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    for place in (tmp_path / "pipe", Path(os.devnull)):
+def test_devices_and_pipes_are_never_written_over_nor_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.json")
+    for place in (tmp_path / "pipe.json", Path(os.devnull)):
         with pytest.raises(ValueError, match="device"):
             can_write(place, lambda path: True, overwrite=True)
-
-
-def test_a_pipe_is_no_record_and_is_not_waited_for(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "out.json")
-    assert not Format("ours").owns(tmp_path / "out.json") and not has_mark(tmp_path / "out.json", "x")
+    assert not Format("ours").owns(tmp_path / "pipe.json") and not has_mark(tmp_path / "pipe.json", "x")
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_an_input_is_never_written_over(overwrite: bool, tmp_path: Path) -> None:
-    source = tmp_path / "scan"
-    source.mkdir()
-    (source / "0.tif").write_text("")
-    os.link(source / "0.tif", tmp_path / "same.tif")
-    (tmp_path / "link").symlink_to(source)
-    cases = [
+@pytest.mark.parametrize(
+    ("read", "written"),
+    [
         ("scan", "scan"),
         ("scan/0.tif", "scan"),
         ("scan", "scan/out.tif"),
         ("scan/0.tif", "same.tif"),
+        ("scan/0.tif::key", "scan/0.tif"),
         ("link", "scan"),
-    ]
-    for read, written in cases:
-        with pytest.raises(ValueError, match="input"):
-            inputs = [tmp_path / read]
-            can_write(
-                tmp_path / "new", lambda path: True, more=[tmp_path / written], inputs=inputs, overwrite=overwrite
-            )
+    ],
+)
+def test_an_input_is_never_written_over(read: str, written: str, overwrite: bool, tmp_path: Path) -> None:
+    source, new = tmp_path / "scan", tmp_path / "new"
+    source.mkdir()
+    (source / "0.tif").write_text("")
+    os.link(source / "0.tif", tmp_path / "same.tif")
+    (tmp_path / "link").symlink_to(source)
     with pytest.raises(ValueError, match="input"):
-        can_write(source / "0.tif", lambda path: True, inputs=[f"{source / '0.tif'}::key"], overwrite=overwrite)
-    can_write(tmp_path / "out.tif", lambda path: True, inputs=[source, "none.tif"], overwrite=overwrite)
+        can_write(new, lambda path: True, more=[tmp_path / written], inputs=[tmp_path / read], overwrite=overwrite)
+    can_write(new, lambda path: True, inputs=[source, "none.tif"], overwrite=overwrite)
 
 
 def test_a_folder_that_cannot_take_files_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -160,8 +157,8 @@ FIELD = Field(np.arange(70 * 6 * 5, dtype=np.float32).reshape(70, 6, 5), (0.1, 0
 def test_save_replaces_its_own_stores_alone(tmp_path: Path) -> None:
     """Of the same kind, and with nothing of a user's put in since."""
     place = tmp_path / "a.zarr"
-    for kind in ("volume", "volume"):
-        save(FIELD, place, kind=kind)
+    for _ in range(2):
+        save(FIELD, place, kind="volume")
     assert np.array_equal(load(place).values, FIELD.values)
     with pytest.raises(ValueError, match="overwrite"):
         save(FIELD, place, kind="mask")
@@ -173,18 +170,132 @@ def test_save_replaces_its_own_stores_alone(tmp_path: Path) -> None:
     assert not (place / "notes.txt").exists()
 
 
-@pytest.mark.parametrize("damage", ["no zarr.json", "another's", "torn", "nested"])
-def test_what_bears_no_mark_is_nobodys_to_replace(damage: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("damage", [None, '{"attributes": {"curvafit": 3}}', '{"attri', "[" * 100_000])
+def test_what_bears_no_mark_is_nobodys_to_replace(damage: str | None, tmp_path: Path) -> None:
+    """A mark that is not there, another's, torn, or nested too deeply."""
     place = tmp_path / "a.zarr"
     save(FIELD, place)
-    if damage == "no zarr.json":
-        (place / "zarr.json").unlink()
-    else:
-        text = {"another's": '{"attributes": {"curvafit": 3}}', "torn": '{"attri', "nested": "[" * 100_000}[damage]
-        (place / "zarr.json").write_text(text)
+    (place / "zarr.json").unlink()
+    if damage is not None:
+        (place / "zarr.json").write_text(damage)
     before = tree(tmp_path)
     with pytest.raises(ValueError, match="overwrite"):
         save(FIELD, place)
     assert tree(tmp_path) == before
-    shutil.rmtree(place)
-    save(FIELD, place)
+
+
+# ---- records ---------------------------------------------------------------------------------------------------------
+
+
+ATLAS = Format("ours", 2, "an atlas file", remedy="extract it again", fixed={"bins": [1, 2]})
+NOTE = Format("note-1")
+ARRAYS = {"points": np.arange(12.0).reshape(3, 4), "names": np.array(["a", "b"]), "f": np.asfortranarray(np.eye(3))}
+
+
+def test_a_record_comes_back(tmp_path: Path) -> None:
+    path = ATLAS.write(tmp_path / "a.npz", {"unit": "mm"}, ARRAYS)
+    for source in (path, str(path), io.BytesIO(path.read_bytes())):
+        header, arrays = ATLAS.read(source)
+        assert header == {"format": "ours", "version": 2, "bins": [1, 2], "unit": "mm"}
+        assert arrays.keys() == ARRAYS.keys() and all(np.array_equal(arrays[k], v) for k, v in ARRAYS.items())
+    assert ATLAS.read(path, lambda header, arrays: header["unit"]) == "mm"
+    assert NOTE.read(NOTE.write(tmp_path / "a.json", {"files": ["x"]})).header == {"format": "note-1", "files": ["x"]}
+    assert sorted(tree(tmp_path)) == ["a.json", "a.npz"]
+
+
+def test_every_bit_of_an_archive_counts_or_changes_nothing(tmp_path: Path) -> None:
+    """A flipped bit or a cut ends in the same values or in a refusal."""
+    path, rng = ATLAS.write(tmp_path / "a.npz", {}, ARRAYS), np.random.default_rng(0)
+    content = path.read_bytes()
+    damaged = [content[:n] for n in range(0, len(content), 97)]
+    for place in rng.integers(0, len(content), 200):
+        damaged.append(content[:place] + bytes([content[place] ^ 1 << int(rng.integers(8))]) + content[place + 1 :])
+    refused = 0
+    for each in damaged:
+        path.write_bytes(each)
+        try:
+            arrays = ATLAS.read(path).arrays
+        except ValueError:
+            refused += 1
+            continue
+        assert all(np.array_equal(value, ARRAYS[name]) for name, value in arrays.items() if name in ARRAYS)
+    assert refused > len(damaged) / 2
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"PK", b"{", b"[]", b'{"format": "other"}', b"[" * 100_000, b'{"format": "ours", "format": 1}', None],
+)
+def test_other_files_are_refused(content: bytes | None, tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    os.mkfifo(path) if content is None else path.write_bytes(content)  # a pipe may never end
+    with pytest.raises(ValueError, match="not an atlas file"):
+        ATLAS.read(path)
+    assert not ATLAS.owns(path)
+
+
+def test_records_of_another_version_or_content_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    with pytest.raises(FileNotFoundError, match="an atlas file"):
+        ATLAS.read(path)
+    for other, word in [(Format("ours", 1, fixed=ATLAS.fixed), "version"), (Format("ours", 2), "bins")]:
+        other.write(path, {}, ARRAYS)
+        assert ATLAS.owns(path)
+        with pytest.raises(ValueError, match=f"{word}.* instead of .*extract it again"):
+            ATLAS.read(path)
+    ATLAS.write(path, {}, ARRAYS)
+    with pytest.raises(ValueError, match="lacks 'unit'"):
+        ATLAS.read(path, lambda header, arrays: header["unit"])
+    np.savez(path, header=np.array([object()]))
+    with pytest.raises(ValueError, match="not an atlas file"):
+        ATLAS.read(path)
+
+
+def test_a_program_replaces_only_what_it_wrote(tmp_path: Path) -> None:
+    """A file of the format, and those that the record beside it lists with it, but none that somebody changed since."""
+    atlas, shape = tmp_path / "a.npz", tmp_path / "a.nii.gz"
+    note, picture = sibling(shape, ".json"), sibling(shape, ".png")
+
+    def taken(path: Path, form: Format, *more: Path, word: str = "overwrite", **options) -> None:
+        with pytest.raises(ValueError, match=word):
+            can_write(path, form, more=more, **options)
+
+    assert can_write(shape, NOTE, more=[note, picture]) == shape
+    ATLAS.write(atlas, {}, ARRAYS)
+    assert can_write(atlas, ATLAS) == atlas
+    taken(atlas, NOTE)
+    for path in (shape, picture):
+        path.write_text("mine")
+        taken(shape, NOTE, note, picture)
+    can_write(shape, NOTE, more=[note, picture], overwrite=True)
+    NOTE.write(note, {"files": ["a.nii.gz", "a.json", "a.png"]})
+    can_write(shape, NOTE, more=[note, picture])
+    taken(sibling(shape, ".tif"), NOTE, note)
+    taken(shape, NOTE, word="input", inputs=[f"{shape}::key"], overwrite=True)
+    taken(tmp_path, NOTE, word="folder", overwrite=True)
+    later = note.stat().st_mtime + 60
+    os.utime(shape, (later, later))
+    taken(shape, NOTE, note, picture)
+
+
+def test_names_beside_a_file() -> None:
+    cases = {"a/b.c.nii.gz": "a/b.c.json", "b.STL": "b.json", "b.OME.zarr": "b.json", "b": "b.json", ".b": ".b.json"}
+    assert {name: str(sibling(name, ".json")) for name in cases} == cases
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("{\n,", "line 2"),
+        (b"\xff", "UTF-8"),
+        ("[" * 100_000, "deeply"),
+        ("NaN", "finite"),
+        ("1e999", "finite"),
+        ("1" * 41, "41 digits"),
+        ('{"a": 1, "a": 2}', "twice"),
+    ],
+)
+def test_json_that_is_read_is_sound(text: str | bytes, word: str) -> None:
+    assert parse_json(b'\xef\xbb\xbf{"a": [1, 2.5, null]}', "JSON", "here") == {"a": [1, 2.5, None]}
+    with pytest.raises(ValueError, match=word):
+        parse_json(text, "a header", "here")

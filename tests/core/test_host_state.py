@@ -17,25 +17,27 @@ import torch
 import curvafit
 from curvafit import priors
 
+ROOT = Path(__file__).resolve().parents[2]
 #: Types and tables whose makers, or users, are among the calls.
 PASSIVE = {"Comparison", "Fit", "Flow", "Inference", "Measures", "Segmentation", "Windows"}
 PASSIVE |= {"Law", "LawLike", "PRESETS", "SIGMA", "WORKING_EPSILON", "WORKING_SPACING"}
 NAMES = list(host_state.calls(Path(tempfile.gettempdir())))
 
 
+def run(*arguments: str) -> str:
+    """The last line that a Python program prints, in a process of its own."""
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    own = {"PYTHONPATH": path, "NUMBA_NUM_THREADS": str(host_state.NUMBA_THREADS)}
+    command = [sys.executable, *arguments]
+    done = subprocess.run(command, env=os.environ | own, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()[-1]
+
+
 @pytest.fixture(scope="module")
 def found() -> dict[str, dict]:
-    """What each call changed, all made in one process of their own."""
-    root = Path(__file__).resolve().parents[2]
-    threads = str(host_state.NUMBA_THREADS)
-    script = [sys.executable, str(root / "tests" / "host_state.py")]
-    path = os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        script, env={**os.environ, "PYTHONPATH": path, "NUMBA_NUM_THREADS": threads},
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+    """What each call changed, all made in one process."""
+    return json.loads(run(str(ROOT / "tests" / "host_state.py")))
 
 
 def test_every_public_name_is_called() -> None:
@@ -81,5 +83,4 @@ print(multiprocessing.get_start_method())
 
 @pytest.mark.slow
 def test_a_program_may_choose_how_processes_start_afterwards() -> None:
-    done = subprocess.run([sys.executable, "-c", SETTLED], capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == "spawn", done.stderr
+    assert run("-c", SETTLED) == "spawn"

@@ -16,7 +16,8 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from curvafit.data_synth import build, cluster, open_store
+from curvafit.data_synth import Design, build, cluster, open_store
+from curvafit.data_synth import store as storing
 from curvafit.data_synth.atlas import verify
 from curvafit.generation.schedule import schedule
 
@@ -42,15 +43,27 @@ def serial(tmp_path_factory):
     return build(tmp_path_factory.mktemp("serial") / "s.zarr", COUNT, EDGE, 1, PLAN)
 
 
-def same(one, other) -> bool:
-    whole = one.indices() == other.indices()
+def assert_same(one, other) -> None:
+    assert one.indices() == other.indices()
     kept = (i for i in one.indices() if one.record(i).viability.viable)
-    return whole and all((one.field(i) == other.field(i)).all() for i in kept)
+    assert all((one.field(i) == other.field(i)).all() for i in kept)
+    assert verify(one.path).problems == verify(one.path).notes == ()
+
+
+def listening() -> set[str]:
+    """The addresses on which this process and its children wait for others."""
+    here = psutil.Process()
+    sockets = (each for process in (here, *here.children(recursive=True)) for each in process.net_connections("inet"))
+    return {each.laddr.ip for each in sockets if each.status == psutil.CONN_LISTEN}
 
 
 @pytest.mark.slow
 def test_two_workers_make_the_store_that_one_process_makes_though_one_is_killed(tmp_path, serial):
-    with cluster(2) as crew:
+    """Dask's own page is shown on the loopback, where it is asked for."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    with cluster(2, dashboard=port) as crew:
+        assert crew._client.dashboard_link == f"http://127.0.0.1:{port}/status"
         heard = crew._client.run(lambda: (os.getpid(), signal.getsignal(signal.SIGINT)))
         pids, interrupts = zip(*heard.values(), strict=True)
         assert set(interrupts) == {signal.SIG_IGN}  # they leave the interrupt to the build
@@ -64,8 +77,8 @@ def test_two_workers_make_the_store_that_one_process_makes_though_one_is_killed(
         store = build(tmp_path / "s.zarr", COUNT, EDGE, 1, PLAN, kill_once, workers=crew)
         crew._client = types.SimpleNamespace(nthreads=dict)
         assert crew.places == 1  # also while all are gone
-    assert killed and same(store, serial)
-    assert verify(store.path).problems == verify(store.path).notes == ()
+    assert killed
+    assert_same(store, serial)
 
 
 @pytest.mark.slow
@@ -80,18 +93,23 @@ def test_a_build_killed_at_random_goes_on_to_the_same_store(tmp_path, serial):
     begun.stdout.close()
     if path.exists():
         assert verify(path).problems == ()
-    store = build(path, COUNT, EDGE, 1, PLAN)
-    assert same(store, serial)
-    assert verify(path).problems == verify(path).notes == ()
+    assert_same(build(path, COUNT, EDGE, 1, PLAN), serial)
 
 
-def test_a_scheduler_that_is_not_there_and_too_few_workers_are_one_sentence(monkeypatch):
+@pytest.mark.parametrize(
+    ("options", "kind", "word"),
+    [
+        ({"scheduler": "tcp://127.0.0.1:9"}, OSError, "tcp://127.0.0.1:9"),
+        ({"count": -1}, ValueError, "workers"),
+        ({"count": 2, "dask": None}, ImportError, "pip install"),
+    ],
+)
+def test_a_scheduler_that_is_not_there_and_too_few_workers_are_one_sentence(monkeypatch, options, kind, word):
     monkeypatch.setattr("curvafit.core.workers.PATIENCE", 1)
-    nowhere = "tcp://127.0.0.1:9"
-    with pytest.raises(OSError, match=nowhere):
-        cluster(scheduler=nowhere).__enter__()
-    with pytest.raises(ValueError, match="workers"):
-        cluster(-1).__enter__()
+    if "dask" in options:
+        monkeypatch.setitem(sys.modules, "distributed", options.pop("dask"))
+    with pytest.raises(kind, match=word):
+        cluster(**options).__enter__()
 
 
 @pytest.mark.parametrize("error", [CommClosedError, CancelledError])
@@ -103,32 +121,8 @@ def test_a_scheduler_that_goes_is_one_sentence(monkeypatch, error):
         raise error("gone")
 
 
-@pytest.mark.slow
-def test_dasks_own_page_is_shown_on_the_loopback_where_it_is_asked_for():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-    with cluster(1, dashboard=port) as crew:
-        assert crew._client.dashboard_link == f"http://127.0.0.1:{port}/status"
-        assert listening() == {"127.0.0.1"}
-
-
-def listening() -> set[str]:
-    """The addresses on which this process and its children wait for others."""
-    here = psutil.Process()
-    sockets = (each for process in (here, *here.children(recursive=True)) for each in process.net_connections("inet"))
-    return {each.laddr.ip for each in sockets if each.status == psutil.CONN_LISTEN}
-
-
-def test_without_dask_the_line_to_type_is_said(monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ImportError, match="pip install"), cluster(2):
-        pass
-
-
 def test_a_barren_design_ends(tmp_path, monkeypatch):
     monkeypatch.setattr("curvafit.data_synth.atlas.BARREN", 3)
-    from curvafit.data_synth import Design
-
     empty = Design("list", points=((1.0, 0.0, 1.0, 0.0, 0.0, 1e9, -0.9),))
     with pytest.raises(ValueError, match="viable"):
         build(tmp_path / "s.zarr", 1, 8, schedule=PLAN, design=empty)
@@ -136,16 +130,12 @@ def test_a_barren_design_ends(tmp_path, monkeypatch):
 
 
 def test_a_full_disk_is_named_and_what_is_made_is_kept(tmp_path, serial, monkeypatch):
-    from curvafit.data_synth import store as storing
+    def full(partial, place):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     store = build(tmp_path / "s.zarr", 2, EDGE, 1, PLAN)
-    monkeypatch.setattr(storing, "_publish", full)
-    with pytest.raises(OSError, match="s.zarr"):
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="s.zarr"):
+        patch.setattr(storing, "_publish", full)
         build(store.path, COUNT, EDGE, 1, PLAN)
-    monkeypatch.undo()
     assert verify(store.path).problems == () and not list((store.path / "draws").glob(".*"))
-    assert same(build(store.path, COUNT, EDGE, 1, PLAN), serial)
-
-
-def full(partial, place):
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert_same(build(store.path, COUNT, EDGE, 1, PLAN), serial)

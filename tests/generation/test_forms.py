@@ -1,14 +1,20 @@
-"""The forms of a field: adjoints, laws, and the flows that move them."""
+"""The forms of a field, and data terms: adjoints, laws, and the flows that move them."""
 
 from __future__ import annotations
 
 import math
+from functools import partial
+from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from curvafit.generation import stepper
+from curvafit.generation.checkpoint import identity
+from curvafit.generation.cost import Cost
+from curvafit.generation.data import Evidence, Hinge
 from curvafit.generation.flow import descend
 from curvafit.generation.forms import FORMS, DivergenceForm
 from curvafit.generation.schedule import Schedule
@@ -20,8 +26,12 @@ from curvafit.priors.grid import Grid
 from curvafit.priors.law import preset
 from curvafit.priors.profile import SIGMA, optimal_profile
 from curvafit.priors.stencils import gaussian_blur
+from curvafit.segmentation.evidence import probability_evidence
+from curvafit.segmentation.reconstruct import reconstruct
+from curvafit.segmentation.refine import refine
+from curvafit.volumes.field import Field
 
-BOUNDARIES = ("periodic", "replicate")
+boundaries = pytest.mark.parametrize("boundary", ["periodic", "replicate"])
 ANISOTROPIC = (0.013, 0.01, 0.008)
 TUBES, WILLMORE = preset("tubes").coefficients, Coefficients.willmore()
 
@@ -37,30 +47,18 @@ def ball(grid: Grid, radius: float, epsilon: float) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("name", FORMS)
-@pytest.mark.parametrize("boundary", BOUNDARIES)
-def test_pullback_is_the_adjoint(boundary, name):
-    """⟨u(p) - u(0), g⟩ = ⟨p, pullback(g)⟩."""
+@boundaries
+def test_pullback_is_the_adjoint_and_a_form_starts_at_the_blurred_field(boundary, name):
+    """⟨u(p) - u(0), g⟩ = ⟨p, pullback(g)⟩; the mass of a divergence is its own."""
     grid = Grid((6, 9, 7), ANISOTROPIC, boundary)
-    form, start = FORMS[name].start_at(rough(*grid.shape), grid, 0.012, gaussian_blur)
+    field = rough(*grid.shape)
+    form, start = FORMS[name].start_at(field, grid, 0.012, gaussian_blur)
+    torch.testing.assert_close(form.field(start), gaussian_blur(field, grid, 0.012), rtol=1e-10, atol=1e-12)
     parameters, slope = rough(*start.shape, seed=1), rough(*grid.shape, seed=2)
     moved = form.field(parameters) - form.field(torch.zeros_like(start))
     there, back = float((moved * slope).sum()), float((parameters * form.pullback(slope)).sum())
     assert abs(there) > 1e-2
     assert there == pytest.approx(back, rel=1e-11)
-
-
-@pytest.mark.parametrize("name", FORMS)
-@pytest.mark.parametrize("boundary", BOUNDARIES)
-def test_a_form_starts_at_the_blurred_field(boundary, name):
-    grid = Grid((6, 9, 7), ANISOTROPIC, boundary)
-    field = rough(*grid.shape)
-    form, start = FORMS[name].start_at(field, grid, 0.012, gaussian_blur)
-    torch.testing.assert_close(form.field(start), gaussian_blur(field, grid, 0.012), rtol=1e-10, atol=1e-12)
-
-
-@pytest.mark.parametrize("boundary", BOUNDARIES)
-def test_mass_is_the_forms_own(boundary):
-    grid = Grid((6, 9, 7), ANISOTROPIC, boundary)
     u = DivergenceForm(grid, 0.012, -0.3).field(rough(3, *grid.shape))
     assert float(u.mean()) == pytest.approx(-0.3, abs=1e-12)
 
@@ -75,7 +73,7 @@ def test_fused_blur_is_the_blur():
 
 @pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
 @pytest.mark.parametrize("flow", FORMS)
-@pytest.mark.parametrize("boundary", BOUNDARIES)
+@boundaries
 def test_every_flow_lowers_the_energy_and_keeps_what_it_keeps(boundary, flow, optimiser):
     grid = Grid((16, 17, 18), 0.01, boundary)
     start = ball(grid, 0.05, 0.02) + 0.1 * rough(*grid.shape).float()
@@ -98,16 +96,12 @@ def test_backends_descend_alike():
     """Adam step by step. L-BFGS in the energy reached: its line search hangs on the energies' last digits."""
     pytest.importorskip("numba")
     grid = Grid((28, 30, 32), 0.01, "replicate")
-    start = ball(grid, 0.09, 0.03)
-
-    def both(**told):
-        return (descend(start, WILLMORE, grid, **told, backend=backend) for backend in ("torch", "fused"))
-
-    plain, fused = both(optimiser="adam", steps=10)
+    start, backends = ball(grid, 0.09, 0.03), ("torch", "fused")
+    plain, fused = (descend(start, WILLMORE, grid, optimiser="adam", steps=10, backend=each) for each in backends)
     moved = float((plain.field - gaussian_blur(start, grid, 0.01)).abs().max())
     assert moved > 0.02
     assert float((plain.field - fused.field).abs().max()) < 1e-4 * moved
-    plain, fused = both(steps=30)
+    plain, fused = (descend(start, WILLMORE, grid, steps=30, backend=each) for each in backends)
     assert plain.history.energy[-1] < 0.5 * plain.history.energy[0]
     assert plain.history.energy[-1] == pytest.approx(fused.history.energy[-1], rel=0.02)
 
@@ -121,22 +115,8 @@ def test_willmore_flow_of_a_wide_ball_is_a_sphere():
     assert end.viability.discrepancy < 0.05
 
 
-class _Bowl:
-    """|p|²/2 - 10: its float32 minimum is reached exactly."""
-
-    grid = Grid((4, 4, 4))
-
-    def field(self, parameters):
-        return parameters
-
-    def pullback(self, slope):
-        return slope
-
-    def to(self, device):
-        return self
-
-
 def test_lbfgs_stalls_where_nothing_is_lower(monkeypatch):
+    """At the minimum of |u|²/2 - 10, which float32 reaches exactly."""
     count = []
 
     def bowl(u, *cost):
@@ -145,11 +125,10 @@ def test_lbfgs_stalls_where_nothing_is_lower(monkeypatch):
 
     monkeypatch.setattr(stepper, "energy_gradient_by_autograd", bowl)
     start = rough(4, 4, 4).float()
-    moved = LbfgsStepper(start, _Bowl(), TUBES, 0.02, (0.9, 0.999), None, "cpu")
-    for _ in range(30):
-        moved.step(1.0)
-        if moved.stalled:
-            break
+    cost = Cost(TUBES, Grid((4, 4, 4)), 0.02, None, 0.0)
+    form, start = FORMS["l2"].start_at(start, cost.grid, 0.0, gaussian_blur)
+    moved = LbfgsStepper(start, form, cost, (0.9, 0.999), None, "cpu")
+    moved.run([1.0] * 30)
     assert moved.stalled
     assert moved.statistics().energy == pytest.approx(-10, abs=1e-6)
     assert len(count) < 100
@@ -174,14 +153,142 @@ def test_without_a_blur_the_field_is_what_moves():
     assert end.history.energy[-1] < end.history.energy[0]
 
 
-def test_wrong_flows_are_refused():
-    grid = Grid((12, 12, 12))
-    field = torch.zeros(grid.shape)
-    with pytest.raises(ValueError, match="flow"):
-        descend(field, TUBES, grid, flow="h1")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="optimiser"):
-        descend(field, TUBES, grid, optimiser="sgd")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="steps"):
-        descend(field, TUBES, grid, steps=0)
-    with pytest.raises(ValueError, match="field"):
-        descend(field[1:], TUBES, grid)
+@pytest.mark.parametrize(
+    ("field", "options", "word"),
+    [
+        (torch.zeros(12, 12, 12), {"flow": "h1"}, "flow"),
+        (torch.zeros(12, 12, 12), {"optimiser": "sgd"}, "optimiser"),
+        (torch.zeros(12, 12, 12), {"steps": 0}, "steps"),
+        (torch.zeros(12, 12, 12), {"frozen": torch.zeros(3, 3, 3, dtype=torch.bool)}, "frozen"),
+        (torch.zeros(12, 12, 11), {}, "field"),
+        (torch.full((12, 12, 12), math.inf), {}, "finite"),
+    ],
+)
+def test_wrong_flows_are_refused(field, options, word):
+    with pytest.raises(ValueError, match=word):
+        descend(field, TUBES, Grid((12, 12, 12)), **options)
+
+
+# ---- data terms: their gradient, what they mean, and runs that they belong to ----------------------------------------
+
+
+pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
+
+GRID = Grid((8, 9, 10), (0.01, 0.012, 0.02), "replicate")
+
+
+def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("kind", [Evidence, Hinge, partial(Hinge, margin=0.2)])
+def test_a_data_term_s_gradient(kind) -> None:
+    term, u, way = kind(drawn(8, 9, 10)), 1.2 * drawn(8, 9, 10, seed=1), drawn(8, 9, 10, seed=2)
+    step = 1e-5
+    ahead, behind = (term.slope(u + sign * step * way, GRID)[0] for sign in (1, -1))
+    _, slope = term.slope(u, GRID)
+    assert (ahead - behind) / (2 * step) == pytest.approx(float((slope * way).sum()), rel=1e-7)
+
+
+def test_evidence_of_a_mask_is_its_log_likelihood() -> None:
+    r, inside = drawn(8, 9, 10), drawn(8, 9, 10, seed=1) > 0
+    values = [Evidence(r).slope(torch.where(m, 1.0, -1.0).double(), GRID)[0] for m in (inside, ~inside)]
+    gained = float((r * torch.where(inside, 1.0, -1.0)).sum()) * GRID.voxel_volume
+    assert values[1] - values[0] == pytest.approx(gained, rel=1e-12)
+
+
+def test_a_hinge_lets_go_where_it_is_right() -> None:
+    ratio, near, short = (torch.full((8, 9, 10), each) for each in (-3.0, -1.1, -0.3))
+    for margin, u in ((1.0, near), (0.2, short)):
+        value, slope = Hinge(ratio, margin).slope(u, GRID)
+        assert value == 0 and not slope.any()
+    assert Hinge(ratio).slope(short, GRID)[0] > 0 and Hinge(ratio, 0.2).to("cpu").margin == 0.2
+
+
+@pytest.mark.parametrize(
+    ("wrong", "word"),
+    [
+        *((lambda kind=kind: kind(torch.full((4, 4, 4), math.nan)), "evidence") for kind in (Evidence, Hinge)),
+        (lambda: Evidence(torch.zeros(4, 4)), "evidence"),
+        (lambda: Hinge(torch.ones(8, 8, 8), 2.0), "a margin from 0 to 1"),
+        (lambda: descend(torch.zeros(8, 8, 8), WILLMORE, Grid(8), data=Evidence(torch.ones(7, 8, 8))), "ratio"),  # type: ignore[arg-type]
+    ],
+)
+def test_bad_evidence_is_refused(wrong, word) -> None:
+    with pytest.raises(ValueError, match=word):
+        wrong()
+
+
+@pytest.mark.parametrize(("flow", "optimiser"), [("l2", "lbfgs"), ("l2", "adam"), ("h-1", "adam")])
+def test_every_flow_lowers_energy_and_data_as_plain_torch_does(flow, optimiser) -> None:
+    """Adam voxel by voxel. L-BFGS in the energy reached: its line search hangs on the energies' last digits, and
+    near the minimum what two searches leave is of second order in what parts them."""
+    grid = Grid((12, 12, 12), boundary="replicate")
+    start = optimal_profile(0.04 - torch.from_numpy(np.linalg.norm(np.mgrid[:12, :12, :12] - 5.5, axis=0)) * 0.01, 0.02)
+    term = Evidence(1e6 * drawn(12, 12, 12))
+    options = {"flow": flow, "optimiser": optimiser, "steps": 10, "schedule": "paper", "data": term}
+    fast, plain = (descend(start, WILLMORE, grid, backend=each, **options) for each in ("auto", "torch"))
+    fall = fast.history.energy[0] - fast.history.energy[-1]
+    assert fall > 0
+    if optimiser == "adam":
+        torch.testing.assert_close(fast.field, plain.field, atol=2e-3, rtol=0)
+    else:
+        assert abs(fast.history.energy[-1] - plain.history.energy[-1]) < 0.01 * fall
+    without = descend(start, WILLMORE, grid, **{**options, "data": None})
+    assert not torch.allclose(without.field, fast.field, atol=1e-3)
+
+
+def test_a_checkpoint_is_its_data_s(tmp_path: Path) -> None:
+    one, same, other = (identity(data=Evidence(drawn(4, 4, 4, seed=k))) for k in (0, 0, 1))
+    assert one == same != other
+    assert one != identity(data=Hinge(drawn(4, 4, 4))) and one != identity(data=None)
+    r, saved = drawn(8, 8, 8), {"checkpoint": tmp_path / "run.pt", "checkpoint_every": 0.0}
+    run = partial(descend, 0.5 * r, WILLMORE, Grid(8), steps=20, optimiser="adam")  # type: ignore[arg-type]
+    run(data=Evidence(r), callbacks=[lambda made, total, state: made >= 10], **saved)
+    with pytest.raises(ValueError, match="checkpoint"):
+        run(data=Evidence(2 * r), **saved)
+    assert torch.equal(run(data=Evidence(r), **saved).field, run(data=Evidence(r)).field)
+
+
+# ---- terms on grids that are not the scan's --------------------------------------------------------------------------
+
+
+#: A grid whose axes all differ, and a ball of radius 7 in it: its signed distance, positive inside.
+SHAPE, EDGES = (9, 21, 13), (3.0, 1.0, 1.5)
+PLACES = np.meshgrid(*((np.arange(n) - (n - 1) / 2) * h for n, h in zip(SHAPE, EDGES, strict=True)), indexing="ij")
+DISTANCE = 7 - np.linalg.norm(PLACES, axis=0)
+
+
+@pytest.mark.parametrize("along", [0, 1, 2])
+def test_known_slices_hold_whatever_the_axis_and_the_spacing(along: int) -> None:
+    """The array turned, its spacing with it: nearly the same field, though the network that it starts from knows slices
+    from their transposes; and at an ε of our own near the profile of that ε."""
+    known, ε, fields = list(range(0, SHAPE[along], (2, 4, 3)[along])), 3.0, []
+    for turn in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        truth = Field((DISTANCE > 0).transpose(turn), tuple(EDGES[k] for k in turn))  # type: ignore[arg-type]
+        found = reconstruct(truth, WILLMORE, known=known, axis=turn.index(along), epsilon=ε, steps=8, stiffness=1e7)
+        assert found.epsilon == ε and any("2-fold" in note for note in found.notes)
+        fields.append(found.phase.values.transpose(np.argsort(turn)))
+    for other in fields[1:]:
+        np.testing.assert_allclose(other, fields[0], atol=0.05)
+    assert np.abs(fields[0] - np.tanh(DISTANCE / (math.sqrt(2) * ε))).mean() < 0.1  # 0.15 at the ε of two voxels
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("epsilon", [1.0, 2.0, 5.0])
+def test_evidence_counts_its_nats_once_whatever_the_volume_of_a_part(epsilon: float, monkeypatch) -> None:
+    gained = []
+
+    def watched(start, law, grid, *, data, **options):
+        ends = [data.slope(torch.full(grid.shape, side), grid)[0] for side in (1.0, -1.0)]
+        gained.append(ends[1] - ends[0])
+        return descend(start, law, grid, data=data, **options)
+
+    monkeypatch.setattr(import_module("curvafit.segmentation.engine"), "descend", watched)
+    noise = np.random.default_rng(0).standard_normal(SHAPE)
+    likely = Field((1 / (1 + np.exp(-DISTANCE - noise))).astype(np.float32), EDGES)
+    law = Coefficients(1.5, 0.5, 2.5)
+    found = refine(likely, law, weight=0.3, epsilon=epsilon, steps=1)
+    assert found.epsilon == epsilon
+    nats = float(probability_evidence(likely).ratio.sum(dtype=np.float64))
+    assert 0.3 * 2 * gained[0] == pytest.approx(nats, rel=1e-4)  # λ times the stiffness, 0.3 (1.5 + 2.5) / 2

@@ -2,32 +2,103 @@
 
 from __future__ import annotations
 
+import copy
+import io
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
+from loss_cases import slope_of
 from torch import Tensor, nn
+from torch.testing import assert_close
 
-from curvafit.priors import CombinedLoss, CurvaturePrior
+from curvafit.priors import Coefficients, CombinedLoss, CurvaturePrior
 
 ROOT = Path(__file__).resolve().parents[2]
+BCE = nn.BCEWithLogitsLoss()
 
 
 def noise(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
-class Net(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        torch.manual_seed(0)
-        self.body = nn.Sequential(nn.Conv3d(1, 4, 3, padding=1), nn.ReLU(), nn.Conv3d(4, 1, 3, padding=1))
+PRIOR, LOGITS, TARGET = CurvaturePrior("tubes", sigmoid=True), noise(1, 1, 8, 8, 8), noise(1, 1, 8, 8, 8, seed=1) > 0
+TARGET = TARGET.float()
 
-    def forward(self, image: Tensor) -> Tensor:
-        return self.body(image)
+
+# ---- CombinedLoss ----------------------------------------------------------------------------------------------------
+
+
+def test_combined_loss_is_the_weighted_sum_and_its_parts_are_there_to_log():
+    mask = (torch.arange(8) < 5).float().expand(1, 1, 8, 8, 8)
+    assert_close(CombinedLoss(BCE, PRIOR, 0.01)(LOGITS, TARGET), BCE(LOGITS, TARGET) + 0.01 * PRIOR(LOGITS))
+    found = CombinedLoss(BCE, PRIOR, 0.01)(LOGITS, TARGET, mask)
+    assert_close(found, BCE(LOGITS, TARGET) + 0.01 * PRIOR(LOGITS, mask=mask))
+    loss, leaf = CombinedLoss(BCE, PRIOR, 2.0, warmup=4), LOGITS.clone().requires_grad_()
+    assert loss.parts == {}
+    value, parts = loss(leaf, TARGET), loss.parts
+    assert not any(part.requires_grad for part in parts.values())
+    assert_close(parts, {"base": BCE(LOGITS, TARGET), "prior": PRIOR(LOGITS), "weight": torch.tensor(0.5)})
+    assert_close(parts["base"] + parts["weight"] * parts["prior"], value.detach())
+    for wrong in ({"weight": -1.0}, {"weight": None}, {"weight": float("inf")}, {"warmup": -1}, {"warmup": 0.5}):
+        with pytest.raises(ValueError, match="from 0, got"):
+            CombinedLoss(BCE, PRIOR, **wrong)
+
+
+def test_the_warm_up_counts_training_steps_and_survives_a_restart():
+    """Weight, warm-up and count go with the state, however it is kept; an older state has the count alone."""
+    loss, alone, ours = CombinedLoss(BCE, PRIOR, 2.0, warmup=4), BCE(LOGITS, TARGET), 2 * PRIOR(LOGITS)
+    for share in (0.25, 0.5, 0.75):
+        assert_close(loss(LOGITS, TARGET), alone + share * ours)
+    with torch.no_grad():
+        assert_close(loss(LOGITS, TARGET), alone + 0.75 * ours)
+    file = io.BytesIO()
+    torch.save(nn.ModuleDict({"loss": loss}).state_dict(), file)
+    file.seek(0)
+    again, whole = CombinedLoss(BCE, PRIOR, 0.0), nn.ModuleDict({"loss": CombinedLoss(BCE, PRIOR, 0.0)})
+    again.load_state_dict(loss.state_dict())
+    whole.load_state_dict(torch.load(file, weights_only=True))
+    for other in (again, whole["loss"], copy.deepcopy(loss), pickle.loads(pickle.dumps(loss))):
+        assert (float(other.weight), other.warmup, int(other.calls)) == (2.0, 4, 3)
+    for _ in range(3):
+        assert_close(again(LOGITS, TARGET), alone + ours)
+    again.eval()
+    assert int(again.calls) == 6 and again(LOGITS, TARGET) is not None and int(again.calls) == 6
+    older = CombinedLoss(BCE, PRIOR, 0.5, warmup=3)
+    older.load_state_dict({"calls": torch.tensor(4)})
+    assert (older.weight, older.warmup, int(older.calls)) == (0.5, 3, 4)
+
+
+def test_it_can_be_copied_and_shown():
+    prior = CurvaturePrior(("tubes", "sponge"), weight=(1, 2), spacing=(1, 1, 2), epsilon=4.0, softmax=True)
+    logits = noise(1, 2, 8, 8, 8)
+    assert torch.equal(copy.deepcopy(prior)(logits), prior(logits))
+    assert all(word in repr(prior) for word in ("preset tubes", "softmax=True", "epsilon=4"))
+    for law in ((1, 2, 1, 0, 0, 0), {"a20": 1, "a11": 2, "a02": 1}):
+        assert CurvaturePrior(law).coefficients == (Coefficients.willmore(),)  # type: ignore[arg-type]
+
+
+# ---- torch -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`", "ignore:ε = .* interpolating")
+def test_it_compiles_into_one_graph():
+    """With another loss and its warm-up; with other spacings after it; as a level of deep supervision; and exported."""
+    torch.compiler.reset()
+    loss = CombinedLoss(BCE, CurvaturePrior("tubes", sigmoid=True, ignore_index=2), 1e-3)
+    compiled = torch.compile(loss, backend="aot_eager", fullgraph=True)
+    assert_close(*(slope_of(lambda x: each(x, TARGET), LOGITS) for each in (loss, compiled)))  # noqa: B023
+    priors = [CurvaturePrior("tubes", sigmoid=True, spacing=spacing) for spacing in (1.0, 0.5, (2.0, 1.0, 1.0))]
+    for prior in (*priors, CurvaturePrior("tubes", shape=(16, 16, 16))):
+        compiled = torch.compile(prior, backend="aot_eager", fullgraph=True)
+        assert_close(compiled(LOGITS.sigmoid(), mask=TARGET), prior(LOGITS.sigmoid(), mask=TARGET))
+    for prior in (priors[0], priors[2]):
+        assert_close(torch.export.export(prior, (LOGITS,)).module()(LOGITS), prior(LOGITS))
+    torch.compiler.reset()
 
 
 def gradients(net: nn.Module, loss: nn.Module, image: Tensor, target: Tensor) -> list[Tensor]:
@@ -36,86 +107,19 @@ def gradients(net: nn.Module, loss: nn.Module, image: Tensor, target: Tensor) ->
     return [p.grad.clone() for p in net.parameters() if p.grad is not None]
 
 
-# ---- CombinedLoss ----------------------------------------------------------------------------------------------------
-
-
-def test_combined_loss_is_the_weighted_sum():
-    base, prior = nn.BCEWithLogitsLoss(), CurvaturePrior("tubes", sigmoid=True)
-    logits, target = noise(1, 1, 8, 8, 8), (noise(1, 1, 8, 8, 8, seed=1) > 0).float()
-    expected = base(logits, target) + 0.01 * prior(logits)
-    torch.testing.assert_close(CombinedLoss(base, prior, 0.01)(logits, target), expected)
-    mask = (torch.arange(8) < 5).float().expand(1, 1, 8, 8, 8)
-    expected = base(logits, target) + 0.01 * prior(logits, mask=mask)
-    torch.testing.assert_close(CombinedLoss(base, prior, 0.01)(logits, target, mask), expected)
-
-
-def test_the_warm_up_counts_training_steps_and_survives_a_restart():
-    base, prior = nn.BCEWithLogitsLoss(), CurvaturePrior("tubes", sigmoid=True)
-    logits, target = noise(1, 1, 8, 8, 8), torch.zeros(1, 1, 8, 8, 8)
-    loss, alone, ours = CombinedLoss(base, prior, 2.0, warmup=4), base(logits, target), 2 * prior(logits)
-    for share in (0.25, 0.5, 0.75):
-        torch.testing.assert_close(loss(logits, target), alone + share * ours)
-    with torch.no_grad():
-        torch.testing.assert_close(loss(logits, target), alone + 0.75 * ours)
-    again = CombinedLoss(base, prior, 2.0, warmup=4)
-    again.load_state_dict(loss.state_dict())
-    for _ in range(3):
-        torch.testing.assert_close(again(logits, target), alone + ours)
-    again.eval()
-    assert int(again.calls) == 6 and again(logits, target) is not None and int(again.calls) == 6
-
-
-def test_the_parts_of_the_sum_are_there_to_log():
-    base, prior = nn.BCEWithLogitsLoss(), CurvaturePrior("tubes", sigmoid=True)
-    logits, target = noise(1, 1, 8, 8, 8).requires_grad_(), torch.zeros(1, 1, 8, 8, 8)
-    loss = CombinedLoss(base, prior, 2.0, warmup=4)
-    assert loss.parts == {}
-    value = loss(logits, target)
-    parts = loss.parts
-    assert set(parts) == {"base", "prior", "weight"} and not any(part.requires_grad for part in parts.values())
-    torch.testing.assert_close(parts["base"], base(logits, target).detach())
-    torch.testing.assert_close(parts["prior"], prior(logits).detach())
-    assert float(parts["weight"]) == 0.5
-    torch.testing.assert_close(parts["base"] + parts["weight"] * parts["prior"], value.detach())
-
-
-def test_combined_loss_refuses_negative_numbers():
-    for options in ({"weight": -1.0}, {"weight": None}, {"weight": float("inf")}, {"warmup": -1}, {"warmup": 0.5}):
-        with pytest.raises(
-            ValueError, match=r"expected a (finite weight|warm-up of a whole number of calls) from 0, got"
-        ):
-            CombinedLoss(nn.BCEWithLogitsLoss(), CurvaturePrior("tubes"), **options)
-
-
-# ---- torch -----------------------------------------------------------------------------------------------------------
-
-
-def test_it_compiles_into_one_graph():
-    loss = CombinedLoss(nn.BCEWithLogitsLoss(), CurvaturePrior("tubes", sigmoid=True, ignore_index=2), 1e-3)
-    loss.calls.zero_()
-    logits, target = noise(2, 1, 8, 8, 8), (noise(2, 1, 8, 8, 8, seed=1) > 0).float()
-    compiled = torch.compile(loss, backend="aot_eager", fullgraph=True)
-    plain, fast = (logits.clone().requires_grad_() for _ in range(2))
-    one, two = loss(plain, target), compiled(fast, target)
-    one.backward()
-    two.backward()
-    torch.testing.assert_close(one, two)
-    torch.testing.assert_close(plain.grad, fast.grad)
-
-
 def test_distributed_training_sees_the_same_gradients(tmp_path):
     import torch.distributed as dist
 
     image, target = noise(2, 1, 8, 8, 8), torch.zeros(2, 1, 8, 8, 8)
-    loss = CombinedLoss(nn.BCEWithLogitsLoss(), CurvaturePrior("tubes", sigmoid=True), 1e-3)
-    expected = gradients(Net(), loss, image, target)
+    net = nn.Sequential(nn.Conv3d(1, 4, 3, padding=1), nn.ReLU(), nn.Conv3d(4, 1, 3, padding=1))
+    loss = CombinedLoss(BCE, PRIOR, 1e-3)
+    expected = gradients(net, loss, image, target)
     dist.init_process_group("gloo", init_method=f"file://{tmp_path}/store", rank=0, world_size=1)
     try:
-        found = gradients(nn.parallel.DistributedDataParallel(Net()), loss, image, target)
+        found = gradients(nn.parallel.DistributedDataParallel(net), loss, image, target)
     finally:
         dist.destroy_process_group()
-    for one, other in zip(found, expected, strict=True):
-        torch.testing.assert_close(one, other)
+    assert_close(found, expected)
 
 
 # ---- MONAI -----------------------------------------------------------------------------------------------------------
@@ -138,23 +142,22 @@ def test_keywords_mean_what_they_mean_in_monai(name):
     assert each.shape == (2, 3, 1, 1, 1) and len(set(each.flatten().tolist())) == 6
     for include, expected in ((True, each), (False, each[:, 1:])):
         options = {"to_onehot_y": True, "softmax": True, "include_background": include}
-        torch.testing.assert_close(value(logits, target, reduction="none", **options), expected)
-        torch.testing.assert_close(value(logits, target, **options), expected.mean())
+        assert_close(value(logits, target, reduction="none", **options), expected)
+        assert_close(value(logits, target, **options), expected.mean())
         if name == "prior":  # of the energies themselves: 6³ voxels inside, ε of two voxels
             expected = expected * 6**3 / 2**3
-        torch.testing.assert_close(value(logits, target, reduction="sum", **options), expected.sum())
+        assert_close(value(logits, target, reduction="sum", **options), expected.sum())
     found = value(logits, onehot, sigmoid=True, reduction="none")
-    torch.testing.assert_close(found, value(logits.sigmoid(), onehot, reduction="none"))
+    assert_close(found, value(logits.sigmoid(), onehot, reduction="none"))
 
 
 def test_tensors_with_metadata_are_tensors():
     data = pytest.importorskip("monai.data", reason="monai is not installed: pip install monai")
-    logits, target = noise(1, 1, 8, 8, 8), torch.zeros(1, 1, 8, 8, 8)
-    prior = CurvaturePrior("tubes", sigmoid=True, ignore_index=1)
-    leaf = data.MetaTensor(logits).requires_grad_()
+    prior, target = CurvaturePrior("tubes", sigmoid=True, ignore_index=1), torch.zeros_like(TARGET)
+    leaf = data.MetaTensor(LOGITS).requires_grad_()
     value = prior(leaf, data.MetaTensor(target), data.MetaTensor(torch.ones_like(target)))
     value.backward()
-    assert type(value) is Tensor and torch.equal(value, prior(logits, target))
+    assert type(value) is Tensor and torch.equal(value, prior(LOGITS, target))
     assert leaf.grad is not None and bool(leaf.grad.any())
 
 
@@ -168,8 +171,7 @@ def test_it_trains_under_monai_s_deep_supervision():
     value = loss(outputs, target)
     value.backward()
     plain = losses.DeepSupervisionLoss(base, weight_mode="exp")(outputs, target)
-    ours = prior(outputs[0]) + 0.5 * prior(outputs[1])
-    torch.testing.assert_close(value, plain + 1e-3 * ours)
+    assert_close(value, plain + 1e-3 * (prior(outputs[0]) + 0.5 * prior(outputs[1])))
     assert all(bool(output.grad.any()) for output in outputs)
 
 

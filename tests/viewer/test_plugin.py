@@ -26,6 +26,10 @@ from curvafit.volumes import ScanError  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 PLACE = {"scale": (0.5, 0.25, 0.25), "units": ("micrometer",) * 3, "translate": (10, 20, 30)}
+Z, Y, X = np.mgrid[:33, :40, :44]
+#: Two rods along z with the labels 3 and 7.
+RODS = np.where(np.hypot(Y - 12 + 3 * np.sin(Z / 6), X - 12) < 5, 3, 0)
+RODS = np.where(np.hypot(Y - 28, X - 30 + 3 * np.cos(Z / 6)) < 6, 7, RODS)
 
 
 @pytest.fixture
@@ -41,6 +45,12 @@ def docked(viewer: Any, kind: type) -> Any:
     return widget
 
 
+def completing(viewer: Any, labels: np.ndarray) -> tuple[Any, Any]:
+    """A layer of labels and the widget that completes it."""
+    layer = viewer.add_labels(labels.copy(), name="cells", **PLACE)
+    return layer, docked(viewer, Complete)
+
+
 def wait(done: Callable[[], bool], seconds: float = 120) -> None:
     end = time.monotonic() + seconds
     while not done():
@@ -53,61 +63,51 @@ def click(button: Any) -> None:
     QTest.mouseClick(button.native, Qt.MouseButton.LeftButton)
 
 
-def run(widget: Any) -> str:
+def run(widget: Any, known: str | None = None) -> str:
     """Press the button, wait for the end, and return what the widget says."""
+    if known is not None:
+        widget.known.value = known
     click(widget.run_button)
     wait(lambda: widget.run_button.enabled)
     return widget.status.value
 
 
-def rods(shape: tuple[int, int, int] = (33, 40, 44)) -> np.ndarray:
-    """Two rods along z with the labels 3 and 7."""
-    z, y, x = np.mgrid[: shape[0], : shape[1], : shape[2]]
-    labels = np.where(np.hypot(y - 12 + 3 * np.sin(z / 6), x - 12) < 5, 3, 0)
-    return np.where(np.hypot(y - 28, x - 30 + 3 * np.cos(z / 6)) < 6, 7, labels)
-
-
-def sparse(every: int = 8) -> np.ndarray:
-    """The rods on every so many slices."""
-    some = np.zeros_like(rods())
-    some[::every] = rods()[::every]
+def sparse(every: int | list[int] = 8, labels: np.ndarray = RODS) -> np.ndarray:
+    """Labels on every so many slices, or on those that are listed."""
+    slices = slice(None, None, every) if isinstance(every, int) else every
+    some = np.zeros_like(labels)
+    some[slices] = labels[slices]
     return some
 
 
 def test_labels_are_completed_and_it_can_be_undone(viewer: Any) -> None:
-    truth, some = rods(), sparse()
-    layer = viewer.add_labels(some.copy(), name="cells", **PLACE)
-    widget = docked(viewer, Complete)
+    some = sparse()
+    layer, widget = completing(viewer, some)
     assert "filled by the network" in run(widget)
     for label in (3, 7):
-        assert dice(layer.data == label, truth == label) > 0.9
-    np.testing.assert_array_equal(layer.data[::8], truth[::8])
+        assert dice(layer.data == label, label == RODS) > 0.9
+    np.testing.assert_array_equal(layer.data[::8], RODS[::8])
     doubt = viewer.layers["doubt of cells"]
-    np.testing.assert_allclose(doubt.scale, PLACE["scale"])
-    np.testing.assert_allclose(doubt.translate, PLACE["translate"])
+    np.testing.assert_allclose((doubt.scale, doubt.translate), (PLACE["scale"], PLACE["translate"]))
     assert str(doubt.units[0]) == "micrometer" and doubt.data.max() <= 1 and not doubt.data[::8].any()
     layer.undo()
     np.testing.assert_array_equal(layer.data, some)
     layer.redo()
-    assert dice(layer.data == 3, truth == 3) > 0.9
+    assert dice(layer.data == 3, RODS == 3) > 0.9
 
 
 def test_slices_are_suggested_and_a_button_goes_there(viewer: Any) -> None:
-    truth = rods()
-    some = np.zeros_like(truth)
-    some[[0, 4, 8, 32]] = truth[[0, 4, 8, 32]]
-    layer = viewer.add_labels(some, name="cells", **PLACE)
+    some = sparse([0, 4, 8, 32])
+    layer, widget = completing(viewer, some)
     layer.selected_label = 7
-    widget = docked(viewer, Complete)
     widget.which.value, widget.suggest.value = "the selected label", 2
     run(widget)
-    assert dice(layer.data == 7, truth == 7) > 0.8
+    assert dice(layer.data == 7, RODS == 7) > 0.8
     np.testing.assert_array_equal(layer.data == 3, some == 3)  # the other label is left alone
-    frames = viewer.layers["suggested slices of cells"]
     buttons = list(widget.suggestions)
     slices = [int(button.text.split()[1]) for button in buttons]
     assert len(slices) == 2 and all(8 < k < 32 for k in slices)  # the largest gap
-    assert [float(frame[0, 0]) for frame in frames.data] == slices
+    assert [float(frame[0, 0]) for frame in viewer.layers["suggested slices of cells"].data] == slices
     click(buttons[1])
     assert viewer.dims.current_step[0] == slices[1]
     run(widget)
@@ -116,11 +116,10 @@ def test_slices_are_suggested_and_a_button_goes_there(viewer: Any) -> None:
 
 def test_empty_slices_next_in_the_rhythm_are_known_and_said(viewer: Any) -> None:
     """Labels of 64 bits on every fourth slice from 12 to 20, and three slices to draw next."""
-    great, truth = 2**63 + 5, rods()
-    drawn = np.isin(np.arange(33), [12, 16, 20])[:, None, None] & (truth > 0)
-    some = np.where(drawn, truth.astype(np.uint64) + np.uint64(2**63), np.uint64(0))
-    layer = viewer.add_labels(some.copy(), name="cells", **PLACE)
-    widget = docked(viewer, Complete)
+    great = 2**63 + 5
+    wide = np.where(RODS > 0, RODS.astype(np.uint64) + np.uint64(2**63), np.uint64(0))
+    some = sparse([12, 16, 20], wide)
+    layer, widget = completing(viewer, some)
     told = run(widget)
     assert "5 of 17 slices known" in told and "Slices 8, 24" in told and "rightly empty" in told
     assert not layer.data[:9].any() and not layer.data[24:].any() and len(widget.suggestions) == 3
@@ -129,136 +128,51 @@ def test_empty_slices_next_in_the_rhythm_are_known_and_said(viewer: Any) -> None
     assert "6 of 17 slices known" in run(widget)
 
 
-def test_a_correction_is_known_at_the_next_fill(viewer: Any) -> None:
-    truth = rods()
-    layer = viewer.add_labels(sparse(16), name="cells", **PLACE)
-    widget = docked(viewer, Complete)
-    assert "3 of 33 slices known" in run(widget)
-    layer.data[8] = truth[8]
-    assert "4 of 33 slices known" in run(widget)
-    np.testing.assert_array_equal(layer.data[[0, 8, 16, 32]], truth[[0, 8, 16, 32]])
-    layer.data[20] = truth[20]
-    widget.known.value = "4"  # besides what was drawn and corrected
-    assert "6 of 33 slices known" in run(widget)
-    np.testing.assert_array_equal(layer.data[20], truth[20])
-    widget.known.value = "only 0::16"
-    assert "3 of 33 slices known" in run(widget)
+#: A first drawing, then steps: what is done to the layer, the slices named, how many are known then.
+STORIES = {
+    "corrections": (16, [(None, "", 3), (8, "", 4), (20, "4", 6), (None, "only 0::16", 3)]),
+    "slices that are named beside the drawn ones": (8, [(None, "0,8,12", 6)]),
+    "a full layer": (1, [(None, "only 0::8", 5)]),
+    "undo, and another drawing": (16, [(None, "", 3), ("undo", "", 3), (24, "", 4), ("undo", "", 4)]),
+    "undo through a fill that changed nothing": (8, [(None, "", 5), (None, "", 5), ("undo", "", 5)]),
+    "what only left out": (8, [(None, "", 5), (4, "", 6), (None, "only 0::16", 3), (None, "", 3)]),
+    "other data": (8, [(None, "", 5), ("other", "", 9)]),
+}
 
 
-def test_what_was_drawn_stays_where_other_slices_are_named(viewer: Any) -> None:
-    some = sparse()
-    layer = viewer.add_labels(some.copy(), name="cells", **PLACE)
-    widget = docked(viewer, Complete)
-    widget.known.value = "0,8,12"
-    assert "6 of 33 slices known" in run(widget)
-    np.testing.assert_array_equal(layer.data[::8], some[::8])
-    assert not layer.data[12].any()  # named, and empty
+@pytest.mark.parametrize("story", STORIES)
+def test_what_was_drawn_is_known_and_stays(viewer: Any, story: str) -> None:
+    every, steps = STORIES[story]
+    layer, widget = completing(viewer, sparse(every))
+    for what, known, count in steps:
+        if what == "undo":
+            layer.undo()
+        elif what == "other":
+            layer.data = sparse(4)
+        elif what is not None:
+            layer.data[what] = RODS[what]
+        assert f"{count} of 33 slices known" in run(widget, known)
+        if story != "undo, and another drawing":
+            np.testing.assert_array_equal(layer.data[::16], RODS[::16])
 
 
-def test_a_full_layer_is_filled_anew_between_the_slices_that_are_named_alone(viewer: Any) -> None:
-    truth = rods()
-    layer = viewer.add_labels(truth.copy(), name="cells")
-    widget = docked(viewer, Complete)
-    assert "only 0::8" in run(widget)
-    widget.known.value = "only 0::8"
-    assert "5 of 33 slices known" in run(widget)
-    np.testing.assert_array_equal(layer.data[::8], truth[::8])
-
-
-def test_one_label_after_all_of_them_is_filled_from_what_was_drawn(viewer: Any) -> None:
-    layer = viewer.add_labels(sparse(), name="cells", **PLACE)
-    widget = docked(viewer, Complete)
-    run(widget)
-    widget.which.value = "the selected label"
-    for label in (3, 7):
-        layer.selected_label = label
-        assert "5 of 33 slices known" in run(widget)
-
-
-def test_after_undo_other_drawings_count(viewer: Any) -> None:
-    truth = rods()
-    layer = viewer.add_labels(sparse(16), name="cells", **PLACE)
-    widget = docked(viewer, Complete)
-    run(widget)
-    layer.undo()
-    layer.data[24] = truth[24]
-    assert "4 of 33 slices known" in run(widget)
-    layer.undo()
-    assert "4 of 33 slices known" in run(widget)
-
-
-def test_undo_reaches_through_a_fill_that_changed_nothing(viewer: Any) -> None:
-    layer = viewer.add_labels(sparse(), name="cells", **PLACE)
-    widget = docked(viewer, Complete)
-    run(widget)
-    done = layer.data.copy()
-    run(widget)
-    np.testing.assert_array_equal(layer.data, done)
-    layer.undo()
-    assert "5 of 33 slices known" in run(widget)
-
-
-def test_redo_is_no_drawing(viewer: Any) -> None:
-    layer = viewer.add_labels(sparse(), name="cells", **PLACE)
-    widget = docked(viewer, Complete)
-    run(widget)
-    layer.undo()
-    widget.known.value = "99"
-    assert "known slices" in run(widget)
-    layer.redo()
-    widget.known.value = ""
-    assert "5 of 33 slices known" in run(widget)
-
-
-def test_what_only_left_out_is_not_known_later(viewer: Any) -> None:
-    truth = rods()
-    layer = viewer.add_labels(sparse(), name="cells", **PLACE)
-    widget = docked(viewer, Complete)
-    run(widget)
-    layer.data[4] = truth[4]
-    assert "6 of 33 slices known" in run(widget)
-    widget.known.value = "only 0::16"
-    run(widget)
-    widget.known.value = ""
-    assert "3 of 33 slices known" in run(widget)
-
-
-def test_a_small_correction_of_a_small_fill_is_one(viewer: Any) -> None:
-    layer = viewer.add_labels(sparse(16), name="cells", **PLACE)
-    widget = docked(viewer, Complete)
-    run(widget)
-    before = layer.data.copy()
-    layer.data[8] = rods()[8]
-    run(widget)
-    layer.data[9] = before[9]  # as it was, and nothing else
-    assert "5 of 33 slices known" in run(widget)
-
-
-def test_other_data_forget_what_was_filled(viewer: Any) -> None:
-    layer = viewer.add_labels(sparse(), name="cells")
-    widget = docked(viewer, Complete)
-    run(widget)
-    layer.data = sparse(4)
-    assert "9 of 33 slices known" in run(widget)
-    layer.data = sparse(16)[:17]
-    assert "2 of 17 slices known" in run(widget)
-
-
-def test_the_label_that_was_filled_is_the_one_to_correct_with(viewer: Any) -> None:
-    layer = viewer.add_labels(np.where(sparse() == 3, 255, 0), name="cells")
+def test_redo_is_no_drawing_and_the_label_that_was_filled_is_selected(viewer: Any) -> None:
+    layer, widget = completing(viewer, np.where(sparse() == 3, 255, 0))
     layer.selected_label = 1
-    run(docked(viewer, Complete))
+    run(widget)
     assert layer.selected_label == 255
+    layer.undo()
+    assert "known slices" in run(widget, "99")
+    layer.redo()
+    assert "5 of 33 slices known" in run(widget, "")
 
 
 def test_what_is_painted_meanwhile_stays(viewer: Any) -> None:
-    truth = rods()
-    layer = viewer.add_labels(sparse(), name="cells", **PLACE)
-    widget = docked(viewer, Complete)
+    layer, widget = completing(viewer, sparse())
     click(widget.run_button)
     layer.data[3, :4, :4] = 7
     wait(lambda: widget.run_button.enabled)
-    assert (layer.data[3, :4, :4] == 7).all() and dice(layer.data == 3, truth == 3) > 0.9
+    assert (layer.data[3, :4, :4] == 7).all() and dice(layer.data == 3, RODS == 3) > 0.9
     click(widget.run_button)
     viewer.layers.remove(layer)
     wait(lambda: widget.run_button.enabled)
@@ -266,36 +180,30 @@ def test_what_is_painted_meanwhile_stays(viewer: Any) -> None:
 
 
 def test_labels_on_slices_of_their_own_are_filled_one_after_the_other(viewer: Any) -> None:
-    truth, some = rods(), np.zeros_like(rods())
-    some[::8] = np.where(truth[::8] == 3, 3, 0)
-    some[4::8] = np.where(truth[4::8] == 7, 7, 0)
-    layer = viewer.add_labels(some, name="cells", **PLACE)
-    widget = docked(viewer, Complete)
+    some = sparse(8, np.where(RODS == 3, 3, 0))
+    some[4::8] = np.where(RODS[4::8] == 7, 7, 0)
+    layer, widget = completing(viewer, some)
     for text in ("", "16"):
-        widget.known.value = text
-        assert "one after the other" in run(widget)
-    widget.known.value = ""
+        assert "one after the other" in run(widget, text)
     widget.which.value = "the selected label"
     for label in (3, 7):
         layer.selected_label = label
-        run(widget)
-    assert dice(layer.data == 3, truth == 3) > 0.9 and dice(layer.data == 7, truth == 7) > 0.85
+        run(widget, "")
+    assert dice(layer.data == 3, RODS == 3) > 0.9 and dice(layer.data == 7, RODS == 7) > 0.85
     layer.selected_label = 3
-    layer.data[20] = np.where(truth[20] == 3, 3, np.where(layer.data[20] == 3, 0, layer.data[20]))
+    layer.data[20] = np.where(RODS[20] == 3, 3, np.where(layer.data[20] == 3, 0, layer.data[20]))
     assert "6 of 33 slices known" in run(widget)  # five drawn, and the corrected one
 
 
 def test_an_image_and_another_axis(viewer: Any) -> None:
-    truth = np.moveaxis(rods(), 0, 2)
-    some = np.zeros_like(truth)
-    some[:, :, ::8] = truth[:, :, ::8]
+    truth, some = (np.moveaxis(each, 0, 2) for each in (RODS, sparse()))
     place = {"scale": (0.25, 0.25, 0.5), "units": ("micrometer",) * 3}
     grey = (60 + 80 * (truth > 0) + 15 * np.random.default_rng(0).standard_normal(truth.shape)).astype(np.float32)
     viewer.add_image(grey, name="scan", **place)
     layer = viewer.add_labels(some, name="cells", **place)
     widget = docked(viewer, Complete)
-    widget.image.value, widget.axis.value, widget.known.value = viewer.layers["scan"], "x", "0::8"
-    assert "image" in run(widget)
+    widget.image.value, widget.axis.value = viewer.layers["scan"], "x"
+    assert "image" in run(widget, "0::8")
     assert dice(layer.data > 0, truth > 0) > 0.93
 
 
@@ -313,12 +221,10 @@ def test_work_stops_where_it_is_told_to(viewer: Any) -> None:
 def test_a_texture_is_grown_at_its_scale_and_measured(viewer: Any, tmp_path: Any) -> None:
     widget = docked(viewer, Generate)
     widget.edge.value, widget.steps.value, widget.spacing.value, widget.unit.value = 40, 300, 0.5, "um"
-    widget.phase.value = True
     run(widget)
     layer = viewer.layers["tubes, seed 0"]
     field = field_of_layer(layer)
     assert field.shape == (40, 40, 40) and field.spacing == (0.5,) * 3 and field.unit == "um"
-    assert np.array_equal(viewer.layers["phase field of tubes, seed 0"].data > 0, layer.data > 0)
     gauge = docked(viewer, Measure)
     gauge.layer.value, gauge.file.value = layer, tmp_path / "tubes.csv"
     assert "tubes.csv written" in run(gauge)
@@ -331,64 +237,52 @@ def test_a_texture_is_grown_at_its_scale_and_measured(viewer: Any, tmp_path: Any
 
 
 def test_each_label_has_its_row_and_its_numbers_beneath_the_mouse(viewer: Any) -> None:
-    layer = viewer.add_labels(rods(), name="cells", **PLACE)
-    gauge = docked(viewer, Measure)
+    layer, gauge = viewer.add_labels(RODS, name="cells", **PLACE), docked(viewer, Measure)
     run(gauge)
-    assert [int(each) for each in gauge.table.row_headers] == [3, 7] and [each.part[1] for each in gauge.measures] == [
-        3,
-        7,
-    ]
+    assert [int(each) for each in gauge.table.row_headers] == [each.part[1] for each in gauge.measures] == [3, 7]
     voxels = layer.features.set_index("index")["V (µm³)"] / (0.5 * 0.25 * 0.25)
-    assert voxels.to_dict() == pytest.approx({k: np.count_nonzero(rods() == k) for k in (3, 7)})
+    assert voxels.to_dict() == pytest.approx({k: np.count_nonzero(k == RODS) for k in (3, 7)})
+
+
+ONES = np.ones((8, 8, 8), int)
 
 
 @pytest.mark.parametrize(
-    ("data", "options", "words"),
+    ("data", "options", "known", "words"),
     [
-        (np.ones((8, 8), int), {}, "three axes"),
-        (np.ones((3, 8, 8, 8), int), {}, "three axes"),
-        (np.zeros((8, 8, 8), int), {}, "slices with labels"),
-        (np.ones((8, 8, 8), int), {"units": ("pixel", "micrometer", "micrometer")}, "kind of unit"),
-        (np.ones((8, 8, 8), int), {"units": ("second",) * 3}, "unit second"),
-        (np.ones((8, 8, 8), int), {}, "slice without labels lies between"),
+        (ONES[0], {}, "", "three axes"),
+        (np.ones((3, 8, 8, 8), int), {}, "", "three axes"),
+        (0 * ONES, {}, "", "slices with labels"),
+        (ONES, {"units": ("pixel", "micrometer", "micrometer")}, "", "kind of unit"),
+        (ONES, {"units": ("second",) * 3}, "", "unit second"),
+        (ONES, {}, "", "slice without labels lies between"),
+        (None, {}, "", "got none"),
+        *(
+            (RODS, {}, text, "known slices")
+            for text in ("a", "0,99", "1:2:3:4", "-1", "5:2", "only", "only 3", "0::8 only", "8,only 16")
+        ),
     ],
 )
-def test_what_is_no_volume_is_said_in_a_sentence(viewer: Any, data: np.ndarray, options: dict, words: str) -> None:
-    viewer.add_labels(data, name="cells", **options)
-    widget = docked(viewer, Complete)
-    assert words in run(widget) and len(viewer.layers) == 1
+def test_what_cannot_be_completed_is_said_in_a_sentence(viewer: Any, data, options, known, words) -> None:
+    if data is not None:
+        viewer.add_labels(data, name="cells", **options)
+    assert words in run(docked(viewer, Complete), known) and len(viewer.layers) == (data is not None)
 
 
 def test_layers_that_cannot_be_edited_or_measured_are_said(viewer: Any) -> None:
     from dask.array import from_array
+    from napari.layers import Image
 
+    gauge = docked(viewer, Measure)
+    assert "got none" in run(gauge)
     viewer.add_labels(from_array(sparse()), name="cells")
     assert "no NumPy array" in run(docked(viewer, Complete))
-    gauge = docked(viewer, Measure)
     assert "complete the layer first" in run(gauge)
     viewer.layers.clear()
-    image = viewer.add_image(np.where(rods() == 3, np.nan, 1.0), name="scan")
+    image = viewer.add_image(np.where(RODS == 3, np.nan, 1.0), name="scan")
     gauge.reset_choices()
     gauge.layer.value = image
     assert "not" in run(gauge) and "finite" in gauge.status.value
-
-
-@pytest.mark.parametrize("text", ["a", "0,99", "1:2:3:4", "-1", "5:2", "only", "only 3", "0::8 only", "8,only 16"])
-def test_slices_that_are_none_are_said(viewer: Any, text: str) -> None:
-    viewer.add_labels(rods(), name="cells")
-    widget = docked(viewer, Complete)
-    widget.known.value = text
-    assert "known slices" in run(widget)
-
-
-def test_no_layer_is_said(viewer: Any) -> None:
-    for kind in (Complete, Measure):
-        assert "got none" in run(docked(viewer, kind))
-
-
-def test_colours_and_other_units() -> None:
-    from napari.layers import Image
-
     with pytest.raises(ScanError, match="colours"):
         field_of_layer(Image(np.zeros((8, 8, 8, 3), np.uint8), rgb=True))
     field = field_of_layer(Image(np.zeros((1, 8, 9, 10)), scale=(1, 2, 300, 300), units=("s", "um", "nm", "nm")))
