@@ -9,13 +9,130 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calling import QUICK, call, refused
+from calling import LAW, QUICK, call, refused
+from exact_store import exact_store
 from found import made_inference, without_drawing
 
-from curvafit.volumes.field import Field
-from curvafit.volumes.write import save
+from curvafit.cli.app import GONE
+from curvafit.cli.console import LONGEST, error_console, sentence, show_stages, writable
 
-# ---- help ------------------------------------------------------------------------------------------------------------
+# ---- what is refused -------------------------------------------------------------------------------------------------
+
+#: In `folder`: words that a command refuses, and one of its sentence.
+REFUSALS: dict[str, dict[str, str]] = {
+    "": {"frob": "'frob'", "--frob": "--frob", "presets all": "argument",
+         "samples get": "(see curvafit samples get --help)", "samples get nothing": "sample"},
+    "generate": {
+        "--frob": "--frob", "--preset tubes": "--output", "a b -o c.npy": "argument", "--preset": "argument",
+        "--preset tubes --seed x -o a.npy": "(see curvafit generate --help)",
+    },
+    f"generate {' '.join(LAW)} -o out.npy": {
+        "--epsilon 1e30": "epsilon", f"--steps {10**18}": "steps", f"--seed {2**64}": "seed", "--shape 1e9": "memory",
+        "--shape 8 --tile 1e6,1e6,1": "memory", "--spacing 1e300": "1e+12", "--spacing 1e-300": "1e-12",
+        "--orientation 0,0,1,1e30": "orientation", "--snapshots 1e300": "snapshots",
+        "--checkpoint-every 5": "--checkpoint",
+        "--checkpoint c.pt --checkpoint-every nan": "seconds", "--no-cap": "--no-cap",
+    },
+    "generate -o out.npy": {
+        f"{' '.join(LAW[:2])} --volume-fraction nan": "volume fraction",
+        "--coefficients 1e300,0,1e300,0,0,0 --mass 0": "a20", f"--preset {'x' * 5000}": "preset",
+        "--preset tu\nbes\x1b[31m\u202e": r"\x1b[31m\u202e",
+    },
+    "infer -o out": {
+        "none.tif": "no such file", "scan.xyz": "scan.xyz", "cut.npy": "cut.npy", "flat.npy": "", "four.npy": "",
+        "nan.npy": "", "constant.npy": "", "thin.npy": "",
+    },
+    "infer": {"": "(see curvafit infer --help)", "scan.npy -o scan.xyz": "folder"},
+    "infer scan.npy -o out": {
+        "--spacing 1,0,1": "--spacing", "--spacing 1,1": "--spacing", "--spacing a": "--spacing",
+        "--threshold high": "--threshold", "--raw-shape 4,5": "--raw-shape", "--unit furlong": "unit",
+        "--kind drawing": "kind", "--method nearest": "method", "--seed -1": "seed",
+        "--kind mask --threshold 4": "threshold",
+        "--label 1 --threshold 4": "label", "--atlas nowhere.npz": "atlas", "--roi nowhere.npy": "no such file",
+        "--label 77": "label", "--crop 1:4": "crop", "--crop 1:4,:,0:21": "crop", "--channel 0": "channel",
+        "--threshold 5": "threshold",
+    },
+    "segment scan.npy -o b.npy --prior tubes": {"--steps 0": "(see curvafit segment --help)"},
+    "reconstruct scan.npy --prior tubes -o out.npy": {"--known 0,8 --first 2": "--first"},
+    "atlas": {"frob": "(see curvafit atlas --help)"},
+    "atlas build s.zarr": {
+        f"--count {10**9}": "count", "--around tubes --spread 1e300": "spread", "--around tubes --spread nan": "spread",
+        f"--workers {10**6}": "workers", "--workers 2 --scheduler tcp://x:1": "scheduler", "--shape 1e5": "memory",
+        "--design box.yaml": "a10", "--design laughs.yaml": "", "--design nest.yaml": "", "--design code.yaml": "",
+    },
+    "synth -o a/set --presets tubes --modality confocal --workers 0 --count 1": {
+        "--voxel 1e300": "voxel", "--calibres 1,1e300": "calibres", "--calibres 1,900 --shape 16": "images",
+        "--shape 1": "images", "--shape 1e9": "images", "--unit mm": "--unit", "--unit furlong --voxel 1": "furlong",
+        "--scheduler tcp://x:1": "scheduler", f"--count {10**9}": "count",
+        "--count many": "(see curvafit synth --help)",
+        "--volume-fraction nan": "volume fraction",
+    },
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Volumes that have no shape, and designs that are none."""
+    here = tmp_path_factory.mktemp("refused")
+    volumes: dict[str, Any] = {
+        "scan": np.random.default_rng(0).normal(size=(20, 20, 20)).astype(np.float32),
+        "flat": np.zeros((20, 20)),
+        "four": np.zeros((5, 5, 5, 5)),
+        "nan": np.full((20, 20, 20), np.nan),
+        "constant": np.ones((20, 20, 20)),
+        "thin": np.indices((30, 30, 30)).sum(0) % 8 == 0,
+    }
+    for name, values in volumes.items():
+        np.save(here / f"{name}.npy", values)
+    (here / "cut.npy").write_bytes((here / "scan.npy").read_bytes()[:900])
+    (here / "scan.xyz").write_bytes(b"12345")
+    laughs = "".join(f", &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 9))
+    designs = {
+        "box": "box:\n  a10: [0, 1e300]\n",
+        "laughs": f"around: tubes\nspread: [&a0 [1, 1]{laughs}]\n",
+        "nest": "box: " + "[" * 3000,
+        "code": "box: !!python/object/apply:os.system ['touch ran']\n",
+    }
+    for name, text in designs.items():
+        (here / f"{name}.yaml").write_text(text)
+    return here
+
+
+@pytest.mark.parametrize("command", REFUSALS)
+def test_a_refusal_is_one_sentence_and_nothing_is_begun(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    monkeypatch.chdir(folder)
+    before = sorted(folder.iterdir())
+    for words, key in REFUSALS[command].items():
+        refused(call(*command.split(), *words.split(" ") if words else ()), key, progress=True)
+        assert sorted(folder.iterdir()) == before, words
+
+
+@pytest.mark.parametrize("name", GONE)
+def test_a_command_that_is_gone_says_what_to_type(name: str) -> None:
+    refused(call(name, "whatever", "--more"), GONE[name])
+
+
+def test_a_set_without_any_case_is_removed(tmp_path: Path) -> None:
+    """All that such images show of the stored shapes is background."""
+    store = exact_store(tmp_path / "s.zarr", 1).path
+    words = ["synth", "--atlas", store, "--modality", "confocal", "--workers", "0", "--shape", "1,1,2", "--voxel", 0.5]
+    result = call(*words, "-o", tmp_path / "a" / "set")
+    assert result.exit_code == 2 and "error: " in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["s.zarr"]
+    (tmp_path / "mine").mkdir()
+    assert call(*words, "-o", tmp_path / "mine").exit_code == 2
+    assert list((tmp_path / "mine").iterdir()) == []
+
+
+# ---- help and lists --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("group", [[], ["atlas"]])
+def test_without_a_command_help_is_shown(group: list[str]) -> None:
+    result = call(*group)
+    assert "Usage:" in result.output and "error:" not in result.output
 
 
 @pytest.mark.parametrize("command", ["generate", "infer", "segment", "atlas build", "samples get"])
@@ -34,7 +151,6 @@ def test_presets_are_listed_with_their_numbers() -> None:
 def test_samples_are_listed_with_their_licences() -> None:
     result = call("samples")
     assert result.exit_code == 0 and re.search(r"^bone .* MIT ", result.stdout, re.MULTILINE)
-    refused(call("samples", "get", "nothing"), "sample")
     assert re.fullmatch(r"curvafit \d+\.\d+\.\d+\S*\n", call("--version").stdout)
 
 
@@ -42,13 +158,9 @@ def test_samples_are_listed_with_their_licences() -> None:
 
 
 @pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_drawing(monkeypatch)
-
-
-@pytest.fixture
-def finding(monkeypatch: pytest.MonkeyPatch, undrawn: None) -> dict[str, Any]:
+def finding(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Puts a made inference in the place of the real one, and keeps what it was called with."""
+    without_drawing(monkeypatch)
     calls: dict[str, Any] = {}
 
     def find(scan: str, *, progress: Any, **given: Any) -> Any:
@@ -88,74 +200,6 @@ def test_infer_hands_every_option_on(tmp_path: Path, finding: dict[str, Any]) ->
     wanted |= {"key": "k", "seed": 9, "spacing": (0.5, 0.5, 0.5), "roi": roi, "atlas": None}
     wanted |= {"channel": 2, "crop": "1:3,:,-4:", "method": "match"}
     assert {name: finding[name] for name in wanted} == wanted
-
-
-@pytest.mark.parametrize(
-    ("arguments", "word"),
-    [
-        ("--spacing 1,0,1", "--spacing"),
-        ("--spacing 1,1", "--spacing"),
-        ("--spacing a", "--spacing"),
-        ("--threshold high", "--threshold"),
-        ("--raw-shape 4,5", "--raw-shape"),
-        ("--unit furlong", "unit"),
-        ("--kind drawing", "kind"),
-        ("--method nearest", "method"),
-        ("--seed -1", "seed"),
-        ("--kind mask --threshold 4", "threshold"),
-        ("--label 1 --threshold 4", "label"),
-        ("--atlas nowhere.npz", "atlas"),
-        ("--roi nowhere.npy", "no such file"),
-        ("--label 77", "label"),
-        ("--crop 1:4", "crop"),
-        ("--crop 1:4,:,0:21", "crop"),
-        ("--channel 0", "channel"),
-        ("--threshold 5", "threshold"),
-    ],
-)
-def test_infer_refuses_options_in_one_sentence(tmp_path: Path, arguments: str, word: str) -> None:
-    values = np.random.default_rng(0).normal(size=(20, 20, 20)).astype(np.float32)
-    scan = save(Field(values), tmp_path / "scan.npy")
-    refused(call("infer", scan, "-o", tmp_path / "out", *arguments.split()), word, progress=True)
-    assert not (tmp_path / "out").exists()
-
-
-def test_infer_checks_before_it_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def read(*_: object, **__: object) -> None:
-        raise AssertionError("the scan was read")
-
-    monkeypatch.setattr(importlib.import_module("curvafit.inference.infer"), "read_scan", read)
-    scan = tmp_path / "scan.npy"
-    scan.touch()
-    for option in (("--seed", "-1"), ("--kind", "drawing"), ("--unit", "furlong")):
-        refused(call("infer", scan, "-o", tmp_path / "out", *option), option[0].strip("-"))
-    assert list(tmp_path.iterdir()) == [scan]
-
-
-BAD_VOLUMES: dict[str, Any] = {
-    "flat": np.zeros((20, 20)),
-    "four": np.zeros((5, 5, 5, 5)),
-    "nan": np.full((20, 20, 20), np.nan),
-    "constant": np.ones((20, 20, 20)),
-    "thin": np.indices((30, 30, 30)).sum(0) % 8 == 0,
-}
-
-
-@pytest.mark.parametrize("name", BAD_VOLUMES)
-def test_infer_refuses_volumes_in_one_sentence(tmp_path: Path, name: str) -> None:
-    np.save(tmp_path / f"{name}.npy", BAD_VOLUMES[name])
-    refused(call("infer", tmp_path / f"{name}.npy", "-o", tmp_path / "out"), progress=True)
-    assert [path.name for path in tmp_path.iterdir()] == [f"{name}.npy"]
-
-
-def test_infer_refuses_missing_unknown_and_truncated_files(tmp_path: Path) -> None:
-    (tmp_path / "scan.xyz").write_bytes(b"12345")
-    np.save(tmp_path / "cut.npy", np.random.default_rng(0).normal(size=(9, 9, 9)))
-    (tmp_path / "cut.npy").write_bytes((tmp_path / "cut.npy").read_bytes()[:900])
-    for name, word in (("none.tif", "no such file"), ("scan.xyz", "scan.xyz"), ("cut.npy", "cut.npy")):
-        refused(call("infer", tmp_path / name, "-o", tmp_path / "out"), word, progress=True)
-    refused(call("infer", tmp_path / "cut.npy", "-o", tmp_path / "scan.xyz"), "folder")
-    assert not (tmp_path / "out").exists()
 
 
 # ---- interruptions and mistakes --------------------------------------------------------------------------------------
@@ -202,3 +246,36 @@ def test_a_warning_becomes_a_note_where_the_command_succeeds(tmp_path: Path) -> 
     assert result.exit_code in (0, 1) and "note: a20 > 0 and a02 > 0" in result.stderr
     refused(call("generate", *law, "--steps", "1", "--mass", "7"), "mass")
     refused(call("generate", *law, "--mass", "0", "--steps", "0"), "steps")
+
+
+# ---- lines -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_job_that_fails_at_its_start_says_why_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(OSError, match="gone"), show_stages() as progress:
+        progress("reading", 0.0)
+        raise OSError("gone")
+    assert capsys.readouterr().err == ""
+    with show_stages() as progress:
+        progress("reading", 0.0)
+    assert capsys.readouterr().err == "[  0 %] reading\n"
+
+
+def test_a_stage_that_counts_on_is_a_line_every_five_percent(capsys: pytest.CaptureFixture[str]) -> None:
+    """Progress where there is no terminal: lines that a log can hold."""
+    with show_stages() as progress:
+        for k in range(1000):
+            progress(f"{k} of 1000 draws checked", 0.9 * k / 1000)
+        progress("making draw 12 again", 0.9)
+        progress("making draw 12 again", 0.9)
+    lines = capsys.readouterr().err.splitlines()
+    assert 15 <= len(lines) <= 21
+    assert lines[0] == "[  0 %] 0 of 1000 draws checked" and lines[-1] == "[ 90 %] making draw 12 again"
+
+
+def test_a_sentence_is_one_line_that_shows() -> None:
+    assert sentence("a\n b\tc") == "error: a b c"
+    assert sentence("\x1b[2J \u202e \ud800", "note") == r"note: \x1b[2J \u202e \ud800"
+    assert sentence("κ1 ≥ κ2, é") == "error: κ1 ≥ κ2, é"
+    assert len(sentence("expected " + "x" * 10**6)) < LONGEST + 20
+    writable("\udcff é", error_console()).encode(error_console().encoding)
