@@ -2,26 +2,18 @@
 
     python docs/house.py                      # docs/house.png, of this tree
     python docs/house.py --tree ../old -o before.png
-    python docs/house.py --types              # no picture: the types that a scan and slices are on their way
 
 A room is a folder of `curvafit/`, or a file beside the folders. A room stands one floor above the highest room that it
 imports; faces (`__init__.py`) count for their own folder only. Prints the numbers of modules, rooms, floors and arrows,
 and every arrow that runs back up or stays on a floor, of which there should be none.
-
-`--types` reads a grown mask with `infer(fast=True)` and completes its slices with `reconstruct`, and lists the types of
-`ROOMS` that one module hands to another meanwhile, without `KNOWLEDGE`, which comes with the package.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
-import sys
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 import networkx as nx
 from matplotlib.figure import Figure
@@ -31,18 +23,13 @@ ROOT = Path(__file__).resolve().parent.parent
 HOUSE, INK, ROOM, ARROW = "curvafit", "#20303c", "#dfe9f2", "#8fa3b3"
 #: Sizes in the drawing's unit: a room's height, the gap between floors, a letter's width, the gap between rooms.
 HEIGHT, STOREY, LETTER, GAP = 1.0, 1.9, 0.155, 0.45
-ROOMS = ("volumes", "geometry", "scan", "inference", "segmentation")
-KNOWLEDGE = ("Atlas", "Posterior", "Emulator", "Compression", "Table")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tree", type=Path, default=ROOT, help="a checkout that holds curvafit/")
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "house.png")
-    parser.add_argument("--types", action="store_true", help="list the types of a scan and of slices")
     options = parser.parse_args()
-    if options.types:
-        return print_types()
     package = options.tree / HOUSE
     lines, arrows = rooms(package), imports(package)
     graph = nx.DiGraph()
@@ -123,42 +110,6 @@ def picture(lines: Counter[str], arrows: Counter[tuple[str, str]], floors: dict[
         axes.add_patch(FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=9, color=ARROW, linewidth=1.1,
                                        shrinkA=0, shrinkB=1, zorder=1))  # fmt: skip
     return figure
-
-
-def print_types() -> None:
-    """Print the types that a scan is on its way through `infer`, and slices through `reconstruct`."""
-    from curvafit import generate, infer, reconstruct
-
-    mask = (generate("tubes", grid=40).field.numpy() > 0).astype("uint8")
-    scan = types_handed_on(lambda: infer(mask, kind="mask", periodic=True, fast=True))
-    slices = types_handed_on(lambda: reconstruct(mask, every=8))
-    print(f"{len(scan)} of a scan: {', '.join(scan)}\n{len(slices)} of slices: {', '.join(slices)}")
-
-
-def types_handed_on(call: Callable[[], Any]) -> list[str]:
-    """Return the names of the types that one module hands to another, or gets from it, while `call` runs."""
-    package, found = str(ROOT / HOUSE), set[str]()
-
-    def watch(frame: FrameType, event: str, result: object) -> None:
-        if event not in ("call", "return") or not frame.f_code.co_filename.startswith(package):
-            return
-        caller = frame.f_back
-        while caller is not None and not caller.f_code.co_filename.startswith(package):
-            caller = caller.f_back
-        if caller is None or caller.f_code.co_filename == frame.f_code.co_filename:
-            return
-        names = frame.f_code.co_varnames[: frame.f_code.co_argcount + frame.f_code.co_kwonlyargcount]
-        for value in [result] if event == "return" else [frame.f_locals.get(name) for name in names]:
-            module, name = type(value).__module__.split("."), type(value).__name__
-            if module[0] == HOUSE and module[1] in ROOMS and name not in KNOWLEDGE and name != "function":
-                found.add(name)
-
-    sys.setprofile(watch)
-    try:
-        call()
-    finally:
-        sys.setprofile(None)
-    return sorted(found)
 
 
 if __name__ == "__main__":
