@@ -63,8 +63,6 @@ class TextureDataset(IterableDataset):
     normalise
         `zscore` (mean 0, deviation 1), `percentile` (percentiles 0.5 and 99.5 become 0 and 1, values beyond are cut),
         or your own function of an image (1, Z, Y, X); by default images keep their counts.
-    rotate
-        Turn shapes by any rotation (interpolated linearly), not by the symmetries of the cube alone.
     shapes, volume_fraction
         With laws: the number of shapes, which take turns among the laws, at least one of each; and the share of the
         volume that they fill, by default that of the law's mass or scan.
@@ -83,7 +81,6 @@ class TextureDataset(IterableDataset):
         voxel: float | None = None,
         calibres: tuple[float, float] = (1.0, 1.0),
         normalise: str | Callable[[Tensor], Tensor] | None = None,
-        rotate: bool = False,
         shapes: int = 16,
         volume_fraction: float | None = None,
         transform: Callable[[Sample], Any] | None = None,
@@ -110,12 +107,12 @@ class TextureDataset(IterableDataset):
         if stores:
             if volume_fraction is not None:
                 raise ValueError("volume_fraction applies to laws only; the source is a store of shapes")
-            self.source = Stored(tuple(map(Path, sources)), rotate=rotate)
+            self.source = Stored(tuple(map(Path, sources)))
         else:
             generated = Generated.of(sources, volume_fraction)
             check_int(shapes, "a pool of at least 1 shape", 1, MOST_POOLED)
             largest = max(max(field_shape(self.size, voxel, kind.base)) for kind, voxel in thinnest)
-            self.source = Pool(generated, max(shapes, len(generated.points)), ROUND * -(-largest // ROUND), rotate)
+            self.source = Pool(generated, max(shapes, len(generated.points)), ROUND * -(-largest // ROUND))
         for kind, voxel in thinnest:
             check_crop(self.source.edge, self.size, voxel, kind)
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()

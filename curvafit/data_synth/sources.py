@@ -17,8 +17,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from filelock import FileLock
-from scipy import ndimage
-from scipy.spatial.transform import Rotation
 
 from curvafit.core.checks import as_tuple
 from curvafit.core.files import write_atomically, write_content
@@ -140,7 +138,7 @@ class Generated:
 
 @dataclass(frozen=True)
 class Stored:
-    """Random crops of the well-formed shapes of one or more stores, under the symmetries of the cube or any rotation.
+    """Random crops of the well-formed shapes of one or more stores, under the symmetries of the cube.
 
     `draws` is the number of well-formed shapes in all stores, by default the present one: a store that grew is another
     source.
@@ -148,7 +146,6 @@ class Stored:
 
     paths: tuple[Path, ...]
     draws: int | None = None
-    rotate: bool = False
     scales = ()
 
     def __post_init__(self) -> None:
@@ -168,11 +165,11 @@ class Stored:
             origin = {"name": f"{store.path.name} {draw}", "parameters": point, "seed": record.seed}
             return PhaseField(store.field(draw), settings.epsilon / settings.spacing[0], origin)
 
-        return _crop_shape(choose, voxels, rng, self.rotate)
+        return _crop_shape(choose, voxels, rng)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the source in JSON's types, for a set's record; `decode_source` reads it."""
-        return {"kind": "stored", "paths": list(map(str, self.paths)), "draws": self.draws, "rotate": self.rotate}
+        return {"kind": "stored", "paths": list(map(str, self.paths)), "draws": self.draws}
 
     @property
     def about(self) -> str:
@@ -207,7 +204,6 @@ class Pool:
     generated: Generated
     count: int
     edge: int
-    rotate: bool = False
     room: Path = field(default_factory=_find_room, compare=False)
 
     @property
@@ -217,7 +213,7 @@ class Pool:
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
         """Return a crop of any of the pool's shapes that shows both structure and background."""
-        return _crop_shape(lambda: self.whole(int(rng.integers(self.count))), voxels, rng, self.rotate)
+        return _crop_shape(lambda: self.whole(int(rng.integers(self.count))), voxels, rng)
 
     def whole(self, number: int) -> PhaseField:
         """Return a shape by its number; ValueError, the same everywhere, where none of its seeds gives one."""
@@ -268,7 +264,9 @@ ShapeSource = Generated | Stored
 def decode_source(content: dict[str, Any]) -> ShapeSource:
     """Return the source that `as_dict` wrote."""
     if content["kind"] == "stored":
-        return Stored(tuple(map(Path, content["paths"])), content["draws"], content["rotate"])
+        if content.get("rotate"):
+            raise ValueError("it turns shapes by any angle, which curvafit does not do: begin another")
+        return Stored(tuple(map(Path, content["paths"])), content["draws"])
     points, plan = tuple(map(tuple, content["points"])), Schedule(**content["schedule"])
     return Generated(points, tuple(content["names"]), plan, content["fraction"], tuple(content.get("scales", ())))
 
@@ -287,13 +285,11 @@ def choose_voxel(laws: Iterable[LawLike], kind: Modality) -> float:
     return edges.pop() if edges else kind.voxel
 
 
-def _crop_shape(
-    choose: Callable[[], PhaseField], voxels: Sequence[int], rng: np.random.Generator, rotate: bool
-) -> PhaseField:
+def _crop_shape(choose: Callable[[], PhaseField], voxels: Sequence[int], rng: np.random.Generator) -> PhaseField:
     """Return a random crop, with both structure and background, of the shapes that `choose` draws."""
     for _ in range(CROPS):
         whole = choose()
-        part, move = random_crop(whole.values, voxels, rng, rotate)
+        part, move = random_crop(whole.values, voxels, rng)
         if part.min() < 0 < part.max():
             return PhaseField(part, whole.epsilon, whole.origin | move)
     edges = " x ".join(map(str, voxels))
@@ -316,30 +312,13 @@ def crop_periodic(values: np.ndarray, corner: Sequence[int], shape: Sequence[int
     return values
 
 
-def crop_rotated(
-    values: np.ndarray, corner: Sequence[int], shape: Sequence[int], quaternion: Sequence[float]
-) -> np.ndarray:
-    """Return a part as `crop_periodic` does, turned about its middle and interpolated linearly.
-
-    The quaternion (x, y, z, w) rotates vectors in the order (z, y, x).
-    """
-    turn = Rotation.from_quat(quaternion).as_matrix()
-    half = (np.array(shape) - 1) / 2
-    first = np.array(corner) + half - turn.T @ half
-    return ndimage.affine_transform(values, turn.T, first, tuple(shape), np.float32, order=1, mode="grid-wrap")
-
-
 def random_crop(
-    values: np.ndarray, shape: Sequence[int], rng: np.random.Generator, rotate: bool = False
+    values: np.ndarray, shape: Sequence[int], rng: np.random.Generator
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """Return a crop of a periodic volume under a random symmetry, and any rotation if `rotate`; and how it was made."""
+    """Return a crop of a periodic volume under a random symmetry of the cube, and how it was made."""
     symmetry = int(rng.integers(SYMMETRIES))
     moved = apply_symmetry(values, symmetry)
     if any(part > whole for part, whole in zip(shape, moved.shape, strict=True)):
         raise ValueError(f"the crop must be within the shape's {moved.shape} voxels, got {tuple(shape)}")
     corner = [int(rng.integers(whole)) for whole in moved.shape]
-    move = {"symmetry": symmetry, "corner": corner}
-    if not rotate:
-        return np.ascontiguousarray(crop_periodic(moved, corner, shape)), move
-    quaternion = rng.normal(size=4).tolist()
-    return crop_rotated(moved, corner, shape, quaternion), move | {"quaternion": quaternion}
+    return np.ascontiguousarray(crop_periodic(moved, corner, shape)), {"symmetry": symmetry, "corner": corner}

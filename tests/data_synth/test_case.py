@@ -1,4 +1,4 @@
-"""Cases of a training set: one shape, its image and mask, each by its number alone."""
+"""Cases of a training set: one shape, its image and mask, each by its number alone; and where shapes come from."""
 
 from __future__ import annotations
 
@@ -11,7 +11,15 @@ from flat_recipe import SHAPE, flat_recipe
 
 from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.imaging.modality import Imaging, Modality
-from curvafit.data_synth.sources import Generated, PhaseField, decode_source
+from curvafit.data_synth.sources import (
+    SYMMETRIES,
+    Generated,
+    PhaseField,
+    apply_symmetry,
+    crop_periodic,
+    decode_source,
+    random_crop,
+)
 from curvafit.generation import loop as steering
 
 
@@ -92,3 +100,32 @@ def test_a_recipe_reads_back(recipe):
     assert Recipe.from_dict(json.loads(json.dumps(thick.as_dict()))) == thick
     kept = recipe.source.as_dict()
     assert decode_source(kept) == recipe.source and kept["draws"] > 0
+
+
+VALUES = np.random.default_rng(0).random((3, 4, 5))
+
+
+def test_the_48_symmetries_are_a_group_of_which_the_first_is_none():
+    """They move the last three axes."""
+    cube = np.arange(27).reshape(3, 3, 3)
+    moved = [apply_symmetry(cube, k) for k in range(SYMMETRIES)]
+    each = {part.tobytes() for part in moved}
+    assert len(each) == 48 and (moved[0] == cube).all()
+    assert {apply_symmetry(part, k).tobytes() for part in moved for k in range(SYMMETRIES)} == each
+    pair = np.stack([VALUES, 2 * VALUES])
+    for k in range(0, SYMMETRIES, 7):
+        assert (apply_symmetry(pair, k)[1] == 2 * apply_symmetry(VALUES, k)).all()
+
+
+def test_a_crop_goes_on_across_the_faces():
+    tiled = np.tile(VALUES, (2, 2, 2))
+    for corner in ((0, 0, 0), (2, 3, 4), (1, 3, 0)):
+        z, y, x = corner
+        assert (crop_periodic(VALUES, corner, (3, 2, 4)) == tiled[z : z + 3, y : y + 2, x : x + 4]).all()
+
+
+def test_a_crop_of_the_whole_is_a_shift():
+    found, how = random_crop(VALUES, (3, 3, 3), np.random.default_rng(5))
+    again, _ = random_crop(VALUES, (3, 3, 3), np.random.default_rng(5))
+    assert found.shape == (3, 3, 3) and (found == again).all() and found.flags["C_CONTIGUOUS"]
+    assert (crop_periodic(apply_symmetry(VALUES, how["symmetry"]), how["corner"], (3, 3, 3)) == found).all()
