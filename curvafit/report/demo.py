@@ -32,6 +32,7 @@ from curvafit.report.page import (
     list_strips,
     picture_of,
     render_template,
+    working_length,
     write_inference,
 )
 from curvafit.scan.measure import measure
@@ -237,7 +238,7 @@ def _map_figure(inference: Inference, atlas: Atlas) -> Figure:
     """Return a figure of the scan's diagram and its place among the atlas's, on the main axes of sliced quantiles."""
     assert inference.diagram is not None
     figure = make_figure(10.2, 4.6)
-    λ, unit = inference.prepared.length, inference.fit.length_unit
+    λ, unit = working_length(inference), inference.fit.length_unit
     left = figure.add_axes((0.07, 0.13, 0.36, 0.78))
     diagram_on(left, inference.diagram, limits=shared_limits([inference.diagram], length=λ), unit=unit, length=λ)
     left.set_title("how much surface has which curvatures", fontsize=11)

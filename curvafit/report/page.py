@@ -49,6 +49,7 @@ from curvafit.inference.candidates import TITLES, Candidate, seed_noise_of
 from curvafit.inference.combinations import KNOWN
 from curvafit.inference.table import parameters_of
 from curvafit.inference.verdict import UNBELIEVED, UNDECIDED
+from curvafit.priors.grid import WORKING_SPACING
 from curvafit.priors.law import FORMAT
 from curvafit.volumes.field import Field
 from curvafit.volumes.write import save
@@ -276,7 +277,7 @@ def describe(inference: Inference) -> str:
     """Return the sentence that a report opens with: family, size, share of the volume."""
     fit, numbers = inference.fit, inference.fit.morphometry
     radius = None if inference.diagram is None else family_radius(inference.diagram, fit.family)
-    physical = numbers.thickness_mean / 2 if radius is None else radius * inference.prepared.length
+    physical = numbers.thickness_mean / 2 if radius is None else radius * working_length(inference)
     pattern = _SIZES.get(fit.family, "{family}, {thickness} thick, {share} of the volume")
     return pattern.format(
         family=fit.family.capitalize(),
@@ -296,6 +297,11 @@ def family_radius(diagram: Diagram, family: str) -> float | None:
         return None
     weights = np.asarray(diagram.weights)[own]
     return float(1 / np.quantile(kappa[own], 0.5, weights=weights, method="inverted_cdf"))
+
+
+def working_length(inference: Inference) -> float:
+    """Return the length of 1 working unit of the scan's diagram, in the fit's unit."""
+    return inference.prepared.working_voxel / WORKING_SPACING
 
 
 def describe_scan(inference: Inference) -> str:
@@ -530,7 +536,7 @@ def _diagrams(inference: Inference) -> list[Picture]:
         if each.name in (inference.fit.chosen, "match"):
             grown = (twin.diagram for twin in inference.twins.get(each.name, ()) if twin.diagram)
             diagrams.append((f"{_title(each)}, regrown", next(grown, None)))
-    λ, unit = inference.prepared.length, inference.fit.length_unit
+    λ, unit = working_length(inference), inference.fit.length_unit
     limits = shared_limits([diagram for _, diagram in diagrams if diagram is not None], length=λ)
     return [
         Picture(None, "", title)
