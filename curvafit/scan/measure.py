@@ -412,7 +412,7 @@ def tabulate_surface(mesh: Surface, spacing: tuple[float, float, float]) -> tupl
 def measure_curvatures(prepared: Prepared) -> tuple[tuple[np.ndarray, np.ndarray], Diagram]:
     """Return triangles' places in the scan's voxels, curvatures times area, and the diagram, in the scan's unit."""
     working = scan_diagram(prepared)
-    length = prepared.working_voxel / WORKING_SPACING
+    length = prepared.length
     physical = replace(
         working, points=working.points / length, weights=working.weights * length**2, unit=f"1/{prepared.unit}"
     )
