@@ -18,6 +18,10 @@ from curvafit.scan.prepare import WORKING_THICKNESS
 
 VERSION = 2
 ATLAS_FILE = Format("curvafit atlas", VERSION, "an atlas file", remedy="extract it again from its store")
+#: What is known of each shape.
+ARRAYS = ("coefficients", "masses", "seeds", "volume_fractions", "thicknesses")
+#: Shapes, nearest in sliced distance, whose Wasserstein distance is computed.
+SHORT = 40
 #: How a shape can be seen: as its phase field, or as the mask {u > 0} re-profiled.
 SEEN_AS = ("field", "mask")
 
@@ -41,19 +45,12 @@ class Atlas:
     field_diagrams: tuple[Diagram, ...]
     mask_diagrams: tuple[Diagram, ...]
     provenance: dict[str, Any]
-    format_version: int = VERSION
     _embedded: dict[str, np.ndarray] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         n = len(self.ids)
-        expected = {
-            "coefficients": (n, 6),
-            "masses": (n,),
-            "seeds": (n,),
-            "volume_fractions": (n,),
-            "thicknesses": (n,),
-        }
-        for name, shape in expected.items():
+        for name in ARRAYS:
+            shape = (n, 6) if name == "coefficients" else (n,)
             if getattr(self, name).shape != shape:
                 raise ValueError(f"expected {name} of shape {shape}, got {getattr(self, name).shape}")
         if not n or len(self.field_diagrams) != n or len(self.mask_diagrams) != n:
@@ -89,9 +86,7 @@ def save_atlas(atlas: Atlas, path: str | Path) -> None:
     Points are stored in float16: κ is rounded by at most 2⁻¹¹ of itself (0.03 at 100), far below the bins' width of 2.
     Weights, as parts of a diagram's area, are stored in float32.
     """
-    arrays = {
-        name: getattr(atlas, name) for name in ("coefficients", "masses", "seeds", "volume_fractions", "thicknesses")
-    }
+    arrays = {name: getattr(atlas, name) for name in ARRAYS}
     for view in SEEN_AS:
         arrays |= {f"{view}_{name}": value for name, value in _pack_diagrams(atlas.diagrams(view)).items()}
     ATLAS_FILE.write(path, {"ids": list(atlas.ids), "provenance": atlas.provenance}, arrays)
@@ -106,9 +101,7 @@ def load_atlas(path: str | Path | None = None) -> Atlas:
     if path is None:
         return ATLAS_FILE.read(open_packaged("inference", "atlas.npz"), _from_arrays, place="the packaged atlas")
     if Path(path).is_dir():
-        raise FileNotFoundError(
-            f"expected an atlas file, got the folder {path}: `curvafit atlas extract` makes one of it"
-        )
+        raise FileNotFoundError(f"expected an atlas file, got the folder {path}: `curvafit atlas extract` makes one")
     return ATLAS_FILE.read(path, _from_arrays)
 
 
@@ -130,17 +123,8 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Atlas
     sound = all(x.dtype.kind in "iuf" and np.isfinite(x).all() for x in arrays.values())
     if not (sound and (np.abs(arrays["masses"]) < 1).all() and all(isinstance(one, str) for one in header["ids"])):
         raise ValueError("expected finite numbers, masses in (-1, 1) and ids that are texts, got others")
-    return Atlas(
-        ids=tuple(header["ids"]),
-        coefficients=arrays["coefficients"],
-        masses=arrays["masses"],
-        seeds=arrays["seeds"],
-        volume_fractions=arrays["volume_fractions"],
-        thicknesses=arrays["thicknesses"],
-        field_diagrams=_unpack_diagrams(arrays, "field"),
-        mask_diagrams=_unpack_diagrams(arrays, "mask"),
-        provenance=header["provenance"],
-    )
+    diagrams = (_unpack_diagrams(arrays, view) for view in SEEN_AS)
+    return Atlas(tuple(header["ids"]), *(arrays[name] for name in ARRAYS), *diagrams, header["provenance"])  # type: ignore[call-arg]
 
 
 def _unpack_diagrams(arrays: dict[str, np.ndarray], view: str) -> tuple[Diagram, ...]:
@@ -182,12 +166,11 @@ def nearest(
     *,
     seen_as: str = "field",
     count: int = 5,
-    shortlist: int = 40,
     exact: bool = False,
 ) -> tuple[Match, ...]:
     """Return the `count` shapes nearest to a diagram, nearest first.
 
-    Raises ValueError if `count` or `shortlist` is not positive, `seen_as` is another word, or the diagram has no area.
+    Raises ValueError if `count` is not positive, `seen_as` is another word, or the diagram has no area.
 
     Parameters
     ----------
@@ -195,18 +178,16 @@ def nearest(
         The query's geometric diagram, in 1 / working unit.
     seen_as
         What the query was measured on, `"field"` or `"mask"`: it is compared with diagrams of the same kind.
-    shortlist
-        Number of shapes, nearest in sliced distance, whose Wasserstein distance is computed; at least `count`.
     exact
         Compute the distances of the matches by geomloss in float64 (`wasserstein`), and not in float32.
     """
-    if count < 1 or shortlist < 1:
-        raise ValueError(f"expected a count and a shortlist of at least 1, got {count} and {shortlist}")
+    if count < 1:
+        raise ValueError(f"expected a count of at least 1, got {count}")
     candidates = atlas.diagrams(seen_as)
     if not float(diagram.weights.sum()) > 0:
         raise ValueError("expected a diagram with area, got an empty one")
     away = np.linalg.norm(atlas.embeddings(seen_as) - np.asarray(sliced_embedding(diagram)), axis=1)
-    near = np.argsort(away, kind="stable")[: max(count, shortlist)].tolist()
+    near = np.argsort(away, kind="stable")[: max(count, SHORT)].tolist()
     distances = one_to_many(diagram, [candidates[i] for i in near])
     matches = [
         Match(

@@ -94,12 +94,8 @@ class Combinations:
 def find_combinations(errors: np.ndarray, parameters: np.ndarray, descriptors: np.ndarray) -> Combinations:
     """Return the combinations whose mean square error, against their variance among laws, is least, then next.
 
-    Parameters
-    ----------
-    errors
-        What a posterior's means miss, `(N, 6)`, of laws that it has not learnt.
-    parameters, descriptors
-        The laws' parameters `(N, 6)`, and descriptors of their shapes `(N, 351)`.
+    `errors` `(N, 6)` are what a posterior's means miss of laws that it has not learnt, `parameters` `(N, 6)` theirs,
+    and `descriptors` `(N, 351)` those of their shapes.
     """
     centre = parameters.mean(0)
     away = parameters - centre

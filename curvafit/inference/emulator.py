@@ -103,14 +103,9 @@ class Emulator:
 def best_parameters(emulator: Emulator, reading: Reading, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the parameters `(6,)` of greatest posterior density given a reading, and their covariance.
 
-    Levenberg and Marquardt's method from many starts, with exact derivatives in float64, by optimistix. The covariance
-    `(6, 6)` is Laplace's approximation. Both are in working units (`PARAMETERS`); the box is the prior.
-
-    Parameters
-    ----------
-    starts
-        `(n, 6)`: parameters to start from, such as draws of a posterior; the covariance between seeds is the mean of
-        theirs.
+    Levenberg and Marquardt's method from many starts `(n, 6)`, with exact derivatives in float64, by optimistix; the
+    covariance between seeds is the mean of theirs. The covariance `(6, 6)` is Laplace's approximation. Both are in
+    working units (`PARAMETERS`); the box is the prior.
     """
     seen = reading.columns
     parameters, slopes, _, values = _minimise(emulator, *seen, np.asarray(starts, dtype=np.float64)[None])
@@ -153,11 +148,8 @@ def _tanh(values: Any) -> Any:
 def _minimise(
     emulator: Emulator, descriptors: np.ndarray, views: np.ndarray, amount: np.ndarray, starts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return where the solver ends, for N rows of descriptors from n starts `(N, n, 6)` each.
-
-    Returns parameters, derivatives of the whitened descriptors by parameters in deviations of the prior, unexplained
-    squares, and twice the negative log posterior.
-    """
+    """Return where the solver ends, for N rows of descriptors from n starts `(N, n, 6)` each: parameters, slopes of the
+    whitened descriptors (by parameters in deviations of the prior), squares that are left, and -2 log posterior."""
     target = emulator.compression(descriptors)
     each = [np.repeat(column, starts.shape[1]) for column in (views, amount)]
     emulated = emulator(starts.reshape(-1, starts.shape[-1]), *each)
@@ -168,13 +160,8 @@ def _minimise(
         import jax.numpy as jnp
 
         deviation *= np.sqrt(emulator.inflation)
-        rest = (
-            emulator.basis,
-            target,
-            deviation,
-            encode_seen(emulator.views, views, amount),
-            np.log(share / (1 - share)),
-        )
+        kinds = encode_seen(emulator.views, views, amount)
+        rest = (emulator.basis, target, deviation, kinds, np.log(share / (1 - share)))
         ends = _minimiser()(_as_jax(emulator.mean), *(jnp.asarray(part, float) for part in rest))
         free, jacobian, misfit, value = (np.asarray(part) for part in ends)
     return low + (high - low) / (1 + np.exp(-free)), jacobian, misfit, value

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.distance import cdist, pdist
@@ -18,7 +17,7 @@ from curvafit.geometry.descriptors import BLOCKS
 from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Misfit, join_tests, twin
 from curvafit.inference.emulator import best_parameters, misfits
-from curvafit.inference.fit import COLUMNS, Fit, to_columns
+from curvafit.inference.fit import COLUMNS, to_columns
 from curvafit.inference.posterior import Posterior
 from curvafit.inference.simulate import Search, Simulate, simulate_draws
 from curvafit.inference.table import (
@@ -46,31 +45,28 @@ TESTED, FAINTEST = 24, 0.05
 RELABELLED = 1999
 
 
-#: From parameters of the phase that is described to those of the structure.
-Turn = Callable[[np.ndarray], np.ndarray]
-
-
 class Described(NamedTuple):
-    """The phase of a scan that is described, what is read of it, and the way from its law to the structure's."""
+    """The phase of a scan that is described, what is read of it, and whether it is the background."""
 
     seen: Prepared
     reading: Reading
-    turn: Turn
+    background: bool
+
+    def turn(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the parameters of the structure from those of the phase that is described, or the other way round."""
+        return mirror_parameters(parameters) if self.background else parameters
 
 
 def measure_descriptors(prepared: Prepared) -> Described | None:
-    """Measure the descriptors of a scan; None where they cannot be measured.
-
-    Of a structure that fills most of the volume the background is described, as the shapes of the training were thin.
-    """
+    """Measure the descriptors of a scan; None where they cannot be measured."""
+    # Of a structure that fills most of the volume the background is described, as the training's shapes were thin.
     turned = prepared.volume_fraction > HALF
     seen = prepared.inverted if turned else prepared
     reading = read_texture(seen)
-    return None if reading is None else Described(seen, reading, mirror_parameters if turned else np.asarray)
+    return None if reading is None else Described(seen, reading, turned)
 
 
 def estimate_law(
-    fit: Fit,
     described: Described | None,
     posterior: Posterior,
     *,
@@ -79,32 +75,25 @@ def estimate_law(
     rounds: int,
     schedule: Schedule | str,
     progress: Progress,
-) -> tuple[Fit, dict[str, tuple[np.ndarray, np.ndarray]] | None]:
+) -> tuple[dict[str, Any], dict[str, tuple[np.ndarray, np.ndarray]] | None]:
     """Read the law of a scan from its descriptors: draw from the posterior, grow some draws, and compare.
 
-    Parameters
-    ----------
-    simulations, rounds, schedule
-        As in `infer`. Without simulations the scan is compared with what training left unexplained.
-
-    Returns
-    -------
-    tuple
-        The fit with draws, combinations and candidates; the same fit where the descriptors cannot be measured. And by
-        block of descriptors the scan's numbers `(k,)` and those of the simulations `(n, k)`; None without simulations.
+    The parameters are as in `infer`; without simulations the scan is compared with what training left unexplained.
+    Returns the draws, view, combinations and candidates of a `Fit` by name, none where the descriptors cannot be
+    measured; and by block of descriptors the scan's numbers `(k,)` and those of the simulations `(n, k)`, if any.
     """
     if described is None:
-        return fit, None
-    seen, reading, turn = described
+        return {}, None
+    reading, turn = described.reading, described.turn
     progress("reading the posterior", 0.0)
     draws = posterior.draw(reading, DRAWS, seed)
     parameters = draws[:, :-1]
     best = best_parameters(posterior.emulator, reading, parameters[:STARTS])
-    told = posterior.combinations.read(parameters, background=turn is mirror_parameters)
-    fit = replace(fit, draws=np.column_stack([turn(parameters), draws[:, -1]]), view=reading.view, combinations=told)
+    law: dict[str, Any] = {"draws": np.column_stack([turn(parameters), draws[:, -1]]), "view": reading.view}
+    law["combinations"] = posterior.combinations.read(parameters, background=described.background)
     thickness = float(np.exp(np.median(draws[:, -1])))
     likely = Candidate("posterior", *law_of(turn(middle_of(parameters))), _deviations(turn(parameters)), thickness)
-    simulate = _simulator(seen, reading.view, schedule)
+    simulate = _simulator(described.seen, reading.view, schedule)
     grown = None
     if simulations:
         part = sub_progress(progress, 0.15, 0.45)
@@ -112,8 +101,8 @@ def estimate_law(
     if grown is None or len(grown.parameters) < FEWEST:
         left = misfits(posterior.emulator, *reading.columns, parameters[None, :STARTS])[0]
         p, level_cut = _join_level_cut(tail_probability(posterior.misfits[reading.view], left), posterior, reading)
-        misfit = Misfit(p, {}, "by the best fit, nothing grown", level_cut=level_cut)
-        return replace(fit, misfit=misfit, candidates=(likely, _best_fit(posterior, *best, turn, thickness))), None
+        law["misfit"] = Misfit(p, {}, "by the best fit, nothing grown", level_cut=level_cut)
+        return law | {"candidates": (likely, _best_fit(posterior, *best, described, thickness))}, None
     pool = posterior.draw(reading, POOL, seed)[:, :-1]
     search = Search(posterior.emulator, reading)
     part = sub_progress(progress, 0.45, 1.0)
@@ -123,7 +112,7 @@ def estimate_law(
     refined, *others = (Candidate(name, *law_of(turn(each)), {}, thickness) for name, each in laws.items())
     names, row, rows = np.array(column_names()), reading.descriptors, grown.columns[0]
     blocks = {name: (row[names == name], rows[:, names == name]) for name in BLOCKS}
-    return replace(fit, candidates=(refined, likely, *others)), blocks
+    return law | {"candidates": (refined, likely, *others)}, blocks
 
 
 def refine_matches(
@@ -136,10 +125,9 @@ def refine_matches(
     """
     if described is None:
         return ()
-    _, reading, turn = described
-    starts = turn(np.stack([parameters_of(each.coefficients, each.mass) for each in matches]))
-    best = best_parameters(posterior.emulator, reading, starts)
-    return (_best_fit(posterior, *best, turn, matches[0].thickness),)
+    starts = described.turn(np.stack([parameters_of(each.coefficients, each.mass) for each in matches]))
+    best = best_parameters(posterior.emulator, described.reading, starts)
+    return (_best_fit(posterior, *best, described, matches[0].thickness),)
 
 
 def middle_of(parameters: np.ndarray) -> np.ndarray:
@@ -149,13 +137,12 @@ def middle_of(parameters: np.ndarray) -> np.ndarray:
 
 
 def _best_fit(
-    posterior: Posterior, best: np.ndarray, covariance: np.ndarray, turn: Turn, thickness: float
+    posterior: Posterior, best: np.ndarray, covariance: np.ndarray, described: Described, thickness: float
 ) -> Candidate:
     """Return the best fit of the descriptors, with deviations by draws from the normal distribution around it."""
     near = np.random.default_rng(0).multivariate_normal(best, covariance, DRAWS, check_valid="ignore")
-    return Candidate(
-        "optimum", *law_of(turn(best)), _deviations(turn(np.clip(near, *posterior.emulator.box.T))), thickness
-    )
+    deviations = _deviations(described.turn(np.clip(near, *posterior.emulator.box.T)))
+    return Candidate("optimum", *law_of(described.turn(best)), deviations, thickness)
 
 
 def _deviations(parameters: np.ndarray) -> dict[str, float]:
@@ -164,10 +151,7 @@ def _deviations(parameters: np.ndarray) -> dict[str, float]:
 
 
 def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simulate:
-    """Return a function that grows a shape from parameters and measures its descriptors as the scan's were measured.
-
-    Shapes grow in the periodic boxes of the training, and are scanned as the scan was.
-    """
+    """Return a function that grows a shape in a box of the training, and reads its descriptors as the scan's were."""
     grid = Grid((EDGE, EDGE, EDGE))
 
     def simulate(parameters: np.ndarray, seed: int) -> Reading | None:
@@ -207,13 +191,13 @@ def check_law(
     """
     if described is None:
         return None
-    seen, reading, _ = described
+    reading, background = described.reading, described.background
     across = windows_along(prepared, [edge.stop - edge.start for edge in prepared.windows[0]])
     count, rows = -(-TESTED // math.prod(across)), []
     for k in range(2 * count):
         grown = twin(law, prepared, seed + k, schedule, longest=EDGE * max(across))
         if grown.seen is not None:
-            own = read_texture(grown.seen if seen is prepared else grown.seen.inverted, reading.view, across)
+            own = read_texture(grown.seen.inverted if background else grown.seen, reading.view, across)
             rows += [] if own is None else [own.windows]
         progress(f"testing the law: {len(rows)} of {count} shapes", len(rows) / count)
         if len(rows) == count:
@@ -251,22 +235,24 @@ def _join_level_cut(p: float, posterior: Posterior, reading: Reading) -> tuple[f
 def compare_windows(posterior: Posterior, reading: Reading, twins: np.ndarray) -> Misfit:
     """Return how probable it is that windows of a scan `(k, 351)` differ so from those of twins `(n, 351)`.
 
-    All descriptors are compared in the emulator's uncorrelated directions, each block in deviations of the twins.
     The law of the twins was found for the scan, and is not quite its own even if there is one. So the scan's departure
-    is ranked among those of shapes of the model whose laws were found in the same way (`Posterior.departures`), and
-    its discriminant among those of shapes of the model in the same view. The probability is twice the less of the
-    two ranks (`join_tests`). Where departures are not known, and for each block, it is that of a law named beforehand.
+    from them, in the emulator's uncorrelated directions, is ranked among those of shapes of the model whose laws were
+    found in the same way (`Posterior.departures`); and its discriminant among those of shapes in the same view. The
+    two tests are joined (`join_tests`). Where departures are not known, and for each block, which is compared in
+    deviations of the twins, the probability is that of a law named beforehand.
     """
-    scan = reading.windows
+    scan, known = reading.windows, posterior.departures
     seen, grown = (posterior.emulator.compression(rows) @ posterior.emulator.basis.T for rows in (scan, twins))
-    departure, usual = float(cdist(seen, grown).mean() - pdist(grown).mean()), posterior.departures
-    p = tail_probability(usual, departure) if len(usual) else probability_alike(seen, grown)
+    departure = float(cdist(seen, grown).mean() - pdist(grown).mean())
+    p = tail_probability(known, departure) if len(known) else probability_alike(seen, grown)
     p, level_cut = _join_level_cut(p, posterior, reading)
-    blocks = {}
-    for name in BLOCKS:
-        own, others = columns_of(scan, [name]), columns_of(twins, [name])
-        spread = others.std(0) + FAINTEST * others.std(0).mean() + 1e-12
-        blocks[name] = probability_alike(own / spread, others / spread)
-    method = f"{len(twins)} windows of shapes of the law, {len(scan)} of the scan"
-    method += f", ranked among {len(usual)} shapes" if len(usual) else ""
-    return Misfit(p, blocks, method, departure, level_cut)
+    ranked = f", ranked among {len(known)} shapes" if len(known) else ""
+    method = f"{len(twins)} windows of shapes of the law, {len(scan)} of the scan{ranked}"
+    return Misfit(p, {name: _compare_block(name, scan, twins) for name in BLOCKS}, method, departure, level_cut)
+
+
+def _compare_block(name: str, scan: np.ndarray, twins: np.ndarray) -> float:
+    """Return `probability_alike` of one block of windows, in deviations of the twins."""
+    own, others = columns_of(scan, [name]), columns_of(twins, [name])
+    spread = others.std(0) + FAINTEST * others.std(0).mean() + 1e-12
+    return probability_alike(own / spread, others / spread)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, make_dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
@@ -203,17 +203,8 @@ def to_columns(draws: np.ndarray) -> np.ndarray:
 Column = Annotated[tuple[float, ...], Rule(filled=True)]
 
 
-@dataclass(frozen=True)
-class _DrawColumns:
-    """Columns of draws, in the order of `COLUMNS`."""
-
-    a11: Column
-    a02: Column
-    a10: Column
-    a01: Column
-    a00: Column
-    mass: Column
-    thickness: Column
+#: Columns of draws.
+_DrawColumns: Any = make_dataclass("_DrawColumns", [(name, Column) for name in COLUMNS], frozen=True)
 
 
 @dataclass(frozen=True)
@@ -222,7 +213,7 @@ class _Posterior:
 
     view: str
     method: str
-    draws: _DrawColumns
+    draws: _DrawColumns  # type: ignore[valid-type]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -310,7 +301,10 @@ def draw_laws(law: LawLike, count: int) -> list[Law]:
 
 
 def _file_of(fit: Fit) -> _File:
-    """Return the content of a fit's file."""
+    """Return the content of a fit's file; draws have `_DIGITS` digits."""
+    columns = None
+    if fit.draws is not None:
+        columns = [tuple(float(f"{x:.{_DIGITS}g}") for x in column) for column in to_columns(fit.draws)]
     return _File(
         **{name: getattr(fit, name) for name in _SAME},
         format=FORMAT,
@@ -321,7 +315,7 @@ def _file_of(fit: Fit) -> _File:
         epsilon_physical=fit.epsilon_physical,
         intervals=fit.intervals(),
         intervals_physical=fit.intervals(physical=True),
-        posterior=None if fit.draws is None else _posterior_of(fit.draws, fit.view),
+        posterior=None if columns is None else _Posterior(fit.view, _METHOD, _DrawColumns(*columns)),
         diagram=None if fit.diagram is None else _columns_of(fit.diagram, fit.kind),
     )  # type: ignore[arg-type]
 
@@ -330,26 +324,16 @@ def _fit_of(content: dict[str, Any]) -> Fit:
     """Return the fit of a checked content."""
     file: _File = decode(_File, content)
     same = {name: getattr(file, name) for name in _SAME}
-    draws, view = (None, "") if file.posterior is None else (_draws_of(file.posterior), file.posterior.view)
+    draws, view = None, ""
+    if file.posterior is not None:
+        columns, view = [getattr(file.posterior.draws, name) for name in COLUMNS], file.posterior.view
+        _check_lengths(columns, "draws", "posterior")
+        draws = np.array(columns, dtype=np.float64).T
+        draws[:, [1, 6]] = np.log(draws[:, [1, 6]])
     fit = Fit(**same, draws=draws, view=view, diagram=_diagram_of(file.diagram))
     if (fit.chosen is None) != (fit.best is None):
         raise ValueError(f"expected a chosen law among the fit's candidates, got {fit.chosen!r}")
     return fit
-
-
-def _posterior_of(draws: np.ndarray, view: str) -> _Posterior:
-    """Return draws as columns of `_DIGITS` digits."""
-    columns = [tuple(float(f"{x:.{_DIGITS}g}") for x in column) for column in to_columns(draws)]
-    return _Posterior(view, _METHOD, _DrawColumns(*columns))
-
-
-def _draws_of(posterior: _Posterior) -> np.ndarray:
-    """Return the draws of a file's columns."""
-    columns = [getattr(posterior.draws, name) for name in COLUMNS]
-    _check_lengths(columns, "draws", "posterior")
-    draws = np.array(columns, dtype=np.float64).T
-    draws[:, [1, 6]] = np.log(draws[:, [1, 6]])
-    return draws
 
 
 def _columns_of(diagram: Diagram, kind: str) -> _Columns:

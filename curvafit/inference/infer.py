@@ -20,14 +20,13 @@ from curvafit.core.units import format_number
 from curvafit.generation.schedule import LEARNED, SCHEDULES, Schedule
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, family_of
 from curvafit.geometry.morphometry import morphometry
-from curvafit.inference.atlas import Atlas, Match, load_atlas, mirror_match, nearest
+from curvafit.inference.atlas import VERSION, Atlas, Match, load_atlas, mirror_match, nearest
 from curvafit.inference.candidates import TITLES, Candidate, Twin, best_candidate, twin
-from curvafit.inference.drift import drift
 from curvafit.inference.estimate import check_law, estimate_law, measure_descriptors, refine_matches
 from curvafit.inference.fit import KINDS, Fit
 from curvafit.inference.posterior import Posterior, load_posterior
 from curvafit.inference.simulate import ROUNDS
-from curvafit.inference.stationarity import stationarity
+from curvafit.inference.stationarity import drift, stationarity
 from curvafit.inference.verdict import verdict
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law
@@ -179,43 +178,38 @@ def infer(
     if measured is None or reason:
         return Inference(volume, prepared, measured, {}, fit)
     progress("measuring descriptors", 0.1)
-    described, simulated = measure_descriptors(prepared), None
+    described, simulated, law = measure_descriptors(prepared), None, {}
     if method == "posterior":
         part = sub_progress(progress, 0.15, 0.5)
         options = {"simulations": 0 if fast else simulations, "rounds": rounds, "schedule": schedule}
-        fit, simulated = estimate_law(fit, described, posterior, seed=seed, progress=part, **options)
+        law, simulated = estimate_law(described, posterior, seed=seed, progress=part, **options)
     progress("searching the atlas", 0.5)
     matches = _match(prepared, measured, atlas, exact=method == "match")
-    read = fit.candidates if method == "posterior" else refine_matches(described, posterior, matches)
+    read = refine_matches(described, posterior, matches) if method == "match" else law.get("candidates", ())
     laws, grown = _list_laws(prepared, read, matches, seed, sub_progress(progress, 0.5, 0.6)), {}
     if not fast:
         part = sub_progress(progress, 0.6, 0.8 if test else 1.0)
         laws, grown = _grow(laws, measured, prepared, count=twins, schedule=schedule, seed=seed, progress=part)
-    fit = replace(fit, candidates=laws, matches=matches)
+    law |= {"candidates": laws, "matches": matches}
     if test and not fast and (best := best_candidate(laws)) is not None:
         part = sub_progress(progress, 0.8, 1.0)
         options = {"seed": seed + TWINS, "schedule": schedule, "progress": part}
-        fit = replace(fit, misfit=check_law(best, prepared, described, posterior, **options))
-    chosen, status = verdict(fit, fast=fast)
-    fit = replace(fit, chosen=chosen, status=status)
-    if prepared.kind != "field" and fit.best is not None and fit.best.thickness is not None:
+        law["misfit"] = check_law(best, prepared, described, posterior, **options)
+    law["chosen"], law["status"] = verdict(laws, law.get("misfit"), fit.morphometry, fast=fast)
+    if (best := next((each for each in laws if each.name == law["chosen"]), None)) is not None:
         # A voxel of the law's shapes is as long on the scan as makes them as thick as its structure.
-        ratio = prepared.thickness / fit.best.thickness
-        scale = tuple(ratio * each for each in prepared.scale)
-        fit = replace(fit, working_voxel=ratio * prepared.working_voxel, scale=scale)
-    if fit.coefficients is not None:
-        step = fit.working_voxel / prepared.working_voxel
-        fit = replace(fit, drift=drift(*_main_window(prepared, step), WORKING_EPSILON, fit.coefficients))
+        known = prepared.kind != "field" and best.thickness is not None
+        ratio = prepared.thickness / best.thickness if known else 1.0  # type: ignore[operator]
+        law |= {"working_voxel": ratio * prepared.working_voxel, "scale": tuple(ratio * h for h in prepared.scale)}
+        step = law["working_voxel"] / prepared.working_voxel
+        law["drift"] = drift(*_main_window(prepared, step), WORKING_EPSILON, best.coefficients)
     progress("done", 1.0)
-    return Inference(volume, prepared, measured, grown, fit, simulated)
+    return Inference(volume, prepared, measured, grown, replace(fit, **law), simulated)
 
 
 def _match(prepared: Prepared, measured: Diagram, atlas: Atlas, exact: bool) -> tuple[Match, ...]:
-    """Return the nearest shapes of the atlas.
-
-    An atlas holds shapes that fill less than half: of a structure that fills more, the background is matched, and
-    inside and outside of its matches are exchanged.
-    """
+    """Return the nearest shapes of the atlas; of a structure that fills over half, those of its background mirrored."""
+    # An atlas holds shapes that fill less than half.
     seen_as = "field" if prepared.kind == "field" else "mask"
     inverted = prepared.volume_fraction > HALF
     query = measured.mirrored if inverted else measured
@@ -325,7 +319,7 @@ def _provenance(volume: Field, shape: tuple[int, ...], atlas: Atlas, posterior: 
         "seed": seed,
         "schedule": SCHEDULES[LEARNED].as_dict(),
         "epsilon": WORKING_EPSILON,
-        "atlas": {"format": atlas.format_version, "shapes": len(atlas.ids)},
+        "atlas": {"format": VERSION, "shapes": len(atlas.ids)},
         "posterior": {name: value for name, value in posterior.provenance.items() if name != "table"},
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "python": platform.python_version(),

@@ -132,10 +132,7 @@ class Posterior:
     def sample(
         self, descriptors: np.ndarray, views: np.ndarray, amount: np.ndarray, count: int = 1000, seed: int = 0
     ) -> np.ndarray:
-        """Draw `TARGETS` `(N, count, 7)` given descriptors `(N, 351)`, kinds of views and how much was seen `(N,)`.
-
-        Raises ValueError if it was not trained on a view, or descriptors are not finite.
-        """
+        """Draw `TARGETS` `(N, count, 7)` given what `context` takes."""
         context = self.context(descriptors, views, amount)
         parts = [len(part) for part in np.array_split(np.arange(count), len(self.members))]
         with torch.random.fork_rng(), torch.no_grad():
@@ -149,9 +146,9 @@ class Posterior:
         return self.sample(*reading.columns, count, seed)[0]
 
     def context(self, descriptors: np.ndarray, views: np.ndarray, amount: np.ndarray) -> Tensor:
-        """Return what the flows see: components of the descriptors, how much was seen, and the kind of each view.
+        """Return what the flows see of descriptors `(N, 351)`, kinds of views and how much was seen `(N,)`.
 
-        Raises ValueError if a view is of another kind, or descriptors are not finite.
+        Raises ValueError if it was not trained on a view, or descriptors are not finite.
         """
         seen = encode_seen(self.views, views, amount)
         if bad := int((~np.isfinite(descriptors)).any(1).sum()):
@@ -229,13 +226,18 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
     architecture = Architecture(**sizes | {name: tuple(sizes[name]) for name in ("hidden", "blocks")})
     views = tuple(str(view) for view in header["views"])
     columns, components = int(np.isin(column_names(), architecture.blocks).sum()), architecture.components
-    expected = {"mean": (columns,), "scale": (columns,), "basis": (components, columns)}
+    arrays = {"departures": np.zeros(0), "discriminant": np.zeros(0)} | arrays  # which earlier files lack
+    taught = ("misfits", "discriminants") if len(arrays["discriminant"]) else ("misfits",)
+    expected: dict[str, tuple[int | None, ...]] = {"mean": (columns,), "scale": (columns,)}
+    expected |= {"basis": (components, columns), "emulator.basis": (components, components), "departures": (None,)}
     expected |= {"box": (len(TARGETS), 2), "centre": (len(TARGETS),), "spread": (len(TARGETS),)}
-    expected |= {"emulator.basis": (components, components)}
     expected |= {"combinations.weights": (len(PARAMETERS), len(PARAMETERS)), "combinations.centre": (len(PARAMETERS),)}
+    expected |= {"discriminant": (columns if len(taught) > 1 else 0,)}
+    expected |= {f"{name}.{view}": (None,) for name in taught for view in views}
     for name, shape in expected.items():
-        if arrays[name].shape != shape:
-            raise ValueError(f"{name} of shape {arrays[name].shape}, not {shape}")
+        own = arrays[name].shape
+        if len(own) != len(shape) or any(n not in (None, m) for n, m in zip(shape, own, strict=True)):
+            raise ValueError(f"{name} of shape {own}, not {shape}")
     members = []
     for number in range(check_int(header["members"], "a number of flows", 1, MOST)):
         with torch.random.fork_rng():  # its first weights are drawn, and then replaced
@@ -246,39 +248,19 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
         members.append(member)
     compression = Compression(architecture.blocks, arrays["mean"], arrays["scale"], arrays["basis"])
     mean, spread = (_read_layers(arrays, f"emulator.{name}", len(views), components) for name in ("mean", "spread"))
-    inflation = check_float(header["inflation"], "an emulator's inflation", 1e-3, 1e3)
-    misfits = {view: arrays[f"misfits.{view}"] for view in views}
-    if any(each.ndim != 1 or not len(each) for each in misfits.values()):
-        raise ValueError("misfits that are no columns of numbers")
-    departures = arrays.get("departures", np.zeros(0))
-    if departures.ndim != 1:
-        raise ValueError("departures that are no column of numbers")
-    discriminant, discriminants = arrays.get("discriminant", np.zeros(0)), {}
-    if len(discriminant):
-        discriminants = {view: arrays[f"discriminants.{view}"] for view in views}
-        if discriminant.shape != (columns,) or any(each.ndim != 1 for each in discriminants.values()):
-            raise ValueError(f"a discriminant of shape {discriminant.shape}, not {(columns,)}, or no columns of them")
+    inflation, box = check_float(header["inflation"], "an emulator's inflation", 1e-3, 1e3), arrays["box"]
+    emulator = Emulator(compression, views, box[: len(PARAMETERS)], mean, spread, arrays["emulator.basis"], inflation)
+    misfits, discriminants = ({view: arrays[f"{name}.{view}"] for view in views} for name in (*taught, *taught)[:2])
+    if not all(map(len, misfits.values())):
+        raise ValueError("misfits without numbers")
     ends = tuple((str(low), str(high)) for low, high in header["ends"])
     if len(ends) != len(PARAMETERS):
         raise ValueError(f"words for {len(ends)} combinations, not {len(PARAMETERS)}")
-    return Posterior(
-        architecture,
-        tuple(members),
-        compression,
-        views,
-        arrays["box"],
-        arrays["centre"],
-        arrays["spread"],
-        Emulator(
-            compression, views, arrays["box"][: len(PARAMETERS)], mean, spread, arrays["emulator.basis"], inflation
-        ),
-        misfits,
-        Combinations(arrays["combinations.weights"], arrays["combinations.centre"], ends),
-        header["provenance"],
-        departures,
-        discriminant,
-        discriminants,
-    )
+    sums = Combinations(arrays["combinations.weights"], arrays["combinations.centre"], ends)
+    places, tests = (box, arrays["centre"], arrays["spread"]), (arrays["departures"], arrays["discriminant"])
+    tests += (discriminants if len(taught) > 1 else {},)
+    made = header["provenance"]
+    return Posterior(architecture, tuple(members), compression, views, *places, emulator, misfits, sums, made, *tests)
 
 
 def _read_layers(arrays: dict[str, np.ndarray], name: str, views: int, outputs: int) -> tuple[Layer, ...]:

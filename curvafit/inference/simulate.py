@@ -128,16 +128,11 @@ class Search:
         seed: int = 0,
         progress: Progress = silent,
     ) -> tuple[np.ndarray, Simulations]:
-        """Find the parameters `(6,)` that are likeliest to grow the query's descriptors.
+        """Return the parameters `(6,)` that are likeliest to grow the query's descriptors, and all simulations.
 
         Each round simulates the likeliest parameters so far, and others at random by their likelihood. The last rounds
         simulate the likeliest alone, until they grow a shape; if they never do, the nearest simulation is the answer.
         Parameters are chosen among a posterior's `draws` `(n, 6)` and near the best simulations so far.
-
-        Returns
-        -------
-        tuple
-            The parameters, and all simulations.
         """
         rng, barren = np.random.default_rng(seed), draws[:0]
         for k in range(rounds + LAST):
@@ -168,12 +163,10 @@ class Search:
         return candidates, self.deviance(candidates, simulated) + avoided
 
     def deviance(self, candidates: np.ndarray, simulated: Simulations) -> np.ndarray:
-        """Return twice the negative log likelihood of each candidate `(m,)`, up to a constant.
-
-        A Gaussian process, fitted to the emulator's residuals at the simulations, is added to the emulator's mean.
-        Descriptors are compared in uncorrelated directions, in units of the emulator's mean deviation along each; that
-        unit is the same for all candidates, so its logarithm is left out.
-        """
+        """Return twice the negative log likelihood of each candidate `(m,)`, up to a constant."""
+        # A Gaussian process, fitted to the emulator's residuals at the simulations, is added to the emulator's mean.
+        # Descriptors are compared in uncorrelated directions, in units of the emulator's mean deviation along each;
+        # that is the same for all candidates, so its logarithm is left out.
         descriptors, *seen = simulated.columns
         emulated = self.emulator(simulated.parameters, *seen)
         basis, deviation = self.emulator.basis, emulated.deviation.mean(0)

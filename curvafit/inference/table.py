@@ -21,13 +21,8 @@ from curvafit.scan.prepare import thinner_thickness
 from curvafit.scan.structure import sample_mask
 from curvafit.volumes.field import Field
 
-TABLE_FILE = Format(
-    "curvafit descriptors",
-    2,
-    "a table of descriptors",
-    "describe the stores into another file, or with --overwrite",
-    {"blocks": BLOCKS},
-)
+_REMEDY = "describe the stores into another file, or with --overwrite"
+TABLE_FILE = Format("curvafit descriptors", 2, "a table of descriptors", _REMEDY, {"blocks": BLOCKS})
 #: What is inferred, with a20 = 1 as the gauge, in working units; and with it how thick the law's shapes are, in their
 #: own voxels, which says how long those are on a scan.
 PARAMETERS = ("a11", "log a02", "a10", "a01", "a00", "m0")
@@ -232,11 +227,8 @@ def see_scan(u: np.ndarray, rng: np.random.Generator) -> Scanned:
 
 
 #: Views by name.
-VIEWS: dict[str, Callable[[np.ndarray, np.random.Generator], Scanned]] = {
-    "field": see_field,
-    "mask": see_mask,
-    "scan": see_scan,
-}
+VIEWS: dict[str, Callable[[np.ndarray, np.random.Generator], Scanned]]
+VIEWS = {"field": see_field, "mask": see_mask, "scan": see_scan}
 
 
 def _open(u: np.ndarray, rng: np.random.Generator) -> np.ndarray:

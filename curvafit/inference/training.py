@@ -214,10 +214,8 @@ def _misfits(emulator: Emulator, number: int, rows: Table) -> np.ndarray:
 
 
 def _inflation(emulator: Emulator, table: Table, left: np.ndarray) -> float:
-    """Return how much more than uncorrelated residuals `left` move the best parameters: the ratio of mean squares.
-
-    Parameters move along the derivatives of the mean, and are held by a prior of deviation 1.
-    """
+    """Return how much more than uncorrelated residuals `left` move the best parameters: the ratio of mean squares."""
+    # Parameters move along the derivatives of the mean, and are held by a prior of deviation 1.
     squared, expected = 0.0, 0.0
     for view in emulator.views:
         mine = table.views == view
@@ -297,17 +295,8 @@ def learn(
     plan: Plan,
     report: Callable[[int, float], object],
 ) -> Network:
-    """Fit a network to all rows but those of a mask, and return it as it was where those cost least.
-
-    Parameters
-    ----------
-    rows
-        Inputs and targets.
-    cost
-        Of the network, inputs and targets: the mean over rows.
-    report
-        Called with the number of each epoch, from 1, and the least cost so far.
-    """
+    """Fit a network to all rows (inputs and targets) but those of a mask, and return it as it was where those cost
+    least; `report` is called with the number of each epoch, from 1, and the least cost so far."""
     optimiser = torch.optim.AdamW(network.parameters(), lr=plan.rate, weight_decay=plan.decay)
     slower = torch.optim.lr_scheduler.ReduceLROnPlateau(optimiser, factor=0.5, patience=plan.patience // 3)
     (x, y), held_out = [part[~validation] for part in rows], [part[validation] for part in rows]

@@ -10,8 +10,7 @@ import numpy as np
 
 from curvafit.core.units import format_number
 from curvafit.geometry.morphometry import Morphometry
-from curvafit.inference.candidates import TITLES, Misfit, best_candidate, join_tests, seed_noise_of
-from curvafit.inference.fit import Fit
+from curvafit.inference.candidates import TITLES, Candidate, Misfit, best_candidate, join_tests, seed_noise_of
 
 #: The probability below which a law is not believed to have made a scan.
 UNBELIEVABLE = 0.05
@@ -22,13 +21,14 @@ FAMILIAR = {"thickness": "thickness_mean", "spacing": "spacing_mean", "connectiv
 NEAR = 0.15
 
 
-def verdict(fit: Fit, *, fast: bool = False) -> tuple[str | None, str]:
-    """Return the name of a fit's best supported law, and the verdict on the scan; no name where nothing grew.
+def verdict(
+    candidates: Sequence[Candidate], misfit: Misfit | None, scan: Morphometry, *, fast: bool = False
+) -> tuple[str | None, str]:
+    """Return the name of the best supported law of a scan, and the verdict on it; no name where nothing grew.
 
     The test alone decides (`Fit.misfit`). A law that is not believable is still named: it is the nearest that there is.
     `fast` says that nothing was grown.
     """
-    candidates, misfit = fit.candidates, fit.misfit
     if fast:
         return candidates[0].name, _join(_describe_misfit(misfit), "Nothing was grown to check the law (--fast).")
     best = best_candidate(candidates)
@@ -43,7 +43,7 @@ def verdict(fit: Fit, *, fast: bool = False) -> tuple[str | None, str]:
         word, reason = UNBELIEVED, _describe_misfit(misfit)
     else:
         word, reason = "Supported", _describe_misfit(misfit)
-    other = find_differences(fit.morphometry, best.twins)
+    other = find_differences(scan, best.twins)
     familiar = f"Twins over scan: {', '.join(other)}." if other else ""
     return best.name, _join(f"{word} ({title}): {distances}", reason, familiar, best.status)
 

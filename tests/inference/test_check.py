@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
@@ -16,14 +18,14 @@ from curvafit.geometry.descriptors import BLOCKS
 from curvafit.inference import estimate
 from curvafit.inference.candidates import Candidate, Misfit, Twin
 from curvafit.inference.emulator import misfits
-from curvafit.inference.estimate import STARTS, compare_windows, tail_probability
+from curvafit.inference.estimate import STARTS, compare_windows, probability_alike, tail_probability
 from curvafit.inference.posterior import Posterior
 from curvafit.inference.simulate import simulate_draws
 from curvafit.inference.table import PARAMETERS, column_names
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.scan.measure import Reading, windows_along
-from curvafit.scan.prepare import prepare
+from curvafit.scan.prepare import Prepared, prepare
 from curvafit.volumes.field import Field
 
 NAMES = np.array(column_names())
@@ -52,10 +54,6 @@ class Linear:
     def discriminate(self, rows: np.ndarray) -> np.ndarray:
         """Fisher's discriminant by one column alone."""
         return rows[:, -1]
-
-    def standardise(self, targets: np.ndarray) -> np.ndarray:
-        found = (targets[..., :6] - BOX.mean(1)) / ((HIGH - LOW) / np.sqrt(12))
-        return np.concatenate([found, targets[..., 6:]], -1)
 
 
 POSTERIOR = cast(Posterior, Linear())
@@ -115,51 +113,47 @@ def test_a_block_that_differs_is_named() -> None:
     assert min(blocks[name] for name in ("chords", "depths", "clearances", "correlation")) > 1 / 25
 
 
+LAW = Candidate("match", Coefficients.willmore(), -0.3, {}, 8.0)
+BARREN = Twin(None, 0.0, None, None, "one phase")
+
+
+def gyroid(fill: float, shape: tuple[int, int, int] = (48, 48, 48)) -> Prepared:
+    mask = Gyroid(fill).distance(centres(Grid(shape))).numpy() > 0
+    return prepare(Field(mask.astype(np.uint8)), kind="mask", one_scale=True)
+
+
+def check(prepared: Prepared, monkeypatch: pytest.MonkeyPatch, grow: Callable[..., Twin]) -> Misfit | None:
+    """The test of `LAW`, of which `grow` makes each shape."""
+    monkeypatch.setattr(estimate, "twin", grow)
+    return estimate.check_law(LAW, prepared, estimate.measure_descriptors(prepared), POSTERIOR)
+
+
 def test_shapes_show_as_many_windows_as_the_scan(monkeypatch: pytest.MonkeyPatch) -> None:
-    mask = Gyroid(0.1).distance(centres(Grid((40, 40, 96)))).numpy() > 0
-    prepared, lengths = prepare(Field(mask.astype(np.uint8)), kind="mask", one_scale=True), []
+    prepared, lengths = gyroid(0.1, (40, 40, 96)), []
     shown = windows_along(prepared, prepared.mask[prepared.windows[0]].shape)
     assert shown == [1, 1, 2]
 
     def grow(*_: object, longest: int, **__: object) -> Twin:
         lengths.append(longest)
-        return Twin(None, 0.0, None, None, seen=prepared)
+        return replace(BARREN, seen=prepared)
 
-    monkeypatch.setattr(estimate, "twin", grow)
-    found = estimate.check_law(
-        Candidate("match", Coefficients.willmore(), -0.3, {}, 8.0),
-        prepared,
-        estimate.measure_descriptors(prepared),
-        POSTERIOR,
-    )
+    found = check(prepared, monkeypatch, grow)
     assert lengths == [2 * estimate.EDGE] * (estimate.TESTED // 2)
     assert found is not None and found.method.startswith(f"{estimate.TESTED} windows of shapes of the law, 3 of")
 
 
-def test_further_shapes_are_tried_where_some_do_not_grow(monkeypatch: pytest.MonkeyPatch) -> None:
-    mask = Gyroid(0.24).distance(centres(Grid((48, 48, 48)))).numpy() > 0
-    prepared = prepare(Field(mask.astype(np.uint8)), kind="mask", one_scale=True)
-    barren, full = Twin(None, 0.0, None, None, "one phase"), Twin(None, 0.0, None, None, seen=prepared)
-    tried = iter([barren, *[full] * 30])
-    monkeypatch.setattr(estimate, "twin", lambda *_, **__: next(tried))
-    law = Candidate("match", Coefficients.willmore(), -0.3, {}, 8.0)
-    found = estimate.check_law(law, prepared, estimate.measure_descriptors(prepared), POSTERIOR)
+def test_further_shapes_are_tried_where_some_do_not_grow_and_few_test_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    prepared = gyroid(0.24)
+    tried = iter([BARREN, *[replace(BARREN, seen=prepared)] * 30])
+    found = check(prepared, monkeypatch, lambda *_, **__: next(tried))
     assert found is not None and found.method.startswith(f"{estimate.TESTED} windows of shapes of the law")
     assert len(list(tried)) == 30 - estimate.TESTED
-
-
-def test_few_shapes_test_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    mask = Gyroid(0.24).distance(centres(Grid((48, 48, 48)))).numpy() > 0
-    prepared = prepare(Field(mask.astype(np.uint8)), kind="mask", one_scale=True)
-    monkeypatch.setattr(estimate, "twin", lambda *_, **__: Twin(None, 0.0, None, None, "one phase"))
-    law = Candidate("match", Coefficients.willmore(), -0.3, {}, 8.0)
-    assert estimate.check_law(law, prepared, estimate.measure_descriptors(prepared), POSTERIOR) is None
+    assert check(prepared, monkeypatch, lambda *_, **__: BARREN) is None
 
 
 def test_a_simulation_that_is_one_ball_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """At the thickness of the scan's structure the ball's whole box is a few voxels wide: too few to measure."""
-    mask = Gyroid(0.1).distance(centres(Grid((48, 48, 48)))).numpy() > 0
-    prepared = prepare(Field(mask.astype(np.uint8)), kind="mask", one_scale=True)
+    prepared = gyroid(0.1)
     ball = torch.tanh(24 - torch.linalg.vector_norm(torch.cartesian_prod(*[torch.arange(64.0) - 32] * 3), dim=1))
     flow = SimpleNamespace(viability=SimpleNamespace(viable=True), field=ball.reshape(64, 64, 64))
     monkeypatch.setattr(estimate, "generate", lambda *_, **__: flow)
@@ -193,13 +187,10 @@ def test_simulations_are_of_draws_each_with_its_seed() -> None:
     assert grown.parameters.shape == (6, len(PARAMETERS))
 
 
-@pytest.mark.parametrize("count", [0, 41])
-def test_a_number_of_simulations_has_bounds(count: int) -> None:
-    with pytest.raises(ValueError, match="simulations"):
-        simulate_draws(np.zeros((40, 6)), described, count)
-
-
-def test_nothing_grown_is_no_row() -> None:
+def test_a_number_of_simulations_has_bounds_and_nothing_grown_is_no_row() -> None:
+    for count in (0, 41):
+        with pytest.raises(ValueError, match="simulations"):
+            simulate_draws(np.zeros((40, 6)), described, count)
     grown = simulate_draws(np.zeros((40, 6)), lambda parameters, seed: None, 3)
     assert grown.readings == () and grown.count == 3
     assert len(grown.parameters) == len(grown.seeds) == 0
@@ -208,3 +199,31 @@ def test_nothing_grown_is_no_row() -> None:
 def test_told_is_what_the_emulator_says() -> None:
     parameters = np.random.default_rng(6).uniform(LOW, HIGH, (3, 6))
     assert POSTERIOR.emulator(parameters, *seen(parameters)[1:]).mean == pytest.approx(told(parameters))
+
+
+# ---- the test among twins --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("windows", [1, 4])
+def test_what_is_alike_is_rejected_as_often_as_said(windows: int) -> None:
+    """Ranks among 19 twins: 400 values of p at most .05 twenty times, give or take four."""
+    random = np.random.default_rng(0)
+    p = np.array([probability_alike(*np.split(random.standard_normal((windows + 19, 5)), [windows]), seed=k)
+                  for k in range(400)])  # fmt: skip
+    assert 0.02 < np.mean(p <= 0.05) < 0.085
+    assert np.mean(p <= 0.5) == pytest.approx(0.5, abs=0.08)
+    assert p.min() >= 1 / 20 if windows == 1 else p.min() > 0
+
+
+def test_more_windows_tell_smaller_differences() -> None:
+    random, found = np.random.default_rng(1), []
+    for windows in (1, 8):
+        pairs = ((random.standard_normal((windows, 5)) + 0.9, random.standard_normal((24, 5))) for _ in range(60))
+        found.append(np.mean([probability_alike(*pair) <= 0.05 for pair in pairs]))
+    assert found[0] < 0.5 < 0.9 < found[1]
+
+
+def test_the_furthest_of_twenty_has_a_twentieth() -> None:
+    twins = np.random.default_rng(2).standard_normal((19, 3))
+    assert probability_alike(np.full((1, 3), 9.0), twins) == pytest.approx(1 / 20)
+    assert probability_alike(twins.mean(0)[None], twins) == 1

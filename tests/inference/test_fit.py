@@ -9,11 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from broken_fits import BROKEN, broken
 from found import lattice, made_fit, measured
 
+from curvafit.core.records import quoted
+from curvafit.core.schema import violation
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE
 from curvafit.inference.estimate import middle_of
-from curvafit.inference.fit import COLUMNS, Fit, to_columns
+from curvafit.inference.fit import COLUMNS, FIT_SCHEMA, Fit, to_columns
 from curvafit.priors import Law
 
 
@@ -34,6 +37,9 @@ def test_every_field_comes_back(fit: Fit) -> None:
     back = Fit.from_json(fit.to_json())
     assert fields(back) == fields(fit)
     assert {type(value) for value in fields(back).values()} == {type(value) for value in fields(fit).values()}
+    odd = dataclasses.replace(fit, status="grown [  3  ]", notes=("scan [ 1, 2 ].tif",))
+    assert fields(Fit.from_json(odd.to_json())) == fields(odd)
+    assert fit == fit and len({fit, fit}) == 1
 
 
 def test_the_diagram_comes_back_to_its_stored_digits(fit: Fit) -> None:
@@ -49,15 +55,6 @@ def test_a_fit_without_a_diagram_and_with_a_phase_that_is_missing(fit: Fit) -> N
     back = Fit.from_json(dataclasses.replace(fit, diagram=None, morphometry=full).to_json())
     assert back.diagram is None and math.isnan(back.morphometry.spacing_mean)
     assert back.morphometry.volume_fraction == 1.0 and back.candidates == fit.candidates
-
-
-def test_texts_come_back_as_they_are(fit: Fit) -> None:
-    odd = dataclasses.replace(fit, status="grown [  3  ]", notes=("scan [ 1, 2 ].tif",))
-    assert fields(Fit.from_json(odd.to_json())) == fields(odd)
-
-
-def test_a_fit_can_be_a_key(fit: Fit) -> None:
-    assert fit == fit and len({fit, fit}) == 1
 
 
 def test_a_distance_that_is_unknown_comes_back() -> None:
@@ -79,12 +76,6 @@ def test_a_fit_without_a_law_is_none(fit: Fit) -> None:
     assert fields(Fit.from_json(none.to_json())) == fields(none)
     with pytest.raises(ValueError, match="law"):
         none.to_law()
-
-
-def test_a_law_chosen_from_nowhere_is_refused(fit: Fit) -> None:
-    content = json.loads(fit.to_json()) | {"chosen": "optimum"}
-    with pytest.raises(ValueError, match="optimum"):
-        Fit.from_json(json.dumps(content))
 
 
 def test_intervals_in_the_scan_s_unit_are_the_draws_in_that_unit(fit: Fit) -> None:
@@ -119,13 +110,6 @@ def test_the_middle_is_the_draw_nearest_to_the_medians() -> None:
     assert middle_of(rows) == pytest.approx(rows[2])
 
 
-def test_draws_of_several_lengths_are_refused(fit: Fit) -> None:
-    content = json.loads(fit.to_json())
-    content["posterior"]["draws"]["a10"].append(0.1)
-    with pytest.raises(ValueError, match="length"):
-        Fit.from_json(json.dumps(content))
-
-
 def test_a_file_is_read_as_a_fit_and_as_a_prior(tmp_path: Path, fit: Fit) -> None:
     path = fit.save(tmp_path / "fit.json")
     assert fields(Fit.load(path)) == fields(fit)
@@ -139,35 +123,6 @@ def test_a_file_is_read_as_a_fit_and_as_a_prior(tmp_path: Path, fit: Fit) -> Non
         Fit.load(tmp_path / "none.json")
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "said"),
-    [
-        ("matches", None, "matches, got none"),
-        ("status", None, "status, got none"),
-        ("chosen", 3, "chosen as a text, or null, got 3"),
-        ("candidates", [{}], "candidates\\[0\\].name, got none"),
-        ("misfit", {"probability": 2, "blocks": {}, "method": ""}, "misfit.probability as a number from 0 to 1, got 2"),
-        ("scale", [1, 1], "scale as a list of 3 numbers"),
-        ("morphometry", [], "morphometry as an object, got"),
-    ],
-)
-def test_a_law_alone_is_no_whole_fit(tmp_path: Path, fit: Fit, name: str, value: object, said: str) -> None:
-    content = json.loads(fit.to_json())
-    content.pop(name) if value is None else content.update({name: value})
-    with pytest.raises(ValueError, match=f"expected a fit.json written by `curvafit infer` with {said}"):
-        Fit.from_json(json.dumps(content))
-    if value is None:
-        (tmp_path / "fit.json").write_text(json.dumps(content))
-        assert Law.load(tmp_path / "fit.json") == fit.to_law()
-
-
-def test_columns_of_several_lengths_are_refused(fit: Fit) -> None:
-    content = json.loads(fit.to_json())
-    content["diagram"]["share"].append(0.1)
-    with pytest.raises(ValueError, match="length"):
-        Fit.from_json(json.dumps(content))
-
-
 def test_a_fit_is_one_line_and_shows_its_scan_s_diagram(fit: Fit) -> None:
     text = repr(fit)
     assert "\n" not in text and "tubes from an image" in text and "working voxel 0.0195 mm" in text
@@ -176,3 +131,96 @@ def test_a_fit_is_one_line_and_shows_its_scan_s_diagram(fit: Fit) -> None:
     assert "<img" not in bare._repr_html_()
     with pytest.raises(ValueError, match="diagram"):
         bare.plot()
+
+
+# ---- what a file may not hold ----------------------------------------------------------------------------------------
+
+SENTENCE = r"\Aexpected [^\n]{1,600}\Z"
+
+
+def refused(path: Path, content: str | bytes) -> str:
+    """What `Fit.load` says of a file."""
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    with pytest.raises(ValueError, match=SENTENCE) as error:
+        Fit.load(path)
+    return str(error.value)
+
+
+#: Where, what stands there as JSON, and what is said.
+BOMBS = [
+    ("mass", "NaN", "NaN, which is not a finite number"),
+    ("coefficients.a00", "-Infinity", "-Infinity, which is not a finite number"),
+    ("epsilon_physical", "1e999", "1e999, which is not a finite number"),
+    ("working_voxel", "1" * 400, "a number of 400 digits"),
+    ("provenance", "1" * 5000, "a number of 5000 digits"),
+    ("provenance", "[" * 100_000 + "]" * 100_000, "nested too deeply"),
+    ("provenance", '{"a":' * 100_000, "nested too deeply"),
+    ("provenance", '{"a": 1, "a": 2}', "the key 'a' twice"),
+    ("provenance", "{", "which is not JSON"),
+    ("status", None, "status, got none"),
+    ("chosen", "3", "chosen as a text, or null, got 3"),
+    ("chosen", '"optimum"', "optimum"),
+    ("candidates", "[{}]", "candidates[0].name, got none"),
+    ("misfit", '{"probability": 2, "blocks": {}, "method": ""}', "misfit.probability as a number from 0 to 1, got 2"),
+    ("scale", "[1, 1]", "scale as a list of 3 numbers"),
+    ("posterior.draws.a10", "[0.1]", "length"),
+    ("diagram", '{"kappa1": [1], "kappa2": [2], "share": [1, 1]}', "length"),
+]
+
+
+@pytest.mark.parametrize(("where", "text", "said"), [*BOMBS, *((*each[:2], each[2].split()[0]) for each in BROKEN)])
+def test_one_thing_wrong_is_named(tmp_path: Path, where: str, text: str | None, said: str) -> None:
+    assert said in refused(tmp_path / "fit.json", broken(where, text))
+
+
+def test_a_law_alone_is_no_whole_fit(tmp_path: Path, fit: Fit) -> None:
+    content = json.loads(fit.to_json())
+    del content["matches"]
+    assert "matches, got none" in refused(tmp_path / "fit.json", json.dumps(content))
+    assert Law.load(tmp_path / "fit.json") == fit.to_law()
+
+
+def test_bytes_that_are_no_utf8_and_a_byte_order_mark(tmp_path: Path) -> None:
+    text = made_fit().to_json()
+    assert "not text in UTF-8" in refused(tmp_path / "fit.json", text.replace("tubes", "tübes").encode("latin-1"))
+    assert "not text in UTF-8" in refused(tmp_path / "fit.json", text.encode("utf-16"))
+    (tmp_path / "fit.json").write_bytes(b"\xef\xbb\xbf" + text.encode())
+    assert Fit.load(tmp_path / "fit.json").mass == made_fit().mass
+
+
+def test_content_that_is_no_object_and_another_format(tmp_path: Path) -> None:
+    for text in ("[]", "7", '"x"', "null", "{}"):
+        assert "expected a fit.json written by `curvafit infer` with" in refused(tmp_path / "fit.json", text)
+    said = refused(tmp_path / "fit.json", json.dumps({"format": ["x" * 10**6] * 100}))
+    assert "expected a fit.json of format curvafit-fit-3, got [" in said
+
+
+def test_what_is_written_is_what_can_be_read() -> None:
+    assert violation(made_fit().as_dict(), FIT_SCHEMA) is None
+    heavy = dataclasses.replace(made_fit().candidates[0], mass=1.5)
+    with pytest.raises(ValueError, match="mass"):
+        dataclasses.replace(made_fit(), candidates=(heavy,)).to_json()
+    with pytest.raises(ValueError, match="length_unit"):
+        dataclasses.replace(made_fit(), length_unit="ell").to_json()
+
+
+def test_the_schema_is_plain_data_in_the_words_that_both_checks_know() -> None:
+    words = {"type", "enum", "required", "properties", "items", "minItems", "minimum", "maximum", "description"}
+
+    def walk(schema: dict) -> None:
+        assert set(schema) <= words | {"exclusiveMinimum", "exclusiveMaximum"} and "description" in schema
+        for inner in [*schema.get("properties", {}).values(), *([schema["items"]] if "items" in schema else [])]:
+            walk(inner)
+
+    walk(FIT_SCHEMA)
+    assert json.loads(json.dumps(FIT_SCHEMA)) == FIT_SCHEMA
+
+
+def test_a_quotation_is_short() -> None:
+    bomb: list = ["x"]
+    for _ in range(40):
+        bomb = [bomb] * 9
+    loop: list = []
+    loop.append(loop)
+    for value in (bomb, loop, "y" * 10**6, {str(k): "z" * 999 for k in range(999)}, 7**400, b"\n" * 10**5):
+        assert len(quoted(value)) < 200 and "\n" not in quoted(value)

@@ -1,19 +1,27 @@
-"""Stationarity on fields that are stationary, or are not; rounded fields."""
+"""What pins the parameters down, and what does not: stationarity of fields, and drift of masks."""
 
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 
+import nibabel
 import numpy as np
 import pytest
 import torch
+from emulated import BOX, linear, reading, row
+from shapes import grown
 
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
+from curvafit.inference.emulator import best_parameters
 from curvafit.inference.stationarity import (
     clip_to_domain,
+    deblur,
+    drift,
     energy_gradients,
     fix_gauge,
+    halo_of,
     integrate_columns,
     solve,
     stationarity,
@@ -21,7 +29,8 @@ from curvafit.inference.stationarity import (
     unit_factors,
     weak_form,
 )
-from curvafit.priors import WORKING_EPSILON, Coefficients, Grid, energy_terms, jet, preset
+from curvafit.priors import WORKING_EPSILON, Coefficients, Grid, energy_terms, jet, phase_field, preset
+from curvafit.priors.stencils import gaussian_blur
 from curvafit.scan.structure import is_rounded
 
 EDGE = 36
@@ -43,6 +52,11 @@ def found(sponge: torch.Tensor):
     return stationarity(sponge, GRID, WORKING_EPSILON, starts=[FAR])
 
 
+def close(found, law: Coefficients, rel: float) -> None:
+    """The coefficients but a20, the gauge, and a00, which is held weakly."""
+    assert list(found.coefficients)[1:5] == pytest.approx([float(value) for value in list(law)[1:5]], rel=rel)
+
+
 def noise(shape: tuple[int, int, int], seed: int = 0) -> torch.Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
@@ -60,9 +74,7 @@ def test_gradients_of_the_six_terms_are_autograds(boundary: str) -> None:
 
 @pytest.mark.slow
 def test_stationarity_finds_what_made_a_field(found) -> None:
-    for name in ("a11", "a02", "a10", "a01"):
-        truth = getattr(TRUTH.coefficients, name)
-        assert getattr(found.coefficients, name) == pytest.approx(truth, rel=0.1), name
+    close(found, TRUTH.coefficients, 0.1)
     assert found.coefficients.a20 == 1
     assert found.mass == pytest.approx(TRUTH.mass, abs=1e-5)
     assert found.name == "stationarity" and found.status.startswith("Stationarity is supported")
@@ -100,17 +112,14 @@ def test_a_field_that_is_not_stationary_is_not_said_to_be(sponge: torch.Tensor) 
 def test_a_shift_changes_nothing(sponge: torch.Tensor, found) -> None:
     """An even shift maps octants and the propagated noise elsewhere, the equations onto themselves."""
     moved = stationarity(sponge.roll((6, 10, 4), (0, 1, 2)), GRID, WORKING_EPSILON)
-    for name in ("a11", "a02", "a10", "a01"):
-        assert getattr(moved.coefficients, name) == pytest.approx(getattr(found.coefficients, name), rel=0.02), name
+    close(moved, found.coefficients, 0.02)
 
 
 @pytest.mark.slow
 def test_the_mirror_image_has_mirrored_coefficients(sponge: torch.Tensor, found) -> None:
     """F_ε[-u; a] = F_ε[u; a'], so -u gives a', in the gauge a20 = 1."""
     mirrored = found.coefficients.mirror()
-    expected = mirrored.scale(1 / mirrored.a20)
-    other = stationarity(-sponge, GRID, WORKING_EPSILON)
-    assert list(other.coefficients)[1:5] == pytest.approx(list(expected)[1:5], rel=0.02)
+    close(stationarity(-sponge, GRID, WORKING_EPSILON), mirrored.scale(1 / mirrored.a20), 0.02)
 
 
 @pytest.mark.slow
@@ -122,18 +131,18 @@ def test_a_crop_says_what_its_inside_says(sponge: torch.Tensor) -> None:
     part = integrate_columns(energy_gradients(crop, grid, WORKING_EPSILON), grid, WORKING_EPSILON, width)
     assert part.shape == (6, 4, 4, 4)
     np.testing.assert_allclose(part, whole[:, 6:10, 6:10, 6:10], rtol=1e-6, atol=1e-9 * np.abs(whole).max())
-    found = stationarity(crop, grid, WORKING_EPSILON)
-    for name in ("a11", "a02", "a10", "a01"):
-        assert getattr(found.coefficients, name) == pytest.approx(getattr(TRUTH.coefficients, name), rel=0.1), name
+    close(stationarity(crop, grid, WORKING_EPSILON), TRUTH.coefficients, 0.1)
 
 
 def test_refusals(sponge: torch.Tensor) -> None:
-    with pytest.raises(ValueError, match="expected a crop of at least 28 voxels"):
-        stationarity(sponge[:20, :20, :20], Grid((20, 20, 20), 0.01, "replicate"), WORKING_EPSILON)
-    with pytest.raises(ValueError, match="expected a finite field"):
-        stationarity(sponge.clone().fill_(math.nan), GRID, WORKING_EPSILON)
-    with pytest.raises(ValueError, match="expected a field of shape"):
-        stationarity(sponge[:-1], GRID, WORKING_EPSILON)
+    small = Grid((20, 20, 20), 0.01, "replicate")  # type: ignore[arg-type]
+    for field, grid, word in (
+        (sponge[:20, :20, :20], small, "crop of at least 28"),
+        (sponge.clone().fill_(math.nan), GRID, "finite"),
+        (sponge[:-1], GRID, "shape"),
+    ):
+        with pytest.raises(ValueError, match=word):
+            stationarity(field, grid, WORKING_EPSILON)
 
 
 def test_a_rounded_field_is_told(sponge: torch.Tensor) -> None:
@@ -151,3 +160,74 @@ def test_gauge_and_domain() -> None:
     assert inside[0] > 0 and inside[2] > 0 and inside[0] + inside[2] == pytest.approx(2)
     a = Coefficients(1, 2, 3, 4, 5, 6)
     assert np.array(list(a)) / unit_factors(0.5) == pytest.approx(list(a.in_unit(0.5)))
+
+
+@pytest.mark.slow
+def test_the_authors_sponge_gives_its_coefficients_back(data) -> None:
+    (path,) = (data / "gallery").glob("sponge coeffs*.nii.gz")
+    field = torch.from_numpy(np.asarray(nibabel.load(path).dataobj, dtype=np.float32))
+    found = stationarity(field, Grid((100, 100, 100)), WORKING_EPSILON, starts=[Coefficients(1, 0, 1)])
+    close(found, TRUTH.coefficients, 0.05)
+    assert found.mass == pytest.approx(TRUTH.mass, abs=1e-4)
+    assert found.name == "stationarity" and found.coefficients.a20 == 1
+
+
+# ---- drift: what a short flow moves ----------------------------------------------------------------------------------
+
+
+MASK = Grid((32, 32, 32))
+
+
+@pytest.fixture(scope="module")
+def mask_phase() -> torch.Tensor:
+    return phase_field(grown("tubes", 32) > 0, MASK, WORKING_EPSILON)
+
+
+def test_the_right_parameters_leave_a_mask_where_it_is(mask_phase: torch.Tensor) -> None:
+    """Of six seeds the interface moves by 0.25 to 0.71 voxels, by 0.08 to 0.26 of what the wrong ones move it."""
+    truth, wrong = (drift(mask_phase, MASK, WORKING_EPSILON, preset(name).coefficients) for name in ("tubes", "sponge"))
+    assert truth is not None and wrong is not None
+    assert truth < 1
+    assert truth < 0.7 * wrong
+
+
+def test_only_the_direction_of_a_counts(mask_phase: torch.Tensor) -> None:
+    shape = preset("tubes").coefficients
+    weak, strong = (drift(mask_phase, MASK, WORKING_EPSILON, shape.scale(c)) for c in (0.5, 2))
+    assert weak == pytest.approx(strong, abs=1e-6)
+
+
+def test_sharpening_undoes_most_of_the_blur(mask_phase: torch.Tensor) -> None:
+    blurred = gaussian_blur(mask_phase, MASK, WORKING_EPSILON)
+    kept = gaussian_blur(deblur(mask_phase, MASK, WORKING_EPSILON), MASK, WORKING_EPSILON)
+    assert (kept - mask_phase).abs().mean() < 0.35 * (blurred - mask_phase).abs().mean()
+    assert float(kept.double().mean()) == pytest.approx(float(mask_phase.double().mean()), abs=1e-5)
+
+
+@pytest.mark.slow
+def test_a_fit_in_float64_leaves_jax_as_it_is() -> None:
+    """As other threads see it while fits run, two at once, and afterwards."""
+    import jax
+    import jax.numpy as jnp
+
+    before, at = jax.config.jax_enable_x64, BOX.mean(1)
+    with ThreadPoolExecutor(3) as pool:
+        asked = (best_parameters, linear(), reading(row(at[None])[0]), np.tile(at, (8, 1)))
+        fits = [pool.submit(*asked) for _ in range(2)]
+        seen = {pool.submit(lambda: jax.config.jax_enable_x64).result() for _ in range(20)}
+        ends = [fit.result() for fit in fits]
+    assert seen == {before} and jax.config.jax_enable_x64 == before
+    assert jnp.ones(1).dtype == (jnp.float64 if before else jnp.float32)
+    for end, _ in ends:
+        assert end == pytest.approx(at, abs=1e-4 * np.ptp(BOX))
+
+
+def test_a_law_without_a20_has_a_drift_and_a_crop_without_an_inside_has_none(mask_phase: torch.Tensor) -> None:
+    """The gauge is a02 then: over a20 the coefficients would be beyond what a flow computes. All of the crop would be
+    the halo that is held."""
+    law = Coefficients(1e-9, 1.0, 1.0, -20.0, 0.0, 100.0)
+    assert np.isfinite(drift(mask_phase, MASK, WORKING_EPSILON, law) or np.nan)
+    frozen = halo_of(Grid((32, 32, 32), boundary="replicate"))
+    assert frozen is not None and bool(frozen[0].all()) and not bool(frozen[16, 16, 16])
+    grid = Grid((16, 24, 24), boundary="replicate")
+    assert drift(torch.ones(grid.shape), grid, WORKING_EPSILON, preset("tubes").coefficients) is None

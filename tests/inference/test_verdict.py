@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 
 import numpy as np
 import pytest
-from found import NUMBERS, made_fit
+from found import NUMBERS
 
 from curvafit.core.schema import decode, encode
 from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.morphometry import Morphometry
 from curvafit.inference.candidates import Candidate, Misfit, Twin, best_candidate, seed_noise_of
 from curvafit.inference.verdict import UNBELIEVABLE, find_differences, verdict
 from curvafit.priors.coefficients import Coefficients
@@ -23,11 +25,6 @@ ODD = Misfit(0.001, {"gaps": 0.004, "chords": 0.3, "depths": 0.0005}, "24 window
 
 def law(name: str, distance: float | None = None, noise: float | None = None, status: str = "") -> Candidate:
     return Candidate(name, LAW, -0.6, {"a11": 0.4}, None, distance, noise, status=status)
-
-
-def judge(candidates: tuple[Candidate, ...], misfit: Misfit | None, fast: bool = False) -> tuple[str | None, str]:
-    """The verdict on a scan of the familiar `NUMBERS`."""
-    return verdict(dataclasses.replace(made_fit(), candidates=candidates, misfit=misfit), fast=fast)
 
 
 def twin(diagram: Diagram | None, mass: float) -> Twin:
@@ -95,58 +92,38 @@ def test_a_candidate_comes_back_from_its_json() -> None:
 # ---- verdicts --------------------------------------------------------------------------------------------------------
 
 
-def test_without_growing_the_first_is_named_and_not_checked() -> None:
-    said = "Nothing was grown to check the law (--fast)."
-    assert judge((law("optimum"), law("match")), None, fast=True) == ("optimum", said)
-    unusual = "A quick reading rules this law out (p = 0.0010)."
-    odd, usual = (dataclasses.replace(each, departure=None) for each in (ODD, USUAL))
-    assert judge((law("optimum"),), odd, fast=True) == ("optimum", f"{unusual} {said}")
-    passed = "A quick reading does not rule this law out (p = 0.40)."
-    assert judge((law("optimum"),), usual, fast=True) == ("optimum", f"{passed} {said}")
+BARE = dataclasses.replace(ODD, blocks={"gaps": 0.3})
+QUICK = [dataclasses.replace(each, departure=None) for each in (USUAL, ODD)]
+EDGE = dataclasses.replace(USUAL, probability=UNBELIEVABLE)
+BARREN = (law("posterior", status="No shape grew: one phase."), law("match"))
+THICK = dataclasses.replace(NUMBERS, thickness_mean=1.5 * NUMBERS.thickness_mean)
+NEAR, FAR = law("match", 0.9, 0.5), law("match", 9.0, 0.5)
+FAT = dataclasses.replace(NEAR, twins=(THICK,))
+#: Candidates, their test and whether nothing was grown; the law that is named, and words of the verdict in order.
+VERDICTS: list[tuple[tuple[Candidate, ...], Misfit | None, bool, str | None, tuple[str, ...]]] = [
+    ((law("optimum"), law("match")), None, True, "optimum", ("Nothing was grown",)),
+    ((law("optimum"),), QUICK[0], True, "optimum", ("does not rule this law out (p = 0.40)", "Nothing was grown")),
+    ((law("optimum"),), QUICK[1], True, "optimum", ("rules this law out (p = 0.0010)", "Nothing was grown")),
+    (BARREN, USUAL, False, None, ("No law: nothing grew", "No shape grew: one phase.")),
+    ((NEAR,), USUAL, False, "match", ("Supported (nearest match)", "lie 0.9", "0.5 from each other", "p = 0.40")),
+    ((law("match", 0.9, status="Hm."),), USUAL, False, "match", ("Supported", "look like the scan", "Hm.")),
+    ((FAR,), EDGE, False, "match", ("Supported",)),  # whatever the distances are
+    ((FAR,), None, False, "match", ("Undecided (nearest match)", "lie 9.0", "was not tested")),
+    ((FAT,), USUAL, False, "match", ("Supported", "Twins over scan: thickness 1.5.")),  # which do not decide
+    ((FAT,), ODD, False, "match", ("No believable twin", "Twins over scan: thickness 1.5.")),
+    ((law("simulation", 0.1, 0.5), FAR), ODD, False, "simulation", ("No believable twin", "depths, gaps.")),
+    ((law("simulation", 0.1),), BARE, False, "simulation", ("no descriptor tells it alone",)),
+    ((law("simulation", 0.1),), dataclasses.replace(BARE, level_cut=0.01), False, "simulation", ("level cut",)),
+    ((law("simulation", 0.1),), dataclasses.replace(ODD, blocks={"fabric": 0.001}), False, "simulation",
+     ("has a direction (fabric)",)),
+]  # fmt: skip
 
 
-def test_where_nothing_grew_there_is_no_law() -> None:
-    why = "No shape grew: the field is of one phase."
-    name, status = judge((law("posterior", status=why), law("match")), USUAL)
-    assert name is None and status == f"No law: nothing grew from any candidate. {why}"
-
-
-def test_the_nearest_is_supported_where_its_twins_are_near() -> None:
-    """As the test says, whatever the distances are."""
-    usual = "Shapes of this law look like the scan (p = 0.40)."
-    near = "Supported (nearest match): its twins lie 0.9 from the scan's curvature diagram"
-    assert judge((law("match", 0.9, 0.5),), USUAL) == ("match", f"{near}, 0.5 from each other. {usual}")
-    assert judge((law("match", 0.9, status="Hm."),), USUAL) == ("match", f"{near}. {usual} Hm.")
-    far = law("match", 9.0, 0.5)
-    assert judge((far,), dataclasses.replace(USUAL, probability=UNBELIEVABLE))[1].startswith("Supported")
-    untested = "Undecided (nearest match): its twins lie 9.0 from the scan's curvature diagram, 0.5 from each other."
-    assert judge((far,), None) == ("match", f"{untested} The law was not tested.")
-
-
-def test_familiar_numbers_explain_and_do_not_decide() -> None:
-    thick = dataclasses.replace(NUMBERS, thickness_mean=1.5 * NUMBERS.thickness_mean)
-    other = dataclasses.replace(law("match", 0.9, 0.5), twins=(thick,))
-    for misfit, word in ((USUAL, "Supported"), (ODD, "No believable twin")):
-        _, status = judge((other,), misfit)
-        assert status.startswith(f"{word} (nearest match): ") and status.endswith("Twins over scan: thickness 1.5.")
-
-
-def test_a_far_or_strange_one_is_named_but_not_believed() -> None:
-    name, status = judge((law("simulation", 0.1, 0.5), law("match", 9.0)), ODD)
-    assert name == "simulation" and status.startswith("No believable twin (nearest of the simulations): ")
-    assert status.endswith(
-        "0.5 from each other. Shapes of this law do not look like the scan (p = 0.0010); "
-        "what differs most: depths, gaps."
-    )
-    single = dataclasses.replace(ODD, blocks={"gaps": 0.3})
-    assert judge((law("simulation", 0.1),), single)[1].endswith("(p = 0.0010); no descriptor tells it alone.")
-    random = dataclasses.replace(single, level_cut=0.01)
-    assert judge((law("simulation", 0.1),), random)[1].endswith(
-        "It looks more like a level cut of a random field, which no law made."
-    )
-    aligned = dataclasses.replace(ODD, blocks={"fabric": 0.001})
-    direction = "The scan has a direction (fabric), and the model has none."
-    assert judge((law("simulation", 0.1),), aligned)[1].endswith(direction)
+@pytest.mark.parametrize(("candidates", "misfit", "fast", "name", "words"), VERDICTS)
+def test_the_test_decides_and_the_verdict_says_what_led_to_it(candidates, misfit, fast, name, words) -> None:
+    found, status = verdict(candidates, misfit, NUMBERS, fast=fast)
+    assert found == name
+    assert re.search(".*".join(map(re.escape, words)), status), status
 
 
 def test_few_tunnels_may_differ_by_the_root_of_their_count() -> None:
@@ -169,23 +146,20 @@ def test_few_tunnels_may_differ_by_the_root_of_their_count() -> None:
 
 def test_familiar_numbers_that_differ_are_named() -> None:
     """Where all twins differ by more than 15 %, the same way; none that the scan does not have."""
-    near = dataclasses.replace(NUMBERS, thickness_mean=1.14 * NUMBERS.thickness_mean)
-    assert (
-        find_differences(NUMBERS, (NUMBERS, near))
-        == find_differences(NUMBERS, (near,))
-        == find_differences(NUMBERS, ())
-        == []
-    )
-    far = dataclasses.replace(NUMBERS, thickness_mean=3 * NUMBERS.thickness_mean, connectivity_density=0.0)
-    further = dataclasses.replace(far, thickness_mean=5 * NUMBERS.thickness_mean)
-    assert find_differences(NUMBERS, (far, further)) == ["thickness 4.0", "connectivity 0"]
-    assert find_differences(NUMBERS, (NUMBERS, far)) == []
-    thin = dataclasses.replace(NUMBERS, thickness_mean=0.5 * NUMBERS.thickness_mean)
-    assert (
-        find_differences(NUMBERS, (thin, dataclasses.replace(far, connectivity_density=NUMBERS.connectivity_density)))
-        == []
-    )
-    pieces = dataclasses.replace(NUMBERS, connectivity_density=-NUMBERS.connectivity_density)
-    assert find_differences(NUMBERS, (pieces,)) == ["connectivity of the other sign"]
-    assert find_differences(dataclasses.replace(NUMBERS, thickness_mean=math.nan), (NUMBERS,)) == []
-    assert find_differences(dataclasses.replace(NUMBERS, connectivity_density=0.0), (NUMBERS,)) == []
+
+    def other(thickness: float, connectivity: float = 1.0) -> Morphometry:
+        own, joined = NUMBERS.thickness_mean, NUMBERS.connectivity_density
+        return dataclasses.replace(NUMBERS, thickness_mean=thickness * own, connectivity_density=connectivity * joined)
+
+    for scan, twins, words in (
+        (NUMBERS, (), []),
+        (NUMBERS, (other(1.14),), []),
+        (NUMBERS, (NUMBERS, other(1.14)), []),
+        (NUMBERS, (other(3, 0), other(5, 0)), ["thickness 4.0", "connectivity 0"]),
+        (NUMBERS, (NUMBERS, other(3, 0)), []),
+        (NUMBERS, (other(0.5), other(3)), []),
+        (NUMBERS, (other(1, -1),), ["connectivity of the other sign"]),
+        (other(math.nan), (NUMBERS,), []),
+        (other(1, 0), (NUMBERS,), []),
+    ):
+        assert find_differences(scan, twins) == words
