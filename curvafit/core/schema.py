@@ -1,9 +1,4 @@
-"""Dataclasses in JSON: the schema of a dataclass, the first fault of a value under it, and conversion in both ways.
-
-A schema is plain data in the words of JSON Schema, so that a page in a browser can check the same: `type`, `enum`,
-`required`, `properties`, `items`, `minItems`, `minimum`, `maximum` and their exclusive forms. Messages use the
-`description`.
-"""
+"""Dataclasses in JSON: a value from JSON as a dataclass, checked on the way, and a dataclass as JSON."""
 
 from __future__ import annotations
 
@@ -31,101 +26,86 @@ class Rule(NamedTuple):
         Keys of some entries of a dictionary, with their types.
     """
 
-    least: float | None = None
-    most: float | None = None
-    above: float | None = None
-    below: float | None = None
+    least: float = -math.inf
+    most: float = math.inf
+    above: float = -math.inf
+    below: float = math.inf
     unknown: bool = False
     filled: bool = False
     keys: tuple[tuple[str, Any], ...] = ()
 
 
-_BOUNDS = {
-    "minimum": (lambda value, bound: value >= bound, "least"),
-    "maximum": (lambda value, bound: value <= bound, "most"),
-    "exclusiveMinimum": (lambda value, bound: value > bound, "above"),
-    "exclusiveMaximum": (lambda value, bound: value < bound, "below"),
-}
-_PLAIN: dict[Any, dict[str, Any]] = {
-    str: {"type": "string", "description": "a text"},
-    bool: {"type": "boolean", "description": "true or false"},
-}
+_PLAIN: dict[Any, str] = {str: "a text", bool: "true or false"}
 
 
-def schema_of(hint: Any, rule: Rule | None = None) -> dict[str, Any]:
-    """Return the schema of a dataclass, text, number, `Literal`, tuple or dictionary, or of one of these or None."""
-    rule = rule or Rule()
-    if get_origin(hint) is Annotated:
-        return schema_of(*get_args(hint)[:2])
-    kinds = _kinds(hint)
-    schema = _schema_of_one(next(kind for kind in kinds if kind is not NoneType), rule)
-    if len(kinds) == 1 and not rule.unknown:
-        return schema
-    return {**schema, "type": [schema["type"], "null"], "description": f"{schema['description']}, or null"}
+def decode(hint: Any, value: Any, name: str = "") -> Any:
+    """Return a value from JSON as a dataclass, text, number, `Literal`, tuple or dictionary, or one of these or None.
+
+    Raises ValueError with the first fault, such as `"mass as a positive number, got 0"`, in which the value is `name`.
+    """
+    hint, rule = get_args(hint)[:2] if get_origin(hint) is Annotated else (hint, Rule())
+    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    # Without tensors, which JSON cannot hold.
+    kind: Any = next(each for each in kinds if each is not NoneType and getattr(each, "__name__", "") != "Tensor")
+    nullable = NoneType in kinds or rule.unknown
+    if value is None and nullable:
+        return math.nan if rule.unknown else None
+    return _decode(kind, value, name, rule, ", or null" * nullable)
 
 
-def _schema_of_one(hint: Any, rule: Rule) -> dict[str, Any]:
-    """Return the schema of a type that is no union."""
-    if hint in _PLAIN:
-        return _PLAIN[hint]
-    if hint in (int, float):
-        bounds = {name: getattr(rule, end) for name, (_, end) in _BOUNDS.items() if getattr(rule, end) is not None}
-        return {"type": "number", **bounds, "description": _number_words(rule)}
-    if get_origin(hint) is Literal:
-        *some, last = get_args(hint)
-        words = f"{', '.join(some)} or {last}" if some else last
-        return {"type": "string", "enum": [*some, last], "description": words}
-    if get_origin(hint) is tuple:
-        items = get_args(hint)
+def _decode(kind: Any, value: Any, name: str, rule: Rule, more: str) -> Any:
+    """Return a value of a type that is no union."""
+    words, fits = _check(kind, rule, value)
+    if not fits:
+        raise ValueError(f"{name or 'the content'} as {words}{more}, got {quoted(value)}")
+    if dataclasses.is_dataclass(kind):
+        return _decode_fields(kind, value, name)
+    if get_origin(kind) is tuple:
+        return tuple(decode(get_args(kind)[0], item, f"{name}[{k}]") for k, item in enumerate(value))
+    if get_origin(kind) is dict:
+        for key, inner in rule.keys:
+            if key in value:
+                decode(inner, value[key], f"{name}.{key}")
+        inner = get_args(kind)[1]
+        return {k: v if v is None or inner is Any else decode(inner, v, f"{name}.{k}") for k, v in value.items()}
+    return kind(value) if kind in (int, float) else value
+
+
+def _decode_fields(kind: Any, value: Mapping[str, Any], name: str) -> Any:
+    """Return a dataclass, whose entries without a default must be there; further entries are left out."""
+    prefix, hints = f"{name}." if name else "", get_type_hints(kind, include_extras=True)
+    for field in dataclasses.fields(kind):
+        if field.default is dataclasses.MISSING and field.name not in value:
+            raise ValueError(f"{prefix}{field.name}, got none")
+    return kind(**{key: decode(hints[key], value[key], prefix + key) for key in hints if key in value})
+
+
+def _check(kind: Any, rule: Rule, value: Any) -> tuple[str, bool]:
+    """Return what a value must be, in words, and whether it is; items and entries are not looked at."""
+    if kind in _PLAIN:
+        return _PLAIN[kind], isinstance(value, kind)
+    if kind in (int, float):
+        fits = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        fits = fits and rule.least <= value <= rule.most and rule.above < value < rule.below
+        return _number_words(rule), fits
+    if get_origin(kind) is Literal:
+        *some, last = get_args(kind)
+        return f"{', '.join(some)} or {last}" if some else last, isinstance(value, str) and value in (*some, last)
+    if get_origin(kind) is tuple:
+        items = get_args(kind)
         count = 0 if items[-1] is Ellipsis else len(items)
-        words = f"a list of {count} numbers" if count else "a list"
-        least = count or int(rule.filled)
-        return {"type": "array", "items": schema_of(items[0]), "minItems": least, "description": words}
-    if dataclasses.is_dataclass(hint):
-        fields, hints = dataclasses.fields(hint), get_type_hints(hint, include_extras=True)
-        required = [field.name for field in fields if field.default is dataclasses.MISSING]
-        properties = {field.name: schema_of(hints[field.name]) for field in fields}
-        return {"type": "object", "required": required, "properties": properties, "description": "an object"}
-    properties = {name: schema_of(inner) for name, inner in rule.keys}
-    return {"type": "object", "required": [], "properties": properties, "description": "an object"}
+        fits = isinstance(value, (list, tuple)) and len(value) >= (count or int(rule.filled))
+        return f"a list of {count} numbers" if count else "a list", fits
+    return "an object", isinstance(value, Mapping)
 
 
-def violation(value: Any, schema: Mapping[str, Any], name: str = "the content") -> str | None:
-    """Return the first fault of a value under a schema, such as `"mass as a positive number, got 0"`, or None."""
-    if not _fits(value, schema):
-        return f"{name} as {schema['description']}, got {quoted(value)}"
-    prefix = "" if name == "the content" else f"{name}."
-    if isinstance(value, Mapping):
-        for key in schema.get("required", ()):
-            if key not in value:
-                return f"{prefix}{key}, got none"
-        for key, inner in schema.get("properties", {}).items():
-            if key in value and (fault := violation(value[key], inner, prefix + key)):
-                return fault
-    if isinstance(value, list) and "items" in schema:
-        for k, item in enumerate(value):
-            if fault := violation(item, schema["items"], f"{name}[{k}]"):
-                return fault
-    return None
-
-
-def decode(hint: Any, value: Any) -> Any:
-    """Return a value of a type from JSON that follows the type's schema: see `violation`."""
-    if get_origin(hint) is Annotated:
-        hint, rule = get_args(hint)[:2]
-        if value is None and rule.unknown:
-            return math.nan
-    if value is None:
-        return None
-    hint = next(kind for kind in _kinds(hint) if kind is not NoneType)
-    if dataclasses.is_dataclass(hint):
-        hints = get_type_hints(hint, include_extras=True)
-        return hint(**{name: decode(hints[name], value[name]) for name in hints if name in value})  # type: ignore[operator]
-    if get_origin(hint) is tuple:
-        return tuple(decode(get_args(hint)[0], item) for item in value)
-    if get_origin(hint) is dict:
-        return {name: decode(get_args(hint)[1], item) for name, item in value.items()}
-    return hint(value) if hint in (int, float) else value
+def _number_words(rule: Rule) -> str:
+    """Return what a number must be, in words."""
+    if rule.above > -math.inf:
+        return "a positive number" if rule.below == math.inf else f"a number between {rule.above:g} and {rule.below:g}"
+    if rule.least > -math.inf:
+        return f"a number from {rule.least:g}" + ("" if rule.most == math.inf else f" to {rule.most:g}")
+    return "a finite number"
 
 
 def encode(value: Any) -> Any:
@@ -137,40 +117,3 @@ def encode(value: Any) -> Any:
     if isinstance(value, (tuple, list)):
         return [encode(item) for item in value]
     return None if isinstance(value, float) and math.isnan(value) else value
-
-
-def _kinds(hint: Any) -> tuple[Any, ...]:
-    """Return the types of a union, without tensors, which JSON cannot hold."""
-    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    return tuple(kind for kind in kinds if getattr(kind, "__name__", "") != "Tensor")
-
-
-def _number_words(rule: Rule) -> str:
-    """Return what a number must be, in words."""
-    if rule.above is not None:
-        return "a positive number" if rule.below is None else f"a number between {rule.above:g} and {rule.below:g}"
-    if rule.least is not None:
-        return f"a number from {rule.least:g}" + ("" if rule.most is None else f" to {rule.most:g}")
-    return "a finite number"
-
-
-def _fits(value: Any, schema: Mapping[str, Any]) -> bool:
-    """Return whether a value follows its schema; its items and properties are not looked at."""
-    kind, kinds = _json_type(value), schema["type"]
-    if kind not in ([kinds] if isinstance(kinds, str) else kinds):
-        return False
-    if "enum" in schema:
-        return value in schema["enum"]
-    if kind == "number":
-        return all(holds(value, schema[bound]) for bound, (holds, _) in _BOUNDS.items() if bound in schema)
-    return kind != "array" or len(value) >= schema.get("minItems", 0)
-
-
-def _json_type(value: Any) -> str | None:
-    """Return JSON's name of a value's type; None where JSON has no such type or the number is not finite."""
-    if isinstance(value, bool):
-        return "boolean"
-    if isinstance(value, (int, float)):
-        return "number" if math.isfinite(value) else None
-    names = {type(None): "null", str: "string", list: "array", dict: "object"}
-    return next((name for kind, name in names.items() if isinstance(value, kind)), None)

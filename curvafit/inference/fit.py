@@ -8,14 +8,14 @@ import re
 from dataclasses import dataclass, fields, make_dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from curvafit.core.checks import check_int, quoted
 from curvafit.core.files import write_content
 from curvafit.core.pictures import Pictured
-from curvafit.core.schema import Rule, decode, encode, schema_of, violation
+from curvafit.core.schema import Rule, decode, encode
 from curvafit.core.units import METRES
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.morphometry import Morphometry
@@ -170,15 +170,17 @@ class Fit(Pictured):
     def to_json(self) -> str:
         """Return the text of a `fit.json`, indented; raise ValueError where `from_json` would not take it."""
         content = self.as_dict()
-        if wrong := violation(content, FIT_SCHEMA):
-            raise ValueError(f"expected {wrong} in a fit")
+        try:
+            decode(_File, content)
+        except ValueError as fault:
+            raise ValueError(f"expected {fault} in a fit") from None
         text = json.dumps(content, indent=2, allow_nan=False)
         return re.sub(r"\[\n\s+([-+.\de,\s]+?)\n\s+\]", lambda numbers: f"[{' '.join(numbers[1].split())}]", text)
 
     @classmethod
     def from_json(cls, text: str | bytes) -> Fit:
-        """Return the fit that a `fit.json`'s text states; raise ValueError if it is not whole (`FIT_SCHEMA`)."""
-        return _fit_of(parse_fit(text, "the text", FIT_SCHEMA))
+        """Return the fit that a `fit.json`'s text states; raise ValueError if it is not whole."""
+        return _fit_of(parse_fit(text, "the text", _File))
 
     def save(self, path: str | PathLike[str]) -> Path:
         """Write a `fit.json`, whole or not at all, and return its path."""
@@ -187,7 +189,7 @@ class Fit(Pictured):
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Fit:
         """Read a `fit.json`; raise FileNotFoundError if there is none, ValueError as `from_json`."""
-        return _fit_of(read_fit(path, FIT_SCHEMA))
+        return _fit_of(read_fit(path, _File))
 
 
 def to_columns(draws: np.ndarray) -> np.ndarray:
@@ -261,8 +263,14 @@ class _File:
     diagram: _Columns | None
 
 
-#: What a `fit.json` must hold, in the words of JSON Schema.
-FIT_SCHEMA: dict[str, Any] = schema_of(_File)
+@dataclass(frozen=True)
+class _Candidates:
+    """The candidates of a `fit.json`, whatever else the file holds."""
+
+    format: Literal["curvafit-fit-3"]
+    candidates: tuple[Candidate, ...] = ()
+
+
 #: The fields that are the same in a `Fit` and its file.
 _SAME = tuple({field.name for field in fields(Fit)} & {field.name for field in fields(_File)} - {"diagram"})
 
@@ -274,9 +282,7 @@ def load_candidates(law: LawLike) -> tuple[Candidate, ...]:
     """
     if not isinstance(law, (str, PathLike)):
         return getattr(getattr(law, "fit", law), "candidates", ())
-    parts = {name: FIT_SCHEMA["properties"][name] for name in ("candidates", "format")}
-    content = read_fit(law, {**FIT_SCHEMA, "required": ["format"], "properties": parts})
-    return decode(get_type_hints(_File, include_extras=True)["candidates"], content.get("candidates", []))
+    return read_fit(law, _Candidates).candidates
 
 
 def draw_laws(law: LawLike, count: int) -> list[Law]:
@@ -320,9 +326,8 @@ def _file_of(fit: Fit) -> _File:
     )  # type: ignore[arg-type]
 
 
-def _fit_of(content: dict[str, Any]) -> Fit:
-    """Return the fit of a checked content."""
-    file: _File = decode(_File, content)
+def _fit_of(file: _File) -> Fit:
+    """Return the fit of a file."""
     same = {name: getattr(file, name) for name in _SAME}
     draws, view = None, ""
     if file.posterior is not None:

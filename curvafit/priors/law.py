@@ -8,18 +8,19 @@ from dataclasses import dataclass, field
 from numbers import Real
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, runtime_checkable
+from typing import Annotated, Any, Literal, Protocol, TypeVar, runtime_checkable
 
 from torch import Tensor
 
 from curvafit.core.checks import quoted, simplify_name
 from curvafit.core.records import parse_json
-from curvafit.core.schema import Rule, decode, schema_of, violation
+from curvafit.core.schema import Rule, decode
 from curvafit.core.units import METRES
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.priors.published import PUBLISHED
 
+Content = TypeVar("Content")
 #: The format of a `fit.json`.
 FORMAT = "curvafit-fit-3"
 
@@ -96,10 +97,9 @@ class Law:
 
         Raises FileNotFoundError where there is no file; ValueError where it is of another format or has no law.
         """
-        content = read_fit(path, _SCHEMA)
-        file: _LawFile = decode(_LawFile, content)
+        file = read_fit(path, _LawFile)
         if file.coefficients is None or file.mass is None or file.coefficients_physical is None:
-            raise ValueError(f"expected a fit with a law, got one without in {path}: {content.get('status', '')}")
+            raise ValueError(f"expected a fit with a law, got one without in {path}: {file.status}")
         share = (file.morphometry or {}).get("volume_fraction")
         width = file.epsilon_physical * WORKING_SPACING / file.working_voxel
         own: dict[str, Any] = {"working_voxel": file.working_voxel, "length_unit": file.length_unit}
@@ -226,18 +226,15 @@ class _LawFile:
     ] = None
 
 
-_SCHEMA = schema_of(_LawFile)
-
-
-def read_fit(path: str | PathLike[str], schema: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of the file of a fit; raise FileNotFoundError if there is none, ValueError as `parse_fit`."""
+def read_fit(path: str | PathLike[str], kind: type[Content]) -> Content:
+    """Return the file of a fit as a dataclass; raise FileNotFoundError if there is none, ValueError as `parse_fit`."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"expected a fit.json, found no file {path}")
-    return parse_fit(Path(path).read_bytes(), path, schema)
+    return parse_fit(Path(path).read_bytes(), path, kind)
 
 
-def parse_fit(text: str | bytes, place: object, schema: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a `fit.json`'s text; raise ValueError if it is of another format or breaks a schema.
+def parse_fit(text: str | bytes, place: object, kind: type[Content]) -> Content:
+    """Return a `fit.json`'s text as a dataclass; raise ValueError if it is of another format or lacks what that needs.
 
     Messages call the file `place`.
     """
@@ -247,9 +244,10 @@ def parse_fit(text: str | bytes, place: object, schema: Mapping[str, Any]) -> di
     if version != FORMAT:
         got = f"got {quoted(version)} in {place}: run `curvafit infer` again"
         raise ValueError(f"expected a fit.json of format {FORMAT}, {got}")
-    if fault := violation(content, schema):
-        raise ValueError(f"expected {expected} with {fault} in {place}")
-    return content
+    try:
+        return decode(kind, content)
+    except ValueError as fault:
+        raise ValueError(f"expected {expected} with {fault} in {place}") from None
 
 
 # ---- presets ---------------------------------------------------------------------------------------------------------
