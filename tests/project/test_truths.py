@@ -16,7 +16,7 @@ def test_every_truth_test_is_there() -> None:
             file = listed.setdefault(line, set())
         elif line.startswith("    "):
             file.add(line.split()[0])
-    assert sum(map(len, listed.values())) > 900
+    assert sum(map(len, listed.values())) > 800
     missing = {name: tests - functions(ROOT / name) for name, tests in listed.items()}
     assert {name: tests for name, tests in missing.items() if tests} == {}
 
