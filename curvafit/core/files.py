@@ -85,9 +85,10 @@ def move_into_place(temporary: Path, target: Path) -> Path:
 
 
 def remove(path: Path) -> None:
-    """Delete a file, a link, or a folder with its content, if there is one."""
+    """Delete a file, a link, or a folder with its content, if there is one; a signal waits until all is gone."""
     if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
+        with hold_signals():  # half a folder of tiles is nobody's, and the same command would refuse it
+            shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
 
