@@ -79,6 +79,7 @@ OTHERS: dict[str, Callable[[Path], object]] = {
     "blosc.zarr": lambda path: store(path, compressors=[BloscCodec()]),
     "sharded.zarr": lambda path: store(path, shards=(8, 10, 12)),
 }
+FORMATS = {**CHECKED, **COUNTED, **OTHERS}
 
 
 def files_of(path: Path) -> list[Path]:

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 
 from tests.calling import call
+from tests.damage import FORMATS, VALUES
 from tests.golden.frozen import CLOSE, exact, files, rounded, volume
 from tests.golden.inputs import FOLDER
-from tests.hostile.volumes import STORES, write_all
 
 #: Commands, as they are typed in a folder with the inputs.
 COMMANDS = {
@@ -95,16 +95,16 @@ def _read_formats(folder: Path) -> dict[str, Any]:
     """Every format: values, spacing and unit."""
     import curvafit
 
-    write_all(folder)
-    found = {}
-    for path in sorted(folder.iterdir()):
-        if path.name.startswith("bare"):
-            continue
-        options = {"key": "volume"} if path.name in STORES and path.name.endswith("group.zarr") else {}
-        field = curvafit.load(path, **options)
-        found[path.name] = [exact(field.values), *rounded(field.spacing), field.unit]
-    raw = curvafit.load(folder / "bare.raw", raw_shape=(9, 10, 12), dtype="u2", spacing=2.0, unit="um")
-    return {**found, "bare.raw": [exact(raw.values), *rounded(raw.spacing), raw.unit]}
+    for name, write in FORMATS.items():
+        write(folder / name)
+    found = {name: _told(curvafit.load(folder / name)) for name in FORMATS}
+    (folder / "bare.raw").write_bytes(VALUES.tobytes())
+    raw = curvafit.load(folder / "bare.raw", raw_shape=VALUES.shape, dtype="u2", spacing=2.0, unit="um")
+    return {**found, "bare.raw": _told(raw)}
+
+
+def _told(field: Any) -> list[Any]:
+    return [exact(field.values), *rounded(field.spacing), field.unit]
 
 
 def _write_formats(folder: Path) -> dict[str, Any]:
