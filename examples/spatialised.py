@@ -38,7 +38,7 @@ AZIMUTH, ELEVATION, WIDTH = 14.0, 18.0, 11.0
 def main() -> None:
     options = parser(__doc__, "spatialised").parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
-    about = {"order": ORDER, "edge": options.edge, "plan": vars(plan_of(options)), "seed": options.seed}
+    about = {"order": ORDER, "edge": options.edge, "plan": plan_of(options).as_dict(), "seed": options.seed}
     whole = kept(options.output / "spatialised.npz", about, lambda: made(options))
     pure = {}
     for n in ORDER[1:-1]:

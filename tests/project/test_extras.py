@@ -10,11 +10,14 @@ from pathlib import Path
 
 import pytest
 
+from tests.golden.inputs import FOLDER
+from tests.golden.rows import COMMANDS
+
 ROOT = Path(__file__).resolve().parents[2]
-EXTRAS = "jax jaxlib optimistix equinox zuko geomloss kornia dask distributed networkx sklearn plotly pandas pyarrow"
+EXTRAS = "jax jaxlib optimistix equinox zuko geomloss dask distributed networkx sklearn plotly pandas pyarrow nrrd"
 
 SCRIPT = f"""
-import json, sys
+import json, os, shutil, sys
 from importlib.machinery import PathFinder
 HIDDEN = set("{EXTRAS}".split())
 class Without(PathFinder):
@@ -22,51 +25,40 @@ class Without(PathFinder):
     def find_spec(cls, name, path=None, target=None):
         return None if name.partition(".")[0] in HIDDEN else super().find_spec(name, path, target)
 sys.meta_path[:] = [finder for finder in sys.meta_path if finder is not PathFinder] + [Without]
-import numpy as np
 import curvafit
 from typer.testing import CliRunner
 from curvafit.cli.app import app
 
-z, y, x = np.indices((32, 24, 24))
-tubes = ((y % 12 - 6) ** 2 + (x % 12 - 6) ** 2 < 12) | ((z % 16 - 8) ** 2 + (y % 12 - 6) ** 2 < 12)
-curvafit.save(tubes.astype(np.uint8), "mask.nii.gz")
-answers = {{"core": {{}}, "missing": {{}}}}
-answers["core"]["fraction"] = curvafit.measure("mask.nii.gz")["BV/TV"].value
-filled = curvafit.reconstruct("mask.nii.gz", "tubes", every=4, stiffness=1e7, steps=5).mask.values
-answers["core"]["reconstruct"] = bool((filled[::4] == tubes[::4]).all())
-generate = "generate --preset tubes --shape 24 --steps 30 -o made.nii.gz --no-picture"
-for words in ("measure mask.nii.gz", "presets", generate):
-    result = CliRunner().invoke(app, words.split())
-    answers["core"][words.split()[0]] = [result.exit_code, repr(result.exception)]
-synth = "synth -o set --preset tubes --modality micro-ct --count 1 --shape 16"
-for words in ("infer mask.nii.gz -o out --fast", synth):
-    result = CliRunner().invoke(app, words.split())
-    answers["missing"][words.split()[0]] = [result.exit_code, result.stderr]
+answers = {{}}
+for name, line in json.loads(sys.stdin.read()).items():
+    shutil.copytree({str(FOLDER)!r}, name)
+    os.chdir(name)
+    before = set(os.listdir())
+    result = CliRunner().invoke(app, line.split())
+    answers[name] = [result.exit_code, result.output, sorted(set(os.listdir()) - before)]
+    os.chdir("..")
 try:
-    curvafit.infer("mask.nii.gz", fast=True)
+    curvafit.infer("mask/mask.nii.gz", fast=True)
 except ImportError as error:
-    answers["missing"]["python"] = [2, str(error)]
+    answers["python"] = [2, str(error), []]
 print(json.dumps(answers))
 """
+#: The extra that a command asks for; the others need none.
+NEEDED = dict.fromkeys(("infer-fast", "infer-match", "python"), "infer") | {"workers": "synth", "map": "atlas"}
+NEEDED |= dict.fromkeys(("reconstruct-image", "reconstruct-cells"), "image")
+MORE = {
+    "mask": "measure mask.nii.gz",
+    "workers": "synth -o out --preset tubes --modality micro-ct --count 1 --shape 16",
+    "map": "atlas map store.zarr -o out",
+}
 
 
 @pytest.mark.slow
-def test_the_core_works_without_extras_and_names_the_one_to_install(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", SCRIPT],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def test_a_command_works_without_extras_or_names_the_one_to_install(tmp_path: Path) -> None:
+    command, env = [sys.executable, "-W", "ignore", "-c", SCRIPT], os.environ | {"PYTHONPATH": str(ROOT)}
+    lines = json.dumps(COMMANDS | MORE)
+    done = subprocess.run(command, cwd=tmp_path, env=env, input=lines, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    answers = json.loads(done.stdout.splitlines()[-1])
-    core = answers["core"]
-    assert 0.1 < core.pop("fraction") < 0.9 and core.pop("reconstruct") is True
-    assert core == {name: [0, "None"] for name in ("measure", "presets", "generate")}
-    assert set(answers["missing"]) == {"infer", "synth", "python"}
-    for name, (code, said) in answers["missing"].items():
-        extra = "synth" if name == "synth" else "infer"
-        assert code == 2 and f'pip install "curvafit[{extra}]"' in said, (name, said)
-    assert not (tmp_path / "out").exists()
+    for name, (code, said, new) in json.loads(done.stdout.splitlines()[-1]).items():
+        asked = f'pip install "curvafit[{NEEDED.get(name)}]"' in said
+        assert (code == 2 and asked and not new) if name in NEEDED else code == 0, (name, said)

@@ -11,19 +11,12 @@ import pytest
 
 pytestmark = pytest.mark.slow
 
-NOTEBOOKS = Path(__file__).resolve().parents[2] / "docs" / "notebooks"
-
-
-@pytest.fixture(autouse=True)
-def no_window():
-    with matplotlib.rc_context():
-        matplotlib.use("agg")
-        yield
-
 
 def run(name: str) -> dict[str, Any]:
     """The names that a notebook ends with."""
-    return runpy.run_path(str(NOTEBOOKS / f"{name}.py"))
+    with matplotlib.rc_context():
+        matplotlib.use("agg")
+        return runpy.run_path(str(Path(__file__).resolve().parents[2] / "docs" / "notebooks" / f"{name}.py"))
 
 
 def test_infer() -> None:
