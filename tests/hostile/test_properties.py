@@ -167,11 +167,11 @@ ODD = st.sampled_from(["null", "true", '"text"', "[]", "{}", "-1", "1e400", "NaN
 @st.composite
 def harmed(draw: st.DrawFn, content: bytes) -> bytes:
     """The bytes of a file, damaged; of JSON, with another value in one place, half of the time."""
-    if content[:1] in b"{[" and draw(st.booleans()):
-        parts = list(places(content := json.loads(content)))  # type: ignore[assignment]
+    parts = list(places(whole := json.loads(content))) if content[:1] in (b"{", b"[") else []
+    if parts and draw(st.booleans()):
         node, key = draw(st.sampled_from(parts))
         node[key] = "@"
-        return json.dumps(content).replace('"@"', draw(ODD)).encode("utf-8", "surrogatepass")
+        return json.dumps(whole).replace('"@"', draw(ODD)).encode("utf-8", "surrogatepass")
     place = draw(st.integers(0, max(0, len(content) - 1)) | st.integers(0, min(600, max(0, len(content) - 1))))
     return HARMS[draw(st.sampled_from(sorted(HARMS)))](content or b"\0", place)
 
