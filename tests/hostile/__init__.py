@@ -1,1 +1,0 @@
-"""Damage, odd words, bombs, signals, full disks and rivals against the command line."""
