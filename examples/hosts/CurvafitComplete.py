@@ -37,7 +37,7 @@ def main(arguments=None):
             work = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, encoding="utf-8")
         except OSError as error:
             return f"cannot run {options.program}: {error.strerror}; choose the curvafit program"
-        for line in work.stderr:
+        for line in work.stderr or ():
             if step := re.match(r"\[ *(\d+) %\] (.*)", line):
                 print(f"<filter-progress>{int(step[1]) / 100}</filter-progress>", flush=True)
                 print(f"<filter-comment>{step[2]}</filter-comment>", flush=True)
