@@ -5,7 +5,7 @@ of two contrasts; slices 21 and 42 are annotated, and a small U-Net learns from 
 steps and their first third, which is Dice + CE alone (`plain`). `area`, `willmore`, `law` and `wrong` add the energy
 of all voxels: the law is that of another volume's mask, the wrong one another texture's. `pseudo` learns what
 `reconstruct` fills from slices and image, each voxel as sure as it is; `filled` is that itself, without a network.
-`refine` (the law) works on what `plain` predicts. Weights are chosen for each texture and way by slice 32, on a seed of
+`refine` (`segment`, with the law) works on what `plain` predicts. Weights are chosen for each texture and way by slice 32, on a seed of
 its own.
 
 Scores are those of the slices that nobody annotated. Differences pair networks by seed, with 95 % intervals of a
@@ -32,7 +32,7 @@ from curvafit.inference.infer import infer
 from curvafit.priors import CombinedLoss, CurvaturePrior
 from curvafit.priors.law import LawLike
 from curvafit.segmentation.reconstruct import reconstruct
-from curvafit.segmentation.refine import refine
+from curvafit.segmentation.segment import segment
 from curvafit.segmentation.trials import dice
 
 TEXTURES = ("draw-0", "draw-5", "trabec", "bone")
@@ -221,9 +221,8 @@ def case(way: str, weight: float, texture: str, seed: int, steps: int, cases: Ca
     truth, mask, said = truth_of(texture, seed, cases), p > 0.5, ""
     if way == "refine":
         truths = truth_of(texture, TUNING, cases).astype(np.uint8)
-        found = refine(
-            p, law_of(texture, cases), example=(predicted("plain", 0.0, texture, TUNING, steps, cases), truths)
-        )
+        example = predicted("plain", 0.0, texture, TUNING, steps, cases), truths
+        found = segment(p, law_of(texture, cases), probabilities=True, example=example)
         mask, said = found.mask.values > 0, found.status
     rest = np.setdiff1d(np.arange(len(truth)), [*KNOWN, JUDGE])
     return {"dice": dice(mask[rest], truth[rest]), "betti": scores(mask, truth)["betti"], "cldice": cldice(mask, truth),

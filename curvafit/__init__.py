@@ -5,8 +5,8 @@ curvatures at constant volume.
 
 - Infer: `infer(scan)` gives the parameters of a scanned volume, with `.fit`, `.plot()` and a report.
 - Synthesise: `generate(law)` grows a shape of a texture; `generate_batch` grows several at once.
-- Prior: `segment(scan, law)`, `refine(probabilities, law)` and `reconstruct(labels, law)` give a mask;
-  `curvafit.priors` has the loss for networks.
+- Prior: `segment(scan, law)` gives a mask of grey levels or of a network's probabilities, `reconstruct(labels, law)`
+  one of annotated slices; `curvafit.priors` has the loss for networks.
 - Files: `load(path)` and `save(volume, path)` read and write volumes with their spacing and unit.
 - Compare: `compare(*groups)` or `compare(table, by="age")` tells whether scans differ by group or number, in what.
 - Map: `windows(scan)` measures a scan in windows: where its texture differs, in maps and clusters.
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from curvafit.scan.measure import Measures as Measures
     from curvafit.scan.tiles import measure as measure
     from curvafit.segmentation.reconstruct import reconstruct as reconstruct
-    from curvafit.segmentation.refine import refine as refine
     from curvafit.segmentation.result import Segmentation as Segmentation
     from curvafit.segmentation.segment import segment as segment
     from curvafit.studies.compare import Comparison as Comparison

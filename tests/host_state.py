@@ -199,7 +199,6 @@ def calls(folder: Path) -> dict[str, Callable[[], object]]:
         "save": lambda: [curvafit.save(sized, folder / name) for name in (*files, "a.npy", "a.mrc", "a.zarr")],
         "load": lambda: [curvafit.load(path) for path in sorted(folder.glob("a.*"))],
         "segment": lambda: curvafit.segment(scan, "tubes", threshold=100.0, steps=2),
-        "refine": lambda: curvafit.refine(0.1 + 0.8 * ball, "tubes", weight=1.0, steps=2),
         "reconstruct": lambda: curvafit.reconstruct(slices, "tubes", every=4, steps=2),
         "infer": infer,
         "measure": lambda: curvafit.measure(ball),

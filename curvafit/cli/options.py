@@ -25,7 +25,7 @@ OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace file
 
 
 #: Parameters of commands that are volumes to read, and those that are laws.
-_VOLUMES = ("scan", "scans", "slices", "probabilities", "roi", "image", "example", "example_probabilities", "like",
+_VOLUMES = ("scan", "scans", "slices", "roi", "image", "example", "example_probabilities", "like",
             "like_mask")  # fmt: skip
 _LAWS = {"preset": "preset", "prior": "prior", "laws": "preset"}
 

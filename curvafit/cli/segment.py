@@ -15,7 +15,6 @@ from curvafit.cli.console import command_line, resumable, say, say_notes, show_s
 from curvafit.cli.options import OverwriteOption, Reading, Volume, command, parse_threshold, parse_whole_numbers
 
 if TYPE_CHECKING:
-    from curvafit.core.runtime import Progress
     from curvafit.segmentation.result import Segmentation
     from curvafit.volumes.boxes import Boxes
     from curvafit.volumes.field import Field
@@ -26,50 +25,117 @@ Target = Annotated[
     Path,
     typer.Option("-o", "--output", help="Mask to write: .nii.gz .nii .tif .npy .mrc .zarr; or IMAGE.zarr/labels/NAME."),
 ]
-Weight = Annotated[float | None, _what(help="Cost of a unit of the energy, in nats; by default chosen, with the law.")]
-OwnPrior = Annotated[
-    str | None, _what("--prior", help="A law as in segment, which is tried from the network's volume; by default none.")
-]
-Stiffness = Annotated[float | None, _what(help="Stiffness of springs on the known slices: try nothing out.")]
 Epsilon = Annotated[float | None, _what(help="ε in the scan's unit; by default twice the smallest voxel edge.")]
 Steps = Annotated[int, _what(help="Steps of the flow.", min=1)]
-TileOption = Annotated[
-    int | None, _what("--tile", help="Longest side of a tile, in working voxels; by default 192 beyond 256³.", min=8)
-]
-WorkersOption = Annotated[int | None, _what("--workers", help="Processes that lower tiles; by default one.", min=0)]
-Axis = Annotated[str, _what(help="Axis across the slices: z, y or x (first, second, last axis of an array).")]
 
 
 @command(
     "curvafit segment bone.nii.gz --prior bone/fit.json -o mask.nii.gz",
     "curvafit segment cells.h5 --key raw --dark --prior sponge --spacing 0.2 --unit um -o mask.tif",
+    "curvafit segment p.nii.gz --probabilities --example mask2.nii.gz --example-probabilities p2.nii.gz -o mask.nii.gz",
+    "curvafit segment predicted --probabilities --channel 1 --prior vessels/fit.json --weight 10 -o masks",
 )
 def segment(
     scan: Volume,
     out: Target,
-    prior: Annotated[str, _what(help="fit.json of `curvafit infer`, or a preset's name (see `curvafit presets`).")],
-    weight: Weight = None,
+    prior: Annotated[str | None, _what(help="fit.json or a preset's name; by default the Willmore energy.")] = None,
+    weight: Annotated[
+        float | None, _what(help="Cost of a unit of the energy, in nats; else 0.3 for a20 + a02 = 2.")
+    ] = None,
     threshold: Annotated[str, _what(help="Grey level between the phases, or otsu.")] = "otsu",
     dark: Annotated[bool, _what("--dark", help="The structure is the dark phase.")] = False,
+    probabilities: Annotated[bool, _what("--probabilities", help="The values are a network's probabilities.")] = False,
+    logits: Annotated[bool, _what("--logits", help="They are log-odds, before the sigmoid.")] = False,
+    *,
+    example: Annotated[Path | None, _what(help="True mask of another volume, to try law and weight out on it.")] = None,
+    example_probabilities: Annotated[Path | None, _what(help="The network's probabilities for the example.")] = None,
+    like: Annotated[Path | None, _what(help="Image of the same voxels; by default one of the NPZ's name.")] = None,
     epsilon: Epsilon = None,
     steps: Steps = 400,
-    tile: TileOption = None,
-    workers: WorkersOption = None,
-    *,
+    tile: Annotated[
+        int | None, _what(help="Longest side of a tile, in working voxels: 192 beyond 256³.", min=8)
+    ] = None,
+    workers: Annotated[int | None, _what(help="Processes that lower tiles; by default one.", min=0)] = None,
     reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Find the structure of a noisy scan under a curvature prior; write its mask, a picture and a record."""
-    options: dict[str, Any] = {"weight": weight, "epsilon": epsilon}
-    options |= {"threshold": parse_threshold(threshold), "dark": dark}
+    """Find the structure of a noisy scan under a curvature prior; write its mask, a picture and a record.
 
-    def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
-        from curvafit.segmentation.segment import segment as segment_scan
+    With --probabilities a better mask is made of a network's output. Law and weight are those that do best on an
+    example; where p > 1/2 does best there, that is the mask. Of nnU-Net's NPZ files --channel takes the class; a folder
+    of them becomes a folder of masks. --label is the example's.
+    """
+    from curvafit.segmentation.segment import calibrate, check_given
+    from curvafit.segmentation.segment import segment as segment_scan
+    from curvafit.volumes.boxes import boxes_of, read_whole
+    from curvafit.volumes.read import load
 
-        return segment_scan(volume, prior, steps=steps, progress=progress, **tools, **options)
+    kind: bool | str = "logits" if logits else probabilities
+    split: dict[str, Any] = {"threshold": parse_threshold(threshold), "dark": dark}
+    check_given(kind, weight, example, **split)
+    if (example is None) != (example_probabilities is None):
+        raise ValueError("--example and --example-probabilities go together, got one of them")
+    if like is not None and not kind:
+        raise ValueError("--like goes with --probabilities")
+    options: dict[str, Any] = {"weight": weight, "epsilon": epsilon, "steps": steps}
+    record = {"job": "segment", "tile": tile, **options}
+    tools: dict[str, Any] = {"tile": tile, "workers": workers}
+    if not kind:
+        job = _Job(scan, out, prior, reading, {**record, **split}, overwrite)
+        compute = partial(segment_scan, prior=prior, **options, **split, **tools)
+        _run(job, compute, partial(boxes_of, scan, **reading))
+        return
+    given = {"example": example, "example_probabilities": example_probabilities, "like": like}
+    texts = {name: None if path is None else str(path) for name, path in given.items()}
+    jobs, read = _list_maps(
+        _Job(scan, out, prior, reading, {**record, "probabilities": kind, **texts}, overwrite), texts
+    )
+    if example is not None:
+        chances = read(example_probabilities, like=None, crop=None)
+        mask = load(example, **{name: reading[name] for name in ("spacing", "unit", "label", "strict")})
+        say_notes((*chances.notes, *mask.notes))
+        with show_stages() as progress:
+            learned = calibrate(chances, mask, prior, epsilon=epsilon, steps=steps, progress=progress)
+        options["example"] = learned
+        jobs = [replace(job, record={**job.record, "calibration": learned.as_dict()}) for job in jobs]
+    for job in jobs:
 
-    record = {"job": "segment", "steps": steps, "tile": tile, **options}
-    run_job(Job(scan, out, prior, reading, record, overwrite, workers), compute)
+        def compute_map(volume: Boxes, **running: Any) -> Segmentation:
+            return segment_scan(read_whole(volume), prior, probabilities=True, **options, **tools, **running)
+
+        _run(job, compute_map, lambda job=job: boxes_of(read(job.source)))
+
+
+def _list_maps(job: _Job, given: dict[str, str | None]) -> tuple[list[_Job], Callable[..., Field]]:
+    """Return a job for a map of probabilities, or for each of a folder of NPZ files, and what reads a map.
+
+    All are read before the first work, which may take minutes, so that what is none is refused.
+    """
+    from curvafit.segmentation.evidence import find_image, load_probabilities, probability_evidence
+    from curvafit.segmentation.slices import check_spacing
+
+    like, reading, kind = given["like"], job.reading, job.record["probabilities"]
+    maps = sorted(Path(job.source).glob("*.npz")) if Path(job.source).is_dir() else []
+    files = {str(path): job.out / f"{path.stem}.nii.gz" for path in maps} or {job.source: job.out}
+    if like is not None and len(files) > 1:
+        raise ValueError("--like is for one file; images of a folder lie beside its NPZ files")
+    has_place = reading["spacing"] is not None or reading["unit"] is not None
+    images = {source: like or (None if has_place else find_image(source)) for source in files}
+    inputs = [path for path in (*files, *images.values(), *given.values()) if path is not None]
+    jobs = [
+        replace(job, source=source, out=target, inputs=inputs, image=images[source]) for source, target in files.items()
+    ]
+    for each in jobs:
+        each.check()
+    how = {name: value for name, value in reading.items() if name != "label"}
+    read = partial(load_probabilities, **how, like=like, logits=kind == "logits")
+    example = None if (path := given["example_probabilities"]) is None else read(path, like=None, crop=None)
+    for each in jobs:
+        field = read(each.source)
+        probability_evidence(field)
+        if example is not None:
+            check_spacing(example, field, "the probabilities")
+    return jobs, read
 
 
 @command(
@@ -84,192 +150,179 @@ def segment(
 def reconstruct(
     slices: Volume,
     out: Target,
-    prior: OwnPrior = None,
+    prior: Annotated[str | None, _what(help="A law as in segment, to be tried; by default none.")] = None,
     every: Annotated[
-        int | None, _what(help="Distance of known slices, 8: every eighth. By default those with labels are known.")
+        int | None, _what(help="Distance of known slices; by default those with labels are known.")
     ] = None,
     first: Annotated[int | None, _what(help="Number of the first known slice, with --every; by default 0.")] = None,
     known: Annotated[str | None, _what(help="Or also: numbers of known slices, 0,7,15.")] = None,
-    ignore: Annotated[
-        int | None, _what(help="Or: the label of voxels that nobody annotated; all others are known.")
-    ] = None,
-    axis: Axis = "z",
+    ignore: Annotated[int | None, _what(help="Or: the label of voxels that nobody annotated.")] = None,
+    axis: Annotated[str, _what(help="Axis across the slices: z, y or x (first, second, last axis of an array).")] = "z",
     *,
-    labels: Annotated[
-        str | None,
-        _what(help="Several structures that exclude each other: all, or their labels, 1,2,5; writes labels."),
-    ] = None,
+    labels: Annotated[str | None, _what(help="Several structures: all, or their labels, 1,2,5; writes labels.")] = None,
     image: Annotated[str | None, _what(help="The grey levels of the volume, on the same voxels.")] = None,
-    instances: Annotated[
-        bool | None,
-        _what(help="With --labels and --image: labels are instances of one kind, such as cells; by default as drawn."),
-    ] = None,
-    example: Annotated[
-        Path | None, _what(help="Mask of another such volume, known whole: it tunes the network for a minute.")
-    ] = None,
-    careful: Annotated[bool, _what("--careful", help="Average eight mirror images: eight times as long.")] = False,
-    filler: Annotated[
-        Path | None, _what(help="Weights of `curvafit atlas teach`; by default the packaged ones.")
-    ] = None,
-    stiffness: Stiffness = None,
+    instances: Annotated[bool | None, _what(help="Labels are of one kind, such as cells; by default as drawn.")] = None,
+    example: Annotated[Path | None, _what(help="Mask of another such volume: it tunes the network.")] = None,
+    filler: Annotated[Path | None, _what(help="Weights of `curvafit atlas teach`, not the packaged ones.")] = None,
+    stiffness: Annotated[float | None, _what(help="Stiffness of springs on the known slices: try nothing out.")] = None,
     periodic: Annotated[bool, _what("--periodic", help="The volume repeats, as generated ones do.")] = False,
     suggest: Annotated[int, _what(help="Number of slices to suggest for annotation next.", min=0)] = 0,
     sure: Annotated[
-        float | None,
-        _what(help="Also write labels for nnU-Net, to be ignored where less probable than, say, 0.9.", min=0.5, max=1),
+        float | None, _what(help="Also write labels, to be ignored where less probable than this.", min=0.5, max=1)
     ] = None,
     epsilon: Epsilon = None,
     steps: Steps = 400,
     tile: Annotated[
-        int | None,
-        _what(help="Side of a block, in voxels, of a volume filled into Zarr; with a law as in segment.", min=8),
+        int | None, _what(help="Side of a block filled into Zarr; with a law as in segment.", min=8)
     ] = None,
     workers: Annotated[int | None, _what(help="Processes for blocks or tiles; by default one.", min=0)] = None,
     reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Fill a mask between known slices; write it, the probability of each voxel, a picture and a record."""
-    if axis.lower() not in ("z", "y", "x"):
-        raise ValueError(f"--axis must be z, y or x, got {axis!r}")
-    if (every is not None or known is not None) and ignore is not None:
-        raise ValueError("give either --every and --known, which slices are known, or --ignore, what is not")
-    if labels is not None and reading["label"] is not None:
-        raise ValueError("--labels is for several structures; --label is for one")
+    from curvafit.volumes.boxes import boxes_of
+
+    options, several = _parse_slices(every, first, known, ignore, axis, labels, reading["label"])
     if instances is not None and None in (labels, image):
         raise ValueError("--instances and --no-instances go with --labels and --image")
-    several = None if labels in (None, "all") else list(parse_whole_numbers(labels, "--labels"))
-    numbers = None if known is None else list(parse_whole_numbers(known, "--known"))
-    if every is None and first is not None:
-        raise ValueError(f"--first {first} goes with --every")
-    place = {"every": every, "first": first or 0, "known": numbers, "ignore": ignore, "axis": "zyx".index(axis.lower())}
-    how: dict[str, Any] = {"stiffness": stiffness, "periodic": periodic, "epsilon": epsilon, "careful": careful}
+    options |= {"epsilon": epsilon, "suggest": suggest, "filler": None if filler is None else str(filler)}
+    whole = {"ignore": ignore, "stiffness": stiffness, "periodic": periodic}  # what is not filled in blocks
+    shown = {"image": image, "example": None if example is None else str(example)}
+    common = {"steps": steps, "tile": tile, **options, **whole}
+    record: dict[str, Any] = {"job": "reconstruct", "sure": sure, **common, **shown}
+    record |= {"labels": labels, "instances": instances} if labels else {}
+    inputs = [each for each in (*shown.values(), filler) if each is not None]
+    maps = ("probability",) if sure is None else ("probability", "sure")
+    job = _Job(slices, out, prior, reading, record, overwrite, inputs, maps)
+    alone = not (prior or labels or sure or any(whole.values()) or any(shown.values())) and ignore is None
+    if alone and _fill_blocks(job, {**options, "tile": tile, "workers": workers}):
+        return
 
-    def compute(volume: Boxes, progress: Progress, **tools: Any) -> Segmentation:
+    def compute(volume: Boxes, **tools: Any) -> Segmentation:
         from curvafit.segmentation.reconstruct import reconstruct as fill
         from curvafit.segmentation.reconstruct import reconstruct_labels
         from curvafit.volumes.boxes import read_whole
         from curvafit.volumes.read import load
 
-        alike = {name: reading[name] for name in ("spacing", "unit", "label", "strict")}
-        whole = None if example is None else load(example, **alike)
-        say_notes(() if whole is None else whole.notes)
-        seen = None if image is None else load(image, **{name: reading[name] for name in ("spacing", "unit", "crop")})
-        say_notes(() if seen is None else seen.notes)
-        common = {
-            "image": seen,
-            "example": whole,
-            "filler": filler,
-            "steps": steps,
-            "suggest": suggest,
-            "progress": progress,
-            **tools,
-            **place,
-            **how,
-        }
+        alike = {"example": ("spacing", "unit", "label", "strict"), "image": ("spacing", "unit", "crop")}
+        for name, path in shown.items():
+            if path is not None:
+                tools[name] = load(path, **{each: reading[each] for each in alike[name]})
+                say_notes(tools[name].notes)
+        tools |= {"workers": workers, **common}
         if labels is None:
-            return fill(read_whole(volume), prior, **common)
-        return reconstruct_labels(read_whole(volume), prior, chosen=several, instances=instances, **common)
+            return fill(read_whole(volume), prior, **tools)
+        return reconstruct_labels(read_whole(volume), prior, chosen=several, instances=instances, **tools)
 
-    record: dict[str, Any] = {"job": "reconstruct", "steps": steps, "tile": tile}
-    record |= {"labels": labels, "instances": instances} if labels else {}
-    record |= {
-        "image": image,
-        "example": None if example is None else str(example),
-        **place,
-        **how,
-        "suggest": suggest,
-        "sure": sure,
-    }
-    record["filler"] = None if filler is None else str(filler)
-    job = Job(slices, out, prior, reading, record, overwrite, workers)
-    alone = not (prior or labels or image or example or periodic or ignore is not None or sure or stiffness)
-    if not (alone and _fill_blocks(job, {**place, "careful": careful, "epsilon": epsilon, "suggest": suggest})):
-        run_job(job, compute)
+    _run(job, compute, partial(boxes_of, slices, **reading), sure=sure)
 
 
-def _fill_blocks(job: Job, options: dict[str, Any]) -> bool:
+def _parse_slices(
+    every: int | None,
+    first: int | None,
+    known: str | None,
+    ignore: int | None,
+    axis: str,
+    labels: str | None,
+    label: int | None,
+) -> tuple[dict[str, Any], list[int] | None]:
+    """Return which slices are known, as `reconstruct` takes it, and which labels are several structures."""
+    if axis.lower() not in ("z", "y", "x"):
+        raise ValueError(f"--axis must be z, y or x, got {axis!r}")
+    if (every is not None or known is not None) and ignore is not None:
+        raise ValueError("give either --every and --known, which slices are known, or --ignore, what is not")
+    if labels is not None and label is not None:
+        raise ValueError("--labels is for several structures; --label is for one")
+    if every is None and first is not None:
+        raise ValueError(f"--first {first} goes with --every")
+    several = None if labels in (None, "all") else list(parse_whole_numbers(labels, "--labels"))
+    numbers = None if known is None else list(parse_whole_numbers(known, "--known"))
+    return {"every": every, "first": first or 0, "known": numbers, "axis": "zyx".index(axis.lower())}, several
+
+
+def _fill_blocks(job: _Job, options: dict[str, Any]) -> bool:
     """Fill a volume between known slices in blocks, if it is so large, and return whether it is."""
     from curvafit.segmentation.blocks import fits_blocks, reconstruct_file
-    from curvafit.segmentation.result import check_mask_target
     from curvafit.volumes.boxes import boxes_of
 
-    reading, tile, filler = dict(job.reading), job.record["tile"], job.record["filler"]
-    options = {**options, "label": reading.pop("label"), "tile": tile, "filler": filler, "workers": job.workers}
-    del options["ignore"]
     if not fits_blocks(job.out, (), 1):
         return False
-    inputs = [] if filler is None else [filler]
-    check_mask_target(job.out, None, [job.source, *inputs], job.overwrite, maps=["probability"])
+    job.check()
+    reading = {name: value for name, value in job.reading.items() if name != "label"}
     with show_stages() as progress:
         progress("reading", 0.0)
-        if not fits_blocks(job.out, boxes_of(job.source, **reading).frame.shape, tile):
+        if not fits_blocks(job.out, boxes_of(job.source, **reading).frame.shape, options["tile"]):
             return False
-        content = {"command": command_line(), "prior": None, **job.record}
-        options |= {"inputs": inputs, "overwrite": job.overwrite, "record": content, "progress": progress}
+        options |= {"record": job.content, "inputs": job.inputs, "overwrite": job.overwrite, "progress": progress}
         with resumable():
-            filled = reconstruct_file(job.source, job.out, **options, **reading)
+            filled = reconstruct_file(job.source, job.out, **options, **job.reading)
     _print_mask(filled.notes, filled.status, filled.paths)
     return True
 
 
+# ---- one mask --------------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
-class Job:
-    """A volume to read, with the options of reading, and a mask to write, with a record of the command's options."""
+class _Job:
+    """A volume to read, a mask to write, and a record of the command's options."""
 
     source: str
     out: Path
-    prior: str | None  # a preset's name or a file; None where an example says what the law is
+    prior: str | None
     reading: dict[str, Any]
     record: dict[str, Any]
     overwrite: bool
-    workers: int | None = None
+    inputs: Sequence[str | Path] = ()  # other files that are read
+    maps: tuple[str, ...] = ()  # volumes beside the mask
     image: Path | None = None  # the file whose header the mask gets; by default the source
 
+    def check(self, frame: Field | None = None) -> None:
+        """Raise ValueError where the mask cannot be written, or the prior is none."""
+        from curvafit.priors.law import Law, preset_name
+        from curvafit.segmentation.result import check_mask_target
 
-def run_job(job: Job, compute: Callable[..., Segmentation], read: Callable[..., Field] | None = None) -> None:
-    """Check, read, compute, write and print. Finished tiles are kept beside the output until it is written.
+        law = [] if self.prior is None or preset_name(self.prior) else [self.prior]
+        check_mask_target(self.out, frame, [self.source, *law, *self.inputs], self.overwrite, maps=self.maps)
+        if self.prior is not None:
+            Law.of(self.prior)
 
-    `read` reads the source; by default its boxes are read where they are asked for.
-    """
+    @property
+    def content(self) -> dict[str, Any]:
+        """What the mask's record says of the command."""
+        return {"command": command_line(), "prior": self.prior, **self.record}
+
+
+def _run(job: _Job, compute: Callable[..., Segmentation], read: Callable[[], Boxes], sure: float | None = None) -> None:
+    """Check, read, compute, write and print. Finished tiles are kept beside the output until it is written."""
     from curvafit.core.files import remove
-    from curvafit.priors.law import Law, preset_name
-    from curvafit.segmentation.result import check_mask_target, hidden_store, write_mask
+    from curvafit.segmentation.result import hidden_store, write_mask
     from curvafit.segmentation.tiles import Tiling
     from curvafit.volumes.boxes import boxes_of, check_fits, read_whole
     from curvafit.volumes.write import check_labels
 
     record, reading = job.record, job.reading
-    law_file = None if preset_name(job.prior) else job.prior
-    named = ("image", "example", "example_probabilities", "filler")
-    shown = (job.image, *(record.get(name) for name in named))
-    options = {"inputs": [file for file in (job.source, law_file, *shown) if file], "overwrite": job.overwrite}
-    least = record.get("sure")
-    likely = record["job"] == "reconstruct"
-    options["maps"] = (["probability"] if likely else []) + (["sure"] if least else [])
-    check_mask_target(job.out, **options)
-    if job.prior is not None:
-        Law.of(job.prior)
+    job.check()
     with show_stages() as progress:
         progress("reading", 0.0)
-        boxes = boxes_of(job.source, **reading) if read is None else boxes_of(read(job.source, **reading))
+        boxes = read()
         check_fits(boxes)  # the mask is written from memory
-        check_mask_target(job.out, boxes.frame, **options)  # again, as a format may not hold the unit
+        job.check(boxes.frame)  # again, as a format may not hold the unit
         if record.get("labels"):
             boxes = boxes_of(whole := read_whole(boxes))
             check_labels(job.out, whole)
         tiling = Tiling.of(boxes.frame, record["epsilon"], record["tile"], periodic=record.get("periodic", False))
         store = hidden_store(job.out)
-        tiles = tiling.count > 1 and (not likely or job.prior is not None)
+        tiles = tiling.count > 1 and (record["job"] == "segment" or job.prior is not None)
         with resumable() if tiles else nullcontext():
-            result = compute(boxes, progress, tile=record["tile"], store=store, workers=job.workers)
+            result = compute(boxes, progress=progress, store=store)
         progress("writing", 1.0)
-        sure = result.keep_sure(least) if least else None
-        result = result if sure is None else replace(result, notes=(*result.notes, *sure.notes))
+        labels = None if sure is None else result.keep_sure(sure)
+        result = result if labels is None else replace(result, notes=(*result.notes, *labels.notes))
         # The header is kept where it says where the voxels are; one of a file of channels is of all of them.
         stated = ("spacing", "crop") if job.image else ("spacing", "crop", "channel", "time")
         like = (job.image or job.source) if all(reading[name] is None for name in stated) else None
-        content = {"command": command_line(), "prior": job.prior, **record}
-        how = {"sure": sure, "like": like, "unit": reading["unit"], "record": content, "overwrite": job.overwrite}
+        how = {"sure": labels, "like": like, "unit": reading["unit"], "record": job.content, "overwrite": job.overwrite}
         paths = write_mask(result, read_whole(boxes), job.out, **how)
         remove(store)
     _print_mask(result.notes, result.status, paths)

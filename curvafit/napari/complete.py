@@ -52,13 +52,8 @@ class Filled:
 class Fill:
     """One fill of a layer: which slices were known of which labels, and what was filled in.
 
-    Attributes
-    ----------
-    where
-        Flat indices, in values of `shape`, of what was filled in: voxels that changed and, in slices that were not
-        known, those of the labels and of earlier fills.
-    before, after
-        The values there.
+    `where` are flat indices, in values of `shape`, of what was filled in: voxels that changed and, in slices that were
+    not known, those of the labels and of earlier fills; `before` and `after` are the values there.
     """
 
     axis: int

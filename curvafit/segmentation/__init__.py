@@ -9,11 +9,9 @@ from curvafit.core.faces import attach_lazy_names
 if TYPE_CHECKING:
     from curvafit.segmentation.reconstruct import reconstruct as reconstruct
     from curvafit.segmentation.reconstruct import reconstruct_labels as reconstruct_labels
-    from curvafit.segmentation.refine import Calibration as Calibration
-    from curvafit.segmentation.refine import Refine as Refine
-    from curvafit.segmentation.refine import calibrate as calibrate
-    from curvafit.segmentation.refine import refine as refine
     from curvafit.segmentation.result import Segmentation as Segmentation
+    from curvafit.segmentation.segment import Calibration as Calibration
+    from curvafit.segmentation.segment import calibrate as calibrate
     from curvafit.segmentation.segment import segment as segment
     from curvafit.segmentation.transforms import FillSlicesd as FillSlicesd
 

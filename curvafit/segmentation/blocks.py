@@ -26,7 +26,6 @@ from curvafit.core.workers import Workers
 from curvafit.scan.pieces import Finder, Found, open_finder
 from curvafit.scan.prepare import LARGEST_BOX
 from curvafit.scan.survey import Volume
-from curvafit.segmentation.engine import choose_epsilon
 from curvafit.segmentation.filler import (
     REACH,
     SLOPE,
@@ -38,19 +37,19 @@ from curvafit.segmentation.filler import (
     sum_depths,
     thickness_of_sums,
 )
+from curvafit.segmentation.flow import choose_epsilon
 from curvafit.segmentation.result import (
     FORMAT,
+    Segmentation,
+    Uncertainty,
     check_mask_target,
-    describe_errors,
     describe_filled,
     describe_run,
-    doubt_filled,
     doubt_labels,
     doubt_places,
     finish_mask,
     hidden_store,
     map_path,
-    note_ends,
     note_labelled,
     volume_summary,
 )
@@ -130,7 +129,6 @@ def reconstruct_file(
     first: int = 0,
     known: Sequence[int] | None = None,
     axis: int = 0,
-    careful: bool = False,
     suggest: int = 0,
     filler: str | Path | None = None,
     epsilon: float | None = None,
@@ -156,7 +154,7 @@ def reconstruct_file(
         A mask, or labels, positive inside; only the known slices count.
     path
         The store to write, `mask.zarr`, or labels of an OME-Zarr image, `IMAGE.zarr/labels/NAME`.
-    every, first, known, axis, careful, suggest, filler, epsilon
+    every, first, known, axis, suggest, filler, epsilon
         As in `reconstruct`.
     tile
         Voxels a side of a block, up to whole chunks; by default memory decides.
@@ -190,14 +188,14 @@ def reconstruct_file(
     check_int(suggest, "a number of slices from 0", 0, job.shape[0] - len(places or ()))
     width, tile, taught = choose_epsilon(frame, epsilon), check_edge(tile), Taught.load(filler)
     run = {"labels": boxes.digest, "label": label, "every": every, "first": first, "known": known, "axis": axis}
-    run |= {"careful": careful, "filler": taught.digest, "tile": tile}
+    run |= {"filler": taught.digest, "tile": tile}
     with open_finder(workers if in_file else None, folder, run, progress, _ENDS) as find:
         which: tuple[str, ...] = ()
         if places is None:
             looked = find(_LOOK, partial(look_at_slab, job), job.slabs)
             places = choose_labelled(there := np.concatenate([each["there"] for each in looked]))
             which = note_labelled(places, there)
-        job = replace(job, places=tuple(places), careful=careful, filler=filler)
+        job = replace(job, places=tuple(places), filler=filler)
         job, doubts = _read_known(job, find, every is not None)
         job = job.cut(tile)
         job.create(frame, target)
@@ -208,29 +206,23 @@ def reconstruct_file(
             for level in range(1, len(group := open_zarr(folder / name))):
                 find(f"halving {name} {level}", partial(halve_core, folder / name, level), len(cores_of(group, level)))
         inside, both, told = (float(cut[name]) for name in ("inside", "both", "told"))
+        size, depth = math.prod(job.shape), job.shape[0]
         dice = 2 * both / max(told + float(filled["sum"]), 1e-9) if job.slices.between.any() else 1.0
-        suggestions = suggest_slices(filled["along 0"], places, suggest)
-        share = inside / math.prod(job.shape)
-        known_share = share_by_slices(job.slices.inside.mean((1, 2)), places, job.shape[0])
-        likely = float(filled["total"]) / math.prod(job.shape)
-        end = describe_errors(dice, taught.error, suggestions, "generated shapes")
-        said = describe_filled(places, job.shape[0], volume_summary(share), known_share, likely)
-        status = f"{taught.status}: {said}; {end}"
-        doubts = (*doubts, *doubt_filled(dice, share, known_share))
-        notes = (*frame.notes, *which, *doubts, *note_ends(places, job.shape[0]))
-        found: dict[str, Any] = {"coefficients": None, "epsilon": width, "weight": None, "volume_fraction": share}
-        found |= {
-            "calibration_error": taught.error,
-            "suggestions": suggestions,
-            "expected_dice": dice,
-            "known_share": known_share,
-            "mean_probability": likely,
-        }
+        uncertain = Uncertainty(
+            frame, taught.error, suggest_slices(filled["along 0"], places, suggest), dice,
+            known_share=share_by_slices(job.slices.inside.mean((1, 2)), places, depth),
+            mean_probability=float(filled["total"]) / size,
+        )  # fmt: skip
+        share = inside / size
+        ways = (taught.status, volume_summary(share), share, uncertain)
+        status, more = describe_filled(*ways, places, depth, tested="generated shapes")
+        notes = (*frame.notes, *which, *doubts, *more)
+        result = Segmentation(frame, frame, None, None, width, status, notes, uncertain)
         for name in (job.mask, job.probability):
             mark(folder / name, FORMAT.name)
             for partial_chunk in (folder / name).rglob("*.partial"):  # of a killed process
                 remove(partial_chunk)
-        content = describe_run(status, record or {}, frame, found, notes)
+        content = describe_run(result, record or {}, frame, share)
         figure = job.draw([filled[f"along {k}"] for k in range(3)], frame)
         paths = finish_mask(folder, target, ["probability"], figure, content)
     remove(folder)
@@ -239,26 +231,10 @@ def reconstruct_file(
 
 @dataclass(frozen=True)
 class Job:
-    """What processes must know to fill blocks of a volume. Its first axis here is that across the slices.
+    """What processes must know to fill blocks of a volume, whose first axis here is `axis`, that across the slices.
 
-    Attributes
-    ----------
-    volume, axis
-        The labels, and the array's axis across the slices.
-    shape, spacing, unit
-        Those of the volume, the axis first.
-    places
-        The numbers of the known slices.
-    folder
-        Where known slices, mask and probability are written; the names of the latter two.
-    thick
-        The number of slices that are read at once.
-    careful, filler
-        As in `reconstruct`.
-    pixel
-        The edge of the network's pixels.
-    edges, chunk
-        Voxels of a block along each axis, whole chunks, and those of a chunk.
+    Known slices at `places`, mask and probability are written into `folder`; `thick` slices are read at once. `pixel`
+    is the edge of the network's pixels, `edges` are the voxels of a block along each axis, whole chunks of `chunk`.
     """
 
     volume: Volume
@@ -271,7 +247,6 @@ class Job:
     mask: str
     probability: str
     thick: int
-    careful: bool = False
     filler: str | Path | None = None
     pixel: float = 0.0
     edges: tuple[int, int, int] = (CHUNK, CHUNK, CHUNK)
@@ -425,7 +400,7 @@ def fill_block(job: Job, number: int) -> Found:
     raster = Raster(job.shape[1:], job.spacing[1:], job.pixel, core[1:])
     rows = core[0]
     likely = np.empty([edge.stop - edge.start for edge in core], dtype=np.float32)
-    for numbers, logits in fill_gaps(slices, load_filler(job.filler), raster, rows, careful=job.careful):
+    for numbers, logits in fill_gaps(slices, load_filler(job.filler), raster, rows):
         here = (numbers >= rows.start) & (numbers < rows.stop)
         likely[numbers[here] - rows.start] = expit(logits[here])
     for k, outer in ((0, slice(0, job.places[0])), (-1, slice(job.places[-1] + 1, job.shape[0]))):

@@ -7,13 +7,22 @@ otherwise, on purpose: see there.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
+from scipy.special import expit
 from skimage.filters import threshold_otsu
 
+from curvafit.volumes.boxes import Boxes, digest_of, subsample
 from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.formats.part import Box, Crop
+from curvafit.volumes.read import Source, field_of, place_of
 
 #: Percentiles to which grey levels are clipped for Otsu's threshold.
 TAILS = (0.1, 99.9)
@@ -25,6 +34,11 @@ LEAST_NOISE, CERTAIN = 0.05, 1e-4
 _STRAY = 1e-3
 #: Contrast, in units of the noise, below which the classes of Otsu's threshold may be noise.
 FAINT = 1.0
+#: Contrast, in units of the noise, below which classes are measured again; voxels from the surface at which that is
+#: done, and the fewest voxels of a class there.
+OVERLAP, DEEP, FEWEST = 0.5, 2, 100
+#: Endings of an image beside an NPZ file of the same name, which says where the voxels are.
+IMAGES = (".nii.gz", ".nii", ".nrrd", ".mha", ".mhd", ".tif", ".tiff")
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +48,15 @@ class VoxelEvidence:
 
     ratio: np.ndarray
     level: np.ndarray
+
+    def of_box(self, box: Box) -> VoxelEvidence:
+        """Return the evidence of a box of voxels."""
+        return VoxelEvidence(self.ratio[box], self.level[box])
+
+    @cached_property
+    def digest(self) -> str:
+        """A text that changes with the content."""
+        return digest_of(self.ratio)
 
 
 @dataclass(frozen=True)
@@ -58,6 +81,51 @@ class Classes:
     def __str__(self) -> str:
         low, high = sorted((self.outside, self.inside))
         return f"classes at {low:.4g} and {high:.4g}, noise {self.noise:.3g}, split at {self.middle:.4g}"
+
+
+@dataclass(frozen=True, eq=False)
+class GreyEvidence:
+    """The evidence of a scan of grey levels, computed box by box: levels are clipped to `bounds`; the first guess is by
+    the classes `first`, and what a level says by the `classes`."""
+
+    boxes: Boxes
+    bounds: tuple[float, float]
+    first: Classes
+    classes: Classes
+
+    @classmethod
+    def of(cls, boxes: Boxes, threshold: float | str = "otsu", dark: bool = False, apart: bool = False) -> GreyEvidence:
+        """Return a scan's evidence by the classes of a sample of it; `apart` measures those that overlap again.
+
+        A threshold of noisy levels leaves some of each phase on either side, which brings the two means together. They
+        are measured again `DEEP` voxels off the first guess of the surface, where few voxels are on the wrong side.
+        """
+        sample, _ = subsample(boxes)
+        levels, bounds = grey_levels(sample, threshold), grey_bounds(sample.values.astype(np.float32), threshold)
+        first = classes = estimate_classes(levels, sample, threshold, dark)
+        if apart and threshold == "otsu" and abs(classes.contrast) < OVERLAP * classes.noise:
+            inside = grey_evidence(levels, sample, classes).level > 0
+            deep = [levels[_erode(side)] for side in (~inside, inside)]
+            if min(map(len, deep)) >= FEWEST:
+                outer, inner = (float(side.mean(dtype=np.float64)) for side in deep)
+                classes = replace(classes, outside=outer, inside=inner, middle=(outer + inner) / 2)
+        return cls(boxes, bounds, first, classes)
+
+    def of_box(self, box: Box) -> VoxelEvidence:
+        """Return the evidence of a box of voxels."""
+        values = self.boxes.part(box).astype(np.float32).clip(*self.bounds)
+        found = grey_evidence(values, self.boxes.frame, self.first)
+        level = found.level / np.float32(abs(self.first.contrast))
+        return VoxelEvidence(grey_ratio(values, self.classes), level)
+
+    @property
+    def digest(self) -> str:
+        """A text that changes with the content."""
+        return f"{self.boxes.digest}, {self.first}, {self.classes}"
+
+
+#: What says of each box of a volume where the inside is.
+VolumeEvidence = VoxelEvidence | GreyEvidence
 
 
 def grey_levels(scan: Field, threshold: float | str = "otsu") -> np.ndarray:
@@ -90,24 +158,16 @@ def estimate_classes(values: np.ndarray, scan: Field, threshold: float | str = "
     return Classes(outside, inside, max(noise, LEAST_NOISE * (means[1] - means[0])), middle)
 
 
-def grey_evidence(values: np.ndarray, scan: Field, classes: Classes, known: np.ndarray | None = None) -> VoxelEvidence:
-    """Return the log-likelihood ratio, inside to outside, of grey levels (Z, Y, X), and smoothed levels to start from.
+def grey_evidence(values: np.ndarray, scan: Field, classes: Classes) -> VoxelEvidence:
+    """Return what grey levels (Z, Y, X) say (`grey_ratio`), and smoothed levels to start from."""
+    level = _smooth(values, scan, _smoothing_width(classes.noise / abs(classes.contrast))) - np.float32(classes.middle)
+    return VoxelEvidence(grey_ratio(values, classes), -level if classes.contrast < 0 else level)
 
-    r = (g - t) (c₁ - c₀) / σ² with grey level g, middle t, means c₁ inside and c₀ outside, and noise σ. Voxels outside
-    `known`, bool (Z, Y, X), have the ratio 0, and a level smoothed in from their neighbours.
-    """
-    steep, sign = np.float32(classes.contrast / classes.noise**2), -1 if classes.contrast < 0 else 1
-    ratio, width = (
-        (values - np.float32(classes.middle)) * steep,
-        _smoothing_width(classes.noise / abs(classes.contrast)),
-    )
-    if known is None:
-        level = _smooth(values, scan, width) - np.float32(classes.middle)
-    else:
-        ratio = np.where(known, ratio, np.float32(0))
-        weight = np.maximum(_smooth(known.astype(np.float32), scan, width), np.float32(1e-6))
-        level = _smooth(np.where(known, values - np.float32(classes.middle), np.float32(0)), scan, width) / weight
-    return VoxelEvidence(ratio, sign * level)
+
+def grey_ratio(values: np.ndarray, classes: Classes) -> np.ndarray:
+    """Return the log-likelihood ratio of inside to outside: (g - t) (c₁ - c₀) / σ² of grey levels g with the middle t,
+    means c₁ inside and c₀ outside, and noise σ."""
+    return (values - np.float32(classes.middle)) * np.float32(classes.contrast / classes.noise**2)
 
 
 def probability_evidence(probability: Field) -> VoxelEvidence:
@@ -122,6 +182,10 @@ def probability_evidence(probability: Field) -> VoxelEvidence:
         raise ScanError(f"probabilities must lie in [0, 1], got {lowest:g} to {highest:g}{source}")
     p = values.clip(CERTAIN, 1 - CERTAIN)
     return VoxelEvidence(np.log(p / (1 - p)), values.clip(0, 1) - np.float32(0.5))
+
+
+def _erode(side: np.ndarray) -> np.ndarray:
+    return np.asarray(ndimage.binary_erosion(side, iterations=DEEP, border_value=1), dtype=bool)
 
 
 def _smooth(values: np.ndarray, scan: Field, width: float) -> np.ndarray:
@@ -150,3 +214,48 @@ def _split(values: np.ndarray, smooth: np.ndarray, threshold: float | str) -> tu
     pooled = share * inside.var(dtype=np.float64) + (1 - share) * outside.var(dtype=np.float64)
     means = float(outside.mean(dtype=np.float64)), float(inside.mean(dtype=np.float64))
     return means, math.sqrt(pooled)
+
+
+# ---- a network's maps ------------------------------------------------------------------------------------------------
+
+
+def load_probabilities(
+    source: Source,
+    *,
+    like: str | os.PathLike[str] | None = None,
+    spacing: Sequence[float] | float | None = None,
+    unit: str | None = None,
+    crop: Crop | None = None,
+    logits: bool = False,
+    **reading: Any,
+) -> Field:
+    """Load a network's probabilities at the place of `like`, an image of the same voxels, where there is one.
+
+    See `refine` for the parameters. Raises `ScanError` if the image has another shape, or both an image and a spacing
+    or unit are given.
+    """
+    stated = spacing is not None or unit is not None
+    if like is not None and stated:
+        raise ScanError("give either an image that says where the voxels are, or a spacing and unit, got both")
+    image = find_image(source) if like is None and not stated else like
+    if image is None:
+        return _to_probabilities(field_of(source, spacing=spacing, unit=unit, crop=crop, **reading), logits)
+    place = place_of(image)
+    field = field_of(source, spacing=place.spacing, unit=place.unit, **reading)
+    if field.shape != place.shape:
+        raise ScanError(f"the probabilities must have the shape {place.shape} of {image}, got {field.shape}")
+    field = replace(field, affine=place.affine, notes=(*field.notes, f"The voxels are those of {image}."))
+    return _to_probabilities(field if crop is None else field.crop(crop), logits)
+
+
+def _to_probabilities(field: Field, logits: bool) -> Field:
+    """Return a field of probabilities, of one of log-odds if it is that."""
+    return replace(field, values=expit(field.values.astype(np.float32))) if logits else field
+
+
+def find_image(source: Source) -> Path | None:
+    """Return the image beside an NPZ file that has its name; None where there is none, or for another source."""
+    if not isinstance(source, str | os.PathLike) or not os.fspath(source).lower().endswith(".npz"):
+        return None
+    stem = os.fspath(source)[: -len(".npz")]
+    return next((Path(stem + suffix) for suffix in IMAGES if Path(stem + suffix).is_file()), None)

@@ -258,23 +258,14 @@ def fill(
     taught: Taught,
     *,
     evidence: np.ndarray | None = None,
-    careful: bool = False,
     progress: Progress = silent,
 ) -> np.ndarray:
     """Return calibrated log-odds of the inside of a volume between known slices, float32 (length, Y, X).
 
     In known slices, and in those before the first and beyond the last, they are `SLOPE` times the signed distance in
-    pixels from the outline in the nearest known slice, but at most 0 in slices that are not filled (`Slices.outside`);
-    with an image, slices before the first and beyond the last have its evidence.
-
-    Parameters
-    ----------
-    evidence
-        What an image says, as log-odds (length, Y, X), if the filler was taught with images.
-    careful
-        Whether the results of all eight mirror images are averaged: eight times as long.
-    progress
-        Called with a sentence, and the share of the gaps that are filled.
+    pixels from the outline in the nearest known slice, but at most 0 in slices that are not filled (`Slices.outside`).
+    `evidence` is what an image says, as log-odds (length, Y, X); slices before the first and beyond the last then have
+    that.
     """
     raster = Raster.of(slices)
     logits = (SLOPE / raster.pixel) * slices.level("nearest")
@@ -282,8 +273,7 @@ def fill(
     if evidence is not None and not slices.periodic:
         for outer in (slice(0, slices.places[0]), slice(slices.places[-1] + 1, None)):
             logits[outer] = evidence[outer]
-    filled = fill_gaps(slices, taught, raster, evidence=evidence, careful=careful, progress=progress)
-    for numbers, inside in filled:
+    for numbers, inside in fill_gaps(slices, taught, raster, evidence=evidence, progress=progress):
         logits[numbers] = inside
     return logits
 
@@ -295,7 +285,6 @@ def fill_gaps(
     rows: slice = slice(None),
     *,
     evidence: np.ndarray | None = None,
-    careful: bool = False,
     progress: Progress = silent,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield the numbers of slices in gaps, and their log-odds as `fill` returns them, float32 (n, Y, X), on the core of
@@ -317,7 +306,7 @@ def fill_gaps(
         marks = None if slices.marks is None else raster.marks(slices.marks[(numbers, *seen)])
         read = None if evidence is None else np.stack([raster.spread(plane) for plane in evidence[(numbers, *seen)]])
         stack = np.stack([known[row] for row in four])
-        inside = _fill_gap(taught.filler, stack, marks, read, gap - 1, step, careful) / taught.temperature(gap * step)
+        inside = _fill_gap(taught.filler, stack, marks, read, gap - 1, step) / taught.temperature(gap * step)
         yield numbers, raster.to_slices(inside)
     progress("filling the gaps", 1.0)
 
@@ -474,7 +463,6 @@ def _fill_gap(
     evidence: np.ndarray | None,
     count: int,
     step: float,
-    careful: bool,
 ) -> np.ndarray:
     """Return the log-odds (count, Y, X) in the slices of a gap whose four known slices have distances (4, Y', X').
 
@@ -495,18 +483,8 @@ def _fill_gap(
         if near[core].any():
             seen = (..., slice(y, y + TILE + 2 * REACH), slice(x, x + TILE + 2 * REACH))
             gaps = Gaps(distances[seen][None], torch.tensor([step]), told[seen], None if read is None else read[seen])
-            mirrors = product((False, True), repeat=3) if careful else [(False, False, False)]
-            found = torch.stack([_fill_mirrored(filler, gaps, *axes) for axes in mirrors]).mean(0)[0]
-            logits[:, *core] = torch.where(near[core], found, logits[:, *core])
+            logits[:, *core] = torch.where(near[core], filler(gaps, REACH)[0], logits[:, *core])
     return logits.numpy()
-
-
-def _fill_mirrored(filler: Filler, gaps: Gaps, z: bool, y: bool, x: bool) -> Tensor:
-    """Return the log-odds of gaps that are mirrored along some axes, filled and mirrored back."""
-    axes = [axis for axis, flip in ((1, z), (2, y), (3, x)) if flip]
-    evidence = None if gaps.evidence is None else gaps.evidence.flip(axes)
-    mirrored = Gaps(gaps.distances.flip(axes), gaps.step, gaps.marks.flip(axes), evidence)
-    return filler(mirrored, REACH).flip(axes)
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------

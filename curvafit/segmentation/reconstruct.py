@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 from scipy.special import expit
+from skimage import measure
 
 from curvafit.core.checks import SEEDS, check_float, check_int
 from curvafit.core.extras import require
@@ -24,21 +25,17 @@ from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.priors.law import LawLike
 from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import profile_distance
-from curvafit.segmentation.engine import STEPS, WorkingGrid, choose_epsilon, laws_of
 from curvafit.segmentation.filler import Taught, fill
-from curvafit.segmentation.image import find_shift, read_image
-from curvafit.segmentation.instances import are_instances, split_structure
+from curvafit.segmentation.flow import STEPS, WorkingGrid, choose_epsilon
+from curvafit.segmentation.image import read_image
 from curvafit.segmentation.result import (
     FEW,
     Segmentation,
     Uncertainty,
-    describe_errors,
     describe_filled,
-    doubt_filled,
     doubt_labels,
     doubt_places,
     flow_summary,
-    note_ends,
     note_labelled,
     volume_summary,
 )
@@ -66,6 +63,7 @@ from curvafit.segmentation.trials import (
     Trial,
     choose_by_masks,
     crop_to_surface,
+    laws_of,
     leave_out_slices,
 )
 from curvafit.segmentation.uncertainty import (
@@ -94,6 +92,8 @@ MARGIN = math.tanh(WORKING_SPACING / 2 / (math.sqrt(2) * WORKING_EPSILON))
 STIFFEST = (1e-9, 1e12)
 #: Stiffness of the springs on unknown voxels, in working units, for each nat of their log-odds: all are tried.
 PULLS = (0.0, 1e4, 3e4)
+#: Which slices are known, and how many to suggest, unless it is said.
+WHICH: dict[str, Any] = {"every": None, "first": 0, "known": None, "ignore": None, "axis": 0, "suggest": 0}
 #: Label of unknown voxels in the mask of one structure.
 UNKNOWN = 255
 #: Fewest grey levels of an image, and most voxels in which they are counted.
@@ -102,12 +102,15 @@ GREY, SAMPLED = 8, 1_000_000
 LEAST_BYTES = 30
 #: Least share of the entropy of slices held out that an image takes away: that of the structure takes half or more.
 TOLD = 0.1
-SHIFTED = "The image seems to lie off the annotated slices by {where}: it fits them better when it is moved back."
 ONCE = "The labels are read in the image as instances of one structure (--no-instances reads each by itself)."
 APIECE = "Each label is read in the image by itself (--instances reads those of one kind, such as cells, as one)."
 UNTOLD = "The image does not tell the structure in annotated slices held out: it is left out."
 #: Voxels around a label's box.
 ROOM = 16
+#: Of instances, labels of one kind that an image tells from the background but not from each other: the share of a
+#: label's area that is in one piece in each slice, the share of labels of which that holds, and the greatest share of
+#: the variance of grey levels that is due to which label they have.
+PIECE, MOST, ALIKE = 0.9, 0.9, 0.5
 #: Probabilities of labels are at least this.
 SURE = 1e-6
 
@@ -123,7 +126,6 @@ def reconstruct(
     axis: int = 0,
     image: Source | None = None,
     example: Source | None = None,
-    careful: bool = False,
     suggest: int = 0,
     periodic: bool = False,
     filler: str | Path | None = None,
@@ -167,8 +169,6 @@ def reconstruct(
         with neither example nor law.
     example
         A mask of another volume of the same kind, known whole. A file or an array has the slices' `spacing` and `unit`.
-    careful
-        Whether the network fills the volume in all eight mirror images, which takes eight times as long.
     suggest
         Number of slices to suggest for annotation next.
     periodic
@@ -189,13 +189,11 @@ def reconstruct(
     ImportError
         If an image is given, and scikit-learn is not installed.
     """
-    volume = field_of(slices, **reading)
-    volume = replace(volume, values=round_labels(volume.values))
+    which: dict[str, Any] = dict(zip(WHICH, (every, first, known, ignore, axis, suggest), strict=True))
+    given = _Given.read(slices, reading, **which)
+    volume, axis = given.volume, given.axis
     check_memory(volume.shape, LEAST_BYTES, "a volume that is filled at once, not in blocks into Zarr,")
-    axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
-    places, marks, which = _find_known(volume, axis, every, first, known, ignore)
-    target = Slices.of(volume, places, axis, periodic, marks)
-    suggest = check_int(suggest, "a number of slices from 0", 0, volume.shape[axis] - len(places))
+    target = Slices.of(volume, given.places, axis, periodic, given.marks)
     if stiffness is not None:
         stiffness = check_float(stiffness, "a positive stiffness", *STIFFEST)
     laws, notes = ((), ()) if prior is None else laws_of(prior, volume)
@@ -205,21 +203,23 @@ def reconstruct(
         if example is not None or laws:
             raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
         seen = _load_image(image, volume, reading)
-        evidence, doubts = _read_evidence(seen, target, axis, sub_progress(progress, 0.0, 0.5))
-        taught, notes = taught if evidence is not None else Taught.load(), (*notes, *doubts)
+        evidence, told = read_image(given.turn(seen.values), target, progress=sub_progress(progress, 0.0, 0.5))
+        notes = (*notes, *seen.notes)
+        if told < TOLD:
+            taught, evidence, notes = Taught.load(), None, (*notes, UNTOLD)
     if example is not None:
-        other = Example.of(_load_example(example, volume, reading), places, axis)
+        other = Example.of(_load_example(example, volume, reading), given.places, axis)
         taught = tune(taught, other, sub_progress(progress, 0.0, 0.5))
         notes = (*notes, *other.notes)
-    engine = _Engine(taught, evidence, careful, epsilon, progress)
+    engine = _Engine(taught, evidence, epsilon, progress)
     chosen, said, task = Trial(), taught.status, None if other is None else other.task
     if stiffness is not None and laws:
         chosen, said = Trial(laws[0], stiffness, steps), "the law is lowered from the network's volume"
     elif laws:
-        tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
-        task = _pose_task(target if tiling.count == 1 else crop_to_surface(target, PART)[0], other)
+        one_tile = Tiling.of(target.frame, epsilon, tile, periodic=periodic).count == 1
+        task = _pose_task(target if one_tile else crop_to_surface(target, PART)[0], other)
         trials = [Trial(law, STIFFNESS, steps, pull) for law, pull in product(laws, PULLS)]
-        chosen = choose_by_masks(task, trials, lambda given, trial: engine.run(given, trial) > 0)
+        chosen = choose_by_masks(task, trials, lambda slices, trial: engine.run(slices, trial) > 0)
         said = _describe_gain(chosen, "left out" if other is None else "of the example")
     if chosen.law is None:
         phase = engine.run(target, chosen)
@@ -230,23 +230,61 @@ def reconstruct(
         problem = SlicesProblem(chosen, target, engine.level(target))
         found = lower_volume(problem, tiling, store=store, workers=workers, progress=progress)
         mask, phase = target.keep_known(found.mask & ~target.outside[:, None, None]), found.phase
-        summary = flow_summary(found)
+        summary, notes = flow_summary(found), (*notes, *tiling.place.notes)
         likely = _weigh_evidence(engine, chosen, task, target, phase)
-        notes = (*notes, *tiling.place.notes)
-    uncertain = _uncertainty(*likely, mask, target, volume, axis, suggest, told=evidence is not None)
+    uncertain = _uncertainty(*likely, mask, target, given, told=evidence is not None)
     tested = "the example" if other else "slices left out" if chosen.law else "generated shapes"
-    end = describe_errors(uncertain.expected_dice, uncertain.calibration_error, uncertain.suggestions, tested)
-    shares, to_ends = (uncertain.known_share, uncertain.mean_probability), evidence is not None or periodic
-    filled = describe_filled(places, volume.shape[axis], summary, *shares, to_ends)
+    ways = {"tested": tested, "image": evidence is not None, "periodic": periodic}
+    share = float(mask.mean())
+    status, doubts = describe_filled(said, summary, share, uncertain, given.places, target.length, **ways)
+    labels = doubt_labels(np.unique(given.turn(volume.values)[given.places]), ignore)
     return Segmentation.of(
-        volume, _turn_back(axis, mask), _turn_back(axis, phase), chosen.law, width,
-        (
-            *which, *doubt_labels(np.unique(np.moveaxis(volume.values, axis, 0)[places]), ignore), *notes,
-            *doubt_filled(uncertain.expected_dice, float(mask.mean()), uncertain.known_share),
-            *(() if periodic else note_ends(places, volume.shape[axis], evidence is not None)),
-        ),
-        weight=None, status=f"{said}: {filled}; {end}", uncertainty=uncertain, image=seen,
+        volume, given.turn_back(mask), given.turn_back(phase), chosen.law, width,
+        (*given.notes, *labels, *notes, *doubts),
+        weight=None, status=status, uncertainty=uncertain, image=seen,
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Given:
+    """Labels of a volume, the slices across an axis that are known, marks of known voxels in others, notes, and how
+    many slices to suggest."""
+
+    volume: Field
+    axis: int
+    places: list[int]
+    marks: np.ndarray | None
+    notes: tuple[str, ...]
+    suggest: int
+
+    @classmethod
+    def read(
+        cls, slices: Source, reading: dict[str, Any], *, every: int | None, first: int, known: Sequence[int] | None,
+        ignore: int | None, axis: int, suggest: int,
+    ) -> _Given:  # fmt: skip
+        volume = field_of(slices, **reading)
+        volume = replace(volume, values=round_labels(volume.values))
+        axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
+        values, marks, notes = np.moveaxis(volume.values, axis, 0), None, ()
+        if ignore is not None:
+            if every is not None or known is not None:
+                raise ScanError("give either every, known or ignore")
+            places, marks = annotated_slices(values, check_int(ignore, "a label to ignore", -SEEDS, IDS))
+        elif every is None and known is None:
+            places = choose_labelled(there := find_labelled(values))
+            notes = note_labelled(places, there)
+        else:
+            places = known_places(len(values), every, first, known)
+            notes = () if every is None else doubt_places(find_labelled(values), places)
+        suggest = check_int(suggest, "a number of slices from 0", 0, len(values) - len(places))
+        return cls(volume, axis, places, marks, notes, suggest)
+
+    def turn(self, values: np.ndarray) -> np.ndarray:
+        """Move the axis across the slices to the front."""
+        return np.moveaxis(values, self.axis, 0)
+
+    def turn_back(self, values: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(np.moveaxis(values, 0, self.axis))
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +293,6 @@ class _Engine:
 
     taught: Taught
     evidence: np.ndarray | None
-    careful: bool
     epsilon: float | None
     progress: Progress
     filled: dict[Slices, np.ndarray] = field(default_factory=dict)
@@ -265,8 +302,7 @@ class _Engine:
         """Return the network's log-odds of the inside (Z, Y, X), computed once."""
         if slices not in self.filled:
             step = sub_progress(self.progress, 0.5, 1.0)
-            how: dict[str, Any] = {"evidence": self.evidence, "careful": self.careful, "progress": step}
-            self.filled[slices] = fill(slices, self.taught, **how)
+            self.filled[slices] = fill(slices, self.taught, evidence=self.evidence, progress=step)
         return self.filled[slices]
 
     def level(self, slices: Slices) -> np.ndarray:
@@ -337,22 +373,6 @@ def _profile(level: np.ndarray, epsilon: float) -> np.ndarray:
     return np.tanh(level / (math.sqrt(2) * epsilon))
 
 
-def _find_known(
-    volume: Field, axis: int, every: int | None, first: int, known: Sequence[int] | None, ignore: int | None
-) -> tuple[list[int], np.ndarray | None, tuple[str, ...]]:
-    """Return the numbers of the known slices, the marks in others, and notes."""
-    values = np.moveaxis(volume.values, axis, 0)
-    if ignore is not None:
-        if every is not None or known is not None:
-            raise ScanError("give either every, known or ignore")
-        return *annotated_slices(values, check_int(ignore, "a label to ignore", -SEEDS, IDS)), ()
-    if every is None and known is None:
-        places = choose_labelled(there := find_labelled(values))
-        return places, None, note_labelled(places, there)
-    places = known_places(len(values), every, first, known)
-    return places, None, () if every is None else doubt_places(find_labelled(values), places)
-
-
 def _pose_task(slices: Slices, example: Example | None) -> Task[Slices]:
     """Return what a law is tried out on: a part of the example, or else every second known slice."""
     task = leave_out_slices(slices) if example is None else example.part
@@ -389,33 +409,19 @@ def _weigh_evidence(
 
 
 def _uncertainty(
-    likely: np.ndarray,
-    error: float,
-    mask: np.ndarray,
-    slices: Slices,
-    volume: Field,
-    axis: int,
-    count: int,
-    *,
-    told: bool,
+    likely: np.ndarray, error: float, mask: np.ndarray, slices: Slices, given: _Given, *, told: bool
 ) -> Uncertainty:
-    """Return probabilities (Z, Y, X) as a volume, 0 or 1 where it is known, what they say of the mask, `count` slices
-    to annotate next, and the volume by known slices; `told` says whether an image tells the ends."""
+    """Return probabilities (Z, Y, X) as a volume, 0 or 1 where it is known, what they say of the mask, slices to
+    annotate next, and the volume by known slices; `told` says whether an image tells the ends."""
     inside = slices.keep_known(np.zeros(slices.shape, dtype=bool))
     values = np.where(slices.known_voxels, inside, likely).astype(np.float32)
-    suggestions = suggest_slices(doubt(values).sum((1, 2)), slices.places, count, slices.periodic)
+    suggestions = suggest_slices(doubt(values).sum((1, 2)), slices.places, given.suggest, slices.periodic)
     dice = expected_dice(likely[slices.between], mask[slices.between]) if slices.between.any() else 1.0
-    known = share_by_slices(
-        slices.inside.mean((1, 2)), slices.places, slices.length, periodic=slices.periodic, whole=told
-    )
-    likely_field = replace(volume, values=_turn_back(axis, values), notes=())
+    areas, ends = slices.inside.mean((1, 2)), {"periodic": slices.periodic, "whole": told}
+    known = share_by_slices(areas, slices.places, slices.length, **ends)
+    likely_field = replace(given.volume, values=given.turn_back(values), notes=())
     mean = float(values[slice(None) if told else ~slices.outside].sum(dtype=np.float64)) / values.size
     return Uncertainty(likely_field, error, suggestions, dice, known_share=known, mean_probability=mean)
-
-
-def _turn_back(axis: int, values: np.ndarray) -> np.ndarray:
-    """Move the first axis of a volume back to where it was."""
-    return np.ascontiguousarray(np.moveaxis(values, 0, axis))
 
 
 def _describe_gain(best: Trial, where: str) -> str:
@@ -437,21 +443,6 @@ def _load_image(image: Source, volume: Field, reading: dict[str, Any]) -> Field:
     return replace(field, notes=laid)
 
 
-def _read_evidence(
-    image: Field, slices: Slices, axis: int, progress: Progress
-) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """Return the log-odds of an image of slices across an axis, which becomes the first; None where it does not tell
-    known slices that are held out. And sentences on what is doubtful."""
-    levels, names = np.moveaxis(image.values, axis, 0), "zyx".replace("zyx"[axis], "")
-    shift = find_shift(levels, slices)
-    where = " and ".join(
-        f"{voxels:+d} voxels along {name}" for voxels, name in zip(shift, names, strict=True) if voxels
-    )
-    doubts = (*image.notes, SHIFTED.format(where=where)) if where else image.notes
-    evidence, told = read_image(levels, slices, progress=progress)
-    return (None, (*doubts, UNTOLD)) if told < TOLD else (evidence, doubts)
-
-
 def _load_example(example: Source, volume: Field, reading: dict[str, Any]) -> Field:
     """Load an example with the spacing and unit of the slices, which are of `volume`."""
     placed = {} if isinstance(example, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
@@ -469,11 +460,6 @@ def reconstruct_labels(
     prior: LawLike | Mapping[int, LawLike] | None = None,
     *,
     chosen: Sequence[int] | None = None,
-    every: int | None = None,
-    first: int = 0,
-    known: Sequence[int] | None = None,
-    ignore: int | None = None,
-    axis: int = 0,
     image: Source | None = None,
     instances: bool | None = None,
     example: Source | None = None,
@@ -508,8 +494,8 @@ def reconstruct_labels(
         read for each by itself. By default they are if nine in ten are one piece in each known slice and grey levels
         vary more within them than between them. Where every voxel is labelled, or the volume repeats, each is read by
         itself.
-    every, first, known, ignore, axis, image, store, progress, spacing, unit, options
-        As in `reconstruct`.
+    image, store, progress, spacing, unit, options
+        As in `reconstruct`, of which options are all others: every, known, ignore, axis and so on.
 
     Returns
     -------
@@ -523,27 +509,24 @@ def reconstruct_labels(
     ValueError
         As `reconstruct`, if it refuses all labels; or if the known slices do not have a label, or none but 0.
     """
-    volume = field_of(slices, spacing=spacing, unit=unit)
-    volume = replace(volume, values=round_labels(volume.values))
-    axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
-    places, marks, notes = _find_known(volume, axis, every, first, known, ignore)
-    suggest = check_int(options.pop("suggest", 0), "a number of slices from 0", 0, volume.shape[axis] - len(places))
-    moved = np.moveaxis(volume.values, axis, 0)
+    reading = {"spacing": spacing, "unit": unit}
+    which = {name: options.pop(name, usual) for name, usual in WHICH.items()}
+    given = _Given.read(slices, reading, **which)
+    volume, places, notes, moved = given.volume, given.places, given.notes, given.turn(given.volume.values)
     numbers = find_labels(moved[places], chosen)
-    if every is None and known is None and ignore is None:
+    if which["every"] is None and which["known"] is None and which["ignore"] is None:
         check_shared(moved, places, numbers)
-    labels = _Labels(
-        replace(volume, values=index_labels(volume.values, numbers, ignore), notes=()), places, axis,
-        _turn_back(axis, mark_known(moved.shape, places, marks)), ignore is not None, options,
-    )  # fmt: skip
-    other = None if example is None else _load_example(example, volume, {"spacing": spacing, "unit": unit})
-    seen = None if image is None else _load_image(image, volume, {"spacing": spacing, "unit": unit})
+    index = replace(volume, values=index_labels(volume.values, numbers, which["ignore"]), notes=())
+    there = given.turn_back(mark_known(moved.shape, places, given.marks))
+    labels = _Labels(replace(given, volume=index), there, which["ignore"] is not None, options)
+    other = None if example is None else _load_example(example, volume, reading)
+    seen = None if image is None else _load_image(image, volume, reading)
     laws = prior if isinstance(prior, Mapping) else dict.fromkeys(numbers, prior)
-    drawn, whole, alone = np.moveaxis(labels.given.values, axis, 0)[places].clip(0), None, seen
+    drawn, whole, alone = given.turn(index.values)[places].clip(0), None, seen
     full, periodic = bool(drawn.all()), bool(options.get("periodic"))
     if seen is not None and not full and not periodic:
         if instances is None:
-            instances = are_instances(drawn, np.moveaxis(seen.values, axis, 0)[places], len(numbers))
+            instances = are_instances(drawn, given.turn(seen.values)[places], len(numbers))
         notes = (*notes, *seen.notes, ONCE if instances else APIECE)
         if instances:
             bare = replace(seen, affine=None, notes=())
@@ -553,18 +536,17 @@ def reconstruct_labels(
         if whole is not None and UNTOLD in whole.notes:
             whole, notes = None, (*notes[:-1], UNTOLD)
     parts, said = _fill_each(labels, numbers, laws, (alone, other, store), progress)
-    far = np.moveaxis(np.ones(volume.shape, dtype=bool), axis, 0)
+    far = np.ones(moved.shape, dtype=bool)
     far[slice(None) if periodic or seen is not None else reach_of(places, len(moved))] = False
-    values, likely, phase, odds = _join_parts(labels, parts, full, np.moveaxis(far, 0, axis))
+    values, likely, phase, odds = _join_parts(labels, parts, full, given.turn_back(far))
     doubts = {number: part.uncertainty for number, (_, part) in zip(numbers, parts, strict=True)}
     dice = {number: doubt.expected_dice for number, doubt in doubts.items() if doubt is not None}
     if whole is not None:
         values, likely, found = _split_instances(labels, parts, whole, values, odds)
         dice, phase, said = dict(zip(numbers, found, strict=True)), whole.phase.values, whole.notes
     likely = np.where(labels.known, 1.0, likely).astype(np.float32)
-    unsure = doubt(np.moveaxis(likely, axis, 0)).sum((1, 2))
     error = max(doubt.calibration_error for doubt in (whole and whole.uncertainty, *doubts.values()) if doubt)
-    following = suggest_slices(unsure, places, suggest, periodic)
+    following = suggest_slices(doubt(given.turn(likely)).sum((1, 2)), places, given.suggest, periodic)
     likely = replace(volume, values=likely, notes=())
     return Segmentation.of(
         volume, values != 0, np.maximum(phase, -1), None, max(part.epsilon for _, part in parts), (*notes, *said),
@@ -576,26 +558,29 @@ def reconstruct_labels(
 
 @dataclass(frozen=True, eq=False)
 class _Labels:
-    """A volume of places of labels (`index_labels`), the known slices across an axis, the known voxels, whether others
-    are marked as such, and options of `reconstruct`."""
+    """What is given, with labels by their places (`index_labels`), the known voxels, whether others are marked as such,
+    and options of `reconstruct`."""
 
-    given: Field
-    places: list[int]
-    axis: int
+    given: _Given
     known: np.ndarray
     marked: bool
     options: dict[str, Any]
 
+    @property
+    def values(self) -> np.ndarray:
+        """The places of the labels (Z, Y, X)."""
+        return self.given.volume.values
+
     def fill(self, place: int | None, box: Box, law: LawLike | None = None, **more: Any) -> Segmentation:
         """Fill one label in a box, by its place, or all as one structure."""
-        values = self.given.values[box]
+        values, given = self.values[box], self.given
         inside = (values > 0 if place is None else values == place).astype(np.uint8)
-        start, stop, _ = box[self.axis].indices(self.given.shape[self.axis])
-        which: dict[str, Any] = {"known": [k - start for k in self.places if start <= k < stop]}
+        start, stop, _ = box[given.axis].indices(self.values.shape[given.axis])
+        which: dict[str, Any] = {"known": [k - start for k in given.places if start <= k < stop]}
         if self.marked:
             inside[values < 0], which = UNKNOWN, {"ignore": UNKNOWN}
-        mask = replace(self.given, values=inside, affine=None)
-        return reconstruct(mask, law, axis=self.axis, **which, **self.options, **more)
+        mask = replace(given.volume, values=inside, affine=None)
+        return reconstruct(mask, law, axis=given.axis, **which, **self.options, **more)
 
 
 _Parts = list[tuple[Box, Segmentation]]
@@ -608,7 +593,7 @@ def _fill_each(
     so; return boxes and labels, and notes."""
     parts, notes, (image, example, store) = [], dict[str, list[int]](), tools
     for place, number in enumerate(numbers, 1):
-        inside = (labels.given.values == place) & labels.known
+        inside = (labels.values == place) & labels.known
         box = WHOLE if labels.options.get("periodic") else _box_of_label(inside, labels)
         more = {
             "image": image and replace(image, values=image.values[box], affine=None, notes=()),
@@ -630,7 +615,7 @@ def _fill_each(
 def _join_parts(labels: _Labels, parts: _Parts, full: bool, far: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return the label with the greatest phase field at each voxel, by its place, 0 where there is none, and where it
     is `far` from known slices; how likely that is; this phase field; and the sum of the labels' odds."""
-    shape = labels.given.shape
+    shape = labels.values.shape
     deepest, owner = np.full(shape, -np.inf, dtype=np.float32), np.zeros(shape, dtype=np.int16)
     largest, odds = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
     for place, (box, part) in enumerate(parts, 1):
@@ -639,10 +624,10 @@ def _join_parts(labels: _Labels, parts: _Parts, full: bool, far: np.ndarray) -> 
         own = _odds(part)
         largest[box], odds[box] = np.maximum(largest[box], own), odds[box] + own
     if full and (unseen := np.isneginf(deepest)).any():  # in no label's box
-        spacing = labels.given.spacing
+        spacing = labels.given.volume.spacing
         near = ndimage.distance_transform_edt(unseen, spacing, return_distances=False, return_indices=True)
         owner = owner[tuple(near)]  # type: ignore[arg-type]
-    values = np.where(labels.known, labels.given.values, np.where(((deepest > 0) | full) & ~far, owner, 0))
+    values = np.where(labels.known, labels.values, np.where(((deepest > 0) | full) & ~far, owner, 0))
     likely = np.where(values, largest, 1.0) / np.maximum(odds + ((values == 0) | (not full)), SURE)
     return values, likely, deepest, odds
 
@@ -653,16 +638,16 @@ def _split_instances(
     """Split what all labels fill as one structure by where each is alone; return places and their probabilities, which
     are that of the structure times the label's share in the odds of all, and the Dice to expect of each."""
     assert whole.probability is not None
-    values = split_structure(whole.mask.values, values, labels.known, labels.given.spacing)
-    inside, axis = whole.probability.values, labels.axis
+    values = split_structure(whole.mask.values, values, labels.known, labels.given.volume.spacing)
+    inside, given = whole.probability.values, labels.given
     likely, dice = np.where(values, inside, 1 - inside), []
-    between = np.zeros(values.shape[axis], dtype=bool)
-    between[labels.places[0] : labels.places[-1]] = True
-    between[labels.places] = False
+    between = np.zeros(values.shape[given.axis], dtype=bool)
+    between[given.places[0] : given.places[-1]] = True
+    between[given.places] = False
     for place, (box, part) in enumerate(parts, 1):
         own, mine = inside[box] * _odds(part) / np.maximum(odds[box], SURE), values[box] == place
         likely[box] = np.where(mine, own, likely[box])
-        own, mine = (np.moveaxis(each, axis, 0)[between[box[axis]]] for each in (own, mine))
+        own, mine = (given.turn(each)[between[box[given.axis]]] for each in (own, mine))
         dice.append(expected_dice(own, mine) if own.size else 1.0)
     return values, likely, dice
 
@@ -677,7 +662,7 @@ def _restore(values: np.ndarray, numbers: Sequence[int], given: np.dtype) -> np.
 def _box_of_label(inside: np.ndarray, labels: _Labels) -> Box:
     """Return the box in which a label may be, given where it is known to be (Z, Y, X): along the axis up to the known
     slices without it, and across it `ROOM` voxels and two gaps beyond."""
-    places, axis, spacing = labels.places, labels.axis, labels.given.spacing
+    places, axis, spacing = labels.given.places, labels.given.axis, labels.given.volume.spacing
     step = 2 * max(np.diff(places)) * spacing[axis]
     box: list[slice] = []
     for k in range(3):
@@ -733,3 +718,44 @@ def find_labels(values: np.ndarray, chosen: Sequence[int] | None) -> list[int]:
     if missing := [number for number in numbers if number not in found]:
         raise ScanError(f"the known slices have the labels {listed}, but not {', '.join(map(str, missing))}")
     return numbers
+
+
+def are_instances(labels: np.ndarray, levels: np.ndarray, count: int) -> bool:
+    """Return whether labels from 1 to `count` in slices (N, Y, X) are instances, as they are drawn and by grey levels
+    there: nine in ten are, but for a tenth of their area, one piece in each slice, and grey levels vary more within
+    labels than between them."""
+    own, grey = labels[labels > 0], levels[labels > 0].astype(np.float64)
+    total, largest = np.bincount(own, minlength=count + 1), np.zeros(count + 1)
+    for plane in labels:
+        pieces = np.asarray(measure.label(plane, connectivity=2))
+        owner = np.zeros(pieces.max() + 1, dtype=np.intp)
+        owner[pieces] = plane
+        best = np.zeros(count + 1)
+        np.maximum.at(best, owner, np.bincount(pieces.ravel()))
+        largest += best
+    means = np.bincount(own, grey, minlength=count + 1) / np.maximum(total, 1)
+    whole = (largest >= PIECE * total)[1:].mean() >= MOST
+    return bool(whole and means[own].var() <= ALIKE * grey.var())
+
+
+def split_structure(mask: np.ndarray, labels: np.ndarray, known: np.ndarray, spacing: Sequence[float]) -> np.ndarray:
+    """Return labels of a structure's mask (Z, Y, X): each voxel has the nearest of the `labels` (Z, Y, X), which are 0
+    where there is none, and those of `known` voxels stay.
+
+    Each label is kept in one piece: of the pieces that it has, those without a known voxel go to the label that they
+    touch most, or to the background.
+    """
+    near = ndimage.distance_transform_edt(labels == 0, spacing, return_distances=False, return_indices=True)
+    found = np.where(known, labels, np.where(mask, labels[tuple(near)], 0))  # type: ignore[arg-type]
+    pieces = np.asarray(measure.label(found, connectivity=3))
+    owner, stays = np.zeros(pieces.max() + 1, dtype=found.dtype), np.zeros(pieces.max() + 1, dtype=bool)
+    owner[pieces], stays[pieces[known]], stays[0] = found, True, True
+    row = np.cumsum(~stays) - 1
+    touched = np.zeros((np.count_nonzero(~stays), int(labels.max()) + 1), dtype=np.intp)
+    for axis in range(3):
+        turned = np.moveaxis(pieces, axis, 0)
+        for one, other in ((turned[1:], turned[:-1]), (turned[:-1], turned[1:])):
+            meet = ~stays[one] & stays[other] & (other > 0)
+            np.add.at(touched, (row[one[meet]], owner[other[meet]]), 1)
+    owner[~stays] = touched.argmax(1)  # that is 0 where nothing is touched
+    return owner[pieces]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -287,7 +287,7 @@ def write_mask(
             write_labels(replace(scan, values=values), work / target.name, image=image)
             mark(work / target.name, FORMAT.name)
         rows = {"scan": (scan.values, None), "mask": (scan.values, mask)}
-        content = _record(segmentation, scan, record or {})
+        content = describe_run(segmentation, record or {}, scan, float(mask.mean()))
         return finish_mask(work, target, list(maps), _figure(segmentation, rows), content)
 
 
@@ -349,37 +349,29 @@ def map_path(target: Path, name: str) -> Path:
     return beside(target, f"_{name}{suffix}")
 
 
-def _record(segmentation: Segmentation, scan: Field, more: dict[str, Any]) -> dict[str, Any]:
-    uncertain, doubts = segmentation.uncertainty, {}
+def describe_run(found: Segmentation, options: Mapping[str, Any], scan: Field, share: float) -> dict[str, Any]:
+    """Return the record of a mask of a scan: its status, the run's options, what was found, and notes; `share` is the
+    mask's of the volume."""
+    uncertain, doubts = found.uncertainty, {}
     if uncertain is not None:
         doubts = {name: getattr(uncertain, name) for name in ("calibration_error", "suggestions", "expected_dice")}
         if uncertain.dice_of_labels:
             doubts["dice_of_labels"] = {str(number): dice for number, dice in uncertain.dice_of_labels.items()}
         if uncertain.known_share:
             doubts |= {"known_share": uncertain.known_share, "mean_probability": uncertain.mean_probability}
-    found = {
-        "coefficients": None if segmentation.coefficients is None else segmentation.coefficients.as_dict(),
-        "epsilon": segmentation.epsilon,
-        "weight": segmentation.weight,
-        "volume_fraction": float(segmentation.mask.values.mean()),
-        **doubts,
-    }
-    return describe_run(segmentation.status, more, scan, found, segmentation.notes)
-
-
-def describe_run(
-    status: str, options: Mapping[str, Any], scan: Field, found: Mapping[str, Any], notes: Sequence[str]
-) -> dict[str, Any]:
-    """Return the record of a mask of a scan: its status, the run's options, what was found, and notes."""
     return {
-        "status": status,
+        "status": found.status,
         **options,
         "scan": scan.source,
         "shape": list(scan.shape),
         "spacing": list(scan.spacing),
         "unit": scan.unit,
-        **found,
-        "notes": list(notes),
+        "coefficients": None if found.coefficients is None else found.coefficients.as_dict(),
+        "epsilon": found.epsilon,
+        "weight": found.weight,
+        "volume_fraction": share,
+        **doubts,
+        "notes": list(found.notes),
         "curvafit": version("curvafit"),
         "torch": version("torch"),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -428,40 +420,38 @@ def doubt_labels(values: np.ndarray, ignore: int | None = None) -> tuple[str, ..
     return (f"The known slices have {count} labels, which are filled as one structure: {how}.",) if count > 1 else ()
 
 
-def doubt_filled(dice: float, share: float, known: Sequence[float]) -> tuple[str, ...]:
-    """Return sentences where a low Dice is expected between known slices, and where a mask's share of the volume lies
-    out of the interval of the share by the known slices alone (`share_by_slices`), and off that by 1 % of it."""
+def describe_filled(
+    said: str, inside: str, share: float, uncertain: Uncertainty, places: Sequence[int], length: int, *, tested: str,
+    image: bool = False, periodic: bool = False,
+) -> tuple[str, tuple[str, ...]]:  # fmt: skip
+    """Return the status of a volume between the known slices at `places`, and sentences on what is doubtful.
+
+    `said` is how it was filled, `inside` a sentence on the mask, `share` its share of the volume, and `tested` what
+    probabilities were held to. With an image or in a periodic volume all slices are filled.
+    """
+    reach = slice(0, length) if image or periodic else reach_of(places, length)
+    left = length - (reach.stop - reach.start)
+    known = uncertain.known_share
+    span = f" ({100 * known[1]:.2f} to {100 * known[2]:.2f})" if known[1:] else ""
+    status = (
+        f"{said}: {len(places)} of {length} slices known{f', {left} beyond them not filled' * (left > 0)}, {inside}, "
+        f"{100 * known[0]:.2f} %{span} by known slices alone, {100 * uncertain.mean_probability:.2f} % by "
+        f"probabilities; expect a Dice of {uncertain.expected_dice:.2f} between known slices; "
+        f"probabilities err by {uncertain.calibration_error:.3f} near the surface of {tested}"
+    )
+    if uncertain.suggestions:
+        status += f"; annotate next: {', '.join(map(str, uncertain.suggestions))}"
     low = "Known slices lie too far apart: what lies between them is more unknown than known."
     off = bool(known[1:]) and not known[1] <= share <= known[2] and abs(share / known[0] - 1) > LITTLE
-    return (low,) * (dice < HALF) + (OFF,) * off
+    notes = (*(low,) * (uncertain.expected_dice < HALF), *(OFF,) * off)
+    return status, (*notes, *(() if periodic else _note_ends(places, length, reach, image)))
 
 
-def note_ends(places: Sequence[int], length: int, image: bool = False) -> tuple[str, ...]:
-    """Return sentences on the slices before the first known one and beyond the last."""
-    reach = slice(0, length) if image else reach_of(places, length)
-    how, found = "told by the image alone" if image else "as that one is", []
+def _note_ends(places: Sequence[int], length: int, reach: slice, image: bool) -> Iterator[str]:
+    """Yield sentences on the slices before the first known one and beyond the last."""
     ends = ((places[0] - reach.start, reach.start), (reach.stop - 1 - places[-1], length - reach.stop))
-    for where, (count, left) in zip(("Before the first", "Beyond the last"), ends, strict=True):
-        more = f"; {left} further away {'are' if left > 1 else 'is'} not filled" if left else ""
-        if count or left:
-            found.append(f"{where} known slice: {count} slice{'s' * (count != 1)}, {how}{more}.")
-    return tuple(found)
-
-
-def describe_filled(
-    places: Sequence[int], length: int, inside: str, known: Sequence[float], likely: float, image: bool = False
-) -> str:
-    """Say how many slices are known and not filled, and what is inside by the mask, known slices and probabilities."""
-    reach = slice(0, length) if image else reach_of(places, length)
-    left = length - (reach.stop - reach.start)
-    text = f"{len(places)} of {length} slices known{f', {left} beyond them not filled' * (left > 0)}, {inside}"
-    span = f" ({100 * known[1]:.2f} to {100 * known[2]:.2f})" if known[1:] else ""
-    return f"{text}, {100 * known[0]:.2f} %{span} by known slices alone, {100 * likely:.2f} % by probabilities"
-
-
-def describe_errors(dice: float, error: float, suggestions: Sequence[int], tested: str) -> str:
-    """Say how good probabilities are, and on what, and what to annotate next, as the end of a sentence."""
-    text = f"expect a Dice of {dice:.2f} between known slices"
-    text = f"{text}; probabilities err by {error:.3f} near the surface of {tested}"
-    following = ", ".join(map(str, suggestions))
-    return f"{text}; annotate next: {following}" if following else text
+    for where, (count, beyond) in zip(("Before the first", "Beyond the last"), ends, strict=True):
+        how = "told by the image alone" if image else "as that one is"
+        more = f"; {beyond} further away {'are' if beyond > 1 else 'is'} not filled" if beyond else ""
+        if count or beyond:
+            yield f"{where} known slice: {count} slice{'s' * (count != 1)}, {how}{more}."

@@ -1,59 +1,57 @@
-"""Segmentation without a network: a scan's evidence and the energy F_ε of the surface."""
+"""A mask of a scan, or of a network's probabilities: what voxels say and the energy F_ε of the surface, lowered."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
 
 import numpy as np
 
-from curvafit.core.checks import check_float
+from curvafit.core.checks import check_float, quoted
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.workers import Workers
 from curvafit.generation.data import Evidence
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import LawLike
-from curvafit.scan.grids import count_faces
+from curvafit.scan.grids import box_with_most_surface
 from curvafit.scan.structure import check_options
-from curvafit.segmentation.engine import (
-    BENDING,
-    STEPS,
-    WorkingGrid,
-    add_willmore,
-    bending,
-    initial_field,
-    laws_of,
-    likelihood,
-)
-from curvafit.segmentation.evidence import (
-    Classes,
-    VoxelEvidence,
-    estimate_classes,
-    grey_bounds,
-    grey_evidence,
-    grey_levels,
-)
+from curvafit.segmentation.evidence import GreyEvidence, VolumeEvidence, load_probabilities, probability_evidence
+from curvafit.segmentation.flow import BENDING, STEPS, WorkingGrid, bending, likelihood
 from curvafit.segmentation.result import Segmentation, flow_summary
-from curvafit.segmentation.tiles import Problem, Tiling, lower_volume
-from curvafit.segmentation.trials import Trial, choose_by_voxels
-from curvafit.volumes.boxes import Boxes, boxes_of, check_finite, check_fits, subsample
-from curvafit.volumes.field import ScanError
-from curvafit.volumes.formats.part import Box, Crop
-from curvafit.volumes.read import Source
+from curvafit.segmentation.slices import check_spacing, require_labels
+from curvafit.segmentation.tiles import LoweredVolume, Problem, Tiling, lower_volume
+from curvafit.segmentation.trials import Task, Trial, choose_by_masks, law_of, laws_of
+from curvafit.volumes.boxes import Boxes, boxes_of, check_finite, check_fits, read_whole
+from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.formats.part import Box
+from curvafit.volumes.place import lay
+from curvafit.volumes.read import Source, field_of
 
-#: A note on classes that may be noise.
-FAINT = "The classes differ by less than the noise, as where the structure is rare: better give a threshold."
-#: Share of the time that trying laws out takes.
-TRIALS = 0.7
+#: The law where none is given; it is also tried beside those of a prior.
+WILLMORE = Coefficients.willmore()
+#: What a unit of F_ε of a law with a20 + a02 = 2 costs in a scan whose weight is not given, in nats. They measure grey
+#: levels by their own noise, so that one number holds for all: it did best on generated textures of noise 3.
+USUAL = 0.3
+#: Weights that are tried on an example, in the same unit, and the first of them.
+NATS, FIRST = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0), 10.0
 #: Least and greatest weight.
 WEIGHTS = (1e-9, 1e9)
+#: Longest edge in voxels of the part of an example on which laws and weights are tried, and the share of the time.
+EDGE, TRIALS = 96, 0.7
+#: Share of the evidence for the first guess's inside that a mask must keep, where no weight is given.
+KEPT = 0.95
+#: A note on classes that may be noise.
+FAINT = "The classes differ by less than the noise: look at the mask. If the structure is rare, give a threshold."
 
 
 def segment(
     scan: Source | Boxes,
-    prior: LawLike,
+    prior: LawLike | None = None,
     *,
     weight: float | None = None,
+    probabilities: bool | str = False,
+    example: tuple[Source, Source] | Calibration | None = None,
     threshold: float | str = "otsu",
     dark: bool = False,
     epsilon: float | None = None,
@@ -61,26 +59,34 @@ def segment(
     tile: int | None = None,
     store: str | PathLike[str] | None = None,
     workers: Workers | int | None = None,
-    crop: Crop | None = None,
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:
-    """Find the structure of a scan: lower -log p(scan | mask) + λ F_ε from a smoothed, thresholded start.
+    """Find the structure of a scan: lower -log p(scan | mask) + λ F_ε from a first guess of the surface.
 
-    Held-out voxels decide on the law and its weight: the laws that a fit trusts and the Willmore energy are tried, and
-    where none predicts the grey levels of these voxels better than the start does, the start is the result. A network's
-    probabilities are for `refine`: neighbouring ones are correlated, so that none can be held out.
+    Of grey levels under noise the first guess is smoothed, and split at a threshold. Of a network's probabilities p it
+    is p > 1/2, and a voxel's evidence is logit p. A network is surer than it is right, and its errors lie side by side:
+    its evidence is worth less by a factor that nobody knows. Only λ over this factor matters, and an example tells it.
 
     Parameters
     ----------
     scan
-        Grey levels of two phases with noise: the path of a file, a `Field`, or an array or tensor (Z, Y, X).
+        Grey levels of two phases with noise, or probabilities of the inside, in [0, 1]: the path of a file, a `Field`,
+        or an array or tensor (Z, Y, X).
     prior
         `Coefficients` with lengths in the scan's unit; or a preset's name, in working units of which the smallest voxel
-        edge is 0.01; or the path of a `fit.json`, whose unit is converted.
+        edge is 0.01; or the path of a `fit.json`, whose unit is converted. By default the Willmore energy, or with an
+        example the law that `infer` finds of its mask.
     weight
-        λ, in nats per unit of F_ε, of the prior's own law, of a fit its best one; then nothing is tried out. Small
+        λ, in nats per unit of F_ε. For grey levels it is by default 0.6 / (a20 + a02); classes that overlap are then
+        measured off the surface, and the first guess is the result where it explains the scan clearly better. Small
         bumps on a plane cost (a20 + a02) / 2 times their Willmore energy (linear terms aside, since ∫κ1κ2 = 0).
+    probabilities
+        Whether the values are a network's probabilities; or `"logits"`, where they are log-odds log p / (1 - p).
+    example
+        With probabilities, in place of a weight: those that the same network gives another volume, on which it was not
+        trained, and the true mask, which is positive inside; or the `Calibration` by them. A file or an array is read
+        as the scan is.
     threshold, dark
         The grey level between the phases, or `"otsu"`; whether the structure is the dark one.
     epsilon
@@ -95,104 +101,218 @@ def segment(
         Where there are several tiles: a folder for finished ones, with which the same call goes on after a kill, and
         whose mapped files the result's arrays are; and the number of processes that lower tiles, or workers such as
         `curvafit.core.workers.cluster`.
-    crop
-        A box of voxels: see `curvafit.load`.
     progress
         Called with a sentence and the share done.
     reading
-        Options of reading a file, or the place of an array: spacing, unit and the others of `curvafit.load`.
+        Options of reading a file, or the place of an array: spacing, unit, crop and the others of `curvafit.load`; and
+        of probabilities `like`, the path of an image of the same voxels that says where they are (by default one that
+        lies beside an NPZ file and has its name, as nnU-Net's segmentations do).
 
     Raises
     ------
     ValueError, FileNotFoundError
         If an argument is out of range or does not fit the scan, or the prior's unit cannot be converted; if there is no
-        such `fit.json`.
+        such `fit.json`; if probabilities are not in [0, 1], or have neither a weight nor an example, or both.
     """
-    boxes = boxes_of(scan, crop=crop, **reading)
+    check_given(probabilities, weight, example, threshold, dark)
+    alike: dict[str, Any] = {}
+    if probabilities:
+        reading["logits"] = probabilities == "logits"
+        alike = {name: value for name, value in reading.items() if name not in ("like", "crop")}
+        reading.pop("label", None)  # that of the example
+        scan, reading = load_probabilities(scan, **reading), {}  # type: ignore[arg-type]
+    boxes = boxes_of(scan, **reading)
     check_fits(boxes)
-    frame = boxes.frame
-    laws, notes = laws_of(prior, frame)
-    tiling = Tiling.of(frame, epsilon, tile)
-    if weight is not None:
-        weight = check_float(weight, "a positive weight", *WEIGHTS)
-    check_options("image", threshold)
-    check_finite(boxes)
-    sample, blocks = subsample(boxes)
-    levels, bounds = grey_levels(sample, threshold), grey_bounds(sample.values.astype(np.float32), threshold)
-    classes = estimate_classes(levels, sample, threshold, dark)
-    _check_phases(_GreyEvidence(boxes, bounds, classes), tiling)
-    gain, stiffness = "", bending(laws[0])
-    if weight is not None:
-        trial = Trial(laws[0], stiffness / BENDING * weight, steps)
+    tiling, said = Tiling.of(boxes.frame, epsilon, tile), ""
+    if example is None:
+        law, notes = law_of(WILLMORE if prior is None else prior, boxes.frame)
+        notes = notes if prior is not None else ("No prior is given: the Willmore energy is lowered.",)
+        trial = Trial(law, (weight or 0.0) * bending(law) / BENDING, steps)
     else:
-        inside = grey_evidence(levels, sample, classes).level > 0
-        block = max(blocks, key=lambda block: int(count_faces(inside[block]).sum()))
-        trials, progress = sub_progress(progress, 0.0, TRIALS), sub_progress(progress, TRIALS, 1.0)
-        trial, classes = choose_by_voxels(
-            levels[block], sample.crop(block), classes, add_willmore(laws),
-            epsilon=epsilon, steps=steps, remeasure=threshold == "otsu" and classes.faint, progress=trials,
-        )  # fmt: skip
-        gain = f"{_describe_gain(trial, trial.law in laws)}; "
-    if classes.faint and threshold == "otsu" and (weight is not None or trial.law is None):
-        notes = (*notes, FAINT)
-    problem = ScanProblem(trial, _GreyEvidence(boxes, bounds, classes))
-    found = lower_volume(problem, tiling, store=store, workers=workers, progress=progress)
-    if weight is None and trial.law is not None:
-        weight = trial.strength * BENDING / bending(trial.law)
-    notes = (*notes, f"{str(classes).capitalize()}.", *tiling.place.notes)
+        if not isinstance(example, Calibration):
+            trials, progress = sub_progress(progress, 0.0, TRIALS), sub_progress(progress, TRIALS, 1.0)
+            example = calibrate(*example, prior, epsilon=epsilon, steps=steps, progress=trials, **alike)
+        check_spacing(example.example, boxes.frame, "the probabilities")
+        trial, notes, said = example.trial, example.notes, f"{example}; "
+    if probabilities:
+        evidence: VolumeEvidence = probability_evidence(values := read_whole(boxes))
+        notes = (*notes, f"Probabilities from {values.values.min():.3g} to {values.values.max():.3g}.")
+    else:
+        check_finite(boxes)
+        evidence = GreyEvidence.of(boxes, threshold, dark, apart=weight is None)
+        classes, trial = evidence.classes, trial if weight else replace(trial, strength=USUAL)
+        notes = (*notes, *(FAINT,) * (classes.faint and threshold == "otsu"), f"{str(classes).capitalize()}.")
+        if missing := _missing_phase(evidence, tiling):
+            raise ScanError(f"the scan shows no {missing}: every voxel is on one side")
+    found = lower(evidence, trial, tiling, store=store, workers=workers, progress=progress)
+    if not probabilities and weight is None and not _explains(evidence, found.mask, tiling):
+        trial, said = replace(trial, law=None), "no prior helps here, the first guess explains the scan better: "
+        found = lower(evidence, trial, tiling)
     return Segmentation.of(
-        frame, found.mask, found.phase, trial.law, tiling.place.epsilon, notes,
-        weight=weight, status=f"{gain}{flow_summary(found)}",
+        boxes.frame, found.mask, found.phase, trial.law, tiling.place.epsilon, (*notes, *tiling.place.notes),
+        weight=None if trial.law is None else trial.strength * BENDING / bending(trial.law),
+        status=f"{said}{flow_summary(found)}",
     )  # fmt: skip
 
 
+def check_given(
+    probabilities: bool | str, weight: float | None, example: object, threshold: float | str, dark: bool
+) -> None:
+    """Raise ScanError where options of `segment` do not go together, or are out of range."""
+    check_options("image", threshold)
+    if weight is not None:
+        check_float(weight, "a positive weight", *WEIGHTS)
+    if not probabilities:
+        if example is not None:
+            raise ScanError("an example goes with a network's probabilities, not with grey levels")
+        return
+    if probabilities not in (True, "logits"):
+        raise ScanError(f"probabilities must be True, False or 'logits', got {quoted(probabilities)}")
+    if threshold != "otsu" or dark:
+        raise ScanError("a threshold and dark split grey levels: leave them out for probabilities")
+    if (example is None) == (weight is None):
+        got = "neither" if weight is None else "both"
+        raise ScanError(f"give probabilities an example, on which law and weight are judged, or a weight, got {got}")
+
+
+def lower(evidence: VolumeEvidence, trial: Trial, tiling: Tiling, **tools: Any) -> LoweredVolume:
+    """Lower -log p(data | mask) + λ F_ε from the evidence's first guess, tile by tile, with the `tools` of
+    `lower_volume`.
+
+    `trial` has the law and λ, in nats of a unit of F_ε if a20 + a02 = 2. The first guess is the result where there is
+    no law, or no surface.
+    """
+    stays = trial.law is not None and _missing_phase(evidence, tiling)
+    return lower_volume(EvidenceProblem(replace(trial, law=None) if stays else trial, evidence), tiling, **tools)
+
+
 @dataclass(frozen=True, eq=False)
-class _GreyEvidence:
-    """The evidence of a box of grey levels, clipped to bounds, with known classes."""
+class EvidenceProblem(Problem):
+    """The evidence of a volume, and a law whose strength is in nats of a unit of F_ε."""
 
-    boxes: Boxes
-    bounds: tuple[float, float]
-    classes: Classes
-
-    def __call__(self, box: Box) -> VoxelEvidence:
-        values = self.boxes.part(box).astype(np.float32).clip(*self.bounds)
-        return grey_evidence(values, self.boxes.frame, self.classes)
-
-
-@dataclass(frozen=True, eq=False)
-class ScanProblem(Problem):
-    """A scan's evidence, and a law whose strength is in nats of a unit of F_ε."""
-
-    evidence: _GreyEvidence
+    evidence: VolumeEvidence
 
     @property
     def inputs(self) -> dict[str, object]:
-        evidence = self.evidence
-        return {"scan": evidence.boxes.digest, "evidence": str(evidence.classes), "nats": self.trial.strength}
+        return {"evidence": self.evidence.digest, "nats": self.trial.strength}
 
     def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Evidence]:
-        evidence = self.evidence(box)
-        return evidence.level, likelihood(evidence, self.trial.strength, place)
+        evidence = self.evidence.of_box(box)
+        return evidence.level, likelihood(evidence, self.trial.strength or 1.0, place)  # no law has no strength
 
     def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
-        return place.to_scan(initial_field(level, place))
+        return np.clip(2 * level, -1, 1)  # the level of probabilities is p - 1/2, of grey levels in contrasts
 
 
-def _check_phases(evidence: _GreyEvidence, tiling: Tiling) -> None:
-    """Raise ScanError where the first guess has one phase only; stop at the first tiles that have both."""
+def _explains(evidence: VolumeEvidence, mask: np.ndarray, tiling: Tiling) -> bool:
+    """Return whether a mask explains the scan nearly as well as the first guess does: so it is, unless thin structures
+    got lost, since the energy is lowered together with -log p."""
+    sums = np.zeros(2)
+    for tile in tiling.tiles:
+        found = evidence.of_box(tile.core)
+        sums += [float(found.ratio[inside].sum(dtype=np.float64)) for inside in (mask[tile.core], found.level > 0)]
+    return bool(sums[0] >= KEPT * sums[1])
+
+
+def _missing_phase(evidence: VolumeEvidence, tiling: Tiling) -> str:
+    """Return which phase the first guess lacks, or nothing; the first tiles that have both end the search."""
     seen: set[bool] = set()
     for tile in tiling.tiles:
-        inside = evidence(tile.core).level > 0
+        inside = evidence.of_box(tile.core).level > 0
         seen |= {bool(inside.any()), bool(inside.all())}
         if len(seen) == 2:
-            return
-    raise ScanError(f"the scan shows no {'background' if True in seen else 'structure'}: every voxel is on one side")
+            return ""
+    return "background" if True in seen else "structure"
 
 
-def _describe_gain(trial: Trial, fitted: bool) -> str:
-    """Say which law was chosen, and what it gains, as the beginning of a sentence."""
-    share = f"{100 * trial.score:+.2g} ± {100 * trial.noise:.2g} % of the voxels left out are on their side"
-    if trial.law is None:
-        return f"no prior helps here: with the best {share}"
-    law = "the prior helps" if fitted else "the Willmore energy helps, more than the prior"
-    return f"{law}, at {trial.strength:g} nats: {share}"
+# ---- an example ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The law and weight that an example chose for a network's probabilities.
+
+    `trial` has the law, its strength in nats of a unit of F_ε (or p > 1/2), and the Dice of both; `fitted` says whether
+    the law is one of the prior's, rather than the Willmore energy. Others than the `example`'s probabilities must have
+    its voxel size; `notes` are on the origin of the prior.
+    """
+
+    trial: Trial
+    fitted: bool
+    example: Field
+    notes: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        best = self.trial
+        if best.law is None:
+            return f"no prior helps here: Dice {best.plain:.3f} on the example, {best.score:.3f} with the best prior"
+        name = "the prior helps" if self.fitted else "the Willmore energy helps, more than the prior"
+        gain = f"{best.score:.3f} on the example, {best.plain:.3f} without, ± {best.noise:.3f}"
+        return f"{name}, at {best.strength:g} nats: Dice {gain}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the choice and its gain, for a record."""
+        best = self.trial
+        return {
+            "law": None if best.law is None else "prior" if self.fitted else "Willmore",
+            "nats": None if best.law is None else best.strength,
+            "dice": best.score,
+            "dice_without": best.plain,
+            "noise": best.noise,
+        }
+
+
+def calibrate(
+    probabilities: Source,
+    mask: Source,
+    prior: LawLike | None = None,
+    *,
+    label: int | None = None,
+    epsilon: float | None = None,
+    steps: int = STEPS,
+    progress: Progress = silent,
+    **reading: Any,
+) -> Calibration:
+    """Choose the law and weight that bring a network's probabilities nearest to a true mask, for `segment`.
+
+    The laws that a fit trusts and the Willmore energy are tried at weights over decades, on the part of 96³ voxels that
+    holds most of the surface. Where none has a better Dice than p > 1/2 beyond the noise, the choice is p > 1/2.
+
+    `label` is the value of the structure in the mask. See `segment` for the other parameters, and for errors.
+    """
+    field = load_probabilities(probabilities, **reading)
+    placed = {} if isinstance(mask, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
+    truth, laid = lay(field_of(mask, label=label, **placed), field, "the mask", "the probabilities", exact=True)
+    inside = require_labels(truth.values, "the example") > 0
+    if inside.all() or not inside.any():
+        state = "full" if inside.all() else "empty"
+        raise ScanError(f"the example must have voxels inside and outside, but is {state}")
+    laws, notes = laws_of(infer_law(truth, progress) if prior is None else prior, field)
+    tried = laws if WILLMORE in laws else (*laws, WILLMORE)
+    for law in tried:
+        bending(law)  # refuses a law before the work
+    probability_evidence(field)  # refuses values outside [0, 1] beyond the part, too
+    where = box_with_most_surface(inside, EDGE)
+    part = replace(field, values=field.values[where])
+    tiling = Tiling.of(part, epsilon)
+    count, expected = 0, 2 * len(tried) + 3
+
+    def fill(evidence: VolumeEvidence, trial: Trial) -> np.ndarray:
+        nonlocal count
+        count += 1
+        progress("trying the prior out", min(count / expected, 1.0))
+        try:
+            return lower(evidence, trial, tiling).mask
+        except ScanError:  # the energy does not stay finite
+            return np.zeros(part.shape, dtype=bool)
+
+    task = Task(probability_evidence(part), inside[where], range(part.shape[0]))
+    best = choose_by_masks(task, [Trial(law, FIRST, steps) for law in tried], fill, NATS)
+    return Calibration(best, best.law in laws, field, (*notes, *truth.notes, *laid))
+
+
+def infer_law(mask: Field, progress: Progress) -> LawLike:
+    """Infer the law of a mask in seconds, without growing anything."""
+    from curvafit.inference.infer import infer  # takes long to import
+
+    return infer(mask, kind="mask", fast=True, progress=progress)

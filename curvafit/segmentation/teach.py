@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
-from abc import ABC, abstractmethod
+from abc import ABC
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -125,51 +125,17 @@ class Mix:
     partial: float = 0.15
 
 
-def draw_window(
-    sources: Sequence[Sequence[Texture]],
-    mix: Mix,
-    rng: np.random.Generator,
-    axes: Sequence[np.ndarray],
-    thinnest: float = 0.0,
-) -> np.ndarray:
-    """Return a window, bool (Z, Y, X), at places along three axes, of one shape or of two, or turned inside out.
-
-    Each source is drawn as often as the others. Structures are at least `thinnest`, if the mix has such thick ones.
-    """
-
-    def cut() -> np.ndarray:
-        textures = sources[int(rng.integers(len(sources)))]
-        texture = textures[int(rng.integers(len(textures)))]
-        low, high = mix.thickness
-        low = min(max(low, thinnest), high)
-        thickness = float(np.exp(rng.uniform(math.log(low), math.log(high))))
-        return texture.cut(rng, axes, thickness, mix)
-
-    inside = cut()
-    if rng.random() < mix.pairs:
-        inside |= cut()
-    return ~inside if rng.random() < mix.holes else inside
-
-
 class Batches(Dataset, ABC):
-    """Batches of lessons, `length` of them, and what a network is to lower on each."""
+    """Batches of gaps to fill, `length` of them; of a window only what is `halo` pixels from its border counts."""
 
     length: int
+    halo: int
 
     def __len__(self) -> int:
         return self.length
 
-    @abstractmethod
-    def loss(self, network: nn.Module, lesson: Any) -> Tensor:
-        """Return the loss of a network on a batch."""
-
-
-class GapBatches(Batches):
-    """Batches of gaps to fill; of a window only what is `halo` pixels from its border counts."""
-
-    halo: int
-
     def loss(self, network: nn.Module, lesson: Lesson) -> Tensor:
+        """Return the loss of a network on a batch."""
         *given, truth = lesson
         return F.binary_cross_entropy_with_logits(network(Gaps(*given))[self.inner], truth[self.inner])  # type: ignore[arg-type,index]
 
@@ -180,7 +146,7 @@ class GapBatches(Batches):
 
 
 @dataclass(frozen=True, eq=False)
-class Lessons(GapBatches):
+class Lessons(Batches):
     """Batches of gaps to fill, the same for ever for a seed: batch k depends on (seed, k) alone.
 
     Attributes
@@ -222,7 +188,19 @@ class Lessons(GapBatches):
         """Return slices of a structure, bool (count + 4, Y, X): two known, those to fill, two known."""
         plane = np.arange(self.edge + 2 * self.halo, dtype=np.float64)
         heights = step * np.array([-count - 1, *range(count + 2), 2 * count + 2], dtype=np.float64)
-        return draw_window(self.sources, self.mix, rng, (heights, plane, plane), step * (count + 1) / SLIMMEST)
+        thinnest, mix = step * (count + 1) / SLIMMEST, self.mix
+
+        def cut() -> np.ndarray:
+            textures = self.sources[int(rng.integers(len(self.sources)))]
+            texture = textures[int(rng.integers(len(textures)))]
+            low, high = mix.thickness
+            thickness = float(np.exp(rng.uniform(math.log(min(max(low, thinnest), high)), math.log(high))))
+            return texture.cut(rng, (heights, plane, plane), thickness, mix)
+
+        inside = cut()
+        if rng.random() < mix.pairs:
+            inside |= cut()
+        return ~inside if rng.random() < mix.holes else inside
 
     def _pose(
         self, rng: np.random.Generator, window: np.ndarray, step: float
@@ -325,7 +303,7 @@ class Whole:
 
 
 @dataclass(frozen=True, eq=False)
-class WholeLessons(GapBatches):
+class WholeLessons(Batches):
     """Batches of gaps in volumes that are known whole, a batch of one volume; batch k depends on (seed, k) alone.
 
     Without evidence gaps are shorter or longer by one slice, and begin anywhere.
@@ -416,14 +394,6 @@ def learn(
     return [float(np.mean(losses[k : k + 100])) for k in range(0, total, 100)]
 
 
-def hold_out(sources: Sequence[Sequence[Texture]]) -> tuple[list[list[Texture]], list[Texture]]:
-    """Return the shapes that teach, by source, and every tenth, which judges; ValueError if a source is empty."""
-    if not sources or not all(sources):
-        raise ValueError("expected sources with one shape or more to teach with")
-    held = [texture for source in sources for texture in source[HELD_OUT - 1 :: HELD_OUT]] or [sources[-1][-1]]
-    return [[texture for texture in source if texture not in held] or list(source) for source in sources], held
-
-
 def teach(
     sources: Sequence[Sequence[Texture]],
     card: dict[str, Any],
@@ -451,23 +421,32 @@ def teach(
     Raises ValueError if a source is empty, or an argument is out of range.
     """
     steps, seed = check_int(steps, "a number of steps from 1", 1, 10**7), check_seed(seed)
-    taught, held = hold_out(sources)
+    if not sources or not all(sources):
+        raise ValueError("expected sources with one shape or more to teach with")
+    held = [texture for source in sources for texture in source[HELD_OUT - 1 :: HELD_OUT]] or [sources[-1][-1]]
+    taught = [[texture for texture in source if texture not in held] or list(source) for source in sources]
     mix = mix or Mix()
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         filler = Filler()
-    lessons = Lessons(taught, mix, seed, steps)
-    losses = learn(
-        filler, lessons, RATE, checkpoint=checkpoint, workers=workers, progress=sub_progress(progress, 0, 0.97)
-    )
-    temperatures, figures, error = judge(filler, Lessons([held], replace(mix, partial=0.0), seed + 1, JUDGED))
+    said = {"shapes": sum(map(len, taught)), "held_out": len(held), "steps": steps, "seed": seed, "mix": asdict(mix)}
+    lessons, exam = Lessons(taught, mix, seed, steps), Lessons([held], replace(mix, partial=0.0), seed + 1, JUDGED)
+    tools = {"checkpoint": checkpoint, "workers": workers, "progress": progress}
+    return learn_and_judge(filler, lessons, exam, {**card, **said}, **tools)  # type: ignore[arg-type]
+
+
+def learn_and_judge(
+    filler: Filler, lessons: Batches, exam: Batches, card: dict[str, Any], progress: Progress, **tools: Any
+) -> Taught:
+    """Teach a filler by lessons, judge it by an exam on shapes held out, and write both on its card."""
+    losses = learn(filler, lessons, RATE, progress=sub_progress(progress, 0.0, 0.97), **tools)
+    temperatures, figures, error = judge(filler, exam)
     progress("judging on shapes held out", 1.0)
-    told = {"shapes": sum(map(len, taught)), "held_out": len(held), "steps": steps, "seed": seed, "mix": asdict(mix)}
-    return Taught(filler, temperatures, {**card, **told, "losses": losses, **figures}, error)
+    return Taught(filler, temperatures, {**card, "losses": losses, **figures}, error)
 
 
 @torch.inference_mode()
-def judge(filler: Filler, lessons: GapBatches) -> tuple[np.ndarray, dict[str, float], float]:
+def judge(filler: Filler, lessons: Batches) -> tuple[np.ndarray, dict[str, float], float]:
     """Return temperatures (2, k) by gap; the cross entropy of held-out lessons and that of the cubic alone; and the
     calibration error near surfaces, where a temperature is of another half of the lessons.
     """
@@ -519,9 +498,8 @@ def tune(taught: Taught, example: Example, progress: Progress = silent) -> Taugh
     logits = torch.from_numpy(volumes[better]).flatten()
     answer = torch.from_numpy(truth).float().flatten()
     temperature = fit_temperature(logits.numpy(), answer.numpy())
-    scores = (
-        f"Dice {dice_of(before.sum(0)):.3f} on a part of the example, {dice_of(after.sum(0)):.3f} tuned on the rest"
-    )
+    plain, better_dice = (float(dice_of(each.sum(0))) for each in (before, after))
+    scores = f"Dice {plain:.3f} on a part of the example, {better_dice:.3f} tuned on the rest"
     return replace(
         tuned if better else taught,
         temperatures=taught.temperatures * [[1.0], [temperature]],

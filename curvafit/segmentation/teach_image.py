@@ -18,7 +18,7 @@ from curvafit.data_synth.imaging.modality import MODALITIES
 from curvafit.segmentation.filler import REACH, Filler, Raster, Taught
 from curvafit.segmentation.image import read_image
 from curvafit.segmentation.slices import Slices
-from curvafit.segmentation.teach import HALO, HELD_OUT, JUDGED, RATE, Texture, Whole, WholeLessons, judge, learn
+from curvafit.segmentation.teach import HALO, HELD_OUT, JUDGED, Texture, Whole, WholeLessons, learn_and_judge
 
 #: Steps of teaching, and volumes that teach.
 STEPS, VOLUMES = 1500, 160
@@ -32,16 +32,9 @@ FILLED = (0.01, 0.9)
 class ImageMix:
     """How imaged shapes are drawn; lengths in pixels, shares from 0 to 1.
 
-    Attributes
-    ----------
-    thickness
-        Interval of the structures' thickness, uniform in the logarithm; thick where a slice would be too many voxels.
-    gap, longest
-        Interval of the slices from a known one to the next, and the most pixels between them.
-    edge, gaps
-        Pixels of a slice's side, and gaps of a volume.
-    noisy, noise
-        Share of images with noise besides the modality's, and interval of its deviation, in contrasts.
+    Intervals of the structures' `thickness` (uniform in the logarithm; thick where a slice would be too many voxels)
+    and of the slices from a known one to the next, `gap`, at most `longest` pixels; a slice's side and gaps of a
+    volume; the share of images with noise besides the modality's, and the interval of its deviation, in contrasts.
     """
 
     thickness: tuple[float, float] = (3.0, 14.0)
@@ -127,10 +120,7 @@ def teach_image(
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         filler = Filler.with_image(plain.filler)
-    lessons = WholeLessons(wholes[:volumes], steps, seed)
-    step = sub_progress(progress, 0.3, 0.97)
-    losses = learn(filler, lessons, RATE, checkpoint=checkpoint, workers=workers, progress=step)
-    temperatures, figures, error = judge(filler, WholeLessons(wholes[volumes:], JUDGED, seed + 1))
-    progress("judging on shapes held out", 1.0)
-    told = {"plain": plain.card, "volumes": volumes, "steps": steps, "seed": seed, "mix": asdict(mix)}
-    return Taught(filler, temperatures, {**card, **told, "losses": losses, **figures}, error)
+    lessons, exam = WholeLessons(wholes[:volumes], steps, seed), WholeLessons(wholes[volumes:], JUDGED, seed + 1)
+    said = {"plain": plain.card, "volumes": volumes, "steps": steps, "seed": seed, "mix": asdict(mix)}
+    tools = {"checkpoint": checkpoint, "workers": workers, "progress": sub_progress(progress, 0.3, 1.0)}
+    return learn_and_judge(filler, lessons, exam, {**card, **said}, **tools)  # type: ignore[arg-type]

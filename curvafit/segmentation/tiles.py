@@ -29,7 +29,7 @@ from curvafit.generation.data import Data
 from curvafit.priors.grid import MOST
 from curvafit.priors.kernels.threads import one_thread
 from curvafit.scan.pieces import RUN, lock_store
-from curvafit.segmentation.engine import HALO, Ends, WorkingGrid, lower_energy
+from curvafit.segmentation.flow import HALO, Ends, WorkingGrid, lower_energy
 from curvafit.segmentation.trials import Trial
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.part import Box, within
@@ -46,18 +46,10 @@ _MASK, _PHASE = "mask.npy", "phase.npy"
 
 @dataclass(frozen=True)
 class Tile:
-    """A part of a volume.
+    """A part of a volume: its number, its core, whose result it gives, and the box in which the energy is lowered.
 
-    Attributes
-    ----------
-    number
-        Its number, from 0.
-    core
-        The voxels whose result the tile gives.
-    box
-        The core with its overlap: where the energy is lowered. In a periodic volume it may go beyond the ends.
-    ends
-        Whether the box ends where the volume does, on either side of each axis.
+    The box is the core with its overlap; in a periodic volume it may go beyond the ends. `ends` says of either side of
+    each axis whether the box ends where the volume does.
     """
 
     number: int

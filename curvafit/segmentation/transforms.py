@@ -27,16 +27,14 @@ class FillSlicesd(MapTransform):
     ----------
     keys, allow_missing_keys
         Which entries of the dictionary are labels, as in MONAI.
-    every, first, known, ignore, axis
-        Which slices are annotated, as in `reconstruct`. The axis across them is counted without the channel: for a
-        NIfTI file that `LoadImaged` reads, slices along its last axis are across axis 2.
     soft
         Whether the label becomes the probability, float32, of what is positive in it.
     sure, ignored
         Where a label is less probable than `sure`, it becomes `ignored`, by default the highest label + 1. Give it
         where some volumes lack the highest label.
     options
-        Further ones of `reconstruct`, such as `careful` and `filler`.
+        Those of `reconstruct`: every, known, ignore, axis and others. The axis across the slices is counted without the
+        channel: for a NIfTI file that `LoadImaged` reads, slices along its last axis are across axis 2.
 
     Raises
     ------
@@ -48,11 +46,6 @@ class FillSlicesd(MapTransform):
         self,
         keys: Hashable | Sequence[Hashable],
         *,
-        every: int | None = None,
-        first: int = 0,
-        known: Sequence[int] | None = None,
-        ignore: int | None = None,
-        axis: int = 0,
         soft: bool = False,
         sure: float | None = None,
         ignored: int | None = None,
@@ -63,7 +56,7 @@ class FillSlicesd(MapTransform):
         if soft and sure is not None:
             raise ValueError("give either soft or sure: probabilities, or labels where they are sure")
         self.soft, self.sure, self.ignored = soft, sure, ignored
-        self.options = {"every": every, "first": first, "known": known, "ignore": ignore, "axis": axis, **options}
+        self.options = options
 
     def __call__(self, data: Mapping[Hashable, Any]) -> dict[Hashable, Any]:
         """Return the dictionary with its labels filled."""

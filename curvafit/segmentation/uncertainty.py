@@ -163,16 +163,8 @@ def _with_constant(evidence: np.ndarray) -> np.ndarray:
 def suggest_slices(entropies: np.ndarray, places: Sequence[int], count: int, periodic: bool = False) -> tuple[int, ...]:
     """Return the slices to annotate next, the most telling first, each chosen as if those before it were known.
 
-    There are fewer where no other slice would tell anything.
-
-    Parameters
-    ----------
-    entropies
-        The entropy of each slice, in nats, (Z,).
-    places
-        The numbers of the known slices.
-    periodic
-        Whether the last slice is followed by the first.
+    `entropies` are those of the slices (Z,), `places` the known ones. There are fewer where no other would tell
+    anything.
     """
     known, left = set(places), np.asarray(entropies, dtype=np.float64)
     chosen: list[int] = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -38,6 +37,7 @@ def grey(noise: float = 40) -> np.ndarray:
     return values.clip(0, 255).astype(np.uint8)
 
 
+EXAMPLE = ("--probabilities", "--example", "p.npy", "--example-probabilities", "law.npy")
 #: What a header says of the place, whatever its unit is called.
 KEPT = [*(f"srow_{k}" for k in "xyz"), *(f"quatern_{k}" for k in "bcd"), *(f"qoffset_{k}" for k in "xyz")]
 KEPT += ["pixdim", "qform_code", "sform_code", "dim"]
@@ -178,111 +178,46 @@ def test_reconstruct_writes_what_is_uncertain(tmp_path: Path) -> None:
     refused(call(*told[:-1], tmp_path / "other.npy", "--suggest", 16), "slices")
 
 
-def test_reconstruct_writes_labels_to_train_with(oblique: Path, tmp_path: Path) -> None:
-    """Beside the mask, with its header to the bit, until it is filled again without them."""
-    labels, target = tmp_path / "labels.nii.gz", tmp_path / "out" / "volume.nii.gz"
-    header = nibabel.load(oblique).header.copy()
-    header.set_slope_inter(1, 0)  # type: ignore[attr-defined]
-    nibabel.save(nibabel.Nifti1Image(ball().astype(np.uint8).T, None, header), labels)
-    told = ("reconstruct", labels, "--every", 4, "-o", target)
-    result = call(*told, "--sure", 0.9)
-    assert result.exit_code == 0, (result.output, result.exception)
-    place = target.with_name("volume_sure.nii.gz")
-    sure, mask, chances = (np.asanyarray(nibabel.load(each).dataobj).T for each in  # type: ignore[attr-defined]
-                           (place, target, target.with_name("volume_probability.nii.gz")))  # fmt: skip
-    assert sure.dtype == np.uint8 and np.array_equal(sure[::4], ball()[::4])
-    assert np.array_equal(sure == 2, (chances < 0.9) & (chances > 1 - np.float32(0.9)))
-    assert np.array_equal(sure[sure < 2], mask[sure < 2]) and (sure == 2).any()
-    one, other = (nibabel.load(each).header for each in (labels, place))
-    assert all(one[name].tobytes() == other[name].tobytes() for name in KEPT)  # type: ignore[index]
-    record = json.loads((target.parent / "volume.json").read_text())
-    assert record["sure"] == 0.9 and place.name in record["files"]
-    assert "label to ignore, 2" in " ".join(result.stdout.split()) and str(place) in result.stdout
-    assert call(*told).exit_code == 0 and not place.exists()
-    (tmp_path / "other_sure.npy").write_text("mine")
-    refused(call(*told[:-1], tmp_path / "other.npy", "--sure", 0.9), "free")
-    refused(call(*told[:-1], tmp_path / "new.npy", "--sure", 0.4), "sure")
-    assert not list(tmp_path.glob("new*"))
-
-
-def test_a_picture_shows_the_slices(oblique: Path, tmp_path: Path) -> None:
-    from matplotlib.image import imread
-
-    assert call("segment", oblique, "--prior", "sponge", "--steps", 1, "-o", tmp_path / "m.npy").exit_code == 0
-    picture = imread(tmp_path / "m.png")
-    assert picture.shape[1] > 1000 and np.ptp(picture[..., 0] - picture[..., 2]) > 0.4  # grey, and an orange line
-
-
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
-        ("segment SCAN --prior tube", "preset"),
-        ("segment SCAN --prior none.json", "none.json"),
-        ("segment SCAN --prior fit.json --unit voxel", "--unit"),
-        ("segment SCAN --prior tubes --weight -1", "weight"),
-        ("segment SCAN --prior tubes --threshold low", "--threshold"),
-        ("segment SCAN --prior tubes --spacing 0", "--spacing"),
-        ("segment none.tif --prior tubes", "no such file"),
-        ("reconstruct SCAN --prior tubes", "every"),
-        ("reconstruct SCAN --prior tubes --every 4 --axis w", "--axis"),
-        ("reconstruct SCAN --prior tubes --known 1,a", "--known"),
-        ("reconstruct SCAN --every 4 --ignore 2", "--ignore"),
-        ("reconstruct SCAN --known 0,4 --first 2", "--first"),
+        ("segment grey.nii --prior tube", "preset"),
+        ("segment grey.nii --prior none.json", "none.json"),
+        ("segment grey.nii --prior fit.json --unit voxel", "--unit"),
+        ("segment grey.nii --threshold low", "--threshold"),
+        ("segment grey.nii --spacing 0", "--spacing"),
+        ("segment none.tif", "no such file"),
+        ("segment grey.nii --example ball.nii --example-probabilities ball.nii", "example"),
+        ("segment grey.nii --like ball.nii", "--like"),
+        ("reconstruct ball.nii --every 4 --axis w", "--axis"),
+        ("reconstruct ball.nii --known 1,a", "--known"),
+        ("reconstruct ball.nii --every 4 --ignore 2", "--ignore"),
+        ("reconstruct ball.nii --known 0,4 --first 2", "--first"),
         ("reconstruct ball.nii --every 4 --filler fit.json", "fit.json"),
-        ("reconstruct ball.nii --every 4 --filler none.npz", "none.npz"),
-        ("reconstruct ball.nii --ignore 7", "7"),
-        ("reconstruct ball.nii --prior tubes --known 6,14", "three"),
-        ("reconstruct ball.nii --every 4 --example small.npy", "spacing"),
-        ("reconstruct ball.nii --prior tubes --every 4 --stiffness 0", "stiffness"),
-        ("reconstruct SCAN --prior tubes --known 3,77", "19"),
+        ("reconstruct ball.nii --every 4 --example coarse.nii", "spacing"),
+        ("reconstruct ball.nii --every 4 --example other.nii", "spacing"),
+        ("reconstruct ball.nii --every 4 --labels all --example grey.nii", "example"),
+        ("reconstruct ball.nii --every 4 --filler version.npz", "version 2"),
+        ("reconstruct ball.nii --every 4 --filler cut.npz", "truncated"),
+        ("reconstruct ball.nii --every 4 --filler arrays.npz", "filler"),
+        ("reconstruct ball.nii --every 4 --filler lacks.npz", "slope"),
+        ("reconstruct ball.nii --every 4 --filler ball.nii", "something else"),
+        ("reconstruct many.nii --every 4 --labels all", "256"),
+        ("reconstruct grey.nii --every 4", "grey image"),
+        ("reconstruct levels.nii --every 4", "whole numbers"),
+        ("reconstruct empty.nii --every 4 --labels 1", "but not 1"),
+        ("reconstruct ball.nii --every 4 --sure 0.4", "sure"),
+        ("reconstruct ball.nii --every 4 --instances", "--image"),
+        ("reconstruct ball.nii --every 4 -o taken.nii", "free"),
+        ("reconstruct ball.nii --every 4 -o noted.nii", "free"),
+        ("reconstruct ball.nii --every 4 -o mapped.nii", "free"),
     ],
 )
-def test_wrong_input_is_a_sentence(arguments, word, oblique, tmp_path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "fit.json").write_text(made_fit().to_json())
-    np.save(tmp_path / "small.npy", np.linspace(0, 1, 125, dtype=np.float32).reshape(5, 5, 5))
-    save(Field(ball(), 0.02, "mm"), tmp_path / "ball.nii")
-    result = call(*(oblique if part == "SCAN" else part for part in arguments.split()), "-o", "m.nii.gz")
-    assert result.exit_code == 2, (result.output, result.exception)
-    last = result.stderr.strip().splitlines()[-1]
-    assert last.startswith("error: ") and word in last
-    assert not (tmp_path / "m.nii.gz").exists() and not list(tmp_path.glob(".m*"))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "word"),
-    [
-        ("ball.nii --example coarse.nii", "spacing"),
-        ("ball.nii --example other.nii", "spacing"),
-        ("ball.nii --labels all --example coarse.nii", "spacing"),
-        ("ball.nii --example grey.nii", "example"),
-        ("ball.nii --labels all --example grey.nii", "example"),
-        ("ball.nii --example empty.nii", "example"),
-        ("ball.nii --filler version.npz", "version 2"),
-        ("ball.nii --labels all --filler version.npz", "version 2"),
-        ("ball.nii --filler cut.npz", "truncated"),
-        ("ball.nii --filler arrays.npz", "filler"),
-        ("ball.nii --filler lacks.npz", "slope"),
-        ("ball.nii --filler ball.nii", "something else"),
-        ("many.nii", "256"),
-        ("many.nii --labels all", "256"),
-        ("grey.nii", "grey image"),
-        ("grey.nii --labels all", "grey image"),
-        ("levels.nii", "whole numbers"),
-        ("empty.nii", "empty"),
-        ("empty.nii --labels all", "other than 0"),
-        ("empty.nii --labels 1", "but not 1"),
-        ("ball.nii -o taken.nii", "free"),
-        ("ball.nii -o noted.nii", "free"),
-        ("ball.nii -o mapped.nii", "free"),
-        ("ball.nii -o ball.nii", "input"),
-    ],
-)
-def test_bad_slices_examples_and_fillers_are_a_sentence(arguments, word, bad_files, monkeypatch) -> None:
+def test_wrong_input_is_a_sentence_and_changes_no_file(arguments, word, bad_files, monkeypatch) -> None:
     monkeypatch.chdir(bad_files)
     before = {path: path.read_bytes() for path in bad_files.iterdir()}
-    words = [*arguments.split(), "--every", 4]
-    refused(call("reconstruct", *(words if "-o" in words else [*words, "-o", "m.nii"])), word, progress=True)
+    words = arguments.split()
+    refused(call(*(words if "-o" in words else [*words, "-o", "m.nii"])), word, progress=True)
     assert before == {path: path.read_bytes() for path in bad_files.iterdir()}
 
 
@@ -306,6 +241,7 @@ def bad_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     replace(FILLER_FILE, version=2).write(folder / "version.npz", header, arrays)
     FILLER_FILE.write(folder / "lacks.npz", header, {name: arrays[name] for name in arrays if name != "slope"})
     np.savez(folder / "arrays.npz", slope=np.ones(3))
+    (folder / "fit.json").write_text(made_fit().to_json())
     for name in ("taken.nii", "noted.json", "mapped_probability.nii"):
         (folder / name).write_text("mine")
     return folder
@@ -362,9 +298,9 @@ def test_places_that_cannot_be_written_are_refused_first(name, word, oblique, tm
     [
         (("segment", "g.npy", "--prior", "tubes"), "g.npy"),
         (("segment", "g.npy", "--prior", "tubes"), "link.npy"),
-        (("refine", "g.npy", "--example", "p.npy", "--example-probabilities", "law.npy"), "p.npy"),
-        (("refine", "g.npy", "--example", "p.npy", "--example-probabilities", "law.npy"), "law.npy"),
-        (("refine", "g.npy", "--prior", "tubes", "--weight", "1", "--like", "p.npy"), "p.npy"),
+        (("segment", "g.npy", *EXAMPLE), "p.npy"),
+        (("segment", "g.npy", *EXAMPLE), "law.npy"),
+        (("segment", "g.npy", "--logits", "--weight", "1", "--like", "p.npy"), "p.npy"),
         (("segment", "g.npy", "--prior", "mine.json"), "mine.npy"),
         (("segment", "g.npy", "--prior", "law.npy"), "law.npy"),
         (("segment", "slices", "--prior", "tubes"), "slices/1.tif"),
@@ -385,11 +321,3 @@ def test_no_input_is_written_over(arguments, target, tmp_path, monkeypatch) -> N
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     refused(call(*arguments, "-o", target), "input")
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-
-
-def test_steps_are_those_of_the_library() -> None:
-    from curvafit.cli import refine, segment
-    from curvafit.segmentation.engine import STEPS
-
-    for command in (segment.segment, segment.reconstruct, refine.refine):
-        assert inspect.signature(command).parameters["steps"].default == STEPS

@@ -94,8 +94,3 @@ def test_workers_without_dask_are_told_what_to_install(scan: Path, tmp_path: Pat
     assert result.exit_code == 2 and "pip install" in result.stderr
     assert not list(tmp_path.glob("*mask*"))
     assert call(*command(scan, tmp_path / "mask.npy", "--workers", 0)).exit_code == 0
-
-
-def test_a_tile_that_is_too_small_is_refused(scan: Path, tmp_path: Path) -> None:
-    refused(call(*command(scan, tmp_path / "mask.npy", "--tile", 7)), "--tile")
-    assert not list(tmp_path.glob("*mask*"))

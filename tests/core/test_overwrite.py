@@ -46,12 +46,12 @@ def commands(scan: Path) -> dict[str, list[object]]:
     return {
         "generate": ["generate", *QUICK, "--shape", 12, "--steps", 4],
         "segment": ["segment", *segmenting],
-        "refine": ["refine", *segmenting, "--weight", 1],
+        "probabilities": ["segment", *segmenting, "--weight", 1, "--probabilities"],
         "reconstruct": ["reconstruct", *segmenting, "--every", 4],
     }
 
 
-@pytest.mark.parametrize("command", ["generate", "segment", "refine", "reconstruct"])
+@pytest.mark.parametrize("command", ["generate", "segment", "probabilities", "reconstruct"])
 def test_a_command_replaces_its_own_output_alone(command: str, scan: Path, tmp_path: Path) -> None:
     """Not a thesis, an atlas, the volume of another command, nor a picture or a record of the same name."""
     words = [*commands(scan)[command], "-o"]

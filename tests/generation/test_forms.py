@@ -28,7 +28,7 @@ from curvafit.priors.profile import SIGMA, optimal_profile
 from curvafit.priors.stencils import gaussian_blur
 from curvafit.segmentation.evidence import probability_evidence
 from curvafit.segmentation.reconstruct import reconstruct
-from curvafit.segmentation.refine import refine
+from curvafit.segmentation.segment import segment
 from curvafit.volumes.field import Field
 
 boundaries = pytest.mark.parametrize("boundary", ["periodic", "replicate"])
@@ -284,11 +284,11 @@ def test_evidence_counts_its_nats_once_whatever_the_volume_of_a_part(epsilon: fl
         gained.append(ends[1] - ends[0])
         return descend(start, law, grid, data=data, **options)
 
-    monkeypatch.setattr(import_module("curvafit.segmentation.engine"), "descend", watched)
+    monkeypatch.setattr(import_module("curvafit.segmentation.flow"), "descend", watched)
     noise = np.random.default_rng(0).standard_normal(SHAPE)
     likely = Field((1 / (1 + np.exp(-DISTANCE - noise))).astype(np.float32), EDGES)
     law = Coefficients(1.5, 0.5, 2.5)
-    found = refine(likely, law, weight=0.3, epsilon=epsilon, steps=1)
+    found = segment(likely, law, weight=0.3, probabilities=True, epsilon=epsilon, steps=1)
     assert found.epsilon == epsilon
     nats = float(probability_evidence(likely).ratio.sum(dtype=np.float64))
     assert 0.3 * 2 * gained[0] == pytest.approx(nats, rel=1e-4)  # λ times the stiffness, 0.3 (1.5 + 2.5) / 2

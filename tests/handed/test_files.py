@@ -251,10 +251,10 @@ def nearly_whole(folder: Path) -> None:
         curvafit.measure_instances(labels * 1.1)
     likely = 1 / (1 + np.exp((z - 6) ** 2 + (y - 7) ** 2 + (x - 8) ** 2 - 20.0))
     stray = likely + np.where(z == 0, -1e-4, 0) + np.where((z == 6) & (y == 7), 1e-4, 0)
-    masks = [curvafit.refine(each, "tubes", weight=0.1).mask.values for each in (likely, stray)]
+    masks = [curvafit.segment(each, "tubes", weight=0.1, probabilities=True).mask.values for each in (likely, stray)]
     assert np.count_nonzero(masks[0] != masks[1]) <= 2
     with pytest.raises(ScanError, match=r"\[0, 1\]"):
-        curvafit.refine(likely * 1.01, "tubes", weight=0.1)
+        curvafit.segment(likely * 1.01, "tubes", weight=0.1, probabilities=True)
 
 
 CASES = (large_ids, a_unit_for_each_axis, a_calibration, mrc_bytes, times, odd_dicom, odd_slices, units_nobody_knows)

@@ -16,7 +16,7 @@ from shapes import grown
 
 from curvafit.core.workers import cluster
 from curvafit.segmentation import blocks
-from curvafit.segmentation.blocks import fits_blocks, reconstruct_file
+from curvafit.segmentation.blocks import reconstruct_file
 from curvafit.segmentation.filler import Raster, Taught, fill_gaps
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.result import write_mask
@@ -141,11 +141,6 @@ def test_labels_of_an_image_are_those_of_the_whole(labels: Path, tmp_path: Path,
     )
 
 
-def test_only_a_large_volume_into_zarr_is_filled_in_blocks(tmp_path: Path) -> None:
-    assert fits_blocks("mask.zarr", (257, 9, 9), None) and fits_blocks("mask.ome.zarr", (9, 9, 9), 64)
-    assert not fits_blocks("mask.zarr", (256, 256, 256), None) and not fits_blocks("mask.nii.gz", (999, 9, 9), 64)
-
-
 # ---- workers, kills --------------------------------------------------------------------------------------------------
 
 
@@ -226,10 +221,3 @@ def test_bad_input_ends_in_one_sentence_and_leaves_nothing(labels: Path, tmp_pat
             progress=True,
         )
     assert sorted(path.name for path in tmp_path.iterdir()) == there
-
-
-def test_a_missing_chunk_is_said(tmp_path: Path) -> None:
-    save(Field(texture()), tmp_path / "labels.zarr")
-    (tmp_path / "labels.zarr/0/c/1/0/0").unlink()
-    found = reconstruct_file(tmp_path / "labels.zarr", tmp_path / "mask.zarr", every=8, tile=64)
-    assert any("1 of 4 chunks" in note for note in found.notes)

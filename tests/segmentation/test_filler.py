@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy import ndimage
 
 import curvafit.segmentation.filler as room
 from curvafit.segmentation.filler import (
@@ -19,7 +18,6 @@ from curvafit.segmentation.filler import (
     Raster,
     Taught,
     fill,
-    fill_gaps,
     interpolate,
     plane_thickness,
 )
@@ -94,15 +92,6 @@ def test_a_volume_that_repeats_may_begin_anywhere() -> None:
     np.testing.assert_allclose(np.roll(turned, -12, 0), found, atol=1e-5)
 
 
-def test_mirror_images_are_filled_alike_where_all_are_averaged() -> None:
-    """Slices are a multiple of four pixels wide, so that the coarser pixels lie alike."""
-    mask, taught = leaning()[:, :36, 1:], stirred()
-    found = fill(known(mask), taught, careful=True)
-    for axis in range(3):
-        mirrored = fill(known(np.flip(mask, axis).copy()), taught, careful=True)
-        np.testing.assert_allclose(np.flip(mirrored, axis), found, atol=2e-4)
-
-
 def test_a_unit_of_length_changes_nothing() -> None:
     mask, taught = leaning(), stirred()
     np.testing.assert_allclose(fill(known(mask, spacing=(0.3,) * 3), taught), fill(known(mask), taught), atol=1e-4)
@@ -159,24 +148,6 @@ def test_what_is_known_in_a_slice_to_fill_reaches_the_network_and_stays() -> Non
     assert np.array_equal(raster.marks(marks[:1])[0, REACH + 36 : REACH + 38, REACH : REACH + 37], marks[0, [18, 18]])
 
 
-@pytest.mark.parametrize(
-    ("thickness", "spacing"), [(4.0, EDGES), (1.2, EDGES), (3.0, (3.0, 1.0, 1.7)), (14.0, (2.0, 1.0, 1.0))]
-)
-def test_a_core_is_filled_as_in_the_whole(thickness: float, spacing: tuple[float, float, float]) -> None:
-    """Pixels of a core are those of the whole, of any size: what differs is the order of sums in convolutions."""
-    noise = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal((17, 121, 96)), thickness)
-    marks = np.zeros(noise.shape, np.int8)
-    marks[:, 20:60, 31] = np.where(noise[:, 20:60, 31] > 0, 1, -1)
-    slices, taught = replace(known(noise > 0.3 * noise.std(), spacing=spacing), marks=marks), stirred()
-    whole, raster = fill(slices, taught), Raster.of(slices)
-    for core in ((slice(51, 102), slice(0, 32)), (slice(118, 121), slice(33, 96))):
-        rows = []
-        for numbers, found in fill_gaps(slices, taught, replace(raster, core=core), slice(7, 13)):
-            assert np.abs(found - whole[(numbers, *core)]).max() < 1e-4
-            rows += numbers.tolist()
-        assert rows == [7, 8, 9, 10, 11]
-
-
 # ---- pixels ----------------------------------------------------------------------------------------------------------
 
 
@@ -219,31 +190,6 @@ def test_a_filler_comes_back_from_its_file(tmp_path: Path) -> None:
     other = Taught.load(tmp_path / "filler.npz")
     assert other.card == {"seed": 3} and other.error == 0.02 and other.temperature(10.0) == taught.temperature(10.0)
     assert np.array_equal(fill(known(leaning()), other), fill(known(leaning()), taught))
-
-
-def test_files_that_are_no_filler_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "filler.npz"
-    with pytest.raises(FileNotFoundError, match="missing"):
-        Taught.load(path)
-    path.write_bytes(b"PK nothing")
-    with pytest.raises(ValueError, match="damaged"):
-        Taught.load(path)
-    broken = stirred()
-    with torch.no_grad():
-        broken.filler.slope.fill_(float("nan"))
-    broken.save(path)
-    with pytest.raises(ValueError, match="finite"):
-        Taught.load(path)
-    room.FILLER_FILE.write(path, {"width": 9, "card": {}, "error": 0.0}, {"temperatures": np.ones((2, 2))})
-    with pytest.raises(ValueError, match="read"):
-        Taught.load(path)
-
-
-def test_the_packaged_filler_is_small_and_says_what_taught_it() -> None:
-    taught = Taught.load()
-    assert sum(weight.numel() for weight in taught.filler.parameters()) < 300_000
-    assert {"sources", "seed", "steps", "held_out_loss", "held_out_cubic"} <= taught.card.keys()
-    assert taught.card["held_out_loss"] < 0.9 * taught.card["held_out_cubic"] and taught.error < 0.03
 
 
 @pytest.mark.parametrize(

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from calling import call
 
 import curvafit.segmentation.image as room
 from curvafit.segmentation.filler import Filler, Gaps, Taught, fill
-from curvafit.segmentation.image import find_shift, read_image
+from curvafit.segmentation.image import read_image
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.teach import Texture
 from curvafit.segmentation.teach_image import ImageMix, image_shape, teach_image
 from curvafit.segmentation.trials import dice
 from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.write import save
 
 pytest.importorskip("sklearn", reason="reading an image needs scikit-learn")
 
@@ -55,36 +52,12 @@ def test_the_unit_of_grey_levels_changes_nothing() -> None:
     assert np.array_equal(once, other)
 
 
-def test_noise_alone_says_little() -> None:
-    mask = rods()
-    said = read_image(photograph(np.zeros_like(mask), 1.0), known(mask))[0]
-    assert (np.abs(said - np.log(mask.mean() / (1 - mask.mean()))) < 2.5).mean() > 0.9
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-def test_an_image_that_lies_off_the_slices_is_told(sign: int) -> None:
-    mask = rods()
-    image, slices = sign * photograph(mask, 1.0), known(mask)
-    assert find_shift(image, slices) == (0, 0)
-    assert find_shift(np.roll(image, (4, -3), (1, 2)), slices) == (4, -3)
-    for seed in range(5):
-        assert find_shift(photograph(np.zeros_like(mask), seed=seed), slices) == (0, 0)
-
-
 def test_slices_that_are_read_in_parts_are_read_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     mask = rods()
     whole = read_image(photograph(mask), known(mask))[0]
     monkeypatch.setattr(room, "HELD", 5 * 37 * 37)
     parts = read_image(photograph(mask), known(mask))[0]
     assert np.median(np.abs(parts - whole)) < 1e-6 and ((parts > 0) == (whole > 0)).mean() > 0.995
-
-
-def test_a_structure_in_one_slice_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room, "LEARNT", 50)
-    mask = np.zeros((25, 30, 30), bool)
-    mask[10:15, 12:16, 12:16] = True
-    said = read_image(photograph(mask, 0.1), known(mask))[0]
-    assert np.isfinite(said).all() and said[mask].mean() > said[~mask].mean() + 1
 
 
 # ---- filling ---------------------------------------------------------------------------------------------------------
@@ -187,16 +160,3 @@ def test_teaching_with_images_makes_a_filler_for_images() -> None:
 def test_what_no_image_can_be_is_refused(told: dict, word: str) -> None:
     with pytest.raises(ScanError, match=word):
         reconstruct(Field(rods().astype(np.uint8)), every=EVERY, **told)
-
-
-def test_the_command_reads_an_image_beside_the_labels(tmp_path: Path) -> None:
-    mask = rods()
-    save(Field(mask.astype(np.uint8), 0.5, "um"), tmp_path / "labels.nii.gz")
-    save(Field(photograph(mask), 0.5, "um"), tmp_path / "scan.nii.gz")
-    save(Field(photograph(mask)[:-1], 0.5, "um"), tmp_path / "short.nii.gz")
-    told = ("reconstruct", tmp_path / "labels.nii.gz", "--every", EVERY, "-o", tmp_path / "out.nii.gz", "--image")
-    for file, word in (("short.nii.gz", "shape"), ("labels.nii.gz", "grey"), ("none.nii.gz", "none.nii.gz")):
-        result = call(*told, tmp_path / file)
-        assert result.exit_code == 2 and word in result.stderr.strip().splitlines()[-1], result.stderr
-        assert not (tmp_path / "out.nii.gz").exists()
-    assert call(*told, tmp_path / "scan.nii.gz").exit_code == 0 and (tmp_path / "out.nii.gz").exists()

@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from pathlib import Path
-
 import numpy as np
 import pytest
-from calling import call, refused
 from skimage import measure
 
-from curvafit.segmentation.instances import are_instances, split_structure
-from curvafit.segmentation.reconstruct import reconstruct_labels
+from curvafit.segmentation.reconstruct import are_instances, reconstruct_labels, split_structure
 from curvafit.segmentation.trials import dice
-from curvafit.volumes.field import Field
-from curvafit.volumes.write import save
 
 EVERY = 6
 
@@ -95,29 +88,3 @@ def test_cells_with_their_image_are_each_one_piece_and_better() -> None:
     likely = told.probability.values
     assert likely.min() >= 0 and likely.max() <= 1 and (likely[::EVERY] == 1).all()
     assert likely[values == truth].mean() > likely[values != truth].mean() + 0.1
-
-
-@pytest.mark.parametrize("instances", [True, False])
-def test_what_is_done_is_said(instances: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of classes each is read by itself; an image that tells nothing is left out for instances too."""
-    pytest.importorskip("sklearn")
-    plane, _ = classes(True)
-    truth = np.where(np.arange(13)[:, None, None] > 3, plane[0], plane[0] > 0)
-    monkeypatch.setattr(import_module("curvafit.segmentation.reconstruct"), "TOLD", 2.0)
-    found = reconstruct_labels(truth, every=4, image=photograph(truth), instances=instances or None)
-    assert np.array_equal(found.labels.values, reconstruct_labels(truth, every=4).labels.values)  # type: ignore[union-attr]
-    assert any("left out" in note for note in found.notes) and not any("of one structure" in n for n in found.notes)
-    assert any("by itself" in note for note in found.notes) != instances
-
-
-def test_the_command_reads_instances(tmp_path: Path) -> None:
-    pytest.importorskip("sklearn")
-    scan, image, out = (tmp_path / f"{name}.nii.gz" for name in ("labels", "image", "out"))
-    truth = cells()[:13, :24]
-    save(Field(truth), scan)
-    save(Field(photograph(truth > 0)), image)
-    told = ("reconstruct", scan, "--every", EVERY, "-o", out)
-    refused(call(*told, "--labels", "all", "--instances"), "--image")
-    refused(call(*told, "--image", image, "--no-instances"), "--labels")
-    done = call(*told, "--labels", "all", "--image", image)
-    assert done.exit_code == 0 and "instances" in done.output

@@ -17,11 +17,11 @@ from found import made_fit
 from curvafit.inference.candidates import Candidate
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import preset
-from curvafit.segmentation.engine import TRUSTED, WorkingGrid, law_of, laws_of, normalise_bending
+from curvafit.segmentation.flow import WorkingGrid
 from curvafit.segmentation.reconstruct import MARGIN, STIFFNESS, reconstruct, reconstruct_labels
 from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.segmentation.trials import Example, dice, leave_out_slices
+from curvafit.segmentation.trials import TRUSTED, Example, dice, law_of, laws_of, leave_out_slices
 from curvafit.volumes.field import Field, ScanError
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -120,16 +120,6 @@ def test_an_example_is_cut_in_two() -> None:
     assert np.array_equal(example.task.truth, mask[[n for n in range(41) if n % 8], :, 42:]) and not example.notes
 
 
-def test_laws_are_tried_on_a_box_of_an_example(monkeypatch: pytest.MonkeyPatch) -> None:
-    mask = np.concatenate([pancakes(1, seed=2), pancakes(3, seed=3)], axis=2)
-    monkeypatch.setattr("curvafit.segmentation.trials.PART", 16)
-    part = Example.of(Field(mask.astype(np.uint8)), range(0, 33, 8), axis=0).part
-    assert part.given.shape[1:] == (16, 16) and part.truth.shape == (len(part.places), 16, 16)
-    monkeypatch.setattr("curvafit.segmentation.trials.LARGEST", 32)
-    smaller = Example.of(Field(mask.astype(np.uint8)), range(0, 33, 8), axis=0)
-    assert smaller.notes == ("Of the example 32 x 32 x 32 voxels are read, where most of its surface is.",)
-
-
 @pytest.mark.slow
 def test_an_example_tunes_the_network_where_that_is_better(monkeypatch: pytest.MonkeyPatch) -> None:
     """Discs that end between slices: the network cannot know where, and learns it from others."""
@@ -156,11 +146,6 @@ def test_a_halo_is_cut_off_again() -> None:
         assert float(shared.sum()) == pytest.approx(float(bare.spread(values, centre=0).sum()), rel=1e-5)
     whole = WorkingGrid.of(Field(values), None, halo=5, periodic=True)
     assert whole.grid.periodic and whole.grid.shape == values.shape
-
-
-def test_a_law_s_scale_does_not_matter_to_the_engine() -> None:
-    one, other = normalise_bending(WILLMORE), normalise_bending(WILLMORE.scale(7.5))
-    assert other.as_dict() == pytest.approx(one.as_dict()) and one.a20 + one.a02 == pytest.approx(2)
 
 
 # ---- the choice ------------------------------------------------------------------------------------------------------
@@ -192,11 +177,6 @@ def test_a_straight_tube_is_filled_exactly_and_no_law_helps() -> None:
     assert np.array_equal(found.mask.values, truth)
     assert found.status.startswith("no law helps here: Dice 1.000 on slices left out by the network")
     assert found.coefficients is None and np.array_equal(found.phase.values > 0, truth)
-
-
-def test_two_slices_are_enough_without_a_law() -> None:
-    found = reconstruct(straight(), known=[0, 23])
-    assert dice(found.mask.values, straight()) > 0.8 and found.status.startswith("filled by the network")
 
 
 def test_what_is_annotated_along_another_axis_is_kept_and_helps() -> None:
@@ -339,14 +319,6 @@ def test_empty_slices_in_the_rhythm_of_those_with_labels_are_known() -> None:
     assert not any("Slices" in note for note in reconstruct(drawn).notes)
 
 
-def test_more_slices_are_known_besides_every_so_many() -> None:
-    truth = leaning().astype(np.uint8)
-    both = reconstruct(truth, every=8, known=[5, 17]).mask.values
-    assert np.array_equal(both, reconstruct(truth, known=[0, 5, 8, 16, 17, 24]).mask.values)
-    whole = reconstruct(truth, every=1)
-    assert np.array_equal(whole.mask.values, truth > 0) and whole.uncertainty.expected_dice == 1  # type: ignore[union-attr]
-
-
 def test_labels_count_as_inside_and_what_is_extrapolated_is_said() -> None:
     truth = leaning()
     labels = np.where(truth, np.random.default_rng(0).integers(1, 200, truth.shape), 0).astype(np.float32)
@@ -360,16 +332,6 @@ def test_labels_count_as_inside_and_what_is_extrapolated_is_said() -> None:
     assert "after 1 step:" in found.status
     whole = reconstruct(Field(truth), WILLMORE, known=[0, 15, 31], steps=1, stiffness=1e7)
     assert not any("Beyond" in note for note in whole.notes)
-
-
-def test_slices_with_labels_that_are_not_among_the_known_ones_are_said() -> None:
-    truth = leaning().astype(np.uint8)
-    sparse = np.where(np.arange(len(truth))[:, None, None] % 5, 0, truth)
-    assert any("5, 10, 15, 20, …" in note for note in reconstruct(sparse, every=8).notes)
-    several = 3 * sparse
-    assert any("5, 10, 15, 20, …" in note for note in reconstruct_labels(several, every=8).notes)
-    for well in (reconstruct(sparse, every=5), reconstruct(truth, every=8), reconstruct(sparse, known=[0, 10])):
-        assert not any("labels" in note for note in well.notes)
 
 
 def test_slices_with_labels_are_known_unasked() -> None:
@@ -494,15 +456,6 @@ def test_bad_labels_are_refused(values: np.ndarray, options: dict, word: str) ->
         reconstruct_labels(values, **{"prior": WILLMORE, "every": 6, **QUICK, **options})
 
 
-def test_labels_that_were_not_chosen_may_be_any_number() -> None:
-    values = organelles().astype(np.int32)
-    values[:, :2] = 1000 + np.arange(values[:, :2].size).reshape(values[:, :2].shape)
-    found, plain = (reconstruct_labels(each, chosen=[2, 7], every=6) for each in (values, organelles()))
-    assert np.array_equal(found.mask.values[:, 2:], plain.mask.values[:, 2:])
-    with pytest.raises(ScanError, match="256 labels"):
-        reconstruct_labels(values, every=6)
-
-
 def test_the_command_writes_labels(tmp_path: Path) -> None:
     scan, out = tmp_path / "labels.nii.gz", tmp_path / "volume.nii.gz"
     image = nibabel.Nifti1Image(organelles().T, np.diag([0.5, 0.5, 0.5, 1]))
@@ -565,14 +518,6 @@ def test_labels_are_kept_where_they_are_sure() -> None:
     assert (one.keep_sure().values.dtype, several.keep_sure().values.dtype) == (np.uint8, np.uint8)
     high = segmentation([True, False], [1, 0.6], [255, 0]).keep_sure()
     assert high.values.dtype == np.uint16 and high.values.ravel().tolist() == [255, 256]
-
-
-@pytest.mark.parametrize("options", [{"least": 0.4}, {"least": 1.1}, {"least": math.nan}, {"ignored": 1}])
-def test_bounds_that_say_nothing_are_refused(options: dict) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        segmentation([True, False], [1, 0]).keep_sure(**options)
-    with pytest.raises(ValueError, match="probabilities"):
-        replace(segmentation([True, False], [1, 0]), uncertainty=None).keep_sure()
 
 
 def test_known_voxels_are_never_ignored() -> None:

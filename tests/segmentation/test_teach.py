@@ -24,9 +24,7 @@ from curvafit.segmentation.teach import (
     learn,
     load_textures,
     teach,
-    tune,
 )
-from curvafit.segmentation.trials import Example
 from curvafit.volumes.field import Field
 from curvafit.volumes.write import save
 
@@ -142,15 +140,6 @@ def test_teaching_lowers_the_loss_of_shapes_held_out(monkeypatch: pytest.MonkeyP
     assert card["held_out_loss"] < 0.9 * card["held_out_cubic"] and 0 <= taught.error < 0.2
     assert (card["shapes"], card["held_out"], card["steps"]) == (3, 1, 60)
     assert taught.temperatures.shape == (2, room.TEMPERATURES) and (np.diff(taught.temperatures[0]) >= 0).all()
-
-
-def test_what_an_example_does_not_better_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A straight tube: nothing can be better than the interpolation, and one step of tuning is worse or the same."""
-    monkeypatch.setattr(room, "TUNING", 1)
-    tube = np.broadcast_to(np.hypot(*(np.mgrid[:24, :36] - 11.3)) < 6, (25, 24, 36))
-    taught = Taught(Filler(4).eval(), np.array([[4.0, 16.0], [0.1, 0.1]]), {}, 0.02)  # as sure as it may be
-    found = tune(taught, Example.of(Field(tube | tube[:, :, ::-1]), range(0, 25, 6), 0))
-    assert found.filler is taught.filler and "1.000" in found.status and found.error < 0.05
 
 
 # ---- sources ---------------------------------------------------------------------------------------------------------

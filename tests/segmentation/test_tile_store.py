@@ -112,7 +112,7 @@ def test_tiles_of_another_run_are_refused(tmp_path: Path, more: dict, word: str)
         found(scan(), store, progress=killed_after(1, store))
     with pytest.raises(ValueError, match=word):
         found(scan(), store, **more)
-    with pytest.raises(ValueError, match="scan"):
+    with pytest.raises(ValueError, match="evidence"):
         found(scan()[::-1].copy(), store)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation import reconstruct, refine, segment
+from curvafit.segmentation import reconstruct, segment
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.tiles import EDGE, OVERLAP, WHOLE, Tiling
 from curvafit.volumes.field import Field
@@ -151,8 +151,10 @@ def test_a_tile_of_background_alone_stays_empty() -> None:
     mask = np.zeros((120, 16, 16), dtype=bool)
     mask[4:20, 4:12, 4:12] = True
     likely = Field(np.where(mask, 0.9, 0.1).astype(np.float32))
-    result = refine(likely, WILLMORE, weight=1.0, steps=50, tile=24)
+    result = segment(likely, WILLMORE, probabilities=True, weight=1.0, steps=50, tile=24)
     assert result.mask.values[:20].any() and not result.mask.values[30:].any()
     for value in (0.1, 0.9):
         plain = Field(np.full_like(likely.values, value))
-        assert (refine(plain, WILLMORE, weight=1.0, steps=50, tile=24).mask.values == (value > 0.5)).all()
+        assert (
+            segment(plain, WILLMORE, probabilities=True, weight=1.0, steps=50, tile=24).mask.values == (value > 0.5)
+        ).all()

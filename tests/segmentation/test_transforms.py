@@ -17,8 +17,8 @@ from curvafit.volumes.field import Field
 
 pytest.importorskip("monai", reason="needs monai, of the extra [dev]")
 
-from monai.data import CacheDataset, DataLoader, MetaTensor
-from monai.transforms import Compose, EnsureChannelFirstd, LoadImaged, RandSpatialCropd
+from monai.data import MetaTensor
+from monai.transforms import Compose, EnsureChannelFirstd, LoadImaged
 
 from curvafit.segmentation import FillSlicesd
 
@@ -89,26 +89,6 @@ def test_targets_are_soft_or_sure() -> None:
     assert np.array_equal(sure[0].numpy(), filled().keep_sure(0.8, 11).values)
 
 
-def test_arrays_and_tensors_stay_what_they_are() -> None:
-    mask = (organelles() == 2)[None]
-    one = FillSlicesd("label", every=6)({"label": mask, "image": 1})
-    other = FillSlicesd("label", every=6)({"label": torch.from_numpy(mask)})["label"]
-    assert isinstance(one["label"], np.ndarray) and one["image"] == 1 and type(other) is torch.Tensor
-    assert one["label"].dtype == np.uint8 and np.array_equal(one["label"], other) and one["label"][0, 3].any()
-    assert FillSlicesd(["label", "none"], every=6, allow_missing_keys=True)({"label": mask}).keys() == {"label"}
-
-
-def test_a_cache_fills_once_and_a_loader_makes_batches(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-    step = FillSlicesd("label", every=6)
-    monkeypatch.setattr(FillSlicesd, "_fill", lambda self, label, spacing: calls.append(1) or label[0])
-    chain = Compose([step, RandSpatialCropd("label", 8, random_size=False)])
-    data = CacheDataset([{"label": tensor(organelles())}], chain, num_workers=0, progress=False)
-    for _ in range(3):
-        (batch,) = DataLoader(data)
-    assert calls == [1] and batch["label"].shape == (1, 1, 8, 8, 8)
-
-
 @pytest.mark.parametrize(
     ("label", "word"),
     [
@@ -121,11 +101,6 @@ def test_a_cache_fills_once_and_a_loader_makes_batches(monkeypatch: pytest.Monke
 def test_what_is_no_label_is_refused(label: np.ndarray, word: str) -> None:
     with pytest.raises(ValueError, match=word):
         FillSlicesd("label", every=6)({"label": label})
-
-
-def test_soft_and_sure_exclude_each_other() -> None:
-    with pytest.raises(ValueError, match="soft"):
-        FillSlicesd("label", every=6, soft=True, sure=0.9)
 
 
 def test_without_monai_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -163,13 +163,6 @@ def test_the_best_threshold_has_the_best_expected_dice() -> None:
     assert found == pytest.approx(expected(found) / 2, abs=0.01)
 
 
-def test_what_is_certain_is_cut_in_the_middle_of_nothing() -> None:
-    certain = np.array([0.0, 0.0, 1.0, 1.0])
-    found = best_threshold(count_probabilities(certain))
-    assert 0 <= found <= 0.5 and np.array_equal(certain > found, certain == 1)
-    assert best_threshold(count_probabilities(np.zeros(4))) <= 0.5
-
-
 # ---- reconstruct -----------------------------------------------------------------------------------------------------
 
 
@@ -187,23 +180,11 @@ def test_a_reconstruction_says_how_sure_it_is() -> None:
     assert found.status.endswith(f"annotate next: {following[0]}, {following[1]}")
 
 
-def test_a_law_s_surface_counts_as_evidence() -> None:
-    """Weights are fitted to slices left out; without any to leave out they are the network's."""
-    mask = ball(32, 12.0)
-    tried = reconstruct(mask, WILLMORE, every=5, steps=30)
-    assert tried.probability is not None and tried.probability.values.max() <= 1
-
-
 def test_a_gap_that_is_left_is_suggested() -> None:
     mask = ball(24, 8.0)
     places = [n for n in range(24) if not 6 < n < 11]
     found = reconstruct(mask, known=places, suggest=1)
     assert found.uncertainty is not None and 6 < found.uncertainty.suggestions[0] < 11
-
-
-def test_more_suggestions_than_slices_are_refused() -> None:
-    with pytest.raises(ValueError, match="slices"):
-        reconstruct(ball(), every=8, suggest=29)
 
 
 # ---- suggestions -----------------------------------------------------------------------------------------------------
@@ -264,11 +245,3 @@ def test_the_expected_dice_is_that_of_truths_that_are_drawn() -> None:
     drawn = [random.random(likely.shape) < likely for _ in range(20)]
     found = [2 * (truth & mask).sum() / (truth.sum() + mask.sum()) for truth in drawn]
     assert expected_dice(likely, mask) == pytest.approx(np.mean(found), abs=2e-3)
-
-
-def test_slices_too_far_apart_are_said_to_be() -> None:
-    z, y, x = np.mgrid[:33, :40, :40]
-    specks = (np.sin(1.1 * z) * np.sin(1.3 * y + z) * np.sin(1.2 * x - 2 * z)) > 0.6
-    far = reconstruct(specks.astype(np.uint8), every=16)
-    assert far.uncertainty is not None and far.uncertainty.expected_dice < 0.5
-    assert any("too far apart" in note for note in far.notes)

@@ -89,7 +89,10 @@ def test_sources_and_options_that_do_not_fit_are_refused(source, options: dict, 
         field_of(source, **options)
 
 
-@pytest.mark.parametrize("job", [infer, lambda *a, **o: segment(*a, "tubes", **o)])
+@pytest.mark.parametrize(
+    "job",
+    [infer, lambda *a, **o: segment(*a, "tubes", **o), lambda *a, **o: segment(*a, probabilities=True, weight=1, **o)],
+)
 def test_no_job_drops_an_option_in_silence(job) -> None:
     for options, word in (({"spacing": 2}, "spacing"), ({"unit": "mm"}, "unit"), ({"strict": True}, "strict")):
         with pytest.raises(ScanError, match=word):

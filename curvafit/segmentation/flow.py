@@ -1,10 +1,9 @@
-"""The engine: data and F_ε lowered together, over hundreds of steps from long to short, from a start."""
+"""The flow on a scan's working grid: data and F_ε lowered together, over hundreds of steps, from a start."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,21 +12,15 @@ from torch.nn.functional import pad
 
 from curvafit.core.checks import LONGEST, SHORTEST, check_float
 from curvafit.core.runtime import Progress, silent
-from curvafit.core.units import METRES
 from curvafit.generation.data import Data, Evidence
 from curvafit.generation.flow import WORKING_BLUR, Flow, descend
-from curvafit.inference.fit import load_candidates
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.priors.law import Law, LawLike
 from curvafit.priors.loss import RESOLVED, choose_refinement
 from curvafit.priors.profile import phase_field
 from curvafit.priors.stencils import refine_axis
 from curvafit.segmentation.evidence import VoxelEvidence
 from curvafit.volumes.field import Field, ScanError
-
-if TYPE_CHECKING:
-    from curvafit.inference.infer import Inference
 
 #: Default steps of Adam.
 STEPS = 400
@@ -37,10 +30,6 @@ HALO = 6
 BENDING = 2.0
 #: Whether there is a halo before and beyond the voxels, along each axis.
 Ends = tuple[tuple[bool, bool], tuple[bool, bool], tuple[bool, bool]]
-#: A law that is tried beside the prior's.
-WILLMORE = Coefficients.willmore()
-#: Candidates of a fit that are laws of their own: the nearest match's destroys.
-TRUSTED = ("refined", "posterior", "simulation", "optimum")
 
 
 def lower_energy(
@@ -48,16 +37,9 @@ def lower_energy(
 ) -> Flow:
     """Lower D(u) + F_ε(u) from the set where a level is positive, with u = k ∗ v: Adam under a cooling schedule.
 
-    Parameters
-    ----------
-    level
-        A smooth volume (Z, Y, X) on the scan's grid, positive inside.
-    law
-        Coefficients with lengths in the scan's unit; their scale does not matter.
-    data
-        D on the working grid, in units of F_ε of a law with a20 + a02 = 2.
-
-    Raises `ScanError` if a20 + a02 is not positive, or the energy does not stay finite.
+    The `level` (Z, Y, X) is smooth, on the scan's grid. The scale of the law, whose lengths are in the scan's unit,
+    does not matter; D is on the working grid, in units of F_ε of a law with a20 + a02 = 2. Raises `ScanError` if a20 +
+    a02 is not positive, or the energy does not stay finite.
     """
 
     def watch(step: int, total: int, state: object) -> None:
@@ -65,7 +47,7 @@ def lower_energy(
 
     flow = descend(
         initial_field(level, place),
-        normalise_bending(law).in_unit(place.unit),
+        law.scale(BENDING / bending(law)).in_unit(place.unit),
         place.grid,
         data=data,
         optimiser="adam",
@@ -106,65 +88,6 @@ def bending(law: Coefficients) -> float:
     return stiffness
 
 
-def normalise_bending(law: Coefficients) -> Coefficients:
-    """Scale a law to a20 + a02 = `BENDING`; raise ScanError as `bending`."""
-    return law.scale(BENDING / bending(law))
-
-
-# ---- laws ------------------------------------------------------------------------------------------------------------
-
-
-def law_of(prior: LawLike, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
-    """Return a law's coefficients with lengths in the scan's unit, and sentences on their origin.
-
-    Raises `ValueError` if there is no such preset, or the units of a `fit.json` and the scan cannot be compared.
-    """
-    law = Law.of(prior)
-    try:
-        coefficients = law.in_unit(scan.unit, min(scan.spacing))
-    except ValueError as reason:
-        mend = ": give --spacing and --unit" if law.fitted and law.length_unit in METRES else ""
-        raise ScanError(f"{reason}{mend}") from None
-    if not law.fitted:
-        note = f"The {law.origin}, at a working voxel of one scan voxel."
-        return coefficients, (note,) if law.working else ()
-    note = f"The prior's lengths, in {law.length_unit}, are converted to {scan.unit}."
-    notes = () if law.length_unit == scan.unit else (note,)
-    return coefficients, (*notes, f"{law.doubt} Compare the mask with the scan.") if law.doubt else notes
-
-
-def laws_of(prior: LawLike, scan: Field) -> tuple[tuple[Coefficients, ...], tuple[str, ...]]:
-    """Return the laws to try for a prior, with lengths in the scan's unit, and sentences on their origin.
-
-    The first is that of `law_of`; of a fit the candidates in `TRUSTED` follow.
-    """
-    first, notes = law_of(prior, scan)
-    law = Law.of(prior)
-    if not law.fitted:
-        return (first,), notes
-    others = [each.coefficients for each in load_candidates(prior) if each.name in TRUSTED]
-    return (first, *_convert_laws([other for other in others if other != law.coefficients], law, scan)), notes
-
-
-def add_willmore(laws: tuple[Coefficients, ...]) -> tuple[Coefficients, ...]:
-    """Append the Willmore energy to the laws to try, unless it is one of them."""
-    return laws if WILLMORE in laws else (*laws, WILLMORE)
-
-
-def infer_law(example: Field | None, progress: Progress = silent) -> Inference:
-    """Infer the law of an example's mask in seconds, without growing anything; raise ScanError where there is none."""
-    from curvafit.inference.infer import infer  # takes long to import
-
-    if example is None:
-        raise ScanError("give a prior, or an example to infer one from, got neither")
-    return infer(example, kind="mask", fast=True, progress=progress)
-
-
-def _convert_laws(laws: Sequence[Coefficients], fit: Law, scan: Field) -> tuple[Coefficients, ...]:
-    """Convert laws from a fit's working units to the scan's unit."""
-    return tuple(law_of(replace(fit, coefficients=each), scan)[0] for each in laws)
-
-
 # ---- grids -----------------------------------------------------------------------------------------------------------
 
 
@@ -179,16 +102,9 @@ def choose_epsilon(scan: Field, epsilon: float | None) -> float:
 class WorkingGrid:
     """The grid of a flow: working units, axes refined until ε spans two voxels, and a halo without data.
 
-    Attributes
-    ----------
-    grid
-        The grid in working units, halo included; the boundary replicates, unless the scan repeats.
-    times
-        The number of parts of a scan voxel along each axis.
-    unit, epsilon
-        A working length of 1, and ε, in the scan's unit.
-    halo, ends
-        Width of the halo in voxels of the grid, and the sides that have one.
+    The `grid` includes the halo, of `halo` voxels on the sides in `ends`; its boundary replicates, unless the scan
+    repeats. A scan voxel has `times` parts along each axis; a working length of 1 is `unit`, and ε `epsilon`, in the
+    scan's unit.
     """
 
     grid: Grid

@@ -1,9 +1,10 @@
-"""Masks of a network's probabilities: their evidence and place, what an example says, the command, and MONAI."""
+"""`segment` of a network's probabilities: evidence and place, what an example says, the command, and MONAI."""
 
 from __future__ import annotations
 
 import json
 import math
+from functools import partial
 from pathlib import Path
 
 import nibabel
@@ -15,9 +16,8 @@ from found import made_fit
 from scipy import ndimage
 
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation import Refine, calibrate, refine
-from curvafit.segmentation.evidence import probability_evidence
-from curvafit.segmentation.refine import load_probabilities
+from curvafit.segmentation import calibrate, segment
+from curvafit.segmentation.evidence import load_probabilities, probability_evidence
 from curvafit.segmentation.trials import dice
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
@@ -39,6 +39,9 @@ def network(truth: np.ndarray, seed: int) -> np.ndarray:
     noise = np.random.default_rng(seed).standard_normal(truth.shape)
     ratio = 5 * (2 * truth - 1) + 9 * ndimage.gaussian_filter(noise, 0.8) * 4
     return (1 / (1 + np.exp(-ratio))).astype(np.float32)
+
+
+refine = partial(segment, probabilities=True)
 
 
 # ---- evidence and place ----------------------------------------------------------------------------------------------
@@ -170,6 +173,9 @@ MAP = network(tubes(), 0)
         ({}, "neither"),
         ({"weight": 1.0, "example": (MAP, tubes())}, "both"),
         ({"weight": 0.0}, "weight"),
+        ({"weight": 1.0, "probabilities": "odds"}, "logits"),
+        ({"weight": 1.0, "dark": True}, "dark"),
+        ({"probabilities": False, "example": (MAP, tubes())}, "example"),
         ({"weight": 1.0, "epsilon": -1.0}, "epsilon"),
         ({"weight": 1.0, "channel": 1}, "channel"),
         ({"example": (MAP, tubes()[1:])}, "shape"),
@@ -216,65 +222,44 @@ def test_a_mask_is_at_the_probabilities_place() -> None:
             calibrate(chances, Field(truth, spacing, unit, moved), WILLMORE, steps=1)
 
 
-# ---- a callable ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
-def test_a_callable_gives_the_mask_of_a_class(dtype: torch.dtype) -> None:
-    p = torch.from_numpy(np.stack((1 - MAP, MAP))).to(dtype)
-    step = Refine(WILLMORE, weight=3.0, steps=20, spacing=(2.0, 1.0, 1.0), unit="um")
-    before, mask = p.clone(), step(p)
-    wanted = refine(p[1], WILLMORE, weight=3.0, steps=20, spacing=(2.0, 1.0, 1.0), unit="um")
-    assert mask.shape == (1, *MAP.shape) and mask.dtype == dtype and torch.equal(p, before)
-    assert np.array_equal(mask[0].numpy() > 0, wanted.mask.values)
-    other = Refine(WILLMORE, example=(MAP, tubes()), steps=2, channel=0)
-    assert torch.equal(other(p[1:]) > 0, Refine(WILLMORE, example=other.example, steps=2)(p) > 0)
-
-
-@pytest.mark.parametrize(
-    ("options", "given", "word"),
-    [
-        ({}, None, "neither"),
-        ({"weight": 1.0, "channel": 0.5}, None, "channel"),
-        ({"weight": 1.0}, torch.zeros(5, 5, 5), "tensor"),
-        ({"weight": 1.0}, np.zeros((2, 5, 5, 5)), "tensor"),
-        ({"weight": 1.0}, torch.zeros(1, 5, 5, 5), "channel"),
-        ({"weight": 1.0}, torch.full((2, 5, 5, 5), 7.0), "probabilities"),
-    ],
-)
-def test_a_callable_refuses(options, given, word) -> None:
-    with pytest.raises(ValueError, match=word):
-        Refine(WILLMORE, **options)(given)
-
-
-def test_a_callable_stands_in_monai_s_chain() -> None:
+def test_a_map_is_segmented_in_monai_s_chain() -> None:
     monai = pytest.importorskip("monai.transforms", reason="needs monai, of the extra [dev]")
-    data = pytest.importorskip("monai.data", reason="needs monai, of the extra [dev]")
     logits = torch.from_numpy(np.log(np.stack((1 - MAP, MAP)) + 1e-6))
-    step = Refine(WILLMORE, weight=3.0, steps=5)
-    chain = monai.Compose([monai.Activations(softmax=True), step])
-    affine = torch.diag(torch.tensor([0.4, 0.5, 1.2, 1.0]))
-    mask = chain(data.MetaTensor(logits, affine=affine))
-    assert torch.equal(torch.as_tensor(mask.affine).float(), affine) and mask.shape == (1, *MAP.shape)
-    assert torch.equal(mask.as_tensor(), step(torch.softmax(logits, 0)))
+    options = {"weight": 3.0, "steps": 5}
+    step = monai.Lambda(lambda p: torch.from_numpy(refine(p[1], WILLMORE, **options).mask.values)[None])
+    mask = monai.Compose([monai.Activations(softmax=True), step])(logits)
+    odds = segment(torch.logit(torch.softmax(logits, 0)[1]), WILLMORE, probabilities="logits", **options)
+    assert mask.shape == (1, *MAP.shape) and (mask[0].numpy() != odds.mask.values).mean() < 1e-3
 
 
 # ---- the command -----------------------------------------------------------------------------------------------------
 
 
-def test_refine_keeps_the_header_and_says_what_was_chosen(tmp_path: Path) -> None:
+def test_the_command_keeps_the_header_and_says_what_was_chosen(tmp_path: Path) -> None:
     path, target = predicted(tmp_path / "in", "a", MAP), tmp_path / "new" / "mask.nii.gz"
     other = predicted(tmp_path / "in", "b", network(tubes(), 3))
     labels = Field(np.where(tubes(), 3, 1).astype(np.uint8), (1.2, 0.4, 0.5), "mm", TURNED)
     save(labels, tmp_path / "truth.nii.gz")
-    told = ("refine", path, "--channel", 1, "--prior", "tubes", "--steps", 10, "--example", tmp_path / "truth.nii.gz")
+    told = (
+        "segment",
+        path,
+        "--probabilities",
+        "--channel",
+        1,
+        "--prior",
+        "tubes",
+        "--steps",
+        10,
+        "--example",
+        tmp_path / "truth.nii.gz",
+    )
     told = (*told, "--example-probabilities", other, "--label", 3, "-o", target)
     result = call(*told)
     assert result.exit_code == 0, (result.output, result.exception)
     one, mask = (nibabel.load(each) for each in (path.with_suffix(".nii.gz"), target))
     assert mask.affine.tobytes() == one.affine.tobytes() and mask.shape == one.shape  # type: ignore[attr-defined]
     record = json.loads((target.parent / "mask.json").read_text())
-    assert (record["job"], record["steps"], record["example_probabilities"]) == ("refine", 10, str(other))
+    assert (record["job"], record["steps"], record["example_probabilities"]) == ("segment", 10, str(other))
     chosen = record["calibration"]
     assert record["status"].startswith("no prior helps here" if chosen["law"] is None else "the ")
     assert (
@@ -284,14 +269,15 @@ def test_refine_keeps_the_header_and_says_what_was_chosen(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_folder_of_predictions_is_refined_by_one_example(tmp_path: Path) -> None:
+def test_a_folder_of_predictions_is_segmented_by_one_example(tmp_path: Path) -> None:
     for name, at in (("a", 0.0), ("b", 1.5), ("c.d", 0.7)):
         predicted(tmp_path / "in", name, network(tubes(at=at), 5))
     example = predicted(tmp_path, "example", network(tubes(), 6))
     truth = tmp_path / "truth.npy"
     np.save(truth, tubes())
-    options = ("--channel", 1, "--prior", "tubes", "--steps", 2, "--example", truth, "--example-probabilities", example)
-    result = call("refine", tmp_path / "in", *options, "-o", tmp_path / "out")
+    options = ("--probabilities", "--channel", 1, "--prior", "tubes", "--steps", 2, "--example", truth)
+    options = (*options, "--example-probabilities", example)
+    result = call("segment", tmp_path / "in", *options, "-o", tmp_path / "out")
     assert result.exit_code == 0, (result.output, result.exception)
     tried = [json.loads(path.read_text())["calibration"] for path in sorted((tmp_path / "out").glob("*.json"))]
     assert len(tried) == 3 and tried[0] == tried[1] == tried[2]
@@ -300,26 +286,22 @@ def test_a_folder_of_predictions_is_refined_by_one_example(tmp_path: Path) -> No
     for name in masks:
         one, other = (load(tmp_path / folder / name) for folder in ("in", "out"))
         assert np.array_equal(one.affine, other.affine)  # type: ignore[arg-type]
-    single = call("refine", tmp_path / "in" / "b.npz", *options, "-o", tmp_path / "b.nii.gz")
+    single = call("segment", tmp_path / "in" / "b.npz", *options, "-o", tmp_path / "b.nii.gz")
     assert single.exit_code == 0
     assert np.array_equal(load(tmp_path / "b.nii.gz").values, load(tmp_path / "out" / "b.nii.gz").values)
-    refused(call("refine", tmp_path / "in", *options, "-o", tmp_path / "in"), "input")
-    refused(call("refine", tmp_path / "in", *options, "--like", truth, "-o", tmp_path / "more"), "--like")
+    refused(call("segment", tmp_path / "in", *options, "-o", tmp_path / "in"), "input")
+    refused(call("segment", tmp_path / "in", *options, "--like", truth, "-o", tmp_path / "more"), "--like")
     predicted(tmp_path / "in", "z", 1.5 * network(tubes(), 5))
-    refused(call("refine", tmp_path / "in", *options, "-o", tmp_path / "more"), "probabilities")
+    refused(call("segment", tmp_path / "in", *options, "-o", tmp_path / "more"), "probabilities")
     assert not (tmp_path / "more").exists()
 
 
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
-        ("--prior tubes", "neither"),
         ("--example truth.npy", "--example-probabilities"),
-        ("--weight 1", "--prior"),
-        ("--prior tube --weight 1", "preset"),
-        ("--prior tubes --weight -1", "weight"),
+        ("--weight 1 --dark", "dark"),
         ("--prior tubes --weight 1 --like small.npy", "shape"),
-        ("--prior tubes --weight 1 --like none.nii", "none.nii"),
         ("--prior tubes --example small.npy --example-probabilities p.npy", "shape"),
         ("--prior tubes --example truth.npy --example-probabilities grey.npy", "probabilities"),
         ("--prior tubes --example truth.npy --example-probabilities p.npy --label 4", "label"),
@@ -331,7 +313,7 @@ def test_wrong_input_is_a_sentence_and_writes_nothing(arguments, word, tmp_path,
     np.save("grey.npy", 100 * MAP)
     np.save("truth.npy", tubes())
     np.save("small.npy", np.arange(125.0).reshape(5, 5, 5) > 60)
-    result = call("refine", "p.npy", *arguments.split(), "-o", "mask.nii.gz")
+    result = call("segment", "p.npy", "--probabilities", *arguments.split(), "-o", "mask.nii.gz")
     said = result.stderr.strip().splitlines()[-1]
     assert result.exit_code == 2 and said.startswith("error: ") and word in said, (result.output, result.exception)
     assert not list(tmp_path.glob("*mask*"))
