@@ -162,7 +162,7 @@ SENTINELS: dict[str, Callable[[], Checked]] = {
     "instances": check_instances,
     "phantoms large windows": check_measures,
     "groups": check_groups,
-    "noise refine": check_noise,
+    "noise": check_noise,
     "transductive": check_networks,
 }
 
