@@ -5,8 +5,8 @@ of two contrasts; slices 21 and 42 are annotated, and a small U-Net learns from 
 steps and their first third, which is Dice + CE alone (`plain`). `area`, `willmore`, `law` and `wrong` add the energy
 of all voxels: the law is that of another volume's mask, the wrong one another texture's. `pseudo` learns what
 `reconstruct` fills from slices and image, each voxel as sure as it is; `filled` is that itself, without a network.
-`refine` (`segment`, with the law) works on what `plain` predicts. Weights are chosen for each texture and way by slice 32, on a seed of
-its own.
+`refine` (`segment`, with the law) works on what `plain` predicts. Weights are chosen for each texture and way by slice
+32, on a seed of its own.
 
 Scores are those of the slices that nobody annotated. Differences pair networks by seed, with 95 % intervals of a
 bootstrap over textures and seeds; p of Holm over two contrasts, `law` less `plain` and less `willmore`.
