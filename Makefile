@@ -27,7 +27,7 @@ test-all: .venv/installed-dev
 	$(PYTEST) --durations=25
 
 test-nightly: .venv/installed-dev
-	$(PYTEST) tests/hostile --hypothesis-profile nightly
+	CURVAFIT_HOSTILE=200 $(PYTEST) tests/hostile
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .
