@@ -13,7 +13,7 @@ import torch
 
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.topology import betti_numbers
-from curvafit.priors import WORKING_EPSILON, Grid, phase_field
+from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
 from curvafit.scan.grids import (
     bounding_box,
     boxes_by_surface,
@@ -118,6 +118,11 @@ class Prepared:
     noise: bool = False
     quality: Quality | None = None
     one_scale: bool = False
+
+    @property
+    def length(self) -> float:
+        """Return a working length of 1 in `unit`."""
+        return self.working_voxel / WORKING_SPACING
 
     @property
     def volume_fraction(self) -> float:
