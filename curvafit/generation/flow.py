@@ -40,7 +40,7 @@ WORKING_BLUR = 0.02
 #: Seconds between two checkpoints by default.
 CHECKPOINT_EVERY = 60.0
 #: The ways to run a flow: see `generate`.
-Backend = Literal["auto", "torch", "fused", "compiled", "slabs"]
+Backend = Literal["auto", "torch", "fused", "slabs"]
 BACKENDS = get_args(Backend)
 
 
@@ -100,8 +100,7 @@ def generate(
         unless `keep_checkpoint`, but stays where a callback stopped the flow.
     backend
         `"auto"` takes the fused step on processors and plain torch elsewhere; `"torch"` and `"fused"` take only that
-        step. `"compiled"` passes the plain step through `torch.compile`; where that fails, a warning says so and the
-        step stays plain. `"slabs"` is the fused step over the processes of `slabs.lead`.
+        step. `"slabs"` is the fused step over the processes of `slabs.lead`.
     device
         Where torch runs, such as `"cpu"` or `"cuda"`.
 
@@ -262,7 +261,7 @@ class _Execution:
     @property
     def plain(self) -> bool:
         """Whether the step is plain torch wherever it runs."""
-        return self.backend in ("torch", "compiled")
+        return self.backend == "torch"
 
     @property
     def blur(self) -> Blur:
@@ -285,8 +284,7 @@ class _Execution:
         if fusible and has_kernel and isinstance(form, DivergenceForm):
             return FusedStepper(start, form, cost, betas, frozen)
         kind = LbfgsStepper if optimiser == "lbfgs" else TorchStepper
-        how = {"fused": not self.plain, "compiled": self.backend == "compiled"}
-        return kind(start, form, cost, betas, frozen, self.device, **how)
+        return kind(start, form, cost, betas, frozen, self.device, fused=not self.plain)
 
     def checkpoint_file(self, stepper: Stepper, options: FlowOptions, **start: object) -> Checkpoint | None:
         """Return the checkpoint of a run from a start, or None where the run has none."""

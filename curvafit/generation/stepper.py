@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -128,8 +127,8 @@ def step_by_adam(
 ) -> None:
     """Make one step of Adam in place, the one of `torch.optim.Adam`.
 
-    `lengths` are two numbers on the device, so that a step neither waits for the host nor is compiled anew: minus the
-    step's length over the first moment's bias correction, and the root of the second moment's correction.
+    `lengths` are two numbers on the device, so that a step does not wait for the host: minus the step's
+    length over the first moment's bias correction, and the root of the second moment's correction.
     """
     momentum, memory = betas
     first.lerp_(slope, 1 - momentum)
@@ -140,13 +139,13 @@ def step_by_adam(
 class TorchStepper(Stepper):
     """Adam on the parameters of a form, on any device, where its whole state stays.
 
-    `fused` takes the energy's gradient from a fused kernel where there is one, instead of from autograd; `compiled`
-    passes the step through `torch.compile`. `frozen` are the voxels `(Z, Y, X)` whose parameters stay.
+    `fused` takes the energy's gradient from a fused kernel where there is one, instead of from autograd. `frozen` are
+    the voxels `(Z, Y, X)` whose parameters stay.
     """
 
     def __init__(
         self, start: Tensor, form: Form, cost: Cost, betas: tuple[float, float], frozen: Tensor | None,
-        device: torch.device | str, *, fused: bool = False, compiled: bool = False,
+        device: torch.device | str, *, fused: bool = False,
     ) -> None:  # fmt: skip
         def move(value):
             return value.to(device, torch.float32) if isinstance(value, Tensor) and value.dim() > 0 else value
@@ -161,10 +160,6 @@ class TorchStepper(Stepper):
         self._u = self._slope = self._parameters
         self._offset = torch.zeros((), device=device)
         self._statistics: Statistics | None = None
-        self._evaluate, self._adam = self._evaluate_plainly, step_by_adam
-        if compiled:
-            compile_ = _Compiler()
-            self._evaluate, self._adam = compile_(self._evaluate_plainly), compile_(step_by_adam)
         self._start_optimiser()
 
     def _start_optimiser(self) -> None:
@@ -172,7 +167,7 @@ class TorchStepper(Stepper):
         self._moments = torch.zeros_like(self._parameters), torch.zeros_like(self._parameters)
         self._taken = 0
 
-    def _evaluate_plainly(self, parameters: Tensor, offset: Tensor) -> tuple[Tensor | float, Tensor, Tensor]:
+    def _evaluate(self, parameters: Tensor, offset: Tensor) -> tuple[Tensor | float, Tensor, Tensor]:
         """Return the energies, u, and the gradient with respect to the parameters."""
         u = self._form.field(parameters) + offset
         value, slope = self._energy_gradient(u, *self._cost)
@@ -196,7 +191,7 @@ class TorchStepper(Stepper):
         lengths = [(-rate / (1 - momentum**k), (1 - memory**k) ** 0.5) for rate, k in zip(rates, taken, strict=True)]
         for numbers in torch.tensor(lengths, dtype=torch.float32).to(self._parameters.device):
             self._value, self._u, self._slope = self._evaluate(self._parameters, self._offset)
-            self._adam(self._parameters, self._slope, *self._moments, self._betas, numbers)
+            step_by_adam(self._parameters, self._slope, *self._moments, self._betas, numbers)
         self._taken += len(rates)
         return len(rates)
 
@@ -230,28 +225,6 @@ class TorchStepper(Stepper):
         for moment, saved in zip(self._moments, state["moments"], strict=True):
             moment.copy_(saved)
         self._taken = state["taken"]
-
-
-class _Compiler:
-    """Compiles functions at their first call; once that fails, a warning says so and all run as they are written."""
-
-    failed: bool = False
-
-    def __call__(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        compiled: list[Callable[..., Any]] = []
-
-        def call(*arguments: Any) -> Any:
-            if not self.failed:
-                try:
-                    compiled[:] = compiled or [torch.compile(function)]
-                    return compiled[0](*arguments)
-                except Exception as error:  # a compiler fails in many ways, and none of them is the flow's
-                    self.failed = True
-                    reason = f"{type(error).__name__}: {error}".splitlines()[0]
-                    warnings.warn(f"torch.compile failed, so the flow runs in plain torch ({reason})", stacklevel=2)
-            return function(*arguments)
-
-        return call
 
 
 class LbfgsStepper(TorchStepper):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -55,38 +53,3 @@ def test_the_step_and_its_run_read_nothing_from_the_device() -> None:
     stepper = TorchStepper(start, form, cost, (0.9, 0.999), None, "meta")
     stepper.run([1e-3, 2e-3])
     assert stepper.state()["parameters"].shape == (3, *grid.shape)
-
-
-def test_a_compiler_that_fails_warns_once(monkeypatch) -> None:
-    def no_compiler(function):
-        raise RuntimeError("no compiler is found")
-
-    monkeypatch.setattr(torch, "compile", no_compiler)
-    grid = Grid((8, 9, 10))
-    with pytest.warns(UserWarning, match="compile") as caught:
-        flow = generate("tubes", -0.6, grid, schedule=PLAN, backend="compiled")
-    assert len(caught) == 1
-    plain = generate("tubes", -0.6, grid, schedule=PLAN, backend="torch")
-    torch.testing.assert_close(flow.field, plain.field, rtol=1e-4, atol=1e-4)
-
-
-#: Two steps, plain and traced as `torch.compile` does but without a C++ compiler's minute, in an interpreter without
-#: the tests' checks of shapes, which cannot be traced.
-COMPILED = """
-import functools
-import torch
-torch.compile = functools.partial(torch.compile, backend="aot_eager")
-from curvafit.generation import Schedule, generate
-plan, ends = Schedule("test", 2, 1e-3, 1e-3, "constant"), []
-for backend in ("torch", "compiled"):
-    ends.append(generate("tubes", grid=(8, 9, 10), schedule=plan, backend=backend).field)
-torch.testing.assert_close(ends[1], ends[0], rtol=1e-4, atol=1e-4)
-print("alike")
-"""
-
-
-@pytest.mark.slow
-def test_the_compiled_step_is_the_plain_one() -> None:
-    command = [sys.executable, "-W", "error:torch.compile failed", "-c", COMPILED]
-    found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert found.stdout.strip() == "alike", found.stderr
