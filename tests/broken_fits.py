@@ -1,7 +1,5 @@
 """Texts of a `fit.json` with one thing wrong: what its readers must refuse, in Python and in a browser alike."""
 
-from __future__ import annotations
-
 import json
 
 from found import made_fit

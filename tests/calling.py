@@ -1,7 +1,5 @@
 """The command line called from tests."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -22,6 +20,13 @@ def call(*arguments: object) -> Result:
         return CliRunner().invoke(app, words)
 
 
+def done(*arguments: object) -> Result:
+    """What a command that succeeds says."""
+    result = call(*arguments)
+    assert result.exit_code == 0, (result.output, result.exception)
+    return result
+
+
 def refused(result: Result, word: str = "", *, progress: bool = False) -> None:
     """One sentence with a key word on the error stream, nothing on the other, exit code 2.
 
@@ -36,7 +41,6 @@ def refused(result: Result, word: str = "", *, progress: bool = False) -> None:
 
 def made(*arguments: object) -> dict[str, Any]:
     """The record that a `generate` which succeeds leaves."""
-    result = call("generate", *arguments)
-    assert result.exit_code == 0, (result.output, result.exception)
-    record = next(Path(line) for line in result.stdout.splitlines() if line.endswith(".json"))
+    lines = done("generate", *arguments).stdout.splitlines()
+    record = next(Path(line) for line in lines if line.endswith(".json"))
     return json.loads(record.read_text())

@@ -1,7 +1,5 @@
 """What all tests share: where outside data is, and array shapes checked against their annotations."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

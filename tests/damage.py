@@ -1,7 +1,5 @@
 """Volume files of every format, and what can happen to their bytes."""
 
-from __future__ import annotations
-
 import gzip
 import random
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What files hold, read without the package."""
 
-from __future__ import annotations
-
 import base64
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An emulator whose law is known: five sums of the parameters, in noise, and nothing of the sixth."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from curvafit.geometry.descriptors import BLOCKS

@@ -5,8 +5,6 @@ from its skeleton, and the curvatures at a point are those of the parallel surfa
 ∫κ1², ∫κ1κ2, ∫κ2², ∫κ1, ∫κ2, ∫1 over the parallel surface at `offset` inside.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

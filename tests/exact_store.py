@@ -1,7 +1,5 @@
 """A small store of exact periodic shapes, in turn layers, tubes, spheres and sponges."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

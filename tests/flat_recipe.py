@@ -1,7 +1,5 @@
 """A recipe for quick cases of a training set."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from exact_store import exact_store

@@ -1,7 +1,5 @@
 """A finished inference made by hand from exact shapes: a lattice of tubes as the scan, two more beside it."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

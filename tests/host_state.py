@@ -4,8 +4,6 @@ This file, run as a program, makes every public call in a process that has done 
 changed, by name. What a first call alone can change, as numbers of threads, shows only there.
 """
 
-from __future__ import annotations
-
 import contextlib
 import decimal
 import gc

@@ -1,7 +1,5 @@
 """What tests of the kernels share: grids, a law, a short schedule, a smooth field and its gradient in plain torch."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

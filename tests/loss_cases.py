@@ -1,7 +1,5 @@
 """What the tests of the training loss share: a law, noise, probabilities, a fit file, a gradient."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Each growth adds a line to the log. Prints the samples of two epochs, the pool's room, and whether it was there.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Small grown shapes that many tests share: each is grown once and kept under the hash of what makes it."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import tempfile
@@ -19,13 +17,8 @@ ROOT = Path(__file__).resolve().parents[1]
 CACHE = ROOT / ".pytest_cache" / "shapes"
 #: The shared shapes: preset, edge in voxels, seed. Periodic boxes; steps as in `STEPS`.
 SHAPES = (
-    ("tubes", 32, 0),
-    ("tubes", 48, 1),
-    ("sponge", 32, 0),
-    ("sponge", 48, 1),
-    ("trabec", 48, 0),
-    ("pearls", 32, 0),
-)
+    ("tubes", 32, 0), ("tubes", 48, 1), ("sponge", 32, 0), ("sponge", 48, 1), ("trabec", 48, 0), ("pearls", 32, 0),
+)  # fmt: skip
 STEPS = 600
 
 

@@ -4,8 +4,6 @@ The first one grows a shape of some steps on slabs and alone, goes on alone from
 what the two share.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`curvafit generate` and the files it touches: resumed, failed, other people's, named in odd ways."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import tifffile
 from calling import QUICK, call, made, refused
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -97,13 +94,3 @@ def test_other_files_are_left_alone(tmp_path: Path) -> None:
         options = ["--checkpoint", tmp_path / name, "-o", tmp_path / "out.npy"]
         refused(call("generate", *QUICK, *options), "checkpoint")
     assert names(tmp_path) == ["scan.png"]
-
-
-@pytest.mark.parametrize(
-    ("name", "spacing", "ome"), [("a.tif", 0.02, False), ("a.ome.tif", 0.02, True), ("b.tif", 2e-10, True)]
-)
-def test_tiff_is_ome_by_name_or_need(tmp_path: Path, name: str, spacing: float, ome: bool) -> None:
-    made(*QUICK, "--spacing", spacing, "--unit", "m", "-o", tmp_path / name)
-    with tifffile.TiffFile(tmp_path / name) as file:
-        assert bool(file.is_ome) == ome
-    assert names(tmp_path) == sorted([f"{name[0]}.json", f"{name[0]}.png", name])

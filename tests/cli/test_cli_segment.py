@@ -1,7 +1,5 @@
 """`curvafit segment` and `reconstruct`: what they write, to the bit, and one sentence with exit code 2 for the rest."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +7,7 @@ from pathlib import Path
 import nibabel
 import numpy as np
 import pytest
-from calling import call, refused
+from calling import call, done, refused
 from found import made_fit
 
 import curvafit.segmentation
@@ -37,7 +35,7 @@ def grey(noise: float = 40) -> np.ndarray:
     return values.clip(0, 255).astype(np.uint8)
 
 
-EXAMPLE = ("--probabilities", "--example", "p.npy", "--example-probabilities", "law.npy")
+EXAMPLE = "--probabilities --example p.npy --example-probabilities law.npy"
 #: What a header says of the place, whatever its unit is called.
 KEPT = [*(f"srow_{k}" for k in "xyz"), *(f"quatern_{k}" for k in "bcd"), *(f"qoffset_{k}" for k in "xyz")]
 KEPT += ["pixdim", "qform_code", "sform_code", "dim"]
@@ -62,8 +60,7 @@ def oblique(tmp_path: Path) -> Path:
 
 def test_segment_keeps_the_header_to_the_bit(oblique: Path, tmp_path: Path) -> None:
     target = tmp_path / "new" / "mask.nii.gz"
-    result = call("segment", oblique, "--prior", "tubes", "--weight", 0.5, "--steps", 120, "-o", target)
-    assert result.exit_code == 0, (result.output, result.exception)
+    result = done("segment", oblique, "--prior", "tubes", "--weight", 0.5, "--steps", 120, "-o", target)
     assert sorted(path.name for path in target.parent.iterdir()) == ["mask.json", "mask.nii.gz", "mask.png"]
     one, other = nibabel.load(oblique), nibabel.load(target)
     for name in (*KEPT, "xyzt_units", "descrip"):
@@ -89,7 +86,7 @@ def test_another_unit_renames_and_keeps_the_rest_of_the_header(unit, written, ob
     one = nibabel.load(oblique)
     one.header.set_xyzt_units("mm", "sec")  # type: ignore[attr-defined]
     nibabel.save(one, oblique)
-    assert call("segment", oblique, "--unit", unit, "--prior", "tubes", "--steps", 1, "-o", target).exit_code == 0
+    done("segment", oblique, "--unit", unit, "--prior", "tubes", "--steps", 1, "-o", target)
     other, made, told = nibabel.load(target), load(target), load(oblique, unit=unit)
     assert made.unit == written and made.spacing == pytest.approx(told.spacing, rel=1e-6)
     np.testing.assert_allclose(made.affine, told.affine, rtol=1e-6)  # type: ignore[arg-type]
@@ -97,7 +94,7 @@ def test_another_unit_renames_and_keeps_the_rest_of_the_header(unit, written, ob
         assert one.header[name].tobytes() == other.header[name].tobytes(), name  # type: ignore[index]
     assert other.header.get_xyzt_units()[1] == "sec"  # type: ignore[attr-defined]
     # a file that bears our own note on its unit loses it
-    assert call("segment", target, "--unit", "um", "--prior", "tubes", "--steps", 1, "-o", again).exit_code == 0
+    done("segment", target, "--unit", "um", "--prior", "tubes", "--steps", 1, "-o", again)
     assert load(again).unit == "um" and load(again).spacing == pytest.approx(made.spacing, rel=1e-6)
 
 
@@ -105,7 +102,7 @@ def test_an_axis_of_one_and_another_spacing(tmp_path: Path) -> None:
     path, target = tmp_path / "scan.nii", tmp_path / "mask.nii"
     image = nibabel.Nifti2Image(grey().T[..., None], np.diag([0.2, 0.2, 0.4, 1]))
     nibabel.save(image, path)
-    assert call("segment", path, "--prior", "sponge", "--steps", 2, "-o", target).exit_code == 0
+    done("segment", path, "--prior", "sponge", "--steps", 2, "-o", target)
     made = nibabel.load(target)
     assert isinstance(made, nibabel.Nifti2Image) and made.shape == (16, 18, 20, 1)
     other = tmp_path / "other.nii"
@@ -118,10 +115,9 @@ def test_other_formats_and_a_fit_in_another_unit(tmp_path: Path) -> None:
     path, prior, target = tmp_path / "scan.tif", tmp_path / "fit.json", tmp_path / "mask.ome.tif"
     save(Field(grey(), (19.5,) * 3, "um"), path)
     prior.write_text(made_fit().to_json())
-    result = call(
+    result = done(
         "segment", path, "--prior", prior, "--dark", "--threshold", 150, "--weight", 1, "--steps", 2, "-o", target
     )
-    assert result.exit_code == 0, (result.output, result.exception)
     assert "um" in result.stdout
     made = load(target)
     assert made.unit == "um" and made.spacing == pytest.approx((19.5,) * 3)
@@ -136,20 +132,18 @@ def test_reconstruct_fills_what_it_is_not_told(tmp_path: Path) -> None:
     given = np.zeros(truth.shape, dtype=np.uint8)
     given[..., ::4] = truth[..., ::4]
     save(Field(given, (0.1, 0.1, 0.1), "mm"), path)
-    result = call("reconstruct", path, "--every", 4, "--axis", "x", "-o", target)
-    assert result.exit_code == 0, (result.output, result.exception)
+    done("reconstruct", path, "--every", 4, "--axis", "x", "-o", target)
     made = load(target).values.astype(bool)
     assert np.array_equal(made[..., ::4], truth[..., ::4]) and (made != truth).mean() < 0.02
     record = json.loads((tmp_path / "volume.json").read_text())
     assert (record["every"], record["axis"], record["weight"]) == (4, 2, None)
     named = tmp_path / "named.nii.gz"
     options = ("--known", "0,4,8,12,16", "--axis", "x")
-    assert call("reconstruct", path, *options, "-o", named).exit_code == 0
+    done("reconstruct", path, *options, "-o", named)
     assert np.array_equal(load(named).values, load(target).values)
     given[..., [k for k in range(17) if k % 4]] = 9
     save(Field(given, (0.1, 0.1, 0.1), "mm"), path)
-    ignoring = call("reconstruct", path, "--ignore", 9, "--axis", "x", "-o", tmp_path / "ignoring.nii.gz")
-    assert ignoring.exit_code == 0, (ignoring.output, ignoring.exception)
+    done("reconstruct", path, "--ignore", 9, "--axis", "x", "-o", tmp_path / "ignoring.nii.gz")
     assert np.array_equal(load(tmp_path / "ignoring.nii.gz").values, load(target).values)
 
 
@@ -158,8 +152,7 @@ def test_reconstruct_writes_what_is_uncertain(tmp_path: Path) -> None:
     path, target = tmp_path / "slices.nii.gz", tmp_path / "out" / "volume.nii.gz"
     save(Field(ball().astype(np.uint8), (0.1, 0.1, 0.1), "mm"), path)
     told = ("reconstruct", path, "--every", 4, "-o", target)
-    result = call(*told, "--suggest", 2)
-    assert result.exit_code == 0, (result.output, result.exception)
+    result = done(*told, "--suggest", 2)
     names = ["volume.json", "volume.nii.gz", "volume.png", "volume_probability.nii.gz"]
     assert sorted(each.name for each in target.parent.iterdir()) == names
     chances, mask = load(target.parent / names[-1]), load(target)
@@ -170,7 +163,7 @@ def test_reconstruct_writes_what_is_uncertain(tmp_path: Path) -> None:
     assert sorted(record["files"]) == names and len(record["suggestions"]) == 2
     said = " ".join(result.stdout.split())
     assert f"annotate next: {', '.join(map(str, record['suggestions']))}." in said
-    assert call(*told).exit_code == 0
+    done(*told)
     assert sorted(each.name for each in target.parent.iterdir()) == names
     (tmp_path / "other_probability.npy").write_text("mine")
     refused(call(*told[:-1], tmp_path / "other.npy"), "free")
@@ -178,47 +171,39 @@ def test_reconstruct_writes_what_is_uncertain(tmp_path: Path) -> None:
     refused(call(*told[:-1], tmp_path / "other.npy", "--suggest", 16), "slices")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "word"),
-    [
-        ("segment grey.nii --prior tube", "preset"),
-        ("segment grey.nii --prior none.json", "none.json"),
-        ("segment grey.nii --prior fit.json --unit voxel", "--unit"),
-        ("segment grey.nii --threshold low", "--threshold"),
-        ("segment grey.nii --spacing 0", "--spacing"),
-        ("segment none.tif", "no such file"),
-        ("segment grey.nii --example ball.nii --example-probabilities ball.nii", "example"),
-        ("segment grey.nii --like ball.nii", "--like"),
-        ("reconstruct ball.nii --every 4 --axis w", "--axis"),
-        ("reconstruct ball.nii --known 1,a", "--known"),
-        ("reconstruct ball.nii --every 4 --ignore 2", "--ignore"),
-        ("reconstruct ball.nii --known 0,4 --first 2", "--first"),
-        ("reconstruct ball.nii --every 4 --filler fit.json", "fit.json"),
-        ("reconstruct ball.nii --every 4 --example coarse.nii", "spacing"),
-        ("reconstruct ball.nii --every 4 --example other.nii", "spacing"),
-        ("reconstruct ball.nii --every 4 --labels all --example grey.nii", "example"),
-        ("reconstruct ball.nii --every 4 --filler version.npz", "version 2"),
-        ("reconstruct ball.nii --every 4 --filler cut.npz", "truncated"),
-        ("reconstruct ball.nii --every 4 --filler arrays.npz", "filler"),
-        ("reconstruct ball.nii --every 4 --filler lacks.npz", "slope"),
-        ("reconstruct ball.nii --every 4 --filler ball.nii", "something else"),
-        ("reconstruct many.nii --every 4 --labels all", "256"),
-        ("reconstruct grey.nii --every 4", "grey image"),
-        ("reconstruct levels.nii --every 4", "whole numbers"),
-        ("reconstruct empty.nii --every 4 --labels 1", "but not 1"),
-        ("reconstruct ball.nii --every 4 --sure 0.4", "sure"),
-        ("reconstruct ball.nii --every 4 --instances", "--image"),
-        ("reconstruct ball.nii --every 4 -o taken.nii", "free"),
-        ("reconstruct ball.nii --every 4 -o noted.nii", "free"),
-        ("reconstruct ball.nii --every 4 -o mapped.nii", "free"),
-    ],
-)
-def test_wrong_input_is_a_sentence_and_changes_no_file(arguments, word, bad_files, monkeypatch) -> None:
+#: In `bad_files`: words that a command refuses, and one of its sentence.
+REFUSALS: dict[str, dict[str, str]] = {
+    "segment grey.nii": {
+        "--prior tube": "preset", "--prior none.json": "none.json", "--prior fit.json --unit voxel": "--unit",
+        "--threshold low": "--threshold", "--spacing 0": "--spacing", "--like ball.nii": "--like",
+        "--example ball.nii --example-probabilities ball.nii": "example",
+        "--prior tubes -o mask.xyz": "mask.xyz", "--prior tubes -o taken.nii/mask.tif": "file",
+    },
+    "segment none.tif": {"": "no such file"},
+    "reconstruct ball.nii": {"--known 1,a": "--known", "--known 0,4 --first 2": "--first"},
+    "reconstruct ball.nii --every 4": {
+        "--axis w": "--axis", "--ignore 2": "--ignore", "--filler fit.json": "fit.json",
+        "--example coarse.nii": "spacing", "--example other.nii": "spacing", "--sure 0.4": "sure",
+        "--labels all --example grey.nii": "example",
+        "--filler version.npz": "version 2", "--filler cut.npz": "truncated", "--filler arrays.npz": "filler",
+        "--filler lacks.npz": "slope", "--filler ball.nii": "something else", "--instances": "--image",
+        "-o taken.nii": "free", "-o noted.nii": "free", "-o mapped.nii": "free",
+    },
+    "reconstruct --every 4": {
+        "many.nii --labels all": "256", "grey.nii": "grey image", "levels.nii": "whole numbers",
+        "empty.nii --labels 1": "but not 1",
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("command", REFUSALS)
+def test_wrong_input_is_a_sentence_and_changes_no_file(command, bad_files, monkeypatch) -> None:
     monkeypatch.chdir(bad_files)
     before = {path: path.read_bytes() for path in bad_files.iterdir()}
-    words = arguments.split()
-    refused(call(*(words if "-o" in words else [*words, "-o", "m.nii"])), word, progress=True)
-    assert before == {path: path.read_bytes() for path in bad_files.iterdir()}
+    for words, key in REFUSALS[command].items():
+        out = () if "-o" in words else ("-o", "m.nii")
+        refused(call(*command.split(), *words.split(), *out), key, progress=True)
+        assert before == {path: path.read_bytes() for path in bad_files.iterdir()}, words
 
 
 @pytest.fixture(scope="module")
@@ -254,8 +239,7 @@ def test_a_part_of_a_file_is_segmented_where_it_was(oblique: Path, tmp_path: Pat
     options = ["--channel", "1", "--crop", "2:,1:17,:-1", "--spacing", "0.09,0.06,0.06", "--unit", "mm"]
     for k, (source, part) in enumerate(((tmp_path / "times.nii", options), (oblique, options[2:4]))):
         target = tmp_path / f"mask{k}.nii.gz"
-        result = call("segment", source, *part, "--prior", "tubes", "--steps", 5, "-o", target)
-        assert result.exit_code == 0, (result.output, result.exception)
+        done("segment", source, *part, "--prior", "tubes", "--steps", 5, "-o", target)
         mask = nibabel.load(target)
         assert mask.shape == (15, 16, 18)
         assert (
@@ -276,38 +260,23 @@ def test_a_label_of_a_volume_is_filled_in(tmp_path: Path) -> None:
     labels[:, :3] = 7
     np.save(tmp_path / "labels.npy", labels)
     some = ("reconstruct", tmp_path / "labels.npy", "--every", 4, "--prior", "tubes", "--steps", 2)
-    result = call(*some, "--label", 3, "-o", tmp_path / "mask.npy")
-    assert result.exit_code == 0, (result.output, result.exception)
+    result = done(*some, "--label", 3, "-o", tmp_path / "mask.npy")
     assert np.array_equal(np.load(tmp_path / "mask.npy")[::4] > 0, (labels == 3)[::4])
     result = call(*some, "--label", 4, "-o", tmp_path / "none.npy")
     assert result.exit_code == 2 and "label" in result.stderr
 
 
 @pytest.mark.parametrize(
-    ("name", "word"), [("mask.xyz", "mask.xyz"), ("taken/mask.tif", "file"), ("other.nii.gz", "free")]
-)
-def test_places_that_cannot_be_written_are_refused_first(name, word, oblique, tmp_path, monkeypatch) -> None:
-    (tmp_path / "taken").write_text("")
-    (tmp_path / "other.json").write_text("{}")
-    monkeypatch.setattr("curvafit.volumes.boxes.boxes_of", lambda *_, **__: pytest.fail("read all the same"))
-    refused(call("segment", oblique, "--prior", "tubes", "-o", tmp_path / name), word)
-
-
-@pytest.mark.parametrize(
     ("arguments", "target"),
     [
-        (("segment", "g.npy", "--prior", "tubes"), "g.npy"),
-        (("segment", "g.npy", "--prior", "tubes"), "link.npy"),
-        (("segment", "g.npy", *EXAMPLE), "p.npy"),
-        (("segment", "g.npy", *EXAMPLE), "law.npy"),
-        (("segment", "g.npy", "--logits", "--weight", "1", "--like", "p.npy"), "p.npy"),
-        (("segment", "g.npy", "--prior", "mine.json"), "mine.npy"),
-        (("segment", "g.npy", "--prior", "law.npy"), "law.npy"),
-        (("segment", "slices", "--prior", "tubes"), "slices/1.tif"),
-        (("reconstruct", "g.npy", "--every", "4", "--prior", "tubes"), "sub/../g.npy"),
-        (("reconstruct", "h.h5::g.npy", "--every", "4", "--prior", "tubes"), "hard.npy"),
+        ("segment g.npy --prior tubes", "g.npy"), ("segment g.npy --prior tubes", "link.npy"),
+        (f"segment g.npy {EXAMPLE}", "p.npy"), (f"segment g.npy {EXAMPLE}", "law.npy"),
+        ("segment g.npy --logits --weight 1 --like p.npy", "p.npy"), ("segment g.npy --prior mine.json", "mine.npy"),
+        ("segment g.npy --prior law.npy", "law.npy"), ("segment slices --prior tubes", "slices/1.tif"),
+        ("reconstruct g.npy --every 4 --prior tubes", "sub/../g.npy"),
+        ("reconstruct h.h5::g.npy --every 4 --prior tubes", "hard.npy"),
     ],
-)
+)  # fmt: skip
 def test_no_input_is_written_over(arguments, target, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     for folder in ("sub", "slices"):
@@ -319,5 +288,5 @@ def test_no_input_is_written_over(arguments, target, tmp_path, monkeypatch) -> N
     (tmp_path / "hard.npy").hardlink_to("h.h5")
     monkeypatch.setattr("curvafit.volumes.boxes.boxes_of", lambda *_, **__: pytest.fail("read all the same"))
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    refused(call(*arguments, "-o", target), "input")
+    refused(call(*arguments.split(), "-o", target), "input")
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}

@@ -1,14 +1,11 @@
 """`segment` and `reconstruct` in tiles: what a kill leaves, what the same command makes of it, and what is refused."""
 
-from __future__ import annotations
-
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from calling import call, refused
+from calling import call, done, refused
 
 from curvafit.segmentation.tiles import TileStore
 from curvafit.volumes import load, save
@@ -52,15 +49,14 @@ def killed(monkeypatch: pytest.MonkeyPatch, tile: int) -> None:
 )
 def test_the_same_command_goes_on_after_a_kill(scan: Path, tmp_path: Path, monkeypatch, name: str) -> None:
     whole, target = tmp_path / "whole" / name, tmp_path / "killed" / name
-    assert call(*command(scan, whole)).exit_code == 0
+    done(*command(scan, whole))
     with monkeypatch.context() as patch:
         killed(patch, 2)
         result = call(*command(scan, target))
     assert result.exit_code == 130 and "same command" in result.stderr
     assert [path.name for path in target.parent.iterdir()] == [f".{name}.curvafit-tiles"]
     refused(call(*command(scan, target, "--epsilon", 0.25)), "tiles")
-    result = call(*command(scan, target))
-    assert result.exit_code == 0, (result.output, result.exception)
+    result = done(*command(scan, target))
     stem = name.split(".")[0]
     assert sorted(path.name for path in target.parent.iterdir()) == sorted([name, f"{stem}.json", f"{stem}.png"])
     one, other = load(whole), load(target)
@@ -72,8 +68,7 @@ def test_slices_are_filled_in_tiles(scan: Path, tmp_path: Path) -> None:
     labels = tmp_path / "labels.npy"
     np.save(labels, load(scan).values > 50)
     options = ("--every", 6, "--prior", "tubes", "--stiffness", 1e7, "--steps", 5, "--tile", 14)
-    result = call("reconstruct", labels, *options, "-o", tmp_path / "volume.npy")
-    assert result.exit_code == 0, (result.output, result.exception)
+    done("reconstruct", labels, *options, "-o", tmp_path / "volume.npy")
     assert np.array_equal(np.load(tmp_path / "volume.npy")[::6] > 0, np.load(labels)[::6])
     assert not list(tmp_path.glob(".*"))
 
@@ -82,15 +77,6 @@ def test_slices_are_filled_in_tiles(scan: Path, tmp_path: Path) -> None:
 def test_worker_processes_make_the_same_mask(scan: Path, tmp_path: Path) -> None:
     masks = []
     for name, more in (("one", ()), ("two", ("--workers", 2))):
-        result = call(*command(scan, tmp_path / name / "mask.npy", *more))
-        assert result.exit_code == 0, (result.output, result.exception)
+        done(*command(scan, tmp_path / name / "mask.npy", *more))
         masks.append(np.load(tmp_path / name / "mask.npy"))
     assert (masks[0] != masks[1]).mean() < 1e-3  # other processes may add up otherwise
-
-
-def test_workers_without_dask_are_told_what_to_install(scan: Path, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    result = call(*command(scan, tmp_path / "mask.npy", "--workers", 2))
-    assert result.exit_code == 2 and "pip install" in result.stderr
-    assert not list(tmp_path.glob("*mask*"))
-    assert call(*command(scan, tmp_path / "mask.npy", "--workers", 0)).exit_code == 0

@@ -1,7 +1,5 @@
 """`verify` finds what is lost, torn, changed, foreign or unlike its design; and nothing in a sound store."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 from collections.abc import Callable

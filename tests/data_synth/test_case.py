@@ -1,7 +1,5 @@
 """Cases of a training set: one shape, its image and mask, each by its number alone; and where shapes come from."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Centreline graphs of shapes whose axes are known, and their files."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from pathlib import Path

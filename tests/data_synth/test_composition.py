@@ -1,26 +1,20 @@
 """What an image shows: walls of even thickness, classes in front of one another."""
 
-from __future__ import annotations
-
-import json
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from exact import Cylinder, Sphere, centres
+from exact import Sphere, centres
 from flat_recipe import flat_recipe
 
 from curvafit.data_synth.case import Case, Composition, Recipe, shell_of
 from curvafit.data_synth.imaging.effects import occupancy
 from curvafit.data_synth.imaging.image import share_voxels
 from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality
-from curvafit.data_synth.sets import SetSpec, build_set, read_spec, write_card, write_preview
-from curvafit.data_synth.sources import Generated, PhaseField
+from curvafit.data_synth.sources import Generated
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
-from curvafit.volumes.read import read_values
 
 N, EPSILON = 48, 2.0
 GRID = Grid((N, N, N), (1.0, 1.0, 1.0))
@@ -68,27 +62,6 @@ def test_wall_and_lumen_fill_the_shape_without_a_gap():
     assert float(shares[1][whole < 1].max()) == 0  # no light of the lumen at the outer surface
 
 
-def test_a_wall_thicker_than_the_shape_fills_it():
-    u = optimal_profile(Cylinder(5.0, (1, 0.3, 0.2), MIDDLE).distance(centres(GRID)), EPSILON).float()
-    assert torch.equal(shell_of(u, EPSILON, 11.0)[0] > 0, u > 0)
-
-
-class Slab:
-    """The half space z > -1, as a source of crops: its surface lies just outside of them."""
-
-    edge = 999
-
-    def shape(self, voxels: Any, index: int, rng: np.random.Generator) -> PhaseField:
-        z = np.arange(voxels[0])[:, None, None] - (voxels[0] - 12) / 2 + 1.0
-        return PhaseField(np.tanh(z / (np.sqrt(2) * EPSILON)) * np.ones(voxels, dtype=np.float32), EPSILON, {})
-
-
-def test_a_wall_of_a_surface_outside_of_a_crop_reaches_into_it():
-    layers = Composition(wall=4.0).draw(Slab(), (12, 8, 8), 1.0, 0, np.random.default_rng(0))  # type: ignore[arg-type]
-    assert layers.values.shape == (2, 12, 8, 8)
-    assert (layers.values[0][:3] > 0).all() and (layers.values[1][4:] > 0).all() and (layers.whole > 0).all()
-
-
 def test_a_shell_has_a_bright_wall_and_a_dark_lumen(solid, shell):
     case, whole = shell.case(2), solid.case(2)
     assert shell.classes == ("wall", "lumen") and case.labels.dtype == np.uint8
@@ -115,22 +88,3 @@ def test_classes_are_a_shape_of_each_law_the_first_in_front(two):
     assert ((two.labels == 1) == (alone.labels == 1)).all()  # no part of the first is hidden
     assert [np.median(two.image[two.labels == k]) for k in range(3)] == pytest.approx([10, 110, 50])
     assert Composition(classes=True).names(Generated.of(["tubes", "tubes"])) == ("tubes 1", "tubes 2")
-
-
-def test_levels_say_how_bright_a_class_is(two):
-    even = recipe_of(LAWS, classes=True).case(0)
-    assert (even.labels == two.labels).all()
-    assert np.median(even.image[even.labels == 2]) == pytest.approx(110)
-
-
-def test_a_set_of_shells_lists_its_classes(tmp_path, shell):
-    spec = SetSpec(shell, "monai", ("radius",))
-    folder = build_set(tmp_path / "set", spec, 1)
-    assert json.loads((folder / "dataset.json").read_text())["labels"] == {"0": "background", "1": "wall", "2": "lumen"}
-    label = read_values(folder / "labelsTr" / "case_00000.nii.gz")
-    assert set(np.unique(label)) == {0, 1, 2}
-    radius = read_values(folder / "parts" / "radius" / "case_00000.nii.gz")
-    assert ((radius > 0) == (label > 0)).mean() > 0.99  # further labels are of wall and lumen together
-    assert read_spec(folder).as_dict() == spec.as_dict()
-    assert write_preview(folder).read_bytes().startswith(b"\x89PNG")
-    assert "0 background, 1 wall, 2 lumen" in write_card(folder).read_text()

@@ -1,7 +1,5 @@
 """Pairs on the fly: by number alone, shared out among workers and ranks, none twice."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import pickle

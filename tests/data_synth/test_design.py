@@ -1,7 +1,5 @@
 """Designs: Experiment 4's random law, Sobol's sequence, lists, surroundings; their YAML."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import kstest
@@ -121,39 +119,18 @@ BOMB = "a0: &a0 [1]\n" + "".join(f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 
 @pytest.mark.parametrize(
     ("text", "word"),
     [
-        ("box: {a11: [1, 2]", "YAML"),
-        ("- 1", "keys"),
-        ("bxo: {a11: 3}", "bxo"),
-        ("law: sobol", "box"),
-        ("box: {}\nlist: []", "list"),
-        ("list: []\nlaw: sobol", "law"),
-        ("list: []", "7 parameters"),
-        ("box: {\n", "line 2"),
-        ("box: {a12: [1, 2]}", "a12"),
-        ("box: {a11: [2, 1]}", "a11"),
-        ("box: {a11: [1, two]}", "a11"),
-        ("box: {a11: .nan}", "finite"),
-        ("log: [a11]\nbox: {}", "a11"),
-        ("log: [[a02]]\nbox: {}", "a02"),
-        ("log: a02\nbox: {}", "a02"),
-        ("log: [a02]\naround: tubes", "log"),
-        ("box: {mass: [-2, 0]}", "-2"),
-        ("law: even\nbox: {}", "even"),
-        ("box: !!bool abc", "abc"),
-        ("box: !!python/object:os.system {}", "YAML"),
-        (f"box: {{a11: 1{'0' * 5000}}}", "digits"),
-        ("[" * 100_000, "recursion"),
-        ("box: &a [*a]", "box"),
-        (BOMB, "a0"),
-        (f"box: {'x' * 100_000}", "x"),
-        ("around: tubs", "preset"),
-        ("around: nowhere/fit.json", "nowhere"),
-        ("around: tubes\nspread: wide", "spread"),
-        ("around: tubes\nspread: 0", "spread"),
-        ("list:\n - {a20: 1}", "a20"),
-        (None, "design.yaml"),
+        ("box: {a11: [1, 2]", "YAML"), ("- 1", "keys"), ("bxo: {a11: 3}", "bxo"), ("law: sobol", "box"),
+        ("box: {}\nlist: []", "list"), ("list: []\nlaw: sobol", "law"), ("list: []", "7 parameters"),
+        ("box: {\n", "line 2"), ("box: {a12: [1, 2]}", "a12"), ("box: {a11: [2, 1]}", "a11"),
+        ("box: {a11: [1, two]}", "a11"), ("box: {a11: .nan}", "finite"), ("log: [a11]\nbox: {}", "a11"),
+        ("log: [[a02]]\nbox: {}", "a02"), ("log: a02\nbox: {}", "a02"), ("log: [a02]\naround: tubes", "log"),
+        ("box: {mass: [-2, 0]}", "-2"), ("law: even\nbox: {}", "even"), ("box: !!bool abc", "abc"),
+        ("box: !!python/object:os.system {}", "YAML"), (f"box: {{a11: 1{'0' * 5000}}}", "digits"),
+        ("[" * 100_000, "recursion"), ("box: &a [*a]", "box"), (BOMB, "a0"), (f"box: {'x' * 100_000}", "x"),
+        ("around: tubs", "preset"), ("around: nowhere/fit.json", "nowhere"), ("around: tubes\nspread: wide", "spread"),
+        ("around: tubes\nspread: 0", "spread"), ("list:\n - {a20: 1}", "a20"), (None, "design.yaml"),
     ],
-)
+)  # fmt: skip
 def test_wrong_yaml_is_one_sentence(tmp_path, text, word):
     with pytest.raises((ValueError, FileNotFoundError), match=word) as error:
         read_design(tmp_path / "design.yaml" if text is None else written(tmp_path, text))

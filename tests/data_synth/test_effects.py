@@ -1,7 +1,5 @@
 """Effects of images against their statistics; random ones by their seed alone."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

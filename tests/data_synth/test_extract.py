@@ -1,8 +1,5 @@
 """Views of shapes, and the table of their descriptors: complete, the same however often stopped, refused if damaged."""
 
-from __future__ import annotations
-
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -140,18 +137,6 @@ def test_a_stopped_table_goes_on_and_grows(tmp_path: Path, monkeypatch: pytest.M
     grown = describe([store.path], tmp_path / "table.npz", ("scan",))
     assert grown.views.tolist() == whole.views.tolist() + ["scan"] * 5
     assert np.array_equal(grown.descriptors[: len(whole)], whole.descriptors)
-
-
-def test_a_shape_that_is_removed_meanwhile_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = exact_store(tmp_path / "store.zarr", 4)
-
-    def thief(u, rng):
-        shutil.rmtree(store.path / "draws" / "000001", ignore_errors=True)
-        return see_field(u, rng)
-
-    monkeypatch.setitem(VIEWS, "field", thief)
-    table = describe([store.path], tmp_path / "table.npz", ("field",))
-    assert table.shapes.tolist() == ["store/000000", "store/000003"]
 
 
 @pytest.mark.slow

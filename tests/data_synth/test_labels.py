@@ -1,7 +1,5 @@
 """Labels against shapes that are known exactly, on cubic and anisotropic voxels, in crops and periodic boxes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,8 +1,6 @@
 """Parameters found again in images that were made from them, with the true mask and without; real scans where there
 are some."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

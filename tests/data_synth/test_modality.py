@@ -1,7 +1,5 @@
 """Images of modalities: drawn parameters, the chain, one grid for image and labels, presets."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -43,22 +41,13 @@ def test_presets_make_images(name: str) -> None:
 @pytest.mark.parametrize(
     "effect",
     [
-        {"contrast.background_texture": 0.3},
-        {"contrast.foreground_texture": 0.3},
-        {"optics.blur": (2.0, 1.0, 1.0)},
-        {"optics.attenuation": 0.02},
-        {"illumination.bias": 0.2, "illumination.bias_length": 20},
-        {"illumination.stripes": 0.1},
-        {"detector.rings": 0.1},
-        {"specimen.dropout": 0.3, "specimen.dropout_length": 5},
-        {"specimen.clutter": 1e-3},
-        {"detector.gain": 2.0},
-        {"noise.gaussian": 3.0},
-        {"noise.rician": 3.0},
-        {"detector.offset": 7.0},
-        {"detector.ceiling": 40.0},
+        {"contrast.background_texture": 0.3}, {"contrast.foreground_texture": 0.3}, {"optics.blur": (2.0, 1.0, 1.0)},
+        {"optics.attenuation": 0.02}, {"illumination.bias": 0.2, "illumination.bias_length": 20},
+        {"illumination.stripes": 0.1}, {"detector.rings": 0.1}, {"specimen.dropout": 0.3, "specimen.dropout_length": 5},
+        {"specimen.clutter": 1e-3}, {"detector.gain": 2.0}, {"noise.gaussian": 3.0}, {"noise.rician": 3.0},
+        {"detector.offset": 7.0}, {"detector.ceiling": 40.0},
     ],
-)
+)  # fmt: skip
 def test_every_effect_counts_and_leaves_the_others_numbers(effect: dict) -> None:
     torch.testing.assert_close(image(FIELDS[1], 1.0, PLAIN, 0), 10 + 50 * effects.occupancy(FIELDS[1]))  # without any
     noisy = PLAIN.assign({"noise.gaussian": 2.0})

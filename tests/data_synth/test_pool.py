@@ -1,8 +1,5 @@
 """A pool: each shape grown once, by whoever wants it first, for all workers and epochs."""
 
-from __future__ import annotations
-
-import dataclasses
 import json
 import multiprocessing
 import os
@@ -18,7 +15,6 @@ import pytest
 from pool_run import SHAPES, balls
 
 from curvafit.data_synth import sources
-from curvafit.data_synth.sources import Pool
 
 SCRIPT = Path(__file__).parents[1] / "pool_run.py"
 
@@ -76,15 +72,6 @@ def test_threads_and_other_sets_share_shapes(tmp_path, capsys):
     assert not capsys.readouterr().err  # what is there is read in silence
 
 
-def test_a_shape_that_fails_fails_alike_everywhere(tmp_path):
-    pool = balls(str(tmp_path / "log")).source
-    assert isinstance(pool, Pool)
-    for each in (pool, pickle.loads(pickle.dumps(pool))):
-        with pytest.raises(ValueError, match="none of 8 seeds"):
-            each.whole(13)
-    assert grown(tmp_path / "log") == [13]
-
-
 @pytest.mark.parametrize("fault", ["read-only", "full"])
 def test_without_room_a_process_keeps_its_own_shapes(tmp_path, monkeypatch, fault):
     def refuse(*arguments: object, **options: object) -> str:
@@ -96,11 +83,3 @@ def test_without_room_a_process_keeps_its_own_shapes(tmp_path, monkeypatch, faul
     with pytest.warns(UserWarning, match="each process grows its own"):
         assert [pairs[k] for k in range(4)] == expected
     assert grown(tmp_path / "own") == grown(tmp_path / "log")
-
-
-def test_a_pool_whose_room_is_gone_takes_that_of_the_process(tmp_path):
-    pairs = balls(str(tmp_path / "log"))
-    assert isinstance(pairs.source, Pool)
-    old = dataclasses.replace(pairs.source, room=tmp_path / "gone")
-    assert (old.whole(0).values == pairs.source.whole(0).values).all()
-    assert grown(tmp_path / "log") == [0]

@@ -1,7 +1,5 @@
 """What is asked for wrongly is refused, in one sentence that names what is wrong."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Samples: fetched once, checked, cached; and a synthetic scan where nothing can be fetched."""
 
-from __future__ import annotations
-
 import hashlib
 import subprocess
 import zipfile

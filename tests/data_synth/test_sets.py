@@ -1,7 +1,5 @@
 """Training sets: the same cases whoever makes them and whenever, whole or not at all, as their readers want them."""
 
-from __future__ import annotations
-
 import errno
 import json
 import shutil
@@ -207,13 +205,6 @@ def test_a_damaged_header_is_one_sentence(tmp_path, folder, wide, wrong):
     with pytest.raises(ValueError, match="curvafit.json"):
         build_set(tmp_path, wide, 1)
     assert file.read_text() == text
-
-
-def test_a_set_that_states_a_blend_of_none_goes_on(tmp_path, folder, wide):
-    header = json.loads((folder / "curvafit.json").read_text())
-    header["order"]["recipe"]["composition"]["blend"] = 0
-    (tmp_path / "curvafit.json").write_text(json.dumps(header))
-    assert read_spec(tmp_path) == wide
 
 
 def test_the_card_tells_what_a_set_is_and_spares_another_s(tmp_path, folder, wide):

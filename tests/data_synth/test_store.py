@@ -1,7 +1,5 @@
 """The store: whole draws or none, what goes in comes out, versions and settings are checked."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

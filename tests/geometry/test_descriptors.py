@@ -1,7 +1,5 @@
 """Descriptors on shapes that are known exactly, and the laws that they obey."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Curvature diagrams: right on exact shapes, blind to the seam, and honest about what they leave out."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -200,16 +198,11 @@ def at(*points: tuple[float, float]) -> Diagram:
 @pytest.mark.parametrize(
     ("points", "name"),
     [
-        ([(1.0, 1.0)], "spheres"),
-        ([(1.0, 0.1)], "tubes"),
-        ([(1.0, -0.9)], "sponge"),
-        ([(0.05, -0.05)], "layers"),
-        ([(0.1, -1.0)], "tubular cavities"),
-        ([(-1.0, -1.1)], "bubbles"),
-        ([(1, 0), (0.01, 0), (0.01, 0)], "layers"),
+        ([(1.0, 1.0)], "spheres"), ([(1.0, 0.1)], "tubes"), ([(1.0, -0.9)], "sponge"), ([(0.05, -0.05)], "layers"),
+        ([(0.1, -1.0)], "tubular cavities"), ([(-1.0, -1.1)], "bubbles"), ([(1, 0), (0.01, 0), (0.01, 0)], "layers"),
         ([(1, 0), (1, 0), (0.01, 0)], "tubes"),
     ],
-)
+)  # fmt: skip
 def test_ideal_shapes_are_named(points: list[tuple[float, float]], name: str) -> None:
     """By where the area lies, whatever the unit of length; a flat half makes layers."""
     assert family_of(at(*points), RADIUS) == name

@@ -1,7 +1,5 @@
 """Distances between diagrams: metric properties, known values, geomloss's values, and what binning costs."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

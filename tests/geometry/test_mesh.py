@@ -1,7 +1,5 @@
 """Surfaces: seams, orientation, caps, topology; and in files, as other programs read them."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from xml.etree import ElementTree

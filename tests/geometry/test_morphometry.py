@@ -1,7 +1,5 @@
 """The familiar numbers on shapes that have them exactly, and on bone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import ndimage

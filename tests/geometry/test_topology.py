@@ -1,7 +1,5 @@
 """Betti numbers of shapes that have them exactly, in boxes that end and on the torus."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import ndimage

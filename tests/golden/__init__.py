@@ -1,1 +1,5 @@
-"""The golden corpus: small inputs, each command and public call on them, and what came of it, frozen."""
+"""Numbers of a small corpus, frozen: its inputs are committed, as another processor would round some otherwise."""
+
+from pathlib import Path
+
+FOLDER = Path(__file__).parent / "inputs"

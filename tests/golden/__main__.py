@@ -1,21 +1,16 @@
-"""Make the inputs anew, or freeze rows: `python -m tests.golden inputs`, `python -m tests.golden freeze [ROW ...]`."""
-
-from __future__ import annotations
+"""Freeze rows: `python -m tests.golden freeze [ROW ...]`."""
 
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-from tests.golden import inputs, rows
+from tests.golden import rows
 from tests.golden.frozen import compare, read, write
 
 
 def main(words: list[str]) -> None:
     """Do what the words say."""
-    if words == ["inputs"]:
-        inputs.make()
-        return
     if words[:1] != ["freeze"] or not set(words[1:]) <= set(rows.ROWS):
         raise SystemExit(f"{__doc__}\nrows: {' '.join(rows.ROWS)}")
     kept = read()

@@ -6,8 +6,6 @@ and a hash of rounded numbers would break at the edge of rounding. For the same 
 `STRAY` of its voxels differ.
 """
 
-from __future__ import annotations
-
 import base64
 import csv
 import json

@@ -1,7 +1,5 @@
 """The rows of the corpus: each command and each public call on a small input."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import warnings
@@ -14,8 +12,8 @@ import torch
 
 from tests.calling import call
 from tests.damage import FORMATS, VALUES
+from tests.golden import FOLDER
 from tests.golden.frozen import CLOSE, exact, files, rounded, volume
-from tests.golden.inputs import FOLDER
 
 #: Commands, as they are typed in a folder with the inputs.
 COMMANDS = {
@@ -116,11 +114,8 @@ def _write_formats(folder: Path) -> dict[str, Any]:
     for name in ("out.nii.gz", "out.tif", "out.ome.tif", "out.npy", "out.zarr", "out.mrc"):
         field = curvafit.load(curvafit.save(scan, folder / name))
         found[name] = [
-            exact(field.values.astype(np.uint8)),
-            field.values.dtype.name,
-            *rounded(field.spacing),
-            field.unit,
-        ]
+            exact(field.values.astype(np.uint8)), field.values.dtype.name, *rounded(field.spacing), field.unit,
+        ]  # fmt: skip
     return found
 
 
@@ -198,13 +193,9 @@ def _field(name: str) -> np.ndarray:
 
 
 CALLS = {
-    "load": _read_formats,
-    "save": _write_formats,
-    "loss": _loss,
-    "geometry": _geometry,
-    "flows": _flows,
+    "load": _read_formats, "save": _write_formats, "loss": _loss, "geometry": _geometry, "flows": _flows,
     "training": _training,
-}
+}  # fmt: skip
 ROWS: dict[str, Callable[[Path], dict[str, Any]]] = {
     **{name: _run_command(line) for name, line in COMMANDS.items()},
     **CALLS,

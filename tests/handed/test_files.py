@@ -1,7 +1,5 @@
 """Cases that were handed in: what volume files state of units, grey values, times and types is used or said."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Cases that were handed in: regions elsewhere, surfaces of windows, padding, thin stacks, empty masks, label maps."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 

@@ -1,7 +1,5 @@
 """Handed cases of volumes between known slices, each by its name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

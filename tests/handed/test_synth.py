@@ -1,7 +1,5 @@
 """Cases that were wrong once: small doors."""
 
-from __future__ import annotations
-
 import csv
 import logging
 import subprocess

@@ -1,19 +1,15 @@
 """Bombs, claims of headers, signals, full disks, rivals: what no random draw would find."""
 
-from __future__ import annotations
-
+import contextlib
 import gzip
-import json
 import os
-import shlex
-import shutil
 import signal
 import struct
 import subprocess
 import sys
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +18,18 @@ import nibabel
 import numpy as np
 import pytest
 import zarr
+from calling import call, refused
 from damage import files_of
 from disk import tree
 
 from curvafit.volumes.read import load
-from tests.golden.inputs import FOLDER
+from tests.golden import FOLDER
+from tests.hostile.test_properties import bounds, copy_inputs
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="commands are forked from a warm process"),
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs limits of memory and signals"),
+    pytest.mark.filterwarnings("default"),
 ]
 
 #: Bytes that a command may map beyond what its libraries do, and zeros that a bomb swells to.
@@ -41,41 +40,6 @@ LONG = f"{LAW} --steps 120 --checkpoint run.pt --checkpoint-every 0 -o out.npy"
 SYNTH = "synth -o out --atlas store.zarr --modality confocal --shape 6 --count 3 --workers 0"
 BUILD = "atlas build out.zarr --shape 16 --around tubes --spread 0.05 --count 2 --workers 0"
 SEGMENT = "segment scan.tif --prior tubes --steps 2"
-
-Fork = Callable[..., list[dict[str, Any]]]
-
-
-@pytest.fixture(scope="module")
-def fork() -> Iterator[Fork]:
-    """Run commands at once, each forked from a process that has loaded the libraries."""
-    program = [sys.executable, "-W", "ignore", Path(__file__).with_name("forked.py")]
-    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
-        assert server.stdin is not None and server.stdout is not None
-
-        def run(*commands: dict[str, Any]) -> list[dict[str, Any]]:
-            print(json.dumps(commands), file=server.stdin, flush=True)
-            return json.loads(server.stdout.readline())
-
-        yield run
-        server.stdin.close()
-
-
-def command(folder: Path, line: str, **how: Any) -> dict[str, Any]:
-    """A command in a folder that gets the inputs which it names."""
-    folder.mkdir(exist_ok=True)
-    for word in line.split():
-        if (FOLDER / word).is_dir():
-            shutil.copytree(FOLDER / word, folder / word, dirs_exist_ok=True)
-        elif (FOLDER / word).is_file():
-            shutil.copyfile(FOLDER / word, folder / word)
-    return {"folder": str(folder), "words": shlex.split(line), **how}
-
-
-def refusal(outcome: dict[str, Any]) -> str:
-    """The one sentence of a command that is refused."""
-    lines = [line for line in outcome["said"].splitlines() if not line.startswith(("[", "changes "))]
-    assert outcome["code"] == 2 and len(lines) == 1 and lines[0].startswith("error: "), outcome
-    return lines[0]
 
 
 # ---- bombs and claims ------------------------------------------------------------------------------------------------
@@ -143,48 +107,108 @@ CLAIMS: dict[str, bytes | Callable[[Path], object]] = {
     "sparse.tif": lambda path: path.touch() or os.truncate(path, 10**12),
     "sparse.npy": lambda path: path.touch() or os.truncate(path, 10**12),
 }
+BOMBS: dict[str, bytes | Callable[[Path], object]] = {
+    "whole.nii.gz": lambda path: path.write_bytes(swollen(nifti(1200, 1200, 1200))),
+    "tail.nii.gz": lambda path: path.write_bytes(swollen(nifti(8, 8, 8))),
+    "bomb.nrrd": lambda path: path.write_bytes(nrrd("8 8 8", "gzip") + swollen(b"")),
+    "bomb.npz": zipped,
+}
 
 
-def test_a_header_that_claims_what_no_memory_holds_is_refused(fork: Fork, tmp_path: Path) -> None:
-    for name, write in CLAIMS.items():
+def test_what_no_memory_holds_is_refused(tmp_path: Path) -> None:
+    """A header that claims it, and a file that swells to it."""
+    for name, write in (CLAIMS | BOMBS).items():
         (tmp_path / name).write_bytes(write) if isinstance(write, bytes) else write(tmp_path / name)
     before = {path: path.stat().st_mtime for path in tmp_path.rglob("*")}
-    for name in CLAIMS:
-        (outcome,) = fork(command(tmp_path, f"segment {name} --prior tubes --steps 1 -o out.nii.gz", memory=MEMORY))
-        assert refusal(outcome), name
+    with contextlib.chdir(tmp_path):
+        for name in CLAIMS | BOMBS:
+            with bounds(MEMORY):
+                result = call(*f"segment {name} --prior tubes --steps 1 -o out.nii.gz".split())
+            refused(result, progress=True)
     assert {path: path.stat().st_mtime for path in tmp_path.rglob("*")} == before
 
 
-def test_a_bomb_is_refused(fork: Fork, tmp_path: Path) -> None:
-    (tmp_path / "whole.nii.gz").write_bytes(swollen(nifti(1200, 1200, 1200)))
-    (tmp_path / "tail.nii.gz").write_bytes(swollen(nifti(8, 8, 8)))
-    (tmp_path / "a.nrrd").write_bytes(nrrd("8 8 8", "gzip") + swollen(b""))
-    zipped(tmp_path / "a.npz")
-    for name in ("whole.nii.gz", "tail.nii.gz", "a.nrrd", "a.npz"):
-        (outcome,) = fork(command(tmp_path, f"segment {name} --prior tubes --steps 1 -o out.nii.gz", memory=MEMORY))
-        assert refusal(outcome), name
-    assert len(list(tmp_path.iterdir())) == 4
+# ---- full disks ------------------------------------------------------------------------------------------------------
 
 
-# ---- signals ---------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("name", ["out.npy", "out.nii.gz", "out.ome.tif", "out.mrc", "out.zarr", "out.stl"])
+def test_a_disk_that_is_full_is_said_and_leaves_nothing(tmp_path: Path, name: str) -> None:
+    for size in (1, 4000):
+        with contextlib.chdir(tmp_path), bounds(file=size):
+            result = call(*f"{QUICK} --spacing 1 --unit um --no-picture -o {name}".split())
+        refused(result, progress=True)
+        assert not list(tmp_path.iterdir()), size
+
+
+@pytest.mark.parametrize("line", [f"{QUICK} -o mask.nii.gz --overwrite", "atlas extract store.zarr -o out.npz", SYNTH])
+def test_a_disk_that_is_full_costs_nothing_that_was_there(tmp_path: Path, line: str) -> None:
+    copy_inputs(line, tmp_path)
+    before = tree(tmp_path)
+    with contextlib.chdir(tmp_path), bounds(file=400):
+        result = call(*line.split())
+    refused(result, progress=True)
+    assert {name: content for name, content in tree(tmp_path).items() if not name.startswith("out/")} == before
+
+
+# ---- signals and rivals ----------------------------------------------------------------------------------------------
+
+#: A command with the changes of files in its folder counted: at one of them it gets a signal, each lasts a while.
+PROGRAM = """
+import os, random, sys, time
+from curvafit.__main__ import main
+change, number, lag, done = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]), 0
+folder, sys.argv = os.getcwd(), ["curvafit", *sys.argv[4:]]
+
+def watch(event, arguments):
+    global done
+    opened = event == "open" and isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR)
+    changed = event in ("os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.truncate", "os.link", "os.symlink")
+    if not (opened or changed) or isinstance(arguments[0], int):
+        return
+    name = os.fsdecode(arguments[0])
+    if not os.path.isabs(name) or name.startswith(folder):
+        done += 1
+        if done == change:
+            os.kill(os.getpid(), number)
+        time.sleep(lag * random.random())
+
+sys.addaudithook(watch)
+try:
+    main()
+finally:
+    print("changes", done, flush=True)
+"""
+
+
+def start(folder: Path, line: str, change: int = 0, number: int = 0, lag: float = 0.0) -> subprocess.Popen[str]:
+    """A command in a folder that gets the inputs which it names."""
+    folder.mkdir(exist_ok=True)
+    copy_inputs(line, folder)
+    words = [sys.executable, "-W", "ignore", "-c", PROGRAM, *map(str, (change, number, lag)), *line.split()]
+    return subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def end(run: subprocess.Popen[str]) -> tuple[int, str]:
+    said = run.communicate()[0]
+    return run.returncode, said
 
 
 @pytest.mark.parametrize("line", [LONG, SYNTH, BUILD, f"{SEGMENT} --tile 16 -o out.nii.gz"])
-def test_a_run_that_is_ended_leaves_whole_files_and_goes_on(fork: Fork, tmp_path: Path, line: str) -> None:
+def test_a_run_that_is_ended_leaves_whole_files_and_goes_on(tmp_path: Path, line: str) -> None:
     """By a signal at any change of a file: afterwards the same command ends as an unbroken one does."""
-    (whole,) = fork(command(tmp_path / "whole", line))
-    assert whole["code"] == 0 and whole["changes"] > 9, whole
+    code, said = end(start(tmp_path / "whole", line))
+    changes = int(said.rpartition("changes ")[2])
+    assert code == 0 and changes > 9, said
     inputs = {word for word in line.split() if (FOLDER / word).exists()}
     for number, share in ((signal.SIGINT, 0.1), (signal.SIGKILL, 0.4), (signal.SIGTERM, 0.7), (signal.SIGINT, 0.95)):
         folder = tmp_path / f"{share}"
-        (ended,) = fork(command(folder, line, change=1 + int(share * whole["changes"]), signal=number))
-        assert ended["code"] in (0, -number, 128 + number) and "Traceback" not in ended["said"], ended
+        code, said = end(start(folder, line, 1 + int(share * changes), number))
+        assert code in (0, -number, 128 + number) and "Traceback" not in said, said
         new = [path for path in folder.rglob("*") if path.relative_to(folder).parts[0] not in inputs]
         if number != signal.SIGKILL:
-            assert not [path for path in new if path.name.startswith(".") and "curvafit" not in path.name], (ended, new)
+            assert not [path for path in new if path.name.startswith(".") and "curvafit" not in path.name], (said, new)
         values(folder)
-        (again,) = fork(command(folder, line))
-        assert again["code"] == 0, (share, ended, again)
+        assert (again := end(start(folder, line)))[0] == 0, (share, said, again)
         assert values(folder) == values(tmp_path / "whole")
 
 
@@ -197,37 +221,14 @@ def values(folder: Path) -> dict[str, bytes]:
     return found
 
 
-# ---- full disks ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["out.npy", "out.nii.gz", "out.ome.tif", "out.mrc", "out.zarr", "out.stl"])
-def test_a_disk_that_is_full_is_said_and_leaves_nothing(fork: Fork, tmp_path: Path, name: str) -> None:
-    for size in (1, 4000):
-        line = f"{QUICK} --spacing 1 --unit um --no-picture -o {name}"
-        (outcome,) = fork(command(tmp_path, line, file=size))
-        assert refusal(outcome)
-        assert not list(tmp_path.iterdir()), size
-
-
-@pytest.mark.parametrize("line", [f"{QUICK} -o mask.nii.gz --overwrite", "atlas extract store.zarr -o out.npz", SYNTH])
-def test_a_disk_that_is_full_costs_nothing_that_was_there(fork: Fork, tmp_path: Path, line: str) -> None:
-    started = command(tmp_path, line, file=400)
-    before = tree(tmp_path)
-    refusal(fork(started)[0])
-    assert {name: content for name, content in tree(tmp_path).items() if not name.startswith("out/")} == before
-
-
-# ---- rivals ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("line", [f"{QUICK} -o out.nii.gz", f"{QUICK} -o out.zarr", LONG, BUILD, SYNTH])
-def test_two_at_once_both_end_or_one_says_why(fork: Fork, tmp_path: Path, line: str) -> None:
+def test_two_at_once_both_end_or_one_says_why(tmp_path: Path, line: str) -> None:
     """What they leave is what one alone does."""
-    outcomes = fork(*[command(tmp_path / "two", line, lag=0.03) for _ in range(2)])
-    assert 0 in [outcome["code"] for outcome in outcomes], outcomes
-    for outcome in outcomes:
-        if outcome["code"]:
-            assert ".part" not in refusal(outcome)
-    fork(command(tmp_path / "one", line))
+    outcomes = [end(run) for run in [start(tmp_path / "two", line, lag=0.03) for _ in range(2)]]
+    assert 0 in [code for code, _ in outcomes], outcomes
+    for code, said in outcomes:
+        sentences = [each for each in said.splitlines() if not each.startswith(("[", "changes "))]
+        assert not code or (code == 2 and len(sentences) == 1 and ".part" not in sentences[0]), said
+    end(start(tmp_path / "one", line))
     assert values(tmp_path / "two") == values(tmp_path / "one")
     assert not [path for path in (tmp_path / "two").rglob(".*") if path.is_file()]

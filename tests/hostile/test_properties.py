@@ -6,8 +6,6 @@ is as it was; with 0 what is new can be read. What stood in the folder before st
 `CURVAFIT_HOSTILE=300 python -m pytest tests/hostile` draws so many examples for each command, new ones every time.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -32,7 +30,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 
 from curvafit.cli.app import app
 from curvafit.volumes.read import load
-from tests.golden.inputs import FOLDER
+from tests.golden import FOLDER
 from tests.golden.rows import COMMANDS
 
 resource = pytest.importorskip("resource", reason="needs limits of memory and time")
@@ -85,18 +83,20 @@ def begins(words: Sequence[str], commands: Sequence[str]) -> bool:
 
 
 @contextlib.contextmanager
-def bounds() -> Iterator[None]:
-    """Bound memory and time while a command runs in this process; Linux alone knows what is mapped."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+def bounds(room: int = ROOM, file: int | None = None) -> Iterator[None]:
+    """Bound memory, time and files' size while a command runs in this process; Linux alone knows what is mapped."""
+    (soft, hard), sizes = resource.getrlimit(resource.RLIMIT_AS), resource.getrlimit(resource.RLIMIT_FSIZE)
     mapped = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     before = signal.signal(signal.SIGPROF, _stop)
-    resource.setrlimit(resource.RLIMIT_AS, (mapped + ROOM, hard))
+    resource.setrlimit(resource.RLIMIT_AS, (mapped + room, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (sizes[0] if file is None else file, sizes[1]))
     signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+        resource.setrlimit(resource.RLIMIT_FSIZE, sizes)
         signal.signal(signal.SIGPROF, before)
 
 
@@ -212,13 +212,17 @@ def inputs(line: str) -> Iterator[Path]:
         folder = Path(name)
         (folder / "folder").mkdir()
         (folder / "folder" / "thesis.txt").write_text("the only copy")
-        for word in line.split():
-            if (FOLDER / word).is_dir():
-                shutil.copytree(FOLDER / word, folder / word, dirs_exist_ok=True)
-            elif (FOLDER / word).exists():
-                (folder / word).parent.mkdir(exist_ok=True)
-                shutil.copyfile(FOLDER / word, folder / word)
+        copy_inputs(line, folder)
         yield folder
+
+
+def copy_inputs(line: str, folder: Path) -> None:
+    for word in line.split():
+        if (FOLDER / word).is_dir():
+            shutil.copytree(FOLDER / word, folder / word, dirs_exist_ok=True)
+        elif (FOLDER / word).exists():
+            (folder / word).parent.mkdir(exist_ok=True)
+            shutil.copyfile(FOLDER / word, folder / word)
 
 
 def plant(folder: Path, out: str, what: str | None) -> None:

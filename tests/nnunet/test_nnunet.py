@@ -1,7 +1,5 @@
 """nnU-Net's trainer: the variables by which it is found, and the trainer in the real package where there is one."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import subprocess

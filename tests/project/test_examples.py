@@ -1,7 +1,5 @@
 """The example scripts, each through its main at a tiny size: a table that makes sense, a picture, kept shapes."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import sys

@@ -1,7 +1,5 @@
 """Without the extras: what the core installs works, and what needs more says which line to type."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -10,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.golden.inputs import FOLDER
+from tests.golden import FOLDER
 from tests.golden.rows import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -1,7 +1,5 @@
 """What calls curvafit from Fiji, 3D Slicer, PolNet and MONAI: its options exist, and what comes back is in place."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import random

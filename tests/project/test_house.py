@@ -1,7 +1,5 @@
 """What an import brings along, and which names each room offers: all asked in one fresh interpreter."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The notebooks of the docs, each run as the script that it is."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The two archives that a release is made of: one copy of the package, and what goes with it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tarfile

@@ -1,7 +1,5 @@
 """Files beside the package: one version, pins that hold, links that lead somewhere, no place of one machine."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from importlib.metadata import entry_points

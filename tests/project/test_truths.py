@@ -1,7 +1,5 @@
 """No truth test goes without notice: each that `tests/truths.txt` lists is there."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The plugin in a real napari, driven by its own buttons: xvfb-run -a python -m pytest -W ignore tests/viewer."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
