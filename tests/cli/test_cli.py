@@ -226,16 +226,6 @@ def test_a_warning_becomes_a_note_where_the_command_succeeds(tmp_path: Path) -> 
 # ---- lines -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_job_that_fails_at_its_start_says_why_alone(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(OSError, match="gone"), show_stages() as progress:
-        progress("reading", 0.0)
-        raise OSError("gone")
-    assert capsys.readouterr().err == ""
-    with show_stages() as progress:
-        progress("reading", 0.0)
-    assert capsys.readouterr().err == "[  0 %] reading\n"
-
-
 def test_a_stage_that_counts_on_is_a_line_every_five_percent(capsys: pytest.CaptureFixture[str]) -> None:
     """Progress where there is no terminal: lines that a log can hold."""
     with show_stages() as progress:
@@ -246,6 +236,13 @@ def test_a_stage_that_counts_on_is_a_line_every_five_percent(capsys: pytest.Capt
     lines = capsys.readouterr().err.splitlines()
     assert 15 <= len(lines) <= 21
     assert lines[0] == "[  0 %] 0 of 1000 draws checked" and lines[-1] == "[ 90 %] making draw 12 again"
+    with pytest.raises(OSError, match="gone"), show_stages() as progress:
+        progress("reading", 0.0)
+        raise OSError("gone")
+    assert capsys.readouterr().err == ""
+    with show_stages() as progress:
+        progress("reading", 0.0)
+    assert capsys.readouterr().err == "[  0 %] reading\n"
 
 
 def test_a_sentence_is_one_line_that_shows() -> None:

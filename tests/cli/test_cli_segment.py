@@ -115,9 +115,8 @@ def test_other_formats_and_a_fit_in_another_unit(tmp_path: Path) -> None:
     path, prior, target = tmp_path / "scan.tif", tmp_path / "fit.json", tmp_path / "mask.ome.tif"
     save(Field(grey(), (19.5,) * 3, "um"), path)
     prior.write_text(made_fit().to_json())
-    result = done(
-        "segment", path, "--prior", prior, "--dark", "--threshold", 150, "--weight", 1, "--steps", 2, "-o", target
-    )
+    options = ("--dark", "--threshold", 150, "--weight", 1, "--steps", 2)
+    result = done("segment", path, "--prior", prior, *options, "-o", target)
     assert "um" in result.stdout
     made = load(target)
     assert made.unit == "um" and made.spacing == pytest.approx((19.5,) * 3)

@@ -85,15 +85,12 @@ def test_a_shape_that_falls_between_the_slices_is_not_a_case():
 
 
 def test_structures_of_many_calibres(recipe):
-    """The same shapes, cropped smaller and shown larger; one calibre leaves a case as it is."""
+    """The same shapes, cropped smaller and shown larger; such a recipe reads back."""
     thick = replace(recipe, calibres=(1.0, 2.0))
     cases = [thick.case(index) for index in range(4)]
     voxels = [case.record["voxel"] for case in cases]
     assert len(set(voxels)) == 4 and min(voxels) >= 0.5 and max(voxels) <= 1.0
     assert [case.epsilon for case in cases] == pytest.approx([2 * voxel for voxel in voxels])
-
-
-def test_a_recipe_reads_back(recipe):
     thick = replace(recipe, calibres=(1.0, 2.0))
     assert Recipe.from_dict(json.loads(json.dumps(thick.as_dict()))) == thick
     kept = recipe.source.as_dict()
@@ -116,13 +113,11 @@ def test_the_48_symmetries_are_a_group_of_which_the_first_is_none():
 
 
 def test_a_crop_goes_on_across_the_faces():
+    """And of the whole it is a shift."""
     tiled = np.tile(VALUES, (2, 2, 2))
     for corner in ((0, 0, 0), (2, 3, 4), (1, 3, 0)):
         z, y, x = corner
         assert (crop_periodic(VALUES, corner, (3, 2, 4)) == tiled[z : z + 3, y : y + 2, x : x + 4]).all()
-
-
-def test_a_crop_of_the_whole_is_a_shift():
     found, how = random_crop(VALUES, (3, 3, 3), np.random.default_rng(5))
     again, _ = random_crop(VALUES, (3, 3, 3), np.random.default_rng(5))
     assert found.shape == (3, 3, 3) and (found == again).all() and found.flags["C_CONTIGUOUS"]

@@ -72,9 +72,6 @@ def test_a_shell_has_a_bright_wall_and_a_dark_lumen(solid, shell):
     assert case.record["class_fractions"] == pytest.approx(counts) and sum(counts) < 1
     one_slice = replace(shell, shape=(1, 16, 16)).case(0)
     assert set(np.unique(one_slice.labels)) == {0, 1, 2}
-
-
-def test_where_labels_are_what_an_image_shows_a_wall_stays_one(solid, shell):
     wide = replace(solid.modality, base=solid.modality.base.assign({"visible": 0.2}))
     exact, seen = shell.case(2), replace(shell, modality=wide).case(2)
     assert set(np.unique(seen.labels[exact.labels == 0])) == {0, 1}  # what is seen beyond the surface is wall

@@ -93,18 +93,6 @@ def test_ranks_share_an_epoch_evenly(store, monkeypatch):
     assert numbers(sent) == [2, 5]
 
 
-def test_samples_of_many_calibres(store):
-    dataset = TextureDataset(store, QUIET, SHAPE, calibres=(1.0, 1.5))
-    voxels = [dataset.sample(k).record["voxel"] for k in range(4)]
-    assert len(set(voxels)) == 4 and 1.5 * QUIET.voxel >= max(voxels) > min(voxels) >= QUIET.voxel
-
-
-def test_modalities_take_turns_at_random(store):
-    loud = Modality("loud", "for tests", 1.0, Imaging(contrast=Contrast(foreground=1000.0)))
-    pairs = TextureDataset(store, [QUIET, loud], SHAPE)
-    assert {pairs[k].record["modality"] for k in range(12)} == {"quiet", "loud"}
-
-
 @pytest.mark.filterwarnings("ignore:NvImgCodec")  # MONAI's, of a reader that is not used
 @pytest.mark.parametrize("unit", ["nm", "um", "mm", "voxel"])
 def test_monai_s_form_is_that_of_a_file(store, tmp_path, unit):
@@ -126,11 +114,18 @@ def test_monai_s_form_is_that_of_a_file(store, tmp_path, unit):
 
 
 def test_one_number_is_a_cube_and_a_name_a_modality(store):
+    """Of several calibres and modalities, samples take turns at random."""
     dataset = TextureDataset(store, "Micro_CT", 12, length=5)
     assert dataset[0].image.shape == (1, 12, 12, 12) and dataset[0].record["modality"] == "micro-ct"
     batch = next(iter(DataLoader(TextureDataset(store, "micro-ct", 12, transform=as_dict), batch_size=3)))
     assert batch["image"].shape == batch["label"].shape == (3, 1, 12, 12, 12)
     assert repr(dataset) == "TextureDataset(7 shapes of s.zarr; micro-ct; 12 x 12 x 12 voxels; 5 samples an epoch)"
+    dataset = TextureDataset(store, QUIET, SHAPE, calibres=(1.0, 1.5))
+    voxels = [dataset.sample(k).record["voxel"] for k in range(4)]
+    assert len(set(voxels)) == 4 and 1.5 * QUIET.voxel >= max(voxels) > min(voxels) >= QUIET.voxel
+    loud = Modality("loud", "for tests", 1.0, Imaging(contrast=Contrast(foreground=1000.0)))
+    pairs = TextureDataset(store, [QUIET, loud], SHAPE)
+    assert {pairs[k].record["modality"] for k in range(12)} == {"quiet", "loud"}
 
 
 def test_shapes_that_are_not_well_formed_are_not_cropped(tmp_path):

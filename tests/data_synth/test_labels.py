@@ -50,6 +50,7 @@ def test_distance(name: str, spacing: tuple[float, float, float], width: float) 
 
 
 def test_distance_around_a_periodic_box() -> None:
+    """And of a hard field that of the voxels' faces."""
     box = Grid((24, 20, 28), FLAT, "periodic")
     size = np.array(box.shape) * box.spacing
     here, corner = ((Sphere(4.0, tuple(size * part))) for part in (0.5, 0.0))
@@ -59,9 +60,6 @@ def test_distance_around_a_periodic_box() -> None:
     u = torch.stack([profile(each, centres(box), 1.5) for each in images]).amax(0)
     assert np.abs(field_distance(u, box, 1.5) - moved).max() < 0.2
     assert np.abs(moved - np.max([each.distance(centres(box)) for each in images], axis=0)).max() < 0.4
-
-
-def test_distance_of_a_hard_field_is_that_of_the_voxels_faces() -> None:
     box = Grid((16, 16, 16), 1.0, "replicate")  # type: ignore[arg-type]
     u = torch.where(torch.arange(16) < 7, 1.0, -1.0).expand(16, 16, 16)
     assert np.allclose(field_distance(u, box, 2.0)[3, 4], 6.5 - np.arange(16), atol=1e-5)
@@ -111,12 +109,6 @@ def test_labels_of_known_shapes(name: str, spacing: tuple[float, float, float]) 
     assert labels["distance"][labels["skeleton"]].min() > depth - max(spacing)
 
 
-def test_a_shell_keeps_its_cavity() -> None:
-    d = Sphere(9.0, MIDDLE).distance(centres(grid(CUBES)))
-    distance = torch.minimum(d, 5 - d).numpy().astype(np.float32)
-    assert betti_numbers(distance > 0) == betti_numbers(skeleton_of(distance, grid(CUBES))) == (1, 0, 1)
-
-
 @pytest.mark.parametrize("boundary", ["periodic", "replicate"])
 def test_the_skeleton_of_a_labyrinth_has_its_topology(labyrinth, boundary: str) -> None:
     """χ = -4 on the torus, half of the gyroid's, in one piece without a cavity; a cut leaves two of its tunnels."""
@@ -145,6 +137,7 @@ def test_two_balls_are_two_until_they_are_one(gap: float, count: int, spacing: t
 
 
 def test_beads_on_a_string_and_an_even_tube() -> None:
+    """And a shell with its cavity, and an instance across the faces of a periodic box."""
     box = grid(CUBES)
     line = np.array([(14.0, 14.2, -20.0), (14.0, 14.2, 50.0)])
     thin, even = Tubes(1.5, (line,)).distance(centres(box)), Tubes(4.0, (line,)).distance(centres(box))
@@ -152,9 +145,9 @@ def test_beads_on_a_string_and_an_even_tube() -> None:
     strung = torch.maximum(thin, beads).numpy().astype(np.float32)
     assert instances_of(strung, box).max() == 2 and betti_numbers(strung > 0)[0] == 1
     assert instances_of(even.numpy().astype(np.float32), box).max() == 1
-
-
-def test_an_instance_goes_on_across_the_faces() -> None:
+    d = Sphere(9.0, MIDDLE).distance(centres(grid(CUBES)))
+    distance = torch.minimum(d, 5 - d).numpy().astype(np.float32)
+    assert betti_numbers(distance > 0) == betti_numbers(skeleton_of(distance, grid(CUBES))) == (1, 0, 1)
     box = grid(CUBES, "periodic")
     whole = profile(Sphere(5.0, MIDDLE), centres(box), 1.0)
     cut = torch.roll(whole, (14, 14, 14), (0, 1, 2))

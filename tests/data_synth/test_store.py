@@ -53,14 +53,12 @@ def changed(file: Path, change) -> None:
 
 
 def test_a_draw_comes_back_as_it_went_in_and_is_not_written_twice(store):
+    """A rejected draw is remembered without a field, and NaN as such."""
     again = open_store(store.path)
     assert again.settings == SETTINGS and again.indices() == [0, 1]
     assert again.record(0) == record(0) and again.field(0).dtype == np.float32
     assert not store.write(record(0), field(1))
     np.testing.assert_array_equal(again.field(0), field(0))
-
-
-def test_a_rejected_draw_is_remembered_without_a_field_and_nan_as_such(store):
     assert "NaN" not in (store.path / "draws" / "000001" / "zarr.json").read_text()
     back = store.record(1)
     assert math.isnan(back.energy) and math.isnan(back.viability.discrepancy) and not back.viability.viable

@@ -43,7 +43,14 @@ def test_parallel_plates(width: int) -> None:
     assert found.euler == 0  # three plates without rim on a torus
 
 
-def test_anisotropic_voxels_measure_the_same_shape() -> None:
+def test_a_rod_between_two_balls_has_two_thicknesses() -> None:
+    z, y, x = np.indices((24, 24, 60)) - np.array([12, 12, 12])[:, None, None, None]
+    balls = (z**2 + y**2 + x**2 < 9**2) | (z**2 + y**2 + (x - 36) ** 2 < 9**2)
+    rod = (z**2 + y**2 < 3**2) & (x > 0) & (x < 36)
+    thickness = local_thickness(balls | rod)
+    assert thickness[12, 12, 12] == thickness.max() == pytest.approx(18, abs=1.5)
+    assert thickness[12, 12, 30] == pytest.approx(6, abs=1)
+    assert np.all(thickness[~(balls | rod)] == 0)
     fine = distance_from_axes(48, 3) < 16
     found = morphometry(fine[::3], (3.0, 1.0, 1.0))
     whole = morphometry(fine)
@@ -53,16 +60,6 @@ def test_anisotropic_voxels_measure_the_same_shape() -> None:
     assert coarse == pytest.approx(local_thickness(fine)[fine].mean(), rel=1 / 8)
 
 
-def test_a_rod_between_two_balls_has_two_thicknesses() -> None:
-    z, y, x = np.indices((24, 24, 60)) - np.array([12, 12, 12])[:, None, None, None]
-    balls = (z**2 + y**2 + x**2 < 9**2) | (z**2 + y**2 + (x - 36) ** 2 < 9**2)
-    rod = (z**2 + y**2 < 3**2) & (x > 0) & (x < 36)
-    thickness = local_thickness(balls | rod)
-    assert thickness[12, 12, 12] == thickness.max() == pytest.approx(18, abs=1.5)
-    assert thickness[12, 12, 30] == pytest.approx(6, abs=1)
-    assert np.all(thickness[~(balls | rod)] == 0)
-
-
 def test_thickness_never_exceeds_the_largest_ball_and_never_undercuts_the_own_one() -> None:
     noise = np.random.default_rng(0).standard_normal((40, 40, 40))
     mask = ndimage.gaussian_filter(noise, 3, mode="wrap") > 0
@@ -70,9 +67,6 @@ def test_thickness_never_exceeds_the_largest_ball_and_never_undercuts_the_own_on
     thickness = local_thickness(mask)
     assert np.all(thickness[mask] >= own[mask] - 1.0 - 0.05 * own.max())
     assert thickness.max() == pytest.approx(own.max())
-
-
-def test_shifts_change_nothing_in_a_periodic_box() -> None:
     noise = np.random.default_rng(1).standard_normal((24, 24, 24))
     mask = ndimage.gaussian_filter(noise, 2, mode="wrap") > 0.3 * 0.1
     here = morphometry(mask, periodic=True)

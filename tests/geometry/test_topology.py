@@ -59,7 +59,13 @@ def test_laws_of_random_masks(seed: int) -> None:
     assert box[0] >= b[0] and box[0] - box[1] + box[2] == euler_number(mask)
 
 
-def test_pieces_are_numbered_in_order_and_joined_across_faces() -> None:
+def test_windows_add_their_share_of_the_euler_number() -> None:
+    """The mean over all places of a window in a box that repeats, exactly; of a structure that it holds, its own."""
+    mask = np.random.default_rng(0).random((6, 7, 5)) < 0.4
+    shares = [euler_of_window(np.roll(mask, by, (0, 1, 2))[:4, :5, :3]) for by in np.ndindex(*mask.shape)]
+    assert np.mean(shares) == pytest.approx(euler_number(mask, periodic=True) * 3 * 4 * 2 / mask.size)
+    alone = np.pad(mask, 1)
+    assert euler_of_window(alone) == euler_number(alone)
     mask = solid(
         (slice(0, 2), slice(0, 2), slice(0, 2)), (slice(4, 6),) * 3, (slice(9, 10), slice(10, 11), slice(11, 12))
     )
@@ -68,12 +74,3 @@ def test_pieces_are_numbered_in_order_and_joined_across_faces() -> None:
     assert count == 2 and labels.dtype == np.int32
     assert labels[0, 0, 0] == labels[-1, -1, -1] == 1 and labels[4, 4, 4] == 2
     assert components(mask, periodic=True, connectivity=6)[1] == 3  # they touch at a corner only
-
-
-def test_windows_add_their_share_of_the_euler_number() -> None:
-    """The mean over all places of a window in a box that repeats, exactly; of a structure that it holds, its own."""
-    mask = np.random.default_rng(0).random((6, 7, 5)) < 0.4
-    shares = [euler_of_window(np.roll(mask, by, (0, 1, 2))[:4, :5, :3]) for by in np.ndindex(*mask.shape)]
-    assert np.mean(shares) == pytest.approx(euler_number(mask, periodic=True) * 3 * 4 * 2 / mask.size)
-    alone = np.pad(mask, 1)
-    assert euler_of_window(alone) == euler_number(alone)

@@ -18,13 +18,11 @@ def bodies(ids: tuple[int, int], kind: type) -> np.ndarray:
 @pytest.mark.parametrize(
     ("ids", "kind", "chosen"),
     [
-        pytest.param(IDS, np.uint64, "all", id="01-uint64-labels"),
-        pytest.param(IDS, np.uint64, ",".join(map(str, IDS)), id="01-uint64-labels-chosen"),
-        pytest.param((2**64 - 2, 2**64 - 1), np.uint64, "all", id="01-uint64-labels-greatest"),
-        pytest.param(IDS, np.int64, "all", id="01-uint64-labels-signed"),
-        pytest.param((3, 7), np.uint64, "3,7", id="01-uint64-labels-small"),
+        (IDS, np.uint64, "all"), (IDS, np.uint64, ",".join(map(str, IDS))), ((2**64 - 2, 2**64 - 1), np.uint64, "all"),
+        (IDS, np.int64, "all"), ((3, 7), np.uint64, "3,7"),
     ],
-)
+    ids=[f"01-uint64-labels{which}" for which in ("", "-chosen", "-greatest", "-signed", "-small")],
+)  # fmt: skip
 def test_64_bit_ids_stay(ids: tuple[int, int], kind: type, chosen: str, tmp_path: Path) -> None:
     truth, out = bodies(ids, kind), tmp_path / "out.npy"
     np.save(tmp_path / "labels.npy", np.where((np.arange(17) % 8 == 0)[:, None, None], truth, kind(0)))

@@ -60,9 +60,7 @@ def log_the_stages_of_an_inference(folder: Path) -> None:
     level = logger.level
     logger.setLevel(logging.INFO)
     try:
-        curvafit.infer(
-            np.indices((48, 48, 48)).sum(0) % 16 < 5, fast=True
-        )  # layers: told at once that they have no law
+        curvafit.infer(np.indices((48, 48, 48)).sum(0) % 16 < 5, fast=True)  # layers are told that they have no law
         log = log_stages()
         for share in (0.5, 0.6):
             log(f"shape {share}", share)

@@ -8,7 +8,6 @@ import struct
 import subprocess
 import sys
 import zipfile
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -61,13 +60,6 @@ def nrrd(sizes: str, coding: str) -> bytes:
     return f"NRRD0004\ntype: float\ndimension: 3\nsizes: {sizes}\nencoding: {coding}\nendian: little\n\n".encode()
 
 
-def meta(packed: bool) -> bytes:
-    return (
-        f"ObjectType = Image\nNDims = 3\nBinaryData = True\nCompressedData = {packed}\nDimSize = 30000 30000 30000\n"
-        "ElementSpacing = 1 1 1\nElementType = MET_FLOAT\nElementDataFile = LOCAL\n"
-    ).encode()
-
-
 def hdf5(path: Path, shape: tuple[int, ...], **options: Any) -> None:
     with h5py.File(path, "w") as file:
         file.create_dataset("volume", shape, "f4", **options)
@@ -95,8 +87,6 @@ CLAIMS: dict[str, bytes | Callable[[Path], object]] = {
     "a.nii": nifti(32767, 32767, 32767) + bytes(99),
     "a.nii.gz": gzip.compress(nifti(32767, 32767, 32767) + bytes(99)),
     "a.mrc": struct.pack("<4i", 30000, 30000, 30000, 2) + bytes(192) + b"MAP \x44\x44\0\0" + bytes(808),
-    "a.mha": meta(False) + bytes(100),
-    "packed.mha": meta(True) + zlib.compress(bytes(100)),
     "a.nrrd": nrrd("30000 30000 30000", "raw") + bytes(100),
     "packed.nrrd": nrrd("30000 30000 30000", "gzip") + gzip.compress(bytes(100)),
     "loop.tif": b"II*\0\x08\0\0\0\0\0\x08\0\0\0",

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 import typer
 from calling import call, refused
-from damage import FORMATS, files_of
+from damage import files_of
 from disk import tree
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
@@ -284,17 +284,6 @@ def test_whatever_a_file_holds_the_law_holds(line: str) -> None:
             obey(folder, line.split())
 
     holds()
-
-
-@MANY
-@given(st.data(), st.sampled_from(sorted(FORMATS)))
-def test_a_damaged_volume_of_any_format_is_measured_or_refused(data: st.DataObject, name: str) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, name)
-        FORMATS[name](path)
-        file = data.draw(st.sampled_from(sorted(files_of(path))))
-        file.write_bytes(data.draw(harmed(file.read_bytes())))
-        obey(Path(folder), ["measure", name, "-o", "out.csv"])
 
 
 @MANY

@@ -79,6 +79,18 @@ def test_interpolated_parameters(script) -> None:
         assert between(*place) == (corner.coefficients, pytest.approx(corner.mass))
     a, mass = between(0, 0.25)
     assert a.a00 == pytest.approx(0.25 * 937.5) and mass == pytest.approx(0.75 * -0.3 + 0.25 * -0.6)
+    place = np.broadcast_to(np.cos(2 * np.pi * np.arange(24) / 24)[:, None, None], (24, 24, 24))
+    lean = script("orientation").lean
+    assert lean(place) == pytest.approx(1, abs=1e-6)
+    assert lean(np.swapaxes(place, 0, 2)) == pytest.approx(0, abs=1e-6)
+    a, mass = script("spatialised").maps(21)
+    assert a.a20.shape == mass.shape == (1, 1, 6 * 21)
+    for k, number in enumerate((1, 1, 2, 3, 4, 4)):
+        stated = preset(f"spatial-{number}")
+        assert a.tensor()[:, 0, 0, 21 * k + 10].tolist() == pytest.approx([*stated.coefficients])
+        assert float(mass[0, 0, 21 * k + 10]) == pytest.approx(stated.mass)
+    ends = mass[0, 0, 0] + mass[0, 0, -1], mass[0, 0, 20] + mass[0, 0, 21], mass[0, 0, 41] + mass[0, 0, 42]
+    assert [float(end) / 2 for end in ends] == pytest.approx([-0.55, -0.4, -0.5])
 
 
 def test_seeds_and_kept_shapes(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -99,24 +111,6 @@ def test_orientation(run: Run) -> None:
     free_tubes, tubes, free_layers, layers = map(numbers, rows)
     assert [free_tubes[0], tubes[0], free_layers[0], layers[0]] == [0, 1000, 0, 800]
     assert tubes[1] < free_tubes[1] and layers[1] < free_layers[1] < 1
-
-
-def test_lean_of_plane_surfaces(script) -> None:
-    place = np.broadcast_to(np.cos(2 * np.pi * np.arange(24) / 24)[:, None, None], (24, 24, 24))
-    lean = script("orientation").lean
-    assert lean(place) == pytest.approx(1, abs=1e-6)
-    assert lean(np.swapaxes(place, 0, 2)) == pytest.approx(0, abs=1e-6)
-
-
-def test_spatialised_maps(script) -> None:
-    a, mass = script("spatialised").maps(21)
-    assert a.a20.shape == mass.shape == (1, 1, 6 * 21)
-    for k, number in enumerate((1, 1, 2, 3, 4, 4)):
-        stated = preset(f"spatial-{number}")
-        assert a.tensor()[:, 0, 0, 21 * k + 10].tolist() == pytest.approx([*stated.coefficients])
-        assert float(mass[0, 0, 21 * k + 10]) == pytest.approx(stated.mass)
-    ends = mass[0, 0, 0] + mass[0, 0, -1], mass[0, 0, 20] + mass[0, 0, 21], mass[0, 0, 41] + mass[0, 0, 42]
-    assert [float(end) / 2 for end in ends] == pytest.approx([-0.55, -0.4, -0.5])
 
 
 @pytest.mark.parametrize(("name", "genus"), [("sphere", 0), ("torus", 1), ("smaller-torus", 1), ("genus-2", 2)])

@@ -85,9 +85,8 @@ def test_polnet_s_units_are_only_units(monkeypatch: pytest.MonkeyPatch) -> None:
     class Generator:
         @classmethod
         def from_params(cls, params: dict) -> Any:
-            made = cls()
-            for key, value in ({"EPS": 0.15, "DELTA_X": 0.03, "M0": -0.5, "MODE": "periodic"} | params).items():
-                setattr(made, f"_{key}" if key == "M0" else f"_{key.lower()}", value)
+            made, params = cls(), {"EPS": 0.15, "DELTA_X": 0.03, "M0": -0.5, "MODE": "periodic"} | params
+            vars(made).update({f"_{key}" if key == "M0" else f"_{key.lower()}": params[key] for key in params})
             return made
 
     kinds: dict[str, Any] = {}

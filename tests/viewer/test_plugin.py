@@ -92,6 +92,7 @@ def test_labels_are_completed_and_it_can_be_undone(viewer: Any) -> None:
     np.testing.assert_array_equal(layer.data, some)
     layer.redo()
     assert dice(layer.data == 3, RODS == 3) > 0.9
+    assert "5 of 33 slices known" in run(widget)  # a redo is no drawing
 
 
 def test_slices_are_suggested_and_a_button_goes_there(viewer: Any) -> None:
@@ -154,17 +155,6 @@ def test_what_was_drawn_is_known_and_stays(viewer: Any, story: str) -> None:
             np.testing.assert_array_equal(layer.data[::16], RODS[::16])
 
 
-def test_redo_is_no_drawing_and_the_label_that_was_filled_is_selected(viewer: Any) -> None:
-    layer, widget = completing(viewer, np.where(sparse() == 3, 255, 0))
-    layer.selected_label = 1
-    run(widget)
-    assert layer.selected_label == 255
-    layer.undo()
-    assert "known slices" in run(widget, "99")
-    layer.redo()
-    assert "5 of 33 slices known" in run(widget, "")
-
-
 def test_what_is_painted_meanwhile_stays(viewer: Any) -> None:
     layer, widget = completing(viewer, sparse())
     click(widget.run_button)
@@ -175,6 +165,14 @@ def test_what_is_painted_meanwhile_stays(viewer: Any) -> None:
     viewer.layers.remove(layer)
     wait(lambda: widget.run_button.enabled)
     assert "gone" in widget.status.value and layer not in viewer.layers
+    widget = docked(viewer, Generate)
+    widget.edge.value, widget.steps.value = 64, 20000
+    click(widget.run_button)
+    assert not widget.run_button.enabled
+    wait(lambda: "Growing" in widget.status.value)
+    click(widget.stop_button)
+    wait(lambda: widget.run_button.enabled, 30)
+    assert widget.status.value == "Stopped." and not len(viewer.layers)
 
 
 def test_labels_on_slices_of_their_own_are_filled_one_after_the_other(viewer: Any) -> None:
@@ -205,18 +203,8 @@ def test_an_image_and_another_axis(viewer: Any) -> None:
     assert dice(layer.data > 0, truth > 0) > 0.93
 
 
-def test_work_stops_where_it_is_told_to(viewer: Any) -> None:
-    widget = docked(viewer, Generate)
-    widget.edge.value, widget.steps.value = 64, 20000
-    click(widget.run_button)
-    assert not widget.run_button.enabled
-    wait(lambda: "Growing" in widget.status.value)
-    click(widget.stop_button)
-    wait(lambda: widget.run_button.enabled, 30)
-    assert widget.status.value == "Stopped." and not len(viewer.layers)
-
-
 def test_a_texture_is_grown_at_its_scale_and_measured(viewer: Any, tmp_path: Any) -> None:
+    """And each label has its row, and its numbers beneath the mouse."""
     widget = docked(viewer, Generate)
     widget.edge.value, widget.steps.value, widget.spacing.value, widget.unit.value = 40, 300, 0.5, "um"
     run(widget)
@@ -232,9 +220,6 @@ def test_a_texture_is_grown_at_its_scale_and_measured(viewer: Any, tmp_path: Any
     gauge.file.value = tmp_path / "mine.csv"
     gauge.file.value.write_text("mine")
     assert "not free" in run(gauge) and gauge.file.value.read_text() == "mine"
-
-
-def test_each_label_has_its_row_and_its_numbers_beneath_the_mouse(viewer: Any) -> None:
     layer, gauge = viewer.add_labels(RODS, name="cells", **PLACE), docked(viewer, Measure)
     run(gauge)
     assert [int(each) for each in gauge.table.row_headers] == [each.part[1] for each in gauge.measures] == [3, 7]
