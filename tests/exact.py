@@ -9,7 +9,6 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -22,22 +21,6 @@ from curvafit.priors.profile import SIGMA, optimal_profile
 from curvafit.priors.stencils import HESSIAN_AXES
 
 MONOMIALS = ("κ1²", "κ1κ2", "κ2²", "κ1", "κ2", "1")
-
-
-class Shape(Protocol):
-    """A solid with a smooth boundary."""
-
-    def distance(self, points: Tensor) -> Tensor:
-        """Signed distance `(...)`."""
-        ...
-
-    def curvatures(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """κ1 ≥ κ2 `(...)` of the parallel surface through each point."""
-        ...
-
-    def integrals(self, offset: float = 0.0) -> np.ndarray:
-        """The six integrals `(6,)` over the parallel surface."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -121,6 +104,10 @@ class Torus:
         R, r = self.major, self.minor - offset
         bend = R / r * (R / math.sqrt(R**2 - r**2) - 1)
         return 4 * math.pi**2 * np.array([R / r, 0, bend, R, 0, R * r])
+
+
+#: Solids with a smooth boundary, whose curvatures and integrals are known.
+Shape = Plane | Sphere | Cylinder | Torus
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,13 @@
-"""A small store of exact periodic shapes, in turn layers, tubes, spheres and sponges."""
+"""A small store of exact periodic shapes, in turn layers, tubes, spheres and sponges; a recipe for cases of them."""
 
 from pathlib import Path
 
 import numpy as np
 
+from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.design import design_box
+from curvafit.data_synth.imaging.modality import Detector, Imaging, Modality, Optics
+from curvafit.data_synth.sources import Stored
 from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.generation.result import Viability
 from curvafit.priors.coefficients import Coefficients
@@ -45,3 +48,19 @@ def exact_store(path: Path, count: int, first: int = 0) -> Store:
         viable = index % 7 != 2
         store.write(exact_record(index, viable), exact_field(index) if viable else None)
     return store
+
+
+#: A quiet kind of images, for quick cases of a training set.
+FLAT = Modality(
+    "flat",
+    "for tests",
+    0.5,
+    Imaging(spacing=(1.0, 0.5, 0.5), optics=Optics((0.4, 0.2, 0.2)), detector=Detector(ceiling=255.0)),
+    {"contrast.foreground": (80.0, 120.0), "noise.gaussian": (1.0, 3.0)},
+)
+CROP = (8, 16, 16)
+
+
+def flat_recipe(path: Path) -> Recipe:
+    """Images of one quiet kind of the shapes of a small exact store, which is made."""
+    return Recipe(Stored((exact_store(path, 8).path,)), FLAT, CROP, 0.5, seed=4)

@@ -45,85 +45,59 @@ _OF_JAX = ("TF_CPP_MIN_LOG_LEVEL", "TPU_SKIP_MDS_QUERY")
 
 def snapshot() -> dict[str, str]:
     """Everything of the process that a library has no business with, as text."""
-    parts = {"torch": _torch(), "numpy": _numpy(), "python": _python(), "process": _process(), "optional": _optional()}
-    return {f"{part} {name}": repr(value) for part, found in parts.items() for name, value in found.items()}
+    with ThreadPoolExecutor(1) as elsewhere:
+        in_a_new_thread = elsewhere.submit(torch.get_num_threads).result()
+    backend, root, mask = torch.backends.cudnn, logging.getLogger(), os.umask(0)
+    os.umask(mask)
+    names = sorted(each.name for each in threading.enumerate())
+    numba, jax, matplotlib = (sys.modules.get(name) for name in ("numba", "jax", "matplotlib"))
+    started = getattr(sys.modules.get("numba.np.ufunc.parallel"), "_is_initialized", False)  # asking would start them
+    found = {
+        "torch threads": (torch.get_num_threads(), in_a_new_thread, torch.get_num_interop_threads()),
+        "torch defaults": (torch.get_default_dtype(), torch.get_default_device(), torch.get_float32_matmul_precision()),
+        "torch gradients": torch.is_grad_enabled(),
+        "torch modes": (torch.is_inference_mode_enabled(), torch.is_anomaly_enabled(), torch.is_autocast_enabled()),
+        "torch deterministic": torch.are_deterministic_algorithms_enabled(),
+        "torch deterministic, warning": torch.is_deterministic_algorithms_warn_only_enabled(),
+        "torch cudnn": (backend.enabled, backend.benchmark, backend.deterministic),
+        "torch denormal numbers": float(torch.tensor(1e-40) / 2),
+        "torch random": _digest(torch.get_rng_state().numpy().tobytes()),
+        "numpy errors": (np.geterr(), np.geterrcall()),
+        "numpy printing": sorted(np.get_printoptions().items(), key=lambda item: item[0]),
+        "numpy random": _digest(repr(np.random.get_state())),  # noqa: NPY002
+        "numpy denormal numbers": float(np.float32(1e-40) / np.float32(2)),
+        "python random": _digest(repr(random.getstate())),
+        "python warnings": (warnings.filters, warnings.showwarning),
+        "python logging": (root.level, root.handlers, root.filters, root.disabled, logging.root.manager.disable),
+        "python loggers": (logging.getLoggerClass(), logging.raiseExceptions, logging.getLogRecordFactory()),
+        "python imports": (sys.path, sys.meta_path[-3:], len(sys.path_hooks)),
+        "python streams": (sys.stdin, sys.stdout, sys.stderr),
+        "python hooks": (sys.excepthook, sys.displayhook, threading.excepthook, sys.unraisablehook, sys.gettrace()),
+        "python limits": (sys.getrecursionlimit(), sys.getswitchinterval(), decimal.getcontext()),
+        "python garbage": (gc.isenabled(), gc.get_threshold(), gc.get_debug()),
+        "python temporary folder": tempfile.tempdir,
+        "python starting of processes": multiprocessing.get_start_method(allow_none=True),
+        "process environment": {name: value for name, value in sorted(os.environ.items()) if name not in _OF_JAX},
+        "process folder": os.getcwd(),
+        "process file mode": mask,
+        "process locale": locale.setlocale(locale.LC_ALL),
+        "process signals": [signal.getsignal(number) for number in sorted(signal.valid_signals())],
+        "process Python threads": [name for name in names if not name.startswith(_OF_ZARR)],
+        "process children": len(multiprocessing.active_children()),
+        # of libraries that the host may use too
+        "optional numba's threads": _ABSENT if numba is None or not started else numba.get_num_threads(),
+        "optional JAX": _ABSENT if jax is None else (jax.config.jax_enable_x64, jax.config.jax_default_device),
+        "optional matplotlib": _ABSENT
+        if matplotlib is None
+        else _digest(repr(sorted(dict.items(matplotlib.rcParams)))),
+        "optional pyplot": "matplotlib.pyplot" in sys.modules,
+    }
+    return {name: repr(value) for name, value in found.items()}
 
 
 def changes(before: dict[str, str], after: dict[str, str]) -> dict[str, list[str]]:
     """What differs, before and after; what a library that was not imported before brings with it is no difference."""
     return {name: [old, after[name]] for name, old in before.items() if after[name] != old and old != repr(_ABSENT)}
-
-
-def _torch() -> dict[str, Any]:
-    with ThreadPoolExecutor(1) as elsewhere:
-        in_a_new_thread = elsewhere.submit(torch.get_num_threads).result()
-    backend = torch.backends.cudnn
-    return {
-        "threads": (torch.get_num_threads(), in_a_new_thread, torch.get_num_interop_threads()),
-        "defaults": (torch.get_default_dtype(), torch.get_default_device(), torch.get_float32_matmul_precision()),
-        "gradients": torch.is_grad_enabled(),
-        "modes": (torch.is_inference_mode_enabled(), torch.is_anomaly_enabled(), torch.is_autocast_enabled()),
-        "deterministic": (
-            torch.are_deterministic_algorithms_enabled(),
-            torch.is_deterministic_algorithms_warn_only_enabled(),
-        ),
-        "cudnn": (backend.enabled, backend.benchmark, backend.deterministic),
-        "denormal numbers": float(torch.tensor(1e-40) / 2),
-        "random": _digest(torch.get_rng_state().numpy().tobytes()),
-    }
-
-
-def _numpy() -> dict[str, Any]:
-    return {
-        "errors": (np.geterr(), np.geterrcall()),
-        "printing": sorted(np.get_printoptions().items(), key=lambda item: item[0]),
-        "random": _digest(repr(np.random.get_state())),  # noqa: NPY002
-        "denormal numbers": float(np.float32(1e-40) / np.float32(2)),
-    }
-
-
-def _python() -> dict[str, Any]:
-    root = logging.getLogger()
-    return {
-        "random": _digest(repr(random.getstate())),
-        "warnings": (warnings.filters, warnings.showwarning),
-        "logging": (root.level, root.handlers, root.filters, root.disabled, logging.root.manager.disable),
-        "class of loggers": (logging.getLoggerClass(), logging.raiseExceptions, logging.getLogRecordFactory()),
-        "imports": (sys.path, sys.meta_path[-3:], len(sys.path_hooks)),
-        "streams": (sys.stdin, sys.stdout, sys.stderr),
-        "hooks": (sys.excepthook, sys.displayhook, threading.excepthook, sys.unraisablehook, sys.gettrace()),
-        "limits": (sys.getrecursionlimit(), sys.getswitchinterval(), decimal.getcontext()),
-        "garbage": (gc.isenabled(), gc.get_threshold(), gc.get_debug()),
-        "temporary folder": tempfile.tempdir,
-        "starting of processes": multiprocessing.get_start_method(allow_none=True),
-    }
-
-
-def _process() -> dict[str, Any]:
-    mask = os.umask(0)
-    os.umask(mask)
-    names = sorted(each.name for each in threading.enumerate())
-    return {
-        "environment": {name: value for name, value in sorted(os.environ.items()) if name not in _OF_JAX},
-        "folder": os.getcwd(),
-        "file mode": mask,
-        "locale": locale.setlocale(locale.LC_ALL),
-        "signals": [signal.getsignal(number) for number in sorted(signal.valid_signals())],
-        "Python threads": [name for name in names if not name.startswith(_OF_ZARR)],
-        "children": len(multiprocessing.active_children()),
-    }
-
-
-def _optional() -> dict[str, Any]:
-    """Of libraries that the host may use too."""
-    numba, jax, matplotlib = (sys.modules.get(name) for name in ("numba", "jax", "matplotlib"))
-    started = getattr(sys.modules.get("numba.np.ufunc.parallel"), "_is_initialized", False)  # asking would start them
-    return {
-        "numba's threads": _ABSENT if numba is None or not started else numba.get_num_threads(),
-        "JAX": _ABSENT if jax is None else (jax.config.jax_enable_x64, jax.config.jax_default_device),
-        "matplotlib": _ABSENT if matplotlib is None else _digest(repr(sorted(dict.items(matplotlib.rcParams)))),
-        "pyplot": "matplotlib.pyplot" in sys.modules,
-    }
 
 
 def _digest(value: str | bytes) -> str:

@@ -150,6 +150,7 @@ def finding(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 def test_infer_writes_three_files_and_says_what_it_found(tmp_path: Path, finding: dict[str, Any]) -> None:
+    """And hands every option on."""
     (tmp_path / "scan.h5").touch()
     scan = f"{tmp_path / 'scan.h5'}::raw"
     result = done("infer", scan, "-o", tmp_path / "out", "--spacing", "2,1,1", "--unit", "um", "--dark")
@@ -162,9 +163,6 @@ def test_infer_writes_three_files_and_says_what_it_found(tmp_path: Path, finding
     assert "[  0 %] reading the scan" in result.stderr
     assert finding["scan"] == scan and finding["spacing"] == (2.0, 1.0, 1.0)
     assert finding["unit"] == "um" and finding["dark"] is True and finding["threshold"] == "otsu"
-
-
-def test_infer_hands_every_option_on(tmp_path: Path, finding: dict[str, Any]) -> None:
     options = "--kind mask --periodic --threshold -12.5 --label 3 --raw-shape 4,5,6 --dtype u1 --key k --seed 9"
     options += " --channel 2 --crop 1:3,:,-4: --method match"
     scan, roi = tmp_path / "a.raw", tmp_path / "r.npy"

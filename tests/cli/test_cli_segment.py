@@ -1,4 +1,4 @@
-"""`curvafit segment` and `reconstruct`: what they write, to the bit, and one sentence with exit code 2 for the rest."""
+"""`curvafit segment` and `reconstruct`: what they write, to the bit, whole and in tiles, and what they refuse."""
 
 import json
 from dataclasses import replace
@@ -12,6 +12,7 @@ from found import made_fit
 
 import curvafit.segmentation
 from curvafit.segmentation.filler import FILLER_FILE
+from curvafit.segmentation.tiles import TileStore
 from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
 from curvafit.volumes.write import save
@@ -98,20 +99,8 @@ def test_another_unit_renames_and_keeps_the_rest_of_the_header(unit, written, ob
     assert load(again).unit == "um" and load(again).spacing == pytest.approx(made.spacing, rel=1e-6)
 
 
-def test_an_axis_of_one_and_another_spacing(tmp_path: Path) -> None:
-    path, target = tmp_path / "scan.nii", tmp_path / "mask.nii"
-    image = nibabel.Nifti2Image(grey().T[..., None], np.diag([0.2, 0.2, 0.4, 1]))
-    nibabel.save(image, path)
-    done("segment", path, "--prior", "sponge", "--steps", 2, "-o", target)
-    made = nibabel.load(target)
-    assert isinstance(made, nibabel.Nifti2Image) and made.shape == (16, 18, 20, 1)
-    other = tmp_path / "other.nii"
-    told = call("segment", path, "--prior", "sponge", "--steps", 2, "--spacing", "3,2,2", "--unit", "um", "-o", other)
-    assert told.exit_code == 0 and "z" in told.stdout
-    assert load(other).spacing == (3, 2, 2) and load(other).unit == "um"
-
-
 def test_other_formats_and_a_fit_in_another_unit(tmp_path: Path) -> None:
+    """And an axis of one, and another spacing."""
     path, prior, target = tmp_path / "scan.tif", tmp_path / "fit.json", tmp_path / "mask.ome.tif"
     save(Field(grey(), (19.5,) * 3, "um"), path)
     prior.write_text(made_fit().to_json())
@@ -124,9 +113,20 @@ def test_other_formats_and_a_fit_in_another_unit(tmp_path: Path) -> None:
     record = json.loads((tmp_path / "mask.json").read_text())
     assert record["dark"] is True and record["threshold"] == 150
     assert record["coefficients"] == pytest.approx(made_fit().coefficients_physical.in_unit(1e-3).as_dict())
+    path, target = tmp_path / "scan.nii", tmp_path / "mask.nii"
+    image = nibabel.Nifti2Image(grey().T[..., None], np.diag([0.2, 0.2, 0.4, 1]))
+    nibabel.save(image, path)
+    done("segment", path, "--prior", "sponge", "--steps", 2, "-o", target)
+    made = nibabel.load(target)
+    assert isinstance(made, nibabel.Nifti2Image) and made.shape == (16, 18, 20, 1)
+    other = tmp_path / "other.nii"
+    told = call("segment", path, "--prior", "sponge", "--steps", 2, "--spacing", "3,2,2", "--unit", "um", "-o", other)
+    assert told.exit_code == 0 and "z" in told.stdout
+    assert load(other).spacing == (3, 2, 2) and load(other).unit == "um"
 
 
 def test_reconstruct_fills_what_it_is_not_told(tmp_path: Path) -> None:
+    """And one label of a volume."""
     truth, path, target = ball((20, 18, 17)), tmp_path / "slices.nii.gz", tmp_path / "volume.nii.gz"
     given = np.zeros(truth.shape, dtype=np.uint8)
     given[..., ::4] = truth[..., ::4]
@@ -144,6 +144,14 @@ def test_reconstruct_fills_what_it_is_not_told(tmp_path: Path) -> None:
     save(Field(given, (0.1, 0.1, 0.1), "mm"), path)
     done("reconstruct", path, "--ignore", 9, "--axis", "x", "-o", tmp_path / "ignoring.nii.gz")
     assert np.array_equal(load(tmp_path / "ignoring.nii.gz").values, load(target).values)
+    labels = np.where(ball(), 3, 1)
+    labels[:, :3] = 7
+    np.save(tmp_path / "labels.npy", labels)
+    some = ("reconstruct", tmp_path / "labels.npy", "--every", 4, "--prior", "tubes", "--steps", 2)
+    result = done(*some, "--label", 3, "-o", tmp_path / "mask.npy")
+    assert np.array_equal(np.load(tmp_path / "mask.npy")[::4] > 0, (labels == 3)[::4])
+    result = call(*some, "--label", 4, "-o", tmp_path / "none.npy")
+    assert result.exit_code == 2 and "label" in result.stderr
 
 
 def test_reconstruct_writes_what_is_uncertain(tmp_path: Path) -> None:
@@ -254,17 +262,6 @@ def test_a_part_of_a_file_is_segmented_where_it_was(oblique: Path, tmp_path: Pat
             assert mask.affine @ [*voxel, 1] == pytest.approx(whole.affine @ [*at, 1], rel=1e-3, abs=1e-4)
 
 
-def test_a_label_of_a_volume_is_filled_in(tmp_path: Path) -> None:
-    labels = np.where(ball(), 3, 1)
-    labels[:, :3] = 7
-    np.save(tmp_path / "labels.npy", labels)
-    some = ("reconstruct", tmp_path / "labels.npy", "--every", 4, "--prior", "tubes", "--steps", 2)
-    result = done(*some, "--label", 3, "-o", tmp_path / "mask.npy")
-    assert np.array_equal(np.load(tmp_path / "mask.npy")[::4] > 0, (labels == 3)[::4])
-    result = call(*some, "--label", 4, "-o", tmp_path / "none.npy")
-    assert result.exit_code == 2 and "label" in result.stderr
-
-
 @pytest.mark.parametrize(
     ("arguments", "target"),
     [
@@ -289,3 +286,71 @@ def test_no_input_is_written_over(arguments, target, tmp_path, monkeypatch) -> N
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     refused(call(*arguments.split(), "-o", target), "input")
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> Path:
+    """A tube along z in noise, as a Zarr store."""
+    z, y, x = (np.arange(n) for n in (66, 12, 14))
+    mask = np.hypot(y[:, None] - 5.3 + np.sin(z / 5)[:, None, None], x - 6.6) < 4
+    values = 100 * mask + 30 * np.random.default_rng(0).standard_normal(mask.shape)
+    return save(Field(values.astype(np.float32), (0.1, 0.1, 0.1), "mm"), tmp_path / "scan.zarr")
+
+
+def command(scan: Path, target: Path, *more: object) -> tuple:
+    return ("segment", scan, "--prior", "tubes", "--weight", 1, "--steps", 5, "--tile", 14, "-o", target, *more)
+
+
+def killed(monkeypatch: pytest.MonkeyPatch, tile: int) -> None:
+    """A run that is interrupted at a tile."""
+    write = TileStore.write
+
+    def stop(store: TileStore, core, piece) -> None:
+        if piece.number == tile:
+            raise KeyboardInterrupt
+        write(store, core, piece)
+
+    monkeypatch.setattr(TileStore, "write", stop)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "mask.npy",
+        pytest.param("mask.zarr", marks=pytest.mark.slow),
+        pytest.param("mask.nii.gz", marks=pytest.mark.slow),
+    ],
+)
+def test_the_same_command_goes_on_after_a_kill(scan: Path, tmp_path: Path, monkeypatch, name: str) -> None:
+    whole, target = tmp_path / "whole" / name, tmp_path / "killed" / name
+    done(*command(scan, whole))
+    with monkeypatch.context() as patch:
+        killed(patch, 2)
+        result = call(*command(scan, target))
+    assert result.exit_code == 130 and "same command" in result.stderr
+    assert [path.name for path in target.parent.iterdir()] == [f".{name}.curvafit-tiles"]
+    refused(call(*command(scan, target, "--epsilon", 0.25)), "tiles")
+    result = done(*command(scan, target))
+    stem = name.split(".")[0]
+    assert sorted(path.name for path in target.parent.iterdir()) == sorted([name, f"{stem}.json", f"{stem}.png"])
+    one, other = load(whole), load(target)
+    assert one.values.tobytes() == other.values.tobytes() and one.spacing == other.spacing
+    assert json.loads((target.parent / f"{stem}.json").read_text())["tile"] == 14
+
+
+def test_slices_are_filled_in_tiles(scan: Path, tmp_path: Path) -> None:
+    labels = tmp_path / "labels.npy"
+    np.save(labels, load(scan).values > 50)
+    options = ("--every", 6, "--prior", "tubes", "--stiffness", 1e7, "--steps", 5, "--tile", 14)
+    done("reconstruct", labels, *options, "-o", tmp_path / "volume.npy")
+    assert np.array_equal(np.load(tmp_path / "volume.npy")[::6] > 0, np.load(labels)[::6])
+    assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.slow
+def test_worker_processes_make_the_same_mask(scan: Path, tmp_path: Path) -> None:
+    masks = []
+    for name, more in (("one", ()), ("two", ("--workers", 2))):
+        done(*command(scan, tmp_path / name / "mask.npy", *more))
+        masks.append(np.load(tmp_path / name / "mask.npy"))
+    assert (masks[0] != masks[1]).mean() < 1e-3  # other processes may add up otherwise

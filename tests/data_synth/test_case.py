@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from flat_recipe import SHAPE, flat_recipe
+from exact_store import CROP as SHAPE
+from exact_store import flat_recipe
 
 from curvafit.data_synth.case import Recipe
 from curvafit.data_synth.imaging.modality import Imaging, Modality

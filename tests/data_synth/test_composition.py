@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from exact import Sphere, centres
-from flat_recipe import flat_recipe
+from exact_store import flat_recipe
 
 from curvafit.data_synth.case import Case, Composition, Recipe, shell_of
 from curvafit.data_synth.imaging.effects import occupancy

@@ -55,15 +55,12 @@ def test_a_pair_is_a_crop_of_a_shape_and_its_image(store):
 
 
 def test_samples_depend_on_seed_and_number_alone(store):
+    """Workers share an epoch and see the next: one process here; `test_pool` has workers that stay."""
     first = [told(TextureDataset(store, QUIET, SHAPE, seed=1)[k]) for k in (0, 1, 7)]
     again = TextureDataset(store, QUIET, SHAPE, seed=1, length=3, transform=told)
     assert [again[k] for k in (0, 1, 7)] == first
     assert len({each.split()[1] for each in first}) == 3
     assert told(TextureDataset(store, QUIET, SHAPE, seed=2)[0]) != first[0]
-
-
-def test_workers_share_an_epoch_and_see_the_next(store):
-    """Of one process here; `test_pool` has workers that stay."""
     dataset = TextureDataset(store, QUIET, SHAPE, length=5, transform=told)
     loader = DataLoader(dataset, batch_size=None)
     assert sorted(loader) == sorted(dataset[k] for k in range(5))
@@ -113,7 +110,7 @@ def test_monai_s_form_is_that_of_a_file(store, tmp_path, unit):
         assert made[name].meta["space"] == read[name].meta["space"]
 
 
-def test_one_number_is_a_cube_and_a_name_a_modality(store):
+def test_one_number_is_a_cube_and_a_name_a_modality(store, tmp_path):
     """Of several calibres and modalities, samples take turns at random."""
     dataset = TextureDataset(store, "Micro_CT", 12, length=5)
     assert dataset[0].image.shape == (1, 12, 12, 12) and dataset[0].record["modality"] == "micro-ct"
@@ -126,10 +123,6 @@ def test_one_number_is_a_cube_and_a_name_a_modality(store):
     loud = Modality("loud", "for tests", 1.0, Imaging(contrast=Contrast(foreground=1000.0)))
     pairs = TextureDataset(store, [QUIET, loud], SHAPE)
     assert {pairs[k].record["modality"] for k in range(12)} == {"quiet", "loud"}
-
-
-def test_shapes_that_are_not_well_formed_are_not_cropped(tmp_path):
-    """A viable shape that reaches |u| = 7 is a fragment."""
     four, record = exact_store(tmp_path / "s.zarr", 4), exact_record(4)
     torn = dataclasses.replace(record, viability=dataclasses.replace(record.viability, highest=7.0))
     four.write(torn, exact_field(4))
@@ -159,9 +152,6 @@ def test_shapes_of_laws():
     assert repr(dataset).startswith("TextureDataset(2 shapes of preset tubes, sponge; quiet; 12 x 12 x 12 voxels")
     filled = TextureDataset(tubes.coefficients, QUIET, 12, shapes=1, volume_fraction=0.2)
     assert dataset.voxels == filled.voxels == [QUIET.voxel] and "1 shapes of coefficients" in repr(filled)
-
-
-def test_a_fit_in_voxels_tells_no_edge_of_images_in_a_unit():
     in_um = dataclasses.replace(made_fit(), length_unit="um", working_voxel=0.25)
     in_voxels = dataclasses.replace(in_um, length_unit="voxel")
     kind, of_voxels = Modality("um", "", 0.5, Imaging()), Modality("voxel", "", 0.5, Imaging(unit="voxel"))

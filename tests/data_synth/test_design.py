@@ -36,10 +36,17 @@ def test_a_parameter_in_log_is_uniform_in_its_logarithm():
 
 
 def test_parameters_and_noise_seeds_are_uncorrelated():
+    """And Sobol's sequence fills the box more evenly than chance."""
     draws = [design_box().draw(1, index) for index in range(2000)]
     table = np.array([[*list(c)[1:], m, s] for c, m, s in draws])
     off_diagonal = np.corrcoef(table.T) - np.eye(7)
     assert np.abs(off_diagonal).max() < 4.5 / np.sqrt(2000)  # 21 pairs of null correlations, sd 1/√n each
+    values = (table(design_box("sobol"), 256)[:, 1:] - [low for low, _ in INTERVALS.values()]) / [
+        high - low for low, high in INTERVALS.values()
+    ]
+    for column in values.T:  # one point in every 256th part of every interval: a (0, m, s)-net seen from one side
+        assert sorted(np.floor(256 * column).astype(int)) == list(range(256))
+    assert not np.array_equal(table(design_box("sobol"), 4), table(design_box("sobol"), 4, seed=1))
 
 
 def written(tmp_path, text: str):
@@ -50,15 +57,6 @@ def written(tmp_path, text: str):
 
 def table(design: Design, count: int, seed: int = 0) -> np.ndarray:
     return np.array([[*draw.coefficients, draw.mass] for draw in (design.draw(seed, i) for i in range(count))])
-
-
-def test_a_sobol_sequence_fills_the_box_more_evenly_than_chance():
-    values = (table(design_box("sobol"), 256)[:, 1:] - [low for low, _ in INTERVALS.values()]) / [
-        high - low for low, high in INTERVALS.values()
-    ]
-    for column in values.T:  # one point in every 256th part of every interval: a (0, m, s)-net seen from one side
-        assert sorted(np.floor(256 * column).astype(int)) == list(range(256))
-    assert not np.array_equal(table(design_box("sobol"), 4), table(design_box("sobol"), 4, seed=1))
 
 
 def test_a_draw_of_any_design_depends_on_seed_and_index_alone():

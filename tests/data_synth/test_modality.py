@@ -88,6 +88,7 @@ def test_masks_of_what_is_seen() -> None:
 
 
 def test_parameters_are_drawn_in_range_and_reproducibly() -> None:
+    """And go through JSON; names are forgiving."""
     for kind in MODALITIES.values():
         draws = [kind.draw(seed) for seed in range(40)]
         assert draws[3] == kind.draw(3) and draws[3] != draws[4]
@@ -99,9 +100,6 @@ def test_parameters_are_drawn_in_range_and_reproducibly() -> None:
     one = Modality("one", "", 1.0, PLAIN, {"illumination.bias": (0.0, 0.5)})
     both = replace(one, ranges={"illumination.stripes": (0.1, 0.2), **one.ranges})
     assert one.draw(3).illumination == replace(both.draw(3).illumination, stripes=0.0)
-
-
-def test_modalities_go_through_json_and_their_names_are_forgiving() -> None:
     for name, kind in MODALITIES.items():
         assert kind.name == name and Modality.from_dict(json.loads(json.dumps(kind.as_dict()))) == kind
         assert Imaging.from_dict(json.loads(json.dumps(kind.draw(5).as_dict()))) == kind.draw(5)

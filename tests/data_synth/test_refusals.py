@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
-from flat_recipe import FLAT, flat_recipe
+from exact_store import FLAT, flat_recipe
 
 from curvafit.data_synth import TextureDataset, design_box
 from curvafit.data_synth.case import Composition, Recipe

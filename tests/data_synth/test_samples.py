@@ -78,14 +78,12 @@ def test_the_cache_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_
     assert fetch("bone").parent == (tmp_path / "xdg" if xdg else tmp_path / "home" / ".cache") / "curvafit"
 
 
-def test_every_sample_says_where_it_is_from() -> None:
+def test_every_sample_says_where_it_is_from(tmp_path: Path) -> None:
+    """And the synthetic one looks like CT."""
     assert list(list_samples()) == ["bone", "shell", "fibers", "fly", SYNTHETIC]
     for _, licence, source in list_samples().values():
         assert licence == "MIT" and source.startswith(("qim3d==1.5.3", "made"))
     assert all(len(sample.sha256) == 64 for sample in module.SAMPLES.values())
-
-
-def test_the_synthetic_scan_looks_like_ct(tmp_path: Path) -> None:
     first, second = (load(synthetic_scan(tmp_path / name, edge=40)) for name in ("a.nii.gz", "b.tif"))
     assert first.values.dtype == np.uint8
     assert (first.shape, first.spacing, first.unit) == ((40, 40, 40), (0.02, 0.02, 0.02), "mm")

@@ -9,7 +9,8 @@ from pathlib import Path
 import nibabel
 import numpy as np
 import pytest
-from flat_recipe import SHAPE, flat_recipe
+from exact_store import CROP as SHAPE
+from exact_store import flat_recipe
 
 from curvafit.data_synth import sets
 from curvafit.data_synth.sets import SetSpec, build_set, make_cases, read_spec, write_card
@@ -49,6 +50,7 @@ def test_a_layout_holds_the_cases(tmp_path, order, layout):
 
 
 def test_a_set_goes_on_and_ends_the_same(tmp_path, order):
+    """As does one of which a killed run left a torn case."""
     whole = build_set(tmp_path / "whole", order, 4)
     part = build_set(tmp_path / "part", order, 2)
     untouched = (part / "labelsTr" / "case_00000.nii.gz").stat().st_mtime_ns
@@ -58,9 +60,6 @@ def test_a_set_goes_on_and_ends_the_same(tmp_path, order):
     assert sums(whole) == sums(part) and len(sums(part)) == 4
     assert (part / "labelsTr" / "case_00000.nii.gz").stat().st_mtime_ns == untouched
     assert json.loads((part / "dataset.json").read_text())["numTraining"] == 4
-
-
-def test_what_a_killed_run_left_is_made_anew(tmp_path, order):
     folder = build_set(tmp_path / "set", order, 2)
     before = sums(folder)
     (folder / "cases" / "case_00001.json").unlink()  # killed before the record, which comes last

@@ -98,7 +98,7 @@ def closed(mesh: Surface) -> bool:
 
 
 def test_caps_close_the_box_on_its_faces() -> None:
-    """A solid that leaves the box is cut where the voxels end, sharply."""
+    """A solid that leaves the box is cut where the voxels end, sharply; opposite faces of a periodic box fit."""
     grid = Grid((10, 12, 8), SPACING, "replicate")
     u = torch.ones(grid.shape)
     u[:, 3:9] = -1.0
@@ -110,6 +110,14 @@ def test_caps_close_the_box_on_its_faces() -> None:
     assert volume(mesh) == pytest.approx(grid.volume / 2, rel=1e-4)
     thick, z, x = 0.24, 1.0, 0.96  # two slabs of half the box's 12 voxels together
     assert areas(mesh).sum() == pytest.approx(4 * z * x + 4 * thick * (z + x), rel=1e-3)
+    grid = Grid((12, 10, 9), SPACING)
+    u = gaussian_filter(np.random.default_rng(3).standard_normal(grid.shape), 1.5, mode="wrap")
+    mesh = capped_surface(u, grid)
+    for axis, (n, h) in enumerate(zip(grid.shape, grid.spacing, strict=True)):
+        low, high = (mesh.vertices[np.abs(mesh.vertices[:, axis] - place) < 1e-9] for place in (-h / 2, (n - 0.5) * h))
+        assert len(low) > 3
+        others = [k for k in range(3) if k != axis]
+        np.testing.assert_allclose(np.unique(low[:, others], axis=0), np.unique(high[:, others], axis=0), atol=1e-9)
 
 
 @settings(deadline=None, max_examples=60)
@@ -130,18 +138,6 @@ def test_whatever_the_field_its_capped_surface_is_closed(seed: int, kind: str, b
     elif kind == "blobs":
         u = gaussian_filter(u, 1.0, mode="wrap")
     assert closed(capped_surface(u, grid, float(u.mean()) if kind == "blobs" else 0.0))
-
-
-def test_caps_of_opposite_faces_fit() -> None:
-    """What one copy of a periodic box covers of its face, the next copy covers of its own."""
-    grid = Grid((12, 10, 9), SPACING)
-    u = gaussian_filter(np.random.default_rng(3).standard_normal(grid.shape), 1.5, mode="wrap")
-    mesh = capped_surface(u, grid)
-    for axis, (n, h) in enumerate(zip(grid.shape, grid.spacing, strict=True)):
-        low, high = (mesh.vertices[np.abs(mesh.vertices[:, axis] - place) < 1e-9] for place in (-h / 2, (n - 0.5) * h))
-        assert len(low) > 3
-        others = [k for k in range(3) if k != axis]
-        np.testing.assert_allclose(np.unique(low[:, others], axis=0), np.unique(high[:, others], axis=0), atol=1e-9)
 
 
 def test_a_solid_has_the_volume_of_its_voxels() -> None:

@@ -1,4 +1,4 @@
-"""Bombs, claims of headers, signals, full disks, rivals: what no random draw would find."""
+"""Bombs, claims of headers, signals, full disks: what no random draw would find."""
 
 import contextlib
 import gzip
@@ -19,7 +19,6 @@ import pytest
 import zarr
 from calling import call, refused
 from damage import files_of
-from disk import tree
 
 from curvafit.volumes.read import load
 from tests.golden import FOLDER
@@ -130,24 +129,14 @@ def test_a_disk_that_is_full_is_said_and_leaves_nothing(tmp_path: Path, name: st
         assert not list(tmp_path.iterdir()), size
 
 
-@pytest.mark.parametrize("line", [f"{QUICK} -o mask.nii.gz --overwrite", "atlas extract store.zarr -o out.npz", SYNTH])
-def test_a_disk_that_is_full_costs_nothing_that_was_there(tmp_path: Path, line: str) -> None:
-    copy_inputs(line, tmp_path)
-    before = tree(tmp_path)
-    with contextlib.chdir(tmp_path), bounds(file=400):
-        result = call(*line.split())
-    refused(result, progress=True)
-    assert {name: content for name, content in tree(tmp_path).items() if not name.startswith("out/")} == before
+# ---- signals ---------------------------------------------------------------------------------------------------------
 
-
-# ---- signals and rivals ----------------------------------------------------------------------------------------------
-
-#: A command with the changes of files in its folder counted: at one of them it gets a signal, each lasts a while.
+#: A command with the changes of files in its folder counted: at one of them it gets a signal.
 PROGRAM = """
-import os, random, sys, time
+import os, sys
 from curvafit.__main__ import main
-change, number, lag, done = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]), 0
-folder, sys.argv = os.getcwd(), ["curvafit", *sys.argv[4:]]
+change, number, done = int(sys.argv[1]), int(sys.argv[2]), 0
+folder, sys.argv = os.getcwd(), ["curvafit", *sys.argv[3:]]
 
 def watch(event, arguments):
     global done
@@ -160,7 +149,6 @@ def watch(event, arguments):
         done += 1
         if done == change:
             os.kill(os.getpid(), number)
-        time.sleep(lag * random.random())
 
 sys.addaudithook(watch)
 try:
@@ -170,35 +158,31 @@ finally:
 """
 
 
-def start(folder: Path, line: str, change: int = 0, number: int = 0, lag: float = 0.0) -> subprocess.Popen[str]:
-    """A command in a folder that gets the inputs which it names."""
+def run(folder: Path, line: str, change: int = 0, number: int = 0) -> tuple[int, str]:
+    """The code and the words of a command in a folder that gets the inputs which it names."""
     folder.mkdir(exist_ok=True)
     copy_inputs(line, folder)
-    words = [sys.executable, "-W", "ignore", "-c", PROGRAM, *map(str, (change, number, lag)), *line.split()]
-    return subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-
-
-def end(run: subprocess.Popen[str]) -> tuple[int, str]:
-    said = run.communicate()[0]
-    return run.returncode, said
+    words = [sys.executable, "-W", "ignore", "-c", PROGRAM, *map(str, (change, number)), *line.split()]
+    ended = subprocess.run(words, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    return ended.returncode, ended.stdout
 
 
 @pytest.mark.parametrize("line", [LONG, SYNTH, BUILD, f"{SEGMENT} --tile 16 -o out.nii.gz"])
 def test_a_run_that_is_ended_leaves_whole_files_and_goes_on(tmp_path: Path, line: str) -> None:
     """By a signal at any change of a file: afterwards the same command ends as an unbroken one does."""
-    code, said = end(start(tmp_path / "whole", line))
+    code, said = run(tmp_path / "whole", line)
     changes = int(said.rpartition("changes ")[2])
     assert code == 0 and changes > 9, said
     inputs = {word for word in line.split() if (FOLDER / word).exists()}
     for number, share in ((signal.SIGINT, 0.1), (signal.SIGKILL, 0.4), (signal.SIGTERM, 0.7), (signal.SIGINT, 0.95)):
         folder = tmp_path / f"{share}"
-        code, said = end(start(folder, line, 1 + int(share * changes), number))
+        code, said = run(folder, line, 1 + int(share * changes), number)
         assert code in (0, -number, 128 + number) and "Traceback" not in said, said
         new = [path for path in folder.rglob("*") if path.relative_to(folder).parts[0] not in inputs]
         if number != signal.SIGKILL:
             assert not [path for path in new if path.name.startswith(".") and "curvafit" not in path.name], (said, new)
         values(folder)
-        assert (again := end(start(folder, line)))[0] == 0, (share, said, again)
+        assert (again := run(folder, line))[0] == 0, (share, said, again)
         assert values(folder) == values(tmp_path / "whole")
 
 
@@ -209,16 +193,3 @@ def values(folder: Path) -> dict[str, bytes]:
     for path in folder.glob("out.zarr/draws/*/field"):
         found[str(path.relative_to(folder))] = np.asarray(zarr.open_array(path, mode="r")[...]).tobytes()
     return found
-
-
-@pytest.mark.parametrize("line", [f"{QUICK} -o out.nii.gz", f"{QUICK} -o out.zarr", LONG, BUILD, SYNTH])
-def test_two_at_once_both_end_or_one_says_why(tmp_path: Path, line: str) -> None:
-    """What they leave is what one alone does."""
-    outcomes = [end(run) for run in [start(tmp_path / "two", line, lag=0.03) for _ in range(2)]]
-    assert 0 in [code for code, _ in outcomes], outcomes
-    for code, said in outcomes:
-        sentences = [each for each in said.splitlines() if not each.startswith(("[", "changes "))]
-        assert not code or (code == 2 and len(sentences) == 1 and ".part" not in sentences[0]), said
-    end(start(tmp_path / "one", line))
-    assert values(tmp_path / "two") == values(tmp_path / "one")
-    assert not [path for path in (tmp_path / "two").rglob(".*") if path.is_file()]

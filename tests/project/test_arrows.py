@@ -1,14 +1,117 @@
-"""Arrows run one way, down the floors of the house. Read from the imports, wherever they stand."""
+"""What an import brings along, which names each room offers, and arrows that run one way, down the floors."""
 
 import ast
 import graphlib
+import json
+import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parents[2] / "curvafit"
+ROOT = Path(__file__).resolve().parents[2]
 WINGS = ("priors", "generation", "data_synth")
+ROOMS = ["curvafit"] + [
+    f"curvafit.{path.parent.name}"
+    for path in sorted((ROOT / "curvafit").glob("*/__init__.py"))
+    if re.search(r"__all__|attach_lazy_names", path.read_text("utf-8"))
+]
+PRIORS = [
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    for path in sorted((ROOT / "curvafit" / "priors").rglob("*.py"))
+    if path.parent.name != "kernels"
+]
+
+#: Asks everything in an order in which no answer depends on an earlier question, and prints the answers as JSON.
+SCRIPT = r"""
+import contextlib, importlib, io, json, sys, types
+from importlib.machinery import PathFinder
+
+before = set(sys.modules)
+import curvafit
+new = {name.split(".")[0] for name in set(sys.modules) - before} - set(sys.stdlib_module_names)
+rooms = {".".join(name.split(".")[:2]) for name in sys.modules if name.startswith("curvafit.")}
+answers = {"package": sorted(new), "rooms": sorted(rooms), "wings": []}
+
+with contextlib.redirect_stdout(io.StringIO()) as shown, contextlib.suppress(SystemExit):
+    from curvafit.cli.app import app
+    app(["--help"])
+answers["help"] = shown.getvalue()
+answers["heavy"] = sorted({"torch", "numpy", "scipy", "matplotlib", "numba", "jax"} & set(sys.modules))
+for wing in WINGS:
+    try:
+        importlib.import_module(wing)
+    except ImportError as error:
+        answers["wings"].append(str(error))
+
+# every package but torch, numpy and what torch itself is made of is hidden, as if it were not installed
+NEEDS = (
+    "numpy torch torchgen functorch triton nvidia sympy mpmath networkx jinja2 markupsafe filelock fsspec "
+    "typing_extensions setuptools _distutils_hack pkg_resources lazy_loader packaging"
+)
+SEEN = {"curvafit", *NEEDS.split(), *sys.stdlib_module_names}
+class Only:
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        return PathFinder.find_spec(name, path, target) if name.partition(".")[0] in SEEN else None
+finders = list(sys.meta_path)
+sys.meta_path[:] = [finder for finder in finders if finder is not PathFinder] + [Only]
+answers["seen"] = []
+for hidden in ("numba", "scipy", "skimage", "jax", "jaxtyping", "geomloss", "nibabel", "matplotlib"):
+    with contextlib.suppress(ImportError):
+        importlib.import_module(hidden)
+        answers["seen"].append(hidden)
+for name in PRIORS:
+    importlib.import_module(name)
+import torch
+from curvafit.priors import Grid, energy, preset
+u = torch.rand((8, 8, 8), generator=torch.Generator().manual_seed(0)).requires_grad_()
+value = energy(u, preset("tubes").coefficients, Grid((8, 8, 8)), 0.02)
+value.backward()
+answers["energy"] = [float(value), float(u.grad.abs().max())]
+sys.meta_path[:] = finders
+
+answers["names"] = {}
+for room in ROOMS:
+    face = importlib.import_module(room)
+    modules = [name for name in face.__all__ if isinstance(getattr(face, name), types.ModuleType)]
+    # a module of that name must not take the function's place
+    homes = [(name, sys.modules.get(f"{room}.{name}")) for name in face.__all__]
+    hidden = [name for name, home in homes if home is not None and getattr(face, name) is not getattr(home, name)]
+    answers["names"][room] = modules + hidden + sorted(set(face.__all__) - set(dir(face)))
+print(json.dumps(answers))
+"""
+
+
+@pytest.fixture(scope="module")
+def answers() -> dict[str, Any]:
+    head = f"WINGS, ROOMS, PRIORS = {WINGS!r}, {ROOMS!r}, {PRIORS!r}\n"
+    done = subprocess.run([sys.executable, "-c", head + SCRIPT], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_the_package_imports_nothing(answers) -> None:
+    assert set(answers["package"]) <= {"curvafit", "lazy_loader"} and set(answers["rooms"]) <= {"curvafit.core"}
+    assert "generate" in answers["help"] and answers["heavy"] == []
+    links = [wing for wing in WINGS if (ROOT / wing).is_symlink()]  # a tree may be made without them
+    assert [wing for wing in links if not any(f"curvafit.{wing}" in said for said in answers["wings"])] == []
+
+
+def test_priors_need_torch_and_numpy_only(answers) -> None:
+    assert answers["seen"] == []
+    value, slope = answers["energy"]
+    assert abs(value) < float("inf") and slope > 0
+
+
+def test_a_room_offers_its_names_and_nothing_else(answers) -> None:
+    assert answers["names"] == {room: [] for room in ROOMS}
+
+
+PACKAGE = Path(__file__).resolve().parents[2] / "curvafit"
 #: The house from the ground up. A folder (or a file at the root) imports from floors below its own.
 FLOORS = (
     ("core",), ("priors",), ("generation", "volumes", "geometry"), ("scan", "drawing"), ("inference",), ("data_synth",),

@@ -56,12 +56,17 @@ def numbers(line: str) -> list[float]:
 
 
 def test_convergence(run: Run) -> None:
+    """And orientation's table."""
     _, *rows, status = run("convergence", "--edge", 24, "--schedule", "fast", "--steps", 300)
     steps, energies, *_ = zip(*map(numbers, rows), strict=True)
     assert steps == (10, 30, 100, 300)
     assert all(a > b for a, b in pairwise(energies))
     assert numbers(rows[-1])[-1] == 0 and 0.02 < numbers(rows[-1])[-2] < 0.4
     assert "after 300 steps" in status
+    _, *rows = run("orientation", "--edge", 32, "--steps", 120)
+    free_tubes, tubes, free_layers, layers = map(numbers, rows)
+    assert [free_tubes[0], tubes[0], free_layers[0], layers[0]] == [0, 1000, 0, 800]
+    assert tubes[1] < free_tubes[1] and layers[1] < free_layers[1] < 1
 
 
 @pytest.mark.parametrize(("name", "size"), [("gallery", 28), ("interpolation", 28), ("spatialised", 20)])
@@ -104,13 +109,6 @@ def test_seeds_and_kept_shapes(run: Run, tmp_path: Path, capsys: pytest.CaptureF
     assert run("seeds", *size) == lines
     made = [line for line in capsys.readouterr().out.splitlines() if " steps" in line and ".npz" not in line]
     assert [line.split(":")[0] for line in made if line.startswith(("seed-", "random-"))] == ["seed-1"]
-
-
-def test_orientation(run: Run) -> None:
-    _, *rows = run("orientation", "--edge", 32, "--steps", 120)
-    free_tubes, tubes, free_layers, layers = map(numbers, rows)
-    assert [free_tubes[0], tubes[0], free_layers[0], layers[0]] == [0, 1000, 0, 800]
-    assert tubes[1] < free_tubes[1] and layers[1] < free_layers[1] < 1
 
 
 @pytest.mark.parametrize(("name", "genus"), [("sphere", 0), ("torus", 1), ("smaller-torus", 1), ("genus-2", 2)])

@@ -1,10 +1,15 @@
-"""Files beside the package: one version, pins that hold, links that lead somewhere, no place of one machine."""
+"""Files beside the package, and the archives of a release: one version, pins that hold, links that lead somewhere."""
 
 import re
+import subprocess
+import sys
+import tarfile
 import tomllib
+import zipfile
 from importlib.metadata import entry_points
 from pathlib import Path
 
+import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -19,15 +24,13 @@ def text(name: str) -> str:
 
 
 def test_one_version_everywhere() -> None:
+    """And pins that hold every requirement."""
     version = PROJECT["version"]
     assert re.findall(r"^## \[(\d[^\]]*)\]", text("CHANGELOG.md"), re.MULTILINE)[0] == version
     assert re.findall(r"^version: (\S+)$", text("CITATION.cff"), re.MULTILINE) == [version]
     assert curvafit.__version__ == version
     (script,) = entry_points(group="console_scripts", name="curvafit")
     assert callable(script.load())
-
-
-def test_constraints_hold_every_requirement() -> None:
     lines = [line for line in text("constraints.txt").splitlines() if line and not line.startswith("#")]
     pins = {canonicalize_name(name): version for name, version in (line.split("==") for line in lines)}
     groups = [PROJECT["dependencies"], *PROJECT["optional-dependencies"].values()]
@@ -47,3 +50,36 @@ def test_no_file_names_a_place_on_one_machine() -> None:
     for page in ("README.md", "CONTRIBUTING.md"):
         links = re.findall(r"\]\(([^)#\s]+)", text(page))
         assert [link for link in links if "://" not in link and not (ROOT / link).exists()] == []
+
+
+#: Files of the package in this tree, without what interpreters and compilers leave behind.
+PACKAGE = {
+    path.relative_to(ROOT).as_posix()
+    for path in (ROOT / "curvafit").rglob("*")
+    if path.is_file() and "__pycache__" not in path.parts
+}
+
+
+def build(target: str, folder: Path) -> Path:
+    pytest.importorskip("hatchling", reason="needs hatchling, of the extra [dev]")
+    command = [sys.executable, "-m", "hatchling", "build", "--target", target, "--directory", str(folder)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (archive,) = folder.iterdir()
+    return archive
+
+
+def test_wheel_holds_one_copy_of_the_package(tmp_path: Path) -> None:
+    """And so does the sdist, with the tests."""
+    with zipfile.ZipFile(build("wheel", tmp_path)) as archive:
+        names = archive.namelist()
+    assert len(names) == len(set(names))
+    assert {name for name in names if ".dist-info/" not in name} == PACKAGE
+    assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
+    with tarfile.open(build("sdist", tmp_path)) as archive:
+        members = archive.getmembers()
+    names = [member.name.partition("/")[2] for member in members if member.isfile()]
+    assert len(names) == len(set(names)) and not [member.name for member in members if member.issym()]
+    wings = ("priors/", "generation/", "data_synth/")
+    assert not [name for name in names if name.startswith(wings)]
+    assert {*PACKAGE, "pyproject.toml", "LICENSE", "README.md", "tests/project/test_project_files.py"} <= set(names)
