@@ -1,5 +1,6 @@
 """A finished inference made by hand from exact shapes: a lattice of tubes as the scan, two more beside it."""
 
+import json
 from functools import lru_cache
 
 import numpy as np
@@ -51,13 +52,8 @@ def made_inference(
     )
     barren = Twin(None, -0.58, None, None, "the field is of one phase")
     twins = {"posterior": (barren,) if lost else (twin_of(regrown),) * 2, "match": (twin_of(matched),)}
-    return Inference(
-        scan=Field(grey, (SCALE,) * 3, "mm", source=source),
-        prepared=prepared,
-        diagram=measured(phase),
-        twins=twins,
-        fit=made_fit("match" if lost else chosen, lost),
-    )
+    scan, fit = Field(grey, (SCALE,) * 3, "mm", source=source), made_fit("match" if lost else chosen, lost)
+    return Inference(scan=scan, prepared=prepared, diagram=measured(phase), twins=twins, fit=fit)
 
 
 def twin_of(phase: np.ndarray) -> Twin:
@@ -116,3 +112,31 @@ def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(pictures, "surface_figure", blank)
     monkeypatch.setattr(pictures, "png", lambda figure: b"\x89PNG")
+
+
+COLUMNS = (("true", "1"), ("2", "-1"), ("2", ""))
+#: What every reader of a `fit.json` refuses: where, and the JSON that stands there, or nothing.
+BROKEN = [
+    (where, text)
+    for where, texts in {
+        "mass": ("1", "-1.5", "true", None), "epsilon_physical": ("0", '"0.02"'), "working_voxel": ("-1", "[0.01]"),
+        "length_unit": ('"furlong"', "[]"), "coefficients": ("[1, 2, 3, 4, 5, 6]",), "coefficients.a02": (None,),
+        "coefficients_physical.a10": ('"x"',), "morphometry": ("7",), "morphometry.volume_fraction": ("2",),
+        "kind": ("3",), "family": ("{}",), "matches": ("{}", "[7]"), "provenance": ('{"scan": 5}',),
+        "diagram": ("7", *('{{"kappa1": [1], "kappa2": [{}], "share": [{}]}}'.format(*each) for each in COLUMNS)),
+    }.items()
+    for text in texts
+]  # fmt: skip
+
+
+def broken(where: str, text: str | None) -> str:
+    """The text of a `fit.json` in which other JSON stands in one place, or nothing."""
+    content = json.loads(made_fit().to_json())
+    *path, name = where.split(".")
+    inner = content
+    for key in path:
+        inner = inner[key]
+    inner[name] = "\0"
+    if text is None:
+        del inner[name]
+    return json.dumps(content).replace('"\\u0000"', text or "")

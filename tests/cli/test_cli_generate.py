@@ -50,18 +50,6 @@ def test_generate_writes_a_field_a_picture_and_a_record(tmp_path: Path) -> None:
     assert str(target) in result.stdout
 
 
-def test_generate_writes_a_surface_in_the_prior_s_unit(tmp_path: Path, prior: Path) -> None:
-    options = ["--prior", prior, "--mass", "-0.4", "--shape", "16,20,24", "--steps", 30]
-    record = made(*options, "-o", tmp_path / "more.ply")
-    assert record["coefficients"] == made_fit().coefficients.as_dict()
-    assert (record["mass"], record["shape"], record["voxel"], record["unit"]) == (-0.4, [16, 20, 24], 0.0195, "mm")
-    assert (tmp_path / "more.ply").read_bytes().startswith(b"ply\nformat binary_little_endian")
-    again = made(*options, "--spacing", 0.04, "-o", tmp_path / "out.npy")
-    assert (again["voxel"], again["unit"], again["working_spacing"]) == (0.04, "mm", [0.01] * 3)
-    refused(call("generate", *options, "-o", tmp_path / "fit.npy"), "input")
-    assert prior.read_text() == made_fit().to_json()
-
-
 def test_a_fit_without_a_law_is_refused_by_all_that_take_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     made_fit(chosen=None).save("fit.json")
@@ -162,12 +150,22 @@ def test_tubes_of_the_published_size_are_watertight_with_the_volume_of_the_phase
     np.testing.assert_allclose(mesh.bounds, [[-0.01] * 3, [0.02 * (edge - 0.5)] * 3], atol=1e-6)
 
 
-def test_a_volume_fraction_is_reached_and_its_mass_recorded(tmp_path: Path) -> None:
+def test_a_volume_fraction_is_reached_and_its_mass_recorded(tmp_path: Path, prior: Path) -> None:
+    """And a surface is in the prior's unit."""
     options = ["--volume-fraction", "0.25", "--shape", "32", "--steps", 200]
     record = made("--preset", "sponge", *options, "-o", tmp_path / "out.npy")
     values = load(tmp_path / "out.npy").values
     assert (values > 0).mean() == pytest.approx(0.25, abs=0.002)
     assert record["mass"] == pytest.approx(values.mean(), abs=1e-6) and record["wanted_volume_fraction"] == 0.25
+    options = ["--prior", prior, "--mass", "-0.4", "--shape", "16,20,24", "--steps", 30]
+    record = made(*options, "-o", tmp_path / "more.ply")
+    assert record["coefficients"] == made_fit().coefficients.as_dict()
+    assert (record["mass"], record["shape"], record["voxel"], record["unit"]) == (-0.4, [16, 20, 24], 0.0195, "mm")
+    assert (tmp_path / "more.ply").read_bytes().startswith(b"ply\nformat binary_little_endian")
+    again = made(*options, "--spacing", 0.04, "-o", tmp_path / "out.npy")
+    assert (again["voxel"], again["unit"], again["working_spacing"]) == (0.04, "mm", [0.01] * 3)
+    refused(call("generate", *options, "-o", tmp_path / "fit.npy"), "input")
+    assert prior.read_text() == made_fit().to_json()
 
 
 def full(*_: Any, **__: Any) -> None:

@@ -144,13 +144,6 @@ def test_variance_is_a_line_over_the_mean(width: float) -> None:
     assert effects.digitise(values, 255).flatten().tolist() == [0, 0, 8, 255]
 
 
-def test_grain_of_the_noise() -> None:
-    noise = effects.gaussian_noise(torch.zeros(60, 60, 60), 5.0, 1, (0, 1.0, 1.0))
-    assert float(noise.std()) == pytest.approx(5, rel=0.02)
-    assert float((noise[..., 1:] * noise[..., :-1]).mean() / 25) == pytest.approx(math.exp(-1 / 4), abs=0.02)
-    assert float((noise[1:] * noise[:-1]).mean() / 25) == pytest.approx(0, abs=0.02)
-
-
 @pytest.mark.parametrize("signal", [0.0, 1.0, 3.0, 10.0])
 def test_rician_moments(signal: float) -> None:
     seen = effects.rician(torch.full((60, 60, 60), 2 * signal, dtype=torch.float64), 2.0, 2)
@@ -161,16 +154,19 @@ def test_rician_moments(signal: float) -> None:
 
 
 def test_bias_has_its_range_and_is_smooth() -> None:
+    """Bias, grain and stripes, which are constant along x but for rounding.
+
+    A value is two sums in an order that the processor's matrix product chooses, over 46 nodes whose products come to
+    some 7 strengths: off by 46 · 7 · 0.1 eps, two of them by twice that.
+    """
     for seed in (1, 2, 3):
         factor = effects.bias(EMPTY, 1.0, 0.3, 25.0, seed)
         assert float(factor.amin()) == pytest.approx(0.7) and float(factor.amax()) == pytest.approx(1.3)
         assert float(factor.diff(dim=-1).abs().max()) < 0.08
-
-
-def test_stripes() -> None:
-    """Constant along x but for rounding. A value is two sums in an order that the processor's matrix product
-    chooses, over 46 nodes whose products come to some 7 strengths: off by 46 · 7 · 0.1 eps, two of them by twice that.
-    """
+    noise = effects.gaussian_noise(torch.zeros(60, 60, 60), 5.0, 1, (0, 1.0, 1.0))
+    assert float(noise.std()) == pytest.approx(5, rel=0.02)
+    assert float((noise[..., 1:] * noise[..., :-1]).mean() / 25) == pytest.approx(math.exp(-1 / 4), abs=0.02)
+    assert float((noise[1:] * noise[:-1]).mean() / 25) == pytest.approx(0, abs=0.02)
     factor = effects.stripes(EMPTY, (1.0, 1.0, 1.0), 0.1, 1.0, 4)
     assert float(factor.diff(dim=-1).abs().max()) <= 2 * N * torch.finfo(factor.dtype).eps
     off = factor[..., 0] - 1

@@ -209,6 +209,7 @@ def viable(path) -> list[int]:
 
 
 def test_nothing_is_wrong_with_a_sound_store(path):
+    """And one that lost a draw, as if the build had been stopped, is whole again after another."""
     found = verify(path)
     assert (found.problems, found.notes) == ((), ())
     assert found.status.endswith("nothing is wrong")
@@ -217,6 +218,11 @@ def test_nothing_is_wrong_with_a_sound_store(path):
     for told in (summarise(store), summarise(Store(path, old))):  # version 0.1 called `fast` what is `cosine` now
         assert (told["shapes"], told["wanted"], told["voxels"]) == ("4", "4", "16 x 16 x 16")
         assert told["schedule"] == "cosine, 40 steps"
+    shutil.rmtree(path / "draws" / f"{viable(path)[1]:06d}")
+    found = verify(path)
+    assert found.problems == () and "1 draws are missing" in found.notes[0]  # as if the build had been stopped
+    build(path, 4, 16, seed=1, schedule=QUICK)
+    assert verify(path).notes == ()
 
 
 def test_an_extended_store_is_as_if_built_at_once(path, tmp_path):
@@ -227,14 +233,6 @@ def test_an_extended_store_is_as_if_built_at_once(path, tmp_path):
     assert longer.indices() == whole.indices() and longer.wanted == whole.wanted == 6
     assert all((longer.field(i) == whole.field(i)).all() for i in viable(path))
     assert verify(path).problems == ()
-
-
-def test_a_lost_draw_is_found_and_made_again(path):
-    shutil.rmtree(path / "draws" / f"{viable(path)[1]:06d}")
-    found = verify(path)
-    assert found.problems == () and "1 draws are missing" in found.notes[0]  # as if the build had been stopped
-    build(path, 4, 16, seed=1, schedule=QUICK)
-    assert verify(path).notes == ()
 
 
 def test_a_draw_that_a_build_adds_meanwhile_is_no_stranger(path, tmp_path):

@@ -251,7 +251,7 @@ def sliced(a: Diagram, b: Diagram) -> float:
 
 
 def test_distances_that_are_zero() -> None:
-    """From itself at any scale of weights, and a point of weight 3 from three points."""
+    """From itself at any scale of weights, and a point of weight 3 from three points. A distance is the pair's own."""
     d, points = blob(), np.array([[0.0, 0.0], [10.0, -10.0]])
     heavy, light = Diagram(points, np.array([3.0, 1.0])), Diagram(points[[0, 0, 0, 1]], np.ones(4))
     assert wasserstein(d, d) == pytest.approx(0, abs=1e-2)
@@ -263,6 +263,19 @@ def test_distances_that_are_zero() -> None:
     assert near < wasserstein(a, moved(a, (5.0, 0.0)), reach=None)
     assert farther == pytest.approx(far, rel=0.12)
     assert far < 20 * math.sqrt(2)  # all of both destroyed and made anew
+    query, others = blob(0), [blob(k, (20.0 + 3 * k, -5.0 - k)) for k in range(1, 6)]
+    full = [wasserstein(query, other, reach=None) for other in others]
+    assert np.argsort(full).tolist() == np.argsort([sliced(query, other) for other in others]).tolist()
+    assert sliced_embedding(query).shape == (288,)
+    together = pairwise(CLOUDS)
+    for i, j in itertools.combinations(range(len(CLOUDS)), 2):
+        assert pairwise([CLOUDS[i], CLOUDS[j]])[0, 1] == pytest.approx(together[i, j], rel=1e-5)
+    others = [replace(d, weights=7 * d.weights) for d in CLOUDS]
+    np.testing.assert_allclose(one_to_many(CLOUDS[1], others), together[1], rtol=1e-5, atol=0.01)
+    assert one_to_many(CLOUDS[0], []).shape == (0,) and pairwise([]).shape == (0, 0)
+    a = CLOUDS[0]
+    more = Diagram(np.concatenate([a.points, [[500.0, 0.0]]]), np.append(a.weights, 0.0))
+    assert one_to_many(a, [more], bin_width=0)[0] == 0
 
 
 @pytest.mark.parametrize("shift", [(1.0, 0.0), (0.0, -2.0), (3.0, 4.0)])
@@ -300,13 +313,6 @@ def test_distances_of_gaussians_in_closed_form() -> None:
 def test_symmetry(seeds: tuple[int, int], by: float) -> None:
     a, b = blob(seeds[0], count=60), moved(blob(seeds[1], count=60), (by, 0.0))
     assert wasserstein(a, b) == pytest.approx(wasserstein(b, a), rel=1e-3, abs=0.03)
-
-
-def test_sliced_distance_ranks_as_the_full_one() -> None:
-    query, others = blob(0), [blob(k, (20.0 + 3 * k, -5.0 - k)) for k in range(1, 6)]
-    full = [wasserstein(query, other, reach=None) for other in others]
-    assert np.argsort(full).tolist() == np.argsort([sliced(query, other) for other in others]).tolist()
-    assert sliced_embedding(query).shape == (288,)
 
 
 #: Near, far enough for exp(-C / blur²) to leave float32's range many times over, narrow, and a single point.
@@ -368,16 +374,3 @@ def test_distances_are_wasserstein_s_far_near_narrow_and_on_single_points(blur: 
     assert (distances == distances.T).all() and (np.diag(distances) == 0).all()
     for i, j in itertools.combinations(range(len(diagrams)), 2):
         assert close(distances[i, j], wasserstein(diagrams[i], diagrams[j], **options)), (i, j)
-
-
-def test_a_distance_is_the_pair_s_own_whoever_else_is_there() -> None:
-    """The number of steps is the pair's. Weights are shares, and points without any do not count."""
-    together = pairwise(CLOUDS)
-    for i, j in itertools.combinations(range(len(CLOUDS)), 2):
-        assert pairwise([CLOUDS[i], CLOUDS[j]])[0, 1] == pytest.approx(together[i, j], rel=1e-5)
-    others = [replace(d, weights=7 * d.weights) for d in CLOUDS]
-    np.testing.assert_allclose(one_to_many(CLOUDS[1], others), together[1], rtol=1e-5, atol=0.01)
-    assert one_to_many(CLOUDS[0], []).shape == (0,) and pairwise([]).shape == (0, 0)
-    a = CLOUDS[0]
-    more = Diagram(np.concatenate([a.points, [[500.0, 0.0]]]), np.append(a.weights, 0.0))
-    assert one_to_many(a, [more], bin_width=0)[0] == 0

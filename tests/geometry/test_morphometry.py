@@ -78,6 +78,7 @@ def test_thickness_never_exceeds_the_largest_ball_and_never_undercuts_the_own_on
 
 
 def test_euler_numbers_of_known_shapes() -> None:
+    """And windows add their share: the mean over all places of a window in a box that repeats, exactly."""
     ring = np.zeros((5, 9, 9), bool)
     ring[2, 2:7, 2:7] = True
     ring[2, 3:6, 3:6] = False
@@ -86,6 +87,19 @@ def test_euler_numbers_of_known_shapes() -> None:
     shell[3:6, 3:6, 3:6] = False
     assert [morphometry(mask, periodic=p).euler for mask in (ring, shell) for p in (False, True)] == [0, 0, 2, 2]
     assert morphometry(ring, 2.0).connectivity_density == pytest.approx(1 / (4 * 8 * 8 * 2**3))
+    mask = np.random.default_rng(0).random((6, 7, 5)) < 0.4
+    shares = [euler_of_window(np.roll(mask, by, (0, 1, 2))[:4, :5, :3]) for by in np.ndindex(*mask.shape)]
+    assert np.mean(shares) == pytest.approx(euler_number(mask, periodic=True) * 3 * 4 * 2 / mask.size)
+    alone = np.pad(mask, 1)
+    assert euler_of_window(alone) == euler_number(alone)
+    mask = solid(
+        (slice(0, 2), slice(0, 2), slice(0, 2)), (slice(4, 6),) * 3, (slice(9, 10), slice(10, 11), slice(11, 12))
+    )
+    assert components(mask)[1] == 3
+    labels, count = components(mask, periodic=True)
+    assert count == 2 and labels.dtype == np.int32
+    assert labels[0, 0, 0] == labels[-1, -1, -1] == 1 and labels[4, 4, 4] == 2
+    assert components(mask, periodic=True, connectivity=6)[1] == 3  # they touch at a corner only
 
 
 @pytest.mark.slow
@@ -148,20 +162,3 @@ def test_laws_of_random_masks(seed: int) -> None:
     assert b[0] - b[1] + b[2] == euler_number(mask, periodic=True) and min(b) >= 0
     box = betti_numbers(mask)
     assert box[0] >= b[0] and box[0] - box[1] + box[2] == euler_number(mask)
-
-
-def test_windows_add_their_share_of_the_euler_number() -> None:
-    """The mean over all places of a window in a box that repeats, exactly; of a structure that it holds, its own."""
-    mask = np.random.default_rng(0).random((6, 7, 5)) < 0.4
-    shares = [euler_of_window(np.roll(mask, by, (0, 1, 2))[:4, :5, :3]) for by in np.ndindex(*mask.shape)]
-    assert np.mean(shares) == pytest.approx(euler_number(mask, periodic=True) * 3 * 4 * 2 / mask.size)
-    alone = np.pad(mask, 1)
-    assert euler_of_window(alone) == euler_number(alone)
-    mask = solid(
-        (slice(0, 2), slice(0, 2), slice(0, 2)), (slice(4, 6),) * 3, (slice(9, 10), slice(10, 11), slice(11, 12))
-    )
-    assert components(mask)[1] == 3
-    labels, count = components(mask, periodic=True)
-    assert count == 2 and labels.dtype == np.int32
-    assert labels[0, 0, 0] == labels[-1, -1, -1] == 1 and labels[4, 4, 4] == 2
-    assert components(mask, periodic=True, connectivity=6)[1] == 3  # they touch at a corner only

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from broken_fits import broken
-from found import made_fit, made_inference
+from found import broken, made_fit, made_inference
 from hypothesis import given
 from hypothesis import strategies as st
 

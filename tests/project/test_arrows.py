@@ -95,19 +95,14 @@ def answers() -> dict[str, Any]:
 
 
 def test_the_package_imports_nothing(answers) -> None:
+    """Priors need torch and NumPy only; a room offers its names and nothing else."""
     assert set(answers["package"]) <= {"curvafit", "lazy_loader"} and set(answers["rooms"]) <= {"curvafit.core"}
     assert "generate" in answers["help"] and answers["heavy"] == []
     links = [wing for wing in WINGS if (ROOT / wing).is_symlink()]  # a tree may be made without them
     assert [wing for wing in links if not any(f"curvafit.{wing}" in said for said in answers["wings"])] == []
-
-
-def test_priors_need_torch_and_numpy_only(answers) -> None:
     assert answers["seen"] == []
     value, slope = answers["energy"]
     assert abs(value) < float("inf") and slope > 0
-
-
-def test_a_room_offers_its_names_and_nothing_else(answers) -> None:
     assert answers["names"] == {room: [] for room in ROOMS}
 
 
@@ -120,6 +115,7 @@ FLOORS = (
 
 
 def test_arrows_run_one_way() -> None:
+    """And modules do not import each other in a circle."""
     for module, line in {
         "priors.energy": "from curvafit.generation.flow import generate", "report.page": "from ..scan import a",
         "generation.flow": "def f():\n    from curvafit import generate", "drawing.plot": "from priors import energy",
@@ -128,9 +124,6 @@ def test_arrows_run_one_way() -> None:
     for path in PACKAGE.rglob("*.py"):
         module = module_name(path)
         assert module == "curvafit" or complaints(module, path.read_text(encoding="utf-8")) == []
-
-
-def test_modules_do_not_import_each_other_in_a_circle() -> None:
     files = {module_name(path): path for path in PACKAGE.rglob("*.py")}
     graph = {}
     for module, path in files.items():

@@ -27,15 +27,12 @@ def test_infer() -> None:
 
 
 def test_generate() -> None:
-    """Two seeds of one texture lie nearer to each other than two textures do, in the mean."""
+    """Two seeds of one texture lie nearer to each other than two textures do, in the mean; the prior's runs."""
     distances = run("generate")["distances"]
     same = [value for ((a, _), (b, _)), value in distances.items() if a == b]
     other = [value for ((a, _), (b, _)), value in distances.items() if a != b]
     assert len(same) == 3 and len(other) == 12
     assert sum(same) / 3 < sum(other) / 12
-
-
-def test_prior() -> None:
     ended = run("prior")
     assert ended["weight"] > 0
     assert all(0 < dice <= 1 for dice, _ in ended["results"].values())
