@@ -48,35 +48,25 @@ def packed_nrrd(path: Path, encoding: str) -> None:
 
 #: Formats whose values have a checksum, or one over all of the file: no damage may be read as data.
 CHECKED: dict[str, Callable[[Path], object]] = {
-    "a.nii.gz": volume(".nii.gz"),
-    "a.npz": lambda path: np.savez(path, raw=VALUES),
+    "a.nii.gz": volume(".nii.gz"), "a.npz": lambda path: np.savez(path, raw=VALUES),
     "packed.npz": lambda path: np.savez_compressed(path, raw=VALUES),
-    "gzip.nrrd": lambda path: packed_nrrd(path, "gzip"),
-    "bzip2.nrrd": lambda path: packed_nrrd(path, "bzip2"),
-    "packed.mha": lambda path: meta(path, True),
-    "crc.zarr": lambda path: store(path, compressors=[Crc32cCodec()]),
-}
+    "gzip.nrrd": lambda path: packed_nrrd(path, "gzip"), "bzip2.nrrd": lambda path: packed_nrrd(path, "bzip2"),
+    "packed.mha": lambda path: meta(path, True), "crc.zarr": lambda path: store(path, compressors=[Crc32cCodec()]),
+}  # fmt: skip
 #: Formats that say no more than how many values there are: what is cut or added is refused.
 COUNTED: dict[str, Callable[[Path], object]] = {
-    "a.nii": volume(".nii"),
-    "a.npy": volume(".npy"),
-    "a.mrc": volume(".mrc"),
-    "raw.nrrd": lambda path: packed_nrrd(path, "raw"),
-    "plain.mha": lambda path: meta(path, False),
-}
+    "a.nii": volume(".nii"), "a.npy": volume(".npy"), "a.mrc": volume(".mrc"),
+    "raw.nrrd": lambda path: packed_nrrd(path, "raw"), "plain.mha": lambda path: meta(path, False),
+}  # fmt: skip
 #: Others, where a flipped bit may go unseen, but nothing may end in anything but values or a sentence.
 OTHERS: dict[str, Callable[[Path], object]] = {
-    "imagej.tif": volume(".tif"),
-    "ome.ome.tif": volume(".ome.tif"),
-    "lzw.tif": lambda path: tiff(path, "lzw", True),
-    "deflate.tif": lambda path: tiff(path, "deflate"),
-    "a.h5": hdf5,
-    "packed.h5": lambda path: hdf5(path, compression="gzip", fletcher32=True),
-    "v3.zarr": store,
+    "imagej.tif": volume(".tif"), "ome.ome.tif": volume(".ome.tif"), "lzw.tif": lambda path: tiff(path, "lzw", True),
+    "deflate.tif": lambda path: tiff(path, "deflate"), "a.h5": hdf5,
+    "packed.h5": lambda path: hdf5(path, compression="gzip", fletcher32=True), "v3.zarr": store,
     "v2.zarr": lambda path: store(path, zarr_format=2, compressors=[numcodecs.Blosc()]),
     "blosc.zarr": lambda path: store(path, compressors=[BloscCodec()]),
     "sharded.zarr": lambda path: store(path, shards=(8, 10, 12)),
-}
+}  # fmt: skip
 FORMATS = {**CHECKED, **COUNTED, **OTHERS}
 
 

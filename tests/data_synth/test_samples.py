@@ -54,14 +54,11 @@ def test_a_sample_is_fetched_once_and_again_where_it_is_damaged(cache: Path, mon
 @pytest.mark.parametrize(
     ("pip", "word"),
     [
-        (Pip(content=b"another volume"), "SHA-256"),
-        (Pip(name="other.tif"), "bone_128"),
-        (Pip(name=""), "wheel"),
-        (Pip(outcome=1), "No matching"),
-        (Pip(outcome=subprocess.TimeoutExpired("pip", 1)), "timed out"),
+        (Pip(content=b"another volume"), "SHA-256"), (Pip(name="other.tif"), "bone_128"), (Pip(name=""), "wheel"),
+        (Pip(outcome=1), "No matching"), (Pip(outcome=subprocess.TimeoutExpired("pip", 1)), "timed out"),
     ],
     ids=lambda part: part if isinstance(part, str) else "",
-)
+)  # fmt: skip
 def test_what_is_not_the_expected_file_is_refused_and_not_kept(cache: Path, monkeypatch, pip: Pip, word: str) -> None:
     monkeypatch.setattr(subprocess, "run", pip)
     with pytest.raises(SampleUnavailable, match=word) as error:

@@ -317,12 +317,9 @@ def test_symmetry(seeds: tuple[int, int], by: float) -> None:
 
 #: Near, far enough for exp(-C / blur²) to leave float32's range many times over, narrow, and a single point.
 CLOUDS = [
-    uneven(0, 60),
-    uneven(1, 45, (15, -4), 6.0),
-    uneven(2, 70, (-150, 200), 30.0),
-    uneven(3, 30, (1, 1), 0.2),
+    uneven(0, 60), uneven(1, 45, (15, -4), 6.0), uneven(2, 70, (-150, 200), 30.0), uneven(3, 30, (1, 1), 0.2),
     uneven(4, 1, (5, 5)),
-]
+]  # fmt: skip
 REGIMES = pytest.mark.parametrize(("blur", "reach"), [(1.0, 20.0), (0.3, 5.0), (1.0, None)])
 
 

@@ -121,7 +121,7 @@ def _content(path: Path) -> Any:
 # ---- how records are compared ----------------------------------------------------------------------------------------
 
 
-def compare(kept: Any, got: Any, where: str = "", close: float = CLOSE) -> list[str]:
+def compare(kept: Any, got: Any, where: str = "", close: float = CLOSE, scale: float = 0.0) -> list[str]:
     """Return a sentence for each difference; none where the records agree to `close`, a relative difference."""
     if isinstance(kept, dict) and isinstance(got, dict):
         if "voxels" in kept and "voxels" in got:
@@ -136,15 +136,8 @@ def compare(kept: Any, got: Any, where: str = "", close: float = CLOSE) -> list[
         numbers = [abs(each) for each in kept if isinstance(each, float | int)]
         scale = max((each for each in numbers if math.isfinite(each)), default=0.0)
         pairs = enumerate(zip(kept, got, strict=True))
-        return [each for k, (old, new) in pairs for each in _compare_values(old, new, f"{where}[{k}]", close, scale)]
-    return _compare_values(kept, got, where, close, 0.0)
-
-
-def _compare_values(kept: Any, got: Any, where: str, close: float, scale: float) -> list[str]:
-    if isinstance(kept, dict | list) and isinstance(got, type(kept)):
-        return compare(kept, got, where, close)
-    numbers = isinstance(kept, float | int) and isinstance(got, float | int)
-    if numbers and isinstance(kept, float):
+        return [each for k, (old, new) in pairs for each in compare(old, new, f"{where}[{k}]", close, scale)]
+    if isinstance(kept, float) and isinstance(got, float | int):
         alike = math.isclose(kept, got, rel_tol=close, abs_tol=close * SMALL * scale + TINY)
     else:
         alike = kept == got
@@ -155,10 +148,6 @@ def _compare_masks(kept: dict[str, Any], got: dict[str, Any], where: str, close:
     keys = sorted({*kept, *got} - {"voxels"})
     if said := [each for key in keys for each in compare(kept.get(key), got.get(key), f"{where}/{key}")]:
         return said
-    old, new = (_unpack(each) for each in (kept, got))
+    old, new = (np.frombuffer(zlib.decompress(base64.b85decode(each["voxels"])), np.uint8) for each in (kept, got))
     stray = np.count_nonzero(old != new) / old.size
     return [f"{where}: {stray:.2%} of the voxels differ"] if stray > max(STRAY, close / 10) else []
-
-
-def _unpack(mask: dict[str, Any]) -> np.ndarray:
-    return np.frombuffer(zlib.decompress(base64.b85decode(mask["voxels"])), np.uint8)

@@ -358,10 +358,8 @@ def zipped(path: Path) -> None:
 
 
 CLAIMS: dict[str, bytes | Callable[[Path], object]] = {
-    "a.npy": npy("(10000, 10000, 10000)") + bytes(100),
-    "b.npy": npy(f"({10**30}, 2, 2)") + bytes(100),
-    "a.nii": nifti(32767, 32767, 32767) + bytes(99),
-    "a.nii.gz": gzip.compress(nifti(32767, 32767, 32767) + bytes(99)),
+    "a.npy": npy("(10000, 10000, 10000)") + bytes(100), "b.npy": npy(f"({10**30}, 2, 2)") + bytes(100),
+    "a.nii": nifti(32767, 32767, 32767) + bytes(99), "a.nii.gz": gzip.compress(nifti(32767, 32767, 32767) + bytes(99)),
     "a.mrc": struct.pack("<4i", 30000, 30000, 30000, 2) + bytes(192) + b"MAP \x44\x44\0\0" + bytes(808),
     "a.nrrd": nrrd("30000 30000 30000", "raw") + bytes(100),
     "packed.nrrd": nrrd("30000 30000 30000", "gzip") + gzip.compress(bytes(100)),
@@ -373,9 +371,8 @@ CLAIMS: dict[str, bytes | Callable[[Path], object]] = {
     "sparse.npy": lambda path: path.touch() or os.truncate(path, 10**12),
     "whole.nii.gz": lambda path: path.write_bytes(swollen(nifti(1200, 1200, 1200))),
     "tail.nii.gz": lambda path: path.write_bytes(swollen(nifti(8, 8, 8))),
-    "bomb.nrrd": lambda path: path.write_bytes(nrrd("8 8 8", "gzip") + swollen(b"")),
-    "bomb.npz": zipped,
-}
+    "bomb.nrrd": lambda path: path.write_bytes(nrrd("8 8 8", "gzip") + swollen(b"")), "bomb.npz": zipped,
+}  # fmt: skip
 
 
 def test_what_no_memory_holds_is_refused(tmp_path: Path) -> None:
