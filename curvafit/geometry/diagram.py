@@ -233,10 +233,7 @@ def _voxel_curvatures(values: Tensor, grid: Grid, epsilon: float, curvature: str
 def _interpolate(
     fields: tuple[np.ndarray, ...], resolved: np.ndarray, centres: np.ndarray, periodic: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return values `(N, 2)` at `centres` `(N, 3)` (in voxels) from the resolved voxels around, and where any are.
-
-    Fields are 0 where they are not resolved.
-    """
+    """Return values `(N, 2)` at `centres` `(N, 3)` (in voxels) from the resolved voxels around, and where any are."""
     *sums, total = (
         map_coordinates(values, centres.T, np.float64, order=1, mode="grid-wrap" if periodic else "nearest")
         for values in (*fields, resolved)

@@ -7,10 +7,10 @@ takes these loops where geomloss is not installed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from importlib.util import find_spec
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,12 +25,8 @@ BLOCK = 8192
 #: Lines on which a sliced embedding projects a diagram, and quantiles of each.
 DIRECTIONS, QUANTILES = 12, 24
 #: All of fast-math but the leave to assume that no value is NaN or infinite.
-_SERIAL = {
-    "cache": True,
-    "fastmath": {"reassoc", "contract", "arcp", "nsz", "afn"},
-    "error_model": "numpy",
-    "nogil": True,
-}
+_FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
+_SERIAL = {"cache": True, "fastmath": _FAST, "error_model": "numpy", "nogil": True}
 #: A sum over the plan is trusted between these; outside, what it adds may have left float32's range.
 _LEAST, _MOST = np.float32(1e-25), np.float32(1e30)
 _LN2 = math.log(2.0)
@@ -52,13 +48,12 @@ def pairwise(
     `wasserstein` is met to 1e-4 of itself, or 1e-5 where that is less than 0.1: the steps are the same, in float32. A
     pair takes half a millisecond, on numba's threads. Options and errors are those of `wasserstein`.
     """
-    clouds = _pack_diagrams(diagrams, blur, reach, bin_width)
     distances = np.zeros((len(diagrams),) * 2)
     first, second = np.triu_indices(len(diagrams), 1)
     order = np.random.default_rng(0).permutation(len(first))  # so that threads get pairs of like sizes
     first, second = first[order], second[order]
-    blocks = _iterate_distances(clouds, first, second, blur=blur, reach=reach)
-    distances[first, second] = distances[second, first] = np.concatenate([np.empty(0), *blocks])
+    found = _measure_pairs(diagrams, first, second, blur, reach, bin_width)
+    distances[first, second] = distances[second, first] = found
     return distances
 
 
@@ -71,30 +66,26 @@ def one_to_many(
     bin_width: float = BIN_WIDTH,
 ) -> np.ndarray:
     """Return the distances `(N,)` of one diagram to each of N; options and errors are those of `pairwise`."""
-    clouds = _pack_diagrams([query, *diagrams], blur, reach, bin_width)
     others = np.arange(1, len(diagrams) + 1)
-    blocks = _iterate_distances(clouds, np.zeros_like(others), others, blur=blur, reach=reach)
-    return np.concatenate([np.empty(0), *blocks])
+    return _measure_pairs([query, *diagrams], np.zeros_like(others), others, blur, reach, bin_width)
 
 
-def _pack_diagrams(diagrams: Sequence[Diagram], blur: float, reach: float | None, bin_width: float) -> Clouds:
-    reduced = _normalise(diagrams, blur, reach, bin_width)
-    return pack([d.points for d in reduced], [d.weights for d in reduced])
-
-
-def _iterate_distances(clouds: Clouds, first: np.ndarray, second: np.ndarray, **options: Any) -> Iterator[np.ndarray]:
-    """Yield the debiased Sinkhorn distances √(cost(a, b) - cost(a, a) / 2 - cost(b, b) / 2) of the pairs, by blocks."""
+def _measure_pairs(
+    diagrams: Sequence[Diagram], first: np.ndarray, second: np.ndarray, blur: float, reach: float | None, width: float
+) -> np.ndarray:
+    """Return the debiased Sinkhorn distances √(cost(a, b) - cost(a, a) / 2 - cost(b, b) / 2) of pairs."""
+    reduced = _normalise(diagrams, blur, reach, width)
+    clouds = pack([d.points for d in reduced], [d.weights for d in reduced])
     # A cloud's cost with itself depends on how often the pair's blur is halved: it is computed once for each cloud and
     # number of halvings, of which a cloud meets two or three.
-    halved = pair_halvings(clouds, first, second, options["blur"])
+    halved = pair_halvings(clouds, first, second, blur)
     keys = np.concatenate([np.stack([ends, halved], axis=1) for ends in (first, second)])
     distinct, places = np.unique(keys, axis=0, return_inverse=True)
-    self_costs = costs(clouds, distinct[:, 0], distinct[:, 0], distinct[:, 1], **options)
+    self_costs = costs(clouds, distinct[:, 0], distinct[:, 0], distinct[:, 1], blur=blur, reach=reach)
     bias = self_costs[places.reshape(2, -1)].sum(0) / 2
-    for start in range(0, len(first), BLOCK):
-        block = slice(start, start + BLOCK)
-        divergence = costs(clouds, first[block], second[block], halved[block], **options) - bias[block]
-        yield np.sqrt(np.maximum(divergence, 0))
+    blocks = (slice(start, start + BLOCK) for start in range(0, len(first), BLOCK))  # Ctrl-C ends work between two
+    pairs = [costs(clouds, first[b], second[b], halved[b], blur=blur, reach=reach) for b in blocks]
+    return np.sqrt(np.maximum(np.concatenate([np.empty(0), *pairs]) - bias, 0))
 
 
 def wasserstein(
@@ -134,10 +125,7 @@ def wasserstein(
 
 
 def _normalise(diagrams: Sequence[Diagram], blur: float, reach: float | None, bin_width: float) -> list[Diagram]:
-    """Return the diagrams binned and with total weight 1, as distances compare them.
-
-    Raises ValueError as `wasserstein`.
-    """
+    """Return the diagrams binned and with total weight 1, as distances compare them, or raise ValueError."""
     if not blur > 0 or not (reach is None or reach > 0) or bin_width < 0:
         raise ValueError(f"expected positive blur and reach, got blur {blur}, reach {reach}, bin width {bin_width}")
     for other in diagrams:
@@ -206,13 +194,7 @@ def pair_halvings(clouds: Clouds, first: np.ndarray, second: np.ndarray, blur: f
 
 
 def costs(
-    clouds: Clouds,
-    first: np.ndarray,
-    second: np.ndarray,
-    falls: np.ndarray,
-    *,
-    blur: float,
-    reach: float | None,
+    clouds: Clouds, first: np.ndarray, second: np.ndarray, falls: np.ndarray, *, blur: float, reach: float | None
 ) -> np.ndarray:
     """Return the entropic, unbalanced cost OT_ε of each pair of clouds, ½|x - y|² a unit moved, `(K,)` float64.
 

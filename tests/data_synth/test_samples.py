@@ -35,8 +35,8 @@ class Pip:
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("CURVAFIT_CACHE", str(tmp_path / "cache"))
-    bone = module.SAMPLES["bone"]._replace(sha256=hashlib.sha256(CONTENT).hexdigest())
-    monkeypatch.setitem(module.SAMPLES, "bone", bone)
+    file, _, about = module.SAMPLES["bone"]
+    monkeypatch.setitem(module.SAMPLES, "bone", (file, hashlib.sha256(CONTENT).hexdigest(), about))
     return tmp_path / "cache"
 
 
@@ -80,7 +80,7 @@ def test_every_sample_says_where_it_is_from(tmp_path: Path) -> None:
     assert list(list_samples()) == ["bone", "shell", "fibers", "fly", SYNTHETIC]
     for _, licence, source in list_samples().values():
         assert licence == "MIT" and source.startswith(("qim3d==1.5.3", "made"))
-    assert all(len(sample.sha256) == 64 for sample in module.SAMPLES.values())
+    assert all(len(sha256) == 64 for _, sha256, _ in module.SAMPLES.values())
     first, second = (load(synthetic_scan(tmp_path / name, edge=40)) for name in ("a.nii.gz", "b.tif"))
     assert first.values.dtype == np.uint8
     assert (first.shape, first.spacing, first.unit) == ((40, 40, 40), (0.02, 0.02, 0.02), "mm")
