@@ -138,5 +138,9 @@ def test_willmore(script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
     (tmp_path / "helps").mkdir()
     monkeypatch.setattr(sys, "argv", ["helps", "--small", "-o", str(tmp_path / "helps")])
     script("helps").main()
-    pictures = {path.stem for path in (tmp_path / "helps").iterdir()}
-    assert pictures == {"helps_better", "helps_equal", "helps_not", "filled"}
+    assert {path.stem for path in (tmp_path / "helps").iterdir()} == {
+        "helps_better",
+        "helps_equal",
+        "helps_not",
+        "filled",
+    }
