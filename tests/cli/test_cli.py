@@ -14,6 +14,8 @@ from found import made_inference, without_drawing
 from curvafit.cli.app import GONE
 from curvafit.cli.console import LONGEST, error_console, sentence, show_stages, writable
 
+# ---- what is refused -------------------------------------------------------------------------------------------------
+
 #: In `folder`: words that a command refuses, and one of its sentence.
 REFUSALS: dict[str, dict[str, str]] = {
     "": {"frob": "'frob'", "--frob": "--frob", "presets all": "argument",
@@ -129,6 +131,9 @@ def test_a_set_without_any_case_is_removed(tmp_path: Path) -> None:
     assert list((tmp_path / "mine").iterdir()) == []
 
 
+# ---- infer -----------------------------------------------------------------------------------------------------------
+
+
 @pytest.fixture
 def finding(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Puts a made inference in the place of the real one, and keeps what it was called with."""
@@ -168,6 +173,9 @@ def test_infer_writes_three_files_and_says_what_it_found(tmp_path: Path, finding
     wanted |= {"key": "k", "seed": 9, "spacing": (0.5, 0.5, 0.5), "roi": roi, "atlas": None}
     wanted |= {"channel": 2, "crop": "1:3,:,-4:", "method": "match"}
     assert {name: finding[name] for name in wanted} == wanted
+
+
+# ---- interruptions and mistakes --------------------------------------------------------------------------------------
 
 
 def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
@@ -211,6 +219,9 @@ def test_a_warning_becomes_a_note_where_the_command_succeeds(tmp_path: Path) -> 
     assert result.exit_code in (0, 1) and "note: a20 > 0 and a02 > 0" in result.stderr
     refused(call("generate", *law, "--steps", "1", "--mass", "7"), "mass")
     refused(call("generate", *law, "--mass", "0", "--steps", "0"), "steps")
+
+
+# ---- lines -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_stage_that_counts_on_is_a_line_every_five_percent(capsys: pytest.CaptureFixture[str]) -> None:

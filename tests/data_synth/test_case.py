@@ -43,15 +43,6 @@ def test_a_case_is_the_image_of_its_field(recipe):
     again, other = recipe.case(3), recipe.case(4)
     assert (again.image == case.image).all() and again.record == case.record
     assert (other.image != case.image).any()
-    thick = replace(recipe, calibres=(1.0, 2.0))
-    cases = [thick.case(index) for index in range(4)]
-    voxels = [case.record["voxel"] for case in cases]
-    assert len(set(voxels)) == 4 and min(voxels) >= 0.5 and max(voxels) <= 1.0
-    assert [case.epsilon for case in cases] == pytest.approx([2 * voxel for voxel in voxels])
-    thick = replace(recipe, calibres=(1.0, 2.0))
-    assert Recipe.from_dict(json.loads(json.dumps(thick.as_dict()))) == thick
-    kept = recipe.source.as_dict()
-    assert decode_source(kept) == recipe.source and kept["draws"] > 0
 
 
 def test_generated_shapes_take_turns_and_other_seeds():
@@ -100,11 +91,24 @@ def test_a_shape_that_falls_between_the_slices_is_not_a_case():
         Recipe(Sheets(third=0), coarse, (1, 8, 8), 1.0).case(0)
 
 
+def test_structures_of_many_calibres(recipe):
+    """The same shapes, cropped smaller and shown larger; such a recipe reads back."""
+    thick = replace(recipe, calibres=(1.0, 2.0))
+    cases = [thick.case(index) for index in range(4)]
+    voxels = [case.record["voxel"] for case in cases]
+    assert len(set(voxels)) == 4 and min(voxels) >= 0.5 and max(voxels) <= 1.0
+    assert [case.epsilon for case in cases] == pytest.approx([2 * voxel for voxel in voxels])
+    thick = replace(recipe, calibres=(1.0, 2.0))
+    assert Recipe.from_dict(json.loads(json.dumps(thick.as_dict()))) == thick
+    kept = recipe.source.as_dict()
+    assert decode_source(kept) == recipe.source and kept["draws"] > 0
+
+
 VALUES = np.random.default_rng(0).random((3, 4, 5))
 
 
 def test_the_48_symmetries_are_a_group_of_which_the_first_is_none():
-    """They move the last three axes; a crop goes on across the faces, and of the whole it is a shift."""
+    """They move the last three axes."""
     cube = np.arange(27).reshape(3, 3, 3)
     moved = [apply_symmetry(cube, k) for k in range(SYMMETRIES)]
     each = {part.tobytes() for part in moved}
@@ -113,6 +117,10 @@ def test_the_48_symmetries_are_a_group_of_which_the_first_is_none():
     pair = np.stack([VALUES, 2 * VALUES])
     for k in range(0, SYMMETRIES, 7):
         assert (apply_symmetry(pair, k)[1] == 2 * apply_symmetry(VALUES, k)).all()
+
+
+def test_a_crop_goes_on_across_the_faces():
+    """And of the whole it is a shift."""
     tiled = np.tile(VALUES, (2, 2, 2))
     for corner in ((0, 0, 0), (2, 3, 4), (1, 3, 0)):
         z, y, x = corner

@@ -15,12 +15,6 @@ def test_the_law_stays_what_stores_and_atlases_were_made_with():
     coefficients, mass, seed = design_box().draw(0, 0)
     first = [1.0, 0.5210541244917071, 14.035801512184953, -8.050181166984373, 108.33339878129931, 1527.9472836744717]
     assert [*coefficients, mass, seed] == pytest.approx([*first, -0.26087924301038296, 3581274545], rel=1e-12)
-    design = design_box("sobol", ["a02"])
-    values = np.array([design.draw(5, index).coefficients.a02 for index in range(1024)])
-    low, high = INTERVALS["a02"]
-    assert kstest(np.log(values), "uniform", (np.log(low), np.log(high / low))).pvalue > 0.01
-    assert Design.from_dict(design.as_dict()) == design
-    assert "log" not in design_box().as_dict(), "stores made before hold no such key"
 
 
 @pytest.mark.parametrize("name", INTERVALS)
@@ -30,6 +24,15 @@ def test_each_parameter_is_uniform_on_its_interval(name):
     values = np.array([mass if name == "mass" else getattr(coefficients, name) for coefficients, mass, _ in draws])
     assert low < values.min() and values.max() < high
     assert kstest(values, "uniform", (low, high - low)).pvalue > 0.01
+
+
+def test_a_parameter_in_log_is_uniform_in_its_logarithm():
+    design = design_box("sobol", ["a02"])
+    values = np.array([design.draw(5, index).coefficients.a02 for index in range(1024)])
+    low, high = INTERVALS["a02"]
+    assert kstest(np.log(values), "uniform", (np.log(low), np.log(high / low))).pvalue > 0.01
+    assert Design.from_dict(design.as_dict()) == design
+    assert "log" not in design_box().as_dict(), "stores made before hold no such key"
 
 
 def test_parameters_and_noise_seeds_are_uncorrelated():
@@ -87,12 +90,7 @@ def test_a_box_in_yaml_changes_some_intervals_and_fixes_others(tmp_path, text, d
         assert low <= values.min() <= values.max() <= high and (low == high or np.ptp(values) > 0.7 * (high - low))
 
 
-def test_a_list_comes_in_turn_with_other_noise(tmp_path):
-    text = "list:\n  - sponge\n  - {a20: 1, a11: 2, a02: 3, a10: -4, a01: 5, a00: 6, mass: -0.3}\n"
-    draws = [read_design(written(tmp_path, text)).draw(0, index) for index in range(4)]
-    assert draws[0].coefficients == draws[2].coefficients == preset("sponge").coefficients
-    assert [*draws[1].coefficients, draws[1].mass] == [1, 2, 3, -4, 5, 6, -0.3]
-    assert draws[0].seed != draws[2].seed
+def test_surroundings_hold_their_point_and_have_the_asked_for_width(tmp_path):
     tubes = preset("tubes")
     found = table(read_design(written(tmp_path, "around: tubes\nspread: 0.2\n")), 300)
     for column, centre, (low, high) in zip(
@@ -102,6 +100,14 @@ def test_a_list_comes_in_turn_with_other_noise(tmp_path):
         assert np.ptp(column) == pytest.approx(0.2 * (high - low), rel=0.05)
     scaled = design_around([2 * value for value in tubes.coefficients] + [tubes.mass], 0.2)
     np.testing.assert_allclose(table(scaled, 5), table(design_around([*tubes.coefficients, tubes.mass], 0.2), 5))
+
+
+def test_a_list_comes_in_turn_with_other_noise(tmp_path):
+    text = "list:\n  - sponge\n  - {a20: 1, a11: 2, a02: 3, a10: -4, a01: 5, a00: 6, mass: -0.3}\n"
+    draws = [read_design(written(tmp_path, text)).draw(0, index) for index in range(4)]
+    assert draws[0].coefficients == draws[2].coefficients == preset("sponge").coefficients
+    assert [*draws[1].coefficients, draws[1].mass] == [1, 2, 3, -4, 5, 6, -0.3]
+    assert draws[0].seed != draws[2].seed
 
 
 #: Aliases of aliases: nine to the power of twelve values, in half a kilobyte.

@@ -97,6 +97,9 @@ def test_blur_has_its_widths_and_is_scipys_within() -> None:
     image = torch.rand((N, N, N), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     expected, inner = ndimage.gaussian_filter(image.numpy(), 1.4, radius=5), (slice(7, -7),) * 3
     np.testing.assert_allclose(effects.blur(image, 1.0, 1.4)[inner], expected[inner], rtol=0, atol=1e-5)
+
+
+def test_blur_keeps_a_uniform_image_to_its_faces_and_widens_with_depth() -> None:
     torch.testing.assert_close(effects.blur(EMPTY + 3, 1.0, (3, 2, 1)), EMPTY + 3)
     deep = effects.blur_with_depth(EMPTY + 3, 1.0, (3, 2, 0), 0.05, 0.02)
     torch.testing.assert_close(deep[:, 3, 5], 3 * torch.exp(-0.02 * (torch.arange(N) + 0.5)).double())

@@ -91,19 +91,6 @@ def test_what_is_pooled_is_as_if_one_scan_had_shown_it() -> None:
     assert pooled.descriptors[8] == pytest.approx(rows.descriptors[:4].mean(0))
     assert pooled.amount[8] == pytest.approx(rows.amount[:4].sum())
     assert (pooled.parameters[6:] == rows.parameters[0]).all()
-    law, mass = preset("trabec").coefficients, -0.5
-    assert law.a20 != 1
-    parameters = parameters_of(law, mass)
-    assert len(parameters) == len(PARAMETERS)
-    assert parameters_of(law.scale(3.0), mass) == pytest.approx(parameters)
-    back, m = law_of(parameters)
-    assert list(back) == pytest.approx(list(law.scale(1 / law.a20)))
-    assert m == mass
-    for a20, a02 in ((0.0, 1.0), (1.0, 0.0), (1.0, -2.0)):
-        with pytest.warns(UserWarning, match="keep the energy bounded below"):
-            unbounded = Coefficients(a20, 0.0, a02)
-        with pytest.raises(ValueError, match="a20"):
-            parameters_of(unbounded, mass)
 
 
 def test_a_table_has_each_view_of_each_shape(tmp_path: Path) -> None:
@@ -171,6 +158,22 @@ def test_a_view_without_a_surface_is_a_row_without_numbers(tmp_path: Path, monke
     table = describe([exact_store(tmp_path / "store.zarr", 2).path], tmp_path / "table.npz", ("mask", "scan"))
     assert table.visible.views.tolist() == ["mask", "mask"]
     assert np.isnan(table.descriptors[table.views == "scan"]).all()
+
+
+def test_parameters_are_those_of_the_law_in_its_gauge() -> None:
+    law, mass = preset("trabec").coefficients, -0.5
+    assert law.a20 != 1
+    parameters = parameters_of(law, mass)
+    assert len(parameters) == len(PARAMETERS)
+    assert parameters_of(law.scale(3.0), mass) == pytest.approx(parameters)
+    back, m = law_of(parameters)
+    assert list(back) == pytest.approx(list(law.scale(1 / law.a20)))
+    assert m == mass
+    for a20, a02 in ((0.0, 1.0), (1.0, 0.0), (1.0, -2.0)):
+        with pytest.warns(UserWarning, match="keep the energy bounded below"):
+            unbounded = Coefficients(a20, 0.0, a02)
+        with pytest.raises(ValueError, match="a20"):
+            parameters_of(unbounded, mass)
 
 
 def small_table(rows: int = 3) -> Table:

@@ -85,7 +85,6 @@ def test_parameters_are_found_again(shape: torch.Tensor, name: str, masked: bool
 
 
 def test_textures_are_found_again(shape: torch.Tensor) -> None:
-    """And of odd scans (below 0, a background of one value, next to no photons, light on dark 0) comes an estimate."""
     b = fit_modality(*scan_of(shape, TEXTURED)).base
     assert b.contrast.background_texture == pytest.approx(0.15, rel=0.3)
     assert b.contrast.background_length == pytest.approx(5, rel=0.35)
@@ -96,6 +95,10 @@ def test_textures_are_found_again(shape: torch.Tensor) -> None:
     assert fit_modality(scan, mask).base.contrast.foreground_texture < 0.5
     plain = fit_modality(*scan_of(shape, PHOTONS)).base
     assert plain.contrast.background_texture < 0.08 and plain.contrast.foreground_texture < 0.1
+
+
+def test_odd_scans(shape: torch.Tensor) -> None:
+    """Values below 0, a background of one value or next to no photons, light on dark 0: an estimate, or a sentence."""
     mask = regrid(shape, 1.0, Imaging()).numpy() > 0
     rng = np.random.default_rng(0)
     signed = np.where(mask, 500, -500) + rng.normal(0, 40, mask.shape)

@@ -60,8 +60,6 @@ def test_every_effect_counts_and_leaves_the_others_numbers(effect: dict) -> None
 
 
 def test_images_and_labels_share_a_grid() -> None:
-    """With even stain and no noise, a share of the light is that share of the contrast, but where the image is within
-    what float32 rounds off some fifty levels."""
     how = replace(PLAIN, spacing=(2.5, 1.0, 1.5), thickness=2.5)
     assert field_shape((12, 32, 20), 1.0, how) == (30, 32, 30)
     for field in FIELDS:
@@ -69,6 +67,11 @@ def test_images_and_labels_share_a_grid() -> None:
         assert tuple(seen.shape) == tuple(labels.shape) == (12, 32, 21)
         agree = (seen > 35) == (labels > 0)
         assert float(agree.double().mean()) > 0.985
+
+
+def test_masks_of_what_is_seen() -> None:
+    """With even stain and no noise, a share of the light is that share of the contrast, but where the image is within
+    what float32 rounds off some fifty levels."""
     how = replace(PLAIN, spacing=(2.5, 1.0, 1.0), thickness=2.5, optics=Optics((3.0, 1.0, 1.0), 0.02), visible=0.1)
     found = torch.stack([label_voxels(u[None], u, 1.0, how) > 0 for u in FIELDS])
     clean = torch.stack([image(u, 1.0, how, 1) for u in FIELDS])

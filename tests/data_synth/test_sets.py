@@ -80,7 +80,6 @@ def test_a_worker_makes_the_same_set(tmp_path, order):
 
 
 def test_a_disk_that_fills_leaves_a_valid_set(tmp_path, order, monkeypatch):
-    """And a list that finds no room is completed by the next run."""
     save, saved = sets.save, []
 
     def until_full(field, path):
@@ -98,7 +97,10 @@ def test_a_disk_that_fills_leaves_a_valid_set(tmp_path, order, monkeypatch):
     assert json.loads((tmp_path / "set" / "dataset.json").read_text())["numTraining"] == 2
     monkeypatch.setattr(sets, "save", save)
     assert len(sums(build_set(tmp_path / "set", order, 4))) == 4
-    folder, write = build_set(tmp_path / "other", order, 1), sets.write_content
+
+
+def test_a_list_that_finds_no_room_is_completed_by_the_next_run(tmp_path, order, monkeypatch):
+    folder, write = build_set(tmp_path / "set", order, 1), sets.write_content
 
     def full(path, content):
         if path.name == "dataset.json":
@@ -180,12 +182,6 @@ def test_what_others_began_is_left_alone(tmp_path, folder, wide):
     with pytest.raises(ValueError, match="seed"):
         build_set(begun, replace(wide, recipe=replace(wide.recipe, seed=5)), 1)
     assert read_spec(begun) == wide and [each.name for each in begun.iterdir()] == ["curvafit.json"]
-    whole = shutil.copytree(folder, tmp_path / "set")
-    text = write_card(whole, "curvafit synth -o set").read_text(encoding="utf-8")
-    for part in ("cases: 1", "8 x 16 x 16", "flat: for tests", *wide.recipe.modality.ranges, "curvafit synth -o set"):
-        assert part in text
-    (whole / "card.md").write_text("my own words")
-    assert write_card(whole).read_text(encoding="utf-8") == "my own words"
 
 
 #: Headers and records that are refused: as whole texts, or as entries in place of those that are there.
@@ -208,3 +204,12 @@ def test_a_damaged_header_is_one_sentence(tmp_path, folder, wide, wrong):
     with pytest.raises(ValueError, match="curvafit.json"):
         build_set(tmp_path, wide, 1)
     assert file.read_text() == text
+
+
+def test_the_card_tells_what_a_set_is_and_spares_another_s(tmp_path, folder, wide):
+    whole = shutil.copytree(folder, tmp_path / "set")
+    text = write_card(whole, "curvafit synth -o set").read_text(encoding="utf-8")
+    for part in ("cases: 1", "8 x 16 x 16", "flat: for tests", *wide.recipe.modality.ranges, "curvafit synth -o set"):
+        assert part in text
+    (whole / "card.md").write_text("my own words")
+    assert write_card(whole).read_text(encoding="utf-8") == "my own words"

@@ -105,10 +105,6 @@ def test_margins_keep_borders_out() -> None:
     found = diagram(u, grid, 2.8, margin=0)
     np.testing.assert_allclose(found.points * 11, 1, atol=0.06)
     assert found.area == pytest.approx(4 * math.pi * 121, rel=0.015)
-    whole = cloud(0, 20000)
-    fine, thin = whole.bin(2.0), whole.thin(2.0, 3e-3)
-    assert len(thin.weights) < 0.75 * len(fine.weights)
-    assert fine.spread < thin.spread < 1.5 * fine.spread
 
 
 def test_only_where_asked() -> None:
@@ -163,6 +159,13 @@ def test_bins_keep_area_and_mean_and_state_their_spread(seed: int, width: float)
 
 def moment(d: Diagram) -> float:
     return float(d.normalised.weights @ (d.points**2).sum(1))
+
+
+def test_thinning_widens_only_the_tails() -> None:
+    whole = cloud(0, 20000)
+    fine, thin = whole.bin(2.0), whole.thin(2.0, 3e-3)
+    assert len(thin.weights) < 0.75 * len(fine.weights)
+    assert fine.spread < thin.spread < 1.5 * fine.spread
 
 
 @pytest.mark.slow

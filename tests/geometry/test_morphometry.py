@@ -59,6 +59,9 @@ def test_a_rod_between_two_balls_has_two_thicknesses() -> None:
     assert found.volume_fraction == pytest.approx(whole.volume_fraction, rel=0.02)
     coarse = local_thickness(fine, largest=8.0)[fine].mean()  # of wide gaps
     assert coarse == pytest.approx(local_thickness(fine)[fine].mean(), rel=1 / 8)
+
+
+def test_thickness_never_exceeds_the_largest_ball_and_never_undercuts_the_own_one() -> None:
     noise = np.random.default_rng(0).standard_normal((40, 40, 40))
     mask = ndimage.gaussian_filter(noise, 3, mode="wrap") > 0
     own = 2 * ndimage.distance_transform_edt(mask)

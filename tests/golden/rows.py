@@ -87,6 +87,9 @@ def _run_command(line: str) -> Callable[[Path], dict[str, Any]]:
     return run_line
 
 
+# ---- public calls ----------------------------------------------------------------------------------------------------
+
+
 def _read_formats(folder: Path) -> dict[str, Any]:
     """Every format: values, spacing and unit."""
     import curvafit

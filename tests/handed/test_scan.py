@@ -148,6 +148,9 @@ def unknown_keywords() -> None:
                 call(scan, nonsense=1)
 
 
+# ---- backgrounds that are no padding ---------------------------------------------------------------------------------
+
+
 def blobs(count: int, n: int = 48) -> np.ndarray:
     """Bright balls without a background: levels that fall to exactly 0."""
     places = np.random.default_rng(0).uniform(0.25 * n, 0.75 * n, (count, 3))

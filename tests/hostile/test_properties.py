@@ -49,6 +49,8 @@ pytestmark = [
     pytest.mark.filterwarnings("default"),
 ]
 
+# ---- the law -------------------------------------------------------------------------------------------------------
+
 #: Bytes that a command may map, and seconds of processor that it may take.
 ROOM, SECONDS = 3 << 30, 60
 #: Commands that keep finished parts where they fail, and those that go on with a store that is there.
@@ -127,6 +129,8 @@ def read_again(path: Path) -> None:
         assert path.read_text(encoding="utf-8").rstrip().endswith("</html>"), path
 
 
+# ---- what is drawn ---------------------------------------------------------------------------------------------------
+
 EXAMPLES = int(os.environ.get("CURVAFIT_HOSTILE", "0"))
 #: Of each command, and of all together.
 FEW, MANY = (
@@ -176,6 +180,9 @@ if not EXAMPLES:
 
 def test_every_command_is_tried() -> None:
     assert {command_of(line)[0] for line in LINES} == {name for name, _ in commands()} - FETCHING
+
+
+# ---- what is typed ---------------------------------------------------------------------------------------------------
 
 
 @st.composite
@@ -236,6 +243,8 @@ def plant(folder: Path, out: str, what: str | None) -> None:
     elif what == "file":
         (folder / out).write_text("the only copy")
 
+
+# ---- what files hold -------------------------------------------------------------------------------------------------
 
 #: What is done to the bytes of a file, at a place in it.
 HARMS: dict[str, Callable[[bytes, int], bytes]] = {
@@ -308,6 +317,9 @@ BUILD = "atlas build out.zarr --shape 16 --around tubes --spread 0.05 --count 2 
 SEGMENT = "segment scan.tif --prior tubes --steps 2"
 
 
+# ---- bombs and claims ------------------------------------------------------------------------------------------------
+
+
 def nifti(*shape: int) -> bytes:
     header = nibabel.Nifti1Header()
     header["dim"], header["datatype"], header["bitpix"] = [3, *shape, 1, 1, 1, 1], 16, 32
@@ -376,6 +388,9 @@ def test_what_no_memory_holds_is_refused(tmp_path: Path) -> None:
     assert {path: path.stat().st_mtime for path in tmp_path.rglob("*")} == before
 
 
+# ---- full disks ------------------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize("name", ["out.npy", "out.nii.gz", "out.ome.tif", "out.mrc", "out.zarr", "out.stl"])
 def test_a_disk_that_is_full_is_said_and_leaves_nothing(tmp_path: Path, name: str) -> None:
     for size in (1, 4000):
@@ -384,6 +399,8 @@ def test_a_disk_that_is_full_is_said_and_leaves_nothing(tmp_path: Path, name: st
         refused(result, progress=True)
         assert not list(tmp_path.iterdir()), size
 
+
+# ---- signals ---------------------------------------------------------------------------------------------------------
 
 #: A command with the changes of files in its folder counted: at one of them it gets a signal.
 PROGRAM = """
