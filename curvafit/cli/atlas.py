@@ -187,8 +187,7 @@ def teach_filler(
         Path | None, typer.Option(help="With --images: the filler to begin with; by default the packaged one.")
     ] = None,
     steps: Annotated[
-        int | None,
-        typer.Option(help="Steps of teaching, by default 4500; 1500 with --images.", min=1),
+        int | None, typer.Option(help="Steps of teaching, by default 4500; 1500 with --images.", min=1)
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the teaching.")] = 0,
     overwrite: OverwriteOption = False,

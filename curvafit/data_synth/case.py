@@ -232,12 +232,7 @@ def shell_of(u: Tensor, epsilon: float, thickness: float, *, periodic: bool = Fa
 
 
 def image_and_labels(
-    layers: Layers,
-    voxel: float,
-    imaging: Imaging,
-    seed: int,
-    shape: Sequence[int],
-    levels: Sequence[float],
+    layers: Layers, voxel: float, imaging: Imaging, seed: int, shape: Sequence[int], levels: Sequence[float]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the image of some classes, and on its voxels the field of the whole and the labels, all of `shape`.
 

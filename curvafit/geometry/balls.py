@@ -58,99 +58,43 @@ def paint_balls(
     edge = float(min(spacing)) if edge is None else edge
     steps, rim = np.asarray(spacing, dtype=np.float32), np.float32(edge)
     radius = np.ascontiguousarray(radius)
-    shape = np.array(radius.shape)
-    box = [(0, n) if end is None else (end.start, end.stop) for n, end in zip(shape, core or (None,) * 3, strict=True)]
-    near = NEAR * edge if core else math.inf
     number = np.int32 if radius.size < 2**31 else np.int64
-    order = np.empty((2, np.count_nonzero(radius)), dtype=number)
-    count = _order_balls(radius, steps, np.array(box), near, order[0])
-    _sort_balls(radius.ravel(), order[:, :count])
-    order = order[0, :count].copy()
+    order = np.flatnonzero(radius if core is None else _find_reaching(radius, spacing, core)).astype(number)
+    order = order[np.argsort(-radius.ravel()[order], kind="stable")]
     painted, owner = np.zeros(radius.size, dtype=np.float32), np.full(radius.size, -1, dtype=number)
-    words = -(-radius.shape[2] // 64)
-    free = np.zeros(radius.shape[0] * radius.shape[1] * words, dtype=np.uint64)
-    blocks = np.zeros(-(-radius.shape[0] // 4) * -(-radius.shape[1] // 4) * words, dtype=np.uint64)
-    _mark_free(radius, free, blocks)
+    # A bit for each voxel with a ball: in 64 of a row, and in those of 4 x 4 rows together.
+    rows = np.pad(radius > 0, ((0, 0), (0, 0), (0, -radius.shape[2] % 64)))
+    free = blocks = np.packbits(rows, axis=2, bitorder="little").view("<u8").astype(np.uint64)
+    for axis in (0, 1):
+        blocks = np.bitwise_or.reduceat(blocks, np.arange(0, radius.shape[axis], 4), axis)
     runs = np.empty([int((float(radius.max(initial=0)) + edge) / h) + 2 for h in steps[:2]], dtype=np.int64)
-    _paint(order, (radius.ravel(), painted, owner, free, blocks), runs, shape, steps, rim, periodic)
+    balls = (radius.ravel(), painted, owner, free.ravel(), blocks.ravel())
+    _paint(order, balls, runs, np.array(radius.shape), steps, rim, periodic)
     return painted.reshape(radius.shape)
 
 
 def reaching_radius(radius: np.ndarray, spacing: Sequence[float], core: tuple[slice, ...]) -> float:
     """Return the largest of the balls, of `radius` (Z, Y, X) around the voxels, that count in a core (see `NEAR`)."""
-    steps, near, largest = np.asarray(spacing, dtype=np.float32), NEAR * float(min(spacing)), 0.0
+    return float(radius[_find_reaching(radius, spacing, core)].max(initial=0))
+
+
+def _find_reaching(radius: np.ndarray, spacing: Sequence[float], core: tuple[slice, ...]) -> np.ndarray:
+    """Return which voxels have a ball that counts in a core."""
+    steps, near = np.asarray(spacing, dtype=np.float32), NEAR * float(min(spacing))
     places = [(np.arange(n), edge) for n, edge in zip(radius.shape, core, strict=True)]
     z, y, x = (
         np.maximum(at - edge.stop + 1, edge.start - at).clip(0) * h for (at, edge), h in zip(places, steps, strict=True)
     )
-    for dz, balls in zip(z, radius, strict=True):
-        reach = dz**2 + y[:, None] ** 2 + x**2 <= (balls + near) ** 2
-        largest = max(largest, float(balls[reach].max(initial=0)))
-    return largest
+    across, counts = y[:, None] ** 2 + x**2, radius > 0
+    for dz, balls, planes in zip(z, radius, counts, strict=True):
+        planes &= dz**2 + across <= (balls + near) ** 2
+    return counts
 
 
 @njit(cache=True)
 def _gap(at, low, high):  # pragma: no cover
     """Return how many voxels a place lies outside of a stretch of an axis."""
     return low - at if at < low else at - high + 1 if at >= high else 0
-
-
-@njit(cache=True)
-def _order_balls(radius, steps, box, near, order):  # pragma: no cover
-    """Fill the centres of balls that reach a box, or end near it; return their number."""
-    nz, ny, nx = radius.shape
-    hz, hy, hx = steps
-    count = 0
-    for z in range(nz):
-        dz = _gap(z, box[0, 0], box[0, 1]) * hz
-        for y in range(ny):
-            dy = _gap(y, box[1, 0], box[1, 1]) * hy
-            for x in range(nx):
-                r = radius[z, y, x]
-                if r > 0:
-                    dx = _gap(x, box[2, 0], box[2, 1]) * hx
-                    if np.sqrt(dz * dz + dy * dy + dx * dx) <= r + near:
-                        order[count] = (z * ny + y) * nx + x
-                        count += 1
-    return count
-
-
-def _sort_balls(radius: np.ndarray, order: np.ndarray) -> None:
-    """Sort centres, the first of two rows, by descending radius; equal ones stay in their order."""
-    counts = np.zeros(1 << 16, dtype=np.int64)
-    for shift in (0, 16):  # a positive float's bits order as the float
-        _sort_digits(radius.view(np.uint32), order[shift // 16], order[1 - shift // 16], counts, shift)
-
-
-@njit(cache=True)
-def _sort_digits(keys, source, target, counts, shift):  # pragma: no cover
-    """Sort centres by descending 16 bits of their keys."""
-    counts[:] = 0
-    for centre in source:
-        counts[(keys[centre] >> shift) & 0xFFFF] += 1
-    place = 0
-    for digit in range(len(counts) - 1, -1, -1):
-        number = counts[digit]
-        counts[digit] = place
-        place += number
-    for centre in source:
-        digit = (keys[centre] >> shift) & 0xFFFF
-        target[counts[digit]] = centre
-        counts[digit] += 1
-
-
-@njit(cache=True)
-def _mark_free(radius, free, blocks):  # pragma: no cover
-    """Set a bit for each voxel with a ball: in 64 of a row, and in those of 4 x 4 rows together."""
-    nz, ny, nx = radius.shape
-    words, across = (nx + 63) // 64, (ny + 3) // 4
-    for z in range(nz):
-        for y in range(ny):
-            for x in range(nx):
-                if radius[z, y, x] > 0:
-                    bit = np.uint64(1) << np.uint64(x % 64)
-                    free[(z * ny + y) * words + x // 64] |= bit
-                    blocks[((z // 4) * across + y // 4) * words + x // 64] |= bit
 
 
 @njit(cache=True)

@@ -37,11 +37,7 @@ _C5, _C4, _C3, _C2, _C1 = (np.float32(_LN2**k / math.factorial(k)) for k in (5, 
 
 
 def pairwise(
-    diagrams: Sequence[Diagram],
-    *,
-    blur: float = 1.0,
-    reach: float | None = 20.0,
-    bin_width: float = BIN_WIDTH,
+    diagrams: Sequence[Diagram], *, blur: float = 1.0, reach: float | None = 20.0, bin_width: float = BIN_WIDTH
 ) -> np.ndarray:
     """Return `wasserstein` of every pair of N diagrams: `(N, N)` float64, symmetric, with a zero diagonal.
 

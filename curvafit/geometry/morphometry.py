@@ -47,11 +47,7 @@ class Morphometry:
 
 
 def morphometry(
-    mask: np.ndarray,
-    spacing: float | tuple[float, float, float] = 1.0,
-    unit: str = "voxel",
-    *,
-    periodic: bool = False,
+    mask: np.ndarray, spacing: float | tuple[float, float, float] = 1.0, unit: str = "voxel", *, periodic: bool = False
 ) -> Morphometry:
     """Measure volume fraction (BV/TV), thickness (Tb.Th), spacing (Tb.Sp), Euler number, connectivity density, BS/BV.
 

@@ -114,9 +114,7 @@ def _to_imaging(scan: Field, structure: Structure, ground: Background, noise: No
         ),
         noise=Noise(gaussian=noise.read_noise, width=ground.width),
         detector=Detector(
-            gain=noise.gain,
-            offset=noise.offset,
-            ceiling=float(np.iinfo(scan.values.dtype).max) if counts else None,
+            gain=noise.gain, offset=noise.offset, ceiling=float(np.iinfo(scan.values.dtype).max) if counts else None
         ),
     )
 
