@@ -15,7 +15,6 @@ from curvafit.cli.options import Crew, Reading, command, parse_numbers, parse_wh
 
 if TYPE_CHECKING:
     from curvafit.data_synth.imaging.modality import Modality
-    from curvafit.data_synth.sets import SetSpec
     from curvafit.data_synth.sources import ShapeSource
 
 _what = partial(typer.Option, rich_help_panel="Shapes: one of these")
@@ -78,9 +77,10 @@ def synth(
     if classes and draws is not None:
         raise ValueError("--classes takes one law for each class: leave out --draws")
     kind = _choose_modality(modality, like, like_mask, visible, reading)
+    from curvafit.core.files import check_folder
     from curvafit.core.units import convert_length
+    from curvafit.data_synth import sets
     from curvafit.data_synth.case import Composition, Recipe
-    from curvafit.data_synth.sets import SetSpec
     from curvafit.data_synth.sources import choose_voxel
 
     edge = choose_voxel(sized, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
@@ -89,25 +89,16 @@ def synth(
     lights = None if levels is None else tuple(parse_numbers(levels, "--levels", levels.count(",") + 1))
     shown = Composition(classes, thickness, lights)
     recipe = Recipe(source, kind, box, edge, seed, (low, high), shown)
-    _build_and_preview(out, SetSpec(recipe, layout, tuple(labels.split(",")) if labels else ()), count, crew)
-
-
-def _build_and_preview(out: Path, spec: SetSpec, count: int, crew: Crew) -> None:
-    """Make the cases of a set and a picture of some, and print where they are listed and drawn."""
-    from curvafit.core.checks import check_int
-    from curvafit.core.files import check_folder
-    from curvafit.data_synth.sets import MOST, build_set, check_set, list_cases, write_card, write_preview
-
-    check_int(count, "a count of at least 1 case", 1, MOST)
+    spec = sets.SetSpec(recipe, layout, tuple(labels.split(",")) if labels else ())
     check_folder(out)
-    check_set(out, spec)
-    if spec.recipe.source.edge == math.inf:
-        crew.check_memory(spec.recipe.largest)
+    sets.check_set(out, spec)
+    if source.edge == math.inf:
+        crew.check_memory(recipe.largest)
     with crew.start() as (workers, progress):
-        build_set(out, spec, count, progress, workers=workers)
-    if (total := len(list_cases(out))) > count:
+        sets.build_set(out, spec, count, progress, workers=workers)
+    if (total := len(sets.list_cases(out))) > count:
         say(f"note: {out} holds {total} cases, more than --count {count}: all are listed", to=error_console())
-    for path in (out / "dataset.json", write_preview(out), write_card(out, command_line())):
+    for path in (out / "dataset.json", sets.write_preview(out), sets.write_card(out, command_line())):
         say(str(path))
 
 

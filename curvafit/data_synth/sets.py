@@ -103,7 +103,7 @@ def build_set(
     Raises ValueError where the folder holds something else or a set of another spec; OSError where it can't be written
     or the workers are gone. Finished cases are kept.
     """
-    count = check_int(count, "a count of at least 1 case", 1, MOST)
+    check_int(count, "a count of at least 1 case", 1, MOST)
     folder = Path(folder)
     check_set(folder, spec)
     if not (folder / HEADER).exists():

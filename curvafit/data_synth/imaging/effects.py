@@ -250,11 +250,6 @@ def rician(image: Volume, deviation: float, seed: int, width: Lengths = 0.0) -> 
     return torch.hypot(image + deviation * real, deviation * imaginary)
 
 
-def digitise(image: Volume, ceiling: float) -> Volume:
-    """Return whole counts from 0 to `ceiling`, where the instrument saturates."""
-    return image.round().clamp_(0, ceiling)
-
-
 def _sum_quantile(mean: Tensor, z: Tensor) -> Tensor:
     """Return the Poisson quantiles of small means: how many of the sums P(X ≤ k), k = 0, 1, …, are below Φ(z)."""
     share = torch.special.ndtr(z)

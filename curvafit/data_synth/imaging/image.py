@@ -35,7 +35,12 @@ def image(
     else:
         light = effects.blur(light, spacing, optics.blur)
     light = effects.sample(light, spacing, imaging.spacing, _window(imaging))
-    return _detect(_illuminate(light, imaging, seed), imaging, seed)
+    lamp = imaging.illumination
+    if lamp.bias:
+        light = light * effects.bias(light, imaging.spacing, lamp.bias, lamp.bias_length, seed)
+    if lamp.stripes:
+        light = light * effects.stripes(light, imaging.spacing, lamp.stripes, lamp.stripe_width, seed)
+    return _detect(light, imaging, seed)
 
 
 def regrid(field: Volume, spacing: float, imaging: Imaging) -> Float[torch.Tensor, "Z Y X"]:
@@ -49,12 +54,16 @@ def label_voxels(
     """Return the labels of the image's voxels, uint8: 0 outside, 1, 2, … in the classes of fields (C, Z, Y, X).
 
     `sampled` is the field of all classes together on the image's voxels (`regrid`). Where it is above 0, a voxel is of
-    the first class whose field is, too. With
-    `Imaging.visible` labels hold the voxels that this share of the light of all classes reaches, stained alike, and a
-    voxel is of the class with most of it.
+    the first class whose field is, too. With `Imaging.visible` labels hold the voxels that this share of the light of
+    all classes reaches, stained alike, and a voxel is of the class with most of it.
     """
     if imaging.visible:
-        shares = torch.stack([_sample_light(share, spacing, imaging) for share in share_voxels(fields, epsilon)])
+        optics, onto = imaging.optics, (imaging.spacing, _window(imaging))
+        lights = (
+            effects.blur_with_depth(share, spacing, optics.blur, optics.growth)
+            for share in share_voxels(fields, epsilon)
+        )
+        shares = torch.stack([effects.sample(light, spacing, *onto) for light in lights])
         return torch.where(shares.sum(0) > imaging.visible, shares.argmax(0) + 1, 0).to(torch.uint8)
     if len(fields) == 1:
         return (sampled > 0).to(torch.uint8)
@@ -62,13 +71,6 @@ def label_voxels(
     inside = levels > 0
     first = torch.where(inside.any(0), inside.to(torch.uint8).argmax(0), levels.argmax(0))
     return torch.where(inside.any(0) | (sampled > 0), first + 1, 0).to(torch.uint8)
-
-
-def _sample_light(share: torch.Tensor, spacing: float, imaging: Imaging) -> torch.Tensor:
-    """Return the light of an even stain (Z, Y, X) that arrives in the image's voxels."""
-    optics = imaging.optics
-    light = effects.blur_with_depth(share, spacing, optics.blur, optics.growth)
-    return effects.sample(light, spacing, imaging.spacing, _window(imaging))
 
 
 def annotator_threshold(imaging: Imaging) -> float:
@@ -126,16 +128,6 @@ def _emit(occupied: torch.Tensor, spacing: float, how: Imaging, seed: int) -> to
     return light.clamp_min(0)
 
 
-def _illuminate(light: torch.Tensor, how: Imaging, seed: int) -> torch.Tensor:
-    """Return the light under uneven illumination."""
-    lamp = how.illumination
-    if lamp.bias:
-        light = light * effects.bias(light, how.spacing, lamp.bias, lamp.bias_length, seed)
-    if lamp.stripes:
-        light = light * effects.stripes(light, how.spacing, lamp.stripes, lamp.stripe_width, seed)
-    return light
-
-
 def _detect(light: torch.Tensor, how: Imaging, seed: int) -> torch.Tensor:
     """Return the counts that a detector makes of light."""
     detector, noise, contrast = how.detector, how.noise, how.contrast
@@ -145,4 +137,4 @@ def _detect(light: torch.Tensor, how: Imaging, seed: int) -> torch.Tensor:
     if detector.rings:
         strength = detector.rings * abs(contrast.foreground - contrast.background) * (detector.gain or 1)
         counts = counts + effects.rings(counts, how.spacing, strength, detector.ring_width, seed)
-    return counts if detector.ceiling is None else effects.digitise(counts, detector.ceiling)
+    return counts if detector.ceiling is None else counts.round().clamp_(0, detector.ceiling)  # where it saturates

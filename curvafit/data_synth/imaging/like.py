@@ -240,10 +240,7 @@ def _measure_background(values: np.ndarray, inside: np.ndarray, steps: np.ndarra
 def _measure_noise(
     values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray, high: float
 ) -> NoiseLine:
-    """Return the line of variance over mean through the background and the residuals' bins over the structure.
-
-    Where the variance hardly rises towards the level `high`, the gain is 0 and the noise is the background's.
-    """
+    """Return the line of variance over mean through the background and the residuals' bins over the structure."""
     # A line gain · mean + constant does not tell offset from read noise: a negative constant is taken as an offset, a
     # positive one as read noise. The slope is limited so that the offset is no brighter than the background's darkest
     # voxels, since fine structure may pass for noise.

@@ -240,7 +240,10 @@ class Modality:
         for name, (low, high) in self.ranges.items():
             key = tuple(name.encode())
             share = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key)).random()
-            drawn[name] = _interpolate(low, high, share)
+            a, b = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
+            positive = bool(np.all(a > 0) and np.all(b > 0))
+            value = np.exp(np.log(a) + share * (np.log(b) - np.log(a))) if positive else a + share * (b - a)
+            drawn[name] = tuple(value.tolist()) if value.ndim else float(value)
         return self.base.assign(drawn)
 
     def as_dict(self) -> dict[str, Any]:
@@ -252,14 +255,6 @@ class Modality:
         """Return the modality that `as_dict` wrote."""
         base = Imaging.from_dict(content["base"])
         return Modality(content["name"], content["about"], content["voxel"], base, content["ranges"])
-
-
-def _interpolate(low: Any, high: Any, share: float) -> Any:
-    """Return the value that lies a share into a range, in the logarithm where both ends are above 0."""
-    a, b = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
-    positive = bool(np.all(a > 0) and np.all(b > 0))
-    value = np.exp(np.log(a) + share * (np.log(b) - np.log(a))) if positive else a + share * (b - a)
-    return tuple(value.tolist()) if value.ndim else float(value)
 
 
 _PRESETS = yaml.safe_load(files("curvafit.data_synth.imaging").joinpath("modalities.yaml").read_text("utf-8"))
