@@ -129,23 +129,14 @@ def _make_draw(store: Store, index: int) -> None:
     """Generate a draw and write it to the store."""
     settings, began = store.settings, time.perf_counter()
     draw = Design.from_dict(settings.design).draw(settings.seed, index)
+    grid, plan = Grid(settings.shape, settings.spacing), Schedule(**settings.schedule)
+    how = {"epsilon": settings.epsilon, "blur": settings.blur, "reject_early": True}
     with one_thread():
-        flow = generate(
-            draw.coefficients,
-            draw.mass,
-            Grid(settings.shape, settings.spacing),
-            seed=draw.seed,
-            schedule=Schedule(**settings.schedule),
-            epsilon=settings.epsilon,
-            blur=settings.blur,
-            reject_early=True,
-        )
+        flow = generate(draw.coefficients, draw.mass, grid, seed=draw.seed, schedule=plan, **how)
     history = flow.history
     record = Record(
         index=index,
-        coefficients=draw.coefficients,
-        mass=draw.mass,
-        seed=draw.seed,
+        **draw._asdict(),
         steps=int(history.step[-1]) if len(history.step) else 0,
         viability=flow.viability,
         energy=float(history.energy[-1]) if len(history.energy) else math.nan,

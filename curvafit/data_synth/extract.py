@@ -170,7 +170,12 @@ def describe(
         rows += zip(begun.shapes.tolist(), begun.views.tolist(), begun.parameters, begun.thickness.tolist(),
                     begun.descriptors, begun.amount.tolist(), strict=True)  # fmt: skip
     present = {row[:2] for row in rows}
-    jobs = [job for store in sources for job in _jobs(store, views, present)]
+    jobs: list[tuple[Store, int, tuple[str, ...]]] = []  # shapes that lack views in the table
+    for store, index in ((own, k) for own in sources for k in own.indices()):
+        missing = tuple(name for name in views if (_shape(store, index), name) not in present)
+        with suppress(KeyError):  # a draw that was removed since it was listed
+            if missing and store.viable(index) and is_well_formed(store.record(index).viability):
+                jobs.append((store, index, missing))
     if not jobs and not rows:
         raise ValueError(f"no well-formed shape in {', '.join(store.name for store in sources)}")
     requests = [(partial(measure, views=missing), store.path, [index]) for store, index, missing in jobs]
@@ -239,20 +244,6 @@ def _to_table(rows: Sequence[Row], provenance: dict[str, Any]) -> Table:
     shapes, views, *numbers = (np.array(column) for column in zip(*rows, strict=True)) if rows else [np.array(())] * 6
     parameters, thickness, found, amount = numbers
     return Table(shapes.astype(str), views.astype(str), parameters, thickness, found, amount, provenance)
-
-
-def _jobs(
-    store: Store, views: Sequence[str], present: set[tuple[str, str]]
-) -> list[tuple[Store, int, tuple[str, ...]]]:
-    """Return the shapes of a store that lack views in a table, each with these views."""
-    jobs = []
-    for index in store.indices():
-        shape = _shape(store, index)
-        missing = tuple(name for name in views if (shape, name) not in present)
-        with suppress(KeyError):  # a draw that was removed since it was listed
-            if missing and store.viable(index) and is_well_formed(store.record(index).viability):
-                jobs.append((store, index, missing))
-    return jobs
 
 
 def _shape(store: Store, index: int) -> str:

@@ -29,8 +29,6 @@ NECK = 0.5
 STEEP = 0.5
 #: Radius (voxels) of the sphere that stands for the surface as seen from far points.
 BEND = 4.0
-
-
 #: Names of all labels.
 NAMES = ("mask", "distance", "skeleton", "instances", "kappa1", "kappa2", "radius", "betti")
 

@@ -67,8 +67,6 @@ class Generated:
     edge = math.inf  # a shape is grown as large as it is wanted
 
     def __post_init__(self) -> None:
-        if self.scales and len(self.scales) != len(self.points):
-            raise ValueError(f"each of {len(self.points)} points needs a scale, got {len(self.scales)}")
         object.__setattr__(self, "names", as_tuple(self.names, "names"))
         if len(self.names) != len(as_tuple(self.points, "points")):
             raise ValueError(f"each of {len(self.points)} points needs a name, got {len(self.names)} names")
@@ -90,16 +88,9 @@ class Generated:
         grid, status = Grid(tuple(voxels)), ""  # type: ignore[arg-type]
         for _ in range(TRIES):
             seed = int(rng.integers(2**32))
+            how = {"volume_fraction": self.fraction, "schedule": self.schedule, "reject_early": True}
             with one_thread():
-                flow = generate(
-                    Coefficients(*six),
-                    mass if self.fraction is None else None,
-                    grid,
-                    volume_fraction=self.fraction,
-                    seed=seed,
-                    schedule=self.schedule,
-                    reject_early=True,
-                )
+                flow = generate(Coefficients(*six), mass if self.fraction is None else None, grid, seed=seed, **how)
             if is_well_formed(flow.viability):
                 point = dict(zip(PARAMETERS, (*six, flow.mass), strict=True))
                 grown = {"seed": seed, "schedule": flow.schedule.as_dict(), "status": flow.status}
@@ -253,7 +244,6 @@ class Pool:
 
 @lru_cache(maxsize=256)
 def _grow_pool_shape(generated: Generated, number: int, edge: int) -> PhaseField:
-    """Return a shape of a pool by its number."""
     return generated.shape((edge,) * 3, number, np.random.default_rng(number))
 
 
