@@ -161,12 +161,7 @@ def mirror_match(match: Match) -> Match:
 
 
 def nearest(
-    diagram: Diagram,
-    atlas: Atlas,
-    *,
-    seen_as: str = "field",
-    count: int = 5,
-    exact: bool = False,
+    diagram: Diagram, atlas: Atlas, *, seen_as: str = "field", count: int = 5, exact: bool = False
 ) -> tuple[Match, ...]:
     """Return the `count` shapes nearest to a diagram, nearest first.
 

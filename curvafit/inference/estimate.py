@@ -20,13 +20,7 @@ from curvafit.inference.emulator import best_parameters, misfits
 from curvafit.inference.fit import COLUMNS, to_columns
 from curvafit.inference.posterior import Posterior
 from curvafit.inference.simulate import Search, Simulate, simulate_draws
-from curvafit.inference.table import (
-    column_names,
-    columns_of,
-    law_of,
-    mirror_parameters,
-    parameters_of,
-)
+from curvafit.inference.table import column_names, columns_of, law_of, mirror_parameters, parameters_of
 from curvafit.priors.grid import Grid
 from curvafit.scan.measure import Reading, read_texture, windows_along
 from curvafit.scan.prepare import HALF, Prepared
