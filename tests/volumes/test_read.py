@@ -1,4 +1,4 @@
-"""What files and arrays say is what is read: spacing, unit, affine, order; one sentence where they cannot be read."""
+"""What files and arrays say is what is read, and what is written comes back: values, spacing, unit, affine, order."""
 
 from __future__ import annotations
 
@@ -26,14 +26,16 @@ from curvafit.volumes import Field, ScanError, field_of, load, save
 from curvafit.volumes.formats.tiff import natural_key
 from curvafit.volumes.read import READERS
 
+TYPES = ("bool", "uint8", "int16", "uint16", "int32", "float32", "float64")
 UNITS = ("voxel", "nm", "um", "mm", "m")
 VALUES = (np.random.default_rng(0).random((9, 10, 11)) * 200 + 1).astype(np.uint16)
 BALL = (np.linalg.norm(np.indices((10, 11, 12)).T - (4.5, 5.0, 5.5), axis=-1).T < 4).astype(np.float32)
 
 
 def ramp(shape: tuple[int, ...] = (4, 5, 6), dtype: str = "float32") -> np.ndarray:
-    """Every voxel different."""
-    return np.arange(np.prod(shape)).reshape(shape).astype(dtype)
+    """Every voxel different, where the type allows."""
+    values = np.arange(np.prod(shape)).reshape(shape)
+    return values % 2 == 0 if dtype == "bool" else values.astype(dtype)
 
 
 def refused(path: Path | str, said: str, **options: object) -> None:
@@ -50,6 +52,10 @@ def hdf5(path: Path, **datasets: object) -> Path:
 
 lengths = st.floats(1e-3, 1e3, allow_nan=False).map(lambda h: float(f"{h:.6g}"))
 spacings = st.tuples(lengths, lengths, lengths)
+shapes = st.tuples(st.integers(2, 7), st.integers(2, 7), st.integers(2, 7))
+axes = st.permutations(range(3))
+signs = st.tuples(*[st.sampled_from((-1.0, 1.0))] * 3)
+origins = st.tuples(*[st.floats(-100, 100)] * 3)
 
 
 # ---- sources ---------------------------------------------------------------------------------------------------------
@@ -61,7 +67,16 @@ def test_every_kind_of_source_is_one_field(tmp_path: Path) -> None:
     at = {"spacing": (3.0, 2.0, 1.0), "unit": "um"}
     assert field_of(field) is field
     tensor = torch.from_numpy(ramp())
-    for source in (field_of(str(path)), field_of(path), field_of(ramp(), **at), field_of(tensor, **at)):
+    again = load(save(path, tmp_path / "again.tif"))
+    written = [load(save(each, tmp_path / "each.zarr", **at)) for each in (ramp(), tensor)]
+    for source in (
+        field_of(str(path)),
+        field_of(path),
+        field_of(ramp(), **at),
+        field_of(tensor, **at),
+        again,
+        *written,
+    ):
         assert np.array_equal(source.values, ramp())
         assert (source.spacing, source.unit) == ((3, 2, 1), "um")
     bare = field_of(tensor.bfloat16().requires_grad_())
@@ -191,14 +206,9 @@ def test_hdf5_and_npz_keys(tmp_path: Path) -> None:
         refused(f"{tmp_path / name}::no", "label")
     field = load(tmp_path / "scan.h5::label")
     assert (field.spacing, field.unit, field.source) == ((0.5, 0.5, 0.5), "mm", f"{tmp_path / 'scan.h5'}::label")
-
-
-@pytest.mark.parametrize("unit", [b"um", ["um"], np.array([b"um"])])
-def test_a_unit_in_bytes_or_in_a_list_of_one(tmp_path: Path, unit) -> None:
-    path = hdf5(tmp_path / "a.h5", raw=VALUES)
-    with h5py.File(path, "a") as file:
-        file["raw"].attrs.update({"spacing": np.array([2]), "unit": unit})
-    assert (load(path).spacing, load(path).unit) == ((2, 2, 2), "um")
+    for unit in (b"um", ["um"], np.array([b"um"])):
+        stated(spacing=np.array([2]), unit=unit)(path)
+        assert (load(path).spacing, load(path).unit) == ((2, 2, 2), "um")
 
 
 @pytest.mark.parametrize("dtype", ["uint8", ">u2", "<f4"])
@@ -394,11 +404,6 @@ def dataset(**options: object) -> Callable[[Path], object]:
     return write
 
 
-def outer(path: Path) -> None:
-    with h5py.File(path, "w") as file:
-        file["raw"] = h5py.ExternalLink("nowhere.h5", "raw")
-
-
 def stated(**attributes: object) -> Callable[[Path], object]:
     """An HDF5 file with a dataset of these attributes."""
 
@@ -443,7 +448,7 @@ REFUSED: list[tuple[str, Callable[[Path], object], dict, str]] = [
     ("a.h5", dataset(shape=(2,), dtype=h5py.vlen_dtype(np.int32)), {}, ""),
     ("a.h5", dataset(shape=(10**4,) * 3, dtype="f8", chunks=(100,) * 3), {}, "memory"),
     ("a.h5", dataset(shape=(8, 8, 8), dtype="u1", external=[("bytes", 0, 512)]), {}, "other files"),
-    ("a.h5", outer, {}, ""),
+    ("a.h5", lambda path: hdf5(path, raw=h5py.ExternalLink("nowhere.h5", "raw")), {}, ""),
     ("a.h5", stated(element_size_um=[0.0, 0.2, 0.2]), {}, "spacing"),
     ("a.tif", lose_strips, {}, "page 4"),
     ("a.ims", lambda path: hdf5(path, raw=VALUES), {}, "no arrays"),
@@ -461,11 +466,6 @@ def test_what_cannot_be_used_is_refused_in_one_sentence(tmp_path: Path, name: st
         warnings.simplefilter("ignore")
         write(tmp_path / name)
     refused(tmp_path / name, word, **options)
-
-
-def test_what_is_not_there_is_no_file(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no such file"):
-        load(tmp_path / "scan.nii")
 
 
 STATED: list[dict[str, object]] = [
@@ -518,8 +518,7 @@ def test_reading_leaves_loggers_and_warnings_as_they_were(tmp_path: Path) -> Non
 @pytest.mark.parametrize("kept", [0.0, 0.01, 0.6, 0.99])
 def test_truncated_files_are_refused(tmp_path: Path, suffix: str, kept: float) -> None:
     path, values = tmp_path / f"scan{suffix}", ramp((20, 20, 20), "float64")
-    writers: dict[str, Callable[[Path], object]] = {".npz": npz(values), ".h5": lambda path: hdf5(path, raw=values)}
-    writers[".ims"] = lambda path: write_imaris(path, 1)
+    writers = {".npz": npz(values), ".h5": dataset(data=values), ".ims": lambda path: write_imaris(path, 1)}
     writers.get(suffix, lambda path: save(Field(values), path))(path)
     whole = path.read_bytes()
     path.write_bytes(whole[: int(kept * len(whole))])
@@ -527,6 +526,110 @@ def test_truncated_files_are_refused(tmp_path: Path, suffix: str, kept: float) -
         assert np.array_equal(load(path).values, values)
     else:
         refused(path, "cannot be read")
+
+
+# ---- what is written comes back ------------------------------------------------------------------------------------
+
+
+@given(
+    st.sampled_from((".nii", ".nii.gz", ".tif", ".zarr")), st.sampled_from(TYPES), shapes, spacings,
+    st.sampled_from(UNITS),
+)  # fmt: skip
+@settings(max_examples=120, deadline=None)
+def test_values_spacing_and_unit_survive(suffix: str, dtype: str, shape, spacing, unit: str) -> None:
+    field = Field(ramp(shape, dtype), spacing, unit)
+    with tempfile.TemporaryDirectory() as folder:
+        back = load(save(field, Path(folder) / f"scan{suffix}"))
+    assert np.array_equal(back.values, field.values)
+    assert back.values.dtype == (np.uint8 if dtype == "bool" and suffix != ".zarr" else field.values.dtype)
+    assert back.spacing == pytest.approx(spacing, rel=1e-6)
+    assert back.unit == unit and back.notes == ()
+
+
+@given(spacings, axes, signs, origins, st.sampled_from(UNITS))
+@settings(max_examples=60, deadline=None)
+def test_a_turned_affine_survives_nifti(spacing, axes, signs, origin, unit: str) -> None:
+    affine = np.eye(4)
+    affine[:3, :3] = (np.eye(3) * signs)[list(axes)] * spacing[::-1]
+    affine[:3, 3] = origin
+    with tempfile.TemporaryDirectory() as folder:
+        path = save(Field(ramp(), spacing, unit, affine), Path(folder) / "scan.nii")
+        back, image = load(path), nibabel.load(path)
+    assert back.affine == pytest.approx(affine, rel=1e-6, abs=1e-5 * max(1, *spacing))
+    assert image.get_qform() == pytest.approx(image.get_sform(), rel=1e-4, abs=1e-4 * max(1, *spacing))
+    assert int(image.header["qform_code"]) > 0 and int(image.header["sform_code"]) > 0
+
+
+def test_npy_keeps_values_only(tmp_path: Path) -> None:
+    back = load(save(Field(ramp(), 0.5, "mm"), tmp_path / "scan.npy"))
+    assert np.array_equal(back.values, ramp())
+    assert (back.spacing, back.unit) == ((1, 1, 1), "voxel")
+    assert back.notes == ("The file states no spacing: lengths are counted in voxels.",)
+
+
+def test_nifti_is_x_y_z_in_the_file(tmp_path: Path) -> None:
+    image = nibabel.load(save(Field(ramp((4, 5, 6)), (3.0, 2.0, 1.0), "um"), tmp_path / "scan.nii.gz"))
+    assert image.shape == (6, 5, 4)
+    assert np.asanyarray(image.dataobj)[5, 0, 3] == ramp((4, 5, 6))[3, 0, 5]
+    assert image.header.get_zooms() == (1, 2, 3) and image.header.get_xyzt_units()[0] == "micron"
+
+
+@pytest.mark.parametrize("member", [100, 2**28])
+def test_a_compressed_nifti_holds_what_a_plain_one_does(tmp_path: Path, monkeypatch, member: int) -> None:
+    monkeypatch.setattr("curvafit.volumes.formats.nifti.MEMBER", member)
+    field = Field(ramp(), (0.3, 0.2, 0.1), "um")
+    plain, packed = (save(field, tmp_path / name).read_bytes() for name in ("scan.nii", "scan.nii.gz"))
+    assert gzip.decompress(packed) == plain
+    assert packed.count(b"\x1f\x8b\x08") == -(-len(plain) // member)
+
+
+def test_tiff_of_ints_is_what_imagej_reads(tmp_path: Path) -> None:
+    with tifffile.TiffFile(save(Field(ramp(dtype="uint16"), (3.0, 0.5, 0.25), "um"), tmp_path / "scan.tif")) as file:
+        metadata, tags = file.imagej_metadata, file.pages[0].tags
+        assert (metadata["spacing"], metadata["unit"], metadata["slices"]) == (3.0, "micron", 4)
+        top, bottom = tags["XResolution"].value
+        assert top / bottom == pytest.approx(4)
+
+
+@pytest.mark.parametrize("dtype", ["bool", "uint8", "int16", "uint16", "float32", "float64"])
+def test_mrc_is_written_in_angstrom(tmp_path: Path, dtype: str) -> None:
+    mrcfile = pytest.importorskip("mrcfile")
+    path = save(Field(ramp(dtype=dtype), (0.03, 0.02, 0.01), "um"), tmp_path / "scan.mrc")
+    assert mrcfile.validate(path)
+    with mrcfile.open(path) as file:
+        assert file.is_volume() or file.header.nz == 4
+        assert (file.voxel_size.x, file.voxel_size.y, file.voxel_size.z) == pytest.approx((100, 200, 300))
+    back = load(path)
+    assert np.array_equal(back.values, ramp(dtype=dtype))
+    assert back.unit == "nm" and back.spacing == pytest.approx((30, 20, 10))
+
+
+def test_what_a_format_cannot_hold_is_refused(tmp_path: Path) -> None:
+    for field, name, word in (
+        (Field(ramp()), "scan.mrc", "unit"),
+        (Field(ramp(dtype="int32"), 1.0, "nm"), "scan.mrc", "int32"),
+        (Field(ramp()), "scan.xyz", "must end"),
+    ):
+        with pytest.raises(ScanError, match=word):
+            save(field, tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", [".nii.gz", ".zarr"])
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch, suffix: str) -> None:
+    path = save(Field(ramp()), tmp_path / f"scan{suffix}")
+    save(Field(ramp() + 1), path)
+    assert np.array_equal(load(path).values, ramp() + 1)
+
+    def fails(field: Field, target: Path) -> None:
+        target.write_bytes(b"half")
+        raise RuntimeError("disk full")
+
+    monkeypatch.setitem(sys.modules["curvafit.volumes.write"].WRITERS, suffix, fails)
+    with pytest.raises(RuntimeError, match="disk full"):
+        save(Field(ramp()), path)
+    assert np.array_equal(load(path).values, ramp() + 1)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
 # ---- real files ------------------------------------------------------------------------------------------------------

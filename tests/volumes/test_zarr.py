@@ -1,23 +1,35 @@
-"""Zarr: OME-NGFF 0.5 level by level, and chunks that are not stored."""
+"""Zarr: OME-NGFF level by level, chunks that are not stored, and labels on the voxels of an image."""
 
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import zarr
+from calling import call, refused
+from disk import tree
 
 from curvafit.volumes import Field, ScanError, load, save
 from curvafit.volumes.read import read_values
 
+pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
-def image(path: Path) -> dict:
-    """The one image of a group's metadata, its namespace checked."""
-    content = json.loads((path / "zarr.json").read_text())
-    assert (content["zarr_format"], content["node_type"]) == (3, "group")
-    ome = content["attributes"]["ome"]
+
+def content(path: Path, version: str) -> dict[str, Any]:
+    """The attributes of a group, of OME's namespace where the version has one."""
+    if version == "0.4":
+        return json.loads((path / ".zattrs").read_text())
+    return json.loads((path / "zarr.json").read_text())["attributes"]["ome"]
+
+
+def multiscale(path: Path) -> dict:
+    """The one image of a group of OME-NGFF 0.5."""
+    ome, written = content(path, "0.5"), json.loads((path / "zarr.json").read_text())
+    assert (written["zarr_format"], written["node_type"]) == (3, "group")
     assert ome["version"] == "0.5" and len(ome["multiscales"]) == 1
     return ome["multiscales"][0]
 
@@ -26,7 +38,7 @@ def image(path: Path) -> dict:
 def test_axes_have_a_name_a_type_and_a_unit(tmp_path: Path, unit: str, named: str | None) -> None:
     values = np.arange(60.0).reshape(3, 4, 5)
     path = save(Field(values, (3.0, 2.0, 0.5), unit), tmp_path / "scan.zarr")
-    found = image(path)
+    found = multiscale(path)
     assert found["axes"] == [{"name": name, "type": "space", **({"unit": named} if named else {})} for name in "zyx"]
     scale = {"type": "scale", "scale": [3.0, 2.0, 0.5]}
     assert found["datasets"] == [{"path": "0", "coordinateTransformations": [scale]}]
@@ -40,7 +52,7 @@ def test_halved_levels_lie_where_the_whole_one_does(tmp_path: Path, dtype: str) 
     """A ramp along z stays the same function of the place that scale and translation give a voxel."""
     z = np.arange(130, dtype=dtype)
     path = save(Field(z[:, None, None] * np.ones((1, 70, 8), dtype), (2.0, 1.0, 0.5), "um"), tmp_path / "scan.zarr")
-    levels = image(path)["datasets"]
+    levels = multiscale(path)["datasets"]
     shapes = [zarr.open_array(path / level["path"], mode="r").shape for level in levels]
     assert shapes == [(130, 70, 8), (65, 35, 4), (33, 18, 2)]
     for level, (n, _, _) in zip(levels, shapes, strict=True):
@@ -121,3 +133,164 @@ def test_chunks_that_a_shard_lacks_are_counted(tmp_path: Path) -> None:
     zarr.create_array(tmp_path / "a.zarr", data=values, chunks=(4, 5, 6), shards=(8, 10, 12))
     (note,) = load(tmp_path / "a.zarr", spacing=1.0).notes
     assert note == "1 of 12 chunks are not stored: their voxels have the fill value 0."
+
+
+# ---- labels ----------------------------------------------------------------------------------------------------------
+
+SHAPE, SPACING = (20, 70, 66), (0.5, 0.25, 0.25)
+
+
+@pytest.fixture(params=["0.4", "0.5"])
+def image(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, str]:
+    """A tube in noise, as the second of two channels, with two levels; the first voxel is not at 0."""
+    z, y, x = np.mgrid[: SHAPE[0], : SHAPE[1], : SHAPE[2]]
+    tube = np.hypot(y - 30 + 5 * np.sin(z / 5), x - 32) < 12
+    grey = (60 + 100 * tube + 10 * np.random.default_rng(0).standard_normal(SHAPE)).astype(np.uint8)
+    old, path = request.param == "0.4", tmp_path / "scan.zarr"
+    naming: dict[str, Any] = {"chunk_key_encoding": {"name": "v2", "separator": "/"}} if old else {}
+    group, levels = zarr.open_group(path, mode="w", zarr_format=2 if old else 3), []
+    for k, n in enumerate((1, 2)):
+        values = np.stack([np.zeros_like(grey), grey])[None, :, ::n, ::n, ::n]
+        group.create_array(str(k), data=values, chunks=(1, 1, 16, 32, 32), **naming)
+        scale = {"type": "scale", "scale": [1, 1, *(n * h / 2 for h in SPACING)]}
+        levels.append({"path": str(k), "coordinateTransformations": [scale]})
+    axes = [{"name": "t", "type": "time"}, {"name": "c", "type": "channel"}]
+    axes += [{"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"]
+    all_levels = [{"type": "scale", "scale": [1, 1, 2, 2, 2]}, {"type": "translation", "translation": [0, 0, 3, 2, 1]}]
+    scales = {"axes": axes, "datasets": levels, "coordinateTransformations": all_levels}
+    named = (
+        {"multiscales": [scales | {"version": "0.4"}]} if old else {"ome": {"version": "0.5", "multiscales": [scales]}}
+    )
+    group.attrs.update(named)
+    return path, request.param
+
+
+def tube_of(path: Path, **part: Any) -> Field:
+    """The mask of the tube, on the voxels of the image or a part of it."""
+    field = load(path, channel=1, **part)
+    return Field(field.values > 110, field.spacing, field.unit, field.affine)
+
+
+def test_steps_of_all_levels_place_each(image: tuple[Path, str]) -> None:
+    field = load(image[0], channel=1)
+    assert (field.shape, field.spacing, field.unit) == (SHAPE, SPACING, "um")
+    assert field.affine is not None and field.affine[:3, 3].tolist() == [1, 2, 3]
+    coarse = load(f"{image[0]}::1", channel=1)
+    assert (
+        coarse.spacing == (1.0, 0.5, 0.5) and coarse.affine is not None and coarse.affine[:3, 3].tolist() == [1, 2, 3]
+    )
+
+
+def test_labels_lie_on_the_image_and_are_listed(image: tuple[Path, str]) -> None:
+    path, version = image
+    before, mask, part = tree(path), tube_of(path), tube_of(path, crop="4:14,:,:")
+    assert save(mask, path / "labels/tube") == path / "labels/tube"
+    save(Field(part.values.astype(np.uint16) * 700, part.spacing, part.unit, part.affine), path / "labels/part")
+    assert {name: data for name, data in tree(path).items() if not name.startswith("labels")} == before
+    assert content(path / "labels", version)["labels"] == ["tube", "part"]
+    own = content(path / "labels/tube", version)
+    assert own["image-label"]["source"] == {"image": "../../"}
+    (scales,) = own["multiscales"]
+    assert scales["name"] == "tube" and [axis["name"] for axis in scales["axes"]] == list("zyx")
+    steps = [level["coordinateTransformations"] for level in scales["datasets"]]
+    for k, (scale, first) in enumerate(steps):
+        assert scale["scale"] == [2**k * h for h in SPACING] and first["translation"] == [3, 2, 1]
+    back = load(f"{path}::labels/tube")
+    assert back.values.dtype == np.uint8 and np.array_equal(back.values, mask.values)
+    np.testing.assert_array_equal(back.affine, mask.affine)
+    low = load(f"{path}::labels/part")
+    assert low.values.max() == 700 and low.affine is not None and low.affine[:3, 3].tolist() == [1, 2, 5]
+    assert load(path, channel=1).shape == SHAPE  # the image is still what the store is read as
+    np.testing.assert_allclose(load(save(part, path.parent / "part.zarr")).affine, part.affine)
+
+
+def test_labels_are_replaced_by_what_wrote_them_alone_and_a_consolidated_store_shows_them(image) -> None:
+    path, version = image
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        zarr.consolidate_metadata(path)
+    mask = tube_of(path)
+    for _ in range(2):
+        save(mask, path / "labels/tube", kind="ours")
+    assert content(path / "labels", version)["labels"] == ["tube"]
+    assert "labels/tube/0" in dict(zarr.open_group(path, mode="r").members(max_depth=None))
+    with pytest.raises(ValueError, match="not free"):
+        save(mask, path / "labels/tube", kind="other")
+
+
+@pytest.mark.parametrize(
+    ("change", "name", "words"),
+    [
+        ({"spacing": (0.5, 0.25, 0.2)}, "tube", "voxels of a level"),
+        ({"unit": "mm"}, "tube", "voxels of a level"),
+        ({"affine": None}, "tube", "voxels of a level"),  # it begins before the image does
+        ({"values": np.ones(SHAPE, np.float32)}, "tube", "whole numbers"),
+        ({}, ".tube", "name of labels"),
+    ],
+)
+def test_other_voxels_are_refused(image: tuple[Path, str], change: dict[str, Any], name: str, words: str) -> None:
+    path, field = image[0], load(image[0], channel=1)
+    before = tree(path)
+    told = {"values": field.values, "spacing": field.spacing, "unit": field.unit, "affine": field.affine} | change
+    with pytest.raises(ScanError, match=words):
+        save(Field(**told), path / "labels" / name)
+    assert tree(path) == before
+
+
+def test_an_image_of_another_version_or_none_is_refused(tmp_path: Path) -> None:
+    group, mask = zarr.open_group(tmp_path / "scan.zarr", mode="w"), Field(np.indices((4, 4, 4))[0] > 1)
+    for attributes, words in (
+        ({}, "no image of OME-Zarr"),
+        ({"version": "0.6", "multiscales": [{}]}, r"OME-Zarr 0\.6"),
+    ):
+        group.attrs["ome"] = attributes
+        with pytest.raises(ScanError, match=words):
+            save(mask, tmp_path / "scan.zarr/labels/a")
+
+
+def test_levels_that_disagree_are_said_and_one_can_be_named(image: tuple[Path, str]) -> None:
+    path = image[0]
+    group: Any = zarr.open_group(path, mode="r+")
+    attributes = group.attrs.asdict()
+    scales = attributes.get("ome", attributes)["multiscales"][0]
+    scales["datasets"][1]["coordinateTransformations"][0]["scale"][3] *= 2
+    group.attrs.update(attributes)
+    refused(call("measure", path, "--channel", 1), "levels of", progress=True)
+    assert load(f"{path}::0", channel=1).shape == SHAPE
+    scales["datasets"][1]["path"] = "9"
+    group.attrs.update(attributes)
+    with pytest.raises(ScanError, match="level 9, which is not there"):
+        load(path, channel=1)
+
+
+def test_an_interrupted_writing_is_made_whole_by_the_next(image: tuple[Path, str], monkeypatch) -> None:
+    path, version = image
+    mask = tube_of(path)
+    with monkeypatch.context() as patch:
+        patch.setattr("curvafit.volumes.formats.zarr.write_content", lambda *_: (_ for _ in ()).throw(OSError("full")))
+        with pytest.raises(OSError, match="full"):
+            save(mask, path / "labels/tube")
+    save(mask, path / "labels/tube")
+    assert content(path / "labels", version)["labels"] == ["tube"]
+    assert np.array_equal(load(f"{path}::labels/tube").values, mask.values)
+    assert [place.name for place in path.parent.iterdir()] == ["scan.zarr"]
+
+
+def test_a_command_writes_labels_and_the_rest_beside_the_store(image: tuple[Path, str], monkeypatch) -> None:
+    path, version = image
+    monkeypatch.chdir(path.parent)
+    command = ("segment", "scan.zarr", "--channel", 1, "--prior", "tubes", "--weight", 0.1, "--steps", 2)
+    for _ in range(2):  # the second replaces the first
+        result = call(*command, "-o", "scan.zarr/labels/tube")
+        assert result.exit_code == 0, result.stderr
+    assert sorted(place.name for place in path.parent.iterdir()) == ["scan.zarr", "scan_tube.json", "scan_tube.png"]
+    assert content(path / "labels", version)["labels"] == ["tube"]
+    record = json.loads(Path("scan_tube.json").read_text())
+    assert record["files"] == ["scan_tube.png", "scan_tube.json"]
+    truth = load(path, channel=1).values > 110
+    assert (load(f"{path}::labels/tube").values == truth).mean() > 0.97
+    before = tree(path.parent)
+    target = ("-o", "scan.zarr/labels/tube")
+    refused(call(*command, "--spacing", 0.3, "--unit", "um", *target), "voxels of a level", progress=True)
+    refused(call("segment", "scan.zarr::labels/tube", *command[4:], *target), "write over the input")
+    assert tree(path.parent) == before
