@@ -186,12 +186,10 @@ def nearest(
     distances = one_to_many(diagram, [candidates[i] for i in near])
     matches = [
         Match(
-            id=atlas.ids[near[k]],
-            distance=wasserstein(diagram, candidates[near[k]]) if exact else float(distances[k]),
-            coefficients=atlas.shape_coefficients(near[k]),
-            mass=float(atlas.masses[near[k]]),
-            seed=int(atlas.seeds[near[k]]),
-            thickness=float(atlas.thicknesses[near[k]]),
+            atlas.ids[near[k]],
+            wasserstein(diagram, candidates[near[k]]) if exact else float(distances[k]),
+            atlas.shape_coefficients(near[k]),
+            *(each[near[k]].item() for each in (atlas.masses, atlas.seeds, atlas.thicknesses)),
         )
         for k in np.argsort(distances, kind="stable")[:count]
     ]

@@ -129,20 +129,14 @@ def misfits(
 
 def forward(layers: tuple[Layer, ...], inputs: Any) -> Any:
     """Return the outputs `(members, N, outputs)` of each network of inputs `(N, inputs)`, NumPy's or JAX's."""
-    values = inputs[None]
+    values, tanh = inputs[None], np.tanh
+    if not isinstance(values, np.ndarray):
+        from jax.numpy import tanh
     for k, layer in enumerate(layers):
         values = values @ layer.weight.swapaxes(1, 2) + layer.bias[:, None]
         if k < len(layers) - 1:
-            values = values * 0.5 * (1 + _tanh(0.5 * values))
+            values = values * 0.5 * (1 + tanh(0.5 * values))
     return values
-
-
-def _tanh(values: Any) -> Any:
-    if isinstance(values, np.ndarray):
-        return np.tanh(values)
-    import jax.numpy as jnp
-
-    return jnp.tanh(values)
 
 
 def _minimise(

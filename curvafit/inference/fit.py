@@ -273,6 +273,8 @@ class _Candidates:
 
 #: The fields that are the same in a `Fit` and its file.
 _SAME = tuple({field.name for field in fields(Fit)} & {field.name for field in fields(_File)} - {"diagram"})
+#: Properties of a `Fit` that its file has for other programs.
+_FOLLOWING = ("coefficients", "mass", "uncertainty", "coefficients_physical", "epsilon_physical")
 
 
 def load_candidates(law: LawLike) -> tuple[Candidate, ...]:
@@ -297,8 +299,8 @@ def draw_laws(law: LawLike, count: int) -> list[Law]:
         raise ValueError(f"expected a fit with draws of a posterior, got {quoted(law)}")
     check_int(count, f"from 1 to {len(fit.draws)} draws", 1, len(fit.draws))
     rows = np.linspace(0, len(fit.draws) - 1, count).round().astype(int)
-    own = {"length_unit": fit.length_unit, "volume_fraction": fit.morphometry.volume_fraction}
-    own |= {"status": fit.status}
+    filled = fit.morphometry.volume_fraction
+    own = {"length_unit": fit.length_unit, "volume_fraction": filled, "status": fit.status}
     source, laws = f" of {os.fspath(law)}" if named else "", []  # type: ignore[arg-type]
     for row, (*five, mass, thickness) in zip(rows, to_columns(fit.draws[rows]).T.tolist(), strict=True):
         edge, origin = fit.thickness / thickness, f"draw {row}{source}"
@@ -311,56 +313,39 @@ def _file_of(fit: Fit) -> _File:
     columns = None
     if fit.draws is not None:
         columns = [tuple(float(f"{x:.{_DIGITS}g}") for x in column) for column in to_columns(fit.draws)]
+    seen = fit.diagram
+    if seen is not None:
+        shares = seen.normalised.weights.round(7)
+        κ1, κ2, share = (tuple(column.tolist()) for column in (*seen.points.round(2).T, shares))
+        told = {"unit": seen.unit, "spread": seen.spread, "excluded": seen.excluded}
+        seen = _Columns(seen_as="field" if fit.kind == "field" else "mask", kappa1=κ1, kappa2=κ2, share=share, **told)
     return _File(
-        **{name: getattr(fit, name) for name in _SAME},
+        **{name: getattr(fit, name) for name in (*_SAME, *_FOLLOWING)},
         format=FORMAT,
-        coefficients=fit.coefficients,
-        mass=fit.mass,
-        uncertainty=fit.uncertainty,
-        coefficients_physical=fit.coefficients_physical,
-        epsilon_physical=fit.epsilon_physical,
         intervals=fit.intervals(),
         intervals_physical=fit.intervals(physical=True),
         posterior=None if columns is None else _Posterior(fit.view, _METHOD, _DrawColumns(*columns)),
-        diagram=None if fit.diagram is None else _columns_of(fit.diagram, fit.kind),
+        diagram=seen,
     )  # type: ignore[arg-type]
 
 
 def _fit_of(file: _File) -> Fit:
     """Return the fit of a file."""
     same = {name: getattr(file, name) for name in _SAME}
-    draws, view = None, ""
+    draws, view, seen = None, "", file.diagram
     if file.posterior is not None:
         columns, view = [getattr(file.posterior.draws, name) for name in COLUMNS], file.posterior.view
         _check_lengths(columns, "draws", "posterior")
         draws = np.array(columns, dtype=np.float64).T
         draws[:, [1, 6]] = np.log(draws[:, [1, 6]])
-    fit = Fit(**same, draws=draws, view=view, diagram=_diagram_of(file.diagram))
+    if seen is not None:
+        _check_lengths([seen.kappa1, seen.kappa2, seen.share], "kappa1, kappa2 and share", "diagram")
+        points = np.stack([seen.kappa1, seen.kappa2], 1)
+        seen = Diagram(points, np.array(seen.share), seen.unit, seen.spread, seen.excluded)
+    fit = Fit(**same, draws=draws, view=view, diagram=seen)
     if (fit.chosen is None) != (fit.best is None):
         raise ValueError(f"expected a chosen law among the fit's candidates, got {fit.chosen!r}")
     return fit
-
-
-def _columns_of(diagram: Diagram, kind: str) -> _Columns:
-    """Return a diagram as columns."""
-    return _Columns(
-        seen_as="field" if kind == "field" else "mask",
-        unit=diagram.unit,
-        kappa1=tuple(diagram.points[:, 0].round(2).tolist()),
-        kappa2=tuple(diagram.points[:, 1].round(2).tolist()),
-        share=tuple(diagram.normalised.weights.round(7).tolist()),
-        spread=diagram.spread,
-        excluded=diagram.excluded,
-    )
-
-
-def _diagram_of(columns: _Columns | None) -> Diagram | None:
-    """Return the diagram of a file's columns, with the shares of area for weights."""
-    if columns is None:
-        return None
-    _check_lengths([columns.kappa1, columns.kappa2, columns.share], "kappa1, kappa2 and share", "diagram")
-    points = np.stack([columns.kappa1, columns.kappa2], 1)
-    return Diagram(points, np.array(columns.share), columns.unit, columns.spread, columns.excluded)
 
 
 def _check_lengths(columns: list[tuple[float, ...]], names: str, place: str) -> None:

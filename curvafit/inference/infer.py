@@ -184,7 +184,11 @@ def infer(
         options = {"simulations": 0 if fast else simulations, "rounds": rounds, "schedule": schedule}
         law, simulated = estimate_law(described, posterior, seed=seed, progress=part, **options)
     progress("searching the atlas", 0.5)
-    matches = _match(prepared, measured, atlas, exact=method == "match")
+    # An atlas holds shapes that fill less than half: of one that fills more the background is looked up.
+    query, seen_as = {"count": MATCHES, "exact": method == "match"}, "field" if prepared.kind == "field" else "mask"
+    inverted = prepared.volume_fraction > HALF
+    matches = nearest(measured.mirrored if inverted else measured, atlas, seen_as=seen_as, **query)
+    matches = tuple(map(mirror_match, matches)) if inverted else matches
     read = refine_matches(described, posterior, matches) if method == "match" else law.get("candidates", ())
     laws, grown = _list_laws(prepared, read, matches, seed, sub_progress(progress, 0.5, 0.6)), {}
     if not fast:
@@ -205,16 +209,6 @@ def infer(
         law["drift"] = drift(*_main_window(prepared, step), WORKING_EPSILON, best.coefficients)
     progress("done", 1.0)
     return Inference(volume, prepared, measured, grown, replace(fit, **law), simulated)
-
-
-def _match(prepared: Prepared, measured: Diagram, atlas: Atlas, exact: bool) -> tuple[Match, ...]:
-    """Return the nearest shapes of the atlas; of a structure that fills over half, those of its background mirrored."""
-    # An atlas holds shapes that fill less than half.
-    seen_as = "field" if prepared.kind == "field" else "mask"
-    inverted = prepared.volume_fraction > HALF
-    query = measured.mirrored if inverted else measured
-    matches = nearest(query, atlas, seen_as=seen_as, count=MATCHES, exact=exact)
-    return tuple(map(mirror_match, matches)) if inverted else matches
 
 
 def _list_laws(

@@ -66,9 +66,8 @@ class Member(nn.Module):
         context = architecture.components + 1 + views
         sizes, splines = architecture.hidden, architecture.transforms
         zuko = require("zuko", "infer", "reading a posterior")
-        self.flow = zuko.flows.NSF(
-            len(TARGETS), context, bins=architecture.bins, transforms=splines, hidden_features=sizes
-        )
+        options = {"bins": architecture.bins, "transforms": splines, "hidden_features": sizes}
+        self.flow = zuko.flows.NSF(len(TARGETS), context, **options)
         self.dropout = nn.Dropout(architecture.dropout)
         self.register_buffer("slope", torch.zeros(views, context))
         self.register_buffer("width", torch.ones(views))
@@ -211,11 +210,10 @@ def load_posterior(path: str | Path | None = None) -> Posterior:
     Raises FileNotFoundError if there is no such file, and ValueError if it is not a posterior, is damaged, or has
     another format version or other blocks.
     """
-    if path is None:
-        return POSTERIOR_FILE.read(
-            open_packaged("inference", "posterior.npz"), _from_arrays, place="the packaged posterior"
-        )
-    return POSTERIOR_FILE.read(path, _from_arrays)
+    if path is not None:
+        return POSTERIOR_FILE.read(path, _from_arrays)
+    file = open_packaged("inference", "posterior.npz")
+    return POSTERIOR_FILE.read(file, _from_arrays, place="the packaged posterior")
 
 
 def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posterior:
@@ -242,9 +240,8 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
     for number in range(check_int(header["members"], "a number of flows", 1, MOST)):
         with torch.random.fork_rng():  # its first weights are drawn, and then replaced
             member = Member(architecture, len(views)).eval()
-        prefix = f"{number}."
-        state = {k.removeprefix(prefix): torch.from_numpy(v) for k, v in arrays.items() if k.startswith(prefix)}
-        member.load_state_dict(state)
+        own = ((k.partition("."), v) for k, v in arrays.items())
+        member.load_state_dict({name: torch.from_numpy(v) for (n, _, name), v in own if n == str(number)})
         members.append(member)
     compression = Compression(architecture.blocks, arrays["mean"], arrays["scale"], arrays["basis"])
     mean, spread = (_read_layers(arrays, f"emulator.{name}", len(views), components) for name in ("mean", "spread"))

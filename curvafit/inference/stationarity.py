@@ -147,7 +147,11 @@ def weak_form(
     width = _test_width(grid)
     progress("differentiating the energy", 0.0)
     gradients = energy_gradients(values, grid, epsilon)
-    octants = _compress_octants(integrate_columns(gradients, grid, epsilon, width))
+    tested = integrate_columns(gradients, grid, epsilon, width)
+    parts = [tested]
+    for axis in (1, 2, 3):
+        parts = [half for part in parts for half in np.array_split(part, 2, axis)]
+    octants = np.stack([_compress(part.reshape(6, -1)) for part in parts]) / math.sqrt(tested[0].size)
     progress("propagating the field's error", 0.2)
     problem, size = _propagate_error(values, gradients, _join_triangles(octants), grid, epsilon, width, seed)
     return octants, problem, size
@@ -176,25 +180,15 @@ def integrate_columns(columns: Tensor, grid: Grid, epsilon: float, width: float)
     return np.stack(smooth) * unit_factors(epsilon).reshape(6, 1, 1, 1)
 
 
-def _compress_octants(tested: np.ndarray) -> np.ndarray:
-    """Return each octant's equations [1 | columns], QR-compressed, `(8, 7, 7)`."""
-    halves = [np.array_split(np.arange(n), 2) for n in tested.shape[1:]]
-    parts = [tested[:, z][:, :, y][..., x] for z in halves[0] for y in halves[1] for x in halves[2]]
-    scale = math.sqrt(tested[0].size)
-    return np.stack([_compress(part.reshape(6, -1)) / scale for part in parts])
-
-
 def _compress(columns: np.ndarray) -> np.ndarray:
     """Return the triangle `(7, 7)` of the QR factorisation of [1 | columns]."""
-    rows = np.concatenate((np.ones((1, columns.shape[1])), columns)).T
-    triangle = np.linalg.qr(rows, mode="r")
+    triangle = np.linalg.qr(np.concatenate((np.ones((1, columns.shape[1])), columns)).T, mode="r")
     return np.pad(triangle, ((0, 7 - len(triangle)), (0, 0)))
 
 
 def _join_triangles(stack: np.ndarray) -> np.ndarray:
     """Return triangles `(n, 7, 7)` as one, `(6, 6)`, without the first column, which is the multiplier's."""
-    triangle = np.asarray(np.linalg.qr(stack.reshape(-1, 7), mode="r"))
-    return triangle[1:, 1:]
+    return np.asarray(np.linalg.qr(stack.reshape(-1, 7), mode="r"))[1:, 1:]
 
 
 def _propagate_error(
@@ -265,9 +259,8 @@ def _minimiser() -> Callable[..., Any]:
 def _status(coefficients: Coefficients, deviations: np.ndarray, fixed: int, residual: float, rounded: bool) -> str:
     """Say in a sentence how well stationarity supports the coefficients."""
     if rounded:
-        return (
-            "Stationarity is not supported: the field was rounded to few values, which its second differences amplify."
-        )
+        why = "the field was rounded to few values, which its second differences amplify"
+        return f"Stationarity is not supported: {why}."
     weak = [name for name, value, d in zip(NAMES, coefficients, deviations, strict=True) if d > abs(value) / 2]
     gauge = "" if fixed == 0 else " a20 is at the edge of the domain, so a02 = 1 fixes the scale."
     verdict = "Stationarity is weakly supported" if residual > _LARGE_ERROR else "Stationarity is supported"
@@ -304,7 +297,11 @@ def drift(phase: Float[Tensor, "z y x"], grid: Grid, epsilon: float, coefficient
     """
     if not grid.periodic and min(grid.shape) <= 2 * HALO + STRIDE:
         return None
-    values, grid = _cut_box(phase.detach().to("cpu", torch.float32), grid)
+    values = phase.detach().to("cpu", torch.float32)
+    if max(grid.shape) > LARGEST_BOX:  # the part with the most surface
+        windows = boxes_by_surface(surface_voxels((values > 0).numpy()), LARGEST_BOX)
+        values = values[windows[0]].contiguous()
+        grid = Grid(tuple(values.shape), grid.spacing, "replicate")  # type: ignore[arg-type]
     start, voxel = deblur(values, grid, epsilon), grid.spacing[0]
     law, _ = fix_gauge(np.array([float(value) for value in coefficients]))
     options = {"steps": SHORT_FLOW.steps, "schedule": SHORT_FLOW, "epsilon": epsilon, "blur": WORKING_BLUR}
@@ -337,15 +334,6 @@ def deblur(phase: Tensor, grid: Grid, width: float) -> Tensor:
     for _ in range(2):
         v = v + phase - gaussian_blur(v, grid, width)
     return v
-
-
-def _cut_box(phase: Tensor, grid: Grid) -> tuple[Tensor, Grid]:
-    """Return the whole, or the part of at most `LARGEST_BOX` voxels a side with the most surface."""
-    if max(grid.shape) <= LARGEST_BOX:
-        return phase, grid
-    windows = boxes_by_surface(surface_voxels((phase > 0).numpy()), LARGEST_BOX)
-    part = phase[windows[0]].contiguous()
-    return part, Grid(tuple(part.shape), grid.spacing, "replicate")  # type: ignore[arg-type]
 
 
 # ---- JAX -------------------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -96,9 +96,8 @@ def train_posterior(
     compression = compression_of(table.descriptors, sizes.components, sizes.blocks)
     flow_plan, emulator_plan = plans or PLANS
     part = sub_progress(progress, 0.0, EMULATOR_PART)
-    emulator, left = train_emulator(
-        table, compression, box[: len(PARAMETERS)], seed=seed, plan=emulator_plan, progress=part
-    )
+    prior = box[: len(PARAMETERS)]
+    emulator, left = train_emulator(table, compression, prior, seed=seed, plan=emulator_plan, progress=part)
     counts = {"shapes": len(np.unique(table.shapes)), "laws": laws, "rows": len(table), "members": members}
     provenance = {"table": table.provenance, **counts, "seed": seed}
     zero, one = np.zeros(len(TARGETS)), np.ones(len(TARGETS))
@@ -121,18 +120,14 @@ def train_posterior(
             flows.append(_fit(flow, context, target, validation, flow_plan, f"member {k + 1} of {members}", part))
         apart.append(np.flatnonzero(validation.numpy()))
     posterior = dataclasses.replace(posterior, members=tuple(flows), centre=centre, spread=spread)
-    return dataclasses.replace(posterior, combinations=_find_combinations(posterior, table, apart))
-
-
-def _find_combinations(posterior: Posterior, table: Table, apart: Sequence[np.ndarray]) -> Combinations:
-    """Return the combinations of parameters that each flow tells best of the rows that it has not learnt."""
-    errors = []
-    for flow, rows in zip(posterior.members, apart, strict=True):
+    missed = []
+    for flow, rows in zip(flows, apart, strict=True):  # what each flow misses of the rows that it has not learnt
         alone, asked = dataclasses.replace(posterior, members=(flow,)), table.rows(rows)
         draws = alone.sample(asked.descriptors, asked.views, asked.amount, DRAWS)
-        errors.append(draws[..., : len(PARAMETERS)].mean(1) - asked.parameters)
+        missed.append(draws[..., : len(PARAMETERS)].mean(1) - asked.parameters)
     asked = table.rows(np.concatenate(apart))
-    return find_combinations(np.concatenate(errors), asked.parameters, asked.descriptors)
+    sums = find_combinations(np.concatenate(missed), asked.parameters, asked.descriptors)
+    return dataclasses.replace(posterior, combinations=sums)
 
 
 def _fit(
@@ -199,18 +194,16 @@ def train_emulator(
     least = min(REFERENCE // FOLDS, *(len(each) for parts in rows for each in parts))
     if not least:
         raise ValueError(f"expected many shapes in each of the views {', '.join(views)}, got few in one")
-    left = [[_misfits(emulator, k, table.rows(parts[k][:least])) for k in range(FOLDS)] for parts in rows]
-    return emulator, {view: np.sort(np.concatenate(each)) for view, each in zip(views, left, strict=True)}
-
-
-def _misfits(emulator: Emulator, number: int, rows: Table) -> np.ndarray:
-    """Return what network `number`, which did not learn from these rows of one view, leaves unexplained of them."""
-    mean, spread = (
-        tuple(Layer(*(each[number : number + 1] for each in layer)) for layer in layers)
-        for layers in (emulator.mean, emulator.spread)
-    )
-    single = dataclasses.replace(emulator, mean=mean, spread=spread)
-    return misfits(single, rows.descriptors, rows.views, rows.amount, rows.parameters[:, None])
+    found: dict[str, list[np.ndarray]] = {view: [] for view in views}
+    for k in range(FOLDS):  # the network that did not learn from these rows
+        mean, spread = (
+            [Layer(w[k : k + 1], b[k : k + 1]) for w, b in each] for each in (emulator.mean, emulator.spread)
+        )
+        single = dataclasses.replace(emulator, mean=tuple(mean), spread=tuple(spread))
+        for view, parts in zip(views, rows, strict=True):
+            own = table.rows(parts[k][:least])
+            found[view].append(misfits(single, own.descriptors, own.views, own.amount, own.parameters[:, None]))
+    return emulator, {view: np.sort(np.concatenate(each)) for view, each in found.items()}
 
 
 def _inflation(emulator: Emulator, table: Table, left: np.ndarray) -> float:
@@ -274,10 +267,7 @@ def _layers(networks: list[nn.Sequential]) -> tuple[Layer, ...]:
     """Return the weights of networks, stacked."""
     linear = [[layer for layer in network if isinstance(layer, nn.Linear)] for network in networks]
     return tuple(
-        Layer(
-            np.stack([layer.weight.detach().numpy() for layer in level]),
-            np.stack([layer.bias.detach().numpy() for layer in level]),
-        )
+        Layer(*(np.stack([getattr(layer, name).detach().numpy() for layer in level]) for name in ("weight", "bias")))
         for level in zip(*linear, strict=True)
     )
 

@@ -71,9 +71,8 @@ def _measure_body(field: Field, numbers: np.ndarray, number: int, box: Box, labe
     thickness = local_thickness(mask, field.spacing)
     around = [math.ceil(float(thickness.max()) / 2 / h) + _AROUND for h in field.spacing]
     try:
-        prepared = prepare(
-            Field(numbers[grow(box, around, numbers.shape)] == number, field.spacing, field.unit), kind="mask"
-        )
+        body = numbers[grow(box, around, numbers.shape)] == number
+        prepared = prepare(Field(body, field.spacing, field.unit), kind="mask")
         (curved, drawn), notes = measure.measure_curvatures(prepared), prepared.notes
         drawn = drawn.thin(BIN_WIDTH / prepared.working_voxel * WORKING_SPACING, TAIL_SHARE)  # there may be thousands
     except ValueError as reason:  # too thin, or without a surface away from the image's borders
@@ -85,17 +84,9 @@ def _measure_body(field: Field, numbers: np.ndarray, number: int, box: Box, labe
     total |= {"χ": euler_number(mask), **_measure_extent(numbers[box] == number, box, field)}
     with np.errstate(divide="ignore", invalid="ignore"):  # without curvature
         values = [(name, symbol, float(figure(total)), math.nan, power) for name, symbol, power, figure in OF_BODIES]
-    return measure.Measures(
-        source=field.source,
-        unit=field.unit,
-        kind="mask",
-        quantities=tuple(measure.Quantity(*each) for each in values),
-        direction=measure.find_direction(total),
-        diagram=drawn,
-        blocks=(1, 1, 1),
-        notes=notes,
-        part=("instance", label),
-    )
+    quantities, direction = tuple(measure.Quantity(*each) for each in values), measure.find_direction(total)
+    part = ("instance", label)
+    return measure.Measures(field.source, field.unit, "mask", quantities, direction, drawn, (1, 1, 1), notes, part)
 
 
 def _measure_extent(body: np.ndarray, box: Box, field: Field) -> dict[str, float]:

@@ -26,10 +26,10 @@ from curvafit.geometry.morphometry import border_weights, local_thickness, measu
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.scan.grids import median_thickness, remove_specks
-from curvafit.scan.prepare import LARGEST_WINDOW, WORKED, Prepared, TooLarge, prepare, smallest_piece
+from curvafit.scan.prepare import DROPPED, LARGEST_WINDOW, WORKED, Prepared, TooLarge, prepare, smallest_piece
 from curvafit.scan.structure import check_options, find_structure, is_rounded, read_labels, read_region
 from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.formats.part import Box
+from curvafit.volumes.formats.part import cut_boxes
 from curvafit.volumes.read import Source, field_of
 
 #: Columns of a table of measures; a CSV file begins with them.
@@ -51,8 +51,6 @@ MOST_COMPARTMENTS = 100
 #: Slices from which on a scan without curvature is refused, and why one of fewer has the other numbers alone.
 FEWEST_SLICES = 10
 TOO_THIN = f"it needs {FEWEST_SLICES} slices or more, or a surface away from the borders of fewer"
-#: The note on specks and pinholes.
-DROPPED = "Dropped what is smaller than a ball of half the median thickness (specks: {}, pinholes: {})."
 #: How sure intervals are.
 SURE = 0.95
 
@@ -224,9 +222,13 @@ def measure(
     field = field_of(scan, **reading)
     options = {"threshold": threshold, "dark": dark, "periodic": periodic}
     check_memory(field.shape, WORKED, "a scan in one piece")
-    labels, laid = (None, ()) if roi is None else _read_compartments(roi, field, scan, **reading)
-    field = replace(field, notes=(*field.notes, *laid))
-    options["imaged"] = None if labels is None else labels != 0
+    labels = options["imaged"] = None
+    if roi is not None:
+        region, laid = read_region(roi, field, scan, **{k: v for k, v in reading.items() if k != "label"})
+        labels = read_labels(region, "a region of interest with labels")
+        if (count := len(np.unique(labels))) > MOST_COMPARTMENTS:
+            raise ScanError(f"expected at most {MOST_COMPARTMENTS} labels in a region of interest, got {count}")
+        field, options["imaged"] = replace(field, notes=(*field.notes, *laid)), labels != 0
     maps = measure_maps(field, kind, options, progress, memory() // WORKED)
     blocks = maps.divide()
     if labels is None:
@@ -238,17 +240,6 @@ def measure(
     return replace(summarise(field, maps, replace(blocks, region=labels != 0)), compartments=parts)
 
 
-def _read_compartments(
-    roi: Source, field: Field, scan: Source, label: int | None = None, **reading: Any
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the labels of a region on the scan's voxels, and a note on how it was laid, or raise ScanError."""
-    region, notes = read_region(roi, field, scan, **reading)
-    labels = read_labels(region, "a region of interest with labels")
-    if (count := len(np.unique(labels))) > MOST_COMPARTMENTS:
-        raise ScanError(f"expected at most {MOST_COMPARTMENTS} labels in a region of interest, got {count}")
-    return labels, notes
-
-
 def summarise(field: Field, maps: Maps, blocks: Blocks, part: tuple[str, int] | None = None) -> Measures:
     """Return the measures of what lies in blocks, and of the whole scan with its own χ."""
     drawn, table, connectivity = maps.diagram, maps.sum(blocks), None
@@ -256,9 +247,8 @@ def summarise(field: Field, maps: Maps, blocks: Blocks, part: tuple[str, int] | 
         connectivity = measure_connectivity(maps.mask, field.spacing, periodic=maps.periodic)
     else:
         inside = blocks.region[blocks.locate(maps.curved[0])]
-        drawn = replace(
-            drawn, points=drawn.points[inside], weights=drawn.weights[inside], places=np.asarray(drawn.places)[inside]
-        )
+        kept = {name: np.asarray(getattr(drawn, name))[inside] for name in ("points", "weights", "places")}
+        drawn = replace(drawn, **kept)
     return summarise_sums(field, maps.kind, blocks, table, connectivity, drawn, maps.notes, part=part)
 
 
@@ -288,17 +278,9 @@ def summarise_sums(
         why = f"they need {LEAST} blocks of a period (thickness and spacing), and the {where} has {count}"
         notes = (*notes, f"No intervals: {why}.")
     rows = zip(QUANTITIES, values, halves, strict=True)
-    return Measures(
-        source=frame.source,
-        unit=frame.unit,
-        kind=kind,
-        quantities=tuple(Quantity(name, symbol, float(v), float(h), power) for (name, symbol, power, _), v, h in rows),
-        direction=find_direction(dict(zip(SUMS, total, strict=True))),
-        diagram=drawn,
-        blocks=blocks.counts,
-        notes=notes,
-        part=part,
-    )
+    numbers = tuple(Quantity(name, symbol, float(v), float(h), power) for (name, symbol, power, _), v, h in rows)
+    direction = find_direction(dict(zip(SUMS, total, strict=True)))
+    return Measures(frame.source, frame.unit, kind, numbers, direction, drawn, blocks.counts, notes, part)
 
 
 class Maps(NamedTuple):
@@ -355,19 +337,9 @@ def measure_maps(
         curved, diagram, working = no_curvature(field.unit, TOO_THIN)
     progress("measuring thickness", 0.5)
     thickness, gap = (local_thickness(each, field.spacing, periodic=periodic) for each in (mask, ~mask))
-    return Maps(
-        spacing=field.spacing,
-        periodic=periodic,
-        mask=mask,
-        thickness=thickness,
-        gap=gap,
-        euler=euler_shares(mask, periodic=periodic),
-        surface=measure_surface(mask, field.spacing, periodic),
-        curved=curved,
-        diagram=diagram,
-        kind=seen,
-        notes=(f"{sampling}.", *notes, *working),
-    )
+    euler, surface = euler_shares(mask, periodic=periodic), measure_surface(mask, field.spacing, periodic)
+    voxels, notes = (mask, thickness, gap, euler), (f"{sampling}.", *notes, *working)
+    return Maps(field.spacing, periodic, *voxels, surface, curved, diagram, seen, notes)
 
 
 def no_curvature(unit: str, reason: object) -> tuple[tuple[np.ndarray, np.ndarray], Diagram, tuple[str, ...]]:
@@ -382,7 +354,7 @@ def _find_structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[n
     seen, signed = find_structure(field, kind=kind, **options)  # type: ignore[arg-type]
     mask, notes = signed.values > 0, signed.notes
     if seen == "image":
-        thickness, _ = median_thickness(mask, field.spacing, options["periodic"])
+        thickness = median_thickness(mask, field.spacing, options["periodic"])[0]
         smallest = smallest_piece(thickness) / math.prod(field.spacing)
         mask, specks, holes = remove_specks(mask, smallest, options["periodic"])
         if specks or holes:
@@ -413,9 +385,8 @@ def measure_curvatures(prepared: Prepared) -> tuple[tuple[np.ndarray, np.ndarray
     """Return triangles' places in the scan's voxels, curvatures times area, and the diagram, in the scan's unit."""
     working = scan_diagram(prepared)
     length = prepared.length
-    physical = replace(
-        working, points=working.points / length, weights=working.weights * length**2, unit=f"1/{prepared.unit}"
-    )
+    points, weights = working.points / length, working.weights * length**2
+    physical = replace(working, points=points, weights=weights, unit=f"1/{prepared.unit}")
     corners = (np.asarray(working.places) / WORKING_SPACING + 0.5) * np.array(prepared.scale)
     voxels = corners - 0.5 + np.array(prepared.origin)
     κ1, κ2 = physical.points.T
@@ -524,13 +495,14 @@ def read_texture(prepared: Prepared, view: str | None = None, across: Sequence[i
     """
     rows, view = [], _kind_of_view(prepared) if view is None else view
     across = windows_along(prepared, prepared.grid.shape) if across is None else across
-    windows = _windows(prepared, across) if prepared.roi is None else [_largest_cube(prepared.roi)]
+    edges = [n // count for n, count in zip(prepared.grid.shape, across, strict=True)]
+    windows = cut_boxes([n * count for n, count in zip(edges, across, strict=True)], edges)
+    windows = windows if prepared.roi is None else filter(None, [_largest_cube(prepared.roi)])
     for where in windows:
-        if where is not None:
-            seen = prepared.phase if view == "field" else prepared.mask
-            with contextlib.suppress(NoSurface):
-                rows.append(descriptors(np.ascontiguousarray(seen[where]), prepared.part(where)).vector())
-                size = prepared.mask[where].size
+        seen = prepared.phase if view == "field" else prepared.mask
+        with contextlib.suppress(NoSurface):
+            rows.append(descriptors(np.ascontiguousarray(seen[where]), prepared.part(where)).vector())
+            size = prepared.mask[where].size
     return Reading(np.array(rows), view, len(rows) * size / prepared.thickness**3) if rows else None
 
 
@@ -539,13 +511,6 @@ def windows_along(prepared: Prepared, shape: Sequence[int]) -> list[int]:
     repeats, or has a region of interest, is read in one."""
     whole = prepared.grid.periodic or prepared.roi is not None
     return [1 if whole else max(n // READ, 1) for n in shape]
-
-
-def _windows(prepared: Prepared, across: Sequence[int]) -> list[Box]:
-    """Cut the working grid into windows of one size, so many across."""
-    edges = [n // count for n, count in zip(prepared.grid.shape, across, strict=True)]
-    starts = itertools.product(*(range(0, count * edge, edge) for count, edge in zip(across, edges, strict=True)))
-    return [tuple(slice(a, a + edge) for a, edge in zip(start, edges, strict=True)) for start in starts]  # type: ignore[misc]
 
 
 def _kind_of_view(prepared: Prepared) -> str:
@@ -644,10 +609,8 @@ def errors(
 def interval_reach(counts: Sequence[int]) -> float:
     """Return how many standard errors an interval of `errors` reaches to either side, from the blocks along axes; NaN
     of one."""
-    if math.prod(counts) == 1:
-        return math.nan
-    form, _ = _neighbour_forms(counts, np.ones(math.prod(counts)))
-    return _reach(form)
+    count = math.prod(counts)
+    return math.nan if count == 1 else _reach(_neighbour_forms(counts, np.ones(count))[0])
 
 
 def _reach(form: np.ndarray) -> float:

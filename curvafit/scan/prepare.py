@@ -14,26 +14,8 @@ import torch
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.topology import betti_numbers
 from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
-from curvafit.scan.grids import (
-    bounding_box,
-    boxes_by_surface,
-    centre_distance,
-    median_thickness,
-    profile_mask,
-    remove_specks,
-    resample,
-    surface_voxels,
-)
-from curvafit.scan.structure import (
-    Kind,
-    Quality,
-    check_options,
-    find_structure,
-    is_noise,
-    measure_quality,
-    read_region,
-    sample_mask,
-)
+from curvafit.scan import grids, structure
+from curvafit.scan.structure import Kind, Quality
 from curvafit.volumes.boxes import InMemory, boxes_of
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.formats.part import Box, Crop
@@ -56,6 +38,8 @@ WORKED = 64
 #: A structure that fills more than this part of the volume may be the wrong phase, which a note says.
 HALF = 0.5
 MOSTLY = "The structure fills {:.0%} of the volume: if the other phase was meant, turn the two round (--dark)."
+#: The note on specks and pinholes.
+DROPPED = "Dropped what is smaller than a ball of half the median thickness (specks: {}, pinholes: {})."
 #: Coarsening stops where a side would have fewer working voxels than this.
 FEWEST = 24
 #: Least mean of √(κ1² + κ2²) times the window's edge at which a surface is not flat; a ball that fits has 2.8.
@@ -134,16 +118,16 @@ class Prepared:
         else its mask `(Z, Y, X)` at this scan's thickness in voxels; an image as blurred and noisy as this one."""
         if self.kind == "field":
             return prepare(Field(grown), kind="field", periodic=True, one_scale=self.one_scale)
-        mask, (z, y, x) = grown > 0, self.scale
+        mask, quality = grown > 0, self.quality
         thickness = thinner_thickness(mask)
         step = [thickness / (scale * self.thickness) for scale in self.scale]
-        edges = (self.working_voxel / z, self.working_voxel / y, self.working_voxel / x)
-        quality = self.quality
-        values = sample_mask(mask, step, keep_volume=True) if quality is None else quality.image(mask, step, seed)
-        values = values.astype(np.uint8 if quality is None else np.float32)
-        scan = Field(values, edges, self.unit)
+        z, y, x = (self.working_voxel / scale for scale in self.scale)
+        if quality is None:
+            values = structure.sample_mask(mask, step, keep_volume=True).astype(np.uint8)
+        else:
+            values = quality.image(mask, step, seed).astype(np.float32)
         options = {"periodic": self.grid.periodic, "one_scale": self.one_scale, "quality": quality}
-        return prepare(scan, kind=self.kind, **options)
+        return prepare(Field(values, (z, y, x), self.unit), kind=self.kind, **options)
 
     @cached_property
     def true_volume_fraction(self) -> float:
@@ -154,7 +138,7 @@ class Prepared:
         if self.kind == "field":
             return self.volume_fraction
         shift = 0.0 if self.quality is None else self.quality.boundary_shift / max(self.scale)
-        inside = centre_distance(self.mask[self.windows[0]], (1.0, 1.0, 1.0), 4.0) > shift
+        inside = grids.centre_distance(self.mask[self.windows[0]], (1.0, 1.0, 1.0), 4.0) > shift
         try:
             seen = self.scan_alike(inside, 0).volume_fraction
         except ScanError:
@@ -185,7 +169,7 @@ def read_scan(
     if whole or isinstance(boxes, InMemory) or max(shape) <= LARGEST_SCAN:
         field = boxes.field if isinstance(boxes, InMemory) else field_of(scan, crop=crop, **reading)
         return field if label is None else field.label(label), shape
-    where, notes = bounding_box(shape, None, LARGEST_SCAN)
+    where, notes = grids.bounding_box(shape, None, LARGEST_SCAN)
     part = tuple(slice(edge.start + at, edge.stop + at) for edge, at in zip(where, boxes.first, strict=True))
     try:
         field = field_of(scan, label=label, crop=part, **reading)  # type: ignore[arg-type]
@@ -261,22 +245,22 @@ def prepare(
     imaged
         Where the grey levels of a padded scan set the threshold, bool of its shape; by default wherever it counts.
     """
-    check_options(kind, threshold)
-    region, laid = (None, ()) if roi is None else read_region(roi, field)
+    structure.check_options(kind, threshold)
+    region, laid = (None, ()) if roi is None else structure.read_region(roi, field)
     region = None if region is None else region.values != 0
-    where, notes = bounding_box(field.shape, region, LARGEST_SCAN if most is None else max(field.shape))
+    where, notes = grids.bounding_box(field.shape, region, LARGEST_SCAN if most is None else max(field.shape))
     region = None if region is None else region[where]
     part = replace(field, values=field.values[where], affine=None, notes=field.notes + laid + notes)
     periodic = periodic and part.shape == field.shape
     options = {"kind": kind, "threshold": threshold, "dark": dark}
     options["imaged"] = None if imaged is None else imaged[where]
     extremes = (field.values.min(), field.values.max())
-    seen, signed = find_structure(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
+    seen, signed = structure.find_structure(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
     mask = signed.values > 0
-    noise = seen != "field" and is_noise(mask)
+    noise = seen != "field" and structure.is_noise(mask)
     prepared = _put_on_grid(_Scan(seen, signed, periodic, region, noise, one_scale), most)
     if seen == "image" and quality is None:
-        quality = measure_quality(-part.values if dark else part.values, mask, part.spacing)
+        quality = structure.measure_quality(-part.values if dark else part.values, mask, part.spacing)
     corner = tuple(s.start + o for s, o in zip(where, prepared.origin, strict=True))
     return replace(prepared, quality=quality, origin=corner)  # type: ignore[arg-type]
 
@@ -304,11 +288,11 @@ class _Scan:
     @property
     def thinner(self) -> tuple[np.ndarray, str]:
         """Return the phase that fills less, whose thickness sets the grid, and its name."""
-        structure = self.counted
-        counted = structure.size if self.region is None else np.count_nonzero(self.region)
-        if np.count_nonzero(structure) <= HALF * counted:
-            return structure, "structure"
-        return (~structure if self.region is None else ~structure & self.region), "background"
+        inside = self.counted
+        counted = inside.size if self.region is None else np.count_nonzero(self.region)
+        if np.count_nonzero(inside) <= HALF * counted:
+            return inside, "structure"
+        return (~inside if self.region is None else ~inside & self.region), "background"
 
     @property
     def counted(self) -> np.ndarray:
@@ -319,7 +303,7 @@ class _Scan:
 def _put_on_grid(scan: _Scan, most: int | None) -> Prepared:
     """Choose the working voxel, move the scan to it, drop specks, profile the mask, choose windows."""
     phase, name = scan.thinner
-    thickness, thick = median_thickness(phase, scan.field.spacing, scan.periodic)
+    thickness, thick = grids.median_thickness(phase, scan.field.spacing, scan.periodic)
     note = judge_thickness(name, thickness, thick, scan.field.spacing, scan.keeps_grid)
     scale, why = _choose_scale(scan, thickness)
     start, shape, cut = _choose_box(scan, scale, most)
@@ -327,9 +311,8 @@ def _put_on_grid(scan: _Scan, most: int | None) -> Prepared:
     values, region = _move(scan, scale, start, shape)
     grid = Grid(shape, boundary="periodic" if scan.periodic and not cut else "replicate")
     mask, dropped = _clean_mask(scan.kind, values, region, thickness / edge, grid.periodic)
-    windows = boxes_by_surface(surface_voxels(mask), LARGEST_WINDOW)
-    filled = float((mask if region is None else mask[region]).mean())
-    inverted = (MOSTLY.format(filled),) if filled > HALF else ()
+    windows = grids.boxes_by_surface(grids.surface_voxels(mask), LARGEST_WINDOW)
+    inverted = note_on_filling(float((mask if region is None else mask[region]).mean()))
     if not windows:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
 
@@ -338,25 +321,19 @@ def _put_on_grid(scan: _Scan, most: int | None) -> Prepared:
 
     if scan.kind != "field":
         # the profile of `measure`, whose scans may be large: the same to some 1e-7
-        phase = profile(mask) if most is None or grid.periodic else profile_mask(mask)
+        phase = profile(mask) if most is None or grid.periodic else grids.profile_mask(mask)
     else:
         phase = values if region is None or region.all() else np.minimum(values, profile(region))
-    return Prepared(
-        kind=scan.kind,
-        phase=np.ascontiguousarray(phase, dtype=np.float32),
-        mask=mask,
-        grid=grid,
-        scale=scale,
-        working_voxel=edge,
-        unit=scan.field.unit,
-        thickness=thickness / edge,
-        windows=tuple(windows),
-        notes=(*scan.field.notes, note, *why, *cut, *dropped, *inverted),
-        origin=tuple(a * s for a, s in zip(start, scale, strict=True)),  # type: ignore[arg-type]
-        roi=region,
-        noise=scan.noise,
-        one_scale=scan.one_scale,
-    )
+    values, size = np.ascontiguousarray(phase, dtype=np.float32), (scale, edge, scan.field.unit, thickness / edge)
+    notes = (*scan.field.notes, note, *why, *cut, *dropped, *inverted)
+    origin = tuple(a * s for a, s in zip(start, scale, strict=True))
+    told = {"roi": region, "noise": scan.noise, "one_scale": scan.one_scale}
+    return Prepared(scan.kind, values, mask, grid, *size, tuple(windows), notes, origin, **told)  # type: ignore[arg-type]
+
+
+def note_on_filling(share: float) -> tuple[str, ...]:
+    """Return a note where the structure fills more than the background."""
+    return (MOSTLY.format(share),) if share > HALF else ()
 
 
 def judge_thickness(
@@ -366,9 +343,7 @@ def judge_thickness(
     voxel = math.prod(spacing) ** (1 / 3)
     thin = thick < (THINNEST - 0.5) * voxel  # balls on the grid understate thin tubes
     if thin and not keeps_grid:
-        raise ScanError(
-            f"expected a {name} at least {THINNEST:g} voxels thick, got one that is thinner nearly everywhere"
-        )
+        raise ScanError(f"expected a {name} at least {THINNEST:g} voxels thick, got one thinner nearly everywhere")
     if median < THINNEST * voxel:
         return f"Half of the {name} is thinner than {median / voxel:.2g} scan voxels: its curvature is uncertain."
     return f"Median thickness of the {name} {median / voxel:.3g} scan voxels."
@@ -426,7 +401,7 @@ def _choose_box(
         return (0, 0, 0), full, ()
     sides = [min(n, LARGEST_BOX) for n in full]
     size = [math.ceil(n * s) for n, s in zip(sides, scale, strict=True)]
-    boxes = boxes_by_surface(surface_voxels(scan.counted), size)
+    boxes = grids.boxes_by_surface(grids.surface_voxels(scan.counted), size)
     corner = boxes[0] if boxes else tuple(slice(0, n) for n in size)
     start = [min(int(c.start / s), n - m) for c, s, n, m in zip(corner, scale, full, sides, strict=True)]
     note = f"Of {_join_sides(full)} working voxels, {_join_sides(sides)} from {tuple(start)} on are used."
@@ -443,11 +418,11 @@ def _move(
         return values[box], None if region is None else region[box]
     if scan.kind == "mask":
         reach = 4 * max(max(s * h, h) for s, h in zip(scale, scan.field.spacing, strict=True))
-        values = centre_distance(scan.mask, scan.field.spacing, reach, scan.periodic)
-    moved = resample(values, scale, start, shape, periodic=scan.periodic)
+        values = grids.centre_distance(scan.mask, scan.field.spacing, reach, scan.periodic)
+    moved = grids.resample(values, scale, start, shape, periodic=scan.periodic)
     if region is None:
         return moved, None
-    return moved, resample(region.astype(np.uint8), scale, start, shape, periodic=scan.periodic, nearest=True) > 0
+    return moved, grids.resample(region.astype(np.uint8), scale, start, shape, periodic=scan.periodic, nearest=True) > 0
 
 
 def _clean_mask(
@@ -457,17 +432,16 @@ def _clean_mask(
     mask = values > 0 if region is None else (values > 0) & region
     if kind == "field":
         return mask, ()
-    cleaned, specks, pinholes = remove_specks(mask, smallest_piece(thickness), periodic)
+    cleaned, specks, pinholes = grids.remove_specks(mask, smallest_piece(thickness), periodic)
     if not specks and not pinholes:
         return mask, ()
-    counts = f"specks: {specks}, pinholes: {pinholes}, {(cleaned != mask).mean():.2g} of the volume"
-    cleaned = cleaned if region is None else cleaned & region
-    return cleaned, (f"Dropped what is smaller than a ball of half the median thickness ({counts}).",)
+    note = DROPPED.format(specks, f"{pinholes}, {(cleaned != mask).mean():.2g} of the volume")
+    return cleaned if region is None else cleaned & region, (note,)
 
 
 def thinner_thickness(mask: np.ndarray) -> float:
     """Return the median thickness, in voxels, of the phase of a period `(Z, Y, X)` that fills less."""
-    return median_thickness(mask if mask.mean() <= HALF else ~mask, (1.0, 1.0, 1.0), periodic=True)[0]
+    return grids.median_thickness(mask if mask.mean() <= HALF else ~mask, (1.0, 1.0, 1.0), periodic=True)[0]
 
 
 def smallest_piece(thickness: float) -> float:

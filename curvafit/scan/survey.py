@@ -116,10 +116,8 @@ def find_levels(volume: Volume, split: Split, place: Place, boxes: Boxes, box: B
     """Return a box of a volume as float32 values that are above 0 in its structure, as `structure.find_structure`."""
     if split.kind == "image":
         around = grow(box, structure.SMOOTHED, place.shape)
-        smooth = structure.smooth_levels(volume.read(boxes, around), place.spacing, padding=split.padding)[
-            within(box, around)
-        ]
-        return structure.sign_levels(smooth, split.level, volume.dark, split.padding)
+        smooth = structure.smooth_levels(volume.read(boxes, around), place.spacing, padding=split.padding)
+        return structure.sign_levels(smooth[within(box, around)], split.level, volume.dark, split.padding)
     values = volume.read(boxes, box)
     if split.kind == "field":
         return (-values if volume.dark else values).astype(np.float32)
@@ -141,10 +139,9 @@ def survey(volume: Volume, find: Finder) -> Plan:
         note = structure.describe_split(split.level, otsu, volume.dark, low, high)
         note = " ".join([*structure.describe_padding(split.padding, otsu), note])
     size, filled = math.prod(place.shape), int(total["filled"])
-    for count, one, other in ((filled, "structure", "background"), (size - filled, "background", "structure")):
-        if not count:
-            start = "a structure" if one == "structure" else "background"
-            raise ScanError(f"expected {start} in the scan, got none: every voxel is {other}")
+    if filled in (0, size):
+        what, other = ("background", "structure") if filled else ("a structure", "background")
+        raise ScanError(f"expected {what} in the scan, got none: every voxel is {other}")
     labelled = () if volume.label is None else (f"The structure is label {volume.label}.",)
     noise = split.kind != "field" and structure.pairs_of_noise(place.shape, filled / size, total["pairs"])
     plan = Plan(volume, place, split, noise, (*place.notes, *labelled, note))
@@ -172,11 +169,6 @@ def _choose_grid(plan: Plan, median: float, thick: float, name: str) -> Plan:
         edge=prepare.working_edge(scale, place.spacing),
         working_notes=(note, *why),
     )
-
-
-def note_on_filling(share: float) -> tuple[str, ...]:
-    """Return a note where the structure fills more than the background, as `prepare.prepare` gives it."""
-    return (prepare.MOSTLY.format(share),) if share > prepare.HALF else ()
 
 
 def _measure_thickness(plan: Plan, boxes: Boxes, order: Sequence[Box], inside: bool) -> tuple[float, float, Plan]:
@@ -231,10 +223,8 @@ def _find_split(volume: Volume, place: Place, dtype: np.dtype, find: Finder) -> 
     if kind == "field":
         return split, f"Taken for a phase field: values {float(lowest):.3g} to {float(highest):.3g}."
     if kind == "mask":
-        return (
-            split,
-            f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else structure.SEVERAL,
-        )
+        note = f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}."
+        return split, note if two else structure.SEVERAL
     size = math.prod(place.shape)
     return _split_image(volume, bars, split, total, value, size, find), ""
 
@@ -311,11 +301,9 @@ def _count_levels(
 ) -> Found:
     """Return a histogram of a bar: of each whole number, or of 256 bins."""
     values = _levels(volume, bars[number], left)
-    if values.dtype.kind in "iu":
-        counts = np.bincount(values.astype(np.int64) - int(lowest), minlength=int(highest) - int(lowest) + 1)
-    else:
-        counts = np.histogram(values, 256, (lowest, highest))[0]
-    return {"counts": counts}
+    if values.dtype.kind not in "iu":
+        return {"counts": np.histogram(values, 256, (lowest, highest))[0]}
+    return {"counts": np.bincount(values.astype(np.int64) - int(lowest), minlength=int(highest) - int(lowest) + 1)}
 
 
 def _sum_sides(volume: Volume, bars: Sequence[Box], level: float, left: float | None, number: int) -> Found:

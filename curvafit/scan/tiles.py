@@ -29,27 +29,14 @@ from curvafit.geometry.morphometry import SOFTENED, border_weights, soften
 from curvafit.geometry.topology import euler_of_window, euler_shares
 from curvafit.priors.grid import WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread
+from curvafit.scan import measure as whole
 from curvafit.scan.grids import CutOut, centre_distance, profile_mask, remove_specks, resample
-from curvafit.scan.measure import (
-    DROPPED,
-    FEWEST_SLICES,
-    MOST,
-    SUMS,
-    TOO_THIN,
-    Blocks,
-    Measures,
-    measure_curvatures,
-    measure_maps,
-    no_curvature,
-    summarise,
-    summarise_sums,
-    tabulate_surface,
-)
+from curvafit.scan.measure import Blocks, Measures
 from curvafit.scan.measure import measure as measure_in_one
 from curvafit.scan.pieces import Found, open_finder
-from curvafit.scan.prepare import LARGEST_BOX, Prepared, TooLarge, smallest_piece
+from curvafit.scan.prepare import DROPPED, LARGEST_BOX, Prepared, TooLarge, note_on_filling, smallest_piece
 from curvafit.scan.structure import check_options
-from curvafit.scan.survey import Plan, Volume, note_on_filling, survey
+from curvafit.scan.survey import Plan, Volume, survey
 from curvafit.volumes.boxes import Boxes, InFile, InMemory, boxes_of
 from curvafit.volumes.field import ScanError
 from curvafit.volumes.formats.part import Box, cut_boxes, grow, within
@@ -129,8 +116,8 @@ def measure(
         field = field if label is None else field.label(label)
         how = {"threshold": threshold, "dark": dark, "periodic": False}
         with suppress(TooLarge):
-            maps = measure_maps(field, kind, how, progress, LARGEST_BOX**3)
-            return summarise(field, maps, maps.divide())
+            maps = whole.measure_maps(field, kind, how, progress, LARGEST_BOX**3)
+            return whole.summarise(field, maps, maps.divide())
     path = isinstance(boxes, InFile) and isinstance(scan, str | PathLike)
     volume = Volume(os.fspath(scan) if path else boxes, reading if path else {}, label, **options)  # type: ignore[arg-type]
     return measure_tiles(volume, edge=tile, workers=workers if path else None, store=store, progress=progress)
@@ -144,15 +131,12 @@ class Tiling:
     cores: tuple[Box, ...]
     factors: tuple[int, int] = (1, 1)
 
-    @classmethod
-    def of(cls, plan: Plan, edge: int | None = None) -> Tiling:
-        """Cut a volume into tiles of `edge` voxels a side, by default as large as `LARGEST_TILE` leaves them."""
-        return cls(plan, tuple(cut_boxes(plan.place.shape, edge or _choose_edges(plan))))
-
     @property
     def finest(self) -> Blocks:
         """Return the division whose parts make up the blocks of any number along an axis up to `MOST`."""
-        starts = (sorted({n * k // count for count in range(1, MOST + 1) for k in range(count)}) for n in self.shape)
+        starts = (
+            sorted({n * k // count for count in range(1, whole.MOST + 1) for k in range(count)}) for n in self.shape
+        )
         return Blocks(self.shape, tuple(map(tuple, starts)))  # type: ignore[arg-type]
 
     @property
@@ -230,7 +214,7 @@ class _Sums:
 
     def __init__(self, finest: Blocks, core: Box) -> None:
         self._finest, self._core = finest, core
-        self.table = np.zeros((finest.count, len(SUMS)))
+        self.table = np.zeros((finest.count, len(whole.SUMS)))
         self._where, starts = [], []
         for edge, all_starts in zip(core, finest.starts, strict=True):
             first, last = (int(np.searchsorted(all_starts, at, side="right")) - 1 for at in (edge.start, edge.stop - 1))
@@ -241,7 +225,7 @@ class _Sums:
 
     def add(self, name: str, values: np.ndarray, each: float) -> None:
         """Add a volume's values on the core."""
-        column = self.table[:, SUMS.index(name)].reshape(self._finest.counts)
+        column = self.table[:, whole.SUMS.index(name)].reshape(self._finest.counts)
         column[tuple(self._where)] += each * self._local.sums(values).reshape(self._local.counts)
 
     def add_thickness(self, of: Sequence[np.ndarray], each: float, structure: bool = True, gaps: bool = True) -> None:
@@ -254,7 +238,7 @@ class _Sums:
 
     def gather(self, name: str, places: np.ndarray, columns: np.ndarray) -> None:
         """Add columns, of which the first is `name`, at places in voxels from the volume's first centre."""
-        first = SUMS.index(name)
+        first = whole.SUMS.index(name)
         self.table[:, first : first + columns.shape[1]] += self._finest.gather(places, columns)
 
     @property
@@ -328,12 +312,6 @@ def _cut_out(core: Box, box: Box, shape: Sequence[int]) -> CutOut:
 # ---- surface and curvature -------------------------------------------------------------------------------------------
 
 
-def _widen(start: int, stop: int, first: int, last: int) -> tuple[int, int]:
-    """Return a stretch of cells with more of `first` to `last`, until there are three: fewer make no grid."""
-    stop = min(max(stop, start + 3), last)
-    return max(min(start, stop - 3), first), stop
-
-
 def _measure_surface(plan: Plan, mask: np.ndarray, box: Box, core: Box) -> tuple[np.ndarray, np.ndarray] | None:
     """Return places and columns, as `measure.measure_surface`, of the cells that begin in a core; None if there are
     none."""
@@ -348,7 +326,7 @@ def _measure_surface(plan: Plan, mask: np.ndarray, box: Box, core: Box) -> tuple
         mesh = march(soft, spacing, 0.5)
     except NoSurface:
         return None
-    places, columns = tabulate_surface(mesh, spacing)
+    places, columns = whole.tabulate_surface(mesh, spacing)
     places = places + [edge.start for edge in part]
     return places, columns * border_weights(places, shape)[:, None]
 
@@ -376,7 +354,7 @@ def _measure_curvature(plan: Plan, boxes: Boxes, core: Box, sums: _Sums) -> Foun
     """Sum the curvatures in the working cells that begin in a core; return the bins of the diagram and other counts."""
     box, owned = _around(plan, core)
     found: dict[str, Any] = {"specks": np.zeros(2, np.int64), "changed": np.int64(0), "filled": np.int64(0)}
-    if min(plan.working) < FEWEST_SLICES or any(edge.start >= edge.stop for edge in owned):
+    if min(plan.working) < whole.FEWEST_SLICES or any(edge.start >= edge.stop for edge in owned):
         return found
     values = _find_working_levels(plan, boxes, box)
     mask, inner = values > 0, within(owned, box)
@@ -390,7 +368,9 @@ def _measure_curvature(plan: Plan, boxes: Boxes, core: Box, sums: _Sums) -> Foun
     own = [(max(e.start, MARGIN), min(e.stop, n - 1 - MARGIN)) for e, n in zip(owned, plan.working, strict=True)]
     if any(start >= stop for start, stop in own) or mask.all() or not mask.any():
         return found
-    wide = [_widen(*cells, MARGIN, n - 1 - MARGIN) for cells, n in zip(own, plan.working, strict=True)]
+    # three cells along an axis at least: fewer make no grid
+    stops = [min(max(stop, start + 3), n - 1 - MARGIN) for (start, stop), n in zip(own, plan.working, strict=True)]
+    wide = [(max(min(start, stop - 3), MARGIN), stop) for (start, _), stop in zip(own, stops, strict=True)]
     part: Box = tuple(slice(start - MARGIN, stop + MARGIN + 1) for start, stop in wide)  # type: ignore[assignment]
     seen = mask[within(part, box)]
     if seen.all() or not seen.any():
@@ -398,7 +378,7 @@ def _measure_curvature(plan: Plan, boxes: Boxes, core: Box, sums: _Sums) -> Foun
     if plan.split.kind != "field":
         values = profile_mask(mask)
     try:
-        (places, columns), drawn = measure_curvatures(_prepare_part(plan, values[within(part, box)], seen, part))
+        (places, columns), drawn = whole.measure_curvatures(_prepare_part(plan, values[within(part, box)], seen, part))
     except NoSurface:
         return found
     corner = np.asarray(drawn.places) / WORKING_SPACING + [edge.start for edge in part]
@@ -427,20 +407,11 @@ def _find_working_levels(plan: Plan, boxes: Boxes, box: Box) -> np.ndarray:
 
 def _prepare_part(plan: Plan, phase: np.ndarray, mask: np.ndarray, part: Box) -> Prepared:
     """Return a part of the working grid as if it were a scan of its own, at its place in the volume."""
-    z, y, x = phase.shape
-    return Prepared(
-        kind=plan.split.kind,
-        phase=np.ascontiguousarray(phase, dtype=np.float32),
-        mask=mask,
-        grid=Grid((z, y, x), boundary="replicate"),
-        scale=plan.scale,
-        working_voxel=plan.edge,
-        unit=plan.place.unit,
-        thickness=plan.thickness / plan.edge,
-        windows=((slice(0, z), slice(0, y), slice(0, x)),),
-        notes=(),
-        origin=tuple(edge.start * s for edge, s in zip(part, plan.scale, strict=True)),  # type: ignore[arg-type]
-    )
+    phase, grid = np.ascontiguousarray(phase, dtype=np.float32), Grid(phase.shape, boundary="replicate")  # type: ignore[arg-type]
+    z, y, x = (slice(0, n) for n in phase.shape)
+    size = (plan.scale, plan.edge, plan.place.unit, plan.thickness / plan.edge)
+    origin = tuple(edge.start * s for edge, s in zip(part, plan.scale, strict=True))
+    return Prepared(plan.split.kind, phase, mask, grid, *size, ((z, y, x),), (), origin)  # type: ignore[arg-type]
 
 
 def _bin(plan: Plan, drawn: Diagram, kept: np.ndarray) -> Found:
@@ -473,48 +444,44 @@ def measure_tiles(
     run = {"scan": digest, "label": volume.label, "kind": volume.kind, "threshold": volume.threshold}
     run |= {"dark": volume.dark, "tile": edge}
     with open_finder(workers, store, run, progress, {_FIRST: 0.95, _AGAIN: 1.0}) as find, one_thread():
-        tiling = Tiling.of(survey(volume, find), edge)
+        plan = survey(volume, find)
+        tiling = Tiling(plan, tuple(cut_boxes(plan.place.shape, edge or _choose_edges(plan))))
         stated = tiling.describe(find.processes)
         found = list(find(_FIRST, partial(measure_tile, tiling), len(tiling.cores), stated))
-        wide = replace(tiling, factors=_choose_factors(tiling, found))
+        # the factors that `morphometry.local_thickness` chooses
+        widest, finest = np.max([each["widest"] for each in found], axis=0), min(plan.place.spacing)
+        wide = replace(tiling, factors=tuple(max(1, math.ceil(each / finest / COARSE)) for each in widest))
         again: list[Found] = []
         if max(wide.factors) > 1:
             again = list(find(_AGAIN, partial(_measure_wide, wide), len(tiling.cores)))
     return _summarise(wide, found, again, stated)
 
 
-def _choose_factors(tiling: Tiling, found: Sequence[Found]) -> tuple[int, int]:
-    """Return the factors of the grids on which balls are painted, as `morphometry.local_thickness` chooses them."""
-    finest = min(tiling.plan.place.spacing)
-    one, other = np.max([each["widest"] for each in found], axis=0)
-    return max(1, math.ceil(one / finest / COARSE)), max(1, math.ceil(other / finest / COARSE))
-
-
 def _summarise(tiling: Tiling, found: Sequence[Found], again: Sequence[Found], stated: str) -> Measures:
     """Return the measures of a volume from what was found in its tiles."""
     plan, finest, shape = tiling.plan, tiling.finest, tiling.shape
-    table = np.zeros((finest.count, len(SUMS)))
+    table = np.zeros((finest.count, len(whole.SUMS)))
     for each in found:
         table[each["rows"]] += each["sums"]
     for factor, names in zip(tiling.factors, (("thickness", "thickness²"), ("gap",)), strict=True):
         if factor > 1:
-            table[:, [SUMS.index(name) for name in names]] = 0
+            table[:, [whole.SUMS.index(name) for name in names]] = 0
     for each in again:
         table[each["rows"]] += each["sums"]
-    total = dict(zip(SUMS, table.sum(0), strict=True))
+    total = dict(zip(whole.SUMS, table.sum(0), strict=True))
     if not 0 < total["inside"] < total["volume"]:
         raise ScanError("expected a structure and background in the scan, got one of them only")
     curved = total["curved"] > 0
-    if not curved and min(shape) >= FEWEST_SLICES:
+    if not curved and min(shape) >= whole.FEWEST_SLICES:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
     period = total["thickness"] / total["inside"] + total["gap"] / (total["volume"] - total["inside"])
     blocks = Blocks.divide(shape, plan.place.spacing, period)
     χ = float(sum(each["euler"] for each in found))
     sampled = math.prod(max(n - 1, 1) for n in shape) * math.prod(plan.place.spacing)
-    drawn, why = (_draw(plan, found), ()) if curved else no_curvature(plan.place.unit, TOO_THIN)[1:]
+    drawn, why = (_draw(plan, found), ()) if curved else whole.no_curvature(plan.place.unit, whole.TOO_THIN)[1:]
     notes = (*_notes(tiling, found), *why, f"Measured in {stated[0].lower()}{stated[1:]}")
     table, connectivity = _merge(table, finest, blocks), (χ, (1 - χ) / sampled)
-    return summarise_sums(plan.place.frame, plan.split.kind, blocks, table, connectivity, drawn, notes)
+    return whole.summarise_sums(plan.place.frame, plan.split.kind, blocks, table, connectivity, drawn, notes)
 
 
 def _merge(table: np.ndarray, finest: Blocks, blocks: Blocks) -> np.ndarray:
@@ -528,8 +495,9 @@ def _merge(table: np.ndarray, finest: Blocks, blocks: Blocks) -> np.ndarray:
 def _draw(plan: Plan, found: Sequence[Found]) -> Diagram:
     """Return the diagram of all tiles: the barycentres of its bins."""
     parts = [each for each in found if "bins" in each]
-    bins, index = np.unique(np.concatenate([each["bins"] for each in parts]), axis=0, return_inverse=True)
-    areas, index = np.concatenate([each["areas"] for each in parts]), index.reshape(-1)
+    bins, areas = (np.concatenate([each[name] for each in parts]) for name in ("bins", "areas"))
+    bins, index = np.unique(bins, axis=0, return_inverse=True)
+    index = index.reshape(-1)
     area, κ1, κ2, square = (np.bincount(index, column, minlength=len(bins)) for column in areas.T)
     points = np.stack([κ1, κ2], axis=1) / area[:, None]
     spread = max(float((square - area * (points**2).sum(1)).sum() / area.sum()), 0.0)
@@ -553,7 +521,6 @@ def _notes(tiling: Tiling, found: Sequence[Found]) -> tuple[str, ...]:
     specks, holes = (int(n) for n in np.sum([each["specks"] for each in found], axis=0))
     if specks or holes:
         changed = sum(int(each["changed"]) for each in found) / count
-        counts = f"specks: {specks}, pinholes: {holes}, {changed:.2g} of the volume"
-        working.append(f"Dropped what is smaller than a ball of half the median thickness ({counts}).")
+        working.append(DROPPED.format(specks, f"{holes}, {changed:.2g} of the volume"))
     working.extend(note_on_filling(sum(int(each["filled"]) for each in found) / count))
     return (*notes, *(f"Of curvature: {note}" for note in working))

@@ -44,9 +44,8 @@ def lay(field: Field, on: Field, name: str, kind: str, *, exact: bool = False) -
         raise ScanError(f"{name} must have the voxels of {kind}, got {sampling} that lie between them: resample it")
     laid, share = _take_nearest(field.values, *((whole, moved) if on_voxels else step), on.shape)
     if share == 0 or (exact and share < 1):
-        raise ScanError(
-            f"{name} must have the {'shape and ' * exact}place of {kind}, but by the affines covers {share:.0%} of it"
-        )
+        what = f"{'shape and ' * exact}place of {kind}"
+        raise ScanError(f"{name} must have the {what}, but by the affines covers {share:.0%} of it")
     note += f" by its affine: {'whole voxels are moved' if on_voxels else f'the nearest of its {sampling} counts'}"
     note += "" if share == 1 else f"; {1 - share:.2g} of {kind} lies beyond it, and counts as 0"
     return replace(field, values=laid, spacing=on.spacing, unit=on.unit, affine=on.affine), (f"{note}.",)

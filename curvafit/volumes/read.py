@@ -43,10 +43,8 @@ READERS: dict[str, Callable[..., Raw]] = {
     ".ims": read_imaris,
     **dict.fromkeys((".raw", ".bin", ".vol"), read_raw),
     ".zarr": read_zarr,
-    ".nrrd": read_nrrd,
-    ".nhdr": read_nrrd,
-    ".mha": read_metaimage,
-    ".mhd": read_metaimage,
+    **dict.fromkeys((".nrrd", ".nhdr"), read_nrrd),
+    **dict.fromkeys((".mha", ".mhd"), read_metaimage),
     **dict.fromkeys((".mrc", ".map", ".rec"), read_mrc),
     ".isq": read_isq,
     ".aim": read_aim,
@@ -224,9 +222,9 @@ def pick_reader(path: Path, shape_given: bool = False) -> Callable[..., Raw]:
 
 def _refuse(options: dict[str, Any], expected: str, got: str) -> None:
     """Raise ScanError where an option would have no effect."""
-    idle = next((name for name, value in options.items() if value is not None and value is not False), None)
-    if idle is not None:
-        raise ScanError(f"{idle} applies to {expected} only, got it with {got}")
+    for name, value in options.items():
+        if value is not None and value is not False:
+            raise ScanError(f"{name} applies to {expected} only, got it with {got}")
 
 
 def _to_numpy(source: np.ndarray | torch.Tensor) -> np.ndarray:
@@ -244,10 +242,8 @@ def _to_numpy(source: np.ndarray | torch.Tensor) -> np.ndarray:
 def split_key(path: str | os.PathLike[str], key: str | None) -> tuple[Path, str | None]:
     """Return the file of a path, and the name of the array in the file, which the path may state after `::`."""
     path = os.fspath(path)
-    if "::" in path and Path(path).exists():
-        return Path(path), key
     name, separator, inner = path.rpartition("::")
-    return (Path(name), key or inner or None) if separator else (Path(path), key)
+    return (Path(path), key) if not separator or Path(path).exists() else (Path(name), key or inner or None)
 
 
 def levels_of(source: object, key: str | None = None) -> dict[str, tuple[float, ...] | None]:
@@ -282,9 +278,8 @@ def to_field(raw: Raw, source: str, spacing: Sequence[float] | float | None, uni
         raise ScanError(f"{reason} for {source}") from None
     if spacing is not None:
         edges = np.array(positive_triple(spacing))
-        if (
-            unit is None and name == "voxel" and edges.min() != 1
-        ):  # edges of which the finest is 1 are ratios, in voxels of that one
+        # edges of which the finest is 1 are ratios, in voxels of that one
+        if unit is None and name == "voxel" and edges.min() != 1:
             raise ScanError(f"expected the unit of the spacing {quoted(spacing)} of {source}, such as mm, got none")
     elif stated is not None:
         edges = factor * np.array(stated)

@@ -23,11 +23,9 @@ from curvafit.volumes.read import Source, field_of
 
 #: Suffix -> writer(field, path).
 WRITERS: dict[str, Callable[[Any, Path], None]] = {
-    ".nii": write_nifti,
-    ".nii.gz": write_nifti,
+    **dict.fromkeys((".nii", ".nii.gz"), write_nifti),
     **dict.fromkeys((".ome.tif", ".ome.tiff"), write_ome_tiff),
-    ".tif": write_tiff,
-    ".tiff": write_tiff,
+    **dict.fromkeys((".tif", ".tiff"), write_tiff),
     ".npy": write_npy,
     ".mrc": write_mrc,
     **dict.fromkeys((".zarr", ".ome.zarr"), write_zarr),

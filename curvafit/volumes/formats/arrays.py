@@ -13,17 +13,8 @@ import numpy as np
 
 from curvafit.core.checks import quoted
 from curvafit.core.records import read_member
-from curvafit.volumes.formats.base import (
-    UNNAMED,
-    Damaged,
-    Raw,
-    ScanError,
-    check_array,
-    check_regular,
-    map_numbers,
-    pick_key,
-    read_spacing,
-)
+from curvafit.volumes.formats import base
+from curvafit.volumes.formats.base import Raw, ScanError
 from curvafit.volumes.formats.part import Part, name_axes, read_part
 
 #: Attributes that may state a spacing or its unit.
@@ -35,7 +26,7 @@ def read_npy(path: Path, *, part: Part | None = None, **_: object) -> Raw:
     """Read the numbers of an NPY file, or of a part of it."""
     values = np.lib.format.open_memmap(path, mode="r")
     if values.offset + values.nbytes != path.stat().st_size:
-        raise Damaged(f"{values.nbytes} bytes of values by its header, not so many in the file")
+        raise base.Damaged(f"{values.nbytes} bytes of values by its header, not so many in the file")
     return read_part(values, part, path)
 
 
@@ -49,7 +40,7 @@ def read_npz(path: Path, *, key: str | None = None, **_: object) -> Raw:
     """Read the array of an NPZ file that a key names."""
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
-        return Raw(read_member(archive, f"{pick_key(names, key, path)}.npy"))
+        return Raw(read_member(archive, f"{base.pick_key(names, key, path)}.npy"))
 
 
 def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
@@ -57,13 +48,13 @@ def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, *
     import h5py
 
     with h5py.File(path, "r") as file:
-        dataset: Any = file[pick_key(_list_datasets(file), key, path)]
+        dataset: Any = file[base.pick_key(_list_datasets(file), key, path)]
         _check_dataset(dataset, path)
         attributes = {name: dataset.attrs[name] for name in _ATTRIBUTES if name in dataset.attrs}
-        spacing, unit = read_spacing(attributes, dataset.ndim)
+        spacing, unit = base.read_spacing(attributes, dataset.ndim)
         gaps = tuple(_gaps(dataset, path))
         tags = json.loads(dataset.attrs["axistags"])["axes"] if "axistags" in dataset.attrs else []
-        axes = name_axes([tag["key"] for tag in tags], path) if len(tags) == dataset.ndim else UNNAMED
+        axes = name_axes([tag["key"] for tag in tags], path) if len(tags) == dataset.ndim else base.UNNAMED
         return read_part(dataset, part, path, axes)._replace(spacing=spacing, unit=unit, gaps=gaps)
 
 
@@ -75,15 +66,15 @@ def read_imaris(path: Path, *, key: str | None = None, part: Part | None = None,
     with h5py.File(path, "r") as file:
         names = [name for name in _list_datasets(file) if name.startswith(level) and name.endswith("/Data")]
         keys = [name.removeprefix(level).removesuffix("/Data") for name in names]
-        channel: Any = file[level + pick_key(keys, key, path)]
+        channel: Any = file[level + base.pick_key(keys, key, path)]
         dataset, image = channel["Data"], file["DataSetInfo/Image"]
         _check_dataset(dataset, path)
         shape = [int(_read_text(channel, f"ImageSize{axis}")) for axis in "ZYX"]
         ends = [[float(_read_text(image, f"Ext{end}{k}")) for k in (2, 1, 0)] for end in ("Min", "Max")]
         if len(dataset.shape) != 3 or not all(0 < n <= stored for n, stored in zip(shape, dataset.shape, strict=True)):
-            raise Damaged(f"{shape} voxels by its header, {list(dataset.shape)} in the file")
-        index = (part or Part()).index(shape, UNNAMED, path)[0]
-        check_array([edge.stop - edge.start for edge in index], dataset.dtype, path)
+            raise base.Damaged(f"{shape} voxels by its header, {list(dataset.shape)} in the file")
+        index = (part or Part()).index(shape, base.UNNAMED, path)[0]
+        base.check_array([edge.stop - edge.start for edge in index], dataset.dtype, path)
         spacing = tuple((last - first) / n for first, last, n in zip(*ends, shape, strict=True))
         unit = _read_text(image, "Unit") if "Unit" in image.attrs else "um"
         return Raw(dataset[index], spacing, unit, gaps=tuple(_gaps(dataset, path)), whole=tuple(shape))
@@ -116,7 +107,7 @@ def _gaps(dataset: Any, path: Path) -> Iterator[str]:
     fill = f"their voxels have the fill value {dataset.fillvalue}."
     if dataset.is_virtual:
         files = {source.file_name for source in dataset.virtual_sources()} - {"."}
-        missing = sorted(name for name in files if not check_regular(path.parent / name).exists())
+        missing = sorted(name for name in files if not base.check_regular(path.parent / name).exists())
         if missing:
             yield f"{len(missing)} of its {len(files)} source files are not there, {missing[0][:80]} among them; {fill}"
     elif dataset.chunks:
@@ -151,4 +142,4 @@ def read_raw(
         raise ScanError(f"dtype must be one of {_RAW_TYPES}, got {quoted(dtype)}") from None
     if size != (nbytes := math.prod(shape) * kind.itemsize):
         raise ScanError(f"shape {shape} of {kind} takes {nbytes} bytes, got {size} in {path}")
-    return read_part(map_numbers(path, 0, shape, kind), part, path)
+    return read_part(base.map_numbers(path, 0, shape, kind), part, path)

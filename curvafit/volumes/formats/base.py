@@ -158,6 +158,11 @@ def check_array(shape: Sequence[int], dtype: np.dtype, place: object) -> None:
         raise ScanError(f"{place} does not fit into memory: its header says {size:.3g} bytes")
 
 
+def affine_of(matrix: np.ndarray, first: Any) -> np.ndarray:
+    """Return the affine of axes (3, 3), x first, and the place of the first voxel."""
+    return np.vstack([np.column_stack([matrix, first]), [0.0, 0.0, 0.0, 1.0]])
+
+
 def check_regular(path: Path) -> Path:
     """Return the path of a file or a folder, or raise ScanError: reading anything else may never end."""
     if path.exists() and not path.is_file() and not path.is_dir():

@@ -16,18 +16,8 @@ import numpy as np
 
 from curvafit.core.extras import require
 from curvafit.core.units import common_unit, convert_length
-from curvafit.volumes.formats.base import (
-    Axes,
-    Damaged,
-    Raw,
-    ScanError,
-    check_array,
-    check_regular,
-    collect_complaints,
-    map_numbers,
-    pick_key,
-    read_numbers,
-)
+from curvafit.volumes.formats import base
+from curvafit.volumes.formats.base import Raw, ScanError
 from curvafit.volumes.formats.part import read_part
 
 #: Suffixes of files that must be DICOM's.
@@ -62,9 +52,7 @@ def read_nrrd(path: Path, **_: object) -> Raw:
     if "space directions" in header:
         directions = np.asarray(header["space directions"], dtype=np.float64)
         directions = directions[~np.isnan(directions).any(axis=1)]
-        affine = np.eye(4)
-        affine[:3, :3] = directions.T
-        affine[:3, 3] = header.get("space origin", np.zeros(3))
+        affine = base.affine_of(directions.T, header.get("space origin", np.zeros(3)))
         if len(factors) == 3:  # one for each axis of the world, x first
             affine[:3] *= np.array(factors)[:, None]
         if str(header.get("space", "")).startswith("left-posterior"):
@@ -83,10 +71,10 @@ def _nrrd_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path)
     # pynrrd reads only the first part of a compressed stream, and not the checksum at its end.
     name = header.pop("data file", None) or header.pop("datafile", None)
     if name is not None:
-        with check_regular(path.parent / str(name)).open("rb") as data:
+        with base.check_regular(path.parent / str(name)).open("rb") as data:
             return _nrrd_values(nrrd, header, data, path)
     if header["dimension"] != len(header["sizes"]):
-        raise Damaged(f"{len(header['sizes'])} sizes for {header['dimension']} axes")
+        raise base.Damaged(f"{len(header['sizes'])} sizes for {header['dimension']} axes")
     shape, encoding = [int(n) for n in header["sizes"]][::-1], str(header.get("encoding")).lower()
     no_values = {"dimension": 1, "sizes": np.zeros(1, int), "encoding": "raw", "type": header["type"]}
     dtype = nrrd.read_data({"endian": header.get("endian", "little"), **no_values}, io.BytesIO()).dtype
@@ -99,10 +87,10 @@ def _nrrd_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path)
         stream.seek(-math.prod(shape) * dtype.itemsize, os.SEEK_END)
     else:
         stream.seek(start, os.SEEK_CUR)
-    return read_numbers(stream, shape, dtype, path)
+    return base.read_numbers(stream, shape, dtype, path)
 
 
-def _other_axes(header: dict[str, Any]) -> Axes:
+def _other_axes(header: dict[str, Any]) -> base.Axes:
     """Return the axis of the values, z first, that is not one of space, where there is just one."""
     count, kinds = int(header["dimension"]), [str(kind).lower() for kind in header.get("kinds", ())]
     if "space directions" in header:
@@ -111,7 +99,7 @@ def _other_axes(header: dict[str, Any]) -> Axes:
     else:
         other = [kind not in ("domain", "space", "none", "???") for kind in kinds]
     axis = count - 1 - other.index(True) if sum(other) == 1 and len(other) == count else None
-    return Axes(None, axis) if "time" in kinds else Axes(axis)
+    return base.Axes(None, axis) if "time" in kinds else base.Axes(axis)
 
 
 def read_metaimage(path: Path, **_: object) -> Raw:
@@ -121,7 +109,7 @@ def read_metaimage(path: Path, **_: object) -> Raw:
         name = header["ElementDataFile"]
         if name.upper() == "LOCAL":
             return _meta_image(header, file, path)
-    with check_regular(path.parent / name).open("rb") as file:
+    with base.check_regular(path.parent / name).open("rb") as file:
         return _meta_image(header, file, path)
 
 
@@ -139,19 +127,16 @@ def _meta_image(header: dict[str, str], file: IO[bytes], path: Path) -> Raw:
     shape = [int(n) for n in header["DimSize"].split()]
     axes, channels = len(shape), int(header.get("ElementNumberOfChannels", 1))
     if header.get("ObjectType", "Image") != "Image" or str(axes) != header["NDims"] or min(shape) < 1:
-        raise Damaged(f"an image of {header['NDims'][:20]} axes with the sizes {shape[:9]}")
+        raise base.Damaged(f"an image of {header['NDims'][:20]} axes with the sizes {shape[:9]}")
     spacing = _meta_numbers(header, ("ElementSpacing", "ElementSize"), np.ones(axes))
     origin = _meta_numbers(header, ("Offset", "Position", "Origin"), np.zeros(axes))
     matrix = _meta_numbers(header, ("TransformMatrix", "Rotation", "Orientation"), np.eye(axes).ravel())
     shape = [*shape[::-1], *([channels] if channels != 1 else [])]
     values, affine = _meta_values(header, shape, file, path), None
     if axes in (3, 4):
-        affine = np.eye(4)
-        affine[:3, :3] = matrix.reshape(axes, axes).T[:3, :3] * spacing[:3]
-        affine[:3, 3] = origin[:3]
-        affine = _LPS_TO_RAS @ affine
+        affine = _LPS_TO_RAS @ base.affine_of(matrix.reshape(axes, axes).T[:3, :3] * spacing[:3], origin[:3])
     channel_axis = axes if values.ndim > axes else 0 if axes == 4 else None
-    return Raw(values, tuple(spacing[::-1].tolist()), "mm", affine, axes=Axes(channel_axis))
+    return Raw(values, tuple(spacing[::-1].tolist()), "mm", affine, axes=base.Axes(channel_axis))
 
 
 def _meta_values(header: dict[str, str], shape: list[int], file: IO[bytes], path: Path) -> np.ndarray:
@@ -162,21 +147,21 @@ def _meta_values(header: dict[str, str], shape: list[int], file: IO[bytes], path
         raise ScanError(f"{path} has the element type {kind[:40]!r}, none of {', '.join(_META_TYPES)}")
     order = header.get("BinaryDataByteOrderMSB", header.get("ElementByteOrderMSB", "False"))
     dtype = np.dtype(_META_TYPES[kind]).newbyteorder(">" if order.lower() in _TRUE else "<")
-    check_array(shape, dtype, path)
+    base.check_array(shape, dtype, path)
     if header.get("BinaryData", "True").lower() not in _TRUE:
         raise ScanError(f"{path} holds values in text, which are not read: write it with binary values")
     nbytes, head = math.prod(shape) * dtype.itemsize, int(header.get("HeaderSize", 0))
     size = os.fstat(file.fileno()).st_size
     file.seek(max(0, size - nbytes) if head < 0 else file.tell() + head)
     if header.get("CompressedData", "False").lower() not in _TRUE:
-        return read_numbers(file, shape, dtype, path)
+        return base.read_numbers(file, shape, dtype, path)
     rest = size - file.tell()
     if int(header.get("CompressedDataSize", rest)) != rest:
-        raise Damaged(f"{header['CompressedDataSize']} compressed bytes by its header, {rest} in the file")
+        raise base.Damaged(f"{header['CompressedDataSize']} compressed bytes by its header, {rest} in the file")
     inflate = zlib.decompressobj()
     content = inflate.decompress(file.read(), nbytes + 1)
     if len(content) != nbytes or not inflate.eof or inflate.unused_data:
-        raise Damaged(f"{nbytes} bytes of values by its header, not so many in the file")
+        raise base.Damaged(f"{nbytes} bytes of values by its header, not so many in the file")
     return np.frombuffer(bytearray(content), dtype).reshape(shape)
 
 
@@ -186,7 +171,7 @@ def _meta_numbers(header: dict[str, str], names: Sequence[str], default: np.ndar
         if name in header:
             numbers = np.array(header[name].split(), dtype=np.float64)
             if len(numbers) != len(default):
-                raise Damaged(f"{name} of {len(numbers)} numbers, not {len(default)}")
+                raise base.Damaged(f"{name} of {len(numbers)} numbers, not {len(default)}")
             return numbers
     return default
 
@@ -199,13 +184,13 @@ def read_mrc(path: Path, **_: object) -> Raw:
         shape, dtype = mrcfile.utils.data_shape_from_header(header), mrcfile.utils.data_dtype_from_header(header)
         start = header.nbytes + int(header.nsymbt)
         stamp, flags = np.frombuffer(header.extra2.tobytes()[40:48], header.mode.dtype)
-    values, notes = map_numbers(path, start, [int(n) for n in shape], dtype), ()
+    values, notes = base.map_numbers(path, start, [int(n) for n in shape], dtype), ()
     # Bytes are signed, as is standard, unless IMOD's stamp says otherwise, or the header's maximum is above theirs.
     if dtype == np.int8 and (not flags & 1 if stamp == _IMOD else header.dmax > 127):
         values = values.view(np.uint8)
         guess = "The bytes are taken for numbers from 0 to 255, as the header's maximum is above 127."
         notes = () if stamp == _IMOD else (guess,)
-    raw = read_part(values, None, path, axes=Axes(0 if values.ndim == 4 else None))
+    raw = read_part(values, None, path, axes=base.Axes(0 if values.ndim == 4 else None))
     spacing = (float(size.z), float(size.y), float(size.x))
     return raw._replace(spacing=spacing if min(spacing) > 0 else None, unit="angstrom", notes=notes)
 
@@ -233,10 +218,10 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
     pydicom = require("pydicom", "io", "reading DICOM folders")
     inside = sorted(p for p in path.iterdir() if p.is_file() and not p.name.startswith("."))
     files = [p for p in inside if is_dicom(p) or p.suffix.lower() in _DICOM]
-    with collect_complaints("pydicom"):
+    with base.collect_complaints("pydicom"):
         images = [image for file in files if (image := _read_slice(pydicom, file)) is not None]
     series = sorted({str(image.get("SeriesInstanceUID", "")) for image in images})
-    uid = pick_key(series, key, path)
+    uid = base.pick_key(series, key, path)
     slices = [image for image in images if str(image.get("SeriesInstanceUID", "")) == uid]
     if frames := next((int(n) for image in slices if (n := image.get("NumberOfFrames") or 1) > 1), None):
         raise ScanError(f"a DICOM series must have a file a slice, got {frames} frames in a file of {path}")
@@ -256,22 +241,20 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Raw:
             raise ScanError(f"DICOM slices must have one {name}, got several in {path}")
     z, origin = _slice_distance(slices, normal, path)
     y, x = (float(h) for h in slices[0].PixelSpacing)
-    affine = np.eye(4)
-    affine[:3, :3] = np.column_stack([rows * x, columns * y, normal * z])
-    affine[:3, 3] = origin
+    affine = base.affine_of(np.column_stack([rows * x, columns * y, normal * z]), origin)
     return _stack_planes(slices)._replace(spacing=(z, y, x), unit="mm", affine=_LPS_TO_RAS @ affine)
 
 
 def _read_slice(pydicom: Any, file: Path) -> Any:
     """Return a slice with its pixels, or None for another kind of file, such as a folder's index or a report."""
     if not is_dicom(file):
-        raise Damaged(f"{file.name} is not a DICOM file")
+        raise base.Damaged(f"{file.name} is not a DICOM file")
     image = pydicom.dcmread(file)
     if "PixelData" in image:
         return image
     kind = pydicom.uid.UID(str(image.file_meta.get("MediaStorageSOPClassUID", "")))
     if not kind or "Image Storage" in kind.name:
-        raise Damaged(f"{file.name} has no pixels")
+        raise base.Damaged(f"{file.name} has no pixels")
     return None
 
 
@@ -284,13 +267,13 @@ def is_dicom(path: Path) -> bool:
 def _stack_planes(slices: list[Any]) -> Raw:
     """Return the slices' pixels, with slope and intercept applied."""
     planes = []
-    with collect_complaints("pydicom"):
+    with base.collect_complaints("pydicom"):
         for image in slices:
             slope, intercept = float(image.get("RescaleSlope", 1)), float(image.get("RescaleIntercept", 0))
             plane = image.pixel_array
             planes.append(plane if (slope, intercept) == (1, 0) else (plane * slope + intercept).astype(np.float32))
     values = np.stack(planes)
-    return Raw(values, axes=Axes(3 if values.ndim == 4 else None))
+    return Raw(values, axes=base.Axes(3 if values.ndim == 4 else None))
 
 
 def _slice_distance(slices: list[Any], normal: np.ndarray, path: Path) -> tuple[float, np.ndarray]:

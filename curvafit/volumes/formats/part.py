@@ -171,6 +171,5 @@ def _is_plain(edge: Any) -> bool:
     """Return whether this is a slice that has whole numbers, or nothing, as ends, and no step."""
     if not isinstance(edge, slice) or edge.step not in (None, 1):
         return False
-    return all(
-        end is None or (isinstance(end, Integral) and not isinstance(end, bool)) for end in (edge.start, edge.stop)
-    )
+    ends = (edge.start, edge.stop)
+    return all(end is None or (isinstance(end, Integral) and not isinstance(end, bool)) for end in ends)

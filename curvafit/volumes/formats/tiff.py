@@ -12,16 +12,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from curvafit.core.units import common_unit, is_unit, parse_unit
-from curvafit.volumes.formats.base import (
-    Axes,
-    Damaged,
-    Raw,
-    ScanError,
-    check_array,
-    check_regular,
-    collect_complaints,
-    smallest_type,
-)
+from curvafit.volumes.formats import base
+from curvafit.volumes.formats.base import Raw, ScanError
 
 if TYPE_CHECKING:
     import tifffile
@@ -46,9 +38,9 @@ def read_tiff(path: Path, **_: object) -> Raw:
     """Read the first series of a file, or raise Damaged where one of its strips or pages is missing."""
     import tifffile
 
-    with collect_complaints("tifffile") as messages, tifffile.TiffFile(path) as file:
+    with base.collect_complaints("tifffile") as messages, tifffile.TiffFile(path) as file:
         series = file.series[0]
-        check_array(series.shape, series.dtype or np.dtype("V1"), path)
+        base.check_array(series.shape, series.dtype or np.dtype("V1"), path)
         _check_pages(file, series)
         values = np.asarray(series.asarray())
         spacing, unit, guesses = _read_spacing(file)
@@ -57,22 +49,22 @@ def read_tiff(path: Path, **_: object) -> Raw:
         count = len(file.series)
     tags = [text for text in messages if text.startswith("<TiffTag")]
     if losses := [text for text in messages if text not in tags and _LOST.search(text)]:
-        raise Damaged(losses[0])
+        raise base.Damaged(losses[0])
     notes = (f"The file holds {count} images: the first is used.",) if count > 1 else ()
     notes += (f"{len(tags)} of the file's tags cannot be read: what they state is not known.",) if tags else ()
     return Raw(values, spacing, unit, notes=(*notes, *guess, *calibration), guesses=guesses, axes=axes)
 
 
-def _other_axes(series: tifffile.TiffPageSeries) -> tuple[Axes, tuple[str, ...]]:
+def _other_axes(series: tifffile.TiffPageSeries) -> tuple[base.Axes, tuple[str, ...]]:
     """Return the axes of colours or channels and of times. In a series of three axes they are taken for slices."""
     long = {name: axis for axis, name in enumerate(series.axes) if series.shape[axis] != 1}
-    axes = Axes(long.get("S", long.get("C")), long.get("T"))
+    axes = base.Axes(long.get("S", long.get("C")), long.get("T"))
     named = [name for name in ("S" if "S" in long else "C", "T") if name in long]
     if named[-1:] in ([], ["S"]) or sum(n != 1 for n in series.shape) - len(named) != 2:
         return axes, ()
     what = "times" if named[-1] == "T" else "channels"
     note = f"The file calls an axis of {series.shape[long[named[-1]]]} {what}: it is taken for slices."
-    return Axes(axes.channel if len(named) == 2 else None), (note,)
+    return base.Axes(axes.channel if len(named) == 2 else None), (note,)
 
 
 def _calibrate(values: np.ndarray, metadata: Mapping[str, Any]) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -84,7 +76,7 @@ def _calibrate(values: np.ndarray, metadata: Mapping[str, Any]) -> tuple[np.ndar
         return values, ()
     grey = np.maximum(values * np.float64(c1) + float(c0), 0 if metadata.get("zeroclip") else -np.inf)
     whole = float(c0).is_integer() and float(c1).is_integer()  # labels stay whole numbers
-    return grey.astype(smallest_type(grey) if whole else np.float32), ()
+    return grey.astype(base.smallest_type(grey) if whole else np.float32), ()
 
 
 def read_slices(path: Path, **_: object) -> Raw:
@@ -93,15 +85,14 @@ def read_slices(path: Path, **_: object) -> Raw:
     names = sorted(files, key=lambda p: natural_key(p.name))
     first, slices = None, []
     for name in names:
-        raw = read_tiff(check_regular(name))
+        raw = read_tiff(base.check_regular(name))
         first, plane = first or raw, _squeeze_plane(raw)
         slices.append(plane)
         if plane.ndim != 2 + (raw.axes.channel is not None) or plane.shape != slices[0].shape:
-            raise ScanError(
-                f"slices must be 2D and of one shape {slices[0].shape}, got {plane.shape} in {name.name} of {path}"
-            )
+            got = f"{plane.shape} in {name.name} of {path}"
+            raise ScanError(f"slices must be 2D and of one shape {slices[0].shape}, got {got}")
     assert first is not None
-    axes, notes = Axes(None if first.axes.channel is None else 3), first.notes
+    axes, notes = base.Axes(None if first.axes.channel is None else 3), first.notes
     kinds = {str(plane.dtype): name.name for name, plane in zip(names[::-1], slices[::-1], strict=True)}
     if len(kinds) > 1:
         listed = ", ".join(f"{kind} in {name}" for kind, name in kinds.items())
@@ -135,20 +126,22 @@ def _check_pages(file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> No
     """Raise Damaged where pages, strips or tiles are missing or beyond the end: tifffile fills them with zeros."""
     metadata = file.imagej_metadata or {}
     if file.is_imagej and int(metadata.get("images", 1)) > math.prod(series.shape[:-2]):
-        raise Damaged(f"{metadata['images']} images by its description, {math.prod(series.shape[:-2])} in the file")
+        raise base.Damaged(
+            f"{metadata['images']} images by its description, {math.prod(series.shape[:-2])} in the file"
+        )
     if series.dataoffset is not None:  # all values in one piece, whatever its pages are
         nbytes = math.prod(series.shape) * np.dtype(series.dtype).itemsize
         if series.dataoffset + nbytes > file.filehandle.size:
-            raise Damaged(f"{nbytes} bytes of values by its header, fewer in the file")
+            raise base.Damaged(f"{nbytes} bytes of values by its header, fewer in the file")
         return
     for number, page in enumerate(series.pages):
         if page is None:
-            raise Damaged(f"page {number} is not there")
+            raise base.Damaged(f"page {number} is not there")
         size = page.parent.filehandle.size  # a series may have its pages in several files
         places = list(zip(page.dataoffsets, page.databytecounts, strict=False))
         whole = all(start > 0 and count > 0 and start + count <= size for start, count in places)
         if not whole or len(places) < (1 if page.is_contiguous else math.prod(page.chunked)):
-            raise Damaged(f"strips or tiles of page {number} are not there")
+            raise base.Damaged(f"strips or tiles of page {number} are not there")
 
 
 def write_tiff(field: Any, path: Path) -> None:
@@ -162,9 +155,8 @@ def write_tiff(field: Any, path: Path) -> None:
         exact = {"curvafit_spacing": f"{z!r},{y!r},{x!r}", "curvafit_unit": field.unit}
         unit = {"um": "micron", "voxel": "pixel"}.get(field.unit, field.unit)
         metadata = {"axes": "ZYX", "spacing": z, "unit": unit, **exact}
-        tifffile.imwrite(
-            path, values, photometric="minisblack", imagej=True, resolution=(1 / x, 1 / y), metadata=metadata
-        )
+        options = {"imagej": True, "resolution": (1 / x, 1 / y), "metadata": metadata}
+        tifffile.imwrite(path, values, photometric="minisblack", **options)
     elif values.dtype.kind == "f" or values.dtype.itemsize < 8:
         write_ome_tiff(field, path)
     else:
@@ -192,7 +184,7 @@ def _to_tiff(values: np.ndarray) -> np.ndarray:
     if values.dtype == bool:
         return values.view(np.uint8)
     if values.dtype.kind in "iu" and values.dtype.itemsize > 4:
-        return values.astype(smallest_type(values))
+        return values.astype(base.smallest_type(values))
     return values.astype(np.float32) if values.dtype == np.float16 else values
 
 

@@ -18,7 +18,7 @@ from curvafit.core.files import move_into_place, write_content
 from curvafit.core.records import MARK, is_zarr
 from curvafit.core.runtime import hold_signals
 from curvafit.core.units import format_sampling, parse_unit
-from curvafit.volumes.formats.base import UNNAMED, Axes, Damaged, Raw, ScanError, pick_key, read_spacing
+from curvafit.volumes.formats.base import UNNAMED, Axes, Damaged, Raw, ScanError, affine_of, pick_key, read_spacing
 from curvafit.volumes.formats.part import Box, Part, cut_boxes, index_of, name_axes, read_part
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
@@ -46,9 +46,7 @@ class _Place(NamedTuple):
         """Return the affine `(4, 4)`, x first; None where the first voxel is at 0, or not known."""
         if self.spacing is None or self.first is None or len(self.spacing) < 3 or not any(self.first[-3:]):
             return None
-        affine = np.diag([*self.spacing[:-4:-1], 1.0])
-        affine[:3, 3] = self.first[:-4:-1]
-        return affine
+        return affine_of(np.diag(self.spacing[:-4:-1]), self.first[:-4:-1])
 
 
 def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
@@ -97,8 +95,7 @@ def _pick_array(node: Any, key: str | None, path: Path) -> tuple[dict[str, Any],
     images = {"": node} | {name: member for name, member in members.items() if name not in arrays}
     levels = {name: _levels(name, group.attrs.asdict()) for name, group in images.items()}
     firsts = {name: next(iter(places)) for name, places in levels.items() if places}
-    unasked = key is None
-    if key is None:
+    if unasked := key is None:
         volumes = [name for name in firsts if "labels" not in name.split("/")]
         key = firsts.get("") or (firsts[volumes[0]] if len(volumes) == 1 else None)
     elif key.strip("/") in firsts:
@@ -391,8 +388,8 @@ def _missing_chunks(array: Any, folder: Path) -> tuple[str, ...]:
             missing += _missing_within(array, path, inside)
         elif blosc:
             _check_blosc(path)
-    fill = f"their voxels have the fill value {array.fill_value}."
-    return (f"{missing} of {chunks} chunks are not stored: {fill}",) if missing else ()
+    note = f"{missing} of {chunks} chunks are not stored: their voxels have the fill value {array.fill_value}."
+    return (note,) if missing else ()
 
 
 def _check_blosc(chunk: Path) -> None:
