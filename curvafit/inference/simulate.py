@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -89,14 +90,11 @@ class Process(NamedTuple):
         for length, variance, noise in itertools.product(LENGTHS, VARIANCES, NOISES):
             covariance = variance * _correlate(places, places, length) + noise * np.eye(len(places))
             factor = np.linalg.cholesky(covariance)
-            tried.append(cls(places, factor, linalg.cho_solve((factor, True), values), length, variance, noise))
-        return min(tried, key=lambda process: process.deviance(values))
-
-    def deviance(self, values: np.ndarray) -> float:
-        """Return twice the negative log likelihood, the mean over columns, of the values it was fitted to, up to a
-        constant."""
-        fit = float((values * self.coefficients).sum()) / values.shape[1]
-        return fit + 2 * float(np.log(np.diag(self.factor)).sum())
+            process = cls(places, factor, linalg.cho_solve((factor, True), values), length, variance, noise)
+            # twice the negative log likelihood, the mean over columns, up to a constant
+            deviance = (values * process.coefficients).sum() / values.shape[1] + 2 * np.log(np.diag(factor)).sum()
+            tried.append((float(deviance), process))
+        return min(tried, key=itemgetter(0))[1]
 
     def __call__(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the means `(m, k)` and variances `(m,)`, with the noise, at places `(m, d)`."""

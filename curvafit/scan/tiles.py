@@ -32,7 +32,6 @@ from curvafit.priors.kernels.threads import one_thread
 from curvafit.scan import measure as whole
 from curvafit.scan.grids import CutOut, centre_distance, profile_mask, remove_specks, resample
 from curvafit.scan.measure import Blocks, Measures
-from curvafit.scan.measure import measure as measure_in_one
 from curvafit.scan.pieces import Found, open_finder
 from curvafit.scan.prepare import DROPPED, LARGEST_BOX, Prepared, TooLarge, note_on_filling, smallest_piece
 from curvafit.scan.structure import check_options
@@ -108,7 +107,7 @@ def measure(
     if roi is not None or periodic:
         if tile is not None:
             raise ValueError("a scan with a region or a periodic one is measured in one piece: leave out tile")
-        return measure_in_one(scan, periodic=periodic, roi=roi, progress=progress, **options, **reading)  # type: ignore[arg-type]
+        return whole.measure(scan, periodic=periodic, roi=roi, progress=progress, **options, **reading)  # type: ignore[arg-type]
     label = reading.pop("label", None)
     boxes = boxes_of(scan, **reading)
     if tile is None and max(boxes.frame.shape) <= LARGEST_BOX:

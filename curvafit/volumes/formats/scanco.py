@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from curvafit.volumes.formats.base import Damaged, Raw, ScanError, check_array, map_numbers
+from curvafit.volumes.formats.base import Damaged, Raw, ScanError, affine_of, check_array, map_numbers
 from curvafit.volumes.formats.part import Part, read_part
 
 #: AIM's types -> numpy's.
@@ -98,8 +98,7 @@ def _unpack_runs(path: Path, start: int, shape: Sequence[int], integer: np.dtype
 def _place(raw: Raw, spacing: np.ndarray, origin: np.ndarray, scaling: int) -> Raw:
     """Return the content with its place, of numbers (x, y, z) in mm in ITK's frame, and with what its values are."""
     flip = np.array([-1, -1, 1])  # from ITK's frame to NIfTI's
-    affine = np.diag([*flip * spacing, 1])
-    affine[:3, 3] = flip * origin
+    affine = affine_of(np.diag(flip * spacing), flip * origin)
     note = f"The values are the file's own: divided by {scaling}, they are the attenuation in 1/cm."
     notes = (note,) if scaling > 1 and raw.values.dtype.itemsize > 1 else ()
     return raw._replace(spacing=tuple(spacing[::-1].tolist()), unit="mm", affine=affine, notes=notes)
