@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -194,9 +194,8 @@ def teach_filler(
 ) -> None:
     """Teach the network that `reconstruct` fills volumes with. The same command resumes one that was stopped."""
     from curvafit.core.files import remove
-    from curvafit.segmentation import teach_image
     from curvafit.segmentation.filler import FILLER_FILE, Taught
-    from curvafit.segmentation.teach import FEW, STEPS, load_textures, teach
+    from curvafit.segmentation.teach import FEW, VOLUMES, load_textures, teach
 
     if filler is not None and not images:
         raise ValueError("--filler goes with --images")
@@ -208,12 +207,8 @@ def teach_filler(
         if (count := sum(map(len, sources))) < FEW:
             say_notes([f"{count} shapes teach little: {FEW} or more are better"])
         card["command"] = command_line()
-        how: dict[str, Any] = {"seed": seed, "checkpoint": checkpoint, "progress": progress}
-        if plain is None:
-            taught = teach(sources, card, steps=steps or STEPS, **how)
-        else:
-            how |= {"steps": steps or teach_image.STEPS, "volumes": images}
-            taught = teach_image.teach_image(sources, plain, card, **how)
+        how = {"plain": plain, "volumes": images or VOLUMES, "steps": steps, "seed": seed}
+        taught = teach(sources, card, **how, checkpoint=checkpoint, progress=progress)
     taught.save(out)
     remove(checkpoint)
     learnt, cubic = (taught.card[f"held_out_{each}"] for each in ("loss", "cubic"))

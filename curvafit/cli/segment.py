@@ -39,9 +39,7 @@ def segment(
     scan: Volume,
     out: Target,
     prior: Annotated[str | None, _what(help="fit.json or a preset's name; by default the Willmore energy.")] = None,
-    weight: Annotated[
-        float | None, _what(help="Cost of a unit of the energy, in nats; else 0.3 for a20 + a02 = 2.")
-    ] = None,
+    weight: Annotated[float | None, _what(help="Nats of a unit of the energy; else 0.3 for a20 + a02 = 2.")] = None,
     threshold: Annotated[str, _what(help="Grey level between the phases, or otsu.")] = "otsu",
     dark: Annotated[bool, _what("--dark", help="The structure is the dark phase.")] = False,
     probabilities: Annotated[bool, _what("--probabilities", help="The values are a network's probabilities.")] = False,
@@ -52,9 +50,7 @@ def segment(
     like: Annotated[Path | None, _what(help="Image of the same voxels; by default one of the NPZ's name.")] = None,
     epsilon: Epsilon = None,
     steps: Steps = 400,
-    tile: Annotated[
-        int | None, _what(help="Longest side of a tile, in working voxels: 192 beyond 256³.", min=8)
-    ] = None,
+    tile: Annotated[int | None, _what(help="Side of a tile, in working voxels: 192 beyond 256³.", min=8)] = None,
     workers: Annotated[int | None, _what(help="Processes that lower tiles; by default one.", min=0)] = None,
     reading: Reading,
     overwrite: OverwriteOption = False,
@@ -87,9 +83,8 @@ def segment(
         return
     given = {"example": example, "example_probabilities": example_probabilities, "like": like}
     texts = {name: None if path is None else str(path) for name, path in given.items()}
-    jobs, read = _list_maps(
-        _Job(scan, out, prior, reading, {**record, "probabilities": kind, **texts}, overwrite), texts
-    )
+    record |= {"probabilities": kind, **texts}
+    jobs, read = _list_maps(_Job(scan, out, prior, reading, record, overwrite), texts)
     if example is not None:
         chances = read(example_probabilities, like=None, crop=None)
         mask = load(example, **{name: reading[name] for name in ("spacing", "unit", "label", "strict")})
@@ -151,9 +146,7 @@ def reconstruct(
     slices: Volume,
     out: Target,
     prior: Annotated[str | None, _what(help="A law as in segment, to be tried; by default none.")] = None,
-    every: Annotated[
-        int | None, _what(help="Distance of known slices; by default those with labels are known.")
-    ] = None,
+    every: Annotated[int | None, _what(help="Distance of known slices; by default those with labels.")] = None,
     first: Annotated[int | None, _what(help="Number of the first known slice, with --every; by default 0.")] = None,
     known: Annotated[str | None, _what(help="Or also: numbers of known slices, 0,7,15.")] = None,
     ignore: Annotated[int | None, _what(help="Or: the label of voxels that nobody annotated.")] = None,
@@ -167,14 +160,10 @@ def reconstruct(
     stiffness: Annotated[float | None, _what(help="Stiffness of springs on the known slices: try nothing out.")] = None,
     periodic: Annotated[bool, _what("--periodic", help="The volume repeats, as generated ones do.")] = False,
     suggest: Annotated[int, _what(help="Number of slices to suggest for annotation next.", min=0)] = 0,
-    sure: Annotated[
-        float | None, _what(help="Also write labels, to be ignored where less probable than this.", min=0.5, max=1)
-    ] = None,
+    sure: Annotated[float | None, _what(help="Also write labels, ignored where less sure.", min=0.5, max=1)] = None,
     epsilon: Epsilon = None,
     steps: Steps = 400,
-    tile: Annotated[
-        int | None, _what(help="Side of a block filled into Zarr; with a law as in segment.", min=8)
-    ] = None,
+    tile: Annotated[int | None, _what(help="Side of a block into Zarr; with a law as in segment.", min=8)] = None,
     workers: Annotated[int | None, _what(help="Processes for blocks or tiles; by default one.", min=0)] = None,
     reading: Reading,
     overwrite: OverwriteOption = False,
@@ -182,9 +171,22 @@ def reconstruct(
     """Fill a mask between known slices; write it, the probability of each voxel, a picture and a record."""
     from curvafit.volumes.boxes import boxes_of
 
-    options, several = _parse_slices(every, first, known, ignore, axis, labels, reading["label"])
-    if instances is not None and None in (labels, image):
-        raise ValueError("--instances and --no-instances go with --labels and --image")
+    named = every is not None or known is not None
+    for wrong, sentence in (
+        (axis.lower() not in ("z", "y", "x"), f"--axis must be z, y or x, got {axis!r}"),
+        (
+            named and ignore is not None,
+            "give either --every and --known, which slices are known, or --ignore, what is not",
+        ),
+        (None not in (labels, reading["label"]), "--labels is for several structures; --label is for one"),
+        (every is None and first is not None, f"--first {first} goes with --every"),
+        (instances is not None and None in (labels, image), "--instances goes with --labels and --image"),
+    ):
+        if wrong:
+            raise ValueError(sentence)
+    several = None if labels in (None, "all") else list(parse_whole_numbers(labels, "--labels"))
+    numbers = None if known is None else list(parse_whole_numbers(known, "--known"))
+    options: dict[str, Any] = {"every": every, "first": first or 0, "known": numbers, "axis": "zyx".index(axis.lower())}
     options |= {"epsilon": epsilon, "suggest": suggest, "filler": None if filler is None else str(filler)}
     whole = {"ignore": ignore, "stiffness": stiffness, "periodic": periodic}  # what is not filled in blocks
     shown = {"image": image, "example": None if example is None else str(example)}
@@ -215,29 +217,6 @@ def reconstruct(
         return reconstruct_labels(read_whole(volume), prior, chosen=several, instances=instances, **tools)
 
     _run(job, compute, partial(boxes_of, slices, **reading), sure=sure)
-
-
-def _parse_slices(
-    every: int | None,
-    first: int | None,
-    known: str | None,
-    ignore: int | None,
-    axis: str,
-    labels: str | None,
-    label: int | None,
-) -> tuple[dict[str, Any], list[int] | None]:
-    """Return which slices are known, as `reconstruct` takes it, and which labels are several structures."""
-    if axis.lower() not in ("z", "y", "x"):
-        raise ValueError(f"--axis must be z, y or x, got {axis!r}")
-    if (every is not None or known is not None) and ignore is not None:
-        raise ValueError("give either --every and --known, which slices are known, or --ignore, what is not")
-    if labels is not None and label is not None:
-        raise ValueError("--labels is for several structures; --label is for one")
-    if every is None and first is not None:
-        raise ValueError(f"--first {first} goes with --every")
-    several = None if labels in (None, "all") else list(parse_whole_numbers(labels, "--labels"))
-    numbers = None if known is None else list(parse_whole_numbers(known, "--known"))
-    return {"every": every, "first": first or 0, "known": numbers, "axis": "zyx".index(axis.lower())}, several
 
 
 def _fill_blocks(job: _Job, options: dict[str, Any]) -> bool:

@@ -64,11 +64,6 @@ class Fill:
     before: np.ndarray
     after: np.ndarray
 
-    @property
-    def empty(self) -> bool:
-        """Whether the fill changed nothing."""
-        return bool((self.before == self.after).all())
-
     def stands(self, values: np.ndarray) -> bool:
         """Return whether more slices are as the fill left them than as they were before: else it was undone."""
         changed = self.before != self.after
@@ -233,7 +228,7 @@ def _standing(fills: Sequence[Fill], values: np.ndarray) -> list[Fill]:
     alike = [fill for fill in fills if fill.shape == values.shape]
     count = len(alike)
     for k in range(len(alike) - 1, -1, -1):
-        if not alike[k].empty:
+        if (alike[k].before != alike[k].after).any():
             if alike[k].stands(values):
                 break
             count = k

@@ -48,10 +48,10 @@ from curvafit.segmentation.result import (
     doubt_labels,
     doubt_places,
     finish_mask,
+    flow_summary,
     hidden_store,
     map_path,
     note_labelled,
-    volume_summary,
 )
 from curvafit.segmentation.slices import (
     LABELS,
@@ -66,10 +66,11 @@ from curvafit.segmentation.slices import (
 )
 from curvafit.segmentation.tiles import check_edge
 from curvafit.segmentation.uncertainty import (
+    LEAST,
+    best_threshold,
     count_probabilities,
     doubt,
     entropy,
-    lowest_inside,
     share_by_slices,
     suggest_slices,
 )
@@ -154,19 +155,15 @@ def reconstruct_file(
         A mask, or labels, positive inside; only the known slices count.
     path
         The store to write, `mask.zarr`, or labels of an OME-Zarr image, `IMAGE.zarr/labels/NAME`.
-    every, first, known, axis, suggest, filler, epsilon
-        As in `reconstruct`.
     tile
         Voxels a side of a block, up to whole chunks; by default memory decides.
     store
-        The folder where finished blocks are until all is written, so that a killed run goes on; it must be on the disk
-        of the path. By default it is beside the path.
+        The folder, on the disk of the path, of finished blocks until all is written: a killed run goes on. By default
+        it is beside the path.
     workers
         Processes that fill blocks of a file that is not read at once, or dask's workers; by default this process does.
-    record, inputs, overwrite
-        As in `write_mask`; no input is overwritten.
-    label, reading
-        The label that is inside, and options of reading the file: see `curvafit.load`.
+
+    The others are those of `reconstruct`, `write_mask` and `curvafit.load`; no input is overwritten.
 
     Raises
     ------
@@ -200,7 +197,7 @@ def reconstruct_file(
         job = job.cut(tile)
         job.create(frame, target)
         filled = _gather(job, find(_FILL, partial(fill_block, job), len(job.cores), job.describe(find.processes)))
-        threshold = lowest_inside(filled["counts"])
+        threshold = max(best_threshold(filled["counts"]), LEAST)
         cut = _gather(job, find(_CUT, partial(cut_block, job, threshold), len(job.cores)))
         for name in (job.mask, job.probability):
             for level in range(1, len(group := open_zarr(folder / name))):
@@ -214,7 +211,7 @@ def reconstruct_file(
             mean_probability=float(filled["total"]) / size,
         )  # fmt: skip
         share = inside / size
-        ways = (taught.status, volume_summary(share), share, uncertain)
+        ways = (taught.status, flow_summary(share), share, uncertain)
         status, more = describe_filled(*ways, places, depth, tested="generated shapes")
         notes = (*frame.notes, *which, *doubts, *more)
         result = Segmentation(frame, frame, None, None, width, status, notes, uncertain)
@@ -320,10 +317,6 @@ class Job:
         """Write a core of the finest level of a store."""
         level_of(open_zarr(self.folder / name), 0)[self.turn_back(core)] = np.moveaxis(values, 0, self.axis)
 
-    def read(self, name: str, core: Box) -> np.ndarray:
-        """Read a core of the finest level of a store."""
-        return np.moveaxis(open_zarr(self.folder / name)["0"][self.turn_back(core)], self.axis, 0)
-
     def draw(self, unsure: Sequence[np.ndarray], frame: Field) -> Figure:
         """Draw the most uncertain slices across each axis, given the entropy of all slices across the job's axes."""
         from curvafit.drawing.plot import THIN, Sections, draw_sections, grey_limits
@@ -331,8 +324,8 @@ class Job:
         places = [int(each.argmax()) for each in unsure]
         places.insert(self.axis, places.pop(0))
         mask, likely = (open_zarr(self.folder / name) for name in (self.mask, self.probability))
-        outlines = [_take(mask["0"], axis, place) for axis, place in enumerate(places)]
-        doubts = [entropy(_take(likely["0"], axis, place)) for axis, place in enumerate(places)]
+        where = [(*(slice(None),) * axis, place) for axis, place in enumerate(places)]
+        outlines, doubts = [np.asarray(mask["0"][at]) for at in where], [entropy(likely["0"][at]) for at in where]
         known = [np.where(e == 0, 2 * m.astype(np.int8) - 1, 0) for e, m in zip(doubts, outlines, strict=True)]
         coarse = next(each for k in range(len(likely)) if max((each := likely[str(k)]).shape) <= THIN)
         rows = {
@@ -340,13 +333,6 @@ class Job:
             "how unsure": Sections(doubts, outlines, grey_limits(entropy(coarse[...]))),
         }
         return draw_sections(rows, frame.spacing, frame.unit, places)
-
-
-def _take(array: Any, axis: int, place: int) -> np.ndarray:
-    """Return a slice across an axis of a stored array."""
-    index: list[Any] = [slice(None)] * 3
-    index[axis] = place
-    return np.asarray(array[tuple(index)])
 
 
 def _read_known(job: Job, find: Finder, doubted: bool) -> tuple[Job, tuple[str, ...]]:
@@ -420,19 +406,16 @@ def fill_block(job: Job, number: int) -> Found:
         along[1] += unsure.sum(1)
         along[2] += unsure.sum(0)
     told = likely[slices.between[rows]]
-    sums = {
-        "counts": count_probabilities(told),
-        "sum": told.sum(dtype=np.float64),
-        "total": likely[~far].sum(dtype=np.float64),
-    }
-    return {**sums, **{f"along {k}": each for k, each in enumerate(along)}}
+    sums = {"sum": told.sum(dtype=np.float64), "total": likely[~far].sum(dtype=np.float64)}
+    return {"counts": count_probabilities(told), **sums, **{f"along {k}": each for k, each in enumerate(along)}}
 
 
 def cut_block(job: Job, threshold: float, number: int) -> Found:
     """Write the mask of a block, given the probability from which voxels between known slices are inside; return how
     many are, and between known slices their number and the sum of their probabilities."""
     core = job.cores[number]
-    likely, between = job.read(job.probability, core), job.slices.between[core[0]]
+    stored = open_zarr(job.folder / job.probability)["0"][job.turn_back(core)]
+    likely, between = np.moveaxis(stored, job.axis, 0), job.slices.between[core[0]]
     mask = likely > np.where(between, threshold, 0.5).astype(np.float32)[:, None, None]
     job.write(job.mask, core, mask.view(np.uint8))
     told = mask[between]
@@ -442,19 +425,17 @@ def cut_block(job: Job, threshold: float, number: int) -> Found:
 
 def halve_core(path: Path, level: int, number: int) -> Found:
     """Write a part of a level of a store from the level before it."""
-    group = open_zarr(path)
-    halve_level(group, level, cores_of(group, level)[number])
+    halve_level(group := open_zarr(path), level, cores_of(group, level)[number])
     return {}
 
 
 def _gather(job: Job, found: Iterable[Found]) -> dict[str, Any]:
     """Return the sums over blocks; of what is along an axis, in its slices."""
-    total: dict[str, Any] = {}
+    total: dict[str, Any] = {f"along {k}": np.zeros(n) for k, n in enumerate(job.shape)}
     for core, each in zip(job.cores, found, strict=True):
         for name, values in each.items():
             if name.startswith("along"):
-                axis = int(name[-1])
-                total.setdefault(name, np.zeros(job.shape[axis]))[core[axis]] += values
+                total[name][core[int(name[-1])]] += values
             else:
                 total[name] = total.get(name, 0) + values
     return total

@@ -10,7 +10,7 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +105,8 @@ class GreyEvidence:
         first = classes = estimate_classes(levels, sample, threshold, dark)
         if apart and threshold == "otsu" and abs(classes.contrast) < OVERLAP * classes.noise:
             inside = grey_evidence(levels, sample, classes).level > 0
-            deep = [levels[_erode(side)] for side in (~inside, inside)]
+            erode = partial(ndimage.binary_erosion, iterations=DEEP, border_value=1)
+            deep = [levels[erode(side)] for side in (~inside, inside)]
             if min(map(len, deep)) >= FEWEST:
                 outer, inner = (float(side.mean(dtype=np.float64)) for side in deep)
                 classes = replace(classes, outside=outer, inside=inner, middle=(outer + inner) / 2)
@@ -184,10 +185,6 @@ def probability_evidence(probability: Field) -> VoxelEvidence:
     return VoxelEvidence(np.log(p / (1 - p)), values.clip(0, 1) - np.float32(0.5))
 
 
-def _erode(side: np.ndarray) -> np.ndarray:
-    return np.asarray(ndimage.binary_erosion(side, iterations=DEEP, border_value=1), dtype=bool)
-
-
 def _smooth(values: np.ndarray, scan: Field, width: float) -> np.ndarray:
     """Smooth by a Gaussian whose deviation is `width` voxels of the finest axis."""
     finest = min(scan.spacing)
@@ -231,7 +228,7 @@ def load_probabilities(
 ) -> Field:
     """Load a network's probabilities at the place of `like`, an image of the same voxels, where there is one.
 
-    See `refine` for the parameters. Raises `ScanError` if the image has another shape, or both an image and a spacing
+    See `segment` for the parameters. Raises `ScanError` if the image has another shape, or both an image and a spacing
     or unit are given.
     """
     stated = spacing is not None or unit is not None
@@ -239,17 +236,14 @@ def load_probabilities(
         raise ScanError("give either an image that says where the voxels are, or a spacing and unit, got both")
     image = find_image(source) if like is None and not stated else like
     if image is None:
-        return _to_probabilities(field_of(source, spacing=spacing, unit=unit, crop=crop, **reading), logits)
-    place = place_of(image)
-    field = field_of(source, spacing=place.spacing, unit=place.unit, **reading)
-    if field.shape != place.shape:
-        raise ScanError(f"the probabilities must have the shape {place.shape} of {image}, got {field.shape}")
-    field = replace(field, affine=place.affine, notes=(*field.notes, f"The voxels are those of {image}."))
-    return _to_probabilities(field if crop is None else field.crop(crop), logits)
-
-
-def _to_probabilities(field: Field, logits: bool) -> Field:
-    """Return a field of probabilities, of one of log-odds if it is that."""
+        field = field_of(source, spacing=spacing, unit=unit, crop=crop, **reading)
+    else:
+        place = place_of(image)
+        field = field_of(source, spacing=place.spacing, unit=place.unit, **reading)
+        if field.shape != place.shape:
+            raise ScanError(f"the probabilities must have the shape {place.shape} of {image}, got {field.shape}")
+        field = replace(field, affine=place.affine, notes=(*field.notes, f"The voxels are those of {image}."))
+        field = field if crop is None else field.crop(crop)
     return replace(field, values=expit(field.values.astype(np.float32))) if logits else field
 
 

@@ -48,12 +48,8 @@ CONDITIONS = 4
 class Block(nn.Module):
     """Two convolutions with a shortcut; features are normalised over channels, pixel by pixel.
 
-    Parameters
-    ----------
-    conditions
-        Length of a condition that scales and shifts each channel.
-    skips
-        Channels of features that are the same for all slices of a gap: they are convolved once, and added.
+    A condition, `conditions` long, scales and shifts each channel; `skips` channels of features that are the same for
+    all slices of a gap are convolved once, and added.
     """
 
     def __init__(self, inputs: int, outputs: int, conditions: int = 0, skips: int = 0) -> None:
@@ -83,19 +79,11 @@ def _normalise(x: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Gaps:
-    """Gaps between known slices, B at a time, all with n slices to fill.
+    """Gaps between known slices, B at a time, all with n slices to fill, `step` (B,) pixels apart.
 
-    Attributes
-    ----------
-    distances
-        Signed distances in the four nearest known slices (B, 4, Y, X), in pixels, positive inside, cut at `FAR`; the
-        gap is between the second and the third. Y and X are multiples of 4.
-    step
-        Distance from slice to slice (B,), in pixels.
-    marks
-        What is known in the slices to fill (B, n, Y, X): 1 inside, -1 outside, 0 not known.
-    evidence
-        What an image says of the slices to fill, as log-odds (B, n, Y, X); None without an image.
+    `distances` are signed ones in the four nearest known slices (B, 4, Y, X), in pixels, positive inside, cut at `FAR`;
+    the gap is between the second and the third, Y and X are multiples of 4. Of the slices to fill (B, n, Y, X), `marks`
+    say what is known, 1 inside, -1 outside, 0 unknown, and `evidence` what an image says, as log-odds.
     """
 
     distances: Tensor
@@ -254,11 +242,7 @@ TILE = 256
 
 
 def fill(
-    slices: Slices,
-    taught: Taught,
-    *,
-    evidence: np.ndarray | None = None,
-    progress: Progress = silent,
+    slices: Slices, taught: Taught, *, evidence: np.ndarray | None = None, progress: Progress = silent
 ) -> np.ndarray:
     """Return calibrated log-odds of the inside of a volume between known slices, float32 (length, Y, X).
 
@@ -457,12 +441,7 @@ def choose_pixel(thickness: float, edges: Sequence[float], gap: float) -> float:
 
 @torch.inference_mode()
 def _fill_gap(
-    filler: Filler,
-    known: np.ndarray,
-    marks: np.ndarray | None,
-    evidence: np.ndarray | None,
-    count: int,
-    step: float,
+    filler: Filler, known: np.ndarray, marks: np.ndarray | None, evidence: np.ndarray | None, count: int, step: float
 ) -> np.ndarray:
     """Return the log-odds (count, Y, X) in the slices of a gap whose four known slices have distances (4, Y', X').
 
@@ -492,18 +471,10 @@ def _fill_gap(
 
 @dataclass(frozen=True, eq=False)
 class Taught:
-    """A filler with its card: what taught it, how well it does on shapes held out, and its temperatures.
+    """A filler with its `card` of JSON's types, on what taught it and how well it does on shapes held out.
 
-    Attributes
-    ----------
-    temperatures
-        Gaps in pixels, ascending, and by what log-odds are divided there to be true probabilities: (2, k).
-    card
-        Stores, seeds, steps, versions and held-out figures, of JSON's types.
-    error
-        The calibration error near surfaces, on shapes held out or on an example.
-    status
-        What fills, as the beginning of a sentence.
+    `temperatures` (2, k) are gaps in pixels, ascending, and by what log-odds are divided there to be true; `error` is
+    the calibration error near surfaces on shapes held out, or an example; `status` begins a sentence on what fills.
     """
 
     filler: Filler

@@ -12,14 +12,13 @@ from torch.nn.functional import pad
 
 from curvafit.core.checks import LONGEST, SHORTEST, check_float
 from curvafit.core.runtime import Progress, silent
-from curvafit.generation.data import Data, Evidence
+from curvafit.generation.data import Data
 from curvafit.generation.flow import WORKING_BLUR, Flow, descend
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.loss import RESOLVED, choose_refinement
 from curvafit.priors.profile import phase_field
 from curvafit.priors.stencils import refine_axis
-from curvafit.segmentation.evidence import VoxelEvidence
 from curvafit.volumes.field import Field, ScanError
 
 #: Default steps of Adam.
@@ -41,10 +40,6 @@ def lower_energy(
     does not matter; D is on the working grid, in units of F_ε of a law with a20 + a02 = 2. Raises `ScanError` if a20 +
     a02 is not positive, or the energy does not stay finite.
     """
-
-    def watch(step: int, total: int, state: object) -> None:
-        progress("lowering the energy", step / total)
-
     flow = descend(
         initial_field(level, place),
         law.scale(BENDING / bending(law)).in_unit(place.unit),
@@ -54,16 +49,11 @@ def lower_energy(
         steps=steps,
         schedule="cosine",
         blur=WORKING_BLUR,
-        callbacks=[watch],
+        callbacks=[lambda step, total, _: progress("lowering the energy", step / total)],
     )
     if not flow.finite:
         raise ScanError(f"the energy did not stay finite ({flow.status}): lower the weight")
     return flow
-
-
-def likelihood(evidence: VoxelEvidence, nats: float, place: WorkingGrid) -> Evidence:
-    """Return -log p(scan | mask) in units of F_ε, where a unit of F_ε costs `nats`."""
-    return Evidence(place.spread(evidence.ratio) / (nats * place.grid.voxel_volume))
 
 
 def initial_field(level: np.ndarray, place: WorkingGrid) -> Tensor:

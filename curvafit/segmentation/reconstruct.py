@@ -37,7 +37,6 @@ from curvafit.segmentation.result import (
     doubt_places,
     flow_summary,
     note_labelled,
-    volume_summary,
 )
 from curvafit.segmentation.slices import (
     IDS,
@@ -224,19 +223,19 @@ def reconstruct(
     if chosen.law is None:
         phase = engine.run(target, chosen)
         mask, likely = target.keep_known(phase > 0), (expit(engine.logits(target)), taught.error)
-        summary = volume_summary(float(mask.mean()))
+        summary = flow_summary(float(mask.mean()))
     else:
         tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
         problem = SlicesProblem(chosen, target, engine.level(target))
         found = lower_volume(problem, tiling, store=store, workers=workers, progress=progress)
         mask, phase = target.keep_known(found.mask & ~target.outside[:, None, None]), found.phase
-        summary, notes = flow_summary(found), (*notes, *tiling.place.notes)
+        summary = flow_summary(float(found.mask.mean()), found.energies, found.steps)
+        notes = (*notes, *tiling.place.notes)
         likely = _weigh_evidence(engine, chosen, task, target, phase)
     uncertain = _uncertainty(*likely, mask, target, given, told=evidence is not None)
     tested = "the example" if other else "slices left out" if chosen.law else "generated shapes"
     ways = {"tested": tested, "image": evidence is not None, "periodic": periodic}
-    share = float(mask.mean())
-    status, doubts = describe_filled(said, summary, share, uncertain, given.places, target.length, **ways)
+    status, doubts = describe_filled(said, summary, float(mask.mean()), uncertain, given.places, target.length, **ways)
     labels = doubt_labels(np.unique(given.turn(volume.values)[given.places]), ignore)
     return Segmentation.of(
         volume, given.turn_back(mask), given.turn_back(phase), chosen.law, width,
@@ -345,10 +344,7 @@ class SlicesProblem(Problem):
         return {"slices": digest_of(slices.inside), **numbers, "start": digest_of(self.level), **springs}
 
     def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, data.Data]:
-        """Return the level on a box, and the hinge term that holds voxels there.
-
-        Known voxels are held with the trial's strength, those between known slices by its pull for each nat.
-        """
+        """Return the level on a box, and the hinge term that holds known voxels, and by the pull those between."""
         slices, trial, (rows, inside) = self.slices, self.trial, self.slices.known(box)
         numbers = slices.numbers(box)
         level = self.level[np.ix_(*numbers)]
@@ -361,7 +357,7 @@ class SlicesProblem(Problem):
         return level, data.Hinge(place.spread(pull, centre=0), MARGIN)
 
     def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
-        """Return the optimal profile tanh(d / √2 ε) of the level."""
+        """Return the optimal profile of the level."""
         return _profile(level, place.epsilon)
 
     def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
@@ -387,11 +383,8 @@ def _pose_task(slices: Slices, example: Example | None) -> Task[Slices]:
 def _weigh_evidence(
     engine: _Engine, trial: Trial, task: Task[Slices] | None, target: Slices, phase: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return the probability of the inside (Z, Y, X) where a law was lowered, and its calibration error on the task.
-
-    The evidence is the network's log-odds and the depth below the law's surface, with weights fitted to the task; where
-    there is none, all the weight is the network's.
-    """
+    """Return the probability of the inside (Z, Y, X) where a law was lowered, by the network's log-odds and the depth
+    below the law's surface, with weights fitted to the task if there is one; and its calibration error there."""
 
     def evidence(slices: Slices, phase: np.ndarray, rows: list[int]) -> np.ndarray:
         depth = profile_distance(torch.from_numpy(phase[rows]), float(RESOLVED)).numpy()
@@ -411,8 +404,7 @@ def _weigh_evidence(
 def _uncertainty(
     likely: np.ndarray, error: float, mask: np.ndarray, slices: Slices, given: _Given, *, told: bool
 ) -> Uncertainty:
-    """Return probabilities (Z, Y, X) as a volume, 0 or 1 where it is known, what they say of the mask, slices to
-    annotate next, and the volume by known slices; `told` says whether an image tells the ends."""
+    """Return what probabilities (Z, Y, X) say; `told` says whether an image tells the ends."""
     inside = slices.keep_known(np.zeros(slices.shape, dtype=bool))
     values = np.where(slices.known_voxels, inside, likely).astype(np.float32)
     suggestions = suggest_slices(doubt(values).sum((1, 2)), slices.places, given.suggest, slices.periodic)
@@ -494,8 +486,8 @@ def reconstruct_labels(
         read for each by itself. By default they are if nine in ten are one piece in each known slice and grey levels
         vary more within them than between them. Where every voxel is labelled, or the volume repeats, each is read by
         itself.
-    image, store, progress, spacing, unit, options
-        As in `reconstruct`, of which options are all others: every, known, ignore, axis and so on.
+    options
+        Those of `reconstruct`, as are the others.
 
     Returns
     -------
@@ -548,10 +540,13 @@ def reconstruct_labels(
     error = max(doubt.calibration_error for doubt in (whole and whole.uncertainty, *doubts.values()) if doubt)
     following = suggest_slices(doubt(given.turn(likely)).sum((1, 2)), places, given.suggest, periodic)
     likely = replace(volume, values=likely, notes=())
+    table = np.array([0, *numbers], volume.values.dtype if volume.values.dtype.kind in "iu" else np.int64)
+    if (kind := smallest_type(table)).itemsize < 8:  # of 64 bits the given one
+        table = table.astype(kind)
     return Segmentation.of(
         volume, values != 0, np.maximum(phase, -1), None, max(part.epsilon for _, part in parts), (*notes, *said),
         weight=None, status=_describe_labels(parts, dice, whole, following), image=seen,
-        labels=replace(volume, values=_restore(values, numbers, volume.values.dtype), notes=()),
+        labels=replace(volume, values=table[values], notes=()),
         uncertainty=Uncertainty(likely, error, following, min(dice.values()), dice),
     )  # fmt: skip
 
@@ -609,12 +604,13 @@ def _fill_each(
         parts.append((box, part))
         for note in part.notes:
             notes.setdefault(note, []).append(number)
-    return parts, [text if len(of) == len(numbers) else f"{_name_labels(of)}: {text}" for text, of in notes.items()]
+    named = {text: f"Label{'s' * (len(of) > 1)} {', '.join(map(str, of))}: {text}" for text, of in notes.items()}
+    return parts, [text if len(notes[text]) == len(numbers) else said for text, said in named.items()]
 
 
 def _join_parts(labels: _Labels, parts: _Parts, full: bool, far: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the label with the greatest phase field at each voxel, by its place, 0 where there is none, and where it
-    is `far` from known slices; how likely that is; this phase field; and the sum of the labels' odds."""
+    """Return the place of the label with the greatest phase field at each voxel, 0 where there is none or `far` from
+    known slices; how likely that is; this phase field; and the sum of the labels' odds."""
     shape = labels.values.shape
     deepest, owner = np.full(shape, -np.inf, dtype=np.float32), np.zeros(shape, dtype=np.int16)
     largest, odds = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
@@ -635,8 +631,8 @@ def _join_parts(labels: _Labels, parts: _Parts, full: bool, far: np.ndarray) -> 
 def _split_instances(
     labels: _Labels, parts: _Parts, whole: Segmentation, values: np.ndarray, odds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[float]]:
-    """Split what all labels fill as one structure by where each is alone; return places and their probabilities, which
-    are that of the structure times the label's share in the odds of all, and the Dice to expect of each."""
+    """Split what all labels fill as one structure by where each is alone; return places, their probabilities (that of
+    the structure times the label's share in the odds of all), and the Dice to expect of each."""
     assert whole.probability is not None
     values = split_structure(whole.mask.values, values, labels.known, labels.given.volume.spacing)
     inside, given = whole.probability.values, labels.given
@@ -650,13 +646,6 @@ def _split_instances(
         own, mine = (given.turn(each)[between[box[given.axis]]] for each in (own, mine))
         dice.append(expected_dice(own, mine) if own.size else 1.0)
     return values, likely, dice
-
-
-def _restore(values: np.ndarray, numbers: Sequence[int], given: np.dtype) -> np.ndarray:
-    """Return labels by their places, in the smallest type for them, or in the given one where that has 64 bits."""
-    table = np.array([0, *numbers], given if given.kind in "iu" else np.int64)
-    kind = smallest_type(table)
-    return table.astype(kind if kind.itemsize < 8 else table.dtype)[values]
 
 
 def _box_of_label(inside: np.ndarray, labels: _Labels) -> Box:
@@ -675,10 +664,6 @@ def _box_of_label(inside: np.ndarray, labels: _Labels) -> Box:
             margin = ROOM + math.ceil(step / spacing[k])
             box.append(slice(max(low - margin, 0), min(high + 1 + margin, inside.shape[k])))
     return box[0], box[1], box[2]
-
-
-def _name_labels(numbers: Sequence[int]) -> str:
-    return f"Label{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"
 
 
 def _describe_labels(

@@ -20,7 +20,6 @@ from curvafit.core.runtime import hold_signals
 from curvafit.core.units import format_sampling
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.slices import IDS, reach_of
-from curvafit.segmentation.tiles import LoweredVolume
 from curvafit.segmentation.uncertainty import doubt
 from curvafit.volumes.field import Field
 from curvafit.volumes.formats.nifti import write_nifti_like
@@ -169,15 +168,9 @@ class Segmentation(Pictured):
         return f"Segmentation({size}, {count}: {self.status})"
 
 
-def volume_summary(share: float) -> str:
-    """Say which share of the volume is inside."""
-    return f"{100 * share:.2f} % of the volume is inside"
-
-
-def flow_summary(lowered: LoweredVolume) -> str:
+def flow_summary(share: float, energy: Sequence[float] = (), steps: int = 0) -> str:
     """Say whether a flow settled, if there was one, and which share of the volume is inside."""
-    share, energy, steps = float(lowered.mask.mean()), lowered.energies, lowered.steps
-    inside = volume_summary(share)
+    inside = f"{100 * share:.2f} % of the volume is inside"
     if not steps:
         return inside
     fall = (energy[0] - energy[-1]) / max(abs(energy[-1]), 1e-30) if len(energy) > 1 else 1.0
@@ -249,19 +242,9 @@ def write_mask(
     their paths are returned. Former ones of `MAPS` are removed. Of labels in an image, `scan.zarr/labels/NAME`, all
     others lie beside the store: `scan_NAME.png` and so on.
 
-    Parameters
-    ----------
-    scan
-        The scan, for the picture's grey levels.
-    sure
-        Labels of `Segmentation.keep_sure`, for `mask_sure.nii.gz`.
-    like, unit
-        The scan's file, and the unit of its lengths, by default its header's. If this file and the target are NIfTI,
-        the mask gets the same header but for type and range.
-    record
-        Entries to add to the record.
-    overwrite
-        Whether files of other origin may be replaced.
+    `sure` are labels of `Segmentation.keep_sure`, for `mask_sure.nii.gz`. Where the scan's file, `like`, and the target
+    are NIfTI, the mask gets the same header but for type and range, and `unit`. `record` has entries to add to the
+    record; with `overwrite` files of other origin may be replaced.
     """
     maps = {
         name: each.values for name, each in zip(MAPS, (segmentation.probability, sure), strict=True) if each is not None

@@ -17,7 +17,7 @@ from curvafit.priors.law import LawLike
 from curvafit.scan.grids import box_with_most_surface
 from curvafit.scan.structure import check_options
 from curvafit.segmentation.evidence import GreyEvidence, VolumeEvidence, load_probabilities, probability_evidence
-from curvafit.segmentation.flow import BENDING, STEPS, WorkingGrid, bending, likelihood
+from curvafit.segmentation.flow import BENDING, STEPS, WorkingGrid, bending
 from curvafit.segmentation.result import Segmentation, flow_summary
 from curvafit.segmentation.slices import check_spacing, require_labels
 from curvafit.segmentation.tiles import LoweredVolume, Problem, Tiling, lower_volume
@@ -151,7 +151,7 @@ def segment(
     return Segmentation.of(
         boxes.frame, found.mask, found.phase, trial.law, tiling.place.epsilon, (*notes, *tiling.place.notes),
         weight=None if trial.law is None else trial.strength * BENDING / bending(trial.law),
-        status=f"{said}{flow_summary(found)}",
+        status=f"{said}{flow_summary(float(found.mask.mean()), found.energies, found.steps)}",
     )  # fmt: skip
 
 
@@ -176,12 +176,8 @@ def check_given(
 
 
 def lower(evidence: VolumeEvidence, trial: Trial, tiling: Tiling, **tools: Any) -> LoweredVolume:
-    """Lower -log p(data | mask) + λ F_ε from the evidence's first guess, tile by tile, with the `tools` of
-    `lower_volume`.
-
-    `trial` has the law and λ, in nats of a unit of F_ε if a20 + a02 = 2. The first guess is the result where there is
-    no law, or no surface.
-    """
+    """Lower -log p(data | mask) + λ F_ε from the evidence's first guess, the result without law or surface;
+    `trial` has λ, in nats of a unit of F_ε if a20 + a02 = 2."""
     stays = trial.law is not None and _missing_phase(evidence, tiling)
     return lower_volume(EvidenceProblem(replace(trial, law=None) if stays else trial, evidence), tiling, **tools)
 
@@ -197,8 +193,8 @@ class EvidenceProblem(Problem):
         return {"evidence": self.evidence.digest, "nats": self.trial.strength}
 
     def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Evidence]:
-        evidence = self.evidence.of_box(box)
-        return evidence.level, likelihood(evidence, self.trial.strength or 1.0, place)  # no law has no strength
+        found, nats = self.evidence.of_box(box), self.trial.strength or 1.0  # no law has no strength
+        return found.level, Evidence(place.spread(found.ratio) / (nats * place.grid.voxel_volume))
 
     def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
         return np.clip(2 * level, -1, 1)  # the level of probabilities is p - 1/2, of grey levels in contrasts
@@ -287,7 +283,11 @@ def calibrate(
     if inside.all() or not inside.any():
         state = "full" if inside.all() else "empty"
         raise ScanError(f"the example must have voxels inside and outside, but is {state}")
-    laws, notes = laws_of(infer_law(truth, progress) if prior is None else prior, field)
+    if prior is None:
+        from curvafit.inference.infer import infer  # takes long to import
+
+        prior = infer(truth, kind="mask", fast=True, progress=progress)
+    laws, notes = laws_of(prior, field)
     tried = laws if WILLMORE in laws else (*laws, WILLMORE)
     for law in tried:
         bending(law)  # refuses a law before the work
@@ -309,10 +309,3 @@ def calibrate(
     task = Task(probability_evidence(part), inside[where], range(part.shape[0]))
     best = choose_by_masks(task, [Trial(law, FIRST, steps) for law in tried], fill, NATS)
     return Calibration(best, best.law in laws, field, (*notes, *truth.notes, *laid))
-
-
-def infer_law(mask: Field, progress: Progress) -> LawLike:
-    """Infer the law of a mask in seconds, without growing anything."""
-    from curvafit.inference.infer import infer  # takes long to import
-
-    return infer(mask, kind="mask", fast=True, progress=progress)

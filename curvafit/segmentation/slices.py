@@ -33,22 +33,11 @@ WHOLE: Box = (slice(0, None), slice(0, None), slice(0, None))
 
 @dataclass(frozen=True, eq=False)
 class Slices:
-    """The known slices across the first axis of a volume.
+    """The known slices across the first axis of a volume of `length` slices: their masks, bool (N, Y, X), and their
+    numbers, ascending.
 
-    Attributes
-    ----------
-    inside
-        Their masks, bool (N, Y, X).
-    places
-        Their N numbers along the axis, ascending.
-    length
-        Number of slices of the volume.
-    spacing, unit
-        Voxel edges (z, y, x), and their unit.
-    periodic
-        Whether the last slice of the volume is followed by the first.
-    marks
-        What is known in the other slices, int8 (length, Y, X): 1 inside, -1 outside, 0 unknown. None if nothing is.
+    In a `periodic` volume the first slice follows the last. `marks` say what is known in the other slices, int8
+    (length, Y, X): 1 inside, -1 outside, 0 unknown; None if nothing is.
     """
 
     inside: np.ndarray
@@ -78,18 +67,11 @@ class Slices:
         edges = turn_axes(volume.spacing, axis)
         return cls(inside, tuple(places), volume.shape[axis], edges, volume.unit, periodic, marks)
 
-    def select(self, rows: Sequence[int]) -> Slices:
-        """Keep some of the known slices, by their rows in `inside`."""
-        return replace(self, inside=self.inside[list(rows)], places=tuple(self.places[k] for k in rows))
-
     def crop(self, box: Box) -> Slices:
         """Return what is known in a box, whose first edge begins and ends with known slices."""
-        (start, stop), (_, ys, xs) = (box[0].start, box[0].stop), box
-        rows = [k for k, place in enumerate(self.places) if start <= place < stop]
-        places = tuple(self.places[k] - start for k in rows)
-        marks = None if self.marks is None else self.marks[box]
-        inside = self.inside[rows][:, ys, xs]
-        return replace(self, inside=inside, places=places, length=stop - start, periodic=False, marks=marks)
+        rows, inside = self.known(box)
+        marks, length = None if self.marks is None else self.marks[box], box[0].stop - box[0].start
+        return replace(self, inside=inside, places=tuple(rows), length=length, periodic=False, marks=marks)
 
     def keep_known(self, mask: np.ndarray, box: Box = WHOLE) -> np.ndarray:
         """Return a mask (Z, Y, X) of a box, with the known voxels as they are."""

@@ -1,4 +1,4 @@
-"""Teach a filler from generated shapes: cut slices of them, and let the network fill the gaps.
+"""Teach a filler from generated shapes: cut slices of them, and let the network fill the gaps, or weigh their images.
 
 Windows of a shape are read at any rotation, scale and stretch: a shape that repeats has no border. What a person's
 slices have and a shape has not is added: outlines that tremble, slices that are shifted, specks, structures of two
@@ -29,13 +29,26 @@ from curvafit.core.files import write_atomically
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.data_synth.store import find_well_formed
 from curvafit.scan.grids import centre_distance
-from curvafit.segmentation.filler import FAR, SLOPE, Filler, Gaps, Raster, Taught, fill, interpolate, plane_thickness
+from curvafit.segmentation.filler import (
+    FAR,
+    REACH,
+    SLOPE,
+    Filler,
+    Gaps,
+    Raster,
+    Taught,
+    fill,
+    interpolate,
+    plane_thickness,
+)
+from curvafit.segmentation.image import read_image
+from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.trials import BEYOND, Example, dice_of, gain_of, tally
 from curvafit.segmentation.uncertainty import UNSURE, best_log_odds, calibration_error, fit_temperature
 from curvafit.volumes.read import load
 
-#: Steps of teaching and of tuning, and the greatest rates of both.
-STEPS, TUNING = 4500, 150
+#: Steps of teaching, with images too, and of tuning, and the greatest rates of teaching and tuning; imaged volumes.
+STEPS, IMAGE_STEPS, TUNING, VOLUMES = 4500, 1500, 150, 160
 RATE, TUNING_RATE = 2e-3, 5e-4
 #: Largest norm of a step's gradient.
 STEEPEST = 1.0
@@ -43,6 +56,8 @@ STEEPEST = 1.0
 SAVED = 100
 #: Shares of a volume between which a shape teaches, and the number of shapes below which they teach little.
 FILLED, FEW = (0.02, 0.75), 200
+#: Voxels of an imaged shape along a slice, at most but for the thinnest structures, and shares as `FILLED` of it.
+FINEST, IMAGED = 160, (0.01, 0.9)
 #: The largest gap, in thicknesses of a structure, that can be learnt.
 SLIMMEST = 4.0
 #: Pixels around a window that are only seen.
@@ -97,19 +112,10 @@ class Texture:
 class Mix:
     """How windows are drawn; lengths in pixels, shares from 0 to 1.
 
-    Attributes
-    ----------
-    thickness, gap, most
-        Intervals of the structures' thickness (uniform in the logarithm) and of the gap, and the most slices to fill.
-    upright
-        Share of windows along the axes of the shape; the others have any rotation.
-    stretch
-        Deviation of the logarithm by which each axis is stretched.
-    coarse
-        Share of windows whose slices are not one pixel apart.
-    ends, pairs, holes, trembling, partial
-        Shares of windows that end at a known slice, have structures of two shapes, are turned inside out, have slices
-        as a person draws them, and have slices to fill that are known in part.
+    Intervals of the structures' `thickness` (uniform in the logarithm) and of the `gap`, the `most` slices to fill, and
+    the deviation of the logarithm by which each axis is stretched. Shares of windows that lie along the axes of the
+    shape, whose slices are not one pixel apart, that end at a known slice, have structures of two shapes, are turned
+    inside out, have slices as a person draws them, and have slices to fill that are known in part.
     """
 
     thickness: tuple[float, float] = (3.0, 14.0)
@@ -147,16 +153,9 @@ class Batches(Dataset, ABC):
 
 @dataclass(frozen=True, eq=False)
 class Lessons(Batches):
-    """Batches of gaps to fill, the same for ever for a seed: batch k depends on (seed, k) alone.
+    """Batches of `size` gaps to fill, the same for ever for a seed: batch k depends on (seed, k) alone.
 
-    Attributes
-    ----------
-    sources
-        Shapes by where they come from: each source teaches as often as the others.
-    edge, halo
-        Pixels of a window's side that count, and around it that are only seen.
-    size
-        Windows of a batch.
+    Each of the `sources` of shapes teaches as often as the others; `edge` pixels of a window's side count.
     """
 
     sources: Sequence[Sequence[Texture]]
@@ -277,17 +276,8 @@ def load_textures(
 
 @dataclass(frozen=True, eq=False)
 class Whole:
-    """A volume that is known whole.
-
-    Attributes
-    ----------
-    distances
-        Signed distances in each slice (Z, Y, X), in pixels.
-    gap, step
-        Slices from a known one to the next, and pixels from slice to slice.
-    evidence
-        What an image of it says where slices 0, `gap`, 2 `gap`, … are known: log-odds (Z, Y, X).
-    """
+    """A volume that is known whole: signed distances in each slice (Z, Y, X), in pixels, `step` pixels apart, and what
+    an image of it says, log-odds (Z, Y, X), where slices 0, `gap`, 2 `gap`, … are known."""
 
     distances: np.ndarray
     gap: int
@@ -346,6 +336,67 @@ class WholeLessons(Batches):
         return distances, steps, np.zeros_like(truths), evidence[0] if evidence else None, truths
 
 
+@dataclass(frozen=True)
+class ImageMix:
+    """How imaged shapes are drawn; lengths in pixels, shares from 0 to 1.
+
+    Intervals of the structures' `thickness` (uniform in the logarithm; thick where a slice would be too many voxels)
+    and of the slices from a known one to the next, `gap`, at most `longest` pixels; a slice's side and gaps of a
+    volume; the share of images with noise besides the modality's, and the interval of its deviation, in contrasts.
+    """
+
+    thickness: tuple[float, float] = (3.0, 14.0)
+    gap: tuple[int, int] = (2, 15)
+    longest: float = 20.0
+    edge: int = 80
+    gaps: int = 3
+    noisy: float = 0.5
+    noise: tuple[float, float] = (0.3, 2.5)
+
+
+def image_shape(textures: Sequence[Sequence[Texture]], mix: ImageMix, seed: Sequence[int]) -> Whole:
+    """Return a shape and what an image of it says where every `gap`-th slice is known, in pixels; any axis is first."""
+    from curvafit.data_synth.imaging.image import field_shape, image, regrid
+    from curvafit.data_synth.imaging.modality import MODALITIES
+
+    rng = np.random.default_rng(seed)
+    while True:
+        source = textures[int(rng.integers(len(textures)))]
+        texture = source[int(rng.integers(len(source)))]
+        names = list(MODALITIES)
+        how = MODALITIES[names[int(rng.integers(len(names)))]].draw(int(rng.integers(2**31)))
+        turn = rng.permutation(3)
+        edges = np.array(how.spacing)[turn]
+        finest = float(edges[1:].min())
+        gap = int(rng.integers(mix.gap[0], max(mix.gap[0], min(mix.gap[1], int(mix.longest * finest / edges[0]))) + 1))
+        sides = np.ceil(mix.edge * finest / edges[1:]).astype(int)
+        shape = np.empty(3, dtype=int)
+        shape[turn] = [mix.gaps * gap + 1, *sides]
+        low, high = mix.thickness
+        low = min(max(low, mix.edge * texture.thickness / FINEST), high)
+        edge = math.exp(rng.uniform(math.log(low), math.log(high))) * finest / texture.thickness
+        size = field_shape(shape.tolist(), edge, how)
+        start = rng.integers(0, texture.values.shape)
+        rows = [(a + np.arange(n)) % m for a, n, m in zip(start, size, texture.values.shape, strict=True)]
+        phase = torch.from_numpy(np.ascontiguousarray(texture.values[np.ix_(*rows)], dtype=np.float32))
+        seen = image(phase, edge, how, int(rng.integers(2**31))).numpy()
+        inside = regrid(phase, edge, how).numpy() > 0
+        box = tuple(slice(n) for n in shape)
+        seen, inside = (np.ascontiguousarray(each[box].transpose(turn)) for each in (seen, inside))
+        known = inside[::gap]
+        if IMAGED[0] < inside.mean() < IMAGED[1] and not known.all() and known.any():
+            break
+    if rng.random() < mix.noisy:
+        contrast = abs(float(seen[inside].mean()) - float(seen[~inside].mean()))
+        deviation = math.exp(rng.uniform(*np.log(mix.noise))) * contrast
+        seen = seen + deviation * rng.standard_normal(seen.shape, dtype=np.float32)
+    slices = Slices(known, tuple(range(0, len(inside), gap)), len(inside), tuple(edges.tolist()))
+    raster, margin = Raster.of(slices), slice(REACH - HALO, HALO - REACH)
+    distances = np.stack([raster.distances(mask)[margin, margin] for mask in inside])
+    evidence = np.stack([raster.spread(plane)[margin, margin] for plane in read_image(seen, slices)[0]])
+    return Whole(distances, gap, slices.spacing[0] / raster.pixel, evidence)
+
+
 def learn(
     network: nn.Module,
     lessons: Batches,
@@ -398,14 +449,16 @@ def teach(
     sources: Sequence[Sequence[Texture]],
     card: dict[str, Any],
     *,
-    steps: int = STEPS,
+    plain: Taught | None = None,
+    volumes: int = VOLUMES,
+    steps: int | None = None,
     seed: int = 0,
     mix: Mix | None = None,
     checkpoint: Path | None = None,
     workers: int = 1,
     progress: Progress = silent,
 ) -> Taught:
-    """Teach a filler by shapes, every tenth of which is held out to judge it.
+    """Teach a filler by shapes, every tenth of which is held out to judge it; or a plain one to weigh images of them.
 
     Parameters
     ----------
@@ -413,6 +466,10 @@ def teach(
         Shapes by where they come from, each source at least one; with fewer than 200 in all the filler knows little.
     card
         Where they come from, kept beside the weights.
+    plain, volumes
+        A filler that learns to weigh the evidence of images, and the imaged shapes that teach; a tenth as many judge.
+    steps
+        By default 4500, or 1500 with images.
     checkpoint
         A file by which a run that was stopped goes on; the caller deletes it.
     workers
@@ -420,29 +477,36 @@ def teach(
 
     Raises ValueError if a source is empty, or an argument is out of range.
     """
-    steps, seed = check_int(steps, "a number of steps from 1", 1, 10**7), check_seed(seed)
+    usual = STEPS if plain is None else IMAGE_STEPS
+    steps = check_int(usual if steps is None else steps, "a number of steps from 1", 1, 10**7)
+    seed, volumes = check_seed(seed), check_int(volumes, "a number of volumes from 1", 1, 10**5)
     if not sources or not all(sources):
         raise ValueError("expected sources with one shape or more to teach with")
-    held = [texture for source in sources for texture in source[HELD_OUT - 1 :: HELD_OUT]] or [sources[-1][-1]]
-    taught = [[texture for texture in source if texture not in held] or list(source) for source in sources]
-    mix = mix or Mix()
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        filler = Filler()
-    said = {"shapes": sum(map(len, taught)), "held_out": len(held), "steps": steps, "seed": seed, "mix": asdict(mix)}
-    lessons, exam = Lessons(taught, mix, seed, steps), Lessons([held], replace(mix, partial=0.0), seed + 1, JUDGED)
-    tools = {"checkpoint": checkpoint, "workers": workers, "progress": progress}
-    return learn_and_judge(filler, lessons, exam, {**card, **said}, **tools)  # type: ignore[arg-type]
-
-
-def learn_and_judge(
-    filler: Filler, lessons: Batches, exam: Batches, card: dict[str, Any], progress: Progress, **tools: Any
-) -> Taught:
-    """Teach a filler by lessons, judge it by an exam on shapes held out, and write both on its card."""
-    losses = learn(filler, lessons, RATE, progress=sub_progress(progress, 0.0, 0.97), **tools)
+        filler = Filler() if plain is None else Filler.with_image(plain.filler)
+    said = {"steps": steps, "seed": seed}
+    if plain is None:
+        held = [texture for source in sources for texture in source[HELD_OUT - 1 :: HELD_OUT]] or [sources[-1][-1]]
+        taught = [[texture for texture in source if texture not in held] or list(source) for source in sources]
+        mix = mix or Mix()
+        lessons, exam = Lessons(taught, mix, seed, steps), Lessons([held], replace(mix, partial=0.0), seed + 1, JUDGED)
+        said |= {"shapes": sum(map(len, taught)), "held_out": len(held), "mix": asdict(mix)}
+    else:
+        judging = [source[HELD_OUT - 1 :: HELD_OUT] or source for source in sources]
+        taught = [[each for k, each in enumerate(source) if (k + 1) % HELD_OUT] for source in sources]
+        count, wholes = volumes + max(volumes // 10, 1), []
+        for number in range(count):
+            progress(f"imaging shape {number + 1} of {count}", 0.3 * number / count)
+            wholes.append(image_shape(taught if number < volumes else judging, ImageMix(), (seed, number)))
+        lessons, exam = WholeLessons(wholes[:volumes], steps, seed), WholeLessons(wholes[volumes:], JUDGED, seed + 1)
+        said |= {"plain": plain.card, "volumes": volumes, "mix": asdict(ImageMix())}
+        progress = sub_progress(progress, 0.3, 1.0)
+    told = sub_progress(progress, 0.0, 0.97)
+    losses = learn(filler, lessons, RATE, checkpoint=checkpoint, workers=workers, progress=told)
     temperatures, figures, error = judge(filler, exam)
     progress("judging on shapes held out", 1.0)
-    return Taught(filler, temperatures, {**card, "losses": losses, **figures}, error)
+    return Taught(filler, temperatures, {**card, **said, "losses": losses, **figures}, error)
 
 
 @torch.inference_mode()

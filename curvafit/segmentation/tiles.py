@@ -142,10 +142,9 @@ class Piece:
 
 
 class TileStore:
-    """The finished tiles of a volume: in memory, or in a folder that outlives a killed run (see `open_store`).
+    """The finished tiles of a volume: in memory, or in mapped files of a folder that outlives a killed run.
 
-    In a folder the volume's arrays are mapped files. Each tile has a note there, `000012.json`, which is written once
-    the tile's voxels are on the disk: a killed run loses the tiles it was at and nothing else.
+    There each tile has a note, `000012.json`, which is written once the tile's voxels are on the disk.
     """
 
     def __init__(self, shape: tuple[int, int, int], folder: Path | None = None) -> None:
@@ -169,11 +168,8 @@ class TileStore:
 
 @contextmanager
 def open_store(folder: str | PathLike[str], shape: tuple[int, int, int], run: Mapping[str, Any]) -> Iterator[TileStore]:
-    """Open the folder of a run's tiles, or make it, and lock it.
-
-    `shape` is the volume's; `run` holds what runs must have in common to share tiles, see `generation.checkpoint`.
-    Raises `ValueError` if the folder holds other things or the tiles of another run, or is in use.
-    """
+    """Open the folder of the tiles of a volume of a shape, or make it, and lock it; `run` holds what runs must have in
+    common to share tiles. Raises `ValueError` if it holds other things or the tiles of another run, or is in use."""
     mine = identity(**run)
     with lock_store(folder, (_MASK, _PHASE)) as (place, other):
         if other is None:
@@ -235,11 +231,8 @@ def lower_volume(
     workers: Workers | int | None = None,
     progress: Progress = silent,
 ) -> LoweredVolume:
-    """Lower a problem on each tile of a volume, and return the whole.
-
-    A volume of several tiles may have a folder, `store`, where finished tiles stay, those of an earlier, killed run
-    too, and workers, or a number of processes; by default this process lowers the tiles, one after another.
-    """
+    """Lower a problem on each tile of a volume, and return the whole; several tiles may have a `store`, where finished
+    ones stay, those of an earlier, killed run too, and workers."""
     trial = problem.trial
     run = {**problem.inputs, "law": trial.law, "steps": trial.steps, "tiles": tiling.counts, "place": tiling.place}
     folder = store if tiling.count > 1 else None
@@ -247,32 +240,27 @@ def lower_volume(
     with join_workers(workers if tiling.count > 1 else None) as crew, opened as finished:
         tiles = tiling.tiles
         rest = [tile for tile in tiles if tile.number not in finished.energies]
+        total, done = tiling.count, tiling.count - len(rest)
         if crew is None:
-            pieces = _lower_in_turn(problem, tiling, rest, progress)
+            steps = (sub_progress(progress, k / total, (k + 1) / total) for k in range(done, total))
+            pieces = (_lower_tile(problem, tiling, *each) for each in zip(rest, steps, strict=True))
         else:
             lower = partial(_lower_tiles, problem, tiling)
             pieces = collect_all(crew, [(lower, Path(), [tile.number]) for tile in rest])
-        for count, piece in enumerate(pieces, tiling.count - len(rest) + 1):
+        for count, piece in enumerate(pieces, done + 1):
             finished.write(tiles[piece.number].core, piece)
-            progress("lowering the energy", count / tiling.count)
+            progress("lowering the energy", count / total)
     if folder is not None:  # what is done with the result must not change the tiles
         finished.mask.flags.writeable = finished.phase.flags.writeable = False
     energies = [finished.energies[tile.number] for tile in tiles]
-    steps = 0 if trial.law is None else trial.steps
-    return LoweredVolume(finished.mask, finished.phase, tuple(map(sum, zip(*energies, strict=True))), steps)
-
-
-def _lower_in_turn(problem: Problem, tiling: Tiling, tiles: Sequence[Tile], progress: Progress) -> Iterator[Piece]:
-    total = tiling.count
-    for count, tile in enumerate(tiles, total - len(tiles)):
-        yield _lower_tile(problem, tiling, tile, sub_progress(progress, count / total, (count + 1) / total))
+    flowed = 0 if trial.law is None else trial.steps
+    return LoweredVolume(finished.mask, finished.phase, tuple(map(sum, zip(*energies, strict=True))), flowed)
 
 
 def _lower_tiles(problem: Problem, tiling: Tiling, _: Path, numbers: Sequence[int]) -> list[Piece]:
     """Lower tiles by their numbers, as a worker does, on one thread: the workers share the cores."""
-    tiles = tiling.tiles
     with one_thread():
-        return [_lower_tile(problem, tiling, tiles[number], silent) for number in numbers]
+        return [_lower_tile(problem, tiling, tiling.tiles[number], silent) for number in numbers]
 
 
 def _lower_tile(problem: Problem, tiling: Tiling, tile: Tile, progress: Progress) -> Piece:

@@ -69,18 +69,11 @@ def laws_of(prior: LawLike, scan: Field) -> tuple[tuple[Coefficients, ...], tupl
 
 @dataclass(frozen=True)
 class Trial:
-    """A way to find or fill a structure: the start as it is, or a law lowered from there; and its score, once chosen.
+    """A way to find or fill a structure: the start as it is, or a law lowered from it, with lengths in the scan's unit.
 
-    Attributes
-    ----------
-    law
-        Coefficients with lengths in the scan's unit; None where the start stays as it is.
-    strength, steps
-        Stiffness of the springs on known voxels, or nats of a unit of F_ε; and steps of the flow.
-    pull
-        Stiffness of the springs on the other voxels for each nat of their log-odds.
-    score, plain, noise
-        Of the chosen trial: the Dice of the best law, that of the start, and the standard error of the difference.
+    `strength` is the stiffness of the springs on known voxels, or the nats of a unit of F_ε; `pull` that of the springs
+    on the others for each nat of their log-odds. Once chosen it has the Dice of the best law, `plain`, that of the
+    start, and the standard error of their difference, `noise`.
     """
 
     law: Coefficients | None = None
@@ -188,7 +181,7 @@ def leave_out_slices(slices: Slices) -> Task[Slices] | None:
     number = len(slices.places)
     out = range(1, number - (0 if slices.periodic and number % 2 == 0 else 1), 2)
     rest = [k for k in range(number) if k not in out]
-    given = slices.select(rest)
+    given = replace(slices, inside=slices.inside[rest], places=tuple(slices.places[k] for k in rest))
     if not out or len(rest) < 2 or given.inside.all() or not given.inside.any():
         return None
     return Task(given, slices.inside[list(out)], [slices.places[k] for k in out])

@@ -83,12 +83,7 @@ def best_log_odds(logits: np.ndarray) -> float:
 
     Where structures are thinner than those that taught, probabilities are too small, and so would the threshold be.
     """
-    return float(logit(lowest_inside(count_probabilities(expit(logits)))))
-
-
-def lowest_inside(counts: np.ndarray) -> float:
-    """Return the `best_threshold` of probabilities by their counts, but not less than `LEAST`."""
-    return max(best_threshold(counts), LEAST)
+    return float(logit(max(best_threshold(count_probabilities(expit(logits))), LEAST)))
 
 
 def fit_temperature(logits: np.ndarray, inside: np.ndarray) -> float:

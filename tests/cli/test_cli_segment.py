@@ -141,17 +141,10 @@ def test_reconstruct_fills_what_it_is_not_told(tmp_path: Path) -> None:
     done("reconstruct", path, *options, "-o", named)
     assert np.array_equal(load(named).values, load(target).values)
     given[..., [k for k in range(17) if k % 4]] = 9
-    save(Field(given, (0.1, 0.1, 0.1), "mm"), path)
-    done("reconstruct", path, "--ignore", 9, "--axis", "x", "-o", tmp_path / "ignoring.nii.gz")
-    assert np.array_equal(load(tmp_path / "ignoring.nii.gz").values, load(target).values)
-    labels = np.where(ball(), 3, 1)
-    labels[:, :3] = 7
-    np.save(tmp_path / "labels.npy", labels)
-    some = ("reconstruct", tmp_path / "labels.npy", "--every", 4, "--prior", "tubes", "--steps", 2)
-    result = done(*some, "--label", 3, "-o", tmp_path / "mask.npy")
-    assert np.array_equal(np.load(tmp_path / "mask.npy")[::4] > 0, (labels == 3)[::4])
-    result = call(*some, "--label", 4, "-o", tmp_path / "none.npy")
-    assert result.exit_code == 2 and "label" in result.stderr
+    save(Field(2 * given, (0.1, 0.1, 0.1), "mm"), path)  # also one label of several
+    for name, more in (("ignoring", ("--ignore", 18)), ("label", ("--every", 4, "--label", 2))):
+        done("reconstruct", path, *more, "--axis", "x", "-o", tmp_path / f"{name}.nii.gz")
+        assert np.array_equal(load(tmp_path / f"{name}.nii.gz").values, load(target).values)
 
 
 def test_reconstruct_writes_what_is_uncertain(tmp_path: Path) -> None:
@@ -172,10 +165,6 @@ def test_reconstruct_writes_what_is_uncertain(tmp_path: Path) -> None:
     assert f"annotate next: {', '.join(map(str, record['suggestions']))}." in said
     done(*told)
     assert sorted(each.name for each in target.parent.iterdir()) == names
-    (tmp_path / "other_probability.npy").write_text("mine")
-    refused(call(*told[:-1], tmp_path / "other.npy"), "free")
-    (tmp_path / "other_probability.npy").unlink()
-    refused(call(*told[:-1], tmp_path / "other.npy", "--suggest", 16), "slices")
 
 
 #: In `bad_files`: words that a command refuses, and one of its sentence.
@@ -194,6 +183,7 @@ REFUSALS: dict[str, dict[str, str]] = {
         "--labels all --example grey.nii": "example",
         "--filler version.npz": "version 2", "--filler cut.npz": "truncated", "--filler arrays.npz": "filler",
         "--filler lacks.npz": "slope", "--filler ball.nii": "something else", "--instances": "--image",
+        "--suggest 16": "slices", "--label 4": "label", "--labels all --label 2": "labels", "--labels two": "labels",
         "-o taken.nii": "free", "-o noted.nii": "free", "-o mapped.nii": "free",
     },
     "reconstruct --every 4": {
@@ -249,10 +239,7 @@ def test_a_part_of_a_file_is_segmented_where_it_was(oblique: Path, tmp_path: Pat
         done("segment", source, *part, "--prior", "tubes", "--steps", 5, "-o", target)
         mask = nibabel.load(target)
         assert mask.shape == (15, 16, 18)
-        assert (
-            "Voxels 2:20, 1:17, 0:15 (z, y, x) are used."
-            in json.loads(target.with_suffix("").with_suffix(".json").read_text())["notes"]
-        )
+        assert "2:20, 1:17, 0:15" in " ".join(json.loads((tmp_path / f"mask{k}.json").read_text())["notes"])
         values, there = np.asanyarray(mask.dataobj).T > 0, ball()[2:, 1:17, :-1]
         assert 2 * (values & there).sum() / (values.sum() + there.sum()) > 0.8
         if not k:

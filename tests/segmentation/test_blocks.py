@@ -17,10 +17,8 @@ from shapes import grown
 from curvafit.core.workers import cluster
 from curvafit.segmentation import blocks
 from curvafit.segmentation.blocks import reconstruct_file
-from curvafit.segmentation.filler import Raster, Taught, fill_gaps
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.result import write_mask
-from curvafit.segmentation.slices import Slices
 from curvafit.volumes import Field, load, save
 from curvafit.volumes.formats.zarr import write_zarr
 
@@ -59,22 +57,19 @@ def levels(store: Path) -> dict[str, np.ndarray]:
 def check_alike(found: Path, whole: Path) -> None:
     """Float32 sums of convolutions in another order move a probability by some millionths, and a voxel that lies just
     there to the other side."""
-    for name, most in (("", 1e-4), ("_probability", 1e-4)):
+    for name in ("", "_probability"):
         one, other = (each.with_name(f"{each.stem}{name}.zarr") for each in (found, whole))
         assert (one / "zarr.json").read_bytes() == (other / "zarr.json").read_bytes()
         for level, expected in levels(other).items():
             values = levels(one)[level]
             assert values.shape == expected.shape and values.dtype == expected.dtype
-            assert np.abs(values.astype(np.float32) - expected).mean() < most
+            assert np.abs(values.astype(np.float32) - expected).mean() < 1e-4
     notes = [json.loads(each.with_suffix(".json").read_text()) for each in (found, whole)]
     assert notes[0]["status"] == notes[1]["status"] and notes[0]["notes"] == notes[1]["notes"]
     for name in ("calibration_error", "suggestions", "epsilon", "shape", "spacing", "unit", "coefficients", "weight"):
         assert notes[0][name] == notes[1][name], name
     for name in ("expected_dice", "volume_fraction"):
         assert notes[0][name] == pytest.approx(notes[1][name], rel=1e-3), name
-
-
-# ---- blocks are the whole --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -89,19 +84,6 @@ def test_blocks_equal_the_whole(labels: Path, whole: Path, tmp_path: Path, edge:
         "whole.json", "whole.png", "whole.zarr", "whole_probability.zarr",
     ]  # fmt: skip
     assert json.loads((tmp_path / "whole.json").read_text())["tile"] == edge
-
-
-@pytest.mark.parametrize("depth", [1, 2, 3])
-def test_every_slice_of_a_gap_is_filled_wherever_a_block_begins(depth: int) -> None:
-    mask, places = texture((18, 24, 24)), [0, 5, 6, 16]
-    slices = Slices.of(Field(mask), places, 0)
-    taught, raster = Taught.load(), Raster.of(slices)
-    for start in range(18 - depth + 1):
-        rows = set(range(start, start + depth))
-        filled = {
-            int(n) for numbers, _ in fill_gaps(slices, taught, raster, slice(start, start + depth)) for n in numbers
-        }
-        assert filled & rows == rows & set(range(17)) - set(places)
 
 
 @pytest.mark.parametrize("axis", [1, 2])
@@ -136,12 +118,6 @@ def test_labels_of_an_image_are_those_of_the_whole(labels: Path, tmp_path: Path,
     assert all(one[name] == two[name] for name in one if not name.rpartition("/")[2].isdigit())
     first, second = (levels(tmp_path / name / "scan.zarr/labels/filled")["0"] for name in ("one", "two"))
     assert (first != second).mean() < 1e-4
-    assert sorted(path.name for path in (tmp_path / "one").iterdir()) == sorted(
-        path.name for path in (tmp_path / "two").iterdir()
-    )
-
-
-# ---- workers, kills --------------------------------------------------------------------------------------------------
 
 
 def test_the_same_command_goes_on_after_a_kill(labels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -191,9 +167,6 @@ def test_workers_that_are_killed_lose_no_voxel(labels: Path, tmp_path: Path) -> 
     check_alike(tmp_path / "two" / "mask.zarr", tmp_path / "one" / "mask.zarr")
 
 
-# ---- bad input -------------------------------------------------------------------------------------------------------
-
-
 def test_bad_input_ends_in_one_sentence_and_leaves_nothing(labels: Path, tmp_path: Path) -> None:
     values = texture()
     grey = np.random.default_rng(0).integers(0, 999, SHAPE).astype(np.int16)
@@ -207,17 +180,11 @@ def test_bad_input_ends_in_one_sentence_and_leaves_nothing(labels: Path, tmp_pat
     there = sorted(path.name for path in tmp_path.iterdir())
     for source, more, word in (
         ("empty.npy", ("--every", 8), "inside and outside"),
-        ("empty.npy", (), "labels"),
         ("grey.npy", ("--every", 8), "labels"),
         ("nan.npy", ("--every", 8), "finite"),
         ("torn.zarr", ("--every", 8), "torn.zarr"),
-        ("torn.zarr", ("--every", 800), "known"),
-        ("torn.zarr", ("--every", 8, "--suggest", 60), "at most 58"),
         ("torn.zarr", ("--every", 8, "-o", tmp_path / "torn.zarr"), "torn.zarr"),
     ):
-        refused(
-            call("reconstruct", tmp_path / source, "--tile", 64, "-o", tmp_path / "mask.zarr", *more),
-            word,
-            progress=True,
-        )
+        result = call("reconstruct", tmp_path / source, "--tile", 64, "-o", tmp_path / "mask.zarr", *more)
+        refused(result, word, progress=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == there

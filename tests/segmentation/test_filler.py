@@ -10,20 +10,9 @@ import pytest
 import torch
 
 import curvafit.segmentation.filler as room
-from curvafit.segmentation.filler import (
-    FAR,
-    REACH,
-    Filler,
-    Gaps,
-    Raster,
-    Taught,
-    fill,
-    interpolate,
-    plane_thickness,
-)
-from curvafit.segmentation.slices import Slices, annotated_slices, plane_distances
+from curvafit.segmentation.filler import FAR, REACH, Filler, Gaps, Raster, Taught, fill, interpolate, plane_thickness
+from curvafit.segmentation.slices import Slices, plane_distances
 from curvafit.segmentation.trials import dice
-from curvafit.volumes.field import ScanError
 
 EDGES = (1.0, 1.0, 1.0)
 
@@ -49,24 +38,17 @@ def leaning(n: int = 37) -> np.ndarray:
     return (np.hypot(y - 0.3 * z, x - 4) < 4) | (z**2 + (y + 7) ** 2 + (x + 7) ** 2 < 25)
 
 
-# ---- what it must not depend on --------------------------------------------------------------------------------------
-
-
-def test_background_around_a_structure_changes_nothing() -> None:
-    mask, taught = leaning(), stirred()
-    wide = np.pad(mask, ((0, 0), (200, 200), (200, 200)))
-    found = fill(known(wide), taught)[:, 200:-200, 200:-200]
-    assert np.abs(found - fill(known(mask), taught)).max() < 1e-5
-
-
-def test_tiles_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_background_around_a_structure_tiles_and_a_unit_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     mask, taught = leaning(), stirred()
     whole = fill(known(mask), taught)
+    wide = np.pad(mask, ((0, 0), (200, 200), (200, 200)))
+    assert np.abs(fill(known(wide), taught)[:, 200:-200, 200:-200] - whole).max() < 1e-5
+    np.testing.assert_allclose(fill(known(mask, spacing=(0.3,) * 3), taught), whole, atol=1e-4)
     monkeypatch.setattr(room, "TILE", 12)
     assert np.abs(fill(known(mask), taught) - whole).max() < 1e-5
 
 
-def test_no_pixel_sees_further_than_the_reach() -> None:
+def test_no_pixel_sees_further_than_the_reach_nor_needs_a_border_that_is_only_seen() -> None:
     filler, distances = stirred().filler, torch.randn(1, 4, 120, 120, generator=torch.Generator().manual_seed(0))
     gaps = Gaps(distances, torch.ones(1), torch.zeros(1, 3, 120, 120))
     moved = distances.clone()
@@ -75,12 +57,6 @@ def test_no_pixel_sees_further_than_the_reach() -> None:
         change = (filler(replace(gaps, distances=moved)) - filler(gaps)).abs().amax((0, 1))
     rows, columns = torch.nonzero(change, as_tuple=True)
     assert max(int((each - 60).abs().max()) for each in (rows, columns)) <= REACH
-
-
-def test_a_border_that_is_only_seen_changes_nothing() -> None:
-    generator = torch.Generator().manual_seed(0)
-    gaps = Gaps(torch.randn(2, 4, 96, 104, generator=generator), torch.ones(2), torch.zeros(2, 3, 96, 104))
-    filler = stirred().filler
     with torch.no_grad():
         torch.testing.assert_close(filler(gaps, 16), filler(gaps)[..., 16:-16, 16:-16], atol=1e-5, rtol=1e-5)
 
@@ -90,14 +66,6 @@ def test_a_volume_that_repeats_may_begin_anywhere() -> None:
     found = fill(known(mask, periodic=True), taught)
     turned = fill(known(np.roll(mask, 12, 0), periodic=True), taught)
     np.testing.assert_allclose(np.roll(turned, -12, 0), found, atol=1e-5)
-
-
-def test_a_unit_of_length_changes_nothing() -> None:
-    mask, taught = leaning(), stirred()
-    np.testing.assert_allclose(fill(known(mask, spacing=(0.3,) * 3), taught), fill(known(mask), taught), atol=1e-4)
-
-
-# ---- what is known ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("spacing", [EDGES, (4.0, 1.0, 1.0), (1.0, 2.0, 1.0)])
@@ -116,39 +84,6 @@ def test_an_untaught_filler_is_the_cubic_interpolation() -> None:
     distances = torch.from_numpy(plane_distances(slices.inside, EDGES[1:], FAR)[1:5].clip(-FAR, FAR)).float()
     _, cubic = interpolate(distances[None], torch.arange(1, 6) / 6)
     np.testing.assert_allclose(fill(slices, taught)[13:18], room.SLOPE * cubic[0].numpy(), atol=1e-4)
-
-
-def test_marks_are_those_of_the_voxels_that_somebody_annotated() -> None:
-    labels = np.full((5, 4, 4), 9)
-    labels[[0, 4]] = 0
-    labels[0, 1, 1], labels[2, :, 2], labels[2, 1, 2] = 3, 0, 3
-    places, marks = annotated_slices(labels, 9)
-    assert places == [0, 4] and marks is not None
-    assert marks[2, :, 2].tolist() == [-1, 1, -1, -1] and np.count_nonzero(marks) == 4
-    labels[2] = 9
-    assert annotated_slices(labels, 9)[1] is None
-    with pytest.raises(ScanError, match="no voxel"):
-        annotated_slices(labels, 5)
-    with pytest.raises(ScanError, match="two"):
-        annotated_slices(labels[:3], 9)
-
-
-def test_what_is_known_in_a_slice_to_fill_reaches_the_network_and_stays() -> None:
-    mask = leaning()
-    marks = np.zeros(mask.shape, np.int8)
-    marks[:, 18] = np.where(mask[:, 18], 1, -1)
-    slices = replace(known(mask), marks=marks)
-    kept = slices.keep_known(np.zeros(mask.shape, bool))
-    assert np.array_equal(kept[:, 18], mask[:, 18]) and np.array_equal(kept[::6], mask[::6]) and not kept[3, :18].any()
-    taught = stirred()
-    assert not np.array_equal(fill(slices, taught)[1:6], fill(known(mask), taught)[1:6])
-    coarse = replace(slices, spacing=(1.0, 2.0, 1.0))
-    raster = Raster.of(coarse)
-    assert raster.scale == (2.0, 1.0)
-    assert np.array_equal(raster.marks(marks[:1])[0, REACH + 36 : REACH + 38, REACH : REACH + 37], marks[0, [18, 18]])
-
-
-# ---- pixels ----------------------------------------------------------------------------------------------------------
 
 
 def test_the_cubic_goes_through_parabolas() -> None:
@@ -181,9 +116,6 @@ def test_slices_come_back_from_any_pixels(factor: int) -> None:
     assert np.abs(back - exact)[near].max() < 1.2 * raster.pixel
 
 
-# ---- files -----------------------------------------------------------------------------------------------------------
-
-
 def test_a_filler_comes_back_from_its_file(tmp_path: Path) -> None:
     taught = replace(stirred(), card={"seed": 3}, error=0.02)
     taught.save(tmp_path / "filler.npz")
@@ -192,10 +124,7 @@ def test_a_filler_comes_back_from_its_file(tmp_path: Path) -> None:
     assert np.array_equal(fill(known(leaning()), other), fill(known(leaning()), taught))
 
 
-@pytest.mark.parametrize(
-    "shape",
-    ["leaning", "branch", "end"],
-)
+@pytest.mark.parametrize("shape", ["leaning", "branch", "end"])
 def test_the_packaged_filler_knows_tubes(shape: str) -> None:
     """A tube that leans, forks or ends: of straight ones a spline knows all, and the network nearly all."""
     z, y, x = np.mgrid[:33, :64, :64].astype(float)

@@ -11,17 +11,30 @@ import nibabel
 import numpy as np
 import pytest
 import torch
-from calling import call, refused
+from calling import call
 from found import made_fit
 
 from curvafit.inference.candidates import Candidate
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import preset
+from curvafit.scan.grids import box_with_most_surface
 from curvafit.segmentation.flow import WorkingGrid
 from curvafit.segmentation.reconstruct import MARGIN, STIFFNESS, reconstruct, reconstruct_labels
 from curvafit.segmentation.result import Segmentation, Uncertainty
+from curvafit.segmentation.segment import FIRST, NATS, calibrate
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.segmentation.trials import TRUSTED, Example, dice, law_of, laws_of, leave_out_slices
+from curvafit.segmentation.trials import (
+    TRUSTED,
+    Example,
+    Task,
+    Trial,
+    choose_by_masks,
+    dice,
+    law_of,
+    laws_of,
+    leave_out_slices,
+    search,
+)
 from curvafit.volumes.field import Field, ScanError
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -52,9 +65,6 @@ def known(mask: np.ndarray, every: int, *, periodic: bool = False) -> Slices:
     return Slices(mask[list(places)], places, len(mask), EDGES, periodic=periodic)
 
 
-# ---- interpolations --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("periodic", [False, True])
 def test_an_interpolation_keeps_the_known_slices(way: str, periodic: bool) -> None:
@@ -76,30 +86,20 @@ def test_a_volume_that_repeats_is_interpolated_across_its_end() -> None:
     assert slices.gap == 6 and known(ball(), 5, periodic=True).gap == 5
 
 
-def test_the_nearest_slice_is_nearest() -> None:
+def test_distances_are_those_of_the_slices_around() -> None:
     inside = np.zeros((2, 4, 4), dtype=bool)
     inside[0, 1:3] = True
     level = Slices(inside, (1, 5), 8, EDGES).level("nearest")
     assert [bool((each > 0).any()) for each in level] == [True] * 4 + [False] * 4
-
-
-def test_distances_between_slices() -> None:
     disc = np.hypot(*(np.mgrid[:32, :32] - 15.5)) < 10
     distance = Slices(np.stack([disc, np.zeros_like(disc)]), (2, 6), 9, (2.0, 1.0, 1.0)).level("spline")
     assert np.array_equal(distance[2] > 0, disc) and np.array_equal(distance[0], distance[2])
     assert distance[6:].max() == -8  # as far outside as the slices are apart
     np.testing.assert_allclose(distance[4], (distance[2] + distance[6]) / 2, atol=1e-6)
-
-
-def test_the_known_slices_around_a_slice() -> None:
-    inside = np.ones((2, 4, 4), dtype=bool)
     slices = Slices(inside, (1, 5), 8, EDGES)
     assert slices.between.tolist() == [False, False, True, True, True, False, False, False]
     around = replace(slices, periodic=True)
     assert around.between.tolist() == [True, False, True, True, True, False, True, True]
-
-
-# ---- an example ------------------------------------------------------------------------------------------------------
 
 
 def pancakes(thin: int, seed: int = 0, width: int = 32) -> np.ndarray:
@@ -130,9 +130,6 @@ def test_an_example_tunes_the_network_where_that_is_better(monkeypatch: pytest.M
     assert dice(tuned.mask.values, truth) > dice(alone.mask.values, truth) + 0.1
 
 
-# ---- grids -----------------------------------------------------------------------------------------------------------
-
-
 def test_a_halo_is_cut_off_again() -> None:
     values = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
     for spacing in (EDGES, (2.0, 1.0, 1.0)):
@@ -146,9 +143,6 @@ def test_a_halo_is_cut_off_again() -> None:
         assert float(shared.sum()) == pytest.approx(float(bare.spread(values, centre=0).sum()), rel=1e-5)
     whole = WorkingGrid.of(Field(values), None, halo=5, periodic=True)
     assert whole.grid.periodic and whole.grid.shape == values.shape
-
-
-# ---- the choice ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -245,26 +239,16 @@ def test_an_axis_and_numbers_of_slices() -> None:
         ({"ignore": 1}, "empty"),
         ({"ignore": 2}, "no voxel"),
         ({"every": 8, "filler": "no.npz"}, "no.npz"),
+        ({"every": 8, "slices": ball() * np.float32(0.5)}, "whole numbers"),
+        ({"every": 8, "slices": np.random.default_rng(0).integers(0, 999, (32, 32, 32), np.int16)}, "256"),
+        ({"every": 8, "slices": np.where(ball(), np.nan, 0)}, "finite"),
+        ({"every": 8, "slices": np.random.default_rng(0).integers(0, 99, (32, 32, 32), np.uint8)}, "grey image"),
+        ({"every": 8, "slices": np.zeros((32, 32, 32))}, "empty"),
     ],
 )
 def test_bad_slices_and_examples_are_refused(options: dict, word: str) -> None:
     with pytest.raises((ValueError, FileNotFoundError), match=word):
-        reconstruct(ball(), **{"prior": WILLMORE, **options})
-
-
-@pytest.mark.parametrize(
-    ("values", "word"),
-    [
-        (ball() * np.float32(0.5), "whole numbers"),
-        (np.random.default_rng(0).integers(0, 999, (32, 32, 32)).astype(np.int16), "256"),
-        (np.where(ball(), np.nan, 0), "whole numbers"),
-        (np.random.default_rng(0).integers(0, 99, (32, 32, 32)).astype(np.uint8), "grey image"),
-        (np.zeros((32, 32, 32)), "empty"),
-    ],
-)
-def test_slices_that_are_no_mask_are_refused(values: np.ndarray, word: str) -> None:
-    with pytest.raises(ValueError, match=word):
-        reconstruct(Field(values), WILLMORE, every=8)
+        reconstruct(**{"slices": ball(), "prior": WILLMORE, **options})
 
 
 def test_a_fit_has_the_laws_that_it_trusts(tmp_path: Path) -> None:
@@ -314,6 +298,7 @@ def test_empty_slices_in_the_rhythm_of_those_with_labels_are_known() -> None:
     unasked, named = reconstruct(drawn), reconstruct(drawn, known=[12, 16, 20, 24, 28])
     np.testing.assert_array_equal(unasked.mask.values, named.mask.values)
     assert any("12, 28" in note and "rightly empty" in note for note in unasked.notes)
+    assert any("3 slices with labels are known: 16, 20, 24." in note for note in unasked.notes)
     assert not unasked.mask.values[:12].any() and not reconstruct_labels(3 * drawn).mask.values[29:].any()
     drawn[23], drawn[24] = truth[23], 0
     assert not any("Slices" in note for note in reconstruct(drawn).notes)
@@ -334,26 +319,13 @@ def test_labels_count_as_inside_and_what_is_extrapolated_is_said() -> None:
     assert not any("Beyond" in note for note in whole.notes)
 
 
-def test_slices_with_labels_are_known_unasked() -> None:
-    truth, places = leaning().astype(np.uint8), [3, 7, 12, 20, 28]
-    sparse = np.zeros_like(truth)
-    sparse[places] = truth[places]
-    unasked, named = reconstruct(sparse), reconstruct(sparse, known=places)
-    np.testing.assert_array_equal(unasked.mask.values, named.mask.values)
-    assert any("5 slices with labels are known: 3, 7, 12, 20, 28." in note for note in unasked.notes)
-    assert any("are known: 3, 7" in note for note in reconstruct_labels(5 * sparse).notes)
-    apart = np.zeros_like(truth)
-    apart[::8], apart[4::8] = 2 * truth[::8], 5 * truth[4::8]
-    with pytest.raises(ScanError, match="one after the other"):
-        reconstruct_labels(apart)
-    one = np.zeros_like(truth)
-    one[7] = truth[7]
-    for values, word in ((one, "got 1"), (np.zeros_like(truth), "got 0"), (truth, "no slice without labels")):
+def test_slices_with_labels_that_say_too_little_are_refused() -> None:
+    truth = leaning().astype(np.uint8)
+    one, apart = np.zeros_like(truth), np.zeros_like(truth)
+    one[7], apart[::8], apart[4::8] = truth[7], 2 * truth[::8], 5 * truth[4::8]
+    for values, word in ((one, "got 1"), (0 * truth, "got 0"), (truth, "no slice without"), (apart, "one after the")):
         with pytest.raises(ScanError, match=word):
-            reconstruct(values)
-
-
-# ---- several structures ----------------------------------------------------------------------------------------------
+            reconstruct_labels(values)
 
 
 def organelles(shift: int = 0) -> np.ndarray:
@@ -366,7 +338,11 @@ def organelles(shift: int = 0) -> np.ndarray:
 
 
 def test_each_label_is_completed_as_alone_and_known_slices_stay() -> None:
-    truth = organelles()
+    truth, affine = organelles(), np.diag([0.2, 0.2, 0.2, 1.0])
+    field = Field(truth, 0.2, "um", affine)
+    found = reconstruct_labels(field, {2: preset("tubes"), 7: WILLMORE}, every=6, **QUICK).labels
+    assert found is not None and (found.spacing, found.unit) == (field.spacing, "um")
+    assert np.array_equal(found.affine, affine)
     found = reconstruct_labels(truth, {2: preset("tubes"), 7: WILLMORE}, every=6, **QUICK)
     assert found.labels is not None
     values = found.labels.values
@@ -468,9 +444,6 @@ def test_the_command_writes_labels(tmp_path: Path) -> None:
     assert set(np.unique(np.asarray(written.dataobj))) == {0, 2, 7}
     assert np.array_equal(written.affine, image.affine)
     assert json.loads((tmp_path / "volume.json").read_text(encoding="utf-8"))["labels"] == "all"
-    for more in (("all", "--label", 2), ("2,5",), ("two",), ("all", "--instances")):
-        refused(call("reconstruct", scan, *options, "--labels", *more, "-o", tmp_path / "other.nii.gz"), "labels")
-    assert not list(tmp_path.glob("other*"))
 
 
 @pytest.mark.slow
@@ -484,18 +457,6 @@ def test_the_law_of_each_label_is_inferred_from_the_example(tmp_path: Path, monk
     truth, values = organelles(), np.load(out)
     assert dice(values == 2, truth == 2) > 0.95
     assert dice(values == 7, truth == 7) > 0.95
-
-
-def test_a_field_keeps_its_place() -> None:
-    affine = np.diag([0.2, 0.2, 0.5, 1.0])
-    field = Field(organelles(), (0.5, 0.2, 0.2), "um", affine)
-    found = reconstruct_labels(field, WILLMORE, every=6, stiffness=1e7, steps=2)
-    assert found.labels is not None
-    assert (found.labels.spacing, found.labels.unit) == (field.spacing, "um")
-    assert np.array_equal(found.labels.affine, affine)
-
-
-# ---- labels to train with --------------------------------------------------------------------------------------------
 
 
 def segmentation(mask: list[bool], likely: list[float], labels: list[int] | None = None) -> Segmentation:
@@ -529,3 +490,90 @@ def test_known_voxels_are_never_ignored() -> None:
     several = np.where(truth, np.where(np.indices(truth.shape)[2] < 17, 1, 3), 0).astype(np.uint8)
     sure = reconstruct_labels(several, every=8, chosen=[3]).keep_sure(1.0).values
     assert np.array_equal(sure[::8], np.where(several == 3, 3, 0)[::8]) and (sure == 4).any()
+
+
+def every_twelfth(mask: np.ndarray) -> Slices:
+    places = tuple(range(0, len(mask), 12))
+    return Slices(mask[list(places)], places, len(mask), (1.0, 1.0, 1.0))
+
+
+def decided(better: np.ndarray) -> Trial:
+    """The choice between an interpolation of a ball and a prior that fills with `better`."""
+    mask, slices = ball(48), every_twelfth(ball(48))
+    between = [n for n in range(36) if n % 12]
+
+    def filled(given: Slices, setting: Trial) -> np.ndarray:
+        return given.level("spline") > 0 if setting.law is None else better
+
+    return choose_by_masks(Task(slices, mask[between], between), [Trial(WILLMORE, 1.0, 1)], filled)
+
+
+def test_a_prior_is_taken_where_it_is_better_only() -> None:
+    best = decided(ball(48))
+    assert best.law is WILLMORE and best.score == 1 > best.plain
+    plain = decided(np.zeros((48, 48, 48), dtype=bool))
+    assert plain.law is None and plain.score == 0 and plain.plain == best.plain
+    same = decided(every_twelfth(ball(48)).level("spline") > 0)
+    assert same.law is None and same.noise == 0
+
+
+def test_a_gain_within_the_noise_is_none() -> None:
+    """A single voxel is one tile's gain: as large as its standard error, (T - 1) / T of it being the jackknife's."""
+    start = every_twelfth(ball(48)).level("spline") > 0
+    wrong = np.argwhere(start != ball(48))
+    wrong = wrong[(wrong[:, 0] < 36) & (wrong[:, 0] % 12 > 0)]
+    better = start.copy()
+    better[tuple(wrong[0])] ^= True
+    best = decided(better)
+    assert best.law is None and best.score > best.plain
+
+
+def test_a_climb_ends_at_the_best_on_either_side() -> None:
+    for heights, first, best in (([5, 1, 2, 3, 4], 2, 4), ([5, 4, 3, 1, 9], 2, 0), ([1, 2, 1], 1, 1), ([7], 0, 0)):
+        found = search([Trial(None, first)], range(len(heights)), lambda trial, h=heights: h[int(trial.strength)])
+        assert found.strength == best
+
+
+def test_strengths_are_tried_as_long_as_they_are_better() -> None:
+    truth, tried = ball(26), []
+
+    def fill(given: None, setting: Trial) -> np.ndarray:
+        tried.append(setting)
+        wrong = 1 if setting.law is None else 1 - 0.1 * [*NATS].index(setting.strength)
+        return truth & (np.random.default_rng(0).random(truth.shape) > 0.3 * wrong)
+
+    other = WILLMORE.scale(2)
+    settings = [Trial(law, FIRST, 1) for law in (WILLMORE, other)]
+    best = choose_by_masks(Task(None, truth, range(len(truth))), settings, fill, NATS)
+    assert (best.law, best.strength) == (WILLMORE, NATS[-1]) and len(tried) == len(set(tried))
+    assert {setting.strength for setting in tried if setting.law is WILLMORE} == {3.0, *NATS[NATS.index(FIRST) :]}
+    assert [setting.strength for setting in tried if setting.law is other] == [FIRST, NATS[-1]]
+
+
+def test_errors_side_by_side_are_one() -> None:
+    """Counts of one cube have no error that is known: 16 voxels in a row are one observation, not sixteen."""
+    truth = np.ones((16, 16, 32), dtype=bool)
+    half = np.arange(32) < 16
+
+    def fill(given: None, setting: Trial) -> np.ndarray:
+        return truth if setting.law is None else truth & half
+
+    best = choose_by_masks(Task(None, truth, range(16)), [Trial(WILLMORE, 1.0, 1)], fill)
+    assert best.noise == pytest.approx(math.sqrt(1 / 4))  # without the one cube 0, without the other -1
+
+
+def test_the_part_that_is_tried_is_where_the_surface_is() -> None:
+    inside = np.zeros((30, 150, 90), dtype=bool)
+    inside[:, 100:140, 5:25] = np.random.default_rng(0).random((30, 40, 20)) < 0.5
+    z, y, x = box_with_most_surface(inside, (64,) * 3)
+    assert (z.start, z.stop) == (0, 30) and y.stop - y.start == x.stop - x.start == 64
+    assert y.start <= 100 and y.stop >= 140 and x.start <= 5 and x.stop <= 90
+
+
+def test_a_flow_that_fails_is_no_choice(monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(*_: object) -> None:
+        raise ScanError("expected an energy that stays finite")
+
+    monkeypatch.setattr("curvafit.segmentation.tiles.lower_energy", failing)
+    found = calibrate(0.2 + 0.6 * ball(20), ball(20), WILLMORE, steps=1)
+    assert found.trial.law is None and (found.trial.score, found.trial.plain) == (0, 1)

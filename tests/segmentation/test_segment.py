@@ -1,26 +1,40 @@
-"""Segmentation without a network: evidence, units, grids, and shapes that come out better."""
+"""Segmentation of grey levels and of probabilities: evidence, units, grids, place, examples, and what comes out."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+from functools import partial
 from pathlib import Path
 
+import nibabel
 import numpy as np
 import pytest
 import torch
+from calling import call, refused
 from found import made_fit
 from scipy import ndimage
 from skimage.filters import threshold_otsu
 
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import preset
-from curvafit.segmentation.evidence import GreyEvidence, VoxelEvidence, estimate_classes, grey_evidence, grey_levels
+from curvafit.segmentation.evidence import (
+    GreyEvidence,
+    VoxelEvidence,
+    estimate_classes,
+    grey_evidence,
+    grey_levels,
+    load_probabilities,
+    probability_evidence,
+)
 from curvafit.segmentation.flow import WorkingGrid
-from curvafit.segmentation.segment import segment
+from curvafit.segmentation.segment import calibrate, segment
 from curvafit.segmentation.trials import dice, law_of
 from curvafit.volumes.boxes import boxes_of
 from curvafit.volumes.field import Field
+from curvafit.volumes.read import load
+from curvafit.volumes.write import save
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
@@ -37,9 +51,6 @@ def tubes(n: int = 32) -> np.ndarray:
 def noisy(mask: np.ndarray, noise: float, **place) -> Field:
     values = 30 + 100 * mask + noise * np.random.default_rng(1).standard_normal(mask.shape)
     return Field(values.astype(np.float32), **place)
-
-
-# ---- evidence --------------------------------------------------------------------------------------------------------
 
 
 def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = False) -> VoxelEvidence:
@@ -80,9 +91,6 @@ def test_a_rare_structure_needs_a_threshold_and_is_told_so() -> None:
     found = of_intensities(scan, 80.0)
     assert dice(found.level > 0, ball) > 0.9
     assert np.median(found.ratio[ball]) > 40 > -40 > np.median(found.ratio[~ball])
-
-
-# ---- units and grids -------------------------------------------------------------------------------------------------
 
 
 def test_a_prior_comes_in_the_scan_s_unit(tmp_path: Path) -> None:
@@ -134,9 +142,6 @@ def test_a_segmentation_does_not_depend_on_the_unit_of_length(scale: float) -> N
     assert (one.mask.values != other.mask.values).mean() < 1e-3
 
 
-# ---- what comes out --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_noisy_tubes_come_out_better_than_from_a_threshold_at_any_smoothing() -> None:
     truth = tubes()
@@ -170,25 +175,16 @@ def test_anisotropic_scans_keep_their_grid() -> None:
         ({"threshold": 500.0}, "threshold"),
         ({"threshold": "li"}, "otsu"),
         ({"epsilon": math.inf}, "epsilon"),
-        ({"prior": Coefficients(torch.ones(32, 32, 32), 0, 1)}, "coefficients"),
+        ({"prior": (torch.ones(32, 32, 32), 0, 1)}, "coefficients"),
+        ({"prior": (1, 0, -2)}, "a20"),
+        ({"scan": np.where(np.indices((9, 9, 9)).sum(0) == 3, math.inf, 1.0)}, "finite"),
     ],
 )
-def test_bad_options_are_refused(options, said) -> None:
-    with pytest.raises(ValueError, match=said):
-        segment(noisy(tubes(), 30), **{"prior": WILLMORE, **options})
-
-
-def test_a_scan_with_holes_is_refused() -> None:
-    scan = noisy(tubes(), 30)
-    scan.values[3, 4, 5:7] = math.nan, math.inf
-    with pytest.raises(ValueError, match="finite"):
-        segment(scan, WILLMORE)
-
-
 @pytest.mark.filterwarnings("ignore:a20 > 0:UserWarning")
-def test_a_prior_without_stiffness_is_refused() -> None:
-    with pytest.raises(ValueError, match="a20"):
-        segment(noisy(tubes(), 30), Coefficients(1, 0, -2))
+def test_bad_options_are_refused(options, said) -> None:
+    prior = Coefficients(*options.get("prior", (0, 0, 1)))
+    with pytest.raises(ValueError, match=said):
+        segment(**{"scan": noisy(tubes(), 30), **options, "prior": prior})
 
 
 def test_a_prior_s_scale_does_not_matter_but_its_weight_does() -> None:
@@ -205,3 +201,230 @@ def test_a_prior_that_is_too_strong_says_so() -> None:
     ball = np.linalg.norm(np.mgrid[:20, :20, :20] - 9.5, axis=0) < 4
     found = segment(noisy(ball, 30), Coefficients(1, 2, 1, 0, 0, 1.0), weight=1e4, steps=400)
     assert found.status.startswith("no surface is left") and not found.mask.values.any()
+
+
+def crossed(shape: tuple[int, int, int] = (24, 26, 28), at: float = 0.0) -> np.ndarray:
+    """Two crossing tubes, none thinner than seven voxels."""
+    z, y, x = (np.arange(n).reshape([-1 if k == axis else 1 for k in range(3)]) - n / 2 for axis, n in enumerate(shape))
+    return (np.hypot(z + 5 + at, y) < 4) | (np.hypot(z - 4 + 0.2 * y, x - at) < 3.5)
+
+
+def network(truth: np.ndarray, seed: int) -> np.ndarray:
+    """Probabilities that are far too sure, with errors that lie side by side."""
+    noise = np.random.default_rng(seed).standard_normal(truth.shape)
+    ratio = 5 * (2 * truth - 1) + 9 * ndimage.gaussian_filter(noise, 0.8) * 4
+    return (1 / (1 + np.exp(-ratio))).astype(np.float32)
+
+
+refine = partial(segment, probabilities=True)
+
+
+def test_a_probability_is_its_own_evidence() -> None:
+    p = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
+    p[0, 0, :2] = 0, 1
+    found = probability_evidence(Field(p))
+    np.testing.assert_allclose(1 / (1 + np.exp(-found.ratio.astype(float))), p.clip(1e-4, 1 - 1e-4), atol=1e-6)
+    assert np.array_equal(found.level > 0, p > 0.5)
+    for bad in (2 * p, p - 1e-3):
+        with pytest.raises(ValueError, match="probabilities"):
+            probability_evidence(Field(bad))
+
+
+#: Turned about z, with the shift and the mirrored axis of a real scanner.
+TURNED = np.array([[-0.5, 0.02, 0, 17.3], [0.02, 0.4, 0, -3.2], [0, 0, 1.2, 40], [0, 0, 0, 1]])
+
+
+def predicted(folder: Path, name: str, p: np.ndarray) -> Path:
+    """A case as nnU-Net writes it with --save_probabilities: classes z, y, x in an NPZ beside the segmentation."""
+    folder.mkdir(exist_ok=True)
+    image = nibabel.Nifti1Image((p > 0.5).astype(np.uint8).T, TURNED)
+    image.header.set_xyzt_units("mm")
+    nibabel.save(image, folder / f"{name}.nii.gz")
+    path = folder / f"{name}.npz"
+    np.savez_compressed(path, probabilities=np.stack((1 - p, p)).astype(np.float16))
+    return path
+
+
+def test_nnu_net_s_probabilities_lie_where_its_segmentation_does(tmp_path: Path) -> None:
+    p = np.random.default_rng(0).random((5, 6, 7)).astype(np.float32)
+    path = predicted(tmp_path, "case.7", p)
+    found, image = load_probabilities(path, channel=1), load(tmp_path / "case.7.nii.gz")
+    np.testing.assert_allclose(found.values, p, atol=1e-3)
+    assert found.spacing == image.spacing == pytest.approx((1.2, 0.4, 0.5), 2e-3) and found.unit == "mm"
+    assert np.array_equal(found.affine, image.affine)  # type: ignore[arg-type]
+    np.testing.assert_allclose(load_probabilities(path, channel=0).values, 1 - p, atol=1e-3)
+    part = load_probabilities(path, channel=1, crop="1:,:4,2:")
+    np.testing.assert_array_equal(part.affine @ [0, 0, 0, 1], image.affine @ [2, 0, 1, 1])  # type: ignore[operator]
+    told = load_probabilities(path, channel=1, spacing=2.0, unit="um")
+    assert (told.spacing, told.unit, told.affine) == ((2.0, 2.0, 2.0), "um", None)
+    alike = load_probabilities(p, like=tmp_path / "case.7.nii.gz")
+    assert alike.spacing == image.spacing and np.array_equal(alike.affine, image.affine)  # type: ignore[arg-type]
+    np.save(tmp_path / "other.npy", np.zeros((3, 3, 3)))
+    other = {"like": tmp_path / "other.npy", "channel": 1}
+    twice = {"like": tmp_path / "case.7.nii.gz", "spacing": 2, "channel": 1}
+    for options, word in ((other, "shape"), (twice, "spacing"), ({}, "channel"), ({"channel": 2}, "channel")):
+        with pytest.raises(ValueError, match=word):
+            load_probabilities(path, **options)
+    path = predicted(tmp_path, "empty", 0.4 * p)
+    empty = refine(path, WILLMORE, channel=1, weight=1.0)
+    assert not empty.mask.values.any() and empty.mask.unit == "mm" and empty.status == "0.00 % of the volume is inside"
+
+
+def test_perfect_probabilities_stay() -> None:
+    truth = crossed()
+    p = truth.astype(np.float32)
+    found = refine(p, "tubes", example=(p, truth), steps=5)
+    assert np.array_equal(found.mask.values, truth) and found.coefficients is None and found.weight is None
+    assert found.status.startswith("no prior helps here: Dice 1.000 on the example, ")
+    assert np.array_equal(found.phase.values > 0, truth)
+    assert dice(refine(p, WILLMORE, weight=1e-3).mask.values, truth) > 0.98
+    learned = calibrate(p, truth, WILLMORE, steps=5)
+    p = np.random.default_rng(0).random((12, 13, 14)).astype(np.float32)
+    p[0] = 0.5
+    found = refine(p, WILLMORE, example=learned)  # where no prior helps, the mask is what is likely
+    assert np.array_equal(found.mask.values, p > 0.5) and found.status.startswith(f"{learned}; ")
+
+
+@pytest.mark.slow
+def test_an_example_chooses_a_weight_that_helps_elsewhere() -> None:
+    one, other = crossed(), crossed(at=1.5)
+    p = network(other, 1)
+    learned = calibrate(network(one, 0), one, WILLMORE, steps=150)
+    found = refine(p, WILLMORE, example=learned, steps=150)
+    assert dice(found.mask.values, other) > dice(p > 0.5, other) + 0.05
+    assert found.coefficients == WILLMORE and found.weight == learned.trial.strength
+    assert f"the prior helps, at {found.weight:g} nats: Dice {learned.trial.score:.3f} on the example" in found.status
+    again = refine(p, WILLMORE, example=(network(one, 0), one), steps=150)
+    assert np.array_equal(again.mask.values, found.mask.values) and again.status == found.status
+
+
+def test_law_and_weight_together_or_evidence_and_weight_together_change_nothing() -> None:
+    """But for voxels at the surface: the flows round otherwise."""
+    p = network(crossed(), 0).clip(0.02, 0.98)
+    odds = (p / (1 - p)) ** 2
+    one = refine(p, WILLMORE, weight=6.0, steps=100)
+    for sure, law, weight in ((p, WILLMORE.scale(3), 2.0), (odds / (1 + odds), WILLMORE, 12.0)):
+        other = refine(sure, law, weight=weight, steps=100)
+        assert other.weight == pytest.approx(weight) and (one.mask.values != other.mask.values).mean() < 1e-3
+
+
+@pytest.mark.parametrize("p", [np.linspace(0, 0.5, 1000, dtype=np.float32), np.linspace(0.6, 1, 1000)])
+def test_a_map_without_a_surface_stays(p: np.ndarray) -> None:
+    found = refine(p.reshape(10, 10, 10), WILLMORE, weight=1.0)
+    assert np.array_equal(found.mask.values, p.reshape(10, 10, 10) > 0.5)
+
+
+MAP = network(crossed(), 0)
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({}, "neither"),
+        ({"weight": 1.0, "example": (MAP, crossed())}, "both"),
+        ({"weight": 0.0}, "weight"),
+        ({"weight": 1.0, "probabilities": "odds"}, "logits"),
+        ({"weight": 1.0, "dark": True}, "dark"),
+        ({"probabilities": False, "example": (MAP, crossed())}, "example"),
+        ({"weight": 1.0, "epsilon": -1.0}, "epsilon"),
+        ({"weight": 1.0, "channel": 1}, "channel"),
+        ({"example": (MAP, crossed()[1:])}, "shape"),
+        ({"example": (MAP, np.zeros(MAP.shape))}, "empty"),
+        ({"example": (MAP, np.ones(MAP.shape))}, "full"),
+        ({"example": (MAP, MAP)}, "labels"),
+        ({"example": (2 * MAP, crossed())}, "probabilities"),
+        ({"example": (Field(MAP, 0.5), crossed())}, "spacing"),
+        ({"example": (MAP, crossed()), "label": 3}, "label"),
+        ({"weight": 1.0, "prior": made_fit()}, "--unit"),
+        ({"example": (MAP, crossed()), "prior": "tube"}, "preset"),
+        ({"weight": 1.0, "scan": np.where(np.indices(MAP.shape)[0] == 3, math.nan, MAP)}, "finite"),
+        ({"weight": 1.0, "prior": (1, 0, -2)}, "a20"),
+        ({"example": (MAP, crossed()), "prior": (1, 0, -2)}, "a20"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:a20 > 0:UserWarning")
+def test_what_cannot_be_judged_is_refused(options, word) -> None:
+    prior = options.get("prior", WILLMORE)
+    given = {"scan": MAP, **options, "prior": Coefficients(*prior) if isinstance(prior, tuple) else prior}
+    with pytest.raises(ValueError, match=word):
+        refine(**given)
+
+
+def test_a_mask_is_at_the_probabilities_place() -> None:
+    truth = crossed((14, 15, 16))
+    chances = Field(network(truth, 0), (1.2, 0.4, 0.5), "mm", TURNED)
+    for unit, factor in (("mm", 1), ("um", 1e3), ("voxel", 1)):
+        spacing = (1.2 * factor, 0.4 * factor, 0.5 * factor)
+        there = np.diag([factor] * 3 + [1]) @ TURNED
+        learned = calibrate(chances, Field(truth, spacing, unit, there), WILLMORE, steps=1)
+        assert learned.example is chances
+        moved = there.copy()
+        moved[0, 3] += 0.5 * factor
+        with pytest.raises(ValueError, match="affine"):
+            calibrate(chances, Field(truth, spacing, unit, moved), WILLMORE, steps=1)
+
+
+def test_a_map_is_segmented_in_monai_s_chain() -> None:
+    monai = pytest.importorskip("monai.transforms", reason="needs monai, of the extra [dev]")
+    logits = torch.from_numpy(np.log(np.stack((1 - MAP, MAP)) + 1e-6))
+    options = {"weight": 3.0, "steps": 5}
+    step = monai.Lambda(lambda p: torch.from_numpy(refine(p[1], WILLMORE, **options).mask.values)[None])
+    mask = monai.Compose([monai.Activations(softmax=True), step])(logits)
+    odds = segment(torch.logit(torch.softmax(logits, 0)[1]), WILLMORE, probabilities="logits", **options)
+    assert mask.shape == (1, *MAP.shape) and (mask[0].numpy() != odds.mask.values).mean() < 1e-3
+
+
+def test_the_command_keeps_the_header_and_says_what_was_chosen(tmp_path: Path) -> None:
+    path, target = predicted(tmp_path / "in", "a", MAP), tmp_path / "new" / "mask.nii.gz"
+    other = predicted(tmp_path / "in", "b", network(crossed(), 3))
+    labels = Field(np.where(crossed(), 3, 1).astype(np.uint8), (1.2, 0.4, 0.5), "mm", TURNED)
+    save(labels, tmp_path / "truth.nii.gz")
+    told = (
+        "--probabilities",
+        "--channel",
+        1,
+        "--prior",
+        "tubes",
+        "--steps",
+        10,
+        "--example",
+        tmp_path / "truth.nii.gz",
+    )
+    result = call("segment", path, *told, "--example-probabilities", other, "--label", 3, "-o", target)
+    assert result.exit_code == 0, (result.output, result.exception)
+    one, mask = (nibabel.load(each) for each in (path.with_suffix(".nii.gz"), target))
+    assert mask.affine.tobytes() == one.affine.tobytes() and mask.shape == one.shape  # type: ignore[attr-defined]
+    record = json.loads((target.parent / "mask.json").read_text())
+    assert (record["job"], record["steps"], record["example_probabilities"]) == ("segment", 10, str(other))
+    chosen = record["calibration"]
+    assert record["status"].startswith("no prior helps here" if chosen["law"] is None else "the ")
+    assert f"Dice {max(chosen['dice'], chosen['dice_without']):.3f}" in result.stdout
+    assert sorted(each.name for each in target.parent.iterdir()) == ["mask.json", "mask.nii.gz", "mask.png"]
+
+
+@pytest.mark.slow
+def test_a_folder_of_predictions_is_segmented_by_one_example(tmp_path: Path) -> None:
+    for name, at in (("a", 0.0), ("b", 1.5), ("c.d", 0.7)):
+        predicted(tmp_path / "in", name, network(crossed(at=at), 5))
+    example = predicted(tmp_path, "example", network(crossed(), 6))
+    truth = tmp_path / "truth.npy"
+    np.save(truth, crossed())
+    options = ("--probabilities", "--channel", 1, "--prior", "tubes", "--steps", 2, "--example", truth)
+    options = (*options, "--example-probabilities", example)
+    result = call("segment", tmp_path / "in", *options, "-o", tmp_path / "out")
+    assert result.exit_code == 0, (result.output, result.exception)
+    tried = [json.loads(path.read_text())["calibration"] for path in sorted((tmp_path / "out").glob("*.json"))]
+    assert len(tried) == 3 and tried[0] == tried[1] == tried[2]
+    masks = sorted(path.name for path in (tmp_path / "out").glob("*.nii.gz"))
+    assert masks == ["a.nii.gz", "b.nii.gz", "c.d.nii.gz"]
+    for name in masks:
+        one, other = (load(tmp_path / folder / name) for folder in ("in", "out"))
+        assert np.array_equal(one.affine, other.affine)  # type: ignore[arg-type]
+    single = call("segment", tmp_path / "in" / "b.npz", *options, "-o", tmp_path / "b.nii.gz")
+    assert single.exit_code == 0
+    assert np.array_equal(load(tmp_path / "b.nii.gz").values, load(tmp_path / "out" / "b.nii.gz").values)
+    refused(call("segment", tmp_path / "in", *options, "-o", tmp_path / "in"), "input")
+    refused(call("segment", tmp_path / "in", *options, "--like", truth, "-o", tmp_path / "more"), "--like")
+    predicted(tmp_path / "in", "z", 1.5 * network(crossed(), 5))
+    refused(call("segment", tmp_path / "in", *options, "-o", tmp_path / "more"), "probabilities")
+    assert not (tmp_path / "more").exists()

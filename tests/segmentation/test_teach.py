@@ -15,16 +15,7 @@ import curvafit.segmentation.teach as room
 from curvafit.data_synth.atlas import build
 from curvafit.generation.schedule import schedule
 from curvafit.segmentation.filler import FAR, Filler, Taught
-from curvafit.segmentation.teach import (
-    Lessons,
-    Mix,
-    Texture,
-    Whole,
-    WholeLessons,
-    learn,
-    load_textures,
-    teach,
-)
+from curvafit.segmentation.teach import Lessons, Mix, Texture, Whole, WholeLessons, learn, load_textures, teach
 from curvafit.volumes.field import Field
 from curvafit.volumes.write import save
 
@@ -46,17 +37,11 @@ def lessons(mix: Mix = EXACT, length: int = 6, **sizes: int) -> Lessons:
     return Lessons([[TEXTURE]], mix, 0, length, **{"size": 2, "edge": 16, "halo": 4, **sizes})
 
 
-# ---- lessons ---------------------------------------------------------------------------------------------------------
-
-
-def test_a_lesson_depends_on_its_number_alone() -> None:
+def test_a_lesson_depends_on_its_number_alone_and_is_what_the_network_reads() -> None:
     one, other = lessons(Mix()), lessons(Mix(), length=99)
     for number in (5, 0, 3):
         assert all(np.array_equal(a, b) for a, b in zip(one[number], other[number], strict=True))
     assert not np.array_equal(one[0][0], replace(one, seed=1)[0][0])
-
-
-def test_lessons_have_what_the_network_reads() -> None:
     for number in range(6):
         distances, steps, marks, evidence, truth = lessons(Mix())[number]
         assert evidence is None
@@ -88,26 +73,16 @@ def test_a_texture_repeats_where_it_is_told_to() -> None:
     assert values[0] == pytest.approx(float(TEXTURE.read(points[:, 2:] - [[0], [0], [24]])[0]), abs=1e-5)
 
 
-def test_lessons_of_an_example_are_its_own_slices() -> None:
-    z, y, x = np.mgrid[:30, :20, :20]
-    distances = (4 - np.hypot(y - 10, x - 5 - z / 4)).astype(np.float32)
-    for number in range(5):
-        known, steps, marks, evidence, truth = WholeLessons([Whole(distances, 6, 1.5)], 5, size=2)[number]
-        assert evidence is None
-        assert known.shape[:2] == (2, 4) and 4 <= truth.shape[1] <= 6 and (steps == 1.5).all() and not marks.any()
-        assert np.isin(known, distances).all()
-
-
-def test_lessons_of_an_imaged_volume_have_the_evidence_of_their_slices() -> None:
+def test_lessons_of_a_whole_volume_are_its_own_slices_with_their_evidence() -> None:
     z, y, x = np.mgrid[:25, :20, :20]
     distances = (4 - np.hypot(y - 10, x - 5 - z / 4)).astype(np.float32)
     for number in range(5):
+        known, steps, marks, evidence, truth = WholeLessons([Whole(distances, 6, 1.5)], 5, size=2)[number]
+        assert evidence is None and np.isin(known, distances).all()
+        assert known.shape[:2] == (2, 4) and 4 <= truth.shape[1] <= 6 and (steps == 1.5).all() and not marks.any()
         known, _, _, evidence, truth = WholeLessons([Whole(distances, 6, 1.5, distances)], 5)[number]
         assert evidence is not None
         assert truth.shape[1] == 5 and ((evidence > 0) == truth).all() and np.isin(known, distances[::6]).all()
-
-
-# ---- learning --------------------------------------------------------------------------------------------------------
 
 
 def test_a_run_that_was_stopped_ends_as_one_that_was_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -140,9 +115,6 @@ def test_teaching_lowers_the_loss_of_shapes_held_out(monkeypatch: pytest.MonkeyP
     assert card["held_out_loss"] < 0.9 * card["held_out_cubic"] and 0 <= taught.error < 0.2
     assert (card["shapes"], card["held_out"], card["steps"]) == (3, 1, 60)
     assert taught.temperatures.shape == (2, room.TEMPERATURES) and (np.diff(taught.temperatures[0]) >= 0).all()
-
-
-# ---- sources ---------------------------------------------------------------------------------------------------------
 
 
 def test_stores_and_masks_teach(tmp_path: Path) -> None:

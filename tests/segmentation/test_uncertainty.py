@@ -34,21 +34,12 @@ def ball(n: int = 32, radius: float = 10.0) -> np.ndarray:
     return np.linalg.norm(np.mgrid[:n, :n, :n] - (n - 1) / 2, axis=0) < radius
 
 
-# ---- harmonic distance -----------------------------------------------------------------------------------------------
-
-
-def test_the_reach_is_that_of_both_sides() -> None:
+def test_the_reach_is_that_of_both_sides_and_a_new_slice_lowers_that_of_its_gap_alone() -> None:
     np.testing.assert_allclose(harmonic_distance([1, 5], 8), [1, 0, 3 / 4, 1, 3 / 4, 0, 1, 2])
     np.testing.assert_allclose(harmonic_distance([1, 5], 8, periodic=True), [3 / 4, 0, 3 / 4, 1, 3 / 4, 0, 3 / 4, 1])
     np.testing.assert_allclose(harmonic_distance([2], 4, periodic=True), [1, 3 / 4, 0, 3 / 4])
-
-
-def test_a_new_slice_lowers_the_reach_of_its_gap_alone() -> None:
     before, after = harmonic_distance([0, 8, 16], 20), harmonic_distance([0, 3, 8, 16], 20)
     assert (after[1:8] < before[1:8]).all() and np.array_equal(after[8:], before[8:])
-
-
-# ---- calibration -----------------------------------------------------------------------------------------------------
 
 
 def test_the_calibration_error_is_exact_where_shares_are() -> None:
@@ -70,8 +61,9 @@ def test_labels_drawn_by_their_probability_are_calibrated() -> None:
     assert abs(calibration_error(overconfident, inside) - gap) < 5 * noise + 1 / BINS  # within a bin p varies by 1 / 15
 
 
-def test_the_weights_are_those_by_which_labels_were_drawn() -> None:
-    """The error of the likeliest weights has the inverse Fisher information for its covariance."""
+def test_the_weights_are_those_by_which_labels_were_drawn_and_end() -> None:
+    """The error of the likeliest weights has the inverse Fisher information for its covariance; what is always right
+    has weights too."""
     rng = np.random.default_rng(1)
     weights = np.array([0.5, 2.0, -0.7])
     signs = np.column_stack([2 * rng.normal(size=40_000), rng.normal(size=40_000)])
@@ -83,31 +75,18 @@ def test_the_weights_are_those_by_which_labels_were_drawn() -> None:
     assert (np.abs(found - weights) < 5 * noise).all()
     other = fit_weights(-signs, ~inside)  # what is inside is named outside
     assert other == pytest.approx(found * [1, 1, -1], rel=1e-4)
-
-
-def test_what_is_always_right_gets_weights_that_end() -> None:
     signs = np.repeat([[-3.0, -4.0], [3.0, 4.0]], 50, axis=0)
     weights = fit_weights(signs, signs[:, 0] > 0)
     assert np.isfinite(weights).all()
     assert calibration_error(probability(signs, weights), signs[:, 0] > 0) < 1e-3
 
 
-def test_the_entropy_of_certainty_is_none() -> None:
-    assert entropy(np.array([0.0, 1.0])).tolist() == [0, 0]
-    assert entropy(np.array([0.5], dtype=np.float32))[0] == pytest.approx(np.log(2))
-
-
-def test_near_is_within_three_voxels() -> None:
+def test_near_is_within_three_voxels_and_certainty_has_no_entropy() -> None:
     mask = np.zeros((20, 4, 4), dtype=bool)
     mask[10:] = True
     assert near_surface(mask)[:, 0, 0].nonzero()[0].tolist() == [7, 8, 9, 10, 11, 12]
-    assert (
-        not near_surface(np.zeros((4, 4, 4), dtype=bool)).any()
-        and not near_surface(np.ones((4, 4, 4), dtype=bool)).any()
-    )
-
-
-# ---- the volume by known slices --------------------------------------------------------------------------------------
+    assert not any(near_surface(np.full((4, 4, 4), value)).any() for value in (False, True))
+    assert entropy(np.array([0.0, 1.0, 0.5], dtype=np.float32)) == pytest.approx([0, 0, np.log(2)])
 
 
 def test_the_interval_of_the_known_slices_holds_the_volume() -> None:
@@ -149,9 +128,6 @@ def test_a_mask_that_is_no_estimate_of_a_volume_is_told() -> None:
     assert not any("volume" in note for note in ball_found.notes)
 
 
-# ---- the best threshold ----------------------------------------------------------------------------------------------
-
-
 def test_the_best_threshold_has_the_best_expected_dice() -> None:
     p = np.random.default_rng(0).beta(0.3, 1.0, 5000)
 
@@ -163,10 +139,7 @@ def test_the_best_threshold_has_the_best_expected_dice() -> None:
     assert found == pytest.approx(expected(found) / 2, abs=0.01)
 
 
-# ---- reconstruct -----------------------------------------------------------------------------------------------------
-
-
-def test_a_reconstruction_says_how_sure_it_is() -> None:
+def test_a_reconstruction_says_how_sure_it_is_and_where_to_annotate() -> None:
     mask = ball(24, 8.0).transpose(1, 2, 0)
     found = reconstruct(mask, every=5, axis=2, suggest=2)
     assert found.probability is not None and found.uncertainty is not None
@@ -178,31 +151,22 @@ def test_a_reconstruction_says_how_sure_it_is() -> None:
     following = found.uncertainty.suggestions
     assert len(following) == 2 and all(n % 5 for n in following)
     assert found.status.endswith(f"annotate next: {following[0]}, {following[1]}")
+    left = reconstruct(ball(24, 8.0), known=[n for n in range(24) if not 6 < n < 11], suggest=1)
+    assert left.uncertainty is not None and 6 < left.uncertainty.suggestions[0] < 11
 
-
-def test_a_gap_that_is_left_is_suggested() -> None:
-    mask = ball(24, 8.0)
-    places = [n for n in range(24) if not 6 < n < 11]
-    found = reconstruct(mask, known=places, suggest=1)
-    assert found.uncertainty is not None and 6 < found.uncertainty.suggestions[0] < 11
-
-
-# ---- suggestions -----------------------------------------------------------------------------------------------------
 
 ENTROPIES = np.random.default_rng(2).uniform(1, 5, 40)
 PLACES = [0, 7, 20, 22, 39]
 
 
-def test_suggestions_are_unknown_slices_in_any_order_of_the_known() -> None:
+def test_suggestions_are_unknown_slices_in_any_order_of_the_known_and_mirrored() -> None:
     found = suggest_slices(ENTROPIES, PLACES, 6)
     assert len(set(found)) == 6 and not set(found) & set(PLACES)
     assert suggest_slices(ENTROPIES, PLACES[::-1], 6) == found
     assert suggest_slices(ENTROPIES, PLACES, 3) == found[:3]
-
-
-def test_a_mirrored_volume_has_mirrored_suggestions() -> None:
     mirrored = suggest_slices(ENTROPIES[::-1], [39 - n for n in PLACES], 6)
-    assert tuple(39 - n for n in mirrored) == suggest_slices(ENTROPIES, PLACES, 6)
+    assert tuple(39 - n for n in mirrored) == found
+    assert suggest_slices(np.zeros(10), [0, 9], 3) == () and suggest_slices(np.ones(4), [0, 1, 2], 3) == (3,)
 
 
 @pytest.mark.parametrize("periodic", [False, True])
@@ -223,11 +187,6 @@ def test_an_even_gap_is_halved_and_the_most_uncertain_comes_first() -> None:
     assert sorted(suggest_slices(flat, [0, 16, 32], 2)) == [8, 24]
     flat[17:32] *= 2
     assert suggest_slices(flat, [0, 16, 32], 1) == (24,)
-
-
-def test_where_nothing_is_open_nothing_is_suggested() -> None:
-    assert suggest_slices(np.zeros(10), [0, 9], 3) == ()
-    assert suggest_slices(np.ones(4), [0, 1, 2], 3) == (3,)
 
 
 def test_the_temperature_is_that_by_which_labels_were_drawn() -> None:
