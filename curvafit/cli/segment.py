@@ -239,9 +239,6 @@ def _fill_blocks(job: _Job, options: dict[str, Any]) -> bool:
     return True
 
 
-# ---- one mask --------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Job:
     """A volume to read, a mask to write, and a record of the command's options."""

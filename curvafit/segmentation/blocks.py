@@ -354,9 +354,6 @@ def _read_known(job: Job, find: Finder, doubted: bool) -> tuple[Job, tuple[str, 
     return replace(job, pixel=pixel), (*doubts, *doubt_labels(values))
 
 
-# ---- one slab, one block ---------------------------------------------------------------------------------------------
-
-
 def look_at_slab(job: Job, number: int) -> Found:
     """Return which slices of a slab have labels."""
     return {"there": find_labelled(job.slab(number)[1])}

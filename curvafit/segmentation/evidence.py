@@ -213,9 +213,6 @@ def _split(values: np.ndarray, smooth: np.ndarray, threshold: float | str) -> tu
     return means, math.sqrt(pooled)
 
 
-# ---- a network's maps ------------------------------------------------------------------------------------------------
-
-
 def load_probabilities(
     source: Source,
     *,

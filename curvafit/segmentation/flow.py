@@ -78,9 +78,6 @@ def bending(law: Coefficients) -> float:
     return stiffness
 
 
-# ---- grids -----------------------------------------------------------------------------------------------------------
-
-
 def choose_epsilon(scan: Field, epsilon: float | None) -> float:
     """Return ε, by default twice the smallest voxel edge; raise ValueError where it is not positive."""
     if epsilon is None:

@@ -180,9 +180,6 @@ def flow_summary(share: float, energy: Sequence[float] = (), steps: int = 0) -> 
     return f"{'settled' if abs(fall) < SETTLED else 'still moving'} after {length}: {inside}"
 
 
-# ---- files -----------------------------------------------------------------------------------------------------------
-
-
 def check_mask_target(
     path: str | Path,
     scan: Field | None = None,
@@ -359,9 +356,6 @@ def describe_run(found: Segmentation, options: Mapping[str, Any], scan: Field, s
         "torch": version("torch"),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
-
-
-# ---- what is said of a volume filled between known slices ------------------------------------------------------------
 
 
 def list_numbers(numbers: Sequence[int], most: int = FEW) -> str:

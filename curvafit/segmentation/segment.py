@@ -221,9 +221,6 @@ def _missing_phase(evidence: VolumeEvidence, tiling: Tiling) -> str:
     return "background" if True in seen else "structure"
 
 
-# ---- an example ------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Calibration:
     """The law and weight that an example chose for a network's probabilities.

@@ -292,9 +292,6 @@ def plane_distances(masks: np.ndarray, spacing: Sequence[float], gap: float) -> 
     return np.where(np.isinf(distances), np.copysign(gap, distances), distances)
 
 
-# ---- checks ----------------------------------------------------------------------------------------------------------
-
-
 def require_labels(values: np.ndarray, name: str, most: float = LABELS) -> np.ndarray:
     """Return the values, or raise ScanError where they are grey levels, or more than `most`; the message calls them
     `name`."""

@@ -128,9 +128,6 @@ class Tiling:
         return tiles
 
 
-# ---- finished tiles --------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Piece:
     """The result of a tile: its number, mask and phase field on the core, and the last two energies of its flow."""
@@ -180,9 +177,6 @@ def open_store(folder: str | PathLike[str], shape: tuple[int, int, int], run: Ma
             parts = "; ".join(f"{name} {other.get(name)} instead of {mine.get(name)}" for name in names)
             raise ValueError(f"the tiles in {place} are another run's, with {parts}: delete them to start again")
         yield TileStore(shape, place)
-
-
-# ---- lowering --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
