@@ -182,9 +182,8 @@ def reconstruct(
     Raises
     ------
     ValueError, FileNotFoundError
-        As `segment`; or if fewer than two slices are known, or too few to try a law out on and there is neither an
-        example nor a stiffness; or if known slices are all empty, all full or grey levels, the example's spacing or the
-        image's voxels are other ones, or more slices are to be suggested than are unknown.
+        As `segment`; or if known slices are fewer than two, or than a law is tried out on, all empty, all full or grey
+        levels; or if an example's spacing or an image's voxels are other ones.
     ImportError
         If an image is given, and scikit-learn is not installed.
     """

@@ -93,10 +93,8 @@ class Texture:
         return ndimage.map_coordinates(self.values, points, np.float32, order=1, mode=mode, prefilter=False)
 
     def cut(self, rng: np.random.Generator, axes: Sequence[np.ndarray], thickness: float, mix: Mix) -> np.ndarray:
-        """Return a window, bool (Z, Y, X), at places along three axes, anywhere, turned and stretched at random.
-
-        `thickness` is that of the structure in the window, in the unit of the places.
-        """
+        """Return a window, bool (Z, Y, X), at places along three axes, anywhere, turned and stretched at random, of
+        structures of a thickness in the unit of the places."""
         voxels = self.thickness / thickness
         if rng.random() < mix.upright or not self.periodic:
             turn = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)[:, None]
@@ -406,11 +404,8 @@ def learn(
     workers: int = 1,
     progress: Progress = silent,
 ) -> list[float]:
-    """Lower the loss of lessons by AdamW in one cycle of rates; return the mean loss of each hundred steps.
-
-    The network learns in place. With a checkpoint, the state is written there every `SAVED` steps, and learning goes on
-    from it.
-    """
+    """Lower the loss of lessons by AdamW in one cycle of rates, in place; return the mean loss of each hundred steps.
+    With a checkpoint, the state is written there every `SAVED` steps, and learning goes on from it."""
     total = len(lessons)
     optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=1e-4)
     cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=total, pct_start=0.1)
@@ -512,8 +507,7 @@ def teach(
 @torch.inference_mode()
 def judge(filler: Filler, lessons: Batches) -> tuple[np.ndarray, dict[str, float], float]:
     """Return temperatures (2, k) by gap; the cross entropy of held-out lessons and that of the cubic alone; and the
-    calibration error near surfaces, where a temperature is of another half of the lessons.
-    """
+    calibration error near surfaces, where a temperature is of another half of the lessons."""
     gaps, logits, plain, truths = [], [], [], []
     for *given, truth in DataLoader(lessons, batch_size=None):
         batch = Gaps(*given)
@@ -529,11 +523,9 @@ def judge(filler: Filler, lessons: Batches) -> tuple[np.ndarray, dict[str, float
         errors += [near_error(z / t, y) for (z, y), t in zip(parts, cooled[::-1], strict=True)]
         table.append((float(np.mean([gaps[k] for k in rows])), float(np.sqrt(np.prod(cooled)))))
     cross_entropy = F.binary_cross_entropy_with_logits
-    whole = {
-        name: float(cross_entropy(torch.cat(each), torch.cat(truths)))
-        for name, each in (("loss", logits), ("cubic", plain))
-    }
-    return np.array(table).T, {f"held_out_{name}": value for name, value in whole.items()}, float(np.mean(errors))
+    pairs = (("held_out_loss", logits), ("held_out_cubic", plain))
+    whole = {name: float(cross_entropy(torch.cat(each), torch.cat(truths))) for name, each in pairs}
+    return np.array(table).T, whole, float(np.mean(errors))
 
 
 def near_error(logits: Tensor, truth: Tensor) -> float:

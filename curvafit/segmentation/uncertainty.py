@@ -79,10 +79,8 @@ def expected_dice(probability: np.ndarray, mask: np.ndarray) -> float:
 
 
 def best_log_odds(logits: np.ndarray) -> float:
-    """Return the log-odds of the `best_threshold` of voxels with these log-odds, but not below that of `LEAST`.
-
-    Where structures are thinner than those that taught, probabilities are too small, and so would the threshold be.
-    """
+    """Return the log-odds of the `best_threshold` of voxels with these log-odds, but not below that of `LEAST`: where
+    structures are thinner than those that taught, probabilities are too small, and so would the threshold be."""
     return float(logit(max(best_threshold(count_probabilities(expit(logits))), LEAST)))
 
 
@@ -97,11 +95,8 @@ def fit_temperature(logits: np.ndarray, inside: np.ndarray) -> float:
 
 
 def calibration_error(probability: np.ndarray, inside: np.ndarray) -> float:
-    """Return the expected calibration error: how far shares inside are from what probabilities say, on average.
-
-    Voxels are sorted into bins of equal width by their probability; the mean over voxels is taken of the difference,
-    in a voxel's bin, between the share that is inside and the mean probability. 0 where there are no voxels.
-    """
+    """Return the expected calibration error: the mean over voxels of the difference, in a voxel's bin of probability,
+    between the share that is inside and the mean probability; 0 where there are no voxels."""
     where = np.minimum((probability * BINS).astype(int), BINS - 1)
     excess = np.bincount(where, inside - probability.astype(np.float64), minlength=BINS)
     return float(np.abs(excess).sum() / max(len(where), 1))
@@ -156,11 +151,8 @@ def _with_constant(evidence: np.ndarray) -> np.ndarray:
 
 
 def suggest_slices(entropies: np.ndarray, places: Sequence[int], count: int, periodic: bool = False) -> tuple[int, ...]:
-    """Return the slices to annotate next, the most telling first, each chosen as if those before it were known.
-
-    `entropies` are those of the slices (Z,), `places` the known ones. There are fewer where no other would tell
-    anything.
-    """
+    """Return the slices to annotate next, given entropies (Z,), the most telling first, each chosen as if those
+    before it were known; fewer where no other would tell anything."""
     known, left = set(places), np.asarray(entropies, dtype=np.float64)
     chosen: list[int] = []
     for _ in range(count):
