@@ -102,10 +102,8 @@ def segment(
 
 
 def _list_maps(job: _Job, given: dict[str, str | None]) -> tuple[list[_Job], Callable[..., Field]]:
-    """Return a job for a map of probabilities, or for each of a folder of NPZ files, and what reads a map.
-
-    All are read before the first work, which may take minutes, so that what is none is refused.
-    """
+    """Return a job for a map of probabilities, or for each of a folder of NPZ files, and what reads a map. All are read
+    before the first work, which may take minutes, so that what is none is refused."""
     from curvafit.segmentation.evidence import find_image, load_probabilities, probability_evidence
     from curvafit.segmentation.slices import check_spacing
 

@@ -50,11 +50,9 @@ class Filled:
 
 @dataclass(frozen=True, eq=False)
 class Fill:
-    """One fill of a layer: which slices were known of which labels, and what was filled in.
-
-    `where` are flat indices, in values of `shape`, of what was filled in: voxels that changed and, in slices that were
-    not known, those of the labels and of earlier fills; `before` and `after` are the values there.
-    """
+    """One fill of a layer: which slices were known of which labels, and what was filled in. `where` are flat indices,
+    in values of `shape`, of what was filled in: voxels that changed and, in slices that were not known, those of the
+    labels and of earlier fills; `before` and `after` are the values there."""
 
     axis: int
     known: Sequence[int]

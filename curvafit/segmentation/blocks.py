@@ -229,10 +229,8 @@ def reconstruct_file(
 @dataclass(frozen=True)
 class Job:
     """What processes must know to fill blocks of a volume, whose first axis here is `axis`, that across the slices.
-
     Known slices at `places`, mask and probability are written into `folder`; `thick` slices are read at once. `pixel`
-    is the edge of the network's pixels, `edges` are the voxels of a block along each axis, whole chunks of `chunk`.
-    """
+    is the edge of the network's pixels, `edges` are the voxels of a block along each axis, whole chunks of `chunk`."""
 
     volume: Volume
     axis: int

@@ -146,11 +146,9 @@ def grey_bounds(values: np.ndarray, threshold: float | str = "otsu") -> tuple[fl
 
 def estimate_classes(values: np.ndarray, scan: Field, threshold: float | str = "otsu", dark: bool = False) -> Classes:
     """Split the smoothed scan at a threshold, and measure the raw levels on either side: means and pooled deviation.
-
     This is done twice: the noise found first sets the width of the smoothing then. With `"otsu"` the classes are split
     half way between their means. A structure of less than 0.1 % of the volume needs a given threshold, since Otsu's
-    takes it for a tail of the noise.
-    """
+    takes it for a tail of the noise."""
     means, noise = _split(values, _smooth(values, scan, WIDTHS[0] + 0.3), threshold)
     width = _smoothing_width(noise / (means[1] - means[0]))
     means, noise = _split(values, _smooth(values, scan, width), threshold)
@@ -172,10 +170,8 @@ def grey_ratio(values: np.ndarray, classes: Classes) -> np.ndarray:
 
 
 def probability_evidence(probability: Field) -> VoxelEvidence:
-    """Return the evidence of probabilities (Z, Y, X): r = log p / (1 - p), and p - 1/2 as level.
-
-    Values within 1e-3 of [0, 1], as resampling leaves them, are cut to it; raises `ScanError` if one lies farther off.
-    """
+    """Return the evidence of probabilities (Z, Y, X): r = log p / (1 - p), and p - 1/2 as level. Values within 1e-3 of
+    [0, 1], as resampling leaves them, are cut to it; raises `ScanError` if one lies farther off."""
     values = probability.values.astype(np.float32)
     lowest, highest = float(values.min()), float(values.max())
     if not -_STRAY <= lowest <= highest <= 1 + _STRAY:

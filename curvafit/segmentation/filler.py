@@ -46,11 +46,9 @@ CONDITIONS = 4
 
 
 class Block(nn.Module):
-    """Two convolutions with a shortcut; features are normalised over channels, pixel by pixel.
-
-    A condition, `conditions` long, scales and shifts each channel; `skips` channels of features that are the same for
-    all slices of a gap are convolved once, and added.
-    """
+    """Two convolutions with a shortcut; features are normalised over channels, pixel by pixel. A condition,
+    `conditions` long, scales and shifts each channel; `skips` channels of features that are the same for all slices of
+    a gap are convolved once, and added."""
 
     def __init__(self, inputs: int, outputs: int, conditions: int = 0, skips: int = 0) -> None:
         super().__init__()
@@ -79,12 +77,10 @@ def _normalise(x: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Gaps:
-    """Gaps between known slices, B at a time, all with n slices to fill, `step` (B,) pixels apart.
-
-    `distances` are signed ones in the four nearest known slices (B, 4, Y, X), in pixels, positive inside, cut at `FAR`;
-    the gap is between the second and the third, Y and X are multiples of 4. Of the slices to fill (B, n, Y, X), `marks`
-    say what is known, 1 inside, -1 outside, 0 unknown, and `evidence` what an image says, as log-odds.
-    """
+    """Gaps between known slices, B at a time, all with n slices to fill, `step` (B,) pixels apart. `distances` are
+    signed ones in the four nearest known slices (B, 4, Y, X), in pixels, positive inside, cut at `FAR`; the gap is
+    between the second and the third, Y and X are multiples of 4. Of the slices to fill (B, n, Y, X), `marks` say what
+    is known, 1 inside, -1 outside, 0 unknown, and `evidence` what an image says, as log-odds."""
 
     distances: Tensor
     step: Tensor
@@ -174,10 +170,8 @@ class Filler(nn.Module):
         return filler
 
     def forward(self, gaps: Gaps, drop: int = 0) -> Tensor:
-        """Return the log-odds of the inside (B, n, Y - 2 drop, X - 2 drop) in the slices to fill.
-
-        `drop` pixels at each border, a multiple of 4, are only seen: 0, or 16 and more.
-        """
+        """Return the log-odds of the inside (B, n, Y - 2 drop, X - 2 drop) in the slices to fill. `drop` pixels at each
+        border, a multiple of 4, are only seen: 0, or 16 and more."""
         n, rim = gaps.marks.shape[1], min(drop, RIM)
         fine = self.fine(gaps.distances / _DISTANCE)
         middle = self.middle(F.avg_pool2d(fine, 2))
@@ -216,10 +210,8 @@ def _trim(x: Tensor, pixels: int) -> Tensor:
 
 
 def _convolve(part: nn.Conv3d, x: Tensor) -> Tensor:
-    """Return a convolution in 3D, (B, c, Z, Y, X), as one in 2D of slices with their neighbours as channels.
-
-    With few channels and slices that is five times as fast on a processor.
-    """
+    """Return a convolution in 3D, (B, c, Z, Y, X), as one in 2D of slices with their neighbours as channels. With few
+    channels and slices that is five times as fast on a processor."""
     size, count = part.kernel_size[0], x.shape[2]
     margin = size // 2
     padded = F.pad(x, (0, 0, 0, 0, margin, margin))
@@ -298,9 +290,7 @@ def fill_gaps(
 @dataclass(frozen=True)
 class Raster:
     """Square pixels for slices, `pixel` wide in the unit of their spacing, so that structures are some pixels thick.
-
-    The pixels cover the core (y, x) of slices of a shape; those of a core lie where those of the whole do.
-    """
+    The pixels cover the core (y, x) of slices of a shape; those of a core lie where those of the whole do."""
 
     shape: tuple[int, int]
     edges: tuple[float, float]
@@ -331,10 +321,8 @@ class Raster:
         return tuple(slice(max(edge.start, 0), min(edge.stop, n)) for edge, n in ends)  # type: ignore[return-value]
 
     def distances(self, mask: np.ndarray) -> np.ndarray:
-        """Return the signed distances of the part of a slice that is seen, in pixels, cut at `FAR`, float32.
-
-        The outlines are continued by `REACH` pixels on each side: the shape is `size` + 2 `REACH`.
-        """
+        """Return the signed distances of the part of a slice that is seen, in pixels, cut at `FAR`, float32. The
+        outlines are continued by `REACH` pixels on each side: the shape is `size` + 2 `REACH`."""
         padded = np.pad(mask, self._padding, mode="edge")
         return self._resample(centre_distance(padded, self.edges, FAR * self.pixel) / self.pixel)
 
@@ -444,10 +432,8 @@ def _fill_gap(
     filler: Filler, known: np.ndarray, marks: np.ndarray | None, evidence: np.ndarray | None, count: int, step: float
 ) -> np.ndarray:
     """Return the log-odds (count, Y, X) in the slices of a gap whose four known slices have distances (4, Y', X').
-
     Those are longer by `REACH` on all sides. Where all four are far inside or far outside, nothing is computed; the
-    rest is filled tile by tile.
-    """
+    rest is filled tile by tile."""
     distances = torch.from_numpy(np.ascontiguousarray(known))
     near = _trim(~((distances == FAR).all(0) | (distances == -FAR).all(0)), REACH)
     told = torch.zeros(1, count, *known.shape[1:])
@@ -472,10 +458,8 @@ def _fill_gap(
 @dataclass(frozen=True, eq=False)
 class Taught:
     """A filler with its `card` of JSON's types, on what taught it and how well it does on shapes held out.
-
     `temperatures` (2, k) are gaps in pixels, ascending, and by what log-odds are divided there to be true; `error` is
-    the calibration error near surfaces on shapes held out, or an example; `status` begins a sentence on what fills.
-    """
+    the calibration error near surfaces on shapes held out, or an example; `status` begins a sentence on what fills."""
 
     filler: Filler
     temperatures: np.ndarray

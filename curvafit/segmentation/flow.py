@@ -34,12 +34,10 @@ Ends = tuple[tuple[bool, bool], tuple[bool, bool], tuple[bool, bool]]
 def lower_energy(
     level: np.ndarray, law: Coefficients, data: Data, place: WorkingGrid, steps: int, progress: Progress = silent
 ) -> Flow:
-    """Lower D(u) + F_ε(u) from the set where a level is positive, with u = k ∗ v: Adam under a cooling schedule.
-
-    The `level` (Z, Y, X) is smooth, on the scan's grid. The scale of the law, whose lengths are in the scan's unit,
-    does not matter; D is on the working grid, in units of F_ε of a law with a20 + a02 = 2. Raises `ScanError` if a20 +
-    a02 is not positive, or the energy does not stay finite.
-    """
+    """Lower D(u) + F_ε(u) from the set where a level is positive, with u = k ∗ v: Adam under a cooling schedule. The
+    `level` (Z, Y, X) is smooth, on the scan's grid. The scale of the law, whose lengths are in the scan's unit, does
+    not matter; D is on the working grid, in units of F_ε of a law with a20 + a02 = 2. Raises `ScanError` if a20 + a02
+    is not positive, or the energy does not stay finite."""
     flow = descend(
         initial_field(level, place),
         law.scale(BENDING / bending(law)).in_unit(place.unit),
@@ -57,10 +55,8 @@ def lower_energy(
 
 
 def initial_field(level: np.ndarray, place: WorkingGrid) -> Tensor:
-    """Return the phase field, on the working grid, of the set where a smooth volume (Z, Y, X) is positive.
-
-    A volume that is positive everywhere or nowhere, as in a tile far from the surface, gives a field of 1 or -1.
-    """
+    """Return the phase field, on the working grid, of the set where a smooth volume (Z, Y, X) is positive. A volume
+    that is positive everywhere or nowhere, as in a tile far from the surface, gives a field of 1 or -1."""
     inside = place.to_grid(level) > 0
     if inside.all() or not inside.any():
         return 2 * inside.float() - 1
@@ -68,10 +64,8 @@ def initial_field(level: np.ndarray, place: WorkingGrid) -> Tensor:
 
 
 def bending(law: Coefficients) -> float:
-    """Return a20 + a02, or raise ScanError where it is not positive.
-
-    Bumps on a plane cost (a20 + a02) / 2 times their Willmore energy.
-    """
+    """Return a20 + a02, or raise ScanError where it is not positive. Bumps on a plane cost (a20 + a02) / 2 times their
+    Willmore energy."""
     stiffness = float(law.a20 + law.a02)
     if stiffness <= 0:
         raise ScanError(f"a20 + a02 must be positive, got {stiffness:g}: surfaces would crumple")
@@ -87,12 +81,9 @@ def choose_epsilon(scan: Field, epsilon: float | None) -> float:
 
 @dataclass(frozen=True)
 class WorkingGrid:
-    """The grid of a flow: working units, axes refined until ε spans two voxels, and a halo without data.
-
-    The `grid` includes the halo, of `halo` voxels on the sides in `ends`; its boundary replicates, unless the scan
-    repeats. A scan voxel has `times` parts along each axis; a working length of 1 is `unit`, and ε `epsilon`, in the
-    scan's unit.
-    """
+    """The grid of a flow: working units, axes refined until ε spans two voxels, and a halo without data. The `grid`
+    includes the halo, of `halo` voxels on the sides in `ends`; its boundary replicates, unless the scan repeats. A scan
+    voxel has `times` parts along each axis; a working length of 1 is `unit`, and ε `epsilon`, in the scan's unit."""
 
     grid: Grid
     times: tuple[int, int, int]

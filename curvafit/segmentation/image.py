@@ -111,9 +111,7 @@ def _eigenvalues(
     zz: np.ndarray, zy: np.ndarray, zx: np.ndarray, yy: np.ndarray, yx: np.ndarray, xx: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the eigenvalues of symmetric 3 × 3 matrices, the greatest first, by the cosines that solve their cubic.
-
-    Ten times as fast as LAPACK, and as exact as features of 16 bits need.
-    """
+    Ten times as fast as LAPACK, and as exact as features of 16 bits need."""
     mean = (zz + yy + xx) / 3
     a, b, c = zz - mean, yy - mean, xx - mean
     scale = np.sqrt((a * a + b * b + c * c + 2 * (zy * zy + zx * zx + yx * yx)) / 6)

@@ -304,10 +304,8 @@ class _Engine:
         return self.filled[slices]
 
     def level(self, slices: Slices) -> np.ndarray:
-        """Return log-odds over those of the best threshold (Z, Y, X), times the edge of a voxel.
-
-        Slices before the first known one and beyond the last have no threshold, unless an image tells them.
-        """
+        """Return log-odds over those of the best threshold (Z, Y, X), times the edge of a voxel. Slices before the
+        first known one and beyond the last have no threshold, unless an image tells them."""
         logits, told = self.logits(slices), slices.between | (self.evidence is not None)
         least = best_log_odds(logits[slices.between]) if slices.between.any() else 0.0
         return (min(slices.spacing[1:]) * (logits - np.where(told, least, 0)[:, None, None])).astype(np.float32)
@@ -327,10 +325,8 @@ class _Engine:
 
 @dataclass(frozen=True, eq=False)
 class SlicesProblem(Problem):
-    """The volume between slices, and a trial whose strength is the stiffness of springs on the known voxels.
-
-    `level` (length, Y, X), positive inside, is the start: log-odds over a threshold's, times the edge of a voxel.
-    """
+    """The volume between slices, and a trial whose strength is the stiffness of springs on the known voxels. `level`
+    (length, Y, X), positive inside, is the start: log-odds over a threshold's, times the edge of a voxel."""
 
     slices: Slices
     level: np.ndarray
@@ -686,10 +682,8 @@ def _odds(part: Segmentation) -> np.ndarray:
 
 
 def find_labels(values: np.ndarray, chosen: Sequence[int] | None) -> list[int]:
-    """Return the labels in known slices that are structures, ascending: the chosen ones, or all but 0.
-
-    Raises `ScanError` if the values are grey levels, a chosen label is missing, or there is none but 0.
-    """
+    """Return the labels in known slices that are structures, ascending: the chosen ones, or all but 0. Raises
+    `ScanError` if the values are grey levels, a chosen label is missing, or there is none but 0."""
     if chosen is not None:
         chosen = sorted({check_int(n, "labels that are whole numbers", -SEEDS, IDS) for n in chosen})
         others = require_labels(values, "the known slices", math.inf)  # of those that are not chosen any number
@@ -724,11 +718,8 @@ def are_instances(labels: np.ndarray, levels: np.ndarray, count: int) -> bool:
 
 def split_structure(mask: np.ndarray, labels: np.ndarray, known: np.ndarray, spacing: Sequence[float]) -> np.ndarray:
     """Return labels of a structure's mask (Z, Y, X): each voxel has the nearest of the `labels` (Z, Y, X), which are 0
-    where there is none, and those of `known` voxels stay.
-
-    Each label is kept in one piece: of the pieces that it has, those without a known voxel go to the label that they
-    touch most, or to the background.
-    """
+    where there is none, and those of `known` voxels stay. Each label is kept in one piece: of the pieces that it has,
+    those without a known voxel go to the label that they touch most, or to the background."""
     near = ndimage.distance_transform_edt(labels == 0, spacing, return_distances=False, return_indices=True)
     found = np.where(known, labels, np.where(mask, labels[tuple(near)], 0))  # type: ignore[arg-type]
     pieces = np.asarray(measure.label(found, connectivity=3))

@@ -189,10 +189,8 @@ def check_mask_target(
     maps: Sequence[str] = (),
 ) -> Path:
     """Return the path, or raise ValueError where the mask of a scan cannot be written there; called before the work.
-
     None of the `inputs`, files or folders, may be overwritten, but the image that gets labels. `overwrite` says whether
-    files of other origin may be replaced, `maps` which of `MAPS` go beside the mask.
-    """
+    files of other origin may be replaced, `maps` which of `MAPS` go beside the mask."""
     target, image = Path(path), image_of(Path(path))
     pick_writer(target, "mm" if scan is None else scan.unit)
     first, *more = beside(target, ".json"), beside(target, ".png"), *(map_path(target, name) for name in maps)
@@ -208,10 +206,8 @@ def check_mask_target(
 
 
 def beside(target: Path, ending: str) -> Path:
-    """Return the path of what lies beside a mask: `mask.json` for `mask.nii.gz`.
-
-    For labels of an image, `scan.zarr/labels/NAME`, it is `scan_NAME.json`, beside the store.
-    """
+    """Return the path of what lies beside a mask: `mask.json` for `mask.nii.gz`. For labels of an image,
+    `scan.zarr/labels/NAME`, it is `scan_NAME.json`, beside the store."""
     if (image := image_of(target)) is None:
         return sibling(target, ending)
     return sibling(store_of(image), f"_{target.name}{ending}")
@@ -300,10 +296,8 @@ def segmentation_figure(segmentation: Segmentation) -> Figure:
 
 
 def _figure(segmentation: Segmentation, rows: Mapping[str, tuple[np.ndarray, np.ndarray | None]]) -> Figure:
-    """Draw rows of middle slices; or of a volume between known slices the most uncertain ones.
-
-    There the outline is drawn over the image, if there is one, or else over what is known; below is how unsure it is.
-    """
+    """Draw rows of middle slices; or of a volume between known slices the most uncertain ones. There the outline is
+    drawn over the image, if there is one, or else over what is known; below is how unsure it is."""
     from curvafit.drawing.plot import section_figure
 
     mask, labels, probability = segmentation.mask, segmentation.labels, segmentation.probability
@@ -379,9 +373,7 @@ def note_empty(empty: Sequence[int]) -> tuple[str, ...]:
 
 def doubt_places(there: np.ndarray, places: Sequence[int]) -> tuple[str, ...]:
     """Return a sentence where few slices have labels, and some of them are not among the known ones at `places`.
-
-    `there` says of each slice whether it has labels, (Z,).
-    """
+    `there` says of each slice whether it has labels, (Z,)."""
     labelled = np.flatnonzero(there)
     strange = sorted(set(labelled.tolist()) - set(places))
     if not strange or 2 * len(labelled) > np.ptp(labelled) + 1:
@@ -401,11 +393,9 @@ def describe_filled(
     said: str, inside: str, share: float, uncertain: Uncertainty, places: Sequence[int], length: int, *, tested: str,
     image: bool = False, periodic: bool = False,
 ) -> tuple[str, tuple[str, ...]]:  # fmt: skip
-    """Return the status of a volume between the known slices at `places`, and sentences on what is doubtful.
-
-    `said` is how it was filled, `inside` a sentence on the mask, `share` its share of the volume, and `tested` what
-    probabilities were held to. With an image or in a periodic volume all slices are filled.
-    """
+    """Return the status of a volume between the known slices at `places`, and sentences on what is doubtful. `said` is
+    how it was filled, `inside` a sentence on the mask, `share` its share of the volume, and `tested` what probabilities
+    were held to. With an image or in a periodic volume all slices are filled."""
     reach = slice(0, length) if image or periodic else reach_of(places, length)
     left = length - (reach.stop - reach.start)
     known = uncertain.known_share

@@ -34,11 +34,8 @@ WHOLE: Box = (slice(0, None), slice(0, None), slice(0, None))
 @dataclass(frozen=True, eq=False)
 class Slices:
     """The known slices across the first axis of a volume of `length` slices: their masks, bool (N, Y, X), and their
-    numbers, ascending.
-
-    In a `periodic` volume the first slice follows the last. `marks` say what is known in the other slices, int8
-    (length, Y, X): 1 inside, -1 outside, 0 unknown; None if nothing is.
-    """
+    numbers, ascending. In a `periodic` volume the first slice follows the last. `marks` say what is known in the other
+    slices, int8 (length, Y, X): 1 inside, -1 outside, 0 unknown; None if nothing is."""
 
     inside: np.ndarray
     places: tuple[int, ...]
@@ -118,12 +115,10 @@ class Slices:
         return positions, self.inside[[index_of_place[int(numbers[k])] for k in positions]][:, ys][:, :, xs]
 
     def level(self, way: str) -> np.ndarray:
-        """Return an interpolation by one of `WAYS`, float32 (length, Y, X), positive inside.
-
-        At a known slice it is the signed distance within the plane. Before the first slice and beyond the last it has
-        the value of the nearest; in a periodic volume it goes around. An empty mask has minus the largest gap between
-        slices, a full one plus this gap.
-        """
+        """Return an interpolation by one of `WAYS`, float32 (length, Y, X), positive inside. At a known slice it is the
+        signed distance within the plane. Before the first slice and beyond the last it has the value of the nearest; in
+        a periodic volume it goes around. An empty mask has minus the largest gap between slices, a full one plus this
+        gap."""
         numbers, places = np.arange(self.length), np.array(self.places)
         distances = plane_distances(self.inside, self.spacing[1:], self.gap * self.spacing[0])
         where = numbers.clip(places[0], places[-1])
@@ -157,9 +152,7 @@ class Slices:
 
 def known_places(length: int, every: int | None, first: int, known: Sequence[int] | None) -> list[int]:
     """Return the numbers of the known slices, ascending: every `every`-th from `first` on, and those listed in `known`.
-
-    Raises `ValueError` if neither is given, or they are not two or more slices of the volume.
-    """
+    Raises `ValueError` if neither is given, or they are not two or more slices of the volume."""
     if every is None and known is None:
         raise ScanError("give every or known: which slices are known")
     known = [*(known or ())]
@@ -209,10 +202,8 @@ def next_in_rhythm(places: Sequence[int] | np.ndarray, length: int) -> list[int]
 
 
 def index_labels(values: np.ndarray, numbers: Sequence[int], ignore: int | None = None) -> np.ndarray:
-    """Return the place of each value among some labels, from 1 on, int16; 0 of other values, -1 of `ignore`.
-
-    Labels of 64 bits are compared as they are: NumPy joins signed and unsigned ones as floats, which merges some.
-    """
+    """Return the place of each value among some labels, from 1 on, int16; 0 of other values, -1 of `ignore`. Labels of
+    64 bits are compared as they are: NumPy joins signed and unsigned ones as floats, which merges some."""
     found = np.zeros(values.shape, dtype=np.int16)
     for place, number in enumerate(numbers, 1):
         found[values == number] = place
@@ -245,10 +236,8 @@ def _to_int(number: Any) -> Any:
 
 
 def annotated_slices(values: np.ndarray, ignore: int) -> tuple[list[int], np.ndarray | None]:
-    """Return the numbers of the slices (Z, Y, X) that are annotated whole, and marks of the others.
-
-    `ignore` is the label of voxels that nobody annotated; 0 is known to be empty. Marks are those of `Slices`.
-    """
+    """Return the numbers of the slices (Z, Y, X) that are annotated whole, and marks of the others. `ignore` is the
+    label of voxels that nobody annotated; 0 is known to be empty. Marks are those of `Slices`."""
     seen = values != ignore
     if seen.all():
         raise ScanError(f"no voxel has the label {ignore}, which tells what nobody annotated")
@@ -269,11 +258,8 @@ def mark_known(shape: Sequence[int], places: Sequence[int], marks: np.ndarray | 
 
 def harmonic_distance(places: Sequence[int], length: int, periodic: bool = False) -> np.ndarray:
     """Return d e / (d + e) for each slice, float64 (length,), where d and e are the distances to the known slices
-    before and after it.
-
-    The error of an interpolation grows in proportion. It is 0 at a known slice and a quarter of the gap in the middle;
-    with a known slice on one side only, it is the distance to that one.
-    """
+    before and after it. The error of an interpolation grows in proportion. It is 0 at a known slice and a quarter of
+    the gap in the middle; with a known slice on one side only, it is the distance to that one."""
     known, every = np.array(places), np.arange(length)
     if periodic:
         known = np.concatenate([known - length, known, known + length])
@@ -284,10 +270,8 @@ def harmonic_distance(places: Sequence[int], length: int, periodic: bool = False
 
 
 def plane_distances(masks: np.ndarray, spacing: Sequence[float], gap: float) -> np.ndarray:
-    """Return signed distances within each of the planes (N, Y, X) with voxel edges (y, x), positive inside.
-
-    An empty plane has minus the gap everywhere, a full one plus the gap.
-    """
+    """Return signed distances within each of the planes (N, Y, X) with voxel edges (y, x), positive inside. An empty
+    plane has minus the gap everywhere, a full one plus the gap."""
     distances = np.stack([centre_distance(mask, spacing, dtype=np.float64) for mask in masks])
     return np.where(np.isinf(distances), np.copysign(gap, distances), distances)
 

@@ -108,13 +108,11 @@ class Texture:
 
 @dataclass(frozen=True)
 class Mix:
-    """How windows are drawn; lengths in pixels, shares from 0 to 1.
-
-    Intervals of the structures' `thickness` (uniform in the logarithm) and of the `gap`, the `most` slices to fill, and
-    the deviation of the logarithm by which each axis is stretched. Shares of windows that lie along the axes of the
-    shape, whose slices are not one pixel apart, that end at a known slice, have structures of two shapes, are turned
-    inside out, have slices as a person draws them, and have slices to fill that are known in part.
-    """
+    """How windows are drawn; lengths in pixels, shares from 0 to 1. Intervals of the structures' `thickness` (uniform
+    in the logarithm) and of the `gap`, the `most` slices to fill, and the deviation of the logarithm by which each axis
+    is stretched. Shares of windows that lie along the axes of the shape, whose slices are not one pixel apart, that end
+    at a known slice, have structures of two shapes, are turned inside out, have slices as a person draws them, and have
+    slices to fill that are known in part."""
 
     thickness: tuple[float, float] = (3.0, 14.0)
     gap: tuple[float, float] = (2.0, 20.0)
@@ -151,10 +149,8 @@ class Batches(Dataset, ABC):
 
 @dataclass(frozen=True, eq=False)
 class Lessons(Batches):
-    """Batches of `size` gaps to fill, the same for ever for a seed: batch k depends on (seed, k) alone.
-
-    Each of the `sources` of shapes teaches as often as the others; `edge` pixels of a window's side count.
-    """
+    """Batches of `size` gaps to fill, the same for ever for a seed: batch k depends on (seed, k) alone. Each of the
+    `sources` of shapes teaches as often as the others; `edge` pixels of a window's side count."""
 
     sources: Sequence[Sequence[Texture]]
     mix: Mix
@@ -244,11 +240,9 @@ def _mark(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
 def load_textures(
     sources: Sequence[str | Path], progress: Progress = silent
 ) -> tuple[list[list[Texture]], dict[str, Any]]:
-    """Return the shapes of stores and of mask files that can teach, by source, and a card that says what they are.
-
-    Of a store all well-formed shapes between `FILLED` of the volume are taken: they repeat. A mask ends at its borders.
-    Raises ValueError and FileNotFoundError as `open_store` and `load`.
-    """
+    """Return the shapes of stores and of mask files that can teach, by source, and a card that says what they are. Of a
+    store all well-formed shapes between `FILLED` of the volume are taken: they repeat. A mask ends at its borders.
+    Raises ValueError and FileNotFoundError as `open_store` and `load`."""
     textures, names = [], []
     for number, source in enumerate(map(Path, sources)):
         if (source / "draws").is_dir():
@@ -293,9 +287,7 @@ class Whole:
 @dataclass(frozen=True, eq=False)
 class WholeLessons(Batches):
     """Batches of gaps in volumes that are known whole, a batch of one volume; batch k depends on (seed, k) alone.
-
-    Without evidence gaps are shorter or longer by one slice, and begin anywhere.
-    """
+    Without evidence gaps are shorter or longer by one slice, and begin anywhere."""
 
     volumes: Sequence[Whole]
     length: int
@@ -336,12 +328,10 @@ class WholeLessons(Batches):
 
 @dataclass(frozen=True)
 class ImageMix:
-    """How imaged shapes are drawn; lengths in pixels, shares from 0 to 1.
-
-    Intervals of the structures' `thickness` (uniform in the logarithm; thick where a slice would be too many voxels)
-    and of the slices from a known one to the next, `gap`, at most `longest` pixels; a slice's side and gaps of a
-    volume; the share of images with noise besides the modality's, and the interval of its deviation, in contrasts.
-    """
+    """How imaged shapes are drawn; lengths in pixels, shares from 0 to 1. Intervals of the structures' `thickness`
+    (uniform in the logarithm; thick where a slice would be too many voxels) and of the slices from a known one to the
+    next, `gap`, at most `longest` pixels; a slice's side and gaps of a volume; the share of images with noise besides
+    the modality's, and the interval of its deviation, in contrasts."""
 
     thickness: tuple[float, float] = (3.0, 14.0)
     gap: tuple[int, int] = (2, 15)
@@ -538,10 +528,8 @@ def near_error(logits: Tensor, truth: Tensor) -> float:
 
 
 def tune(taught: Taught, example: Example, progress: Progress = silent) -> Taught:
-    """Teach a filler the texture of an example for a minute, and keep what it learnt if it is better than the noise.
-
-    It learns from the example's lesson; on the task it is judged, and its probabilities are calibrated.
-    """
+    """Teach a filler the texture of an example for a minute, and keep what it learnt if it is better than the noise. It
+    learns from the example's lesson; on the task it is judged, and its probabilities are calibrated."""
     given, truth, places = example.task.given, example.task.truth, list(example.task.places)
     filler = copy.deepcopy(taught.filler)
     lessons = WholeLessons([Whole.of(example)], TUNING)

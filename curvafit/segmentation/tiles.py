@@ -46,11 +46,9 @@ _MASK, _PHASE = "mask.npy", "phase.npy"
 
 @dataclass(frozen=True)
 class Tile:
-    """A part of a volume: its number, its core, whose result it gives, and the box in which the energy is lowered.
-
-    The box is the core with its overlap; in a periodic volume it may go beyond the ends. `ends` says of either side of
-    each axis whether the box ends where the volume does.
-    """
+    """A part of a volume: its number, its core, whose result it gives, and the box in which the energy is lowered. The
+    box is the core with its overlap; in a periodic volume it may go beyond the ends. `ends` says of either side of each
+    axis whether the box ends where the volume does."""
 
     number: int
     core: Box
@@ -76,10 +74,8 @@ def check_edge(edge: int | None) -> int | None:
 
 @dataclass(frozen=True)
 class Tiling:
-    """A volume of `shape` voxels in tiles: `counts` along each axis, whose sizes differ by a voxel at most.
-
-    `place` is the working grid of the whole volume.
-    """
+    """A volume of `shape` voxels in tiles: `counts` along each axis, whose sizes differ by a voxel at most. `place` is
+    the working grid of the whole volume."""
 
     shape: tuple[int, int, int]
     place: WorkingGrid
@@ -139,10 +135,8 @@ class Piece:
 
 
 class TileStore:
-    """The finished tiles of a volume: in memory, or in mapped files of a folder that outlives a killed run.
-
-    There each tile has a note, `000012.json`, which is written once the tile's voxels are on the disk.
-    """
+    """The finished tiles of a volume: in memory, or in mapped files of a folder that outlives a killed run. There each
+    tile has a note, `000012.json`, which is written once the tile's voxels are on the disk."""
 
     def __init__(self, shape: tuple[int, int, int], folder: Path | None = None) -> None:
         self._folder, self.energies = folder, dict[int, tuple[float, ...]]()
@@ -181,10 +175,8 @@ def open_store(folder: str | PathLike[str], shape: tuple[int, int, int], run: Ma
 
 @dataclass(frozen=True, eq=False)
 class Problem(ABC):
-    """An energy to lower, and the start; any box of the volume sees the same data.
-
-    The trial's law has lengths in the scan's unit; without a law the start is the result.
-    """
+    """An energy to lower, and the start; any box of the volume sees the same data. The trial's law has lengths in the
+    scan's unit; without a law the start is the result."""
 
     trial: Trial
 

@@ -37,10 +37,8 @@ CUBE = 16
 
 
 def law_of(prior: LawLike, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
-    """Return a law's coefficients with lengths in the scan's unit, and sentences on their origin.
-
-    Raises `ValueError` if there is no such preset, or the units of a `fit.json` and the scan cannot be compared.
-    """
+    """Return a law's coefficients with lengths in the scan's unit, and sentences on their origin. Raises `ValueError`
+    if there is no such preset, or the units of a `fit.json` and the scan cannot be compared."""
     law = Law.of(prior)
     try:
         coefficients = law.in_unit(scan.unit, min(scan.spacing))
@@ -56,10 +54,8 @@ def law_of(prior: LawLike, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
 
 
 def laws_of(prior: LawLike, scan: Field) -> tuple[tuple[Coefficients, ...], tuple[str, ...]]:
-    """Return the laws to try for a prior, with lengths in the scan's unit, and sentences on their origin.
-
-    The first is that of `law_of`; of a fit the candidates in `TRUSTED` follow.
-    """
+    """Return the laws to try for a prior, with lengths in the scan's unit, and sentences on their origin. The first is
+    that of `law_of`; of a fit the candidates in `TRUSTED` follow."""
     first, notes = law_of(prior, scan)
     law = Law.of(prior)
     others = [each.coefficients for each in load_candidates(prior) if each.name in TRUSTED] if law.fitted else []
@@ -70,11 +66,9 @@ def laws_of(prior: LawLike, scan: Field) -> tuple[tuple[Coefficients, ...], tupl
 @dataclass(frozen=True)
 class Trial:
     """A way to find or fill a structure: the start as it is, or a law lowered from it, with lengths in the scan's unit.
-
     `strength` is the stiffness of the springs on known voxels, or the nats of a unit of F_ε; `pull` that of the springs
     on the others for each nat of their log-odds. Once chosen it has the Dice of the best law, `plain`, that of the
-    start, and the standard error of their difference, `noise`.
-    """
+    start, and the standard error of their difference, `noise`."""
 
     law: Coefficients | None = None
     strength: float = 0.0
@@ -87,9 +81,7 @@ class Trial:
 
 def search(trials: Sequence[Trial], strengths: Sequence[float], worth: Callable[[Trial], float]) -> Trial:
     """Return the best of some trials, then climb from it to stronger and weaker strengths as long as they are better.
-
-    `strengths` ascend; a trial whose own strength is not among them stays as it is.
-    """
+    `strengths` ascend; a trial whose own strength is not among them stays as it is."""
     first = max(trials, key=worth)
     best = first
     for step in (1, -1):
@@ -106,10 +98,8 @@ def search(trials: Sequence[Trial], strengths: Sequence[float], worth: Callable[
 
 @dataclass(frozen=True, eq=False)
 class Task(Generic[Given]):
-    """The given part of a volume, slices or evidence, and the slices that a filled volume is compared with.
-
-    `truth` holds the true masks of these slices, bool (N, Y, X), and `places` their numbers in the volume, ascending.
-    """
+    """The given part of a volume, slices or evidence, and the slices that a filled volume is compared with. `truth`
+    holds the true masks of these slices, bool (N, Y, X), and `places` their numbers in the volume, ascending."""
 
     given: Given
     truth: np.ndarray
@@ -118,11 +108,9 @@ class Task(Generic[Given]):
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """An example, cut in two along the longer axis of its slices.
-
-    Of `lesson`, two thirds, every slice is known; of `task`, the rest, slices as far apart as those of the volume to
-    fill. A note says where only a box of the example is read.
-    """
+    """An example, cut in two along the longer axis of its slices. Of `lesson`, two thirds, every slice is known; of
+    `task`, the rest, slices as far apart as those of the volume to fill. A note says where only a box of the example is
+    read."""
 
     lesson: Slices
     task: Task[Slices]
@@ -174,10 +162,8 @@ def crop_to_surface(slices: Slices, edge: int) -> tuple[Slices, Box]:
 
 
 def leave_out_slices(slices: Slices) -> Task[Slices] | None:
-    """Return the task to predict every second known slice from the others; None where there are too few.
-
-    The first and the last slice are not left out, unless the volume is periodic.
-    """
+    """Return the task to predict every second known slice from the others; None where there are too few. The first and
+    the last slice are not left out, unless the volume is periodic."""
     number = len(slices.places)
     out = range(1, number - (0 if slices.periodic and number % 2 == 0 else 1), 2)
     rest = [k for k in range(number) if k not in out]
@@ -193,11 +179,9 @@ def choose_by_masks(
     fill: Callable[[Given, Trial], np.ndarray],
     strengths: Sequence[float] = (),
 ) -> Trial:
-    """Return the trial with the best Dice on a task: a law where it beats the start by more than the noise.
-
-    `fill` fills the task's volume by a trial: a mask (Z, Y, X). The best of the trials is tried at other `strengths`,
-    ascending, its own among them, and then the others at the best strength; by default only at their own.
-    """
+    """Return the trial with the best Dice on a task: a law where it beats the start by more than the noise. `fill`
+    fills the task's volume by a trial: a mask (Z, Y, X). The best of the trials is tried at other `strengths`,
+    ascending, its own among them, and then the others at the best strength; by default only at their own."""
 
     @cache
     def counts(trial: Trial) -> np.ndarray:
@@ -235,9 +219,7 @@ def dice_of(counts: np.ndarray) -> np.ndarray:
 
 def gain_of(after: np.ndarray, before: np.ndarray) -> tuple[float, float]:
     """Return the difference of the Dice coefficients of two counts (T, 2), and its error by a jackknife over the cubes.
-
-    The errors of neighbouring voxels are correlated, those of cubes hardly.
-    """
+    The errors of neighbouring voxels are correlated, those of cubes hardly."""
     whole = dice_of(after.sum(0)) - dice_of(before.sum(0))
     without = dice_of(after.sum(0) - after) - dice_of(before.sum(0) - before)
     return float(whole), float(np.sqrt((len(without) - 1) * without.var()))

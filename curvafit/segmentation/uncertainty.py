@@ -61,11 +61,9 @@ def count_probabilities(probability: np.ndarray) -> np.ndarray:
 
 def best_threshold(counts: np.ndarray) -> float:
     """Return the probability, at most one half, above which voxels are inside in the mask with the best expected Dice.
-
     `counts` are those of `count_probabilities`. A mask of N voxels whose probabilities add up to s has the expected
     Dice 2 s / (N + S), where S is the sum over all voxels; its maximum leaves out what is less likely than half of it.
-    At one half, structures that are hard to predict would get lost.
-    """
+    At one half, structures that are hard to predict would get lost."""
     edges = np.linspace(0.0, 1.0, THRESHOLDS + 1)
     sizes, sums = (np.cumsum(each[::-1]) for each in (counts, counts * (edges[1:] + edges[:-1]) / 2))
     best = int(np.argmax(sums / np.maximum(sizes + sums[-1], 1e-9)))
@@ -171,10 +169,8 @@ def suggest_slices(entropies: np.ndarray, places: Sequence[int], count: int, per
 def remaining_entropy(
     entropies: np.ndarray, places: Sequence[int] | set[int], new: int, periodic: bool = False
 ) -> np.ndarray:
-    """Return the entropies (Z,) of the slices once a new one is known.
-
-    The uncertain layer of a slice is as thick as its `harmonic_distance`: in that proportion the entropy falls. A new
-    slice tells nothing about slices beyond other known ones.
-    """
+    """Return the entropies (Z,) of the slices once a new one is known. The uncertain layer of a slice is as thick as
+    its `harmonic_distance`: in that proportion the entropy falls. A new slice tells nothing about slices beyond other
+    known ones."""
     before, after = (harmonic_distance(sorted(known), len(entropies), periodic) for known in (places, {*places, new}))
     return entropies * np.divide(after, before, out=np.zeros_like(before), where=before > 0)
