@@ -340,13 +340,10 @@ def organelles(shift: int = 0) -> np.ndarray:
 def test_each_label_is_completed_as_alone_and_known_slices_stay() -> None:
     truth, affine = organelles(), np.diag([0.2, 0.2, 0.2, 1.0])
     field = Field(truth, 0.2, "um", affine)
-    found = reconstruct_labels(field, {2: preset("tubes"), 7: WILLMORE}, every=6, **QUICK).labels
-    assert found is not None and (found.spacing, found.unit) == (field.spacing, "um")
-    assert np.array_equal(found.affine, affine)
-    found = reconstruct_labels(truth, {2: preset("tubes"), 7: WILLMORE}, every=6, **QUICK)
-    assert found.labels is not None
+    found = reconstruct_labels(field, {2: preset("tubes"), 7: WILLMORE}, every=6, **QUICK)
+    assert found.labels is not None and (found.labels.spacing, found.labels.unit) == (field.spacing, "um")
     values = found.labels.values
-    assert values.dtype == np.uint8
+    assert np.array_equal(found.labels.affine, affine) and values.dtype == np.uint8  # type: ignore[arg-type]
     assert np.array_equal(values[::6], truth[::6])
     assert np.array_equal(found.mask.values, values > 0)
     for number, law in ((2, preset("tubes")), (7, WILLMORE)):
@@ -380,6 +377,10 @@ def test_where_all_is_labelled_no_voxel_is_left_out() -> None:
     assert found.labels.values.dtype == np.uint16
     assert set(np.unique(found.labels.values)) == {1, 300}
     assert dice(found.labels.values == 300, truth == 300) > 0.95
+    labels = np.ones((17, 90, 90), np.uint8)  # also where no label's box is
+    labels[:, 45:], labels[8:, :, 40:], labels[8:, :10, :10] = 2, 3, 3
+    found = reconstruct_labels(labels, known=[0, 16]).labels
+    assert found is not None and set(np.unique(found.values)) == {1, 2, 3}
 
 
 def test_a_label_that_is_refused_is_filled_by_the_network_and_said() -> None:
@@ -404,16 +405,6 @@ def test_a_label_is_filled_in_its_own_box_as_in_the_whole_volume() -> None:
     assert set(found.uncertainty.dice_of_labels) == set(range(1, 6))  # type: ignore[union-attr]
     assert found.status.startswith("5 labels") and len(found.status) < 250
     assert found.phase.values.min() >= -1 and not found.labels.values[:, :8, 100:].any()  # type: ignore[union-attr]
-
-
-def test_a_volume_that_is_labelled_everywhere_stays_so_where_no_label_s_box_is() -> None:
-    labels = np.ones((17, 90, 90), np.uint8)
-    labels[:, 45:] = 2
-    labels[8:, :, 40:] = 3
-    labels[8:, :10, :10] = 3
-    sparse = np.where(np.isin(np.indices(labels.shape)[0], (0, 16)), labels, 0)
-    found = reconstruct_labels(sparse, known=[0, 16]).labels
-    assert found is not None and set(np.unique(found.values)) == {1, 2, 3}
 
 
 @pytest.mark.parametrize(
@@ -492,14 +483,9 @@ def test_known_voxels_are_never_ignored() -> None:
     assert np.array_equal(sure[::8], np.where(several == 3, 3, 0)[::8]) and (sure == 4).any()
 
 
-def every_twelfth(mask: np.ndarray) -> Slices:
-    places = tuple(range(0, len(mask), 12))
-    return Slices(mask[list(places)], places, len(mask), (1.0, 1.0, 1.0))
-
-
 def decided(better: np.ndarray) -> Trial:
     """The choice between an interpolation of a ball and a prior that fills with `better`."""
-    mask, slices = ball(48), every_twelfth(ball(48))
+    mask, slices = ball(48), known(ball(48), 12)
     between = [n for n in range(36) if n % 12]
 
     def filled(given: Slices, setting: Trial) -> np.ndarray:
@@ -508,18 +494,15 @@ def decided(better: np.ndarray) -> Trial:
     return choose_by_masks(Task(slices, mask[between], between), [Trial(WILLMORE, 1.0, 1)], filled)
 
 
-def test_a_prior_is_taken_where_it_is_better_only() -> None:
+def test_a_prior_is_taken_where_it_is_better_than_the_noise_only() -> None:
+    """A single voxel is one tile's gain: as large as its standard error, (T - 1) / T of it being the jackknife's."""
     best = decided(ball(48))
     assert best.law is WILLMORE and best.score == 1 > best.plain
     plain = decided(np.zeros((48, 48, 48), dtype=bool))
     assert plain.law is None and plain.score == 0 and plain.plain == best.plain
-    same = decided(every_twelfth(ball(48)).level("spline") > 0)
+    start = known(ball(48), 12).level("spline") > 0
+    same = decided(start)
     assert same.law is None and same.noise == 0
-
-
-def test_a_gain_within_the_noise_is_none() -> None:
-    """A single voxel is one tile's gain: as large as its standard error, (T - 1) / T of it being the jackknife's."""
-    start = every_twelfth(ball(48)).level("spline") > 0
     wrong = np.argwhere(start != ball(48))
     wrong = wrong[(wrong[:, 0] < 36) & (wrong[:, 0] % 12 > 0)]
     better = start.copy()
