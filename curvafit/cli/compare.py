@@ -34,9 +34,6 @@ def compare(
     *,
     structure: Structure,
     reading: Reading,
-    laws: Annotated[
-        bool, typer.Option("--laws", help="Read each scan's law too: what it tells of six combinations of parameters.")
-    ] = False,
     primary: Annotated[str | None, typer.Option(help="One number named beforehand, tested alone: Tb.Th.")] = None,
     permutations: Annotated[int, typer.Option(help="Permutations of subjects; all where there are fewer.")] = 9999,
     seed: Annotated[int, typer.Option(help="Seed of the permutations, where not all are tried.")] = 0,
@@ -49,7 +46,7 @@ def compare(
         from curvafit.studies.compare import compare as compare_scans
 
         check_comparison(out, [*scans, *([] if subjects is None else [subjects])], overwrite, command_line())
-        how = {"laws": laws, "primary": primary, "permutations": permutations, "seed": seed, "subjects": subjects}
+        how = {"primary": primary, "permutations": permutations, "seed": seed, "subjects": subjects}
         how |= {"workers": workers, "progress": progress, "paired": paired}
         labels = by.split(",") if by is not None and "," in by else by
         groups = scans if labels is by else [scans]

@@ -255,7 +255,6 @@ def compare(
     periodic: bool = False,
     threshold: Literal["otsu"] | float = "otsu",
     dark: bool = False,
-    laws: bool = False,
     primary: str | None = None,
     permutations: int = PERMUTATIONS,
     seed: int = 0,
@@ -288,8 +287,6 @@ def compare(
         A CSV table of the columns scan and subject, for groups. Without it each scan is a subject.
     kind, periodic, threshold, dark
         As in `measure`.
-    laws
-        Compare what each scan tells of its law, too: the six combinations of parameters, where its law can be read.
     primary
         The symbol or name of the one number that was chosen before the scans were seen: its p needs no correction.
     permutations
@@ -309,7 +306,7 @@ def compare(
         check_choice(primary, names, f"a primary number of {', '.join(symbol for _, symbol, *_ in QUANTITIES)}")
     cases, notes = list_cases(groups, by, subjects, paired)
     options = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark}
-    measures, more = measure_scans(cases, options, reading, workers, sub_progress(progress, 0.0, 0.97), laws)
+    measures, more = measure_scans(cases, options, reading, workers, sub_progress(progress, 0.0, 0.97))
     progress("comparing", 0.97)
     name = by if isinstance(by, str) else "group" if isinstance(cases[0].label, str) else "the number"
     parameters = {**options, **reading, "by": name, "paired": paired, "primary": primary}

@@ -15,13 +15,8 @@ import numpy as np
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number
 from curvafit.core.workers import cluster, collect_all
-from curvafit.inference.infer import Inference, infer
-from curvafit.inference.posterior import Posterior, load_posterior
-from curvafit.inference.table import PARAMETERS
-from curvafit.inference.verdict import UNBELIEVABLE
 from curvafit.scan.instances import measure_instances
-from curvafit.scan.measure import SURE, Measures, Quantity
-from curvafit.scan.prepare import HALF
+from curvafit.scan.measure import Measures
 from curvafit.scan.tiles import measure
 from curvafit.studies.groups import Case
 from curvafit.volumes.boxes import boxes_of
@@ -38,25 +33,17 @@ _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
 def measure_scans(
-    cases: Sequence[Case],
-    options: dict[str, Any],
-    reading: dict[str, Any],
-    workers: int,
-    progress: Progress,
-    laws: bool = False,
+    cases: Sequence[Case], options: dict[str, Any], reading: dict[str, Any], workers: int, progress: Progress
 ) -> tuple[list[Measures], list[str]]:
     """Measure scans with `options` of `measure`; return their measures, in the first scan's unit, and notes.
 
-    With `laws`, the measures have what the scans tell of their laws besides (`add_combinations`). All are read before
-    the first is measured. Raises ValueError, with the scan's name, as `measure`; and where only some scans have a
-    physical unit.
+    All are read before the first is measured. Raises ValueError, with the scan's name, as `measure`; and where only
+    some scans have a physical unit.
     """
-    if laws and any(isinstance(case.source, Measures) for case in cases):
-        raise ValueError("expected scans whose laws can be read, got one that is measured already")
     unit, notes = _check_scans(cases, reading, sub_progress(progress, 0.0, 0.05))
     found = {k: case.source for k, case in enumerate(cases) if isinstance(case.source, Measures)}
     how = options | reading
-    tasks = {k: partial(_measure_case, case, how, laws) for k, case in enumerate(cases) if k not in found}
+    tasks = {k: partial(_measure_case, case, how) for k, case in enumerate(cases) if k not in found}
     names = [case.name for case in cases]
     measures = _share_out(tasks, found, names, workers, sub_progress(progress, 0.05, 1.0))
     if flat := [case.name for case, each in zip(cases, measures, strict=True) if not each.diagram.area > 0]:
@@ -203,49 +190,11 @@ def _check_mixture(units: Mapping[str, str]) -> None:
         )
 
 
-def _measure_case(case: Case, options: dict[str, Any], laws: bool, progress: Progress) -> Measures:
+def _measure_case(case: Case, options: dict[str, Any], progress: Progress) -> Measures:
     """Measure one scan; its diagram is binned finely, so that many scans take little memory."""
     with name_errors(case.name):
         measures = measure(case.source, progress=progress, **options)  # type: ignore[arg-type]
-        if laws:
-            measures = add_combinations(measures, infer(case.source, fast=True, **options))  # type: ignore[arg-type]
     return replace(_bin_diagrams(measures), source=measures.source or case.name)
-
-
-def add_combinations(measures: Measures, inference: Inference) -> Measures:
-    """Return measures with six more quantities, those of `list_combinations`."""
-    rows, why = list_combinations(inference)
-    notes = (*measures.notes, f"No combinations of a law's parameters: {why}.") if why else measures.notes
-    return replace(measures, quantities=(*measures.quantities, *rows), notes=notes)
-
-
-def list_combinations(inference: Inference | None) -> tuple[list[Quantity], str]:
-    """Return what a scan tells of the combinations of a law's parameters, `L1` to `L6`, in deviations among laws.
-
-    They are NaN where the packaged posterior does not know scans of its kind, and a reason says why; of None too.
-    """
-    posterior = load_posterior()
-    values, halves, why = _read_combinations(inference, posterior)
-    ends = posterior.combinations.ends
-    rows = [
-        Quantity(f"{low} to {high}" if low else f"sum {k} of the law", f"L{k}", float(value), float(half), 0)
-        for k, ((low, high), value, half) in enumerate(zip(ends, values, halves, strict=True), 1)
-    ]
-    return rows, why
-
-
-def _read_combinations(inference: Inference | None, posterior: Posterior) -> tuple[np.ndarray, np.ndarray, str]:
-    """Return the medians and half the widths of the `SURE` intervals of combinations, or why they are not known."""
-    unknown = np.full(len(PARAMETERS), np.nan)
-    if inference is None or (fit := inference.fit).draws is None:
-        return unknown, unknown, "the scan shows no texture"
-    if inference.prepared.volume_fraction > HALF:
-        return unknown, unknown, "the structure fills more than half of the scan"
-    if fit.misfit is not None and fit.misfit.probability < UNBELIEVABLE:
-        return unknown, unknown, f"no law makes such scans (p = {format_number(fit.misfit.probability, 2)})"
-    sums = posterior.combinations(fit.draws[:, : len(PARAMETERS)])
-    low, middle, high = np.quantile(sums, ((1 - SURE) / 2, 0.5, (1 + SURE) / 2), axis=0)
-    return middle, (high - low) / 2, ""
 
 
 @contextmanager

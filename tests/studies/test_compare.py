@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 from calling import call, refused
-from found import lattice
 from scipy import stats
 from scipy.spatial.distance import cdist
 
@@ -33,12 +32,10 @@ from curvafit.core.permutation import (
 )
 from curvafit.drawing.groups import numbers_figure
 from curvafit.geometry.diagram import Diagram
-from curvafit.inference.candidates import Misfit
-from curvafit.inference.infer import Inference, infer
 from curvafit.report.comparison import FILES, check_comparison, describe_methods
-from curvafit.scan.measure import QUANTITIES, Measures, Quantity, interval_reach, measure
+from curvafit.scan.measure import QUANTITIES, Measures, Quantity, interval_reach
 from curvafit.studies.compare import Comparison, compare
-from curvafit.studies.scans import add_combinations, merge_notes
+from curvafit.studies.scans import merge_notes
 from curvafit.volumes.field import Field
 
 N = 32
@@ -417,36 +414,6 @@ def test_units_are_converted(shapes: Comparison) -> None:
     for one, other in zip(mixed.numbers, shapes.numbers, strict=True):
         assert one.means == pytest.approx(other.means, rel=5e-4, abs=1e-5), one.name  # float32's distances
     assert any("converted" in note for note in mixed.notes)
-
-
-# ---- laws ------------------------------------------------------------------------------------------------------------
-
-MASK = Field((lattice(56, 28, 5.0) > 0).astype(np.uint8), (0.02,) * 3, "mm")
-
-
-def combinations(measures: Measures, inference: Inference, p: float | None = None) -> np.ndarray:
-    """What a scan tells of its law, if shapes of it are as far from the scan with probability `p`."""
-    if p is not None:
-        inference = replace(inference, fit=replace(inference.fit, misfit=Misfit(p, {}, "nothing")))
-    return np.array([[each.value, each.half] for each in add_combinations(measures, inference).quantities[-6:]])
-
-
-def test_combinations_are_those_of_the_fit_where_a_law_makes_such_scans() -> None:
-    measures, inference = measure(MASK), infer(MASK, fast=True)
-    found = combinations(measures, inference, 0.5)
-    assert sorted(found[:, 0]) == pytest.approx(sorted(each.median for each in inference.fit.combinations))
-    # A 95 % interval is wider than the fit's 90 % one.
-    assert found[:, 1].sum() > sum(np.ptp(each.interval) / 2 for each in inference.fit.combinations)
-    assert np.isnan(combinations(measures, inference, 0.01)).all()
-    noise = Field((np.random.default_rng(0).random((32, 32, 32)) > 0.7).astype(np.uint8))
-    mostly = replace(MASK, values=1 - MASK.values)  # the background
-    for other in (noise, mostly):
-        assert np.isnan(combinations(measures, infer(other, fast=True))).all()
-    series = [replace(MASK, values=np.roll(MASK.values, k, 0)) for k in range(3)]
-    symbols = [each.symbol for each in compare(series, by=range(3), laws=True).numbers]
-    assert symbols[-6:] == [f"L{k}" for k in range(1, 7)]
-    with pytest.raises(ValueError, match="measured already"):
-        compare([measures] * 3, by=range(3), laws=True)
 
 
 # ---- files and the command -------------------------------------------------------------------------------------------
