@@ -18,13 +18,9 @@ from curvafit.cli.options import add_commands, add_gone
 app = typer.Typer(
     help="Shape texture of tubes and membranes in 3D: a scan in, its parameters out; parameters in, shapes out.",
     epilog="Start with `curvafit infer SCAN -o DIR` or `curvafit generate --preset tubes -o tubes.nii.gz`. "
-    "CURVAFIT_DEBUG=1 shows where an error came from.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
-    context_settings={"help_option_names": ["-h", "--help"]},
-    cls=Commands,
-)
+    "CURVAFIT_DEBUG=1 shows where an error came from.", no_args_is_help=True, pretty_exceptions_enable=False,
+    rich_markup_mode="rich", context_settings={"help_option_names": ["-h", "--help"]}, cls=Commands,
+)  # fmt: skip
 add_commands(app, samples.demo, infer.infer, measure.measure, compare.compare)
 add_commands(app, generate.generate, generate.presets, synth.synth)
 add_commands(app, segment.segment, segment.reconstruct)

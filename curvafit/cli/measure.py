@@ -78,11 +78,16 @@ def measure(
             "--labels states the structure of instances, each in a box of its own: leave out --roi, --tile, --kind, "
             "--periodic, --threshold and --dark"
         )
-    if windows is not None or stride is not None or clusters is not None:
-        plain = not (labels or workers or roi or subjects or tile)
-        grid = _parse_grid(windows, stride, plain and len(scans) == 1 and folder is not None)
+    if windows is None and (stride, clusters) != (None, None):
+        raise ValueError("--stride and --clusters go with --windows")
+    if windows is not None:
+        if folder is None or len(scans) > 1 or labels or workers or roi or subjects or tile:
+            raise ValueError(
+                "--windows maps one scan as a whole into a folder: give one scan, and a name without a suffix with -o; "
+                "leave out --labels, --roi, --subjects, --tile and --workers"
+            )
         how = {"clusters": 2 if clusters is None else clusters, **structure, **reading}
-        _map_windows(scans[0], folder or Path(), grid, overwrite, how)
+        _map_windows(scans[0], folder, windows, stride, overwrite, how)
         return
     store = None if out is None else out.with_name(f".{out.name}.curvafit-tiles")
     with _keep_tiles(store):
@@ -120,30 +125,19 @@ def measure(
             say(str(write_table(table, out, columns=columns, overwrite=overwrite)))
 
 
-def _parse_grid(windows: str | None, stride: str | None, alone: bool) -> tuple[tuple[int, int, int], ...]:
-    """Return the size and the stride of windows; refuse what does not go with them."""
-    if windows is None:
-        raise ValueError("--stride and --clusters go with --windows")
-    if not alone:
-        raise ValueError(
-            "--windows maps one scan as a whole into a folder: give one scan, and a name without a suffix with -o; "
-            "leave out --labels, --roi, --subjects, --tile and --workers"
-        )
-    size = parse_whole_triple(windows, "--windows")
-    halves = tuple(n if n % 2 else n // 2 for n in size)
-    return size, halves if stride is None else parse_whole_triple(stride, "--stride")  # type: ignore[return-value]
-
-
 def _map_windows(
-    scan: str, folder: Path, grid: tuple[tuple[int, int, int], ...], overwrite: bool, how: dict[str, Any]
+    scan: str, folder: Path, windows: str, stride: str | None, overwrite: bool, how: dict[str, Any]
 ) -> None:
     """Measure a scan in windows, and write its maps."""
+    size = parse_whole_triple(windows, "--windows")
+    halves = tuple(n if n % 2 else n // 2 for n in size)
+    steps = halves if stride is None else parse_whole_triple(stride, "--stride")
     with show_stages() as progress:
         from curvafit.report.windows import check_windows, write_windows
         from curvafit.studies.windows import windows as measure_windows
 
         check_windows(folder, scan, overwrite, command_line())
-        found = measure_windows(scan, *grid, progress=progress, **how)
+        found = measure_windows(scan, size, steps, progress=progress, **how)
         progress("drawing the page", 1.0)
         page = write_windows(found, folder, command=command_line(), overwrite=overwrite)
     say_notes(found.notes)
@@ -182,14 +176,17 @@ def _keep_tiles(store: Path | None) -> Iterator[None]:
 
 
 def _print_found(found: Sequence[tuple[Measures, ...]], labels: bool) -> None:
-    """Print the numbers of scans, or of the bodies of label images."""
+    """Print the notes and the numbers of scans and compartments, or of the bodies of label images."""
     for measures in found:
         if len(found) > 1:
             say(measures[0].source, style="bold")
         if labels:
             _print_instances(measures)
-        else:
-            _print_scan(measures[0])
+            continue
+        parts = list(measures[0].compartments.values()) or measures
+        say_notes(dict.fromkeys(note for part in parts for note in part.notes))
+        for part in parts:
+            _print_measures(part)
 
 
 def _print_instances(instances: Sequence[Measures]) -> None:
@@ -205,14 +202,6 @@ def _print_instances(instances: Sequence[Measures]) -> None:
     cut = sum(each["S.cut"].value > 0 for each in instances)
     thin = sum(math.isnan(each["H"].value) for each in instances)
     say(f"{len(instances)} instances; {cut} are cut by the border, {thin} too thin for curvature.")
-
-
-def _print_scan(measures: Measures) -> None:
-    """Print the notes and the numbers of a scan or of its compartments."""
-    parts = list(measures.compartments.values()) or [measures]
-    say_notes(dict.fromkeys(note for part in parts for note in part.notes))
-    for part in parts:
-        _print_measures(part)
 
 
 def _print_measures(measures: Measures) -> None:

@@ -76,7 +76,7 @@ def _check_inputs(arguments: Mapping[str, Any]) -> None:
     for argument, name in _LAWS.items():
         given = arguments.get(argument)
         for law in [] if given is None or given.endswith(".json") else given.split(","):
-            if simplify_name(law) not in PUBLISHED and not law.endswith(".json") and not os.path.isfile(given):
+            if simplify_name(law) not in PUBLISHED and not law.endswith(".json") and not os.path.isfile(str(given)):
                 names = ", ".join(PUBLISHED)
                 raise ValueError(f"--{name} takes a preset among {names}, or a fit.json, got {quoted(law)}")
 

@@ -57,7 +57,7 @@ def demo(
     """Fill a real scan from every 8th slice, measure it, and find textures like it: one page, in a minute."""
     with show_stages() as progress:
         from curvafit.data_synth.samples import SYNTHETIC, SampleUnavailable, fetch
-        from curvafit.report.demo import write_demo
+        from curvafit.report.demo import EVERY, write_demo
         from curvafit.volumes.read import load
 
         name = sample or _FIRST
@@ -69,11 +69,11 @@ def demo(
                 raise
             say(f"{error}; taking the synthetic scan", to=error_console())
             path = fetch(SYNTHETIC)
-        found = write_demo(load(path), out, seed=seed, overwrite=overwrite, progress=progress)
-    dice, every = found.completion.dice, found.completion.every
-    plain = max(value for way, value in dice.items() if way != "curvafit")
-    say(f"Filled from every {every}th slice: Dice {dice['curvafit']:.3f}; by the best plain interpolation {plain:.3f}.")
-    say(str(found.page))
+        page, found = write_demo(load(path), out, seed=seed, overwrite=overwrite, progress=progress)
+    plain = max(value for way, value in found.dice.items() if way != "curvafit")
+    own = found.dice["curvafit"]
+    say(f"Filled from every {EVERY}th slice: Dice {own:.3f}; by the best plain interpolation {plain:.3f}.")
+    say(str(page))
 
 
 def _copy_to(path: Path, target: Path, overwrite: bool) -> Path:

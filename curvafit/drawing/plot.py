@@ -35,13 +35,9 @@ from curvafit.volumes.field import Field
 CONTOUR, DIAGONAL, INK = "#E69F00", "#C8372D", "#22262B"
 #: Of the families, from the same.
 FAMILY_COLOURS = {
-    "spheres": "#0072B2",
-    "layers": "#E69F00",
-    "tubes": "#009E73",
-    "sponge": "#CC79A7",
-    "tubular cavities": "#56B4E9",
+    "spheres": "#0072B2", "layers": "#E69F00", "tubes": "#009E73", "sponge": "#CC79A7", "tubular cavities": "#56B4E9",
     "bubbles": "#D55E00",
-}
+}  # fmt: skip
 #: Area density in a diagram: light where little, dark where much.
 DENSITY = LinearSegmentedColormap.from_list(
     "density", ["#E3ECF5", "#A9CBE3", "#5AA2CB", "#2B6FA8", "#1B3F7A", "#16193F"]
@@ -138,14 +134,6 @@ def slice_figure(
     axes.set_xlabel(axes_names[1], labelpad=2)
     scale_on(axes, 1.0, unit)
     return figure
-
-
-def round_length(length: float) -> float:
-    """Return the largest of 1, 2, 5 × 10ⁿ that is not above `length`."""
-    if not length > 0:
-        raise ValueError(f"a length must be positive, got {length}")
-    power = 10.0 ** math.floor(math.log10(length))
-    return max((step * power for step in (1, 2, 5) if step * power <= length), default=power)
 
 
 # ---- curvature diagrams ----------------------------------------------------------------------------------------------
@@ -306,7 +294,9 @@ def draw_sections(rows: Mapping[str, Sections], spacing: Sequence[float], unit: 
 def scale_on(axes: Axes, edge: float, unit: str) -> None:
     """Draw a bar of a round length below a slice whose voxels are `edge` wide."""
     left, right = axes.get_xlim()
-    length = round_length(abs(right - left) * edge / 3)
+    longest = abs(right - left) * edge / 3
+    power = 10.0 ** math.floor(math.log10(longest))
+    length = max((step * power for step in (1, 2, 5) if step * power <= longest), default=power)
     end, bar = left + length / edge, axes.get_xaxis_transform()
     axes.plot([left, end], [-0.05, -0.05], color=INK, linewidth=2.5, transform=bar, clip_on=False)
     words = {"transform": bar, "va": "center", "fontsize": 8}
@@ -336,46 +326,33 @@ def corner_figure(
     d = draws.shape[1]
     figure = make_figure(_SQUARE * d + 0.7, _SQUARE * d + 0.6)
     grid = figure.add_gridspec(d, d, left=0.09, right=0.985, bottom=0.085, top=0.985, wspace=0.09, hspace=0.09)
-    for row in range(d):
-        for column in range(row + 1):
-            axes = figure.add_subplot(grid[row, column])
-            axes.set_xlim(limits[column])
-            if row == column:
-                axes.hist(draws[:, row], bins=np.linspace(*limits[row], 31).tolist(), color=_DRAWN, linewidth=0)
-                axes.set_yticks([])
-            else:
-                axes.set_ylim(limits[row])
-                axes.scatter(
-                    draws[:, column], draws[:, row], s=3, color=_DRAWN, alpha=0.35, linewidth=0, rasterized=True
-                )
-            _mark(axes, marks, column, None if row == column else row)
-            _label(axes, names, row, column)
+    styles = list(zip(marks.items(), ((CONTOUR, "o"), (INK, "x"), (QUIET, "+")), strict=False))
+    for row, column in [(k, other) for k in range(d) for other in range(k + 1)]:
+        axes = figure.add_subplot(grid[row, column])
+        axes.set_xlim(limits[column])
+        axes.spines[:].set_color(QUIET)
+        axes.tick_params(length=2, labelsize=8)
+        axes.xaxis.set_major_locator(MaxNLocator(2, prune="both"))
+        axes.set_xlabel(names[column], fontsize=11)
+        if row == column:
+            axes.hist(draws[:, row], bins=np.linspace(*limits[row], 31).tolist(), color=_DRAWN, linewidth=0)
+            axes.set_yticks([])
+            for (_, point), (colour, _) in styles:
+                axes.axvline(point[column], color=colour, linewidth=1.6)
+        else:
+            axes.set_ylim(limits[row])
+            of = {"s": 3, "color": _DRAWN, "alpha": 0.35, "linewidth": 0, "rasterized": True}
+            axes.scatter(draws[:, column], draws[:, row], **of)
+            axes.yaxis.set_major_locator(MaxNLocator(2, prune="both"))
+            axes.set_ylabel(names[row], fontsize=11)
+            for (name, point), (colour, symbol) in styles:
+                place = point[column], point[row]
+                axes.plot(*place, symbol, color=colour, markersize=6, markeredgewidth=1.8, label=name)
+        axes.label_outer()
     handles, labels = figure.axes[1].get_legend_handles_labels() if d > 1 else ([], [])
     if handles:
         figure.legend(handles, labels, loc="upper right", bbox_to_anchor=(0.98, 0.98), frameon=False, fontsize=11)
     return figure
-
-
-def _mark(axes: Axes, marks: Mapping[str, np.ndarray], column: int, row: int | None) -> None:
-    """Draw the marked points: a line in a histogram, a symbol in a pair."""
-    styles = zip(marks.items(), ((CONTOUR, "o"), (INK, "x"), (QUIET, "+")), strict=False)
-    for (name, point), (colour, symbol) in styles:
-        if row is None:
-            axes.axvline(point[column], color=colour, linewidth=1.6)
-        else:
-            axes.plot(point[column], point[row], symbol, color=colour, markersize=6, markeredgewidth=1.8, label=name)
-
-
-def _label(axes: Axes, names: Sequence[str], row: int, column: int) -> None:
-    """Write ticks and names on axes at the left and the bottom of the figure."""
-    axes.spines[:].set_color(QUIET)
-    axes.tick_params(length=2, labelsize=8)
-    axes.xaxis.set_major_locator(MaxNLocator(2, prune="both"))
-    axes.set_xlabel(names[column], fontsize=11)
-    if row != column:
-        axes.yaxis.set_major_locator(MaxNLocator(2, prune="both"))
-        axes.set_ylabel(names[row], fontsize=11)
-    axes.label_outer()
 
 
 def bands_figure(blocks: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:

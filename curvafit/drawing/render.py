@@ -77,13 +77,12 @@ def render(
     u: np.ndarray,
     *,
     spacing: tuple[float, float, float] = (1.0, 1.0, 1.0),
-    level: float = 0.0,
     width: int = 720,
     height: int | None = None,
     azimuth: float = 32.0,
     elevation: float = 24.0,
 ) -> tuple[np.ndarray, View]:
-    """Return a picture of the level set of `u` `(Z, Y, X)`, and the projection that it shows.
+    """Return a picture of the zero level of `u` `(Z, Y, X)`, and the projection that it shows.
 
     The picture is RGBA bytes, transparent where there is nothing; it is `width` pixels wide, or less where it would be
     higher than `height`. A volume that has no 3 axes of at least 4 voxels, or is not finite, is a ValueError.
@@ -98,7 +97,7 @@ def render(
         width = max(2, min(width, round(height * camera.half[0] / camera.half[1])))
     height = max(2, round(width * camera.half[1] / camera.half[0]))
     size = (width * _SUPERSAMPLE, height * _SUPERSAMPLE)
-    picture = Image.fromarray(_colours(field - np.float32(level), camera, size))
+    picture = Image.fromarray(_colours(field, camera, size))
     return np.asarray(picture.reduce(_SUPERSAMPLE)), camera
 
 
@@ -241,15 +240,15 @@ def surface_picture(u: np.ndarray, path: str | Path, *, width: int = 900, **opti
     return write_content(Path(path), buffer.getvalue())
 
 
-def render_in_box(u: np.ndarray, *, level: float = 0.0, **options) -> np.ndarray:
+def render_in_box(u: np.ndarray, **options) -> np.ndarray:
     """Return the level set of a field (or the outline of a bool mask) in its box, cut faces capped.
 
     The picture is RGBA bytes, transparent where there is nothing; `options` are those of `render`.
     """
     values = np.asarray(u)
     if values.dtype == np.bool_:
-        values, level = gaussian_filter(values.astype(np.float32), 0.7), level + 0.5
-    surface, camera = render(values, level=level, **options)
+        values = gaussian_filter(values.astype(np.float32), 0.7) - np.float32(0.5)
+    surface, camera = render(values, **options)
     size = (surface.shape[1], surface.shape[0])
     layers = (_edges(camera, size, front=False), Image.fromarray(surface), _edges(camera, size, front=True))
     sheet = Image.new("RGBA", size)

@@ -147,7 +147,10 @@ def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | No
     data = None
     if target.suffix.lower() == ".vtp":
         data = _vertex_curvatures(mesh, field, Grid(grid.shape, edges, grid.boundary))
-        data = {name: np.where(_vertices_on_faces(mesh, box), 0, κ) for name, κ in data.items()}
+        middle = (np.array(box.shape) - 1) / 2
+        reach = np.abs(mesh.vertices / np.array(box.spacing) - middle)
+        capped = np.any(reach > middle + 0.5 - 1e-6, axis=1)  # faces are half a voxel beyond the outermost centres
+        data = {name: np.where(capped, 0, κ) for name, κ in data.items()}
     return write_surface(mesh, target, unit=how.unit, data=data)
 
 
@@ -162,22 +165,13 @@ def shape_record(
     return {
         "format": FORMAT.name,
         "coefficients": dict(zip(NAMES, map(_number_or_range, flow.coefficients), strict=True)),
-        "mass": _number_or_range(flow.mass if mass is None else mass),
-        "shape": list(flow.grid.shape),
-        "working_spacing": list(flow.grid.spacing),
-        "epsilon": _number_or_range(flow.epsilon),
-        "boundary": flow.grid.boundary,
-        "seed": flow.seed,
-        "schedule": flow.schedule.as_dict(),
-        "status": flow.status,
-        "viable": flow.viability.viable,
-        "volume_fraction": float(np.mean(flow.field.numpy() > 0)),
-        **dataclasses.asdict(output or Output()),
-        **more,
-        "curvafit": version("curvafit"),
-        "torch": version("torch"),
+        "mass": _number_or_range(flow.mass if mass is None else mass), "shape": list(flow.grid.shape),
+        "working_spacing": list(flow.grid.spacing), "epsilon": _number_or_range(flow.epsilon),
+        "boundary": flow.grid.boundary, "seed": flow.seed, "schedule": flow.schedule.as_dict(), "status": flow.status,
+        "viable": flow.viability.viable, "volume_fraction": float(np.mean(flow.field.numpy() > 0)),
+        **dataclasses.asdict(output or Output()), **more, "curvafit": version("curvafit"), "torch": version("torch"),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-    }
+    }  # fmt: skip
 
 
 def _number_or_range(value: float | Tensor) -> float | dict[str, float]:
@@ -196,10 +190,3 @@ def _vertex_curvatures(mesh: Surface, field: Tensor, grid: Grid) -> dict[str, np
     known = {"kappa1": κ1, "kappa2": κ2}
     known = {name: torch.nan_to_num(κ).clamp(-sharpest, sharpest).numpy() for name, κ in known.items()}
     return {name: map_coordinates(κ, places, order=1, mode=beyond) for name, κ in known.items()}
-
-
-def _vertices_on_faces(mesh: Surface, box: Grid) -> np.ndarray:
-    """Return a mask `(V,)` of the vertices on the box's faces, which are half a voxel beyond the outermost centres."""
-    middle = (np.array(box.shape) - 1) / 2
-    reach = np.abs(mesh.vertices / np.array(box.spacing) - middle)
-    return np.any(reach > middle + 0.5 - 1e-6, axis=1)

@@ -16,7 +16,7 @@ from html import escape
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -42,7 +42,7 @@ from curvafit.geometry.mesh import capped_surface
 from curvafit.inference.atlas import Atlas
 from curvafit.inference.fit import Fit
 from curvafit.priors.grid import WORKING_SPACING, Grid
-from curvafit.report.page import MARK, render_template
+from curvafit.report.page import MARK, name_source, render_template
 from curvafit.scan.prepare import HALF, WORKING_THICKNESS
 
 #: Below this, there is nothing to lay out; the nearest shapes that are named beside one.
@@ -56,24 +56,13 @@ COLUMNS = ("a₂₀, of κ₁²", "a₁₁, of κ₁κ₂", "a₀₂, of κ₂²
            "m₀, mass", "share of the volume", "thickness in voxels")  # fmt: skip
 
 
-class Plane(NamedTuple):
-    """The two directions in which embeddings `(N, D)` differ most, and the share of their variance along each."""
-
-    middle: np.ndarray
-    axes: np.ndarray
-    shares: np.ndarray
-
-    def place(self, embeddings: np.ndarray) -> np.ndarray:
-        """Return where embeddings lie on the plane, `(n, 2)`."""
-        return (embeddings - self.middle) @ self.axes.T
-
-
-def find_plane(embeddings: np.ndarray) -> Plane:
-    """Return the main axes of sliced embeddings, in which Euclidean distance is the sliced Wasserstein distance."""
+def place_on_plane(embeddings: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where `others` `(n, 2)` lie on the two directions in which sliced embeddings `(N, D)` differ most, and the
+    share of these' variance along each; Euclidean distance there is the sliced Wasserstein distance."""
     middle = embeddings.mean(0)
     _, spread, main = np.linalg.svd(embeddings - middle, full_matrices=False)
     main = main[:2] * np.sign(main[:2].sum(1, keepdims=True))  # a direction's sign has no meaning: take one that stays
-    return Plane(middle, main, spread[:2] ** 2 / max(float((spread**2).sum()), 1e-30))
+    return (others - middle) @ main.T, spread[:2] ** 2 / max(float((spread**2).sum()), 1e-30)
 
 
 def families_of(atlas: Atlas) -> tuple[str, ...]:
@@ -92,8 +81,8 @@ def map_on(axes: Axes, atlas: Atlas, seen_as: str, embeddings: np.ndarray) -> np
     Return the places (n, 2) there of diagrams whose sliced `embeddings` (n, 288) are in working units.
     """
     of_atlas = atlas.embeddings(seen_as)
-    plane = find_plane(of_atlas)
-    places, own = plane.place(of_atlas), plane.place(embeddings)
+    both, shares = place_on_plane(of_atlas, np.concatenate([of_atlas, embeddings]))
+    places, own = both[: len(of_atlas)], both[len(of_atlas) :]
     names = np.array(families_of(atlas))
     for name, colour in FAMILY_COLOURS.items():
         if (names == name).any():
@@ -105,21 +94,13 @@ def map_on(axes: Axes, atlas: Atlas, seen_as: str, embeddings: np.ndarray) -> np
     legend = {"fontsize": 8, "frameon": False, "handletextpad": 0, "columnspacing": 0.9}
     axes.legend(loc="lower center", ncols=6, bbox_to_anchor=(0.5, -0.15), **legend)
     axes.set_title(f"its place among {len(atlas)} grown textures", fontsize=11)
-    words = f"the directions hold {plane.shares.sum():.0%} of their spread"
+    words = f"the directions hold {shares.sum():.0%} of their spread"
     axes.text(0.99, 0.015, words, transform=axes.transAxes, ha="right", fontsize=7.5, color="#5b616b")
     axes.spines[:].set_color("#dfe2e6")
     return own
 
 
 # ---- the page --------------------------------------------------------------------------------------------------------
-
-
-def check_map(path: str | Path, inputs: Sequence[str | Path] = (), overwrite: bool = False) -> Path:
-    """Return the path if a map can be written there, else raise ValueError; call it before long work."""
-    target = Path(path)
-    if target.suffix.lower() not in (".html", ".htm"):
-        raise ValueError(f"the name of a map must end in .html, got {target.name!r}")
-    return can_write(target, lambda there: has_mark(there, MARK), inputs=inputs, overwrite=overwrite)
 
 
 def write_map(
@@ -140,9 +121,12 @@ def write_map(
     script = require("plotly.offline", "atlas", "the map of an atlas").get_plotlyjs()
     sources = open_all(stores)
     read = [each for each in fits if not isinstance(each, Fit)]
-    target = check_map(path, [*(store.path for store in sources), *map(Path, read)], overwrite)
+    if (target := Path(path)).suffix.lower() not in (".html", ".htm"):
+        raise ValueError(f"the name of a map must end in .html, got {target.name!r}")
+    inputs = [*(store.path for store in sources), *map(Path, read)]
+    can_write(target, lambda there: has_mark(there, MARK), inputs=inputs, overwrite=overwrite)
     scans = [each if isinstance(each, Fit) else Fit.load(each) for each in fits]
-    names = [name_fit(fit, number) for number, fit in enumerate(scans, 1)]
+    names = [name_source(fit.provenance.get("scan")) or f"scan {k}" for k, fit in enumerate(scans, 1)]
     if bare := [name for name, fit in zip(names, scans, strict=True) if fit.diagram is None]:
         raise ValueError(f"the fit of {bare[0]} has no curvature diagram: {scans[names.index(bare[0])].status}")
     atlas = extract(sources, progress=sub_progress(progress, 0.0, 0.6))
@@ -151,8 +135,7 @@ def write_map(
     λ = WORKING_THICKNESS * WORKING_SPACING
     diagrams = [replace(each, points=each.points * λ) for each in atlas.mask_diagrams] + list(map(scale_fit, scans))
     embeddings = np.stack([sliced_embedding(each) for each in diagrams])
-    plane = find_plane(embeddings[:n])
-    places = plane.place(embeddings)
+    places, shares = place_on_plane(embeddings[:n], embeddings)
     away = cdist(embeddings, embeddings[:n])
     np.fill_diagonal(away, np.inf)
     near = np.argsort(away, axis=1, kind="stable")[:, :NEIGHBOURS]
@@ -178,7 +161,7 @@ def write_map(
     for k, shape in enumerate(shapes):
         shape |= {"name": [*atlas.ids, *names][k], "place": places[k].round(4).tolist(), "near": near[k].tolist()}
         shape |= {"distances": distances[k].round(3).tolist(), "diagram": _pack(_shades(diagrams[k], limits))}
-    figure = _map_figure(plane, places, names, kinds, columns)
+    figure = _map_figure(shares, places, names, kinds, columns)
     shades = [to_hex(DENSITY(share)) for share in np.linspace(0, 1, 9)]
     data = {"shapes": shapes, "count": n, "map": json.loads(figure.to_json()), "bins": BINS, "limits": limits}
     data |= {"shades": shades, "colours": [to_hex(SURFACE), to_hex(CAP)], "diagonal": DIAGONAL}
@@ -195,12 +178,6 @@ def write_map(
         provenance=[each for each in rows.items() if each[1]],
     )  # fmt: skip
     return write_content(target, text)
-
-
-def name_fit(fit: Fit, number: int) -> str:
-    """Return the name of a fit on the map: its scan's file."""
-    path, _, key = str(fit.provenance.get("scan") or "").partition("::")
-    return "::".join(filter(None, (Path(path).name, key))) or f"scan {number}"
 
 
 def scale_fit(fit: Fit) -> Diagram:
@@ -236,15 +213,18 @@ def _columns(atlas: Atlas) -> dict[str, np.ndarray]:
 def _describe_fit(fit: Fit, far: bool) -> list[tuple[str, str]]:
     """Return what is said of a scan; `far` is whether it lies farther from shapes than these from each other."""
     inverted = fit.morphometry.volume_fraction > HALF
-    distance = (
-        "farther from shapes than 95 % of them from each other" if far else "as near to shapes as they to each other"
-    )
+    distance = "farther from shapes than 95 % of them from" if far else "as near to shapes as they to"
     part = "background, which fills less" if inverted else "structure"
-    return [("family", fit.family), ("placed by its", part), ("lies", distance), ("verdict", fit.status)]
+    return [
+        ("family", fit.family),
+        ("placed by its", part),
+        ("lies", f"{distance} each other"),
+        ("verdict", fit.status),
+    ]
 
 
 def _map_figure(
-    plane: Plane, places: np.ndarray, scans: Sequence[str], kinds: Sequence[str], columns: dict[str, np.ndarray]
+    shares: np.ndarray, places: np.ndarray, scans: Sequence[str], kinds: Sequence[str], columns: dict[str, np.ndarray]
 ) -> Any:
     """Return the map: points by family, or by a number; stars for scans; last a ring, for the chosen one."""
     n, names = len(kinds), np.array(kinds)
@@ -278,16 +258,14 @@ def _map_figure(
         choices.append({"label": f"colour: {words}", "method": "restyle", "args": [{"visible": seen}]})
     menu = {"buttons": choices, "x": 0, "y": 1.07, "xanchor": "left", "yanchor": "bottom", "bgcolor": "white"}
     first, second = (
-        {
-            "title": f"{word} main direction of the diagrams, in 1/thickness ({share:.0%} of variance)",
-            "title_font_size": 13,
-        }
-        for word, share in zip(("first", "second"), plane.shares, strict=True)
+        {"title": f"{word} main direction of the diagrams, in 1/thickness ({share:.0%} of variance)"}
+        for word, share in zip(("first", "second"), shares, strict=True)
     )
+    small = {"title_font_size": 13}
     figure.update_layout(
         margin={"l": 62, "r": 8, "t": 84, "b": 50}, template="simple_white", uirevision="kept", hovermode="closest",
         dragmode="pan", updatemenus=[menu], legend={"orientation": "h", "y": 1.0, "yanchor": "bottom"}, font_color=INK,
-        xaxis=first, yaxis=second | {"scaleanchor": "x"},
+        xaxis=first | small, yaxis=second | small | {"scaleanchor": "x"},
     )  # fmt: skip
     return figure
 

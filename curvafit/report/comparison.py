@@ -17,18 +17,10 @@ from curvafit.core.records import Format
 from curvafit.core.units import format_number, format_percent, per_unit, plain_unit, power_name
 from curvafit.drawing.groups import comparison_figure, numbers_figure
 from curvafit.geometry.distances import DIRECTIONS, QUANTILES
-from curvafit.report.page import (
-    Picture,
-    check_result_folder,
-    picture_of,
-    record_study,
-    render_template,
-    write_study,
-)
+from curvafit.report.page import check_result_folder, start_record, write_study
 from curvafit.scan.measure import Measures
 from curvafit.studies.compare import BINS, LEVEL, SMOOTH, Comparison, Number, join_names
 from curvafit.studies.scans import count_notes
-from curvafit.studies.tables import format_csv
 
 #: `format` of a comparison's record.
 FORMAT = Format("curvafit comparison", 1, title="the record of a comparison")
@@ -50,40 +42,31 @@ def write_comparison(
     others are a ValueError without `overwrite`. `command` is what the record calls the command line.
     """
     target = check_comparison(directory, overwrite=overwrite, command=command)
-    difference, numbers = comparison_figure(comparison), numbers_figure(comparison)
+    c, label, tests = comparison, "group" if comparison.groups else "number", list(_test_rows(comparison))
+    tried = {"seed": c.options["seed"], "permutations": c.permutations}
+    record = start_record(command, unit=c.unit, options=c.options, status=c.status, notes=c.notes, **tried)
+    record |= {"exact": c.exact, "p": c.p, "least_p": c.least, "by": c.by, "groups": list(c.groups)}
+    record["scans"] = [
+        {"scan": each.source, "subject": case.subject, label: case.label, "kind": each.kind, "notes": list(each.notes)}
+        for each, case in zip(c.measures, c.cases, strict=True)
+    ]
+    record |= {"energy" if c.groups else "distance_correlation": c.statistic, "apart": c.apart, "within": c.within}
+    record |= {"tests": tests, "methods": describe_methods(c)}
+    page = {
+        "title": c.verdict, "scans": "; ".join(_count_scans(c)) + ".", "status": c.status, "groups": c.groups,
+        "effect": c.effect, "differs": bool(c.significant.any()),
+        "head": [*c.groups, "difference" if c.groups else "slope", c.effect, "95 %", *TESTS, "known error"],
+        "rows": [_format_row(number, c) for number in c.numbers], "level": f"{LEVEL:.2g}",
+        "methods": record["methods"], "notes": c.notes,
+    }  # fmt: skip
     drawn = {
-        "difference": (difference, picture_of(difference, "Mean curvature diagrams and their difference")),
-        "numbers": (numbers, picture_of(numbers, f"Each number by {comparison.by}")),
+        "difference": (comparison_figure(c), "Mean curvature diagrams and their difference"),
+        "numbers": (numbers_figure(c), f"Each number by {c.by}"),
     }
-    record = _record(comparison, command)
-    texts = {
-        "measures.csv": format_csv(list(_measure_rows(comparison))),
-        "numbers.csv": format_csv(list(_test_rows(comparison))),
-        "compare.html": _page(comparison, record, {name: picture for name, (_, picture) in drawn.items()}),
-    }
-    return write_study(target, FORMAT, FILES, record, texts, drawn)
-
-
-def _page(comparison: Comparison, record: dict[str, Any], pictures: dict[str, Picture]) -> str:
-    """Return the page of a comparison, with its record and its pictures, as text."""
-    c = comparison
-    return render_template(
-        "compare.html",
-        version=version("curvafit"),
-        title=c.verdict,
-        scans="; ".join(_count_scans(c)) + ".",
-        status=c.status,
-        groups=c.groups,
-        effect=c.effect,
-        differs=bool(c.significant.any()),
-        head=[*c.groups, "difference" if c.groups else "slope", c.effect, "95 %", *TESTS, "known error"],
-        rows=[_format_row(number, c) for number in c.numbers],
-        level=f"{LEVEL:.2g}",
-        **pictures,
-        methods=record["methods"],
-        notes=c.notes,
-        provenance=[(name, record[name]) for name in ("command", "date", "seed", "permutations") if record[name] != ""],
-    )
+    whose = [{"subject": case.subject, label: case.label} for case in c.cases]
+    rows = (row for each, told in zip(c.measures, whose, strict=True) for row in each.rows(**told))
+    tables = {"measures.csv": rows, "numbers.csv": tests}
+    return write_study(target, FORMAT, FILES, record, page, tables, figures=drawn, told=("command", "date", *tried))
 
 
 def describe_methods(comparison: Comparison) -> str:
@@ -193,12 +176,6 @@ def name_quantity(name: str, symbol: str, power: int, unit: str) -> dict[str, st
 # ---- tables and record -----------------------------------------------------------------------------------------------
 
 
-def _measure_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
-    """Yield the rows of `curvafit measure`'s table, with each scan's subject and its group or number."""
-    for measures, case in zip(comparison.measures, comparison.cases, strict=True):
-        yield from measures.rows(subject=case.subject, **{"group" if comparison.groups else "number": case.label})
-
-
 def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
     """Yield a row for each test: the diagrams', then each number's; None where there is no value."""
     c, letters = comparison, ascii_lowercase[: len(comparison.groups)]
@@ -215,27 +192,3 @@ def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
         cells += (each.p, each.family, each.holm, each.discovery, each.known)
         known = (None if isinstance(cell, float) and not math.isfinite(cell) else cell for cell in cells)
         yield dict(zip(columns, known, strict=True))
-
-
-def _record(comparison: Comparison, command: str) -> dict[str, Any]:
-    """Return the content of `compare.json`."""
-    c, label = comparison, "group" if comparison.groups else "number"
-    return {
-        **record_study(c, command, FILES),
-        "seed": c.options["seed"],
-        "permutations": c.permutations,
-        "exact": c.exact,
-        "p": c.p,
-        "least_p": c.least,
-        "by": c.by,
-        "groups": list(c.groups),
-        "scans": [
-            {"scan": each.source, "subject": case.subject, label: case.label, "kind": each.kind, "notes": each.notes}
-            for each, case in zip(c.measures, c.cases, strict=True)
-        ],
-        "energy" if c.groups else "distance_correlation": c.statistic,
-        "apart": c.apart,
-        "within": c.within,
-        "tests": list(_test_rows(c)),
-        "methods": describe_methods(c),
-    }

@@ -32,7 +32,6 @@ from curvafit.report.page import (
     list_strips,
     picture_of,
     render_template,
-    working_length,
     write_inference,
 )
 from curvafit.scan.measure import measure
@@ -44,7 +43,6 @@ from curvafit.volumes.field import Field, ScanError
 
 if TYPE_CHECKING:
     from curvafit.inference.atlas import Atlas
-    from curvafit.inference.fit import Fit
     from curvafit.inference.infer import Inference
     from curvafit.scan.measure import Measures
 
@@ -58,15 +56,8 @@ PLACES, EDGE = ("nearest", "second", "third"), 64
 _MEASURES = ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D", "BS/BV", "DA", "H", "K")
 
 
-class Demo(NamedTuple):
-    """The path of the page, and how well the scan was filled."""
-
-    page: Path
-    completion: Completion
-
-
 class Completion(NamedTuple):
-    """A mask, the mask filled from every `every`-th of its slices, both bool (Z, Y, X), and how well they agree.
+    """A mask, the mask filled from one in `EVERY` of its slices, both bool (Z, Y, X), and how well they agree.
 
     `axis` is the one across the slices. `dice` has the Dice coefficients, on the slices left out, of the filled volume
     (`"curvafit"`) and of the plain interpolations of `segmentation.slices.WAYS`.
@@ -74,7 +65,6 @@ class Completion(NamedTuple):
 
     truth: np.ndarray
     filled: np.ndarray
-    every: int
     axis: int
     dice: Mapping[str, float]
 
@@ -83,13 +73,13 @@ class Completion(NamedTuple):
         """The known slices alone, bool (Z, Y, X)."""
         mask = np.zeros_like(self.truth)
         known, truth = (np.moveaxis(each, self.axis, 0) for each in (mask, self.truth))
-        known[:: self.every] = truth[:: self.every]
+        known[::EVERY] = truth[::EVERY]
         return mask
 
 
 def write_demo(
     scan: Field, directory: str | Path, *, seed: int = 0, overwrite: bool = False, progress: Progress = silent
-) -> Demo:
+) -> tuple[Path, Completion]:
     """Measure a scan, fill it from every 8th slice, find textures like it, and write one page on it into a folder.
 
     The structure is measured (`measure`). The volume is filled from slices across its shortest axis (`reconstruct`) and
@@ -111,39 +101,31 @@ def write_demo(
     mask, axis = signed.values > 0, int(np.argmin(np.array(scan.shape) * scan.spacing))
     volume = Field(mask.view(np.uint8), scan.spacing, scan.unit)
     filled = reconstruct(volume, every=EVERY, axis=axis, progress=sub_progress(progress, 0.3, 0.6))
-    completion = score_completion(mask, filled.mask.values, EVERY, axis)
-    textures = grow_nearest(inference.fit, sub_progress(progress, 0.6, 0.95))
+    completion = score_completion(mask, filled.mask.values, axis)
+    textures: list[np.ndarray] = []
+    for match in inference.fit.matches:
+        if len(textures) < len(PLACES):
+            progress("growing the nearest textures", 0.6 + 0.35 * len(textures) / len(PLACES))
+            flow = generate(match.coefficients, match.mass, EDGE, seed=match.seed, schedule=LEARNED)
+            textures += [flow.field.numpy()] * flow.viability.viable
     progress("drawing the page", 0.95)
     text = demo_page(inference, measures, completion, textures, atlas)
     write_inference(inference, folder, overwrite=overwrite)
-    return Demo(write_content(page, text), completion)
+    return write_content(page, text), completion
 
 
-def score_completion(truth: np.ndarray, filled: np.ndarray, every: int, axis: int = 0) -> Completion:
-    """Compare a volume filled from every `every`-th slice of a mask, and plain interpolations, with what was left out.
+def score_completion(truth: np.ndarray, filled: np.ndarray, axis: int = 0) -> Completion:
+    """Compare a volume filled from one in `EVERY` slices of a mask, and plain interpolations, with what was left out.
 
     Only slices between the first and the last known one count.
     """
     known, found = (np.moveaxis(each, axis, 0) for each in (truth, filled))
-    places = tuple(range(0, len(known), every))
-    slices = Slices(known[::every], places, len(known), (1.0, 1.0, 1.0))
+    places = tuple(range(0, len(known), EVERY))
+    slices = Slices(known[::EVERY], places, len(known), (1.0, 1.0, 1.0))
     left_out = slices.between
     volumes = {"curvafit": found, **{way: slices.level(way) > 0 for way in WAYS}}
     scores = {name: dice(volume[left_out], known[left_out]) for name, volume in volumes.items()}
-    return Completion(truth, filled, every, axis, scores)
-
-
-def grow_nearest(fit: Fit, progress: Progress = silent) -> list[np.ndarray]:
-    """Grow the nearest shapes of the atlas anew: phase fields (64, 64, 64), the nearest first, one for each place."""
-    grown: list[np.ndarray] = []
-    for match in fit.matches:
-        if len(grown) == len(PLACES):
-            break
-        progress("growing the nearest textures", len(grown) / len(PLACES))
-        flow = generate(match.coefficients, match.mass, EDGE, seed=match.seed, schedule=LEARNED)
-        if flow.viability.viable:
-            grown.append(flow.field.numpy())
-    return grown
+    return Completion(truth, filled, axis, scores)
 
 
 def demo_page(
@@ -160,35 +142,27 @@ def demo_page(
     fit = inference.fit
     grown = {f"{place} texture": u for place, u in zip(PLACES, textures, strict=False)}
     return render_template(
-        "demo.html",
-        version=version("curvafit"),
-        sentence=describe(inference),
-        scan=describe_scan(inference),
+        "demo.html", version=version("curvafit"), sentence=describe(inference), scan=describe_scan(inference),
         shapes=picture_of(
             _shape_figure(completion, inference.scan.spacing), "Known slices, the filled volume, and the scan"
         ),
         slices=picture_of(_slice_figure(inference.scan, completion), "A left-out slice, as it is and as filled"),
-        every=completion.every,
-        axis="zyx"[completion.axis],
+        every=EVERY, axis="zyx"[completion.axis],
         scores=[(name, f"{score:.3f}") for name, score in completion.dice.items()],
         measures=[(measures[symbol].name, symbol, *measures[symbol].format(measures.unit)) for symbol in _MEASURES],
-        blocks=int(np.prod(measures.blocks)) if np.isfinite(measures["BV/TV"].half) else 0,
-        count=len(atlas),
+        blocks=int(np.prod(measures.blocks)) if np.isfinite(measures["BV/TV"].half) else 0, count=len(atlas),
         map=picture_of(_map_figure(inference, atlas), "The scan's curvature diagram, and its place on the atlas's map"),
         near=picture_of(gallery_figure(grown, columns=3, width=1500), "The nearest textures") if grown else None,
-        misfit=fit.misfit,
-        status=fit.status,
-        believed=fit.misfit is not None and fit.misfit.probability >= UNBELIEVABLE,
-        number=format_number,
-        strips=list_strips(fit),
-        notes=dict.fromkeys((*inference.scan.notes, *fit.notes)),
-    )
+        misfit=fit.misfit, status=fit.status,
+        believed=fit.misfit is not None and fit.misfit.probability >= UNBELIEVABLE, number=format_number,
+        strips=list_strips(fit), notes=dict.fromkeys((*inference.scan.notes, *fit.notes)),
+    )  # fmt: skip
 
 
 def _shape_figure(completion: Completion, spacing: tuple[float, float, float]) -> Figure:
     """Return a figure of the known slices, the filled volume and the scan, cut open, the slices lying."""
     shapes = {
-        f"every {completion.every}th slice": completion.known,
+        f"every {EVERY}th slice": completion.known,
         "filled between them": completion.filled,
         "the scan": completion.truth,
     }
@@ -202,9 +176,9 @@ def _shape_figure(completion: Completion, spacing: tuple[float, float, float]) -
 
 def _slice_figure(scan: Field, completion: Completion) -> Figure:
     """Return the slice midway between two known ones: its grey values, and where the filled slice differs."""
-    every, axis = completion.every, completion.axis
-    place = (scan.shape[axis] // 2 // every) * every + every // 2
-    place -= every if place > (scan.shape[axis] - 1) // every * every else 0
+    axis = completion.axis
+    place = (scan.shape[axis] // 2 // EVERY) * EVERY + EVERY // 2
+    place -= EVERY if place > (scan.shape[axis] - 1) // EVERY * EVERY else 0
     plane, truth, filled = (
         each.take(place, axis) for each in (np.asarray(scan.values), completion.truth, completion.filled)
     )
@@ -229,7 +203,7 @@ def _slice_figure(scan: Field, completion: Completion) -> Figure:
     axes[2].set_title("missing (blue), too much (orange)", fontsize=11)
     for each in axes:
         each.set(xticks=[], yticks=[])
-    words = f"{'zyx'[axis]} = {place}, {every // 2} slices from the nearest known one"
+    words = f"{'zyx'[axis]} = {place}, {EVERY // 2} slices from the nearest known one"
     figure.suptitle(words, fontsize=9, color="#5b616b")
     return figure
 
@@ -238,7 +212,7 @@ def _map_figure(inference: Inference, atlas: Atlas) -> Figure:
     """Return a figure of the scan's diagram and its place among the atlas's, on the main axes of sliced quantiles."""
     assert inference.diagram is not None
     figure = make_figure(10.2, 4.6)
-    λ, unit = working_length(inference), inference.fit.length_unit
+    λ, unit = inference.prepared.length, inference.fit.length_unit
     left = figure.add_axes((0.07, 0.13, 0.36, 0.78))
     diagram_on(left, inference.diagram, limits=shared_limits([inference.diagram], length=λ), unit=unit, length=λ)
     left.set_title("how much surface has which curvatures", fontsize=11)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from importlib.metadata import version
 from operator import itemgetter
@@ -11,21 +11,18 @@ from typing import Any
 
 from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, silent
-from curvafit.core.workers import cluster, collect_all
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer
 from curvafit.report.page import (
     check_report,
     check_result_folder,
     list_strips,
-    render_template,
     start_record,
     with_command,
     write_inference,
     write_study,
 )
-from curvafit.studies.scans import name_errors
-from curvafit.studies.tables import format_csv
+from curvafit.studies.scans import Task, name_errors, share_out
 
 #: `format` of the record.
 FORMAT = Format("curvafit laws", 1, title="the record of many inferences")
@@ -52,20 +49,22 @@ def infer_scans(
     check_result_folder(FORMAT, FILES, target, scans, overwrite, command)
     for folder in folders:
         check_report(target / folder, scans, overwrite, command)
-    left = [k for k, folder in enumerate(folders) if not _is_done(target / folder, command)]
+    left: dict[int, Task] = {
+        k: partial(_infer_one, scans[k], target / folder, command, overwrite, options)
+        for k, folder in enumerate(folders)
+        if not _is_done(target / folder, command)
+    }
     target.mkdir(parents=True, exist_ok=True)
-
-    def watch(k: int, text: str, share: float) -> None:
-        progress(f"{folders[k]}: {text}", (k + share) / len(folders))
-
-    make = partial(
-        _infer_one, list(zip(scans, folders, strict=True)), command, overwrite, options, None if workers else watch
-    )
-    with cluster(workers) as crew:
-        for k in collect_all(crew, ((make, target, [k]) for k in left)):
-            watch(k, "inferred", 1.0)
+    share_out(left, folders, workers, progress)
     fits = {folder: Fit.load(target / folder / "fit.json") for folder in folders}
-    return write_laws(fits, target, command=command, overwrite=overwrite)
+    record = start_record(command, scans={name: fit.provenance.get("scan", "") for name, fit in fits.items()})
+    rows = [row for name, fit in fits.items() for row in _rows(name, fit)]
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for name, fit in fits.items():
+        for strip in filter(itemgetter("low"), list_strips(fit)):
+            groups.setdefault((strip["low"], strip["high"]), []).append(strip | {"scan": name})
+    page = {"title": f"The laws of {len(fits)} scans", "fits": fits, "groups": groups}
+    return write_study(target, FORMAT, FILES, record, page, {"laws.csv": rows})
 
 
 def name_folders(scans: Sequence[str]) -> list[str]:
@@ -78,33 +77,13 @@ def name_folders(scans: Sequence[str]) -> list[str]:
     return found
 
 
-def write_laws(fits: dict[str, Fit], directory: str | Path, *, command: str = "", overwrite: bool = False) -> Path:
-    """Write page, table and record of fits, by the names of their folders, and return the page's path."""
-    target = check_result_folder(FORMAT, FILES, directory, (), overwrite, command)
-    record = start_record(command, scans={name: fit.provenance.get("scan", "") for name, fit in fits.items()})
-    rows = [row for name, fit in fits.items() for row in _rows(name, fit)]
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for name, fit in fits.items():
-        for strip in filter(itemgetter("low"), list_strips(fit)):
-            groups.setdefault((strip["low"], strip["high"]), []).append(strip | {"scan": name})
-    page = render_template(
-        "laws.html", version=record["curvafit"], title=f"The laws of {len(fits)} scans", fits=fits, groups=groups,
-        provenance=[(name, record[name]) for name in ("command", "date") if record[name]],
-    )  # fmt: skip
-    return write_study(target, FORMAT, FILES, record, {"laws.html": page, "laws.csv": format_csv(rows)}, {})
-
-
 def _infer_one(
-    jobs: Sequence[tuple[str, str]], command: str, overwrite: bool, options: dict[str, Any],
-    watch: Callable[[int, str, float], None] | None, target: Path, indices: Sequence[int],
-) -> list[int]:  # fmt: skip
-    """Infer some of the scans, and write their reports into their folders."""
-    for k in indices:
-        scan, folder = jobs[k]
-        with name_errors(scan):
-            found = infer(scan, progress=silent if watch is None else partial(watch, k), **options)
-        write_inference(with_command(found, command), target / folder, overwrite=overwrite)
-    return list(indices)
+    scan: str, folder: Path, command: str, overwrite: bool, options: dict[str, Any], progress: Progress
+) -> None:
+    """Infer one of the scans, and write its report into its folder."""
+    with name_errors(scan):
+        found = infer(scan, progress=progress, **options)
+    write_inference(with_command(found, command), folder, overwrite=overwrite)
 
 
 def _is_done(folder: Path, command: str) -> bool:

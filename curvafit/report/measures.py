@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -10,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -18,17 +18,10 @@ from curvafit.core.units import format_number, power_name
 from curvafit.drawing.groups import FIRST, FIRST_SHOWN, SIGNED, plain, shown_window
 from curvafit.drawing.plot import QUIET, diagram_on, make_figure
 from curvafit.report.comparison import describe_measures, say_kinds
-from curvafit.report.page import (
-    Picture,
-    check_result_folder,
-    picture_of,
-    render_template,
-    start_record,
-    write_study,
-)
+from curvafit.report.page import check_result_folder, start_record, write_study
 from curvafit.scan.measure import Measures
 from curvafit.studies.scans import count_notes
-from curvafit.studies.tables import format_csv, list_rows
+from curvafit.studies.tables import list_rows
 
 #: `format` of the record.
 FORMAT = Format("curvafit measured scans", 1, title="the record of measured scans")
@@ -69,73 +62,36 @@ def write_measures(
         for part in each.compartments.values() or (each,)
     ]
     parts = [part for part, _ in rows]
-    drawn = _draw(parts)
+    names, heads = name_parts(parts), list(dict.fromkeys(name for _, more in rows for name in more))
+    status, notes, unit = describe_range(parts), list(count_notes(parts)), measures[0].unit
     record = start_record(
-        command,
-        unit=measures[0].unit,
-        options=json.loads(json.dumps(dict(options or {}), default=str)),
-        status=describe_range(parts),
-        scans=[{"scan": each.source, "kind": each.kind, "notes": list(each.notes)} for each in measures],
-        notes=list(count_notes(parts)),
-        files=list(FILES),
-    )
-    texts = {
-        "measures.csv": format_csv(list_rows(measures, told)),
-        "measures.html": _page(measures, rows, record, {key: picture for key, (_, picture) in drawn.items()}),
-    }
-    return write_study(target, FORMAT, FILES, record, texts, drawn)
-
-
-def _draw(parts: Sequence[Measures]) -> dict[str, tuple[Figure, Picture]]:
-    """Return the figures of scans and compartments, each with its picture."""
-    names = name_parts(parts)
-    figures = {
-        "diagrams": diagrams_figure(names[:MOST_DIAGRAMS], parts[:MOST_DIAGRAMS]),
-        "numbers": intervals_figure(names[:MOST_ROWS], parts[:MOST_ROWS]),
-    }
-    alts = ("The curvature diagram of each scan", "Numbers of each scan with their intervals")
-    return {key: (each, picture_of(each, alt)) for (key, each), alt in zip(figures.items(), alts, strict=True)}
-
-
-def _page(
-    measures: Sequence[Measures],
-    rows: Sequence[tuple[Measures, Mapping[str, str]]],
-    record: dict[str, Any],
-    pictures: Mapping[str, Picture],
-) -> str:
-    """Return the page of scans as text; `rows` are its table's, scans or compartments and their further columns."""
-    heads = list(dict.fromkeys(name for _, more in rows for name in more))
-    names, numbers = name_parts([part for part, _ in rows]), (measures[0][symbol] for symbol in FIRST_SHOWN)
-    return render_template(
-        "measures.html",
-        version=record["curvafit"],
-        title=f"{len(measures)} scans measured" if len(measures) > 1 else "One scan measured",
-        status=record["status"],
-        heads=heads,
-        symbols=[(each.symbol, power_name(record["unit"], each.power)) for each in numbers],
-        rows=[
-            {"name": name, "told": [more.get(head, "") for head in heads], "cells": _format_cells(part)}
-            for name, (part, more) in zip(names, rows, strict=True)
-        ],
-        left={"diagrams": max(0, len(rows) - MOST_DIAGRAMS), "numbers": max(0, len(rows) - MOST_ROWS)},
-        **pictures,
-        methods=describe_methods(measures),
-        notes=record["notes"],
-        provenance=[(name, record[name]) for name in ("command", "date") if record[name]],
-    )
-
-
-def describe_methods(measures: Sequence[Measures]) -> str:
-    """Return a paragraph, for a paper, on how scans were measured."""
+        command, unit=unit, options=dict(options or {}), status=status,
+        scans=[{"scan": each.source, "kind": each.kind, "notes": each.notes} for each in measures], notes=notes,
+    )  # fmt: skip
     count = f"{len(measures)} scans were" if len(measures) > 1 else "A scan was"
-    return " ".join(
-        [
-            f"{count} measured with curvafit {version('curvafit')}; {say_kinds(measures)}.",
-            "Intervals are 95 %, by a jackknife over blocks of one period of the structure: they tell how well a scan "
-            "shows the mean of the structure that it was cut from.",
-            *describe_measures(measures),
-        ]
-    )
+    methods = [
+        f"{count} measured with curvafit {version('curvafit')}; {say_kinds(measures)}.",
+        "Intervals are 95 %, by a jackknife over blocks of one period of the structure: they tell how well a scan "
+        "shows the mean of the structure that it was cut from.",
+        *describe_measures(measures),
+    ]
+    cells = [
+        {"name": name, "told": [more.get(head, "") for head in heads], "cells": _format_cells(part)}
+        for name, (part, more) in zip(names, rows, strict=True)
+    ]
+    page = {
+        "title": f"{len(measures)} scans measured" if len(measures) > 1 else "One scan measured", "status": status,
+        "symbols": [(symbol, power_name(unit, measures[0][symbol].power)) for symbol in FIRST_SHOWN],
+        "left": {"diagrams": max(0, len(rows) - MOST_DIAGRAMS), "numbers": max(0, len(rows) - MOST_ROWS)},
+        "heads": heads, "rows": cells, "methods": " ".join(methods), "notes": notes,
+    }  # fmt: skip
+    diagrams = diagrams_figure(names[:MOST_DIAGRAMS], parts[:MOST_DIAGRAMS])
+    numbers = intervals_figure(names[:MOST_ROWS], parts[:MOST_ROWS])
+    drawn = {
+        "diagrams": (diagrams, "The curvature diagram of each scan"),
+        "numbers": (numbers, "Numbers of each scan with their intervals"),
+    }
+    return write_study(target, FORMAT, FILES, record, page, {"measures.csv": list_rows(measures, told)}, figures=drawn)
 
 
 def describe_range(parts: Sequence[Measures]) -> str:
@@ -218,10 +174,10 @@ def intervals_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figu
     places = range(len(names), 0, -1)
     for axes, symbol in zip(panels.ravel(), FIRST_SHOWN, strict=True):
         found = [each[symbol] for each in measures]
-        values, halves = [each.value for each in found], [each.half for each in found]
-        low = [v - h if math.isfinite(h) else v for v, h in zip(values, halves, strict=True)]
-        low = low if symbol in SIGNED else [max(0.0, each) for each in low]
-        high = [v + h if math.isfinite(h) else v for v, h in zip(values, halves, strict=True)]
+        values = np.array([each.value for each in found])
+        halves = np.nan_to_num([each.half for each in found])
+        low, high = values - halves, values + halves
+        low = low if symbol in SIGNED else np.maximum(0.0, low)
         axes.hlines(places, low, high, color=FIRST, alpha=0.4, linewidth=1.6)
         axes.plot(values, places, "o", color=FIRST, markersize=4, markeredgewidth=0)
         unit = power_name(measures[0].unit, found[0].power)

@@ -49,8 +49,8 @@ from curvafit.inference.candidates import TITLES, Candidate, seed_noise_of
 from curvafit.inference.combinations import KNOWN
 from curvafit.inference.table import parameters_of
 from curvafit.inference.verdict import UNBELIEVED, UNDECIDED
-from curvafit.priors.grid import WORKING_SPACING
 from curvafit.priors.law import FORMAT
+from curvafit.studies.tables import format_csv
 from curvafit.volumes.field import Field
 from curvafit.volumes.write import save
 
@@ -58,8 +58,6 @@ if TYPE_CHECKING:
     from curvafit.geometry.diagram import Diagram
     from curvafit.inference.fit import Fit
     from curvafit.inference.infer import Inference
-    from curvafit.studies.compare import Comparison
-    from curvafit.studies.windows import Windows
 
 #: The mark by which a page is known as this program's.
 MARK = '<meta name="generator" content="curvafit'
@@ -67,14 +65,9 @@ MARK = '<meta name="generator" content="curvafit'
 FILES = ("fit.json", "report.html", "regenerated.nii.gz")
 #: Each parameter as it is written, what it multiplies, and the power of 1/length that it carries in physical units.
 _TERMS = {
-    "a20": ("a₂₀", "κ₁²", 0),
-    "a11": ("a₁₁", "κ₁κ₂", 0),
-    "a02": ("a₀₂", "κ₂²", 0),
-    "a10": ("a₁₀", "κ₁", 1),
-    "a01": ("a₀₁", "κ₂", 1),
-    "a00": ("a₀₀", "1", 2),
-    "mass": ("m₀", "mass", 0),
-}
+    "a20": ("a₂₀", "κ₁²", 0), "a11": ("a₁₁", "κ₁κ₂", 0), "a02": ("a₀₂", "κ₂²", 0), "a10": ("a₁₀", "κ₁", 1),
+    "a01": ("a₀₁", "κ₂", 1), "a00": ("a₀₀", "1", 2), "mass": ("m₀", "mass", 0),
+}  # fmt: skip
 #: The parameters as a corner plot names them.
 SYMBOLS = ("a₁₁", "log a₀₂", "a₁₀", "a₀₁", "a₀₀", "m₀")
 _AXES = "zyx"
@@ -89,15 +82,6 @@ _ROUND: dict[str, _Radii] = {
     "tubes": lambda k1, k2: ((k1 > 0) & (np.abs(k2) < _NARROW * k1), k1),
     "tubular cavities": lambda k1, k2: ((k2 < 0) & (np.abs(k1) < -_NARROW * k2), -k2),
     "bubbles": lambda k1, k2: ((k1 < 0) & (-k1 > -_NARROW * k2), -(k1 + k2) / 2),
-}
-#: The sentence for each family.
-_SIZES = {
-    "layers": "{family}, {thickness} thick, {share} of the volume",
-    "sponge": "{family}, struts {thickness} thick, {share} of the volume",
-    "spheres": "{family}, radius {radius}, {share} of the volume",
-    "tubes": "{family}, radius {radius}, {share} of the volume",
-    "tubular cavities": "{family}, radius {radius}, in a phase that is {share} of the volume",
-    "bubbles": "{family}, radius {radius}, in a phase that is {share} of the volume",
 }
 
 
@@ -157,16 +141,10 @@ def fill_folder(target: Path, files: Sequence[str]) -> Iterator[Path]:
 
 
 def start_record(command: str, **more: Any) -> dict[str, Any]:
-    """Return what every record begins with: version, date and command line."""
+    """Return a record: version, date and command line, and more, of which is text what JSON has not."""
     date = datetime.now(UTC).isoformat(timespec="seconds")
-    return {"curvafit": version("curvafit"), "date": date, "command": command, **more}
-
-
-def record_study(study: Comparison | Windows, command: str, files: Sequence[str]) -> dict[str, Any]:
-    """Return what the records of all studies hold."""
-    options = json.loads(json.dumps(study.options, default=str))
-    more = {"unit": study.unit, "options": options, "status": study.status, "notes": list(study.notes)}
-    return start_record(command, **more, files=list(files))
+    made = {"curvafit": version("curvafit"), "date": date, "command": command}
+    return made | json.loads(json.dumps(more, default=str))
 
 
 def write_study(
@@ -174,23 +152,30 @@ def write_study(
     form: Format,
     files: Sequence[str],
     record: dict[str, Any],
-    texts: Mapping[str, str],
-    drawn: Mapping[str, tuple[Figure, Picture]],
+    values: Mapping[str, Any],
+    tables: Mapping[str, Iterable[dict[str, Any]]],
+    *,
+    figures: Mapping[str, tuple[Figure, str]] | None = None,
     maps: Mapping[str, Field] | None = None,
+    told: Sequence[str] = ("command", "date"),
 ) -> Path:
-    """Write a study's record, texts, maps, and figures as PNG and SVG, into a folder together; return the page's path.
+    """Write a study's record, page, tables, maps, and figures as PNG and SVG, into a folder together.
 
-    `drawn` has each figure with its picture for the page.
+    Return the page's path. `values` fill the template of the page's name, besides the figures, each with what it shows
+    in words, and the entries of the record that are `told`.
     """
+    pictures = {name: picture_of(*each) for name, each in (figures or {}).items()}
+    provenance = [(name, record[name]) for name in told if record[name] not in ("", {})]
+    page = render_template(files[1], version=record["curvafit"], provenance=provenance, **pictures, **values)
     with fill_folder(target, files) as work:
         for name, field in (maps or {}).items():
             save(field, work / name, kind=form.name)
-        for name, text in texts.items():
+        for name, text in {files[1]: page, **{name: format_csv(list(rows)) for name, rows in tables.items()}}.items():
             (work / name).write_text(text, encoding="utf-8", newline="")
-        for name, (figure, picture) in drawn.items():
-            (work / f"{name}.png").write_bytes(base64.b64decode(picture.data or ""))
+        for name, (figure, _) in (figures or {}).items():
+            (work / f"{name}.png").write_bytes(base64.b64decode(pictures[name].data or ""))
             (work / f"{name}.svg").write_bytes(svg(figure))
-        form.write(work / files[0], record)
+        form.write(work / files[0], record | {"files": list(files)})
     return target / files[1]
 
 
@@ -229,13 +214,9 @@ def write_report(inference: Inference, path: str | Path) -> Path:
 def render_template(name: str, **values: Any) -> str:
     """Return a page of `templates`, filled with values; all text is escaped."""
     environment = Environment(
-        loader=PackageLoader("curvafit.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
+        loader=PackageLoader("curvafit.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True, keep_trailing_newline=True,
+    )  # fmt: skip
     return environment.get_template(name).render(**values)
 
 
@@ -243,31 +224,18 @@ def report_html(inference: Inference) -> str:
     """Return the report of an inference as the text of its page."""
     fit = inference.fit
     return render_template(
-        "report.html",
-        version=fit.provenance.get("curvafit", ""),
-        glossary=GLOSSARY,
-        number=format_number,
-        fit=fit,
-        sentence=describe(inference),
-        scan=describe_scan(inference),
-        voxel=format_length(inference.prepared.working_voxel, fit.length_unit, 3),
-        slices=_slices(inference),
-        framed=_is_framed(inference),
-        windows=len(inference.prepared.windows),
+        "report.html", version=fit.provenance.get("curvafit", ""), glossary=GLOSSARY, number=format_number, fit=fit,
+        sentence=describe(inference), scan=describe_scan(inference),
+        voxel=format_length(inference.prepared.working_voxel, fit.length_unit, 3), slices=_slices(inference),
+        framed=_is_framed(inference), windows=len(inference.prepared.windows),
         shapes=_shapes(inference) if inference.twins else [],
         diagrams=[] if inference.diagram is None else _diagrams(inference),
-        bars=_bars(inference) if inference.twins else [],
-        unit=format_length(fit.length, fit.length_unit, 3),
-        noise=seed_noise_of(fit.candidates),
-        twins=0 if fit.best is None else len(fit.best.twins),
-        numbers=_number_rows(inference),
-        strips=list_strips(fit),
-        law=_law(inference),
-        corner=_corner(inference),
-        bands=bands(inference),
-        symbols=[symbol for symbol, _, _ in _TERMS.values()],
+        bars=_bars(inference) if inference.twins else [], unit=format_length(fit.length, fit.length_unit, 3),
+        noise=seed_noise_of(fit.candidates), twins=0 if fit.best is None else len(fit.best.twins),
+        numbers=_number_rows(inference), strips=list_strips(fit), law=_law(inference), corner=_corner(inference),
+        bands=bands(inference), symbols=[symbol for symbol, _, _ in _TERMS.values()],
         provenance=[(str(name).replace("_", " "), _to_words(value)) for name, value in fit.provenance.items()],
-    )
+    )  # fmt: skip
 
 
 # ---- words and numbers -----------------------------------------------------------------------------------------------
@@ -277,14 +245,14 @@ def describe(inference: Inference) -> str:
     """Return the sentence that a report opens with: family, size, share of the volume."""
     fit, numbers = inference.fit, inference.fit.morphometry
     radius = None if inference.diagram is None else family_radius(inference.diagram, fit.family)
-    physical = numbers.thickness_mean / 2 if radius is None else radius * working_length(inference)
-    pattern = _SIZES.get(fit.family, "{family}, {thickness} thick, {share} of the volume")
-    return pattern.format(
-        family=fit.family.capitalize(),
-        radius=format_length(physical, fit.length_unit),
-        thickness=format_length(numbers.thickness_mean, fit.length_unit),
-        share=format_percent(numbers.volume_fraction),
-    )
+    if fit.family in _ROUND:
+        physical = numbers.thickness_mean / 2 if radius is None else radius * inference.prepared.length
+        size = f"radius {format_length(physical, fit.length_unit)}"
+    else:
+        struts = "struts " if fit.family == "sponge" else ""
+        size = f"{struts}{format_length(numbers.thickness_mean, fit.length_unit)} thick"
+    whose = "in a phase that is " if fit.family in ("tubular cavities", "bubbles") else ""
+    return f"{fit.family.capitalize()}, {size}, {whose}{format_percent(numbers.volume_fraction)} of the volume"
 
 
 def family_radius(diagram: Diagram, family: str) -> float | None:
@@ -299,11 +267,6 @@ def family_radius(diagram: Diagram, family: str) -> float | None:
     return float(1 / np.quantile(kappa[own], 0.5, weights=weights, method="inverted_cdf"))
 
 
-def working_length(inference: Inference) -> float:
-    """Return the length of 1 working unit of the scan's diagram, in the fit's unit."""
-    return inference.prepared.working_voxel / WORKING_SPACING
-
-
 def describe_scan(inference: Inference) -> str:
     """Return what was read: name, kind, voxels and their size."""
     scan, fit = inference.scan, inference.fit
@@ -312,9 +275,13 @@ def describe_scan(inference: Inference) -> str:
     same = len({round(h / scan.spacing[0], 6) for h in scan.spacing}) == 1
     spacing = (scan.spacing[0],) if same else scan.spacing
     voxel = " × ".join(f"{h:.4g}" for h in spacing) + f" {unit_name(scan.unit, spacing[0])}"
-    path, _, key = scan.source.partition("::")
-    name = "::".join(filter(None, (Path(path).name, key))) or "a volume"
-    return f"{name}: {kind} of {shape} voxels (z, y, x), voxel edge {voxel}."
+    return f"{name_source(scan.source) or 'a volume'}: {kind} of {shape} voxels (z, y, x), voxel edge {voxel}."
+
+
+def name_source(source: str | None) -> str:
+    """Return the name of a scan's file, with the key of its array."""
+    path, _, key = (source or "").partition("::")
+    return "::".join(filter(None, (Path(path).name, key)))
 
 
 def _bars(inference: Inference) -> list[dict[str, Any]]:
@@ -379,7 +346,9 @@ def _parameters(inference: Inference) -> list[tuple[str, tuple[str, ...], str]]:
         median = format_number(known["median"]) if known else ""
         scaled = "" if name == "mass" else format_number(physical.as_dict()[name])
         ranges = ("" if known is None else " to ".join(map(format_number, known[level])) for level in ("50", "90"))
-        cells = (format_number(value), _deviation(best, name), median, *ranges, scaled)
+        own = best.uncertainty.get(name)
+        deviation = "" if own is None else "fixed" if own == 0 else format_number(own, 2)
+        cells = (format_number(value), deviation, median, *ranges, scaled)
         rows.append((name, cells, per_unit(fit.length_unit, power) if power else ""))
     return rows
 
@@ -410,12 +379,6 @@ def _law(inference: Inference) -> dict[str, Any] | None:
         "title": TITLES.get(best.name, best.name),
         "own": bool(best.uncertainty),
     }
-
-
-def _deviation(candidate: Candidate, name: str) -> str:
-    """Return a candidate's deviation of a parameter as text, empty where it has none."""
-    value = candidate.uncertainty.get(name)
-    return "" if value is None else "fixed" if value == 0 else format_number(value, 2)
 
 
 def _to_words(value: object) -> str:
@@ -475,15 +438,11 @@ def _slice(inference: Inference, axis: int, index: int, limits: tuple[float, flo
     size = np.array(scan.values.shape) * scan.spacing
     framed = (first[across], last[across], last[down], first[down]) if _is_framed(inference) else None
     figure = slice_figure(
-        np.asarray(scan.values.take(row, axis), dtype=np.float32),
-        prepared.phase.take(index, axis),
+        np.asarray(scan.values.take(row, axis), dtype=np.float32), prepared.phase.take(index, axis),
         image_extent=(0.0, size[across], size[down], 0.0),
-        extent=(start[across], stop[across], stop[down], start[down]),
-        limits=limits,
-        unit=scan.unit,
-        axes_names=(_AXES[down], _AXES[across]),
-        window=framed,
-    )
+        extent=(start[across], stop[across], stop[down], start[down]), limits=limits, unit=scan.unit,
+        axes_names=(_AXES[down], _AXES[across]), window=framed,
+    )  # fmt: skip
     depth = format_length((row + 0.5) * scan.spacing[axis], scan.unit)
     part = list(scan.values.shape) != inference.fit.provenance.get("scan_shape", list(scan.values.shape))
     of = " of the part that was read" if part else ""
@@ -536,7 +495,7 @@ def _diagrams(inference: Inference) -> list[Picture]:
         if each.name in (inference.fit.chosen, "match"):
             grown = (twin.diagram for twin in inference.twins.get(each.name, ()) if twin.diagram)
             diagrams.append((f"{_title(each)}, regrown", next(grown, None)))
-    λ, unit = working_length(inference), inference.fit.length_unit
+    λ, unit = inference.prepared.length, inference.fit.length_unit
     limits = shared_limits([diagram for _, diagram in diagrams if diagram is not None], length=λ)
     return [
         Picture(None, "", title)

@@ -16,9 +16,8 @@ from curvafit.core.records import Format
 from curvafit.core.units import format_length, format_number, format_percent, power_name, unit_name
 from curvafit.drawing.plot import FAMILIAR, INK, LABELS, QUIET, make_figure, scale_on
 from curvafit.report.comparison import name_quantity
-from curvafit.report.page import check_result_folder, picture_of, record_study, render_template, write_study
+from curvafit.report.page import check_result_folder, start_record, write_study
 from curvafit.scan.measure import QUANTITIES
-from curvafit.studies.tables import format_csv
 from curvafit.studies.windows import NAMES, Windows
 
 #: `format` of the record.
@@ -50,25 +49,22 @@ def write_windows(windows: Windows, directory: str | Path, *, command: str = "",
     """
     source = windows.clusters.source
     target, files = check_windows(directory, source, overwrite, command), list_files(source)
-    record = record_study(windows, command, files)
-    record |= {"scan": source, "kind": windows.kind, "explained": windows.explained}
-    figure = windows_figure(windows)
-    picture = picture_of(figure, "The structure, coloured by clusters and by six numbers")
-    page = render_template(
-        "windows.html",
-        version=record["curvafit"],
-        title="A scan in windows",
-        status=windows.status,
-        picture=picture,
-        clusters=range(1, 1 + int(windows.clusters.values.max())),
-        rows=[_format_row(windows, k) for k in range(len(NAMES))],
-        notes=windows.notes,
-        provenance=[(name, record[name]) for name in ("scan", "command", "date", "options") if record[name]],
-    )
-    texts = {"windows.html": page, "windows.csv": format_csv(list(_rows(windows)))}
+    record = start_record(
+        command, unit=windows.unit, options=windows.options, status=windows.status, notes=windows.notes,
+        scan=source, kind=windows.kind, explained=windows.explained,
+    )  # fmt: skip
+    page = {
+        "title": "A scan in windows", "status": windows.status,
+        "clusters": range(1, 1 + int(windows.clusters.values.max())),
+        "rows": [_format_row(windows, k) for k in range(len(NAMES))], "notes": windows.notes,
+    }  # fmt: skip
+    drawn = {"windows": (windows_figure(windows), "The structure, coloured by clusters and by six numbers")}
     fields = (windows.clusters, *map(windows.__getitem__, NAMES))
     maps = dict(zip(files[len(FILES) :], fields, strict=True))
-    return write_study(target, FORMAT, files, record, texts, {"windows": (figure, picture)}, maps)
+    told = ("scan", "command", "date", "options")
+    return write_study(
+        target, FORMAT, files, record, page, {"windows.csv": _rows(windows)}, figures=drawn, maps=maps, told=told
+    )
 
 
 def _rows(windows: Windows) -> Iterator[dict[str, Any]]:
@@ -126,7 +122,9 @@ def windows_figure(windows: Windows) -> Figure:
             extreme = format_number(values[window] + 0.0)  # of -0 as well
             axes.set_title(f"{word} {symbol}: {extreme}, {_position(windows, 0, place)}", fontsize=9.5)
             axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
-            _frame_on(axes, windows, window)
+            edges = (np.array(windows.size) * windows.clusters.spacing / windows.stride)[1:]
+            corner = windows.centres[window][1:] - edges / 2
+            axes.add_patch(Rectangle(corner[::-1], *edges[::-1], fill=False, edgecolor=INK, linestyle=(0, (4, 3))))
         if not ends:
             pair[0].set_title(f"{label} is not known", fontsize=9.5)
             continue
@@ -169,13 +167,6 @@ def _section_on(axes: Axes, windows: Windows, plane: np.ndarray, axis: int, plac
     axes.set_ylabel(named[0], fontsize=8)
     axes.set_xlabel(named[1], fontsize=8)
     return axes.imshow(plane, extent=extent, interpolation="nearest", **colours)
-
-
-def _frame_on(axes: Axes, windows: Windows, window: tuple[int, ...]) -> None:
-    """Draw the frame of a window on a slice across z."""
-    edges = (np.array(windows.size) * windows.clusters.spacing / windows.stride)[1:]
-    corner = windows.centres[window][1:] - edges / 2
-    axes.add_patch(Rectangle(corner[::-1], *edges[::-1], fill=False, edgecolor=INK, linestyle=(0, (4, 3))))
 
 
 def _nearest(windows: Windows, axis: int) -> np.ndarray:

@@ -339,34 +339,16 @@ def _compare_measures(
     alike = (sides[:, None] == sides) & ~np.eye(len(sides), dtype=bool)
     edges, differences, p = _compare_bins(pooled, labels, arranged, blocks)
     values, errors, halves = _average(measures, scans)
+    least = share_beyond(correlate(tested[:, None], arranged, blocks))[0]  # of a number that is the label
     return Comparison(
-        by=options["by"],
-        groups=groups,
-        unit=measures[0].unit,
-        cases=tuple(cases),
-        measures=tuple(measures),
-        subjects=tuple(subjects),
-        labels=labels,
-        blocks=blocks,
-        values=values,
-        errors=errors,
-        halves=halves,
+        by=options["by"], groups=groups, unit=measures[0].unit, cases=tuple(cases), measures=tuple(measures),
+        subjects=tuple(subjects), labels=labels, blocks=blocks, values=values, errors=errors, halves=halves,
         numbers=_compare_numbers(measures[0], values, errors, labels, arranged, blocks),
-        statistic=float(statistics[0]),
-        p=float(share_beyond(statistics)),
-        least=float(share_beyond(correlate(tested[:, None], arranged, blocks))[0]),  # of a number that is the label
-        sides=sides,
-        diagrams=means,
-        apart=float(pdist(np.stack([sliced_embedding(each) for each in means])).max()),
-        within=float(away[alike].mean()),
-        edges=edges,
-        differences=differences,
-        bins_p=p,
-        permutations=len(arranged),
-        exact=exact,
-        options=options,
-        notes=(*notes, *gather_notes(measures, cases)),
-    )
+        statistic=float(statistics[0]), p=float(share_beyond(statistics)), least=float(least), sides=sides,
+        diagrams=means, apart=float(pdist(np.stack([sliced_embedding(each) for each in means])).max()),
+        within=float(away[alike].mean()), edges=edges, differences=differences, bins_p=p, permutations=len(arranged),
+        exact=exact, options=options, notes=(*notes, *gather_notes(measures, cases)),
+    )  # fmt: skip
 
 
 def _halve(numbers: np.ndarray) -> np.ndarray:

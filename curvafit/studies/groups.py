@@ -48,7 +48,12 @@ def list_cases(
     else:
         cases = _list_labelled(groups[0], by) if len(groups) == 1 else _list_groups(groups, by, paired, notes)
         if table is not None:
-            rows = _read_subjects(Path(table))
+            told = _read_table(Path(table), ("scan", "subject"))
+            if "group" in told[0]:
+                raise ValueError(
+                    f"expected the groups once, got two folders and a column group in {table}: leave one out"
+                )
+            rows = {row["scan"]: row["subject"] for row in told}
             cases = [case._replace(subject=_find_row(case.source, case.name, rows, Path(table))) for case in cases]
         elif not paired and not any(isinstance(group, Mapping) for group in groups):
             notes.append("Each scan counts as a subject; a table (--subjects) tells if several are of one.")
@@ -206,14 +211,6 @@ def _read_cases(table: Path, by: str, paired: bool) -> list[Case]:
             raise FileNotFoundError(f"no such file: {row['scan']}, which {table} names")
         cases.append(Case(str(place), place.name, row.get("subject") or row["scan"], row[by]))
     return cases
-
-
-def _read_subjects(table: Path) -> dict[str, str]:
-    """Return the subject of each scan that a table names."""
-    rows = _read_table(table, ("scan", "subject"))
-    if "group" in rows[0]:
-        raise ValueError(f"expected the groups once, got two folders and a column group in {table}: leave one out")
-    return {row["scan"]: row["subject"] for row in rows}
 
 
 def read_columns(table: str | PathLike[str], scans: Sequence[str], taken: Sequence[str] = ()) -> list[dict[str, str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -27,7 +27,7 @@ from curvafit.volumes.read import field_of
 FINE = 0.1
 #: Voxel edges of groups that differ by more than this part deserve a note.
 ALIKE_EDGES = 0.1
-#: What measures one scan, given its progress; a function that has a module's name.
+#: What is done with one scan, given its progress; a function that has a module's name.
 Task = Callable[[Progress], Any]
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
@@ -41,11 +41,13 @@ def measure_scans(
     some scans have a physical unit.
     """
     unit, notes = _check_scans(cases, reading, sub_progress(progress, 0.0, 0.05))
-    found = {k: case.source for k, case in enumerate(cases) if isinstance(case.source, Measures)}
     how = options | reading
-    tasks = {k: partial(_measure_case, case, how) for k, case in enumerate(cases) if k not in found}
-    names = [case.name for case in cases]
-    measures = _share_out(tasks, found, names, workers, sub_progress(progress, 0.05, 1.0))
+    found: dict[int, Any] = {k: (case.source,) for k, case in enumerate(cases) if isinstance(case.source, Measures)}
+    tasks: dict[int, Task] = {
+        k: partial(_measure_one, case.source, case.name, False, how) for k, case in enumerate(cases) if k not in found
+    }
+    found |= share_out(tasks, [case.name for case in cases], workers, sub_progress(progress, 0.05, 1.0))
+    measures: list[Measures] = [found[k][0] for k in range(len(cases))]
     if flat := [case.name for case, each in zip(cases, measures, strict=True) if not each.diagram.area > 0]:
         raise ValueError(
             f"{flat[0]}: expected a scan with curvature, got a stack too thin for it: measure has its numbers"
@@ -75,39 +77,38 @@ def measure_each(
     tasks: dict[int, Task] = {}
     for k, scan in enumerate(scans):
         tiles = {} if labels or store is None else {"store": store / f"{k:04d}"}
-        tasks[k] = partial(_measure_one, scan, several, labels, options | tiles)
-    return _share_out(tasks, {}, scans, workers if several else 0, progress)
+        tasks[k] = partial(_measure_one, scan, scan if several else "", labels, options | tiles)
+    found = share_out(tasks, scans, workers if several else 0, progress)
+    return [found[k] for k in tasks]
 
 
 def _measure_one(
-    scan: str, several: bool, labels: bool, options: dict[str, Any], progress: Progress
+    scan: Any, name: str, labels: bool, options: dict[str, Any], progress: Progress
 ) -> tuple[Measures, ...]:
-    """Measure one scan, or its instances."""
-    with name_errors(scan) if several else nullcontext():
+    """Measure a scan, or its instances; one that is named is among several, and its diagram is binned finely."""
+    with name_errors(name):
         if labels:
             return measure_instances(scan, progress=progress, **options)
         whole = measure(scan, progress=progress, **options)
-    return (_bin_diagrams(whole) if several else whole,)
+    return (_bin_diagrams(replace(whole, source=whole.source or name)) if name else whole,)
 
 
-def _share_out(
-    tasks: Mapping[int, Task], found: dict[int, Any], names: Sequence[str], workers: int, progress: Progress
-) -> list[Any]:
-    """Measure scans by their numbers, in this process or by several, besides those `found`; return all in order."""
-    count = len(names)
+def share_out(tasks: Mapping[int, Task], names: Sequence[str], workers: int, progress: Progress) -> dict[int, Any]:
+    """Do the tasks of scans, by their numbers among `names`, in this process or by several; return what they return."""
+    count, found = len(names), {}
     with cluster(workers) as crew:
         parts = {k: sub_progress(progress, k / count, (k + 1) / count) for k in tasks}
         tell = {
             k: silent if workers else lambda text, share, k=k: parts[k](f"{names[k]}: {text}", share) for k in tasks
         }
-        for k, measures in collect_all(crew, ((partial(_do, tasks[k], tell[k]), Path(), [k]) for k in tasks)):
-            found[k] = measures
-            progress(f"{len(found)} of {count} scans measured", len(found) / count)
-    return [found[k] for k in range(count)]
+        for k, result in collect_all(crew, ((partial(_do, tasks[k], tell[k]), Path(), [k]) for k in tasks)):
+            found[k] = result
+            progress(f"{len(found)} of {count} scans done", len(found) / count)
+    return found
 
 
 def _do(task: Task, progress: Progress, folder: Path, indices: Sequence[int]) -> list[tuple[int, Any]]:
-    """Measure a scan, as a worker does."""
+    """Do the task of a scan, as a worker does."""
     return [(k, task(progress)) for k in indices]
 
 
@@ -188,13 +189,6 @@ def _check_mixture(units: Mapping[str, str]) -> None:
             f"expected a physical spacing in all scans or in none, got none in {units['voxel']} and {other} in "
             f"{units[other]}: say it with --spacing and --unit"
         )
-
-
-def _measure_case(case: Case, options: dict[str, Any], progress: Progress) -> Measures:
-    """Measure one scan; its diagram is binned finely, so that many scans take little memory."""
-    with name_errors(case.name):
-        measures = measure(case.source, progress=progress, **options)  # type: ignore[arg-type]
-    return replace(_bin_diagrams(measures), source=measures.source or case.name)
 
 
 @contextmanager

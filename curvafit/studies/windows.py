@@ -161,22 +161,14 @@ def windows(
     rest = [n % step for n, step in zip(field.shape, strides, strict=True)]
     thin = tuple(-(-n // MOST_SHOWN) for n in field.shape)
     shown = np.ascontiguousarray(maps.mask[tuple(slice(None, None, step) for step in thin)])
+    edges = tuple(h * n for h, n in zip(field.spacing, thin, strict=True))
+    structure = replace(field, values=shown, spacing=edges, affine=None)
     left = f"The last {', '.join(map(str, rest))} voxels along z, y, x are in no window."
+    how = {"size": sizes, "stride": strides, "clusters": clusters, "seed": seed, "kind": kind}
     return Windows(
-        kind=maps.kind,
-        size=sizes,
-        stride=strides,
-        values=values,
-        clusters=grid,
-        explained=explained,
-        structure=replace(
-            field, values=shown, spacing=tuple(h * n for h, n in zip(field.spacing, thin, strict=True)), affine=None
-        ),
-        options={"size": sizes, "stride": strides, "clusters": clusters, "seed": seed, "kind": kind}
-        | options
-        | reading,
-        notes=(*maps.notes, *([left] if any(rest) else [])),
-    )
+        kind=maps.kind, size=sizes, stride=strides, values=values, clusters=grid, explained=explained,
+        structure=structure, options=how | options | reading, notes=(*maps.notes, *([left] if any(rest) else [])),
+    )  # fmt: skip
 
 
 def _check_grid(shape: Sequence[int], *edges: int | Sequence[int]) -> tuple[tuple[int, int, int], tuple[int, int, int]]:

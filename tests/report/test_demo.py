@@ -26,26 +26,22 @@ def test_scores_are_of_the_slices_left_out_alone() -> None:
     truth = cone()
     known = np.zeros_like(truth)
     known[::8] = truth[::8]
-    assert score_completion(truth, truth, 8).dice["curvafit"] == 1
-    completion = score_completion(truth, known, 8)
+    assert score_completion(truth, truth).dice["curvafit"] == 1
+    completion = score_completion(truth, known)
     assert completion.dice["curvafit"] == 0 and np.array_equal(completion.known, known)
     assert set(completion.dice) == {"curvafit", *WAYS}
     assert completion.dice["linear"] > 0.98 > completion.dice["nearest"]
-
-
-def test_what_lies_beyond_the_last_known_slice_does_not_count() -> None:
-    truth = cone(37)
-    filled = truth.copy()
-    filled[33:] = False
-    assert score_completion(truth, filled, 8).dice["curvafit"] == 1
+    truth, filled = cone(37), cone(37)
+    filled[33:] = False  # beyond the last known slice, which does not count
+    assert score_completion(truth, filled).dice["curvafit"] == 1
 
 
 def test_slices_across_any_axis_score_alike() -> None:
     truth = cone()
     filled = np.roll(truth, 1, axis=2)
-    turned = score_completion(np.moveaxis(truth, 0, 1), np.moveaxis(filled, 0, 1), 8, axis=1)
-    assert turned.dice == score_completion(truth, filled, 8).dice
-    assert np.array_equal(np.moveaxis(turned.known, 1, 0), score_completion(truth, filled, 8).known)
+    turned = score_completion(np.moveaxis(truth, 0, 1), np.moveaxis(filled, 0, 1), axis=1)
+    assert turned.dice == score_completion(truth, filled).dice
+    assert np.array_equal(np.moveaxis(turned.known, 1, 0), score_completion(truth, filled).known)
 
 
 def test_the_page_stands_alone_and_escapes_what_it_is_told() -> None:
@@ -53,7 +49,7 @@ def test_the_page_stands_alone_and_escapes_what_it_is_told() -> None:
     measures = measure(Field(mask, (SCALE,) * 3, "mm"))
     texture = lattice(16, 8, 2.0)
     for textures, pictures in (([texture, texture], 4), ([], 3)):
-        page = demo_page(inference, measures, score_completion(mask, mask, 8, axis=1), textures, load_atlas())
+        page = demo_page(inference, measures, score_completion(mask, mask, axis=1), textures, load_atlas())
         assert "tubes &lt;b&gt;&amp;.tif" in page and page.count("data:image/png;base64,") == pictures
         assert re.findall(r'(?:src|href)="(?!data:|report\.html)', page) == []
         assert 'chosen">1.000</td>' in page and "1/mm" in page and "--axis y" in page
