@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import re
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import matplotlib.image
 import numpy as np
 import pytest
+import torch
 
+import curvafit
+from curvafit.core.pictures import Pictured
 from curvafit.drawing.plot import (
     DIAGONAL,
     bands_figure,
@@ -21,7 +27,9 @@ from curvafit.drawing.plot import (
     write_picture,
 )
 from curvafit.drawing.render import render, surface_picture, view
+from curvafit.generation import Schedule, generate
 from curvafit.geometry.diagram import Diagram
+from curvafit.volumes.field import Field
 
 
 def test_a_diagram_shows_itself() -> None:
@@ -60,11 +68,21 @@ def test_a_ball_covers_its_disc_and_is_lit_from_the_upper_left() -> None:
     assert brightness[middle - reach, 100 - reach] > brightness[middle + reach, 100 + reach] + 40
 
 
-@pytest.mark.parametrize(("azimuth", "elevation"), [(0, 0), (0, 90), (45, -90), (90, 0), (200, -50), (-45, 35.26)])
-def test_a_ball_is_a_disc_from_everywhere(azimuth: float, elevation: float) -> None:
-    """Also along an axis, from below, from behind, and along the diagonal."""
-    picture, camera = render(ball((30, 34, 38), 12), width=160, azimuth=azimuth, elevation=elevation)
-    assert cover(picture) * (2 * camera.half[0] / 160) ** 2 == pytest.approx(math.pi * 12**2, rel=0.01)
+@pytest.mark.parametrize(
+    ("shape", "spacing", "azimuth", "elevation"),
+    [
+        ((30, 34, 38), (1.0, 1.0, 1.0), 0, 90),
+        ((30, 34, 38), (1.0, 1.0, 1.0), 200, -50),
+        ((30, 34, 38), (1.0, 1.0, 1.0), -45, 35.26),
+        ((20, 40, 40), (2.0, 1.0, 1.0), 32, 24),
+    ],
+)
+def test_a_ball_is_a_disc_from_everywhere(shape: Any, spacing: Any, azimuth: float, elevation: float) -> None:
+    """Also along an axis, from behind and below, along the diagonal, and in a flat box of long voxels."""
+    u = ball(shape, 12, spacing)
+    picture, camera = render(u, spacing=spacing, width=160, azimuth=azimuth, elevation=elevation)
+    assert camera.box == pytest.approx((np.array(shape) - 1) * spacing)
+    assert cover(picture) * (2 * camera.half[0] / 160) ** 2 == pytest.approx(math.pi * 12**2, rel=0.02)
 
 
 def shaded(z0: float, y0: float, x0: float) -> float:
@@ -85,13 +103,6 @@ def test_a_ball_between_a_plate_and_the_light_shades_it(monkeypatch: pytest.Monk
     assert shaded(30, 24 + 20, 24 - 12.6) < shaded(30, 24 - 20, 24 + 12.6) - 15
 
 
-def test_spacing_makes_a_ball_of_a_flat_box() -> None:
-    spacing = (2.0, 1.0, 1.0)
-    picture, camera = render(ball((20, 40, 40), 12, spacing), spacing=spacing, width=160)
-    assert camera.box == pytest.approx((38, 39, 39))
-    assert cover(picture) * (2 * camera.half[0] / 160) ** 2 == pytest.approx(math.pi * 12**2, rel=0.02)
-
-
 def test_cut_faces_are_capped_in_another_colour() -> None:
     solid, _ = render(np.ones((16, 16, 16)), width=120)
     camera = view((16, 16, 16))
@@ -101,11 +112,6 @@ def test_cut_faces_are_capped_in_another_colour() -> None:
     rounded, _ = render(ball((16, 16, 16), 6), width=120)
     warmth = [p[p[..., 3] == 255][:, 0].mean() / p[p[..., 3] == 255][:, 2].mean() for p in (solid, rounded)]
     assert warmth[0] > warmth[1] + 0.15
-
-
-def test_nothing_inside_is_transparent() -> None:
-    picture, _ = render(-np.ones((8, 8, 8)), width=60)
-    assert not picture[..., 3].any()
 
 
 def test_the_nearer_of_two_balls_hides_the_other() -> None:
@@ -228,3 +234,34 @@ def test_bands_hold_what_they_say_and_show_the_scan_s_numbers() -> None:
         assert (values.min(), values.max()) == pytest.approx(ends)
     for bar, ends in zip(dot.collections, ((5, 95), (25, 75)), strict=True):
         assert bar.get_paths()[0].vertices[:, 1] == pytest.approx(ends)
+
+
+def test_the_three_middle_slices_are_drawn_in_proportion() -> None:
+    values = np.arange(5 * 6 * 7, dtype=np.float32).reshape(5, 6, 7)
+    figure = Field(values, (3.0, 2.0, 1.0), "um").plot()
+    for axes, plane in zip(figure.axes, (values[2], values[:, 3], values[:, :, 3]), strict=True):
+        assert np.array_equal(axes.images[0].get_array(), plane)
+    assert [axes.get_aspect() for axes in figure.axes] == [2.0, 3.0, 1.5]
+    assert [axes.get_title()[:5] for axes in figure.axes] == ["z = 2", "y = 3", "x = 3"]
+
+
+def test_every_type_with_a_picture_has_a_function_that_draws_it() -> None:
+    for name, place in curvafit._FIGURES.items():
+        module, _, function = place.partition(":")
+        assert callable(getattr(import_module(module), function))
+        assert issubclass(getattr(curvafit, name), Pictured)
+    kinds = (getattr(curvafit, name) for name in curvafit.__all__)
+    pictured = {kind.__name__ for kind in kinds if isinstance(kind, type) and issubclass(kind, Pictured)}
+    assert pictured == set(curvafit._FIGURES)
+
+
+def test_a_picture_of_a_shape_and_none_of_what_is_not_finite() -> None:
+    flow = generate("tubes", grid=16, schedule=Schedule("brief", 60, 1e-2, 1e-3, "constant"))
+    sphere = 5 - (torch.stack(torch.meshgrid(*[torch.arange(16.0) - 8] * 3, indexing="ij")) ** 2).sum(0).sqrt()
+    assert dataclasses.replace(flow, field=sphere).plot(width=64).axes
+    shown = dataclasses.replace(flow, field=sphere)._repr_html_()
+    assert re.search(r'<img src="data:image/png;base64,[\w+/=]{100,}" width="320"', shown)
+    broken = dataclasses.replace(flow, field=torch.full((16, 16, 16), torch.nan))
+    with pytest.raises(ValueError, match="finite"):
+        broken.plot()
+    assert "<img" not in broken._repr_html_() and "16 x 16 x 16" in broken._repr_html_()

@@ -12,7 +12,6 @@ from disk import vtk_array
 from exact import Sphere, centres
 from torch import Tensor
 
-from curvafit.core.records import sibling
 from curvafit.drawing.shapes import Output, write_field
 from curvafit.priors.grid import Grid
 from curvafit.volumes.read import load
@@ -60,7 +59,3 @@ def test_a_unit_is_named_and_converted_once(tmp_path: Path) -> None:
     ):
         with pytest.raises(ValueError, match=said):
             Output(**wrong)
-
-
-def test_names_beside_a_shape() -> None:
-    assert sibling("a/b.c.nii.gz", ".json") == Path("a/b.c.json")

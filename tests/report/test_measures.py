@@ -1,9 +1,8 @@
-"""The page of many measured scans: its files, its table, workers, compartments, names, and what is refused."""
+"""The pages of many scans, measured and inferred: their files, tables and names, and what is refused."""
 
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,8 @@ import pytest
 from calling import call, refused
 from found import lattice
 
-from curvafit.report.measures import FILES, WORD, describe_range, name_parts, shorten
+from curvafit.report.laws import infer_scans, name_folders
+from curvafit.report.measures import WORD, describe_range, name_parts, shorten
 from curvafit.scan.measure import Measures, measure
 from curvafit.volumes.field import Field
 from curvafit.volumes.write import save
@@ -38,18 +38,12 @@ def test_a_folder_has_page_figures_and_table(scans: list[Path], tmp_path: Path) 
     words = ("measure", *scans, "--subjects", table, "-o", tmp_path / "out")
     result = call(*words)
     assert result.exit_code == 0, result.output
-    assert result.stdout.splitlines()[-1] == str(tmp_path / "out" / "measures.html")
-    assert sorted(each.name for each in (tmp_path / "out").iterdir()) == sorted(FILES)
     rows = rows_of(tmp_path / "out" / "measures.csv")
     assert {row["group"] for row in rows} == {"a", "b"}
     thickness = [float(row["value"]) for row in rows if row["symbol"] == "Tb.Th"]
     alone = [measure(scan).convert("mm")["Tb.Th"].value for scan in scans]
     assert thickness == pytest.approx(alone, rel=1e-9)
     assert {row["unit"] for row in rows if row["symbol"] == "Tb.Th"} == {"mm"}
-    page = (tmp_path / "out" / "measures.html").read_text(encoding="utf-8")
-    assert all(word in page for word in ("2 scans measured", "r45.nii.gz", "<th>group</th>", "Hildebrand"))
-    record = json.loads((tmp_path / "out" / "measures.json").read_text(encoding="utf-8"))
-    assert [Path(each["scan"]).name for each in record["scans"]] == ["r45.nii.gz", "r60.nii.gz"]
     assert call(*words).exit_code == 0  # the same command replaces its own
     refused(call("measure", scans[0], "-o", tmp_path / "out"), "not free", progress=True)
 
@@ -98,3 +92,34 @@ def test_names_and_the_sentence_of_the_range(scans: list[Path]) -> None:
     assert "Thickness from 0.1" in said
     assert said.index("r45.nii.gz") < said.index("r60.nii.gz")  # thin before thick
     assert len(set(name_parts([measure(lattice(56, 28, 5.0)), measure(lattice(56, 28, 6.0))]))) == 2  # arrays
+
+
+# ---- laws ------------------------------------------------------------------------------------------------------------
+
+
+def test_each_scan_has_its_report_and_its_rows(scans: list[Path], tmp_path: Path) -> None:
+    names = list(map(str, scans))
+    page = infer_scans(names, tmp_path / "out", fast=True, command="one")
+    rows = rows_of(tmp_path / "out" / "laws.csv")
+    assert {row["scan"] for row in rows} == {"r45", "r60"}
+    assert all(float(row["low"]) <= float(row["value"]) <= float(row["high"]) for row in rows if row["low"])
+    assert 'href="r45/report.html"' in page.read_text(encoding="utf-8")
+    times = [(tmp_path / "out" / name / "fit.json").stat().st_mtime_ns for name in ("r45", "r60")]
+    infer_scans(names, tmp_path / "out", fast=True, command="one")
+    assert times == [(tmp_path / "out" / name / "fit.json").stat().st_mtime_ns for name in ("r45", "r60")]
+    infer_scans(names[:1], tmp_path / "out", fast=True, command="another", overwrite=True)
+    assert times[0] != (tmp_path / "out" / "r45" / "fit.json").stat().st_mtime_ns
+
+
+def test_what_is_wrong_is_said_with_the_scan(scans: list[Path], tmp_path: Path) -> None:
+    empty = save(Field(np.zeros((40, 40, 40), np.uint8)), tmp_path / "empty.nii.gz")
+    with pytest.raises(ValueError, match="empty.nii.gz"):
+        infer_scans([str(scans[0]), str(empty)], tmp_path / "out", fast=True, command="one")
+    assert not (tmp_path / "out" / "laws.html").exists()
+
+
+def test_folders_are_named_by_scans() -> None:
+    assert name_folders(["a/x.nii.gz", "b/y.tif", "c.h5::raw"]) == ["x", "y", "c"]
+    assert name_folders(["a/x.nii.gz", "b/x.tif"]) == ["x.nii.gz", "x.tif"]
+    with pytest.raises(ValueError, match="several named x.tif"):
+        name_folders(["a/x.tif", "b/x.tif"])

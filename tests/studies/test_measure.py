@@ -14,10 +14,12 @@ from calling import call, refused
 
 from curvafit.geometry.morphometry import morphometry
 from curvafit.geometry.topology import euler_number, euler_shares
+from curvafit.report.windows import check_windows
 from curvafit.scan.measure import LEAST, QUANTITIES, Blocks, Measures, errors, measure, measure_maps
-from curvafit.studies import tables
 from curvafit.studies.tables import COLUMNS, write_table
+from curvafit.studies.windows import NAMES, Windows, windows
 from curvafit.volumes.field import Field
+from curvafit.volumes.read import load
 
 N = 48
 
@@ -208,36 +210,12 @@ def test_tables_are_tidy(measures: Measures, tmp_path: Path) -> None:
     assert write_table([measures], path) == path  # its own file
 
 
-def test_a_table_says_whose_the_scans_are(cut: np.ndarray, tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        np.save(tmp_path / f"{name}.npy", cut)
-    study, out = tmp_path / "study.csv", tmp_path / "table.csv"
-    study.write_text("scan;Subject;group;time\nb.npy;m2;treated;14\na.npy;m1;control;0\n", encoding="utf-8")
-    scans = (tmp_path / "a.npy", tmp_path / "b.npy")
-    result = call("measure", *scans, "--subjects", study, "--spacing", 0.5, "--unit", "um", "-o", out)
-    assert result.exit_code == 0, result.output
-    assert "Tb.Th" in result.output and "1/µm³" in result.output
-    rows = list(csv.DictReader(out.read_text(encoding="utf-8").splitlines()))
-    assert len(rows) == 2 * len(QUANTITIES)
-    assert [tuple(rows[k][name] for name in ("subject", "group", "time")) for k in (0, -1)] == [
-        ("m1", "control", "0"),
-        ("m2", "treated", "14"),
-    ]
-    assert call("measure", scans[0], "-o", out).exit_code == 0  # its own file
-
-
 def test_parquet_has_the_same_rows(measures: Measures, tmp_path: Path) -> None:
     pandas = pytest.importorskip("pandas", reason="the extra 'tables' is not installed")
     pytest.importorskip("pyarrow", reason="the extra 'tables' is not installed")
     frame = pandas.read_parquet(write_table([measures], tmp_path / "table.parquet"))
     assert list(frame.columns) == list(COLUMNS)
     assert frame["value"].tolist() == [row["value"] for row in measures.rows()]
-
-
-def test_parquet_without_pandas_names_the_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "pandas", None)
-    with pytest.raises(ImportError, match=r"pip install \"curvafit\[tables\]\""):
-        tables.check_table(tmp_path / "table.parquet")
 
 
 @pytest.mark.parametrize(
@@ -306,14 +284,6 @@ def test_compartments_add_up_to_the_whole(cut: np.ndarray) -> None:
     assert np.sum(parts, axis=0) == pytest.approx(maps.sum(blocks), rel=1e-6, abs=1e-6)
 
 
-def test_a_region_of_everything_has_the_intervals_of_the_scan(cut: np.ndarray, measures: Measures) -> None:
-    """Blocks differ by a voxel along an axis, which their weights count and the scan's do not: by some percent."""
-    found = measure(Field(cut, (0.5, 0.5, 0.5), "um"), roi=np.ones(cut.shape, np.uint8)).compartments[1]
-    for symbol in ("BV/TV", "Tb.Th", "BS/BV", "H", "K"):
-        assert found[symbol].value == pytest.approx(measures[symbol].value, rel=1e-9)
-        assert found[symbol].half == pytest.approx(measures[symbol].half, rel=0.05)
-
-
 def test_a_compartment_without_structure_has_none(cut: np.ndarray) -> None:
     labels = np.zeros(cut.shape, np.uint8)
     labels[:2, :2, :2], labels[30:] = 7, 1
@@ -321,3 +291,101 @@ def test_a_compartment_without_structure_has_none(cut: np.ndarray) -> None:
     assert found["BV/TV"].value == 0
     assert math.isnan(found["Tb.Th"].value)
     assert found.rows()[1]["value"] is None
+
+
+# ---- windows ---------------------------------------------------------------------------------------------------------
+
+SIZE, STRIDE = 48, 24
+THIN, THICK = 4.0, 6.0
+
+
+@pytest.fixture(scope="module")
+def halves() -> Field:
+    """Thin rods below thick ones, along z."""
+    return Field(np.concatenate([tubes(2 * N, 16, THIN)[:N], tubes(2 * N, 24, THICK)[:N]]), (0.5, 0.5, 0.5), "um")
+
+
+@pytest.fixture(scope="module")
+def mapped(halves: Field) -> Windows:
+    return windows(halves, SIZE, STRIDE)
+
+
+def test_a_volume_of_two_halves_gives_its_map_back(mapped: Windows) -> None:
+    thickness = mapped["Tb.Th"].values
+    assert thickness[0] == pytest.approx(np.full((3, 3), THIN), rel=0.1)  # in um, of 0.5 um a voxel
+    assert thickness[2] == pytest.approx(np.full((3, 3), THICK), rel=0.1)
+    assert (mapped.clusters.values[0] == 1).all()
+    assert (mapped.clusters.values[2] == 2).all()  # the windows between straddle
+    assert mapped.explained > 0.5
+    assert [place[0] for place in mapped.extremes("thickness")] == [0, 2]
+    assert mapped["share of tubes"].values[0].min() > 0.9
+
+
+def test_disjoint_windows_agree_with_the_whole(halves: Field, mapped: Windows) -> None:
+    whole, apart = measure(halves), mapped.values[::2, ::2, ::2].reshape(8, -1)
+    fraction, thickness, surface = (
+        apart[:, NAMES.index(name)] for name in ("volume fraction", "thickness", "surface density")
+    )
+    assert fraction.mean() == pytest.approx(whole["BV/TV"].value, rel=1e-9)
+    assert surface.mean() == pytest.approx(whole["BS/TV"].value, rel=1e-9)
+    assert (fraction * thickness).sum() / fraction.sum() == pytest.approx(whole["Tb.Th"].value, rel=1e-9)
+
+
+def test_the_grid_has_its_place(halves: Field) -> None:
+    affine = np.array([[0, -0.5, 0, 7], [0.5, 0, 0, -3], [0, 0, 0.5, 1], [0, 0, 0, 1]])
+    grid = windows(Field(halves.values[:, :49], (0.5, 0.5, 0.5), "um", affine), (96, 48, 48), (48, 48, 24)).clusters
+    assert grid.shape == (1, 1, 3)
+    assert grid.spacing == (24, 24, 12)
+    # columns x, y, z; the first centre lies 47, 23.5, 23.5 steps of a voxel (z, y, x) from the first voxel's
+    for index, voxel in (((0, 0, 0), (23.5, 23.5, 47.5)), ((2, 0, 0), (71.5, 23.5, 47.5))):
+        assert grid.affine is not None
+        assert grid.affine @ [*index, 1] == pytest.approx(affine @ [*voxel, 1])
+
+
+def test_windows_without_structure_are_unknown(halves: Field) -> None:
+    values = halves.values.copy()
+    values[:, :, 48:] = 0
+    found = windows(values, SIZE, STRIDE)
+    assert np.isnan(found.values[:, :, 2]).all()
+    assert (found.clusters.values[:, :, 2] == 0).all()
+    assert np.isfinite(found.values[:, :, 0]).all()
+    assert f" {(~found.known).sum()} of them" in found.status
+
+
+def test_the_command_writes_maps_table_and_page(halves: Field, mapped: Windows, tmp_path: Path) -> None:
+    scan, out = tmp_path / "scan.npy", tmp_path / "maps"
+    np.save(scan, halves.values)
+    arguments = ("measure", scan, "--windows", SIZE, "--spacing", 0.5, "--unit", "um", "-o", out)
+    assert call(*arguments).exit_code == 0
+    thickness = load(out / "thickness.nii.gz")
+    assert thickness.values == pytest.approx(mapped["thickness"].values)
+    assert thickness.spacing == pytest.approx((12, 12, 12))
+    rows = list(csv.DictReader((out / "windows.csv").read_text(encoding="utf-8").splitlines()))
+    assert [float(row["thickness"]) for row in rows] == pytest.approx(mapped["Tb.Th"].values.ravel())
+    command = json.loads((out / "windows.json").read_text(encoding="utf-8"))["command"]
+    assert check_windows(out, scan, command=command) == out  # its own files
+    with pytest.raises(ValueError, match="free"):
+        check_windows(out, scan, command="curvafit measure another.npy -o maps")
+
+
+def test_windows_that_do_not_fit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.save("scan.npy", tubes(2 * N, 24, THICK)[:N])
+    for words, said in (
+        ("--windows 32 --stride 48 -o out", "stride"),
+        ("--windows 32 --stride 12 -o out", "divides"),
+        ("--windows 64 -o out", "fit into"),
+        ("--windows 32 --clusters 0 -o out", "clusters"),
+        ("--stride 32 -o out", "--windows"),
+        ("--windows 32", "folder"),
+        ("--windows 32 -o maps.csv", "folder"),
+        ("scan.npy --windows 32 -o out", "one scan"),
+        ("--windows 32 --tile 32 -o out", "--tile"),
+    ):
+        refused(call("measure", "scan.npy", *words.split()), said, progress=True)
+    refused(call("windows", "scan.npy", "--size", 32), "--windows 64")
+    sparse = np.zeros((48, 48, 48), dtype=np.uint8)
+    sparse[20:28, 20:28, 20:28] = 1
+    with pytest.raises(ValueError, match="larger"):
+        windows(sparse, 24, 24)
+    assert not (tmp_path / "out").exists()
