@@ -41,11 +41,10 @@ def build_atlas(
     box = parse_whole_triple(shape, "--shape")
     law = _choose_design(design, around, spread)
     from curvafit.core.files import check_folder
-    from curvafit.data_synth.atlas import build, check_count, make_settings
+    from curvafit.data_synth.atlas import build, make_settings
     from curvafit.data_synth.store import open_store
     from curvafit.generation.schedule import schedule as named
 
-    check_count(count, 1)
     crew.check_memory(box)
     plan = named(schedule, steps)
     settings = make_settings(box, seed, plan, law)
@@ -65,10 +64,9 @@ def extend_atlas(
     crew: Crew,
 ) -> None:
     """Add shapes to a store, with the design and the settings of the store."""
-    from curvafit.data_synth.atlas import check_count, extend
+    from curvafit.data_synth.atlas import extend
     from curvafit.data_synth.store import open_store
 
-    check_count(count, 0)
     target = open_store(store).wanted + count
 
     def again() -> str:
@@ -180,15 +178,9 @@ def train_atlas(
 def teach_filler(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, or masks.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="The weights (.npz) to write.")],
-    images: Annotated[
-        int, typer.Option(help="Teach from images of so many shapes, for `reconstruct --image`.", min=0)
-    ] = 0,
-    filler: Annotated[
-        Path | None, typer.Option(help="With --images: the filler to begin with; by default the packaged one.")
-    ] = None,
-    steps: Annotated[
-        int | None, typer.Option(help="Steps of teaching, by default 4500; 1500 with --images.", min=1)
-    ] = None,
+    images: Annotated[int, typer.Option(help="Teach for `reconstruct --image`, from so many shapes.", min=0)] = 0,
+    filler: Annotated[Path | None, typer.Option(help="With --images: filler to begin with, else the packaged.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Steps, by default 4500; 1500 with --images.", min=1)] = None,
     seed: Annotated[int, typer.Option(help="Seed of the teaching.")] = 0,
     overwrite: OverwriteOption = False,
 ) -> None:

@@ -28,6 +28,8 @@ from curvafit.priors.kernels.threads import one_thread
 
 #: A build ends with an error where fewer than one draw in so many is viable.
 BARREN = 200
+#: Viable shapes that a store may be asked for.
+MOST = 10**7
 
 
 def build(
@@ -53,7 +55,7 @@ def build(
     Raises ValueError where the store was made with other settings, a shape does not fit into memory, or hardly any draw
     is viable; OSError where the store can't be written or the workers are gone. Finished draws are kept.
     """
-    check_count(count, 1)
+    check_int(count, "a count of shapes from 1", 1, MOST)
     if workers is None:
         check_memory(Grid(shape).shape, FLOW, "a shape")  # type: ignore[arg-type]
     settings = make_settings(shape, seed, schedule, design)
@@ -65,14 +67,9 @@ def extend(store_path: str | Path, count: int, progress: Progress = silent, *, w
 
     A count of 0 finishes a build that was stopped. Raises FileNotFoundError where there is no store, and as `build`.
     """
-    check_count(count, 0)
+    check_int(count, "a count of shapes from 0", 0, MOST)
     store = open_store(store_path)
     return _fill(store, store.wanted + count, workers or ThisProcess(), progress)
-
-
-def check_count(count: int, least: int) -> None:
-    """Raise ValueError unless `count` is a whole number from `least` to 10 million."""
-    check_int(count, f"a count of shapes from {least}", least, 10**7)
 
 
 def make_settings(

@@ -254,10 +254,7 @@ def check_shape(shape: Sequence[int]) -> tuple[int, int, int]:
 
 
 def draw_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generator) -> float:
-    """Draw the edge of a shape's voxel: `voxel` times a factor between the calibres, even in the logarithm.
-
-    Equal calibres use no random number.
-    """
+    """Draw the edge of a shape's voxel, even in the logarithm between calibres; equal ones take no random number."""
     low, high = calibres
     return voxel * (low if low == high else math.exp(rng.uniform(math.log(low), math.log(high))))
 

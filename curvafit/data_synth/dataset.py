@@ -100,14 +100,15 @@ class TextureDataset(IterableDataset):
             check_choice(normalise, NORMALISATIONS, names)
             normalise = NORMALISATIONS[normalise]
         self.normalise = normalise
-        stores = all(map(_is_store, sources))
+        paths = [Path(each) for each in sources if isinstance(each, (str, PathLike))]
+        stores = len(paths) == len(sources) and all(path.is_dir() or path.suffix == ".zarr" for path in paths)
         edge = None if voxel is None else check_float(voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
         self.voxels = [edge or choose_voxel([] if stores else sources, kind) for kind in self.modalities]
         thinnest = [(kind, edge * self.calibres[0]) for kind, edge in zip(self.modalities, self.voxels, strict=True)]
         if stores:
             if volume_fraction is not None:
                 raise ValueError("volume_fraction applies to laws only; the source is a store of shapes")
-            self.source = Stored(tuple(map(Path, sources)))
+            self.source = Stored(tuple(paths))
         else:
             generated = Generated.of(sources, volume_fraction)
             check_int(shapes, "a pool of at least 1 shape", 1, MOST_POOLED)
@@ -205,7 +206,3 @@ def percentile(image: Tensor) -> Tensor:
 
 #: Normalisations of an image (1, Z, Y, X), by name.
 NORMALISATIONS: dict[str, Callable[[Tensor], Tensor]] = {"zscore": zscore, "percentile": percentile}
-
-
-def _is_store(source: Any) -> bool:
-    return isinstance(source, (str, PathLike)) and (Path(source).is_dir() or Path(source).suffix == ".zarr")

@@ -269,17 +269,10 @@ def _create(path: Path, settings: Settings) -> None:
 def _write_draw(folder: Path, record: Record, field: np.ndarray | None) -> None:
     attributes = _to_json(dataclasses.asdict(record) | {"coefficients": record.coefficients.as_dict()})
     zarr.create_group(store=str(folder), attributes=attributes | {"sha256": _digest(attributes, field)})
-    if field is None:
-        return
-    array = zarr.create_array(
-        store=str(folder / "field"),
-        shape=field.shape,
-        dtype=field.dtype,
-        chunks=field.shape,
-        compressors=[BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"), Crc32cCodec()],
-        dimension_names=("z", "y", "x"),
-    )
-    array[...] = field
+    if field is not None:
+        codecs = [BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"), Crc32cCodec()]
+        how = {"chunks": field.shape, "compressors": codecs, "dimension_names": ("z", "y", "x")}
+        zarr.create_array(store=str(folder / "field"), data=field, **how)
 
 
 def _publish(partial: Path, place: Path) -> bool:

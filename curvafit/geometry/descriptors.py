@@ -171,9 +171,8 @@ def _depth_quantiles(inside: Tensor, grid: Grid) -> tuple[np.ndarray, np.ndarray
 
 @lru_cache(maxsize=4)
 def _distance_to_faces(shape: tuple[int, int, int]) -> np.ndarray:
-    axes = [np.minimum(np.arange(n), np.arange(n)[::-1]) + 0.5 for n in shape]
-    near = np.minimum(np.minimum(axes[0][:, None, None], axes[1][:, None]), axes[2])
-    return np.minimum(near, DEPTH)
+    axes = np.ix_(*(np.minimum(np.arange(n), np.arange(n)[::-1]) + 0.5 for n in shape))
+    return np.minimum(np.minimum.reduce(np.broadcast_arrays(*axes)), DEPTH)
 
 
 def _estimate_shares(events: np.ndarray, counts: np.ndarray) -> np.ndarray:

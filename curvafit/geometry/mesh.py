@@ -219,7 +219,5 @@ def _vtp(mesh: Surface, remark: str, data: Data) -> bytes:
 def _vtk_array(name: str, values: np.ndarray, kind: str, components: int = 1) -> str:
     content = np.ascontiguousarray(values, dtype=f"<{kind}").tobytes()
     text = base64.b64encode(np.uint64(len(content)).astype("<u8").tobytes() + content).decode()
-    what = {"f4": "Float32", "i8": "Int64"}[kind]
-    return (
-        f'<DataArray type="{what}" Name="{name}" NumberOfComponents="{components}" format="binary">{text}</DataArray>'
-    )
+    form = f'type="{np.dtype(kind).name.capitalize()}" Name="{name}" NumberOfComponents="{components}" format="binary"'
+    return f"<DataArray {form}>{text}</DataArray>"

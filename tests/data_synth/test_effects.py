@@ -36,8 +36,8 @@ RANDOM: dict[str, Callable[[Tensor, int], Tensor]] = {
     "rings": lambda v, seed: effects.rings(v, 1.0, 0.2, 1.5, seed),
     "dropout": lambda v, seed: effects.dropout(v, 1.0, 0.3, 6.0, 0.9, seed),
     "clutter": lambda v, seed: effects.clutter(v, 1.0, 1e-3, 1.5, seed),
-    "poisson": lambda v, seed: effects.poisson(20 * v, seed, 0.7),
-    "few photons": lambda v, seed: effects.poisson(v, seed),
+    "poisson": lambda v, seed: effects.poisson_gaussian(20 * v, 1, 0, 0, seed, 0.7),
+    "few photons": lambda v, seed: effects.poisson_gaussian(v, 1, 0, 0, seed),
     "gaussian noise": lambda v, seed: effects.gaussian_noise(v, 2.0, seed),
     "rician": lambda v, seed: effects.rician(v, 2.0, seed),
 }

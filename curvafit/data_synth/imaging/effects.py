@@ -209,13 +209,9 @@ def poisson_gaussian(
     + N. Noise has the correlation that a Gaussian of deviations `width`, in voxels (z, y, x), leaves, as reconstruction
     and denoising do; every voxel's own law stays as it is.
     """
-    counts = photons if gain == 0 else gain * poisson(photons, seed, width)
-    return gaussian_noise(counts + offset, read_noise, seed, width)
-
-
-def poisson(photons: Volume, seed: int, width: Lengths = 0.0) -> Volume:
-    """Draw numbers of photons with these means: the `poisson_quantile` of noise that is smoothed by `width` voxels."""
-    return poisson_quantile(photons, grainy_noise(photons, as_triple(width), seed, "photons"))
+    if gain:
+        photons = gain * poisson_quantile(photons, grainy_noise(photons, as_triple(width), seed, "photons"))
+    return gaussian_noise(photons + offset, read_noise, seed, width)
 
 
 def poisson_quantile(mean: Tensor, z: Tensor) -> Tensor:
@@ -346,9 +342,7 @@ def correlated_field(like: Volume, lengths: Sequence[float], seed: int, purpose:
 
 
 def grainy_noise(like: Volume, widths: Sequence[float], seed: int, purpose: str) -> Volume:
-    """Return Gaussian noise of mean 0 and variance 1, smoothed by a Gaussian of deviations `widths` (z, y, x), in
-    voxels. Its correlation is a Gaussian of deviations √2 `widths`.
-    """
+    """Return noise of mean 0 and variance 1, smoothed by a Gaussian of deviations `widths` (z, y, x) in voxels."""
     noise = white_noise(tuple(like.shape), like, seed, purpose)
     maps = [gaussian_matrix(n, width, like) for n, width in zip(like.shape, widths, strict=True)]
     return apply_matrices(noise, *(None if weights is None else _normalise_rows(weights) for weights in maps))
@@ -361,10 +355,8 @@ def uniform(count: int, seed: int, purpose: str, like: Tensor) -> Tensor:
 
 
 def _interpolate_nodes(count: int, length: float, like: Tensor) -> Tensor | None:
-    """Return the weights (count, nodes) that interpolate random nodes, or None where every voxel is a node.
-
-    Nodes are a deviation apart, at least a voxel, and go four deviations beyond the box.
-    """
+    """Return the weights (count, nodes) that interpolate random nodes, or None where every voxel is a node."""
+    # Nodes are a deviation apart, at least a voxel, and go four deviations beyond the box.
     if math.isinf(length):
         return torch.ones((count, 1), device=like.device, dtype=like.dtype)
     if length < 0.5:
