@@ -25,6 +25,10 @@ WIDTHS, LEAST = (0.7, 1.2, 2.0, 3.4, 5.6), 0.5
 SMOOTH = 0.7
 #: Most voxels that trees learn from, trees, their rate and leaves.
 LEARNT, TREES, RATE, LEAVES = 200_000, 120, 0.1, 31
+#: Furthest shift of an image that is looked for, in voxels, and the width of the mean that its levels are taken from;
+#: the least shift that is told, by what part the image must fit the slices better there, and how many times better than
+#: anywhere (root mean square).
+FURTHEST, LOCAL, NEAREST, BETTER, CLEAR = 12, 61, 2, 0.1, 5.0
 #: Voxels whose features are computed at once, and most of which they are kept for the second reading.
 HELD, KEPT = 4_000_000, 20_000_000
 
@@ -63,6 +67,24 @@ def read_image(values: np.ndarray, slices: Slices, progress: Progress = silent) 
             evidence[row] = (slope * logits + shift).reshape(plane.shape[:2])
     progress("reading the image", 1.0)
     return evidence, told
+
+
+def find_shift(values: np.ndarray, slices: Slices) -> tuple[int, int]:
+    """Return by how many voxels (y, x) an image (Z, Y, X) lies off the known slices; (0, 0) where it lies on them.
+
+    The correlation of slices with grey levels, whichever of the two is brighter, is greatest at the shift.
+    """
+    whole = np.zeros(slices.inside.shape[1:])
+    for place, inside in zip(slices.places, slices.inside, strict=True):
+        plane = values[place].astype(np.float64)
+        plane -= ndimage.uniform_filter(plane, LOCAL, mode="nearest")
+        mask, grey = np.fft.rfft2(inside - inside.mean()), np.fft.rfft2(plane / max(plane.std(), 1e-12))
+        whole += np.fft.irfft2(mask.conj() * grey, whole.shape)
+    reach = [min(FURTHEST, n // 4) for n in whole.shape]
+    near = np.abs(np.roll(whole, reach, (0, 1))[: 2 * reach[0] + 1, : 2 * reach[1] + 1])
+    y, x = (int(k) - r for k, r in zip(np.unravel_index(near.argmax(), near.shape), reach, strict=True))
+    least = max((1 + BETTER) * near[reach[0], reach[1]], CLEAR * float(np.sqrt(np.square(whole).mean())))
+    return (y, x) if max(abs(y), abs(x)) >= NEAREST and near.max() > least else (0, 0)
 
 
 def _learn(features: np.ndarray, inside: np.ndarray) -> Any:

@@ -27,7 +27,7 @@ from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import profile_distance
 from curvafit.segmentation.filler import Taught, fill
 from curvafit.segmentation.flow import STEPS, WorkingGrid, choose_epsilon
-from curvafit.segmentation.image import read_image
+from curvafit.segmentation.image import find_shift, read_image
 from curvafit.segmentation.result import (
     FEW,
     Segmentation,
@@ -103,6 +103,7 @@ LEAST_BYTES = 30
 TOLD = 0.1
 ONCE = "The labels are read in the image as instances of one structure (--no-instances reads each by itself)."
 APIECE = "Each label is read in the image by itself (--instances reads those of one kind, such as cells, as one)."
+SHIFTED = "The image seems to lie off the annotated slices by {} voxels along {}: it fits them better when it is moved."
 UNTOLD = "The image does not tell the structure in annotated slices held out: it is left out."
 #: Voxels around a label's box.
 ROOM = 16
@@ -201,10 +202,8 @@ def reconstruct(
         if example is not None or laws:
             raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
         seen = _load_image(image, volume, reading)
-        evidence, told = read_image(given.turn(seen.values), target, progress=sub_progress(progress, 0.0, 0.5))
-        notes = (*notes, *seen.notes)
-        if told < TOLD:
-            taught, evidence, notes = Taught.load(), None, (*notes, UNTOLD)
+        evidence, doubts = _read_evidence(given.turn(seen.values), target, axis, sub_progress(progress, 0.0, 0.5))
+        taught, notes = Taught.load() if evidence is None else taught, (*notes, *seen.notes, *doubts)
     if example is not None:
         other = Example.of(_load_example(example, volume, reading), given.places, axis)
         taught = tune(taught, other, sub_progress(progress, 0.0, 0.5))
@@ -430,6 +429,16 @@ def _load_image(image: Source, volume: Field, reading: dict[str, Any]) -> Field:
     return replace(field, notes=laid)
 
 
+def _read_evidence(
+    levels: np.ndarray, slices: Slices, axis: int, progress: Progress
+) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """Return what an image says of a volume, None where it does not tell known slices, and sentences on its doubts."""
+    off = zip(find_shift(levels, slices), "zyx".replace("zyx"[axis], ""), strict=True)
+    doubts = tuple(SHIFTED.format(f"{voxels:+d}", name) for voxels, name in off if voxels)
+    evidence, told = read_image(levels, slices, progress=progress)
+    return (None, (*doubts, UNTOLD)) if told < TOLD else (evidence, doubts)
+
+
 def _load_example(example: Source, volume: Field, reading: dict[str, Any]) -> Field:
     """Load an example with the spacing and unit of the slices, which are of `volume`."""
     placed = {} if isinstance(example, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
@@ -520,6 +529,7 @@ def reconstruct_labels(
             whole = labels.fill(None, WHOLE, image=bare, progress=sub_progress(progress, 0.0, 0.5))
             progress, alone = sub_progress(progress, 0.5, 1.0), None
             options.pop("filler", None)  # that one reads images
+            notes = (*notes, *(note for note in whole.notes if note.startswith(SHIFTED.partition("{")[0])))
         if whole is not None and UNTOLD in whole.notes:
             whole, notes = None, (*notes[:-1], UNTOLD)
     parts, said = _fill_each(labels, numbers, laws, (alone, other, store), progress)

@@ -11,7 +11,7 @@ from skimage import measure
 
 import curvafit.segmentation.image as room
 from curvafit.segmentation.filler import Filler, Gaps, Taught, fill
-from curvafit.segmentation.image import read_image
+from curvafit.segmentation.image import find_shift, read_image
 from curvafit.segmentation.reconstruct import are_instances, reconstruct, reconstruct_labels, split_structure
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.teach import ImageMix, Texture, image_shape, teach
@@ -191,3 +191,13 @@ def test_cells_with_their_image_are_each_one_piece_and_better() -> None:
     likely = told.probability.values
     assert likely.min() >= 0 and likely.max() <= 1 and (likely[::EVERY] == 1).all()
     assert likely[values == truth].mean() > likely[values != truth].mean() + 0.1
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_an_image_that_lies_off_the_slices_is_told(sign: int) -> None:
+    mask = rods()
+    image, slices = sign * photograph(mask, 1.0), known(mask)
+    assert find_shift(image, slices) == (0, 0)
+    assert find_shift(np.roll(image, (4, -3), (1, 2)), slices) == (4, -3)
+    for seed in range(5):
+        assert find_shift(photograph(np.zeros_like(mask), seed=seed), slices) == (0, 0)
