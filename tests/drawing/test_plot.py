@@ -165,14 +165,9 @@ def test_a_diagram_puts_its_mass_where_the_curvatures_are() -> None:
 def test_a_slice_shows_its_contour_in_physical_places() -> None:
     structure = ball((32, 32, 32), 8)[16]
     figure = slice_figure(
-        structure,
-        structure,
-        image_extent=(0, 3.2, 3.2, 0),
-        extent=(0, 3.2, 3.2, 0),
-        limits=(-1, 1),
-        unit="mm",
+        structure, structure, image_extent=(0, 3.2, 3.2, 0), extent=(0, 3.2, 3.2, 0), limits=(-1, 1), unit="mm",
         axes_names=("y", "x"),
-    )
+    )  # fmt: skip
     outline = np.concatenate([path.vertices for path in figure.axes[0].collections[0].get_paths()])
     radii = np.hypot(*(outline - 1.6).T)
     assert radii == pytest.approx(0.8, abs=0.02)

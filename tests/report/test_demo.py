@@ -36,14 +36,6 @@ def test_scores_are_of_the_slices_left_out_alone() -> None:
     assert score_completion(truth, filled).dice["curvafit"] == 1
 
 
-def test_slices_across_any_axis_score_alike() -> None:
-    truth = cone()
-    filled = np.roll(truth, 1, axis=2)
-    turned = score_completion(np.moveaxis(truth, 0, 1), np.moveaxis(filled, 0, 1), axis=1)
-    assert turned.dice == score_completion(truth, filled).dice
-    assert np.array_equal(np.moveaxis(turned.known, 1, 0), score_completion(truth, filled).known)
-
-
 def test_the_page_stands_alone_and_escapes_what_it_is_told() -> None:
     inference, mask = made_inference(), lattice(48, 24, 5.0) > 0
     measures = measure(Field(mask, (SCALE,) * 3, "mm"))
