@@ -168,7 +168,7 @@ def test_infer_writes_three_files_and_says_what_it_found(tmp_path: Path, finding
     scan, roi = tmp_path / "a.raw", tmp_path / "r.npy"
     for file in (scan, roi):
         file.touch()
-    done("infer", scan, "-o", tmp_path / "out", *options.split(), "--spacing", "0.5", "--roi", roi)
+    done("infer", scan, "-o", tmp_path / "more", *options.split(), "--spacing", "0.5", "--roi", roi)
     wanted = {"kind": "mask", "periodic": True, "threshold": -12.5, "label": 3, "raw_shape": (4, 5, 6), "dtype": "u1"}
     wanted |= {"key": "k", "seed": 9, "spacing": (0.5, 0.5, 0.5), "roi": roi, "atlas": None}
     wanted |= {"channel": 2, "crop": "1:3,:,-4:", "method": "match"}

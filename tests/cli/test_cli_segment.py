@@ -113,7 +113,7 @@ def test_other_formats_and_a_fit_in_another_unit(tmp_path: Path) -> None:
     record = json.loads((tmp_path / "mask.json").read_text())
     assert record["dark"] is True and record["threshold"] == 150
     assert record["coefficients"] == pytest.approx(made_fit().coefficients_physical.in_unit(1e-3).as_dict())
-    path, target = tmp_path / "scan.nii", tmp_path / "mask.nii"
+    path, target = tmp_path / "scan.nii", tmp_path / "axis.nii"
     image = nibabel.Nifti2Image(grey().T[..., None], np.diag([0.2, 0.2, 0.4, 1]))
     nibabel.save(image, path)
     done("segment", path, "--prior", "sponge", "--steps", 2, "-o", target)
