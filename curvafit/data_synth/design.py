@@ -13,16 +13,7 @@ import numpy as np
 import yaml
 from scipy.stats import qmc
 
-from curvafit.core.checks import (
-    SEEDS,
-    as_tuple,
-    check_choice,
-    check_float,
-    check_int,
-    check_open_interval,
-    check_seed,
-    quoted,
-)
+from curvafit.core.checks import SEEDS, as_tuple, check_choice, check_float, check_int, check_open_interval, quoted
 from curvafit.priors.coefficients import NAMES, Coefficients, check_strengths
 from curvafit.priors.grid import WORKING_EPSILON
 from curvafit.priors.law import Law
@@ -169,8 +160,11 @@ def design_around(point: Sequence[float], spread: float, sampling: Sampling = "r
 
 def _seed_stream(seed: int, index: int, purpose: str) -> np.random.SeedSequence:
     """Return the random stream of a draw for its `parameters` or for the `start` of its flow."""
-    index = check_int(index, "an index that is a whole number from 0", 0, SEEDS - 1)
-    return np.random.SeedSequence(check_seed(seed), spawn_key=(index, ("parameters", "start").index(purpose)))
+    seed, index = (
+        check_int(number, f"{name} that is a whole number from 0", 0, SEEDS - 1)
+        for name, number in (("a seed", seed), ("an index", index))
+    )
+    return np.random.SeedSequence(seed, spawn_key=(index, ("parameters", "start").index(purpose)))
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------
@@ -193,10 +187,7 @@ def read_design(path: str | PathLike[str]) -> Design:
 
 
 def read_point(source: Any, folder: Path = Path()) -> tuple[float, ...]:
-    """Return the seven numbers of a law: a preset's name, a `fit.json`, or the numbers by name.
-
-    The path of a `fit.json` is relative to `folder`.
-    """
+    """Return the seven numbers of a law: a preset's name, a `fit.json` in `folder`, or the numbers by name."""
     if isinstance(source, str):
         return Law.of(folder / source if source.endswith(".json") else source).point
     if not isinstance(source, Mapping) or set(source) != set(PARAMETERS):

@@ -33,7 +33,6 @@ from curvafit.volumes.field import Field, ScanError
 
 #: Seconds between two writings of a table that grows.
 PAUSE = 60.0
-
 #: A row of a table: its columns in their order.
 Row = tuple[str, str, np.ndarray, float, np.ndarray, float]
 
