@@ -129,11 +129,8 @@ def _is_nearly_inside(centre, o, radius, shape, spacing, edge, periodic):  # pra
     """Return whether a ball sticks out of another, around the voxel o, so little that it is left out."""
     nz, ny, nx = shape
     hz, hy, hx = spacing
-    dz, dy, dx = (
-        abs(centre // (ny * nx) - o // (ny * nx)),
-        abs(centre // nx % ny - o // nx % ny),
-        abs(centre % nx - o % nx),
-    )
+    dz, dy = abs(centre // (ny * nx) - o // (ny * nx)), abs(centre // nx % ny - o // nx % ny)
+    dx = abs(centre % nx - o % nx)
     if periodic:
         dz, dy, dx = min(dz, nz - dz), min(dy, ny - dy), min(dx, nx - dx)
     out = np.sqrt((dz * hz) ** 2 + (dy * hy) ** 2 + (dx * hx) ** 2) + radius[centre] - radius[o]
