@@ -106,7 +106,7 @@ class GreyEvidence:
         if apart and threshold == "otsu" and abs(classes.contrast) < OVERLAP * classes.noise:
             inside = grey_evidence(levels, sample, classes).level > 0
             erode = partial(ndimage.binary_erosion, iterations=DEEP, border_value=1)
-            deep = [levels[erode(side)] for side in (~inside, inside)]
+            deep = [levels[np.asarray(erode(side), dtype=bool)] for side in (~inside, inside)]
             if min(map(len, deep)) >= FEWEST:
                 outer, inner = (float(side.mean(dtype=np.float64)) for side in deep)
                 classes = replace(classes, outside=outer, inside=inner, middle=(outer + inner) / 2)
