@@ -38,8 +38,8 @@ def test_a_parameter_in_log_is_uniform_in_its_logarithm():
 def test_parameters_and_noise_seeds_are_uncorrelated():
     """And Sobol's sequence fills the box more evenly than chance."""
     draws = [design_box().draw(1, index) for index in range(2000)]
-    table = np.array([[*list(c)[1:], m, s] for c, m, s in draws])
-    off_diagonal = np.corrcoef(table.T) - np.eye(7)
+    rows = np.array([[*list(c)[1:], m, s] for c, m, s in draws])
+    off_diagonal = np.corrcoef(rows.T) - np.eye(7)
     assert np.abs(off_diagonal).max() < 4.5 / np.sqrt(2000)  # 21 pairs of null correlations, sd 1/√n each
     values = (table(design_box("sobol"), 256)[:, 1:] - [low for low, _ in INTERVALS.values()]) / [
         high - low for low, high in INTERVALS.values()
