@@ -4,7 +4,7 @@ A texture is six coefficients and a mass: shapes that minimise the integral of a
 curvatures at constant volume.
 
 - Infer: `infer(scan)` gives the parameters of a scanned volume, with `.fit`, `.plot()` and a report.
-- Synthesise: `generate(law)` grows a shape of a texture; `generate_batch` grows several at once.
+- Synthesise: `generate(law)` grows a shape of a texture.
 - Prior: `segment(scan, law)` gives a mask of grey levels or of a network's probabilities, `reconstruct(labels, law)`
   one of annotated slices; `curvafit.priors` has the loss for networks.
 - Files: `load(path)` and `save(volume, path)` read and write volumes with their spacing and unit.
@@ -26,7 +26,6 @@ from curvafit.core.faces import attach_lazy_names
 if TYPE_CHECKING:
     from curvafit.generation.flow import descend as descend
     from curvafit.generation.flow import generate as generate
-    from curvafit.generation.flow import generate_batch as generate_batch
     from curvafit.generation.result import Flow as Flow
     from curvafit.geometry.diagram import Diagram as Diagram
     from curvafit.geometry.diagram import diagram as diagram

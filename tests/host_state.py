@@ -161,7 +161,6 @@ def calls(folder: Path) -> dict[str, Callable[[], object]]:
         "CurvaturePrior": lambda: train(priors.CurvaturePrior("tubes")),
         "CombinedLoss": lambda: train(priors.CombinedLoss(mse, priors.CurvaturePrior("tubes"), 0.1, 2)),
         "generate": lambda: keep("flow", curvafit.generate("tubes", grid=grid, seed=1)),
-        "generate_batch": lambda: list(curvafit.generate_batch(law, -0.4, 12, seeds=[1, 2], schedule=brief)),
         "descend": lambda: (descend(), descend(flow="h-1", optimiser="adam")),
         "diagram": lambda: keep("diagram", curvafit.diagram(kept["flow"].field, grid, 0.02)),
         "Diagram": lambda: curvafit.Diagram(np.zeros((1, 2)), np.ones(1)),

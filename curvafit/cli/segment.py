@@ -68,7 +68,7 @@ def segment(
 
     kind: bool | str = "logits" if logits else probabilities
     split: dict[str, Any] = {"threshold": parse_threshold(threshold), "dark": dark}
-    check_given(kind, weight, example, **split)
+    check_given(kind, weight, example, **split, label=reading["label"])
     if (example is None) != (example_probabilities is None):
         raise ValueError("--example and --example-probabilities go together, got one of them")
     if like is not None and not kind:

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from curvafit.generation.data import Hinge as Hinge
     from curvafit.generation.flow import descend as descend
     from curvafit.generation.flow import generate as generate
-    from curvafit.generation.flow import generate_batch as generate_batch
     from curvafit.generation.forms import white_noise as white_noise
     from curvafit.generation.result import Flow as Flow
     from curvafit.generation.result import History as History

@@ -1,10 +1,9 @@
-"""The flows of the paper: from noise at constant mass (Algorithm 1), one or several; from a field (Algorithm 2)."""
+"""The flows of the paper: from noise at constant mass (Algorithm 1); from a field (Algorithm 2)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -12,15 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import (
-    as_tuple,
-    check_choice,
-    check_float,
-    check_open_interval,
-    check_seed,
-    check_type,
-    quoted,
-)
+from curvafit.core.checks import check_choice, check_float, check_open_interval, check_seed, check_type, quoted
 from curvafit.generation.checkpoint import Checkpoint, identity
 from curvafit.generation.cost import Cost, check_shape
 from curvafit.generation.data import Data
@@ -33,7 +24,7 @@ from curvafit.generation.slabs import SlabStepper
 from curvafit.generation.stepper import FusedStepper, LbfgsStepper, Stepper, TorchStepper
 from curvafit.priors import kernels, stencils
 from curvafit.priors.grid import WORKING_EPSILON, Bool, Float, Grid
-from curvafit.priors.law import Law, LawLike, read_laws
+from curvafit.priors.law import Law, LawLike
 
 #: Standard deviation of the published blur, in working units (two voxels).
 WORKING_BLUR = 0.02
@@ -120,49 +111,6 @@ def generate(
     form = DivergenceForm.of(grid, cost.blur, base, execution.blur)
     stepper = execution.stepper(white_noise(grid, seed), form, options)
     return run(stepper, options, seed, execution.checkpoint_file(stepper, options, seed=seed, mass=base))
-
-
-def generate_batch(
-    laws: LawLike | Sequence[LawLike],
-    masses: float | Tensor | Sequence[float | Tensor] | None = None,
-    grid: Grid | int | tuple[int, int, int] = 100,
-    *,
-    seeds: int | Sequence[int] = 0,
-    schedule: str | Schedule | None = None,
-    epsilon: float | Tensor = WORKING_EPSILON,
-    blur: float = WORKING_BLUR,
-    reject_early: bool = False,
-    backend: Backend = "auto",
-    device: torch.device | str = "cpu",
-) -> Iterator[Flow]:
-    """Make shapes as `generate` does, and yield each flow when it is done, in order.
-
-    Parameters
-    ----------
-    laws, masses, seeds
-        A law, a mass and a seed for all shapes, or sequences of one length with one for each shape. None takes the
-        laws' masses. A mass that is a tensor varies in space, for all shapes.
-
-    The other arguments are those of `generate`, for all shapes. Raises ValueError at once if the sequences differ in
-    length, otherwise as `generate` does, when the shape is made.
-    """
-    known = read_laws(laws)
-    columns = [
-        known,
-        [masses] if masses is None or isinstance(masses, (Real, Tensor)) else as_tuple(masses, "masses"),
-        [seeds] if isinstance(seeds, Real) else as_tuple(seeds, "seeds"),
-    ]
-    lengths = {len(column) for column in columns} - {1}
-    if len(lengths) > 1 or 0 in lengths:
-        counts = ", ".join(str(len(column)) for column in columns)
-        raise ValueError(f"laws, masses and seeds must be of one length, or one for all, got {counts}")
-    backends = [name for name in BACKENDS if name != "slabs"]  # which are of one shape
-    check_choice(backend, backends, f"a backend among {', '.join(backends)}")
-    options = {"schedule": choose_schedule(known, schedule), "epsilon": epsilon, "blur": blur}
-    options |= {"reject_early": reject_early, "backend": backend, "device": device}
-    count = max(lengths, default=1)
-    rows = zip(*([*column] * (count // len(column)) for column in columns), strict=True)
-    return (generate(law, mass, grid, seed=seed, **options) for law, mass, seed in rows)
 
 
 def descend(

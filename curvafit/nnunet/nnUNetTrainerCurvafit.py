@@ -38,7 +38,7 @@ class nnUNetTrainerCurvafit(nnUNetTrainer):
     def _build_loss(self):
         loss, self._own = super()._build_loss(), self._prior()
         weight, epochs = _number("CURVAFIT_WEIGHT", 0.0), _number("CURVAFIT_WARMUP", 50.0)
-        self._share = 0.0 if weight else _number("CURVAFIT_SHARE", 0.1)
+        self._share = 0.0 if os.environ.get("CURVAFIT_WEIGHT") else _number("CURVAFIT_SHARE", 0.1)
         deep = isinstance(loss, DeepSupervisionWrapper)
         levels = sum(factor != 0 for factor in loss.weight_factors) if deep else 1
         warmup = 0 if self._share else int(epochs * self.num_iterations_per_epoch) * levels

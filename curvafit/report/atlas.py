@@ -46,7 +46,7 @@ from curvafit.report.page import MARK, name_source, render_template
 from curvafit.scan.prepare import HALF, WORKING_THICKNESS
 
 #: Below this, there is nothing to lay out; the nearest shapes that are named beside one.
-LEAST_SHAPES, NEIGHBOURS = 5, 5
+LEAST_SHAPES, NEIGHBOURS = 6, 5
 #: The most shapes whose solids are in the page, and the most voxels along an edge of one: 40 kB a shape.
 SOLIDS, EDGE = 150, 24
 #: Width of a small picture in pixels, bins along an axis of a diagram, and decades of its colours.
@@ -173,8 +173,9 @@ def write_map(
     rows["measured on"] = atlas.provenance["date"]
     text = render_template(
         "atlas.html", version=version("curvafit"), title=f"Atlas of {n} shapes", plotly=script,
-        data=json.dumps(data, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c"),
-        names=[*names, *atlas.ids], scans=len(names), solids=len(turned), missing=n - len(turned),
+        data=json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
+        names=[*enumerate(names, n), *enumerate(atlas.ids)], scans=len(names), solids=len(turned),
+        missing=n - len(turned),
         provenance=[each for each in rows.items() if each[1]],
     )  # fmt: skip
     return write_content(target, text)

@@ -178,7 +178,7 @@ def name_quantity(name: str, symbol: str, power: int, unit: str) -> dict[str, st
 
 def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
     """Yield a row for each test: the diagrams', then each number's; None where there is no value."""
-    c, letters = comparison, ascii_lowercase[: len(comparison.groups)]
+    c, letters = comparison, [*ascii_lowercase, *range(27, 1 + len(comparison.groups))][: len(comparison.groups)]
     columns = ["quantity", "symbol", "unit", *(f"mean_{each}" for each in letters), *(f"sd_{each}" for each in letters)]
     effect = {"g": "g", "η": "eta", "r": "r"}[c.effect]
     columns += ["slope" if c.effect == "r" else "difference", effect, f"{effect}_low", f"{effect}_high"]

@@ -114,7 +114,7 @@ def segment(
         If an argument is out of range or does not fit the scan, or the prior's unit cannot be converted; if there is no
         such `fit.json`; if probabilities are not in [0, 1], or have neither a weight nor an example, or both.
     """
-    check_given(probabilities, weight, example, threshold, dark)
+    check_given(probabilities, weight, example, threshold, dark, reading.get("label"))
     alike: dict[str, Any] = {}
     if probabilities:
         reading["logits"] = probabilities == "logits"
@@ -156,7 +156,12 @@ def segment(
 
 
 def check_given(
-    probabilities: bool | str, weight: float | None, example: object, threshold: float | str, dark: bool
+    probabilities: bool | str,
+    weight: float | None,
+    example: object,
+    threshold: float | str,
+    dark: bool,
+    label: int | None = None,
 ) -> None:
     """Raise ScanError where options of `segment` do not go together, or are out of range."""
     check_options("image", threshold)
@@ -173,6 +178,8 @@ def check_given(
     if (example is None) == (weight is None):
         got = "neither" if weight is None else "both"
         raise ScanError(f"give probabilities an example, on which law and weight are judged, or a weight, got {got}")
+    if label is not None and example is None:
+        raise ScanError("a label chooses the voxels of an example's mask: give an example, or leave the label out")
 
 
 def lower(evidence: VolumeEvidence, trial: Trial, tiling: Tiling, **tools: Any) -> LoweredVolume:
@@ -201,13 +208,14 @@ class EvidenceProblem(Problem):
 
 
 def _explains(evidence: VolumeEvidence, mask: np.ndarray, tiling: Tiling) -> bool:
-    """Return whether a mask explains the scan nearly as well as the first guess does: so it is, unless thin structures
-    got lost, since the energy is lowered together with -log p."""
-    sums = np.zeros(2)
+    """Return whether a mask keeps nearly all the evidence for each phase that the first guess has: so it does, unless
+    thin structures, or pores, got lost, since the energy is lowered together with -log p."""
+    kept, guessed = np.zeros((2, 2))
     for tile in tiling.tiles:
         found = evidence.of_box(tile.core)
-        sums += [float(found.ratio[inside].sum(dtype=np.float64)) for inside in (mask[tile.core], found.level > 0)]
-    return bool(sums[0] >= KEPT * sums[1])
+        for sums, inside in ((kept, mask[tile.core] > 0), (guessed, found.level > 0)):
+            sums += [found.ratio[inside].sum(dtype=np.float64), -found.ratio[~inside].sum(dtype=np.float64)]
+    return bool((kept >= KEPT * guessed).all() and 0 < mask.mean() < 1)
 
 
 def _missing_phase(evidence: VolumeEvidence, tiling: Tiling) -> str:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from curvafit.data_synth import atlas
 from curvafit.data_synth.store import open_store
-from curvafit.generation import SCHEDULES, Schedule, descend, generate_batch
+from curvafit.generation import SCHEDULES, Schedule, descend
 from curvafit.generation.cost import Cost
 from curvafit.generation.loop import FlowOptions, run
 from curvafit.generation.result import viability
@@ -74,13 +74,12 @@ def test_figures_that_are_not_finite_end_a_flow(part: str, step: int, bad: float
 
 @pytest.mark.parametrize("backend", ["torch", "auto"])
 def test_every_flow_tells_of_a_field_too_large_for_float32(backend) -> None:
-    """Its energy is finite in float64. And of a step that is far too long, in a batch of each shape."""
+    """Its energy is finite in float64."""
     huge = 1e30 * ball()
     flows = [
         relax(huge, TUBES, GRID, schedule=RUNAWAY, backend=backend),
         descend(huge, TUBES, GRID, steps=3, backend=backend),
         descend(huge, TUBES, GRID, steps=3, optimiser="adam", backend=backend),
-        *generate_batch(TUBES, MASS, Grid((12, 12, 12)), seeds=(1, 2), schedule=RUNAWAY, backend=backend),
     ]
     for flow in flows:
         assert "not finite" in flow.status and not flow.viability.viable and not flow.finite

@@ -18,7 +18,7 @@ from curvafit.generation.data import Evidence, Hinge
 from curvafit.generation.flow import descend
 from curvafit.generation.forms import FORMS, DivergenceForm
 from curvafit.generation.schedule import Schedule
-from curvafit.generation.stepper import LbfgsStepper
+from curvafit.generation.stepper import LbfgsStepper, TorchStepper
 from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import energy, orientation
@@ -292,3 +292,13 @@ def test_evidence_counts_its_nats_once_whatever_the_volume_of_a_part(epsilon: fl
     assert found.epsilon == epsilon
     nats = float(probability_evidence(likely).ratio.sum(dtype=np.float64))
     assert 0.3 * 2 * gained[0] == pytest.approx(nats, rel=1e-4)  # λ times the stiffness, 0.3 (1.5 + 2.5) / 2
+
+
+def test_the_step_and_its_run_read_nothing_from_the_device() -> None:
+    """On the device "meta" nothing can be read: a step that waits for a number fails there."""
+    grid = Grid((8, 9, 10))
+    start, form = torch.zeros(3, *grid.shape), DivergenceForm(grid, 0.01, -0.6)
+    cost = Cost(TUBES, grid, 0.02, None, 0.01)
+    stepper = TorchStepper(start, form, cost, (0.9, 0.999), None, "meta")
+    stepper.run([1e-3, 2e-3])
+    assert stepper.state()["parameters"].shape == (3, *grid.shape)

@@ -162,13 +162,13 @@ def _geometry(_: Path) -> dict[str, Any]:
 
 
 def _flows(_: Path) -> dict[str, Any]:
-    """Shapes grown together, and a field lowered."""
+    """Two shapes grown, and a field lowered."""
     import curvafit
     from curvafit.generation.schedule import schedule
     from curvafit.priors import Grid
 
     plan = schedule("fast", steps=30)
-    batch = list(curvafit.generate_batch("tubes", grid=16, schedule=plan, seeds=[1, 2]))
+    batch = [curvafit.generate("tubes", grid=16, schedule=plan, seed=seed) for seed in (1, 2)]
     lowered = curvafit.descend(torch.from_numpy(_field("field.nii.gz").copy()), "tubes", Grid((24, 24, 24)), steps=10)
     return {"batch": [volume((flow.field > 0).numpy()) for flow in (*batch, lowered)]}
 

@@ -18,7 +18,7 @@ from curvafit.data_synth.design import Design, design_around, design_box
 from curvafit.data_synth.imaging.modality import MODALITIES
 from curvafit.data_synth.sources import Generated
 from curvafit.drawing.shapes import Output
-from curvafit.generation import Schedule, descend, generate, generate_batch, white_noise
+from curvafit.generation import Schedule, descend, generate, white_noise
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import orientation
 from curvafit.priors.grid import Grid
@@ -80,10 +80,6 @@ def flow(**wrong: Any) -> None:
     generate(**{"law": TUBES, "mass": MASS, "grid": 8, "schedule": BRIEF} | wrong)
 
 
-def batch(**wrong: Any) -> None:
-    generate_batch(grid=Grid((8, 8, 8)), **{"laws": TUBES, "masses": MASS, "seeds": 0} | wrong)
-
-
 def recipe(**wrong: Any) -> None:
     source, confocal = Generated((POINT,), ("tubes",)), MODALITIES["confocal"]
     Recipe(**{"source": source, "modality": confocal, "shape": (16, 16, 16), "voxel": confocal.voxel} | wrong)
@@ -137,12 +133,6 @@ REFUSALS: list[tuple[Callable, dict[str, Any], str]] = [
     ),
     (flow, {"mass": None}, "neither"),
     (flow, {"schedule": 5}, "schedule"),
-    (batch, {"laws": object()}, r"expected a law \(.*\), got <object object"),
-    (batch, {"masses": object()}, "expected a sequence of masses, got <object object"),
-    (batch, {"seeds": object()}, "expected a sequence of seeds, got <object object"),
-    (batch, {"masses": (-0.5, -0.4), "seeds": (1, 2, 3)}, "length"),
-    (batch, {"seeds": ()}, "length"),
-    (batch, {"backend": "slabs"}, "backend"),
     *((lambda spread: design_around(POINT, spread), {"spread": s}, "spread") for s in (1e300, math.nan, -1, "wide")),
     (design_box, {"a10": (0, 1e300)}, "a10"),
     (Generated, {"points": ((*POINT[:5], 1e300, -0.6),), "names": ("far",)}, "a00"),
