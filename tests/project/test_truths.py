@@ -1,18 +1,25 @@
-"""No truth test goes without notice: each that `tests/truths.txt` lists is there."""
+"""No truth test goes without notice: each that `tests/truths.txt` lists is there, and each that was listed still stands
+in it, behind the name that it has now or among what is gone."""
 
 import ast
+import re
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
+#: Names of tests in the list when it was frozen, old names too.
+NAMES = 1065
+
+
 def test_every_truth_test_is_there() -> None:
-    missing, there, count = [], set(), 0
-    for line in (ROOT / "tests" / "truths.txt").read_text(encoding="utf-8").splitlines():
+    text = (ROOT / "tests" / "truths.txt").read_text(encoding="utf-8")
+    missing, there = [], set()
+    for line in text.splitlines():
         if line.startswith("tests/"):
             tree = ast.parse((ROOT / line).read_text(encoding="utf-8"))
             there = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
         elif line.startswith("    "):
-            count += 1
             missing += [] if line.split()[0] in there else [line]
-    assert missing == [] and count > 700
+    assert missing == []
+    assert len(set(re.findall(r"\btest_\w+\b(?!\.py)", text))) >= NAMES
