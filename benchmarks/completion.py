@@ -69,7 +69,7 @@ def plain_ways() -> tuple[str, ...]:
     """Return the plain interpolations; ITK's where its package is installed."""
     if find_spec("itk") is not None:
         return (*WAYS, ITK)
-    print("no ITK: install itk-morphologicalcontourinterpolation, or the extra 'bench'")
+    print("no ITK: install itk-morphologicalcontourinterpolation, or the group bench")
     return tuple(WAYS)
 
 

@@ -12,50 +12,83 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 #: A loss on two of numba's threads, and data whose shapes workers grow.
-TRAINING = """
+HEAD = """
 import sys
 import torch
-from curvafit.data_synth import TextureDataset, as_dict
+from curvafit.data_synth import TextureDataset, as_dict, as_monai
 from curvafit.priors import CurvaturePrior
 
 prior = CurvaturePrior("tubes", sigmoid=True)
 
-def look(batch):
-    (prior(torch.randn(1, 1, 48, 48, 48, requires_grad=True)) + batch["image"].mean()).backward()
+def make(transform):
+    return TextureDataset("tubes", "micro-ct", 24, length=2, shapes=1, transform=transform)
 
-if __name__ == "__main__":
+def look(batch, scale=1.0):
+    return prior(scale * torch.randn(1, 1, 48, 48, 48, requires_grad=True)) + batch["image"].mean()
+
+def main(start):
     for workers, persistent in ((1, False), (2, True)):
-        options = {"num_workers": workers, "persistent_workers": persistent, "multiprocessing_context": sys.argv[1]}
-        look({"image": torch.zeros(1)})
-        data = TextureDataset("tubes", "micro-ct", 24, length=2, shapes=1, transform=as_dict)
-        loader = torch.utils.data.DataLoader(data, batch_size=1, **options)
-        for epoch in range(2):
-            for batch in loader:
-                look(batch)
+        options = {"num_workers": workers, "persistent_workers": persistent, "multiprocessing_context": start}
+        look({"image": torch.zeros(1)}).backward()
+        train(options)
     from curvafit.priors.kernels.threads import count_threads
     print("threads", count_threads())
 """
+PLAIN = """
+def train(options):
+    loader = DataLoader(make(TRANSFORM), batch_size=1, **options)
+    for epoch in range(2):
+        for batch in loader:
+            look(batch).backward()
+"""
+LOOPS = {
+    "torch": "from torch.utils.data import DataLoader" + PLAIN.replace("TRANSFORM", "as_dict"),
+    "monai": "from monai.data import DataLoader" + PLAIN.replace("TRANSFORM", "as_monai"),
+    "lightning": """
+import lightning
+
+class Segmenter(lightning.LightningModule):
+    def __init__(self):
+        super().__init__()
+        self.scale = torch.nn.Parameter(torch.ones(()))
+
+    def training_step(self, batch, _):
+        return look(batch, self.scale)
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), 1e-3)
+
+def train(options):
+    quiet = dict.fromkeys(("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
+    loader = torch.utils.data.DataLoader(make(as_dict), batch_size=1, **options)
+    lightning.Trainer(max_epochs=2, accelerator="cpu", **quiet).fit(Segmenter(), loader)
+""",
+}
 
 
-def run(program: str, folder: Path, *arguments: str, **environment: str) -> str:
-    """The last line that a program prints; it runs in a process of two threads."""
+def run(program: Path, *arguments: str, **environment: str) -> tuple[str, str]:
+    """The last line that a program prints, and all that it says beside; it runs in a process of two threads."""
     threads = {"OMP_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2", "PYTHONPATH": str(ROOT)} | environment
     threads["MKL_NUM_THREADS"] = threads["OMP_NUM_THREADS"]  # torch follows MKL's number, which dask sets to 1
-    path = folder / "program.py"
-    path.write_text(program)
-    command = [sys.executable, str(path), *arguments]
+    command = [sys.executable, str(program), *arguments]
     done = subprocess.run(command, env=os.environ | threads, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()[-1]
+    return done.stdout.splitlines()[-1], done.stderr
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("start", ["fork", "spawn", "forkserver"])
-def test_workers_grow_shapes_beside_the_loss(start, tmp_path) -> None:
+@pytest.mark.parametrize(
+    ("loop", "start"),
+    [("torch", "fork"), ("torch", "spawn"), ("torch", "forkserver"), ("monai", "fork"), ("lightning", "fork")],
+)
+def test_workers_grow_shapes_beside_the_loss(loop, start, tmp_path) -> None:
     """One worker, and two that persist, two epochs each; the main process keeps its threads."""
     if start not in multiprocessing.get_all_start_methods():
         pytest.skip(f"this platform has no {start}")
-    assert run(TRAINING, tmp_path, start) == "threads 2"
+    pytest.importorskip(loop, reason=f"{loop} is not installed: pip install {loop}")
+    program = tmp_path / "train.py"
+    program.write_text(f"{HEAD}\n{LOOPS[loop]}\nif __name__ == '__main__':\n    main(sys.argv[1])\n")
+    assert run(program, start)[0] == "threads 2"
 
 
 THREADS = """
@@ -88,7 +121,9 @@ print(len(values), len(set(values)), started)
 )
 def test_several_threads_may_call_the_loss(environment, started, tmp_path) -> None:
     """On numba's queue, which serves one caller at a time; and with one thread, where numba starts none."""
-    assert run(THREADS, tmp_path, **environment) == f"15 1 {started}"
+    program = tmp_path / "threads.py"
+    program.write_text(THREADS)
+    assert run(program, **environment)[0] == f"15 1 {started}"
 
 
 FORKED = """
@@ -118,4 +153,33 @@ print(here, there, abs(value / same - 1) < 1e-5)
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this platform has no fork")
 def test_a_forked_process_takes_one_thread(tmp_path) -> None:
     """Whatever torch's number is there; the energies' sums have one order."""
-    assert run(FORKED, tmp_path) == "2 1 True"
+    program = tmp_path / "forked.py"
+    program.write_text(FORKED)
+    assert run(program)[0] == "2 1 True"
+
+
+FIRST = """
+import importlib.util, logging, sys
+if "bare" in sys.argv:
+    find = importlib.util.find_spec
+    importlib.util.find_spec = lambda name, *rest: None if name == "numba" else find(name, *rest)
+import torch
+from curvafit.priors import CurvaturePrior
+
+for _ in range(2):
+    CurvaturePrior("tubes", sigmoid=True)(torch.zeros(1, 1, 8, 8, 8, requires_grad=True)).backward()
+print("done")
+"""
+
+
+@pytest.mark.slow
+def test_what_takes_long_is_logged_once(tmp_path) -> None:
+    """That the kernels are being compiled, where no cache has them; that there are none."""
+    program, cache = tmp_path / "first.py", str(tmp_path / "cache")
+    program.write_text(FIRST)
+    said = [run(program, *bare, NUMBA_CACHE_DIR=cache)[1] for bare in ([], [], ["bare"])]
+    assert [(text.count("compiling"), text.count("numba is not installed")) for text in said] == [
+        (1, 0),
+        (0, 0),
+        (0, 1),
+    ]

@@ -58,7 +58,7 @@ PACKAGE = {
 
 
 def build(target: str, folder: Path) -> Path:
-    pytest.importorskip("hatchling", reason="needs hatchling, of the extra [dev]")
+    pytest.importorskip("hatchling", reason="needs hatchling, of the group dev")
     command = [sys.executable, "-m", "hatchling", "build", "--target", target, "--directory", str(folder)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

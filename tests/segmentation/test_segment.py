@@ -365,7 +365,7 @@ def test_a_mask_is_at_the_probabilities_place() -> None:
 
 
 def test_a_map_is_segmented_in_monai_s_chain() -> None:
-    monai = pytest.importorskip("monai.transforms", reason="needs monai, of the extra [dev]")
+    monai = pytest.importorskip("monai.transforms", reason="needs monai, of the group dev")
     logits = torch.from_numpy(np.log(np.stack((1 - MAP, MAP)) + 1e-6))
     options = {"weight": 3.0, "steps": 5}
     step = monai.Lambda(lambda p: torch.from_numpy(refine(p[1], WILLMORE, **options).mask.values)[None])

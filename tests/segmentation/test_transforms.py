@@ -13,7 +13,7 @@ import torch
 from curvafit.segmentation.reconstruct import reconstruct, reconstruct_labels
 from curvafit.volumes.field import Field
 
-pytest.importorskip("monai", reason="needs monai, of the extra [dev]")
+pytest.importorskip("monai", reason="needs monai, of the group dev")
 
 from monai.data import MetaTensor
 from monai.transforms import Compose, EnsureChannelFirstd, LoadImaged
