@@ -118,7 +118,7 @@ def test_a_solid_has_the_surface_where_it_was(made: Made) -> None:
     ("words", "said"),
     [
         (("none.zarr", "-o", "m.html"), "none"),
-        (("s.zarr", "-o", "m.html"), "5 shapes"),
+        (("s.zarr", "-o", "m.html"), "6 shapes"),
         (("s.zarr", "-o", "m"), ".html"),
         (("s.zarr", "-o", "mine.html"), "overwrite"),
         (("s.zarr", "-o", "s.zarr/m.html"), "input"),
