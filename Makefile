@@ -34,9 +34,10 @@ lint: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# The notebooks run, and become pages with what they show.
+# The notebooks run, and become pages with what they show; with EXECUTE= they become pages without it.
+EXECUTE ?= --execute
 docs: .venv/installed-dev
-	PYTHONWARNINGS=ignore $(BIN)/jupytext --quiet --to ipynb --execute docs/notebooks/*.py
+	PYTHONWARNINGS=ignore $(BIN)/jupytext --quiet --to ipynb $(EXECUTE) docs/notebooks/*.py
 	$(BIN)/jupyter nbconvert --log-level WARN --to markdown docs/notebooks/*.ipynb
 	NO_MKDOCS_2_WARNING=1 PYTHONWARNINGS=ignore $(BIN)/python -m mkdocs build --strict --quiet
 

@@ -445,7 +445,7 @@ def test_a_run_that_is_ended_leaves_whole_files_and_goes_on(tmp_path: Path, line
     changes = int(said.rpartition("changes ")[2])
     assert code == 0 and changes > 9, said
     inputs = {word for word in line.split() if (FOLDER / word).exists()}
-    for number, share in ((signal.SIGINT, 0.1), (signal.SIGKILL, 0.4), (signal.SIGTERM, 0.7), (signal.SIGINT, 0.95)):
+    for number, share in ((signal.SIGINT, 0.1), (signal.SIGKILL, 0.5), (signal.SIGTERM, 0.9)):
         folder = tmp_path / f"{share}"
         code, said = run(folder, line, 1 + int(share * changes), number)
         assert code in (0, -number, 128 + number) and "Traceback" not in said, said
