@@ -208,14 +208,16 @@ class EvidenceProblem(Problem):
 
 
 def _explains(evidence: VolumeEvidence, mask: np.ndarray, tiling: Tiling) -> bool:
-    """Return whether a mask keeps nearly all the evidence for each phase that the first guess has: so it does, unless
+    """Return whether a mask keeps nearly all the evidence for the rarer phase of the first guess: so it does, unless
     thin structures, or pores, got lost, since the energy is lowered together with -log p."""
-    kept, guessed = np.zeros((2, 2))
+    kept, guessed, voxels = np.zeros((3, 2))
     for tile in tiling.tiles:
         found = evidence.of_box(tile.core)
         for sums, inside in ((kept, mask[tile.core] > 0), (guessed, found.level > 0)):
             sums += [found.ratio[inside].sum(dtype=np.float64), -found.ratio[~inside].sum(dtype=np.float64)]
-    return bool((kept >= KEPT * guessed).all() and 0 < mask.mean() < 1)
+        voxels += [np.count_nonzero(found.level > 0), np.count_nonzero(found.level <= 0)]
+    rarer = int(voxels.argmin())
+    return bool(kept[rarer] >= KEPT * guessed[rarer] and 0 < mask.mean() < 1)
 
 
 def _missing_phase(evidence: VolumeEvidence, tiling: Tiling) -> str:
