@@ -142,9 +142,11 @@ def segment(
         evidence = GreyEvidence.of(boxes, threshold, dark, apart=weight is None)
         classes, trial = evidence.classes, trial if weight else replace(trial, strength=USUAL)
         notes = (*notes, *(FAINT,) * (classes.faint and threshold == "otsu"), f"{str(classes).capitalize()}.")
-        if missing := _missing_phase(evidence, tiling):
-            raise ScanError(f"the scan shows no {missing}: every voxel is on one side")
-    found = lower(evidence, trial, tiling, store=store, workers=workers, progress=progress)
+    missing = trial.law is not None and _missing_phase(evidence, tiling)
+    if missing and not probabilities:
+        raise ScanError(f"the scan shows no {missing}: every voxel is on one side")
+    stays = replace(trial, law=None) if missing else trial  # without a surface there is nothing to lower
+    found = lower(evidence, stays, tiling, store=store, workers=workers, progress=progress)
     if not probabilities and weight is None and not _explains(evidence, found.mask, tiling):
         trial, said = replace(trial, law=None), "no prior helps here, the first guess explains the scan better: "
         found = lower(evidence, trial, tiling)
@@ -183,10 +185,9 @@ def check_given(
 
 
 def lower(evidence: VolumeEvidence, trial: Trial, tiling: Tiling, **tools: Any) -> LoweredVolume:
-    """Lower -log p(data | mask) + λ F_ε from the evidence's first guess, the result without law or surface;
-    `trial` has λ, in nats of a unit of F_ε if a20 + a02 = 2."""
-    stays = trial.law is not None and _missing_phase(evidence, tiling)
-    return lower_volume(EvidenceProblem(replace(trial, law=None) if stays else trial, evidence), tiling, **tools)
+    """Lower -log p(data | mask) + λ F_ε from the evidence's first guess, which is the result without a law; `trial` has
+    λ, in nats of a unit of F_ε if a20 + a02 = 2."""
+    return lower_volume(EvidenceProblem(trial, evidence), tiling, **tools)
 
 
 @dataclass(frozen=True, eq=False)
