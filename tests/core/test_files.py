@@ -1,7 +1,5 @@
 """What is written is whole or not there, and takes nobody else's place; a record comes back as it was written."""
 
-from __future__ import annotations
-
 import io
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Nothing of the program that calls is changed: threads, random numbers, precision, warnings, environment, the rest."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

@@ -1,7 +1,5 @@
 """What no such command wrote stays, until --overwrite says otherwise; what is read stays always: for every command."""
 
-from __future__ import annotations
-
 import importlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Signals: exceptions that clean up, that wait while files change, and an exit code that tells of them."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Draws by workers: the same store whoever makes it; killed workers and builds lose their own draw at most."""
 
-from __future__ import annotations
-
 import errno
 import os
 import random

@@ -4,8 +4,6 @@
 python -m tests.golden.inputs
 """
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -11,10 +11,11 @@ import numpy as np
 import torch
 
 from tests.calling import call
-from tests.damage import FORMATS, VALUES
+from tests.damage import FORMATS
 from tests.golden import FOLDER
 from tests.golden.frozen import CLOSE, exact, files, rounded, volume
 
+Row = Callable[[Path], dict[str, Any]]
 #: Commands, as they are typed in a folder with the inputs.
 COMMANDS = {
     "measure-mask": "measure mask.nii.gz -o out.csv",
@@ -72,7 +73,7 @@ def closeness(name: str) -> float:
     return CLOSENESS.get(name, CLOSE)
 
 
-def _run_command(line: str) -> Callable[[Path], dict[str, Any]]:
+def _run_command(line: str) -> Row:
     def run_line(folder: Path) -> dict[str, Any]:
         shutil.copytree(FOLDER, folder, dirs_exist_ok=True)
         before, here = set(folder.rglob("*")), Path.cwd()
@@ -90,33 +91,16 @@ def _run_command(line: str) -> Callable[[Path], dict[str, Any]]:
 # ---- public calls ----------------------------------------------------------------------------------------------------
 
 
-def _read_formats(folder: Path) -> dict[str, Any]:
-    """Every format: values, spacing and unit."""
+def _volumes(folder: Path) -> dict[str, Any]:
+    """Every format that is read, and those that are written, read again: values, type, spacing and unit."""
     import curvafit
 
     for name, write in FORMATS.items():
         write(folder / name)
-    found = {name: _told(curvafit.load(folder / name)) for name in FORMATS}
-    (folder / "bare.raw").write_bytes(VALUES.tobytes())
-    raw = curvafit.load(folder / "bare.raw", raw_shape=VALUES.shape, dtype="u2", spacing=2.0, unit="um")
-    return {**found, "bare.raw": _told(raw)}
-
-
-def _told(field: Any) -> list[Any]:
-    return [exact(field.values), *rounded(field.spacing), field.unit]
-
-
-def _write_formats(folder: Path) -> dict[str, Any]:
-    """Every format that is written, read again: labels, a field; spacing, unit and place."""
-    import curvafit
-
-    scan, found = curvafit.load(FOLDER / "mask.nii.gz"), {}
     for name in ("out.nii.gz", "out.tif", "out.ome.tif", "out.npy", "out.zarr", "out.mrc"):
-        field = curvafit.load(curvafit.save(scan, folder / name))
-        found[name] = [
-            exact(field.values.astype(np.uint8)), field.values.dtype.name, *rounded(field.spacing), field.unit,
-        ]  # fmt: skip
-    return found
+        curvafit.save(FOLDER / "mask.nii.gz", folder / name)
+    fields = {path.name: curvafit.load(path) for path in sorted(folder.iterdir())}
+    return {name: [exact(field.values), *rounded(field.spacing), field.unit] for name, field in fields.items()}
 
 
 def _loss(_: Path) -> dict[str, Any]:
@@ -192,11 +176,5 @@ def _field(name: str) -> np.ndarray:
     return curvafit.load(FOLDER / name).values
 
 
-CALLS = {
-    "load": _read_formats, "save": _write_formats, "loss": _loss, "geometry": _geometry, "flows": _flows,
-    "training": _training,
-}  # fmt: skip
-ROWS: dict[str, Callable[[Path], dict[str, Any]]] = {
-    **{name: _run_command(line) for name, line in COMMANDS.items()},
-    **CALLS,
-}
+CALLS = {"volumes": _volumes, "loss": _loss, "geometry": _geometry, "flows": _flows, "training": _training}
+ROWS: dict[str, Row] = {name: _run_command(line) for name, line in COMMANDS.items()} | CALLS

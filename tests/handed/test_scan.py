@@ -5,7 +5,7 @@ import itertools
 import logging
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,7 @@ def level_set(shape: Sequence[int], width: float, share: float, seed: int = 0) -
     return field > np.quantile(field, 1 - share)
 
 
-def a_region_elsewhere() -> None:
+def test_a_region_elsewhere() -> None:
     """A region that is stored with x reversed has the numbers of the one that is not."""
     mask = np.concatenate([level_set((24, 32, 20), width, 0.3) for width in (1.8, 3.0)], axis=2)
     labels = np.zeros(mask.shape, np.uint8)
@@ -45,7 +45,7 @@ def a_region_elsewhere() -> None:
     assert not any("laid on the scan" in note for note in same.notes)
 
 
-def surfaces_of_parts() -> None:
+def test_surfaces_of_parts() -> None:
     """Parts of 16 voxels and more average to the whole within 1 %, of a texture that does not repeat.
 
     Of 216 windows of 16³ the areas' deviation is .16 of their mean, and neighbours share edges: their mean is the
@@ -82,7 +82,7 @@ def circle(n: int) -> np.ndarray:
     return np.broadcast_to(y**2 + x**2 < (n / 2 - 0.5) ** 2, (n, n, n))
 
 
-def a_padded_scan() -> None:
+def test_a_padded_scan() -> None:
     """What a scanner writes outside of its circle sets no threshold: with the region BV/TV is the mask's.
 
     Smoothing by a voxel takes 5 % of the volume of structures that are 4 voxels thick.
@@ -100,7 +100,7 @@ def a_padded_scan() -> None:
     assert next(note for note in whole.notes if "exactly" in note) in tiled.notes
 
 
-def a_thin_stack() -> None:
+def test_a_thin_stack() -> None:
     z, y, x = np.mgrid[:16, :64, :64]
     rods = ((((y % 32) - 15.5) ** 2 + ((x % 32) - 15.5) ** 2 < 36) & (z >= 0)).astype(np.uint8)
     for count in (3, 5, 8):
@@ -118,7 +118,7 @@ def a_thin_stack() -> None:
         assert tiled["BS/TV"].value == pytest.approx(found["BS/TV"].value, rel=1e-6)
 
 
-def an_empty_mask() -> None:
+def test_an_empty_mask() -> None:
     empty = np.zeros((20, 20, 20))
     for dtype in (bool, np.uint8, np.float32):
         with pytest.raises(ValueError, match="structure in the scan, got none"):
@@ -127,7 +127,7 @@ def an_empty_mask() -> None:
             curvafit.measure((empty + 1).astype(dtype))
 
 
-def labels_without_a_name() -> None:
+def test_labels_without_a_name() -> None:
     """Whole numbers of a few values are labels: their union is measured, and a note says so; kind image splits them."""
     labels = level_set((40, 40, 40), 2.5, 0.3).astype(np.int64)
     labels[20:] *= 3
@@ -141,7 +141,7 @@ def labels_without_a_name() -> None:
     assert curvafit.measure(few).kind == "image"  # of 4 bits, with noise
 
 
-def unknown_keywords() -> None:
+def test_unknown_keywords() -> None:
     for call in (curvafit.measure, curvafit.windows, curvafit.measure_instances, curvafit.infer):
         for scan in (np.eye(3), "none.npy"):
             with pytest.raises(TypeError, match="nonsense"):
@@ -187,28 +187,31 @@ def test_a_background_of_one_value_stays_a_background(scan: np.ndarray) -> None:
     assert any(f"threshold of {level:.4g}" in note for note in found.notes), found.notes
 
 
-def refuse_inputs_before_libraries(folder: Path) -> None:
-    """The command ends before torch is imported."""
-    code = "import sys\nfrom curvafit.cli.app import app\ntry:\n    app(sys.argv[1:])\n"
-    code += "except SystemExit as end:\n    print(end.code, 'torch' in sys.modules)"
-    for words, sentence in (
-        ("measure typo.tif", "no such file: typo.tif"),
-        ("reconstruct typo.h5::a -o a.tif", "no such file: typo.h5"),
-        ("generate --preset tubez -o a.tif", "takes a preset among"),
-        ("synth --presets tubes,spunge --modality confocal -o set", "got 'spunge'"),
-    ):
-        run = subprocess.run([sys.executable, "-c", code, *words.split()], cwd=folder, capture_output=True, text=True)
-        assert run.stdout.split() == ["2", "False"] and sentence in run.stderr, run
+def test_inputs_are_refused_before_libraries(tmp_path: Path) -> None:
+    """The commands end before torch is imported."""
+    code = (
+        "import sys\nfrom curvafit.cli.app import app\nfor line in sys.argv[1:]:\n    try:\n        app(line.split())\n"
+    )
+    code += "    except SystemExit as end:\n        print(end.code, 'torch' in sys.modules)"
+    refusals = {
+        "measure typo.tif": "no such file: typo.tif",
+        "reconstruct typo.h5::a -o a.tif": "no such file: typo.h5",
+        "generate --preset tubez -o a.tif": "takes a preset among",
+        "synth --presets tubes,spunge --modality confocal -o set": "got 'spunge'",
+    }
+    run = subprocess.run([sys.executable, "-c", code, *refusals], cwd=tmp_path, capture_output=True, text=True)
+    assert run.stdout.splitlines() == ["2 False"] * len(refusals), run
+    assert all(sentence in run.stderr for sentence in refusals.values()), run
 
 
-def keep_formulas_out_of_a_spreadsheet(folder: Path) -> None:
+def test_formulas_are_kept_out_of_a_spreadsheet() -> None:
     odd = {"=1+1": "@SUM(A1)", "b": "-x", "c": "+1.5", "d": "-0.5 0.1 -1e-05", "e": -2.5, "f": "-1+cmd|' /C calc'!A0"}
     head, row = csv.reader(format_csv([odd]).splitlines())
     assert head[:2] == ["'=1+1", "b"]
     assert row == ["'@SUM(A1)", "'-x", "+1.5", "-0.5 0.1 -1e-05", "-2.5", "'-1+cmd|' /C calc'!A0"]
 
 
-def show_measures_in_a_notebook(folder: Path) -> None:
+def test_measures_show_in_a_notebook() -> None:
     """A table of all numbers, of each compartment; a data frame with the columns of a file; a figure."""
     phase = np.indices((32, 32, 32)).sum(0) % 16 < 8
     halves = np.ones(phase.shape, np.uint8)
@@ -223,41 +226,11 @@ def show_measures_in_a_notebook(folder: Path) -> None:
         assert tuple(frame)[: len(COLUMNS)] == COLUMNS and len(frame) == columns * len(found.quantities)
 
 
-def log_the_stages_of_an_inference(folder: Path) -> None:
-    records: list[logging.LogRecord] = []
-    logger, handler = logging.getLogger("curvafit"), logging.Handler(logging.INFO)
-    handler.emit = records.append  # type: ignore[method-assign, assignment]
-    logger.addHandler(handler)
-    level = logger.level
-    logger.setLevel(logging.INFO)
-    try:
-        curvafit.infer(np.indices((48, 48, 48)).sum(0) % 16 < 5, fast=True)  # layers are told that they have no law
+def test_the_stages_of_an_inference_are_logged(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO, "curvafit"):
+        curvafit.infer(np.indices((32, 32, 32)).sum(0) % 16 < 5, fast=True)  # layers are told that they have no law
         log = log_stages()
         for share in (0.5, 0.6):
             log(f"shape {share}", share)
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(level)
-    said = [record.getMessage() for record in records]
+    said = [record.getMessage() for record in caplog.records if record.name == "curvafit"]
     assert said == ["reading the scan (0 % done)", "measuring curvature (5 % done)", "shape 0.5 (50 % done)"]
-
-
-CASES: dict[str, Callable[[Path], None]] = {
-    "eng-12-missing-inputs": refuse_inputs_before_libraries,
-    "eng-12-formulas": keep_formulas_out_of_a_spreadsheet,
-    "eng-12-measures": show_measures_in_a_notebook,
-    "infer-is-silent": log_the_stages_of_an_inference,
-}
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_handed(case, tmp_path):
-    CASES[case](tmp_path)
-
-
-SCANS = (a_region_elsewhere, surfaces_of_parts, a_padded_scan, a_thin_stack, an_empty_mask, labels_without_a_name)
-
-
-@pytest.mark.parametrize("case", [*SCANS, unknown_keywords])
-def test_a_scan(case):
-    case()

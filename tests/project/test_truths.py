@@ -1,13 +1,10 @@
 """No truth test goes without notice: each that `tests/truths.txt` lists is there, and each that was listed still stands
 in it, behind the name that it has now or among what is gone."""
 
-import ast
 import re
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
 #: Names of tests in the list, old names and those of what is gone too.
 NAMES = 1142
 
@@ -17,8 +14,7 @@ def test_every_truth_test_is_there() -> None:
     missing, there = [], set()
     for line in text.splitlines():
         if line.startswith("tests/"):
-            tree = ast.parse((ROOT / line).read_text(encoding="utf-8"))
-            there = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+            there = set(re.findall(r"^def (test_\w+)", (ROOT / line).read_text(encoding="utf-8"), re.MULTILINE))
         elif line.startswith("    "):
             missing += [] if line.split()[0] in there else [line]
     assert missing == []

@@ -1,7 +1,5 @@
 """From scan to working grid: the right phase, size and place; a scan's blur and noise, and shapes as it shows them."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

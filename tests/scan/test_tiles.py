@@ -1,7 +1,5 @@
 """A scan in tiles has the numbers of the scan in one piece, whatever the tiles; a killed run goes on."""
 
-from __future__ import annotations
-
 import csv
 import math
 from pathlib import Path

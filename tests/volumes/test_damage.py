@@ -1,7 +1,5 @@
 """Damage is never read as data: checksums, sizes and headers of volume files are taken at their word."""
 
-from __future__ import annotations
-
 import gzip
 import os
 import random

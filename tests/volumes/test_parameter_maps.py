@@ -1,7 +1,5 @@
 """Parameters that vary in space, from files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

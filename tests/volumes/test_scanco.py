@@ -1,7 +1,5 @@
 """Scanco's files, written here by their layout: values and place come back."""
 
-from __future__ import annotations
-
 import struct
 from contextlib import suppress
 from pathlib import Path

@@ -1,9 +1,8 @@
 """Zarr: OME-NGFF level by level, chunks that are not stored, and labels on the voxels of an image."""
 
-from __future__ import annotations
-
 import json
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +27,7 @@ def content(path: Path, version: str) -> dict[str, Any]:
 
 def multiscale(path: Path) -> dict:
     """The one image of a group of OME-NGFF 0.5."""
-    ome, written = content(path, "0.5"), json.loads((path / "zarr.json").read_text())
-    assert (written["zarr_format"], written["node_type"]) == (3, "group")
+    ome = content(path, "0.5")
     assert ome["version"] == "0.5" and len(ome["multiscales"]) == 1
     return ome["multiscales"][0]
 
@@ -82,10 +80,8 @@ def test_groups_and_scales_are_read(tmp_path: Path) -> None:
     group = zarr.create_group(tmp_path / "scan.zarr")
     for path, size in (("0", 8), ("1", 4)):
         group.create_array(path, data=np.arange(size**3, dtype=np.uint16).reshape(1, size, size, size))
-    levels = [
-        {"path": path, "coordinateTransformations": [{"type": "scale", "scale": [1.0, 4 * f, 2 * f, f]}]}
-        for path, f in (("0", 0.5), ("1", 1.0))
-    ]
+    scales = [{"type": "scale", "scale": [1.0, 4 * f, 2 * f, f]} for f in (0.5, 1.0)]
+    levels = [{"path": str(k), "coordinateTransformations": [scale]} for k, scale in enumerate(scales)]
     axes = [{"name": n, "type": "space", "unit": "micrometer"} for n in "czyx"]
     group.attrs["ome"] = {"multiscales": [{"axes": axes, "datasets": levels}]}
     field = load(tmp_path / "scan.zarr")
@@ -158,10 +154,8 @@ def image(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, str]:
     axes += [{"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"]
     all_levels = [{"type": "scale", "scale": [1, 1, 2, 2, 2]}, {"type": "translation", "translation": [0, 0, 3, 2, 1]}]
     scales = {"axes": axes, "datasets": levels, "coordinateTransformations": all_levels}
-    named = (
-        {"multiscales": [scales | {"version": "0.4"}]} if old else {"ome": {"version": "0.5", "multiscales": [scales]}}
-    )
-    group.attrs.update(named)
+    named = {"version": request.param, "multiscales": [scales | ({"version": "0.4"} if old else {})]}
+    group.attrs.update(named if old else {"ome": named})
     return path, request.param
 
 
@@ -176,9 +170,8 @@ def test_steps_of_all_levels_place_each(image: tuple[Path, str]) -> None:
     assert (field.shape, field.spacing, field.unit) == (SHAPE, SPACING, "um")
     assert field.affine is not None and field.affine[:3, 3].tolist() == [1, 2, 3]
     coarse = load(f"{image[0]}::1", channel=1)
-    assert (
-        coarse.spacing == (1.0, 0.5, 0.5) and coarse.affine is not None and coarse.affine[:3, 3].tolist() == [1, 2, 3]
-    )
+    assert coarse.spacing == (1.0, 0.5, 0.5)
+    assert coarse.affine is not None and coarse.affine[:3, 3].tolist() == [1, 2, 3]
 
 
 def test_labels_lie_on_the_image_and_are_listed(image: tuple[Path, str]) -> None:
@@ -221,28 +214,24 @@ def test_labels_are_replaced_by_what_wrote_them_alone_and_a_consolidated_store_s
 @pytest.mark.parametrize(
     ("change", "name", "words"),
     [
-        ({"spacing": (0.5, 0.25, 0.2)}, "tube", "voxels of a level"),
-        ({"unit": "mm"}, "tube", "voxels of a level"),
-        ({"affine": None}, "tube", "voxels of a level"),  # it begins before the image does
+        *(({name: value}, "tube", "voxels of a level")  # without a place it begins before the image does
+          for name, value in (("spacing", (0.5, 0.25, 0.2)), ("unit", "mm"), ("affine", None))),
         ({"values": np.ones(SHAPE, np.float32)}, "tube", "whole numbers"),
         ({}, ".tube", "name of labels"),
     ],
-)
+)  # fmt: skip
 def test_other_voxels_are_refused(image: tuple[Path, str], change: dict[str, Any], name: str, words: str) -> None:
     path, field = image[0], load(image[0], channel=1)
     before = tree(path)
-    told = {"values": field.values, "spacing": field.spacing, "unit": field.unit, "affine": field.affine} | change
     with pytest.raises(ScanError, match=words):
-        save(Field(**told), path / "labels" / name)
+        save(replace(field, **change), path / "labels" / name)
     assert tree(path) == before
 
 
 def test_an_image_of_another_version_or_none_is_refused(tmp_path: Path) -> None:
     group, mask = zarr.open_group(tmp_path / "scan.zarr", mode="w"), Field(np.indices((4, 4, 4))[0] > 1)
-    for attributes, words in (
-        ({}, "no image of OME-Zarr"),
-        ({"version": "0.6", "multiscales": [{}]}, r"OME-Zarr 0\.6"),
-    ):
+    newer = {"version": "0.6", "multiscales": [{}]}
+    for attributes, words in (({}, "no image of OME-Zarr"), (newer, r"OME-Zarr 0\.6")):
         group.attrs["ome"] = attributes
         with pytest.raises(ScanError, match=words):
             save(mask, tmp_path / "scan.zarr/labels/a")
