@@ -2,10 +2,11 @@
 
 import importlib
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from calling import QUICK, call, made, refused
+from calling import QUICK, call, done, made, refused
 from disk import tree
 from exact_store import exact_store
 from found import made_inference
@@ -65,21 +66,20 @@ def test_a_command_replaces_its_own_output_alone(command: str, scan: Path, tmp_p
     assert tree(tmp_path) == before
     (tmp_path / "new.zarr").mkdir()
     for name in ("new.zarr", "new.zarr", "own.npy", "own.npy"):
-        result = call(*words, tmp_path / name)
-        assert result.exit_code == 0, result.output
+        done(*words, tmp_path / name)
     refused(call(*other, tmp_path / "own.npy"), TAKEN)
     (tmp_path / "new.zarr" / "notes.txt").write_text("mine")
     before = tree(tmp_path)
     refused(call(*words, tmp_path / "new.zarr"), TAKEN)
     assert tree(tmp_path) == before
-    assert call(*words, tmp_path / "new.zarr", "--overwrite").exit_code == 0
+    done(*words, tmp_path / "new.zarr", "--overwrite")
     assert load(tmp_path / "new.zarr").shape == (12, 12, 12)
     assert not (tmp_path / "new.zarr" / "notes.txt").exists()
 
 
 def test_a_record_speaks_for_its_own_files_alone(tmp_path: Path) -> None:
     """A shape beside a scan of the same stem does not make the scan replaceable."""
-    quick = [*QUICK, "--shape", 12, "--steps", 4]
+    quick = commands(tmp_path)["generate"][1:]
     made(*quick, "-o", tmp_path / "a.tif")
     (tmp_path / "a.nii.gz").write_text("mine")
     refused(call("generate", *quick, "-o", tmp_path / "a.nii.gz"), TAKEN)
@@ -104,13 +104,12 @@ def test_infer_leaves_other_peoples_files(tmp_path: Path, monkeypatch: pytest.Mo
         with pytest.raises(ValueError, match=TAKEN):
             write_inference(made_inference(), folder)
         assert tree(folder) == before
-        assert call(*told, "-o", folder, "--overwrite").exit_code == 0
-        assert call(*told, "-o", folder).exit_code == 0
+        done(*told, "-o", folder, "--overwrite")
+        done(*told, "-o", folder)
         assert sorted(tree(folder)) == sorted([*FILES, "thesis.txt"])
         (folder / "report.html").write_text("mine")  # beside a fit.json that was copied there
         refused(call(*told, "-o", folder), TAKEN)
-        again = ["infer", folder / "regenerated.nii.gz", "-o", folder, "--overwrite"]
-        refused(call(*again), "input")
+        refused(call("infer", folder / "regenerated.nii.gz", "-o", folder, "--overwrite"), "input")
 
 
 def test_atlases_leave_other_peoples_files(tmp_path: Path) -> None:
@@ -122,27 +121,18 @@ def test_atlases_leave_other_peoples_files(tmp_path: Path) -> None:
     refused(call("atlas", "extract", store, "-o", tmp_path / "atlas.npz"), TAKEN)
     assert before.items() <= tree(tmp_path).items()
     for _ in range(2):
-        assert call("atlas", "extract", store, "-o", tmp_path / "new.npz").exit_code == 0
+        done("atlas", "extract", store, "-o", tmp_path / "new.npz")
 
 
-def test_a_store_may_begin_in_an_empty_folder(tmp_path: Path) -> None:
+def test_a_store_may_begin_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And records the number of steps that was asked for."""
+    monkeypatch.setattr("curvafit.data_synth.atlas.build", build := Mock())
     (tmp_path / "s.zarr").mkdir()
-    told = ["atlas", "build", tmp_path / "s.zarr", "--count", 1, "--shape", 12, "--around", "sponge", "--workers", 0]
-    monkey = pytest.MonkeyPatch()
-    with monkey.context() as patch:
-        patch.setattr("curvafit.data_synth.atlas.build", lambda *_, **__: None)
-        assert call(*told).exit_code == 0
-    assert open_store(tmp_path / "s.zarr").indices() == []
-
-
-def test_a_store_records_the_number_of_steps_that_was_asked_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    plans = []
-    monkeypatch.setattr("curvafit.data_synth.atlas.build", lambda *settings, **_: plans.append(settings[4]))
     told = ["atlas", "build", tmp_path / "s.zarr", "--count", 1, "--shape", 12, "--workers", 0, "--schedule", "paper"]
-    assert call(*told, "--steps", 700).exit_code == 0
-    assert [(plan.name, plan.steps) for plan in plans] == [("paper", 700)]
+    done(*told, "--steps", 700)
+    assert open_store(tmp_path / "s.zarr").indices() == []
+    plan = build.call_args.args[4]
+    assert (plan.name, plan.steps) == ("paper", 700)
 
 
 def test_a_sample_is_copied_over_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,6 +145,6 @@ def test_a_sample_is_copied_over_nothing_else(tmp_path: Path, monkeypatch: pytes
     result = call(*told, tmp_path / "mine.nii.gz")
     assert result.exit_code == 2 and TAKEN in result.stderr and (tmp_path / "mine.nii.gz").read_text() == "mine"
     for _ in range(2):
-        assert call(*told, tmp_path / "new.nii.gz").exit_code == 0
-    assert call(*told, tmp_path / "mine.nii.gz", "--overwrite").exit_code == 0
+        done(*told, tmp_path / "new.nii.gz")
+    done(*told, tmp_path / "mine.nii.gz", "--overwrite")
     assert (tmp_path / "mine.nii.gz").read_text() == "a sample"

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -54,9 +55,7 @@ def test_a_signal_is_an_exception(number: int, where: str, listening: None, capf
 
 
 @signals
-def test_it_waits_until_files_are_moved(
-    number: int, listening: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_waits_until_files_are_moved(number: int, listening: None, tmp_path: Path, monkeypatch) -> None:
     real = os.replace
 
     def disturbed(source: Path, target: Path) -> None:
@@ -79,8 +78,6 @@ def test_nested_blocks_end_with_the_outermost(listening: None) -> None:
             reached.append("inner")
         reached.append("outer")
     assert reached == ["inner", "outer"]
-    with hold_signals():
-        pass
 
 
 def test_what_is_ignored_stays_ignored(listening: None) -> None:
@@ -92,22 +89,19 @@ def test_what_is_ignored_stays_ignored(listening: None) -> None:
 
 def test_other_threads_are_let_alone() -> None:
     """They get no signals; their changes hold none back."""
-    inside, done = threading.Event(), threading.Event()
+    both = threading.Barrier(2, timeout=5)
 
     def work() -> None:
         with hold_signals():
-            inside.set()
-            done.wait(5)
+            both.wait()
+            both.wait()
 
-    thread = threading.Thread(target=work)
-    thread.start()
-    inside.wait(5)
-    try:
+    with ThreadPoolExecutor(1) as other:
+        other.submit(work)
+        both.wait()
         with pytest.raises(KeyboardInterrupt), hold_signals():
             raise KeyboardInterrupt
-    finally:
-        done.set()
-        thread.join()
+        both.wait()
 
 
 @pytest.mark.slow

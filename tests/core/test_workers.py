@@ -97,11 +97,10 @@ def test_a_build_killed_at_random_goes_on_to_the_same_store(tmp_path, serial):
 @pytest.mark.parametrize(
     ("options", "kind", "word"),
     [
-        ({"scheduler": "tcp://127.0.0.1:9"}, OSError, "tcp://127.0.0.1:9"),
-        ({"count": -1}, ValueError, "workers"),
+        ({"scheduler": "tcp://127.0.0.1:9"}, OSError, "tcp://127.0.0.1:9"), ({"count": -1}, ValueError, "workers"),
         ({"count": 2, "dask": None}, ImportError, "pip install"),
     ],
-)
+)  # fmt: skip
 def test_a_scheduler_that_is_not_there_and_too_few_workers_are_one_sentence(monkeypatch, options, kind, word):
     monkeypatch.setattr("curvafit.core.workers.PATIENCE", 1)
     if "dask" in options:
@@ -128,12 +127,9 @@ def test_a_barren_design_ends(tmp_path, monkeypatch):
 
 
 def test_a_full_disk_is_named_and_what_is_made_is_kept(tmp_path, serial, monkeypatch):
-    def full(partial, place):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
     store = build(tmp_path / "s.zarr", 2, EDGE, 1, PLAN)
     with monkeypatch.context() as patch, pytest.raises(OSError, match="s.zarr"):
-        patch.setattr(storing, "_publish", full)
+        patch.setattr(storing, "_publish", MagicMock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))))
         build(store.path, COUNT, EDGE, 1, PLAN)
     assert verify(store.path).problems == () and not list((store.path / "draws").glob(".*"))
     assert_same(build(store.path, COUNT, EDGE, 1, PLAN), serial)

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,19 +9,12 @@ from exact import Sphere, centres
 from exact_store import CROP as SHAPE
 from exact_store import flat_recipe
 
-from curvafit.data_synth.case import Case, Composition, Recipe, shell_of
+from curvafit.data_synth import sources
+from curvafit.data_synth.case import Composition, Recipe, shell_of
 from curvafit.data_synth.imaging.effects import occupancy
 from curvafit.data_synth.imaging.image import share_voxels
 from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality
-from curvafit.data_synth.sources import (
-    SYMMETRIES,
-    Generated,
-    PhaseField,
-    apply_symmetry,
-    crop_periodic,
-    decode_source,
-    random_crop,
-)
+from curvafit.data_synth.sources import SYMMETRIES, Generated, PhaseField, apply_symmetry, crop_periodic, random_crop
 from curvafit.generation import loop as steering
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
@@ -62,7 +54,7 @@ def test_shapes_fill_the_share_that_is_asked_for(monkeypatch):
     made = source.shape((20, 20, 20), 0, np.random.default_rng(0))
     assert (made.values > 0).mean() == 0.15 and made.origin["parameters"]["mass"] != -0.5
     assert "after 1500 steps" in made.origin["status"] and "volume fraction" not in made.origin["status"]
-    assert decode_source(source.as_dict()) == source
+    assert sources.decode_source(source.as_dict()) == source
     monkeypatch.setattr(steering, "FRACTION_LAST", -1.0)
     missed = source.shape((20, 20, 20), 0, np.random.default_rng(0))
     assert f"volume fraction {(missed.values > 0).mean():.4f} instead of 0.1500" in missed.origin["status"]
@@ -98,10 +90,9 @@ def test_structures_of_many_calibres(recipe):
     voxels = [case.record["voxel"] for case in cases]
     assert len(set(voxels)) == 4 and min(voxels) >= 0.5 and max(voxels) <= 1.0
     assert [case.epsilon for case in cases] == pytest.approx([2 * voxel for voxel in voxels])
-    thick = replace(recipe, calibres=(1.0, 2.0))
     assert Recipe.from_dict(json.loads(json.dumps(thick.as_dict()))) == thick
     kept = recipe.source.as_dict()
-    assert decode_source(kept) == recipe.source and kept["draws"] > 0
+    assert sources.decode_source(kept) == recipe.source and kept["draws"] > 0
 
 
 VALUES = np.random.default_rng(0).random((3, 4, 5))
@@ -135,21 +126,6 @@ N, EPSILON = 48, 2.0
 GRID = Grid((N, N, N), (1.0, 1.0, 1.0))
 MIDDLE = (N / 2, N / 2, N / 2)
 CLEAR = Modality("clear", "for tests", 1.0, Imaging(contrast=Contrast(10.0, 110.0)))
-LAWS = Generated.of(["tubes", "sponge"])
-
-
-def recipe_of(source: Generated, **options: Any) -> Recipe:
-    return Recipe(source, CLEAR, (16, 16, 16), 1.0, composition=Composition(**options))
-
-
-@pytest.fixture(scope="module")
-def shell(recipe: Recipe) -> Recipe:
-    return replace(recipe, composition=Composition(wall=0.8))
-
-
-@pytest.fixture(scope="module")
-def two() -> Case:
-    return recipe_of(LAWS, classes=True, levels=(1, 0.4)).case(0)
 
 
 @pytest.mark.parametrize("thickness", [4.0, 6.5])
@@ -172,7 +148,8 @@ def test_wall_and_lumen_fill_the_shape_without_a_gap():
     assert float(shares[1][whole < 1].max()) == 0  # no light of the lumen at the outer surface
 
 
-def test_a_shell_has_a_bright_wall_and_a_dark_lumen(recipe, shell):
+def test_a_shell_has_a_bright_wall_and_a_dark_lumen(recipe):
+    shell = replace(recipe, composition=Composition(wall=0.8))
     case, whole = shell.case(2), recipe.case(2)
     assert shell.classes == ("wall", "lumen") and case.labels.dtype == np.uint8
     assert ((case.labels > 0) == (case.field > 0)).all() and set(np.unique(case.labels)) == {0, 1, 2}
@@ -189,9 +166,15 @@ def test_a_shell_has_a_bright_wall_and_a_dark_lumen(recipe, shell):
     assert counts[1][0] > counts[0][0] and counts[1][1] > 0.5 * counts[0][1]
 
 
-def test_classes_are_a_shape_of_each_law_the_first_in_front(two):
+def test_classes_are_a_shape_of_each_law_the_first_in_front():
+    two, alone = (
+        Recipe(Generated.of(laws), CLEAR, (16, 16, 16), 1.0, composition=composition).case(0)
+        for laws, composition in (
+            (["tubes", "sponge"], Composition(classes=True, levels=(1, 0.4))),
+            (["tubes"], Composition()),
+        )
+    )
     assert [origin["name"] for origin in two.record["source"]] == ["tubes", "sponge"]
-    alone = recipe_of(Generated.of(["tubes"])).case(0)
     assert ((two.labels == 1) == (alone.labels == 1)).all()  # no part of the first is hidden
     assert [np.median(two.image[two.labels == k]) for k in range(3)] == pytest.approx([10, 110, 50])
     assert Composition(classes=True).names(Generated.of(["tubes", "tubes"])) == ("tubes 1", "tubes 2")

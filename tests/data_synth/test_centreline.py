@@ -50,23 +50,14 @@ def cycle_rank(graph: nx.MultiGraph) -> int:
     return edges + sum(graph.nodes[node]["rings"] for node in graph)
 
 
-def half(box: Grid) -> np.ndarray:
-    """From the box's corner, where `centres` counts from, to the first voxel's centre, where graphs do."""
-    return np.array(box.spacing) / 2
-
-
+BRANCHES = Tubes(4.0, tuple(np.array([Y[0], end]) for end in Y[1:]))
 TUBE = np.array([(14.2, 10.0, 8.0), (34.0, 38.0, 40.0)])
 #: Shapes, the kinds of their nodes, their cycles, and their length.
 SHAPES: dict[str, tuple[Any, dict[str, int], int, float]] = {
     "tube": (Tubes(4.0, (TUBE,)), {"end": 2}, 0, math.dist(*TUBE)),
     "helix": (Tubes(3.0, (SPIRAL,)), {"end": 2}, 0, 2 * math.hypot(2 * math.pi * 11, 15)),
     "torus": (Torus(14.0, 4.0, MIDDLE), {"loop": 1}, 1, 2 * math.pi * 14),
-    "junction": (
-        Tubes(4.0, tuple(np.array([Y[0], end]) for end in Y[1:])),
-        {"end": 3, "junction": 1},
-        0,
-        sum(math.dist(Y[0], end) for end in Y[1:]),
-    ),
+    "junction": (BRANCHES, {"end": 3, "junction": 1}, 0, sum(math.dist(Y[0], end) for end in Y[1:])),
     "ball": (Sphere(9.0, MIDDLE), {"point": 1}, 0, 0.0),
 }
 
@@ -90,7 +81,8 @@ def test_nodes_lengths_radii_and_places(name: str, spacing: tuple[float, float, 
         middle = slice(4, -4) if name != "torus" else slice(None)
         assert abs(of["radius"] - radius) < 0.2 * max(spacing)
         assert np.abs(radii[middle] - radius).max() < 0.4 * max(spacing)
-        off = shape.distance(torch.from_numpy(points + half(box))).numpy()
+        # `centres` counts from the box's corner, graphs from the first voxel's centre
+        off = shape.distance(torch.from_numpy(points + np.array(spacing) / 2)).numpy()
         assert (radius - off)[middle].max() < 0.5 * max(spacing)
 
 

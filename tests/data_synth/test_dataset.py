@@ -1,7 +1,6 @@
 """Pairs on the fly: by number alone, shared out, none twice; and a pool of shapes that are each grown once."""
 
 import dataclasses
-import hashlib
 import json
 import multiprocessing
 import os
@@ -20,12 +19,12 @@ import pytest
 import torch
 from exact_store import exact_field, exact_record, exact_store
 from found import made_fit
-from pool_run import SHAPES, balls
+from pool_run import SHAPES, balls, brief
 from torch.utils.data import DataLoader
 
 from curvafit.data_synth import dataset as training
 from curvafit.data_synth import sources
-from curvafit.data_synth.dataset import Sample, TextureDataset, as_dict, as_monai
+from curvafit.data_synth.dataset import TextureDataset, as_dict, as_monai
 from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality, Noise, Optics
 from curvafit.data_synth.sources import apply_symmetry, choose_voxel, crop_periodic
 from curvafit.data_synth.store import open_store
@@ -40,11 +39,6 @@ SHAPE = (12, 16, 20)
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return exact_store(tmp_path_factory.mktemp("shapes") / "s.zarr", 8).path
-
-
-def told(sample: Sample) -> str:
-    """Its number and the sum of its voxels' bytes."""
-    return f"{sample.record['number']} {hashlib.sha256(sample.image.numpy().tobytes()).hexdigest()}"
 
 
 def numbers(samples: Iterable[str]) -> list[int]:
@@ -66,12 +60,12 @@ def test_a_pair_is_a_crop_of_a_shape_and_its_image(store):
 
 def test_samples_depend_on_seed_and_number_alone(store):
     """Workers share an epoch and see the next: one process here; the pool's tests have workers that stay."""
-    first = [told(TextureDataset(store, QUIET, SHAPE, seed=1)[k]) for k in (0, 1, 7)]
-    again = TextureDataset(store, QUIET, SHAPE, seed=1, length=3, transform=told)
+    first = [brief(TextureDataset(store, QUIET, SHAPE, seed=1)[k]) for k in (0, 1, 7)]
+    again = TextureDataset(store, QUIET, SHAPE, seed=1, length=3, transform=brief)
     assert [again[k] for k in (0, 1, 7)] == first
     assert len({each.split()[1] for each in first}) == 3
-    assert told(TextureDataset(store, QUIET, SHAPE, seed=2)[0]) != first[0]
-    dataset = TextureDataset(store, QUIET, SHAPE, length=5, transform=told)
+    assert brief(TextureDataset(store, QUIET, SHAPE, seed=2)[0]) != first[0]
+    dataset = TextureDataset(store, QUIET, SHAPE, length=5, transform=brief)
     loader = DataLoader(dataset, batch_size=None)
     assert sorted(loader) == sorted(dataset[k] for k in range(5))
     dataset.set_epoch(3)
@@ -86,7 +80,7 @@ def test_ranks_share_an_epoch_evenly(store, monkeypatch):
         for name, value in answers.items():
             monkeypatch.setattr(torch.distributed, name, lambda value=value: value, raising=False)
 
-    dataset, seen = TextureDataset(store, QUIET, SHAPE, length=7, transform=told), []
+    dataset, seen = TextureDataset(store, QUIET, SHAPE, length=7, transform=brief), []
     for rank in range(3):
         join(rank, 3)
         found = numbers(dataset)

@@ -41,9 +41,8 @@ def test_parameters_and_noise_seeds_are_uncorrelated():
     rows = np.array([[*list(c)[1:], m, s] for c, m, s in draws])
     off_diagonal = np.corrcoef(rows.T) - np.eye(7)
     assert np.abs(off_diagonal).max() < 4.5 / np.sqrt(2000)  # 21 pairs of null correlations, sd 1/√n each
-    values = (table(design_box("sobol"), 256)[:, 1:] - [low for low, _ in INTERVALS.values()]) / [
-        high - low for low, high in INTERVALS.values()
-    ]
+    low, high = np.array([*INTERVALS.values()]).T
+    values = (table(design_box("sobol"), 256)[:, 1:] - low) / (high - low)
     for column in values.T:  # one point in every 256th part of every interval: a (0, m, s)-net seen from one side
         assert sorted(np.floor(256 * column).astype(int)) == list(range(256))
     assert not np.array_equal(table(design_box("sobol"), 4), table(design_box("sobol"), 4, seed=1))
@@ -62,12 +61,8 @@ def table(design: Design, count: int, seed: int = 0) -> np.ndarray:
 def test_a_draw_of_any_design_depends_on_seed_and_index_alone():
     many = [design_box().draw(0, index) for index in range(20)]
     assert len({tuple(draw.coefficients) for draw in many}) == 20 and many[17] != design_box().draw(4, 17)
-    for design in (
-        design_box(),
-        design_box("sobol"),
-        design_around(table(design_box(), 1)[0], 0.1),
-        Design("list", points=((1.0,) * 6 + (0.0,),)),
-    ):
+    listed, near = Design("list", points=((1.0,) * 6 + (0.0,),)), design_around(table(design_box(), 1)[0], 0.1)
+    for design in (design_box(), design_box("sobol"), near, listed):
         assert design.draw(3, 17) == design.draw(3, 17)
         assert Design.from_dict(design.as_dict()) == design
         assert len({design.draw(0, index).seed for index in range(20)}) == 20
@@ -92,14 +87,15 @@ def test_a_box_in_yaml_changes_some_intervals_and_fixes_others(tmp_path, text, d
 
 def test_surroundings_hold_their_point_and_have_the_asked_for_width(tmp_path):
     tubes = preset("tubes")
-    found = table(read_design(written(tmp_path, "around: tubes\nspread: 0.2\n")), 300)
-    for column, centre, (low, high) in zip(
-        found[:, 1:].T, [*tubes.coefficients, tubes.mass][1:], INTERVALS.values(), strict=True
-    ):
+    found, centres = (
+        table(read_design(written(tmp_path, "around: tubes\nspread: 0.2\n")), 300),
+        [*tubes.coefficients, tubes.mass],
+    )
+    for column, centre, (low, high) in zip(found[:, 1:].T, centres[1:], INTERVALS.values(), strict=True):
         assert column.min() < centre < column.max()
         assert np.ptp(column) == pytest.approx(0.2 * (high - low), rel=0.05)
     scaled = design_around([2 * value for value in tubes.coefficients] + [tubes.mass], 0.2)
-    np.testing.assert_allclose(table(scaled, 5), table(design_around([*tubes.coefficients, tubes.mass], 0.2), 5))
+    np.testing.assert_allclose(table(scaled, 5), table(design_around(centres, 0.2), 5))
 
 
 def test_a_list_comes_in_turn_with_other_noise(tmp_path):

@@ -7,24 +7,12 @@ import pytest
 from calling import call, refused
 from exact import Gyroid, centres
 from exact_store import exact_record, exact_store
-from scipy import ndimage
 
 from curvafit.core.workers import cluster
 from curvafit.data_synth.extract import describe
 from curvafit.geometry.descriptors import BLOCKS, descriptors
-from curvafit.inference.table import (
-    BLUR,
-    PARAMETERS,
-    SNR,
-    VIEWS,
-    Table,
-    column_names,
-    law_of,
-    load_table,
-    parameters_of,
-    save_table,
-    see_field,
-)
+from curvafit.inference import table as tables
+from curvafit.inference.table import VIEWS, Table, column_names, law_of, load_table, parameters_of, save_table
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import preset
@@ -69,15 +57,12 @@ def test_a_view_depends_on_its_generator_alone(name: str) -> None:
 
 
 def test_a_scan_is_blurred_and_noisy() -> None:
-    """Half of what Otsu gets wrong lies at the surface, as blur and slices of two voxels do it."""
-    assert BLUR > 0
-    assert SNR > 0
-    u, _ = gyroid()
-    scan = VIEWS["scan"](u, np.random.default_rng(1)).scan
-    assert scan.spacing == (2.0, 1.0, 1.0)
-    near = ndimage.gaussian_filter((u > 0).astype(np.float32), BLUR).reshape(24, 2, 48, 48).mean(1)
-    rolled = max(np.corrcoef(np.roll(near, shift, 0).ravel(), scan.values.ravel())[0, 1] for shift in range(24))
-    assert rolled < 1
+    """As its grey levels show; slices are two voxels thick."""
+    seen = VIEWS["scan"](gyroid()[0], np.random.default_rng(1))
+    quality = prepare(seen.scan, kind=seen.kind, one_scale=True).quality
+    assert seen.scan.spacing == (2.0, 1.0, 1.0) and quality is not None
+    assert quality.blur == pytest.approx(tables.BLUR, abs=0.5)
+    assert quality.noise == pytest.approx(1 / tables.SNR, rel=0.05)
 
 
 def test_what_is_pooled_is_as_if_one_scan_had_shown_it() -> None:
@@ -97,13 +82,11 @@ def test_a_table_has_each_view_of_each_shape(tmp_path: Path) -> None:
     store = exact_store(tmp_path / "store.zarr", 8)
     table = describe([store.path], tmp_path / "table.npz", FAST)
     viable = [index for index in range(8) if index % 7 != 2]
-    assert sorted(zip(table.shapes, table.views, strict=True)) == [
-        (f"store/{index:06d}", view) for index in viable for view in FAST
-    ]
+    rows = [(f"store/{index:06d}", view) for index in viable for view in FAST]
+    assert sorted(zip(table.shapes, table.views, strict=True)) == rows
     assert table.descriptors.shape == (2 * len(viable), len(column_names()))
-    for shape, view, parameters, row in zip(
-        table.shapes, table.views, table.parameters, table.descriptors, strict=True
-    ):
+    columns = (table.shapes, table.views, table.parameters, table.descriptors)
+    for shape, view, parameters, row in zip(*columns, strict=True):
         index = int(shape[-6:])
         record, u = exact_record(index), store.field(index)
         assert np.array_equal(parameters, parameters_of(record.coefficients, record.mass))
@@ -122,7 +105,7 @@ def test_a_stopped_table_goes_on_and_grows(tmp_path: Path, monkeypatch: pytest.M
         measured.append(1)
         if len(measured) == 2:
             raise KeyboardInterrupt
-        return see_field(u, rng)
+        return tables.see_field(u, rng)
 
     with monkeypatch.context() as patch:
         patch.setitem(VIEWS, "field", stops)
@@ -164,7 +147,7 @@ def test_parameters_are_those_of_the_law_in_its_gauge() -> None:
     law, mass = preset("trabec").coefficients, -0.5
     assert law.a20 != 1
     parameters = parameters_of(law, mass)
-    assert len(parameters) == len(PARAMETERS)
+    assert len(parameters) == len(tables.PARAMETERS)
     assert parameters_of(law.scale(3.0), mass) == pytest.approx(parameters)
     back, m = law_of(parameters)
     assert list(back) == pytest.approx(list(law.scale(1 / law.a20)))
@@ -186,17 +169,9 @@ def small_table(rows: int = 3) -> Table:
 
 def test_damaged_tables_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "table.npz"
-    with pytest.raises(FileNotFoundError, match="table"):
+    np.savez(path, descriptors=np.ones(3))
+    with pytest.raises(ValueError, match="table"):
         load_table(path)
-    save_table(small_table(), path)
-    content = path.read_bytes()
-    for damage in (
-        lambda: path.write_bytes(content[: len(content) // 2]),
-        lambda: np.savez(path, descriptors=np.ones(3)),
-    ):
-        damage()
-        with pytest.raises(ValueError, match="table"):
-            load_table(path)
     save_table(small_table(), path)
     monkeypatch.setitem(BLOCKS, "another", 2)
     with pytest.raises(ValueError, match="blocks"):
@@ -219,13 +194,11 @@ def test_the_command_refuses_in_one_sentence(tmp_path: Path, monkeypatch: pytest
 
 
 def test_another_store_of_the_same_name_is_not_taken_for_the_first(tmp_path: Path) -> None:
-    (tmp_path / "a").mkdir()
-    (tmp_path / "b").mkdir()
-    stores = [exact_store(tmp_path / each / "s.zarr", 1) for each in ("a", "b")]
-    describe([stores[0].path], tmp_path / "t.npz", ("field",))
-    header = stores[1].path / "zarr.json"
+    store = exact_store(tmp_path / "s.zarr", 1).path
+    describe([store], tmp_path / "t.npz", ("field",))
+    header = store / "zarr.json"
     header.write_text(header.read_text().replace('"seed": 3', '"seed": 4'))
     with pytest.raises(ValueError, match="store"):
-        describe([stores[1].path], tmp_path / "t.npz", ("field",))
-    describe([stores[1].path], tmp_path / "t.npz", ("field",), overwrite=True)
+        describe([store], tmp_path / "t.npz", ("field",))
+    describe([store], tmp_path / "t.npz", ("field",), overwrite=True)
     assert load_table(tmp_path / "t.npz").provenance["stores"]["s"]["seed"] == 4
