@@ -104,9 +104,6 @@ def _digest(value: str | bytes) -> str:
     return hashlib.sha256(value.encode() if isinstance(value, str) else value).hexdigest()[:12]
 
 
-# ---- every public name at work, small --------------------------------------------------------------------------------
-
-
 def calls(folder: Path) -> dict[str, Callable[[], object]]:
     """Every public call by name, in the order to make them; later ones take what earlier ones left in `kept`."""
     grid, law, brief = priors.Grid((24, 24, 24)), priors.preset("tubes").coefficients, schedule("fast", 200)

@@ -131,8 +131,6 @@ def test_a_folder_that_cannot_take_files_is_refused(tmp_path: Path, monkeypatch:
         check_folder(tmp_path / "new")
 
 
-# ---- Zarr stores -----------------------------------------------------------------------------------------------------
-
 FIELD = Field(np.arange(70 * 6 * 5, dtype=np.float32).reshape(70, 6, 5), (0.1, 0.2, 0.3), "mm")
 
 

@@ -26,11 +26,9 @@ def grid(spacing: tuple[float, float, float], boundary: str = "replicate") -> Gr
 
 
 SHAPES: dict[str, Shape] = {
-    "plane": Plane((1.0, 0.4, 0.3), MIDDLE),
-    "sphere": Sphere(5.0, MIDDLE),
+    "plane": Plane((1.0, 0.4, 0.3), MIDDLE), "sphere": Sphere(5.0, MIDDLE), "torus": Torus(9.0, 4.0, MIDDLE),
     "cylinder": Cylinder(5.0, (0.3, 1.0, 0.4), MIDDLE),
-    "torus": Torus(9.0, 4.0, MIDDLE),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("spacing", [CUBES, FLAT])
@@ -53,10 +51,9 @@ def test_distance_around_a_periodic_box() -> None:
     """And of a hard field that of the voxels' faces."""
     box = Grid((24, 20, 28), FLAT, "periodic")
     size = np.array(box.shape) * box.spacing
-    here, corner = ((Sphere(4.0, tuple(size * part))) for part in (0.5, 0.0))
-    middle = field_distance(profile(here, centres(box), 1.5), box, 1.5)
+    middle = field_distance(profile(Sphere(4.0, tuple(size / 2)), centres(box), 1.5), box, 1.5)
     moved = np.roll(np.asarray(middle), [n // 2 for n in box.shape], (0, 1, 2))
-    images = [Sphere(4.0, tuple(corner.centre + size * k)) for k in np.ndindex(2, 2, 2)]
+    images = [Sphere(4.0, tuple(size * k)) for k in np.ndindex(2, 2, 2)]
     u = torch.stack([profile(each, centres(box), 1.5) for each in images]).amax(0)
     assert np.abs(field_distance(u, box, 1.5) - moved).max() < 0.2
     assert np.abs(moved - np.max([each.distance(centres(box)) for each in images], axis=0)).max() < 0.4
@@ -145,14 +142,12 @@ def test_beads_on_a_string_and_an_even_tube() -> None:
     strung = torch.maximum(thin, beads).numpy().astype(np.float32)
     assert instances_of(strung, box).max() == 2 and betti_numbers(strung > 0)[0] == 1
     assert instances_of(even.numpy().astype(np.float32), box).max() == 1
-    d = Sphere(9.0, MIDDLE).distance(centres(grid(CUBES)))
+    d = Sphere(9.0, MIDDLE).distance(centres(box))
     distance = torch.minimum(d, 5 - d).numpy().astype(np.float32)
-    assert betti_numbers(distance > 0) == betti_numbers(skeleton_of(distance, grid(CUBES))) == (1, 0, 1)
-    box = grid(CUBES, "periodic")
-    whole = profile(Sphere(5.0, MIDDLE), centres(box), 1.0)
-    cut = torch.roll(whole, (14, 14, 14), (0, 1, 2))
-    counts = [labels_of(cut, each, 1.0, "instances")["instances"].max() for each in (box, grid(CUBES))]
-    assert counts == [1, 8]
+    assert betti_numbers(distance > 0) == betti_numbers(skeleton_of(distance, box)) == (1, 0, 1)
+    cut = torch.roll(profile(Sphere(5.0, MIDDLE), centres(box), 1.0), (14, 14, 14), (0, 1, 2))
+    for around, count in ((grid(CUBES, "periodic"), 1), (box, 8)):
+        assert labels_of(cut, around, 1.0, "instances")["instances"].max() == count
 
 
 def test_only_what_is_asked_for() -> None:

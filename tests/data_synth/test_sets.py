@@ -5,6 +5,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import nibabel
 import numpy as np
@@ -79,14 +80,15 @@ def test_a_worker_makes_the_same_set(tmp_path, order):
     assert sums(theirs) == sums(build_set(tmp_path / "ours", order, 3))
 
 
+full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
+
+
 def test_a_disk_that_fills_leaves_a_valid_set(tmp_path, order, monkeypatch):
     save, saved = sets.save, []
 
     def until_full(field, path):
-        if len(saved) == 5:  # the image of the third case: its label is there already
-            raise OSError(errno.ENOSPC, "No space left on device", str(path))
         saved.append(path)
-        return save(field, path)
+        return full() if len(saved) == 6 else save(field, path)  # an image, whose label is there
 
     monkeypatch.setattr(sets, "save", until_full)
     with pytest.raises(OSError, match="No space left on device"):
@@ -102,12 +104,10 @@ def test_a_disk_that_fills_leaves_a_valid_set(tmp_path, order, monkeypatch):
 def test_a_list_that_finds_no_room_is_completed_by_the_next_run(tmp_path, order, monkeypatch):
     folder, write = build_set(tmp_path / "set", order, 1), sets.write_content
 
-    def full(path, content):
-        if path.name == "dataset.json":
-            raise OSError(errno.ENOSPC, "No space left on device", str(path))
-        return write(path, content)
+    def write_others(path, content):
+        return full() if path.name == "dataset.json" else write(path, content)
 
-    monkeypatch.setattr(sets, "write_content", full)
+    monkeypatch.setattr(sets, "write_content", write_others)
     with pytest.raises(OSError, match="No space"):
         build_set(folder, order, 3)
     assert len(sums(folder)) >= 1 and json.loads((folder / "dataset.json").read_text())["numTraining"] == 1

@@ -44,9 +44,6 @@ def write(rows: dict[str, Any]) -> None:
     KEPT.write_text("{\n" + ",\n".join(lines) + "\n}\n")
 
 
-# ---- what is frozen --------------------------------------------------------------------------------------------------
-
-
 def exact(values: np.ndarray) -> str:
     """Return a hash of numbers, their type and shape."""
     little = np.ascontiguousarray(values).astype(values.dtype.newbyteorder("<"))
@@ -116,9 +113,6 @@ def _content(path: Path) -> Any:
         with np.load(path, allow_pickle=False) as arrays:
             return {key: volume(arrays[key]) for key in sorted(arrays.files) if arrays[key].dtype.kind in "biuf"}
     return "file"
-
-
-# ---- how records are compared ----------------------------------------------------------------------------------------
 
 
 def compare(kept: Any, got: Any, where: str = "", close: float = CLOSE, scale: float = 0.0) -> list[str]:

@@ -88,9 +88,6 @@ def _run_command(line: str) -> Row:
     return run_line
 
 
-# ---- public calls ----------------------------------------------------------------------------------------------------
-
-
 def _volumes(folder: Path) -> dict[str, Any]:
     """Every format that is read, and those that are written, read again: values, type, spacing and unit."""
     import curvafit

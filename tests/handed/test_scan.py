@@ -148,9 +148,6 @@ def test_unknown_keywords() -> None:
                 call(scan, nonsense=1)
 
 
-# ---- backgrounds that are no padding ---------------------------------------------------------------------------------
-
-
 def blobs(count: int, n: int = 48) -> np.ndarray:
     """Bright balls without a background: levels that fall to exactly 0."""
     places = np.random.default_rng(0).uniform(0.25 * n, 0.75 * n, (count, 3))
@@ -169,14 +166,12 @@ def porous_body() -> np.ndarray:
 @pytest.mark.parametrize(
     "scan",
     [
-        blobs(1),
-        blobs(6),
-        porous_body(),
+        blobs(1), blobs(6), porous_body(),
         np.where(level_set((48, 48, 48), 2.5, 0.3), grey(np.ones((48,) * 3, bool)), 0),
         grey(level_set((48, 48, 48), 2.5, 0.3), 0, 1500, 200).clip(0),
     ],
     ids=["one blob", "blobs", "porous body", "masked levels", "cut noise"],
-)
+)  # fmt: skip
 def test_a_background_of_one_value_stays_a_background(scan: np.ndarray) -> None:
     """The threshold is Otsu's of all voxels."""
     from skimage.filters import threshold_otsu

@@ -182,9 +182,6 @@ def test_every_command_is_tried() -> None:
     assert {command_of(line)[0] for line in LINES} == {name for name, _ in commands()} - FETCHING
 
 
-# ---- what is typed ---------------------------------------------------------------------------------------------------
-
-
 @st.composite
 def typed(draw: st.DrawFn, line: str) -> list[str]:
     """Options of the line's command, read off the command itself, with odd values."""
@@ -388,9 +385,6 @@ def test_what_no_memory_holds_is_refused(tmp_path: Path) -> None:
     assert {path: path.stat().st_mtime for path in tmp_path.rglob("*")} == before
 
 
-# ---- full disks ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["out.npy", "out.nii.gz", "out.ome.tif", "out.mrc", "out.zarr", "out.stl"])
 def test_a_disk_that_is_full_is_said_and_leaves_nothing(tmp_path: Path, name: str) -> None:
     for size in (1, 4000):
@@ -399,8 +393,6 @@ def test_a_disk_that_is_full_is_said_and_leaves_nothing(tmp_path: Path, name: st
         refused(result, progress=True)
         assert not list(tmp_path.iterdir()), size
 
-
-# ---- signals ---------------------------------------------------------------------------------------------------------
 
 #: A command with the changes of files in its folder counted: at one of them it gets a signal.
 PROGRAM = """

@@ -102,9 +102,6 @@ def test_a_file_larger_than_memory_is_read_in_its_middle(tmp_path, monkeypatch) 
         read_scan(tmp_path / "scan.npy", whole=True)
 
 
-# ---- kinds -----------------------------------------------------------------------------------------------------------
-
-
 TUBE = tube_mask((32, 32, 32), (1, 1, 1), 6)
 FIELD = phase_field(torch.from_numpy(TUBE.copy()), Grid(TUBE.shape), 0.02).numpy()
 
@@ -145,9 +142,6 @@ def test_the_image_of_a_mask_gives_the_mask_back() -> None:
     assert threshold_of(bright) == pytest.approx(100, abs=12)
     given = prepare(Field(image_of(mask)), threshold=100.0)
     assert "the given threshold of 100" in " ".join(given.notes)
-
-
-# ---- the other phase -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("radius", [4, 12])
@@ -300,9 +294,6 @@ def test_only_the_region_of_interest_counts(tmp_path) -> None:
     assert any("holds 32.0% of the scan" in note for note in prepared.notes)
 
 
-# ---- windows ---------------------------------------------------------------------------------------------------------
-
-
 @given(st.tuples(*[st.integers(4, 60)] * 3), st.integers(4, 30), st.integers(0, 10**6))
 @settings(max_examples=40, deadline=None)
 def test_boxes_cover_what_there_is(shape, size: int, seed: int) -> None:
@@ -323,9 +314,6 @@ def test_the_middle_comes_first_unless_it_is_poor() -> None:
     content[:20, :20, :20] = True
     assert boxes_by_surface(content, 20)[0] == (slice(0, 20),) * 3
     assert boxes_by_surface(np.zeros((9, 9, 9), bool), 20) == []
-
-
-# ---- refusals --------------------------------------------------------------------------------------------------------
 
 
 THIN, AT = np.zeros(TUBE.shape, np.uint8), np.broadcast_to(np.arange(32) < 8, TUBE.shape).T

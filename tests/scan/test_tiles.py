@@ -65,9 +65,6 @@ def check_alike(found: Measures, whole: Measures) -> None:
     assert found.diagram.mean() == pytest.approx(whole.diagram.mean(), rel=1e-5)
 
 
-# ---- tiles are the whole ---------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("name", "edge", "shape"),
     [
@@ -152,9 +149,6 @@ def test_the_same_command_goes_on_after_a_kill(store: Path, tmp_path: Path, monk
     assert calls[3:] == [2, 3, 4, 5, 6, 7]
     assert target.read_bytes() == whole.read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["killed.csv", "whole.csv"]
-
-
-# ---- bad input -------------------------------------------------------------------------------------------------------
 
 
 def test_bad_input_ends_in_one_sentence(store: Path, tmp_path: Path) -> None:

@@ -61,9 +61,6 @@ def test_damage_is_never_read_as_data(tmp_path: Path, capfd, name: str) -> None:
     assert capfd.readouterr() == ("", "")
 
 
-# ---- gzip ------------------------------------------------------------------------------------------------------------
-
-
 def test_a_gzip_stream_is_its_members_alone_to_the_last_bit(tmp_path: Path) -> None:
     path = save(Field(VALUES, 1.0, "mm"), tmp_path / "scan.nii.gz")
     whole = path.read_bytes()

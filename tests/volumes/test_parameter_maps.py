@@ -40,15 +40,11 @@ def test_one_number_holds_everywhere_and_a_folder_may_hold_constants(tmp_path: P
 @pytest.mark.parametrize(
     ("arrays", "said"),
     [
-        ({}, "none"),
-        ({"a21": RAMP, "a20": RAMP}, "a21"),
-        ({"a20": RAMP, "a02": RAMP[:3]}, "shape"),
-        ({"a20": RAMP[0]}, "shape"),
-        ({"a20": np.where(RAMP > 1.5, np.nan, RAMP)}, "finite"),
-        ({"a20": RAMP * 1e39}, "finite"),
-        ({"a20": RAMP * 1j}, "finite"),
+        ({}, "none"), ({"a21": RAMP, "a20": RAMP}, "a21"), ({"a20": RAMP, "a02": RAMP[:3]}, "shape"),
+        ({"a20": RAMP[0]}, "shape"), ({"a20": np.where(RAMP > 1.5, np.nan, RAMP)}, "finite"),
+        ({"a20": RAMP * 1e39}, "finite"), ({"a20": RAMP * 1j}, "finite"),
     ],
-)
+)  # fmt: skip
 def test_maps_that_do_not_fit_are_refused(tmp_path: Path, arrays: dict[str, np.ndarray], said: str) -> None:
     np.savez(tmp_path / "maps.npz", **arrays)
     with pytest.raises(ValueError, match=said):

@@ -208,9 +208,6 @@ def test_no_more_than_the_crop_needs_memory_and_a_cut_file_is_refused(tmp_path: 
             load(path, crop="0:2,:,:", **options)
 
 
-# ---- labels ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("label", range(4))
 def test_a_label_is_a_mask(tmp_path: Path, label: int) -> None:
     labels = np.random.default_rng(0).integers(0, 4, SHAPE).astype(np.uint8)

@@ -612,9 +612,6 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch, suffix:
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
-# ---- real files ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("name", "options", "shape", "spacing", "unit"),
     [

@@ -91,8 +91,6 @@ def test_groups_and_scales_are_read(tmp_path: Path) -> None:
         load(f"{tmp_path}/scan.zarr::2")
 
 
-# ---- chunks ----------------------------------------------------------------------------------------------------------
-
 VALUES = (np.random.default_rng(0).random((9, 10, 11)) * 200 + 1).astype(np.uint16)
 
 
