@@ -51,13 +51,8 @@ def exact_store(path: Path, count: int, first: int = 0) -> Store:
 
 
 #: A quiet kind of images, for quick cases of a training set.
-FLAT = Modality(
-    "flat",
-    "for tests",
-    0.5,
-    Imaging(spacing=(1.0, 0.5, 0.5), optics=Optics((0.4, 0.2, 0.2)), detector=Detector(ceiling=255.0)),
-    {"contrast.foreground": (80.0, 120.0), "noise.gaussian": (1.0, 3.0)},
-)
+SHARP = Imaging(spacing=(1.0, 0.5, 0.5), optics=Optics((0.4, 0.2, 0.2)), detector=Detector(ceiling=255.0))
+FLAT = Modality("flat", "for tests", 0.5, SHARP, {"contrast.foreground": (80.0, 120.0), "noise.gaussian": (1.0, 3.0)})
 CROP = (8, 16, 16)
 
 

@@ -57,8 +57,7 @@ def snapshot() -> dict[str, str]:
         "torch defaults": (torch.get_default_dtype(), torch.get_default_device(), torch.get_float32_matmul_precision()),
         "torch gradients": torch.is_grad_enabled(),
         "torch modes": (torch.is_inference_mode_enabled(), torch.is_anomaly_enabled(), torch.is_autocast_enabled()),
-        "torch deterministic": torch.are_deterministic_algorithms_enabled(),
-        "torch deterministic, warning": torch.is_deterministic_algorithms_warn_only_enabled(),
+        "torch deterministic": torch.get_deterministic_debug_mode(),
         "torch cudnn": (backend.enabled, backend.benchmark, backend.deterministic),
         "torch denormal numbers": float(torch.tensor(1e-40) / 2),
         "torch random": _digest(torch.get_rng_state().numpy().tobytes()),
@@ -87,9 +86,7 @@ def snapshot() -> dict[str, str]:
         # of libraries that the host may use too
         "optional numba's threads": _ABSENT if numba is None or not started else numba.get_num_threads(),
         "optional JAX": _ABSENT if jax is None else (jax.config.jax_enable_x64, jax.config.jax_default_device),
-        "optional matplotlib": _ABSENT
-        if matplotlib is None
-        else _digest(repr(sorted(dict.items(matplotlib.rcParams)))),
+        "optional matplotlib": (matplotlib and _digest(repr(sorted(dict.items(matplotlib.rcParams))))) or _ABSENT,
         "optional pyplot": "matplotlib.pyplot" in sys.modules,
     }
     return {name: repr(value) for name, value in found.items()}
@@ -106,7 +103,7 @@ def _digest(value: str | bytes) -> str:
 
 def calls(folder: Path) -> dict[str, Callable[[], object]]:
     """Every public call by name, in the order to make them; later ones take what earlier ones left in `kept`."""
-    grid, law, brief = priors.Grid((24, 24, 24)), priors.preset("tubes").coefficients, schedule("fast", 200)
+    grid, law, brief = priors.Grid((24, 24, 24)), priors.preset("tubes").coefficients, schedule("fast", 100)
     noise = torch.rand((1, 1, 24, 24, 24), generator=torch.Generator().manual_seed(0))
     u, mse = noise[0, 0], torch.nn.functional.mse_loss
     z, y, x = np.mgrid[:24, :24, :24] - 11.5
@@ -130,7 +127,7 @@ def calls(folder: Path) -> dict[str, Callable[[], object]]:
         plot.png(plot.surface_figure(kept["flow"].field.numpy(), width=32))
 
     def infer() -> None:
-        few = {"simulations": 2, "rounds": 1, "twins": 1, "test": False, "schedule": brief}
+        few = {"simulations": 1, "rounds": 1, "twins": 1, "test": False, "schedule": brief}
         found = curvafit.infer(curvafit.Field(kept["flow"].field.numpy()), kind="field", periodic=True, **few)
         (folder / "fit.json").write_text(found.fit.to_json())
 

@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -221,9 +222,7 @@ def test_threads_and_other_sets_share_shapes(tmp_path, capsys):
 
 @pytest.mark.parametrize("fault", ["read-only", "full"])
 def test_without_room_a_process_keeps_its_own_shapes(tmp_path, monkeypatch, fault):
-    def refuse(*arguments: object, **options: object) -> str:
-        raise OSError(28, "No space left on device")
-
+    refuse = Mock(side_effect=OSError(28, "No space left on device"))
     expected = [balls(str(tmp_path / "log"))[k] for k in range(4)]
     monkeypatch.setattr(sources, "get_temp_dir" if fault == "read-only" else "write_content", refuse)
     pairs = balls(str(tmp_path / "own"))
