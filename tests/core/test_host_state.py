@@ -50,24 +50,16 @@ def test_a_call_changes_nothing_of_the_host(name: str, found) -> None:
     assert found[name] == {}
 
 
-def test_a_change_is_seen() -> None:
+def test_a_change_is_seen(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The snapshot's own test: of what may be changed and put back here."""
     before = host_state.snapshot()
     assert host_state.changes(before, host_state.snapshot()) == {}
-    generator, folder, names = torch.get_rng_state(), Path.cwd(), dict(os.environ)
-    try:
+    monkeypatch.setenv("CURVAFIT_TEST", "1")
+    monkeypatch.chdir(tmp_path)
+    with torch.random.fork_rng(), torch.no_grad():
         torch.rand(1)
-        os.environ["CURVAFIT_TEST"] = "1"
-        torch.set_grad_enabled(False)
-        os.chdir(tempfile.gettempdir())
         changed = host_state.changes(before, host_state.snapshot())
-    finally:
-        torch.set_rng_state(generator)
-        torch.set_grad_enabled(True)
-        os.environ.pop("CURVAFIT_TEST")
-        os.chdir(folder)
     assert {"torch random", "torch gradients", "process environment", "process folder"} <= set(changed)
-    assert dict(os.environ) == names
 
 
 SETTLED = """

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exact import Sphere, centres
+from exact import Sphere, centres, profile
 from exact_store import CROP as SHAPE
 from exact_store import flat_recipe
 
@@ -17,7 +17,6 @@ from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality
 from curvafit.data_synth.sources import SYMMETRIES, Generated, PhaseField, apply_symmetry, crop_periodic, random_crop
 from curvafit.generation import loop as steering
 from curvafit.priors.grid import Grid
-from curvafit.priors.profile import optimal_profile
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +130,7 @@ CLEAR = Modality("clear", "for tests", 1.0, Imaging(contrast=Contrast(10.0, 110.
 @pytest.mark.parametrize("thickness", [4.0, 6.5])
 def test_the_wall_of_a_ball_is_a_shell_and_the_lumen_a_ball(thickness):
     distance = Sphere(16.0, MIDDLE).distance(centres(GRID))
-    wall, lumen = shell_of(optimal_profile(distance, EPSILON).float(), EPSILON, thickness)
+    wall, lumen = shell_of(profile(Sphere(16.0, MIDDLE), centres(GRID), EPSILON).float(), EPSILON, thickness)
     inner = 4 / 3 * np.pi * (16 - thickness) ** 3
     assert float(occupancy(wall, EPSILON).sum()) == pytest.approx(4 / 3 * np.pi * 16**3 - inner, rel=0.02)
     assert float(occupancy(lumen, EPSILON).sum()) == pytest.approx(inner, rel=0.03)
@@ -141,7 +140,7 @@ def test_the_wall_of_a_ball_is_a_shell_and_the_lumen_a_ball(thickness):
 
 
 def test_wall_and_lumen_fill_the_shape_without_a_gap():
-    u = optimal_profile(Sphere(16.3, MIDDLE).distance(centres(GRID)), EPSILON).float()
+    u = profile(Sphere(16.3, MIDDLE), centres(GRID), EPSILON).float()
     shares, whole = share_voxels(shell_of(u, EPSILON, 5.0), EPSILON), occupancy(u, EPSILON)
     assert float((sum(shares) - whole).abs().max()) < 0.1
     assert float(sum(shares).sum() / whole.sum()) == pytest.approx(1, abs=1e-3)

@@ -6,14 +6,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from exact import Cylinder, Plane, Sphere, centres
+from exact import Cylinder, Plane, Sphere, centres, profile
 from scipy import ndimage, stats
 from torch import Tensor
 
 from curvafit.data_synth.imaging import effects
 from curvafit.data_synth.imaging.effects import poisson_quantile, uniform
 from curvafit.priors.grid import Grid
-from curvafit.priors.profile import optimal_profile
 
 N = 40
 GRID = Grid((N, N, N), (1.0, 1.0, 1.0))
@@ -22,7 +21,7 @@ EMPTY = torch.zeros((N, N, N), dtype=torch.float64)
 
 
 def field(shape, grid: Grid = GRID) -> Tensor:
-    return optimal_profile(shape.distance(centres(grid)), effects.EPSILON)
+    return profile(shape, centres(grid), effects.EPSILON)
 
 
 FULL = effects.occupancy(field(Cylinder(5.0, (1, 0.3, 0.2), MIDDLE)))
@@ -60,7 +59,7 @@ def test_occupancy_holds_the_volume() -> None:
 @pytest.mark.parametrize(("normal", "most"), [((0, 0, 1), 0.051), ((0, 1, 1), 0.1), ((1, 1, 1), 0.1), ((3, 2, 1), 0.1)])
 def test_occupancy_of_a_plane(normal: tuple[float, float, float], most: float) -> None:
     """Against the mean over 10³ points of every voxel, themselves off by a layer of points."""
-    plane = Plane(normal, (5.2, 5.2, 5.2))
+    plane = Plane(normal, (5.2,) * 3)
     fine = plane.distance(centres(Grid((100, 100, 100), (0.1,) * 3))) > 0
     inside = fine.double().reshape(10, 10, 10, 10, 10, 10).mean((1, 3, 5))
     assert (effects.occupancy(field(plane, Grid((10, 10, 10), (1.0,) * 3))) - inside).abs().max() < most

@@ -1,11 +1,12 @@
 """Views of shapes, and the table of their descriptors: complete, the same however often stopped, refused if damaged."""
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from calling import call, refused
-from exact import Gyroid, centres
+from exact import Gyroid, centres, profile
 from exact_store import exact_record, exact_store
 
 from curvafit.core.workers import cluster
@@ -16,7 +17,6 @@ from curvafit.inference.table import VIEWS, Table, column_names, law_of, load_ta
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import preset
-from curvafit.priors.profile import optimal_profile
 from curvafit.scan.measure import read_texture
 from curvafit.scan.prepare import WORKING_THICKNESS, prepare, thinner_thickness
 from curvafit.volumes.field import ScanError
@@ -26,7 +26,7 @@ FAST = ("field", "mask")
 
 def gyroid(n: int = 48) -> tuple[np.ndarray, Grid]:
     grid = Grid((n, n, n))
-    return optimal_profile(Gyroid(0.24).distance(centres(grid)), 0.02).float().numpy(), grid
+    return profile(Gyroid(0.24), centres(grid), 0.02).float().numpy(), grid
 
 
 @pytest.mark.parametrize("name", VIEWS)
@@ -134,10 +134,7 @@ def test_workers_measure_the_same(tmp_path: Path) -> None:
 
 
 def test_a_view_without_a_surface_is_a_row_without_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def empty(u, rng):
-        raise ScanError("expected a surface, got none")
-
-    monkeypatch.setitem(VIEWS, "scan", empty)
+    monkeypatch.setitem(VIEWS, "scan", Mock(side_effect=ScanError("expected a surface, got none")))
     table = describe([exact_store(tmp_path / "store.zarr", 2).path], tmp_path / "table.npz", ("mask", "scan"))
     assert table.visible.views.tolist() == ["mask", "mask"]
     assert np.isnan(table.descriptors[table.views == "scan"]).all()

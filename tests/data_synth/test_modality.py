@@ -5,18 +5,17 @@ from dataclasses import replace
 
 import pytest
 import torch
-from exact import Cylinder, Sphere, centres
+from exact import Cylinder, Sphere, centres, profile
 
 from curvafit.data_synth.imaging import effects
 from curvafit.data_synth.imaging.image import annotator_threshold, field_shape, image, label_voxels, regrid
 from curvafit.data_synth.imaging.modality import MODALITIES, Contrast, Imaging, Modality, Optics, modality
 from curvafit.priors.grid import Grid
-from curvafit.priors.profile import optimal_profile
 
 N = 32
 POINTS = centres(Grid((N, N, N), (1.0, 1.0, 1.0)))
 SHAPES = [Cylinder(5.0, (0.3, 1, 0.2), (16, 16, 16)), Sphere(9.0, (16, 16, 16))]
-FIELDS = [optimal_profile(shape.distance(POINTS), effects.EPSILON).float() for shape in SHAPES]
+FIELDS = [profile(shape, POINTS, effects.EPSILON).float() for shape in SHAPES]
 
 PLAIN = Imaging(contrast=Contrast(background=10, foreground=60))
 

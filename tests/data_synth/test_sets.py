@@ -4,6 +4,7 @@ import errno
 import json
 import shutil
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -186,20 +187,18 @@ def test_what_others_began_is_left_alone(tmp_path, folder, wide):
 
 #: Headers and records that are refused: as whole texts, or as entries in place of those that are there.
 TORN = ("{", "null", "[]", "NaN", "[" * 100_000, '{"version": ' + "9" * 5000 + "}", '{"version": NaN}', "{}")
-HEADERS = ({"version": 1}, *({"order": each} for each in ({"recipe": 7}, {"layout": "cubes"}, {"parts": None},
-           {"recipe": {"source": []}}, {"recipe": {"composition": {"blend": 0.2}}})))  # fmt: skip
+HEADERS = {"version": 1, "order.recipe": 7, "order.layout": "cubes", "order.parts": None, "order.recipe.source": []}
+HEADERS["order.recipe.composition"] = {"blend": 0.2}
 
 
 @pytest.mark.parametrize("wrong", [*TORN, *HEADERS])
 def test_a_damaged_header_is_one_sentence(tmp_path, folder, wide, wrong):
     """And is left alone; so is that of a set that blends textures."""
-    file = tmp_path / "curvafit.json"
-    header = json.loads((folder / "curvafit.json").read_text())
-    if isinstance(wrong, dict):
-        order, recipe = header["order"], wrong.get("order", {}).get("recipe")
-        mended = {"recipe": order["recipe"] | recipe} if isinstance(recipe, dict) else {}
-        wrong = header | wrong | {"order": order | wrong.get("order", {}) | mended}
-    text = wrong if isinstance(wrong, str) else json.dumps(wrong)
+    file, header = tmp_path / "curvafit.json", json.loads((folder / "curvafit.json").read_text())
+    if wrong in HEADERS:
+        *path, name = wrong.split(".")
+        reduce(dict.__getitem__, path, header)[name] = HEADERS[wrong]
+    text = json.dumps(header) if wrong in HEADERS else wrong
     file.write_text(text)
     with pytest.raises(ValueError, match="curvafit.json"):
         build_set(tmp_path, wide, 1)

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.calling import call
+from curvafit.volumes import Field, save
+from tests.calling import done
 from tests.golden import FOLDER
 
 EDGE = 0.0195
@@ -23,15 +24,15 @@ def make(folder: Path = FOLDER) -> None:
     _nifti(phase[:24, :24, :24], folder / "field.nii.gz")
     _nifti((phase > 0).astype(np.uint8), folder / "mask.nii.gz")
     grey = np.clip(110 + 50 * phase + rng.normal(0, 14, phase.shape), 0, 255).astype(np.uint8)
-    _imagej(grey, folder / "scan.tif")
+    save(Field(grey, EDGE, "mm"), folder / "scan.tif")
     halves = np.ones(phase.shape, np.uint8)
     halves[:, :, 17:] = 2
     _nifti(halves, folder / "halves.nii.gz")
     inside = np.clip(0.5 + 0.4 * phase + rng.normal(0, 0.1, phase.shape), 0, 1)
     _nifti(np.round(inside, 2).astype(np.float32), folder / "probabilities.nii.gz")
     cells, light = nuclei((26, 40, 44), 5, rng)
-    _imagej(cells, folder / "cells.tif")
-    _imagej(light, folder / "light.tif")
+    save(Field(cells, EDGE, "mm"), folder / "cells.tif")
+    save(Field(light, EDGE, "mm"), folder / "light.tif")
     for group, radius in (("control", 3.0), ("treated", 3.8)):
         (folder / group).mkdir(exist_ok=True)
         for k in range(4):
@@ -43,7 +44,7 @@ def make(folder: Path = FOLDER) -> None:
     store = folder / "store.zarr"
     shutil.rmtree(store, ignore_errors=True)
     build = "--shape 20 --around tubes --spread 0.1 --steps 200 --workers 0 --count 6"
-    assert call("atlas", "build", store, *build.split()).exit_code == 0
+    done("atlas", "build", store, *build.split())
 
 
 def tubes(shape: tuple[int, int, int], period: float, radius: float, shift: float = 0.0) -> np.ndarray:
@@ -68,20 +69,9 @@ def nuclei(shape: tuple[int, int, int], count: int, rng: np.random.Generator) ->
 
 
 def _nifti(values: np.ndarray, path: Path) -> None:
-    import nibabel
-
     affine = np.diag([EDGE, EDGE, EDGE, 1.0])
     affine[:3, 3] = 1, -2, 3
-    image = nibabel.Nifti1Image(np.ascontiguousarray(values.T), affine)
-    image.header.set_xyzt_units("mm")
-    nibabel.save(image, path)
-
-
-def _imagej(values: np.ndarray, path: Path) -> None:
-    import tifffile
-
-    about = {"axes": "ZYX", "spacing": EDGE, "unit": "mm"}
-    tifffile.imwrite(path, values, imagej=True, resolution=(1 / EDGE,) * 2, metadata=about, compression="zlib")
+    save(Field(values, EDGE, "mm", affine), path)
 
 
 if __name__ == "__main__":

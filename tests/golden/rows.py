@@ -1,6 +1,6 @@
 """The rows of the corpus: each command and each public call on a small input."""
 
-import os
+import contextlib
 import shutil
 import warnings
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tests.calling import call
+from tests.calling import done
 from tests.damage import FORMATS
 from tests.golden import FOLDER
 from tests.golden.frozen import CLOSE, exact, files, rounded, volume
@@ -76,13 +76,9 @@ def closeness(name: str) -> float:
 def _run_command(line: str) -> Row:
     def run_line(folder: Path) -> dict[str, Any]:
         shutil.copytree(FOLDER, folder, dirs_exist_ok=True)
-        before, here = set(folder.rglob("*")), Path.cwd()
-        os.chdir(folder)
-        try:
-            result = call(*line.split())
-        finally:
-            os.chdir(here)
-        assert result.exit_code == 0, (line, result.output, result.exception)
+        before = set(folder.rglob("*"))
+        with contextlib.chdir(folder):
+            result = done(*line.split())
         return files(folder, before) or {"lines": len(result.stdout.splitlines())}
 
     return run_line

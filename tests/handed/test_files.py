@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import tifffile
 import zarr
-from calling import call
+from calling import done
 
 import curvafit
 from curvafit.segmentation.reconstruct import reconstruct_labels
@@ -268,8 +268,7 @@ def bodies(ids: tuple[int, int], kind: type) -> np.ndarray:
 def test_64_bit_ids_stay(ids: tuple[int, int], kind: type, chosen: str, tmp_path: Path) -> None:
     truth, out = bodies(ids, kind), tmp_path / "out.npy"
     np.save(tmp_path / "labels.npy", np.where((np.arange(17) % 8 == 0)[:, None, None], truth, kind(0)))
-    done = call("reconstruct", tmp_path / "labels.npy", "--every", 8, "--labels", chosen, "-o", out)
-    assert done.exit_code == 0, done.output
+    done("reconstruct", tmp_path / "labels.npy", "--every", 8, "--labels", chosen, "-o", out)
     found = np.load(out)
     assert found.dtype.kind in "iu" and np.unique(found).tolist() == [0, *ids]
     assert np.array_equal(found[::8], truth[::8])

@@ -19,8 +19,6 @@ pytestmark = pytest.mark.slow
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
-Run = Callable[..., list[str]]
-
 
 @pytest.fixture
 def script(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
@@ -31,7 +29,7 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
 
 
 @pytest.fixture
-def run(script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+def run(script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., list[str]]:
     """Run a script with options, check its files, and give the table's lines under the head."""
 
     def ran(name: str, *options: object) -> list[str]:
@@ -55,7 +53,7 @@ def numbers(line: str) -> list[float]:
     return found
 
 
-def test_convergence(run: Run) -> None:
+def test_convergence(run) -> None:
     """And orientation's table."""
     _, *rows, status = run("convergence", "--edge", 24, "--schedule", "fast", "--steps", 300)
     steps, energies, *_ = zip(*map(numbers, rows), strict=True)
@@ -70,7 +68,7 @@ def test_convergence(run: Run) -> None:
 
 
 @pytest.mark.parametrize(("name", "size"), [("gallery", 28), ("interpolation", 28), ("spatialised", 20)])
-def test_a_script_makes_its_table(run: Run, script, monkeypatch: pytest.MonkeyPatch, name: str, size: int) -> None:
+def test_a_script_makes_its_table(run, script, monkeypatch: pytest.MonkeyPatch, name: str, size: int) -> None:
     if name == "gallery":
         monkeypatch.setattr(script(name), "NAMES", ("tubes", "exp-0366"))
     head, *rows = run(name, "--edge", size, *(("--count", 3) if name == "interpolation" else ()), "--steps", 150)
@@ -98,7 +96,7 @@ def test_interpolated_parameters(script) -> None:
     assert [float(end) / 2 for end in ends] == pytest.approx([-0.55, -0.4, -0.5])
 
 
-def test_seeds_and_kept_shapes(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_seeds_and_kept_shapes(run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     size = ("--edge", 28, "--count", 3, "--steps", 150)
     lines = run("seeds", *size)
     assert "random-0000: " in capsys.readouterr().out
@@ -125,15 +123,14 @@ def test_willmore_energy_is_extrapolated(script) -> None:
     rows = []
     for edge, width in ((15, 4), (20, 5), (20, 4)):
         field, grid = willmore.start("sphere", edge, width)
-        ε = width * grid.spacing[0]
-        flow = SimpleNamespace(grid=grid, field=field)
+        ε, flow = width * grid.spacing[0], SimpleNamespace(grid=grid, field=field)
         rows.append(willmore.Row(ε, 50 + 3 * ε**2 - 7 / width**2, 0.0, 0.0, flow))
     assert willmore.extrapolated(rows) == pytest.approx(50, abs=1e-9)
 
 
 def test_willmore(script, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    options = ("--cases", "sphere", "--scale", 0.3, "--steps", 3, "-o", tmp_path)
-    monkeypatch.setattr(sys, "argv", ["willmore", *map(str, options)])
+    options = ["--cases", "sphere", "--scale", "0.3", "--steps", "3", "-o", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", ["willmore", *options])
     script("willmore").main()
     _, *rows, _, area = (tmp_path / "willmore.txt").read_text(encoding="utf-8").splitlines()
     assert [numbers(row.split(")")[1])[1] for row in rows] == pytest.approx([16 * np.pi] * 3, rel=0.09)

@@ -8,13 +8,13 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from calling import call
+from calling import done
 from scipy import ndimage
 
 from curvafit.generation import generate
@@ -50,9 +50,9 @@ def test_slicer_gets_volumes_in_their_place_and_progress(labels: Path, tmp_path:
     if not program.exists():
         pytest.skip("the program curvafit is not installed beside this Python")
     filled, likely = tmp_path / "filled.nii.gz", tmp_path / "likely.nii.gz"
-    done = run(script, labels, filled, "--probability", likely, "--every", 8, "--program", program)
-    assert done.returncode == 0, done.stderr
-    assert re.search(r"<filter-progress>0\.\d+</filter-progress>\n<filter-comment>\w", done.stdout)
+    ended = run(script, labels, filled, "--probability", likely, "--every", 8, "--program", program)
+    assert ended.returncode == 0, ended.stderr
+    assert re.search(r"<filter-progress>0\.\d+</filter-progress>\n<filter-comment>\w", ended.stdout)
     known, mask = load(labels), load(filled)
     np.testing.assert_allclose(mask.affine, known.affine)  # type: ignore[arg-type]
     assert np.array_equal(mask.values[::8], known.values[::8]) and mask.values[4].sum() > 60
@@ -72,8 +72,7 @@ def test_the_command_of_fiji_s_macro_runs(labels: Path, tmp_path: Path) -> None:
     save(load(labels), tmp_path / "labels.tif")
     words = ["".join(each.strip('"') if '"' in each else values[each] for each in part.split(" + "))
              for part in called[1].split(", ")]  # fmt: skip
-    result = call(*words)
-    assert result.exit_code == 0, result.stderr
+    done(*words)
     for name in re.findall(r'open\(folder \+ "(.*)"\)', macro):
         assert load(tmp_path / name).shape == (17, 24, 24)
 
@@ -90,14 +89,14 @@ def test_polnet_s_units_are_only_units(monkeypatch: pytest.MonkeyPatch) -> None:
             return made
 
     kinds: dict[str, Any] = {}
-    factory = type("Factory", (), {"register": staticmethod(lambda name: lambda kind: kinds.setdefault(name, kind))})
-    contents = {"": {}, ".mb": {"MbError": ArithmeticError}, ".mb_curvatubes": {"CurvatubesGen": Generator}}
-    for name, content in (contents | {".mb_factory": {"MbFactory": factory}}).items():
-        module = ModuleType(f"polnet.sample.membranes{name}")
-        module.__dict__.update(content)
-        monkeypatch.setitem(sys.modules, module.__name__, module)
-    for name in ("polnet", "polnet.sample"):
-        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    factory = SimpleNamespace(register=lambda name: lambda kind: kinds.setdefault(name, kind))
+    for name, content in {
+        "": {}, ".sample": {}, ".sample.membranes": {}, ".sample.membranes.mb": {"MbError": ArithmeticError},
+        ".sample.membranes.mb_curvatubes": {"CurvatubesGen": Generator},
+        ".sample.membranes.mb_factory": {"MbFactory": factory},
+    }.items():  # fmt: skip
+        monkeypatch.setitem(sys.modules, f"polnet{name}", ModuleType(f"polnet{name}"))
+        vars(sys.modules[f"polnet{name}"]).update(content)
     spec = importlib.util.spec_from_file_location("curvafit_membranes", HOSTS / "curvafit_membranes.py")
     assert spec is not None and spec.loader is not None
     spec.loader.exec_module(importlib.util.module_from_spec(spec))
@@ -132,8 +131,8 @@ def test_the_monai_bundle_learns_from_slices_and_writes_masks(tmp_path: Path) ->
         save(Field(values.T, 0.5, "mm"), folder / "data" / kind / "case.nii.gz")
     for name, words in (("train", ("--epochs", "60", "--every", "8")), ("inference", ())):
         files = str([f"configs/{each}.json" for each in ("common", name)])
-        done = run("-m", "monai.bundle", "run", "--config_file", files, *words, folder=folder)
-        assert done.returncode == 0, done.stderr
+        ended = run("-m", "monai.bundle", "run", "--config_file", files, *words, folder=folder)
+        assert ended.returncode == 0, ended.stderr
     predicted = load(folder / "predicted" / "case_mask.nii.gz")
     mask = predicted.values.T > 0
     assert predicted.spacing == (0.5, 0.5, 0.5)

@@ -394,13 +394,9 @@ def test_gallery_fields_are_known_as_such(data, name: str) -> None:
 
 
 CUBIC = (1.0, 1.0, 1.0)
-
-
-def bodies(n: int = 48) -> np.ndarray:
-    """Balls and a tube in a periodic box."""
-    z, y, _ = np.indices((n, n, n)) + 0.5
-    tube = (z - 38) ** 2 + (y - 12) ** 2 < 25
-    return ball(n, n / 3 - 0.5, 9) | ball(n, 2 * n / 3 - 0.5, 7) | tube
+Z, Y, _ = np.indices((48, 48, 48)) + 0.5
+#: Balls and a tube in a periodic box.
+BODIES = ball(48, 15.5, 9) | ball(48, 31.5, 7) | ((Z - 38) ** 2 + (Y - 12) ** 2 < 25)
 
 
 def image(mask: np.ndarray, blur: float, noise: float) -> np.ndarray:
@@ -412,8 +408,7 @@ def image(mask: np.ndarray, blur: float, noise: float) -> np.ndarray:
 @pytest.mark.parametrize("noise", [0.02, 0.1, 0.3])
 @pytest.mark.parametrize("blur", [0.5, 1.0, 1.5])
 def test_blur_and_noise_are_read_from_grey_levels(blur: float, noise: float) -> None:
-    mask = bodies()
-    quality = measure_quality(image(mask, blur, noise), mask, CUBIC)
+    quality = measure_quality(image(BODIES, blur, noise), BODIES, CUBIC)
     assert quality.blur == pytest.approx(blur, abs=0.5)  # a step of those tried, and a mask's own stairs
     assert quality.noise == pytest.approx(noise, rel=0.15, abs=0.01)
     assert quality.degraded == (noise > 0.2)
@@ -430,7 +425,7 @@ def test_what_smoothing_leaves_of_white_noise() -> None:
 
 @pytest.mark.parametrize("spacing", [CUBIC, (2.0, 1.0, 1.0)])
 def test_noise_is_read_on_slices_that_are_thicker(spacing: tuple[float, float, float]) -> None:
-    mask = bodies()[:: int(spacing[0])]
+    mask = BODIES[:: int(spacing[0])]
     quality = measure_quality(image(mask, 0.7, 0.2), mask, spacing)
     assert quality.noise == pytest.approx(0.2, rel=0.15)
     assert quality.grain <= 0.5
@@ -439,10 +434,9 @@ def test_noise_is_read_on_slices_that_are_thicker(spacing: tuple[float, float, f
 
 @pytest.mark.parametrize("grain", [0.7, 1.2])
 def test_noise_that_neighbours_share_is_read_with_its_grain(grain: float) -> None:
-    mask = bodies()
-    noise = ndimage.gaussian_filter(np.random.default_rng(1).standard_normal(mask.shape), grain)
-    levels = image(mask, 1.0, 0.0) + 50 * 0.1 * noise / noise.std()
-    quality = measure_quality(levels, mask, CUBIC)
+    noise = ndimage.gaussian_filter(np.random.default_rng(1).standard_normal(BODIES.shape), grain)
+    levels = image(BODIES, 1.0, 0.0) + 50 * 0.1 * noise / noise.std()
+    quality = measure_quality(levels, BODIES, CUBIC)
     assert quality.noise == pytest.approx(0.1, rel=0.2)
     assert quality.grain == pytest.approx(grain, rel=0.25)
 
@@ -450,8 +444,7 @@ def test_noise_that_neighbours_share_is_read_with_its_grain(grain: float) -> Non
 @pytest.mark.parametrize("fat", [1, 2])
 def test_a_mask_that_is_too_fat_is_known_as_such(fat: int) -> None:
     """And does not lower the contrast, by which the noise would seem too great."""
-    mask = bodies()
-    quality = measure_quality(image(mask, 1.0, 0.2), ndimage.binary_dilation(mask, iterations=fat), CUBIC)
+    quality = measure_quality(image(BODIES, 1.0, 0.2), ndimage.binary_dilation(BODIES, iterations=fat), CUBIC)
     # of faces' neighbours: less than a voxel in the mean
     assert quality.boundary_shift == pytest.approx(min(0.8 * fat, 1.5), abs=0.5)
     assert quality.noise == pytest.approx(0.2, rel=0.15)
@@ -470,31 +463,30 @@ def shown(quality: Quality, mask: np.ndarray, seed: int = 0, slices: int = 1) ->
 
 
 def test_a_sharp_clean_scan_shows_the_shape() -> None:
-    mask = bodies()
-    seen = shown(Quality(0.5, 0.01, 0.0, 0.0, CUBIC), mask)
-    beside = np.abs(centre_distance(mask, CUBIC, 3.0, periodic=True)) <= 1.5
-    assert np.array_equal(seen[~beside], mask[~beside])
-    assert seen.mean() == pytest.approx(mask.mean(), rel=0.05)
+    seen = shown(Quality(0.5, 0.01, 0.0, 0.0, CUBIC), BODIES)
+    beside = np.abs(centre_distance(BODIES, CUBIC, 3.0, periodic=True)) <= 1.5
+    assert np.array_equal(seen[~beside], BODIES[~beside])
+    assert seen.mean() == pytest.approx(BODIES.mean(), rel=0.05)
 
 
 def test_noise_moves_the_surface_and_seeds_move_it_differently() -> None:
-    mask, noisy = bodies(), Quality(1.0, 0.4, 0.0, 0.0, CUBIC)
-    first, second = (shown(noisy, mask, seed) for seed in (0, 1))
-    for other in (second, shown(Quality(1.0, 0.0, 0.0, 0.0, CUBIC), mask)):
+    noisy = Quality(1.0, 0.4, 0.0, 0.0, CUBIC)
+    first, second = (shown(noisy, BODIES, seed) for seed in (0, 1))
+    for other in (second, shown(Quality(1.0, 0.0, 0.0, 0.0, CUBIC), BODIES)):
         assert np.count_nonzero(first != other) > 100
 
 
 @pytest.mark.parametrize("slices", [1, 2])
 def test_what_a_scan_without_noise_shows_moves_with_the_shape(slices: int) -> None:
-    mask, sharp = bodies(), Quality(1.0, 0.0, 0.0, 0.0, (float(slices), 1.0, 1.0))
-    moved = np.roll(mask, (6, 5, 11), (0, 1, 2))
+    sharp = Quality(1.0, 0.0, 0.0, 0.0, (float(slices), 1.0, 1.0))
+    moved = np.roll(BODIES, (6, 5, 11), (0, 1, 2))
     for show in (lambda shape: shown(sharp, shape, 0, slices), lambda shape: sample_mask(shape, (slices, 1.0, 1.0))):
-        difference = show(moved) != np.roll(show(mask), (6 // slices, 5, 11), (0, 1, 2))
+        difference = show(moved) != np.roll(show(BODIES), (6 // slices, 5, 11), (0, 1, 2))
         assert difference.mean() < 1e-4  # ties at the threshold
 
 
 def test_voxelised_on_the_same_voxels_is_the_mask_and_thick_slices_lose_a_thin_plate() -> None:
-    mask = bodies()
+    mask = BODIES.copy()
     assert np.array_equal(sample_mask(mask, CUBIC), mask)
     mask[3] = True
     assert not sample_mask(mask, (4.0, 1.0, 1.0))[0].all()
@@ -502,22 +494,20 @@ def test_voxelised_on_the_same_voxels_is_the_mask_and_thick_slices_lose_a_thin_p
 
 def test_two_sharp_levels_are_split_in_their_middle() -> None:
     """Otsu's threshold lies anywhere between two sharp levels; at the lower one the structure would be a voxel fat."""
-    mask = bodies()
-    found = find_structure(Field(image(mask, 0.0, 0.005), CUBIC, "voxel"), kind="image", periodic=True)[1]
+    found = find_structure(Field(image(BODIES, 0.0, 0.005), CUBIC, "voxel"), kind="image", periodic=True)[1]
     assert threshold_of(found) == pytest.approx(125, abs=2)
-    assert np.mean(found.values > 0) == pytest.approx(mask.mean(), rel=0.03)
+    assert np.mean(found.values > 0) == pytest.approx(BODIES.mean(), rel=0.03)
 
 
 def test_an_image_knows_its_imaging_and_a_mask_has_none() -> None:
-    mask = bodies()
-    grey = image(mask, 1.0, 0.1)
+    grey = image(BODIES, 1.0, 0.1)
     scan = prepare(Field(grey, CUBIC, "voxel"), kind="image", periodic=True)
     dark = prepare(Field(-grey, CUBIC, "voxel"), kind="image", periodic=True, dark=True)
     assert scan.quality is not None and dark.quality is not None
     assert dark.quality.blur == scan.quality.blur
     assert dark.quality.noise == pytest.approx(scan.quality.noise, rel=0.01)
-    assert scan.scan_alike(mask, 0).quality == scan.quality  # which made its grey levels
-    assert prepare(Field(mask, CUBIC, "voxel"), periodic=True).quality is None
+    assert scan.scan_alike(BODIES, 0).quality == scan.quality  # which made its grey levels
+    assert prepare(Field(BODIES, CUBIC, "voxel"), periodic=True).quality is None
 
 
 @pytest.mark.parametrize("noise", [0.05, 0.1, 0.2, 0.3])

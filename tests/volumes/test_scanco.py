@@ -1,11 +1,13 @@
 """Scanco's files, written here by their layout: values and place come back."""
 
+import random
 import struct
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
+from damage import damaged
 
 from curvafit.volumes import ScanError, load
 
@@ -92,16 +94,13 @@ def test_damage_is_one_sentence(tmp_path: Path, name: str) -> None:
     content, _ = FILES[name]
     path = tmp_path / name
     whole = len(content) - 100 if "ISQ" in name else len(content)
-    rng = np.random.default_rng(2)
     cut = [content[: min(size, whole - 1)] for size in (0, 15, 100, 500, 512, 1000, whole // 2, whole - 1)]
-    for damaged in (*cut, b"<!DOCTYPE html>" * 100):
-        path.write_bytes(damaged)
+    for broken in (*cut, b"<!DOCTYPE html>" * 100):
+        path.write_bytes(broken)
         with pytest.raises(ScanError, match=r"^[^\n]*$"):
             load(path)
+    chance = random.Random(2)
     for _ in range(60):  # a broken header is a ScanError or read, never another fault
-        broken = bytearray(content)
-        for place in rng.integers(0, 512, 3):
-            broken[place] = rng.choice([0, 1, 127, 128, 255])
-        path.write_bytes(broken)
+        path.write_bytes(damaged(content[:512], chance) + content[512:])
         with suppress(ScanError):
             load(path)
