@@ -1,4 +1,4 @@
-"""What files hold, read without the package."""
+"""What files hold, read without the package; and what the package refuses to read."""
 
 import base64
 import os
@@ -6,6 +6,15 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+import pytest
+
+from curvafit.volumes import ScanError, load
+
+
+def unreadable(path: Path | str, word: str = "", **options: object) -> None:
+    """Refused in one sentence with a key word."""
+    with pytest.raises(ScanError, match=rf"^[^\n]*({word})[^\n]*$"):
+        load(path, **options)  # type: ignore[arg-type]
 
 
 def tree(folder: Path) -> dict[str, bytes]:

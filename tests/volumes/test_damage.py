@@ -15,6 +15,7 @@ pytest.importorskip("SimpleITK")
 pytest.importorskip("mrcfile")
 
 from damage import CHECKED, COUNTED, OTHERS, VALUES, damaged, files_of, gzipped
+from disk import unreadable
 
 from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.parameter_maps import read_maps
@@ -75,11 +76,9 @@ def test_a_gzip_stream_is_its_members_alone_to_the_last_bit(tmp_path: Path) -> N
     broken += [gzipped(content) + b"garbage", gzipped(content + bytes(50_000_000)), gzipped(moon)]
     for case in broken:
         path.write_bytes(case)
-        with pytest.raises(ScanError, match=r"^[^\n]*$"):
-            load(path)
+        unreadable(path)
     (tmp_path / "scan.nii").write_bytes(moon)
-    with pytest.raises(ScanError, match=r"^[^\n]*$"):
-        load(tmp_path / "scan.nii")
+    unreadable(tmp_path / "scan.nii")
 
 
 def test_nibabel_keeps_its_complaints_to_itself_and_the_note_tells(tmp_path: Path, capfd) -> None:
@@ -101,8 +100,7 @@ def test_pipes_and_devices_are_refused_at_once(tmp_path: Path, suffix: str) -> N
     os.mkfifo(tmp_path / f"pipe{suffix}")
     (tmp_path / f"endless{suffix}").symlink_to("/dev/zero")
     for name in ("pipe", "endless"):
-        with pytest.raises(ScanError, match="neither"):
-            load(tmp_path / f"{name}{suffix}", raw_shape=(2, 2, 2))
+        unreadable(tmp_path / f"{name}{suffix}", "neither", raw_shape=(2, 2, 2))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs named pipes")
@@ -118,8 +116,7 @@ def test_pipes_within_folders_and_headers_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="NPZ"):
         read_maps(tmp_path / "maps.npz")
     for name in ("scan.zarr", "slices", "a.mhd"):
-        with pytest.raises(ScanError, match="file"):
-            load(tmp_path / name)
+        unreadable(tmp_path / name, "file")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs symbolic links")
@@ -129,11 +126,9 @@ def test_links_in_circles_and_strange_names(tmp_path: Path) -> None:
         load(tmp_path / "a.nii")
     OTHERS["v3.zarr"](tmp_path / "scan.zarr")
     (tmp_path / "scan.zarr" / "inner").symlink_to(tmp_path / "scan.zarr")
-    with pytest.raises(ScanError, match="link"):
-        load(tmp_path / "scan.zarr")
+    unreadable(tmp_path / "scan.zarr", "link")
     np.save(tmp_path / "two\nlines.npy", np.zeros((2, 2, 2)))
-    with pytest.raises(ScanError, match=r"two\\nlines.npy"):
-        load(tmp_path / "two\nlines.npy")
+    unreadable(tmp_path / "two\nlines.npy", r"two\\nlines.npy")
     np.save(tmp_path / "a::b.npy", VALUES)
     assert np.array_equal(load(tmp_path / "a::b.npy").values, VALUES)
     for name in ("::", "::a", f"{tmp_path}/none.h5::a::b", "nul\0.nii"):

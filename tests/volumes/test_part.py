@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 import zarr
+from disk import unreadable
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -104,23 +105,19 @@ def test_a_channel_is_read_of_every_format(tmp_path: Path, kind: str) -> None:
     part = load(path, channel=1, crop="1:5,:,-3:-1")
     assert np.array_equal(part.values, VALUES[1:5, :, -3:-1])
     assert part.spacing == whole.spacing and part.affine is not None
-    with pytest.raises(ScanError, match="channel"):
-        load(path, channel=3)
-    with pytest.raises(ScanError, match="channel"):
-        load(path)
+    unreadable(path, "channel", channel=3)
+    unreadable(path, "channel")
 
 
 def test_a_file_of_one_channel_has_none_to_choose(tmp_path: Path) -> None:
     path = save(Field(VALUES), tmp_path / "scan.nii.gz")
-    with pytest.raises(ScanError, match="channel"):
-        load(path, channel=0)
+    unreadable(path, "channel", channel=0)
     np.save(tmp_path / "scan.npy", CHANNELS)
     for wrong in (-1, 1.5, True, "1"):
         with pytest.raises(ValueError, match="channel"):
             load(tmp_path / "scan.npy", channel=wrong)  # type: ignore[arg-type]
     np.save(tmp_path / "five.npy", np.zeros((2, 2, *SHAPE)))
-    with pytest.raises(ScanError, match="channel|5D"):
-        load(tmp_path / "five.npy", channel=0)
+    unreadable(tmp_path / "five.npy", "channel|5D", channel=0)
 
 
 def test_channels_without_slices_are_said_to_be_taken_for_them(tmp_path: Path) -> None:
@@ -163,8 +160,7 @@ def test_a_crop_is_where_it_was_in_the_whole_or_refused(tmp_path: Path, name: st
         assert image.affine @ [0, 1, 2, 1] == pytest.approx(full.affine @ [3, 2, 4, 1], rel=1e-5)
         assert np.asanyarray(image.dataobj)[0, 1, 2] == np.asanyarray(full.dataobj)[3, 2, 4]
     for crop in ("0:7,:,:", ":,3:3,:", ":,:,5:2", ":,:,-9:"):
-        with pytest.raises(ScanError, match="crop"):
-            load(path, crop=crop, **options)
+        unreadable(path, "crop", crop=crop, **options)
 
 
 edges = st.integers(-9, 9) | st.none()
@@ -200,12 +196,10 @@ def test_no_more_than_the_crop_needs_memory_and_a_cut_file_is_refused(tmp_path: 
     part = load(path, crop="0:2,:,:", **options)
     assert np.array_equal(part.values, VALUES[:2])
     if name != "scan.raw":
-        with pytest.raises(ScanError, match="memory"):
-            load(path, **options)
+        unreadable(path, "memory", **options)
     if path.suffix in (".nii", ".npy", ".raw"):  # a file that is cut is refused whatever the crop
         path.write_bytes(path.read_bytes()[:-8])
-        with pytest.raises(ScanError, match="cannot be read|bytes"):
-            load(path, crop="0:2,:,:", **options)
+        unreadable(path, "cannot be read|bytes", crop="0:2,:,:", **options)
 
 
 @pytest.mark.parametrize("label", range(4))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from damage import damaged
+from disk import unreadable
 
 from curvafit.volumes import ScanError, load
 
@@ -97,8 +98,7 @@ def test_damage_is_one_sentence(tmp_path: Path, name: str) -> None:
     cut = [content[: min(size, whole - 1)] for size in (0, 15, 100, 500, 512, 1000, whole // 2, whole - 1)]
     for broken in (*cut, b"<!DOCTYPE html>" * 100):
         path.write_bytes(broken)
-        with pytest.raises(ScanError, match=r"^[^\n]*$"):
-            load(path)
+        unreadable(path)
     chance = random.Random(2)
     for _ in range(60):  # a broken header is a ScanError or read, never another fault
         path.write_bytes(damaged(content[:512], chance) + content[512:])
