@@ -57,15 +57,13 @@ def brief(sample: Sample) -> str:
 def main(method: str, workers: str, persistent: str, log: str) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's jobs in the background ignore it
     pairs, found = balls(log, length=12), []
-    lasting = bool(int(persistent))
-    how = {"batch_size": None, "multiprocessing_context": method, "persistent_workers": lasting}
-    loader = DataLoader(pairs, num_workers=int(workers), **how)
+    how = {"multiprocessing_context": method, "persistent_workers": bool(int(persistent))}
+    loader = DataLoader(pairs, None, num_workers=int(workers), **how)
     for epoch in range(2):
         pairs.set_epoch(epoch)
         found += list(loader)
     assert isinstance(pairs.source, Pool)
-    place = pairs.source.room
-    print(json.dumps({"samples": sorted(found), "room": str(place), "there": place.is_dir()}))
+    print(json.dumps({"samples": sorted(found), "room": str(pairs.source.room), "there": pairs.source.room.is_dir()}))
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
+import pool_run
 import pytest
 import torch
 from exact_store import exact_field, exact_record, exact_store
@@ -164,12 +165,9 @@ def test_shapes_of_laws():
     assert choose_voxel([in_voxels], kind) == 0.5
 
 
-SCRIPT = Path(__file__).parents[1] / "pool_run.py"
-
-
 def start(*arguments: object, **room: str) -> subprocess.Popen[str]:
     room = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OMP_NUM_THREADS": "1"} | room
-    command, pipe = [sys.executable, str(SCRIPT), *map(str, arguments)], subprocess.PIPE
+    command, pipe = [sys.executable, pool_run.__file__, *map(str, arguments)], subprocess.PIPE
     return subprocess.Popen(command, env=room, text=True, stdout=pipe, stderr=pipe, start_new_session=os.name != "nt")
 
 

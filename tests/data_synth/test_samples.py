@@ -19,8 +19,7 @@ class Pip:
     """A stand-in for pip, which puts a wheel with a file into the folder, or fails, and keeps what it was asked."""
 
     def __init__(self, name: str = FILE, content: bytes = CONTENT, outcome: int | Exception = 0) -> None:
-        self.calls: list[list[str]] = []
-        self.name, self.content, self.outcome = name, content, outcome
+        self.calls, self.name, self.content, self.outcome = [], name, content, outcome
 
     def __call__(self, command: list[str], **options: object) -> subprocess.CompletedProcess[str]:
         self.calls.append(command)

@@ -34,11 +34,6 @@ def test_a_difference_is_noticed() -> None:
     for change in (far, {"b": {"shape": [3], "n": 8}}, {"b": {"shape": [3]}}, {"c": 1}):
         assert len(compare(kept, kept | change)) == 1
     assert compare(kept, kept | {"a": [[1.0, 250.1], ["Tb.Th", 0.1235]]}) == []  # a last digit
-
-
-def test_a_mask_may_differ_in_stray_voxels_alone() -> None:
-    mask = np.indices((12, 13, 14)).sum(0) % 8 < 3
-    for count, alike in ((int(STRAY * mask.size), True), (int(STRAY * mask.size) + 1, False)):
-        other = mask.copy()
-        other.flat[:count] ^= True
-        assert (compare(volume(mask), volume(other)) == []) is alike
+    mask = np.arange(10 / STRAY).reshape(1, 1, -1) % 8 < 3
+    for count in (10, 11):  # voxels that may stray, and one more
+        assert len(compare(volume(mask), volume(mask ^ (np.arange(mask.size) < count)))) == count - 10

@@ -25,24 +25,20 @@ from curvafit.volumes.write import save
 CASES = 30
 
 
-def outcome(path: Path) -> np.ndarray | None:
-    """The values, or None where they are refused in one sentence."""
-    try:
-        return load(path).values
-    except ScanError as error:
-        assert str(error).isprintable() and len(str(error)) < 900
-        return None
-
-
 def outcomes(path: Path, seed: str):
-    """Every damage to every file of a volume in turn, and what is read then."""
+    """Damage to files of a volume: by how much one grew, and the values then, or None where they are refused."""
     chance = random.Random(seed)
     for _ in range(CASES):
         file = chance.choice(files_of(path))
         whole = file.read_bytes()
         broken = damaged(whole, chance)
         file.write_bytes(broken)
-        yield len(broken) - len(whole), outcome(path)
+        try:
+            values = load(path).values
+        except ScanError as error:
+            assert str(error).isprintable() and len(str(error)) < 900
+            values = None
+        yield len(broken) - len(whole), values
         file.write_bytes(whole)
 
 

@@ -25,18 +25,12 @@ def content(path: Path, version: str) -> dict[str, Any]:
     return json.loads((path / "zarr.json").read_text())["attributes"]["ome"]
 
 
-def multiscale(path: Path) -> dict:
-    """The one image of a group of OME-NGFF 0.5."""
-    ome = content(path, "0.5")
-    assert ome["version"] == "0.5" and len(ome["multiscales"]) == 1
-    return ome["multiscales"][0]
-
-
 @pytest.mark.parametrize(("unit", "named"), [("nm", "nanometer"), ("um", "micrometer"), ("voxel", None)])
 def test_axes_have_a_name_a_type_and_a_unit(tmp_path: Path, unit: str, named: str | None) -> None:
     values = np.arange(60.0).reshape(3, 4, 5)
     path = save(Field(values, (3.0, 2.0, 0.5), unit), tmp_path / "scan.zarr")
-    found = multiscale(path)
+    (found,) = content(path, "0.5")["multiscales"]
+    assert content(path, "0.5")["version"] == "0.5"
     assert found["axes"] == [{"name": name, "type": "space", **({"unit": named} if named else {})} for name in "zyx"]
     scale = {"type": "scale", "scale": [3.0, 2.0, 0.5]}
     assert found["datasets"] == [{"path": "0", "coordinateTransformations": [scale]}]
@@ -50,7 +44,7 @@ def test_halved_levels_lie_where_the_whole_one_does(tmp_path: Path, dtype: str) 
     """A ramp along z stays the same function of the place that scale and translation give a voxel."""
     z = np.arange(130, dtype=dtype)
     path = save(Field(z[:, None, None] * np.ones((1, 70, 8), dtype), (2.0, 1.0, 0.5), "um"), tmp_path / "scan.zarr")
-    levels = multiscale(path)["datasets"]
+    levels = content(path, "0.5")["multiscales"][0]["datasets"]
     shapes = [zarr.open_array(path / level["path"], mode="r").shape for level in levels]
     assert shapes == [(130, 70, 8), (65, 35, 4), (33, 18, 2)]
     for level, (n, _, _) in zip(levels, shapes, strict=True):
