@@ -13,17 +13,21 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "curvafit"
 WINGS = ("priors", "generation", "data_synth")
 ROOMS = ["curvafit"] + [
     f"curvafit.{path.parent.name}"
-    for path in sorted((ROOT / "curvafit").glob("*/__init__.py"))
+    for path in sorted(PACKAGE.glob("*/__init__.py"))
     if re.search(r"__all__|attach_lazy_names", path.read_text("utf-8"))
 ]
-PRIORS = [
-    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
-    for path in sorted((ROOT / "curvafit" / "priors").rglob("*.py"))
-    if path.parent.name != "kernels"
-]
+
+
+def module_name(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+FILES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+PRIORS = [name for name in FILES if f"{name}.".startswith("curvafit.priors.") and "kernels" not in name]
 
 #: Asks everything in an order in which no answer depends on an earlier question, and prints the answers as JSON.
 SCRIPT = r"""
@@ -106,7 +110,6 @@ def test_the_package_imports_nothing(answers) -> None:
     assert answers["names"] == {room: [] for room in ROOMS}
 
 
-PACKAGE = Path(__file__).resolve().parents[2] / "curvafit"
 #: The house from the ground up. A folder (or a file at the root) imports from floors below its own.
 FLOORS = (
     ("core",), ("priors",), ("generation", "volumes", "geometry"), ("scan", "drawing"), ("inference",), ("data_synth",),
@@ -121,15 +124,12 @@ def test_arrows_run_one_way() -> None:
         "generation.flow": "def f():\n    from curvafit import generate", "drawing.plot": "from priors import energy",
     }.items():  # fmt: skip
         assert complaints(f"curvafit.{module}", line) != []
-    for path in PACKAGE.rglob("*.py"):
-        module = module_name(path)
-        assert module == "curvafit" or complaints(module, path.read_text(encoding="utf-8")) == []
-    files = {module_name(path): path for path in PACKAGE.rglob("*.py")}
     graph = {}
-    for module, path in files.items():
-        names = [name for name, _ in imports(path.read_text(encoding="utf-8"))]
-        targets = {name if name in files else name.rpartition(".")[0] for name in names}
-        graph[module] = targets & files.keys() - {"curvafit", module}
+    for module, path in FILES.items():
+        text = path.read_text(encoding="utf-8")
+        assert module == "curvafit" or complaints(module, text) == []
+        targets = {name if name in FILES else name.rpartition(".")[0] for name, _ in imports(text)}
+        graph[module] = targets & FILES.keys() - {"curvafit", module}
     graphlib.TopologicalSorter(graph).prepare()
     with pytest.raises(graphlib.CycleError):
         graphlib.TopologicalSorter(graph | {"curvafit.core.checks": {"curvafit.cli.app"}}).prepare()
@@ -157,8 +157,3 @@ def imports(text: str) -> Iterator[tuple[str, int]]:
             yield from ((f"{alias.name}.*", 0) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             yield from ((f"{node.module or ''}.{alias.name}", node.level) for alias in node.names)
-
-
-def module_name(path: Path) -> str:
-    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)

@@ -50,11 +50,8 @@ def test_one_version_everywhere() -> None:
 
 
 #: Files of the package in this tree, without what interpreters and compilers leave behind.
-PACKAGE = {
-    path.relative_to(ROOT).as_posix()
-    for path in (ROOT / "curvafit").rglob("*")
-    if path.is_file() and "__pycache__" not in path.parts
-}
+FILES = (path for path in (ROOT / "curvafit").rglob("*") if path.is_file() and "__pycache__" not in path.parts)
+PACKAGE = {path.relative_to(ROOT).as_posix() for path in FILES}
 
 
 def build(target: str, folder: Path) -> Path:

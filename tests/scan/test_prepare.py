@@ -39,9 +39,6 @@ def threshold_of(scan: Prepared | Field) -> float:
     return float(match[1])
 
 
-# ---- large files -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("crop", [None, ":,4:20,:"])
 def test_of_a_large_file_the_middle_is_read(tmp_path, monkeypatch, crop) -> None:
     monkeypatch.setattr("curvafit.scan.prepare.LARGEST_SCAN", 24)
@@ -173,9 +170,6 @@ def test_only_the_region_of_interest_is_filled_or_turned() -> None:
     assert any("of the background" in note for note in own.notes)
 
 
-# ---- what is no texture ----------------------------------------------------------------------------------------------
-
-
 def ball(n: int, centre: float, radius: float) -> np.ndarray:
     return np.square(np.indices((n, n, n)) - centre).sum(0) < radius**2
 
@@ -284,8 +278,7 @@ def test_only_the_region_of_interest_counts(tmp_path) -> None:
     path = save(Field(region), tmp_path / "roi.nii")
     for roi in (region, Field(region), path):
         prepared = prepare(Field(mask), roi=roi)
-        assert prepared.mask.shape == (32, 32, 20)
-        assert prepared.origin == (4, 4, 10)
+        assert prepared.mask.shape == (32, 32, 20) and prepared.origin == (4, 4, 10)
         assert np.array_equal(prepared.mask, mask[4:36, 4:36, 10:30])
     holed = region.copy()
     holed[:, :20] = 0
@@ -427,8 +420,7 @@ def test_what_smoothing_leaves_of_white_noise() -> None:
 def test_noise_is_read_on_slices_that_are_thicker(spacing: tuple[float, float, float]) -> None:
     mask = BODIES[:: int(spacing[0])]
     quality = measure_quality(image(mask, 0.7, 0.2), mask, spacing)
-    assert quality.noise == pytest.approx(0.2, rel=0.15)
-    assert quality.grain <= 0.5
+    assert quality.noise == pytest.approx(0.2, rel=0.15) and quality.grain <= 0.5
     assert Quality(0.5, 0.02, 0.0, 0.0, spacing).degraded == (spacing != CUBIC)  # worse than a mask
 
 

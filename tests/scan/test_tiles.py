@@ -109,9 +109,6 @@ def test_balls_of_a_core_are_those_of_the_whole(spacing: tuple[float, float, flo
         assert np.mean(paint_coarse_balls(radius, spacing, 2)[phase]) == pytest.approx(whole[phase].mean(), rel=0.1)
 
 
-# ---- files, workers, kills -------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scan = Field(noisy(texture((70, 48, 48)) > 0), 0.5, "um")  # type: ignore[arg-type]

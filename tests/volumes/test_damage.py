@@ -87,9 +87,6 @@ def test_nibabel_keeps_its_complaints_to_itself_and_the_note_tells(tmp_path: Pat
     assert capfd.readouterr() == ("", "")
 
 
-# ---- what is no file -------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="needs named pipes")
 @pytest.mark.parametrize("suffix", [".nii", ".nii.gz", ".tif", ".npy", ".npz", ".h5", ".nrrd", ".mha", ".mrc", ".raw"])
 def test_pipes_and_devices_are_refused_at_once(tmp_path: Path, suffix: str) -> None:

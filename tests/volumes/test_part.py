@@ -243,8 +243,7 @@ def test_a_volume_is_itself_in_every_pose(axes: tuple[int, ...], signs: tuple[in
     columns = (np.array(signs)[:, None] * steps)[::-1].T
     field = world(turned, columns, AFFINE[:3, 3] + lengths @ steps)
     laid, notes = lay(field, SCAN, "the region", "the scan", exact=True)
-    assert (laid.values == LABELS).all()
-    assert laid.values.dtype == LABELS.dtype
+    assert (laid.values == LABELS).all() and laid.values.dtype == LABELS.dtype
     assert bool(notes) == (axes != (0, 1, 2) or signs != (1, 1, 1))
 
 
@@ -252,8 +251,7 @@ def test_a_shift_leaves_zeros_beyond_and_a_unit_converts() -> None:
     origin = AFFINE[:3, 3] + [H, 0, 0]
     for field in (world(LABELS, H * np.eye(3), origin), world(LABELS, 1000 * H * np.eye(3), 1000 * origin, "um")):
         laid, (note,) = lay(field, SCAN, "the region", "the scan")
-        assert (laid.values[..., 1:] == LABELS[..., :-1]).all()
-        assert not laid.values[..., 0].any()
+        assert (laid.values[..., 1:] == LABELS[..., :-1]).all() and not laid.values[..., 0].any()
         assert (laid.unit, laid.spacing) == ("mm", (H, H, H))
         assert "beyond" in note
         with pytest.raises(ScanError, match="covers"):

@@ -130,22 +130,19 @@ OME = {"PhysicalSizeX": 0.2, "PhysicalSizeY": 0.2, "PhysicalSizeZ": 900, "Physic
     [
         ({**imagej(spacing=3, unit="micron"), "resolution": (4, 2)}, (3, 0.5, 0.25), "um"),
         ({**imagej(unit="cm"), "resolution": (4, 4)}, (2.5, 2.5, 2.5), "mm"),
-        ({**imagej(spacing=2), "resolution": (0.5, 0.5)}, (1, 1, 1), "voxel"),
-        (imagej(spacing=5), (5, 1, 1), "voxel"),
+        ({**imagej(spacing=2), "resolution": (0.5, 0.5)}, (1, 1, 1), "voxel"), (imagej(spacing=5), (5, 1, 1), "voxel"),
         ({"ome": True, "metadata": {"axes": "ZYX", **OME}}, (0.9, 0.2, 0.2), "um"),
         ({"metadata": {"axes": "ZYX", "spacing": [3, 2, 1], "unit": "um"}}, (3, 2, 1), "um"),
         ({"metadata": {"axes": "ZYX", "spacing": 19.5, "unit": "um"}}, (19.5, 19.5, 19.5), "um"),
         ({"resolution": (500, 500), "resolutionunit": "CENTIMETER"}, (0.02, 0.02, 0.02), "mm"),
-        ({"resolution": (72, 72), "resolutionunit": "INCH"}, (1, 1, 1), "voxel"),
-        ({"resolution": (25.4, 25.4), "resolutionunit": "INCH"}, (1, 1, 1), "voxel"),
+        *(({"resolution": (each, each), "resolutionunit": "INCH"}, (1, 1, 1), "voxel") for each in (72, 25.4)),
         ({}, (1, 1, 1), "voxel"),
     ],
-)
+)  # fmt: skip
 def test_tiff_states_its_spacing_in_many_ways(tmp_path: Path, options: dict, spacing, unit: str) -> None:
     tifffile.imwrite(tmp_path / "scan.tif", ramp(), photometric="minisblack", **options)
     field = load(tmp_path / "scan.tif")
-    assert field.spacing == pytest.approx(spacing, rel=1e-5)
-    assert field.unit == unit
+    assert field.spacing == pytest.approx(spacing, rel=1e-5) and field.unit == unit
     given = load(tmp_path / "scan.tif", spacing=(3, 2, 1), unit="nm")
     assert (given.spacing, given.unit, given.notes) == ((3, 2, 1), "nm", ())
 
@@ -213,8 +210,7 @@ def test_arguments_override_the_file_and_the_affine_follows(stated, given_spacin
         path = save(Field(ramp(), stated, file_unit), Path(folder) / "scan.nii")
         field = load(path, spacing=given_spacing, unit=unit)
     name, factor = (file_unit, 1.0) if unit is None else parse_unit(unit)
-    assert field.unit == name
-    assert field.spacing == pytest.approx(tuple(h * factor for h in given_spacing))
+    assert field.unit == name and field.spacing == pytest.approx(tuple(h * factor for h in given_spacing))
     assert np.linalg.norm(field.affine[:3, :3], axis=0)[::-1] == pytest.approx(field.spacing, rel=1e-5)
 
 
@@ -239,9 +235,6 @@ def test_compressed_tiffs_and_slices_are_read(tmp_path: Path, compression: str) 
         for number, plane in enumerate(VALUES):
             tifffile.imwrite(tmp_path / "slices" / f"{number}.tif", plane, rowsperstrip=3, **options)
         assert np.array_equal(load(tmp_path / "slices").values, VALUES)
-
-
-# ---- the extra formats -----------------------------------------------------------------------------------------------
 
 
 def test_nrrd(tmp_path: Path) -> None:
