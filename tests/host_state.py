@@ -135,13 +135,10 @@ def calls(folder: Path) -> dict[str, Callable[[], object]]:
     sized = curvafit.Field(ball, (2.0, 1.0, 1.0), "um")
     every = {
         "Coefficients": lambda: curvafit.Coefficients(1, 2, 6).in_unit(2.0),
-        "Grid": lambda: curvafit.Grid((8, 8, 8)).volume,
-        "__version__": lambda: curvafit.__version__,
-        "preset": lambda: curvafit.preset("tubes"),
-        "energy": lambda: priors.energy(u, law, grid, 0.02),
+        "Grid": lambda: curvafit.Grid((8, 8, 8)).volume, "__version__": lambda: curvafit.__version__,
+        "preset": lambda: curvafit.preset("tubes"), "energy": lambda: priors.energy(u, law, grid, 0.02),
         "energy_gradient": lambda: priors.energy_gradient(u, law, grid, 0.02),
-        "energy_terms": lambda: priors.energy_terms(priors.jet(u, grid), 0.02),
-        "jet": lambda: priors.jet(u, grid),
+        "energy_terms": lambda: priors.energy_terms(priors.jet(u, grid), 0.02), "jet": lambda: priors.jet(u, grid),
         "diffuse_curvatures": lambda: priors.diffuse_curvatures(priors.jet(u, grid), 0.02),
         "geometric_curvatures": lambda: priors.geometric_curvatures(priors.jet(u, grid)),
         "cahn_hilliard_area": lambda: priors.cahn_hilliard_area(u, grid, 0.02),
@@ -158,20 +155,17 @@ def calls(folder: Path) -> dict[str, Callable[[], object]]:
         "descend": lambda: (descend(), descend(flow="h-1", optimiser="adam")),
         "diagram": lambda: keep("diagram", curvafit.diagram(kept["flow"].field, grid, 0.02)),
         "Diagram": lambda: curvafit.Diagram(np.zeros((1, 2)), np.ones(1)),
-        "wasserstein": lambda: curvafit.wasserstein(kept["diagram"], kept["diagram"]),
-        "plot": plot,
+        "wasserstein": lambda: curvafit.wasserstein(kept["diagram"], kept["diagram"]), "plot": plot,
         "Field": lambda: curvafit.Field(ball),
         "save": lambda: [curvafit.save(sized, folder / name) for name in (*files, "a.npy", "a.mrc", "a.zarr")],
         "load": lambda: [curvafit.load(path) for path in sorted(folder.glob("a.*"))],
         "segment": lambda: curvafit.segment(scan, "tubes", threshold=100.0, steps=2),
-        "reconstruct": lambda: curvafit.reconstruct(slices, "tubes", every=4, steps=2),
-        "infer": infer,
-        "measure": lambda: curvafit.measure(ball),
-        "measure_instances": lambda: curvafit.measure_instances(ball),
+        "reconstruct": lambda: curvafit.reconstruct(slices, "tubes", every=4, steps=2), "infer": infer,
+        "measure": lambda: curvafit.measure(ball), "measure_instances": lambda: curvafit.measure_instances(ball),
         "windows": lambda: curvafit.windows((np.indices((24, 24, 36))[2] % 12 < 6).astype(np.uint8), 24, 12),
         "compare": lambda: curvafit.compare(*[[np.roll(ball, k, 0) for k in (0, 1)]] * 2),
         "read_laws": lambda: priors.read_laws(["tubes", law, folder / "fit.json"]),
-    }
+    }  # fmt: skip
     public = {*curvafit.__all__, *priors.__all__, "__version__"}
     return {name: call for name, call in every.items() if name in public}
 

@@ -402,14 +402,19 @@ def run(folder: Path, line: str, change: int = 0, number: int = 0) -> tuple[int,
     return ended.returncode, ended.stdout
 
 
-@pytest.mark.parametrize("line", [LONG, SYNTH, BUILD, f"{SEGMENT} --tile 16 -o out.nii.gz"])
-def test_a_run_that_is_ended_leaves_whole_files_and_goes_on(tmp_path: Path, line: str) -> None:
+#: Early or late, which are one exception.
+EARLY, LATE = (signal.SIGINT, 0.1), (signal.SIGTERM, 0.9)
+TILED = f"{SEGMENT} --tile 16 -o out.nii.gz"
+
+
+@pytest.mark.parametrize(("line", "other"), [(LONG, EARLY), (SYNTH, LATE), (BUILD, EARLY), (TILED, LATE)])
+def test_a_run_that_is_ended_leaves_whole_files_and_goes_on(tmp_path: Path, line: str, other: tuple) -> None:
     """By a signal at any change of a file: afterwards the same command ends as an unbroken one does."""
     code, said = run(tmp_path / "whole", line)
     changes = int(said.rpartition("changes ")[2])
     assert code == 0 and changes > 9, said
     inputs = {word for word in line.split() if (FOLDER / word).exists()}
-    for number, share in ((signal.SIGINT, 0.1), (signal.SIGKILL, 0.5), (signal.SIGTERM, 0.9)):
+    for number, share in ((signal.SIGKILL, 0.5), other):
         folder = tmp_path / f"{share}"
         code, said = run(folder, line, 1 + int(share * changes), number)
         assert code in (0, -number, 128 + number) and "Traceback" not in said, said

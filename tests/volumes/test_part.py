@@ -75,21 +75,18 @@ PLACED = {"space": "right-anterior-superior", "space directions": DIRECTIONS, "s
 CHANNELLED: dict[str, tuple[str, Callable[[Path], None]]] = {
     "ome-tiff": ("scan.ome.tif", tiff(CHANNELS, "CZYX", ome=True)),
     "imagej": ("scan.tif", tiff(np.moveaxis(CHANNELS, 0, 1), "ZCYX", imagej=True)),
-    "rgb": ("rgb.tif", tiff(LAST.astype(np.uint16), photometric="rgb")),
-    "rgb slices": ("slices", write_rgb_slices),
-    "nifti": ("scan.nii", nifti(CHANNELS)),
-    "nifti.gz": ("scan.nii.gz", nifti(CHANNELS)),
+    "rgb": ("rgb.tif", tiff(LAST.astype(np.uint16), photometric="rgb")), "rgb slices": ("slices", write_rgb_slices),
+    "nifti": ("scan.nii", nifti(CHANNELS)), "nifti.gz": ("scan.nii.gz", nifti(CHANNELS)),
     "vector nifti": ("scan.nii", nifti(CHANNELS[:, None])),
     "nrrd": ("scan.nrrd", nrrd(LAST, **PLACED, kinds=["vector", *["domain"] * 3])),
     "nrrd kinds": ("scan.nrrd", nrrd(CHANNELS, kinds=[*["domain"] * 3, "list"])),
     "mha": ("scan.mha", metaimage(LAST, True, (0.1, 0.2, 0.3))),
-    "mha times": ("scan.mha", metaimage(CHANNELS, False, (1.0,) * 4)),
-    "ome-zarr": ("scan.ome.zarr", write_ome_zarr),
+    "mha times": ("scan.mha", metaimage(CHANNELS, False, (1.0,) * 4)), "ome-zarr": ("scan.ome.zarr", write_ome_zarr),
     "hdf5": ("scan.h5", lambda path: h5py.File(path, "w").create_dataset("raw", data=LAST).file.close()),
     "npy": ("scan.npy", lambda path: np.save(path, CHANNELS)),
     "npy, fortran": ("scan.npy", lambda path: np.save(path, np.asfortranarray(CHANNELS))),
     "npz": ("scan.npz", lambda path: np.savez(path, LAST)),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", CHANNELLED)
