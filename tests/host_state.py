@@ -103,7 +103,7 @@ def _digest(value: str | bytes) -> str:
 
 def calls(folder: Path) -> dict[str, Callable[[], object]]:
     """Every public call by name, in the order to make them; later ones take what earlier ones left in `kept`."""
-    grid, law, brief = priors.Grid((24, 24, 24)), priors.preset("tubes").coefficients, schedule("fast", 100)
+    grid, law, brief = priors.Grid((24, 24, 24)), priors.preset("tubes").coefficients, schedule("fast", 50)
     noise = torch.rand((1, 1, 24, 24, 24), generator=torch.Generator().manual_seed(0))
     u, mse = noise[0, 0], torch.nn.functional.mse_loss
     z, y, x = np.mgrid[:24, :24, :24] - 11.5

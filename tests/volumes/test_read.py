@@ -398,14 +398,11 @@ RECORDS = np.zeros((2, 3, 4), np.dtype([("a", "f4"), ("ö", "i2")]))
 BARE = {"spacing": "abc"}, {"spacing": (1, 0, 1)}, {"spacing": (1, -1, 1)}, {"spacing": (1, 1)}, {"spacing": 0.0}
 BARE += ({"spacing": (1, 2, 3, 4)}, {"spacing": (1, float("nan"), 1)})
 REFUSED: list[tuple[str, Callable[[Path], object], dict, str]] = [
-    ("a.npy", npy(ramp((5, 6))), {}, "2D"),
-    ("a.npy", npy(ramp((1, 5, 6))), {}, "2D"),
-    ("a.npy", npy(ramp((2, 3, 4, 5))), {}, "4D"),
-    ("a.npy", npy(np.zeros((0, 5, 6))), {}, "no values"),
+    ("a.npy", npy(ramp((5, 6))), {}, "2D"), ("a.npy", npy(ramp((1, 5, 6))), {}, "2D"),
+    ("a.npy", npy(ramp((2, 3, 4, 5))), {}, "4D"), ("a.npy", npy(np.zeros((0, 5, 6))), {}, "no values"),
     ("a.npy", npy(np.where(ramp() == 7, np.nan, ramp())), {}, "NaN"),
     ("a.npy", npy(np.where(ramp() < 2, np.inf, ramp())), {}, "infinite"),
-    ("a.npy", npy(np.full((4, 5, 6), 3)), {}, "vary"),
-    ("a.npy", npy(VALUES), {"key": "raw"}, "key"),
+    ("a.npy", npy(np.full((4, 5, 6), 3)), {}, "vary"), ("a.npy", npy(VALUES), {"key": "raw"}, "key"),
     ("a.npy", lambda path: hdf5(path, raw=VALUES), {}, "cannot be read"),
     *(("a.npy", npy(ramp()), options, "spacing") for options in BARE),
     *((name, write(values), {}, "")
@@ -418,8 +415,7 @@ REFUSED: list[tuple[str, Callable[[Path], object], dict, str]] = [
     ("a.h5", dataset(shape=(10**4,) * 3, dtype="f8", chunks=(100,) * 3), {}, "memory"),
     ("a.h5", dataset(shape=(8, 8, 8), dtype="u1", external=[("bytes", 0, 512)]), {}, "other files"),
     ("a.h5", lambda path: hdf5(path, raw=h5py.ExternalLink("nowhere.h5", "raw")), {}, ""),
-    ("a.h5", stated(element_size_um=[0.0, 0.2, 0.2]), {}, "spacing"),
-    ("a.tif", lose_strips, {}, "page 4"),
+    ("a.h5", stated(element_size_um=[0.0, 0.2, 0.2]), {}, "spacing"), ("a.tif", lose_strips, {}, "page 4"),
     ("a.ims", lambda path: hdf5(path, raw=VALUES), {}, "no arrays"),
     ("a.ims", lambda path: write_imaris(path, 1, voxels=900), {}, "900"),
     ("a.nowhere", lambda path: path.write_bytes(b"x"), {}, "must end"),
