@@ -14,8 +14,7 @@ import tifffile
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from curvafit.volumes.field import Field
-from curvafit.volumes.write import save
+from curvafit.volumes import Field, save
 
 VALUES = (np.random.default_rng(0).random((9, 10, 11)) * 200).astype(np.uint16)
 VALUES[2:5] = 0

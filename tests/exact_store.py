@@ -4,11 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from curvafit.data_synth import Detector, Imaging, Modality, Optics, Record, Settings, Store, design_box, open_store
 from curvafit.data_synth.case import Recipe
-from curvafit.data_synth.design import design_box
-from curvafit.data_synth.imaging.modality import Detector, Imaging, Modality, Optics
 from curvafit.data_synth.sources import Stored
-from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.generation.result import Viability
 from curvafit.priors.coefficients import Coefficients
 

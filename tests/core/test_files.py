@@ -14,9 +14,7 @@ from disk import tree
 from curvafit.core import files
 from curvafit.core.files import check_folder, is_empty, move_together, temporary_folder, write_atomically, write_content
 from curvafit.core.records import Format, can_write, has_mark, parse_json, sibling
-from curvafit.volumes.field import Field
-from curvafit.volumes.read import load
-from curvafit.volumes.write import save
+from curvafit.volumes import Field, load, save
 
 
 def test_a_file_is_the_new_one_or_the_old_one(tmp_path: Path) -> None:

@@ -13,9 +13,7 @@ from found import made_inference
 
 from curvafit.data_synth.store import open_store
 from curvafit.report.page import FILES, write_inference
-from curvafit.volumes.field import Field
-from curvafit.volumes.read import load
-from curvafit.volumes.write import save
+from curvafit.volumes import Field, load, save
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
@@ -36,8 +34,7 @@ def thesis(folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("scan") / "slices.npy"
-    return save(MASK, path)
+    return save(MASK, tmp_path_factory.mktemp("scan") / "slices.npy")
 
 
 def commands(scan: Path) -> dict[str, list[object]]:

@@ -31,8 +31,7 @@ from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality, No
 from curvafit.data_synth.sources import apply_symmetry, choose_voxel, crop_periodic
 from curvafit.data_synth.store import open_store
 from curvafit.priors import preset
-from curvafit.volumes.field import Field
-from curvafit.volumes.write import save
+from curvafit.volumes import Field, save
 
 QUIET = Modality("quiet", "for tests", 1.0, Imaging(optics=Optics(blur=(0.5, 0.5, 0.5)), noise=Noise(gaussian=1.0)))
 SHAPE = (12, 16, 20)

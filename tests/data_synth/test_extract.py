@@ -14,9 +14,7 @@ from curvafit.data_synth.extract import describe
 from curvafit.geometry.descriptors import BLOCKS, descriptors
 from curvafit.inference import table as tables
 from curvafit.inference.table import VIEWS, Table, column_names, law_of, load_table, parameters_of, save_table
-from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.grid import Grid
-from curvafit.priors.law import preset
+from curvafit.priors import Coefficients, Grid, preset
 from curvafit.scan.measure import read_texture
 from curvafit.scan.prepare import WORKING_THICKNESS, prepare, thinner_thickness
 from curvafit.volumes.field import ScanError

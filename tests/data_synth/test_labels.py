@@ -9,9 +9,8 @@ from scipy.spatial import cKDTree
 
 from curvafit.data_synth.centreline import skeleton_of
 from curvafit.data_synth.labels import NAMES, field_distance, instances_of, labels_of
+from curvafit.geometry import betti_numbers, surface
 from curvafit.geometry.diagram import MARGIN
-from curvafit.geometry.mesh import surface
-from curvafit.geometry.topology import betti_numbers
 from curvafit.priors.grid import Grid
 
 pytestmark = pytest.mark.slow

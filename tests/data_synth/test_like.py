@@ -12,10 +12,8 @@ from curvafit.data_synth.imaging.effects import EPSILON
 from curvafit.data_synth.imaging.image import image, regrid
 from curvafit.data_synth.imaging.like import fit_modality
 from curvafit.data_synth.imaging.modality import Contrast, Detector, Imaging, Noise, Optics
-from curvafit.priors.grid import Grid
-from curvafit.priors.profile import optimal_profile
-from curvafit.volumes.field import Field
-from curvafit.volumes.read import load
+from curvafit.priors import Grid, optimal_profile
+from curvafit.volumes import Field, load
 
 pytestmark = pytest.mark.slow
 
@@ -31,12 +29,8 @@ PHOTONS = Imaging(
 SLICES = Imaging(
     spacing=(2, 1, 1), contrast=Contrast(40, 160), optics=Optics((2, 1.2, 1.2)), noise=Noise(12, width=(0, 0.7, 0.7))
 )
-TEXTURED = Imaging(
-    contrast=Contrast(60, 180, 0.15, 5, 0.2, 8),
-    optics=Optics((1.2,) * 3),
-    noise=Noise(8),
-    detector=Detector(ceiling=255),
-)
+UNEVEN = Contrast(60, 180, 0.15, 5, 0.2, 8)
+TEXTURED = Imaging(contrast=UNEVEN, optics=Optics((1.2,) * 3), noise=Noise(8), detector=Detector(ceiling=255))
 DARK = Imaging(contrast=Contrast(150, 60), optics=Optics(blur=(1.0, 1.0, 1.0)), noise=Noise(gaussian=5))
 CASES = {"photons": PHOTONS, "slices": SLICES, "textured": TEXTURED, "dark": DARK}
 
@@ -102,12 +96,8 @@ def test_odd_scans(shape: torch.Tensor) -> None:
     low = fit_modality(Field(signed.astype(np.int16), (1.0, 1.0, 1.0), "um"), mask)
     assert low.base.detector.ceiling is None
     assert image(shape, 1.0, low.base, 0).amin() < -300
-    bare, few, light = (
-        np.where(mask, 80.0, 0.0),
-        rng.poisson(0.02 + 3.0 * mask),
-        rng.normal(0, 10, mask.shape) + 100 * mask,
-    )
-    for values in (bare, few, light):
+    few, light = rng.poisson(0.02 + 3.0 * mask), rng.normal(0, 10, mask.shape) + 100 * mask
+    for values in (np.where(mask, 80.0, 0.0), few, light):
         found = fit_modality(Field(values.astype(np.float32), (1.0, 1.0, 1.0), "um"), mask)
         assert 0 <= found.base.illumination.bias <= 0.9 and np.isfinite(found.base.detector.gain)
     small = fit_modality(Field(signed[:40, :14, :40].astype(np.float32), (1.0, 1.0, 1.0), "um"), mask[:40, :14, :40])

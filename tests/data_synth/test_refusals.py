@@ -11,16 +11,13 @@ import pytest
 import torch
 from exact_store import FLAT, flat_recipe
 
-from curvafit.data_synth import TextureDataset, design_box
+from curvafit.data_synth import Contrast, Imaging, Modality, TextureDataset, design_box, labels_of, open_store
 from curvafit.data_synth.case import Composition, Recipe
 from curvafit.data_synth.centreline import centreline
 from curvafit.data_synth.imaging.like import fit_modality
-from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality
-from curvafit.data_synth.labels import labels_of
 from curvafit.data_synth.samples import fetch
 from curvafit.data_synth.sets import SetSpec, build_set, make_cases, read_spec
 from curvafit.data_synth.sources import Generated, decode_source, random_crop
-from curvafit.data_synth.store import open_store
 from curvafit.priors import Grid, preset
 from curvafit.volumes.field import Field
 

@@ -129,8 +129,6 @@ def read_again(path: Path) -> None:
         assert path.read_text(encoding="utf-8").rstrip().endswith("</html>"), path
 
 
-# ---- what is drawn ---------------------------------------------------------------------------------------------------
-
 EXAMPLES = int(os.environ.get("CURVAFIT_HOSTILE", "0"))
 #: Of each command, and of all together.
 DRAWN = settings(deadline=None, phases=[Phase.generate], print_blob=True, suppress_health_check=list(HealthCheck))

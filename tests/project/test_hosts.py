@@ -18,8 +18,7 @@ from calling import done
 from scipy import ndimage
 
 from curvafit.generation import generate
-from curvafit.priors import Coefficients, Grid
-from curvafit.priors.law import preset
+from curvafit.priors import Coefficients, Grid, preset
 from curvafit.volumes import Field, load, save
 
 HOSTS = Path(__file__).resolve().parents[2] / "examples" / "hosts"

@@ -16,9 +16,7 @@ from curvafit.scan import prepare as preparing
 from curvafit.scan.grids import boxes_by_surface, centre_distance, median_thickness, remove_specks, resample
 from curvafit.scan.prepare import WORKING_THICKNESS, Prepared, coarser_level, is_ball, prepare, read_scan
 from curvafit.scan.structure import Quality, find_structure, is_noise, measure_quality, sample_mask
-from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.read import load
-from curvafit.volumes.write import save
+from curvafit.volumes import Field, ScanError, load, save
 
 
 def tube_mask(shape: tuple[int, int, int], spacing: tuple[float, float, float], radius: float) -> np.ndarray:

@@ -18,8 +18,7 @@ from curvafit.scan.instances import OF_BODIES, measure_instances
 from curvafit.scan.measure import Measures
 from curvafit.scan.measure import measure as measure_in_one
 from curvafit.scan.tiles import measure
-from curvafit.volumes.field import Field
-from curvafit.volumes.write import save
+from curvafit.volumes import Field, save
 
 #: Shapes of scans, in voxels: of quick tests, and of those of any size of tiles, which have intervals.
 SMALL, LARGE = (66, 51, 54), (99, 67, 73)
@@ -246,10 +245,7 @@ def test_the_command_writes_rows_for_each_instance(labels: np.ndarray, tmp_path:
     np.save(tmp_path / "grey.npy", np.random.default_rng(0).integers(0, 200, (20, 20, 20)))
     np.save(tmp_path / "part.npy", labels + 0.5)
     for arguments, word in (
-        (("grey.npy", "--labels"), "grey"),
-        (("part.npy", "--labels"), "whole"),
-        (("labels.npy", "--labels", "--dark"), "--dark"),
-        (("labels.npy", "--labels", "--roi", path), "--roi"),
-        (("labels.npy", "--labels", "--label", 5), "label"),
-    ):
-        refused(call("measure", tmp_path / arguments[0], *arguments[1:]), word)
+        (("grey.npy",), "grey"), (("part.npy",), "whole"), (("labels.npy", "--dark"), "--dark"),
+        (("labels.npy", "--roi", path), "--roi"), (("labels.npy", "--label", 5), "label"),
+    ):  # fmt: skip
+        refused(call("measure", tmp_path / arguments[0], "--labels", *arguments[1:]), word)

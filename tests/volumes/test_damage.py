@@ -17,10 +17,7 @@ pytest.importorskip("mrcfile")
 from damage import CHECKED, COUNTED, OTHERS, VALUES, damaged, files_of, gzipped
 from disk import unreadable
 
-from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.parameter_maps import read_maps
-from curvafit.volumes.read import load
-from curvafit.volumes.write import save
+from curvafit.volumes import Field, ScanError, load, read_maps, save
 
 CASES = 30
 

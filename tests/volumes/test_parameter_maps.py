@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from curvafit.volumes.field import Field
+from curvafit.volumes import Field, save
 from curvafit.volumes.parameter_maps import map_shape, read_maps
-from curvafit.volumes.write import save
 
 RAMP = np.linspace(1, 2, 4 * 5 * 6).reshape(4, 5, 6)
 

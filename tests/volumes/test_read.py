@@ -53,9 +53,6 @@ signs = st.tuples(*[st.sampled_from((-1.0, 1.0))] * 3)
 origins = st.tuples(*[st.floats(-100, 100)] * 3)
 
 
-# ---- sources ---------------------------------------------------------------------------------------------------------
-
-
 def test_every_kind_of_source_is_one_field(tmp_path: Path) -> None:
     field = Field(ramp(), (3.0, 2.0, 1.0), "um")
     path = save(field, tmp_path / "scan.nii.gz")

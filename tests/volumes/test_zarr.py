@@ -121,8 +121,6 @@ def test_chunks_that_a_shard_lacks_are_counted(tmp_path: Path) -> None:
     assert note == "1 of 12 chunks are not stored: their voxels have the fill value 0."
 
 
-# ---- labels ----------------------------------------------------------------------------------------------------------
-
 SHAPE, SPACING = (20, 70, 66), (0.5, 0.25, 0.25)
 
 
