@@ -27,6 +27,7 @@ COUNT, EDGE, PLAN = 8, 16, schedule("cosine", steps=60)
 #: As a script: builds with two workers, and says where it is.
 SCRIPT = f"""
 import sys
+from curvafit.data_synth import build, cluster
 from curvafit.generation.schedule import schedule
 if __name__ == "__main__":
     with cluster(2) as crew:
