@@ -79,8 +79,3 @@ def test_each_plane_is_one_processs_own_and_its_neighbours_beyond(
         assert slab.places[slab.below].tolist() == before.places[before.own][-reach:].tolist()
         assert slab.places[slab.above].tolist() == after.places[after.own][:reach].tolist()
         assert len(slab.places) == slab.last - slab.first + 2 * reach
-
-
-def test_slabs_thinner_than_a_halo_are_refused() -> None:
-    with pytest.raises(ValueError, match="at least 10 planes along z for each of 4 processes, got 36"):
-        divide(Grid((36, 8, 8)), 4, 10)

@@ -301,9 +301,6 @@ def _quantile(measured, direction: np.ndarray, share: float) -> float:
     return float(values[order][np.searchsorted(cumulated, share)])
 
 
-# ---- as the paper's author would -------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_the_nearest_match_is_refined_by_gradients(tubes: np.ndarray) -> None:
     """By its descriptors as a mask, by its stationarity as a field; distances are geomloss's."""

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from calling import call, refused
+from calling import call, done, refused
 
 import curvafit.segmentation.teach as room
 from curvafit.data_synth.atlas import build
@@ -135,8 +135,7 @@ def test_the_command_teaches_and_refuses(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(room, "JUDGED", 5)
     save(Field((rods() > 0).astype(np.uint8)), tmp_path / "mask.npy")
     target = tmp_path / "filler.npz"
-    result = call("atlas", "teach", tmp_path / "mask.npy", "-o", target, "--steps", 2)
-    assert result.exit_code == 0, (result.output, result.exception)
+    result = done("atlas", "teach", tmp_path / "mask.npy", "-o", target, "--steps", 2)
     assert "200" in result.stderr and Taught.load(target).card["steps"] == 2
     assert not list(tmp_path.glob(".*"))
     refused(call("atlas", "teach", tmp_path / "mask.npy", "-o", tmp_path / "filler.txt"), "npz")
