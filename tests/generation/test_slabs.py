@@ -37,7 +37,7 @@ def start(count: int, *command: str) -> list[subprocess.Popen]:
     ]
 
 
-@pytest.mark.parametrize(("count", "shape", "boundary"), [(2, "64,64,64", "periodic"), (3, "96,64,48", "replicate")])
+@pytest.mark.parametrize(("count", "shape", "boundary"), [(2, "32,24,24", "periodic"), (3, "48,24,20", "replicate")])
 def test_slabs_are_one_box_bit_for_bit(count: int, shape: str, boundary: str, tmp_path: Path) -> None:
     processes = start(count, str(ROOT / "tests" / "slabs_run.py"), str(tmp_path), shape, boundary)
     ends = [process.communicate(timeout=300) for process in processes]

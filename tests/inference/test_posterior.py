@@ -49,7 +49,7 @@ def columns(rows: room.Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def posterior() -> Posterior:
-    plans = (PLANS[0]._replace(rate=1e-2, epochs=60), PLANS[1]._replace(epochs=20))
+    plans = (PLANS[0]._replace(rate=1e-2, epochs=30), PLANS[1]._replace(epochs=8))
     return train_posterior(table(800), SMALL, members=2, plans=plans)
 
 

@@ -98,7 +98,7 @@ def test_an_example_is_cut_in_two() -> None:
 @pytest.mark.slow
 def test_an_example_tunes_the_network_where_that_is_better(monkeypatch: pytest.MonkeyPatch) -> None:
     """Discs that end between slices: the network cannot know where, and learns it from others."""
-    monkeypatch.setattr("curvafit.segmentation.teach.TUNING", 90)  # lessons enough for discs
+    monkeypatch.setattr("curvafit.segmentation.teach.TUNING", 25)  # lessons enough for discs
     truth, other = pancakes(1, seed=1), np.concatenate([pancakes(1, seed=k) for k in (2, 3, 4)], axis=2)
     alone, tuned = reconstruct(truth, every=8), reconstruct(truth, every=8, example=other)
     assert "tuned on the example" in tuned.status

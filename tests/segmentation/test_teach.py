@@ -110,10 +110,10 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(tmp_path: Path, monkeyp
 def test_teaching_lowers_the_loss_of_shapes_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(room, "JUDGED", 6)
     turned = [Texture(np.roll(rods(), k, 0)) for k in range(4)]
-    taught = teach([turned], {"sources": []}, steps=60, workers=0, mix=replace(EXACT, gap=(2.0, 8.0), most=6))
+    taught = teach([turned], {"sources": []}, steps=35, workers=0, mix=replace(EXACT, gap=(2.0, 8.0), most=6))
     card = json.loads(json.dumps(taught.card))
     assert card["held_out_loss"] < 0.9 * card["held_out_cubic"] and 0 <= taught.error < 0.2
-    assert (card["shapes"], card["held_out"], card["steps"]) == (3, 1, 60)
+    assert (card["shapes"], card["held_out"], card["steps"]) == (3, 1, 35)
     assert taught.temperatures.shape == (2, room.TEMPERATURES) and (np.diff(taught.temperatures[0]) >= 0).all()
 
 
