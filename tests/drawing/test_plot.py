@@ -1,7 +1,5 @@
 """Pictures: the renderer against exact silhouettes and shades, limits of diagrams, files."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

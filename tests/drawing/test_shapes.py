@@ -1,7 +1,5 @@
 """Shapes on disk: units, repeats, curvatures at the vertices of a surface."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from xml.etree import ElementTree
 

@@ -1,7 +1,5 @@
 """A run that is killed goes on where it was, and ends in the same array."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import os

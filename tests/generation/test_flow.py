@@ -1,7 +1,5 @@
 """The flow: what it keeps, what it lowers, when it stops, and that its two ways of stepping are one."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """The forms of a field, and data terms: adjoints, laws, and the flows that move them."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from importlib import import_module

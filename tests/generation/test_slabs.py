@@ -1,7 +1,5 @@
 """One shape over several processes: each voxel is that of one process."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket

@@ -1,7 +1,5 @@
 """Building resumes to the same draws; atlas files come back within their rounding; a shape that is sought is itself."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import types

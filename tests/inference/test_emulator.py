@@ -1,7 +1,5 @@
 """The emulator on a table whose law is known: the best parameters, simulations, the check of a query, and sums."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import cast
@@ -245,9 +243,8 @@ class Linear:
         assert set(views) == {"mask"}
         noise = NOISE * np.random.default_rng(seed).standard_normal((len(rows), count, 6))
         sums = self.compression(rows)[:, None]
-        scaled = np.concatenate(
-            [sums[..., :1] / np.sqrt(2), sums[..., 1:4], sums[..., :1] / np.sqrt(2), sums[..., 4:]], 2
-        )
+        half = sums[..., :1] / np.sqrt(2)
+        scaled = np.concatenate([half, sums[..., 1:4], half, sums[..., 4:]], 2)
         found = BOX.mean(1) + (scaled + noise) * (HIGH - LOW) / np.sqrt(12)
         return np.concatenate([found, np.zeros((*found.shape[:2], 1))], 2)  # and a thickness
 

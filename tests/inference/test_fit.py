@@ -1,7 +1,5 @@
 """A fit, its file and its verdict: what is written is what is read, and each sentence is led to by numbers."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """The main job on a small shape of our own, end to end, and the laws that its result must obey."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The posterior on tables whose answer is known, its file, and its command."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What pins the parameters down, and what does not: stationarity of fields, and drift of masks."""
 
-from __future__ import annotations
-
 import math
 from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Numbers that are given: NumPy's are taken as Python's, and what is of another kind or out of range is refused."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from functools import partial

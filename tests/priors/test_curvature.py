@@ -1,7 +1,5 @@
 """Diffuse and geometric curvatures: right on exact jets, and their laws on any field; the exact shapes themselves."""
 
-from __future__ import annotations
-
 import math
 
 import exact

@@ -1,7 +1,5 @@
 """F_ε: its value on exact profiles, its relatives, its laws, its derivatives, and how a grid errs."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The curvature prior beside the losses and in the loops that people have."""
 
-from __future__ import annotations
-
 import copy
 import io
 import os

@@ -1,7 +1,5 @@
 """The fused kernels against the plain-torch definition, and against what must hold of them whatever the definition."""
 
-from __future__ import annotations
-
 import os
 import platform
 import subprocess

@@ -1,7 +1,5 @@
 """One law, however it is stated; the ways to state a polynomial, and its laws."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The training loss is the energy, of windows, classes, units, masks, types of float; what it takes and refuses."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from pathlib import Path
@@ -305,7 +303,7 @@ def test_the_suggested_weight_balances_gradients():
         prior.suggest_weight(base, (torch.full_like(logits, 1e4), target))
 
 
-# ---- wrong input ----------------------------------------------------------------------------------------------------
+# ---- wrong input: any number is finite or refused --------------------------------------------------------------------
 
 
 def box(*shape: int) -> torch.Tensor:
@@ -363,9 +361,6 @@ def test_what_changes_nothing_is_said():
         with pytest.warns(UserWarning, match=word):
             found = CurvaturePrior("tubes", **{name: value})(p)
         assert torch.equal(found, CurvaturePrior("tubes")(p))
-
-
-# ---- any number is finite or refused ---------------------------------------------------------------------------------
 
 
 HOSTILE = (

@@ -1,7 +1,5 @@
 """Differences and blur; double well, profile, and the ways between mask, distance and phase field."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """F_ε's gradient where the root √(2|M|² - (Tr M)²)⁺ has none: one choice, in every precision and every program."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The loss beside kernels elsewhere: in a loader's workers by every start method, and in several Python threads."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The page of an atlas: what it holds, where scans lie on it, what is refused, and that a browser shows it all."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import json

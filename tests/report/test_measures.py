@@ -1,7 +1,5 @@
 """The pages of many scans, measured and inferred: their files, tables and names, and what is refused."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The report: one self-contained page, readable numbers, files written whole or not at all."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import json

@@ -1,7 +1,5 @@
 """A volume filled in blocks from a file is the volume filled whole, whatever the blocks; a killed run goes on."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """The network that fills gaps: what it must not depend on, what it keeps, and its file."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

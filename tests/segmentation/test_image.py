@@ -1,7 +1,5 @@
 """What an image says of a volume, a filler that weighs it, and labels that it does not tell from each other."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

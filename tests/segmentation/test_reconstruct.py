@@ -1,7 +1,5 @@
 """A volume between known slices: interpolations, the network, an example, the choice of a law by the data, labels."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

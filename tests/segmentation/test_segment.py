@@ -1,7 +1,5 @@
 """Segmentation of grey levels and of probabilities: evidence, units, grids, place, examples, and what comes out."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

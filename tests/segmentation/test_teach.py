@@ -1,7 +1,5 @@
 """Lessons cut from shapes, learning that a stop does not change, and what an example adds."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

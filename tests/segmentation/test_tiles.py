@@ -1,7 +1,5 @@
 """Tiles with overlap hold each voxel once and do not show; a killed run goes on; files are read by box."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

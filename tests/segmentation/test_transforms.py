@@ -1,7 +1,5 @@
 """MONAI's transform that fills a label, in MONAI's own chains and caches."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -45,9 +43,8 @@ def test_a_nifti_file_is_filled_in_monai_s_chain_and_stays_where_it_is(tmp_path:
     nibabel.save(nibabel.Nifti1Image(labels.T, affine), tmp_path / "labels.nii.gz")
     read = [LoadImaged("label", reader="NibabelReader"), EnsureChannelFirstd("label")]
     chain = Compose([*read, FillSlicesd("label", every=6, axis=2)])
-    given, found = (
-        Compose(steps)({"label": tmp_path / "labels.nii.gz"})["label"] for steps in (read, chain.transforms)
-    )
+    source = {"label": tmp_path / "labels.nii.gz"}
+    given, found = (Compose(steps)(source)["label"] for steps in (read, chain.transforms))
     assert isinstance(found, MetaTensor) and found.dtype == given.dtype == torch.float32
     assert torch.equal(found.affine, given.affine) and np.allclose(found.affine, affine)
     assert found.meta["filename_or_obj"] == given.meta["filename_or_obj"]

@@ -1,7 +1,5 @@
 """Probabilities between known slices, how well they are calibrated, and the slices to annotate next."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from annotated import ball

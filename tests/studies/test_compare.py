@@ -1,7 +1,5 @@
 """`compare`: sizes and powers of its tests, exact p-values, whole subjects, corrections, effect sizes, refusals."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

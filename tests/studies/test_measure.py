@@ -1,7 +1,5 @@
 """`measure`: exact shapes, laws of units and symmetries, sums over blocks and their errors, tables and the command."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import json
@@ -49,7 +47,7 @@ def measures(cut: np.ndarray) -> Measures:
     return measure(Field(cut, (0.5, 0.5, 0.5), "um"))
 
 
-# ---- exact shapes ----------------------------------------------------------------------------------------------------
+# ---- exact shapes, and laws ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -95,9 +93,6 @@ def test_curvature_obeys_gauss_and_bonnet(of_balls: Measures) -> None:
     """∫K dA = 4πχ of the solid, here 8 balls."""
     found = of_balls
     assert found["K"].value * found["BS/TV"].value * N**3 == pytest.approx(4 * math.pi * 8, rel=0.05)
-
-
-# ---- laws ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_change_of_unit_scales_each_number_by_its_power(cut: np.ndarray, measures: Measures) -> None:
