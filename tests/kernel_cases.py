@@ -7,7 +7,6 @@ from curvafit.generation.flow import WORKING_BLUR, descend
 from curvafit.generation.result import Flow
 from curvafit.generation.schedule import Schedule
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.energy import energy
 from curvafit.priors.grid import Grid
 from curvafit.priors.stencils import gaussian_blur
 
@@ -33,13 +32,6 @@ def rough(grid: Grid, seed: int = 0, *batch: int) -> torch.Tensor:
     noise = torch.randn(*batch, *grid.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     u = gaussian_blur(noise, grid, 1.2 * max(grid.spacing))
     return 0.7 * u / u.std()
-
-
-def torch_gradient(u: torch.Tensor, a: Coefficients, grid: Grid, ε=EPSILON, Q=None, mask=None) -> tuple:
-    free = u.clone().requires_grad_()
-    value = energy(free, a, grid, ε, Q, mask)
-    (slope,) = torch.autograd.grad(value, free)
-    return float(value.detach()), slope.double()
 
 
 def assert_same(one: Flow, other: Flow) -> None:

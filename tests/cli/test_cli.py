@@ -175,7 +175,7 @@ def test_infer_writes_three_files_and_says_what_it_found(tmp_path: Path, finding
     assert {name: finding[name] for name in wanted} == wanted
 
 
-# ---- interruptions and mistakes --------------------------------------------------------------------------------------
+# ---- interruptions, mistakes, lines ----------------------------------------------------------------------------------
 
 
 def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
@@ -219,9 +219,6 @@ def test_a_warning_becomes_a_note_where_the_command_succeeds(tmp_path: Path) -> 
     assert result.exit_code in (0, 1) and "note: a20 > 0 and a02 > 0" in result.stderr
     refused(call("generate", *law, "--steps", "1", "--mass", "7"), "mass")
     refused(call("generate", *law, "--mass", "0", "--steps", "0"), "steps")
-
-
-# ---- lines -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_stage_that_counts_on_is_a_line_every_five_percent(capsys: pytest.CaptureFixture[str]) -> None:

@@ -61,7 +61,7 @@ def test_a_fit_without_a_law_is_refused_by_all_that_take_one(tmp_path: Path, mon
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fit.json", "scan.npy"]
 
 
-# ---- what is handed on -----------------------------------------------------------------------------------------------
+# ---- what is handed on, and what is written --------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -99,9 +99,6 @@ def test_every_option_reaches_the_generator(tmp_path: Path, handed: dict[str, An
     assert handed["grid"].shape == (5, 6, 7)
     refused(call("generate", *LAW, "--maps", maps, "-o", tmp_path / "out.npy"), "--mass")
     refused(call("generate", *LAW, "--shape", "8", "--maps", maps, "-o", tmp_path / "out.npy"), "a00")
-
-
-# ---- what is written -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

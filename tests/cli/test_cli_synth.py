@@ -26,8 +26,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def made(folder: Path, *options: object) -> Any:
-    result = done("synth", "-o", folder, *options)
-    return result
+    return done("synth", "-o", folder, *options)
 
 
 def listed(folder: Path) -> dict:
@@ -63,11 +62,8 @@ def test_a_set_of_inferred_shapes_like_a_scan(tmp_path):
     fit = {"format": FORMAT, "coefficients": working, "coefficients_physical": working, "mass": -0.5}
     fit |= {"epsilon_physical": 0.002, "working_voxel": 0.001, "length_unit": "mm"}
     (tmp_path / "fit.json").write_text(json.dumps(fit | {"morphometry": {"volume_fraction": 0.2}}))
-    out, told = (
-        tmp_path / "set",
-        ["--prior", tmp_path / "fit.json", "--visible", "auto", "--voxel", "1", "--unit", "um"],
-    )
-    told += ["--like", tmp_path / "scan.nii.gz", "--like-mask", tmp_path / "mask.nii.gz", "--label", "1"]
+    out, told = tmp_path / "set", ["--prior", tmp_path / "fit.json", "--like", tmp_path / "scan.nii.gz", "--label", "1"]
+    told += ["--like-mask", tmp_path / "mask.nii.gz", "--visible", "auto", "--voxel", "1", "--unit", "um"]
     made(out, *told, "--count", "1", "--shape", "8,16,16", "--workers", "0")  # the unit is of the shape's voxel alone
     image = load(out / "imagesTr" / "case_00000_0000.nii.gz")
     assert image.spacing == pytest.approx(edges) and image.unit == "mm"

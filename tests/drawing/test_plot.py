@@ -1,7 +1,5 @@
 """Pictures: the renderer against exact silhouettes and shades, limits of diagrams, files."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re
@@ -14,18 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-import curvafit
-from curvafit.core.pictures import Pictured
-from curvafit.drawing.plot import (
-    DIAGONAL,
-    bands_figure,
-    corner_figure,
-    diagram_figure,
-    gallery_figure,
-    shared_limits,
-    slice_figure,
-    write_picture,
-)
+from curvafit.drawing import plot
 from curvafit.drawing.render import render, surface_picture, view
 from curvafit.generation import Schedule, generate
 from curvafit.geometry.diagram import Diagram
@@ -71,12 +58,10 @@ def test_a_ball_covers_its_disc_and_is_lit_from_the_upper_left() -> None:
 @pytest.mark.parametrize(
     ("shape", "spacing", "azimuth", "elevation"),
     [
-        ((30, 34, 38), (1.0, 1.0, 1.0), 0, 90),
-        ((30, 34, 38), (1.0, 1.0, 1.0), 200, -50),
-        ((30, 34, 38), (1.0, 1.0, 1.0), -45, 35.26),
-        ((20, 40, 40), (2.0, 1.0, 1.0), 32, 24),
+        ((30, 34, 38), (1.0, 1.0, 1.0), 0, 90), ((30, 34, 38), (1.0, 1.0, 1.0), 200, -50),
+        ((30, 34, 38), (1.0, 1.0, 1.0), -45, 35.26), ((20, 40, 40), (2.0, 1.0, 1.0), 32, 24),
     ],
-)
+)  # fmt: skip
 def test_a_ball_is_a_disc_from_everywhere(shape: Any, spacing: Any, azimuth: float, elevation: float) -> None:
     """Also along an axis, from behind and below, along the diagonal, and in a flat box of long voxels."""
     u = ball(shape, 12, spacing)
@@ -144,27 +129,27 @@ def test_what_cannot_be_drawn_is_refused(volume: np.ndarray, said: str) -> None:
 def test_shared_limits_hold_both_curvatures_and_leave_out_a_thin_tail() -> None:
     first = Diagram(np.array([[1.0, -2.0], [3.0, 0.0], [900.0, -900.0]]), np.array([1.0, 1.0, 1e-6]))
     second = Diagram(np.array([[5.0, 5.0]]), np.array([1.0]))
-    low, high = shared_limits([first, second])
+    low, high = plot.shared_limits([first, second])
     assert low < -2 and high > 5 and high - low < 10
-    assert shared_limits([first, second], length=2.0) == pytest.approx((low / 2, high / 2))
+    assert plot.shared_limits([first, second], length=2.0) == pytest.approx((low / 2, high / 2))
 
 
 def test_a_diagram_puts_its_mass_where_the_curvatures_are() -> None:
     point = Diagram(np.array([[20.0, -10.0]]), np.array([3.0]))
-    figure = diagram_figure(point, limits=(-40.0, 40.0))
+    figure = plot.diagram_figure(point, limits=(-40.0, 40.0))
     axes = figure.axes[0]
     mesh = axes.collections[0]
     shares = np.ma.filled(mesh.get_array(), 0.0).reshape(72, 72)
     row, column = np.unravel_index(shares.argmax(), shares.shape)
     centre = np.linspace(-40, 40, 73)[:-1] + 40 / 72
     assert centre[column] == pytest.approx(20, abs=1) and centre[row] == pytest.approx(-10, abs=1)
-    diagonal = [line for line in axes.lines if line.get_color() == DIAGONAL]
+    diagonal = [line for line in axes.lines if line.get_color() == plot.DIAGONAL]
     assert len(diagonal) == 1 and np.array_equal(*diagonal[0].get_data())
 
 
 def test_a_slice_shows_its_contour_in_physical_places() -> None:
     structure = ball((32, 32, 32), 8)[16]
-    figure = slice_figure(
+    figure = plot.slice_figure(
         structure, structure, image_extent=(0, 3.2, 3.2, 0), extent=(0, 3.2, 3.2, 0), limits=(-1, 1), unit="mm",
         axes_names=("y", "x"),
     )  # fmt: skip
@@ -178,8 +163,8 @@ def test_a_slice_shows_its_contour_in_physical_places() -> None:
 def test_pictures_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
     made = surface_picture(ball((12, 12, 12), 4) > 0, tmp_path / "ball.png", width=160)
     assert matplotlib.image.imread(made).shape[:2] == (160, 160)
-    two = gallery_figure({"one": ball((12, 12, 12), 4), "two": ball((12, 12, 12), 3)}, width=320)
-    write_picture(two, tmp_path / "two.png")
+    two = plot.gallery_figure({"one": ball((12, 12, 12), 4), "two": ball((12, 12, 12), 3)}, width=320)
+    plot.write_picture(two, tmp_path / "two.png")
     assert matplotlib.image.imread(tmp_path / "two.png").shape[1] == 320
     with pytest.raises(ValueError, match="finite"):
         surface_picture(np.full((8, 8, 8), np.inf), tmp_path / "no.png")
@@ -198,7 +183,7 @@ def test_rays_along_the_boxs_sides_stay_in_it(azimuth: float) -> None:
 def test_a_corner_plot_has_a_histogram_of_each_and_a_picture_of_each_pair() -> None:
     draws = np.random.default_rng(0).uniform(0.1, 0.9, (50, 3)) * [1, 10, 100]
     limits = [(0.0, 1.0), (0.0, 10.0), (0.0, 100.0)]
-    figure = corner_figure(draws, ("a", "b", "c"), limits, {"truth": np.array([0.5, 5.0, 50.0])})
+    figure = plot.corner_figure(draws, ("a", "b", "c"), limits, {"truth": np.array([0.5, 5.0, 50.0])})
     places = [(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]
     assert len(figure.axes) == len(places)
     for axes, (row, column) in zip(figure.axes, places, strict=True):
@@ -214,13 +199,13 @@ def test_a_corner_plot_has_a_histogram_of_each_and_a_picture_of_each_pair() -> N
             assert np.array_equal(np.asarray(axes.collections[0].get_offsets()), draws[:, (column, row)])
             assert (*mark.get_xdata(), *mark.get_ydata()) == (50 / 10 ** (2 - column), 50 / 10 ** (2 - row))
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["truth"]
-    assert len(corner_figure(draws[:, :1], ("a",), limits[:1], {}).axes) == 1
+    assert len(plot.corner_figure(draws[:, :1], ("a",), limits[:1], {}).axes) == 1
 
 
 def test_bands_hold_what_they_say_and_show_the_scan_s_numbers() -> None:
     others = np.outer(np.arange(101.0), np.ones(5))
     own = np.array([3.0, 1, 4, 1, 5])
-    figure = bands_figure({"curve": (own, others), "number": (own[:1], others[:, :1])})
+    figure = plot.bands_figure({"curve": (own, others), "number": (own[:1], others[:, :1])})
     curve, dot = figure.axes
     assert [curve.get_title(), dot.get_title()] == ["curve", "number"]
     assert curve.lines[0].get_ydata() == pytest.approx(own) and dot.lines[0].get_ydata() == pytest.approx([3])
@@ -238,16 +223,6 @@ def test_the_three_middle_slices_are_drawn_in_proportion() -> None:
         assert np.array_equal(axes.images[0].get_array(), plane)
     assert [axes.get_aspect() for axes in figure.axes] == [2.0, 3.0, 1.5]
     assert [axes.get_title()[:5] for axes in figure.axes] == ["z = 2", "y = 3", "x = 3"]
-
-
-def test_every_type_with_a_picture_has_a_function_that_draws_it() -> None:
-    for name, place in curvafit._FIGURES.items():
-        module, _, function = place.partition(":")
-        assert callable(getattr(import_module(module), function))
-        assert issubclass(getattr(curvafit, name), Pictured)
-    kinds = (getattr(curvafit, name) for name in curvafit.__all__)
-    pictured = {kind.__name__ for kind in kinds if isinstance(kind, type) and issubclass(kind, Pictured)}
-    assert pictured == set(curvafit._FIGURES)
 
 
 def test_a_picture_of_a_shape_and_none_of_what_is_not_finite() -> None:

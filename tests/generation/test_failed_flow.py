@@ -1,7 +1,5 @@
 """A flow whose energy, gradient or field is not finite is no shape, whatever its field looks like: and it says so."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

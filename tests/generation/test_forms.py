@@ -1,7 +1,5 @@
 """The forms of a field, and data terms: adjoints, laws, and the flows that move them."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from importlib import import_module
@@ -10,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from loss_cases import noise
 
 from curvafit.generation import stepper
 from curvafit.generation.checkpoint import identity
@@ -36,10 +35,6 @@ ANISOTROPIC = (0.013, 0.01, 0.008)
 TUBES, WILLMORE = preset("tubes").coefficients, Coefficients.willmore()
 
 
-def rough(*shape: int, seed: int = 0) -> torch.Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
 def ball(grid: Grid, radius: float, epsilon: float) -> torch.Tensor:
     axes = [h * (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) for n, h in zip(grid.shape, grid.spacing)]  # noqa: B905
     z, y, x = torch.meshgrid(*axes, indexing="ij")
@@ -51,22 +46,22 @@ def ball(grid: Grid, radius: float, epsilon: float) -> torch.Tensor:
 def test_pullback_is_the_adjoint_and_a_form_starts_at_the_blurred_field(boundary, name):
     """⟨u(p) - u(0), g⟩ = ⟨p, pullback(g)⟩; the mass of a divergence is its own."""
     grid = Grid((6, 9, 7), ANISOTROPIC, boundary)
-    field = rough(*grid.shape)
+    field = noise(*grid.shape)
     form, start = FORMS[name].start_at(field, grid, 0.012, gaussian_blur)
     torch.testing.assert_close(form.field(start), gaussian_blur(field, grid, 0.012), rtol=1e-10, atol=1e-12)
-    parameters, slope = rough(*start.shape, seed=1), rough(*grid.shape, seed=2)
+    parameters, slope = noise(*start.shape, seed=1), noise(*grid.shape, seed=2)
     moved = form.field(parameters) - form.field(torch.zeros_like(start))
     there, back = float((moved * slope).sum()), float((parameters * form.pullback(slope)).sum())
     assert abs(there) > 1e-2
     assert there == pytest.approx(back, rel=1e-11)
-    u = DivergenceForm(grid, 0.012, -0.3).field(rough(3, *grid.shape))
+    u = DivergenceForm(grid, 0.012, -0.3).field(noise(3, *grid.shape))
     assert float(u.mean()) == pytest.approx(-0.3, abs=1e-12)
 
 
 def test_fused_blur_is_the_blur():
     pytest.importorskip("numba")
     grid = Grid((6, 9, 7), ANISOTROPIC)
-    u = rough(*grid.shape)
+    u = noise(*grid.shape)
     torch.testing.assert_close(kernels.gaussian_blur(u.float(), grid, 0.012), gaussian_blur(u, grid, 0.012).float())
     assert torch.equal(kernels.gaussian_blur(u, grid, 0.012), gaussian_blur(u, grid, 0.012))
 
@@ -76,7 +71,7 @@ def test_fused_blur_is_the_blur():
 @boundaries
 def test_every_flow_lowers_the_energy_and_keeps_what_it_keeps(boundary, flow, optimiser):
     grid = Grid((16, 17, 18), 0.01, boundary)
-    start = ball(grid, 0.05, 0.02) + 0.1 * rough(*grid.shape).float()
+    start = ball(grid, 0.05, 0.02) + 0.1 * noise(*grid.shape).float()
     plan = Schedule("test", 1, 1e-3, 1e-3, "constant")
     end = descend(start, TUBES, grid, flow=flow, optimiser=optimiser, steps=30, schedule=plan)
     history = end.history
@@ -124,7 +119,7 @@ def test_lbfgs_stalls_where_nothing_is_lower(monkeypatch):
         return float(u.double().square().sum()) / 2 - 10, u.clone()
 
     monkeypatch.setattr(stepper, "energy_gradient_by_autograd", bowl)
-    start = rough(4, 4, 4).float()
+    start = noise(4, 4, 4).float()
     cost = Cost(TUBES, Grid((4, 4, 4)), 0.02, None, 0.0)
     form, start = FORMS["l2"].start_at(start, cost.grid, 0.0, gaussian_blur)
     moved = LbfgsStepper(start, form, cost, (0.9, 0.999), None, "cpu")
@@ -153,22 +148,6 @@ def test_without_a_blur_the_field_is_what_moves():
     assert end.history.energy[-1] < end.history.energy[0]
 
 
-@pytest.mark.parametrize(
-    ("field", "options", "word"),
-    [
-        (torch.zeros(12, 12, 12), {"flow": "h1"}, "flow"),
-        (torch.zeros(12, 12, 12), {"optimiser": "sgd"}, "optimiser"),
-        (torch.zeros(12, 12, 12), {"steps": 0}, "steps"),
-        (torch.zeros(12, 12, 12), {"frozen": torch.zeros(3, 3, 3, dtype=torch.bool)}, "frozen"),
-        (torch.zeros(12, 12, 11), {}, "field"),
-        (torch.full((12, 12, 12), math.inf), {}, "finite"),
-    ],
-)
-def test_wrong_flows_are_refused(field, options, word):
-    with pytest.raises(ValueError, match=word):
-        descend(field, TUBES, Grid((12, 12, 12)), **options)
-
-
 # ---- data terms: their gradient, what they mean, and runs that they belong to ----------------------------------------
 
 
@@ -177,13 +156,9 @@ pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 GRID = Grid((8, 9, 10), (0.01, 0.012, 0.02), "replicate")
 
 
-def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
 @pytest.mark.parametrize("kind", [Evidence, Hinge, partial(Hinge, margin=0.2)])
 def test_a_data_term_s_gradient(kind) -> None:
-    term, u, way = kind(drawn(8, 9, 10)), 1.2 * drawn(8, 9, 10, seed=1), drawn(8, 9, 10, seed=2)
+    term, u, way = kind(noise(8, 9, 10)), 1.2 * noise(8, 9, 10, seed=1), noise(8, 9, 10, seed=2)
     step = 1e-5
     ahead, behind = (term.slope(u + sign * step * way, GRID)[0] for sign in (1, -1))
     _, slope = term.slope(u, GRID)
@@ -191,7 +166,7 @@ def test_a_data_term_s_gradient(kind) -> None:
 
 
 def test_evidence_of_a_mask_is_its_log_likelihood() -> None:
-    r, inside = drawn(8, 9, 10), drawn(8, 9, 10, seed=1) > 0
+    r, inside = noise(8, 9, 10), noise(8, 9, 10, seed=1) > 0
     values = [Evidence(r).slope(torch.where(m, 1.0, -1.0).double(), GRID)[0] for m in (inside, ~inside)]
     gained = float((r * torch.where(inside, 1.0, -1.0)).sum()) * GRID.voxel_volume
     assert values[1] - values[0] == pytest.approx(gained, rel=1e-12)
@@ -205,27 +180,13 @@ def test_a_hinge_lets_go_where_it_is_right() -> None:
     assert Hinge(ratio).slope(short, GRID)[0] > 0 and Hinge(ratio, 0.2).to("cpu").margin == 0.2
 
 
-@pytest.mark.parametrize(
-    ("wrong", "word"),
-    [
-        *((lambda kind=kind: kind(torch.full((4, 4, 4), math.nan)), "evidence") for kind in (Evidence, Hinge)),
-        (lambda: Evidence(torch.zeros(4, 4)), "evidence"),
-        (lambda: Hinge(torch.ones(8, 8, 8), 2.0), "a margin from 0 to 1"),
-        (lambda: descend(torch.zeros(8, 8, 8), WILLMORE, Grid(8), data=Evidence(torch.ones(7, 8, 8))), "ratio"),  # type: ignore[arg-type]
-    ],
-)
-def test_bad_evidence_is_refused(wrong, word) -> None:
-    with pytest.raises(ValueError, match=word):
-        wrong()
-
-
 @pytest.mark.parametrize(("flow", "optimiser"), [("l2", "lbfgs"), ("l2", "adam"), ("h-1", "adam")])
 def test_every_flow_lowers_energy_and_data_as_plain_torch_does(flow, optimiser) -> None:
     """Adam voxel by voxel. L-BFGS in the energy reached: its line search hangs on the energies' last digits, and
     near the minimum what two searches leave is of second order in what parts them."""
     grid = Grid((12, 12, 12), boundary="replicate")
     start = optimal_profile(0.04 - torch.from_numpy(np.linalg.norm(np.mgrid[:12, :12, :12] - 5.5, axis=0)) * 0.01, 0.02)
-    term = Evidence(1e6 * drawn(12, 12, 12))
+    term = Evidence(1e6 * noise(12, 12, 12))
     options = {"flow": flow, "optimiser": optimiser, "steps": 10, "schedule": "paper", "data": term}
     fast, plain = (descend(start, WILLMORE, grid, backend=each, **options) for each in ("auto", "torch"))
     fall = fast.history.energy[0] - fast.history.energy[-1]
@@ -239,10 +200,10 @@ def test_every_flow_lowers_energy_and_data_as_plain_torch_does(flow, optimiser) 
 
 
 def test_a_checkpoint_is_its_data_s(tmp_path: Path) -> None:
-    one, same, other = (identity(data=Evidence(drawn(4, 4, 4, seed=k))) for k in (0, 0, 1))
+    one, same, other = (identity(data=Evidence(noise(4, 4, 4, seed=k))) for k in (0, 0, 1))
     assert one == same != other
-    assert one != identity(data=Hinge(drawn(4, 4, 4))) and one != identity(data=None)
-    r, saved = drawn(8, 8, 8), {"checkpoint": tmp_path / "run.pt", "checkpoint_every": 0.0}
+    assert one != identity(data=Hinge(noise(4, 4, 4))) and one != identity(data=None)
+    r, saved = noise(8, 8, 8), {"checkpoint": tmp_path / "run.pt", "checkpoint_every": 0.0}
     run = partial(descend, 0.5 * r, WILLMORE, Grid(8), steps=20, optimiser="adam")  # type: ignore[arg-type]
     run(data=Evidence(r), callbacks=[lambda made, total, state: made >= 10], **saved)
     with pytest.raises(ValueError, match="checkpoint"):
@@ -268,6 +229,8 @@ def test_known_slices_hold_whatever_the_axis_and_the_spacing(along: int) -> None
         truth = Field((DISTANCE > 0).transpose(turn), tuple(EDGES[k] for k in turn))  # type: ignore[arg-type]
         found = reconstruct(truth, WILLMORE, known=known, axis=turn.index(along), epsilon=ε, steps=8, stiffness=1e7)
         assert found.epsilon == ε and any("2-fold" in note for note in found.notes)
+        kept = (found.mask.values == truth.values).all(tuple(k for k in range(3) if k != turn.index(along)))
+        assert kept[known].all()
         fields.append(found.phase.values.transpose(np.argsort(turn)))
     for other in fields[1:]:
         np.testing.assert_allclose(other, fields[0], atol=0.05)
@@ -285,8 +248,8 @@ def test_evidence_counts_its_nats_once_whatever_the_volume_of_a_part(epsilon: fl
         return descend(start, law, grid, data=data, **options)
 
     monkeypatch.setattr(import_module("curvafit.segmentation.flow"), "descend", watched)
-    noise = np.random.default_rng(0).standard_normal(SHAPE)
-    likely = Field((1 / (1 + np.exp(-DISTANCE - noise))).astype(np.float32), EDGES)
+    errors = np.random.default_rng(0).standard_normal(SHAPE)
+    likely = Field((1 / (1 + np.exp(-DISTANCE - errors))).astype(np.float32), EDGES)
     law = Coefficients(1.5, 0.5, 2.5)
     found = segment(likely, law, weight=0.3, probabilities=True, epsilon=epsilon, steps=1)
     assert found.epsilon == epsilon

@@ -217,15 +217,11 @@ R, OUTER, INNER = RADIUS, 0.11, 0.05
         ([(1 / R, 0.0)], [2 * np.pi * R], np.pi * R**2, R),
         ([(1 / R, 1 / R)], [4 * np.pi * R**2], 4 / 3 * np.pi * R**3, R),
         ([(1 / R, -1 / R)], [1.0], 2 / 3 * R, R),
-        (
-            [(1 / OUTER,) * 2, (-1 / INNER,) * 2],
-            [4 * np.pi * OUTER**2, 4 * np.pi * INNER**2],
-            4 / 3 * np.pi * (OUTER**3 - INNER**3),
-            (OUTER - INNER) / 2,
-        ),
+        ([(1 / OUTER,) * 2, (-1 / INNER,) * 2], [4 * np.pi * OUTER**2, 4 * np.pi * INNER**2],
+         4 / 3 * np.pi * (OUTER**3 - INNER**3), (OUTER - INNER) / 2),
     ],
     ids=["plate", "cylinder", "ball", "saddle", "thick shell"],
-)
+)  # fmt: skip
 def test_volume_and_curvatures_tell_how_thick_plates_cylinders_and_balls_are(points, areas, volume, thickness) -> None:
     several = Diagram(np.array(points), 3 * np.array(areas))
     assert half_thickness(several, 3 * volume) == pytest.approx(thickness, rel=0.02)

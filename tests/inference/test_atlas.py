@@ -1,7 +1,5 @@
 """Building resumes to the same draws; atlas files come back within their rounding; a shape that is sought is itself."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import types
@@ -201,17 +199,15 @@ def test_an_atlas_file_comes_back_within_its_stated_rounding(saved, atlas):
 @pytest.mark.parametrize(
     ("name", "change"),
     [
-        ("masses", lambda values: values + 2),
-        ("coefficients", lambda values: values * np.nan),
-        ("mask_offsets", lambda values: values[::-1]),
-        ("field_points", lambda values: values[:-1]),
+        ("masses", lambda values: values + 2), ("coefficients", lambda values: values * np.nan),
+        ("mask_offsets", lambda values: values[::-1]), ("field_points", lambda values: values[:-1]),
         ("mask_areas", lambda values: values.astype("S9")),
         ("header", lambda values: np.frombuffer(b"[" * 100_000, np.uint8)),
         ("header", lambda values: np.frombuffer(b'{"format": "another"}', np.uint8)),
         ("header", lambda values: np.frombuffer(values.tobytes().replace(b'"version": 2', b'"version": 3'), np.uint8)),
         ("header", None),
     ],
-)
+)  # fmt: skip
 def test_an_atlas_with_damaged_arrays_is_one_sentence(tmp_path, saved, name, change):
     with np.load(saved) as archive:
         arrays = dict(archive)

@@ -1,7 +1,5 @@
 """A fit, its file and its verdict: what is written is what is read, and each sentence is led to by numbers."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math
@@ -62,9 +60,8 @@ def test_the_diagram_comes_back_to_its_stored_digits(fit: Fit) -> None:
 def test_numbers_and_uncertainty_are_those_of_one_candidate(fit: Fit) -> None:
     for chosen in fit.candidates:
         other = dataclasses.replace(fit, chosen=chosen.name)
-        assert (other.coefficients, other.mass, other.uncertainty) == (
-            chosen.coefficients, chosen.mass, chosen.uncertainty,
-        )  # fmt: skip
+        for name in ("coefficients", "mass", "uncertainty"):
+            assert getattr(other, name) == getattr(chosen, name)
 
 
 def test_a_fit_without_a_law_is_none(fit: Fit) -> None:
@@ -147,21 +144,16 @@ BOMBS = [
     ("mass", "NaN", "NaN, which is not a finite number"),
     ("coefficients.a00", "-Infinity", "-Infinity, which is not a finite number"),
     ("epsilon_physical", "1e999", "1e999, which is not a finite number"),
-    ("working_voxel", "1" * 400, "a number of 400 digits"),
-    ("provenance", "1" * 5000, "a number of 5000 digits"),
+    ("working_voxel", "1" * 400, "a number of 400 digits"), ("provenance", "1" * 5000, "a number of 5000 digits"),
     ("provenance", "[" * 100_000 + "]" * 100_000, "nested too deeply"),
-    ("provenance", '{"a":' * 100_000, "nested too deeply"),
-    ("provenance", '{"a": 1, "a": 2}', "the key 'a' twice"),
-    ("provenance", "{", "which is not JSON"),
-    ("status", None, "status, got none"),
-    ("chosen", "3", "chosen as a text, or null, got 3"),
-    ("chosen", '"optimum"', "optimum"),
+    ("provenance", '{"a":' * 100_000, "nested too deeply"), ("provenance", '{"a": 1, "a": 2}', "the key 'a' twice"),
+    ("provenance", "{", "which is not JSON"), ("status", None, "status, got none"),
+    ("chosen", "3", "chosen as a text, or null, got 3"), ("chosen", '"optimum"', "optimum"),
     ("candidates", "[{}]", "candidates[0].name, got none"),
     ("misfit", '{"probability": 2, "blocks": {}, "method": ""}', "misfit.probability as a number from 0 to 1, got 2"),
-    ("scale", "[1, 1]", "scale as a list of 3 numbers"),
-    ("posterior.draws.a10", "[0.1]", "length"),
+    ("scale", "[1, 1]", "scale as a list of 3 numbers"), ("posterior.draws.a10", "[0.1]", "length"),
     ("diagram", '{"kappa1": [1], "kappa2": [2], "share": [1, 1]}', "length"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("where", "text", "said"), [*BOMBS, *((where, text, where) for where, text in BROKEN)])
@@ -205,9 +197,6 @@ def test_a_quotation_is_short() -> None:
         assert len(quoted(value)) < 200 and "\n" not in quoted(value)
 
 
-# ---- candidates and verdicts -----------------------------------------------------------------------------------------
-
-
 LAW = Coefficients(1, 2, 6, -40, -40, 400)
 USUAL = Misfit(0.4, {"gaps": 0.3, "chords": 0.2}, "24 windows", 1.1)
 ODD = Misfit(0.001, {"gaps": 0.004, "chords": 0.3, "depths": 0.0005}, "24 windows", 3.0)
@@ -232,15 +221,10 @@ def test_the_nearest_is_the_best_or_stationarity_within_seed_noise_of_it() -> No
     nearest, quiet, single = (law("simulation", 2.0, noise) for noise in (0.5, 0.25, None))
     exact = law("stationarity", 2.5)
     for order, best in (
-        ((barren, first, nearest, last), nearest),
-        ((last, nearest, first), nearest),
-        ((barren, first, last), last),
-        ((exact, first, nearest), exact),
-        ((exact, first, quiet), quiet),
-        ((exact, single), single),
-        ((barren,), None),
-        ((), None),
-    ):
+        ((barren, first, nearest, last), nearest), ((last, nearest, first), nearest), ((barren, first, last), last),
+        ((exact, first, nearest), exact), ((exact, first, quiet), quiet), ((exact, single), single),
+        ((barren,), None), ((), None),
+    ):  # fmt: skip
         assert best_candidate(order) == best
 
 
@@ -319,16 +303,10 @@ def test_the_test_decides_and_the_verdict_says_what_led_to_it(candidates, misfit
 def test_few_tunnels_may_differ_by_the_root_of_their_count() -> None:
     """Two counts of n differ by some √2n: of 1000 by 45, where 15 % is more; of 100 by 14, of one by some two."""
     for tunnels, ratio, words in (
-        (1000, 1.14, []),
-        (1000, 1.17, ["connectivity 1.2"]),
-        (100, 1.29, []),
-        (100, 1.4, ["connectivity 1.4"]),
-        (100, 0.74, []),
-        (100, 0.7, ["connectivity 0.70"]),
-        (16, 0.3, ["connectivity 0.30"]),
-        (1, 7.0, ["connectivity 7.0"]),
-        (1, 6.0, []),
-    ):
+        (1000, 1.14, []), (1000, 1.17, ["connectivity 1.2"]), (100, 1.29, []), (100, 1.4, ["connectivity 1.4"]),
+        (100, 0.74, []), (100, 0.7, ["connectivity 0.70"]), (16, 0.3, ["connectivity 0.30"]),
+        (1, 7.0, ["connectivity 7.0"]), (1, 6.0, []),
+    ):  # fmt: skip
         scan = dataclasses.replace(NUMBERS, euler=1 - tunnels)
         other = dataclasses.replace(scan, connectivity_density=ratio * scan.connectivity_density)
         assert find_differences(scan, (other,)) == words
@@ -342,14 +320,10 @@ def test_familiar_numbers_that_differ_are_named() -> None:
         return dataclasses.replace(NUMBERS, thickness_mean=thickness * own, connectivity_density=connectivity * joined)
 
     for scan, twins, words in (
-        (NUMBERS, (), []),
-        (NUMBERS, (other(1.14),), []),
-        (NUMBERS, (NUMBERS, other(1.14)), []),
+        (NUMBERS, (), []), (NUMBERS, (other(1.14),), []), (NUMBERS, (NUMBERS, other(1.14)), []),
         (NUMBERS, (other(3, 0), other(5, 0)), ["thickness 4.0", "connectivity 0"]),
-        (NUMBERS, (NUMBERS, other(3, 0)), []),
-        (NUMBERS, (other(0.5), other(3)), []),
+        (NUMBERS, (NUMBERS, other(3, 0)), []), (NUMBERS, (other(0.5), other(3)), []),
         (NUMBERS, (other(1, -1),), ["connectivity of the other sign"]),
-        (other(math.nan), (NUMBERS,), []),
-        (other(1, 0), (NUMBERS,), []),
-    ):
+        (other(math.nan), (NUMBERS,), []), (other(1, 0), (NUMBERS,), []),
+    ):  # fmt: skip
         assert find_differences(scan, twins) == words

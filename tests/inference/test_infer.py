@@ -1,7 +1,5 @@
 """The main job on a small shape of our own, end to end, and the laws that its result must obey."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path
@@ -299,9 +297,6 @@ def _quantile(measured, direction: np.ndarray, share: float) -> float:
     order = np.argsort(values)
     cumulated = np.cumsum(measured.weights[order]) / measured.area
     return float(values[order][np.searchsorted(cumulated, share)])
-
-
-# ---- as the paper's author would -------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -1,28 +1,18 @@
 """The posterior on tables whose answer is known, its file, and its command."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
-from calling import call, refused
+from calling import call, done, refused
 from emulated import HIGH, LOW
 
+import curvafit.inference.table as room
 import curvafit.inference.training as training
 from curvafit.geometry.descriptors import BLOCKS
 from curvafit.inference.posterior import Architecture, Posterior, load_posterior, save_posterior
-from curvafit.inference.table import (
-    Table,
-    column_names,
-    columns_of,
-    compression_of,
-    law_of,
-    mirror_parameters,
-    parameters_of,
-    save_table,
-)
+from curvafit.inference.table import columns_of, mirror_parameters
 from curvafit.inference.training import PLANS, train_posterior
 from curvafit.scan.measure import Reading
 
@@ -33,7 +23,7 @@ ONCE = (PLANS[0]._replace(epochs=1), PLANS[1]._replace(epochs=1))
 TOLD = {0: 0, 100: 2}
 
 
-def table(shapes: int = 400, seed: int = 0) -> Table:
+def table(shapes: int = 400, seed: int = 0) -> room.Table:
     """Two views of each shape. The mask's curvature block holds a11 and a10, in deviations, in the noise of a fifth of
     them; the crop's in noise of once their size. Of the others nothing is told."""
     rng = np.random.default_rng(seed)
@@ -48,16 +38,16 @@ def table(shapes: int = 400, seed: int = 0) -> Table:
     views = np.repeat(["mask", "crop"], shapes)
     thickness, amount = rng.uniform(5, 12, shapes), 10 ** rng.uniform(2, 4, shapes)
     columns = (np.tile(parameters, (2, 1)), np.tile(thickness, 2), descriptors, np.tile(amount, 2))
-    return Table(np.tile(names, 2), views, *columns, {})
+    return room.Table(np.tile(names, 2), views, *columns, {})
 
 
-def columns(rows: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def columns(rows: room.Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return rows.descriptors, rows.views, rows.amount
 
 
 @pytest.fixture(scope="module")
 def posterior() -> Posterior:
-    plans = (PLANS[0]._replace(rate=1e-2, epochs=60), PLANS[1]._replace(epochs=20))
+    plans = (PLANS[0]._replace(rate=1e-2, epochs=30), PLANS[1]._replace(epochs=8))
     return train_posterior(table(800), SMALL, members=2, plans=plans)
 
 
@@ -177,7 +167,7 @@ def test_an_architecture_has_bounds(sizes: dict, word: str) -> None:
 
 def test_components_are_uncorrelated_and_the_first_are_the_largest() -> None:
     rows = np.random.default_rng(0).random((300, sum(BLOCKS.values()))) + 0.5
-    components = compression_of(rows, SMALL.components)(rows)
+    components = room.compression_of(rows, SMALL.components)(rows)
     variance = components.var(0)
     assert variance.mean() == pytest.approx(1, abs=0.02)
     assert (np.diff(variance) < 0).all()
@@ -185,7 +175,7 @@ def test_components_are_uncorrelated_and_the_first_are_the_largest() -> None:
 
 
 def test_blocks_are_chosen_by_name() -> None:
-    rows, names = np.random.default_rng(0).random((3, sum(BLOCKS.values()))) + 0.5, np.array(column_names())
+    rows, names = np.random.default_rng(0).random((3, sum(BLOCKS.values()))) + 0.5, np.array(room.column_names())
     assert columns_of(rows, ["curvature", "fabric"]) == pytest.approx(rows[:, np.isin(names, ["curvature", "fabric"])])
     assert columns_of(rows, ["fraction"]) == pytest.approx(np.log(rows[:, names == "fraction"]))
 
@@ -193,12 +183,8 @@ def test_blocks_are_chosen_by_name() -> None:
 def test_shapes_and_flows_that_do_not_do_are_refused() -> None:
     fixed = table(20)
     fixed.parameters[:, 2] = 7.0
-    for rows, members, word in (
-        (table(7), 1, "8 laws"),
-        (fixed, 1, "a10"),
-        (table(20), 0, "flows"),
-        (table(20), 65, "flows"),
-    ):
+    counts = ((table(20), count, "flows") for count in (0, 65))
+    for rows, members, word in ((table(7), 1, "8 laws"), (fixed, 1, "a10"), *counts):
         with pytest.raises(ValueError, match=word):
             train_posterior(rows, SMALL, members=members)
 
@@ -207,24 +193,21 @@ def test_shapes_and_flows_that_do_not_do_are_refused() -> None:
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "PLANS", ONCE)
     source, out = tmp_path / "table.npz", tmp_path / "posterior.npz"
-    save_table(table(80), source)
-    result = call("atlas", "train", source, "-o", out, "--views", "mask", "--members", 1)
-    assert result.exit_code == 0, result.stderr
+    room.save_table(table(80), source)
+    result = done("atlas", "train", source, "-o", out, "--views", "mask", "--members", 1)
     assert result.stdout.strip() == str(out)
     assert load_posterior(out).views == ("mask",)
 
 
 def test_the_command_refuses_and_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    save_table(table(5), "table.npz")
-    for source, out, views, word in (
-        ("nothing.npz", "posterior.npz", "mask", "nothing.npz"),
-        ("table.npz", "posterior.pt", "mask", ".npz"),
-        ("table.npz", "table.npz", "mask", "input"),
-        ("table.npz", "posterior.npz", "ghost", "ghost"),
-        ("table.npz", "posterior.npz", "mask", "shapes"),
-    ):
-        refused(call("atlas", "train", source, "-o", out, "--views", views), word, progress=True)
+    room.save_table(table(5), "table.npz")
+    for words, said in {
+        "nothing.npz -o posterior.npz --views mask": "nothing.npz", "table.npz -o posterior.pt --views mask": ".npz",
+        "table.npz -o table.npz --views mask": "input", "table.npz -o posterior.npz --views ghost": "ghost",
+        "table.npz -o posterior.npz --views mask": "shapes",
+    }.items():  # fmt: skip
+        refused(call("atlas", "train", *words.split()), said, progress=True)
         assert [path.name for path in tmp_path.iterdir()] == ["table.npz"]
 
 
@@ -232,6 +215,6 @@ def test_mirrored_parameters_are_those_of_the_mirrored_law() -> None:
     rows = np.random.default_rng(0).uniform(LOW, HIGH, (20, 6))
     assert mirror_parameters(mirror_parameters(rows)) == pytest.approx(rows)
     for row in rows:
-        six, mass = law_of(row)
+        six, mass = room.law_of(row)
         other = six.mirror()
-        assert mirror_parameters(row) == pytest.approx(parameters_of(other.scale(1 / float(other.a20)), -mass))
+        assert mirror_parameters(row) == pytest.approx(room.parameters_of(other.scale(1 / float(other.a20)), -mass))

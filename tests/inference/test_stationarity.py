@@ -1,34 +1,21 @@
 """What pins the parameters down, and what does not: stationarity of fields, and drift of masks."""
 
-from __future__ import annotations
-
 import math
 from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
 
 import nibabel
 import numpy as np
 import pytest
 import torch
 from emulated import BOX, linear, reading, row
+from loss_cases import noise
 from shapes import grown
 
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
 from curvafit.inference.emulator import best_parameters
-from curvafit.inference.stationarity import (
-    clip_to_domain,
-    deblur,
-    drift,
-    energy_gradients,
-    fix_gauge,
-    halo_of,
-    integrate_columns,
-    solve,
-    stationarity,
-    total_least_squares,
-    unit_factors,
-    weak_form,
-)
+from curvafit.inference.stationarity import clip_to_domain, drift, energy_gradients, integrate_columns, stationarity
 from curvafit.priors import WORKING_EPSILON, Coefficients, Grid, energy_terms, jet, phase_field, preset
 from curvafit.priors.stencils import gaussian_blur
 from curvafit.scan.structure import is_rounded
@@ -37,6 +24,8 @@ EDGE = 36
 GRID = Grid((EDGE,) * 3)
 FAR = Coefficients(1, 0.5, 3, 30, -20, 100)
 TRUTH = preset("sponge")
+#: The module, which has a function of its own name.
+room = import_module("curvafit.inference.stationarity")
 
 
 @pytest.fixture(scope="module")
@@ -57,14 +46,10 @@ def close(found, law: Coefficients, rel: float) -> None:
     assert list(found.coefficients)[1:5] == pytest.approx([float(value) for value in list(law)[1:5]], rel=rel)
 
 
-def noise(shape: tuple[int, int, int], seed: int = 0) -> torch.Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
 @pytest.mark.parametrize("boundary", ["periodic", "replicate"])
 def test_gradients_of_the_six_terms_are_autograds(boundary: str) -> None:
     grid = Grid((30, 7, 9), 0.01, boundary)  # type: ignore[arg-type]
-    u = (0.8 * torch.tanh(noise(grid.shape))).requires_grad_()
+    u = (0.8 * torch.tanh(noise(*grid.shape))).requires_grad_()
     each = energy_gradients(u.detach(), grid, WORKING_EPSILON)
     inside = (slice(None) if grid.periodic else slice(1, -1),) * 3
     for k, term in enumerate(energy_terms(jet(u, grid), WORKING_EPSILON)):
@@ -83,10 +68,12 @@ def test_stationarity_finds_what_made_a_field(found) -> None:
 def test_all_starts_end_at_the_whitened_singular_vector(sponge: torch.Tensor) -> None:
     """The constrained minimum is inside the domain here, so it is the unconstrained one; its value is 1 by the
     choice of the error's size."""
-    _, problem, _ = weak_form(sponge.double(), GRID, WORKING_EPSILON)
-    best, singular = total_least_squares(problem)
-    starts = np.stack([clip_to_domain(each) for each in (best, np.array(list(FAR)) / unit_factors(WORKING_EPSILON))])
-    solutions, residuals = solve([problem] * 2, starts)
+    _, problem, _ = room.weak_form(sponge.double(), GRID, WORKING_EPSILON)
+    best, singular = room.total_least_squares(problem)
+    starts = np.stack(
+        [clip_to_domain(each) for each in (best, np.array(list(FAR)) / room.unit_factors(WORKING_EPSILON))]
+    )
+    solutions, residuals = room.solve([problem] * 2, starts)
     np.testing.assert_allclose(residuals, singular[-1], rtol=1e-4)
     np.testing.assert_allclose(solutions / solutions[:, :1], np.stack([best / best[0]] * 2), rtol=1e-2)
     assert len(singular) == 6
@@ -104,7 +91,7 @@ def test_deviations_cover_the_error_within_a_few(found) -> None:
 @pytest.mark.slow
 def test_a_field_that_is_not_stationary_is_not_said_to_be(sponge: torch.Tensor) -> None:
     bent = (sponge + 0.05 * torch.sin(torch.linspace(0, 6 * math.pi, EDGE))).clamp(-1, 1)
-    own, other = (weak_form(u.double(), GRID, WORKING_EPSILON)[2] for u in (sponge, bent))
+    own, other = (room.weak_form(u.double(), GRID, WORKING_EPSILON)[2] for u in (sponge, bent))
     assert other > 5 * own
 
 
@@ -149,14 +136,14 @@ def test_refusals_and_a_rounded_field(sponge: torch.Tensor) -> None:
 
 
 def test_gauge_and_domain() -> None:
-    coefficients, fixed = fix_gauge(np.array([2.0, 4, 8, -20, 6, 100]))
+    coefficients, fixed = room.fix_gauge(np.array([2.0, 4, 8, -20, 6, 100]))
     assert list(coefficients) == [1, 2, 4, -10, 3, 50] and fixed == 0
-    coefficients, fixed = fix_gauge(np.array([1e-5, 4, 2.0, 0, 0, 0]))
+    coefficients, fixed = room.fix_gauge(np.array([1e-5, 4, 2.0, 0, 0, 0]))
     assert coefficients.a02 == 1 and fixed == 2
     inside = clip_to_domain(np.array([-0.2, 1.0, 4.2, 1, 1, 1]))
     assert inside[0] > 0 and inside[2] > 0 and inside[0] + inside[2] == pytest.approx(2)
     a = Coefficients(1, 2, 3, 4, 5, 6)
-    assert np.array(list(a)) / unit_factors(0.5) == pytest.approx(list(a.in_unit(0.5)))
+    assert np.array(list(a)) / room.unit_factors(0.5) == pytest.approx(list(a.in_unit(0.5)))
 
 
 @pytest.mark.slow
@@ -196,7 +183,7 @@ def test_only_the_direction_of_a_counts(mask_phase: torch.Tensor) -> None:
 
 def test_sharpening_undoes_most_of_the_blur(mask_phase: torch.Tensor) -> None:
     blurred = gaussian_blur(mask_phase, MASK, WORKING_EPSILON)
-    kept = gaussian_blur(deblur(mask_phase, MASK, WORKING_EPSILON), MASK, WORKING_EPSILON)
+    kept = gaussian_blur(room.deblur(mask_phase, MASK, WORKING_EPSILON), MASK, WORKING_EPSILON)
     assert (kept - mask_phase).abs().mean() < 0.35 * (blurred - mask_phase).abs().mean()
     assert float(kept.double().mean()) == pytest.approx(float(mask_phase.double().mean()), abs=1e-5)
 
@@ -224,7 +211,7 @@ def test_a_law_without_a20_has_a_drift_and_a_crop_without_an_inside_has_none(mas
     the halo that is held."""
     law = Coefficients(1e-9, 1.0, 1.0, -20.0, 0.0, 100.0)
     assert np.isfinite(drift(mask_phase, MASK, WORKING_EPSILON, law) or np.nan)
-    frozen = halo_of(Grid((32, 32, 32), boundary="replicate"))
+    frozen = room.halo_of(Grid((32, 32, 32), boundary="replicate"))
     assert frozen is not None and bool(frozen[0].all()) and not bool(frozen[16, 16, 16])
     grid = Grid((16, 24, 24), boundary="replicate")
     assert drift(torch.ones(grid.shape), grid, WORKING_EPSILON, preset("tubes").coefficients) is None

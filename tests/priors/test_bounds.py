@@ -1,9 +1,8 @@
 """Numbers that are given: NumPy's are taken as Python's, and what is of another kind or out of range is refused."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,10 +18,14 @@ from curvafit.data_synth.imaging.modality import MODALITIES
 from curvafit.data_synth.sources import Generated
 from curvafit.drawing.shapes import Output
 from curvafit.generation import Schedule, descend, generate, white_noise
+from curvafit.generation.data import Evidence, Hinge
+from curvafit.generation.schedule import Phase, schedule
+from curvafit.generation.slabs import divide
+from curvafit.priors import kernels, stencils
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.energy import orientation
+from curvafit.priors.energy import energy, orientation
 from curvafit.priors.grid import Grid
-from curvafit.priors.law import preset
+from curvafit.priors.law import Law, preset
 
 TUBES, MASS = preset("tubes").coefficients, preset("tubes").mass
 POINT = (1.0, 2.0, 6.0, -40.0, -40.0, 400.0, -0.6)
@@ -80,84 +83,96 @@ def flow(**wrong: Any) -> None:
     generate(**{"law": TUBES, "mass": MASS, "grid": 8, "schedule": BRIEF} | wrong)
 
 
+def lower(**wrong: Any) -> None:
+    descend(**{"field": torch.zeros(8, 8, 8), "law": TUBES, "grid": BOX} | wrong)
+
+
+def plan(**wrong: Any) -> None:
+    Schedule(**{"name": "x", "steps": 10, "start": 1e-3, "stop": 1e-3, "shape": "cosine"} | wrong)
+
+
+def blurred(width: float, spacing: float = 1.0) -> None:
+    grid = Grid((8, 8, 8), (spacing, 1.0, 1.0))
+    with pytest.raises(ValueError, match="blur"):
+        kernels.gaussian_blur(torch.zeros(8, 8, 8), grid, width)
+    stencils.gaussian_blur(torch.zeros(8, 8, 8), grid, width)
+
+
 def recipe(**wrong: Any) -> None:
     source, confocal = Generated((POINT,), ("tubes",)), MODALITIES["confocal"]
     Recipe(**{"source": source, "modality": confocal, "shape": (16, 16, 16), "voxel": confocal.voxel} | wrong)
 
 
+BOX, CUBE = Grid((8, 8, 8)), torch.zeros(8, 8, 8)
 NO_GRIDS = [0, -5, True, "64", (64, 64), None, 64.0, (64, 64, 6.5), math.nan, {}, 10**30]
 NO_SEEDS = [-1, 2**63, 2**70, 1.5, "a", None, True]
-NO_FIELDS = [None, 3, "u", np.zeros((8, 8)), object()]
-#: What is called with which wrong argument, and a word of the refusal.
-REFUSALS: list[tuple[Callable, dict[str, Any], str]] = [
-    *(
-        (flow, {"grid": grid}, "^expected a shape of 3 whole numbers, each at least 4.*, got [^\n]*$")
-        for grid in NO_GRIDS
-    ),
-    *((flow, {"seed": seed}, "seed") for seed in NO_SEEDS),
-    *((lambda seed: white_noise(Grid((8, 8, 8)), seed), {"seed": seed}, "seed") for seed in NO_SEEDS),
-    *((lambda field: descend(field, TUBES, Grid((8, 8, 8))), {"field": field}, "field") for field in NO_FIELDS),
-    (flow, {"law": Coefficients(1e300, 0, 1e300)}, "a20"),
-    (flow, {"law": Coefficients(1, 0, 1, 1e9)}, "a10"),
-    (flow, {"law": Coefficients(1, 0, 1, a00=torch.full((8, 8, 8), 1e20))}, "a00"),
-    (flow, {"law": "tube"}, "preset"),
-    (flow, {"law": (1, 2, 6)}, "law"),
-    (flow, {"epsilon": 1e30}, "epsilon"),
-    (flow, {"epsilon": 1e-9}, "epsilon"),
-    (flow, {"epsilon": 0.0}, "epsilon"),
-    (flow, {"epsilon": math.nan}, "epsilon"),
-    (flow, {"epsilon": torch.tensor([0.02, 1e9])}, "epsilon"),
-    (flow, {"epsilon": torch.tensor([0.02] * 7 + [0.0])}, "expected epsilon > 0"),
-    (flow, {"epsilon": torch.full((2, 8, 8, 8), 0.02)}, "epsilon"),
-    (flow, {"law": Coefficients(1, 2, 6, 0, 0, torch.ones(3, 1))}, "a00"),
-    (flow, {"blur": 1e3}, "blur"),
-    (flow, {"blur": -0.01}, "blur"),
-    (flow, {"orientation": orientation((0, 0, 1), 1e30)}, "orientation"),
-    (flow, {"orientation": [[1]]}, "orientation"),
-    (flow, {"grid": Grid(8, 1e-10)}, "edges"),  # type: ignore[arg-type]
-    (flow, {"grid": (10**5,) * 3}, "memory"),
-    (flow, {"snapshots": 5}, "snapshots"),
-    (flow, {"snapshots": [1.5]}, "snapshots"),
-    (flow, {"snapshots": (1, 41)}, "snapshots"),
-    (flow, {"callbacks": [3]}, "callbacks"),
-    (flow, {"device": "abacus"}, "device"),
-    (flow, {"backend": "cuda"}, "expected a backend"),
-    (flow, {"backend": "fused", "device": "meta"}, "device"),
-    (flow, {"checkpoint_every": math.inf}, "seconds"),
-    (flow, {"checkpoint_every": -1}, "seconds"),
-    *((flow, {"volume_fraction": share, "mass": None}, "volume fraction") for share in (0.0, 1.0, -0.1, math.nan)),
-    *((flow, {"volume_fraction": 0.2, "mass": mass}, "mass") for mass in (1.0, math.nan, torch.full((8, 8, 8), -0.5))),
-    *(
-        (flow, {"mass": mass}, "mass")
-        for mass in ("half", 1.0, -1.5, math.nan, torch.tensor([0.5, 1.5]), torch.ones(7))
-    ),
-    (flow, {"mass": None}, "neither"),
-    (flow, {"schedule": 5}, "schedule"),
-    *((lambda spread: design_around(POINT, spread), {"spread": s}, "spread") for s in (1e300, math.nan, -1, "wide")),
-    (design_box, {"a10": (0, 1e300)}, "a10"),
-    (Generated, {"points": ((*POINT[:5], 1e300, -0.6),), "names": ("far",)}, "a00"),
-    (Design, {"sampling": "random", "box": ((0, 1, 2),) * 7}, "interval"),
-    (check_workers, {"count": 10**6, "scheduler": None}, "workers"),
-    *((Output, {"voxel": edge}, "edge") for edge in (1e300, 1e-300, 0, math.inf)),
-    (Output, {"tile": (2, 2, 2.5)}, "repeats"),
-    (lambda tile: Output(tile=tile).shape(Grid((8, 8, 8))), {"tile": (10**6, 10**6, 1)}, "memory"),
-    (recipe, {"shape": (1, 1, 1)}, "images"),
-    (recipe, {"shape": (10**9,) * 3}, "images"),
-    (recipe, {"shape": (16, 16, "16")}, "voxels"),
-    (recipe, {"voxel": 1e300}, "voxel"),
-    (recipe, {"voxel": 1e6}, "1 x 1 x 1"),
-    (recipe, {"calibres": (1, 1e300)}, "calibres"),
-    (recipe, {"calibres": (1, 500)}, "shapes"),
-    (recipe, {"calibres": 1}, "factors"),
-    (recipe, {"seed": 2**63}, "seed"),
-    (recipe, {"source": None}, "source"),
-]
+NO_FIELDS = [None, 3, "u", np.zeros((8, 8)), torch.zeros(8, 8, 7), object()]
+NO_SHARES, NO_MASSES = (0.0, 1.0, -0.1, math.nan), (1.0, math.nan, torch.full((8, 8, 8), -0.5))
+phase = partial(Phase, start=1e-3, stop=1e-3, shape="constant")
+NO_EPSILONS = (1e30, 1e-9, 0.0, math.nan, torch.tensor([0.02, 1e9]), torch.full((2, 8, 8, 8), 0.02))
+#: What is called, an argument and what it may not be, and a word of the refusal.
+REFUSALS: list[tuple[Callable, str, Sequence[Any], str]] = [
+    (flow, "grid", NO_GRIDS, "^expected a shape of 3 whole numbers, each at least 4.*, got [^\n]*$"),
+    (flow, "grid", [Grid(8, 1e-10)], "edges"),  # type: ignore[arg-type]
+    (flow, "grid", [(10**5,) * 3], "memory"), (Grid, "shape", [(3, 5, 5), (5, 5)], "each at least 4"),
+    (Grid, "shape", [(4.5, 5, 5)], "whole numbers"),
+    (partial(Grid, 5), "spacing", [(0.2, 0, 0.2), (1, 1, math.nan)], r"positive numbers \(z, y, x\), got"),
+    (partial(Grid, 5), "boundary", ["mirror"], "'periodic' or 'replicate', got 'mirror'"),
+    (flow, "seed", NO_SEEDS, "seed"), (partial(white_noise, BOX), "seed", NO_SEEDS, "seed"),
+    (lower, "field", NO_FIELDS, "field"), (lower, "field", [torch.full((8, 8, 8), math.inf)], "finite"),
+    (lower, "flow", ["h1"], "flow"), (lower, "optimiser", ["sgd"], "optimiser"), (lower, "steps", [0], "steps"),
+    (lower, "frozen", [torch.zeros(3, 3, 3, dtype=torch.bool)], "frozen"),
+    (lower, "data", [Evidence(torch.ones(7, 8, 8))], "ratio"),
+    (Evidence, "ratio", [torch.full((4, 4, 4), math.nan), torch.zeros(4, 4)], "evidence"),
+    (Hinge, "ratio", [torch.full((4, 4, 4), math.nan)], "evidence"),
+    (partial(Hinge, CUBE), "margin", [2.0], "a margin from 0 to 1"),
+    (flow, "law", [Coefficients(1e300, 0, 1e300)], "a20"), (flow, "law", [Coefficients(1, 0, 1, 1e9)], "a10"),
+    (flow, "law", [Coefficients(1, 0, 1, a00=each) for each in (torch.full((8, 8, 8), 1e20), torch.ones(3, 1))], "a00"),
+    (flow, "law", ["tube"], "preset"), (flow, "law", [(1, 2, 6)], "law"),
+    (Law.of, "law", ["tube", "x" * 5000, 7, None], "preset"), (preset, "name", ["tube"], "preset"),
+    (partial(Coefficients, 1, a02=1), "a11", [math.nan], "a11"), (Coefficients(1, 0, 1).in_unit, "unit", [0], "unit"),
+    (flow, "epsilon", NO_EPSILONS, "epsilon"),
+    (flow, "epsilon", [torch.tensor([0.02] * 7 + [0.0])], "expected epsilon > 0"),
+    (flow, "blur", [1e3, -0.01], "blur"), (blurred, "width", [-1.0, 8.1, 1e6, math.inf, math.nan], "blur"),
+    (partial(blurred, 1.0), "spacing", [1e-6], "blur"),
+    (partial(stencils.gradient, grid=BOX), "u", [torch.zeros(8, 8, 7)], "axes"),
+    (flow, "orientation", [orientation((0, 0, 1), 1e30), [[1]]], "orientation"),
+    (partial(orientation, strength=1.0), "direction", [(0, 0, 0), (1, 2), (1, math.nan, 0)], "direction"),
+    (partial(orientation, (1, 0, 0)), "strength", [math.inf], "strength"),
+    (partial(energy, CUBE, TUBES, BOX, 0.02), "orientation", [torch.arange(9.0).reshape(3, 3)], "symmetric"),
+    (flow, "snapshots", [5, [1.5], (1, 41)], "snapshots"), (flow, "callbacks", [[3]], "callbacks"),
+    (flow, "device", ["abacus"], "device"), (flow, "backend", ["cuda"], "expected a backend"),
+    (partial(flow, device="meta"), "backend", ["fused"], "device"),
+    (flow, "checkpoint_every", [math.inf, -1], "seconds"),
+    (partial(flow, mass=None), "volume_fraction", NO_SHARES, "volume fraction"),
+    (partial(flow, volume_fraction=0.2), "mass", NO_MASSES, "mass"),
+    (flow, "mass", ["half", 1.0, -1.5, math.nan, torch.tensor([0.5, 1.5]), torch.ones(7)], "mass"),
+    (flow, "mass", [None], "neither"), (flow, "schedule", [5], "schedule"), (schedule, "name", ["slow"], "schedule"),
+    (plan, "steps", [0], "steps"), (plan, "start", [0.0], "positive step"), (plan, "shape", ["linear"], "shape"),
+    (plan, "momentum", [1], "momentum in"), (plan, "memory", [1], "memory in"),
+    (phase, "share", [0.0, 1.0, -0.5], "share"), (plan, "opening", [(phase(share=0.5),) * 2], "share"),
+    (plan, "opening", [(3,)], "opening"),
+    (partial(divide, Grid((36, 8, 8)), 4), "halo", [10], "at least 10 planes"),
+    (partial(design_around, POINT), "spread", [1e300, math.nan, -1, "wide"], "spread"),
+    (design_box, "a10", [(0, 1e300)], "a10"),
+    (partial(Generated, names=("far",)), "points", [((*POINT[:5], 1e300, -0.6),)], "a00"),
+    (partial(Design, "random"), "box", [((0, 1, 2),) * 7], "interval"),
+    (partial(check_workers, scheduler=None), "count", [10**6], "workers"),
+    (Output, "voxel", [1e300, 1e-300, 0, math.inf], "edge"), (Output, "tile", [(2, 2, 2.5), (1, 0, 1)], "repeats"),
+    (Output, "unit", ["x"], "unit"),
+    (lambda tile: Output(tile=tile).shape(BOX), "tile", [(10**6, 10**6, 1)], "memory"),
+    (recipe, "shape", [(1, 1, 1), (10**9,) * 3], "images"), (recipe, "shape", [(16, 16, "16")], "voxels"),
+    (recipe, "voxel", [1e300], "voxel"), (recipe, "voxel", [1e6], "1 x 1 x 1"),
+    (recipe, "calibres", [(1, 1e300)], "calibres"), (recipe, "calibres", [(1, 500)], "shapes"),
+    (recipe, "calibres", [1], "factors"), (recipe, "seed", [2**63], "seed"), (recipe, "source", [None], "source"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(("make", "wrong", "said"), REFUSALS)
-def test_what_is_out_of_range_is_refused(make: Callable, wrong: dict[str, Any], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
-        make(**wrong)
+@pytest.mark.parametrize(("make", "argument", "values", "said"), REFUSALS)
+def test_what_is_out_of_range_is_refused(make: Callable, argument: str, values: Sequence[Any], said: str) -> None:
+    for value in values:
+        with pytest.raises(ValueError, match=said):
+            make(**{argument: value})
 
 
 def test_memory_is_told_before_it_is_taken() -> None:

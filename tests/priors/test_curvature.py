@@ -1,7 +1,5 @@
 """Diffuse and geometric curvatures: right on exact jets, and their laws on any field; the exact shapes themselves."""
 
-from __future__ import annotations
-
 import math
 
 import exact
@@ -11,6 +9,7 @@ import torch
 from exact import Cylinder, Gyroid, Plane, Sphere, Torus, exact_jet, profile, shape_operator_curvatures
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from loss_cases import noise
 from torch.testing import assert_close
 
 from curvafit.priors.curvature import Jet, diffuse_curvatures, geometric_curvatures, jet, second_form
@@ -41,10 +40,6 @@ def random_jet(seed: int, count: int = 50) -> Jet:
     generator = torch.Generator().manual_seed(seed)
     draw = [torch.randn(n, count, 1, 1, generator=generator, dtype=torch.float64) for n in (1, 3, 6)]
     return Jet(draw[0][0], 3 * draw[1], 20 * draw[2])
-
-
-def noise(*shape: int, seed: int) -> torch.Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 @pytest.mark.parametrize("name", SHAPES)

@@ -1,7 +1,5 @@
 """F_ε: its value on exact profiles, its relatives, its laws, its derivatives, and how a grid errs."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -126,7 +124,7 @@ def test_helfrich_and_willmore_are_their_own_formulas(grid: Grid) -> None:
     assert float(helfrich) == pytest.approx(float(density.sum()) * grid.voxel_volume, rel=1e-8)
 
 
-# ---- laws ------------------------------------------------------------------------------------------------------------
+# ---- laws, derivatives, area -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("form", [energy, UNSIMPLIFIED, CURVATURE_INTEGRAL])
@@ -185,9 +183,6 @@ def test_batches_precision_and_coefficients_in_space() -> None:
     assert_close(energy(u[0], Coefficients(*five, a00=a00), grid, ε), flat + extra, rtol=1e-12, atol=0)
 
 
-# ---- derivatives -----------------------------------------------------------------------------------------------------
-
-
 @boundaries
 @pytest.mark.parametrize("turned", [False, True])
 def test_gradients_by_finite_differences(turned: bool, boundary: str) -> None:
@@ -211,9 +206,6 @@ def test_gradients_are_finite_on_flat_and_floored_fields() -> None:
         free = u.clone().requires_grad_()
         (slope,) = torch.autograd.grad(energy(free, preset("tubes").coefficients, grid, 0.02), free)
         assert bool(torch.isfinite(slope).all())
-
-
-# ---- area ------------------------------------------------------------------------------------------------------------
 
 
 def test_cahn_hilliard_area_of_a_plane_from_below() -> None:
@@ -277,19 +269,6 @@ def test_orientation_is_strength_times_the_directions_square() -> None:
     Q = orientation((0, 3, 4), 50.0)
     assert_close(Q, torch.tensor([[0, 0, 0], [0, 18, 24], [0, 24, 32]]).double())
     assert float(Q.trace()) == pytest.approx(50)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "word"),
-    [
-        *((lambda way=way: orientation(way, 1.0), "direction") for way in ((0, 0, 0), (1, 2), (1, math.nan, 0))),
-        (lambda: orientation((1, 0, 0), math.inf), "strength"),
-        (lambda: energy(rough(Grid(4)), UNEQUAL, Grid(4), 0.02, torch.arange(9.0).reshape(3, 3)), "symmetric"),  # type: ignore[arg-type]
-    ],
-)
-def test_a_wrong_orientation_is_refused(wrong, word) -> None:
-    with pytest.raises(ValueError, match=word):
-        wrong()
 
 
 @pytest.mark.parametrize("waves", [(1, 0, 0), (1, -2, 0), (2, 1, 3)])

@@ -1,7 +1,5 @@
 """The curvature prior beside the losses and in the loops that people have."""
 
-from __future__ import annotations
-
 import copy
 import io
 import os
@@ -82,7 +80,7 @@ def test_it_can_be_copied_and_shown():
         assert CurvaturePrior(law).coefficients == (Coefficients.willmore(),)  # type: ignore[arg-type]
 
 
-# ---- torch -----------------------------------------------------------------------------------------------------------
+# ---- torch and MONAI -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`", "ignore:ε = .* interpolating")
@@ -120,9 +118,6 @@ def test_distributed_training_sees_the_same_gradients(tmp_path):
     finally:
         dist.destroy_process_group()
     assert_close(found, expected)
-
-
-# ---- MONAI -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["prior", "dice"])

@@ -1,7 +1,5 @@
 """The fused kernels against the plain-torch definition, and against what must hold of them whatever the definition."""
 
-from __future__ import annotations
-
 import os
 import platform
 import subprocess
@@ -10,10 +8,10 @@ import sys
 import numpy as np
 import pytest
 import torch
-from kernel_cases import ADAM_EPS, BETAS, BLUR, BOUNDARIES, EPSILON, SPACINGS, TUBES, smooth_field, torch_gradient
+from kernel_cases import ADAM_EPS, BETAS, BLUR, BOUNDARIES, EPSILON, SPACINGS, TUBES, smooth_field
 
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.energy import energy
+from curvafit.priors.energy import energy, energy_gradient_by_autograd
 from curvafit.priors.grid import Grid
 from curvafit.priors.stencils import divergence, gaussian_blur, gradient
 
@@ -28,17 +26,11 @@ UNEQUAL = Coefficients(1.3, -0.7, 4.0, -60.0, 35.0, 500.0)
 @pytest.mark.parametrize(
     ("shape", "varies"),
     [
-        ((12, 9, 21), ""),
-        ((4, 5, 16), ""),
-        ((5, 4, 4), ""),
-        ((9, 8, 13), "orientation"),
-        ((9, 8, 13), "coefficients"),
-        ((9, 8, 13), "epsilon"),
-        ((9, 8, 13), "orientation, coefficients, epsilon"),
-        ((9, 8, 35), "mask"),
-        ((9, 8, 35), "orientation, coefficients, mask"),
+        ((12, 9, 21), ""), ((4, 5, 16), ""), ((5, 4, 4), ""), ((9, 8, 13), "orientation"),
+        ((9, 8, 13), "coefficients"), ((9, 8, 13), "epsilon"), ((9, 8, 13), "orientation, coefficients, epsilon"),
+        ((9, 8, 35), "mask"), ((9, 8, 35), "orientation, coefficients, mask"),
     ],
-)
+)  # fmt: skip
 def test_energy_and_gradient_are_the_definitions(shape, varies, spacing, boundary):
     """No farther from float64 than a few times what the definition itself loses in float32.
 
@@ -53,8 +45,8 @@ def test_energy_and_gradient_are_the_definitions(shape, varies, spacing, boundar
     ε = EPSILON * (1.3 + 0.1 * smooth_field(grid, 9)) if "epsilon" in varies else EPSILON
     Q = ORIENTATION if "orientation" in varies else None
     mask = (smooth_field(grid, 5) > -0.3) * (1 + smooth_field(grid, 6).abs()) if "mask" in varies else None
-    value, slope = torch_gradient(u, Coefficients(*a), grid, ε, Q, mask)
-    value32, slope32 = torch_gradient(u.float(), Coefficients(*a), grid, ε, Q, mask)
+    cost = Coefficients(*a), grid, ε, Q, mask
+    (value, slope), (value32, slope32) = (energy_gradient_by_autograd(each, *cost) for each in (u, u.float()))
     given = [each.numpy() if isinstance(each, torch.Tensor) else each for each in (*a, ε, Q, mask)]
     found, gradient_found = cpu.fused_energy_gradient(u.numpy(), given[:6], grid, *given[6:])
     assert abs(found - value) <= 4 * abs(value32 - value) + 1e-6 * abs(value)
@@ -109,19 +101,16 @@ def test_blur_is_its_own_adjoint(boundary):
     assert left == pytest.approx((first * cpu.gaussian_blur(second, grid, BLUR).astype(np.float64)).sum(), abs=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("word", "call"),
-    [
-        ("field", lambda grid, u: cpu.fused_energy_gradient(u[..., 1:], list(TUBES), grid, EPSILON)),
-        ("array", lambda grid, u: cpu.fused_energy_gradient(u, list(TUBES), grid, u[..., 1:])),
-        ("symmetric", lambda grid, u: cpu.fused_energy_gradient(u, list(TUBES), grid, EPSILON, np.tri(3))),
-        ("field", lambda grid, u: cpu.gaussian_blur(u[..., 1:], grid, BLUR)),
-    ],
-)
-def test_wrong_shapes_and_orientations_are_refused(word, call):
-    grid = Grid((6, 7, 16))
-    with pytest.raises(ValueError, match=word):
-        call(grid, np.zeros(grid.shape, np.float32))
+def test_wrong_shapes_and_orientations_are_refused():
+    grid, u, law = Grid((6, 7, 16)), np.zeros((6, 7, 16), np.float32), list(TUBES)
+    for word, call in (
+        ("field", lambda: cpu.fused_energy_gradient(u[..., 1:], law, grid, EPSILON)),
+        ("array", lambda: cpu.fused_energy_gradient(u, law, grid, u[..., 1:])),
+        ("symmetric", lambda: cpu.fused_energy_gradient(u, law, grid, EPSILON, np.tri(3))),
+        ("field", lambda: cpu.gaussian_blur(u[..., 1:], grid, BLUR)),
+    ):
+        with pytest.raises(ValueError, match=word):
+            call()
 
 
 # ---- the flow's steps ------------------------------------------------------------------------------------------------

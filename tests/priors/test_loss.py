@@ -1,7 +1,5 @@
 """The training loss is the energy, of windows, classes, units, masks, types of float; what it takes and refuses."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from pathlib import Path
@@ -171,13 +169,7 @@ def test_gradcheck(options):
 
 
 @pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"sigmoid": True},
-        {"spacing": (0.75, 0.25, 0.25)},
-        {"spacing": (0.75, 0.25, 0.25), "reduction": "sum"},
-    ],
+    "options", [{}, {"sigmoid": True}, *({"spacing": (0.75, 0.25, 0.25), "reduction": how} for how in ("mean", "sum"))]
 )
 def test_float32_is_float64(options):
     """Values and gradients of the fused kernels and of the definition, per class, under a mask of each class; the
@@ -311,7 +303,7 @@ def test_the_suggested_weight_balances_gradients():
         prior.suggest_weight(base, (torch.full_like(logits, 1e4), target))
 
 
-# ---- wrong input ----------------------------------------------------------------------------------------------------
+# ---- wrong input: any number is finite or refused --------------------------------------------------------------------
 
 
 def box(*shape: int) -> torch.Tensor:
@@ -329,29 +321,22 @@ LABELS = torch.ones(2, 1, 8, 8, 8)
 #: A loss's options, its arguments, and a word of the refusal.
 REFUSALS = [
     ({"sigmoid": True, "softmax": True}, (), "expected sigmoid or softmax, got both"),
-    ({"reduction": "max"}, (), "reduction"),
-    ({"spacing": (1, 0, 1)}, (), "expected a spacing of 3 positive numbers"),
+    ({"reduction": "max"}, (), "reduction"), ({"spacing": (1, 0, 1)}, (), "expected a spacing of 3 positive numbers"),
     ({"epsilon": -1.0}, (), "expected epsilon > 0"),
     ({"epsilon": 1e30}, (), "expected epsilon > 0 in spacing's unit, at most 10000, got 1e.30"),
     ({"epsilon": 11.0}, (box(1, 1, 8, 9, 10),), "expected an ε of at most the window's longest side, 10, got 11"),
-    ({"epsilon": 0.02}, (), "fold"),
-    ({"epsilon": 2.0, "spacing": (16.1, 1.0, 1.0)}, (), "fold"),
-    ({"border": 0.5}, (), "expected a border of whole voxels"),
-    ({"weight": -1}, (), "expected a weight from 0"),
+    ({"epsilon": 0.02}, (), "fold"), ({"epsilon": 2.0, "spacing": (16.1, 1.0, 1.0)}, (), "fold"),
+    ({"border": 0.5}, (), "expected a border of whole voxels"), ({"weight": -1}, (), "expected a weight from 0"),
     ({"weight": None}, (), "expected a weight from 0 to 1e.09, or one for each class, got None"),
-    ({"shape": (8, 8)}, (), "expected a shape of 3 whole numbers"),
-    ({"unit": "furlong"}, (), "unit"),
-    ({"law": LAW, "unit": "furlong"}, (), "unit"),
-    ({"law": "tubs"}, (), "preset"),
-    ({"law": Path("nowhere/fit.json")}, (), "no file"),
-    ({"law": Coefficients(torch.ones(2), 1, 1)}, (), "numbers"),
+    ({"shape": (8, 8)}, (), "expected a shape of 3 whole numbers"), ({"unit": "furlong"}, (), "unit"),
+    ({"law": LAW, "unit": "furlong"}, (), "unit"), ({"law": "tubs"}, (), "preset"),
+    ({"law": Path("nowhere/fit.json")}, (), "no file"), ({"law": Coefficients(torch.ones(2), 1, 1)}, (), "numbers"),
     ({"law": Coefficients(1, 1, 1, a00=1e7)}, (), "a00"),
     ({"law": ("tubes", "sponge")}, (box(1, 1, 8, 8, 8),), "one law"),
     ({}, (box(1, 1, 1, 16, 16),), "at least 4 voxels"),
     ({}, (box(1, 16, 16, 16),), "expected an input of floats .B, N, D, H, W."),
     ({}, (box(0, 1, 8, 8, 8),), "expected an input of floats .B, N, D, H, W., got torch.float32 .0, 1, 8, 8, 8."),
-    ({}, (LABELS.long(),), "input"),
-    ({}, (LABELS.numpy(),), "expected a torch tensor"),
+    ({}, (LABELS.long(),), "input"), ({}, (LABELS.numpy(),), "expected a torch tensor"),
     *(({"ignore_index": 2}, (box(), labels), "target") for labels in (None, box(), box(2, 1, 8, 8, 4))),
     ({"to_onehot_y": True}, (box(), box()), "target"),
     *(
@@ -360,7 +345,7 @@ REFUSALS = [
     ),
     *(({}, (box(), None, spoiled(value)), "mask") for value in (-1.0, 1e300, math.inf, math.nan)),
     *(({}, (box().to(kind), None, box().requires_grad_()), "detach") for kind in (torch.float32, torch.float64)),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("options", "given", "said"), REFUSALS)
@@ -369,22 +354,13 @@ def test_what_it_cannot_take_is_refused(options, given, said):
         CurvaturePrior(**{"law": "tubes"} | options)(*given)
 
 
-@pytest.mark.parametrize(
-    ("options", "word"),
-    [
-        ({"softmax": True}, "single channel"),
-        ({"include_background": False}, "single channel"),
-        ({"unit": "nm"}, "unit"),
-    ],
-)
-def test_what_changes_nothing_is_said(options, word):
+def test_what_changes_nothing_is_said():
     p = probabilities(1, 1, 8, 8, 8)
-    with pytest.warns(UserWarning, match=word):
-        found = CurvaturePrior("tubes", **options)(p)
-    assert torch.equal(found, CurvaturePrior("tubes")(p))
-
-
-# ---- any number is finite or refused ---------------------------------------------------------------------------------
+    useless = ("softmax", True, "channel"), ("include_background", False, "channel"), ("unit", "nm", "unit")
+    for name, value, word in useless:
+        with pytest.warns(UserWarning, match=word):
+            found = CurvaturePrior("tubes", **{name: value})(p)
+        assert torch.equal(found, CurvaturePrior("tubes")(p))
 
 
 HOSTILE = (
@@ -439,11 +415,10 @@ def test_what_is_no_probability_is_said_once_and_shows_in_the_loss(value, dtype)
     ("spacing", "epsilon", "times"),
     [
         *((spacing, 2 * min(spacing), (1, 1, 1)) for spacing in ((1.003, 1, 1.003), (0.8, 0.76, 0.76), (1, 1, 1.1))),
-        ((1.11, 1.0, 1.0), 2.0, (2, 1, 1)),
-        ((5.0, 0.994, 3.0), 1.988, (6, 1, 4)),
+        ((1.11, 1.0, 1.0), 2.0, (2, 1, 1)), ((5.0, 0.994, 3.0), 1.988, (6, 1, 4)),
         ((16.0, 2.0, 1.0), 2.0, (16, 2, 1)),
     ],
-)
+)  # fmt: skip
 def test_an_axis_a_little_coarser_is_not_interpolated_and_others_have_two_voxels_to_epsilon(spacing, epsilon, times):
     assert choose_refinement(spacing, epsilon) == times
 

@@ -1,7 +1,5 @@
 """The training loss's derivatives in every mode: those of the definition in float64, or refused."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from loss_cases import LAW, noise, probabilities, slope_of

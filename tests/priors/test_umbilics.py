@@ -1,7 +1,5 @@
 """F_ε's gradient where the root √(2|M|² - (Tr M)²)⁺ has none: one choice, in every precision and every program."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -60,9 +58,6 @@ def one_sided(u: Tensor, grid: Grid, place: Tensor, step: float, a: Coefficients
     return sides[0], sides[1]
 
 
-# ---- the root --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_roots_derivative_is_zero_or_the_roots(dtype) -> None:
     half, twice = 50 * ROOT_ROUNDING, 200 * ROOT_ROUNDING  # of the share of 100 that is undecided
@@ -74,9 +69,6 @@ def test_the_roots_derivative_is_zero_or_the_roots(dtype) -> None:
     torch.testing.assert_close(root.detach(), values)
     torch.testing.assert_close(slope, torch.tensor([0, 0, 0, 0, 1, 1], dtype=dtype) / (2 * values))
     assert bool(positive_root(torch.tensor(math.nan), torch.tensor(1.0)).isnan())  # a lost value shows
-
-
-# ---- the gradient ----------------------------------------------------------------------------------------------------
 
 
 @boundaries

@@ -1,7 +1,5 @@
 """The loss beside kernels elsewhere: in a loader's workers by every start method, and in several Python threads."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import subprocess
@@ -27,7 +25,7 @@ def look(batch, scale=1.0):
     return prior(scale * torch.randn(1, 1, 48, 48, 48, requires_grad=True)) + batch["image"].mean()
 
 def main(start):
-    for workers, persistent in ((1, False), (2, True)):
+    for workers, persistent in (((1, False), (2, True)) if start == "fork" else ((2, True),)):
         options = {"num_workers": workers, "persistent_workers": persistent, "multiprocessing_context": start}
         look({"image": torch.zeros(1)}).backward()
         train(options)
@@ -82,7 +80,7 @@ def run(program: Path, *arguments: str, **environment: str) -> tuple[str, str]:
     [("torch", "fork"), ("torch", "spawn"), ("torch", "forkserver"), ("monai", "fork"), ("lightning", "fork")],
 )
 def test_workers_grow_shapes_beside_the_loss(loop, start, tmp_path) -> None:
-    """One worker, and two that persist, two epochs each; the main process keeps its threads."""
+    """Two workers that persist, and forked also one that does not; the main process keeps its threads."""
     if start not in multiprocessing.get_all_start_methods():
         pytest.skip(f"this platform has no {start}")
     pytest.importorskip(loop, reason=f"{loop} is not installed: pip install {loop}")
@@ -178,8 +176,5 @@ def test_what_takes_long_is_logged_once(tmp_path) -> None:
     program, cache = tmp_path / "first.py", str(tmp_path / "cache")
     program.write_text(FIRST)
     said = [run(program, *bare, NUMBA_CACHE_DIR=cache)[1] for bare in ([], [], ["bare"])]
-    assert [(text.count("compiling"), text.count("numba is not installed")) for text in said] == [
-        (1, 0),
-        (0, 0),
-        (0, 1),
-    ]
+    assert [text.count("compiling") for text in said] == [1, 0, 0]
+    assert [text.count("numba is not installed") for text in said] == [0, 0, 1]

@@ -1,7 +1,5 @@
 """The page of a first look: scores on what was left out, a page that stands alone, no page of others lost."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

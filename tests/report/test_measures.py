@@ -1,14 +1,12 @@
 """The pages of many scans, measured and inferred: their files, tables and names, and what is refused."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 
 import numpy as np
 import pytest
-from calling import call, refused
-from found import lattice
+from calling import call, done, refused
+from found import lattice, without_drawing
 
 from curvafit.report.laws import infer_scans, name_folders
 from curvafit.report.measures import WORD, describe_range, name_parts, shorten
@@ -36,23 +34,15 @@ def test_a_folder_has_page_figures_and_table(scans: list[Path], tmp_path: Path) 
     table = tmp_path / "mice.csv"
     table.write_text("scan,subject,group\nr45.nii.gz,m1,a\nr60.nii.gz,m2,b\n")
     words = ("measure", *scans, "--subjects", table, "-o", tmp_path / "out")
-    result = call(*words)
-    assert result.exit_code == 0, result.output
+    done(*words)
     rows = rows_of(tmp_path / "out" / "measures.csv")
     assert {row["group"] for row in rows} == {"a", "b"}
     thickness = [float(row["value"]) for row in rows if row["symbol"] == "Tb.Th"]
     alone = [measure(scan).convert("mm")["Tb.Th"].value for scan in scans]
     assert thickness == pytest.approx(alone, rel=1e-9)
     assert {row["unit"] for row in rows if row["symbol"] == "Tb.Th"} == {"mm"}
-    assert call(*words).exit_code == 0  # the same command replaces its own
+    done(*words)  # the same command replaces its own
     refused(call("measure", scans[0], "-o", tmp_path / "out"), "not free", progress=True)
-
-
-@pytest.mark.slow
-def test_workers_measure_the_same(scans: list[Path], tmp_path: Path) -> None:
-    for workers in (0, 2):
-        assert call("measure", *scans, "-o", tmp_path / f"by{workers}", "--workers", workers).exit_code == 0
-    assert rows_of(tmp_path / "by0" / "measures.csv") == rows_of(tmp_path / "by2" / "measures.csv")
 
 
 def test_compartments_have_rows(scans: list[Path], tmp_path: Path) -> None:
@@ -63,8 +53,7 @@ def test_compartments_have_rows(scans: list[Path], tmp_path: Path) -> None:
     region = save(Field(labels, (0.02,) * 3, "mm"), tmp_path / "roi.nii.gz")
     twin = tmp_path / "twin.nii.gz"
     twin.write_bytes(scans[0].read_bytes())
-    done = call("measure", scans[0], twin, "--roi", region, "--kind", "mask", "-o", tmp_path / "out")
-    assert done.exit_code == 0, done.output
+    done("measure", scans[0], twin, "--roi", region, "--kind", "mask", "-o", tmp_path / "out")
     assert {row["compartment"] for row in rows_of(tmp_path / "out" / "measures.csv")} == {"1", "2", "3", "4"}
     page = (tmp_path / "out" / "measures.html").read_text(encoding="utf-8")
     assert "r45.nii.gz, compartment 2" in page and "No intervals" in page  # the note of a compartment
@@ -97,7 +86,8 @@ def test_names_and_the_sentence_of_the_range(scans: list[Path]) -> None:
 # ---- laws ------------------------------------------------------------------------------------------------------------
 
 
-def test_each_scan_has_its_report_and_its_rows(scans: list[Path], tmp_path: Path) -> None:
+def test_each_scan_has_its_report_and_its_rows(scans: list[Path], tmp_path: Path, monkeypatch) -> None:
+    without_drawing(monkeypatch)
     names = list(map(str, scans))
     page = infer_scans(names, tmp_path / "out", fast=True, command="one")
     rows = rows_of(tmp_path / "out" / "laws.csv")
@@ -114,7 +104,7 @@ def test_each_scan_has_its_report_and_its_rows(scans: list[Path], tmp_path: Path
 def test_what_is_wrong_is_said_with_the_scan(scans: list[Path], tmp_path: Path) -> None:
     empty = save(Field(np.zeros((40, 40, 40), np.uint8)), tmp_path / "empty.nii.gz")
     with pytest.raises(ValueError, match="empty.nii.gz"):
-        infer_scans([str(scans[0]), str(empty)], tmp_path / "out", fast=True, command="one")
+        infer_scans([str(empty), str(scans[0])], tmp_path / "out", fast=True, command="one")
     assert not (tmp_path / "out" / "laws.html").exists()
 
 

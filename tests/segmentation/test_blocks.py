@@ -1,7 +1,5 @@
 """A volume filled in blocks from a file is the volume filled whole, whatever the blocks; a killed run goes on."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -11,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
-from calling import call, refused
+from calling import call, done, refused
 from shapes import grown
 
 from curvafit.core.workers import cluster
@@ -72,17 +70,13 @@ def check_alike(found: Path, whole: Path) -> None:
         assert notes[0][name] == pytest.approx(notes[1][name], rel=1e-3), name
 
 
-@pytest.mark.parametrize(
-    "edge", [64, pytest.param(33, marks=pytest.mark.slow), pytest.param(96, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("edge", [64, *(pytest.param(edge, marks=pytest.mark.slow) for edge in (33, 96))])
 def test_blocks_equal_the_whole(labels: Path, whole: Path, tmp_path: Path, edge: int) -> None:
     target = tmp_path / whole.name
-    result = call("reconstruct", labels, "--every", 8, "--tile", edge, "-o", target)
-    assert result.exit_code == 0, (result.output, result.exception)
+    done("reconstruct", labels, "--every", 8, "--tile", edge, "-o", target)
     check_alike(target, whole)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "whole.json", "whole.png", "whole.zarr", "whole_probability.zarr",
-    ]  # fmt: skip
+    names = ["whole.json", "whole.png", "whole.zarr", "whole_probability.zarr"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
     assert json.loads((tmp_path / "whole.json").read_text())["tile"] == edge
 
 
@@ -110,9 +104,7 @@ def test_labels_of_an_image_are_those_of_the_whole(labels: Path, tmp_path: Path,
         volume = load(labels)
         write_zarr(volume.label(1), tmp_path / name / "scan.zarr", version)
         target = tmp_path / name / "scan.zarr" / "labels" / "filled"
-        more = ("--tile", 64) if name == "two" else ()
-        result = call("reconstruct", labels, "--every", 8, *more, "-o", target)
-        assert result.exit_code == 0, (result.output, result.exception)
+        done("reconstruct", labels, "--every", 8, *(("--tile", 64) if name == "two" else ()), "-o", target)
     one, two = (files(tmp_path / name / "scan.zarr") for name in ("one", "two"))
     assert one.keys() == two.keys()
     assert all(one[name] == two[name] for name in one if not name.rpartition("/")[2].isdigit())
@@ -124,7 +116,7 @@ def test_the_same_command_goes_on_after_a_kill(labels: Path, tmp_path: Path, mon
     def command(name: str) -> tuple:
         return ("reconstruct", labels, "--every", 8, "--tile", 64, "-o", tmp_path / name / "mask.zarr")
 
-    assert call(*command("whole")).exit_code == 0
+    done(*command("whole"))
     filled: list[int] = []
 
     def stop(job: blocks.Job, number: int, fill=blocks.fill_block) -> object:
@@ -138,8 +130,7 @@ def test_the_same_command_goes_on_after_a_kill(labels: Path, tmp_path: Path, mon
     assert result.exit_code == 130 and "same command" in result.stderr
     assert [path.name for path in (tmp_path / "killed").iterdir()] == [".mask.zarr.curvafit-tiles"]
     refused(call(*command("killed"), "--axis", "y"), "tiles", progress=True)
-    result = call(*command("killed"))
-    assert result.exit_code == 0, (result.output, result.exception)
+    done(*command("killed"))
     assert filled[3:] == [2, 3]
     for name in ("mask.zarr", "mask_probability.zarr"):
         assert files(tmp_path / "killed" / name) == files(tmp_path / "whole" / name)
@@ -178,13 +169,8 @@ def test_bad_input_ends_in_one_sentence_and_leaves_nothing(labels: Path, tmp_pat
     chunk = tmp_path / "torn.zarr/0/c/1/0/0"
     chunk.write_bytes(chunk.read_bytes()[:-9])
     there = sorted(path.name for path in tmp_path.iterdir())
-    for source, more, word in (
-        ("empty.npy", ("--every", 8), "inside and outside"),
-        ("grey.npy", ("--every", 8), "labels"),
-        ("nan.npy", ("--every", 8), "finite"),
-        ("torn.zarr", ("--every", 8), "torn.zarr"),
-        ("torn.zarr", ("--every", 8, "-o", tmp_path / "torn.zarr"), "torn.zarr"),
-    ):
-        result = call("reconstruct", tmp_path / source, "--tile", 64, "-o", tmp_path / "mask.zarr", *more)
-        refused(result, word, progress=True)
+    said = {"empty.npy": "inside and outside", "grey.npy": "labels", "nan.npy": "finite", "torn.zarr": "torn.zarr"}
+    for source, target in (*((name, "mask.zarr") for name in said), ("torn.zarr", "torn.zarr")):
+        words = ("reconstruct", tmp_path / source, "--every", 8, "--tile", 64, "-o", tmp_path / target)
+        refused(call(*words), said[source], progress=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == there

@@ -1,45 +1,23 @@
 """The network that fills gaps: what it must not depend on, what it keeps, and its file."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from annotated import EDGES, known, leaning, stirred
 
 import curvafit.segmentation.filler as room
 from curvafit.segmentation.filler import FAR, REACH, Filler, Gaps, Raster, Taught, fill, interpolate, plane_thickness
 from curvafit.segmentation.slices import Slices, plane_distances
 from curvafit.segmentation.trials import dice
 
-EDGES = (1.0, 1.0, 1.0)
-
-
-def stirred(seed: int = 0) -> Taught:
-    """A filler whose weights are all random, also the last ones."""
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        filler = Filler(8).eval()
-        for weight in filler.parameters():
-            torch.nn.init.normal_(weight, std=0.1)
-    return Taught(filler, np.array([[4.0, 16.0], [1.0, 1.5]]), {}, 0.0)
-
-
-def known(mask: np.ndarray, every: int = 6, spacing=EDGES, *, periodic: bool = False) -> Slices:
-    places = tuple(range(0, len(mask), every))
-    return Slices(mask[list(places)], places, len(mask), spacing, periodic=periodic)
-
-
-def leaning(n: int = 37) -> np.ndarray:
-    """A leaning tube and a ball, clear of the border."""
-    z, y, x = np.mgrid[:n, :n, :n] - n / 2 + 0.5
-    return (np.hypot(y - 0.3 * z, x - 4) < 4) | (z**2 + (y + 7) ** 2 + (x + 7) ** 2 < 25)
+STIRRED = Taught(stirred(), np.array([[4.0, 16.0], [1.0, 1.5]]), {}, 0.0)
 
 
 def test_background_around_a_structure_tiles_and_a_unit_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    mask, taught = leaning(), stirred()
+    mask, taught = leaning(37, 7), STIRRED
     whole = fill(known(mask), taught)
     wide = np.pad(mask, ((0, 0), (200, 200), (200, 200)))
     assert np.abs(fill(known(wide), taught)[:, 200:-200, 200:-200] - whole).max() < 1e-5
@@ -49,7 +27,7 @@ def test_background_around_a_structure_tiles_and_a_unit_change_nothing(monkeypat
 
 
 def test_no_pixel_sees_further_than_the_reach_nor_needs_a_border_that_is_only_seen() -> None:
-    filler, distances = stirred().filler, torch.randn(1, 4, 120, 120, generator=torch.Generator().manual_seed(0))
+    filler, distances = STIRRED.filler, torch.randn(1, 4, 120, 120, generator=torch.Generator().manual_seed(0))
     gaps = Gaps(distances, torch.ones(1), torch.zeros(1, 3, 120, 120))
     moved = distances.clone()
     moved[..., 60, 60] += 3
@@ -62,7 +40,7 @@ def test_no_pixel_sees_further_than_the_reach_nor_needs_a_border_that_is_only_se
 
 
 def test_a_volume_that_repeats_may_begin_anywhere() -> None:
-    mask, taught = leaning(36), stirred()
+    mask, taught = leaning(36, 7), STIRRED
     found = fill(known(mask, periodic=True), taught)
     turned = fill(known(np.roll(mask, 12, 0), periodic=True), taught)
     np.testing.assert_allclose(np.roll(turned, -12, 0), found, atol=1e-5)
@@ -70,15 +48,15 @@ def test_a_volume_that_repeats_may_begin_anywhere() -> None:
 
 @pytest.mark.parametrize("spacing", [EDGES, (4.0, 1.0, 1.0), (1.0, 2.0, 1.0)])
 def test_known_slices_are_kept(spacing: tuple[float, float, float]) -> None:
-    mask = leaning()
-    found = fill(known(mask, spacing=spacing), stirred())
+    mask = leaning(37, 7)
+    found = fill(known(mask, spacing=spacing), STIRRED)
     assert found.dtype == np.float32 and found.shape == mask.shape
     assert np.array_equal(found[::6] > 0, mask[::6])
 
 
 def test_an_untaught_filler_is_the_cubic_interpolation() -> None:
     """Its last layers are zero: log-odds are the slope times distances in pixels, in pixels of any size."""
-    mask = leaning()
+    mask = leaning(37, 7)
     taught = Taught(Filler().eval(), np.array([[4.0, 16.0], [1.0, 1.0]]), {}, 0.0)
     slices = known(mask)
     distances = torch.from_numpy(plane_distances(slices.inside, EDGES[1:], FAR)[1:5].clip(-FAR, FAR)).float()
@@ -117,7 +95,7 @@ def test_slices_come_back_from_any_pixels(factor: int) -> None:
 
 
 def test_a_filler_comes_back_from_its_file(tmp_path: Path) -> None:
-    taught = replace(stirred(), card={"seed": 3}, error=0.02)
+    taught = replace(STIRRED, card={"seed": 3}, error=0.02)
     taught.save(tmp_path / "filler.npz")
     other = Taught.load(tmp_path / "filler.npz")
     assert other.card == {"seed": 3} and other.error == 0.02 and other.temperature(10.0) == taught.temperature(10.0)

@@ -1,22 +1,20 @@
 """What an image says of a volume, a filler that weighs it, and labels that it does not tell from each other."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from annotated import known, stirred
 from skimage import measure
 
 import curvafit.segmentation.image as room
 from curvafit.segmentation.filler import Filler, Gaps, Taught, fill
 from curvafit.segmentation.image import find_shift, read_image
 from curvafit.segmentation.reconstruct import are_instances, reconstruct, reconstruct_labels, split_structure
-from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.teach import ImageMix, Texture, image_shape, teach
 from curvafit.segmentation.trials import dice
-from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.field import Field
 
 pytest.importorskip("sklearn", reason="reading an image needs scikit-learn")
 
@@ -33,10 +31,6 @@ def photograph(mask: np.ndarray, noise: float = 0.4, seed: int = 0) -> np.ndarra
     return mask + noise * np.random.default_rng(seed).standard_normal(mask.shape).astype(np.float32)
 
 
-def known(mask: np.ndarray, spacing=(1.0, 1.0, 1.0)) -> Slices:
-    return Slices(mask[::EVERY], tuple(range(0, len(mask), EVERY)), len(mask), spacing)
-
-
 def test_the_inside_is_found_bright_or_dark_in_any_unit_and_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     mask, grey = rods(), photograph(rods())
     whole, other, dark = (read_image(values, known(mask))[0] for values in (grey, 64 * grey, -grey))
@@ -45,15 +39,6 @@ def test_the_inside_is_found_bright_or_dark_in_any_unit_and_in_parts(monkeypatch
     monkeypatch.setattr(room, "HELD", 5 * 37 * 37)
     parts = read_image(grey, known(mask))[0]
     assert np.median(np.abs(parts - whole)) < 1e-6 and ((parts > 0) == (whole > 0)).mean() > 0.995
-
-
-def stirred() -> Filler:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        plain = Filler(8).eval()
-        for weight in plain.parameters():
-            torch.nn.init.normal_(weight, std=0.1)
-    return plain
 
 
 def test_a_filler_that_takes_images_begins_as_a_plain_one() -> None:
@@ -107,34 +92,20 @@ def test_imaged_shapes_depend_on_their_seed_alone() -> None:
     assert (len(one.distances) - 1) % one.gap == 0 and one.evidence.shape == one.distances.shape
 
 
-def test_teaching_with_images_makes_a_filler_for_images() -> None:
+def test_teaching_with_images_makes_a_filler_for_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("curvafit.segmentation.teach.JUDGED", 6)
     plain = Taught(Filler(4).eval(), np.array([[2.0, 16.0], [1.0, 1.0]]), {"name": "plain"}, 0.0)
     taught = teach([[texture()]], {}, plain=plain, steps=2, volumes=2, workers=0)
     assert taught.filler.image and taught.card["plain"] == {"name": "plain"} and taught.card["volumes"] == 2
     assert set(taught.card["losses"]) and np.isfinite(taught.card["held_out_loss"])
 
 
-@pytest.mark.parametrize(
-    ("told", "word"),
-    [
-        ({"image": np.zeros((37, 37, 36))}, "shape"),
-        ({"image": rods().astype(np.uint8)}, "grey"),
-        ({"image": photograph(rods()), "prior": "tubes"}, "both"),
-        ({"image": photograph(rods()), "example": rods()}, "both"),
-    ],
-)
-def test_what_no_image_can_be_is_refused(told: dict, word: str) -> None:
-    with pytest.raises(ScanError, match=word):
-        reconstruct(Field(rods().astype(np.uint8)), every=EVERY, **told)
-
-
 def cells() -> np.ndarray:
     """Five cells, of which two touch, labels 10 to 50."""
     z, y, x = np.mgrid[:31, :44, :44]
     labels = np.zeros(z.shape, np.uint8)
-    for k, (c, b, a, r) in enumerate(
-        ((14, 12, 12, 9), (16, 12, 28, 8), (15, 33, 12, 8), (9, 32, 32, 7), (23, 31, 33, 6))
-    ):
+    places = ((14, 12, 12, 9), (16, 12, 28, 8), (15, 33, 12, 8), (9, 32, 32, 7), (23, 31, 33, 6))
+    for k, (c, b, a, r) in enumerate(places):
         labels[((z - c) ** 2 + (y - b) ** 2 + (x - a) ** 2 < r**2) & (labels == 0)] = 10 * (k + 1)
     return labels
 
@@ -173,7 +144,6 @@ def test_each_label_is_one_piece_and_known_voxels_stay() -> None:
 
 
 def test_cells_with_their_image_are_each_one_piece_and_better() -> None:
-    pytest.importorskip("sklearn")
     truth, image = cells(), photograph(cells() > 0, 0.3)
     alone, found = (reconstruct_labels(truth, every=EVERY, image=seen, suggest=2) for seen in (None, image))
 

@@ -1,7 +1,5 @@
 """Tiles with overlap hold each voxel once and do not show; a killed run goes on; files are read by box."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys
@@ -13,7 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from calling import call, refused
+from calling import call, done, refused
 from filelock import FileLock
 
 from curvafit.priors.coefficients import Coefficients
@@ -47,12 +45,10 @@ def grey(mask: np.ndarray, noise: float = 40) -> Field:
 @pytest.mark.parametrize(
     ("shape", "spacing", "edge"),
     [
-        ((75, 40, 9), (1, 1, 1), 24),
-        ((27, 5, 101), (2.5, 1, 1), 24),
-        ((4, 4, 4), (1, 1, 1), 8),
+        ((75, 40, 9), (1, 1, 1), 24), ((27, 5, 101), (2.5, 1, 1), 24), ((4, 4, 4), (1, 1, 1), 8),
         ((99, 1_000, 4), (1, 1, 3), 96),
     ],
-)
+)  # fmt: skip
 def test_tiles_hold_each_voxel_once(shape, spacing, edge: int, periodic: bool) -> None:
     tiling = Tiling.of(frame(shape, spacing), None, edge, periodic=periodic)
     times, tiles, count = tiling.place.times, tiling.tiles, np.zeros(shape, dtype=np.uint8)
@@ -214,13 +210,15 @@ def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
     assert same(found(scan(), store), whole)  # and once more, with all of them
 
 
-@pytest.mark.parametrize("name", ["mask.npy", pytest.param("mask.nii.gz", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["mask.npy", *(pytest.param(f"mask.{suffix}", marks=pytest.mark.slow) for suffix in ("zarr", "nii.gz"))]
+)
 def test_the_same_command_goes_on_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """One, two or no worker processes: other processes may add up otherwise."""
     source = save(Field(scan(), (0.1, 0.1, 0.1), "mm"), tmp_path / "scan.zarr")
     options = ("segment", source, "--prior", "tubes", "--weight", 1, "--steps", 5, "--tile", 14)
     whole, target, write = tmp_path / "whole" / name, tmp_path / "killed" / name, TileStore.write
-    assert call(*options, "-o", whole, "--workers", 0).exit_code == 0
+    done(*options, "-o", whole, "--workers", 0)
 
     def stop(store: TileStore, core: Any, piece: Any) -> None:
         if piece.number == 2:
@@ -237,8 +235,7 @@ def test_the_same_command_goes_on_after_a_kill(tmp_path: Path, monkeypatch: pyte
     assert "pip install" in call(*options, "-o", target, "--workers", 2).stderr
     monkeypatch.undo()
     more = ("--workers", 2) if name.endswith("gz") else ()
-    result = call(*options, "-o", target, *more)
-    assert result.exit_code == 0, (result.output, result.exception)
+    done(*options, "-o", target, *more)
     assert sorted(path.suffix for path in target.parent.iterdir()) == sorted([".json", ".png", target.suffix])
     one, other = load(whole), load(target)
     assert (one.values != other.values).mean() <= (1e-3 if more else 0) and one.spacing == other.spacing
@@ -259,13 +256,10 @@ def test_known_slices_stay_exact_after_a_kill(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("more", "word"),
     [
-        ({"weight": 2.0}, "nats"),
-        ({"steps": 6}, "steps"),
-        ({"tile": 20}, "tiles"),
-        ({"epsilon": 2.5}, "place"),
+        ({"weight": 2.0}, "nats"), ({"steps": 6}, "steps"), ({"tile": 20}, "tiles"), ({"epsilon": 2.5}, "place"),
         ({"threshold": 40.0}, "evidence"),
     ],
-)
+)  # fmt: skip
 def test_tiles_of_another_run_are_refused(tmp_path: Path, more: dict, word: str) -> None:
     store = tmp_path / "tiles"
     with pytest.raises(KeyboardInterrupt):

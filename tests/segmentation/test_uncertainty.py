@@ -1,37 +1,16 @@
 """Probabilities between known slices, how well they are calibrated, and the slices to annotate next."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
+from annotated import ball
 from scipy.ndimage import gaussian_filter
 
-from curvafit.priors.coefficients import Coefficients
+import curvafit.segmentation.uncertainty as room
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import harmonic_distance
-from curvafit.segmentation.uncertainty import (
-    BINS,
-    best_threshold,
-    calibration_error,
-    count_probabilities,
-    entropy,
-    expected_dice,
-    fit_temperature,
-    fit_weights,
-    near_surface,
-    probability,
-    remaining_entropy,
-    share_by_slices,
-    suggest_slices,
-)
+from curvafit.segmentation.uncertainty import calibration_error, probability
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
-
-WILLMORE = Coefficients.willmore()
-
-
-def ball(n: int = 32, radius: float = 10.0) -> np.ndarray:
-    return np.linalg.norm(np.mgrid[:n, :n, :n] - (n - 1) / 2, axis=0) < radius
 
 
 def test_the_reach_is_that_of_both_sides_and_a_new_slice_lowers_that_of_its_gap_alone() -> None:
@@ -54,11 +33,11 @@ def test_labels_drawn_by_their_probability_are_calibrated() -> None:
     """The excess of a bin of n voxels has a deviation of at most √n / 2; their sum over bins is largest at equal n."""
     rng = np.random.default_rng(0)
     p = rng.random(100_000)
-    inside, noise = rng.random(len(p)) < p, np.sqrt(BINS / len(p)) / 2
+    inside, noise = rng.random(len(p)) < p, np.sqrt(room.BINS / len(p)) / 2
     assert calibration_error(p, inside) < 5 * noise
     overconfident = probability(np.column_stack([np.zeros(len(p)), np.log(p / (1 - p))]), np.array([0.0, 2.0, 0.0]))
     gap = float(np.abs(overconfident - p).mean())
-    assert abs(calibration_error(overconfident, inside) - gap) < 5 * noise + 1 / BINS  # within a bin p varies by 1 / 15
+    assert abs(calibration_error(overconfident, inside) - gap) < 5 * noise + 1 / room.BINS  # p varies so within a bin
 
 
 def test_the_weights_are_those_by_which_labels_were_drawn_and_end() -> None:
@@ -71,12 +50,12 @@ def test_the_weights_are_those_by_which_labels_were_drawn_and_end() -> None:
     inside = rng.random(len(p)) < p
     columns = np.column_stack([signs, np.ones(len(p))])
     noise = np.sqrt(np.diag(np.linalg.inv(columns.T @ (columns * (p * (1 - p))[:, None]))))
-    found = fit_weights(signs, inside)
+    found = room.fit_weights(signs, inside)
     assert (np.abs(found - weights) < 5 * noise).all()
-    other = fit_weights(-signs, ~inside)  # what is inside is named outside
+    other = room.fit_weights(-signs, ~inside)  # what is inside is named outside
     assert other == pytest.approx(found * [1, 1, -1], rel=1e-4)
     signs = np.repeat([[-3.0, -4.0], [3.0, 4.0]], 50, axis=0)
-    weights = fit_weights(signs, signs[:, 0] > 0)
+    weights = room.fit_weights(signs, signs[:, 0] > 0)
     assert np.isfinite(weights).all()
     assert calibration_error(probability(signs, weights), signs[:, 0] > 0) < 1e-3
 
@@ -84,9 +63,9 @@ def test_the_weights_are_those_by_which_labels_were_drawn_and_end() -> None:
 def test_near_is_within_three_voxels_and_certainty_has_no_entropy() -> None:
     mask = np.zeros((20, 4, 4), dtype=bool)
     mask[10:] = True
-    assert near_surface(mask)[:, 0, 0].nonzero()[0].tolist() == [7, 8, 9, 10, 11, 12]
-    assert not any(near_surface(np.full((4, 4, 4), value)).any() for value in (False, True))
-    assert entropy(np.array([0.0, 1.0, 0.5], dtype=np.float32)) == pytest.approx([0, 0, np.log(2)])
+    assert room.near_surface(mask)[:, 0, 0].nonzero()[0].tolist() == [7, 8, 9, 10, 11, 12]
+    assert not any(room.near_surface(np.full((4, 4, 4), value)).any() for value in (False, True))
+    assert room.entropy(np.array([0.0, 1.0, 0.5], dtype=np.float32)) == pytest.approx([0, 0, np.log(2)])
 
 
 def test_the_interval_of_the_known_slices_holds_the_volume() -> None:
@@ -100,7 +79,7 @@ def test_the_interval_of_the_known_slices_holds_the_volume() -> None:
     held, wide = [], []
     for k, areas in enumerate(shapes):
         every = (4, 8, 16)[k // 6 % 3]
-        known, low, high = share_by_slices(areas[::every], range(0, 97, every), 97)
+        known, low, high = room.share_by_slices(areas[::every], range(0, 97, every), 97)
         held.append(low <= areas.mean() <= high)
         wide.append((high - low) / 2 / known)
     # of 80 intervals of 95 %, 71 or more hold with a probability of .98; wider ones hold more often
@@ -108,11 +87,11 @@ def test_the_interval_of_the_known_slices_holds_the_volume() -> None:
 
 
 def test_the_volume_by_known_slices_is_that_of_what_is_filled() -> None:
-    flat = share_by_slices(np.full(4, 0.3), [6, 10, 14, 18], 40)
+    flat = room.share_by_slices(np.full(4, 0.3), [6, 10, 14, 18], 40)
     assert flat == pytest.approx((0.3 * 17 / 40,) * 3)  # slices 4 to 20
-    assert share_by_slices(np.full(4, 0.3), [6, 10, 14, 18], 40, whole=True) == pytest.approx((0.3,) * 3)
-    assert share_by_slices(np.full(4, 0.3), [0, 10, 20, 30], 40, periodic=True) == pytest.approx((0.3,) * 3)
-    assert share_by_slices(np.array([0.0, 1.0]), [0, 4], 5) == pytest.approx((0.5,))  # no interval of two
+    assert room.share_by_slices(np.full(4, 0.3), [6, 10, 14, 18], 40, whole=True) == pytest.approx((0.3,) * 3)
+    assert room.share_by_slices(np.full(4, 0.3), [0, 10, 20, 30], 40, periodic=True) == pytest.approx((0.3,) * 3)
+    assert room.share_by_slices(np.array([0.0, 1.0]), [0, 4], 5) == pytest.approx((0.5,))  # no interval of two
 
 
 def test_a_mask_that_is_no_estimate_of_a_volume_is_told() -> None:
@@ -134,7 +113,7 @@ def test_the_best_threshold_has_the_best_expected_dice() -> None:
     def expected(least: float) -> float:
         return 2 * p[p > least].sum() / ((p > least).sum() + p.sum())
 
-    found = best_threshold(count_probabilities(p))
+    found = room.best_threshold(room.count_probabilities(p))
     assert expected(found) > max(expected(least) for least in np.linspace(0, 0.5, 101)) - 1e-4
     assert found == pytest.approx(expected(found) / 2, abs=0.01)
 
@@ -146,7 +125,7 @@ def test_a_reconstruction_says_how_sure_it_is_and_where_to_annotate() -> None:
     values = found.probability.values
     assert values.dtype == np.float32 and values.min() >= 0 and values.max() <= 1
     assert np.array_equal(values[:, :, ::5], mask[:, :, ::5])
-    unsure = entropy(values).sum((0, 1))
+    unsure = room.entropy(values).sum((0, 1))
     assert unsure[::5].max() == 0 and unsure[[7, 12, 17]].min() > 0
     following = found.uncertainty.suggestions
     assert len(following) == 2 and all(n % 5 for n in following)
@@ -160,23 +139,23 @@ PLACES = [0, 7, 20, 22, 39]
 
 
 def test_suggestions_are_unknown_slices_in_any_order_of_the_known_and_mirrored() -> None:
-    found = suggest_slices(ENTROPIES, PLACES, 6)
+    found = room.suggest_slices(ENTROPIES, PLACES, 6)
     assert len(set(found)) == 6 and not set(found) & set(PLACES)
-    assert suggest_slices(ENTROPIES, PLACES[::-1], 6) == found
-    assert suggest_slices(ENTROPIES, PLACES, 3) == found[:3]
-    mirrored = suggest_slices(ENTROPIES[::-1], [39 - n for n in PLACES], 6)
+    assert room.suggest_slices(ENTROPIES, PLACES[::-1], 6) == found
+    assert room.suggest_slices(ENTROPIES, PLACES, 3) == found[:3]
+    mirrored = room.suggest_slices(ENTROPIES[::-1], [39 - n for n in PLACES], 6)
     assert tuple(39 - n for n in mirrored) == found
-    assert suggest_slices(np.zeros(10), [0, 9], 3) == () and suggest_slices(np.ones(4), [0, 1, 2], 3) == (3,)
+    assert room.suggest_slices(np.zeros(10), [0, 9], 3) == () and room.suggest_slices(np.ones(4), [0, 1, 2], 3) == (3,)
 
 
 @pytest.mark.parametrize("periodic", [False, True])
 def test_each_suggestion_lowers_the_entropy(periodic: bool) -> None:
     left, places = ENTROPIES.copy(), list(PLACES)
     left[places] = 0
-    for new in suggest_slices(left, PLACES, 5, periodic):
-        after = remaining_entropy(left, places, new, periodic)
+    for new in room.suggest_slices(left, PLACES, 5, periodic):
+        after = room.remaining_entropy(left, places, new, periodic)
         assert (after <= left).all() and after[new] == 0 and after.sum() < left.sum()
-        others = [remaining_entropy(left, places, n, periodic).sum() for n in range(40) if n not in places]
+        others = [room.remaining_entropy(left, places, n, periodic).sum() for n in range(40) if n not in places]
         assert after.sum() == min(others)
         left, places = after, [*places, new]
 
@@ -184,23 +163,23 @@ def test_each_suggestion_lowers_the_entropy(periodic: bool) -> None:
 def test_an_even_gap_is_halved_and_the_most_uncertain_comes_first() -> None:
     flat = np.ones(33)
     flat[[0, 16, 32]] = 0
-    assert sorted(suggest_slices(flat, [0, 16, 32], 2)) == [8, 24]
+    assert sorted(room.suggest_slices(flat, [0, 16, 32], 2)) == [8, 24]
     flat[17:32] *= 2
-    assert suggest_slices(flat, [0, 16, 32], 1) == (24,)
+    assert room.suggest_slices(flat, [0, 16, 32], 1) == (24,)
 
 
 def test_the_temperature_is_that_by_which_labels_were_drawn() -> None:
     random = np.random.default_rng(0)
     logits = 3 * random.standard_normal(60_000)
     labels = random.random(60_000) < 1 / (1 + np.exp(-logits / 1.7))
-    assert fit_temperature(logits, labels) == pytest.approx(1.7, rel=0.05)
-    assert fit_temperature(np.array([50.0]), np.array([1.0])) == 1
+    assert room.fit_temperature(logits, labels) == pytest.approx(1.7, rel=0.05)
+    assert room.fit_temperature(np.array([50.0]), np.array([1.0])) == 1
 
 
 def test_the_expected_dice_is_that_of_truths_that_are_drawn() -> None:
     random = np.random.default_rng(0)
     likely = random.beta(0.5, 1.5, 40_000)
-    mask = likely > best_threshold(count_probabilities(likely))
+    mask = likely > room.best_threshold(room.count_probabilities(likely))
     drawn = [random.random(likely.shape) < likely for _ in range(20)]
     found = [2 * (truth & mask).sum() / (truth.sum() + mask.sum()) for truth in drawn]
-    assert expected_dice(likely, mask) == pytest.approx(np.mean(found), abs=2e-3)
+    assert room.expected_dice(likely, mask) == pytest.approx(np.mean(found), abs=2e-3)

@@ -1,7 +1,5 @@
 """`measure`: exact shapes, laws of units and symmetries, sums over blocks and their errors, tables and the command."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import json
@@ -10,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calling import call, refused
+from calling import call, done, refused
 
 from curvafit.geometry.morphometry import morphometry
 from curvafit.geometry.topology import euler_number, euler_shares
@@ -49,7 +47,7 @@ def measures(cut: np.ndarray) -> Measures:
     return measure(Field(cut, (0.5, 0.5, 0.5), "um"))
 
 
-# ---- exact shapes ----------------------------------------------------------------------------------------------------
+# ---- exact shapes, and laws ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -84,15 +82,10 @@ def test_balls_in_a_periodic_box(of_balls: Measures) -> None:
 
 def test_the_familiar_numbers_are_those_of_morphometry(cut: np.ndarray, measures: Measures) -> None:
     numbers = morphometry(cut > 0, 0.5, "um")
-    for symbol, name in (
-        ("BV/TV", "volume_fraction"),
-        ("Tb.Th", "thickness_mean"),
-        ("Tb.Th.SD", "thickness_std"),
-        ("Tb.Sp", "spacing_mean"),
-        ("Conn.D", "connectivity_density"),
-        ("BS/BV", "surface_to_volume"),
-    ):
-        assert measures[symbol].value == pytest.approx(getattr(numbers, name), rel=1e-5), symbol
+    thickness, spacing = (numbers.thickness_mean, numbers.thickness_std), (numbers.spacing_mean,)
+    others = (numbers.volume_fraction, numbers.connectivity_density, numbers.surface_to_volume)
+    symbols = ("Tb.Th", "Tb.Th.SD", "Tb.Sp", "BV/TV", "Conn.D", "BS/BV")
+    assert [measures[symbol].value for symbol in symbols] == pytest.approx([*thickness, *spacing, *others], rel=1e-5)
     assert round(measures["χ"].value) == numbers.euler
 
 
@@ -100,9 +93,6 @@ def test_curvature_obeys_gauss_and_bonnet(of_balls: Measures) -> None:
     """∫K dA = 4πχ of the solid, here 8 balls."""
     found = of_balls
     assert found["K"].value * found["BS/TV"].value * N**3 == pytest.approx(4 * math.pi * 8, rel=0.05)
-
-
-# ---- laws ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_change_of_unit_scales_each_number_by_its_power(cut: np.ndarray, measures: Measures) -> None:
@@ -218,39 +208,30 @@ def test_parquet_has_the_same_rows(measures: Measures, tmp_path: Path) -> None:
     assert frame["value"].tolist() == [row["value"] for row in measures.rows()]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "word"),
-    [
-        ("scan.npy -o mine.csv", "free"),
-        ("scan.npy -o table.xlsx", ".parquet"),
-        ("scan.npy -o scan.npy", ".parquet"),
-        ("none.npy -o t.csv", "none.npy"),
-        ("scan.npy --kind tube -o t.csv", "kind"),
-        ("scan.npy --label 7 -o t.csv", "label"),
-        ("scan.npy --roi empty.npy", "vary"),
-        ("scan.npy --roi short.npy", "shape"),
-        ("scan.npy --roi grey.npy", "grey"),
-        ("scan.npy --subjects other.csv -o t.csv", "none for scan.npy"),
-        ("scan.npy --subjects taken.csv -o t.csv", "got value"),
-        ("scan.npy --subjects other.csv", "--subjects is for the table"),
-    ],
-)
-def test_bad_input_is_refused(
-    cut: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: str, word: str
-) -> None:
+#: What `measure scan.npy` refuses, and a word of the sentence.
+REFUSALS = {
+    "-o mine.csv": "free", "-o table.xlsx": ".parquet", "-o scan.npy": ".parquet", "none.npy -o t.csv": "none.npy",
+    "--kind tube -o t.csv": "kind", "--label 7 -o t.csv": "label", "--roi empty.npy": "vary",
+    "--roi short.npy": "shape", "--roi grey.npy": "grey", "--subjects other.csv -o t.csv": "none for scan.npy",
+    "--subjects taken.csv -o t.csv": "got value", "--subjects other.csv": "--subjects is for the table",
+    "--windows 32 --stride 48 -o out": "stride", "--windows 32 --stride 12 -o out": "divides",
+    "--windows 64 -o out": "fit into", "--windows 32 --clusters 0 -o out": "clusters",
+    "--stride 32 -o out": "--windows", "--windows 32": "folder", "--windows 32 -o maps.csv": "folder",
+    "scan.npy --windows 32 -o out": "one scan", "--windows 32 --tile 32 -o out": "--tile",
+}  # fmt: skip
+
+
+def test_bad_input_is_refused(cut: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     grey = np.random.default_rng(0).integers(0, 99, cut.shape)
     for name, values in {"scan": cut, "empty": 0 * cut, "short": cut[1:], "grey": grey}.items():
         np.save(f"{name}.npy", values)
-    for name, text in {
-        "mine": "a,b\n1,2\n",
-        "other": "scan,group\na.npy,x\n",
-        "taken": "scan,value\nscan.npy,1\n",
-    }.items():
-        Path(f"{name}.csv").write_text(text, encoding="utf-8")
+    for name, text in {"mine": "a,b\n1,2", "other": "scan,group\na.npy,x", "taken": "scan,value\nscan.npy,1"}.items():
+        Path(f"{name}.csv").write_text(text + "\n", encoding="utf-8")
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    refused(call("measure", *arguments.split()), word, progress=True)
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    for words, key in REFUSALS.items():
+        refused(call("measure", "scan.npy", *words.split()), key, progress=True)
+        assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before, words
 
 
 # ---- compartments ----------------------------------------------------------------------------------------------------
@@ -323,9 +304,8 @@ def test_a_volume_of_two_halves_gives_its_map_back(mapped: Windows) -> None:
 
 def test_disjoint_windows_agree_with_the_whole(halves: Field, mapped: Windows) -> None:
     whole, apart = measure(halves), mapped.values[::2, ::2, ::2].reshape(8, -1)
-    fraction, thickness, surface = (
-        apart[:, NAMES.index(name)] for name in ("volume fraction", "thickness", "surface density")
-    )
+    names = ("volume fraction", "thickness", "surface density")
+    fraction, thickness, surface = (apart[:, NAMES.index(name)] for name in names)
     assert fraction.mean() == pytest.approx(whole["BV/TV"].value, rel=1e-9)
     assert surface.mean() == pytest.approx(whole["BS/TV"].value, rel=1e-9)
     assert (fraction * thickness).sum() / fraction.sum() == pytest.approx(whole["Tb.Th"].value, rel=1e-9)
@@ -355,8 +335,7 @@ def test_windows_without_structure_are_unknown(halves: Field) -> None:
 def test_the_command_writes_maps_table_and_page(halves: Field, mapped: Windows, tmp_path: Path) -> None:
     scan, out = tmp_path / "scan.npy", tmp_path / "maps"
     np.save(scan, halves.values)
-    arguments = ("measure", scan, "--windows", SIZE, "--spacing", 0.5, "--unit", "um", "-o", out)
-    assert call(*arguments).exit_code == 0
+    done("measure", scan, "--windows", SIZE, "--spacing", 0.5, "--unit", "um", "-o", out)
     thickness = load(out / "thickness.nii.gz")
     assert thickness.values == pytest.approx(mapped["thickness"].values)
     assert thickness.spacing == pytest.approx((12, 12, 12))
@@ -368,24 +347,8 @@ def test_the_command_writes_maps_table_and_page(halves: Field, mapped: Windows, 
         check_windows(out, scan, command="curvafit measure another.npy -o maps")
 
 
-def test_windows_that_do_not_fit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    np.save("scan.npy", tubes(2 * N, 24, THICK)[:N])
-    for words, said in (
-        ("--windows 32 --stride 48 -o out", "stride"),
-        ("--windows 32 --stride 12 -o out", "divides"),
-        ("--windows 64 -o out", "fit into"),
-        ("--windows 32 --clusters 0 -o out", "clusters"),
-        ("--stride 32 -o out", "--windows"),
-        ("--windows 32", "folder"),
-        ("--windows 32 -o maps.csv", "folder"),
-        ("scan.npy --windows 32 -o out", "one scan"),
-        ("--windows 32 --tile 32 -o out", "--tile"),
-    ):
-        refused(call("measure", "scan.npy", *words.split()), said, progress=True)
-    refused(call("windows", "scan.npy", "--size", 32), "--windows 64")
+def test_windows_smaller_than_the_structure_are_refused() -> None:
     sparse = np.zeros((48, 48, 48), dtype=np.uint8)
     sparse[20:28, 20:28, 20:28] = 1
     with pytest.raises(ValueError, match="larger"):
         windows(sparse, 24, 24)
-    assert not (tmp_path / "out").exists()

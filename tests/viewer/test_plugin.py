@@ -233,19 +233,17 @@ ONES = np.ones((8, 8, 8), int)
 @pytest.mark.parametrize(
     ("data", "options", "known", "words"),
     [
-        (ONES[0], {}, "", "three axes"),
-        (np.ones((3, 8, 8, 8), int), {}, "", "three axes"),
+        (ONES[0], {}, "", "three axes"), (np.ones((3, 8, 8, 8), int), {}, "", "three axes"),
         (0 * ONES, {}, "", "slices with labels"),
         (ONES, {"units": ("pixel", "micrometer", "micrometer")}, "", "kind of unit"),
-        (ONES, {"units": ("second",) * 3}, "", "unit second"),
-        (ONES, {}, "", "slice without labels lies between"),
+        (ONES, {"units": ("second",) * 3}, "", "unit second"), (ONES, {}, "", "slice without labels lies between"),
         (None, {}, "", "got none"),
         *(
             (RODS, {}, text, "known slices")
             for text in ("a", "0,99", "1:2:3:4", "-1", "5:2", "only", "only 3", "0::8 only", "8,only 16")
         ),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_completed_is_said_in_a_sentence(viewer: Any, data, options, known, words) -> None:
     if data is not None:
         viewer.add_labels(data, name="cells", **options)
