@@ -89,6 +89,7 @@ def variables(*words: str) -> subprocess.CompletedProcess:
     return subprocess.run(command, env=env, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_a_shell_takes_the_variables_that_are_printed():
     script = variables("Bilinear_Tubes").stdout + 'echo "$nnUNet_extTrainer|$CURVAFIT_PRIOR"'
     for env, rest in (({}, ""), ({"nnUNet_extTrainer": "/elsewhere"}, ":/elsewhere")):

@@ -34,6 +34,7 @@ def test_scores_are_of_the_slices_left_out_alone() -> None:
     assert score_completion(truth, filled).dice["curvafit"] == 1
 
 
+@pytest.mark.slow
 def test_the_page_stands_alone_and_escapes_what_it_is_told() -> None:
     inference, mask = made_inference(), lattice(48, 24, 5.0) > 0
     measures = measure(Field(mask, (SCALE,) * 3, "mm"))

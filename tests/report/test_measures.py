@@ -93,6 +93,7 @@ def test_names_and_the_sentence_of_the_range(scans: list[Path]) -> None:
 # ---- laws ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_each_scan_has_its_report_and_its_rows(scans: list[Path], tmp_path: Path, monkeypatch) -> None:
     without_drawing(monkeypatch)
     names = list(map(str, scans))

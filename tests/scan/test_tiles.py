@@ -114,6 +114,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save(scan, tmp_path_factory.mktemp("scans") / "scan.zarr")
 
 
+@pytest.mark.slow
 def test_workers_make_the_same_bytes(store: Path, tmp_path: Path) -> None:
     with cluster(2) as crew:
         two = measure(store, tile=40, workers=crew)

@@ -92,6 +92,7 @@ def test_imaged_shapes_depend_on_their_seed_alone() -> None:
     assert (len(one.distances) - 1) % one.gap == 0 and one.evidence.shape == one.distances.shape
 
 
+@pytest.mark.slow
 def test_teaching_with_images_makes_a_filler_for_images(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("curvafit.segmentation.teach.JUDGED", 6)
     plain = Taught(Filler(4).eval(), np.array([[2.0, 16.0], [1.0, 1.0]]), {"name": "plain"}, 0.0)
