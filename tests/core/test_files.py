@@ -234,6 +234,7 @@ def test_a_program_replaces_only_what_it_wrote(tmp_path: Path) -> None:
         path.write_text("mine")
         with pytest.raises(ValueError, match="overwrite"):
             can_write(shape, NOTE, more=[note, picture])
+    can_write(shape, NOTE, more=[note, picture], overwrite=True)
     NOTE.write(note, {"files": ["a.nii.gz", "a.json", "a.png"]})
     can_write(shape, NOTE, more=[note, picture])
     later = note.stat().st_mtime + 60

@@ -164,9 +164,17 @@ def small_table(rows: int = 3) -> Table:
 
 def test_damaged_tables_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "table.npz"
-    np.savez(path, descriptors=np.ones(3))
-    with pytest.raises(ValueError, match="table"):
+    with pytest.raises(FileNotFoundError, match="table"):
         load_table(path)
+    save_table(small_table(), path)
+    content = path.read_bytes()
+    for damage in (
+        lambda: path.write_bytes(content[: len(content) // 2]),
+        lambda: np.savez(path, descriptors=np.ones(3)),
+    ):
+        damage()
+        with pytest.raises(ValueError, match="table"):
+            load_table(path)
     save_table(small_table(), path)
     monkeypatch.setitem(BLOCKS, "another", 2)
     with pytest.raises(ValueError, match="blocks"):
@@ -189,8 +197,10 @@ def test_the_command_refuses_in_one_sentence(tmp_path: Path, monkeypatch: pytest
 
 
 def test_another_store_of_the_same_name_is_not_taken_for_the_first(tmp_path: Path) -> None:
-    store = exact_store(tmp_path / "s.zarr", 1).path
-    describe([store], tmp_path / "t.npz", ("field",))
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    first, store = (exact_store(tmp_path / each / "s.zarr", 1).path for each in ("a", "b"))
+    describe([first], tmp_path / "t.npz", ("field",))
     header = store / "zarr.json"
     header.write_text(header.read_text().replace('"seed": 3', '"seed": 4'))
     with pytest.raises(ValueError, match="store"):

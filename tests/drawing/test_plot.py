@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 import torch
 
+import curvafit
+from curvafit.core.pictures import Pictured
 from curvafit.drawing import plot
 from curvafit.drawing.render import render, surface_picture, view
 from curvafit.generation import Schedule, generate
@@ -223,6 +225,16 @@ def test_the_three_middle_slices_are_drawn_in_proportion() -> None:
         assert np.array_equal(axes.images[0].get_array(), plane)
     assert [axes.get_aspect() for axes in figure.axes] == [2.0, 3.0, 1.5]
     assert [axes.get_title()[:5] for axes in figure.axes] == ["z = 2", "y = 3", "x = 3"]
+
+
+def test_every_type_with_a_picture_has_a_function_that_draws_it() -> None:
+    for name, place in curvafit._FIGURES.items():
+        module, _, function = place.partition(":")
+        assert callable(getattr(import_module(module), function))
+        assert issubclass(getattr(curvafit, name), Pictured)
+    kinds = (getattr(curvafit, name) for name in curvafit.__all__)
+    pictured = {kind.__name__ for kind in kinds if isinstance(kind, type) and issubclass(kind, Pictured)}
+    assert pictured == set(curvafit._FIGURES)
 
 
 def test_a_picture_of_a_shape_and_none_of_what_is_not_finite() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from tests.calling import done
-from tests.damage import FORMATS
+from tests.damage import FORMATS, VALUES
 from tests.golden import FOLDER
 from tests.golden.frozen import CLOSE, exact, files, rounded, volume
 
@@ -87,6 +87,8 @@ def _volumes(folder: Path) -> dict[str, Any]:
     for name in ("out.nii.gz", "out.tif", "out.ome.tif", "out.npy", "out.zarr", "out.mrc"):
         curvafit.save(FOLDER / "mask.nii.gz", folder / name)
     fields = {path.name: curvafit.load(path) for path in sorted(folder.iterdir())}
+    VALUES.tofile(folder / "bare.raw")
+    fields["bare.raw"] = curvafit.load(folder / "bare.raw", raw_shape=VALUES.shape, dtype="u2", spacing=2.0, unit="um")
     return {name: [exact(field.values), *rounded(field.spacing), field.unit] for name, field in fields.items()}
 
 

@@ -2,13 +2,16 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
 import pytest
+import torch
 from emulated import BOX, COLUMNS, HIDDEN, HIGH, LOW, NOISE, PLAIN, linear, reading, row, seen, told
 from exact import Gyroid, centres
 
+from curvafit.generation.schedule import LEARNED
 from curvafit.geometry.descriptors import BLOCKS
 from curvafit.inference import estimate
 from curvafit.inference.candidates import Candidate, Misfit, Twin
@@ -325,6 +328,7 @@ def check(prepared: Prepared, monkeypatch: pytest.MonkeyPatch, grow: Callable[..
     return estimate.check_law(LAW, prepared, estimate.measure_descriptors(prepared), POSTERIOR)
 
 
+@pytest.mark.slow
 def test_shapes_show_as_many_windows_as_the_scan(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(estimate, "TESTED", 8)
     prepared, lengths = gyroid(0.1, (40, 40, 96)), []
@@ -347,6 +351,15 @@ def test_further_shapes_are_tried_where_some_do_not_grow_and_few_test_nothing(mo
     assert found is not None and found.method.startswith(f"{estimate.TESTED} windows of shapes of the law")
     assert len(list(tried)) == 30 - estimate.TESTED
     assert check(prepared, monkeypatch, lambda *_, **__: BARREN) is None
+
+
+def test_a_simulation_that_is_one_ball_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the thickness of the scan's structure the ball's whole box is a few voxels wide: too few to measure."""
+    prepared = gyroid(0.1)
+    ball = torch.tanh(24 - torch.linalg.vector_norm(torch.cartesian_prod(*[torch.arange(64.0) - 32] * 3), dim=1))
+    flow = SimpleNamespace(viability=SimpleNamespace(viable=True), field=ball.reshape(64, 64, 64))
+    monkeypatch.setattr(estimate, "generate", lambda *_, **__: flow)
+    assert estimate._simulator(prepared, "mask", LEARNED)(BOX.mean(1), 63) is None
 
 
 def test_without_simulations_the_reference_tells() -> None:

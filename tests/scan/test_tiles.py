@@ -18,7 +18,7 @@ from curvafit.scan.instances import OF_BODIES, measure_instances
 from curvafit.scan.measure import Measures
 from curvafit.scan.measure import measure as measure_in_one
 from curvafit.scan.tiles import measure
-from curvafit.volumes import Field, save
+from curvafit.volumes import Field, ScanError, save
 
 #: Shapes of scans, in voxels: of quick tests, and of those of any size of tiles, which have intervals.
 SMALL, LARGE = (66, 51, 54), (99, 67, 73)
@@ -94,6 +94,8 @@ def test_a_label_is_measured_in_tiles() -> None:
     labels = np.where(texture() > 0, 7, 3).astype(np.uint16)
     found = measure(labels, label=7, tile=64)
     check_alike(found, measure_in_one(labels, label=7))
+    with pytest.raises(ScanError, match="label 5"):
+        measure(labels, label=5, tile=64)
 
 
 @pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.3, 0.17, 0.17)])

@@ -336,7 +336,7 @@ def test_a_label_is_filled_in_its_own_box_as_in_the_whole_volume() -> None:
     for number, (a, b) in enumerate(((20, 20), (20, 90), (90, 25), (95, 95), (60, 60)), 1):
         labels[(np.hypot(y - a - 0.2 * (z - 24), x - b) < 6) & (abs(z - 24) < 18)] = number
     found = reconstruct_labels(labels, every=8)
-    for number in (1, 5):
+    for number in range(1, 6):
         alone = reconstruct((labels == number).astype(np.uint8), every=8).mask.values
         assert dice(found.labels.values == number, alone) > 0.995  # type: ignore[union-attr]
     assert set(found.uncertainty.dice_of_labels) == set(range(1, 6))  # type: ignore[union-attr]

@@ -129,6 +129,7 @@ def test_stores_and_masks_teach(tmp_path: Path) -> None:
         load_textures([tmp_path / "nearly.npy"])
 
 
+@pytest.mark.slow
 def test_the_command_teaches_and_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(room, "JUDGED", 5)
     save(Field((rods() > 0).astype(np.uint8)), tmp_path / "mask.npy")
