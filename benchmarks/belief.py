@@ -35,7 +35,7 @@ from curvafit.inference.posterior import Posterior, load_posterior, save_posteri
 from curvafit.inference.table import column_names, load_table, parameters_of
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.scan.prepare import prepare
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 KINDS = ("shape", "cut")
 LEVEL = 0.05
@@ -45,12 +45,12 @@ ANGLES = 4001
 RIDGE = 0.1
 
 
-def masked(store: Store, index: int, cut: bool) -> Field:
+def masked(store: Store, index: int, cut: bool) -> Volume:
     """Return a shape, or its level cut, as a mask that is cut open at another place."""
     mask, random = store.field(index) > 0, np.random.default_rng(index)
     if cut:
         mask = level_cut(mask, Grid(mask.shape), index) > 0
-    return Field(np.roll(mask, random.integers(mask.shape[0], size=3), (0, 1, 2)).astype(np.uint8))
+    return Volume(np.roll(mask, random.integers(mask.shape[0], size=3), (0, 1, 2)).astype(np.uint8))
 
 
 def case(store: Store, index: int, cut: bool) -> Values:

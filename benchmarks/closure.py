@@ -37,7 +37,7 @@ from curvafit.inference.table import (
 )
 from curvafit.scan.measure import read_texture
 from curvafit.scan.prepare import prepare, thinner_thickness
-from curvafit.volumes.field import ScanError
+from curvafit.volumes.volume import ScanError
 
 DRAWS = 400
 #: What the packaged posterior was trained on; its columns are float16 between their ends (`load_table`).

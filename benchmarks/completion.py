@@ -38,8 +38,8 @@ from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.trials import dice
 from curvafit.segmentation.uncertainty import calibration_error, near_surface
-from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
+from curvafit.volumes.volume import Volume
 
 LAWS = ("tubes", "trabec", "sponge", "metatubes", "pearls", "sieve", "flow", "bilayers")
 #: Draws of the paper's box, with log a02, that no network and no choice has seen: the seed of Sobol's sequence, and the
@@ -116,7 +116,7 @@ def fitted(law: str, seed: int, cases: Cases) -> Fit:
 
 
 def filled(
-    way: str, truth: Field, places: range, axis: int, prior: Callable[[], Any], example: Callable[[], Any]
+    way: str, truth: Volume, places: range, axis: int, prior: Callable[[], Any], example: Callable[[], Any]
 ) -> Values:
     """Return the scores of a way to fill a mask of which some slices are known."""
     begun, first, status = time.perf_counter(), np.moveaxis(truth.values > 0, axis, 0), ""
@@ -138,7 +138,7 @@ def filled(
 
 
 def shape_case(way: str, law: str, seed: int, every: int, cases: Cases) -> Values:
-    truth, other = (Field(shape(law, k, cases).astype(np.uint8)) for k in (seed, seed + 1))
+    truth, other = (Volume(shape(law, k, cases).astype(np.uint8)) for k in (seed, seed + 1))
     return filled(way, truth, range(0, EDGE, every), 0, partial(fitted, law, seed + 1, cases), lambda: other)
 
 
@@ -216,7 +216,7 @@ STRUCTURES = {
 
 
 @cache
-def sides(name: str) -> tuple[Field, Field]:
+def sides(name: str) -> tuple[Volume, Volume]:
     """Return the masks of a structure's two sides."""
     structure = STRUCTURES[name]
     volumes = [mask_of(load(data("scans", file), **structure.reading), structure) for file in structure.files]
@@ -228,7 +228,7 @@ def sides(name: str) -> tuple[Field, Field]:
     return volumes[0], volumes[1]
 
 
-def mask_of(volume: Field, structure: Structure) -> Field:
+def mask_of(volume: Volume, structure: Structure) -> Volume:
     """Return the mask of a file; coarser voxels are inside where half of them is."""
     from skimage.filters import threshold_otsu
     from skimage.segmentation import find_boundaries
@@ -242,11 +242,11 @@ def mask_of(volume: Field, structure: Structure) -> Field:
     n = structure.coarser
     parts = np.asarray(values > 0).reshape([m for size in values.shape for m in (size // n, n)])
     inside = (parts.mean(axis=(1, 3, 5)) >= 0.5).astype(np.uint8)
-    return replace(volume, values=inside, spacing=tuple(n * h for h in volume.spacing), affine=None)
+    return replace(volume, array=inside, spacing=tuple(n * h for h in volume.spacing), affine=None)
 
 
 @cache
-def blocks(name: str, side: int) -> list[Field]:
+def blocks(name: str, side: int) -> list[Volume]:
     """Return the blocks of a side, the fullest first."""
     whole, size = sides(name)[side], STRUCTURES[name].block
     starts = product(*(range(0, n - m + 1, m) for n, m in zip(whole.shape, size, strict=True)))

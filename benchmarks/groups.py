@@ -46,7 +46,7 @@ from curvafit.priors.law import Law
 from curvafit.scan.measure import QUANTITIES, Measures, Quantity, measure
 from curvafit.studies.compare import LEVEL, compare
 from curvafit.studies.scans import FINE
-from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.volume import ScanError, Volume
 
 WINDOW, EDGE, SUBJECTS = 50, 64, 20
 BASE, SHIFTED, SHIFTS = "tubes", ("a10", "a01"), (0.25, 0.5, 0.1)
@@ -63,7 +63,7 @@ FAMILIAR = [k for k, (_, symbol, *_) in enumerate(QUANTITIES) if symbol in ("BV/
 # ---- subjects --------------------------------------------------------------------------------------------------------
 
 
-def subject(name: str, scan: Callable[[], Field], periodic: bool, cases: Cases) -> list[Measures]:
+def subject(name: str, scan: Callable[[], Volume], periodic: bool, cases: Cases) -> list[Measures]:
     """Return what `compare` keeps of a mask, measured once; nothing of one without a surface."""
 
     def numbers() -> np.ndarray:
@@ -101,10 +101,10 @@ def shapes(law: str, cases: Cases, count: int = SUBJECTS, schedule: str = "deep"
         deviation = np.ptp(INTERVALS[name]) / np.sqrt(12)
         coefficients = replace(coefficients, **{name: getattr(coefficients, name) - float(shift) * deviation})
 
-    def mask(seed: int) -> Field:
+    def mask(seed: int) -> Volume:
         grown = generate(coefficients, known.mass, EDGE, schedule=schedule, seed=seed)
         assert grown.viability.viable, (law, grown.status)
-        return Field((grown.field.numpy() > 0).astype(np.uint8))
+        return Volume((grown.field.numpy() > 0).astype(np.uint8))
 
     start = 100 * LAWS.index(law) if schedule == "deep" else 1000 + 100 * PATH.index(law)
     seeds = start + np.arange(count)

@@ -27,8 +27,8 @@ from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.trials import dice_of, gain_of, tally
 from curvafit.segmentation.uncertainty import calibration_error, near_surface
-from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
+from curvafit.volumes.volume import Volume
 
 WAYS = ("ours", "alone", "trees", "forest")
 EVERY = 8
@@ -62,7 +62,7 @@ SCANS = {
 }
 
 
-def read(name: str) -> tuple[Field, Field]:
+def read(name: str) -> tuple[Volume, Volume]:
     """Return the image and the mask of a scan."""
     scan, structure = SCANS[name], STRUCTURES[SCANS[name].mask]
     mask = mask_of(load(data("scans", structure.files[0]), **structure.reading), structure).crop(scan.box)
@@ -70,7 +70,7 @@ def read(name: str) -> tuple[Field, Field]:
     inside = mask.values > 0
     contrast = abs(float(grey[inside].mean()) - float(grey[~inside].mean()))
     grey = grey + scan.noise * contrast * np.random.default_rng(0).standard_normal(grey.shape, dtype=np.float32)
-    return Field(grey, mask.spacing, mask.unit), mask
+    return Volume(grey, mask.spacing, mask.unit), mask
 
 
 def forest(grey: np.ndarray, truth: np.ndarray, places: list[int]) -> np.ndarray:

@@ -31,7 +31,7 @@ from skimage.segmentation import find_boundaries
 from benchmarks.harness import CACHE, Cases, Figure, Values, data, show
 from curvafit.segmentation.reconstruct import reconstruct_labels
 from curvafit.segmentation.trials import dice
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 SCANS = {"nuclei": 8, "stardist": 4, "ovule": 8}
 #: Whether labels are instances: by default as they are drawn.
@@ -77,7 +77,7 @@ def case(name: str, way: str) -> Values:
     """Return the scores of a way."""
     image, labels = read(name)
     every, begun = SCANS[name], time.process_time()
-    seen = None if way == "alone" else Field(image.astype(np.float32))
+    seen = None if way == "alone" else Volume(image.astype(np.float32))
     found = reconstruct_labels(labels.astype(np.uint16), every=every, image=seen, instances=WAYS[way])
     seconds = time.process_time() - begun
     assert found.labels is not None and found.uncertainty is not None

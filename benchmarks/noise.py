@@ -25,7 +25,7 @@ from benchmarks.harness import Cases, Figure, Values, best, bootstrap, scores, s
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.evidence import estimate_classes, grey_evidence, grey_levels
 from curvafit.segmentation.segment import segment
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 #: Laws and ways of the grey levels (bilayers do not finish), and of the probabilities.
 ALL = {"grey": LAWS[:7], "probabilities": ("tubes", "trabec", "sponge", "metatubes")}
@@ -73,7 +73,7 @@ def rival(way: str, kind: str, values: np.ndarray, truth: np.ndarray) -> np.ndar
 def grey_case(way: str, law: str, seed: int, noise: float, cases: Cases) -> Values:
     truth, status = shape(law, seed, cases), ""
     values = (truth + noise * np.random.default_rng(seed).standard_normal(truth.shape)).astype(np.float32)
-    scan = Field(values, (1.0, 1.0, 1.0))
+    scan = Volume(values, (1.0, 1.0, 1.0))
     if way == "start":
         levels = grey_levels(scan)
         mask = grey_evidence(levels, scan, estimate_classes(levels, scan)).level > 0

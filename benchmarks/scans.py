@@ -14,8 +14,8 @@ import numpy as np
 
 from benchmarks.harness import Cases, Figure, Values, data, show
 from curvafit.inference.infer import infer
-from curvafit.volumes.field import Field, ScanError
 from curvafit.volumes.read import load
+from curvafit.volumes.volume import ScanError, Volume
 
 #: Numbers of a scan's twins over those of the scan.
 RATIOS = ("volume_fraction", "thickness_mean", "spacing_mean", "connectivity_density", "surface_to_volume")
@@ -46,14 +46,14 @@ SCANS = {
 }
 
 
-def field_of(name: str) -> Field:
+def read(name: str) -> Volume:
     return load(data("scans", SCANS[name].file), **SCANS[name].reading)
 
 
 def report(name: str) -> Values:
     """Return what a whole `infer` says of a scan."""
     try:
-        fit = infer(field_of(name), kind=SCANS[name].kind).fit  # type: ignore[arg-type]
+        fit = infer(load(name), kind=SCANS[name].kind).fit  # type: ignore[arg-type]
     except ScanError as error:
         return {"verdict": f"refused: {error}"}
     own, voxel, twins = fit.morphometry, fit.working_voxel, () if fit.best is None else fit.best.twins

@@ -37,7 +37,7 @@ from curvafit.segmentation.reconstruct import reconstruct, reconstruct_labels
 from curvafit.segmentation.segment import segment
 from curvafit.segmentation.trials import dice
 from curvafit.studies.compare import compare
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 from tests.exact import Sphere, centres, profile
 
 #: Values with the differences that are allowed.
@@ -90,7 +90,7 @@ def check_texture() -> Checked:
 
 def check_reading() -> Checked:
     """Check what the posterior reads from a texture, and how much that looks like a level cut, which it is."""
-    found, posterior = measure_descriptors(prepare(Field(texture(64)), kind="mask", one_scale=True)), load_posterior()
+    found, posterior = measure_descriptors(prepare(Volume(texture(64)), kind="mask", one_scale=True)), load_posterior()
     assert found is not None
     medians = np.median(posterior.standardise(posterior.draw(found.reading, 2000)), axis=0)[:6]
     checked = {f"parameter {k + 1}": (float(value), 0.1) for k, value in enumerate(medians)}
@@ -99,14 +99,14 @@ def check_reading() -> Checked:
 
 def check_completion() -> Checked:
     ways = {
-        way: completion.filled(way, Field(texture()), range(0, 48, 8), 0, dict, dict) for way in ("spline", "filler")
+        way: completion.filled(way, Volume(texture()), range(0, 48, 8), 0, dict, dict) for way in ("spline", "filler")
     }
     return {way: (row["dice"], 0.003) for way, row in ways.items()}
 
 
 def check_image() -> Checked:
     truth = texture(32, 2.5)
-    found = reconstruct(Field(truth), every=8, image=Field(transductive.image_of(truth, 0)))
+    found = reconstruct(Volume(truth), every=8, image=Volume(transductive.image_of(truth, 0)))
     return {"Dice": (dice(found.mask.values > 0, truth > 0), 0.02)}
 
 
@@ -131,7 +131,7 @@ def check_groups() -> Checked:
 def check_noise() -> Checked:
     truth = texture(24, 2.5)
     scan = truth + np.random.default_rng(0).standard_normal(truth.shape)
-    found = segment(Field(scan.astype(np.float32)), Coefficients.willmore())
+    found = segment(Volume(scan.astype(np.float32)), Coefficients.willmore())
     return {"Dice": (dice(found.mask.values > 0, truth > 0), 0.01)}
 
 

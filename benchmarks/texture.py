@@ -51,7 +51,7 @@ def author_field(name: str) -> torch.Tensor:
     return torch.from_numpy(load(author_volumes()[name]).values.astype(np.float32))
 
 
-def field_of(name: str, schedule: str, seed: int, edge: int) -> torch.Tensor:
+def load(name: str, schedule: str, seed: int, edge: int) -> torch.Tensor:
     """Return a grown field, rounded down to 1/100 where the author's is."""
     u = generate(name, grid=Grid((edge,) * 3), schedule=schedule, seed=seed).field
     hundred = 100 * author_field(name) if edge == EDGE and name in author_volumes() else u
@@ -62,7 +62,7 @@ def diagram_of(name: str, schedule: str, seed: int, edge: int, cases: Cases) -> 
     """Return the diagram of a grown shape, from its file where it is there."""
 
     def make() -> np.ndarray:
-        found = diagram(field_of(name, schedule, seed, edge), Grid((edge,) * 3), WORKING_EPSILON)
+        found = diagram(load(name, schedule, seed, edge), Grid((edge,) * 3), WORKING_EPSILON)
         return np.column_stack([found.points, found.weights])
 
     plan = hashlib.sha256(repr(SCHEDULES[schedule]).encode()).hexdigest()[:8]

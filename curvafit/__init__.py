@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     from curvafit.studies.compare import compare as compare
     from curvafit.studies.windows import Windows as Windows
     from curvafit.studies.windows import windows as windows
-    from curvafit.volumes.field import Field as Field
     from curvafit.volumes.read import load as load
+    from curvafit.volumes.volume import Volume as Volume
     from curvafit.volumes.write import save as save
 
 __version__ = "0.1.0"
@@ -56,7 +56,7 @@ __version__ = "0.1.0"
 _FIGURES = {
     "Comparison": "curvafit.drawing.groups:comparison_figure",
     "Diagram": "curvafit.drawing.plot:diagram_figure",
-    "Field": "curvafit.drawing.plot:field_figure",
+    "Volume": "curvafit.drawing.plot:field_figure",
     "Fit": "curvafit.drawing.plot:fit_figure",
     "Flow": "curvafit.drawing.plot:flow_figure",
     "Inference": "curvafit.report.page:inference_figure",

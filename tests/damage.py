@@ -14,14 +14,16 @@ import tifffile
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from curvafit.volumes import Field, save
+from curvafit.volumes import Volume, save
 
 VALUES = (np.random.default_rng(0).random((9, 10, 11)) * 200).astype(np.uint16)
 VALUES[2:5] = 0
 
 
 def volume(suffix: str) -> Callable[[Path], object]:
-    return lambda path: save(Field(VALUES, (0.3, 0.2, 0.1), "um"), path.with_name(f"{path.stem.split('.')[0]}{suffix}"))
+    return lambda path: save(
+        Volume(VALUES, (0.3, 0.2, 0.1), "um"), path.with_name(f"{path.stem.split('.')[0]}{suffix}")
+    )
 
 
 def hdf5(path: Path, **options: object) -> None:

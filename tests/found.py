@@ -17,7 +17,7 @@ from curvafit.inference.fit import Fit
 from curvafit.inference.infer import Inference
 from curvafit.priors import Coefficients, Grid, preset
 from curvafit.scan.prepare import Prepared
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 EPSILON = 0.02
 RADIUS = 5.0
@@ -52,7 +52,7 @@ def made_inference(
     )
     barren = Twin(None, -0.58, None, None, "the field is of one phase")
     twins = {"posterior": (barren,) if lost else (twin_of(regrown),) * 2, "match": (twin_of(matched),)}
-    scan, fit = Field(grey, (SCALE,) * 3, "mm", source=source), made_fit("match" if lost else chosen, lost)
+    scan, fit = Volume(grey, (SCALE,) * 3, "mm", source=source), made_fit("match" if lost else chosen, lost)
     return Inference(scan=scan, prepared=prepared, diagram=measured(phase), twins=twins, fit=fit)
 
 

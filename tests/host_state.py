@@ -128,11 +128,11 @@ def calls(folder: Path) -> dict[str, Callable[[], object]]:
 
     def infer() -> None:
         few = {"simulations": 1, "rounds": 1, "twins": 1, "test": False, "schedule": brief}
-        found = curvafit.infer(curvafit.Field(kept["flow"].field.numpy()), kind="field", periodic=True, **few)
+        found = curvafit.infer(curvafit.Volume(kept["flow"].field.numpy()), kind="field", periodic=True, **few)
         (folder / "fit.json").write_text(found.fit.to_json())
 
-    scan, slices, files = curvafit.Field(200.0 * ball + 1), curvafit.Field(ball), ("a.nii.gz", "a.tif", "a.ome.tif")
-    sized = curvafit.Field(ball, (2.0, 1.0, 1.0), "um")
+    scan, slices, files = curvafit.Volume(200.0 * ball + 1), curvafit.Volume(ball), ("a.nii.gz", "a.tif", "a.ome.tif")
+    sized = curvafit.Volume(ball, (2.0, 1.0, 1.0), "um")
     every = {
         "Coefficients": lambda: curvafit.Coefficients(1, 2, 6).in_unit(2.0),
         "Grid": lambda: curvafit.Grid((8, 8, 8)).volume, "__version__": lambda: curvafit.__version__,
@@ -156,7 +156,7 @@ def calls(folder: Path) -> dict[str, Callable[[], object]]:
         "diagram": lambda: keep("diagram", curvafit.diagram(kept["flow"].field, grid, 0.02)),
         "Diagram": lambda: curvafit.Diagram(np.zeros((1, 2)), np.ones(1)),
         "wasserstein": lambda: curvafit.wasserstein(kept["diagram"], kept["diagram"]), "plot": plot,
-        "Field": lambda: curvafit.Field(ball),
+        "Volume": lambda: curvafit.Volume(ball),
         "save": lambda: [curvafit.save(sized, folder / name) for name in (*files, "a.npy", "a.mrc", "a.zarr")],
         "load": lambda: [curvafit.load(path) for path in sorted(folder.glob("a.*"))],
         "segment": lambda: curvafit.segment(scan, "tubes", threshold=100.0, steps=2),

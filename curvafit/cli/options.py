@@ -99,7 +99,7 @@ def add_gone(app: typer.Typer, name: str, instead: str) -> None:
 _read = partial(typer.Option, rich_help_panel="How to read the file")
 
 FILES = "NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr …"
-Volume = Annotated[str, typer.Argument(help=FILES)]
+Input = Annotated[str, typer.Argument(help=FILES)]
 #: The options of the group `reading`, as `curvafit.load` takes them.
 Reading = dict[str, Any]
 
@@ -122,7 +122,7 @@ def parse_reading(
 
         parse_unit(unit)
     if crop is not None:
-        from curvafit.volumes.formats.part import parse_box
+        from curvafit.volumes.boxes import parse_box
 
         parse_box(crop)
     return {

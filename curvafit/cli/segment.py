@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli.console import command_line, resumable, say, say_notes, show_stages
-from curvafit.cli.options import OverwriteOption, Reading, Volume, command, parse_threshold, parse_whole_numbers
+from curvafit.cli.options import Input, OverwriteOption, Reading, command, parse_threshold, parse_whole_numbers
 
 if TYPE_CHECKING:
     from curvafit.segmentation.result import Segmentation
-    from curvafit.volumes.boxes import Boxes
-    from curvafit.volumes.field import Field
+    from curvafit.volumes.volume import Volume
 
 _what = partial(typer.Option, rich_help_panel="What to do")
 
@@ -36,7 +35,7 @@ Steps = Annotated[int, _what(help="Steps of the flow.", min=1)]
     "curvafit segment predicted --probabilities --channel 1 --prior vessels/fit.json --weight 10 -o masks",
 )
 def segment(
-    scan: Volume,
+    scan: Input,
     out: Target,
     prior: Annotated[str | None, _what(help="fit.json or a preset's name; by default the Willmore energy.")] = None,
     weight: Annotated[float | None, _what(help="Nats of a unit of the energy; else 0.3 for a20 + a02 = 2.")] = None,
@@ -63,7 +62,6 @@ def segment(
     """
     from curvafit.segmentation.segment import calibrate, check_given
     from curvafit.segmentation.segment import segment as segment_scan
-    from curvafit.volumes.boxes import boxes_of, read_whole
     from curvafit.volumes.read import load
 
     kind: bool | str = "logits" if logits else probabilities
@@ -79,7 +77,7 @@ def segment(
     if not kind:
         job = _Job(scan, out, prior, reading, {**record, **split}, overwrite)
         compute = partial(segment_scan, prior=prior, **options, **split, **tools)
-        _run(job, compute, partial(boxes_of, scan, **reading))
+        _run(job, compute, partial(load, scan, **reading, lazy=True))
         return
     given = {"example": example, "example_probabilities": example_probabilities, "like": like}
     texts = {name: None if path is None else str(path) for name, path in given.items()}
@@ -94,14 +92,11 @@ def segment(
         options["example"] = learned
         jobs = [replace(job, record={**job.record, "calibration": learned.as_dict()}) for job in jobs]
     for job in jobs:
-
-        def compute_map(volume: Boxes, **running: Any) -> Segmentation:
-            return segment_scan(read_whole(volume), prior, probabilities=True, **options, **tools, **running)
-
-        _run(job, compute_map, lambda job=job: boxes_of(read(job.source)))
+        compute = partial(segment_scan, prior=prior, probabilities=True, **options, **tools)
+        _run(job, compute, partial(read, job.source))
 
 
-def _list_maps(job: _Job, given: dict[str, str | None]) -> tuple[list[_Job], Callable[..., Field]]:
+def _list_maps(job: _Job, given: dict[str, str | None]) -> tuple[list[_Job], Callable[..., Volume]]:
     """Return a job for a map of probabilities, or for each of a folder of NPZ files, and what reads a map. All are read
     before the first work, which may take minutes, so that what is none is refused."""
     from curvafit.segmentation.evidence import find_image, load_probabilities, probability_evidence
@@ -141,7 +136,7 @@ def _list_maps(job: _Job, given: dict[str, str | None]) -> tuple[list[_Job], Cal
     "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json -o volume.nii.gz",
 )
 def reconstruct(
-    slices: Volume,
+    slices: Input,
     out: Target,
     prior: Annotated[str | None, _what(help="A law as in segment, to be tried; by default none.")] = None,
     every: Annotated[int | None, _what(help="Distance of known slices; by default those with labels.")] = None,
@@ -167,7 +162,7 @@ def reconstruct(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Fill a mask between known slices; write it, the probability of each voxel, a picture and a record."""
-    from curvafit.volumes.boxes import boxes_of
+    from curvafit.volumes.read import load
 
     named = every is not None or known is not None
     for wrong, sentence in (
@@ -198,11 +193,9 @@ def reconstruct(
     if alone and _fill_blocks(job, {**options, "tile": tile, "workers": workers}):
         return
 
-    def compute(volume: Boxes, **tools: Any) -> Segmentation:
+    def compute(volume: Volume, **tools: Any) -> Segmentation:
         from curvafit.segmentation.reconstruct import reconstruct as fill
         from curvafit.segmentation.reconstruct import reconstruct_labels
-        from curvafit.volumes.boxes import read_whole
-        from curvafit.volumes.read import load
 
         alike = {"example": ("spacing", "unit", "label", "strict"), "image": ("spacing", "unit", "crop")}
         for name, path in shown.items():
@@ -211,16 +204,16 @@ def reconstruct(
                 say_notes(tools[name].notes)
         tools |= {"workers": workers, **common}
         if labels is None:
-            return fill(read_whole(volume), prior, **tools)
-        return reconstruct_labels(read_whole(volume), prior, chosen=several, instances=instances, **tools)
+            return fill(volume.load(), prior, **tools)
+        return reconstruct_labels(volume.load(), prior, chosen=several, instances=instances, **tools)
 
-    _run(job, compute, partial(boxes_of, slices, **reading), sure=sure)
+    _run(job, compute, partial(load, slices, **reading, lazy=True), sure=sure)
 
 
 def _fill_blocks(job: _Job, options: dict[str, Any]) -> bool:
     """Fill a volume between known slices in blocks, if it is so large, and return whether it is."""
     from curvafit.segmentation.blocks import fits_blocks, reconstruct_file
-    from curvafit.volumes.boxes import boxes_of
+    from curvafit.volumes.read import load
 
     if not fits_blocks(job.out, (), 1):
         return False
@@ -228,7 +221,7 @@ def _fill_blocks(job: _Job, options: dict[str, Any]) -> bool:
     reading = {name: value for name, value in job.reading.items() if name != "label"}
     with show_stages() as progress:
         progress("reading", 0.0)
-        if not fits_blocks(job.out, boxes_of(job.source, **reading).frame.shape, options["tile"]):
+        if not fits_blocks(job.out, load(job.source, **reading, lazy=True).shape, options["tile"]):
             return False
         options |= {"record": job.content, "inputs": job.inputs, "overwrite": job.overwrite, "progress": progress}
         with resumable():
@@ -251,7 +244,7 @@ class _Job:
     maps: tuple[str, ...] = ()  # volumes beside the mask
     image: Path | None = None  # the file whose header the mask gets; by default the source
 
-    def check(self, frame: Field | None = None) -> None:
+    def check(self, frame: Volume | None = None) -> None:
         """Raise ValueError where the mask cannot be written, or the prior is none."""
         from curvafit.priors.law import Law, preset_name
         from curvafit.segmentation.result import check_mask_target
@@ -267,29 +260,30 @@ class _Job:
         return {"command": command_line(), "prior": self.prior, **self.record}
 
 
-def _run(job: _Job, compute: Callable[..., Segmentation], read: Callable[[], Boxes], sure: float | None = None) -> None:
+def _run(
+    job: _Job, compute: Callable[..., Segmentation], read: Callable[[], Volume], sure: float | None = None
+) -> None:
     """Check, read, compute, write and print. Finished tiles are kept beside the output until it is written."""
     from curvafit.core.files import remove
     from curvafit.segmentation.result import hidden_store, write_mask
     from curvafit.segmentation.tiles import Tiling
-    from curvafit.volumes.boxes import boxes_of, check_fits, read_whole
     from curvafit.volumes.write import check_labels
 
     record, reading = job.record, job.reading
     job.check()
     with show_stages() as progress:
         progress("reading", 0.0)
-        boxes = read()
-        check_fits(boxes)  # the mask is written from memory
-        job.check(boxes.frame)  # again, as a format may not hold the unit
+        volume = read()
+        volume.check_fits()  # the mask is written from memory
+        job.check(volume)  # again, as a format may not hold the unit
         if record.get("labels"):
-            boxes = boxes_of(whole := read_whole(boxes))
-            check_labels(job.out, whole)
-        tiling = Tiling.of(boxes.frame, record["epsilon"], record["tile"], periodic=record.get("periodic", False))
+            volume = volume.load()
+            check_labels(job.out, volume)
+        tiling = Tiling.of(volume, record["epsilon"], record["tile"], periodic=record.get("periodic", False))
         store = hidden_store(job.out)
         tiles = tiling.count > 1 and (record["job"] == "segment" or job.prior is not None)
         with resumable() if tiles else nullcontext():
-            result = compute(boxes, progress=progress, store=store)
+            result = compute(volume, progress=progress, store=store)
         progress("writing", 1.0)
         labels = None if sure is None else result.keep_sure(sure)
         result = result if labels is None else replace(result, notes=(*result.notes, *labels.notes))
@@ -297,7 +291,7 @@ def _run(job: _Job, compute: Callable[..., Segmentation], read: Callable[[], Box
         stated = ("spacing", "crop") if job.image else ("spacing", "crop", "channel", "time")
         like = (job.image or job.source) if all(reading[name] is None for name in stated) else None
         how = {"sure": labels, "like": like, "unit": reading["unit"], "record": job.content, "overwrite": job.overwrite}
-        paths = write_mask(result, read_whole(boxes), job.out, **how)
+        paths = write_mask(result, volume.load(), job.out, **how)
         remove(store)
     _print_mask(result.notes, result.status, paths)
 

@@ -19,8 +19,8 @@ from curvafit.data_synth.imaging.image import field_shape
 from curvafit.data_synth.imaging.modality import Modality, modality
 from curvafit.data_synth.sources import Generated, Pool, Stored, choose_voxel
 from curvafit.priors.law import LAW_TYPES, LawLike
-from curvafit.volumes.field import Field
 from curvafit.volumes.formats.nifti import affine_in_file
+from curvafit.volumes.volume import Volume
 
 #: Percentiles that `percentile` makes 0 and 1.
 PERCENTILES = (0.5, 99.5)
@@ -188,7 +188,7 @@ def as_monai(sample: Sample) -> dict[str, Any]:
     except ImportError as error:
         raise ImportError("as_monai needs MONAI: pip install monai", name="monai") from error
     image, label = (values.permute(0, 3, 2, 1).contiguous() for values in (sample.image, sample.label))
-    field = Field(sample.image[0].numpy(), sample.spacing, sample.record["imaging"]["unit"])
+    field = Volume(sample.image[0].numpy(), sample.spacing, sample.record["imaging"]["unit"])
     affine = torch.from_numpy(affine_in_file(field)).float().double()  # the digits that a file keeps
     return {name: MetaTensor(values, affine=affine) for name, values in (("image", image), ("label", label))}
 

@@ -29,7 +29,7 @@ from curvafit.inference.table import VIEWS, Table, load_table, parameters_of, sa
 from curvafit.priors.grid import Grid
 from curvafit.scan.measure import Reading, read_texture, scan_diagram
 from curvafit.scan.prepare import prepare, thinner_thickness
-from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.volume import ScanError, Volume
 
 #: Seconds between two writings of a table that grows.
 PAUSE = 60.0
@@ -93,7 +93,7 @@ def _measure_shape(store: Store, record: Record) -> tuple[float, float, Diagram,
     that of a scan is measured."""
     field = store.field(record.index)
     grid, epsilon = Grid(store.settings.shape, store.settings.spacing), store.settings.epsilon
-    mask = prepare(Field((field > 0).astype(np.uint8)), kind="mask", periodic=True, one_scale=True)
+    mask = prepare(Volume((field > 0).astype(np.uint8)), kind="mask", periodic=True, one_scale=True)
     both = (diagram(torch.from_numpy(field), grid, epsilon), scan_diagram(mask))
     as_field, as_mask = (each.thin(BIN_WIDTH, TAIL_SHARE) for each in both)
     return float((field > 0).mean()), thinner_thickness(field > 0), as_field, as_mask

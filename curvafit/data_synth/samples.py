@@ -17,7 +17,7 @@ from curvafit.core.files import write_content
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
 from curvafit.priors import Grid, preset
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
 #: The package that holds the samples, and the seconds that its download may take.
@@ -99,7 +99,7 @@ def synthetic_scan(path: str | os.PathLike[str], *, edge: int = 96) -> Path:
     flow = generate(bone.coefficients, bone.mass, Grid((edge, edge, edge)), schedule=plan, seed=0)
     if not flow.viability.viable:
         raise ValueError(f"no shape grows at an edge of {edge} voxels ({flow.viability.reason}): take another")
-    return save(Field(_ct_image(flow.field.numpy()), (0.02, 0.02, 0.02), "mm", source="synthetic"), path)
+    return save(Volume(_ct_image(flow.field.numpy()), (0.02, 0.02, 0.02), "mm", source="synthetic"), path)
 
 
 def _ct_image(phase: np.ndarray) -> np.ndarray:

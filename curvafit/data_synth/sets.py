@@ -25,8 +25,8 @@ from curvafit.data_synth.labels import NAMES, labels_of
 from curvafit.data_synth.store import check_same
 from curvafit.drawing.plot import CONTOUR, make_figure, write_picture
 from curvafit.priors.grid import Grid
-from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
+from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
 SET = Format("curvafit set", 3, "a set of curvafit", remedy="begin it anew in another folder")
@@ -200,7 +200,7 @@ def _write_case(folder: Path, spec: SetSpec, index: int, case: Case) -> None:
         known = _write_parts(folder, spec, name, case, places)
         for values, pattern in ((case.labels, layout.label), (case.image, layout.image)):
             places.append(folder / pattern.format(case=name))
-            save(Field(values, case.spacing, case.unit), places[-1])
+            save(Volume(values, case.spacing, case.unit), places[-1])
         both = {"image": case.image, "label": case.labels}
         sums = {part: hashlib.sha256(np.ascontiguousarray(of).tobytes()).hexdigest() for part, of in both.items()}
         _write_json(record, case.record | known | {"sha256": sums, "versions": versions()})
@@ -228,7 +228,7 @@ def _write_parts(folder: Path, spec: SetSpec, name: str, case: Case, places: lis
             write_graphml(graph, places[-1], case.unit)
         else:
             places.append(place)
-            save(Field(labels[part], case.spacing, case.unit), place)
+            save(Volume(labels[part], case.spacing, case.unit), place)
     return known
 
 

@@ -29,7 +29,7 @@ from curvafit.core.units import format_length, unit_name
 from curvafit.drawing.render import DPI, QUIET, render_in_box
 from curvafit.generation.result import Flow
 from curvafit.geometry.diagram import Diagram
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 #: Colours that stay apart for the colour-blind (Okabe & Ito 2008).
 CONTOUR, DIAGONAL, INK = "#E69F00", "#C8372D", "#22262B"
@@ -227,7 +227,7 @@ def _name_families(axes: Axes, across: Limits, up: Limits) -> None:
 # ---- three middle slices ---------------------------------------------------------------------------------------------
 
 
-def field_figure(field: Field) -> Figure:
+def field_figure(field: Volume) -> Figure:
     """Return a figure of a field's middle slices."""
     return section_figure({"": (field.values, None)}, field.spacing, field.unit)
 

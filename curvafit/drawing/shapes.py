@@ -27,7 +27,7 @@ from curvafit.priors.coefficients import NAMES
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.profile import profile_distance
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import WRITERS, pick_writer, save
 
 #: What a record beside a shape says that it is.
@@ -141,7 +141,7 @@ def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | No
     how.shape(grid)
     values, edges = np.tile(field.numpy(), how.tile), (how.voxel, how.voxel, how.voxel)
     if not target.name.lower().endswith(SUFFIXES):
-        return save(Field(values, edges, how.unit), target, kind=FORMAT.name)
+        return save(Volume(values, edges, how.unit), target, kind=FORMAT.name)
     box = Grid(values.shape, edges, grid.boundary)
     mesh = solid_surface(values, box)
     data = None

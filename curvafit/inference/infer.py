@@ -34,9 +34,9 @@ from curvafit.priors.profile import phase_field
 from curvafit.scan.measure import scan_diagram
 from curvafit.scan.prepare import HALF, NOISE, Prepared, coarser_level, prepare, read_scan, why_no_texture
 from curvafit.scan.structure import check_options, is_rounded, read_region, sample_mask
-from curvafit.volumes.field import Field
-from curvafit.volumes.formats.part import Crop
+from curvafit.volumes.boxes import Crop
 from curvafit.volumes.read import Source
+from curvafit.volumes.volume import Volume
 
 #: Number of nearest shapes, and of those from which stationarity starts.
 MATCHES, STARTS = 5, 3
@@ -63,7 +63,7 @@ class Inference(Pictured):
         `(n, k)`; None where none were.
     """
 
-    scan: Field
+    scan: Volume
     prepared: Prepared
     diagram: Diagram | None
     twins: dict[str, tuple[Twin, ...]]
@@ -127,7 +127,7 @@ def infer(
     Parameters
     ----------
     scan
-        The path of a volume file, a `Field`, or an array or tensor (Z, Y, X).
+        The path of a volume file, a `Volume`, or an array or tensor (Z, Y, X).
     kind
         `"field"`, `"mask"`, `"image"`, or `"auto"`: two values are a mask, plateaus near ±1 a phase field.
     periodic
@@ -265,7 +265,7 @@ def _grow(
 
 def _read_and_prepare(
     scan: Source, label: int | None, crop: Crop | None, options: Mapping[str, Any], reading: Mapping[str, Any]
-) -> tuple[Field, tuple[int, int, int], Prepared]:
+) -> tuple[Volume, tuple[int, int, int], Prepared]:
     """Return a scan, or the middle of a large one at the level of its pyramid that suits its structure, the shape of
     that level, and the scan prepared."""
     whole = options["roi"] is not None or options["periodic"]
@@ -304,7 +304,9 @@ def _describe(prepared: Prepared, measured: Diagram | None, provenance: dict[str
     )
 
 
-def _provenance(volume: Field, shape: tuple[int, ...], atlas: Atlas, posterior: Posterior, seed: int) -> dict[str, Any]:
+def _provenance(
+    volume: Volume, shape: tuple[int, ...], atlas: Atlas, posterior: Posterior, seed: int
+) -> dict[str, Any]:
     return {
         "curvafit": version("curvafit"),
         "scan": str(volume.source),

@@ -19,7 +19,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.scan.measure import Reading
 from curvafit.scan.prepare import thinner_thickness
 from curvafit.scan.structure import sample_mask
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 _REMEDY = "describe the stores into another file, or with --overwrite"
 TABLE_FILE = Format("curvafit descriptors", 2, "a table of descriptors", _REMEDY, {"blocks": BLOCKS})
@@ -199,14 +199,14 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Table
 class Scanned(NamedTuple):
     """What a scanner makes of a shape, and what `prepare` is told of it: its kind, and whether it repeats."""
 
-    scan: Field
+    scan: Volume
     kind: Literal["field", "mask", "image"]
     periodic: bool = False
 
 
 def see_field(u: np.ndarray, rng: np.random.Generator) -> Scanned:
     """Return the phase field itself."""
-    return Scanned(Field(u), "field", periodic=True)
+    return Scanned(Volume(u), "field", periodic=True)
 
 
 def see_mask(u: np.ndarray, rng: np.random.Generator) -> Scanned:
@@ -214,7 +214,7 @@ def see_mask(u: np.ndarray, rng: np.random.Generator) -> Scanned:
     inside = _open(u, rng)
     voxel = float(np.clip(thinner_thickness(inside) / math.exp(rng.uniform(*np.log(SAMPLED))), *SCALES))
     coarse = sample_mask(inside, [voxel] * 3, periodic=False)
-    return Scanned(Field(coarse.astype(np.uint8)), "mask")
+    return Scanned(Volume(coarse.astype(np.uint8)), "mask")
 
 
 def see_scan(u: np.ndarray, rng: np.random.Generator) -> Scanned:
@@ -223,7 +223,7 @@ def see_scan(u: np.ndarray, rng: np.random.Generator) -> Scanned:
     whole = np.pad(grey, ((0, -len(grey) % SLICE), (0, 0), (0, 0)), mode="edge")
     grey = whole.reshape(-1, SLICE, *grey.shape[1:]).mean(1)
     grey += rng.standard_normal(grey.shape, dtype=np.float32) / SNR
-    return Scanned(Field(grey, (float(SLICE), 1.0, 1.0), "voxel"), "image")
+    return Scanned(Volume(grey, (float(SLICE), 1.0, 1.0), "voxel"), "image")
 
 
 #: Views by name.

@@ -19,7 +19,7 @@ from curvafit.segmentation.reconstruct import reconstruct, reconstruct_labels
 from curvafit.segmentation.result import Segmentation, note_empty
 from curvafit.segmentation.slices import check_shared, index_labels, next_in_rhythm, require_labels
 from curvafit.segmentation.uncertainty import entropy
-from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.volume import ScanError, Volume
 
 _ALL, _ONE = "all labels", "the selected label"
 
@@ -29,12 +29,12 @@ class Task:
     """A labels layer to fill: its field, the labels, the axis across its slices, the known ones, and the rest."""
 
     layer: Any
-    field: Field
+    field: Volume
     numbers: Sequence[int]
     axis: int
     known: Sequence[int]
     notes: Sequence[str]
-    image: Field | None
+    image: Volume | None
     suggest: int
 
 
@@ -102,7 +102,7 @@ class Complete(Dock):
         field = field_of_layer(layer, "a labels layer")
         if layer.multiscale or not isinstance(layer.data, np.ndarray):
             raise ScanError(f"expected labels that can be edited, got {layer.name}, which is no NumPy array")
-        field = replace(field, values=np.array(field.values))
+        field = replace(field, array=np.array(field.values))
         values = np.moveaxis(field.values, axis, 0)
         numbers = [int(layer.selected_label)] if self.which.value == _ONE else np.unique(values[values != 0]).tolist()
         most = {"most": math.inf} if self.which.value == _ONE else {}
@@ -209,7 +209,7 @@ def _fill(task: Task, progress: Progress) -> Filled:
         assert found.labels is not None
         return Filled(task, values, found.labels.values, found)
     number = task.numbers[0]
-    inside = replace(task.field, values=(values == number).astype(np.uint8))
+    inside = replace(task.field, array=(values == number).astype(np.uint8))
     found, after = reconstruct(inside, **options), values.copy()
     after[values == number] = 0
     after[(after == 0) & found.mask.values] = number

@@ -18,7 +18,7 @@ from curvafit.generation.schedule import schedule
 from curvafit.napari.dock import Dock
 from curvafit.napari.layers import place_of_field, put_layer
 from curvafit.priors.law import PRESETS
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 
 class Generate(Dock):
@@ -42,7 +42,7 @@ class Generate(Dock):
     def show_result(self, result: Flow) -> str:
         """Add the shape."""
         edge = 1.0 if self.unit.value == "voxel" else self.spacing.value
-        shape = Field((result.field.numpy() > 0).astype(np.uint8), (edge, edge, edge), self.unit.value)
+        shape = Volume((result.field.numpy() > 0).astype(np.uint8), (edge, edge, edge), self.unit.value)
         name = f"{self.preset.value}, seed {self.seed.value}"
         put_layer(self.viewer, "labels", shape.values, name, **place_of_field(shape))
         return f"{result.status}."

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.units import convert_length, is_unit, parse_unit
-from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.volume import ScanError, Volume
 
 #: Our unit -> napari's.
 _UNITS = {"voxel": "pixel", "nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter"}
 
 
-def field_of_layer(layer: Any, kind: str = "a layer") -> Field:
+def field_of_layer(layer: Any, kind: str = "a layer") -> Volume:
     """Return the values of a layer, of its finest level, with its scale and unit; else ScanError, which names the kind.
 
     The layer has three axes, besides any of length one before them, and no colours. A turned or sheared layer is read
@@ -30,7 +30,7 @@ def field_of_layer(layer: Any, kind: str = "a layer") -> Field:
     if faults := np.count_nonzero(~np.isfinite(values)):
         raise ScanError(f"expected finite values in the layer {layer.name}, got {faults} that are not")
     spacing, unit = _lengths(layer)
-    return Field(values, spacing, unit, source=layer.name)
+    return Volume(values, spacing, unit, source=layer.name)
 
 
 def _lengths(layer: Any) -> tuple[tuple[float, float, float], str]:
@@ -57,7 +57,7 @@ def place_of_layer(layer: Any) -> dict[str, Any]:
     }
 
 
-def place_of_field(field: Field) -> dict[str, Any]:
+def place_of_field(field: Volume) -> dict[str, Any]:
     """Return options of a layer for a field."""
     return {"scale": field.spacing, "units": (_UNITS[field.unit],) * 3}
 

@@ -39,7 +39,7 @@ from curvafit.scan.structure import find_structure
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.trials import dice
-from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.volume import ScanError, Volume
 
 if TYPE_CHECKING:
     from curvafit.inference.atlas import Atlas
@@ -78,7 +78,7 @@ class Completion(NamedTuple):
 
 
 def write_demo(
-    scan: Field, directory: str | Path, *, seed: int = 0, overwrite: bool = False, progress: Progress = silent
+    scan: Volume, directory: str | Path, *, seed: int = 0, overwrite: bool = False, progress: Progress = silent
 ) -> tuple[Path, Completion]:
     """Measure a scan, fill it from every 8th slice, find textures like it, and write one page on it into a folder.
 
@@ -99,7 +99,7 @@ def write_demo(
         raise ScanError(f"expected a scan with a structure: {inference.fit.status}")
     _, signed = find_structure(scan)
     mask, axis = signed.values > 0, int(np.argmin(np.array(scan.shape) * scan.spacing))
-    volume = Field(mask.view(np.uint8), scan.spacing, scan.unit)
+    volume = Volume(mask.view(np.uint8), scan.spacing, scan.unit)
     filled = reconstruct(volume, every=EVERY, axis=axis, progress=sub_progress(progress, 0.3, 0.6))
     completion = score_completion(mask, filled.mask.values, axis)
     textures: list[np.ndarray] = []
@@ -174,7 +174,7 @@ def _shape_figure(completion: Completion, spacing: tuple[float, float, float]) -
     return gallery_figure(halves, columns=3, width=1500, spacing=tuple(spacing[k] for k in order))
 
 
-def _slice_figure(scan: Field, completion: Completion) -> Figure:
+def _slice_figure(scan: Volume, completion: Completion) -> Figure:
     """Return the slice midway between two known ones: its grey values, and where the filled slice differs."""
     axis = completion.axis
     place = (scan.shape[axis] // 2 // EVERY) * EVERY + EVERY // 2

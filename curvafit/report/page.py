@@ -51,7 +51,7 @@ from curvafit.inference.table import parameters_of
 from curvafit.inference.verdict import UNBELIEVED, UNDECIDED
 from curvafit.priors.law import FORMAT
 from curvafit.studies.tables import format_csv
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
 if TYPE_CHECKING:
@@ -156,7 +156,7 @@ def write_study(
     tables: Mapping[str, Iterable[dict[str, Any]]],
     *,
     figures: Mapping[str, tuple[Figure, str]] | None = None,
-    maps: Mapping[str, Field] | None = None,
+    maps: Mapping[str, Volume] | None = None,
     told: Sequence[str] = ("command", "date"),
 ) -> Path:
     """Write a study's record, page, tables, maps, and figures as PNG and SVG, into a folder together.
@@ -196,7 +196,7 @@ def write_inference(inference: Inference, directory: str | Path, *, overwrite: b
         write_report(inference, work / "report.html")
         if inference.best is not None:
             edge = inference.fit.working_voxel
-            save(Field(inference.best, (edge, edge, edge), inference.fit.length_unit), work / "regenerated.nii.gz")
+            save(Volume(inference.best, (edge, edge, edge), inference.fit.length_unit), work / "regenerated.nii.gz")
     return target / "report.html"
 
 

@@ -15,7 +15,7 @@ from curvafit.geometry.morphometry import local_thickness
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.kernels.cpu import gaussian_blur
 from curvafit.priors.profile import PULL, PULL_WIDTH, STAIRS, SWEEPS
-from curvafit.volumes.formats.part import Box
+from curvafit.volumes.boxes import Box
 
 #: Median thickness is measured in a box of at most this many voxels a side.
 MEASURED = 160

@@ -17,9 +17,9 @@ from curvafit.priors.grid import WORKING_SPACING
 from curvafit.scan import measure
 from curvafit.scan.prepare import prepare
 from curvafit.scan.structure import read_labels
-from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.formats.part import Box, grow
-from curvafit.volumes.read import Source, field_of
+from curvafit.volumes.boxes import Box, grow
+from curvafit.volumes.read import Source, load
+from curvafit.volumes.volume import ScanError, Volume
 
 #: Symbols of the numbers that need a volume around a structure: a body has none.
 _OF_TEXTURES = ("BV/TV", "Tb.Sp", "Tb.N", "Conn.D", "BS/TV")
@@ -46,13 +46,13 @@ def measure_instances(labels: Source, *, progress: Progress = silent, **reading:
     Parameters
     ----------
     labels
-        The path of a file, a `Field`, or an array or tensor (Z, Y, X).
+        The path of a file, a `Volume`, or an array or tensor (Z, Y, X).
     reading
         Options of reading a file, or the place of an array: see `curvafit.load`.
     """
     if reading.get("label") is not None:
         raise ValueError("instances are all labels of an image: leave out the label of one")
-    field = field_of(labels, **reading)
+    field = load(labels, **reading)
     values = read_labels(field, "labels of instances")
     names = np.unique(values[values != 0])
     if len(names) == 1 and values.all():
@@ -65,14 +65,14 @@ def measure_instances(labels: Source, *, progress: Progress = silent, **reading:
     return tuple(found)
 
 
-def _measure_body(field: Field, numbers: np.ndarray, number: int, box: Box, label: int) -> measure.Measures:
+def _measure_body(field: Volume, numbers: np.ndarray, number: int, box: Box, label: int) -> measure.Measures:
     """Return the measures of the body of a number, which lies in a box."""
     mask = numbers[grow(box, 3, numbers.shape)] == number  # the reach of the blur before marching cubes
     thickness = local_thickness(mask, field.spacing)
     around = [math.ceil(float(thickness.max()) / 2 / h) + _AROUND for h in field.spacing]
     try:
         body = numbers[grow(box, around, numbers.shape)] == number
-        prepared = prepare(Field(body, field.spacing, field.unit), kind="mask")
+        prepared = prepare(Volume(body, field.spacing, field.unit), kind="mask")
         (curved, drawn), notes = measure.measure_curvatures(prepared), prepared.notes
         drawn = drawn.thin(BIN_WIDTH / prepared.working_voxel * WORKING_SPACING, TAIL_SHARE)  # there may be thousands
     except ValueError as reason:  # too thin, or without a surface away from the image's borders
@@ -89,7 +89,7 @@ def _measure_body(field: Field, numbers: np.ndarray, number: int, box: Box, labe
     return measure.Measures(field.source, field.unit, "mask", quantities, direction, drawn, (1, 1, 1), notes, part)
 
 
-def _measure_extent(body: np.ndarray, box: Box, field: Field) -> dict[str, float]:
+def _measure_extent(body: np.ndarray, box: Box, field: Volume) -> dict[str, float]:
     """Return the longest over the middle axis of a body's ellipsoid of moments, and its area in the image's faces."""
     # A voxel's own moments count, so that a row of voxels has a width.
     edges = np.array(field.spacing)

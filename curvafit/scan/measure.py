@@ -28,9 +28,9 @@ from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.scan.grids import median_thickness, remove_specks
 from curvafit.scan.prepare import DROPPED, LARGEST_WINDOW, WORKED, Prepared, TooLarge, prepare, smallest_piece
 from curvafit.scan.structure import check_options, find_structure, is_rounded, read_labels, read_region
-from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.formats.part import cut_boxes
-from curvafit.volumes.read import Source, field_of
+from curvafit.volumes.boxes import cut_boxes
+from curvafit.volumes.read import Source, load
+from curvafit.volumes.volume import ScanError, Volume
 
 #: Columns of a table of measures; a CSV file begins with them.
 COLUMNS = ("scan", "quantity", "symbol", "value", "low", "high", "unit", "direction", "version")
@@ -219,7 +219,7 @@ def measure(
     Raises what that does, and ValueError if the scan does not fit into memory.
     """
     check_options(kind, threshold, reading.get("label"))
-    field = field_of(scan, **reading)
+    field = load(scan, **reading)
     options = {"threshold": threshold, "dark": dark, "periodic": periodic}
     check_memory(field.shape, WORKED, "a scan in one piece")
     labels = options["imaged"] = None
@@ -240,7 +240,7 @@ def measure(
     return replace(summarise(field, maps, replace(blocks, region=labels != 0)), compartments=parts)
 
 
-def summarise(field: Field, maps: Maps, blocks: Blocks, part: tuple[str, int] | None = None) -> Measures:
+def summarise(field: Volume, maps: Maps, blocks: Blocks, part: tuple[str, int] | None = None) -> Measures:
     """Return the measures of what lies in blocks, and of the whole scan with its own χ."""
     drawn, table, connectivity = maps.diagram, maps.sum(blocks), None
     if blocks.region is None:
@@ -253,7 +253,7 @@ def summarise(field: Field, maps: Maps, blocks: Blocks, part: tuple[str, int] | 
 
 
 def summarise_sums(
-    frame: Field,
+    frame: Volume,
     kind: str,
     blocks: Blocks,
     table: np.ndarray,
@@ -318,7 +318,7 @@ class Maps(NamedTuple):
 
 
 def measure_maps(
-    field: Field, kind: str, options: dict[str, Any], progress: Progress = silent, most: int | None = None
+    field: Volume, kind: str, options: dict[str, Any], progress: Progress = silent, most: int | None = None
 ) -> Maps:
     """Measure what is summed of a scan; `options` are the threshold, dark and periodic of `measure`, and where a padded
     scan was `imaged`; `most` as in `prepare.prepare`, which raises TooLarge."""
@@ -349,7 +349,7 @@ def no_curvature(unit: str, reason: object) -> tuple[tuple[np.ndarray, np.ndarra
     return (np.zeros((0, 3)), columns), drawn, (f"No curvature: {reason}.",)
 
 
-def _find_structure(field: Field, kind: str, options: dict[str, Any]) -> tuple[np.ndarray, str, tuple[str, ...]]:
+def _find_structure(field: Volume, kind: str, options: dict[str, Any]) -> tuple[np.ndarray, str, tuple[str, ...]]:
     """Return the structure on the scan's voxels, its kind, and notes; specks of an image are dropped."""
     seen, signed = find_structure(field, kind=kind, **options)  # type: ignore[arg-type]
     mask, notes = signed.values > 0, signed.notes

@@ -18,7 +18,7 @@ from curvafit.core.files import remove, write_content
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.workers import ThisProcess, Workers, collect_all, join_workers
 from curvafit.priors.kernels.threads import one_thread
-from curvafit.volumes.field import ScanError
+from curvafit.volumes.volume import ScanError
 
 #: Arrays and numbers that were found in a piece of a volume, by name.
 Found = Mapping[str, Any]

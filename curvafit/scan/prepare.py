@@ -16,10 +16,9 @@ from curvafit.geometry.topology import betti_numbers
 from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
 from curvafit.scan import grids, structure
 from curvafit.scan.structure import Kind, Quality
-from curvafit.volumes.boxes import InMemory, boxes_of
-from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.formats.part import Box, Crop
-from curvafit.volumes.read import Source, field_of, levels_of
+from curvafit.volumes.boxes import Box, Crop
+from curvafit.volumes.read import Source, levels_of, load
+from curvafit.volumes.volume import ScanError, Volume
 
 #: Median thickness in voxels that a scan is resampled to; those of isotropic scans whose grid is kept: where a shape is
 #: measured, and where a law is read.
@@ -117,7 +116,7 @@ class Prepared:
         """Scan a period of a grown shape as this scan was made, and prepare it alike: its phase field if this is one,
         else its mask `(Z, Y, X)` at this scan's thickness in voxels; an image as blurred and noisy as this one."""
         if self.kind == "field":
-            return prepare(Field(grown), kind="field", periodic=True, one_scale=self.one_scale)
+            return prepare(Volume(grown), kind="field", periodic=True, one_scale=self.one_scale)
         mask, quality = grown > 0, self.quality
         thickness = thinner_thickness(mask)
         step = [thickness / (scale * self.thickness) for scale in self.scale]
@@ -127,7 +126,7 @@ class Prepared:
         else:
             values = quality.image(mask, step, seed).astype(np.float32)
         options = {"periodic": self.grid.periodic, "one_scale": self.one_scale, "quality": quality}
-        return prepare(Field(values, (z, y, x), self.unit), kind=self.kind, **options)
+        return prepare(Volume(values, (z, y, x), self.unit), kind=self.kind, **options)
 
     @cached_property
     def true_volume_fraction(self) -> float:
@@ -161,21 +160,21 @@ class Prepared:
 
 def read_scan(
     scan: Source, *, label: int | None = None, crop: Crop | None = None, whole: bool = False, **reading: Any
-) -> tuple[Field, tuple[int, int, int]]:
-    """Return a scan as `field_of`, and its shape; of a large file no more is read than `prepare` uses, which a note
+) -> tuple[Volume, tuple[int, int, int]]:
+    """Return a scan as `load`, and its shape; of a large file no more is read than `prepare` uses, which a note
     says, unless `whole`."""
-    boxes = boxes_of(scan, crop=crop, **reading)
-    shape = boxes.frame.shape
-    if whole or isinstance(boxes, InMemory) or max(shape) <= LARGEST_SCAN:
-        field = boxes.field if isinstance(boxes, InMemory) else field_of(scan, crop=crop, **reading)
-        return field if label is None else field.label(label), shape
+    volume = load(scan, crop=crop, **reading, lazy=True)
+    shape = volume.shape
+    if whole or not volume.in_file or max(shape) <= LARGEST_SCAN:
+        volume = volume.load()
+        return volume if label is None else volume.label(label), shape
     where, notes = grids.bounding_box(shape, None, LARGEST_SCAN)
-    part = tuple(slice(edge.start + at, edge.stop + at) for edge, at in zip(where, boxes.first, strict=True))
     try:
-        field = field_of(scan, label=label, crop=part, **reading)  # type: ignore[arg-type]
+        part = volume.crop(where).load()
+        part = part if label is None else part.label(label)
     except ScanError as error:
         raise ScanError(f"{error}, in the middle of this large scan: name another part with crop") from error
-    return replace(field, notes=field.notes + notes), shape
+    return replace(part, notes=part.notes + notes), shape
 
 
 def coarser_level(
@@ -199,7 +198,7 @@ def coarser_level(
 
 
 def prepare(
-    field: Field,
+    field: Volume,
     *,
     kind: Literal["auto", "field", "mask", "image"] = "auto",
     periodic: bool = False,
@@ -250,7 +249,7 @@ def prepare(
     region = None if region is None else region.values != 0
     where, notes = grids.bounding_box(field.shape, region, LARGEST_SCAN if most is None else max(field.shape))
     region = None if region is None else region[where]
-    part = replace(field, values=field.values[where], affine=None, notes=field.notes + laid + notes)
+    part = replace(field, array=field.values[where], affine=None, notes=field.notes + laid + notes)
     periodic = periodic and part.shape == field.shape
     options = {"kind": kind, "threshold": threshold, "dark": dark}
     options["imaged"] = None if imaged is None else imaged[where]
@@ -270,7 +269,7 @@ class _Scan:
     """A scan once its structure, where the field is above 0, is known."""
 
     kind: Kind
-    field: Field
+    field: Volume
     periodic: bool
     region: np.ndarray | None
     noise: bool
@@ -350,7 +349,7 @@ def judge_thickness(
 
 
 def choose_scale(
-    kind: Kind, frame: Field, noise: bool, thickness: float
+    kind: Kind, frame: Volume, noise: bool, thickness: float
 ) -> tuple[tuple[float, float, float], tuple[str, ...]]:
     """Return the working voxel of a scan in its own voxels (z, y, x), and notes; of `frame` only the place counts."""
     return _choose_scale(_Scan(kind, frame, False, None, noise, one_scale=False), thickness)

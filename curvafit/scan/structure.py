@@ -23,11 +23,10 @@ from skimage.filters import threshold_otsu
 
 from curvafit.core.checks import SEEDS, check_choice, check_float, check_int
 from curvafit.scan.grids import boxes_by_surface, centre_distance, resample, surface_voxels
-from curvafit.volumes.boxes import boxes_of
-from curvafit.volumes.field import Field, ScanError, round_labels
-from curvafit.volumes.formats.part import Box, Crop
+from curvafit.volumes.boxes import Box, Crop
 from curvafit.volumes.place import lay
-from curvafit.volumes.read import Source, field_of
+from curvafit.volumes.read import Source, load
+from curvafit.volumes.volume import ScanError, Volume, round_labels
 
 Kind = Literal["field", "mask", "image"]
 
@@ -73,7 +72,7 @@ _ROUNDED_VALUES = 4096
 
 
 def find_structure(
-    field: Field,
+    field: Volume,
     *,
     kind: Literal["auto", "field", "mask", "image"] = "auto",
     threshold: Literal["otsu"] | float = "otsu",
@@ -82,7 +81,7 @@ def find_structure(
     periodic: bool = False,
     extremes: tuple[float, float] | None = None,
     imaged: np.ndarray | None = None,
-) -> tuple[Kind, Field]:
+) -> tuple[Kind, Volume]:
     """Return the kind of a scan, and the scan as float32 values that are above 0 in its structure, with notes on how.
 
     The parameters are as in `prepare.prepare`; `extremes` are the lowest and highest value of the whole that `field` is
@@ -112,7 +111,7 @@ def find_structure(
         raise ScanError("expected a structure in the scan, got none: every voxel is background")
     if counted.all():
         raise ScanError("expected background in the scan, got none: every voxel is structure")
-    return seen, replace(field, values=values, notes=(*field.notes, note))
+    return seen, replace(field, array=values, notes=(*field.notes, note))
 
 
 def check_options(kind: str, threshold: float | str, label: int | None = None) -> None:
@@ -129,24 +128,24 @@ def check_options(kind: str, threshold: float | str, label: int | None = None) -
 
 
 def read_region(
-    roi: Source, field: Field, scan: Source | None = None, crop: Crop | None = None, **reading: Any
-) -> tuple[Field, tuple[str, ...]]:
+    roi: Source, field: Volume, scan: Source | None = None, crop: Crop | None = None, **reading: Any
+) -> tuple[Volume, tuple[str, ...]]:
     """Return a region of interest on the voxels of a field, and a note on how it was laid.
 
     A field that is a crop of a scan names that, and its reading: without a place, the region is cropped alike. Raises
     ScanError where the region is empty, and as `lay`.
     """
-    region, on = field_of(roi), field if crop is None or scan is None else boxes_of(scan, **reading).frame
+    region, on = load(roi), field if crop is None or scan is None else load(scan, **reading, lazy=True)
     if region.affine is not None and on.affine is not None:
         on, crop = field, None
     region, notes = lay(region, on, "the region of interest", "the scan")
     values = region.values if crop is None else region.crop(crop).values
     if not values.any():
         raise ScanError("expected a region of interest with voxels in it, got an empty one")
-    return replace(field, values=values, notes=notes), notes
+    return replace(field, array=values, notes=notes), notes
 
 
-def read_labels(labels: Field, what: str) -> np.ndarray:
+def read_labels(labels: Volume, what: str) -> np.ndarray:
     """Return a volume's labels, whole numbers (Z, Y, X); ScanError if all are 0, or the values are grey levels."""
     rounded = round_labels(labels.values)
     values = rounded.astype(np.int64) if rounded.dtype.kind == "f" else rounded
@@ -325,7 +324,7 @@ def describe_split(level: float, otsu: bool, dark: bool, lowest: float, highest:
 
 
 def _split_image(
-    field: Field, threshold: Literal["otsu"] | float, dark: bool, region: Any, periodic: bool, padding: Padding | None
+    field: Volume, threshold: Literal["otsu"] | float, dark: bool, region: Any, periodic: bool, padding: Padding | None
 ) -> tuple[np.ndarray, str]:
     """Return grey levels smoothed by one voxel of the finest axis, less the raw levels' threshold, and a note."""
     # Smoothing lowers thin structures' grey: a threshold of the smoothed levels would sink and make them fat.

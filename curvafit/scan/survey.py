@@ -8,10 +8,10 @@ There the thickness is measured that sets the working grid.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from skimage.filters import threshold_otsu
@@ -20,10 +20,8 @@ from curvafit.geometry.balls import ball_radii
 from curvafit.scan import prepare, structure
 from curvafit.scan.grids import MEASURED, candidate_boxes, order_boxes, surface_voxels, thickness_beneath
 from curvafit.scan.pieces import Finder, Found
-from curvafit.volumes.boxes import Boxes, boxes_of
-from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.formats.part import Box, cut_boxes, grow, within
-from curvafit.volumes.read import Source
+from curvafit.volumes.boxes import Box, cut_boxes, grow, within
+from curvafit.volumes.volume import ScanError, Volume
 
 #: Voxels that the first passes read at once.
 PIECE = 2**24
@@ -32,23 +30,18 @@ _MOST_LEVELS = 2**22
 
 
 @dataclass(frozen=True)
-class Volume:
-    """A volume (a path, which each process opens for itself, or boxes in memory), and what the caller says of it."""
+class Request:
+    """A volume, and what the caller says of it."""
 
-    source: Source | Boxes
-    reading: Mapping[str, Any]
+    volume: Volume
     label: int | None
     kind: Literal["auto", "field", "mask", "image"]
     threshold: Literal["otsu"] | float
     dark: bool
 
-    def open(self) -> Boxes:
-        """Return the boxes of the volume."""
-        return boxes_of(self.source, **self.reading)
-
-    def read(self, boxes: Boxes, box: Box) -> np.ndarray:
+    def read(self, box: Box) -> np.ndarray:
         """Return the values of a box; of a label, where it is."""
-        values = boxes.part(box)
+        values = self.volume.read(box)
         values = values if self.label is None else values == self.label
         return values.view(np.uint8) if values.dtype.kind == "b" else values
 
@@ -65,37 +58,16 @@ class Split:
     padding: structure.Padding | None = None
 
 
-class Place(NamedTuple):
-    """The shape of a volume, its spacing and unit, and where it came from."""
-
-    shape: tuple[int, int, int]
-    spacing: tuple[float, float, float]
-    unit: str
-    source: str
-    notes: tuple[str, ...]
-
-    @classmethod
-    def of(cls, frame: Field) -> Place:
-        """Return the place of a volume without its values."""
-        return cls(frame.shape, frame.spacing, frame.unit, frame.source, frame.notes)
-
-    @property
-    def frame(self) -> Field:
-        """Return the volume with zeros that take no memory."""
-        return Field(np.broadcast_to(np.uint8(0), self.shape), self.spacing, self.unit, None, self.source, self.notes)
-
-
 @dataclass(frozen=True)
 class Plan:
     """What the tiles of a volume have in common.
 
     `smallest` is the fewest voxels of a piece of an image's structure that is no speck, 0 where all pieces count; a
     working voxel has `scale` of the volume's voxels and the edge `edge`, and there are `working` along (z, y, x);
-    `reach` is the radius of the largest ball where the thickness was measured. Lengths are in `place.unit`.
+    `reach` is the radius of the largest ball where the thickness was measured. Lengths are in the volume's unit.
     """
 
-    volume: Volume
-    place: Place
+    request: Request
     split: Split
     noise: bool
     notes: tuple[str, ...]
@@ -107,80 +79,83 @@ class Plan:
     reach: float = 0.0
     working_notes: tuple[str, ...] = ()
 
-    def levels(self, boxes: Boxes, box: Box) -> np.ndarray:
+    @property
+    def volume(self) -> Volume:
+        """The volume that is measured."""
+        return self.request.volume
+
+    def levels(self, box: Box) -> np.ndarray:
         """Return a box of the volume as float32 values that are above 0 in its structure."""
-        return find_levels(self.volume, self.split, self.place, boxes, box)
+        return find_levels(self.request, self.split, box)
 
 
-def find_levels(volume: Volume, split: Split, place: Place, boxes: Boxes, box: Box) -> np.ndarray:
+def find_levels(request: Request, split: Split, box: Box) -> np.ndarray:
     """Return a box of a volume as float32 values that are above 0 in its structure, as `structure.find_structure`."""
     if split.kind == "image":
-        around = grow(box, structure.SMOOTHED, place.shape)
-        smooth = structure.smooth_levels(volume.read(boxes, around), place.spacing, padding=split.padding)
-        return structure.sign_levels(smooth[within(box, around)], split.level, volume.dark, split.padding)
-    values = volume.read(boxes, box)
+        around, volume = grow(box, structure.SMOOTHED, request.volume.shape), request.volume
+        smooth = structure.smooth_levels(request.read(around), volume.spacing, padding=split.padding)
+        return structure.sign_levels(smooth[within(box, around)], split.level, request.dark, split.padding)
+    values = request.read(box)
     if split.kind == "field":
-        return (-values if volume.dark else values).astype(np.float32)
+        return (-values if request.dark else values).astype(np.float32)
     mask = values == split.highest if split.two else values > 0
-    return np.where(mask != volume.dark, np.float32(1), np.float32(-1))
+    return np.where(mask != request.dark, np.float32(1), np.float32(-1))
 
 
-def survey(volume: Volume, find: Finder) -> Plan:
+def survey(request: Request, find: Finder) -> Plan:
     """Find what the tiles of a volume have in common; raise ScanError as `measure.measure`."""
-    boxes = volume.open()
-    place = Place.of(boxes.frame)
-    split, note = _find_split(volume, place, boxes.frame.values.dtype, find)
-    pieces = cut_boxes(place.shape, round(PIECE ** (1 / 3)))
-    total = _add(find("counting the structure", partial(_count_structure, volume, split, place, pieces), len(pieces)))
+    volume = request.volume
+    split, note = _find_split(request, find)
+    pieces = cut_boxes(volume.shape, round(PIECE ** (1 / 3)))
+    total = _add(find("counting the structure", partial(_count_structure, request, split, pieces), len(pieces)))
     if split.kind == "image":
-        otsu = volume.threshold == "otsu"
+        otsu = request.threshold == "otsu"
         ends = [float(e) for e in (total["lowest"], total["highest"])]
-        low, high = sorted(split.level - e for e in ends) if volume.dark else [split.level + e for e in ends]
-        note = structure.describe_split(split.level, otsu, volume.dark, low, high)
+        low, high = sorted(split.level - e for e in ends) if request.dark else [split.level + e for e in ends]
+        note = structure.describe_split(split.level, otsu, request.dark, low, high)
         note = " ".join([*structure.describe_padding(split.padding, otsu), note])
-    size, filled = math.prod(place.shape), int(total["filled"])
+    size, filled = math.prod(volume.shape), int(total["filled"])
     if filled in (0, size):
         what, other = ("background", "structure") if filled else ("a structure", "background")
         raise ScanError(f"expected {what} in the scan, got none: every voxel is {other}")
-    labelled = () if volume.label is None else (f"The structure is label {volume.label}.",)
-    noise = split.kind != "field" and structure.pairs_of_noise(place.shape, filled / size, total["pairs"])
-    plan = Plan(volume, place, split, noise, (*place.notes, *labelled, note))
+    labelled = () if request.label is None else (f"The structure is label {request.label}.",)
+    noise = split.kind != "field" and structure.pairs_of_noise(volume.shape, filled / size, total["pairs"])
+    plan = Plan(request, split, noise, (*volume.notes, *labelled, note))
     thinner = filled <= prepare.HALF * size
-    candidates = candidate_boxes(place.shape, MEASURED)
-    median, thick, plan = _measure_thickness(plan, boxes, order_boxes(candidates, total["surface"].tolist()), True)
+    candidates = candidate_boxes(volume.shape, MEASURED)
+    median, thick, plan = _measure_thickness(plan, order_boxes(candidates, total["surface"].tolist()), True)
     if split.kind == "image":
-        plan = replace(plan, smallest=prepare.smallest_piece(median) / math.prod(place.spacing))
+        plan = replace(plan, smallest=prepare.smallest_piece(median) / math.prod(volume.spacing))
     if not thinner:
         order = order_boxes(candidates, total["other surface"].tolist())
-        median, thick, plan = _measure_thickness(plan, boxes, order, False)
+        median, thick, plan = _measure_thickness(plan, order, False)
     return _choose_grid(plan, median, thick, "structure" if thinner else "background")
 
 
 def _choose_grid(plan: Plan, median: float, thick: float, name: str) -> Plan:
     """Return the plan with its working grid, as `prepare.prepare` chooses it."""
-    kind, place = plan.split.kind, plan.place
-    note = prepare.judge_thickness(name, median, thick, place.spacing, kind == "field" or plan.noise)
-    scale, why = prepare.choose_scale(kind, place.frame, plan.noise, median)
+    kind, volume = plan.split.kind, plan.volume
+    note = prepare.judge_thickness(name, median, thick, volume.spacing, kind == "field" or plan.noise)
+    scale, why = prepare.choose_scale(kind, volume, plan.noise, median)
     return replace(
         plan,
         thickness=median,
         scale=scale,
-        working=prepare.count_voxels(place.shape, scale) if min(place.shape) > 3 else (0, 0, 0),  # no curvature
-        edge=prepare.working_edge(scale, place.spacing),
+        working=prepare.count_voxels(volume.shape, scale) if min(volume.shape) > 3 else (0, 0, 0),  # no curvature
+        edge=prepare.working_edge(scale, volume.spacing),
         working_notes=(note, *why),
     )
 
 
-def _measure_thickness(plan: Plan, boxes: Boxes, order: Sequence[Box], inside: bool) -> tuple[float, float, Plan]:
+def _measure_thickness(plan: Plan, order: Sequence[Box], inside: bool) -> tuple[float, float, Plan]:
     """Return median and 95th percentile of a phase's thickness, as `grids.median_thickness`, and the plan's reach."""
-    place = plan.place
-    box = order[0]
-    around = grow(box, 1, place.shape)
-    mask = (plan.levels(boxes, around) > 0) == inside
+    spacing, box = plan.volume.spacing, order[0]
+    around = grow(box, 1, plan.volume.shape)
+    mask = (plan.levels(around) > 0) == inside
     part, surface = (each[within(box, around)] for each in (mask, surface_voxels(mask)))
-    median, thick = thickness_beneath(part, surface, place.spacing)
-    half = max(n * h for n, h in zip(part.shape, place.spacing, strict=True)) / 2
-    finite = [float(ball_radii(each, place.spacing, half).max()) for each in (part, ~part) if each.any()]
+    median, thick = thickness_beneath(part, surface, spacing)
+    half = max(n * h for n, h in zip(part.shape, spacing, strict=True)) / 2
+    finite = [float(ball_radii(each, spacing, half).max()) for each in (part, ~part) if each.any()]
     return median, thick, replace(plan, reach=max(plan.reach, *finite))
 
 
@@ -197,57 +172,58 @@ def _add(found: Iterable[Found]) -> dict[str, np.ndarray]:
 # ---- kind and threshold ----------------------------------------------------------------------------------------------
 
 
-def _find_split(volume: Volume, place: Place, dtype: np.dtype, find: Finder) -> tuple[Split, str]:
+def _find_split(request: Request, find: Finder) -> tuple[Split, str]:
     """Return how structure and background are split, and a note for fields and masks."""
-    side = max(1, math.isqrt(PIECE // place.shape[2]))
-    bars = cut_boxes(place.shape, (side, side, place.shape[2]))
-    value = volume.read(volume.open(), (slice(0, 1), slice(0, 1), slice(0, 1)))[0, 0, 0]
-    found = list(find("reading", partial(_look_at_values, volume, bars, value), len(bars)))
+    volume = request.volume
+    side = max(1, math.isqrt(PIECE // volume.shape[2]))
+    bars = cut_boxes(volume.shape, (side, side, volume.shape[2]))
+    value = request.read((slice(0, 1), slice(0, 1), slice(0, 1)))[0, 0, 0]
+    found = list(find("reading", partial(_look_at_values, request, bars, value), len(bars)))
     total = _add({name: each[name] for name in each if name not in ("two", "values")} for each in found)
     if faults := int(total["faults"]):
-        raise ScanError(f"a volume must be finite, got {faults} values that are not in {place.source}")
+        raise ScanError(f"a volume must be finite, got {faults} values that are not in {volume.source}")
     lowest, highest = total["lowest"], total["highest"]
     if lowest == highest:
-        if volume.label is not None:
-            raise ScanError(f"label {volume.label} is no label of the scan, or the only one")
-        raise ScanError(f"every voxel of {place.source} is {lowest}: a volume must vary")
+        if request.label is not None:
+            raise ScanError(f"label {request.label} is no label of the scan, or the only one")
+        raise ScanError(f"every voxel of {volume.source} is {lowest}: a volume must vary")
     ends = {float(lowest), float(highest)}
     two = all(bool(each["two"]) and {float(each["lowest"]), float(each["highest"])} <= ends for each in found)
-    kind, values = volume.kind, np.unique(np.concatenate([each["values"] for each in found]))
+    kind, values = request.kind, np.unique(np.concatenate([each["values"] for each in found]))
     if kind == "auto":
-        kind = "mask" if two or (volume.threshold == "otsu" and structure.are_labels(values)) else "image"
-        if kind == "image" and structure.may_be_field(dtype, volume.threshold, float(lowest), float(highest)):
+        kind = "mask" if two or (request.threshold == "otsu" and structure.are_labels(values)) else "image"
+        if kind == "image" and structure.may_be_field(volume.dtype, request.threshold, float(lowest), float(highest)):
             steady = 2 * total["steady"] > total["steps"] or not total["steps"]
-            kind = "field" if steady and total["plateau"] > structure.PLATEAUS * math.prod(place.shape) else "image"
+            kind = "field" if steady and total["plateau"] > structure.PLATEAUS * math.prod(volume.shape) else "image"
     split = Split(kind, float(lowest), float(highest), two)
     if kind == "field":
         return split, f"Taken for a phase field: values {float(lowest):.3g} to {float(highest):.3g}."
     if kind == "mask":
         note = f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}."
         return split, note if two else structure.SEVERAL
-    size = math.prod(place.shape)
-    return _split_image(volume, bars, split, total, value, size, find), ""
+    size = math.prod(volume.shape)
+    return _split_image(request, bars, split, total, value, size, find), ""
 
 
 def _split_image(
-    volume: Volume, bars: Sequence[Box], split: Split, total: Found, value: Any, size: int, find: Finder
+    request: Request, bars: Sequence[Box], split: Split, total: Found, value: Any, size: int, find: Finder
 ) -> Split:
     """Return the split with the padding and the threshold of an image of so many voxels, of which `total` is known."""
     left, ends = None, (total["lowest"], total["highest"])
     if total["constant"] > structure.PADDED * size:
-        counted = _add(find("looking for padding", partial(_count_padding, volume, bars, value), len(bars)))
+        counted = _add(find("looking for padding", partial(_count_padding, request, bars, value), len(bars)))
         split = replace(split, padding=structure.judge_padding(value, counted["padding"]))
         if split.padding is not None and split.padding.sure:
             left, ends = split.padding.value, (counted["lowest"], counted["highest"])
-    if volume.threshold != "otsu":
-        return replace(split, level=float(volume.threshold))
-    return replace(split, level=_find_threshold(volume, bars, *ends, left, find))
+    if request.threshold != "otsu":
+        return replace(split, level=float(request.threshold))
+    return replace(split, level=_find_threshold(request, bars, *ends, left, find))
 
 
-def _look_at_values(volume: Volume, bars: Sequence[Box], value: Any, number: int) -> Found:
+def _look_at_values(request: Request, bars: Sequence[Box], value: Any, number: int) -> Found:
     """Return the extremes of a bar, how many voxels have a value, whether it has two values at most, and what tells
     labels and a phase field."""
-    values = volume.read(volume.open(), bars[number])
+    values = request.read(bars[number])
     lowest, highest = values.min(), values.max()
     found = {"lowest": lowest, "highest": highest, "two": np.all((values == lowest) | (values == highest))}
     found["values"] = np.array([lowest, highest]) if found["two"] else structure.list_values(values)
@@ -255,22 +231,22 @@ def _look_at_values(volume: Volume, bars: Sequence[Box], value: Any, number: int
     if values.dtype.kind != "f":
         return {**found, "faults": np.int64(0)}
     found["faults"] = np.int64(values.size - np.count_nonzero(np.isfinite(values)))
-    if volume.kind == "auto" and not found["faults"] and lowest >= -2 and highest <= 2:
+    if request.kind == "auto" and not found["faults"] and lowest >= -2 and highest <= 2:
         steps = np.abs(np.diff(values, 3, axis=2)) if values.shape[2] > 3 else np.empty(0)
         found |= {"steady": np.count_nonzero(steps < structure.JITTER), "steps": np.int64(steps.size)}
         found["plateau"] = np.count_nonzero(np.abs(values) > structure.PLATEAU)
     return {name: np.asarray(value) for name, value in found.items()}
 
 
-def _count_padding(volume: Volume, bars: Sequence[Box], value: Any, number: int) -> Found:
+def _count_padding(request: Request, bars: Sequence[Box], value: Any, number: int) -> Found:
     """Return what tells padding with a value in a bar, and the extremes of the other values."""
-    values = volume.read(volume.open(), bars[number])
+    values = request.read(bars[number])
     found, others = {"padding": structure.count_constant(values, value)}, values[values != value]
     return found | {"lowest": others.min(), "highest": others.max()} if others.size else found
 
 
 def _find_threshold(
-    volume: Volume, bars: Sequence[Box], lowest: Any, highest: Any, left: float | None, find: Finder
+    request: Request, bars: Sequence[Box], lowest: Any, highest: Any, left: float | None, find: Finder
 ) -> float:
     """Return the threshold of grey levels but one that is left out, as `structure.find_structure` finds it."""
     lowest, highest = lowest[()], highest[()]
@@ -278,7 +254,7 @@ def _find_threshold(
     if whole and int(highest) - int(lowest) >= _MOST_LEVELS:
         raise ScanError(f"expected at most {_MOST_LEVELS} grey levels, got {lowest} to {highest}: give a threshold")
     name = "finding the threshold"
-    counts = _add(find(name, partial(_count_levels, volume, bars, lowest, highest, left), len(bars)))["counts"]
+    counts = _add(find(name, partial(_count_levels, request, bars, lowest, highest, left), len(bars)))["counts"]
     if whole:
         centres = np.arange(int(lowest), int(highest) + 1)
         high = centres > threshold_otsu(hist=(counts, centres))
@@ -286,29 +262,29 @@ def _find_threshold(
         return float(sum(means)) / 2
     edges = np.histogram_bin_edges(np.empty(0, lowest.dtype), 256, (lowest, highest))
     otsu = threshold_otsu(hist=(counts, (edges[1:] + edges[:-1]) / 2))
-    sums = _add(find(f"{name}'s sides", partial(_sum_sides, volume, bars, otsu, left), len(bars)))["sums"]
+    sums = _add(find(f"{name}'s sides", partial(_sum_sides, request, bars, otsu, left), len(bars)))["sums"]
     return float(sums[0, 1] / sums[0, 0] + sums[1, 1] / sums[1, 0]) / 2
 
 
-def _levels(volume: Volume, box: Box, left: float | None) -> np.ndarray:
+def _levels(request: Request, box: Box, left: float | None) -> np.ndarray:
     """Return the values of a box, without those that are left out."""
-    values = volume.read(volume.open(), box).ravel()
+    values = request.read(box).ravel()
     return values if left is None else values[values != left]
 
 
 def _count_levels(
-    volume: Volume, bars: Sequence[Box], lowest: Any, highest: Any, left: float | None, number: int
+    request: Request, bars: Sequence[Box], lowest: Any, highest: Any, left: float | None, number: int
 ) -> Found:
     """Return a histogram of a bar: of each whole number, or of 256 bins."""
-    values = _levels(volume, bars[number], left)
+    values = _levels(request, bars[number], left)
     if values.dtype.kind not in "iu":
         return {"counts": np.histogram(values, 256, (lowest, highest))[0]}
     return {"counts": np.bincount(values.astype(np.int64) - int(lowest), minlength=int(highest) - int(lowest) + 1)}
 
 
-def _sum_sides(volume: Volume, bars: Sequence[Box], level: float, left: float | None, number: int) -> Found:
+def _sum_sides(request: Request, bars: Sequence[Box], level: float, left: float | None, number: int) -> Found:
     """Return the numbers and sums of the values above a level, and of the others."""
-    values = _levels(volume, bars[number], left)
+    values = _levels(request, bars[number], left)
     high = values > level
     sides = [(values[side].size, values[side].sum(dtype=np.float64)) for side in (high, ~high)]
     return {"sums": np.array(sides, dtype=np.float64)}
@@ -317,21 +293,21 @@ def _sum_sides(volume: Volume, bars: Sequence[Box], level: float, left: float | 
 # ---- structure -------------------------------------------------------------------------------------------------------
 
 
-def _count_structure(volume: Volume, split: Split, place: Place, pieces: Sequence[Box], number: int) -> Found:
+def _count_structure(request: Request, split: Split, pieces: Sequence[Box], number: int) -> Found:
     """Return the structure's voxels in a piece, its surface in boxes that may be measured, and `count_pairs`."""
-    core = pieces[number]
-    box = grow(core, max(structure.LAGS), place.shape)
-    levels = find_levels(volume, split, place, volume.open(), box)
+    core, shape = pieces[number], request.volume.shape
+    box = grow(core, max(structure.LAGS), shape)
+    levels = find_levels(request, split, box)
     inner = within(core, box)
     found = {"lowest": levels[inner].min(), "highest": levels[inner].max()}
     mask = levels > 0
     found["filled"] = np.int64(np.count_nonzero(mask[inner]))
     for name, phase in (("surface", mask), ("other surface", ~mask)):
         surface = surface_voxels(phase)[inner]
-        shared = [_overlap(core, each) for each in candidate_boxes(place.shape, MEASURED)]
+        shared = [_overlap(core, each) for each in candidate_boxes(shape, MEASURED)]
         counts = [0 if each is None else np.count_nonzero(surface[within(each, core)]) for each in shared]
         found[name] = np.array(counts, dtype=np.int64)
-    found["pairs"] = structure.count_pairs(mask, inner, core, place.shape)
+    found["pairs"] = structure.count_pairs(mask, inner, core, shape)
     return {name: np.asarray(value) for name, value in found.items()}
 
 

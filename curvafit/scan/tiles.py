@@ -8,7 +8,6 @@ faces. So a scan in tiles has the numbers of the scan in one piece.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -35,11 +34,10 @@ from curvafit.scan.measure import Blocks, Measures
 from curvafit.scan.pieces import Found, open_finder
 from curvafit.scan.prepare import DROPPED, LARGEST_BOX, Prepared, TooLarge, note_on_filling, smallest_piece
 from curvafit.scan.structure import check_options
-from curvafit.scan.survey import Plan, Volume, survey
-from curvafit.volumes.boxes import Boxes, InFile, InMemory, boxes_of
-from curvafit.volumes.field import ScanError
-from curvafit.volumes.formats.part import Box, cut_boxes, grow, within
-from curvafit.volumes.read import Source, field_of
+from curvafit.scan.survey import Plan, Request, survey
+from curvafit.volumes.boxes import Box, cut_boxes, grow, within
+from curvafit.volumes.read import Source, load
+from curvafit.volumes.volume import ScanError
 
 #: Radius, in voxels of the finest axis, from which balls are painted on a coarser grid, and the largest ball's.
 COARSE, WIDEST = 24, 48
@@ -72,7 +70,7 @@ def measure(
 ) -> Measures:
     """Measure the structure in a scan of any size, with an interval for each number.
 
-    Volume fraction, thickness, spacing, connectivity, surface and fabric are those of the structure on the scan's own
+    Request fraction, thickness, spacing, connectivity, surface and fabric are those of the structure on the scan's own
     voxels, all of them. Curvature is that of the scan on the working grid, as `infer` reads it. Intervals are 95 %, by
     a jackknife over blocks of a period (thickness and spacing) of the structure (`errors`); a scan with fewer than
     eight has none. A stack of under ten slices may have no curvature (NaN, and a note). A scan with a side of more than
@@ -84,7 +82,7 @@ def measure(
     Parameters
     ----------
     scan
-        The path of a file, a `Field`, or an array or tensor (Z, Y, X).
+        The path of a file, a `Volume`, or an array or tensor (Z, Y, X).
     kind, periodic, threshold, dark
         As in `infer`.
     roi
@@ -109,17 +107,16 @@ def measure(
             raise ValueError("a scan with a region or a periodic one is measured in one piece: leave out tile")
         return whole.measure(scan, periodic=periodic, roi=roi, progress=progress, **options, **reading)  # type: ignore[arg-type]
     label = reading.pop("label", None)
-    boxes = boxes_of(scan, **reading)
-    if tile is None and max(boxes.frame.shape) <= LARGEST_BOX:
-        field = boxes.field if isinstance(boxes, InMemory) else field_of(scan, **reading)
-        field = field if label is None else field.label(label)
+    volume = load(scan, **reading, lazy=True)
+    if tile is None and max(volume.shape) <= LARGEST_BOX:
+        field = volume.load() if label is None else volume.load().label(label)
         how = {"threshold": threshold, "dark": dark, "periodic": False}
         with suppress(TooLarge):
             maps = whole.measure_maps(field, kind, how, progress, LARGEST_BOX**3)
             return whole.summarise(field, maps, maps.divide())
-    path = isinstance(boxes, InFile) and isinstance(scan, str | PathLike)
-    volume = Volume(os.fspath(scan) if path else boxes, reading if path else {}, label, **options)  # type: ignore[arg-type]
-    return measure_tiles(volume, edge=tile, workers=workers if path else None, store=store, progress=progress)
+    request = Request(volume, label, **options)  # type: ignore[arg-type]
+    workers = workers if volume.in_file else None
+    return measure_tiles(request, edge=tile, workers=workers, store=store, progress=progress)
 
 
 @dataclass(frozen=True)
@@ -141,12 +138,12 @@ class Tiling:
     @property
     def shape(self) -> tuple[int, int, int]:
         """Return the shape of the volume."""
-        return self.plan.place.shape
+        return self.plan.volume.shape
 
     def describe(self, processes: int) -> str:
         """Return how many tiles there are, and how much memory they take at most, as a sentence."""
         sides = " x ".join(str(max(core[axis].stop - core[axis].start for core in self.cores)) for axis in range(3))
-        spacing = self.plan.place.spacing
+        spacing = self.plan.volume.spacing
         reach = _reach(self.plan.reach, min(spacing))
         most = 0
         for core in self.cores:
@@ -159,9 +156,9 @@ class Tiling:
 
 def _choose_edges(plan: Plan) -> tuple[int, ...]:
     """Return the edges of tiles that are `LARGEST_TILE` voxels with their surroundings, on both grids."""
-    side, finest = round(LARGEST_TILE ** (1 / 3)), min(plan.place.spacing)
+    side, finest = round(LARGEST_TILE ** (1 / 3)), min(plan.volume.spacing)
     edges = []
-    for n, h, scale in zip(plan.place.shape, plan.place.spacing, plan.scale, strict=True):
+    for n, h, scale in zip(plan.volume.shape, plan.volume.spacing, plan.scale, strict=True):
         most = side - 2 * math.ceil(_reach(plan.reach, finest) / h)
         most = max(SHORTEST, min(most, int((side - 2 * HALO) * scale)))
         edges.append(math.ceil(n / math.ceil(n / most)))
@@ -178,11 +175,11 @@ def _reach(radius: float, edge: float) -> float:
 
 def measure_tile(tiling: Tiling, number: int) -> Found:
     """Return the sums over a tile's core, on the rows of the finest division that it touches, and what else adds up."""
-    plan, core, boxes = tiling.plan, tiling.cores[number], tiling.plan.volume.open()
+    plan, core = tiling.plan, tiling.cores[number]
     sums = _Sums(tiling.finest, core)
-    balls = _measure_balls(plan, boxes, core, tiling.factors)
+    balls = _measure_balls(plan, core, tiling.factors)
     mask, inner = balls.mask, within(core, balls.box)
-    voxel = math.prod(plan.place.spacing)
+    voxel = math.prod(plan.volume.spacing)
     sums.add("volume", np.ones(mask[inner].shape, dtype=bool), voxel)
     sums.add("inside", mask[inner], voxel)
     sums.add_thickness(balls.thickness, voxel)
@@ -196,15 +193,15 @@ def measure_tile(tiling: Tiling, number: int) -> Found:
     if with_surface is not None:
         sums.gather("area", *with_surface)
     del mask, balls
-    found |= _measure_curvature(plan, boxes, core, sums)
+    found |= _measure_curvature(plan, core, sums)
     return {**found, **sums.rows}
 
 
 def _measure_wide(tiling: Tiling, number: int) -> Found:
     """Return the sums over a tile's core that balls on a coarser grid change."""
     plan, core = tiling.plan, tiling.cores[number]
-    sums, balls = _Sums(tiling.finest, core), _measure_balls(plan, plan.volume.open(), core, tiling.factors)
-    sums.add_thickness(balls.thickness, math.prod(plan.place.spacing), *(factor > 1 for factor in tiling.factors))
+    sums, balls = _Sums(tiling.finest, core), _measure_balls(plan, core, tiling.factors)
+    sums.add_thickness(balls.thickness, math.prod(plan.volume.spacing), *(factor > 1 for factor in tiling.factors))
     return sums.rows
 
 
@@ -260,13 +257,13 @@ class _Balls:
     wide: tuple[int, int]
 
 
-def _measure_balls(plan: Plan, boxes: Boxes, core: Box, factors: tuple[int, int]) -> _Balls:
+def _measure_balls(plan: Plan, core: Box, factors: tuple[int, int]) -> _Balls:
     """Measure the thickness of both phases on a core, from as much around it as its balls reach; it is left out (0)
     where balls are wider than `COARSE` and yet to be painted on the finer grid."""
-    spacing, finest = plan.place.spacing, min(plan.place.spacing)
+    spacing, finest = plan.volume.spacing, min(plan.volume.spacing)
     reach = min(_reach(plan.reach, finest), _reach(WIDEST * finest, finest))
     while True:
-        box, mask, pieces = _find_structure(plan, boxes, core, reach)
+        box, mask, pieces = _find_structure(plan, core, reach)
         inner = within(core, box)
         radii = [ball_radii(phase, spacing, WIDEST * finest) for phase in (mask, ~mask)]
         largest = [reaching_radius(radius, spacing, inner) for radius in radii]
@@ -288,18 +285,18 @@ def _measure_balls(plan: Plan, boxes: Boxes, core: Box, factors: tuple[int, int]
     return _Balls(box, mask, pieces, tuple(thickness), tuple(widest), tuple(wide))  # type: ignore[arg-type]
 
 
-def _find_structure(plan: Plan, boxes: Boxes, core: Box, reach: float) -> tuple[Box, np.ndarray, tuple[int, int]]:
+def _find_structure(plan: Plan, core: Box, reach: float) -> tuple[Box, np.ndarray, tuple[int, int]]:
     """Return a box around a core, the structure there, and how many specks and pinholes were dropped."""
     least = 2 * SOFTENED + 2
-    around = grow(core, [max(math.ceil(reach / h), least) for h in plan.place.spacing], plan.place.shape)
+    around = grow(core, [max(math.ceil(reach / h), least) for h in plan.volume.spacing], plan.volume.shape)
     # a coarser grid begins with the volume: boxes begin and end where two voxels of it meet
     z, y, x = (
-        slice(e.start // 2 * 2, min(-(-e.stop // 2) * 2, n)) for e, n in zip(around, plan.place.shape, strict=True)
+        slice(e.start // 2 * 2, min(-(-e.stop // 2) * 2, n)) for e, n in zip(around, plan.volume.shape, strict=True)
     )
     box, pieces = (z, y, x), (0, 0)
-    mask = plan.levels(boxes, box) > 0
+    mask = plan.levels(box) > 0
     if plan.smallest:
-        mask, *pieces = remove_specks(mask, plan.smallest, False, _cut_out(core, box, plan.place.shape))
+        mask, *pieces = remove_specks(mask, plan.smallest, False, _cut_out(core, box, plan.volume.shape))
     return box, mask, tuple(pieces)  # type: ignore[return-value]
 
 
@@ -314,7 +311,7 @@ def _cut_out(core: Box, box: Box, shape: Sequence[int]) -> CutOut:
 def _measure_surface(plan: Plan, mask: np.ndarray, box: Box, core: Box) -> tuple[np.ndarray, np.ndarray] | None:
     """Return places and columns, as `measure.measure_surface`, of the cells that begin in a core; None if there are
     none."""
-    shape, spacing = plan.place.shape, plan.place.spacing
+    shape, spacing = plan.volume.shape, plan.volume.spacing
     own = [(edge.start, min(edge.stop, n - 1)) for edge, n in zip(core, shape, strict=True)]
     if any(start >= stop for start, stop in own):
         return None
@@ -342,20 +339,20 @@ def _find_own(places: np.ndarray, own: Sequence[tuple[int, int]], wide: Sequence
 def _around(plan: Plan, core: Box) -> tuple[Box, Box]:
     """Return the working voxels that a core's curvature depends on, and those of the core."""
     owned = []
-    for edge, n, scale, count in zip(core, plan.place.shape, plan.scale, plan.working, strict=True):
+    for edge, n, scale, count in zip(core, plan.volume.shape, plan.scale, plan.working, strict=True):
         start, stop = (count if at == n else min(count, round(at / scale)) for at in (edge.start, edge.stop))
         owned.append(slice(start, stop))
     z, y, x = owned
     return grow((z, y, x), HALO, plan.working), (z, y, x)
 
 
-def _measure_curvature(plan: Plan, boxes: Boxes, core: Box, sums: _Sums) -> Found:
+def _measure_curvature(plan: Plan, core: Box, sums: _Sums) -> Found:
     """Sum the curvatures in the working cells that begin in a core; return the bins of the diagram and other counts."""
     box, owned = _around(plan, core)
     found: dict[str, Any] = {"specks": np.zeros(2, np.int64), "changed": np.int64(0), "filled": np.int64(0)}
     if min(plan.working) < whole.FEWEST_SLICES or any(edge.start >= edge.stop for edge in owned):
         return found
-    values = _find_working_levels(plan, boxes, box)
+    values = _find_working_levels(plan, box)
     mask, inner = values > 0, within(owned, box)
     if plan.split.kind != "field":
         smallest, cut = smallest_piece(plan.thickness / plan.edge), _cut_out(owned, box, plan.working)
@@ -386,20 +383,20 @@ def _measure_curvature(plan: Plan, boxes: Boxes, core: Box, sums: _Sums) -> Foun
     return {**found, **_bin(plan, drawn, kept)}
 
 
-def _find_working_levels(plan: Plan, boxes: Boxes, box: Box) -> np.ndarray:
+def _find_working_levels(plan: Plan, box: Box) -> np.ndarray:
     """Return values that are above 0 in the structure on a box of the working grid, as `prepare.prepare` makes them."""
     if plan.scale == (1.0, 1.0, 1.0):
-        return plan.levels(boxes, box)
-    place = plan.place
+        return plan.levels(box)
+    volume = plan.volume
     ends = [(math.floor(e.start * s), math.ceil(e.stop * s)) for e, s in zip(box, plan.scale, strict=True)]
-    z, y, x = (slice(min(a, n), min(b, n)) for (a, b), n in zip(ends, place.shape, strict=True))
+    z, y, x = (slice(min(a, n), min(b, n)) for (a, b), n in zip(ends, volume.shape, strict=True))
     blurred = [math.ceil(4 * max(0.0, (s - 1) / 2)) + 2 for s in plan.scale]
-    limit = 4 * max(max(s * h, h) for s, h in zip(plan.scale, place.spacing, strict=True))
-    far = [math.ceil(limit / h) + 1 for h in place.spacing] if plan.split.kind == "mask" else [0] * 3
-    around = grow((z, y, x), [a + b for a, b in zip(blurred, far, strict=True)], place.shape)
-    values = plan.levels(boxes, around)
+    limit = 4 * max(max(s * h, h) for s, h in zip(plan.scale, volume.spacing, strict=True))
+    far = [math.ceil(limit / h) + 1 for h in volume.spacing] if plan.split.kind == "mask" else [0] * 3
+    around = grow((z, y, x), [a + b for a, b in zip(blurred, far, strict=True)], volume.shape)
+    values = plan.levels(around)
     if plan.split.kind == "mask":
-        values = centre_distance(values > 0, place.spacing, limit)
+        values = centre_distance(values > 0, volume.spacing, limit)
     start, shape = [edge.start for edge in box], [edge.stop - edge.start for edge in box]
     return resample(values, plan.scale, start, shape, corner=[edge.start for edge in around])
 
@@ -408,7 +405,7 @@ def _prepare_part(plan: Plan, phase: np.ndarray, mask: np.ndarray, part: Box) ->
     """Return a part of the working grid as if it were a scan of its own, at its place in the volume."""
     phase, grid = np.ascontiguousarray(phase, dtype=np.float32), Grid(phase.shape, boundary="replicate")  # type: ignore[arg-type]
     z, y, x = (slice(0, n) for n in phase.shape)
-    size = (plan.scale, plan.edge, plan.place.unit, plan.thickness / plan.edge)
+    size = (plan.scale, plan.edge, plan.volume.unit, plan.thickness / plan.edge)
     origin = tuple(edge.start * s for edge, s in zip(part, plan.scale, strict=True))
     return Prepared(plan.split.kind, phase, mask, grid, *size, ((z, y, x),), (), origin)  # type: ignore[arg-type]
 
@@ -431,7 +428,7 @@ def _bin(plan: Plan, drawn: Diagram, kept: np.ndarray) -> Found:
 
 
 def measure_tiles(
-    volume: Volume,
+    request: Request,
     *,
     edge: int | None = None,
     workers: Workers | int | None = None,
@@ -439,16 +436,15 @@ def measure_tiles(
     progress: Progress = silent,
 ) -> Measures:
     """Measure a volume in tiles of `edge` voxels a side, as `measure` says; raise as it does."""
-    digest = volume.open().digest
-    run = {"scan": digest, "label": volume.label, "kind": volume.kind, "threshold": volume.threshold}
-    run |= {"dark": volume.dark, "tile": edge}
+    run = {"scan": request.volume.digest, "label": request.label, "kind": request.kind, "threshold": request.threshold}
+    run |= {"dark": request.dark, "tile": edge}
     with open_finder(workers, store, run, progress, {_FIRST: 0.95, _AGAIN: 1.0}) as find, one_thread():
-        plan = survey(volume, find)
-        tiling = Tiling(plan, tuple(cut_boxes(plan.place.shape, edge or _choose_edges(plan))))
+        plan = survey(request, find)
+        tiling = Tiling(plan, tuple(cut_boxes(plan.volume.shape, edge or _choose_edges(plan))))
         stated = tiling.describe(find.processes)
         found = list(find(_FIRST, partial(measure_tile, tiling), len(tiling.cores), stated))
         # the factors that `morphometry.local_thickness` chooses
-        widest, finest = np.max([each["widest"] for each in found], axis=0), min(plan.place.spacing)
+        widest, finest = np.max([each["widest"] for each in found], axis=0), min(plan.volume.spacing)
         wide = replace(tiling, factors=tuple(max(1, math.ceil(each / finest / COARSE)) for each in widest))
         again: list[Found] = []
         if max(wide.factors) > 1:
@@ -474,13 +470,13 @@ def _summarise(tiling: Tiling, found: Sequence[Found], again: Sequence[Found], s
     if not curved and min(shape) >= whole.FEWEST_SLICES:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
     period = total["thickness"] / total["inside"] + total["gap"] / (total["volume"] - total["inside"])
-    blocks = Blocks.divide(shape, plan.place.spacing, period)
+    blocks = Blocks.divide(shape, plan.volume.spacing, period)
     χ = float(sum(each["euler"] for each in found))
-    sampled = math.prod(max(n - 1, 1) for n in shape) * math.prod(plan.place.spacing)
-    drawn, why = (_draw(plan, found), ()) if curved else whole.no_curvature(plan.place.unit, whole.TOO_THIN)[1:]
+    sampled = math.prod(max(n - 1, 1) for n in shape) * math.prod(plan.volume.spacing)
+    drawn, why = (_draw(plan, found), ()) if curved else whole.no_curvature(plan.volume.unit, whole.TOO_THIN)[1:]
     notes = (*_notes(tiling, found), *why, f"Measured in {stated[0].lower()}{stated[1:]}")
     table, connectivity = _merge(table, finest, blocks), (χ, (1 - χ) / sampled)
-    return whole.summarise_sums(plan.place.frame, plan.split.kind, blocks, table, connectivity, drawn, notes)
+    return whole.summarise_sums(plan.volume, plan.split.kind, blocks, table, connectivity, drawn, notes)
 
 
 def _merge(table: np.ndarray, finest: Blocks, blocks: Blocks) -> np.ndarray:
@@ -501,20 +497,20 @@ def _draw(plan: Plan, found: Sequence[Found]) -> Diagram:
     points = np.stack([κ1, κ2], axis=1) / area[:, None]
     spread = max(float((square - area * (points**2).sum(1)).sum() / area.sum()), 0.0)
     lost = float(sum(each["lost"] for each in parts)) / float(area.sum())
-    return Diagram(points, area, f"1/{plan.place.unit}", math.sqrt(spread), lost)
+    return Diagram(points, area, f"1/{plan.volume.unit}", math.sqrt(spread), lost)
 
 
 def _notes(tiling: Tiling, found: Sequence[Found]) -> tuple[str, ...]:
     """Return notes on how a volume was measured, as `measure.measure` gives them."""
     plan = tiling.plan
-    notes = [f"{format_sampling(plan.place.shape, plan.place.spacing, plan.place.unit)}.", *plan.notes]
+    notes = [f"{format_sampling(plan.volume.shape, plan.volume.spacing, plan.volume.unit)}.", *plan.notes]
     specks, holes = (int(n) for n in np.sum([each["pieces"] for each in found], axis=0))
     if specks or holes:
         notes.append(DROPPED.format(specks, holes))
     wide = np.sum([each["wide"] for each in found], axis=0)
     for name, count in zip(("structure", "background"), wide, strict=True):
         if count:
-            share = f"around {count / math.prod(plan.place.shape):.2g} of the voxels, in the {name}"
+            share = f"around {count / math.prod(plan.volume.shape):.2g} of the voxels, in the {name}"
             notes.append(f"Balls wider than {2 * WIDEST} voxels count as that wide: {share}.")
     working, count = [*plan.working_notes], max(1, math.prod(plan.working))
     specks, holes = (int(n) for n in np.sum([each["specks"] for each in found], axis=0))

@@ -25,7 +25,7 @@ from curvafit.core.runtime import Progress, silent
 from curvafit.core.workers import Workers
 from curvafit.scan.pieces import Finder, Found, open_finder
 from curvafit.scan.prepare import LARGEST_BOX
-from curvafit.scan.survey import Volume
+from curvafit.scan.survey import Request
 from curvafit.segmentation.filler import (
     REACH,
     SLOPE,
@@ -74,9 +74,7 @@ from curvafit.segmentation.uncertainty import (
     share_by_slices,
     suggest_slices,
 )
-from curvafit.volumes.boxes import InFile, boxes_of
-from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.formats.part import Box, cut_boxes
+from curvafit.volumes.boxes import Box, cut_boxes
 from curvafit.volumes.formats.zarr import (
     CHUNK,
     cores_of,
@@ -88,6 +86,8 @@ from curvafit.volumes.formats.zarr import (
     open_zarr,
     version_of,
 )
+from curvafit.volumes.read import load
+from curvafit.volumes.volume import ScanError, Volume
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -173,20 +173,19 @@ def reconstruct_file(
     target, axis = Path(path), check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
     own: list[str | Path] = [str(source), *map(str, inputs)]
     check_mask_target(target, None, own, overwrite, maps=["probability"])
-    boxes = boxes_of(source, **reading)
-    frame, in_file = boxes.frame, isinstance(boxes, InFile)
+    frame = load(source, **reading, lazy=True)
     check_mask_target(target, frame, own, overwrite, maps=["probability"])
-    volume = Volume(str(source) if in_file else boxes, reading if in_file else {}, label, "mask", "otsu", dark=False)
+    request = Request(frame, label, "mask", "otsu", dark=False)
     folder = Path(store) if store is not None else hidden_store(target)
     shape, names = turn_axes(frame.shape, axis), (target.name, map_path(target, "probability").name)
-    thick = min(THICK, max(1, SLAB // (shape[1] * shape[2] * frame.values.dtype.itemsize)))
-    job = Job(volume, axis, shape, turn_axes(frame.spacing, axis), frame.unit, (), folder, *names, thick)
+    thick = min(THICK, max(1, SLAB // (shape[1] * shape[2] * frame.dtype.itemsize)))
+    job = Job(request, axis, shape, turn_axes(frame.spacing, axis), frame.unit, (), folder, *names, thick)
     places = None if every is None and known is None else known_places(job.shape[0], every, first, known)
     check_int(suggest, "a number of slices from 0", 0, job.shape[0] - len(places or ()))
     width, tile, taught = choose_epsilon(frame, epsilon), check_edge(tile), Taught.load(filler)
-    run = {"labels": boxes.digest, "label": label, "every": every, "first": first, "known": known, "axis": axis}
+    run = {"labels": frame.digest, "label": label, "every": every, "first": first, "known": known, "axis": axis}
     run |= {"filler": taught.digest, "tile": tile}
-    with open_finder(workers if in_file else None, folder, run, progress, _ENDS) as find:
+    with open_finder(workers if frame.in_file else None, folder, run, progress, _ENDS) as find:
         which: tuple[str, ...] = ()
         if places is None:
             looked = find(_LOOK, partial(look_at_slab, job), job.slabs)
@@ -232,7 +231,7 @@ class Job:
     Known slices at `places`, mask and probability are written into `folder`; `thick` slices are read at once. `pixel`
     is the edge of the network's pixels, `edges` are the voxels of a block along each axis, whole chunks of `chunk`."""
 
-    volume: Volume
+    request: Request
     axis: int
     shape: tuple[int, int, int]
     spacing: tuple[float, float, float]
@@ -256,7 +255,7 @@ class Job:
         """Return the numbers of the slices of a slab, and their values (n, Y, X)."""
         rows = slice(number * self.thick, min((number + 1) * self.thick, self.shape[0]))
         box = self.turn_back((rows, slice(0, self.shape[1]), slice(0, self.shape[2])))
-        values = self.volume.read(self.volume.open(), box)
+        values = self.request.read(box)
         if values.dtype.kind == "f" and (faults := np.count_nonzero(~np.isfinite(values))):
             raise ScanError(f"a volume must be finite, got {faults} values that are not")
         return rows, np.moveaxis(values, self.axis, 0)
@@ -299,7 +298,7 @@ class Job:
         named = " x ".join(map(str, sides))
         return f"{len(self.cores)} blocks of {named} voxels, in about {total / 1e9:.2g} GB of memory."
 
-    def create(self, frame: Field, target: Path) -> None:
+    def create(self, frame: Volume, target: Path) -> None:
         """Create the stores of mask and probability, where an earlier run did not."""
         image = image_of(target)
         version = "0.5" if image is None else version_of(image) or ""
@@ -315,7 +314,7 @@ class Job:
         """Write a core of the finest level of a store."""
         level_of(open_zarr(self.folder / name), 0)[self.turn_back(core)] = np.moveaxis(values, 0, self.axis)
 
-    def draw(self, unsure: Sequence[np.ndarray], frame: Field) -> Figure:
+    def draw(self, unsure: Sequence[np.ndarray], frame: Volume) -> Figure:
         """Draw the most uncertain slices across each axis, given the entropy of all slices across the job's axes."""
         from curvafit.drawing.plot import THIN, Sections, draw_sections, grey_limits
 

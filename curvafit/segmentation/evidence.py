@@ -11,6 +11,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,9 @@ from scipy import ndimage
 from scipy.special import expit
 from skimage.filters import threshold_otsu
 
-from curvafit.volumes.boxes import Boxes, digest_of, subsample
-from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.formats.part import Box, Crop
-from curvafit.volumes.read import Source, field_of, place_of
+from curvafit.volumes.boxes import Box, Crop, cut_boxes
+from curvafit.volumes.read import Source, load
+from curvafit.volumes.volume import ScanError, Volume, digest_of
 
 #: Percentiles to which grey levels are clipped for Otsu's threshold.
 TAILS = (0.1, 99.9)
@@ -37,6 +37,8 @@ FAINT = 1.0
 #: Contrast, in units of the noise, below which classes are measured again; voxels from the surface at which that is
 #: done, and the fewest voxels of a class there.
 OVERLAP, DEEP, FEWEST = 0.5, 2, 100
+#: A sample has at most so many runs of neighbouring voxels along each axis, each so long.
+RUNS, LONG = 4, 64
 #: Endings of an image beside an NPZ file of the same name, which says where the voxels are.
 IMAGES = (".nii.gz", ".nii", ".nrrd", ".mha", ".mhd", ".tif", ".tiff")
 
@@ -88,19 +90,21 @@ class GreyEvidence:
     """The evidence of a scan of grey levels, computed box by box: levels are clipped to `bounds`; the first guess is by
     the classes `first`, and what a level says by the `classes`."""
 
-    boxes: Boxes
+    volume: Volume
     bounds: tuple[float, float]
     first: Classes
     classes: Classes
 
     @classmethod
-    def of(cls, boxes: Boxes, threshold: float | str = "otsu", dark: bool = False, apart: bool = False) -> GreyEvidence:
+    def of(
+        cls, volume: Volume, threshold: float | str = "otsu", dark: bool = False, apart: bool = False
+    ) -> GreyEvidence:
         """Return a scan's evidence by the classes of a sample of it; `apart` measures those that overlap again.
 
         A threshold of noisy levels leaves some of each phase on either side, which brings the two means together. They
         are measured again `DEEP` voxels off the first guess of the surface, where few voxels are on the wrong side.
         """
-        sample, _ = subsample(boxes)
+        sample, _ = subsample(volume)
         levels, bounds = grey_levels(sample, threshold), grey_bounds(sample.values.astype(np.float32), threshold)
         first = classes = estimate_classes(levels, sample, threshold, dark)
         if apart and threshold == "otsu" and abs(classes.contrast) < OVERLAP * classes.noise:
@@ -110,26 +114,26 @@ class GreyEvidence:
             if min(map(len, deep)) >= FEWEST:
                 outer, inner = (float(side.mean(dtype=np.float64)) for side in deep)
                 classes = replace(classes, outside=outer, inside=inner, middle=(outer + inner) / 2)
-        return cls(boxes, bounds, first, classes)
+        return cls(volume, bounds, first, classes)
 
     def of_box(self, box: Box) -> VoxelEvidence:
         """Return the evidence of a box of voxels."""
-        values = self.boxes.part(box).astype(np.float32).clip(*self.bounds)
-        found = grey_evidence(values, self.boxes.frame, self.first)
+        values = self.volume.read(box).astype(np.float32).clip(*self.bounds)
+        found = grey_evidence(values, self.volume, self.first)
         level = found.level / np.float32(abs(self.first.contrast))
         return VoxelEvidence(grey_ratio(values, self.classes), level)
 
     @property
     def digest(self) -> str:
         """A text that changes with the content."""
-        return f"{self.boxes.digest}, {self.first}, {self.classes}"
+        return f"{self.volume.digest}, {self.first}, {self.classes}"
 
 
 #: What says of each box of a volume where the inside is.
 VolumeEvidence = VoxelEvidence | GreyEvidence
 
 
-def grey_levels(scan: Field, threshold: float | str = "otsu") -> np.ndarray:
+def grey_levels(scan: Volume, threshold: float | str = "otsu") -> np.ndarray:
     """Return a scan's grey levels as float32, clipped to `grey_bounds`."""
     values = scan.values.astype(np.float32)
     return values.clip(*grey_bounds(values, threshold))
@@ -144,7 +148,7 @@ def grey_bounds(values: np.ndarray, threshold: float | str = "otsu") -> tuple[fl
     return -math.inf, math.inf
 
 
-def estimate_classes(values: np.ndarray, scan: Field, threshold: float | str = "otsu", dark: bool = False) -> Classes:
+def estimate_classes(values: np.ndarray, scan: Volume, threshold: float | str = "otsu", dark: bool = False) -> Classes:
     """Split the smoothed scan at a threshold, and measure the raw levels on either side: means and pooled deviation.
     This is done twice: the noise found first sets the width of the smoothing then. With `"otsu"` the classes are split
     half way between their means. A structure of less than 0.1 % of the volume needs a given threshold, since Otsu's
@@ -157,7 +161,7 @@ def estimate_classes(values: np.ndarray, scan: Field, threshold: float | str = "
     return Classes(outside, inside, max(noise, LEAST_NOISE * (means[1] - means[0])), middle)
 
 
-def grey_evidence(values: np.ndarray, scan: Field, classes: Classes) -> VoxelEvidence:
+def grey_evidence(values: np.ndarray, scan: Volume, classes: Classes) -> VoxelEvidence:
     """Return what grey levels (Z, Y, X) say (`grey_ratio`), and smoothed levels to start from."""
     level = _smooth(values, scan, _smoothing_width(classes.noise / abs(classes.contrast))) - np.float32(classes.middle)
     return VoxelEvidence(grey_ratio(values, classes), -level if classes.contrast < 0 else level)
@@ -169,7 +173,7 @@ def grey_ratio(values: np.ndarray, classes: Classes) -> np.ndarray:
     return (values - np.float32(classes.middle)) * np.float32(classes.contrast / classes.noise**2)
 
 
-def probability_evidence(probability: Field) -> VoxelEvidence:
+def probability_evidence(probability: Volume) -> VoxelEvidence:
     """Return the evidence of probabilities (Z, Y, X): r = log p / (1 - p), and p - 1/2 as level. Values within 1e-3 of
     [0, 1], as resampling leaves them, are cut to it; raises `ScanError` if one lies farther off."""
     values = probability.values.astype(np.float32)
@@ -181,7 +185,7 @@ def probability_evidence(probability: Field) -> VoxelEvidence:
     return VoxelEvidence(np.log(p / (1 - p)), values.clip(0, 1) - np.float32(0.5))
 
 
-def _smooth(values: np.ndarray, scan: Field, width: float) -> np.ndarray:
+def _smooth(values: np.ndarray, scan: Volume, width: float) -> np.ndarray:
     """Smooth by a Gaussian whose deviation is `width` voxels of the finest axis."""
     finest = min(scan.spacing)
     return ndimage.gaussian_filter(values, [width * finest / h for h in scan.spacing], mode="nearest", truncate=3.0)
@@ -209,6 +213,30 @@ def _split(values: np.ndarray, smooth: np.ndarray, threshold: float | str) -> tu
     return means, math.sqrt(pooled)
 
 
+def subsample(volume: Volume) -> tuple[Volume, list[Box]]:
+    """Return a sample of a volume, without an affine, and the boxes of the sample in which voxels are neighbours.
+
+    Along an axis of more than `RUNS` x `LONG` voxels, the sample has `RUNS` runs of `LONG` voxels, from the middles of
+    equal parts; along a shorter one it has all voxels.
+    """
+    runs = [_sample_runs(n) for n in volume.shape]
+    # The runs, which are of one length along an axis, lie end to end in the sample.
+    shape = [sum(run.stop - run.start for run in axis) for axis in runs]
+    sample = np.empty(shape, volume.dtype)
+    places = cut_boxes(shape, [axis[0].stop - axis[0].start for axis in runs])
+    for place, (z, y, x) in zip(places, product(*runs), strict=True):
+        sample[place] = volume.read((z, y, x))
+    return replace(volume, array=sample, affine=None), places
+
+
+def _sample_runs(n: int) -> list[slice]:
+    """Return the runs of a sample along an axis of n voxels."""
+    if n <= RUNS * LONG:
+        return [slice(0, n)]
+    starts = [(2 * k + 1) * n // (2 * RUNS) - LONG // 2 for k in range(RUNS)]
+    return [slice(start, start + LONG) for start in starts]
+
+
 def load_probabilities(
     source: Source,
     *,
@@ -218,7 +246,7 @@ def load_probabilities(
     crop: Crop | None = None,
     logits: bool = False,
     **reading: Any,
-) -> Field:
+) -> Volume:
     """Load a network's probabilities at the place of `like`, an image of the same voxels, where there is one.
 
     See `segment` for the parameters. Raises `ScanError` if the image has another shape, or both an image and a spacing
@@ -229,15 +257,15 @@ def load_probabilities(
         raise ScanError("give either an image that says where the voxels are, or a spacing and unit, got both")
     image = find_image(source) if like is None and not stated else like
     if image is None:
-        field = field_of(source, spacing=spacing, unit=unit, crop=crop, **reading)
+        field = load(source, spacing=spacing, unit=unit, crop=crop, **reading)
     else:
-        place = place_of(image)
-        field = field_of(source, spacing=place.spacing, unit=place.unit, **reading)
+        place = load(image, lazy=True)
+        field = load(source, spacing=place.spacing, unit=place.unit, **reading)
         if field.shape != place.shape:
             raise ScanError(f"the probabilities must have the shape {place.shape} of {image}, got {field.shape}")
         field = replace(field, affine=place.affine, notes=(*field.notes, f"The voxels are those of {image}."))
         field = field if crop is None else field.crop(crop)
-    return replace(field, values=expit(field.values.astype(np.float32))) if logits else field
+    return replace(field, array=expit(field.values.astype(np.float32))) if logits else field
 
 
 def find_image(source: Source) -> Path | None:

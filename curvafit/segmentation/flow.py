@@ -19,7 +19,7 @@ from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.loss import RESOLVED, choose_refinement
 from curvafit.priors.profile import phase_field
 from curvafit.priors.stencils import refine_axis
-from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.volume import ScanError, Volume
 
 #: Default steps of Adam.
 STEPS = 400
@@ -72,7 +72,7 @@ def bending(law: Coefficients) -> float:
     return stiffness
 
 
-def choose_epsilon(scan: Field, epsilon: float | None) -> float:
+def choose_epsilon(scan: Volume, epsilon: float | None) -> float:
     """Return ε, by default twice the smallest voxel edge; raise ValueError where it is not positive."""
     if epsilon is None:
         return RESOLVED * min(scan.spacing)
@@ -93,7 +93,7 @@ class WorkingGrid:
     ends: Ends = ((True, True), (True, True), (True, True))
 
     @classmethod
-    def of(cls, scan: Field, epsilon: float | None, *, halo: int = 0, periodic: bool = False) -> WorkingGrid:
+    def of(cls, scan: Volume, epsilon: float | None, *, halo: int = 0, periodic: bool = False) -> WorkingGrid:
         """Return the working grid of a scan, for the ε of `choose_epsilon`.
 
         A periodic scan has no halo. Raises `ValueError` if ε is not positive or the scan is too small.

@@ -76,12 +76,11 @@ from curvafit.segmentation.uncertainty import (
     share_by_slices,
     suggest_slices,
 )
-from curvafit.volumes.boxes import digest_of
-from curvafit.volumes.field import Field, ScanError, round_labels
+from curvafit.volumes.boxes import Box
 from curvafit.volumes.formats.base import smallest_type
-from curvafit.volumes.formats.part import Box
 from curvafit.volumes.place import lay
-from curvafit.volumes.read import Source, field_of
+from curvafit.volumes.read import Source, load
+from curvafit.volumes.volume import ScanError, Volume, digest_of, round_labels
 
 #: Stiffness of the springs on known voxels, in working units: a tenth of it gives way, ten times as much stalls.
 STIFFNESS = 1e7
@@ -149,7 +148,7 @@ def reconstruct(
     Parameters
     ----------
     slices
-        A mask, or labels, of the whole volume's shape, positive inside, as a path, a `Field`, an array or a tensor;
+        A mask, or labels, of the whole volume's shape, positive inside, as a path, a `Volume`, an array or a tensor;
         only the known slices count.
     prior
         A law as in `segment`, to be tried; by default none. Each law that a fit trusts is tried.
@@ -247,7 +246,7 @@ class _Given:
     """Labels of a volume, the slices across an axis that are known, marks of known voxels in others, notes, and how
     many slices to suggest."""
 
-    volume: Field
+    volume: Volume
     axis: int
     places: list[int]
     marks: np.ndarray | None
@@ -259,8 +258,8 @@ class _Given:
         cls, slices: Source, reading: dict[str, Any], *, every: int | None, first: int, known: Sequence[int] | None,
         ignore: int | None, axis: int, suggest: int,
     ) -> _Given:  # fmt: skip
-        volume = field_of(slices, **reading)
-        volume = replace(volume, values=round_labels(volume.values))
+        volume = load(slices, **reading)
+        volume = replace(volume, array=round_labels(volume.values))
         axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
         values, marks, notes = np.moveaxis(volume.values, axis, 0), None, ()
         if ignore is not None:
@@ -405,7 +404,7 @@ def _uncertainty(
     dice = expected_dice(likely[slices.between], mask[slices.between]) if slices.between.any() else 1.0
     areas, ends = slices.inside.mean((1, 2)), {"periodic": slices.periodic, "whole": told}
     known = share_by_slices(areas, slices.places, slices.length, **ends)
-    likely_field = replace(given.volume, values=given.turn_back(values), notes=())
+    likely_field = replace(given.volume, array=given.turn_back(values), notes=())
     mean = float(values[slice(None) if told else ~slices.outside].sum(dtype=np.float64)) / values.size
     return Uncertainty(likely_field, error, suggestions, dice, known_share=known, mean_probability=mean)
 
@@ -418,11 +417,13 @@ def _describe_gain(best: Trial, where: str) -> str:
     return f"a law helps: {score} on slices {where}, {plain} by the network alone"
 
 
-def _load_image(image: Source, volume: Field, reading: dict[str, Any]) -> Field:
+def _load_image(image: Source, volume: Volume, reading: dict[str, Any]) -> Volume:
     """Load the grey levels of the volume that the slices are of."""
     require("sklearn.ensemble", "image", "reading an image")
-    placed = {} if isinstance(image, Field) else {name: reading.get(name) for name in ("spacing", "unit", "crop")}
-    field = field_of(image, **placed)
+    placed: dict[str, Any] = (
+        {} if isinstance(image, Volume) else {name: reading.get(name) for name in ("spacing", "unit", "crop")}
+    )
+    field = load(image, **placed)
     field, laid = lay(field, volume, "the image", "the slices", exact=True)
     if (count := len(np.unique(field.values.ravel()[:: -(-field.values.size // SAMPLED)]))) < GREY:
         raise ScanError(f"the image must have grey levels, but has {count} values: is it a mask?")
@@ -439,10 +440,12 @@ def _read_evidence(
     return (None, (*doubts, UNTOLD)) if told < TOLD else (evidence, doubts)
 
 
-def _load_example(example: Source, volume: Field, reading: dict[str, Any]) -> Field:
+def _load_example(example: Source, volume: Volume, reading: dict[str, Any]) -> Volume:
     """Load an example with the spacing and unit of the slices, which are of `volume`."""
-    placed = {} if isinstance(example, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
-    field = field_of(example, **placed)
+    placed: dict[str, Any] = (
+        {} if isinstance(example, Volume) else {name: reading.get(name) for name in ("spacing", "unit")}
+    )
+    field = load(example, **placed)
     check_spacing(field, volume, "the slices")
     require_labels(field.values, "the example")
     return field
@@ -512,7 +515,7 @@ def reconstruct_labels(
     numbers = find_labels(moved[places], chosen)
     if which["every"] is None and which["known"] is None and which["ignore"] is None:
         check_shared(moved, places, numbers)
-    index = replace(volume, values=index_labels(volume.values, numbers, which["ignore"]), notes=())
+    index = replace(volume, array=index_labels(volume.values, numbers, which["ignore"]), notes=())
     there = given.turn_back(mark_known(moved.shape, places, given.marks))
     labels = _Labels(replace(given, volume=index), there, which["ignore"] is not None, options)
     other = None if example is None else _load_example(example, volume, reading)
@@ -544,14 +547,14 @@ def reconstruct_labels(
     likely = np.where(labels.known, 1.0, likely).astype(np.float32)
     error = max(doubt.calibration_error for doubt in (whole and whole.uncertainty, *doubts.values()) if doubt)
     following = suggest_slices(doubt(given.turn(likely)).sum((1, 2)), places, given.suggest, periodic)
-    likely = replace(volume, values=likely, notes=())
+    likely = replace(volume, array=likely, notes=())
     table = np.array([0, *numbers], volume.values.dtype if volume.values.dtype.kind in "iu" else np.int64)
     if (kind := smallest_type(table)).itemsize < 8:  # of 64 bits the given one
         table = table.astype(kind)
     return Segmentation.of(
         volume, values != 0, np.maximum(phase, -1), None, max(part.epsilon for _, part in parts), (*notes, *said),
         weight=None, status=_describe_labels(parts, dice, whole, following), image=seen,
-        labels=replace(volume, values=table[values], notes=()),
+        labels=replace(volume, array=table[values], notes=()),
         uncertainty=Uncertainty(likely, error, following, min(dice.values()), dice),
     )  # fmt: skip
 
@@ -579,7 +582,7 @@ class _Labels:
         which: dict[str, Any] = {"known": [k - start for k in given.places if start <= k < stop]}
         if self.marked:
             inside[values < 0], which = UNKNOWN, {"ignore": UNKNOWN}
-        mask = replace(given.volume, values=inside, affine=None)
+        mask = replace(given.volume, array=inside, affine=None)
         return reconstruct(mask, law, axis=given.axis, **which, **self.options, **more)
 
 
@@ -596,8 +599,8 @@ def _fill_each(
         inside = (labels.values == place) & labels.known
         box = WHOLE if labels.options.get("periodic") else _box_of_label(inside, labels)
         more = {
-            "image": image and replace(image, values=image.values[box], affine=None, notes=()),
-            "example": example and replace(example, values=(example.values == number).astype(np.uint8), notes=()),
+            "image": image and replace(image, array=image.values[box], affine=None, notes=()),
+            "example": example and replace(example, array=(example.values == number).astype(np.uint8), notes=()),
             "store": store and Path(store) / str(number),
         }
         step = sub_progress(progress, (place - 1) / len(numbers), place / len(numbers))

@@ -21,9 +21,9 @@ from curvafit.core.units import format_sampling
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.slices import IDS, reach_of
 from curvafit.segmentation.uncertainty import doubt
-from curvafit.volumes.field import Field
 from curvafit.volumes.formats.nifti import write_nifti_like
 from curvafit.volumes.formats.zarr import add_labels, check_place, image_of, mark, store_of, write_labels
+from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import pick_writer, save
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ class Uncertainty:
         Of one structure: its share of the volume by the probabilities, 0 in slices that are not filled.
     """
 
-    probability: Field
+    probability: Volume
     calibration_error: float
     suggestions: tuple[int, ...]
     expected_dice: float
@@ -104,21 +104,21 @@ class Segmentation(Pictured):
         Of a volume filled with its image: that image.
     """
 
-    mask: Field
-    phase: Field
+    mask: Volume
+    phase: Volume
     weight: float | None
     coefficients: Coefficients | None
     epsilon: float
     status: str
     notes: tuple[str, ...]
     uncertainty: Uncertainty | None = None
-    labels: Field | None = None
-    image: Field | None = None
+    labels: Volume | None = None
+    image: Volume | None = None
 
     @classmethod
     def of(
         cls,
-        scan: Field,
+        scan: Volume,
         mask: np.ndarray,
         phase: np.ndarray,
         law: Coefficients | None,
@@ -127,15 +127,15 @@ class Segmentation(Pictured):
         **more: Any,
     ) -> Segmentation:
         """Return a segmentation whose mask and phase field (Z, Y, X) lie as the scan does; `more` are attributes."""
-        inside, field = (replace(scan, values=values, notes=()) for values in (mask, phase))
+        inside, field = (replace(scan, array=values, notes=()) for values in (mask, phase))
         return cls(inside, field, coefficients=law, epsilon=epsilon, notes=(*scan.notes, *notes), **more)
 
     @property
-    def probability(self) -> Field | None:
+    def probability(self) -> Volume | None:
         """The probability of the inside, of a volume between known slices."""
         return None if self.uncertainty is None else self.uncertainty.probability
 
-    def keep_sure(self, least: float = 0.9, ignored: int | None = None) -> Field:
+    def keep_sure(self, least: float = 0.9, ignored: int | None = None) -> Volume:
         """Return labels to train a network with: where one is less probable than `least`, it is replaced by `ignored`.
 
         `ignored` is by default the highest label + 1, as nnU-Net demands. Known voxels keep their labels, of which one
@@ -159,7 +159,7 @@ class Segmentation(Pictured):
         values[likely < least] = number
         share = 100 * float((likely < least).mean())
         note = f"{share:.3g} % of the voxels are less sure than {least:g} and have the label to ignore, {number}."
-        return replace(self.mask, values=values, notes=(note,))
+        return replace(self.mask, array=values, notes=(note,))
 
     def __repr__(self) -> str:
         mask = self.mask.values
@@ -182,7 +182,7 @@ def flow_summary(share: float, energy: Sequence[float] = (), steps: int = 0) -> 
 
 def check_mask_target(
     path: str | Path,
-    scan: Field | None = None,
+    scan: Volume | None = None,
     inputs: Iterable[str | Path] = (),
     overwrite: bool = False,
     *,
@@ -220,10 +220,10 @@ def hidden_store(target: Path) -> Path:
 
 def write_mask(
     segmentation: Segmentation,
-    scan: Field,
+    scan: Volume,
     path: str | Path,
     *,
-    sure: Field | None = None,
+    sure: Volume | None = None,
     like: str | Path | None = None,
     unit: str | None = None,
     record: dict[str, Any] | None = None,
@@ -250,7 +250,7 @@ def write_mask(
         if like is not None and all(str(each).lower().endswith(_NIFTI) for each in (like, target)):
             write_nifti_like(values, Path(like), place, unit)
         else:
-            save(Field(values, scan.spacing, scan.unit, scan.affine), place, kind=FORMAT.name)
+            save(Volume(values, scan.spacing, scan.unit, scan.affine), place, kind=FORMAT.name)
 
     with temporary_folder(beside(target, ".json")) as work:
         mask, labels = segmentation.mask.values, segmentation.labels
@@ -260,7 +260,7 @@ def write_mask(
         if image is None:
             write(values, work / target.name)
         else:
-            write_labels(replace(scan, values=values), work / target.name, image=image)
+            write_labels(replace(scan, array=values), work / target.name, image=image)
             mark(work / target.name, FORMAT.name)
         rows = {"scan": (scan.values, None), "mask": (scan.values, mask)}
         content = describe_run(segmentation, record or {}, scan, float(mask.mean()))
@@ -323,7 +323,7 @@ def map_path(target: Path, name: str) -> Path:
     return beside(target, f"_{name}{suffix}")
 
 
-def describe_run(found: Segmentation, options: Mapping[str, Any], scan: Field, share: float) -> dict[str, Any]:
+def describe_run(found: Segmentation, options: Mapping[str, Any], scan: Volume, share: float) -> dict[str, Any]:
     """Return the record of a mask of a scan: its status, the run's options, what was found, and notes; `share` is the
     mask's of the volume."""
     uncertain, doubts = found.uncertainty, {}

@@ -22,11 +22,10 @@ from curvafit.segmentation.result import Segmentation, flow_summary
 from curvafit.segmentation.slices import check_spacing, require_labels
 from curvafit.segmentation.tiles import LoweredVolume, Problem, Tiling, lower_volume
 from curvafit.segmentation.trials import Task, Trial, choose_by_masks, law_of, laws_of
-from curvafit.volumes.boxes import Boxes, boxes_of, check_finite, check_fits, read_whole
-from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.formats.part import Box
+from curvafit.volumes.boxes import Box, cut_boxes
 from curvafit.volumes.place import lay
-from curvafit.volumes.read import Source, field_of
+from curvafit.volumes.read import Source, load
+from curvafit.volumes.volume import ScanError, Volume
 
 #: The law where none is given; it is also tried beside those of a prior.
 WILLMORE = Coefficients.willmore()
@@ -41,12 +40,14 @@ WEIGHTS = (1e-9, 1e9)
 EDGE, TRIALS = 96, 0.7
 #: Share of the evidence for the first guess's inside that a mask must keep, where no weight is given.
 KEPT = 0.95
+#: Voxels that are checked at once.
+_SLAB = 2**24
 #: A note on classes that may be noise.
 FAINT = "The classes differ by less than the noise: look at the mask. If the structure is rare, give a threshold."
 
 
 def segment(
-    scan: Source | Boxes,
+    scan: Source,
     prior: LawLike | None = None,
     *,
     weight: float | None = None,
@@ -71,7 +72,7 @@ def segment(
     Parameters
     ----------
     scan
-        Grey levels of two phases with noise, or probabilities of the inside, in [0, 1]: the path of a file, a `Field`,
+        Grey levels of two phases with noise, or probabilities of the inside, in [0, 1]: the path of a file, a `Volume`,
         or an array or tensor (Z, Y, X).
     prior
         `Coefficients` with lengths in the scan's unit; or a preset's name, in working units of which the smallest voxel
@@ -121,25 +122,25 @@ def segment(
         alike = {name: value for name, value in reading.items() if name not in ("like", "crop")}
         reading.pop("label", None)  # that of the example
         scan, reading = load_probabilities(scan, **reading), {}  # type: ignore[arg-type]
-    boxes = boxes_of(scan, **reading)
-    check_fits(boxes)
-    tiling, said = Tiling.of(boxes.frame, epsilon, tile), ""
+    volume = load(scan, **reading, lazy=True)
+    volume.check_fits()
+    tiling, said = Tiling.of(volume, epsilon, tile), ""
     if example is None:
-        law, notes = law_of(WILLMORE if prior is None else prior, boxes.frame)
+        law, notes = law_of(WILLMORE if prior is None else prior, volume)
         notes = notes if prior is not None else ("No prior is given: the Willmore energy is lowered.",)
         trial = Trial(law, (weight or 0.0) * bending(law) / BENDING, steps)
     else:
         if not isinstance(example, Calibration):
             trials, progress = sub_progress(progress, 0.0, TRIALS), sub_progress(progress, TRIALS, 1.0)
             example = calibrate(*example, prior, epsilon=epsilon, steps=steps, progress=trials, **alike)
-        check_spacing(example.example, boxes.frame, "the probabilities")
+        check_spacing(example.example, volume, "the probabilities")
         trial, notes, said = example.trial, example.notes, f"{example}; "
     if probabilities:
-        evidence: VolumeEvidence = probability_evidence(values := read_whole(boxes))
-        notes = (*notes, f"Probabilities from {values.values.min():.3g} to {values.values.max():.3g}.")
+        evidence: VolumeEvidence = probability_evidence(likely := volume.load())
+        notes = (*notes, f"Probabilities from {likely.values.min():.3g} to {likely.values.max():.3g}.")
     else:
-        check_finite(boxes)
-        evidence = GreyEvidence.of(boxes, threshold, dark, apart=weight is None)
+        _check_finite(volume)
+        evidence = GreyEvidence.of(volume, threshold, dark, apart=weight is None)
         classes, trial = evidence.classes, trial if weight else replace(trial, strength=USUAL)
         notes = (*notes, *(FAINT,) * (classes.faint and threshold == "otsu"), f"{str(classes).capitalize()}.")
     missing = trial.law is not None and _missing_phase(evidence, tiling)
@@ -151,7 +152,7 @@ def segment(
         trial, said = replace(trial, law=None), "no prior helps here, the first guess explains the scan better: "
         found = lower(evidence, trial, tiling)
     return Segmentation.of(
-        boxes.frame, found.mask, found.phase, trial.law, tiling.place.epsilon, (*notes, *tiling.place.notes),
+        volume, found.mask, found.phase, trial.law, tiling.place.epsilon, (*notes, *tiling.place.notes),
         weight=None if trial.law is None else trial.strength * BENDING / bending(trial.law),
         status=f"{said}{flow_summary(float(found.mask.mean()), found.energies, found.steps)}",
     )  # fmt: skip
@@ -221,6 +222,14 @@ def _explains(evidence: VolumeEvidence, mask: np.ndarray, tiling: Tiling) -> boo
     return bool(kept[rarer] >= KEPT * guessed[rarer] and 0 < mask.mean() < 1)
 
 
+def _check_finite(volume: Volume) -> None:
+    """Read all of a volume, some slices at once, and raise ScanError where values are not finite."""
+    shape = volume.shape
+    slabs = cut_boxes(shape, (max(1, _SLAB // max(1, shape[1] * shape[2])), *shape[1:]))
+    if faults := sum(np.count_nonzero(~np.isfinite(volume.read(slab))) for slab in slabs):
+        raise ScanError(f"a volume must be finite, got {faults} values that are not")
+
+
 def _missing_phase(evidence: VolumeEvidence, tiling: Tiling) -> str:
     """Return which phase the first guess lacks, or nothing; the first tiles that have both end the search."""
     seen: set[bool] = set()
@@ -243,7 +252,7 @@ class Calibration:
 
     trial: Trial
     fitted: bool
-    example: Field
+    example: Volume
     notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
@@ -285,8 +294,10 @@ def calibrate(
     `label` is the value of the structure in the mask. See `segment` for the other parameters, and for errors.
     """
     field = load_probabilities(probabilities, **reading)
-    placed = {} if isinstance(mask, Field) else {name: reading.get(name) for name in ("spacing", "unit")}
-    truth, laid = lay(field_of(mask, label=label, **placed), field, "the mask", "the probabilities", exact=True)
+    placed: dict[str, Any] = (
+        {} if isinstance(mask, Volume) else {name: reading.get(name) for name in ("spacing", "unit")}
+    )
+    truth, laid = lay(load(mask, label=label, **placed), field, "the mask", "the probabilities", exact=True)
     inside = require_labels(truth.values, "the example") > 0
     if inside.all() or not inside.any():
         state = "full" if inside.all() else "empty"
@@ -301,7 +312,7 @@ def calibrate(
         bending(law)  # refuses a law before the work
     probability_evidence(field)  # refuses values outside [0, 1] beyond the part, too
     where = box_with_most_surface(inside, EDGE)
-    part = replace(field, values=field.values[where])
+    part = replace(field, array=field.values[where])
     tiling = Tiling.of(part, epsilon)
     count, expected = 0, 2 * len(tried) + 3
 

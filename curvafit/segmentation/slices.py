@@ -13,8 +13,8 @@ from curvafit.core.checks import check_int
 from curvafit.core.units import format_sampling
 from curvafit.priors.grid import MOST
 from curvafit.scan.grids import centre_distance
-from curvafit.volumes.field import Field, ScanError, round_labels
-from curvafit.volumes.formats.part import Box
+from curvafit.volumes.boxes import Box
+from curvafit.volumes.volume import ScanError, Volume, round_labels
 
 #: Plain interpolations, the usual one first: signed distances on a cubic spline and on lines; the nearest slice.
 WAYS = ("spline", "linear", "nearest")
@@ -48,7 +48,7 @@ class Slices:
     @classmethod
     def of(
         cls,
-        volume: Field,
+        volume: Volume,
         places: Sequence[int],
         axis: int,
         periodic: bool = False,
@@ -91,9 +91,9 @@ class Slices:
         return (self.length, *self.inside.shape[1:])  # type: ignore[return-value]
 
     @property
-    def frame(self) -> Field:
+    def frame(self) -> Volume:
         """A field of zeros, without memory of its own, with the volume's shape and spacing."""
-        return Field(np.broadcast_to(np.float32(0), self.shape), self.spacing, self.unit)
+        return Volume(np.broadcast_to(np.float32(0), self.shape), self.spacing, self.unit)
 
     def numbers(self, box: Box) -> list[np.ndarray]:
         """Return the indices of a box's voxels along each axis; in a periodic volume a box may cross the ends."""
@@ -301,7 +301,7 @@ def require_outline(inside: int, count: int, name: str) -> None:
         )
 
 
-def check_spacing(example: Field, volume: Field, name: str) -> None:
+def check_spacing(example: Volume, volume: Volume, name: str) -> None:
     """Raise ScanError where an example's voxels differ in size from the volume's; the message calls that `name`."""
     if example.unit != volume.unit or not np.allclose(example.spacing, volume.spacing, rtol=SAME):
         expected, given = (format_sampling(field.shape, field.spacing, field.unit) for field in (volume, example))

@@ -31,8 +31,8 @@ from curvafit.priors.kernels.threads import one_thread
 from curvafit.scan.pieces import RUN, lock_store
 from curvafit.segmentation.flow import HALO, Ends, WorkingGrid, lower_energy
 from curvafit.segmentation.trials import Trial
-from curvafit.volumes.field import Field
-from curvafit.volumes.formats.part import Box, within
+from curvafit.volumes.boxes import Box, within
+from curvafit.volumes.volume import Volume
 
 #: Working voxels beyond a tile that are lowered with it: at that distance the cut is not felt any more.
 OVERLAP = 24
@@ -82,7 +82,7 @@ class Tiling:
     counts: tuple[int, int, int]
 
     @classmethod
-    def of(cls, frame: Field, epsilon: float | None, edge: int | None = None, *, periodic: bool = False) -> Tiling:
+    def of(cls, frame: Volume, epsilon: float | None, edge: int | None = None, *, periodic: bool = False) -> Tiling:
         """Cut a volume into tiles of at most `edge` working voxels a side without the overlap.
 
         By default the volume is one tile up to `WHOLE` working voxels, else tiles of `EDGE`. Raises `ValueError` as

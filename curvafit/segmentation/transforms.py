@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.segmentation.reconstruct import reconstruct, reconstruct_labels
-from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.volume import ScanError, Volume
 
 try:
     from monai.transforms.transform import MapTransform
@@ -71,7 +71,7 @@ class FillSlicesd(MapTransform):
         """Return the values (A, B, C) that take the place of a label (1, A, B, C)."""
         if label.ndim != 4 or len(label) != 1:
             raise ScanError(f"a label must have one channel and three axes, (1, A, B, C), got {label.shape}")
-        volume = Field(label[0], spacing)  # type: ignore[arg-type]
+        volume = Volume(label[0], spacing)  # type: ignore[arg-type]
         if self.soft:
             return reconstruct(volume, **self.options).probability.values  # type: ignore[union-attr]
         found = reconstruct_labels(volume, **self.options)

@@ -19,8 +19,8 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import Law, LawLike
 from curvafit.scan.grids import box_with_most_surface
 from curvafit.segmentation.slices import Slices
-from curvafit.volumes.field import Field, ScanError
-from curvafit.volumes.formats.part import Box
+from curvafit.volumes.boxes import Box
+from curvafit.volumes.volume import ScanError, Volume
 
 #: The known part of a volume.
 Given = TypeVar("Given")
@@ -36,7 +36,7 @@ BEYOND = 1.0
 CUBE = 16
 
 
-def law_of(prior: LawLike, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
+def law_of(prior: LawLike, scan: Volume) -> tuple[Coefficients, tuple[str, ...]]:
     """Return a law's coefficients with lengths in the scan's unit, and sentences on their origin. Raises `ValueError`
     if there is no such preset, or the units of a `fit.json` and the scan cannot be compared."""
     law = Law.of(prior)
@@ -53,7 +53,7 @@ def law_of(prior: LawLike, scan: Field) -> tuple[Coefficients, tuple[str, ...]]:
     return coefficients, (*notes, f"{law.doubt} Compare the mask with the scan.") if law.doubt else notes
 
 
-def laws_of(prior: LawLike, scan: Field) -> tuple[tuple[Coefficients, ...], tuple[str, ...]]:
+def laws_of(prior: LawLike, scan: Volume) -> tuple[tuple[Coefficients, ...], tuple[str, ...]]:
     """Return the laws to try for a prior, with lengths in the scan's unit, and sentences on their origin. The first is
     that of `law_of`; of a fit the candidates in `TRUSTED` follow."""
     first, notes = law_of(prior, scan)
@@ -117,7 +117,7 @@ class Example:
     notes: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, volume: Field, places: Sequence[int], axis: int) -> Example:
+    def of(cls, volume: Volume, places: Sequence[int], axis: int) -> Example:
         """Cut an example for a volume whose known slices have these places.
 
         Raises `ScanError` if it is not longer than a gap, is no mask, or has a part without a surface.

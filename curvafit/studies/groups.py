@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 from curvafit.core.checks import as_tuple, quoted
 from curvafit.scan.measure import Measures
-from curvafit.volumes.field import ScanError
 from curvafit.volumes.read import Source, pick_reader
+from curvafit.volumes.volume import ScanError
 
 #: A group as a caller gives it: a folder of scans, scans, or scans by subject. What is measured already is taken so.
 Group = str | PathLike[str] | Sequence[Source | Measures] | Mapping[str, Sequence[Source | Measures]]

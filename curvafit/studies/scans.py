@@ -19,9 +19,8 @@ from curvafit.scan.instances import measure_instances
 from curvafit.scan.measure import Measures
 from curvafit.scan.tiles import measure
 from curvafit.studies.groups import Case
-from curvafit.volumes.boxes import boxes_of
-from curvafit.volumes.field import ScanError
-from curvafit.volumes.read import field_of
+from curvafit.volumes.read import load
+from curvafit.volumes.volume import ScanError
 
 #: Edge of the bins of a scan's diagram as it is kept, over the inverse of the structure's thickness.
 FINE = 0.1
@@ -159,7 +158,7 @@ def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progr
             units.setdefault(case.source.unit, case.name)
             continue
         with name_errors(case.name):
-            field = field_of(case.source, **reading)
+            field = load(case.source, **reading)
         units.setdefault(field.unit, case.name)
         edges.setdefault(case.label, []).append(float(np.prod(field.spacing) ** (1 / 3)))
     _check_mixture(units)
@@ -177,7 +176,7 @@ def check_units(scans: Sequence[str], progress: Progress = silent, **reading: An
     for k, scan in enumerate(scans):
         progress(f"{scan}: reading", k / len(scans))
         with name_errors(scan):
-            units.setdefault(boxes_of(scan, **reading).frame.unit, scan)
+            units.setdefault(load(scan, **reading, lazy=True).unit, scan)
     _check_mixture(units)
 
 

@@ -16,8 +16,8 @@ from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import format_length, format_number, format_percent, unit_name
 from curvafit.scan.measure import QUANTITIES, Blocks, combine, measure_maps
 from curvafit.scan.structure import check_options
-from curvafit.volumes.field import Field
-from curvafit.volumes.read import Source, field_of
+from curvafit.volumes.read import Source, load
+from curvafit.volumes.volume import Volume
 
 NAMES = tuple(name for name, *_ in QUANTITIES)
 #: The most clusters, the most blocks of a stride, and the most voxels along an axis that are kept for pictures.
@@ -50,9 +50,9 @@ class Windows(Pictured):
     size: tuple[int, int, int]
     stride: tuple[int, int, int]
     values: np.ndarray
-    clusters: Field
+    clusters: Volume
     explained: float
-    structure: Field
+    structure: Volume
     options: dict[str, Any]
     notes: tuple[str, ...]
 
@@ -60,11 +60,11 @@ class Windows(Pictured):
         grid = "×".join(map(str, self.clusters.shape))
         return f"Windows({grid}, {self.known.sum()} known, of {self.clusters.source or 'an array'})"
 
-    def __getitem__(self, name: str) -> Field:
+    def __getitem__(self, name: str) -> Volume:
         """Return the map of a quantity by name or symbol, float32; raise KeyError where there is none."""
         for k, (word, symbol, *_) in enumerate(QUANTITIES):
             if name in (word, symbol):
-                return replace(self.clusters, values=self.values[..., k].astype(np.float32))
+                return replace(self.clusters, array=self.values[..., k].astype(np.float32))
         raise KeyError(f"expected one of {', '.join(NAMES)}, got {name!r}")
 
     @property
@@ -147,7 +147,7 @@ def windows(
     check_options(kind, threshold, reading.get("label"))
     check_int(clusters, f"a number of clusters from 1 to {MOST_CLUSTERS}", 1, MOST_CLUSTERS)
     check_seed(seed)
-    field = field_of(scan, **reading)
+    field = load(scan, **reading)
     sizes, strides = _check_grid(field.shape, size, stride)
     starts = tuple(tuple(range(0, n, step)) for n, step in zip(field.shape, strides, strict=True))
     options = {"threshold": threshold, "dark": dark, "periodic": periodic}
@@ -157,12 +157,12 @@ def windows(
     corner = field.move_origin([(n - 1) / 2 for n in sizes]).affine
     assert corner is not None
     spacing = tuple(h * step for h, step in zip(field.spacing, strides, strict=True))
-    grid = replace(field, values=labels, spacing=spacing, affine=corner @ np.diag([*strides[::-1], 1]))  # type: ignore[arg-type]
+    grid = replace(field, array=labels, spacing=spacing, affine=corner @ np.diag([*strides[::-1], 1]))  # type: ignore[arg-type]
     rest = [n % step for n, step in zip(field.shape, strides, strict=True)]
     thin = tuple(-(-n // MOST_SHOWN) for n in field.shape)
     shown = np.ascontiguousarray(maps.mask[tuple(slice(None, None, step) for step in thin)])
     edges = tuple(h * n for h, n in zip(field.spacing, thin, strict=True))
-    structure = replace(field, values=shown, spacing=edges, affine=None)
+    structure = replace(field, array=shown, spacing=edges, affine=None)
     left = f"The last {', '.join(map(str, rest))} voxels along z, y, x are in no window."
     how = {"size": sizes, "stride": strides, "clusters": clusters, "seed": seed, "kind": kind}
     return Windows(
@@ -190,7 +190,7 @@ def _check_grid(shape: Sequence[int], *edges: int | Sequence[int]) -> tuple[tupl
     return size, stride
 
 
-def _sum_windows(table: np.ndarray, field: Field, size: Sequence[int], stride: Sequence[int]) -> np.ndarray:
+def _sum_windows(table: np.ndarray, field: Volume, size: Sequence[int], stride: Sequence[int]) -> np.ndarray:
     """Return the numbers (nz, ny, nx, Q) of windows from sums (Z, Y, X, C) over blocks."""
     table = table[tuple(slice(n // step) for n, step in zip(field.shape, stride, strict=True))]
     for axis in range(3):

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from curvafit.core.records import read_archive
 from curvafit.priors.coefficients import NAMES
-from curvafit.volumes.field import ScanError
 from curvafit.volumes.read import READERS, read_values
+from curvafit.volumes.volume import ScanError
 
 #: What may vary: the six coefficients, the mass and ε, all in working units.
 PARAMETERS = (*NAMES, "mass", "epsilon")

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 
 from curvafit.core.units import METRES, format_sampling
-from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.volume import ScanError, Volume
 
 #: Voxels by which places may differ that are one.
 ASTRAY = 0.1
@@ -16,7 +16,7 @@ ASTRAY = 0.1
 _TIE = 1e-3
 
 
-def lay(field: Field, on: Field, name: str, kind: str, *, exact: bool = False) -> tuple[Field, tuple[str, ...]]:
+def lay(field: Volume, on: Volume, name: str, kind: str, *, exact: bool = False) -> tuple[Volume, tuple[str, ...]]:
     """Return a volume on the voxels of another, and a note on how it was laid where the two differ.
 
     Where both state where they lie, the affines decide: axes change places and directions, and voxels move. On other
@@ -48,10 +48,10 @@ def lay(field: Field, on: Field, name: str, kind: str, *, exact: bool = False) -
         raise ScanError(f"{name} must have the {what}, but by the affines covers {share:.0%} of it")
     note += f" by its affine: {'whole voxels are moved' if on_voxels else f'the nearest of its {sampling} counts'}"
     note += "" if share == 1 else f"; {1 - share:.2g} of {kind} lies beyond it, and counts as 0"
-    return replace(field, values=laid, spacing=on.spacing, unit=on.unit, affine=on.affine), (f"{note}.",)
+    return replace(field, array=laid, spacing=on.spacing, unit=on.unit, affine=on.affine), (f"{note}.",)
 
 
-def _find_step(field: Field, on: Field) -> tuple[np.ndarray, np.ndarray] | None:
+def _find_step(field: Volume, on: Volume) -> tuple[np.ndarray, np.ndarray] | None:
     """Return matrix and offset from voxels (z, y, x) of a volume to those of another, None where no place tells it.
 
     A length in voxels is one in any unit where the voxels are as long: a file may not name its unit.

@@ -12,14 +12,14 @@ import numpy as np
 
 from curvafit.core.files import temporary_folder, write_atomically
 from curvafit.core.records import can_write, is_own_zarr
-from curvafit.volumes.field import Field
 from curvafit.volumes.formats.arrays import write_npy
 from curvafit.volumes.formats.base import ScanError, smallest_type
-from curvafit.volumes.formats.medical import check_mrc, write_mrc
+from curvafit.volumes.formats.mrc import check_mrc, write_mrc
 from curvafit.volumes.formats.nifti import write_nifti
 from curvafit.volumes.formats.tiff import check_ome_tiff, write_ome_tiff, write_tiff
 from curvafit.volumes.formats.zarr import add_labels, image_of, mark, store_of, write_labels, write_zarr
-from curvafit.volumes.read import Source, field_of
+from curvafit.volumes.read import Source, load
+from curvafit.volumes.volume import Volume
 
 #: Suffix -> writer(field, path).
 WRITERS: dict[str, Callable[[Any, Path], None]] = {
@@ -57,15 +57,15 @@ def save(
     Parameters
     ----------
     source
-        A `Field`, an array or tensor (Z, Y, X), or the path of another volume file.
+        A `Volume`, an array or tensor (Z, Y, X), or the path of another volume file.
     spacing, unit
-        Spacing and unit of an array, or in place of those of another file: see `field_of`.
+        Spacing and unit of an array, or in place of those of another file: see `load`.
     kind
         The mark of a Zarr store: what the store is for.
     overwrite
         Whether any other folder of that name may be replaced.
     """
-    field = field_of(source, spacing=spacing, unit=unit)
+    field = load(source, spacing=spacing, unit=unit)
     target = Path(path)
     writer = pick_writer(target, field.unit, field.values)
     can_write(target, lambda there: not there.is_dir() or is_own_zarr(there, kind), overwrite=overwrite)
@@ -102,7 +102,7 @@ def pick_writer(path: Path, unit: str, values: np.ndarray | None = None) -> Call
     return WRITERS[suffix]
 
 
-def check_labels(path: str | Path, labels: Field) -> None:
+def check_labels(path: str | Path, labels: Volume) -> None:
     """Raise ScanError, before the work, if a format cannot hold labels as large as these."""
     limits = np.array([labels.values.min(), labels.values.max()])
     pick_writer(Path(path), labels.unit, limits.astype(smallest_type(limits)))

@@ -23,11 +23,11 @@ flow = curvafit.generate("sponge", grid=40, seed=0)
 print(flow.status)
 
 # %% [markdown]
-# A `Field` is values with voxel edges and a unit. Here the values are a phase field: about +1 inside, -1 outside, with
+# A `Volume` is values with voxel edges and a unit. Here the values are a phase field: about +1 inside, -1 outside, with
 # a smooth step between. `kind="field"` says so, and `periodic=True` that the box repeats. A scan needs neither.
 
 # %%
-scan = curvafit.Field(flow.field.numpy(), (20.0, 20.0, 20.0), "um")
+scan = curvafit.Volume(flow.field.numpy(), (20.0, 20.0, 20.0), "um")
 fewer = {"simulations": 4, "rounds": 1, "twins": 2}  # shapes than by default, so that this page is made soon
 inference = curvafit.infer(scan, kind="field", periodic=True, seed=1, **fewer)
 fit = inference.fit

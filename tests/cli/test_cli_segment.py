@@ -12,8 +12,8 @@ from found import made_fit
 
 import curvafit.segmentation
 from curvafit.segmentation.filler import FILLER_FILE
-from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
+from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -101,7 +101,7 @@ def test_another_unit_renames_and_keeps_the_rest_of_the_header(unit, written, ob
 def test_other_formats_and_a_fit_in_another_unit(tmp_path: Path) -> None:
     """And an axis of one, and another spacing."""
     path, prior, target = tmp_path / "scan.tif", tmp_path / "fit.json", tmp_path / "mask.ome.tif"
-    save(Field(grey(), (19.5,) * 3, "um"), path)
+    save(Volume(grey(), (19.5,) * 3, "um"), path)
     prior.write_text(made_fit().to_json())
     options = ("--dark", "--threshold", 150, "--weight", 1, "--steps", 2)
     result = done("segment", path, "--prior", prior, *options, "-o", target)
@@ -129,7 +129,7 @@ def test_reconstruct_fills_what_it_is_not_told(tmp_path: Path) -> None:
     truth, path, target = ball((20, 18, 17)), tmp_path / "slices.nii.gz", tmp_path / "volume.nii.gz"
     given = np.zeros(truth.shape, dtype=np.uint8)
     given[..., ::4] = truth[..., ::4]
-    save(Field(given, (0.1, 0.1, 0.1), "mm"), path)
+    save(Volume(given, (0.1, 0.1, 0.1), "mm"), path)
     done("reconstruct", path, "--every", 4, "--axis", "x", "-o", target)
     made = load(target).values.astype(bool)
     assert np.array_equal(made[..., ::4], truth[..., ::4]) and (made != truth).mean() < 0.02
@@ -140,7 +140,7 @@ def test_reconstruct_fills_what_it_is_not_told(tmp_path: Path) -> None:
     done("reconstruct", path, *options, "-o", named)
     assert np.array_equal(load(named).values, load(target).values)
     given[..., [k for k in range(17) if k % 4]] = 9
-    save(Field(2 * given, (0.1, 0.1, 0.1), "mm"), path)  # also one label of several
+    save(Volume(2 * given, (0.1, 0.1, 0.1), "mm"), path)  # also one label of several
     for name, more in (("ignoring", ("--ignore", 18)), ("label", ("--every", 4, "--label", 2))):
         done("reconstruct", path, *more, "--axis", "x", "-o", tmp_path / f"{name}.nii.gz")
         assert np.array_equal(load(tmp_path / f"{name}.nii.gz").values, load(target).values)
@@ -149,7 +149,7 @@ def test_reconstruct_fills_what_it_is_not_told(tmp_path: Path) -> None:
 def test_reconstruct_writes_what_is_uncertain(tmp_path: Path) -> None:
     """A probability beside the mask, with the header of the slices, as long as its mask; and what to annotate next."""
     path, target = tmp_path / "slices.nii.gz", tmp_path / "out" / "volume.nii.gz"
-    save(Field(ball().astype(np.uint8), (0.1, 0.1, 0.1), "mm"), path)
+    save(Volume(ball().astype(np.uint8), (0.1, 0.1, 0.1), "mm"), path)
     told = ("reconstruct", path, "--every", 4, "-o", target)
     result = done(*told, "--suggest", 2)
     names = ["volume.json", "volume.nii.gz", "volume.png", "volume_probability.nii.gz"]
@@ -214,7 +214,7 @@ def bad_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     }  # fmt: skip
     for name, values in volumes.items():
         edge, unit = 0.04 if name == "coarse" else 0.02, "um" if name == "other" else "mm"
-        save(Field(values, (edge,) * 3, unit), folder / f"{name}.nii")
+        save(Volume(values, (edge,) * 3, unit), folder / f"{name}.nii")
     packaged = Path(curvafit.segmentation.__file__).parent / "data" / "filler.npz"
     (folder / "cut.npz").write_bytes(packaged.read_bytes()[:9999])
     header, arrays = FILLER_FILE.read(packaged)
@@ -268,7 +268,7 @@ def test_no_input_is_written_over(arguments, target, tmp_path, monkeypatch) -> N
     (tmp_path / "mine.json").write_text('{"format": "curvafit-mask-1"}')
     (tmp_path / "link.npy").symlink_to("g.npy")
     (tmp_path / "hard.npy").hardlink_to("h.h5")
-    monkeypatch.setattr("curvafit.volumes.boxes.boxes_of", lambda *_, **__: pytest.fail("read all the same"))
+    monkeypatch.setattr("curvafit.volumes.read.load", lambda *_, **__: pytest.fail("read all the same"))
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     refused(call(*arguments.split(), "-o", target), "input")
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}

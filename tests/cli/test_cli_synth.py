@@ -12,8 +12,8 @@ from found import made_fit
 
 from curvafit.inference.fit import to_columns
 from curvafit.priors.law import FORMAT
-from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
+from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
 ONE = ["--count", "1", "--shape", "16", "--workers", "0", "--modality", "micro-CT"]
@@ -56,8 +56,8 @@ def test_a_set_of_inferred_shapes_like_a_scan(tmp_path):
     rng, edges = np.random.default_rng(0), (0.002, 0.001, 0.001)
     z, y, x = np.mgrid[:24, :40, :40]
     inside = (np.hypot(y - 20, x - 20) < 7) | (np.hypot(z - 12, y - 8) < 4)
-    save(Field(rng.poisson(np.where(inside, 90.0, 12.0)).astype(np.uint8), edges, "mm"), tmp_path / "scan.nii.gz")
-    save(Field(inside.astype(np.uint8), edges, "mm"), tmp_path / "mask.nii.gz")
+    save(Volume(rng.poisson(np.where(inside, 90.0, 12.0)).astype(np.uint8), edges, "mm"), tmp_path / "scan.nii.gz")
+    save(Volume(inside.astype(np.uint8), edges, "mm"), tmp_path / "mask.nii.gz")
     working = {"a20": 1, "a11": 2, "a02": 6, "a10": -40, "a01": -40, "a00": 400}
     fit = {"format": FORMAT, "coefficients": working, "coefficients_physical": working, "mass": -0.5}
     fit |= {"epsilon_physical": 0.002, "working_voxel": 0.001, "length_unit": "mm"}

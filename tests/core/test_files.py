@@ -14,7 +14,7 @@ from disk import tree
 from curvafit.core import files
 from curvafit.core.files import check_folder, is_empty, move_together, temporary_folder, write_atomically, write_content
 from curvafit.core.records import Format, can_write, has_mark, parse_json, sibling
-from curvafit.volumes import Field, load, save
+from curvafit.volumes import Volume, load, save
 
 
 def test_a_file_is_the_new_one_or_the_old_one(tmp_path: Path) -> None:
@@ -129,7 +129,7 @@ def test_a_folder_that_cannot_take_files_is_refused(tmp_path: Path, monkeypatch:
         check_folder(tmp_path / "new")
 
 
-FIELD = Field(np.arange(70 * 6 * 5, dtype=np.float32).reshape(70, 6, 5), (0.1, 0.2, 0.3), "mm")
+FIELD = Volume(np.arange(70 * 6 * 5, dtype=np.float32).reshape(70, 6, 5), (0.1, 0.2, 0.3), "mm")
 
 
 def test_save_replaces_its_own_stores_alone(tmp_path: Path) -> None:

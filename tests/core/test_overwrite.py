@@ -13,12 +13,12 @@ from found import made_inference
 
 from curvafit.data_synth.store import open_store
 from curvafit.report.page import FILES, write_inference
-from curvafit.volumes import Field, load, save
+from curvafit.volumes import Volume, load, save
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
 TAKEN = "overwrite"
-MASK = Field((np.indices((12, 12, 12)).sum(0) % 12 < 6).astype(np.uint8))
+MASK = Volume((np.indices((12, 12, 12)).sum(0) % 12 < 6).astype(np.uint8))
 
 
 @pytest.fixture(autouse=True)

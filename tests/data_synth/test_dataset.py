@@ -31,7 +31,7 @@ from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality, No
 from curvafit.data_synth.sources import apply_symmetry, choose_voxel, crop_periodic
 from curvafit.data_synth.store import open_store
 from curvafit.priors import preset
-from curvafit.volumes import Field, save
+from curvafit.volumes import Volume, save
 
 QUIET = Modality("quiet", "for tests", 1.0, Imaging(optics=Optics(blur=(0.5, 0.5, 0.5)), noise=Noise(gaussian=1.0)))
 SHAPE = (12, 16, 20)
@@ -105,7 +105,7 @@ def test_monai_s_form_is_that_of_a_file(store, tmp_path, unit):
     made = as_monai(sample)
     files = {name: tmp_path / f"{name}.nii.gz" for name in made}
     for name, file in files.items():
-        save(Field(getattr(sample, name)[0].numpy(), sample.spacing, unit), file)
+        save(Volume(getattr(sample, name)[0].numpy(), sample.spacing, unit), file)
     load = [transforms.LoadImaged(list(made), reader="NibabelReader"), transforms.EnsureChannelFirstd(list(made))]
     read = transforms.Compose(load)(files)
     for name in made:

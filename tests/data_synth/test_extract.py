@@ -17,7 +17,7 @@ from curvafit.inference.table import VIEWS, Table, column_names, law_of, load_ta
 from curvafit.priors import Coefficients, Grid, preset
 from curvafit.scan.measure import read_texture
 from curvafit.scan.prepare import WORKING_THICKNESS, prepare, thinner_thickness
-from curvafit.volumes.field import ScanError
+from curvafit.volumes.volume import ScanError
 
 FAST = ("field", "mask")
 

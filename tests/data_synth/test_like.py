@@ -13,7 +13,7 @@ from curvafit.data_synth.imaging.image import image, regrid
 from curvafit.data_synth.imaging.like import fit_modality
 from curvafit.data_synth.imaging.modality import Contrast, Detector, Imaging, Noise, Optics
 from curvafit.priors import Grid, optimal_profile
-from curvafit.volumes import Field, load
+from curvafit.volumes import Volume, load
 
 pytestmark = pytest.mark.slow
 
@@ -42,9 +42,9 @@ def shape() -> torch.Tensor:
     return optimal_profile(distance, EPSILON).float()
 
 
-def scan_of(shape: torch.Tensor, how: Imaging) -> tuple[Field, np.ndarray]:
+def scan_of(shape: torch.Tensor, how: Imaging) -> tuple[Volume, np.ndarray]:
     values = image(shape, 1.0, how, 3).numpy()
-    return Field(values, how.spacing, "um"), regrid(shape, 1.0, how).numpy() > 0
+    return Volume(values, how.spacing, "um"), regrid(shape, 1.0, how).numpy() > 0
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_parameters_are_found_again(shape: torch.Tensor, name: str, masked: bool
         heights = [one.detector.gain**2 * one.contrast.background + one.noise.gaussian**2 for one in (b, how)]
         assert heights[0] == pytest.approx(heights[1], rel=0.1)
     if (name, masked) == ("slices", True):
-        small = fit_modality(Field(scan.values, (2000.0, 1000.0, 1000.0), "nm"), mask).base
+        small = fit_modality(Volume(scan.values, (2000.0, 1000.0, 1000.0), "nm"), mask).base
         assert small.optics.blur == pytest.approx(tuple(1000 * width for width in b.optics.blur))
         assert small.noise.gaussian == pytest.approx(b.noise.gaussian)
 
@@ -93,17 +93,17 @@ def test_odd_scans(shape: torch.Tensor) -> None:
     mask = regrid(shape, 1.0, Imaging()).numpy() > 0
     rng = np.random.default_rng(0)
     signed = np.where(mask, 500, -500) + rng.normal(0, 40, mask.shape)
-    low = fit_modality(Field(signed.astype(np.int16), (1.0, 1.0, 1.0), "um"), mask)
+    low = fit_modality(Volume(signed.astype(np.int16), (1.0, 1.0, 1.0), "um"), mask)
     assert low.base.detector.ceiling is None
     assert image(shape, 1.0, low.base, 0).amin() < -300
     few, light = rng.poisson(0.02 + 3.0 * mask), rng.normal(0, 10, mask.shape) + 100 * mask
     for values in (np.where(mask, 80.0, 0.0), few, light):
-        found = fit_modality(Field(values.astype(np.float32), (1.0, 1.0, 1.0), "um"), mask)
+        found = fit_modality(Volume(values.astype(np.float32), (1.0, 1.0, 1.0), "um"), mask)
         assert 0 <= found.base.illumination.bias <= 0.9 and np.isfinite(found.base.detector.gain)
-    small = fit_modality(Field(signed[:40, :14, :40].astype(np.float32), (1.0, 1.0, 1.0), "um"), mask[:40, :14, :40])
+    small = fit_modality(Volume(signed[:40, :14, :40].astype(np.float32), (1.0, 1.0, 1.0), "um"), mask[:40, :14, :40])
     assert small.base.contrast.foreground > small.base.contrast.background
     scan, mask = scan_of(shape, PHOTONS)
-    found = fit_modality(Field(scan.values.astype(np.uint16), scan.spacing, "um"), mask)
+    found = fit_modality(Volume(scan.values.astype(np.uint16), scan.spacing, "um"), mask)
     assert found.base.detector.ceiling == 65535
     low, high = found.ranges["detector.gain"]
     assert low < found.base.detector.gain < high and found.draw(1) != found.draw(2)
@@ -112,7 +112,7 @@ def test_odd_scans(shape: torch.Tensor) -> None:
 def test_a_real_bone(data: Path) -> None:
     """Two classes of grey; the noise as a difference of neighbours sees it; edges of one to two voxels."""
     scan = load(data / "scans" / "lhdl_trabecular_200.tif", spacing=19.5, unit="um")
-    cut = Field(scan.values[50:130, 50:130, 50:130], scan.spacing, "um")
+    cut = Volume(scan.values[50:130, 50:130, 50:130], scan.spacing, "um")
     b = fit_modality(cut).base
     assert 10 < b.contrast.background * (b.detector.gain or 1) + b.detector.offset < 40
     assert 120 < b.contrast.foreground * (b.detector.gain or 1) + b.detector.offset < 220

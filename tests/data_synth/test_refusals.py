@@ -19,7 +19,7 @@ from curvafit.data_synth.samples import fetch
 from curvafit.data_synth.sets import SetSpec, build_set, make_cases, read_spec
 from curvafit.data_synth.sources import Generated, decode_source, random_crop
 from curvafit.priors import Grid, preset
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 
 class Given(NamedTuple):
@@ -93,11 +93,11 @@ REFUSALS: list[tuple[str, Callable[[Given], object]]] = [
     ("gain", lambda g: PLAIN.assign({"detector.gain": -1})),
     ("foreground", lambda g: PLAIN.assign({"contrast.foreground": math.nan})),
     ("ceiling", lambda g: PLAIN.assign({"detector.ceiling": 0})), ("unit", lambda g: PLAIN.assign({"unit": "ell"})),
-    ("8 voxels", lambda g: fit_modality(Field(GREY[:4]))),
-    ("finite", lambda g: fit_modality(Field(np.zeros((9, 9, 9))))),
-    ("finite", lambda g: fit_modality(Field(GREY * np.nan))),
-    ("shape", lambda g: fit_modality(Field(GREY), np.ones((3, 3, 3), bool))),
-    ("mask", lambda g: fit_modality(Field(GREY), np.ones(GREY.shape, bool))),
+    ("8 voxels", lambda g: fit_modality(Volume(GREY[:4]))),
+    ("finite", lambda g: fit_modality(Volume(np.zeros((9, 9, 9))))),
+    ("finite", lambda g: fit_modality(Volume(GREY * np.nan))),
+    ("shape", lambda g: fit_modality(Volume(GREY), np.ones((3, 3, 3), bool))),
+    ("mask", lambda g: fit_modality(Volume(GREY), np.ones(GREY.shape, bool))),
 ]  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from curvafit.drawing import plot
 from curvafit.drawing.render import render, surface_picture, view
 from curvafit.generation import Schedule, generate
 from curvafit.geometry.diagram import Diagram
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 
 def test_a_diagram_shows_itself() -> None:
@@ -220,7 +220,7 @@ def test_bands_hold_what_they_say_and_show_the_scan_s_numbers() -> None:
 
 def test_the_three_middle_slices_are_drawn_in_proportion() -> None:
     values = np.arange(5 * 6 * 7, dtype=np.float32).reshape(5, 6, 7)
-    figure = Field(values, (3.0, 2.0, 1.0), "um").plot()
+    figure = Volume(values, (3.0, 2.0, 1.0), "um").plot()
     for axes, plane in zip(figure.axes, (values[2], values[:, 3], values[:, :, 3]), strict=True):
         assert np.array_equal(axes.images[0].get_array(), plane)
     assert [axes.get_aspect() for axes in figure.axes] == [2.0, 3.0, 1.5]

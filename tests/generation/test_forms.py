@@ -28,7 +28,7 @@ from curvafit.priors.stencils import gaussian_blur
 from curvafit.segmentation.evidence import probability_evidence
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.segment import segment
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 boundaries = pytest.mark.parametrize("boundary", ["periodic", "replicate"])
 ANISOTROPIC = (0.013, 0.01, 0.008)
@@ -226,7 +226,7 @@ def test_known_slices_hold_whatever_the_axis_and_the_spacing(along: int) -> None
     from their transposes; and at an ε of our own near the profile of that ε."""
     known, ε, fields = list(range(0, SHAPE[along], (2, 4, 3)[along])), 3.0, []
     for turn in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        truth = Field((DISTANCE > 0).transpose(turn), tuple(EDGES[k] for k in turn))  # type: ignore[arg-type]
+        truth = Volume((DISTANCE > 0).transpose(turn), tuple(EDGES[k] for k in turn))  # type: ignore[arg-type]
         found = reconstruct(truth, WILLMORE, known=known, axis=turn.index(along), epsilon=ε, steps=8, stiffness=1e7)
         assert found.epsilon == ε and any("2-fold" in note for note in found.notes)
         kept = (found.mask.values == truth.values).all(tuple(k for k in range(3) if k != turn.index(along)))
@@ -249,7 +249,7 @@ def test_evidence_counts_its_nats_once_whatever_the_volume_of_a_part(epsilon: fl
 
     monkeypatch.setattr(import_module("curvafit.segmentation.flow"), "descend", watched)
     errors = np.random.default_rng(0).standard_normal(SHAPE)
-    likely = Field((1 / (1 + np.exp(-DISTANCE - errors))).astype(np.float32), EDGES)
+    likely = Volume((1 / (1 + np.exp(-DISTANCE - errors))).astype(np.float32), EDGES)
     law = Coefficients(1.5, 0.5, 2.5)
     found = segment(likely, law, weight=0.3, probabilities=True, epsilon=epsilon, steps=1)
     assert found.epsilon == epsilon

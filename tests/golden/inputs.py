@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from curvafit.volumes import Field, save
+from curvafit.volumes import Volume, save
 from tests.calling import done
 from tests.golden import FOLDER
 
@@ -24,15 +24,15 @@ def make(folder: Path = FOLDER) -> None:
     _nifti(phase[:24, :24, :24], folder / "field.nii.gz")
     _nifti((phase > 0).astype(np.uint8), folder / "mask.nii.gz")
     grey = np.clip(110 + 50 * phase + rng.normal(0, 14, phase.shape), 0, 255).astype(np.uint8)
-    save(Field(grey, EDGE, "mm"), folder / "scan.tif")
+    save(Volume(grey, EDGE, "mm"), folder / "scan.tif")
     halves = np.ones(phase.shape, np.uint8)
     halves[:, :, 17:] = 2
     _nifti(halves, folder / "halves.nii.gz")
     inside = np.clip(0.5 + 0.4 * phase + rng.normal(0, 0.1, phase.shape), 0, 1)
     _nifti(np.round(inside, 2).astype(np.float32), folder / "probabilities.nii.gz")
     cells, light = nuclei((26, 40, 44), 5, rng)
-    save(Field(cells, EDGE, "mm"), folder / "cells.tif")
-    save(Field(light, EDGE, "mm"), folder / "light.tif")
+    save(Volume(cells, EDGE, "mm"), folder / "cells.tif")
+    save(Volume(light, EDGE, "mm"), folder / "light.tif")
     for group, radius in (("control", 3.0), ("treated", 3.8)):
         (folder / group).mkdir(exist_ok=True)
         for k in range(4):
@@ -71,7 +71,7 @@ def nuclei(shape: tuple[int, int, int], count: int, rng: np.random.Generator) ->
 def _nifti(values: np.ndarray, path: Path) -> None:
     affine = np.diag([EDGE, EDGE, EDGE, 1.0])
     affine[:3, 3] = 1, -2, 3
-    save(Field(values, EDGE, "mm", affine), path)
+    save(Volume(values, EDGE, "mm", affine), path)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import curvafit
 from curvafit.core.runtime import log_stages
 from curvafit.scan.measure import COLUMNS, measure_surface
 from curvafit.studies.tables import format_csv
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 
 def level_set(shape: Sequence[int], width: float, share: float, seed: int = 0) -> np.ndarray:
@@ -35,9 +35,9 @@ def test_a_region_elsewhere() -> None:
     affine[:3, 3] = 1, 2, 3
     turned = affine @ np.diag([-1.0, 1.0, 1.0, 1.0])
     turned[0, 3] += 39 * 0.02
-    scan = Field(mask.astype(np.uint8), 0.02, "mm", affine)
-    same = curvafit.measure(scan, roi=Field(labels, 0.02, "mm", affine))
-    flipped = curvafit.measure(scan, roi=Field(labels[..., ::-1], 0.02, "mm", turned))
+    scan = Volume(mask.astype(np.uint8), 0.02, "mm", affine)
+    same = curvafit.measure(scan, roi=Volume(labels, 0.02, "mm", affine))
+    flipped = curvafit.measure(scan, roi=Volume(labels[..., ::-1], 0.02, "mm", turned))
     for label in (1, 2):
         values = [each.compartments[label]["Tb.Th"].value for each in (same, flipped)]
         assert values[0] == pytest.approx(values[1], rel=1e-12)

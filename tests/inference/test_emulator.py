@@ -26,7 +26,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.scan.measure import Reading, windows_along
 from curvafit.scan.prepare import Prepared, prepare
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 DEVIATION = (HIGH - LOW) / np.sqrt(12)
 
@@ -319,7 +319,7 @@ BARREN = Twin(None, 0.0, None, None, "one phase")
 
 def gyroid(fill: float, shape: tuple[int, int, int] = (48, 48, 48)) -> Prepared:
     mask = Gyroid(fill).distance(centres(Grid(shape))).numpy() > 0
-    return prepare(Field(mask.astype(np.uint8)), kind="mask", one_scale=True)
+    return prepare(Volume(mask.astype(np.uint8)), kind="mask", one_scale=True)
 
 
 def check(prepared: Prepared, monkeypatch: pytest.MonkeyPatch, grow: Callable[..., Twin]) -> Misfit | None:

@@ -29,7 +29,7 @@ from curvafit.report.page import write_inference
 from curvafit.scan.measure import read_texture, scan_diagram
 from curvafit.scan.prepare import prepare
 from curvafit.scan.structure import Quality
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
 GRID = Grid((32, 32, 32))
@@ -43,7 +43,7 @@ def tubes() -> np.ndarray:
 @pytest.fixture(scope="module")
 def inference(tubes: np.ndarray) -> Inference:
     """With fewer shapes, of fewer steps, than a user's: every stage is passed, none polished."""
-    scan = Field((tubes > 0).astype(np.uint8), (2.0, 2.0, 2.0), "um", source="tubes")
+    scan = Volume((tubes > 0).astype(np.uint8), (2.0, 2.0, 2.0), "um", source="tubes")
     few = {"simulations": 8, "rounds": 1, "twins": 2, "schedule": schedule(LEARNED, steps=400)}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(estimate, "TESTED", 8)
@@ -122,7 +122,7 @@ def test_fit_json_holds_what_the_generator_needs(inference: Inference, tmp_path)
 
 def quick(values: np.ndarray, spacing: float = 1.0, unit: str = "um", **options) -> Fit:
     """The fit of a mask without any shape grown."""
-    scan = Field(values.astype(np.uint8), (spacing,) * 3, unit)
+    scan = Volume(values.astype(np.uint8), (spacing,) * 3, unit)
     return infer(scan, kind="mask", periodic=True, fast=True, **options).fit
 
 
@@ -192,7 +192,7 @@ PLANE = np.abs(np.indices((40, 40, 40))[0] + 0.3 * np.indices((40, 40, 40))[1] -
     ("shape", "said"), [(NOISE, "the scan is noise"), (BALL, "a single ball-like body"), (PLANE, "is flat")]
 )
 def test_what_is_no_texture_has_no_law(shape, said: str, tmp_path: Path) -> None:
-    inference = infer(Field(shape.astype(np.uint8), (1.0,) * 3, "um"), kind="mask")
+    inference = infer(Volume(shape.astype(np.uint8), (1.0,) * 3, "um"), kind="mask")
     assert inference.fit.coefficients is None and inference.fit.status.startswith("No law: ")
     assert said in inference.fit.status
     report = write_inference(inference, tmp_path / "out")
@@ -205,13 +205,13 @@ def test_what_is_no_texture_has_no_law(shape, said: str, tmp_path: Path) -> None
 def test_grey_noise_is_noise_and_a_texture_under_it_is_not(tubes: np.ndarray) -> None:
     rng = np.random.default_rng(1)
     grey = rng.normal(100, 20, GRID.shape).astype(np.float32)
-    assert prepare(Field(grey, (1.0,) * 3, "um"), kind="image").noise
-    assert not prepare(Field(grey + 60 * (tubes > 0), (1.0,) * 3, "um"), kind="image").noise
+    assert prepare(Volume(grey, (1.0,) * 3, "um"), kind="image").noise
+    assert not prepare(Volume(grey + 60 * (tubes > 0), (1.0,) * 3, "um"), kind="image").noise
 
 
 def test_tiles_measure_what_the_whole_box_measures(tubes: np.ndarray) -> None:
     rng = np.random.default_rng(0)
-    prepared = prepare(Field(np.tile(tubes, (1, 1, 5)), (1.0, 1.0, 1.0), "um"), kind="field")
+    prepared = prepare(Volume(np.tile(tubes, (1, 1, 5)), (1.0, 1.0, 1.0), "um"), kind="field")
     assert prepared.phase.shape == (32, 32, 160)
     tiled = scan_diagram(prepared)
     grid = Grid((32, 32, 160), prepared.grid.spacing, "replicate")
@@ -226,7 +226,7 @@ def test_tiles_measure_what_the_whole_box_measures(tubes: np.ndarray) -> None:
 
 def test_a_region_of_interest_hides_the_surface_that_it_cuts() -> None:
     inside = Gyroid(0.22).distance(centres(Grid((44, 44, 44)))).numpy() > 0
-    scan = Field(inside.astype(np.uint8), (1.0, 1.0, 1.0), "um")
+    scan = Volume(inside.astype(np.uint8), (1.0, 1.0, 1.0), "um")
     z, y, x = np.indices(scan.values.shape) - 21.5
     region = z**2 + y**2 + x**2 < 20**2
     prepared = prepare(scan, kind="mask", roi=region)
@@ -247,7 +247,7 @@ def test_of_a_large_pyramid_the_level_that_suits_the_structure_is_read(tmp_path,
     monkeypatch.setattr("curvafit.scan.prepare.LARGEST_SCAN", 64)
     monkeypatch.setattr("curvafit.volumes.formats.zarr.CHUNK", 48)
     mask = (lattice(96, 48, 12.0) > 0).astype(np.uint8)
-    path = save(Field(mask, (0.5, 0.5, 0.5), "um"), tmp_path / "scan.zarr")
+    path = save(Volume(mask, (0.5, 0.5, 0.5), "um"), tmp_path / "scan.zarr")
     found = infer(path, fast=True)
     assert found.scan.shape == (48, 48, 48) and found.scan.spacing == (1.0, 1.0, 1.0)
     assert any("the level 1 of its pyramid" in note for note in found.fit.notes)
@@ -258,7 +258,7 @@ def test_the_largest_cube_of_a_region_is_described() -> None:
     """Of a region of a box beside a thin slab, the box; of a smaller one nothing, and of one without a surface."""
     box = Grid((44, 44, 44))
     mask = Gyroid(0.22).distance(centres(box)).numpy() > 0
-    own = dataclasses.replace(prepare(Field(mask), kind="mask"), mask=mask, grid=Grid(box.shape, 0.01, "replicate"))
+    own = dataclasses.replace(prepare(Volume(mask), kind="mask"), mask=mask, grid=Grid(box.shape, 0.01, "replicate"))
     region = np.zeros(box.shape, dtype=bool)
     region[6:33, 10:37, 12:39] = region[40:43] = True
     seen = read_texture(dataclasses.replace(own, roi=region))
@@ -275,7 +275,7 @@ def test_the_largest_cube_of_a_region_is_described() -> None:
 def test_a_scan_is_seen_as_a_kind_of_view() -> None:
     grid = Grid((32, 32, 32))
     distance = Gyroid(0.32).distance(centres(grid, (0.001, 0.0023, 0.0007))).numpy()
-    whole = prepare(Field(np.tanh(20 * distance).astype(np.float32)), kind="field", periodic=True)
+    whole = prepare(Volume(np.tanh(20 * distance).astype(np.float32)), kind="field", periodic=True)
     assert whole.kind == "field" and whole.grid.periodic
     parts: list[tuple[str, dict]] = [
         ("field", {}),
@@ -302,8 +302,8 @@ def _quantile(measured, direction: np.ndarray, share: float) -> float:
 @pytest.mark.slow
 def test_the_nearest_match_is_refined_by_gradients(tubes: np.ndarray) -> None:
     """By its descriptors as a mask, by its stationarity as a field; distances are geomloss's."""
-    mask = Field((tubes > 0).astype(np.uint8), (1.0,) * 3, "um")
-    for scan, name in ((mask, "optimum"), (Field(tubes, (1.0,) * 3, "um"), "stationarity")):
+    mask = Volume((tubes > 0).astype(np.uint8), (1.0,) * 3, "um")
+    for scan, name in ((mask, "optimum"), (Volume(tubes, (1.0,) * 3, "um"), "stationarity")):
         inference = infer(scan, periodic=True, method="match", fast=True)
         fit = inference.fit
         assert fit.chosen == name and [each.name for each in fit.candidates][-1] == "match" and fit.draws is None

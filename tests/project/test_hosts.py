@@ -19,7 +19,7 @@ from scipy import ndimage
 
 from curvafit.generation import generate
 from curvafit.priors import Coefficients, Grid, preset
-from curvafit.volumes import Field, load, save
+from curvafit.volumes import Volume, load, save
 
 HOSTS = Path(__file__).resolve().parents[2] / "examples" / "hosts"
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -37,7 +37,7 @@ def labels(tmp_path: Path) -> Path:
     tube = np.hypot(y - 11 + np.sin(z / 4), x - 12) < 6
     tube[np.arange(17) % 8 > 0] = False
     affine = np.array([[-0.3, 0, 0, 5], [0, -0.3, 0, 6], [0, 0, 0.6, 7], [0, 0, 0, 1]])
-    return save(Field(tube.astype(np.uint8), (0.6, 0.3, 0.3), "mm", affine), tmp_path / "labels.nii.gz")
+    return save(Volume(tube.astype(np.uint8), (0.6, 0.3, 0.3), "mm", affine), tmp_path / "labels.nii.gz")
 
 
 def test_slicer_gets_volumes_in_their_place_and_progress(labels: Path, tmp_path: Path) -> None:
@@ -127,7 +127,7 @@ def test_the_monai_bundle_learns_from_slices_and_writes_masks(tmp_path: Path) ->
     known = np.where(np.arange(40) % 8 == 0, truth, False)
     for kind, values in (("images", image.astype(np.float32)), ("labels", known.astype(np.uint8))):
         (folder / "data" / kind).mkdir(parents=True)
-        save(Field(values.T, 0.5, "mm"), folder / "data" / kind / "case.nii.gz")
+        save(Volume(values.T, 0.5, "mm"), folder / "data" / kind / "case.nii.gz")
     for name, words in (("train", ("--epochs", "60", "--every", "8")), ("inference", ())):
         files = str([f"configs/{each}.json" for each in ("common", name)])
         ended = run("-m", "monai.bundle", "run", "--config_file", files, *words, folder=folder)

@@ -11,7 +11,7 @@ from curvafit.inference.atlas import load_atlas
 from curvafit.report.demo import demo_page, score_completion, write_demo
 from curvafit.scan.measure import measure
 from curvafit.segmentation.slices import WAYS
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 
 def cone(n: int = 33) -> np.ndarray:
@@ -37,7 +37,7 @@ def test_scores_are_of_the_slices_left_out_alone() -> None:
 @pytest.mark.slow
 def test_the_page_stands_alone_and_escapes_what_it_is_told() -> None:
     inference, mask = made_inference(), lattice(48, 24, 5.0) > 0
-    measures = measure(Field(mask, (SCALE,) * 3, "mm"))
+    measures = measure(Volume(mask, (SCALE,) * 3, "mm"))
     texture = lattice(16, 8, 2.0)
     for textures, pictures in (([texture, texture], 4), ([], 3)):
         page = demo_page(inference, measures, score_completion(mask, mask, axis=1), textures, load_atlas())
@@ -50,5 +50,5 @@ def test_another_program_s_page_is_kept(tmp_path: Path) -> None:
     page = tmp_path / "demo.html"
     page.write_text("mine")
     with pytest.raises(ValueError, match="overwrite"):
-        write_demo(Field(cone(), (1.0,) * 3, "voxel"), tmp_path)
+        write_demo(Volume(cone(), (1.0,) * 3, "voxel"), tmp_path)
     assert page.read_text() == "mine" and [path.name for path in tmp_path.iterdir()] == ["demo.html"]

@@ -11,7 +11,7 @@ from found import lattice, without_drawing
 from curvafit.report.laws import infer_scans, name_folders
 from curvafit.report.measures import WORD, describe_range, name_parts, shorten
 from curvafit.scan.measure import Measures, measure
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
 
@@ -22,7 +22,7 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     found = []
     for radius, edge, unit in ((4.5, 0.02, "mm"), (6.0, 20.0, "um")):
         mask = (lattice(56, 28, radius) > 0).astype(np.uint8)
-        found.append(Path(save(Field(mask, (edge,) * 3, unit), folder / f"r{10 * radius:.0f}.nii.gz")))
+        found.append(Path(save(Volume(mask, (edge,) * 3, unit), folder / f"r{10 * radius:.0f}.nii.gz")))
     return found
 
 
@@ -57,7 +57,7 @@ def test_compartments_have_rows(scans: list[Path], tmp_path: Path) -> None:
     labels[28:] = 2
     labels[24:32, :6, :6] = 3  # without structure
     labels[(lattice(56, 28, 6.0) > 0) & ~(lattice(56, 28, 4.5) > 0) & (labels == 2)] = 4  # a shell of background
-    region = save(Field(labels, (0.02,) * 3, "mm"), tmp_path / "roi.nii.gz")
+    region = save(Volume(labels, (0.02,) * 3, "mm"), tmp_path / "roi.nii.gz")
     twin = tmp_path / "twin.nii.gz"
     twin.write_bytes(scans[0].read_bytes())
     done("measure", scans[0], twin, "--roi", region, "--kind", "mask", "-o", tmp_path / "out")
@@ -73,7 +73,7 @@ def test_scans_that_do_not_go_together_are_refused(scans: list[Path], tmp_path: 
     refused(call("measure", scans[0], "--labels", "-o", tmp_path / "out"), "no page", progress=True)
     refused(call("measure", scans[0], "-o", "/"), "of its own")
     refused(call("measure", scans[0], "-o", tmp_path / "study.v2"), "no suffix", progress=True)
-    empty = save(Field(np.zeros((40, 40, 40), np.uint8), (0.02,) * 3, "mm"), tmp_path / "empty.nii.gz")
+    empty = save(Volume(np.zeros((40, 40, 40), np.uint8), (0.02,) * 3, "mm"), tmp_path / "empty.nii.gz")
     refused(call("measure", scans[0], empty, "-o", tmp_path / "out"), "empty.nii.gz", progress=True)
     assert not (tmp_path / "out").exists()
     assert sorted(each.name for each in tmp_path.iterdir()) == ["bare.npy", "empty.nii.gz"]
@@ -110,7 +110,7 @@ def test_each_scan_has_its_report_and_its_rows(scans: list[Path], tmp_path: Path
 
 
 def test_what_is_wrong_is_said_with_the_scan(scans: list[Path], tmp_path: Path) -> None:
-    empty = save(Field(np.zeros((40, 40, 40), np.uint8)), tmp_path / "empty.nii.gz")
+    empty = save(Volume(np.zeros((40, 40, 40), np.uint8)), tmp_path / "empty.nii.gz")
     with pytest.raises(ValueError, match="empty.nii.gz"):
         infer_scans([str(empty), str(scans[0])], tmp_path / "out", fast=True, command="one")
     assert not (tmp_path / "out" / "laws.html").exists()

@@ -16,7 +16,7 @@ from curvafit.scan import prepare as preparing
 from curvafit.scan.grids import boxes_by_surface, centre_distance, median_thickness, remove_specks, resample
 from curvafit.scan.prepare import WORKING_THICKNESS, Prepared, coarser_level, is_ball, prepare, read_scan
 from curvafit.scan.structure import Quality, find_structure, is_noise, measure_quality, sample_mask
-from curvafit.volumes import Field, ScanError, load, save
+from curvafit.volumes import ScanError, Volume, load, save
 
 
 def tube_mask(shape: tuple[int, int, int], spacing: tuple[float, float, float], radius: float) -> np.ndarray:
@@ -30,7 +30,7 @@ def image_of(mask: np.ndarray, noise: float = 8.0, seed: int = 0) -> np.ndarray:
     return np.clip(grey + np.random.default_rng(seed).normal(0, noise, mask.shape), 0, 255).astype(np.uint8)
 
 
-def threshold_of(scan: Prepared | Field) -> float:
+def threshold_of(scan: Prepared | Volume) -> float:
     """The grey level that separates the phases, as a note says."""
     match = re.search(r"threshold of ([\d.]+):", " ".join(scan.notes))
     assert match is not None
@@ -42,7 +42,7 @@ def test_of_a_large_file_the_middle_is_read(tmp_path, monkeypatch, crop) -> None
     monkeypatch.setattr("curvafit.scan.prepare.LARGEST_SCAN", 24)
     mask = tube_mask((20, 24, 60), (1, 1, 1), 6)
     grey = image_of(mask)
-    path = save(Field(grey, (1.0, 1.0, 1.0), "um"), tmp_path / "scan.zarr")
+    path = save(Volume(grey, (1.0, 1.0, 1.0), "um"), tmp_path / "scan.zarr")
     field, shape = read_scan(path, crop=crop)
     rows = slice(4, 20) if crop else slice(0, 24)
     assert shape == grey[:, rows].shape and (field.values == grey[:, rows, 18:42]).all()
@@ -51,7 +51,7 @@ def test_of_a_large_file_the_middle_is_read(tmp_path, monkeypatch, crop) -> None
     assert read_scan(path, label=int(grey[9, 12, 30]))[0].values[9, 12, 12] == 1
     with pytest.raises(ScanError, match="in the middle of this large scan"):
         read_scan(path, label=999)
-    packed = save(Field(grey, (1.0, 1.0, 1.0), "um"), tmp_path / "scan.nii.gz")  # cannot be read in part
+    packed = save(Volume(grey, (1.0, 1.0, 1.0), "um"), tmp_path / "scan.nii.gz")  # cannot be read in part
     assert read_scan(packed)[0].shape == (20, 24, 60)
 
 
@@ -61,8 +61,8 @@ def test_a_coarser_level_is_chosen_where_the_structure_is_thick_there(tmp_path, 
     monkeypatch.setattr("curvafit.scan.prepare.LARGEST_SCAN", 64)
     monkeypatch.setattr("curvafit.volumes.formats.zarr.CHUNK", 48)
     mask = tube_mask((96, 96, 200), (1, 1, 1), radius)
-    path = save(Field(mask.astype(np.uint8), (0.5, 0.5, 0.5), "um"), tmp_path / "scan.zarr")
-    prepared = prepare(Field(mask.astype(np.uint8)), one_scale=True)
+    path = save(Volume(mask.astype(np.uint8), (0.5, 0.5, 0.5), "um"), tmp_path / "scan.zarr")
+    prepared = prepare(Volume(mask.astype(np.uint8)), one_scale=True)
     assert coarser_level(path, mask.shape, prepared) == level
     assert coarser_level(path, mask.shape, prepared, spacing=(1, 1, 1)) is None  # which may be the finest's alone
     assert coarser_level(path, mask.shape, replace(prepared, kind="field")) is None  # whose ε is the finest's
@@ -74,7 +74,7 @@ def test_a_level_keeps_the_structure_s_voxels_and_the_slab_s(tmp_path, monkeypat
     """A pyramid of fourths leaves 6 of 24 voxels, and a half of a slab of 40 slices too few slices."""
     monkeypatch.setattr("curvafit.scan.prepare.LARGEST_SCAN", 64)
     store = tmp_path / "scan.zarr"
-    save(Field(tube_mask((96, 96, 200), (1, 1, 1), 12).astype(np.uint8), (1.0, 1.0, 1.0), "um"), store)
+    save(Volume(tube_mask((96, 96, 200), (1, 1, 1), 12).astype(np.uint8), (1.0, 1.0, 1.0), "um"), store)
     prepared = prepare(load(store), one_scale=True)
     for scale, shape, level in ((2, (96, 96, 200), "1"), (4, (96, 96, 200), None), (2, (40, 96, 200), None)):
         attributes = json.loads((store / "zarr.json").read_text())
@@ -108,20 +108,20 @@ def test_kinds_are_told_apart() -> None:
         (image_of(TUBE), {}, "image"), (scaled, {}, "image"), (FIELD, {"threshold": 0.5}, "image"),
         *((FIELD, {"kind": kind}, kind) for kind in ("field", "mask", "image")),
     ):  # fmt: skip
-        assert prepare(Field(values), **options).kind == kind
+        assert prepare(Volume(values), **options).kind == kind
 
 
 def test_a_phase_field_stays_as_it_is() -> None:
-    prepared = prepare(Field(FIELD, 0.5, "um"), periodic=True)
+    prepared = prepare(Volume(FIELD, 0.5, "um"), periodic=True)
     assert np.array_equal(prepared.phase, FIELD)
     assert prepared.grid == Grid(TUBE.shape, boundary="periodic")
     assert (prepared.scale, prepared.working_voxel, prepared.unit) == ((1, 1, 1), 0.5, "um")
-    assert np.array_equal(prepare(Field(FIELD), dark=True).mask, ~(FIELD >= 0))
+    assert np.array_equal(prepare(Volume(FIELD), dark=True).mask, ~(FIELD >= 0))
 
 
 def test_a_mask_is_profiled_as_the_atlas_profiles_its_masks() -> None:
     mask = tube_mask((24, 24, 24), (1, 1, 1), 5)
-    prepared = prepare(Field(mask))
+    prepared = prepare(Volume(mask))
     assert prepared.grid.boundary == "replicate"
     assert np.array_equal(prepared.mask, mask)
     assert np.array_equal(prepared.phase, phase_field(torch.from_numpy(mask.copy()), prepared.grid, 0.02).numpy())
@@ -130,12 +130,12 @@ def test_a_mask_is_profiled_as_the_atlas_profiles_its_masks() -> None:
 
 def test_the_image_of_a_mask_gives_the_mask_back() -> None:
     mask = tube_mask((40, 40, 40), (1, 1, 1), 6)
-    bright, dark = prepare(Field(image_of(mask))), prepare(Field(255 - image_of(mask)), dark=True)
+    bright, dark = prepare(Volume(image_of(mask))), prepare(Volume(255 - image_of(mask)), dark=True)
     for prepared in (bright, dark):
         overlap = (prepared.mask & mask).sum() / (prepared.mask | mask).sum()
         assert overlap > 0.9
     assert threshold_of(bright) == pytest.approx(100, abs=12)
-    given = prepare(Field(image_of(mask)), threshold=100.0)
+    given = prepare(Volume(image_of(mask)), threshold=100.0)
     assert "the given threshold of 100" in " ".join(given.notes)
 
 
@@ -143,14 +143,14 @@ def test_the_image_of_a_mask_gives_the_mask_back() -> None:
 def test_a_structure_and_its_background_get_one_working_grid(radius: float) -> None:
     """The thinner of the two sets it; and the note says how to turn them round."""
     mask = tube_mask((40, 40, 40), (1, 1, 1), radius)
-    own, other = prepare(Field(mask)), prepare(Field(~mask))
+    own, other = prepare(Volume(mask)), prepare(Volume(~mask))
     assert (own.scale, own.grid, own.thickness) == (other.scale, other.grid, other.thickness)
     assert np.array_equal(own.mask, ~other.mask)
     assert own.volume_fraction == pytest.approx(1 - other.volume_fraction) and own.volume_fraction < 0.5
     (note,) = (note for note in other.notes if "--dark" in note)
     assert f"fills {other.volume_fraction:.0%} of the volume" in note
     assert not any("--dark" in note for note in own.notes)
-    turned = prepare(Field(~mask), kind="mask", dark=True)
+    turned = prepare(Volume(~mask), kind="mask", dark=True)
     assert np.array_equal(turned.mask, own.mask) and not any("--dark" in note for note in turned.notes)
     assert np.array_equal(own.inverted.mask, ~own.mask) and np.array_equal(own.inverted.phase, -own.phase)
     assert np.array_equal(own.inverted.inverted.mask, own.mask) and own.inverted.grid == own.grid
@@ -160,7 +160,7 @@ def test_only_the_region_of_interest_is_filled_or_turned() -> None:
     """Half a tube of radius 10 in a region as thick as it: the background there is thinner."""
     mask, region = tube_mask((40, 40, 40), (1, 1, 1), 10), np.zeros((40, 40, 40), dtype=bool)
     region[8:32, 8:32, :30] = True
-    own = prepare(Field(mask), roi=region)
+    own = prepare(Volume(mask), roi=region)
     assert own.roi is not None
     assert own.volume_fraction == own.mask[own.roi].mean() > 0.5
     assert not own.inverted.mask[~own.roi].any()
@@ -207,7 +207,7 @@ def test_a_fine_gyroid_is_no_noise(period: int) -> None:
 def test_resampled_to_a_known_thickness_at_the_right_place(tube, grey: bool) -> None:
     shape, spacing, radius = tube
     mask = tube_mask(shape, spacing, radius)
-    prepared = prepare(Field(image_of(mask, 3.0) if grey else mask, spacing, "um"))
+    prepared = prepare(Volume(image_of(mask, 3.0) if grey else mask, spacing, "um"))
     assert prepared.scale != (1, 1, 1)
     edge = prepared.working_voxel
     assert tuple(s * h for s, h in zip(prepared.scale, spacing, strict=True)) == pytest.approx((edge,) * 3)
@@ -224,7 +224,7 @@ def test_resampled_to_a_known_thickness_at_the_right_place(tube, grey: bool) -> 
 @pytest.mark.parametrize(("radius", "measured", "law"), [(1.8, 0, 0), (4.4, 1, 1), (7, 1, 0), (11, 0, 0)])
 def test_the_grid_is_kept_from_5_to_16_voxels_and_laws_are_read_at_8(radius: float, measured: int, law: int) -> None:
     side = 32 if radius < 3 else 72
-    scan = Field(tube_mask((side, side, side), (1, 1, 1), radius))
+    scan = Volume(tube_mask((side, side, side), (1, 1, 1), radius))
     for one_scale, kept in ((False, measured), (True, law)):
         prepared = prepare(scan, one_scale=one_scale)
         assert (prepared.scale == (1, 1, 1)) == any("grid is kept" in note for note in prepared.notes) == bool(kept)
@@ -247,7 +247,7 @@ def test_resampling_keeps_linear_functions_of_position(scale, start, slope) -> N
 def test_periodic_boxes_stay_periodic_when_resampled() -> None:
     shape = (80, 80, 60)
     mask = np.roll(tube_mask(shape, (1, 1, 1), 9.6), 40, axis=0)  # the tube crosses the seam
-    rolled, plain = prepare(Field(mask), periodic=True), prepare(Field(np.roll(mask, 40, axis=0)), periodic=True)
+    rolled, plain = prepare(Volume(mask), periodic=True), prepare(Volume(np.roll(mask, 40, axis=0)), periodic=True)
     assert rolled.grid.boundary == plain.grid.boundary == "periodic"
     assert tuple(n * s for n, s in zip(rolled.mask.shape, rolled.scale, strict=True)) == pytest.approx(shape)
     assert rolled.mask.mean() == pytest.approx(plain.mask.mean(), rel=0.05)
@@ -260,7 +260,7 @@ def test_specks_and_pinholes_are_dropped() -> None:
     clean = mask.copy()
     mask[3, 3, 3] = mask[36, 5:7, 30] = True
     mask[20, 20, 10] = False
-    prepared = prepare(Field(mask))
+    prepared = prepare(Volume(mask))
     assert np.array_equal(prepared.mask, clean)
     assert any("specks: 2, pinholes: 1" in note for note in prepared.notes)
     seam = np.zeros((12, 12, 12), bool)
@@ -273,15 +273,15 @@ def test_only_the_region_of_interest_counts(tmp_path) -> None:
     mask = tube_mask((40, 40, 40), (1, 1, 1), 5)
     region = np.zeros(mask.shape, np.uint8)
     region[4:36, 4:36, 10:30] = 1
-    path = save(Field(region), tmp_path / "roi.nii")
-    for roi in (region, Field(region), path):
-        prepared = prepare(Field(mask), roi=roi)
+    path = save(Volume(region), tmp_path / "roi.nii")
+    for roi in (region, Volume(region), path):
+        prepared = prepare(Volume(mask), roi=roi)
         assert prepared.mask.shape == (32, 32, 20) and prepared.origin == (4, 4, 10)
         assert np.array_equal(prepared.mask, mask[4:36, 4:36, 10:30])
     holed = region.copy()
     holed[:, :20] = 0
     holed[4, 4, 10] = 1  # keeps the bounding box
-    assert not prepare(Field(mask), roi=holed).mask[:, :16].any()
+    assert not prepare(Volume(mask), roi=holed).mask[:, :16].any()
     assert any("holds 32.0% of the scan" in note for note in prepared.notes)
 
 
@@ -325,7 +325,7 @@ FLAT[3, 3, 3] = -0.8
 )  # fmt: skip
 def test_what_has_no_shape_is_refused(values: np.ndarray, options: dict, word: str) -> None:
     with pytest.raises(ValueError, match=word):
-        prepare(Field(values), **options)
+        prepare(Volume(values), **options)
 
 
 # ---- real scans ------------------------------------------------------------------------------------------------------
@@ -347,7 +347,7 @@ def test_bone_is_kept_on_its_grid(data) -> None:
     inner = (slice(60, 140),) * 3
     # as the mask's README states, between whole levels
     assert threshold_of(find_structure(scan)[1]) == pytest.approx(84, abs=0.5)
-    prepared = prepare(Field(scan.values[inner], scan.spacing, scan.unit), threshold=84)
+    prepared = prepare(Volume(scan.values[inner], scan.spacing, scan.unit), threshold=84)
     check(prepared)
     assert (prepared.kind, prepared.scale, prepared.working_voxel, prepared.unit) == ("image", (1, 1, 1), 19.5, "um")
     dice = 2 * (prepared.mask & truth[inner]).sum() / (prepared.mask.sum() + truth[inner].sum())
@@ -364,7 +364,7 @@ def test_anisotropic_membranes_become_cubic(data) -> None:
 
 def test_thin_fibres_are_magnified(data) -> None:
     scan = load(data / "scans" / "quanfima_polymer3d_8bit_128x128x128.raw", raw_shape=(128, 128, 128))
-    prepared = prepare(Field(scan.values[:48, :48, :48]))
+    prepared = prepare(Volume(scan.values[:48, :48, :48]))
     check(prepared)
     assert prepared.thickness == pytest.approx(WORKING_THICKNESS)
     assert max(prepared.scale) < 0.7
@@ -449,7 +449,7 @@ def test_thin_structures_have_their_noise_read_from_differences() -> None:
 def shown(quality: Quality, mask: np.ndarray, seed: int = 0, slices: int = 1) -> np.ndarray:
     """The structure in an image of a mask, whose slices are so many voxels thick."""
     grey = quality.image(mask, (slices, 1.0, 1.0), seed)
-    return find_structure(Field(grey, (float(slices), 1.0, 1.0), "voxel"), kind="image", periodic=True)[1].values > 0
+    return find_structure(Volume(grey, (float(slices), 1.0, 1.0), "voxel"), kind="image", periodic=True)[1].values > 0
 
 
 def test_a_sharp_clean_scan_shows_the_shape() -> None:
@@ -484,20 +484,20 @@ def test_voxelised_on_the_same_voxels_is_the_mask_and_thick_slices_lose_a_thin_p
 
 def test_two_sharp_levels_are_split_in_their_middle() -> None:
     """Otsu's threshold lies anywhere between two sharp levels; at the lower one the structure would be a voxel fat."""
-    found = find_structure(Field(image(BODIES, 0.0, 0.005), CUBIC, "voxel"), kind="image", periodic=True)[1]
+    found = find_structure(Volume(image(BODIES, 0.0, 0.005), CUBIC, "voxel"), kind="image", periodic=True)[1]
     assert threshold_of(found) == pytest.approx(125, abs=2)
     assert np.mean(found.values > 0) == pytest.approx(BODIES.mean(), rel=0.03)
 
 
 def test_an_image_knows_its_imaging_and_a_mask_has_none() -> None:
     grey = image(BODIES, 1.0, 0.1)
-    scan = prepare(Field(grey, CUBIC, "voxel"), kind="image", periodic=True)
-    dark = prepare(Field(-grey, CUBIC, "voxel"), kind="image", periodic=True, dark=True)
+    scan = prepare(Volume(grey, CUBIC, "voxel"), kind="image", periodic=True)
+    dark = prepare(Volume(-grey, CUBIC, "voxel"), kind="image", periodic=True, dark=True)
     assert scan.quality is not None and dark.quality is not None
     assert dark.quality.blur == scan.quality.blur
     assert dark.quality.noise == pytest.approx(scan.quality.noise, rel=0.01)
     assert scan.scan_alike(BODIES, 0).quality == scan.quality  # which made its grey levels
-    assert prepare(Field(BODIES, CUBIC, "voxel"), periodic=True).quality is None
+    assert prepare(Volume(BODIES, CUBIC, "voxel"), periodic=True).quality is None
 
 
 @pytest.mark.parametrize("noise", [0.05, 0.1, 0.2, 0.3])
@@ -506,7 +506,7 @@ def test_the_true_share_is_without_what_imaging_adds(blur: float, noise: float) 
     """Thin tubes: their mask is up to half too full, their share less than half as much."""
     z, y, x = np.indices((60, 60, 60)) % 20 - 9.5
     truth = np.minimum(z**2 + y**2, np.minimum(y**2 + x**2, z**2 + x**2)) < 3.2**2
-    scan = prepare(Field(image(truth, blur, noise), CUBIC, "voxel"), kind="image")
+    scan = prepare(Volume(image(truth, blur, noise), CUBIC, "voxel"), kind="image")
     full = truth.mean()
     assert abs(scan.true_volume_fraction - full) < 0.5 * abs(scan.volume_fraction - full)
 
@@ -528,7 +528,7 @@ def test_a_mask_keeps_its_volume_on_other_voxels(step: float) -> None:
 def test_a_grown_shape_is_read_with_the_volume_of_the_same_shape_scanned() -> None:
     """A mask loses some of its volume on the working grid; a shape that is scanned alike must not lose it twice."""
     mask = threads()
-    scan = prepare(Field(mask.astype(np.uint8)), kind="mask", periodic=True, one_scale=True)
+    scan = prepare(Volume(mask.astype(np.uint8)), kind="mask", periodic=True, one_scale=True)
     assert scan.volume_fraction < 0.99 * mask.mean()
     assert scan.scan_alike(mask, 0).volume_fraction == pytest.approx(scan.volume_fraction, rel=0.01)
     assert scan.true_volume_fraction == pytest.approx(mask.mean(), rel=0.01)

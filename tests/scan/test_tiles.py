@@ -18,7 +18,7 @@ from curvafit.scan.instances import OF_BODIES, measure_instances
 from curvafit.scan.measure import Measures
 from curvafit.scan.measure import measure as measure_in_one
 from curvafit.scan.tiles import measure
-from curvafit.volumes import Field, ScanError, save
+from curvafit.volumes import ScanError, Volume, save
 
 #: Shapes of scans, in voxels: of quick tests, and of those of any size of tiles, which have intervals.
 SMALL, LARGE = (66, 51, 54), (99, 67, 73)
@@ -36,16 +36,16 @@ def noisy(mask: np.ndarray, seed: int = 0) -> np.ndarray:
     return grey + np.random.default_rng(seed).normal(0, 20, mask.shape).astype(np.float32)
 
 
-def scans(shape: tuple[int, int, int] = SMALL) -> dict[str, Field]:
+def scans(shape: tuple[int, int, int] = SMALL) -> dict[str, Volume]:
     mask = texture(shape) > 0
     flat = mask[::2]
     return {
-        "mask": Field(mask.astype(np.uint8), 0.5, "um"),  # type: ignore[arg-type]
-        "image": Field(noisy(mask), 0.5, "um"),  # type: ignore[arg-type]
-        "dark levels": Field(np.clip(200 - noisy(mask), 0, 255).astype(np.uint8)),
-        "field": Field(texture(shape)),
-        "slices": Field(flat.astype(np.uint8), (2.0, 1.0, 1.0), "nm"),
-        "slices of an image": Field(noisy(flat), (2.0, 1.0, 1.0), "nm"),
+        "mask": Volume(mask.astype(np.uint8), 0.5, "um"),  # type: ignore[arg-type]
+        "image": Volume(noisy(mask), 0.5, "um"),  # type: ignore[arg-type]
+        "dark levels": Volume(np.clip(200 - noisy(mask), 0, 255).astype(np.uint8)),
+        "field": Volume(texture(shape)),
+        "slices": Volume(flat.astype(np.uint8), (2.0, 1.0, 1.0), "nm"),
+        "slices of an image": Volume(noisy(flat), (2.0, 1.0, 1.0), "nm"),
     }
 
 
@@ -86,7 +86,7 @@ def test_wide_balls_are_those_of_the_whole() -> None:
     for row, column in ((6, 8), (64, 60), (62, 6), (8, 58)):
         mask |= np.hypot(y - row, x - column - 3 * np.sin(z / 12)) < 5
     assert 24 < ball_radii(~mask, (1.0, 1.0, 1.0)).max() < tiles.WIDEST
-    scan = Field(mask.astype(np.uint8))
+    scan = Volume(mask.astype(np.uint8))
     check_alike(measure(scan, tile=52), measure_in_one(scan))
 
 
@@ -112,7 +112,7 @@ def test_balls_of_a_core_are_those_of_the_whole(spacing: tuple[float, float, flo
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    scan = Field(noisy(texture((70, 48, 48)) > 0), 0.5, "um")  # type: ignore[arg-type]
+    scan = Volume(noisy(texture((70, 48, 48)) > 0), 0.5, "um")  # type: ignore[arg-type]
     return save(scan, tmp_path_factory.mktemp("scans") / "scan.zarr")
 
 
@@ -199,7 +199,7 @@ def labels() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def bodies(labels: np.ndarray) -> dict[int, Measures]:
-    found = measure_instances(Field(labels, (0.5, 0.5, 0.5), "um"))
+    found = measure_instances(Volume(labels, (0.5, 0.5, 0.5), "um"))
     assert all(each.part is not None and each.part[0] == "instance" for each in found)
     return {each.part[1]: each for each in found if each.part}
 
@@ -232,7 +232,7 @@ def test_rods_rows_and_units(bodies: dict[int, Measures]) -> None:
 
 
 def test_neighbours_change_nothing(labels: np.ndarray, bodies: dict[int, Measures]) -> None:
-    (alone,) = measure_instances(Field(np.where(labels == 9, 1, 0), (0.5, 0.5, 0.5), "um"))
+    (alone,) = measure_instances(Volume(np.where(labels == 9, 1, 0), (0.5, 0.5, 0.5), "um"))
     assert alone.part == ("instance", 1)
     assert [each.value for each in alone.quantities] == [each.value for each in bodies[9].quantities]
 

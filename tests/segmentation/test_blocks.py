@@ -17,7 +17,7 @@ from curvafit.segmentation import blocks
 from curvafit.segmentation.blocks import reconstruct_file
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.result import write_mask
-from curvafit.volumes import Field, load, save
+from curvafit.volumes import Volume, load, save
 from curvafit.volumes.formats.zarr import write_zarr
 
 #: Blocks of 64 leave a last one of 3 voxels along z, and of 5 along x.
@@ -32,7 +32,7 @@ def texture(shape: tuple[int, int, int] = SHAPE) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def labels(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save(Field(texture(), (0.5, 0.5, 0.5), "um"), tmp_path_factory.mktemp("labels") / "labels.zarr")
+    return save(Volume(texture(), (0.5, 0.5, 0.5), "um"), tmp_path_factory.mktemp("labels") / "labels.zarr")
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +165,7 @@ def test_bad_input_ends_in_one_sentence_and_leaves_nothing(labels: Path, tmp_pat
     broken[50, 3, 3] = np.nan
     for name, array in {"empty": 0 * values, "grey": grey, "nan": broken}.items():
         np.save(tmp_path / f"{name}.npy", array)
-    save(Field(values), tmp_path / "torn.zarr")
+    save(Volume(values), tmp_path / "torn.zarr")
     chunk = tmp_path / "torn.zarr/0/c/1/0/0"
     chunk.write_bytes(chunk.read_bytes()[:-9])
     there = sorted(path.name for path in tmp_path.iterdir())

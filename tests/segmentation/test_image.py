@@ -14,7 +14,7 @@ from curvafit.segmentation.image import find_shift, read_image
 from curvafit.segmentation.reconstruct import are_instances, reconstruct, reconstruct_labels, split_structure
 from curvafit.segmentation.teach import ImageMix, Texture, image_shape, teach
 from curvafit.segmentation.trials import dice
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 pytest.importorskip("sklearn", reason="reading an image needs scikit-learn")
 
@@ -64,14 +64,14 @@ def test_background_around_an_image_changes_nothing() -> None:
 
 def test_the_packaged_filler_finds_what_only_the_image_shows_across_any_axis() -> None:
     mask, grey, turn = rods(), photograph(rods()), (1, 2, 0)
-    shown = Field(mask.astype(np.uint8))
+    shown = Volume(mask.astype(np.uint8))
     alone = reconstruct(shown, every=EVERY).mask.values
     straight = reconstruct(shown, every=EVERY, image=grey)
     found, ball = straight.mask.values, np.s_[13:18, 9:16, 23:30]
     assert dice(found, mask) > dice(alone, mask) + 0.02
     assert not alone[ball].any() and dice(found[ball], mask[ball]) > 0.8
     assert np.array_equal(found[::EVERY], mask[::EVERY])
-    turned = Field(np.ascontiguousarray(mask.transpose(turn)).astype(np.uint8))
+    turned = Volume(np.ascontiguousarray(mask.transpose(turn)).astype(np.uint8))
     other = reconstruct(turned, every=EVERY, axis=2, image=grey.transpose(turn)).probability.values
     assert np.abs(other.transpose(np.argsort(turn)) - straight.probability.values).max() < 1e-3
     blank = reconstruct(shown, every=EVERY, image=photograph(np.zeros_like(mask)))  # of something else: left out

@@ -24,7 +24,7 @@ from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.segmentation.segment import FIRST, NATS, calibrate
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.trials import Task, Trial, choose_by_masks, dice, laws_of
-from curvafit.volumes.field import Field, ScanError
+from curvafit.volumes.volume import ScanError, Volume
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
@@ -86,7 +86,7 @@ def pancakes(thin: int, seed: int = 0, width: int = 32) -> np.ndarray:
 
 def test_an_example_is_cut_in_two() -> None:
     mask = np.concatenate([pancakes(1, seed=2), pancakes(3, seed=3)], axis=2)
-    example = room.Example.of(Field(mask.astype(np.uint8)), range(0, 33, 8), axis=0)
+    example = room.Example.of(Volume(mask.astype(np.uint8)), range(0, 33, 8), axis=0)
     assert np.array_equal(example.lesson.inside, mask[:, :, :42]) and example.lesson.places == tuple(range(41))
     given = example.task.given
     assert np.array_equal(given.inside, mask[::8, :, 42:]) and given.places == (0, 8, 16, 24, 32, 40)
@@ -106,7 +106,7 @@ def test_an_example_tunes_the_network_where_that_is_better(monkeypatch: pytest.M
 def test_a_halo_is_cut_off_again() -> None:
     values = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
     for spacing in (EDGES, (2.0, 1.0, 1.0)):
-        scan = Field(values, spacing)
+        scan = Volume(values, spacing)
         bare, place = (WorkingGrid.of(scan, None, halo=halo) for halo in (0, 5))
         assert place.grid.shape == tuple(n + 10 for n in bare.grid.shape) and place.grid.spacing == bare.grid.spacing
         np.testing.assert_array_equal(place.to_scan(place.to_grid(values)), bare.to_scan(bare.to_grid(values)))
@@ -114,7 +114,7 @@ def test_a_halo_is_cut_off_again() -> None:
         shared = place.spread(values, centre=0)
         np.testing.assert_array_equal(place.to_scan(shared), bare.to_scan(bare.spread(values, centre=0)))
         assert float(shared.sum()) == pytest.approx(float(bare.spread(values, centre=0).sum()), rel=1e-5)
-    whole = WorkingGrid.of(Field(values), None, halo=5, periodic=True)
+    whole = WorkingGrid.of(Volume(values), None, halo=5, periodic=True)
     assert whole.grid.periodic and whole.grid.shape == values.shape
 
 
@@ -172,7 +172,7 @@ def test_known_slices_are_kept_and_the_rest_beats_interpolation() -> None:
     n, every = 41, 8
     truth = np.linalg.norm(np.mgrid[:n, :n, :n] - 20.0, axis=0) < 15.2
     places = np.arange(0, n, every)
-    found = reconstruct(Field(truth.astype(np.uint8)), WILLMORE, every=every, stiffness=STIFFNESS)
+    found = reconstruct(Volume(truth.astype(np.uint8)), WILLMORE, every=every, stiffness=STIFFNESS)
     lines = Slices(truth[places], tuple(places), n, (1.0, 1.0, 1.0)).level("linear") > 0
     assert np.array_equal(found.mask.values[places], truth[places])
     assert dice(found.mask.values, truth) > dice(lines, truth) + 0.01
@@ -184,7 +184,7 @@ GREY, PHOTO = RANDOM.integers(0, 99, (32, 32, 32), np.uint8), BALL + 0.4 * RANDO
 #: What `reconstruct` refuses of a ball of which every eighth slice is known, by a word of the sentence.
 REFUSALS: dict[str, list[dict]] = {
     "between": [{"example": BALL, "every": None, "known": [15, 16]}], "longer": [{"example": BALL[:8]}],
-    "spacing": [{"example": Field(BALL, (1.0,) * 3, "mm")}], "two or more": [{"every": None, "known": [3]}],
+    "spacing": [{"example": Volume(BALL, (1.0,) * 3, "mm")}], "two or more": [{"every": None, "known": [3]}],
     "empty": [{"example": 0 * BALL}, {"every": None, "ignore": 1}, {"slices": 0 * BALL}],
     "12.5": [{"every": None, "known": [0.0, 12.5]}],
     "whole numbers": [{"example": BALL * np.float32(0.5)}, {"slices": BALL * np.float32(0.5)}],
@@ -207,13 +207,13 @@ def test_bad_slices_and_examples_are_refused(word: str) -> None:
 
 
 def test_a_fit_has_the_laws_that_it_trusts(tmp_path: Path) -> None:
-    assert [len(laws_of(prior, Field(ball()))[0]) for prior in (WILLMORE, "tubes")] == [1, 1]
+    assert [len(laws_of(prior, Volume(ball()))[0]) for prior in (WILLMORE, "tubes")] == [1, 1]
     fit, names = made_fit(), ("match", *room.TRUSTED)
     known = [Candidate(name, Coefficients(1, k, 2, 3, 4, 5), -0.5, {}) for k, name in enumerate(names)]
     fit = replace(fit, candidates=(*fit.candidates, *known))
     path = tmp_path / "fit.json"
     path.write_text(fit.to_json())
-    scan = Field(ball(), (0.0195,) * 3, "mm")
+    scan = Volume(ball(), (0.0195,) * 3, "mm")
     laws, _ = laws_of(fit, scan)
     assert laws[0] == room.law_of(fit, scan)[0]
     for each in known[1:]:
@@ -263,20 +263,20 @@ def test_labels_count_as_inside_and_what_is_extrapolated_is_said() -> None:
     truth = leaning()
     labels = np.where(truth, np.random.default_rng(0).integers(1, 200, truth.shape), 0).astype(np.float32)
     labels[1::2] += 0.5  # these are not read
-    found = reconstruct(Field(labels), WILLMORE, every=8.0, first=2, steps=1, stiffness=1e7)  # type: ignore[arg-type]
-    plain = reconstruct(Field(truth), WILLMORE, known=[2, 10, 18, 26], steps=1, stiffness=1e7)
+    found = reconstruct(Volume(labels), WILLMORE, every=8.0, first=2, steps=1, stiffness=1e7)  # type: ignore[arg-type]
+    plain = reconstruct(Volume(truth), WILLMORE, known=[2, 10, 18, 26], steps=1, stiffness=1e7)
     assert np.array_equal(found.mask.values, plain.mask.values) and set(plain.notes) <= set(found.notes)
     assert [note for note in found.notes if "one structure" in note] and len(found.notes) == len(plain.notes) + 1
     assert any("Before" in note and "2" in note for note in found.notes)
     assert any("Beyond" in note and "4 slices" in note and "1 further" in note for note in found.notes)
     assert "after 1 step:" in found.status
-    whole = reconstruct(Field(truth), WILLMORE, known=[0, 15, 31], steps=1, stiffness=1e7)
+    whole = reconstruct(Volume(truth), WILLMORE, known=[0, 15, 31], steps=1, stiffness=1e7)
     assert not any("Beyond" in note for note in whole.notes)
 
 
 def test_each_label_is_completed_as_alone_and_known_slices_stay() -> None:
     truth, affine = organelles(), np.diag([0.2, 0.2, 0.2, 1.0])
-    field = Field(truth, 0.2, "um", affine)
+    field = Volume(truth, 0.2, "um", affine)
     found = reconstruct_labels(field, {2: preset("tubes"), 7: WILLMORE}, every=6, **QUICK)
     assert found.labels is not None and (found.labels.spacing, found.labels.unit) == (field.spacing, "um")
     values = found.labels.values
@@ -391,8 +391,8 @@ def test_the_law_of_each_label_is_inferred_from_the_example(tmp_path: Path, monk
 
 def segmentation(mask: list[bool], likely: list[float], labels: list[int] | None = None) -> Segmentation:
     """One row of voxels with these probabilities, of the inside or of their labels."""
-    inside, chances = (Field(np.array(each)[None, None]) for each in (mask, np.float32(likely)))
-    several = None if labels is None else Field(np.array(labels, dtype=np.uint8)[None, None])
+    inside, chances = (Volume(np.array(each)[None, None]) for each in (mask, np.float32(likely)))
+    several = None if labels is None else Volume(np.array(labels, dtype=np.uint8)[None, None])
     uncertain = Uncertainty(chances, 0.0, (), 1.0)
     return Segmentation(inside, chances, None, None, 1.0, "", (), uncertain, several)
 

@@ -22,9 +22,8 @@ from curvafit.segmentation.evidence import load_probabilities
 from curvafit.segmentation.flow import WorkingGrid
 from curvafit.segmentation.segment import calibrate, segment
 from curvafit.segmentation.trials import dice, law_of
-from curvafit.volumes.boxes import boxes_of
-from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
+from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -39,12 +38,12 @@ def tubes(n: int = 32) -> np.ndarray:
     return first | second | (z**2 + (y + 9) ** 2 + (x + 9) ** 2 < 25)
 
 
-def noisy(mask: np.ndarray, noise: float, **place) -> Field:
+def noisy(mask: np.ndarray, noise: float, **place) -> Volume:
     values = 30 + 100 * mask + noise * np.random.default_rng(1).standard_normal(mask.shape)
-    return Field(values.astype(np.float32), **place)
+    return Volume(values.astype(np.float32), **place)
 
 
-def of_intensities(scan: Field, threshold: float | str = "otsu", dark: bool = False) -> room.VoxelEvidence:
+def of_intensities(scan: Volume, threshold: float | str = "otsu", dark: bool = False) -> room.VoxelEvidence:
     values = room.grey_levels(scan, threshold)
     return room.grey_evidence(values, scan, room.estimate_classes(values, scan, threshold, dark))
 
@@ -63,11 +62,11 @@ def test_intensities_find_the_classes_and_the_noise() -> None:
 def test_classes_that_overlap_are_measured_apart() -> None:
     """Otsu's halves hold some of both phases, so that their means are nearer to each other: off the surface they are
     not."""
-    scan = boxes_of(noisy(tubes(48), 250))
+    scan = load(noisy(tubes(48), 250), lazy=True)
     found = room.GreyEvidence.of(scan, apart=True)
     assert found.first.faint and room.GreyEvidence.of(scan).classes == found.first
     assert abs(found.classes.middle - 80) < abs(found.first.middle - 80) / 1.3
-    clear = room.GreyEvidence.of(boxes_of(noisy(tubes(), 25)), apart=True)
+    clear = room.GreyEvidence.of(load(noisy(tubes(), 25), lazy=True), apart=True)
     assert clear.classes == clear.first
 
 
@@ -88,13 +87,13 @@ def test_a_prior_comes_in_the_scan_s_unit(tmp_path: Path) -> None:
     fit = made_fit()
     path = tmp_path / "fit.json"
     path.write_text(fit.to_json())
-    mm, um = (Field(np.zeros((4, 4, 4)), (h,) * 3, unit) for h, unit in ((0.0195, "mm"), (19.5, "um")))
+    mm, um = (Volume(np.zeros((4, 4, 4)), (h,) * 3, unit) for h, unit in ((0.0195, "mm"), (19.5, "um")))
     assert law_of(path, mm)[0] == fit.coefficients_physical
     law, notes = law_of(str(path), um)
     assert law.as_dict() == pytest.approx(fit.coefficients_physical.in_unit(1e-3).as_dict())
     assert "mm" in notes[0] and "um" in notes[0]
     with pytest.raises(ValueError, match="--unit"):
-        law_of(path, Field(np.zeros((4, 4, 4))))
+        law_of(path, Volume(np.zeros((4, 4, 4))))
     with pytest.raises(ValueError, match="preset"):
         law_of("tube", mm)
     with pytest.raises(FileNotFoundError):
@@ -105,13 +104,13 @@ def test_a_prior_comes_in_the_scan_s_unit(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("status", "count"), [("Supported (refined): …", 0), ("No believable twin (refined): …", 1)])
 def test_a_prior_that_is_not_supported_is_said_to_be_so(status: str, count: int) -> None:
-    mm = Field(np.zeros((4, 4, 4)), (0.0195,) * 3, "mm")
+    mm = Volume(np.zeros((4, 4, 4)), (0.0195,) * 3, "mm")
     fit = dataclasses.replace(made_fit(), status=status)
     assert law_of(fit, mm)[1] == (f"{fit.to_law().doubt} Compare the mask with the scan.",) * count
 
 
 def test_axes_are_refined_and_brought_back() -> None:
-    place = WorkingGrid.of(Field(np.zeros((6, 7, 8)), (2.5, 1.0, 1.0)), None)
+    place = WorkingGrid.of(Volume(np.zeros((6, 7, 8)), (2.5, 1.0, 1.0)), None)
     assert place.times == (3, 1, 1) and place.grid.shape == (18, 7, 8) and place.epsilon == 2
     assert min(place.grid.spacing) * 100 == pytest.approx(2.5 / 3)
     values = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
@@ -194,12 +193,12 @@ refine = partial(segment, probabilities=True)
 def test_a_probability_is_its_own_evidence() -> None:
     p = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
     p[0, 0, :2] = 0, 1
-    found = room.probability_evidence(Field(p))
+    found = room.probability_evidence(Volume(p))
     np.testing.assert_allclose(1 / (1 + np.exp(-found.ratio.astype(float))), p.clip(1e-4, 1 - 1e-4), atol=1e-6)
     assert np.array_equal(found.level > 0, p > 0.5)
     for bad in (2 * p, p - 1e-3):
         with pytest.raises(ValueError, match="probabilities"):
-            room.probability_evidence(Field(bad))
+            room.probability_evidence(Volume(bad))
 
 
 #: Turned about z, with the shift and the mirrored axis of a real scanner.
@@ -296,7 +295,7 @@ REFUSALS: dict[str, list[dict]] = {
     "epsilon": [{"weight": 1.0, "epsilon": -1.0}, {**GREY, "epsilon": math.inf}],
     "shape": [{"example": (MAP, crossed()[1:])}], "empty": [{"example": (MAP, np.zeros(MAP.shape))}],
     "full": [{"example": (MAP, np.ones(MAP.shape))}], "labels": [{"example": (MAP, MAP)}],
-    "probabilities": [{"example": (2 * MAP, crossed())}], "spacing": [{"example": (Field(MAP, 0.5), crossed())}],
+    "probabilities": [{"example": (2 * MAP, crossed())}], "spacing": [{"example": (Volume(MAP, 0.5), crossed())}],
     "--unit": [{"weight": 1.0, "prior": made_fit()}], "preset": [{**TAUGHT, "prior": "tube"}],
     "a20": [{**options, "prior": (1, 0, -2)} for options in ({"weight": 1.0}, TAUGHT, GREY)],
     "finite": [{**options, "scan": np.where(np.indices(MAP.shape)[0] == 3, bad, MAP)}
@@ -318,16 +317,16 @@ def test_what_cannot_be_judged_is_refused(word: str) -> None:
 
 def test_a_mask_is_at_the_probabilities_place() -> None:
     truth = crossed((14, 15, 16))
-    chances = Field(network(truth, 0), (1.2, 0.4, 0.5), "mm", TURNED)
+    chances = Volume(network(truth, 0), (1.2, 0.4, 0.5), "mm", TURNED)
     for unit, factor in (("mm", 1), ("um", 1e3), ("voxel", 1)):
         spacing = (1.2 * factor, 0.4 * factor, 0.5 * factor)
         there = np.diag([factor] * 3 + [1]) @ TURNED
-        learned = calibrate(chances, Field(truth, spacing, unit, there), WILLMORE, steps=1)
+        learned = calibrate(chances, Volume(truth, spacing, unit, there), WILLMORE, steps=1)
         assert learned.example is chances
         moved = there.copy()
         moved[0, 3] += 0.5 * factor
         with pytest.raises(ValueError, match="affine"):
-            calibrate(chances, Field(truth, spacing, unit, moved), WILLMORE, steps=1)
+            calibrate(chances, Volume(truth, spacing, unit, moved), WILLMORE, steps=1)
 
 
 def test_a_map_is_segmented_in_monai_s_chain() -> None:
@@ -343,7 +342,7 @@ def test_a_map_is_segmented_in_monai_s_chain() -> None:
 def test_the_command_keeps_the_header_and_says_what_was_chosen(tmp_path: Path) -> None:
     path, target = predicted(tmp_path / "in", "a", MAP), tmp_path / "new" / "mask.nii.gz"
     other = predicted(tmp_path / "in", "b", network(crossed(), 3))
-    labels = Field(np.where(crossed(), 3, 1).astype(np.uint8), (1.2, 0.4, 0.5), "mm", TURNED)
+    labels = Volume(np.where(crossed(), 3, 1).astype(np.uint8), (1.2, 0.4, 0.5), "mm", TURNED)
     save(labels, tmp_path / "truth.nii.gz")
     options = ("--probabilities", "--channel", 1, "--prior", "tubes", "--steps", 10, "--label", 3)
     example = ("--example", tmp_path / "truth.nii.gz", "--example-probabilities", other)

@@ -14,7 +14,7 @@ from curvafit.data_synth.atlas import build
 from curvafit.generation.schedule import schedule
 from curvafit.segmentation.filler import FAR, Filler, Taught
 from curvafit.segmentation.teach import Lessons, Mix, Texture, Whole, WholeLessons, learn, load_textures, teach
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
 #: Windows along the axes of a shape, as it is.
@@ -117,7 +117,7 @@ def test_teaching_lowers_the_loss_of_shapes_held_out(monkeypatch: pytest.MonkeyP
 
 def test_stores_and_masks_teach(tmp_path: Path) -> None:
     build(tmp_path / "store.zarr", 2, (16, 16, 16), 0, schedule("fast", 300))
-    save(Field((rods() > 0).astype(np.uint8)), tmp_path / "mask.npy")
+    save(Volume((rods() > 0).astype(np.uint8)), tmp_path / "mask.npy")
     sources, card = load_textures([tmp_path / "store.zarr", tmp_path / "mask.npy"])
     assert [texture.periodic for source in sources for texture in source][-1] is False
     assert [each["source"] for each in card["sources"]] == ["store.zarr", "mask.npy"]
@@ -132,7 +132,7 @@ def test_stores_and_masks_teach(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_command_teaches_and_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(room, "JUDGED", 5)
-    save(Field((rods() > 0).astype(np.uint8)), tmp_path / "mask.npy")
+    save(Volume((rods() > 0).astype(np.uint8)), tmp_path / "mask.npy")
     target = tmp_path / "filler.npz"
     result = done("atlas", "teach", tmp_path / "mask.npy", "-o", target, "--steps", 2)
     assert "200" in result.stderr and Taught.load(target).card["steps"] == 2

@@ -19,16 +19,16 @@ from curvafit.segmentation import Segmentation, reconstruct, segment
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.tiles import EDGE, OVERLAP, WHOLE, TileStore, Tiling
 from curvafit.volumes import ScanError, load, save
-from curvafit.volumes.boxes import boxes_of, check_finite, subsample
-from curvafit.volumes.field import Field
+from curvafit.volumes.boxes import subsample
+from curvafit.volumes.volume import Volume
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
 WILLMORE = Coefficients.willmore()
 
 
-def frame(shape: tuple[int, int, int], spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Field:
-    return Field(np.broadcast_to(np.float32(0), shape), spacing)
+def frame(shape: tuple[int, int, int], spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Volume:
+    return Volume(np.broadcast_to(np.float32(0), shape), spacing)
 
 
 def beads(length: int = 100) -> np.ndarray:
@@ -37,8 +37,8 @@ def beads(length: int = 100) -> np.ndarray:
     return np.hypot(y - 9.3, x - 10.6) < 6 + 2 * np.sin(z / 7)
 
 
-def grey(mask: np.ndarray, noise: float = 40) -> Field:
-    return Field(100.0 * mask + noise * np.random.default_rng(0).standard_normal(mask.shape))
+def grey(mask: np.ndarray, noise: float = 40) -> Volume:
+    return Volume(100.0 * mask + noise * np.random.default_rng(0).standard_normal(mask.shape))
 
 
 @pytest.mark.parametrize("periodic", [False, True])
@@ -145,12 +145,12 @@ def test_the_tiles_do_not_show_in_a_scan() -> None:
 def test_a_tile_of_background_alone_stays_empty() -> None:
     mask = np.zeros((120, 16, 16), dtype=bool)
     mask[4:20, 4:12, 4:12] = True
-    likely = Field(np.where(mask, 0.9, 0.1).astype(np.float32))
+    likely = Volume(np.where(mask, 0.9, 0.1).astype(np.float32))
     options = {"probabilities": True, "weight": 1.0, "steps": 50, "tile": 24}
     result = segment(likely, WILLMORE, **options)
     assert result.mask.values[:20].any() and not result.mask.values[30:].any()
     for value in (0.1, 0.9):
-        plain = segment(Field(np.full_like(likely.values, value)), WILLMORE, **options)
+        plain = segment(Volume(np.full_like(likely.values, value)), WILLMORE, **options)
         assert (plain.mask.values == (value > 0.5)).all()
 
 
@@ -215,7 +215,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
 )
 def test_the_same_command_goes_on_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """One, two or no worker processes: other processes may add up otherwise."""
-    source = save(Field(scan(), (0.1, 0.1, 0.1), "mm"), tmp_path / "scan.zarr")
+    source = save(Volume(scan(), (0.1, 0.1, 0.1), "mm"), tmp_path / "scan.zarr")
     options = ("segment", source, "--prior", "tubes", "--weight", 1, "--steps", 5, "--tile", 14)
     whole, target, write = tmp_path / "whole" / name, tmp_path / "killed" / name, TileStore.write
     done(*options, "-o", whole, "--workers", 0)
@@ -300,7 +300,7 @@ def test_workers_lower_the_same_tiles(tmp_path: Path) -> None:
 def stored(folder: Path) -> list[tuple[Path, dict]]:
     values = scan()
     files = [
-        (save(Field(values, 0.1, "mm"), folder / f"scan.{suffix}"), {}) for suffix in ("npy", "nii", "zarr", "tif")
+        (save(Volume(values, 0.1, "mm"), folder / f"scan.{suffix}"), {}) for suffix in ("npy", "nii", "zarr", "tif")
     ]
     (folder / "scan.raw").write_bytes(values.tobytes())
     with h5py.File(folder / "scan.h5", "w") as file:
@@ -318,36 +318,34 @@ def test_boxes_of_a_file_are_those_of_the_loaded_volume(tmp_path: Path) -> None:
             and made.mask.source == load(path, **reading).source
         )
         for options in (reading, {**reading, "crop": crop}):
-            loaded, boxes = load(path, **options), boxes_of(path, **options)
-            np.testing.assert_array_equal(boxes.part(box), loaded.values[box])
-            frame = boxes.frame
-            assert (frame.shape, frame.spacing, frame.unit) == (loaded.shape, loaded.spacing, loaded.unit)
-            assert frame.notes == loaded.notes and frame.values.dtype == loaded.values.dtype
-            assert (frame.affine is None) == (loaded.affine is None)
-            if frame.affine is not None and loaded.affine is not None:
-                np.testing.assert_allclose(frame.affine, loaded.affine)
-            check_finite(boxes)
-            assert boxes_of(boxes) is boxes
+            loaded, boxes = load(path, **options), load(path, **options, lazy=True)
+            np.testing.assert_array_equal(boxes.read(box), loaded.values[box])
+            assert (boxes.shape, boxes.spacing, boxes.unit) == (loaded.shape, loaded.spacing, loaded.unit)
+            assert boxes.notes == loaded.notes and boxes.dtype == loaded.dtype
+            assert (boxes.affine is None) == (loaded.affine is None)
+            if boxes.affine is not None and loaded.affine is not None:
+                np.testing.assert_allclose(boxes.affine, loaded.affine)
+            assert load(boxes, lazy=True) is boxes
 
 
 def test_a_file_is_mapped_rather_than_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The boxes of an NPY file do not load it."""
-    path = save(Field(scan()), tmp_path / "scan.npy")
-    monkeypatch.setattr("curvafit.volumes.boxes.field_of", lambda *_, **__: pytest.fail("the whole was read"))
-    boxes = boxes_of(path)
-    assert boxes.frame.values.strides == (0, 0, 0) and boxes.part((slice(0, 2),) * 3).shape == (2, 2, 2)
+    path = save(Volume(scan()), tmp_path / "scan.npy")
+    monkeypatch.setattr(Volume, "values", property(lambda _: pytest.fail("the whole was read")))
+    boxes = load(path, lazy=True)
+    assert boxes.in_file and boxes.read((slice(0, 2),) * 3).shape == (2, 2, 2)
 
 
 def test_a_changed_file_has_another_digest(tmp_path: Path) -> None:
     for path, reading in stored(tmp_path):
-        before = boxes_of(path, **reading).digest
-        assert boxes_of(path, **reading).digest == before
-        assert boxes_of(path, **reading, crop="1:,:,:").digest != before
+        before = load(path, **reading, lazy=True).digest
+        assert load(path, **reading, lazy=True).digest == before
+        assert load(path, **reading, crop="1:,:,:", lazy=True).digest != before
         if path.is_file():
             os.utime(path, ns=(0, 10**18))
-            assert path.suffix == ".tif" or boxes_of(path, **reading).digest != before
-    one, other = (boxes_of(values).digest for values in (scan(), scan()[::-1]))
-    assert one != other and one == boxes_of(scan()).digest
+            assert path.suffix == ".tif" or load(path, **reading, lazy=True).digest != before
+    one, other = (load(values, lazy=True).digest for values in (scan(), scan()[::-1]))
+    assert one != other and one == load(scan(), lazy=True).digest
 
 
 def test_values_that_are_not_finite_are_refused_wherever_they_are(tmp_path: Path) -> None:
@@ -360,9 +358,9 @@ def test_values_that_are_not_finite_are_refused_wherever_they_are(tmp_path: Path
 
 def test_a_sample_of_a_long_volume_has_runs_of_neighbours() -> None:
     values = np.arange(1000)[:, None, None] * np.ones((1, 5, 6))
-    sample, blocks = subsample(boxes_of(values))
+    sample, blocks = subsample(load(values, lazy=True))
     assert sample.shape == (256, 5, 6) and len(blocks) == 4
     for block, start in zip(blocks, (93, 343, 593, 843), strict=True):
         np.testing.assert_array_equal(sample.values[block][:, 0, 0], np.arange(start, start + 64))
-    whole, (block,) = subsample(boxes_of(values[:256]))
+    whole, (block,) = subsample(load(values[:256], lazy=True))
     assert np.array_equal(whole.values, values[:256]) and whole.values[block].shape == (256, 5, 6)

@@ -10,7 +10,7 @@ import torch
 from annotated import organelles
 
 from curvafit.segmentation.reconstruct import reconstruct, reconstruct_labels
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 pytest.importorskip("monai", reason="needs monai, of the group dev")
 
@@ -48,7 +48,7 @@ def test_a_nifti_file_is_filled_in_monai_s_chain_and_stays_where_it_is(tmp_path:
     assert isinstance(found, MetaTensor) and found.dtype == given.dtype == torch.float32
     assert torch.equal(found.affine, given.affine) and np.allclose(found.affine, affine)
     assert found.meta["filename_or_obj"] == given.meta["filename_or_obj"]
-    wanted = reconstruct_labels(Field(labels.T, SPACING[::-1]), every=6, axis=2).labels
+    wanted = reconstruct_labels(Volume(labels.T, SPACING[::-1]), every=6, axis=2).labels
     assert wanted is not None and (wanted.values[..., 3] > 0).any() and not labels[3].any()
     assert np.array_equal(found[0].numpy(), wanted.values)
     assert np.array_equal(given[0].numpy().T, labels)  # what was given is not changed
@@ -58,11 +58,11 @@ def test_targets_are_soft_or_sure() -> None:
     labels = some_slices()
     soft = FillSlicesd("label", every=6, soft=True)({"label": tensor(labels)})["label"]
     assert isinstance(soft, MetaTensor) and soft.dtype == torch.float32
-    wanted = reconstruct(Field(labels, SPACING), every=6).probability
+    wanted = reconstruct(Volume(labels, SPACING), every=6).probability
     assert wanted is not None and np.array_equal(soft[0].numpy(), wanted.values)
     sure = FillSlicesd("label", every=6, sure=0.8, ignored=11)({"label": tensor(labels)})["label"]
     assert isinstance(sure, MetaTensor) and set(np.unique(sure)) == {0, 2, 7, 11}
-    wanted = reconstruct_labels(Field(labels, SPACING), every=6).keep_sure(0.8, 11)
+    wanted = reconstruct_labels(Volume(labels, SPACING), every=6).keep_sure(0.8, 11)
     assert np.array_equal(sure[0].numpy(), wanted.values)
 
 

@@ -24,7 +24,7 @@ from curvafit.report.comparison import FILES, check_comparison, describe_methods
 from curvafit.scan.measure import QUANTITIES, Measures, Quantity
 from curvafit.studies.compare import Comparison, compare
 from curvafit.studies.scans import merge_notes
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 N = 32
 #: Labels of nine values: numbers, three groups, and pairs with the blocks that they are exchanged in.
@@ -306,8 +306,8 @@ def tubes(radius: float) -> np.ndarray:
     return np.broadcast_to(np.hypot(y, x) < radius, (N, N, N)).astype(np.uint8)
 
 
-def fields(shapes: Sequence[np.ndarray], edge: float = 0.01, unit: str = "mm") -> list[Field]:
-    return [Field(shape, (edge,) * 3, unit) for shape in shapes]
+def fields(shapes: Sequence[np.ndarray], edge: float = 0.01, unit: str = "mm") -> list[Volume]:
+    return [Volume(shape, (edge,) * 3, unit) for shape in shapes]
 
 
 RADII = (5.0, 5.4, 5.8, 6.2)

@@ -16,8 +16,8 @@ from curvafit.report.windows import check_windows
 from curvafit.scan.measure import LEAST, QUANTITIES, Blocks, Measures, errors, measure, measure_maps
 from curvafit.studies.tables import COLUMNS, write_table
 from curvafit.studies.windows import NAMES, Windows, windows
-from curvafit.volumes.field import Field
 from curvafit.volumes.read import load
+from curvafit.volumes.volume import Volume
 
 N = 48
 
@@ -44,7 +44,7 @@ def cut() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def measures(cut: np.ndarray) -> Measures:
-    return measure(Field(cut, (0.5, 0.5, 0.5), "um"))
+    return measure(Volume(cut, (0.5, 0.5, 0.5), "um"))
 
 
 # ---- exact shapes, and laws ------------------------------------------------------------------------------------------
@@ -96,14 +96,14 @@ def test_curvature_obeys_gauss_and_bonnet(of_balls: Measures) -> None:
 
 
 def test_a_change_of_unit_scales_each_number_by_its_power(cut: np.ndarray, measures: Measures) -> None:
-    longer = measure(Field(cut, (1.5, 1.5, 1.5), "um"))
+    longer = measure(Volume(cut, (1.5, 1.5, 1.5), "um"))
     for one, other in zip(measures.quantities, longer.quantities, strict=True):
         assert other.value == pytest.approx(one.value * 3.0**one.power, rel=1e-4, abs=1e-9), one.name
         assert other.half == pytest.approx(one.half * 3.0**one.power, rel=1e-3, abs=1e-9), one.name
 
 
 def test_a_turn_changes_nothing_but_the_direction(cut: np.ndarray, measures: Measures) -> None:
-    turned = measure(Field(np.ascontiguousarray(cut.transpose(1, 2, 0)), (0.5, 0.5, 0.5), "um"))
+    turned = measure(Volume(np.ascontiguousarray(cut.transpose(1, 2, 0)), (0.5, 0.5, 0.5), "um"))
     for one, other in zip(measures.quantities, turned.quantities, strict=True):
         # Lewiner's cubes and balls painted in another order: not to the bit
         assert other.value == pytest.approx(one.value, rel=0.01, abs=0.002), one.name
@@ -114,7 +114,7 @@ def test_a_turn_changes_nothing_but_the_direction(cut: np.ndarray, measures: Mea
 def test_layers_say_that_the_direction_is_within_them() -> None:
     """Layers of 6 every 16 voxels have 1 / 16 of them a voxel."""
     layers = np.broadcast_to((np.indices((N,))[0] % 16 < 6)[:, None, None], (N, N, N)).astype(np.uint8)
-    found = measure(Field(layers, 0.5, "mm"), kind="mask", periodic=True)
+    found = measure(Volume(layers, 0.5, "mm"), kind="mask", periodic=True)
     assert found["share of layers"].value > 0.95
     assert abs(found.direction[0]) < 1e-6
     assert found["Tb.Th"].value == pytest.approx(3, abs=0.5)
@@ -258,7 +258,7 @@ def test_each_half_of_a_scan_has_its_own_numbers(rods: tuple[np.ndarray, np.ndar
 
 
 def test_compartments_add_up_to_the_whole(cut: np.ndarray) -> None:
-    maps = measure_maps(Field(cut), "mask", {"threshold": "otsu", "dark": False, "periodic": False})
+    maps = measure_maps(Volume(cut), "mask", {"threshold": "otsu", "dark": False, "periodic": False})
     blocks = maps.divide()
     labels = np.random.default_rng(0).integers(0, 3, cut.shape)
     parts = [maps.sum(dataclasses.replace(blocks, region=labels == k)) for k in range(3)]
@@ -281,13 +281,13 @@ THIN, THICK = 4.0, 6.0
 
 
 @pytest.fixture(scope="module")
-def halves() -> Field:
+def halves() -> Volume:
     """Thin rods below thick ones, along z."""
-    return Field(np.concatenate([tubes(2 * N, 16, THIN)[:N], tubes(2 * N, 24, THICK)[:N]]), (0.5, 0.5, 0.5), "um")
+    return Volume(np.concatenate([tubes(2 * N, 16, THIN)[:N], tubes(2 * N, 24, THICK)[:N]]), (0.5, 0.5, 0.5), "um")
 
 
 @pytest.fixture(scope="module")
-def mapped(halves: Field) -> Windows:
+def mapped(halves: Volume) -> Windows:
     return windows(halves, SIZE, STRIDE)
 
 
@@ -302,7 +302,7 @@ def test_a_volume_of_two_halves_gives_its_map_back(mapped: Windows) -> None:
     assert mapped["share of tubes"].values[0].min() > 0.9
 
 
-def test_disjoint_windows_agree_with_the_whole(halves: Field, mapped: Windows) -> None:
+def test_disjoint_windows_agree_with_the_whole(halves: Volume, mapped: Windows) -> None:
     whole, apart = measure(halves), mapped.values[::2, ::2, ::2].reshape(8, -1)
     names = ("volume fraction", "thickness", "surface density")
     fraction, thickness, surface = (apart[:, NAMES.index(name)] for name in names)
@@ -311,9 +311,9 @@ def test_disjoint_windows_agree_with_the_whole(halves: Field, mapped: Windows) -
     assert (fraction * thickness).sum() / fraction.sum() == pytest.approx(whole["Tb.Th"].value, rel=1e-9)
 
 
-def test_the_grid_has_its_place(halves: Field) -> None:
+def test_the_grid_has_its_place(halves: Volume) -> None:
     affine = np.array([[0, -0.5, 0, 7], [0.5, 0, 0, -3], [0, 0, 0.5, 1], [0, 0, 0, 1]])
-    grid = windows(Field(halves.values[:, :49], (0.5, 0.5, 0.5), "um", affine), (96, 48, 48), (48, 48, 24)).clusters
+    grid = windows(Volume(halves.values[:, :49], (0.5, 0.5, 0.5), "um", affine), (96, 48, 48), (48, 48, 24)).clusters
     assert grid.shape == (1, 1, 3)
     assert grid.spacing == (24, 24, 12)
     # columns x, y, z; the first centre lies 47, 23.5, 23.5 steps of a voxel (z, y, x) from the first voxel's
@@ -322,7 +322,7 @@ def test_the_grid_has_its_place(halves: Field) -> None:
         assert grid.affine @ [*index, 1] == pytest.approx(affine @ [*voxel, 1])
 
 
-def test_windows_without_structure_are_unknown(halves: Field) -> None:
+def test_windows_without_structure_are_unknown(halves: Volume) -> None:
     values = halves.values.copy()
     values[:, :, 48:] = 0
     found = windows(values, SIZE, STRIDE)
@@ -332,7 +332,7 @@ def test_windows_without_structure_are_unknown(halves: Field) -> None:
     assert f" {(~found.known).sum()} of them" in found.status
 
 
-def test_the_command_writes_maps_table_and_page(halves: Field, mapped: Windows, tmp_path: Path) -> None:
+def test_the_command_writes_maps_table_and_page(halves: Volume, mapped: Windows, tmp_path: Path) -> None:
     scan, out = tmp_path / "scan.npy", tmp_path / "maps"
     np.save(scan, halves.values)
     done("measure", scan, "--windows", SIZE, "--spacing", 0.5, "--unit", "um", "-o", out)

@@ -17,7 +17,7 @@ pytest.importorskip("mrcfile")
 from damage import CHECKED, COUNTED, OTHERS, VALUES, damaged, files_of, gzipped
 from disk import unreadable
 
-from curvafit.volumes import Field, ScanError, load, read_maps, save
+from curvafit.volumes import ScanError, Volume, load, read_maps, save
 
 CASES = 30
 
@@ -56,7 +56,7 @@ def test_damage_is_never_read_as_data(tmp_path: Path, capfd, name: str) -> None:
 
 
 def test_a_gzip_stream_is_its_members_alone_to_the_last_bit(tmp_path: Path) -> None:
-    path = save(Field(VALUES, 1.0, "mm"), tmp_path / "scan.nii.gz")
+    path = save(Volume(VALUES, 1.0, "mm"), tmp_path / "scan.nii.gz")
     whole = path.read_bytes()
     content = gzip.decompress(whole)
     path.write_bytes(b"".join(gzipped(content[k : k + 500]) for k in range(0, len(content), 500)))
@@ -75,7 +75,7 @@ def test_a_gzip_stream_is_its_members_alone_to_the_last_bit(tmp_path: Path) -> N
 
 
 def test_nibabel_keeps_its_complaints_to_itself_and_the_note_tells(tmp_path: Path, capfd) -> None:
-    path = save(Field(VALUES, (3.0, 2.0, 1.0), "mm"), tmp_path / "scan.nii")
+    path = save(Volume(VALUES, (3.0, 2.0, 1.0), "mm"), tmp_path / "scan.nii")
     content = bytearray(path.read_bytes())
     content[80:84] = np.float32(-1).tobytes()  # pixdim[1]
     path.write_bytes(content)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from curvafit.volumes import Field, save
+from curvafit.volumes import Volume, save
 from curvafit.volumes.parameter_maps import map_shape, read_maps
 
 RAMP = np.linspace(1, 2, 4 * 5 * 6).reshape(4, 5, 6)
@@ -15,8 +15,8 @@ RAMP = np.linspace(1, 2, 4 * 5 * 6).reshape(4, 5, 6)
 def test_an_npz_and_a_folder_say_the_same(tmp_path: Path) -> None:
     np.savez(tmp_path / "maps.npz", a20=RAMP, mass=-RAMP / 4)
     folder = tmp_path / "maps"
-    save(Field(RAMP, (1, 2, 3), "mm"), folder / "a20.nii.gz")
-    save(Field(-RAMP / 4), folder / "mass.zarr")
+    save(Volume(RAMP, (1, 2, 3), "mm"), folder / "a20.nii.gz")
+    save(Volume(-RAMP / 4), folder / "mass.zarr")
     (folder / "README.md").write_text("what these are")
     for path in (tmp_path / "maps.npz", folder):
         maps = read_maps(path)
@@ -54,7 +54,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.npz").write_text("a20 = 1")
     np.save(tmp_path / "one.npy", RAMP)
     for first, second in (("a20.npy", "other.npy"), ("a20.npy", "a20.NPY")):
-        save(Field(RAMP), tmp_path / second / first)
+        save(Volume(RAMP), tmp_path / second / first)
         (tmp_path / second / second).write_bytes((tmp_path / second / first).read_bytes())
     for name, word in (("text.npz", "NPZ"), ("one.npy", "NPZ"), ("other.npy", "other"), ("a20.NPY", "two")):
         with pytest.raises(ValueError, match=word):

@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from curvafit.scan.structure import read_region
-from curvafit.volumes import Field, ScanError, field_of, load, save
-from curvafit.volumes.formats.part import parse_box
+from curvafit.volumes import ScanError, Volume, load, save
+from curvafit.volumes.boxes import parse_box
 from curvafit.volumes.place import lay
 
 SHAPE = (6, 7, 8)
@@ -107,7 +107,7 @@ def test_a_channel_is_read_of_every_format(tmp_path: Path, kind: str) -> None:
 
 
 def test_a_file_of_one_channel_has_none_to_choose(tmp_path: Path) -> None:
-    path = save(Field(VALUES), tmp_path / "scan.nii.gz")
+    path = save(Volume(VALUES), tmp_path / "scan.nii.gz")
     unreadable(path, "channel", channel=0)
     np.save(tmp_path / "scan.npy", CHANNELS)
     for wrong in (-1, 1.5, True, "1"):
@@ -139,7 +139,7 @@ def written(path: Path) -> tuple[Path, dict]:
     elif path.suffix == ".npz":
         np.savez(path, raw=VALUES)
     else:
-        save(Field(VALUES, (0.3, 0.2, 0.1), "mm", TURNED[:, [1, 0, 2, 3]] if ".nii" in path.name else None), path)
+        save(Volume(VALUES, (0.3, 0.2, 0.1), "mm", TURNED[:, [1, 0, 2, 3]] if ".nii" in path.name else None), path)
     return path, {}
 
 
@@ -148,7 +148,7 @@ def test_a_crop_is_where_it_was_in_the_whole_or_refused(tmp_path: Path, name: st
     path, options = written(tmp_path / name)
     whole = load(path, **options)
     box = (slice(2, 5), slice(1, 4), slice(3, None))
-    for part in (load(path, crop="2:5,1:4,3:", **options), field_of(path, crop=box, **options), whole.crop(box)):
+    for part in (load(path, crop="2:5,1:4,3:", **options), load(path, crop=box, **options), whole.crop(box)):
         assert np.array_equal(part.values, VALUES[box])
         assert (part.spacing, part.unit) == (whole.spacing, whole.unit)
         assert "Voxels 2:5, 1:4, 3:8 (z, y, x) are used." in part.notes
@@ -173,7 +173,7 @@ def test_a_crop_is_what_python_s_slices_are_or_refused(ends) -> None:
     of_numpy = tuple(slice(*(None if edge is None else np.int64(edge) for edge in pair)) for pair in ends)
     assert parse_box(of_numpy) == slices
     try:
-        part = Field(VALUES).crop(text)
+        part = Volume(VALUES).crop(text)
     except ScanError as error:
         assert "crop" in str(error)
         return
@@ -183,7 +183,7 @@ def test_a_crop_is_what_python_s_slices_are_or_refused(ends) -> None:
 def test_what_is_no_crop_is_refused() -> None:
     for crop in ("", "1:2", "1:2,3:4", "1:2,3:4,5", "a:b,:,:", "::2,:,:", (slice(0, 4, 2),) * 3, 3.5):
         with pytest.raises(ScanError, match="crop"):
-            field_of(VALUES, crop=crop)  # type: ignore[arg-type]
+            load(VALUES, crop=crop)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", ["scan.nii", "scan.npy", "scan.raw", "scan.zarr", "scan.h5"])
@@ -203,7 +203,7 @@ def test_no_more_than_the_crop_needs_memory_and_a_cut_file_is_refused(tmp_path: 
 def test_a_label_is_a_mask(tmp_path: Path, label: int) -> None:
     labels = np.random.default_rng(0).integers(0, 4, SHAPE).astype(np.uint8)
     path = save(labels, tmp_path / "labels.nii.gz")
-    for mask in (load(path, label=label), field_of(labels, label=label), Field(labels).label(label)):
+    for mask in (load(path, label=label), load(labels, label=label), Volume(labels).label(label)):
         assert mask.values.dtype == bool and np.array_equal(mask.values, labels == label)
         assert f"The structure is label {label}." in mask.notes
 
@@ -212,7 +212,7 @@ def test_a_label_that_is_not_there_is_told_those_that_are() -> None:
     labels = np.where(VALUES > 200, 7, np.where(VALUES < 56, 0, 3))
     for label, crop, word in ((5, None, "0, 3, 7"), (7, ":3,:,:", "0, 3"), (0.5, None, "label")):
         with pytest.raises(ValueError, match=word):
-            field_of(labels, label=label, crop=crop)  # type: ignore[arg-type]
+            load(labels, label=label, crop=crop)  # type: ignore[arg-type]
 
 
 # ---- places ----------------------------------------------------------------------------------------------------------
@@ -221,14 +221,14 @@ def test_a_label_that_is_not_there_is_told_those_that_are() -> None:
 EXTENT, H = (5, 6, 7), 0.02
 LABELS = np.random.default_rng(0).integers(0, 2**40, EXTENT) * 2**20 + 1
 AFFINE = np.array([[H, 0, 0, 1], [0, H, 0, 2], [0, 0, H, 3], [0, 0, 0, 1.0]])
-SCAN = Field(np.zeros(EXTENT, np.uint8), H, "mm", AFFINE)
+SCAN = Volume(np.zeros(EXTENT, np.uint8), H, "mm", AFFINE)
 
 
-def world(values: np.ndarray, matrix: np.ndarray, origin: np.ndarray, unit: str = "mm") -> Field:
+def world(values: np.ndarray, matrix: np.ndarray, origin: np.ndarray, unit: str = "mm") -> Volume:
     """Return values whose voxel i (x, y, z) lies at `matrix` i + `origin`."""
     affine = np.eye(4)
     affine[:3, :3], affine[:3, 3] = matrix, origin
-    return Field(values, tuple(np.linalg.norm(matrix, axis=0)[::-1]), unit, affine)
+    return Volume(values, tuple(np.linalg.norm(matrix, axis=0)[::-1]), unit, affine)
 
 
 @pytest.mark.parametrize("axes", list(itertools.permutations(range(3))))
@@ -262,7 +262,7 @@ def test_labels_on_other_voxels_are_those_of_the_nearest(factor: float) -> None:
     """The corners of the two boxes coincide: a coarse voxel is eight fine ones, of fine ones each second counts."""
     fine = LABELS.repeat(2, 0).repeat(2, 1).repeat(2, 2)
     values, shape = (LABELS, fine.shape) if factor == 2 else (fine, EXTENT)
-    scan = Field(np.zeros(shape, np.uint8), H, "mm", AFFINE)
+    scan = Volume(np.zeros(shape, np.uint8), H, "mm", AFFINE)
     corner = AFFINE[:3, 3] + (factor - 1) / 2 * H
     laid, (note,) = lay(world(values, factor * H * np.eye(3), corner), scan, "the region", "the scan")
     assert (laid.values == (fine if factor == 2 else LABELS)).all()
@@ -278,7 +278,7 @@ def test_a_turn_by_a_few_degrees_takes_the_nearest() -> None:
     c, s = np.cos(0.2), np.sin(0.2)
     turn = H * np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     middle = AFFINE[:3, 3] + 10 * H
-    field, scan = world(ball, turn, middle - turn @ [10, 10, 10]), Field(ball, H, "mm", AFFINE)
+    field, scan = world(ball, turn, middle - turn @ [10, 10, 10]), Volume(ball, H, "mm", AFFINE)
     laid, _ = lay(field, scan, "the region", "the scan")
     assert np.count_nonzero(laid.values != ball) < 0.1 * ball.sum()  # of 1357 voxels 420 lie at the surface
 
@@ -286,26 +286,26 @@ def test_a_turn_by_a_few_degrees_takes_the_nearest() -> None:
 @pytest.mark.parametrize("placed", ["field", "scan", "neither", "voxels"])
 def test_without_a_place_equal_shapes_go_voxel_by_voxel(placed: str) -> None:
     """A place in voxels says nothing of one in mm where the voxels are not as long."""
-    field = Field(LABELS, H, "mm", AFFINE if placed == "field" else None)
-    scan = Field(np.zeros(EXTENT), H, "mm", None if placed in ("field", "neither") else AFFINE)
+    field = Volume(LABELS, H, "mm", AFFINE if placed == "field" else None)
+    scan = Volume(np.zeros(EXTENT), H, "mm", None if placed in ("field", "neither") else AFFINE)
     if placed == "voxels":
-        field = Field(LABELS, 1.0, "voxel", np.eye(4))
+        field = Volume(LABELS, 1.0, "voxel", np.eye(4))
     laid, notes = lay(field, scan, "the region", "the scan")
     assert laid.values is field.values
     assert ["voxel by voxel" in note for note in notes] == [True] * (placed != "neither")
     with pytest.raises(ScanError, match="shape"):
-        lay(Field(LABELS[1:], field.spacing, field.unit, field.affine), scan, "the region", "the scan")
+        lay(Volume(LABELS[1:], field.spacing, field.unit, field.affine), scan, "the region", "the scan")
 
 
 @pytest.mark.parametrize("placed", ["both", "scan", "region", "neither"])
 def test_a_region_of_a_cropped_scan_is_cropped_alike(placed: str) -> None:
     """By the affines, or with the scan where one of them has none; a crop has an affine of its own."""
     scan = replace(SCAN, affine=AFFINE if placed in ("both", "scan") else None)
-    region = Field(LABELS, H, "mm", AFFINE if placed in ("both", "region") else None)
+    region = Volume(LABELS, H, "mm", AFFINE if placed in ("both", "region") else None)
     if placed == "both":
         turned = AFFINE @ np.diag([-1.0, 1, 1, 1])
         turned[0, 3] += (EXTENT[2] - 1) * H
-        region = Field(LABELS[..., ::-1], H, "mm", turned)
+        region = Volume(LABELS[..., ::-1], H, "mm", turned)
     crop = "1:4,2:,:-1"
     laid, notes = read_region(region, scan.crop(crop), scan, crop)
     assert (laid.values == LABELS[1:4, 2:, :-1]).all()

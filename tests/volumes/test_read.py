@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 from curvafit import infer, segment
 from curvafit.core.units import parse_unit
-from curvafit.volumes import Field, ScanError, field_of, load, save
+from curvafit.volumes import ScanError, Volume, load, save
 from curvafit.volumes.formats.tiff import natural_key
 from curvafit.volumes.read import READERS
 
@@ -54,24 +54,24 @@ origins = st.tuples(*[st.floats(-100, 100)] * 3)
 
 
 def test_every_kind_of_source_is_one_field(tmp_path: Path) -> None:
-    field = Field(ramp(), (3.0, 2.0, 1.0), "um")
+    field = Volume(ramp(), (3.0, 2.0, 1.0), "um")
     path = save(field, tmp_path / "scan.nii.gz")
     at = {"spacing": (3.0, 2.0, 1.0), "unit": "um"}
-    assert field_of(field) is field
+    assert load(field) is field
     tensor = torch.from_numpy(ramp())
-    taken = [field_of(str(path)), field_of(path), *(field_of(values, **at) for values in (ramp(), tensor))]
+    taken = [load(str(path)), load(path), *(load(values, **at) for values in (ramp(), tensor))]
     written = [load(save(values, tmp_path / "new.zarr", **at)) for values in (ramp(), tensor)]
     for source in (*taken, *written, load(save(path, tmp_path / "again.tif"))):
         assert np.array_equal(source.values, ramp())
         assert (source.spacing, source.unit) == ((3, 2, 1), "um")
-    bare = field_of(tensor.bfloat16().requires_grad_())
+    bare = load(tensor.bfloat16().requires_grad_())
     assert (bare.spacing, bare.unit, bare.values.dtype) == ((1, 1, 1), "voxel", np.float32)
 
 
 @pytest.mark.parametrize(
     ("source", "options", "word"),
     [
-        *((Field(ramp()), {name: 2}, name) for name in ("spacing", "unit", "key")),
+        *((Volume(ramp()), {name: 2}, name) for name in ("spacing", "unit", "key")),
         (ramp(), {"raw_shape": (4, 5, 6)}, "raw_shape"), (ramp(), {"spacing": (1, 2)}, "spacing"),
         (ramp(), {"unit": "furlong"}, "unit"), (ramp((5, 6)), {}, "3D"), ([[[1.0]]], {}, "volume"),
         (np.where(ramp() == 7, np.nan, ramp()), {}, "NaN"),
@@ -80,7 +80,7 @@ def test_every_kind_of_source_is_one_field(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_sources_and_options_that_do_not_fit_are_refused(source, options: dict, word: str) -> None:
     with pytest.raises(ValueError, match=word):
-        field_of(source, **options)
+        load(source, **options)
 
 
 @pytest.mark.parametrize(
@@ -89,16 +89,18 @@ def test_sources_and_options_that_do_not_fit_are_refused(source, options: dict, 
 def test_no_job_drops_an_option_in_silence(job) -> None:
     for options, word in (({"spacing": 2}, "spacing"), ({"unit": "mm"}, "unit"), ({"strict": True}, "strict")):
         with pytest.raises(ScanError, match=word):
-            job(Field(BALL), **options)
+            job(Volume(BALL), **options)
     with pytest.raises(ScanError, match="volume"):
         job(None)
 
 
 def test_a_field_is_one_line_and_equals_itself() -> None:
-    field = Field(ramp(), (3.0, 2.0, 1.0), "um", source="scan\n.nii.gz")
-    assert repr(field) == "Field(4 x 5 x 6 voxels of 3 x 2 x 1 um, float32 from 0 to 119, from scan\\n.nii.gz)"
-    assert repr(Field(ramp(dtype="uint8"), 0.0195, "mm")) == "Field(4 x 5 x 6 voxels of 0.0195 mm, uint8 from 0 to 119)"
-    assert field == field and field != Field(ramp()) and len({field, field}) == 1
+    field = Volume(ramp(), (3.0, 2.0, 1.0), "um", source="scan\n.nii.gz")
+    assert repr(field) == "Volume(4 x 5 x 6 voxels of 3 x 2 x 1 um, float32 from 0 to 119, from scan\\n.nii.gz)"
+    assert (
+        repr(Volume(ramp(dtype="uint8"), 0.0195, "mm")) == "Volume(4 x 5 x 6 voxels of 0.0195 mm, uint8 from 0 to 119)"
+    )
+    assert field == field and field != Volume(ramp()) and len({field, field}) == 1
 
 
 # ---- what files say --------------------------------------------------------------------------------------------------
@@ -204,7 +206,7 @@ def test_raw_files(tmp_path: Path, dtype: str) -> None:
 def test_arguments_override_the_file_and_the_affine_follows(stated, given_spacing, file_unit: str, unit) -> None:
     assume(unit is not None or file_unit != "voxel" or min(given_spacing) == 1)  # else a unit is asked for
     with tempfile.TemporaryDirectory() as folder:
-        path = save(Field(ramp(), stated, file_unit), Path(folder) / "scan.nii")
+        path = save(Volume(ramp(), stated, file_unit), Path(folder) / "scan.nii")
         field = load(path, spacing=given_spacing, unit=unit)
     name, factor = (file_unit, 1.0) if unit is None else parse_unit(unit)
     assert field.unit == name and field.spacing == pytest.approx(tuple(h * factor for h in given_spacing))
@@ -468,7 +470,7 @@ def test_reading_leaves_loggers_and_warnings_as_they_were(tmp_path: Path) -> Non
     state = [(logging.getLogger(name).level, logging.getLogger(name).filters[:]) for name in names]
     filters = warnings.filters[:]
     for suffix in (".tif", ".nii.gz", ".nii"):
-        path = save(Field(VALUES, 1.0, "um"), tmp_path / f"scan{suffix}")
+        path = save(Volume(VALUES, 1.0, "um"), tmp_path / f"scan{suffix}")
         load(path)
         path.write_bytes(path.read_bytes()[:400])
         unreadable(path, "cannot be read")
@@ -481,7 +483,7 @@ def test_reading_leaves_loggers_and_warnings_as_they_were(tmp_path: Path) -> Non
 def test_truncated_files_are_refused(tmp_path: Path, suffix: str, kept: float) -> None:
     path, values = tmp_path / f"scan{suffix}", ramp((20, 20, 20), "float64")
     writers = {".npz": npz(values), ".h5": dataset(data=values), ".ims": lambda path: write_imaris(path, 1)}
-    writers.get(suffix, lambda path: save(Field(values), path))(path)
+    writers.get(suffix, lambda path: save(Volume(values), path))(path)
     whole = path.read_bytes()
     path.write_bytes(whole[: int(kept * len(whole))])
     if suffix == ".tif" and kept == 0.99:  # its values precede the directories of its last pages
@@ -499,7 +501,7 @@ suffixes = st.sampled_from((".nii", ".nii.gz", ".tif", ".zarr"))
 @given(suffixes, st.sampled_from(TYPES), shapes, spacings, st.sampled_from(UNITS))
 @settings(max_examples=120, deadline=None)
 def test_values_spacing_and_unit_survive(suffix: str, dtype: str, shape, spacing, unit: str) -> None:
-    field = Field(ramp(shape, dtype), spacing, unit)
+    field = Volume(ramp(shape, dtype), spacing, unit)
     with tempfile.TemporaryDirectory() as folder:
         back = load(save(field, Path(folder) / f"scan{suffix}"))
     assert np.array_equal(back.values, field.values)
@@ -515,7 +517,7 @@ def test_a_turned_affine_survives_nifti(spacing, axes, signs, origin, unit: str)
     affine[:3, :3] = (np.eye(3) * signs)[list(axes)] * spacing[::-1]
     affine[:3, 3] = origin
     with tempfile.TemporaryDirectory() as folder:
-        path = save(Field(ramp(), spacing, unit, affine), Path(folder) / "scan.nii")
+        path = save(Volume(ramp(), spacing, unit, affine), Path(folder) / "scan.nii")
         back, image = load(path), nibabel.load(path)
     assert back.affine == pytest.approx(affine, rel=1e-6, abs=1e-5 * max(1, *spacing))
     assert image.get_qform() == pytest.approx(image.get_sform(), rel=1e-4, abs=1e-4 * max(1, *spacing))
@@ -523,14 +525,14 @@ def test_a_turned_affine_survives_nifti(spacing, axes, signs, origin, unit: str)
 
 
 def test_npy_keeps_values_only(tmp_path: Path) -> None:
-    back = load(save(Field(ramp(), 0.5, "mm"), tmp_path / "scan.npy"))
+    back = load(save(Volume(ramp(), 0.5, "mm"), tmp_path / "scan.npy"))
     assert np.array_equal(back.values, ramp())
     assert (back.spacing, back.unit) == ((1, 1, 1), "voxel")
     assert back.notes == ("The file states no spacing: lengths are counted in voxels.",)
 
 
 def test_nifti_is_x_y_z_in_the_file(tmp_path: Path) -> None:
-    image = nibabel.load(save(Field(ramp((4, 5, 6)), (3.0, 2.0, 1.0), "um"), tmp_path / "scan.nii.gz"))
+    image = nibabel.load(save(Volume(ramp((4, 5, 6)), (3.0, 2.0, 1.0), "um"), tmp_path / "scan.nii.gz"))
     assert image.shape == (6, 5, 4)
     assert np.asanyarray(image.dataobj)[5, 0, 3] == ramp((4, 5, 6))[3, 0, 5]
     assert image.header.get_zooms() == (1, 2, 3) and image.header.get_xyzt_units()[0] == "micron"
@@ -539,14 +541,14 @@ def test_nifti_is_x_y_z_in_the_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("member", [100, 2**28])
 def test_a_compressed_nifti_holds_what_a_plain_one_does(tmp_path: Path, monkeypatch, member: int) -> None:
     monkeypatch.setattr("curvafit.volumes.formats.nifti.MEMBER", member)
-    field = Field(ramp(), (0.3, 0.2, 0.1), "um")
+    field = Volume(ramp(), (0.3, 0.2, 0.1), "um")
     plain, packed = (save(field, tmp_path / name).read_bytes() for name in ("scan.nii", "scan.nii.gz"))
     assert gzip.decompress(packed) == plain
     assert packed.count(b"\x1f\x8b\x08") == -(-len(plain) // member)
 
 
 def test_tiff_of_ints_is_what_imagej_reads(tmp_path: Path) -> None:
-    with tifffile.TiffFile(save(Field(ramp(dtype="uint16"), (3.0, 0.5, 0.25), "um"), tmp_path / "scan.tif")) as file:
+    with tifffile.TiffFile(save(Volume(ramp(dtype="uint16"), (3.0, 0.5, 0.25), "um"), tmp_path / "scan.tif")) as file:
         metadata, tags = file.imagej_metadata, file.pages[0].tags
         assert (metadata["spacing"], metadata["unit"], metadata["slices"]) == (3.0, "micron", 4)
         top, bottom = tags["XResolution"].value
@@ -556,7 +558,7 @@ def test_tiff_of_ints_is_what_imagej_reads(tmp_path: Path) -> None:
 @pytest.mark.parametrize("dtype", ["bool", "uint8", "int16", "uint16", "float32", "float64"])
 def test_mrc_is_written_in_angstrom(tmp_path: Path, dtype: str) -> None:
     mrcfile = pytest.importorskip("mrcfile")
-    path = save(Field(ramp(dtype=dtype), (0.03, 0.02, 0.01), "um"), tmp_path / "scan.mrc")
+    path = save(Volume(ramp(dtype=dtype), (0.03, 0.02, 0.01), "um"), tmp_path / "scan.mrc")
     assert mrcfile.validate(path)
     with mrcfile.open(path) as file:
         assert file.is_volume() or file.header.nz == 4
@@ -567,8 +569,8 @@ def test_mrc_is_written_in_angstrom(tmp_path: Path, dtype: str) -> None:
 
 
 def test_what_a_format_cannot_hold_is_refused(tmp_path: Path) -> None:
-    wide = Field(ramp(dtype="int32"), 1.0, "nm")
-    for field, name, word in ((Field(ramp()), "a.mrc", "unit"), (wide, "a.mrc", "int32"), (wide, "a.xyz", "must end")):
+    wide = Volume(ramp(dtype="int32"), 1.0, "nm")
+    for field, name, word in ((Volume(ramp()), "a.mrc", "unit"), (wide, "a.mrc", "int32"), (wide, "a.xyz", "must end")):
         with pytest.raises(ScanError, match=word):
             save(field, tmp_path / name)
     assert list(tmp_path.iterdir()) == []
@@ -576,17 +578,17 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".nii.gz", ".zarr"])
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch, suffix: str) -> None:
-    path = save(Field(ramp()), tmp_path / f"scan{suffix}")
-    save(Field(ramp() + 1), path)
+    path = save(Volume(ramp()), tmp_path / f"scan{suffix}")
+    save(Volume(ramp() + 1), path)
     assert np.array_equal(load(path).values, ramp() + 1)
 
-    def fails(field: Field, target: Path) -> None:
+    def fails(field: Volume, target: Path) -> None:
         target.write_bytes(b"half")
         raise RuntimeError("disk full")
 
     monkeypatch.setitem(sys.modules["curvafit.volumes.write"].WRITERS, suffix, fails)
     with pytest.raises(RuntimeError, match="disk full"):
-        save(Field(ramp()), path)
+        save(Volume(ramp()), path)
     assert np.array_equal(load(path).values, ramp() + 1)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 

@@ -12,7 +12,7 @@ import zarr
 from calling import call, done, refused
 from disk import tree, unreadable
 
-from curvafit.volumes import Field, ScanError, load, save
+from curvafit.volumes import ScanError, Volume, load, save
 from curvafit.volumes.read import read_values
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -28,7 +28,7 @@ def content(path: Path, version: str) -> dict[str, Any]:
 @pytest.mark.parametrize(("unit", "named"), [("nm", "nanometer"), ("um", "micrometer"), ("voxel", None)])
 def test_axes_have_a_name_a_type_and_a_unit(tmp_path: Path, unit: str, named: str | None) -> None:
     values = np.arange(60.0).reshape(3, 4, 5)
-    path = save(Field(values, (3.0, 2.0, 0.5), unit), tmp_path / "scan.zarr")
+    path = save(Volume(values, (3.0, 2.0, 0.5), unit), tmp_path / "scan.zarr")
     (found,) = content(path, "0.5")["multiscales"]
     assert content(path, "0.5")["version"] == "0.5"
     assert found["axes"] == [{"name": name, "type": "space", **({"unit": named} if named else {})} for name in "zyx"]
@@ -43,7 +43,7 @@ def test_axes_have_a_name_a_type_and_a_unit(tmp_path: Path, unit: str, named: st
 def test_halved_levels_lie_where_the_whole_one_does(tmp_path: Path, dtype: str) -> None:
     """A ramp along z stays the same function of the place that scale and translation give a voxel."""
     z = np.arange(130, dtype=dtype)
-    path = save(Field(z[:, None, None] * np.ones((1, 70, 8), dtype), (2.0, 1.0, 0.5), "um"), tmp_path / "scan.zarr")
+    path = save(Volume(z[:, None, None] * np.ones((1, 70, 8), dtype), (2.0, 1.0, 0.5), "um"), tmp_path / "scan.zarr")
     levels = content(path, "0.5")["multiscales"][0]["datasets"]
     shapes = [zarr.open_array(path / level["path"], mode="r").shape for level in levels]
     assert shapes == [(130, 70, 8), (65, 35, 4), (33, 18, 2)]
@@ -61,10 +61,10 @@ def test_halved_levels_lie_where_the_whole_one_does(tmp_path: Path, dtype: str) 
 
 
 def test_a_store_replaces_a_longer_one_and_has_all_its_chunks(tmp_path: Path) -> None:
-    save(Field(np.random.default_rng(0).random((130, 8, 8))), tmp_path / "scan.zarr")
+    save(Volume(np.random.default_rng(0).random((130, 8, 8))), tmp_path / "scan.zarr")
     mask = np.zeros((70, 70, 70), np.uint8)
     mask[:5] = 1
-    path = save(Field(mask[:, :, :50], 1.0, "um"), tmp_path / "scan.zarr")
+    path = save(Volume(mask[:, :, :50], 1.0, "um"), tmp_path / "scan.zarr")
     assert sorted(p.name for p in path.iterdir()) == ["0", "1", "zarr.json"]
     assert [p.name for p in tmp_path.iterdir()] == ["scan.zarr"]
     assert load(path, strict=True).notes == ()
@@ -147,10 +147,10 @@ def image(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, str]:
     return path, request.param
 
 
-def tube_of(path: Path, **part: Any) -> Field:
+def tube_of(path: Path, **part: Any) -> Volume:
     """The mask of the tube, on the voxels of the image or a part of it."""
     field = load(path, channel=1, **part)
-    return Field(field.values > 110, field.spacing, field.unit, field.affine)
+    return Volume(field.values > 110, field.spacing, field.unit, field.affine)
 
 
 def test_steps_of_all_levels_place_each(image: tuple[Path, str]) -> None:
@@ -166,7 +166,7 @@ def test_labels_lie_on_the_image_and_are_listed(image: tuple[Path, str]) -> None
     path, version = image
     before, mask, part = tree(path), tube_of(path), tube_of(path, crop="4:14,:,:")
     assert save(mask, path / "labels/tube") == path / "labels/tube"
-    save(Field(part.values.astype(np.uint16) * 700, part.spacing, part.unit, part.affine), path / "labels/part")
+    save(Volume(part.values.astype(np.uint16) * 700, part.spacing, part.unit, part.affine), path / "labels/part")
     assert {name: data for name, data in tree(path).items() if not name.startswith("labels")} == before
     assert content(path / "labels", version)["labels"] == ["tube", "part"]
     own = content(path / "labels/tube", version)
@@ -204,7 +204,7 @@ def test_labels_are_replaced_by_what_wrote_them_alone_and_a_consolidated_store_s
     [
         *(({name: value}, "tube", "voxels of a level")  # without a place it begins before the image does
           for name, value in (("spacing", (0.5, 0.25, 0.2)), ("unit", "mm"), ("affine", None))),
-        ({"values": np.ones(SHAPE, np.float32)}, "tube", "whole numbers"),
+        ({"array": np.ones(SHAPE, np.float32)}, "tube", "whole numbers"),
         ({}, ".tube", "name of labels"),
     ],
 )  # fmt: skip
@@ -217,7 +217,7 @@ def test_other_voxels_are_refused(image: tuple[Path, str], change: dict[str, Any
 
 
 def test_an_image_of_another_version_or_none_is_refused(tmp_path: Path) -> None:
-    group, mask = zarr.open_group(tmp_path / "scan.zarr", mode="w"), Field(np.indices((4, 4, 4))[0] > 1)
+    group, mask = zarr.open_group(tmp_path / "scan.zarr", mode="w"), Volume(np.indices((4, 4, 4))[0] > 1)
     newer = {"version": "0.6", "multiscales": [{}]}
     for attributes, words in (({}, "no image of OME-Zarr"), (newer, r"OME-Zarr 0\.6")):
         group.attrs["ome"] = attributes

@@ -28,7 +28,7 @@ from curvafit.priors.profile import profile_distance
 Triple = tuple[float, float, float]
 #: Lengths along (z, y, x), or one for all three.
 Lengths = float | Sequence[float]
-Volume = Float[Tensor, "z y x"]
+Voxels = Float[Tensor, "z y x"]
 
 #: ε of a generated shape, in its voxels.
 EPSILON = WORKING_EPSILON / WORKING_SPACING
@@ -47,7 +47,7 @@ CUT = 16.0
 # ---- optics ----------------------------------------------------------------------------------------------------------
 
 
-def occupancy(field: Volume, epsilon: float = EPSILON) -> Volume:
+def occupancy(field: Voxels, epsilon: float = EPSILON) -> Voxels:
     """Return the share of each cubic voxel that is inside the shape (partial volume); ε is in voxels.
 
     The profile tanh(d / √2 ε) holds the sub-voxel distance d = √2 ε artanh u, and the share is d + ½ clipped to [0, 1]:
@@ -57,7 +57,7 @@ def occupancy(field: Volume, epsilon: float = EPSILON) -> Volume:
     return profile_distance(field, epsilon).add_(0.5).clamp_(0, 1)
 
 
-def texture(like: Volume, spacing: Lengths, deviation: float, length: float, seed: int, purpose: str) -> Volume:
+def texture(like: Voxels, spacing: Lengths, deviation: float, length: float, seed: int, purpose: str) -> Voxels:
     """Return a random factor of mean 1 and standard deviation `deviation`, correlated by `length`.
 
     The factor is lognormal; its logarithm is a `correlated_field`. Textures of another `purpose` (a name) are
@@ -67,15 +67,15 @@ def texture(like: Volume, spacing: Lengths, deviation: float, length: float, see
     return _field(like, spacing, length, seed, purpose).mul_(spread).sub_(spread**2 / 2).exp_()
 
 
-def blur(image: Volume, spacing: Lengths, widths: Lengths) -> Volume:
+def blur(image: Voxels, spacing: Lengths, widths: Lengths) -> Voxels:
     """Return the image under a Gaussian point-spread function of standard deviations `widths` along (z, y, x)."""
     every = zip(image.shape, as_triple(widths), as_triple(spacing), strict=True)
     return apply_matrices(image, *(gaussian_matrix(n, σ / h, image) for n, σ, h in every))
 
 
 def blur_with_depth(
-    image: Volume, spacing: Lengths, widths: Lengths, growth: float, attenuation: float = 0.0
-) -> Volume:
+    image: Voxels, spacing: Lengths, widths: Lengths, growth: float, attenuation: float = 0.0
+) -> Voxels:
     """Blur an image by a Gaussian that widens with depth, as scatter and aberrations make it.
 
     Its deviations are σ(z) = σ(0) (1 + growth z), and light from depth z is weakened by exp(-attenuation z).
@@ -90,7 +90,7 @@ def blur_with_depth(
     return blurred * torch.exp(-attenuation * depth)[:, None, None]
 
 
-def sample(image: Volume, spacing: Lengths, onto: Lengths, window: Lengths = 0.0) -> Float[Tensor, "Z Y X"]:
+def sample(image: Voxels, spacing: Lengths, onto: Lengths, window: Lengths = 0.0) -> Float[Tensor, "Z Y X"]:
     """Sample an image on a grid of voxels `onto`, each the mean over a `window` about the voxel's centre.
 
     The window is the slice's thickness and the pixel's size. The corners of both grids' first voxels coincide, and
@@ -104,7 +104,7 @@ def sample(image: Volume, spacing: Lengths, onto: Lengths, window: Lengths = 0.0
 # ---- specimen, light and detector ------------------------------------------------------------------------------------
 
 
-def bias(like: Volume, spacing: Lengths, strength: float, length: float, seed: int) -> Volume:
+def bias(like: Voxels, spacing: Lengths, strength: float, length: float, seed: int) -> Voxels:
     """Return the factor of uneven illumination: smooth, from 1 - strength to 1 + strength, correlated by `length`."""
     field = _field(like, spacing, length, seed, "bias")
     low, high = field.aminmax()
@@ -112,7 +112,7 @@ def bias(like: Volume, spacing: Lengths, strength: float, length: float, seed: i
     return (field - middle).mul_(strength / half).add_(1)
 
 
-def stripes(like: Volume, spacing: Lengths, strength: float, width: float, seed: int) -> Volume:
+def stripes(like: Voxels, spacing: Lengths, strength: float, width: float, seed: int) -> Voxels:
     """Return the factor of stripes along x, as shadows in a light sheet or a milling curtain make.
 
     It has mean 1 and deviation `strength`, is not below 0, constant along x, and correlated by `width` across it.
@@ -122,7 +122,7 @@ def stripes(like: Volume, spacing: Lengths, strength: float, width: float, seed:
     return field.mul_(strength).add_(1).clamp_min_(0).expand(like.shape)
 
 
-def rings(like: Volume, spacing: Lengths, strength: float, width: float, seed: int) -> Volume:
+def rings(like: Voxels, spacing: Lengths, strength: float, width: float, seed: int) -> Voxels:
     """Return the rings about an axis along z that defects of a CT detector leave: a term of mean 0.
 
     Its deviation is `strength`. A slice's rings are its own, since a detector's row makes a slice. Few are strong: the
@@ -145,7 +145,7 @@ def rings(like: Volume, spacing: Lengths, strength: float, width: float, seed: i
     return torch.lerp(profile[:, near], profile[:, near + 1], radius - near) * strength
 
 
-def dropout(occupied: Volume, spacing: Lengths, share: float, length: float, loss: float, seed: int) -> Volume:
+def dropout(occupied: Voxels, spacing: Lengths, share: float, length: float, loss: float, seed: int) -> Voxels:
     """Return the factor of lost stain: smooth, 1 where the stain holds and down to 1 - loss in stretches.
 
     A random field of correlation `length` decides: where that is over a tube's radius, stretches of tube fade. Of the
@@ -156,7 +156,7 @@ def dropout(occupied: Volume, spacing: Lengths, share: float, length: float, los
     return 1 - loss * torch.sigmoid((field - threshold) / FADING)
 
 
-def clutter(occupied: Volume, spacing: Lengths, density: float, radius: float, seed: int) -> Volume:
+def clutter(occupied: Voxels, spacing: Lengths, density: float, radius: float, seed: int) -> Voxels:
     """Return specks outside the structure: Gaussian blobs up to 1 high, 0 wherever a voxel is full.
 
     Their number is Poisson's, at `density` a unit of volume; half-widths (deviations) along each axis are uniform in
@@ -183,7 +183,7 @@ def clutter(occupied: Volume, spacing: Lengths, density: float, radius: float, s
     return (planes.mT @ x).reshape(occupied.shape).clamp_max_(1) * (1 - occupied)
 
 
-def _field(like: Volume, spacing: Lengths, length: float, seed: int, purpose: str) -> Volume:
+def _field(like: Voxels, spacing: Lengths, length: float, seed: int, purpose: str) -> Voxels:
     """Return a `correlated_field` with one length along all axes, in the spacing's unit."""
     return correlated_field(like, [length / h for h in as_triple(spacing)], seed, purpose)
 
@@ -201,8 +201,8 @@ def _find_level(values: Tensor, share: float) -> Tensor:
 
 
 def poisson_gaussian(
-    photons: Volume, gain: float, read_noise: float, offset: float, seed: int, width: Lengths = 0.0
-) -> Volume:
+    photons: Voxels, gain: float, read_noise: float, offset: float, seed: int, width: Lengths = 0.0
+) -> Voxels:
     """Return counts: offset + gain · Poisson(photons) + N(0, read_noise²), whose variance is a line over the mean.
 
     Photons are means, from 0. A gain of 0 is an instrument whose noise does not depend on the signal: offset + photons
@@ -232,12 +232,12 @@ def poisson_quantile(mean: Tensor, z: Tensor) -> Tensor:
     return many
 
 
-def gaussian_noise(image: Volume, deviation: float, seed: int, width: Lengths = 0.0) -> Volume:
+def gaussian_noise(image: Voxels, deviation: float, seed: int, width: Lengths = 0.0) -> Voxels:
     """Return the image plus normal noise of a standard deviation, smoothed by `width` voxels at that deviation."""
     return image + deviation * grainy_noise(image, as_triple(width), seed, "read noise") if deviation else image
 
 
-def rician(image: Volume, deviation: float, seed: int, width: Lengths = 0.0) -> Volume:
+def rician(image: Voxels, deviation: float, seed: int, width: Lengths = 0.0) -> Voxels:
     """Return the magnitude of a signal with normal noise in both channels: √((v + σ n₁)² + (σ n₂)²).
 
     The mean square is v² + 2σ²; where there is no signal, the mean is σ √(π/2) (Gudbjartsson and Patz 1995).
@@ -265,7 +265,7 @@ def _sum_quantile(mean: Tensor, z: Tensor) -> Tensor:
 
 
 def apply_matrices(
-    volume: Volume, z: Tensor | None = None, y: Tensor | None = None, x: Tensor | None = None
+    volume: Voxels, z: Tensor | None = None, y: Tensor | None = None, x: Tensor | None = None
 ) -> Float[Tensor, "Z Y X"]:
     """Apply a matrix (out, in), or None, along each axis; those of y and x may differ by slice, (Z, out, in)."""
     if x is not None:
@@ -329,7 +329,7 @@ def white_noise(shape: tuple[int, ...], like: Tensor, seed: int, purpose: str) -
     return torch.randn(shape, generator=stream(seed, purpose, like.device), device=like.device, dtype=like.dtype)
 
 
-def correlated_field(like: Volume, lengths: Sequence[float], seed: int, purpose: str) -> Volume:
+def correlated_field(like: Voxels, lengths: Sequence[float], seed: int, purpose: str) -> Voxels:
     """Return a Gaussian random field of mean 0, variance 1 and correlation exp(-½ Σ (d/length)²) over a distance d.
 
     Lengths are along (z, y, x), in voxels; under half a voxel there is no correlation, and infinity means constant.
@@ -341,7 +341,7 @@ def correlated_field(like: Volume, lengths: Sequence[float], seed: int, purpose:
     return apply_matrices(white_noise(nodes, like, seed, purpose), *maps)
 
 
-def grainy_noise(like: Volume, widths: Sequence[float], seed: int, purpose: str) -> Volume:
+def grainy_noise(like: Voxels, widths: Sequence[float], seed: int, purpose: str) -> Voxels:
     """Return noise of mean 0 and variance 1, smoothed by a Gaussian of deviations `widths` (z, y, x) in voxels."""
     noise = white_noise(tuple(like.shape), like, seed, purpose)
     maps = [gaussian_matrix(n, width, like) for n, width in zip(like.shape, widths, strict=True)]

@@ -8,13 +8,13 @@ from collections.abc import Sequence
 import torch
 
 from curvafit.data_synth.imaging import effects
-from curvafit.data_synth.imaging.effects import EPSILON, Triple, Volume
+from curvafit.data_synth.imaging.effects import EPSILON, Triple, Voxels
 from curvafit.data_synth.imaging.modality import Imaging
 from curvafit.priors.grid import Float
 
 
 def image(
-    field: Volume,
+    field: Voxels,
     spacing: float,
     imaging: Imaging,
     seed: int,
@@ -43,7 +43,7 @@ def image(
     return _detect(light, imaging, seed)
 
 
-def regrid(field: Volume, spacing: float, imaging: Imaging) -> Float[torch.Tensor, "Z Y X"]:
+def regrid(field: Voxels, spacing: float, imaging: Imaging) -> Float[torch.Tensor, "Z Y X"]:
     """Return the phase field at the centres of its image's voxels, interpolated linearly; for labels."""
     return effects.sample(field, spacing, imaging.spacing)
 

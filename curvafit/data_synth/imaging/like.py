@@ -13,7 +13,7 @@ from skimage.filters import threshold_otsu
 
 from curvafit.data_synth.imaging.effects import blur
 from curvafit.data_synth.imaging.modality import Contrast, Detector, Illumination, Imaging, Modality, Noise, Optics
-from curvafit.volumes.field import Field
+from curvafit.volumes.volume import Volume
 
 #: The least brightness, as a share of the mean, that counts for the structure's texture.
 DIMMEST = 0.1
@@ -59,7 +59,7 @@ class Structure(NamedTuple):
     length: float
 
 
-def fit_modality(scan: Field, mask: np.ndarray | None = None) -> Modality:
+def fit_modality(scan: Volume, mask: np.ndarray | None = None) -> Modality:
     """Return a modality whose images look like a scan: its spacing, levels, textures, blur, noise and uneven light.
 
     The scan is taken to have two classes, a Gaussian blur of one width in the plane and one along z, and noise whose
@@ -88,7 +88,7 @@ def fit_modality(scan: Field, mask: np.ndarray | None = None) -> Modality:
     return Modality("like", about, float(min(scan.spacing)), base, ranges)
 
 
-def _to_imaging(scan: Field, structure: Structure, ground: Background, noise: NoiseLine) -> Imaging:
+def _to_imaging(scan: Volume, structure: Structure, ground: Background, noise: NoiseLine) -> Imaging:
     """Return the estimates as parameters of an image: levels in photons where there is a gain, textures before blur."""
     unit = noise.gain or 1.0
     low = max(ground.level - noise.offset, 0.0) / unit
@@ -119,7 +119,7 @@ def _to_imaging(scan: Field, structure: Structure, ground: Background, noise: No
     )
 
 
-def _crop_middle(scan: Field, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+def _crop_middle(scan: Volume, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
     """Check a scan and its mask; return the middle of both, of at most `MOST` voxels."""
     if min(scan.shape) < 8:
         raise ValueError(f"the scan must have at least 8 voxels along each axis, got {scan.shape}")

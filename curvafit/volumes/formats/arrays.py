@@ -14,20 +14,19 @@ import numpy as np
 from curvafit.core.checks import quoted
 from curvafit.core.records import read_member
 from curvafit.volumes.formats import base
-from curvafit.volumes.formats.base import Raw, ScanError
-from curvafit.volumes.formats.part import Part, name_axes, read_part
+from curvafit.volumes.formats.base import ScanError, Stated
 
 #: Attributes that may state a spacing or its unit.
 _ATTRIBUTES = ("element_size_um", "spacing", "voxel_size", "unit", "units")
 _RAW_TYPES = "uint8, int8, uint16, int16, uint32, int32, float32, float64 (or with > for big-endian, as in >u2)"
 
 
-def read_npy(path: Path, *, part: Part | None = None, **_: object) -> Raw:
-    """Read the numbers of an NPY file, or of a part of it."""
+def read_npy(path: Path, **_: object) -> Stated:
+    """Read the numbers of an NPY file."""
     values = np.lib.format.open_memmap(path, mode="r")
     if values.offset + values.nbytes != path.stat().st_size:
         raise base.Damaged(f"{values.nbytes} bytes of values by its header, not so many in the file")
-    return read_part(values, part, path)
+    return Stated(values, "?" * values.ndim)
 
 
 def write_npy(field: Any, path: Path) -> None:
@@ -36,48 +35,55 @@ def write_npy(field: Any, path: Path) -> None:
         np.save(stream, field.values)
 
 
-def read_npz(path: Path, *, key: str | None = None, **_: object) -> Raw:
+def read_npz(path: Path, *, key: str | None = None, **_: object) -> Stated:
     """Read the array of an NPZ file that a key names."""
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
-        return Raw(read_member(archive, f"{base.pick_key(names, key, path)}.npy"))
+        values = read_member(archive, f"{base.pick_key(names, key, path)}.npy")
+    return Stated(values, "?" * values.ndim)
 
 
-def read_hdf5(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
+def read_hdf5(path: Path, *, key: str | None = None, **_: object) -> Stated:
     """Read a dataset, with spacing and unit (`element_size_um`, or `spacing` and `unit`) and ilastik's axes."""
     import h5py
 
-    with h5py.File(path, "r") as file:
-        dataset: Any = file[base.pick_key(_list_datasets(file), key, path)]
-        _check_dataset(dataset, path)
-        attributes = {name: dataset.attrs[name] for name in _ATTRIBUTES if name in dataset.attrs}
-        spacing, unit = base.read_spacing(attributes, dataset.ndim)
-        gaps = tuple(_gaps(dataset, path))
-        tags = json.loads(dataset.attrs["axistags"])["axes"] if "axistags" in dataset.attrs else []
-        axes = name_axes([tag["key"] for tag in tags], path) if len(tags) == dataset.ndim else base.UNNAMED
-        return read_part(dataset, part, path, axes)._replace(spacing=spacing, unit=unit, gaps=gaps)
+    file = h5py.File(path, "r")
+    dataset: Any = file[base.pick_key(_list_datasets(file), key, path)]
+    _check_dataset(dataset, path)
+    attributes = {name: dataset.attrs[name] for name in _ATTRIBUTES if name in dataset.attrs}
+    tags = json.loads(dataset.attrs["axistags"])["axes"] if "axistags" in dataset.attrs else []
+    axes = base.name_axes([tag["key"] for tag in tags]) if len(tags) == dataset.ndim else "?" * dataset.ndim
+    return Stated(dataset, axes, **base.read_spacing(attributes, dataset.ndim), gaps=tuple(_gaps(dataset, path)))
 
 
-def read_imaris(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
+def read_imaris(path: Path, *, key: str | None = None, **_: object) -> Stated:
     """Read a channel (key `TimePoint 0/Channel 1`) of an Imaris file, without voxels that fill up its last chunks."""
     import h5py
 
     level = "DataSet/ResolutionLevel 0/"
-    with h5py.File(path, "r") as file:
-        names = [name for name in _list_datasets(file) if name.startswith(level) and name.endswith("/Data")]
-        keys = [name.removeprefix(level).removesuffix("/Data") for name in names]
-        channel: Any = file[level + base.pick_key(keys, key, path)]
-        dataset, image = channel["Data"], file["DataSetInfo/Image"]
-        _check_dataset(dataset, path)
-        shape = [int(_read_text(channel, f"ImageSize{axis}")) for axis in "ZYX"]
-        ends = [[float(_read_text(image, f"Ext{end}{k}")) for k in (2, 1, 0)] for end in ("Min", "Max")]
-        if len(dataset.shape) != 3 or not all(0 < n <= stored for n, stored in zip(shape, dataset.shape, strict=True)):
-            raise base.Damaged(f"{shape} voxels by its header, {list(dataset.shape)} in the file")
-        index = (part or Part()).index(shape, base.UNNAMED, path)[0]
-        base.check_array([edge.stop - edge.start for edge in index], dataset.dtype, path)
-        spacing = tuple((last - first) / n for first, last, n in zip(*ends, shape, strict=True))
-        unit = _read_text(image, "Unit") if "Unit" in image.attrs else "um"
-        return Raw(dataset[index], spacing, unit, gaps=tuple(_gaps(dataset, path)), whole=tuple(shape))
+    file: Any = h5py.File(path, "r")
+    names = [name for name in _list_datasets(file) if name.startswith(level) and name.endswith("/Data")]
+    keys = [name.removeprefix(level).removesuffix("/Data") for name in names]
+    channel = file[level + base.pick_key(keys, key, path)]
+    dataset, image = channel["Data"], file["DataSetInfo/Image"]
+    _check_dataset(dataset, path)
+    shape = tuple(int(_read_text(channel, f"ImageSize{axis}")) for axis in "ZYX")
+    ends = [[float(_read_text(image, f"Ext{end}{k}")) for k in (2, 1, 0)] for end in ("Min", "Max")]
+    if len(dataset.shape) != 3 or not all(0 < n <= stored for n, stored in zip(shape, dataset.shape, strict=True)):
+        raise base.Damaged(f"{list(shape)} voxels by its header, {list(dataset.shape)} in the file")
+    steps = [(last - first) / n for first, last, n in zip(*ends, shape, strict=True)]
+    unit = _read_text(image, "Unit") if "Unit" in image.attrs else "um"
+    return Stated(Corner(dataset, shape), "zyx", steps, (unit,) * 3, gaps=tuple(_gaps(dataset, path)))
+
+
+class Corner:
+    """The first voxels of a larger array."""
+
+    def __init__(self, array: Any, shape: tuple[int, ...]) -> None:
+        self.array, self.shape, self.dtype = array, shape, array.dtype
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        return self.array[index]
 
 
 def _list_datasets(file: Any) -> list[str]:
@@ -124,9 +130,8 @@ def read_raw(
     *,
     raw_shape: Sequence[int] | None = None,
     dtype: str | None = None,
-    part: Part | None = None,
     **_: object,
-) -> Raw:
+) -> Stated:
     """Read bare numbers, x fastest; shape and type come from the caller (one byte per voxel needs no type)."""
     if raw_shape is None:
         raise ScanError(f"{path} holds bare numbers: give raw_shape (--raw-shape Z,Y,X)")
@@ -142,4 +147,4 @@ def read_raw(
         raise ScanError(f"dtype must be one of {_RAW_TYPES}, got {quoted(dtype)}") from None
     if size != (nbytes := math.prod(shape) * kind.itemsize):
         raise ScanError(f"shape {shape} of {kind} takes {nbytes} bytes, got {size} in {path}")
-    return read_part(base.map_numbers(path, 0, shape, kind), part, path)
+    return Stated(base.map_numbers(path, 0, shape, kind), "zyx")

@@ -1,4 +1,4 @@
-"""What every reader shares: its result and errors, a library's complaints, keys, attributes, and a file's numbers."""
+"""What every reader shares: what a file states, errors, a library's complaints, keys, attributes, numbers."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ import numpy as np
 from curvafit.core.checks import quoted
 from curvafit.core.runtime import memory, one_line
 
+#: From DICOM's and ITK's patient frame (left, posterior, superior) to NIfTI's (right, anterior, superior).
+LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 #: Bytes of one read.
 _PIECE = 1 << 22
 
@@ -31,35 +33,40 @@ class Damaged(Exception):
     """A fault of a file; `read_file` makes a sentence of it that names the file."""
 
 
-class Axes(NamedTuple):
-    """The axes of channels and of times of a file's array, where the file names them."""
+class Stated(NamedTuple):
+    """What a file states of a volume, and nothing more.
 
-    channel: int | None = None
-    time: int | None = None
-
-
-#: No axis has a name.
-UNNAMED = Axes()
-
-
-class Raw(NamedTuple):
-    """The content of a file: an array with z first, and spacing, unit and affine where the file states them.
-
-    `spacing` has one number per axis of `values`, or three for (z, y, x). `guesses` are sentences on a spacing or unit
-    that the file does not state; they do not hold where the caller states them. `gaps` are sentences on values that the
-    file lacks and that were filled in. `axes` are those of channels and times. Where `values` are only a part of the
-    file's array, `whole` is the shape of the array, which has as many axes.
+    Attributes
+    ----------
+    array
+        The values as the file means them: an array, or what has `shape`, `dtype` and `array[index]` and reads then.
+    axes
+        A letter for each axis of the array: z, y, x; t (times), c (channels), s (samples of a colour); or `?` where the
+        file names none.
+    steps, units
+        The distance of voxels along each axis and the unit it is in, or along z, y and x if there are three; None where
+        the file does not say.
+    origin
+        Where the first voxel lies, as `steps`; None where the file does not say, or has an affine.
+    affine
+        4x4 map from index (x, y, z, 1) to the world, right, anterior, superior, in the unit of x.
+    custom
+        The unit of steps that name none, by the custom of the format.
+    notes, guesses, gaps
+        Sentences: on what was done; on a spacing or unit that the file does not state, which do not hold where the
+        caller states them; on values that the file lacks and that were filled in.
     """
 
-    values: np.ndarray
-    spacing: tuple[float, ...] | None = None
-    unit: str | None = None
+    array: Any
+    axes: str
+    steps: Sequence[Any] | None = None
+    units: Sequence[Any] = (None, None, None)
+    origin: Sequence[float] | None = None
     affine: np.ndarray | None = None
+    custom: str = "voxel"
     notes: tuple[str, ...] = ()
     guesses: tuple[str, ...] = ()
     gaps: tuple[str, ...] = ()
-    axes: Axes = UNNAMED
-    whole: tuple[int, ...] | None = None
 
 
 @contextmanager
@@ -99,14 +106,15 @@ def pick_key(keys: list[str], key: str | None, path: object) -> str:
     return name
 
 
-def read_spacing(attributes: Mapping[str, Any], ndim: int) -> tuple[tuple[Any, ...] | None, Any]:
-    """Return spacing and unit from an array's attributes, unchecked; one number counts for all axes."""
+def read_spacing(attributes: Mapping[str, Any], ndim: int) -> dict[str, Any]:
+    """Return steps and units from an array's attributes, unchecked; one number counts for all axes."""
     for name, fixed_unit in (("element_size_um", "um"), ("spacing", None), ("voxel_size", None)):
         if name in attributes:
             sizes = _entries(attributes[name])
             unit = fixed_unit or next(iter(_entries(attributes.get("unit", attributes.get("units")))), None)
-            return sizes * ndim if len(sizes) == 1 else sizes, unit
-    return None, None
+            sizes = sizes * ndim if len(sizes) == 1 else sizes
+            return {"steps": sizes, "units": (unit,) * len(sizes)}
+    return {}
 
 
 def _entries(value: Any) -> tuple[Any, ...]:
@@ -168,3 +176,18 @@ def check_regular(path: Path) -> Path:
     if path.exists() and not path.is_file() and not path.is_dir():
         raise ScanError(f"{path} is neither a file nor a folder")
     return path
+
+
+def name_axes(names: Sequence[str]) -> str:
+    """Return the letter of each axis, `?` of a name that is none."""
+    letters = {"channel": "c", "time": "t"}
+    known = (letters.get(name.casefold(), name.casefold()) for name in names)
+    return "".join(name if name in tuple("tcszyx") else "?" for name in known)
+
+
+def first_voxel(volume: Any) -> tuple[float, ...]:
+    """Return where a volume's first voxel lies (z, y, x); at 0 if its axes are turned, which few formats can say."""
+    affine = volume.affine
+    if affine is None or not np.allclose(affine[:3, :3], np.diag(volume.spacing[::-1]), rtol=1e-5, atol=0):
+        return (0.0, 0.0, 0.0)
+    return tuple(affine[2::-1, 3].tolist())

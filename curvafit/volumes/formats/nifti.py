@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.units import parse_unit
-from curvafit.volumes.formats.base import Axes, Raw, ScanError, collect_complaints, map_numbers, read_numbers
-from curvafit.volumes.formats.part import Part, read_part
+from curvafit.volumes.formats.base import ScanError, Stated, collect_complaints, map_numbers, read_numbers
 
 #: Bytes of one member of a compressed file.
 MEMBER = 2**28
@@ -22,58 +21,72 @@ _TO_FILE = {"voxel": ("unknown", 1.0), "nm": ("micron", 1e-3), "um": ("micron", 
 _TO_FILE |= {"mm": ("mm", 1.0), "m": ("meter", 1.0)}
 
 
-def read_nifti(path: Path, *, part: Part | None = None, **_: object) -> Raw:
-    """Read values, zooms, unit and affine; without a unit, zooms other than 1 are taken for mm, as is usual."""
+def read_nifti(path: Path, **_: object) -> Stated:
+    """Read values, zooms, unit and affine; without a unit, lengths that are stated are taken for mm, as is usual."""
     import nibabel
 
     with collect_complaints("nibabel.global") as repairs:
         image: Any = nibabel.load(path)
-        raw = _values(image, path, part)
-    zooms = tuple(float(f"{h:.7g}") for h in image.header.get_zooms())[:3]  # stored as float32
+    header, affine = image.header, np.array(image.affine, dtype=np.float64)
+    zooms = tuple(float(f"{h:.7g}") for h in header.get_zooms())[:3]  # stored as float32
     if len(zooms) < 3:
         raise ScanError(f"a volume must be 3D, got {len(image.shape)}D of shape {image.shape[::-1]} in {path}")
-    unit = image.header.get_xyzt_units()[0]
-    affine = np.array(image.affine, dtype=np.float64)
-    spacing: tuple[float, ...] | None = zooms[::-1]
+    steps, unit, custom = zooms[::-1], header.get_xyzt_units()[0], "voxel"
     guesses = [f"The file's header is mended: {text}." for text in dict.fromkeys(repairs)]
-    own = _own_unit(image.header)
-    if own:
+    if own := _own_unit(header):
         unit, factor = own
         affine[:3] *= factor
-        spacing = tuple(h * factor for h in zooms[::-1])
-    elif unit == "unknown" and all(h == 1 for h in zooms):
-        spacing = None
+        steps = tuple(h * factor for h in zooms[::-1])
     elif unit == "unknown":
-        unit = "mm"
-        guesses.append("The file names no unit of length: mm is assumed.")
-    lengths = np.linalg.norm(affine[:3, :3], axis=0)[::-1]
-    if spacing is not None and not np.allclose(lengths, spacing, rtol=0.01):
+        unit, placed = None, header["qform_code"] > 0 or header["sform_code"] > 0
+        if any(h != 1 for h in zooms) or (placed and not np.allclose(affine, np.eye(4))):
+            custom = "mm"
+            guesses.append("The file names no unit of length: mm is assumed.")
+        else:
+            steps = None
+    if steps is not None and not np.allclose(np.linalg.norm(affine[:3, :3], axis=0)[::-1], steps, rtol=0.01):
         guesses.append("The file's affine and voxel sizes disagree: the voxel sizes are used.")
-    if spacing is not None:
-        spacing = (1.0,) * (raw.values.ndim - 3) + spacing
-    return raw._replace(spacing=spacing, unit=unit, affine=affine, guesses=tuple(guesses))
+    array, axes = _open_values(image, path)
+    return Stated(array, axes, steps, (unit,) * 3, affine=affine, custom=custom, guesses=tuple(guesses))
 
 
-def _values(image: Any, path: Path, part: Part | None) -> Raw:
-    """Return the scaled values, z first, or the part of them from a file that is not compressed."""
-    from nibabel.volumeutils import apply_read_scaling
-
-    proxy, compression = image.dataobj, path.name.lower().endswith(".gz")
+def _open_values(image: Any, path: Path) -> tuple[Any, str]:
+    """Return the scaled values, z first, and the letters of their axes; of a file that is not compressed, unread."""
+    proxy, compressed = image.dataobj, path.name.lower().endswith(".gz")
     shape = proxy.shape[::-1]
     # Of axes beyond space NIfTI's fourth is time, but programs use it for channels: it is that of channels where no
     # other has more than one entry, unless the header has a unit of time.
     long = [axis for axis, n in enumerate(shape[:-3]) if n != 1]
     timed = len(long) > 1 or image.header.get_xyzt_units()[1] in ("sec", "msec", "usec")
     time = long[-1] if long and long[-1] == len(shape) - 4 and timed else None
-    axes = Axes(next((axis for axis in long if axis != time), None), time)
-    if part is not None and not compression:
-        raw = read_part(map_numbers(path, proxy.offset, shape, proxy.dtype), part, path, axes)
-    else:
-        with gzip.open(path) if compression else path.open("rb") as stream:
+    channel = next((axis for axis in long if axis != time), None)
+    letters = ("t" if axis == time else "c" if axis == channel else "?" for axis in range(len(shape) - 3))
+    if compressed:
+        with gzip.open(path) as stream:
             stream.seek(proxy.offset)
-            raw = Raw(read_numbers(stream, shape, proxy.dtype, path), axes=axes)
-    values = apply_read_scaling(raw.values, np.asanyarray(proxy.slope), np.asanyarray(proxy.inter))
-    return raw._replace(values=values)
+            array = read_numbers(stream, shape, proxy.dtype, path)
+    else:
+        array = map_numbers(path, proxy.offset, shape, proxy.dtype)
+    if (proxy.slope, proxy.inter) != (1, 0):
+        scaled = Scaled(array, np.asanyarray(proxy.slope), np.asanyarray(proxy.inter))
+        array = scaled[...] if compressed else scaled
+    return array, "".join(letters) + "zyx"
+
+
+class Scaled:
+    """An array of values times a slope, plus an intercept."""
+
+    def __init__(self, array: np.ndarray, slope: np.ndarray, intercept: np.ndarray) -> None:
+        self.array, self.slope, self.intercept, self.shape = array, slope, intercept, array.shape
+        self.dtype = self._scale(np.zeros(1, array.dtype)).dtype
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        return self._scale(self.array[index])
+
+    def _scale(self, values: np.ndarray) -> np.ndarray:
+        from nibabel.volumeutils import apply_read_scaling
+
+        return apply_read_scaling(values, self.slope, self.intercept)  # type: ignore[arg-type]
 
 
 def write_nifti(field: Any, path: Path) -> None:

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from curvafit.volumes.formats.base import Damaged, Raw, ScanError, affine_of, check_array, map_numbers
-from curvafit.volumes.formats.part import Part, read_part
+from curvafit.volumes.formats.base import Damaged, ScanError, Stated, affine_of, check_array, map_numbers
 
 #: AIM's types -> numpy's.
 _AIM_TYPES = {0x00010001: "i1", 0x00160001: "u1", 0x000D0001: "u1", 0x00020002: "<i2"}
@@ -23,7 +22,7 @@ _AIM_TYPES |= {0x00170002: "<u2", 0x00030004: "<i4", 0x001A0004: "<f4"}
 _TWO_VALUES, _PAIRS = 0x00150001, 0x00080002
 
 
-def read_isq(path: Path, *, part: Part | None = None, **_: object) -> Raw:
+def read_isq(path: Path, **_: object) -> Stated:
     """Read an ISQ scan, whose header states the edges of the whole volume in µm."""
     head = _read_head(path, 512)
     if head[:16] != b"CTDATA-HEADER_V1":
@@ -33,10 +32,10 @@ def read_isq(path: Path, *, part: Part | None = None, **_: object) -> Raw:
     if min(*shape, *edges, blocks + 1) < 1:
         raise Damaged(f"{shape.tolist()} voxels with edges of {edges.tolist()} µm in all")
     values = map_numbers(path, 512 * (blocks + 1), shape[::-1].tolist(), np.dtype("<i2"), tail=True)
-    return _place(read_part(values, part, path), edges / shape / 1000, np.zeros(3), int(numbers[18]))
+    return _place(values, edges / shape / 1000, np.zeros(3), int(numbers[18]))
 
 
-def read_aim(path: Path, *, part: Part | None = None, **_: object) -> Raw:
+def read_aim(path: Path, **_: object) -> Stated:
     """Read an AIM scan or mask of version 020 or 030, at its position in the scan that it was cut from."""
     head = _read_head(path, 264)
     old = head[:16] != b"AIMDATA_V030   \0"
@@ -59,7 +58,7 @@ def read_aim(path: Path, *, part: Part | None = None, **_: object) -> Raw:
     else:
         raise ScanError(f"{path} has values of AIM's type {kind:#010x}, which are not read")
     scaling = re.search(rb"Mu_Scaling +(\d{1,9})\b", log)
-    return _place(read_part(values, part, path), spacing, position * spacing, int(scaling[1]) if scaling else 0)
+    return _place(values, spacing, position * spacing, int(scaling[1]) if scaling else 0)
 
 
 def _read_head(path: Path, size: int) -> bytes:
@@ -95,10 +94,10 @@ def _unpack_runs(path: Path, start: int, shape: Sequence[int], integer: np.dtype
     return np.repeat(values, lengths)[:count].reshape(tuple(shape))
 
 
-def _place(raw: Raw, spacing: np.ndarray, origin: np.ndarray, scaling: int) -> Raw:
+def _place(values: np.ndarray, spacing: np.ndarray, origin: np.ndarray, scaling: int) -> Stated:
     """Return the content with its place, of numbers (x, y, z) in mm in ITK's frame, and with what its values are."""
     flip = np.array([-1, -1, 1])  # from ITK's frame to NIfTI's
     affine = affine_of(np.diag(flip * spacing), flip * origin)
     note = f"The values are the file's own: divided by {scaling}, they are the attenuation in 1/cm."
-    notes = (note,) if scaling > 1 and raw.values.dtype.itemsize > 1 else ()
-    return raw._replace(spacing=tuple(spacing[::-1].tolist()), unit="mm", affine=affine, notes=notes)
+    notes = (note,) if scaling > 1 and values.dtype.itemsize > 1 else ()
+    return Stated(values, "zyx", spacing[::-1].tolist(), ("mm",) * 3, affine=affine, notes=notes)

@@ -11,9 +11,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from curvafit.core.units import common_unit, is_unit, parse_unit
+from curvafit.core.units import is_unit, parse_unit
 from curvafit.volumes.formats import base
-from curvafit.volumes.formats.base import Raw, ScanError
+from curvafit.volumes.formats.base import ScanError, Stated
 
 if TYPE_CHECKING:
     import tifffile
@@ -28,13 +28,15 @@ _RESOLUTION_LIMIT = 2**31
 _LOST = re.compile("invalid (page )?offset|missing|corrupted|not match|failed to|out of range|raised", re.IGNORECASE)
 _TAG_UNITS = {2: "inch", 3: "cm"}
 _NO_DISTANCE = "The file states no distance of slices: it is taken as the pixel's."
-#: Spacing (z, y, x) and unit, where the file states them, and notes on what is assumed.
-_Spacing = tuple[tuple[float, ...] | None, str | None, tuple[str, ...]]
+#: Steps along (z, y, x) and their units, where the file states them, and notes on what is assumed.
+_Spacing = tuple[Sequence[float] | None, Sequence[str | None], tuple[str, ...]]
+#: Nothing is stated.
+_UNKNOWN: _Spacing = (None, (None,) * 3, ())
 #: Resolutions that programs write when they know none (dots per inch; 25.4 is one dot per millimetre).
 _SCREEN = (1, 25.4, 72, 96, 100, 150, 200, 300, 600)
 
 
-def read_tiff(path: Path, **_: object) -> Raw:
+def read_tiff(path: Path, **_: object) -> Stated:
     """Read the first series of a file, or raise Damaged where one of its strips or pages is missing."""
     import tifffile
 
@@ -43,8 +45,8 @@ def read_tiff(path: Path, **_: object) -> Raw:
         base.check_array(series.shape, series.dtype or np.dtype("V1"), path)
         _check_pages(file, series)
         values = np.asarray(series.asarray())
-        spacing, unit, guesses = _read_spacing(file)
-        axes, guess = _other_axes(series)
+        steps, units, guesses = _read_spacing(file)
+        axes = base.name_axes(series.axes)
         values, calibration = _calibrate(values, file.imagej_metadata or {})
         count = len(file.series)
     tags = [text for text in messages if text.startswith("<TiffTag")]
@@ -52,19 +54,7 @@ def read_tiff(path: Path, **_: object) -> Raw:
         raise base.Damaged(losses[0])
     notes = (f"The file holds {count} images: the first is used.",) if count > 1 else ()
     notes += (f"{len(tags)} of the file's tags cannot be read: what they state is not known.",) if tags else ()
-    return Raw(values, spacing, unit, notes=(*notes, *guess, *calibration), guesses=guesses, axes=axes)
-
-
-def _other_axes(series: tifffile.TiffPageSeries) -> tuple[base.Axes, tuple[str, ...]]:
-    """Return the axes of colours or channels and of times. In a series of three axes they are taken for slices."""
-    long = {name: axis for axis, name in enumerate(series.axes) if series.shape[axis] != 1}
-    axes = base.Axes(long.get("S", long.get("C")), long.get("T"))
-    named = [name for name in ("S" if "S" in long else "C", "T") if name in long]
-    if named[-1:] in ([], ["S"]) or sum(n != 1 for n in series.shape) - len(named) != 2:
-        return axes, ()
-    what = "times" if named[-1] == "T" else "channels"
-    note = f"The file calls an axis of {series.shape[long[named[-1]]]} {what}: it is taken for slices."
-    return base.Axes(axes.channel if len(named) == 2 else None), (note,)
+    return Stated(values, axes, steps, units, notes=(*notes, *calibration), guesses=guesses)
 
 
 def _calibrate(values: np.ndarray, metadata: Mapping[str, Any]) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -79,33 +69,33 @@ def _calibrate(values: np.ndarray, metadata: Mapping[str, Any]) -> tuple[np.ndar
     return grey.astype(base.smallest_type(grey) if whole else np.float32), ()
 
 
-def read_slices(path: Path, **_: object) -> Raw:
+def read_slices(path: Path, **_: object) -> Stated:
     """Read a folder of 2D slices in the natural order of their names, with the pixel size of the first slice."""
     files = (p for p in path.iterdir() if p.suffix.lower() in SLICES and not p.name.startswith("."))
     names = sorted(files, key=lambda p: natural_key(p.name))
-    first, slices = None, []
+    first, planes = None, []
     for name in names:
-        raw = read_tiff(base.check_regular(name))
-        first, plane = first or raw, _squeeze_plane(raw)
-        slices.append(plane)
-        if plane.ndim != 2 + (raw.axes.channel is not None) or plane.shape != slices[0].shape:
+        stated = read_tiff(base.check_regular(name))
+        first, plane = first or stated, _squeeze_plane(stated)
+        planes.append(plane)
+        if plane.ndim != 2 + ("s" in first.axes) or plane.shape != planes[0].shape:
             got = f"{plane.shape} in {name.name} of {path}"
-            raise ScanError(f"slices must be 2D and of one shape {slices[0].shape}, got {got}")
+            raise ScanError(f"slices must be 2D and of one shape {planes[0].shape}, got {got}")
     assert first is not None
-    axes, notes = base.Axes(None if first.axes.channel is None else 3), first.notes
-    kinds = {str(plane.dtype): name.name for name, plane in zip(names[::-1], slices[::-1], strict=True)}
+    notes = first.notes
+    kinds = {str(plane.dtype): name.name for name, plane in zip(names[::-1], planes[::-1], strict=True)}
     if len(kinds) > 1:
         listed = ", ".join(f"{kind} in {name}" for kind, name in kinds.items())
         notes += (f"The slices differ in type, {listed}: their values may not be of one scale.",)
     gaps = _skipped_numbers([name.stem for name in names])
-    return first._replace(values=np.stack(slices), gaps=gaps, axes=axes, notes=notes)
+    return first._replace(array=np.stack(planes), axes="zyxs"[: planes[0].ndim + 1], gaps=gaps, notes=notes)
 
 
-def _squeeze_plane(raw: Raw) -> np.ndarray:
-    """Return a slice (Y, X), or (Y, X, channels)."""
-    if raw.axes.channel is None:
-        return np.squeeze(raw.values)
-    values = np.moveaxis(raw.values, raw.axes.channel, -1)
+def _squeeze_plane(stated: Stated) -> np.ndarray:
+    """Return a slice (Y, X), or (Y, X, samples)."""
+    if "s" not in stated.axes:
+        return np.squeeze(stated.array)
+    values = np.moveaxis(stated.array, stated.axes.index("s"), -1)
     return values.reshape([*(n for n in values.shape[:-1] if n != 1), values.shape[-1]])
 
 
@@ -200,7 +190,8 @@ def _read_spacing(file: tifffile.TiffFile) -> _Spacing:
         return _from_sizes(next((node.attrib for node in nodes if node.tag.endswith("Pixels")), {}))
     description: dict[str, Any] = dict(file.imagej_metadata or (file.shaped_metadata or ({},))[0])
     if "curvafit_spacing" in description:
-        return tuple(float(h) for h in description["curvafit_spacing"].split(",")), description["curvafit_unit"], ()
+        steps = [float(h) for h in description["curvafit_spacing"].split(",")]
+        return steps, (description["curvafit_unit"],) * 3, ()
     if "PhysicalSizeX" in description:
         return _from_sizes(description)
     if file.is_imagej:
@@ -208,53 +199,50 @@ def _read_spacing(file: tifffile.TiffFile) -> _Spacing:
     if "spacing" not in description:
         return _from_tags(file)
     # tifffile's JSON has three numbers, or one for all axes
-    sizes, unit = tuple(float(h) for h in np.atleast_1d(description["spacing"])), description.get("unit")
+    sizes, unit = [float(h) for h in np.atleast_1d(description["spacing"])], description.get("unit")
     if len(sizes) == 3:
-        return sizes, unit, ()
+        return sizes, (unit,) * 3, ()
     note = f"The file states one voxel size, {sizes[0]:g} {unit or ''}".rstrip() + ": it is taken for all three axes."
-    return sizes[:1] * 3, unit, (note,)
+    return sizes[:1] * 3, (unit,) * 3, (note,)
 
 
 def _from_sizes(pixels: Mapping[str, Any]) -> _Spacing:
-    """Return spacing, unit and a note from OME's sizes, where 0 is not known; an axis without a size has that of x."""
+    """Return steps, units and a note from OME's sizes, where 0 is not known; an axis without a size has that of x."""
     sizes = {axis: float(pixels.get(f"PhysicalSize{axis}", 0)) for axis in "ZYX"}
     if not sizes["X"]:
-        return None, None, ()
+        return _UNKNOWN
     axes = [axis if sizes[axis] else "X" for axis in "ZYX"]
-    names = [pixels.get("unit", pixels.get(f"PhysicalSize{axis}Unit", "um")) for axis in axes]
-    unit, factors = common_unit(names)
+    units = [pixels.get("unit", pixels.get(f"PhysicalSize{axis}Unit", "um")) for axis in axes]
     guesses = (_NO_DISTANCE,) if not sizes["Z"] and int(pixels.get("SizeZ", 1)) > 1 else ()
-    if "reference frame" in names:
+    if "reference frame" in units:
         guesses += ("The file states sizes in a reference frame, not in a unit of length: they are taken for voxels.",)
-    return tuple(f * sizes[axis] for f, axis in zip(factors, axes, strict=True)), unit, guesses
+    return [sizes[axis] for axis in axes], units, guesses
 
 
 def _from_imagej(file: tifffile.TiffFile, description: dict[str, Any]) -> _Spacing:
-    """Return spacing, unit and a note from ImageJ's description: the distance of slices in `zunit`, and by the tags
+    """Return steps, units and a note from ImageJ's description: the distance of slices in `zunit`, and by the tags
     pixels per `unit` or `yunit`. Without a unit only proportions have a meaning: lengths are in pixels along x."""
     y, x = _pixels_per_unit(file)
     z = abs(float(description.get("spacing") or 0))
     units = [description.get(f"{axis}unit", description.get("unit")) for axis in "zyx"]
-    unit, (fz, fy, fx) = common_unit(units if z else [units[2], *units[1:]])
-    sizes = (fz * (z or 1 / x), fy / y, fx / x)
-    if is_unit(unit) and parse_unit(unit)[0] == "voxel":
-        sizes = (sizes[0] * x, x / y, 1.0)
-        return (None if np.allclose(sizes, 1) else sizes), None, ()
-    return sizes, unit, () if z else (_NO_DISTANCE,)
+    units = units if z else [units[2], *units[1:]]
+    if all(is_unit(unit) and parse_unit(unit)[0] == "voxel" for unit in units):
+        steps = (z * x if z else 1.0, x / y, 1.0)
+        return (None if np.allclose(steps, 1) else steps), _UNKNOWN[1], ()
+    return (z or 1 / x, 1 / y, 1 / x), units, () if z else (_NO_DISTANCE,)
 
 
 def _from_tags(file: tifffile.TiffFile) -> _Spacing:
-    """Return spacing, unit and a note from the resolution tags, unless they are a program's default."""
+    """Return steps, units and a note from the resolution tags, unless they are a program's default."""
     y, x = _pixels_per_unit(file)
     tag = file.pages[0].tags.get("ResolutionUnit")  # type: ignore[union-attr]
     unit = _TAG_UNITS.get(int(tag.value)) if tag is not None else None
     if unit is None or min(x, y) <= 0:
-        return None, None, ()
+        return _UNKNOWN
     dots = x * (2.54 if unit == "cm" else 1.0)
     if any(abs(dots - screen) < 0.51 for screen in _SCREEN):
-        return None, None, ()
-    _, factor = parse_unit(unit)
-    return (factor / x, factor / y, factor / x), "mm", (_NO_DISTANCE,)
+        return _UNKNOWN
+    return (1 / x, 1 / y, 1 / x), (unit,) * 3, (_NO_DISTANCE,)
 
 
 def _pixels_per_unit(file: tifffile.TiffFile) -> tuple[float, float]:

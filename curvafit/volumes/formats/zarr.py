@@ -10,16 +10,16 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from curvafit.core.files import move_into_place, write_content
 from curvafit.core.records import MARK, is_zarr
 from curvafit.core.runtime import hold_signals
-from curvafit.core.units import format_sampling, parse_unit
-from curvafit.volumes.formats.base import UNNAMED, Axes, Damaged, Raw, ScanError, affine_of, pick_key, read_spacing
-from curvafit.volumes.formats.part import Box, Part, cut_boxes, index_of, name_axes, read_part
+from curvafit.core.units import common_unit, format_sampling, parse_unit
+from curvafit.volumes.boxes import Box, cut_boxes
+from curvafit.volumes.formats.base import Damaged, ScanError, Stated, first_voxel, name_axes, pick_key, read_spacing
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
 CHUNK = 64
@@ -33,23 +33,11 @@ _UNITS = {"nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter
 _FORMATS = {"0.4": 2, "0.5": 3}
 
 
-class _Place(NamedTuple):
-    """Where an array's voxels lie: spacing and first voxel along all axes, unit and named axes, where known."""
-
-    spacing: tuple[Any, ...] | None = None
-    unit: Any = None
-    axes: Axes = UNNAMED
-    first: tuple[float, ...] | None = None
-
-    @property
-    def affine(self) -> np.ndarray | None:
-        """Return the affine `(4, 4)`, x first; None where the first voxel is at 0, or not known."""
-        if self.spacing is None or self.first is None or len(self.spacing) < 3 or not any(self.first[-3:]):
-            return None
-        return affine_of(np.diag(self.spacing[:-4:-1]), self.first[:-4:-1])
+#: The letters of the axes of a level of an image, and the steps, units and origin along them, as `Stated` has them.
+_Place = dict[str, Any]
 
 
-def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, **_: object) -> Raw:
+def read_zarr(path: Path, *, key: str | None = None, **_: object) -> Stated:
     """Read an array, or one of a group, with spacing and unit of its attributes or of OME-Zarr's multiscales.
 
     A key names an array, or an image of OME-Zarr, of which the finest level is read. Without one a group is that image,
@@ -60,15 +48,15 @@ def read_zarr(path: Path, *, key: str | None = None, part: Part | None = None, *
     _check_store(path)
     node: Any = zarr.open(path, mode="r")
     if isinstance(node, zarr.Array):
-        return _read_array(node, path, _Place(*read_spacing(node.attrs.asdict(), node.ndim)), part)
+        return _state_array(node, path, read_spacing(node.attrs.asdict(), node.ndim))
     arrays, places, name, unasked = _pick_array(node, key, path)
     array = arrays[name]
     if unasked:
         _check_levels(arrays, places, path)
     place = places.get(name)
     if place is None:
-        place = _Place(*read_spacing({**node.attrs.asdict(), **array.attrs.asdict()}, array.ndim))
-    return _read_array(array, path / array.path, place, part)
+        place = read_spacing({**node.attrs.asdict(), **array.attrs.asdict()}, array.ndim)
+    return _state_array(array, path / array.path, place)
 
 
 def list_levels(path: Path, key: str | None) -> dict[str, tuple[float, ...] | None]:
@@ -82,7 +70,7 @@ def list_levels(path: Path, key: str | None) -> dict[str, tuple[float, ...] | No
     arrays, places, name, _ = _pick_array(node, key, path)
     if key is not None and key.strip("/") == name:
         return {}
-    return {each: place.spacing for each, place in places.items() if each in arrays}
+    return {each: place["steps"] for each, place in places.items() if each in arrays}
 
 
 def _pick_array(node: Any, key: str | None, path: Path) -> tuple[dict[str, Any], dict[str, _Place], str, bool]:
@@ -104,12 +92,11 @@ def _pick_array(node: Any, key: str | None, path: Path) -> tuple[dict[str, Any],
     return arrays, next((each for each in levels.values() if name in each), {}), name, unasked
 
 
-def _read_array(array: Any, folder: Path, place: _Place, part: Part | None) -> Raw:
-    """Return the values of an array in a folder, with a sentence on chunks that are not stored."""
-    index_of(array, part, folder, place.axes)  # before chunks are counted: a header may claim any number of them
-    gaps = _missing_chunks(array, folder)
-    raw = read_part(array, part, folder, place.axes)
-    return raw._replace(spacing=place.spacing, unit=place.unit, affine=place.affine, gaps=gaps)
+def _state_array(array: Any, folder: Path, place: _Place) -> Stated:
+    """Return an array in a folder at its place, with a sentence on chunks that are not stored."""
+    axes, units = place.get("axes", ""), place.get("units") or (None,) * 3
+    axes = axes if len(axes) == array.ndim else "?" * array.ndim
+    return Stated(array, **{**place, "axes": axes, "units": units}, gaps=_missing_chunks(array, folder))
 
 
 def write_zarr(field: Any, path: Path, version: str = "0.5", labels: bool = False) -> None:
@@ -144,7 +131,7 @@ def create_zarr(
     datasets = []
     for k in range(len(shapes)):
         transforms = [{"type": "scale", "scale": [2**k * h for h in frame.spacing]}]
-        first = [x + shift * (2**k - 1) * h for x, h in zip(_first(frame), frame.spacing, strict=True)]
+        first = [x + shift * (2**k - 1) * h for x, h in zip(first_voxel(frame), frame.spacing, strict=True)]
         if any(first):
             transforms += [{"type": "translation", "translation": first}]
         datasets.append({"path": str(k), "coordinateTransformations": transforms})
@@ -201,14 +188,6 @@ def halve_level(group: Any, level: int, core: Box) -> None:
     level_of(group, level)[core] = values
 
 
-def _first(field: Any) -> tuple[float, ...]:
-    """Return where a field's first voxel lies (z, y, x); at 0 if its axes are turned, which OME-Zarr cannot say."""
-    affine = field.affine
-    if affine is None or not np.allclose(affine[:3, :3], np.diag(field.spacing[::-1]), rtol=1e-5, atol=0):
-        return (0.0, 0.0, 0.0)
-    return tuple(affine[2::-1, 3].tolist())
-
-
 # ---- labels of an image ----------------------------------------------------------------------------------------------
 
 
@@ -242,7 +221,7 @@ def write_labels(field: Any, path: Path, *, image: Path) -> None:
     if field.values.dtype.kind not in "biu":
         raise ScanError(f"labels must be whole numbers, got values of type {field.values.dtype}")
     check_place(field, image)
-    whole = replace(field, values=field.values.view(np.uint8)) if field.values.dtype.kind == "b" else field
+    whole = replace(field, array=field.values.view(np.uint8)) if field.values.dtype.kind == "b" else field
     write_zarr(whole, path, version_of(image) or "", labels=True)
 
 
@@ -251,16 +230,16 @@ def check_place(field: Any, image: Path) -> None:
     import zarr
 
     group: Any = zarr.open_group(image, mode="r")
-    places = _levels("", group.attrs.asdict())
-    for name, place in places.items():
-        edges = np.array(place.spacing or (1.0, 1.0, 1.0), dtype=np.float64)[-3:]
-        start = np.array(place.first or (0.0, 0.0, 0.0))[-3:]
-        unit, factor = parse_unit(place.unit)
-        first = (np.array(_first(field)) / factor - start) / edges
-        last = first + field.shape
-        alike = np.allclose(np.array(field.spacing) / factor, edges, rtol=1e-3, atol=0)
-        inside = (first > -0.01).all() and (last < np.array(group[name].shape[-3:]) + 0.01).all()
-        if unit == field.unit and alike and inside:
+    for name, place in _levels("", group.attrs.asdict()).items():
+        axes = place["axes"] or "zyx"
+        where, count = [axes.index(letter) for letter in "zyx"], len(axes)
+        stated = (place["steps"] or (1.0,) * count, place["origin"] or (0.0,) * count, group[name].shape)
+        edges, start, shape = (np.array([each[axis] for axis in where]) for each in stated)
+        common, factors = common_unit([place["units"][axis] for axis in where] if place["units"] else [None] * 3)
+        unit, factor = parse_unit(common)
+        alike = np.allclose(np.array(field.spacing) / factor, edges * factors, rtol=1e-3, atol=0)
+        first = (np.array(first_voxel(field)) / factor / factors - start) / edges
+        if unit == field.unit and alike and (first > -0.01).all() and (first + field.shape < shape + 0.01).all():
             return
     size = format_sampling(field.shape, field.spacing, field.unit)
     raise ScanError(f"labels must have the voxels of a level of {image} or of a part of one, got {size}")
@@ -315,12 +294,11 @@ def mark(folder: Path, kind: str) -> None:
 
 
 def _levels(name: str, attributes: Mapping[str, Any]) -> dict[str, _Place]:
-    """Return the place of each level of an OME-Zarr image, by the level's path; the unit is that of the last axis."""
+    """Return the place of each level of an OME-Zarr image, by the level's path."""
     image = next(iter(attributes.get("ome", attributes).get("multiscales") or []), {})
     axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", [])]
-    unit = axes[-1].get("unit") if axes else None
-    letters = {"channel": "c", "time": "t"}
-    kinds = name_axes([letters.get(str(axis.get("type")), str(axis.get("name"))) for axis in axes], name or "the image")
+    names = (str(axis["type"] if axis.get("type") in ("channel", "time") else axis.get("name")) for axis in axes)
+    kinds = {"axes": name_axes(list(names)), "units": [axis.get("unit") for axis in axes]}
     places: dict[str, _Place] = {}
     for level in image.get("datasets", []):
         scale, first = None, None
@@ -331,8 +309,8 @@ def _levels(name: str, attributes: Mapping[str, Any]) -> dict[str, _Place]:
                 scale, first = by if scale is None else by * scale, None if first is None else by * first
             elif step.get("type") == "translation":
                 first = np.array(step["translation"], dtype=np.float64) + (0.0 if first is None else first)
-        spacing, corner = (None if each is None else tuple(each.tolist()) for each in (scale, first))
-        places[f"{name}/{level['path']}".strip("/")] = _Place(spacing, unit, kinds, corner)
+        steps, origin = (None if each is None else each.tolist() for each in (scale, first))
+        places[f"{name}/{level['path']}".strip("/")] = {**kinds, "steps": steps, "origin": origin}
     return places
 
 
@@ -342,11 +320,11 @@ def _check_levels(arrays: Mapping[str, Any], places: Mapping[str, _Place], path:
     for name, place in places.items():
         if name not in arrays:
             raise ScanError(f"{path} lists the level {name}, which is not there: name another, as in {path}::0")
-        if place.spacing is None or len(place.spacing) != arrays[name].ndim:
+        if place["steps"] is None or len(place["steps"]) != arrays[name].ndim:
             continue
-        extents[name] = np.array(place.spacing) * arrays[name].shape
+        extents[name] = np.array(place["steps"]) * arrays[name].shape
         first = next(iter(extents))
-        if (np.abs(extents[name] - extents[first]) > 1.01 * np.array(place.spacing)).any():
+        if (np.abs(extents[name] - extents[first]) > 1.01 * np.array(place["steps"])).any():
             sizes = (" x ".join(f"{edge:g}" for edge in extents[each]) for each in (first, name))
             said = " and ".join(f"{size} of {each}" for size, each in zip(sizes, (first, name), strict=True))
             raise ScanError(f"the levels of {path} disagree in extent, {said}: name one, as in {path}::{first}")
