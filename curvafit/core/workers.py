@@ -1,12 +1,11 @@
-"""Who makes the parts of a job: this process, or the workers of a dask cluster."""
+"""Who does jobs: this process, or the workers of a dask cluster."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from curvafit.core.checks import check_int
@@ -29,31 +28,28 @@ _ENVIRONMENT = {
 #: What a worker on this machine runs first: Ctrl-C in the terminal is for the main process, which ends its workers.
 _IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 
-#: Makes some parts of a folder, by their indices, and returns one result each; a function that has a module's name.
-Make = Callable[[Path, Sequence[int]], list[Any]]
-
 
 class ThisProcess:
-    """This process, as the only worker of a job: `submit` asks for parts of a folder, `collect` makes them."""
+    """This process, as the only worker: `submit` takes a job, `collect` does it."""
 
     places = 1
 
     def __init__(self) -> None:
-        self._requests: list[tuple[Make, Path, Sequence[int]]] = []
+        self._jobs: list[tuple[Callable[[Any], Any], Any]] = []
 
-    def submit(self, make: Make, path: Path, indices: Sequence[int]) -> None:
-        self._requests.append((make, path, indices))
+    def submit(self, function: Callable[[Any], Any], job: Any) -> None:
+        self._jobs.append((function, job))
 
-    def collect(self) -> list[Any]:
-        make, path, indices = self._requests.pop(0)
-        return make(path, indices)
+    def collect(self) -> Any:
+        function, job = self._jobs.pop(0)
+        return function(job)
 
 
 class Cluster:
-    """The workers of a dask cluster, which must see the folder under the same name.
+    """The workers of a dask cluster, which must see folders under the same names.
 
-    `submit` asks for parts of the folder; `collect` waits for one of the requests and returns its results. `places` is
-    the number of requests that may wait at once. A request whose worker dies goes to another.
+    `submit` hands a job out, `collect` waits for one of them and returns its result. `places` is the number of jobs
+    that may wait at once. A job whose worker dies goes to another.
     """
 
     def __init__(self, client: Client) -> None:
@@ -66,13 +62,13 @@ class Cluster:
 
     @property
     def places(self) -> int:
-        """Return two requests for each thread there is now; at least one, since workers may still come."""
+        """Return two jobs for each thread there is now; at least one, since workers may still come."""
         return max(1, 2 * sum(self._client.nthreads().values()))  # type: ignore
 
-    def submit(self, make: Make, path: Path, indices: Sequence[int]) -> None:
-        self._futures.add(self._client.submit(make, path.resolve(), list(indices), pure=False))
+    def submit(self, function: Callable[[Any], Any], job: Any) -> None:
+        self._futures.add(self._client.submit(function, job, pure=False))
 
-    def collect(self) -> list[Any]:
+    def collect(self) -> Any:
         from distributed import KilledWorker
 
         first = next(self._futures)
@@ -82,20 +78,23 @@ class Cluster:
             raise OSError(f"a part of the work killed several workers: {error}") from error
 
 
-#: Whoever makes the parts of a job, such as the draws of an atlas.
+#: Who does jobs, such as the draws of an atlas.
 Workers = ThisProcess | Cluster
 
 
-def collect_all(workers: Workers, requests: Iterable[tuple[Make, Path, Sequence[int]]]) -> Iterator[Any]:
-    """Make requests, as many at once as the workers have places, and yield the results in the order they come."""
-    queue, waiting = iter(requests), 0
+def run_jobs(function: Callable[[Any], Any], jobs: Iterable[Any], workers: Workers | None = None) -> Iterator[Any]:
+    """Yield the results of a function of each job in the order they come; by default this process does them.
+
+    As many jobs wait at once as the workers have places. The function has a module's name, or is a partial of one.
+    """
+    queue, waiting, workers = iter(jobs), 0, workers or ThisProcess()
     while True:
-        while waiting < workers.places and (request := next(queue, None)) is not None:
-            workers.submit(*request)
+        while waiting < workers.places and (job := next(queue, None)) is not None:
+            workers.submit(function, job)
             waiting += 1
         if not waiting:
             return
-        yield from workers.collect()
+        yield workers.collect()
         waiting -= 1
 
 

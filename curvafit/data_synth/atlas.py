@@ -10,6 +10,8 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,7 @@ from llvmlite import binding
 
 from curvafit.core.checks import check_int, check_seed, check_type
 from curvafit.core.runtime import FILE, FLOW, Progress, check_memory, silent
-from curvafit.core.workers import ThisProcess, Workers
+from curvafit.core.workers import Workers, run_jobs
 from curvafit.data_synth.design import Design, design_box
 from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.generation.flow import WORKING_BLUR, generate
@@ -59,7 +61,7 @@ def build(
     if workers is None:
         check_memory(Grid(shape).shape, FLOW, "a shape")  # type: ignore[arg-type]
     settings = make_settings(shape, seed, schedule, design)
-    return _fill(open_store(store_path, settings), count, workers or ThisProcess(), progress)
+    return _fill(open_store(store_path, settings), count, workers, progress)
 
 
 def extend(store_path: str | Path, count: int, progress: Progress = silent, *, workers: Workers | None = None) -> Store:
@@ -69,7 +71,7 @@ def extend(store_path: str | Path, count: int, progress: Progress = silent, *, w
     """
     check_int(count, "a count of shapes from 0", 0, MOST)
     store = open_store(store_path)
-    return _fill(store, store.wanted + count, workers or ThisProcess(), progress)
+    return _fill(store, store.wanted + count, workers, progress)
 
 
 def make_settings(
@@ -84,42 +86,35 @@ def make_settings(
     return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, design.as_dict(), check_seed(seed), plan)
 
 
-def _fill(store: Store, count: int, workers: Workers, progress: Progress) -> Store:
-    """Request draws in order, and only as many at once as may be needed, so that the last draw is viable."""
+def _fill(store: Store, count: int, workers: Workers | None, progress: Progress) -> Store:
+    """Make draws in order, in rounds of as many as are needed at least, so that the last draw is viable."""
     store.want(count)
     viable = {index: store.viable(index) for index in store.indices()}
-    pending = 0
-    todo = (index for index in itertools.count() if index not in viable)
-    while (total := sum(viable.values())) < count:
-        while pending < min(workers.places, count - total):
-            workers.submit(make_draws, store.path, [next(todo)])
-            pending += 1
-        for record in workers.collect():
-            pending -= 1
+    rest = (index for index in itertools.count() if index not in viable)
+    while (missing := count - sum(viable.values())) > 0:
+        for record in run_jobs(partial(make_draw, store.path.resolve()), islice(rest, missing), workers):
             viable[record.index] = record.viability.viable
-            progress(f"{sum(viable.values())} viable of {len(viable)} draws", sum(viable.values()) / count)
-        if len(viable) > BARREN * (1 + sum(viable.values())):
-            raise ValueError(
-                f"hardly any draw of this design is viable: {sum(viable.values())} of {len(viable)}; "
-                f"the last was not, as {record.status}"
-            )
+            made = sum(viable.values())
+            progress(f"{made} viable of {len(viable)} draws", made / count)
+            if len(viable) > BARREN * (1 + made):
+                what = f"hardly any draw of this design is viable: {made} of {len(viable)}"
+                raise ValueError(f"{what}; the last was not, as {record.status}")
     return store
 
 
-def make_draws(path: str | Path, indices: Sequence[int]) -> list[Record]:
-    """Make the missing draws among `indices`, a worker's part of `build`, and return the records of all.
+def make_draw(path: str | Path, index: int) -> Record:
+    """Make a draw of a store, unless it is there, and return its record: a worker's part of `build`.
 
-    Each draw is made on one thread, so that a field depends on nothing but its store's settings, its index and the kind
-    of processor.
+    It is made on one thread, so that a field depends on nothing but its store's settings, its index and the kind of
+    processor.
     """
     store = open_store(path)
     try:
-        for index in indices:
-            if not store.has(index):
-                _make_draw(store, index)
+        if not store.has(index):
+            _make_draw(store, index)
     except OSError as error:
         raise OSError(error.errno, error.strerror or str(error), error.filename or str(store.path)) from error
-    return [store.record(index) for index in indices]
+    return store.record(index)
 
 
 def _make_draw(store: Store, index: int) -> None:

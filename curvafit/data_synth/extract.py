@@ -9,7 +9,6 @@ import math
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 import torch
 
 from curvafit.core.runtime import Progress, silent
-from curvafit.core.workers import ThisProcess, Workers, collect_all
+from curvafit.core.workers import Workers, run_jobs
 from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.design import design_box
 from curvafit.data_synth.store import Record, Store, open_store
@@ -169,18 +168,17 @@ def describe(
         rows += zip(begun.shapes.tolist(), begun.views.tolist(), begun.parameters, begun.thickness.tolist(),
                     begun.descriptors, begun.amount.tolist(), strict=True)  # fmt: skip
     present = {row[:2] for row in rows}
-    jobs: list[tuple[Store, int, tuple[str, ...]]] = []  # shapes that lack views in the table
+    jobs: list[tuple[Path, int, tuple[str, ...]]] = []  # shapes that lack views in the table
     for store, index in ((own, k) for own in sources for k in own.indices()):
         missing = tuple(name for name in views if (_shape(store, index), name) not in present)
         with suppress(KeyError):  # a draw that was removed since it was listed
             if missing and store.viable(index) and is_well_formed(store.record(index).viability):
-                jobs.append((store, index, missing))
+                jobs.append((store.path.resolve(), index, missing))
     if not jobs and not rows:
         raise ValueError(f"no well-formed shape in {', '.join(store.name for store in sources)}")
-    requests = [(partial(measure, views=missing), store.path, [index]) for store, index, missing in jobs]
     last_save = time.monotonic()
     try:
-        for count, shape in enumerate(collect_all(workers or ThisProcess(), requests), 1):
+        for count, shape in enumerate(run_jobs(measure, jobs, workers), 1):
             rows += (
                 (shape["shape"], view, shape["parameters"], shape["thickness"], to_row(reading).astype(np.float32),
                  math.nan if reading is None else reading.amount)
@@ -196,23 +194,21 @@ def describe(
     return _to_table(rows, provenance)
 
 
-def measure(path: Path, indices: Sequence[int], views: Sequence[str]) -> list[dict[str, Any]]:
-    """Measure shapes of a store, and return the parameters of each and its descriptors by view, None without a surface.
+def measure(job: tuple[Path, int, Sequence[str]]) -> dict[str, Any]:
+    """Measure a shape, by its store, index and views, and return its parameters and its descriptors by view, None
+    without a surface.
 
     A shape that is no longer in the store has no views. One that is damaged is a ValueError.
     """
+    path, index, views = job
     store = open_store(path)
-    rows = []
-    for index in indices:
-        rows.append({"shape": _shape(store, index), "views": {}})
-        try:
-            record, u = store.record(index), store.field(index)
-        except KeyError:
-            continue
-        rows[-1]["parameters"] = parameters_of(record.coefficients, record.mass)
-        rows[-1]["thickness"] = thinner_thickness(u > 0)
-        rows[-1]["views"] = {name: _read_view(u, name, record.seed) for name in views}
-    return rows
+    row = {"shape": _shape(store, index), "views": {}}
+    try:
+        record, u = store.record(index), store.field(index)
+    except KeyError:
+        return row
+    row |= {"parameters": parameters_of(record.coefficients, record.mass), "thickness": thinner_thickness(u > 0)}
+    return row | {"views": {name: _read_view(u, name, record.seed) for name in views}}
 
 
 def _read_view(u: np.ndarray, name: str, seed: int) -> Reading | None:

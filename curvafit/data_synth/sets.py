@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from curvafit.core.files import remove, write_content
 from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, hold_signals, silent
 from curvafit.core.units import format_number, unit_name
-from curvafit.core.workers import ThisProcess, Workers, collect_all
+from curvafit.core.workers import Workers, run_jobs
 from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.case import Case, Recipe
 from curvafit.data_synth.centreline import centreline, write_graphml
@@ -112,9 +112,9 @@ def build_set(
         check_set(folder, spec)  # another process may have begun it meanwhile
         _write_case(folder, spec, 0, first)
     cases, listed = set(list_cases(folder)), -LISTED_EVERY
-    requests = ((make_cases, folder, [index]) for index in range(count) if index not in cases)
+    rest = (index for index in range(count) if index not in cases)
     try:
-        for case in collect_all(workers or ThisProcess(), requests):
+        for case in run_jobs(partial(make_case, folder.resolve()), rest, workers):
             cases.add(case)
             progress(f"{min(len(cases), count)} of {count} cases", min(len(cases), count) / count)
             if time.monotonic() > listed + LISTED_EVERY:
@@ -125,16 +125,15 @@ def build_set(
         _write_list(folder, spec)
 
 
-def make_cases(folder: str | Path, indices: Sequence[int]) -> list[int]:
-    """Make some cases of a set, a worker's part of `build_set`; a case that fails leaves no file."""
+def make_case(folder: str | Path, index: int) -> int:
+    """Make a case of a set, a worker's part of `build_set`, and return its index; one that fails leaves no file."""
     folder = Path(folder)
     spec = read_spec(folder)
     try:
-        for index in indices:
-            _write_case(folder, spec, index, spec.recipe.case(index))
+        _write_case(folder, spec, index, spec.recipe.case(index))
     except OSError as error:
         raise OSError(error.errno, error.strerror or str(error), error.filename or str(folder)) from error
-    return list(indices)
+    return index
 
 
 def read_spec(folder: str | Path) -> SetSpec:

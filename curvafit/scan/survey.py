@@ -19,8 +19,8 @@ from skimage.filters import threshold_otsu
 from curvafit.geometry.balls import ball_radii
 from curvafit.scan import prepare, structure
 from curvafit.scan.grids import MEASURED, candidate_boxes, order_boxes, surface_voxels, thickness_beneath
-from curvafit.scan.pieces import Finder, Found
 from curvafit.volumes.boxes import Box, cut_boxes, grow, within
+from curvafit.volumes.run import Record, Run
 from curvafit.volumes.volume import ScanError, Volume
 
 #: Voxels that the first passes read at once.
@@ -102,12 +102,12 @@ def find_levels(request: Request, split: Split, box: Box) -> np.ndarray:
     return np.where(mask != request.dark, np.float32(1), np.float32(-1))
 
 
-def survey(request: Request, find: Finder) -> Plan:
+def survey(request: Request, run: Run) -> Plan:
     """Find what the tiles of a volume have in common; raise ScanError as `measure.measure`."""
     volume = request.volume
-    split, note = _find_split(request, find)
+    split, note = _find_split(request, run)
     pieces = cut_boxes(volume.shape, round(PIECE ** (1 / 3)))
-    total = _add(find("counting the structure", partial(_count_structure, request, split, pieces), len(pieces)))
+    total = _add(run("counting the structure", partial(_count_structure, request, split, pieces), len(pieces)))
     if split.kind == "image":
         otsu = request.threshold == "otsu"
         ends = [float(e) for e in (total["lowest"], total["highest"])]
@@ -159,7 +159,7 @@ def _measure_thickness(plan: Plan, order: Sequence[Box], inside: bool) -> tuple[
     return median, thick, replace(plan, reach=max(plan.reach, *finite))
 
 
-def _add(found: Iterable[Found]) -> dict[str, np.ndarray]:
+def _add(found: Iterable[Record]) -> dict[str, np.ndarray]:
     """Return the sums over pieces; of what is called lowest and highest the extremes."""
     total: dict[str, np.ndarray] = {}
     for each in found:
@@ -172,13 +172,13 @@ def _add(found: Iterable[Found]) -> dict[str, np.ndarray]:
 # ---- kind and threshold ----------------------------------------------------------------------------------------------
 
 
-def _find_split(request: Request, find: Finder) -> tuple[Split, str]:
+def _find_split(request: Request, run: Run) -> tuple[Split, str]:
     """Return how structure and background are split, and a note for fields and masks."""
     volume = request.volume
     side = max(1, math.isqrt(PIECE // volume.shape[2]))
     bars = cut_boxes(volume.shape, (side, side, volume.shape[2]))
     value = request.read((slice(0, 1), slice(0, 1), slice(0, 1)))[0, 0, 0]
-    found = list(find("reading", partial(_look_at_values, request, bars, value), len(bars)))
+    found = list(run("reading", partial(_look_at_values, request, bars, value), len(bars)))
     total = _add({name: each[name] for name in each if name not in ("two", "values")} for each in found)
     if faults := int(total["faults"]):
         raise ScanError(f"a volume must be finite, got {faults} values that are not in {volume.source}")
@@ -202,25 +202,25 @@ def _find_split(request: Request, find: Finder) -> tuple[Split, str]:
         note = f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}."
         return split, note if two else structure.SEVERAL
     size = math.prod(volume.shape)
-    return _split_image(request, bars, split, total, value, size, find), ""
+    return _split_image(request, bars, split, total, value, size, run), ""
 
 
 def _split_image(
-    request: Request, bars: Sequence[Box], split: Split, total: Found, value: Any, size: int, find: Finder
+    request: Request, bars: Sequence[Box], split: Split, total: Record, value: Any, size: int, run: Run
 ) -> Split:
     """Return the split with the padding and the threshold of an image of so many voxels, of which `total` is known."""
     left, ends = None, (total["lowest"], total["highest"])
     if total["constant"] > structure.PADDED * size:
-        counted = _add(find("looking for padding", partial(_count_padding, request, bars, value), len(bars)))
+        counted = _add(run("looking for padding", partial(_count_padding, request, bars, value), len(bars)))
         split = replace(split, padding=structure.judge_padding(value, counted["padding"]))
         if split.padding is not None and split.padding.sure:
             left, ends = split.padding.value, (counted["lowest"], counted["highest"])
     if request.threshold != "otsu":
         return replace(split, level=float(request.threshold))
-    return replace(split, level=_find_threshold(request, bars, *ends, left, find))
+    return replace(split, level=_find_threshold(request, bars, *ends, left, run))
 
 
-def _look_at_values(request: Request, bars: Sequence[Box], value: Any, number: int) -> Found:
+def _look_at_values(request: Request, bars: Sequence[Box], value: Any, number: int) -> Record:
     """Return the extremes of a bar, how many voxels have a value, whether it has two values at most, and what tells
     labels and a phase field."""
     values = request.read(bars[number])
@@ -238,7 +238,7 @@ def _look_at_values(request: Request, bars: Sequence[Box], value: Any, number: i
     return {name: np.asarray(value) for name, value in found.items()}
 
 
-def _count_padding(request: Request, bars: Sequence[Box], value: Any, number: int) -> Found:
+def _count_padding(request: Request, bars: Sequence[Box], value: Any, number: int) -> Record:
     """Return what tells padding with a value in a bar, and the extremes of the other values."""
     values = request.read(bars[number])
     found, others = {"padding": structure.count_constant(values, value)}, values[values != value]
@@ -246,7 +246,7 @@ def _count_padding(request: Request, bars: Sequence[Box], value: Any, number: in
 
 
 def _find_threshold(
-    request: Request, bars: Sequence[Box], lowest: Any, highest: Any, left: float | None, find: Finder
+    request: Request, bars: Sequence[Box], lowest: Any, highest: Any, left: float | None, run: Run
 ) -> float:
     """Return the threshold of grey levels but one that is left out, as `structure.find_structure` finds it."""
     lowest, highest = lowest[()], highest[()]
@@ -254,7 +254,7 @@ def _find_threshold(
     if whole and int(highest) - int(lowest) >= _MOST_LEVELS:
         raise ScanError(f"expected at most {_MOST_LEVELS} grey levels, got {lowest} to {highest}: give a threshold")
     name = "finding the threshold"
-    counts = _add(find(name, partial(_count_levels, request, bars, lowest, highest, left), len(bars)))["counts"]
+    counts = _add(run(name, partial(_count_levels, request, bars, lowest, highest, left), len(bars)))["counts"]
     if whole:
         centres = np.arange(int(lowest), int(highest) + 1)
         high = centres > threshold_otsu(hist=(counts, centres))
@@ -262,7 +262,7 @@ def _find_threshold(
         return float(sum(means)) / 2
     edges = np.histogram_bin_edges(np.empty(0, lowest.dtype), 256, (lowest, highest))
     otsu = threshold_otsu(hist=(counts, (edges[1:] + edges[:-1]) / 2))
-    sums = _add(find(f"{name}'s sides", partial(_sum_sides, request, bars, otsu, left), len(bars)))["sums"]
+    sums = _add(run(f"{name}'s sides", partial(_sum_sides, request, bars, otsu, left), len(bars)))["sums"]
     return float(sums[0, 1] / sums[0, 0] + sums[1, 1] / sums[1, 0]) / 2
 
 
@@ -274,7 +274,7 @@ def _levels(request: Request, box: Box, left: float | None) -> np.ndarray:
 
 def _count_levels(
     request: Request, bars: Sequence[Box], lowest: Any, highest: Any, left: float | None, number: int
-) -> Found:
+) -> Record:
     """Return a histogram of a bar: of each whole number, or of 256 bins."""
     values = _levels(request, bars[number], left)
     if values.dtype.kind not in "iu":
@@ -282,7 +282,7 @@ def _count_levels(
     return {"counts": np.bincount(values.astype(np.int64) - int(lowest), minlength=int(highest) - int(lowest) + 1)}
 
 
-def _sum_sides(request: Request, bars: Sequence[Box], level: float, left: float | None, number: int) -> Found:
+def _sum_sides(request: Request, bars: Sequence[Box], level: float, left: float | None, number: int) -> Record:
     """Return the numbers and sums of the values above a level, and of the others."""
     values = _levels(request, bars[number], left)
     high = values > level
@@ -293,7 +293,7 @@ def _sum_sides(request: Request, bars: Sequence[Box], level: float, left: float 
 # ---- structure -------------------------------------------------------------------------------------------------------
 
 
-def _count_structure(request: Request, split: Split, pieces: Sequence[Box], number: int) -> Found:
+def _count_structure(request: Request, split: Split, pieces: Sequence[Box], number: int) -> Record:
     """Return the structure's voxels in a piece, its surface in boxes that may be measured, and `count_pairs`."""
     core, shape = pieces[number], request.volume.shape
     box = grow(core, max(structure.LAGS), shape)

@@ -31,12 +31,12 @@ from curvafit.priors.kernels.threads import one_thread
 from curvafit.scan import measure as whole
 from curvafit.scan.grids import CutOut, centre_distance, profile_mask, remove_specks, resample
 from curvafit.scan.measure import Blocks, Measures
-from curvafit.scan.pieces import Found, open_finder
 from curvafit.scan.prepare import DROPPED, LARGEST_BOX, Prepared, TooLarge, note_on_filling, smallest_piece
 from curvafit.scan.structure import check_options
 from curvafit.scan.survey import Plan, Request, survey
 from curvafit.volumes.boxes import Box, cut_boxes, grow, within
 from curvafit.volumes.read import Source, load
+from curvafit.volumes.run import Record, open_run
 from curvafit.volumes.volume import ScanError
 
 #: Radius, in voxels of the finest axis, from which balls are painted on a coarser grid, and the largest ball's.
@@ -173,7 +173,7 @@ def _reach(radius: float, edge: float) -> float:
 # ---- one tile --------------------------------------------------------------------------------------------------------
 
 
-def measure_tile(tiling: Tiling, number: int) -> Found:
+def measure_tile(tiling: Tiling, number: int) -> Record:
     """Return the sums over a tile's core, on the rows of the finest division that it touches, and what else adds up."""
     plan, core = tiling.plan, tiling.cores[number]
     sums = _Sums(tiling.finest, core)
@@ -197,7 +197,7 @@ def measure_tile(tiling: Tiling, number: int) -> Found:
     return {**found, **sums.rows}
 
 
-def _measure_wide(tiling: Tiling, number: int) -> Found:
+def _measure_wide(tiling: Tiling, number: int) -> Record:
     """Return the sums over a tile's core that balls on a coarser grid change."""
     plan, core = tiling.plan, tiling.cores[number]
     sums, balls = _Sums(tiling.finest, core), _measure_balls(plan, core, tiling.factors)
@@ -238,7 +238,7 @@ class _Sums:
         self.table[:, first : first + columns.shape[1]] += self._finest.gather(places, columns)
 
     @property
-    def rows(self) -> Found:
+    def rows(self) -> Record:
         """Return the numbers of the rows that hold anything, and the rows."""
         rows = np.flatnonzero(self.table.any(axis=1))
         return {"rows": rows, "sums": self.table[rows]}
@@ -346,7 +346,7 @@ def _around(plan: Plan, core: Box) -> tuple[Box, Box]:
     return grow((z, y, x), HALO, plan.working), (z, y, x)
 
 
-def _measure_curvature(plan: Plan, core: Box, sums: _Sums) -> Found:
+def _measure_curvature(plan: Plan, core: Box, sums: _Sums) -> Record:
     """Sum the curvatures in the working cells that begin in a core; return the bins of the diagram and other counts."""
     box, owned = _around(plan, core)
     found: dict[str, Any] = {"specks": np.zeros(2, np.int64), "changed": np.int64(0), "filled": np.int64(0)}
@@ -410,7 +410,7 @@ def _prepare_part(plan: Plan, phase: np.ndarray, mask: np.ndarray, part: Box) ->
     return Prepared(plan.split.kind, phase, mask, grid, *size, ((z, y, x),), (), origin)  # type: ignore[arg-type]
 
 
-def _bin(plan: Plan, drawn: Diagram, kept: np.ndarray) -> Found:
+def _bin(plan: Plan, drawn: Diagram, kept: np.ndarray) -> Record:
     """Return the bins of a diagram's points that are kept: their place, and area times 1, κ1, κ2 and κ1² + κ2²."""
     points, weights = drawn.points[kept], drawn.weights[kept]
     bins = np.floor(points / (_BIN * BIN_WIDTH * WORKING_SPACING / plan.edge)).astype(np.int64)
@@ -436,23 +436,23 @@ def measure_tiles(
     progress: Progress = silent,
 ) -> Measures:
     """Measure a volume in tiles of `edge` voxels a side, as `measure` says; raise as it does."""
-    run = {"scan": request.volume.digest, "label": request.label, "kind": request.kind, "threshold": request.threshold}
-    run |= {"dark": request.dark, "tile": edge}
-    with open_finder(workers, store, run, progress, {_FIRST: 0.95, _AGAIN: 1.0}) as find, one_thread():
-        plan = survey(request, find)
+    same = {"scan": request.volume.digest, "label": request.label, "kind": request.kind, "threshold": request.threshold}
+    same |= {"dark": request.dark, "tile": edge}
+    with open_run(workers, store, same, progress, {_FIRST: 0.95, _AGAIN: 1.0}) as run, one_thread():
+        plan = survey(request, run)
         tiling = Tiling(plan, tuple(cut_boxes(plan.volume.shape, edge or _choose_edges(plan))))
-        stated = tiling.describe(find.processes)
-        found = list(find(_FIRST, partial(measure_tile, tiling), len(tiling.cores), stated))
+        stated = tiling.describe(run.processes)
+        found = list(run(_FIRST, partial(measure_tile, tiling), len(tiling.cores), stated))
         # the factors that `morphometry.local_thickness` chooses
         widest, finest = np.max([each["widest"] for each in found], axis=0), min(plan.volume.spacing)
         wide = replace(tiling, factors=tuple(max(1, math.ceil(each / finest / COARSE)) for each in widest))
-        again: list[Found] = []
+        again: list[Record] = []
         if max(wide.factors) > 1:
-            again = list(find(_AGAIN, partial(_measure_wide, wide), len(tiling.cores)))
+            again = list(run(_AGAIN, partial(_measure_wide, wide), len(tiling.cores)))
     return _summarise(wide, found, again, stated)
 
 
-def _summarise(tiling: Tiling, found: Sequence[Found], again: Sequence[Found], stated: str) -> Measures:
+def _summarise(tiling: Tiling, found: Sequence[Record], again: Sequence[Record], stated: str) -> Measures:
     """Return the measures of a volume from what was found in its tiles."""
     plan, finest, shape = tiling.plan, tiling.finest, tiling.shape
     table = np.zeros((finest.count, len(whole.SUMS)))
@@ -487,7 +487,7 @@ def _merge(table: np.ndarray, finest: Blocks, blocks: Blocks) -> np.ndarray:
     return sums.reshape(blocks.count, -1)
 
 
-def _draw(plan: Plan, found: Sequence[Found]) -> Diagram:
+def _draw(plan: Plan, found: Sequence[Record]) -> Diagram:
     """Return the diagram of all tiles: the barycentres of its bins."""
     parts = [each for each in found if "bins" in each]
     bins, areas = (np.concatenate([each[name] for each in parts]) for name in ("bins", "areas"))
@@ -500,7 +500,7 @@ def _draw(plan: Plan, found: Sequence[Found]) -> Diagram:
     return Diagram(points, area, f"1/{plan.volume.unit}", math.sqrt(spread), lost)
 
 
-def _notes(tiling: Tiling, found: Sequence[Found]) -> tuple[str, ...]:
+def _notes(tiling: Tiling, found: Sequence[Record]) -> tuple[str, ...]:
     """Return notes on how a volume was measured, as `measure.measure` gives them."""
     plan = tiling.plan
     notes = [f"{format_sampling(plan.volume.shape, plan.volume.spacing, plan.volume.unit)}.", *plan.notes]

@@ -23,7 +23,6 @@ from curvafit.core.checks import check_int
 from curvafit.core.files import remove
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.workers import Workers
-from curvafit.scan.pieces import Finder, Found, open_finder
 from curvafit.scan.prepare import LARGEST_BOX
 from curvafit.scan.survey import Request
 from curvafit.segmentation.filler import (
@@ -87,6 +86,7 @@ from curvafit.volumes.formats.zarr import (
     version_of,
 )
 from curvafit.volumes.read import load
+from curvafit.volumes.run import Record, Run, open_mapped, open_run
 from curvafit.volumes.volume import ScanError, Volume
 
 if TYPE_CHECKING:
@@ -183,24 +183,24 @@ def reconstruct_file(
     places = None if every is None and known is None else known_places(job.shape[0], every, first, known)
     check_int(suggest, "a number of slices from 0", 0, job.shape[0] - len(places or ()))
     width, tile, taught = choose_epsilon(frame, epsilon), check_edge(tile), Taught.load(filler)
-    run = {"labels": frame.digest, "label": label, "every": every, "first": first, "known": known, "axis": axis}
-    run |= {"filler": taught.digest, "tile": tile}
-    with open_finder(workers if frame.in_file else None, folder, run, progress, _ENDS) as find:
+    same = {"labels": frame.digest, "label": label, "every": every, "first": first, "known": known, "axis": axis}
+    same |= {"filler": taught.digest, "tile": tile}
+    with open_run(workers if frame.in_file else None, folder, same, progress, _ENDS) as run:
         which: tuple[str, ...] = ()
         if places is None:
-            looked = find(_LOOK, partial(look_at_slab, job), job.slabs)
+            looked = run(_LOOK, partial(look_at_slab, job), job.slabs)
             places = choose_labelled(there := np.concatenate([each["there"] for each in looked]))
             which = note_labelled(places, there)
         job = replace(job, places=tuple(places), filler=filler)
-        job, doubts = _read_known(job, find, every is not None)
+        job, doubts = _read_known(job, run, every is not None)
         job = job.cut(tile)
         job.create(frame, target)
-        filled = _gather(job, find(_FILL, partial(fill_block, job), len(job.cores), job.describe(find.processes)))
+        filled = _gather(job, run(_FILL, partial(fill_block, job), len(job.cores), job.describe(run.processes)))
         threshold = max(best_threshold(filled["counts"]), LEAST)
-        cut = _gather(job, find(_CUT, partial(cut_block, job, threshold), len(job.cores)))
+        cut = _gather(job, run(_CUT, partial(cut_block, job, threshold), len(job.cores)))
         for name in (job.mask, job.probability):
             for level in range(1, len(group := open_zarr(folder / name))):
-                find(f"halving {name} {level}", partial(halve_core, folder / name, level), len(cores_of(group, level)))
+                run(f"halving {name} {level}", partial(halve_core, folder / name, level), len(cores_of(group, level)))
         inside, both, told = (float(cut[name]) for name in ("inside", "both", "told"))
         size, depth = math.prod(job.shape), job.shape[0]
         dice = 2 * both / max(told + float(filled["sum"]), 1e-9) if job.slices.between.any() else 1.0
@@ -332,13 +332,12 @@ class Job:
         return draw_sections(rows, frame.spacing, frame.unit, places)
 
 
-def _read_known(job: Job, find: Finder, doubted: bool) -> tuple[Job, tuple[str, ...]]:
+def _read_known(job: Job, run: Run, doubted: bool) -> tuple[Job, tuple[str, ...]]:
     """Read the known slices into a mapped file; return the job with the network's pixel, and what is doubtful: of the
     places too, if they are `doubted`."""
     shape = (len(job.places), *job.shape[1:])
-    if not (job.folder / _KNOWN).exists():
-        np.lib.format.open_memmap(job.folder / _KNOWN, mode="w+", dtype=np.bool_, shape=shape).flush()
-    found = list(find(_READ, partial(read_slab, job), job.slabs))
+    open_mapped(job.folder / _KNOWN, np.bool_, shape)
+    found = list(run(_READ, partial(read_slab, job), job.slabs))
     values = np.unique(np.concatenate([each["values"] for each in found]))
     if len(values) > LABELS:
         raise ScanError(f"the known slices must be a mask or have at most {LABELS} labels, got {len(values)} values")
@@ -351,12 +350,12 @@ def _read_known(job: Job, find: Finder, doubted: bool) -> tuple[Job, tuple[str, 
     return replace(job, pixel=pixel), (*doubts, *doubt_labels(values))
 
 
-def look_at_slab(job: Job, number: int) -> Found:
+def look_at_slab(job: Job, number: int) -> Record:
     """Return which slices of a slab have labels."""
     return {"there": find_labelled(job.slab(number)[1])}
 
 
-def read_slab(job: Job, number: int) -> Found:
+def read_slab(job: Job, number: int) -> Record:
     """Write the known slices of a slab into their file; return which slices have labels, which labels known slices
     have, how many of their voxels are inside, and how deep these lie."""
     rows, values = job.slab(number)
@@ -373,7 +372,7 @@ def read_slab(job: Job, number: int) -> Found:
     return {**found, "values": np.unique(values), "inside": np.count_nonzero(inside), "depths": depths}
 
 
-def fill_block(job: Job, number: int) -> Found:
+def fill_block(job: Job, number: int) -> Record:
     """Write the probabilities of a block; return, of its voxels between known slices, the counts and the sum of
     probabilities, and the entropy of all its slices across each axis."""
     core, slices = job.cores[number], job.slices
@@ -404,7 +403,7 @@ def fill_block(job: Job, number: int) -> Found:
     return {"counts": count_probabilities(told), **sums, **{f"along {k}": each for k, each in enumerate(along)}}
 
 
-def cut_block(job: Job, threshold: float, number: int) -> Found:
+def cut_block(job: Job, threshold: float, number: int) -> Record:
     """Write the mask of a block, given the probability from which voxels between known slices are inside; return how
     many are, and between known slices their number and the sum of their probabilities."""
     core = job.cores[number]
@@ -417,13 +416,13 @@ def cut_block(job: Job, threshold: float, number: int) -> Found:
     return {"inside": np.count_nonzero(mask), "told": np.count_nonzero(told), "both": both}
 
 
-def halve_core(path: Path, level: int, number: int) -> Found:
+def halve_core(path: Path, level: int, number: int) -> Record:
     """Write a part of a level of a store from the level before it."""
     halve_level(group := open_zarr(path), level, cores_of(group, level)[number])
     return {}
 
 
-def _gather(job: Job, found: Iterable[Found]) -> dict[str, Any]:
+def _gather(job: Job, found: Iterable[Record]) -> dict[str, Any]:
     """Return the sums over blocks; of what is along an axis, in its slices."""
     total: dict[str, Any] = {f"along {k}": np.zeros(n) for k, n in enumerate(job.shape)}
     for core, each in zip(job.cores, found, strict=True):

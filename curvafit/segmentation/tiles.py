@@ -6,32 +6,26 @@ most.
 
 from __future__ import annotations
 
-import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise, product
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from curvafit.core.checks import check_int
-from curvafit.core.files import write_content
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.workers import Workers, collect_all, join_workers
+from curvafit.core.workers import Workers
 from curvafit.generation.checkpoint import identity
 from curvafit.generation.data import Data
 from curvafit.priors.grid import MOST
-from curvafit.priors.kernels.threads import one_thread
-from curvafit.scan.pieces import RUN, lock_store
 from curvafit.segmentation.flow import HALO, Ends, WorkingGrid, lower_energy
 from curvafit.segmentation.trials import Trial
 from curvafit.volumes.boxes import Box, within
+from curvafit.volumes.run import Record, open_mapped, open_run
 from curvafit.volumes.volume import Volume
 
 #: Working voxels beyond a tile that are lowered with it: at that distance the cut is not felt any more.
@@ -40,8 +34,8 @@ OVERLAP = 24
 WHOLE, EDGE = 256**3, 192
 #: Shortest edge of a tile, in working voxels.
 SHORTEST = 8
-#: Files of a folder besides the run's: the volume's arrays.
-_MASK, _PHASE = "mask.npy", "phase.npy"
+#: The name of the pass, and the volume's arrays in a run's folder.
+_LOWER, _MASK, _PHASE = "lowering the energy", "mask.npy", "phase.npy"
 
 
 @dataclass(frozen=True)
@@ -125,55 +119,6 @@ class Tiling:
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
-    """The result of a tile: its number, mask and phase field on the core, and the last two energies of its flow."""
-
-    number: int
-    mask: np.ndarray
-    phase: np.ndarray
-    energies: tuple[float, ...]
-
-
-class TileStore:
-    """The finished tiles of a volume: in memory, or in mapped files of a folder that outlives a killed run. There each
-    tile has a note, `000012.json`, which is written once the tile's voxels are on the disk."""
-
-    def __init__(self, shape: tuple[int, int, int], folder: Path | None = None) -> None:
-        self._folder, self.energies = folder, dict[int, tuple[float, ...]]()
-        if folder is None:
-            self.mask, self.phase = np.empty(shape, dtype=bool), np.empty(shape, dtype=np.float32)
-        else:
-            self.mask, self.phase = (np.load(folder / name, mmap_mode="r+") for name in (_MASK, _PHASE))
-            notes = folder.glob("[0-9]*.json")
-            self.energies = {int(note.stem): tuple(json.loads(note.read_bytes())) for note in notes}
-
-    def write(self, core: Box, piece: Piece) -> None:
-        """Keep the result of a tile."""
-        self.mask[core], self.phase[core] = piece.mask, piece.phase
-        if self._folder is not None:
-            self.mask.flush()  # type: ignore[attr-defined]
-            self.phase.flush()  # type: ignore[attr-defined]
-            write_content(self._folder / f"{piece.number:06d}.json", json.dumps(piece.energies))
-        self.energies[piece.number] = piece.energies
-
-
-@contextmanager
-def open_store(folder: str | PathLike[str], shape: tuple[int, int, int], run: Mapping[str, Any]) -> Iterator[TileStore]:
-    """Open the folder of the tiles of a volume of a shape, or make it, and lock it; `run` holds what runs must have in
-    common to share tiles. Raises `ValueError` if it holds other things or the tiles of another run, or is in use."""
-    mine = identity(**run)
-    with lock_store(folder, (_MASK, _PHASE)) as (place, other):
-        if other is None:
-            for name, kind in ((_MASK, np.bool_), (_PHASE, np.float32)):
-                np.lib.format.open_memmap(place / name, mode="w+", dtype=kind, shape=shape).flush()
-            write_content(place / RUN, json.dumps(mine, indent=2))
-        elif names := [name for name in {**other, **mine} if other.get(name) != mine.get(name)]:
-            parts = "; ".join(f"{name} {other.get(name)} instead of {mine.get(name)}" for name in names)
-            raise ValueError(f"the tiles in {place} are another run's, with {parts}: delete them to start again")
-        yield TileStore(shape, place)
-
-
-@dataclass(frozen=True, eq=False)
 class Problem(ABC):
     """An energy to lower, and the start; any box of the volume sees the same data. The trial's law has lengths in the
     scan's unit; without a law the start is the result."""
@@ -219,43 +164,41 @@ def lower_volume(
 ) -> LoweredVolume:
     """Lower a problem on each tile of a volume, and return the whole; several tiles may have a `store`, where finished
     ones stay, those of an earlier, killed run too, and workers."""
-    trial = problem.trial
-    run = {**problem.inputs, "law": trial.law, "steps": trial.steps, "tiles": tiling.counts, "place": tiling.place}
-    folder = store if tiling.count > 1 else None
-    opened = nullcontext(TileStore(tiling.shape)) if folder is None else open_store(folder, tiling.shape, run)
-    with join_workers(workers if tiling.count > 1 else None) as crew, opened as finished:
-        tiles = tiling.tiles
-        rest = [tile for tile in tiles if tile.number not in finished.energies]
-        total, done = tiling.count, tiling.count - len(rest)
-        if crew is None:
-            steps = (sub_progress(progress, k / total, (k + 1) / total) for k in range(done, total))
-            pieces = (_lower_tile(problem, tiling, *each) for each in zip(rest, steps, strict=True))
-        else:
-            lower = partial(_lower_tiles, problem, tiling)
-            pieces = collect_all(crew, [(lower, Path(), [tile.number]) for tile in rest])
-        for count, piece in enumerate(pieces, done + 1):
-            finished.write(tiles[piece.number].core, piece)
-            progress("lowering the energy", count / total)
+    trial, tiles = problem.trial, tiling.tiles
+    folder, workers = (None, None) if tiling.count == 1 else (None if store is None else Path(store), workers)
+    same = identity(**problem.inputs, law=trial.law, steps=trial.steps, tiles=tiling.counts, place=tiling.place)
+    with open_run(workers, folder, same, progress, {_LOWER: 1.0}) as run:
+        mask, phase = (
+            np.empty(tiling.shape, kind) if folder is None else open_mapped(folder / name, kind, tiling.shape)
+            for name, kind in ((_MASK, np.bool_), (_PHASE, np.float32))
+        )
+
+        def keep(number: int, record: Record) -> Record:
+            core = tiles[number].core
+            for array, name in ((mask, "mask"), (phase, "phase")):
+                array[core] = record[name]
+                if isinstance(array, np.memmap):
+                    array.flush()
+            return {"energies": record["energies"]}
+
+        lower = partial(_lower_tile, problem, tiling, progress if run.alone else silent)
+        records = run(_LOWER, lower, tiling.count, keep=keep)
+        energies = np.sum([record["energies"] for record in records], axis=0)
     if folder is not None:  # what is done with the result must not change the tiles
-        finished.mask.flags.writeable = finished.phase.flags.writeable = False
-    energies = [finished.energies[tile.number] for tile in tiles]
-    flowed = 0 if trial.law is None else trial.steps
-    return LoweredVolume(finished.mask, finished.phase, tuple(map(sum, zip(*energies, strict=True))), flowed)
+        mask.flags.writeable = phase.flags.writeable = False
+    return LoweredVolume(mask, phase, tuple(energies.tolist()), 0 if trial.law is None else trial.steps)
 
 
-def _lower_tiles(problem: Problem, tiling: Tiling, _: Path, numbers: Sequence[int]) -> list[Piece]:
-    """Lower tiles by their numbers, as a worker does, on one thread: the workers share the cores."""
-    with one_thread():
-        return [_lower_tile(problem, tiling, tiling.tiles[number], silent) for number in numbers]
-
-
-def _lower_tile(problem: Problem, tiling: Tiling, tile: Tile, progress: Progress) -> Piece:
-    place, trial, energies = tiling.place_of(tile), problem.trial, ()
+def _lower_tile(problem: Problem, tiling: Tiling, progress: Progress, number: int) -> Record:
+    """Return mask and phase field on a tile's core, and the last two energies of its flow."""
+    tile, trial, energies = tiling.tiles[number], problem.trial, ()
+    place = tiling.place_of(tile)
     level, term = problem.terms(tile.box, place)
     if trial.law is None:
         phase = problem.plain(level, place)
     else:
-        flow = lower_energy(level, trial.law, term, place, trial.steps, progress)
+        step = sub_progress(progress, number / tiling.count, (number + 1) / tiling.count)
+        flow = lower_energy(level, trial.law, term, place, trial.steps, step)
         phase, energies = place.to_scan(flow.field), tuple(map(float, flow.history.energy[-2:]))
     phase = np.ascontiguousarray(phase[tile.inner])
-    return Piece(tile.number, problem.mask(phase, tile.core), phase, energies)
+    return {"mask": problem.mask(phase, tile.core), "phase": phase, "energies": np.array(energies, dtype=np.float64)}

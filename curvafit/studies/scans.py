@@ -14,7 +14,7 @@ import numpy as np
 
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number
-from curvafit.core.workers import cluster, collect_all
+from curvafit.core.workers import cluster, run_jobs
 from curvafit.scan.instances import measure_instances
 from curvafit.scan.measure import Measures
 from curvafit.scan.tiles import measure
@@ -100,15 +100,16 @@ def share_out(tasks: Mapping[int, Task], names: Sequence[str], workers: int, pro
         tell = {
             k: silent if workers else lambda text, share, k=k: parts[k](f"{names[k]}: {text}", share) for k in tasks
         }
-        for k, result in collect_all(crew, ((partial(_do, tasks[k], tell[k]), Path(), [k]) for k in tasks)):
+        for k, result in run_jobs(_do, ((k, tasks[k], tell[k]) for k in tasks), crew):
             found[k] = result
             progress(f"{len(found)} of {count} scans done", len(found) / count)
     return found
 
 
-def _do(task: Task, progress: Progress, folder: Path, indices: Sequence[int]) -> list[tuple[int, Any]]:
+def _do(job: tuple[int, Task, Progress]) -> tuple[int, Any]:
     """Do the task of a scan, as a worker does."""
-    return [(k, task(progress)) for k in indices]
+    number, task, progress = job
+    return number, task(progress)
 
 
 def _bin_diagrams(measures: Measures) -> Measures:

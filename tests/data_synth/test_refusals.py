@@ -16,7 +16,7 @@ from curvafit.data_synth.case import Composition, Recipe
 from curvafit.data_synth.centreline import centreline
 from curvafit.data_synth.imaging.like import fit_modality
 from curvafit.data_synth.samples import fetch
-from curvafit.data_synth.sets import SetSpec, build_set, make_cases, read_spec
+from curvafit.data_synth.sets import SetSpec, build_set, make_case, read_spec
 from curvafit.data_synth.sources import Generated, decode_source, random_crop
 from curvafit.priors import Grid, preset
 from curvafit.volumes.volume import Volume
@@ -63,7 +63,7 @@ REFUSALS: list[tuple[str, Callable[[Given], object]]] = [
     ("voxel thick, 0.5 um, got 0.4", lambda g: g.composed(wall=0.4)), ("larger --shape", lambda g: g.composed(wall=50)),
     ("8 shapes showed no", lambda g: g.composed(4, 8, 8, wall=2.9).case(0)),
     ("folder", lambda g: build_set(g.taken, SetSpec(g.recipe), 1)), ("taken", lambda g: read_spec(g.taken)),
-    ("nowhere", lambda g: make_cases(g.taken / "nowhere", [0])),
+    ("nowhere", lambda g: make_case(g.taken / "nowhere", 0)),
     *(("voxels", lambda g, size=size: g.set(FLAT, size)) for size in (16.5, "16", (8, 8), (8, 8, 0))),
     *(("voxel", lambda g, edge=edge: g.set(voxel=edge)) for edge in (0, -1)),
     *(("seed", lambda g, seed=seed: g.set(seed=seed)) for seed in (-1, 0.5)),

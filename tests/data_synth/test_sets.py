@@ -15,7 +15,7 @@ from exact_store import CROP as SHAPE
 from exact_store import flat_recipe
 
 from curvafit.data_synth import sets
-from curvafit.data_synth.sets import SetSpec, build_set, make_cases, read_spec, write_card
+from curvafit.data_synth.sets import SetSpec, build_set, make_case, read_spec, write_card
 from curvafit.volumes.read import load, read_values
 
 
@@ -118,7 +118,7 @@ def test_a_list_that_finds_no_room_is_completed_by_the_next_run(tmp_path, order,
 def test_a_run_that_is_stopped_leaves_the_case_that_another_completed(tmp_path, order, monkeypatch):
     folder = build_set(tmp_path / "set", order, 1)
     monkeypatch.setattr(sets, "save", lambda *_, **__: pytest.fail("made again"))
-    make_cases(folder, [0])
+    make_case(folder, 0)
     (folder / "cases" / "case_00000.json").rename(tmp_path / "record")
 
     def stopped(field, path):
@@ -127,7 +127,7 @@ def test_a_run_that_is_stopped_leaves_the_case_that_another_completed(tmp_path, 
 
     monkeypatch.setattr(sets, "save", stopped)
     with pytest.raises(KeyboardInterrupt):
-        make_cases(folder, [0])
+        make_case(folder, 0)
     assert len(sums(folder)) == 1 and (folder / "imagesTr" / "case_00000_0000.nii.gz").exists()
 
 

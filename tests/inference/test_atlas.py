@@ -116,7 +116,7 @@ def test_a_real_draw_is_what_its_record_says(tmp_path):
     quick = dataclasses.replace(schedule("fast"), name="quick", steps=30)
     grid = Grid((16,) * 3)
     store = open_store(tmp_path / "s.zarr", _settings(grid, quick))
-    (record,) = building.make_draws(store.path, [0])
+    record = building.make_draw(store.path, 0)
     assert store.record(0) == record and record.versions == building.versions()
     assert 0 < record.steps <= 30 and np.isfinite(record.energy)
     if record.viability.viable:

@@ -1,12 +1,14 @@
 """Tiles with overlap hold each voxel once and do not show; a killed run goes on; files are read by box."""
 
+import itertools
 import json
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import h5py
 import numpy as np
@@ -15,11 +17,11 @@ from calling import call, done, refused
 from filelock import FileLock
 
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation import Segmentation, reconstruct, segment
+from curvafit.segmentation import Segmentation, reconstruct, segment, tiles
+from curvafit.segmentation.evidence import subsample
 from curvafit.segmentation.slices import Slices
-from curvafit.segmentation.tiles import EDGE, OVERLAP, WHOLE, TileStore, Tiling
+from curvafit.segmentation.tiles import EDGE, OVERLAP, WHOLE, Tiling
 from curvafit.volumes import ScanError, load, save
-from curvafit.volumes.boxes import subsample
 from curvafit.volumes.volume import Volume
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -51,9 +53,9 @@ def grey(mask: np.ndarray, noise: float = 40) -> Volume:
 )  # fmt: skip
 def test_tiles_hold_each_voxel_once(shape, spacing, edge: int, periodic: bool) -> None:
     tiling = Tiling.of(frame(shape, spacing), None, edge, periodic=periodic)
-    times, tiles, count = tiling.place.times, tiling.tiles, np.zeros(shape, dtype=np.uint8)
-    assert [tile.number for tile in tiles] == list(range(tiling.count))
-    for tile in tiles:
+    times, count = tiling.place.times, np.zeros(shape, dtype=np.uint8)
+    assert [tile.number for tile in tiling.tiles] == list(range(tiling.count))
+    for tile in tiling.tiles:
         count[tile.core] += 1
         assert all((c.stop - c.start) * n <= max(edge, n) for c, n in zip(tile.core, times, strict=True))
         box = np.empty(tile.shape)
@@ -65,7 +67,7 @@ def test_tiles_hold_each_voxel_once(shape, spacing, edge: int, periodic: bool) -
             assert beyond or (whole.stop - core.stop) * times[axis] >= OVERLAP
     assert count.min() == count.max() == 1
     for axis in range(3):
-        sizes = {tile.core[axis].stop - tile.core[axis].start for tile in tiles}
+        sizes = {tile.core[axis].stop - tile.core[axis].start for tile in tiling.tiles}
         assert max(sizes) - min(sizes) <= 1
 
 
@@ -174,7 +176,7 @@ def killed_after(count: int, store: Path) -> Callable[[str, float], None]:
     """A progress that ends the run once so many tiles are finished."""
 
     def progress(text: str, share: float) -> None:
-        if (store / f"{count - 1:06d}.json").exists():
+        if (store / f"lowering-the-energy-{count - 1:06d}.npz").exists():
             raise KeyboardInterrupt
 
     return progress
@@ -189,11 +191,11 @@ class Threads:
         self._pool, self._asked = ThreadPoolExecutor(2), list[Future]()
         self.numbers: list[int] = []
 
-    def submit(self, make: Callable[[Path, Sequence[int]], list[Any]], path: Path, indices: Sequence[int]) -> None:
-        self.numbers.extend(indices)
-        self._asked.append(self._pool.submit(make, path, indices))
+    def submit(self, function: Callable[[int], Any], number: int) -> None:
+        self.numbers.append(number)
+        self._asked.append(self._pool.submit(function, number))
 
-    def collect(self) -> list[Any]:
+    def collect(self) -> Any:
         return self._asked.pop(-1).result()  # the last first: the order must not matter
 
 
@@ -201,8 +203,8 @@ def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
     whole, store = found(scan()), tmp_path / "new" / "tiles"
     with pytest.raises(KeyboardInterrupt):
         found(scan(), store, progress=killed_after(3, store))
-    notes = sorted(path.name for path in store.glob("0*.json"))
-    assert notes == [f"{k:06d}.json" for k in range(3)]
+    notes = sorted(path.name for path in store.glob("*.npz"))
+    assert notes == [f"lowering-the-energy-{k:06d}.npz" for k in range(3)]
     before = {name: (store / name).stat().st_mtime_ns for name in notes}
     again = found(scan(), store)
     assert same(again, whole)
@@ -217,16 +219,18 @@ def test_the_same_command_goes_on_after_a_kill(tmp_path: Path, monkeypatch: pyte
     """One, two or no worker processes: other processes may add up otherwise."""
     source = save(Volume(scan(), (0.1, 0.1, 0.1), "mm"), tmp_path / "scan.zarr")
     options = ("segment", source, "--prior", "tubes", "--weight", 1, "--steps", 5, "--tile", 14)
-    whole, target, write = tmp_path / "whole" / name, tmp_path / "killed" / name, TileStore.write
+    whole, target, lower = tmp_path / "whole" / name, tmp_path / "killed" / name, tiles.lower_energy
     done(*options, "-o", whole, "--workers", 0)
 
-    def stop(store: TileStore, core: Any, piece: Any) -> None:
-        if piece.number == 2:
+    made = itertools.count()
+
+    def stop(*arguments: Any) -> Any:
+        if next(made) == 2:
             raise KeyboardInterrupt
-        write(store, core, piece)
+        return lower(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(TileStore, "write", stop)
+        patch.setattr(tiles, "lower_energy", stop)
         result = call(*options, "-o", target)
     assert result.exit_code == 130 and "same command" in result.stderr
     assert [path.name for path in target.parent.iterdir()] == [f".{name}.curvafit-tiles"]
@@ -283,11 +287,14 @@ def test_a_store_is_no_other_folder_and_no_one_else_s(tmp_path: Path) -> None:
         found(scan(), tmp_path / "tiles")
 
 
-def test_a_run_killed_while_it_made_its_arrays_starts_anew(tmp_path: Path) -> None:
-    (tmp_path / "tiles").mkdir()
-    (tmp_path / "tiles" / "mask.npy").write_bytes(b"half")
-    assert same(found(scan(), tmp_path / "tiles"), found(scan()))
-    assert json.loads((tmp_path / "tiles" / "run.json").read_text())["nats"] == "1.0"
+def test_a_run_killed_while_it_made_its_arrays_starts_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = tmp_path / "tiles"
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(np.lib.format, "open_memmap", MagicMock(side_effect=KeyboardInterrupt))
+        found(scan(), store)
+    assert json.loads((store / "run.json").read_text())["nats"] == "1.0"
+    (store / "mask.npy.new").write_bytes(b"half")
+    assert same(found(scan(), store), found(scan()))
 
 
 def test_workers_lower_the_same_tiles(tmp_path: Path) -> None:

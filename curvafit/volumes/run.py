@@ -1,0 +1,156 @@
+"""The runner: passes over the blocks of a volume, by workers; records may stay in a folder that outlives a kill."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from functools import partial
+from importlib.metadata import version
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import FileLock, Timeout
+
+from curvafit.core.files import remove, write_content
+from curvafit.core.runtime import Progress, silent
+from curvafit.core.workers import ThisProcess, Workers, join_workers, run_jobs
+from curvafit.priors.kernels.threads import one_thread
+from curvafit.volumes.formats.base import ScanError
+
+#: Arrays and numbers of a block of a volume, by name.
+Record = Mapping[str, Any]
+#: The file in a run's folder that says whose it is.
+_RUN = "run.json"
+
+
+class Run:
+    """Runs passes over the blocks of a volume: a pass is a function of a block's number, whose record is kept.
+
+    Parameters
+    ----------
+    crew
+        Who does it; each of several workers has one thread.
+    folder
+        Where records stay, so that a killed run goes on; None for none.
+    progress
+        Called after each block.
+    ends
+        The share of the work that is done after a pass, by its name; other passes take a fiftieth each.
+    """
+
+    def __init__(self, crew: Workers, folder: Path | None, progress: Progress, ends: Mapping[str, float]) -> None:
+        self.alone = isinstance(crew, ThisProcess)
+        self.processes = 1 if self.alone else max(1, crew.places // 2)
+        self._crew, self._folder, self._progress, self._ends = crew, folder, progress, ends
+        self._share = 0.0
+
+    def __call__(
+        self,
+        name: str,
+        function: Callable[[int], Record],
+        count: int,
+        shown: str = "",
+        keep: Callable[[int, Record], Record] = lambda _, record: record,
+    ) -> Iterator[Record]:
+        """Return the records of blocks 0 to `count` - 1, in their order.
+
+        The progress says the pass's name, or what is `shown`. `keep` is called here with each new record, to store its
+        voxels, and returns what is kept.
+        """
+        records = {} if self._folder is None else _read_records(self._folder, name, count)
+        rest = [number for number in range(count) if number not in records]
+        start = self._share
+        self._share = stop = max(start, min(self._ends.get(name, start + 0.02), 1.0))
+        self._progress(shown or name, start)
+        do = partial(_do, function, not self.alone)
+        for done, (number, record) in enumerate(run_jobs(do, rest, self._crew), count - len(rest) + 1):
+            records[number] = keep(number, record)
+            if self._folder is not None:
+                _write_record(self._folder, name, number, records[number])
+            self._progress(shown or name, start + (stop - start) * done / count)
+        return iter([records[number] for number in range(count)])
+
+
+def _do(function: Callable[[int], Record], shared: bool, number: int) -> tuple[int, Record]:
+    """Return the record of a block, made on one thread where workers share the cores."""
+    with one_thread() if shared else nullcontext():
+        return number, function(number)
+
+
+def _file_of(folder: Path, name: str, number: int) -> Path:
+    return folder / f"{name.replace(' ', '-').replace(chr(39), '')}-{number:06d}.npz"
+
+
+def _read_records(folder: Path, name: str, count: int) -> dict[int, Record]:
+    """Return the records of earlier runs, by number of the block."""
+    records = {}
+    for number in range(count):
+        path = _file_of(folder, name, number)
+        if path.exists():
+            with np.load(path, allow_pickle=False) as arrays:
+                records[number] = dict(arrays)
+    return records
+
+
+def _write_record(folder: Path, name: str, number: int, record: Mapping[str, np.ndarray]) -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **record)
+    write_content(_file_of(folder, name, number), buffer.getvalue())
+
+
+@contextmanager
+def open_run(
+    workers: Workers | int | None,
+    store: str | PathLike[str] | None,
+    same: Mapping[str, Any],
+    progress: Progress = silent,
+    ends: Mapping[str, float] | None = None,
+) -> Iterator[Run]:
+    """Start workers, or a number of processes, open the folder `store`, if there is one, and return the run.
+
+    `same` is what runs must have in common to share records. Raises ValueError where the folder holds other things, or
+    another run's, or is in use. It is removed where a ScanError is raised: of such a scan nothing is of use.
+    """
+    mine = {name: str(each) for name, each in {**same, "curvafit": version("curvafit")}.items()}
+    with join_workers(workers) as joined, nullcontext() if store is None else _lock(Path(store), mine) as folder:
+        yield Run(joined or ThisProcess(), folder, progress, ends or {})
+
+
+def open_mapped(path: Path, dtype: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Open an array in a mapped file to write to, which is made, whole or not at all, where there is none."""
+    if not path.exists():
+        new = path.with_name(f"{path.name}.new")
+        np.lib.format.open_memmap(new, mode="w+", dtype=dtype, shape=shape).flush()
+        os.replace(new, path)
+    return np.load(path, mmap_mode="r+")
+
+
+@contextmanager
+def _lock(folder: Path, mine: Mapping[str, str]) -> Iterator[Path]:
+    """Make the folder of a run, if there is none, and lock it."""
+    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    if (_RUN not in names and names - {"lock"}) or (folder.exists() and not folder.is_dir()):
+        raise ValueError(f"tiles need a new folder, but {folder} holds something else")
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / "lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ValueError(f"the tiles in {folder} are in use by another run") from None
+    try:
+        other = json.loads((folder / _RUN).read_bytes()) if (folder / _RUN).exists() else mine
+        if changed := [name for name in sorted({**other, **mine}) if other.get(name) != mine.get(name)]:
+            values = "; ".join(f"{name} {other.get(name)} instead of {mine.get(name)}" for name in changed)
+            raise ValueError(f"the tiles in {folder} are another run's, with {values[:500]}: delete them")
+        write_content(folder / _RUN, json.dumps(mine, indent=2))
+        yield folder
+    except ScanError:
+        remove(folder)
+        raise
+    finally:
+        lock.release()
