@@ -129,7 +129,7 @@ def load(
     volume = volume if box is None else volume.crop(box)
     if volume.in_file and not (lazy and label is None):
         volume = volume.load()
-    elif isinstance(source, str | os.PathLike) and not volume.in_file:
+    elif isinstance(source, str | os.PathLike) and not (lazy or volume.in_file):
         check_varies(volume.values, volume.source)
     return volume if label is None else volume.label(label)
 

@@ -152,7 +152,7 @@ def _find_lengths(
         raise ScanError(f"{reason} for {source}") from None
     measured = is_unit(own) and parse_unit(own)[0] != "voxel" and any(units)
     if unit is not None and measured and given == "voxel" and spacing is None:
-        raise ScanError(f"lengths of {source} are in {own}, which does not convert to voxels: give --spacing too")
+        raise ScanError(f"lengths of {source} are in {own}, which no --unit voxel converts: give --spacing too")
     by = convert_length(1.0, own, given) if unit is not None and measured else times
     scale, note = np.array(factors) * float(f"{by:.15g}"), ()
     if edges is not None:

@@ -108,10 +108,10 @@ class Volume(Pictured):
 
     def load(self) -> Volume:
         """Return the volume in memory; ScanError where that of a file does not fit, is not finite, or constant."""
-        if not self.in_file:
-            return self
-        check_varies(values := self.values, self.source)
-        return replace(self, array=values)
+        values = self.values
+        if self.source:
+            check_varies(values, self.source)
+        return replace(self, array=values) if self.in_file else self
 
     def check_fits(self) -> None:
         """Raise ScanError where all values do not fit into memory."""

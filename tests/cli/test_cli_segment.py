@@ -11,6 +11,7 @@ from calling import call, done, refused
 from found import made_fit
 
 import curvafit.segmentation
+from curvafit.core.units import convert_length
 from curvafit.segmentation.filler import FILLER_FILE
 from curvafit.volumes.read import load
 from curvafit.volumes.volume import Volume
@@ -80,22 +81,34 @@ def test_segment_keeps_the_header_to_the_bit(oblique: Path, tmp_path: Path) -> N
     assert again.exit_code == 0 and json.loads(target.with_name("mask.json").read_text())["steps"] == 1
 
 
-@pytest.mark.parametrize(("unit", "written"), [("um", "um"), ("voxel", "voxel"), ("cm", "mm")])
-def test_another_unit_renames_and_keeps_the_rest_of_the_header(unit, written, oblique, tmp_path) -> None:
+UNITS = ("um", "voxel", "cm")
+
+
+@pytest.mark.parametrize(
+    ("stated", "unit", "written"),
+    [
+        ("mm", "um", "mm"),
+        ("mm", "cm", "mm"),
+        *(("unknown", *pair) for pair in (("um", "um"), ("voxel", "voxel"), ("cm", "mm"))),
+    ],
+)
+def test_a_unit_converts_or_names_and_the_rest_of_the_header_stays(stated, unit, written, oblique, tmp_path) -> None:
+    """Lengths in a unit that the file states are converted, so its header stays; others get the unit's name."""
     target, again = tmp_path / "mask.nii.gz", tmp_path / "again.nii"
     one = nibabel.load(oblique)
-    one.header.set_xyzt_units("mm", "sec")  # type: ignore[attr-defined]
+    one.header.set_xyzt_units(stated, "sec")  # type: ignore[attr-defined]
     nibabel.save(one, oblique)
     done("segment", oblique, "--unit", unit, "--prior", "tubes", "--steps", 1, "-o", target)
     other, made, told = nibabel.load(target), load(target), load(oblique, unit=unit)
-    assert made.unit == written and made.spacing == pytest.approx(told.spacing, rel=1e-6)
-    np.testing.assert_allclose(made.affine, told.affine, rtol=1e-6)  # type: ignore[arg-type]
-    for name in KEPT if unit in ("um", "voxel") else ["qform_code", "sform_code", "quatern_b"]:
+    factor = convert_length(1.0, told.unit, written) if written != "voxel" else 1.0
+    assert made.unit == written and made.spacing == pytest.approx([factor * h for h in told.spacing], rel=1e-6)
+    np.testing.assert_allclose(made.affine[:3], factor * told.affine[:3], rtol=1e-6)  # type: ignore[index]
+    for name in KEPT if (stated, unit) != ("unknown", "cm") else ["qform_code", "sform_code", "quatern_b"]:
         assert one.header[name].tobytes() == other.header[name].tobytes(), name  # type: ignore[index]
     assert other.header.get_xyzt_units()[1] == "sec"  # type: ignore[attr-defined]
-    # a file that bears our own note on its unit loses it
-    done("segment", target, "--unit", "um", "--prior", "tubes", "--steps", 1, "-o", again)
-    assert load(again).unit == "um" and load(again).spacing == pytest.approx(made.spacing, rel=1e-6)
+    if written == "voxel":  # our own note that there is no unit goes once there is one
+        done("segment", target, "--unit", "um", "--prior", "tubes", "--steps", 1, "-o", again)
+        assert load(again).unit == "um" and load(again).spacing == pytest.approx(made.spacing, rel=1e-6)
 
 
 def test_other_formats_and_a_fit_in_another_unit(tmp_path: Path) -> None:

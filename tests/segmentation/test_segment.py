@@ -55,7 +55,7 @@ def test_intensities_find_the_classes_and_the_noise() -> None:
     inner = ndimage.binary_erosion(truth, iterations=2) | ndimage.binary_erosion(~truth, iterations=2, border_value=1)
     slope = np.polyfit(ideal[inner], found.ratio[inner], 1)
     assert slope == pytest.approx([1, 0], abs=0.15)
-    dark = of_intensities(dataclasses.replace(noisy(truth, 25), values=200 - noisy(truth, 25).values), dark=True)
+    dark = of_intensities(dataclasses.replace(noisy(truth, 25), array=200 - noisy(truth, 25).values), dark=True)
     np.testing.assert_allclose(dark.ratio, found.ratio, rtol=0.02, atol=0.1)
 
 

@@ -118,8 +118,8 @@ def affine_in_file(field: Any) -> np.ndarray:
 def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | None = None) -> None:
     """Write values (Z, Y, X) with the header of another NIfTI file of that shape: affines, codes and zooms to the bit.
 
-    Only the values' type, scale, range and intent are new, and the unit if one is given: it renames the lengths in the
-    header. NIfTI has neither nm nor cm: lengths in these are converted.
+    Only the values' type, scale, range and intent are new, and the unit if one is given and the header has none: it
+    names the lengths in the header. NIfTI has neither nm nor cm: lengths in these are converted.
     """
     import nibabel
 
@@ -132,8 +132,9 @@ def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | Non
     header.set_slope_inter(1, 0)
     header.set_intent("none")
     header["cal_min"] = header["cal_max"] = 0
-    if unit is not None:
-        _rename(header, unit)
+    stated = (_own_unit(header) or header.get_xyzt_units())[0]
+    if unit is not None and stated in ("voxel", "unknown"):
+        _name_unit(header, unit)
     _save(type(image)(values.T.reshape(image.shape), None, header), path)
 
 
@@ -159,14 +160,11 @@ def _own_unit(header: Any) -> tuple[str, float] | None:
     return unit, 1 / _TO_FILE[unit][1]
 
 
-def _rename(header: Any, unit: str) -> None:
-    """Give the lengths in a header another unit; the numbers stay where NIfTI has the unit."""
+def _name_unit(header: Any, unit: str) -> None:
+    """Name the unit of the lengths in a header; the numbers stay where NIfTI has the unit."""
     name, factor = parse_unit(unit)
     code, into = _TO_FILE[name]
-    own = _own_unit(header)
-    # A length in the header times `own` is the number that `read_nifti` returns; then times `factor` it is in our unit,
-    # and times `into` in NIfTI's.
-    scale = factor * into * (own[1] if own else 1.0)
+    scale, own = factor * into, _own_unit(header)
     header.set_xyzt_units(code, header.get_xyzt_units()[1])
     if scale != 1:
         header["pixdim"][1:4] *= scale
