@@ -43,7 +43,8 @@ from curvafit.generation.flow import generate
 from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.priors.law import Law
-from curvafit.scan.measure import QUANTITIES, Measures, Quantity, measure
+from curvafit.scan.measure import QUANTITIES, Measures, Quantity
+from curvafit.scan.tiles import measure
 from curvafit.studies.compare import LEVEL, compare
 from curvafit.studies.scans import FINE
 from curvafit.volumes.volume import ScanError, Volume

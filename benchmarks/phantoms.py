@@ -25,7 +25,7 @@ from numba import njit
 from scipy import ndimage
 
 from benchmarks.harness import Cases, Figure, Values, run_python, show
-from curvafit.scan.measure import measure
+from curvafit.scan.tiles import measure
 
 #: Edge of the box in thicknesses; positions of each phantom by its thickness in voxels.
 EDGE = 6

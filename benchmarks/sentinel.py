@@ -31,8 +31,8 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energy import energy
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import SIGMA, phase_field
-from curvafit.scan.measure import measure
 from curvafit.scan.prepare import prepare
+from curvafit.scan.tiles import measure
 from curvafit.segmentation.reconstruct import reconstruct, reconstruct_labels
 from curvafit.segmentation.segment import segment
 from curvafit.segmentation.trials import dice

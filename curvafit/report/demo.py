@@ -34,8 +34,8 @@ from curvafit.report.page import (
     render_template,
     write_inference,
 )
-from curvafit.scan.measure import measure
 from curvafit.scan.structure import find_structure
+from curvafit.scan.tiles import measure
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.trials import dice

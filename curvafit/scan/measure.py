@@ -10,26 +10,25 @@ from dataclasses import dataclass, replace
 from dataclasses import field as default
 from html import escape
 from importlib.metadata import version
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from scipy import ndimage, stats
 
 from curvafit.core.extras import require
 from curvafit.core.pictures import Pictured
-from curvafit.core.runtime import Progress, check_memory, memory, silent
+from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import convert_length, format_number, format_sampling, plain_unit, power_name
 from curvafit.geometry.descriptors import descriptors
 from curvafit.geometry.diagram import FAMILIES, MARGIN, Diagram, diagram, families
 from curvafit.geometry.mesh import NoSurface, Surface, area_vectors
-from curvafit.geometry.morphometry import border_weights, local_thickness, measure_connectivity, smooth_surface
+from curvafit.geometry.morphometry import border_weights, local_thickness, smooth_surface
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.scan.grids import median_thickness, remove_specks
-from curvafit.scan.prepare import DROPPED, LARGEST_WINDOW, WORKED, Prepared, TooLarge, prepare, smallest_piece
-from curvafit.scan.structure import check_options, find_structure, is_rounded, read_labels, read_region
+from curvafit.scan.prepare import DROPPED, LARGEST_WINDOW, Prepared, TooLarge, prepare, smallest_piece
+from curvafit.scan.structure import find_structure, is_rounded
 from curvafit.volumes.boxes import cut_boxes
-from curvafit.volumes.read import Source, load
 from curvafit.volumes.volume import ScanError, Volume
 
 #: Columns of a table of measures; a CSV file begins with them.
@@ -46,8 +45,6 @@ SMALLEST_CUBE = 24
 READ = 56
 #: The fewest blocks, and the most along an axis; the length of a block in periods of the structure.
 LEAST, MOST, PERIODS = 8, 6, 1.0
-#: The most labels of a region of interest.
-MOST_COMPARTMENTS = 100
 #: Slices from which on a scan without curvature is refused, and why one of fewer has the other numbers alone.
 FEWEST_SLICES = 10
 TOO_THIN = f"it needs {FEWEST_SLICES} slices or more, or a surface away from the borders of fewer"
@@ -203,55 +200,6 @@ def find_quantity(rows: Sequence[Row], name: str) -> Row:
     raise KeyError(f"expected one of {', '.join(each.name for each in rows)}, got {name!r}")
 
 
-def measure(
-    scan: Source,
-    *,
-    kind: Literal["auto", "field", "mask", "image"] = "auto",
-    periodic: bool = False,
-    threshold: Literal["otsu"] | float = "otsu",
-    dark: bool = False,
-    roi: Source | None = None,
-    progress: Progress = silent,
-    **reading: Any,
-) -> Measures:
-    """Measure a scan in one piece, as `tiles.measure` measures one of any size; its arguments are the same.
-
-    Raises what that does, and ValueError if the scan does not fit into memory.
-    """
-    check_options(kind, threshold, reading.get("label"))
-    field = load(scan, **reading)
-    options = {"threshold": threshold, "dark": dark, "periodic": periodic}
-    check_memory(field.shape, WORKED, "a scan in one piece")
-    labels = options["imaged"] = None
-    if roi is not None:
-        region, laid = read_region(roi, field, scan, **{k: v for k, v in reading.items() if k != "label"})
-        labels = read_labels(region, "a region of interest with labels")
-        if (count := len(np.unique(labels))) > MOST_COMPARTMENTS:
-            raise ScanError(f"expected at most {MOST_COMPARTMENTS} labels in a region of interest, got {count}")
-        field, options["imaged"] = replace(field, notes=(*field.notes, *laid)), labels != 0
-    maps = measure_maps(field, kind, options, progress, memory() // WORKED)
-    blocks = maps.divide()
-    if labels is None:
-        return summarise(field, maps, blocks)
-    parts = {
-        label: summarise(field, maps, replace(blocks, region=labels == label), ("compartment", label))
-        for label in np.unique(labels[labels != 0]).tolist()
-    }
-    return replace(summarise(field, maps, replace(blocks, region=labels != 0)), compartments=parts)
-
-
-def summarise(field: Volume, maps: Maps, blocks: Blocks, part: tuple[str, int] | None = None) -> Measures:
-    """Return the measures of what lies in blocks, and of the whole scan with its own χ."""
-    drawn, table, connectivity = maps.diagram, maps.sum(blocks), None
-    if blocks.region is None:
-        connectivity = measure_connectivity(maps.mask, field.spacing, periodic=maps.periodic)
-    else:
-        inside = blocks.region[blocks.locate(maps.curved[0])]
-        kept = {name: np.asarray(getattr(drawn, name))[inside] for name in ("points", "weights", "places")}
-        drawn = replace(drawn, **kept)
-    return summarise_sums(field, maps.kind, blocks, table, connectivity, drawn, maps.notes, part=part)
-
-
 def summarise_sums(
     frame: Volume,
     kind: str,
@@ -320,8 +268,8 @@ class Maps(NamedTuple):
 def measure_maps(
     field: Volume, kind: str, options: dict[str, Any], progress: Progress = silent, most: int | None = None
 ) -> Maps:
-    """Measure what is summed of a scan; `options` are the threshold, dark and periodic of `measure`, and where a padded
-    scan was `imaged`; `most` as in `prepare.prepare`, which raises TooLarge."""
+    """Measure what is summed of a scan; `options` are the threshold, dark and periodic of `measure`; `most` as in
+    `prepare.prepare`, which raises TooLarge."""
     periodic: bool = options["periodic"]
     progress("finding the structure", 0.0)
     mask, seen, notes = _find_structure(field, kind, options)
@@ -533,14 +481,10 @@ def _largest_cube(region: np.ndarray) -> tuple[slice, slice, slice] | None:
 
 @dataclass(frozen=True)
 class Blocks:
-    """A division of a volume (Z, Y, X) into blocks: the first voxel of each along (z, y, x).
-
-    Of a `region`, bool (Z, Y, X), what lies inside alone is summed.
-    """
+    """A division of a volume (Z, Y, X) into blocks: the first voxel of each along (z, y, x)."""
 
     shape: tuple[int, int, int]
     starts: tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
-    region: np.ndarray | None = None
 
     @classmethod
     def divide(cls, shape: Sequence[int], spacing: Sequence[float], period: float) -> Blocks:
@@ -563,7 +507,6 @@ class Blocks:
     def sums(self, values: np.ndarray) -> np.ndarray:
         """Return the sum of a volume (Z, Y, X) over each block, float64 (N,)."""
         kind = np.float64 if values.dtype.kind == "f" else np.int64
-        values = values if self.region is None else values * self.region
         for axis, starts in enumerate(self.starts):
             values = np.add.reduceat(values, starts, axis=axis, dtype=kind)
         return values.ravel().astype(np.float64)
@@ -573,9 +516,6 @@ class Blocks:
         voxels, numbers = self.locate(places), np.zeros(len(places), dtype=np.int64)
         for axis, starts in enumerate(self.starts):
             numbers = numbers * len(starts) + np.searchsorted(starts, voxels[axis], side="right") - 1
-        if self.region is not None:
-            inside = self.region[voxels]
-            numbers, weights = numbers[inside], weights[inside]
         columns = weights.reshape(len(weights), math.prod(weights.shape[1:]))
         sums = [np.bincount(numbers, column, minlength=self.count) for column in columns.T]
         return np.stack(sums, axis=1).reshape(self.count, *weights.shape[1:])

@@ -208,7 +208,6 @@ def prepare(
     one_scale: bool = False,
     most: int | None = None,
     quality: Quality | None = None,
-    imaged: np.ndarray | None = None,
 ) -> Prepared:
     """Find the structure and put it on the working grid, where its median thickness is a known number of voxels.
 
@@ -241,8 +240,6 @@ def prepare(
         is cut, and a note says so.
     quality
         Blur and noise of an image, where they are known; else they are measured.
-    imaged
-        Where the grey levels of a padded scan set the threshold, bool of its shape; by default wherever it counts.
     """
     structure.check_options(kind, threshold)
     region, laid = (None, ()) if roi is None else structure.read_region(roi, field)
@@ -252,7 +249,6 @@ def prepare(
     part = replace(field, array=field.values[where], affine=None, notes=field.notes + laid + notes)
     periodic = periodic and part.shape == field.shape
     options = {"kind": kind, "threshold": threshold, "dark": dark}
-    options["imaged"] = None if imaged is None else imaged[where]
     extremes = (field.values.min(), field.values.max())
     seen, signed = structure.find_structure(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
     mask = signed.values > 0

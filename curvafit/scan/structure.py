@@ -80,7 +80,6 @@ def find_structure(
     region: np.ndarray | None = None,
     periodic: bool = False,
     extremes: tuple[float, float] | None = None,
-    imaged: np.ndarray | None = None,
 ) -> tuple[Kind, Volume]:
     """Return the kind of a scan, and the scan as float32 values that are above 0 in its structure, with notes on how.
 
@@ -102,8 +101,6 @@ def find_structure(
         padding, corner = None, values[0, 0, 0]
         if np.count_nonzero(values == corner) > PADDED * values.size:
             padding = judge_padding(corner, count_constant(values, corner))
-        if imaged is not None and padding is not None:
-            region = imaged if region is None else imaged & region
         values, note = _split_image(field, threshold, dark, region, periodic, padding)
         note = " ".join([*describe_padding(padding, threshold == "otsu", region is not None), note])
     counted = values > 0 if region is None else values[region] > 0

@@ -8,7 +8,7 @@ There the thickness is measured that sets the working grid.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
@@ -29,6 +29,10 @@ PIECE = 2**24
 _MOST_LEVELS = 2**22
 
 
+#: Values of a box that count for a threshold.
+Levels = Callable[[Box], np.ndarray]
+
+
 @dataclass(frozen=True)
 class Request:
     """A volume, and what the caller says of it."""
@@ -38,6 +42,7 @@ class Request:
     kind: Literal["auto", "field", "mask", "image"]
     threshold: Literal["otsu"] | float
     dark: bool
+    region: Volume | None = None  # labels on its voxels; of a padded scan they say where the threshold is taken
 
     def read(self, box: Box) -> np.ndarray:
         """Return the values of a box; of a label, where it is."""
@@ -109,11 +114,11 @@ def survey(request: Request, run: Run) -> Plan:
     pieces = cut_boxes(volume.shape, round(PIECE ** (1 / 3)))
     total = _add(run("counting the structure", partial(_count_structure, request, split, pieces), len(pieces)))
     if split.kind == "image":
-        otsu = request.threshold == "otsu"
+        otsu, inside = request.threshold == "otsu", request.region is not None
         ends = [float(e) for e in (total["lowest"], total["highest"])]
         low, high = sorted(split.level - e for e in ends) if request.dark else [split.level + e for e in ends]
         note = structure.describe_split(split.level, otsu, request.dark, low, high)
-        note = " ".join([*structure.describe_padding(split.padding, otsu), note])
+        note = " ".join([*structure.describe_padding(split.padding, otsu, inside), note])
     size, filled = math.prod(volume.shape), int(total["filled"])
     if filled in (0, size):
         what, other = ("background", "structure") if filled else ("a structure", "background")
@@ -209,15 +214,19 @@ def _split_image(
     request: Request, bars: Sequence[Box], split: Split, total: Record, value: Any, size: int, run: Run
 ) -> Split:
     """Return the split with the padding and the threshold of an image of so many voxels, of which `total` is known."""
-    left, ends = None, (total["lowest"], total["highest"])
+    levels, ends = partial(_read_levels, request, None, False), (total["lowest"], total["highest"])
     if total["constant"] > structure.PADDED * size:
         counted = _add(run("looking for padding", partial(_count_padding, request, bars, value), len(bars)))
         split = replace(split, padding=structure.judge_padding(value, counted["padding"]))
-        if split.padding is not None and split.padding.sure:
-            left, ends = split.padding.value, (counted["lowest"], counted["highest"])
     if request.threshold != "otsu":
         return replace(split, level=float(request.threshold))
-    return replace(split, level=_find_threshold(request, bars, *ends, left, run))
+    if split.padding is not None and (split.padding.sure or request.region is not None):
+        levels = partial(_read_levels, request, split.padding.value if split.padding.sure else None, True)
+        counted = _add(run("looking at levels", partial(_look_at_levels, levels, bars), len(bars)))
+        if not counted or counted["lowest"] == counted["highest"]:
+            raise ScanError("expected grey levels that differ where they count, got one of them only")
+        ends = (counted["lowest"], counted["highest"])
+    return replace(split, level=_find_threshold(levels, bars, *ends, run))
 
 
 def _look_at_values(request: Request, bars: Sequence[Box], value: Any, number: int) -> Record:
@@ -239,22 +248,33 @@ def _look_at_values(request: Request, bars: Sequence[Box], value: Any, number: i
 
 
 def _count_padding(request: Request, bars: Sequence[Box], value: Any, number: int) -> Record:
-    """Return what tells padding with a value in a bar, and the extremes of the other values."""
-    values = request.read(bars[number])
-    found, others = {"padding": structure.count_constant(values, value)}, values[values != value]
-    return found | {"lowest": others.min(), "highest": others.max()} if others.size else found
+    """Return what tells padding with a value in a bar."""
+    return {"padding": structure.count_constant(request.read(bars[number]), value)}
 
 
-def _find_threshold(
-    request: Request, bars: Sequence[Box], lowest: Any, highest: Any, left: float | None, run: Run
-) -> float:
-    """Return the threshold of grey levels but one that is left out, as `structure.find_structure` finds it."""
+def _read_levels(request: Request, left: float | None, inside: bool, box: Box) -> np.ndarray:
+    """Return the values of a box but one that is left out, `inside` of the region, if there is one."""
+    values = request.read(box)
+    counted = np.ones(values.shape, dtype=bool) if left is None else values != left
+    if inside and request.region is not None:
+        counted &= request.region.read(box) != 0
+    return values[counted]
+
+
+def _look_at_levels(levels: Levels, bars: Sequence[Box], number: int) -> Record:
+    """Return the extremes of a bar's values that count."""
+    values = levels(bars[number])
+    return {"lowest": values.min(), "highest": values.max()} if values.size else {}
+
+
+def _find_threshold(levels: Levels, bars: Sequence[Box], lowest: Any, highest: Any, run: Run) -> float:
+    """Return the threshold of the levels that count, as `structure.find_structure` finds it."""
     lowest, highest = lowest[()], highest[()]
     whole = lowest.dtype.kind in "iu"
     if whole and int(highest) - int(lowest) >= _MOST_LEVELS:
         raise ScanError(f"expected at most {_MOST_LEVELS} grey levels, got {lowest} to {highest}: give a threshold")
     name = "finding the threshold"
-    counts = _add(run(name, partial(_count_levels, request, bars, lowest, highest, left), len(bars)))["counts"]
+    counts = _add(run(name, partial(_count_levels, levels, bars, lowest, highest), len(bars)))["counts"]
     if whole:
         centres = np.arange(int(lowest), int(highest) + 1)
         high = centres > threshold_otsu(hist=(counts, centres))
@@ -262,29 +282,21 @@ def _find_threshold(
         return float(sum(means)) / 2
     edges = np.histogram_bin_edges(np.empty(0, lowest.dtype), 256, (lowest, highest))
     otsu = threshold_otsu(hist=(counts, (edges[1:] + edges[:-1]) / 2))
-    sums = _add(run(f"{name}'s sides", partial(_sum_sides, request, bars, otsu, left), len(bars)))["sums"]
+    sums = _add(run(f"{name}'s sides", partial(_sum_sides, levels, bars, otsu), len(bars)))["sums"]
     return float(sums[0, 1] / sums[0, 0] + sums[1, 1] / sums[1, 0]) / 2
 
 
-def _levels(request: Request, box: Box, left: float | None) -> np.ndarray:
-    """Return the values of a box, without those that are left out."""
-    values = request.read(box).ravel()
-    return values if left is None else values[values != left]
-
-
-def _count_levels(
-    request: Request, bars: Sequence[Box], lowest: Any, highest: Any, left: float | None, number: int
-) -> Record:
+def _count_levels(levels: Levels, bars: Sequence[Box], lowest: Any, highest: Any, number: int) -> Record:
     """Return a histogram of a bar: of each whole number, or of 256 bins."""
-    values = _levels(request, bars[number], left)
+    values = levels(bars[number])
     if values.dtype.kind not in "iu":
         return {"counts": np.histogram(values, 256, (lowest, highest))[0]}
     return {"counts": np.bincount(values.astype(np.int64) - int(lowest), minlength=int(highest) - int(lowest) + 1)}
 
 
-def _sum_sides(request: Request, bars: Sequence[Box], level: float, left: float | None, number: int) -> Record:
+def _sum_sides(levels: Levels, bars: Sequence[Box], level: float, number: int) -> Record:
     """Return the numbers and sums of the values above a level, and of the others."""
-    values = _levels(request, bars[number], left)
+    values = levels(bars[number])
     high = values > level
     sides = [(values[side].size, values[side].sum(dtype=np.float64)) for side in (high, ~high)]
     return {"sums": np.array(sides, dtype=np.float64)}

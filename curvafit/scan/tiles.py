@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from os import PathLike
@@ -18,26 +17,26 @@ from typing import Any, Literal
 import numpy as np
 
 from curvafit.core.checks import check_int
-from curvafit.core.runtime import Progress, silent
+from curvafit.core.runtime import Progress, check_memory, memory, silent
 from curvafit.core.units import format_sampling
 from curvafit.core.workers import Workers
 from curvafit.geometry.balls import NEAR, ball_radii, paint_balls, paint_coarse_balls, reaching_radius
 from curvafit.geometry.diagram import BIN_WIDTH, MARGIN, Diagram
 from curvafit.geometry.mesh import NoSurface, march
-from curvafit.geometry.morphometry import SOFTENED, border_weights, soften
+from curvafit.geometry.morphometry import SOFTENED, border_weights, measure_connectivity, soften
 from curvafit.geometry.topology import euler_of_window, euler_shares
 from curvafit.priors.grid import WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread
 from curvafit.scan import measure as whole
 from curvafit.scan.grids import CutOut, centre_distance, profile_mask, remove_specks, resample
 from curvafit.scan.measure import Blocks, Measures
-from curvafit.scan.prepare import DROPPED, LARGEST_BOX, Prepared, TooLarge, note_on_filling, smallest_piece
-from curvafit.scan.structure import check_options
+from curvafit.scan.prepare import DROPPED, LARGEST_BOX, WORKED, Prepared, TooLarge, note_on_filling, smallest_piece
+from curvafit.scan.structure import check_options, read_labels, read_region
 from curvafit.scan.survey import Plan, Request, survey
 from curvafit.volumes.boxes import Box, cut_boxes, grow, within
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.run import Record, open_run
-from curvafit.volumes.volume import ScanError
+from curvafit.volumes.volume import ScanError, Volume
 
 #: Radius, in voxels of the finest axis, from which balls are painted on a coarser grid, and the largest ball's.
 COARSE, WIDEST = 24, 48
@@ -50,6 +49,10 @@ LARGEST_TILE, SHORTEST = 224**3, 32
 _EACH, _PROGRAM = 100, 300 * 2**20
 #: Bins of the stored curvature diagram, in `diagram.BIN_WIDTH`.
 _BIN = 0.25
+#: Parts of a volume: all of it, and its region of interest; the region's labels are others.
+_WHOLE, INSIDE = "", "inside"
+#: The most labels of a region of interest.
+MOST_COMPARTMENTS = 100
 #: Names of the passes over tiles.
 _FIRST, _AGAIN = "measuring tiles", "measuring wide balls"
 
@@ -102,21 +105,37 @@ def measure(
     if tile is not None:
         check_int(tile, f"a tile of {SHORTEST} or more voxels a side", SHORTEST, 2**31)
     options = {"kind": kind, "threshold": threshold, "dark": dark}
-    if roi is not None or periodic:
-        if tile is not None:
-            raise ValueError("a scan with a region or a periodic one is measured in one piece: leave out tile")
-        return whole.measure(scan, periodic=periodic, roi=roi, progress=progress, **options, **reading)  # type: ignore[arg-type]
-    label = reading.pop("label", None)
+    if periodic and (roi is not None or tile is not None):
+        raise ValueError("a scan that repeats is measured in one piece and without a region: leave out tile and roi")
+    label, region = reading.pop("label", None), None
     volume = load(scan, **reading, lazy=True)
-    if tile is None and max(volume.shape) <= LARGEST_BOX:
+    if roi is not None:
+        region, laid = read_region(roi, volume, scan, **reading)
+        region = replace(region, array=read_labels(region, "a region of interest with labels"))
+        if (count := len(np.unique(region.values))) > MOST_COMPARTMENTS:
+            raise ScanError(f"expected at most {MOST_COMPARTMENTS} labels in a region of interest, got {count}")
+        volume = replace(volume, notes=(*volume.notes, *laid))
+    elif periodic or (tile is None and max(volume.shape) <= LARGEST_BOX):
+        check_memory(volume.shape, WORKED, "a scan in one piece")
         field = volume.load() if label is None else volume.load().label(label)
-        how = {"threshold": threshold, "dark": dark, "periodic": False}
-        with suppress(TooLarge):
-            maps = whole.measure_maps(field, kind, how, progress, LARGEST_BOX**3)
-            return whole.summarise(field, maps, maps.divide())
-    request = Request(volume, label, **options)  # type: ignore[arg-type]
-    workers = workers if volume.in_file else None
+        try:
+            return _measure_whole(field, periodic, progress, **options)  # type: ignore[arg-type]
+        except TooLarge:
+            if periodic:
+                raise
+    request = Request(volume, label, region=region, **options)  # type: ignore[arg-type]
+    workers = workers if volume.in_file and (region is None or region.in_file) else None
     return measure_tiles(request, edge=tile, workers=workers, store=store, progress=progress)
+
+
+def _measure_whole(field: Volume, periodic: bool, progress: Progress, kind: str, **options: Any) -> Measures:
+    """Measure a scan in one piece."""
+    most = memory() // WORKED if periodic else LARGEST_BOX**3
+    maps = whole.measure_maps(field, kind, {**options, "periodic": periodic}, progress, most)
+    connectivity = measure_connectivity(maps.mask, field.spacing, periodic=periodic)
+    blocks = maps.divide()
+    table = maps.sum(blocks)
+    return whole.summarise_sums(field, maps.kind, blocks, table, connectivity, maps.diagram, maps.notes)
 
 
 @dataclass(frozen=True)
@@ -176,7 +195,7 @@ def _reach(radius: float, edge: float) -> float:
 def measure_tile(tiling: Tiling, number: int) -> Record:
     """Return the sums over a tile's core, on the rows of the finest division that it touches, and what else adds up."""
     plan, core = tiling.plan, tiling.cores[number]
-    sums = _Sums(tiling.finest, core)
+    sums = _Sums(tiling, core)
     balls = _measure_balls(plan, core, tiling.factors)
     mask, inner = balls.mask, within(core, balls.box)
     voxel = math.prod(plan.volume.spacing)
@@ -200,17 +219,20 @@ def measure_tile(tiling: Tiling, number: int) -> Record:
 def _measure_wide(tiling: Tiling, number: int) -> Record:
     """Return the sums over a tile's core that balls on a coarser grid change."""
     plan, core = tiling.plan, tiling.cores[number]
-    sums, balls = _Sums(tiling.finest, core), _measure_balls(plan, core, tiling.factors)
+    sums, balls = _Sums(tiling, core), _measure_balls(plan, core, tiling.factors)
     sums.add_thickness(balls.thickness, math.prod(plan.volume.spacing), *(factor > 1 for factor in tiling.factors))
     return sums.rows
 
 
 class _Sums:
-    """Sums of a core on the finest division of a volume."""
+    """Sums of a core on the finest division of a volume: of all of it, and of the parts that a region labels, by name.
 
-    def __init__(self, finest: Blocks, core: Box) -> None:
-        self._finest, self._core = finest, core
-        self.table = np.zeros((finest.count, len(whole.SUMS)))
+    The part of no name is all, `INSIDE` the region, and a number one of its labels.
+    """
+
+    def __init__(self, tiling: Tiling, core: Box) -> None:
+        finest, plan, names = tiling.finest, tiling.plan, [_WHOLE]
+        self._finest, self._core, self._near, self._labels = finest, core, core, None
         self._where, starts = [], []
         for edge, all_starts in zip(core, finest.starts, strict=True):
             first, last = (int(np.searchsorted(all_starts, at, side="right")) - 1 for at in (edge.start, edge.stop - 1))
@@ -218,11 +240,18 @@ class _Sums:
             starts.append(tuple(max(all_starts[k] - edge.start, 0) for k in range(first, last + 1)))
         z, y, x = (edge.stop - edge.start for edge in core)
         self._local = Blocks((z, y, x), tuple(starts))  # type: ignore[arg-type]
+        if plan.request.region is not None:  # surface lies up to a working voxel beyond the core
+            self._near = grow(core, [math.ceil(s) + 2 for s in plan.scale], tiling.shape)
+            self._labels = plan.request.region.read(self._near)
+            names += [INSIDE, *(str(label) for label in np.unique(self._labels).tolist() if label)]
+        self.tables = {name: np.zeros((finest.count, len(whole.SUMS))) for name in names}
 
     def add(self, name: str, values: np.ndarray, each: float) -> None:
         """Add a volume's values on the core."""
-        column = self.table[:, whole.SUMS.index(name)].reshape(self._finest.counts)
-        column[tuple(self._where)] += each * self._local.sums(values).reshape(self._local.counts)
+        for part, table in self.tables.items():
+            column = table[:, whole.SUMS.index(name)].reshape(self._finest.counts)
+            own = values if part == _WHOLE else values * self._lie_in(part, within(self._core, self._near))
+            column[tuple(self._where)] += each * self._local.sums(own).reshape(self._local.counts)
 
     def add_thickness(self, of: Sequence[np.ndarray], each: float, structure: bool = True, gaps: bool = True) -> None:
         """Add the thickness of structure and background on the core, or of one of them."""
@@ -235,13 +264,29 @@ class _Sums:
     def gather(self, name: str, places: np.ndarray, columns: np.ndarray) -> None:
         """Add columns, of which the first is `name`, at places in voxels from the volume's first centre."""
         first = whole.SUMS.index(name)
-        self.table[:, first : first + columns.shape[1]] += self._finest.gather(places, columns)
+        for part, table in self.tables.items():
+            own = self.select(part, places)
+            table[:, first : first + columns.shape[1]] += self._finest.gather(places[own], columns[own])
+
+    def select(self, part: str, places: np.ndarray) -> np.ndarray:
+        """Return which places, in voxels from the volume's first centre, lie in a part."""
+        if part == _WHOLE:
+            return np.ones(len(places), dtype=bool)
+        corner, shape = np.array([[edge.start, edge.stop - edge.start] for edge in self._near]).T
+        voxels = np.clip(np.rint(places) - corner, 0, shape - 1).astype(np.int64)
+        return self._lie_in(part, tuple(voxels.T))
+
+    def _lie_in(self, part: str, where: Any) -> np.ndarray:
+        assert self._labels is not None
+        labels = self._labels[where]
+        return labels != 0 if part == INSIDE else labels == int(part)
 
     @property
     def rows(self) -> Record:
-        """Return the numbers of the rows that hold anything, and the rows."""
-        rows = np.flatnonzero(self.table.any(axis=1))
-        return {"rows": rows, "sums": self.table[rows]}
+        """Return the numbers of the rows that hold anything, and the rows, of each part."""
+        rows = {part: np.flatnonzero(table.any(axis=1)) for part, table in self.tables.items()}
+        sums = {f"sums{part}": self.tables[part][numbers] for part, numbers in rows.items()}
+        return {**{f"rows{part}": numbers for part, numbers in rows.items()}, **sums}
 
 
 @dataclass(frozen=True)
@@ -380,7 +425,9 @@ def _measure_curvature(plan: Plan, core: Box, sums: _Sums) -> Record:
     corner = np.asarray(drawn.places) / WORKING_SPACING + [edge.start for edge in part]
     kept = _find_own(corner, own, wide)
     sums.gather("curved", places[kept], columns[kept])
-    return {**found, **_bin(plan, drawn, kept)}
+    for name in sums.tables:
+        found |= _bin(plan, drawn, kept & sums.select(name, places), name)
+    return found
 
 
 def _find_working_levels(plan: Plan, box: Box) -> np.ndarray:
@@ -410,7 +457,7 @@ def _prepare_part(plan: Plan, phase: np.ndarray, mask: np.ndarray, part: Box) ->
     return Prepared(plan.split.kind, phase, mask, grid, *size, ((z, y, x),), (), origin)  # type: ignore[arg-type]
 
 
-def _bin(plan: Plan, drawn: Diagram, kept: np.ndarray) -> Record:
+def _bin(plan: Plan, drawn: Diagram, kept: np.ndarray, part: str) -> Record:
     """Return the bins of a diagram's points that are kept: their place, and area times 1, κ1, κ2 and κ1² + κ2²."""
     points, weights = drawn.points[kept], drawn.weights[kept]
     bins = np.floor(points / (_BIN * BIN_WIDTH * WORKING_SPACING / plan.edge)).astype(np.int64)
@@ -421,7 +468,8 @@ def _bin(plan: Plan, drawn: Diagram, kept: np.ndarray) -> Record:
     areas = np.stack([np.bincount(numbers, column) for column in columns.T], axis=1)
     held = np.flatnonzero(areas[:, 0])
     bins = np.stack(np.divmod(held, across), axis=1) + first
-    return {"bins": bins, "areas": areas[held], "lost": np.float64(drawn.excluded * weights.sum())}
+    lost = np.float64(drawn.excluded * weights.sum())
+    return {f"bins{part}": bins, f"areas{part}": areas[held], f"lost{part}": lost}
 
 
 # ---- all tiles -------------------------------------------------------------------------------------------------------
@@ -437,11 +485,11 @@ def measure_tiles(
 ) -> Measures:
     """Measure a volume in tiles of `edge` voxels a side, as `measure` says; raise as it does."""
     same = {"scan": request.volume.digest, "label": request.label, "kind": request.kind, "threshold": request.threshold}
-    same |= {"dark": request.dark, "tile": edge}
+    same |= {"dark": request.dark, "tile": edge, "region": request.region and request.region.digest}
     with open_run(workers, store, same, progress, {_FIRST: 0.95, _AGAIN: 1.0}) as run, one_thread():
         plan = survey(request, run)
         tiling = Tiling(plan, tuple(cut_boxes(plan.volume.shape, edge or _choose_edges(plan))))
-        stated = tiling.describe(run.processes)
+        stated = f"Measured in {tiling.describe(run.processes)}"
         found = list(run(_FIRST, partial(measure_tile, tiling), len(tiling.cores), stated))
         # the factors that `morphometry.local_thickness` chooses
         widest, finest = np.max([each["widest"] for each in found], axis=0), min(plan.volume.spacing)
@@ -453,17 +501,11 @@ def measure_tiles(
 
 
 def _summarise(tiling: Tiling, found: Sequence[Record], again: Sequence[Record], stated: str) -> Measures:
-    """Return the measures of a volume from what was found in its tiles."""
+    """Return the measures of a volume, and of the parts of its region, from what was found in its tiles."""
     plan, finest, shape = tiling.plan, tiling.finest, tiling.shape
-    table = np.zeros((finest.count, len(whole.SUMS)))
-    for each in found:
-        table[each["rows"]] += each["sums"]
-    for factor, names in zip(tiling.factors, (("thickness", "thickness²"), ("gap",)), strict=True):
-        if factor > 1:
-            table[:, [whole.SUMS.index(name) for name in names]] = 0
-    for each in again:
-        table[each["rows"]] += each["sums"]
-    total = dict(zip(whole.SUMS, table.sum(0), strict=True))
+    parts = {name.removeprefix("rows") for each in found for name in each if name.startswith("rows")}
+    tables = {part: _sum_tiles(tiling, found, again, part) for part in parts}
+    total = dict(zip(whole.SUMS, tables[_WHOLE].sum(0), strict=True))
     if not 0 < total["inside"] < total["volume"]:
         raise ScanError("expected a structure and background in the scan, got one of them only")
     curved = total["curved"] > 0
@@ -473,10 +515,34 @@ def _summarise(tiling: Tiling, found: Sequence[Record], again: Sequence[Record],
     blocks = Blocks.divide(shape, plan.volume.spacing, period)
     χ = float(sum(each["euler"] for each in found))
     sampled = math.prod(max(n - 1, 1) for n in shape) * math.prod(plan.volume.spacing)
-    drawn, why = (_draw(plan, found), ()) if curved else whole.no_curvature(plan.volume.unit, whole.TOO_THIN)[1:]
-    notes = (*_notes(tiling, found), *why, f"Measured in {stated[0].lower()}{stated[1:]}")
-    table, connectivity = _merge(table, finest, blocks), (χ, (1 - χ) / sampled)
-    return whole.summarise_sums(plan.volume, plan.split.kind, blocks, table, connectivity, drawn, notes)
+    none = whole.no_curvature(plan.volume.unit, whole.TOO_THIN)
+    notes = (*_notes(tiling, found), *(() if curved else none[2]), *([stated] if len(tiling.cores) > 1 else []))
+
+    def summarise(part: str, label: int | None = None) -> Measures:
+        drawn = _draw(plan, found, part) if tables[part][:, whole.SUMS.index("curved")].any() else none[1]
+        connectivity = (χ, (1 - χ) / sampled) if part == _WHOLE else None
+        table, named = _merge(tables[part], finest, blocks), None if label is None else ("compartment", label)
+        return whole.summarise_sums(plan.volume, plan.split.kind, blocks, table, connectivity, drawn, notes, part=named)
+
+    if plan.request.region is None:
+        return summarise(_WHOLE)
+    labels = sorted(int(part) for part in parts - {_WHOLE, INSIDE})
+    return replace(summarise(INSIDE), compartments={label: summarise(str(label), label) for label in labels})
+
+
+def _sum_tiles(tiling: Tiling, found: Sequence[Record], again: Sequence[Record], part: str) -> np.ndarray:
+    """Return the sums of all tiles over a part on the finest division."""
+    table, rows, sums = np.zeros((tiling.finest.count, len(whole.SUMS))), f"rows{part}", f"sums{part}"
+    for each in found:
+        if rows in each:
+            table[each[rows]] += each[sums]
+    for factor, names in zip(tiling.factors, (("thickness", "thickness²"), ("gap",)), strict=True):
+        if factor > 1:
+            table[:, [whole.SUMS.index(name) for name in names]] = 0
+    for each in again:
+        if rows in each:
+            table[each[rows]] += each[sums]
+    return table
 
 
 def _merge(table: np.ndarray, finest: Blocks, blocks: Blocks) -> np.ndarray:
@@ -487,16 +553,16 @@ def _merge(table: np.ndarray, finest: Blocks, blocks: Blocks) -> np.ndarray:
     return sums.reshape(blocks.count, -1)
 
 
-def _draw(plan: Plan, found: Sequence[Record]) -> Diagram:
-    """Return the diagram of all tiles: the barycentres of its bins."""
-    parts = [each for each in found if "bins" in each]
-    bins, areas = (np.concatenate([each[name] for each in parts]) for name in ("bins", "areas"))
+def _draw(plan: Plan, found: Sequence[Record], part: str) -> Diagram:
+    """Return the diagram of a part over all tiles: the barycentres of its bins."""
+    parts = [each for each in found if f"bins{part}" in each]
+    bins, areas = (np.concatenate([each[f"{name}{part}"] for each in parts]) for name in ("bins", "areas"))
     bins, index = np.unique(bins, axis=0, return_inverse=True)
     index = index.reshape(-1)
     area, κ1, κ2, square = (np.bincount(index, column, minlength=len(bins)) for column in areas.T)
     points = np.stack([κ1, κ2], axis=1) / area[:, None]
     spread = max(float((square - area * (points**2).sum(1)).sum() / area.sum()), 0.0)
-    lost = float(sum(each["lost"] for each in parts)) / float(area.sum())
+    lost = float(sum(each[f"lost{part}"] for each in parts)) / float(area.sum())
     return Diagram(points, area, f"1/{plan.volume.unit}", math.sqrt(spread), lost)
 
 

@@ -9,7 +9,7 @@ from found import SCALE, lattice, made_inference
 
 from curvafit.inference.atlas import load_atlas
 from curvafit.report.demo import demo_page, score_completion, write_demo
-from curvafit.scan.measure import measure
+from curvafit.scan.tiles import measure
 from curvafit.segmentation.slices import WAYS
 from curvafit.volumes.volume import Volume
 

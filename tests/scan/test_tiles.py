@@ -16,7 +16,6 @@ from curvafit.geometry.morphometry import local_thickness
 from curvafit.scan import tiles
 from curvafit.scan.instances import OF_BODIES, measure_instances
 from curvafit.scan.measure import Measures
-from curvafit.scan.measure import measure as measure_in_one
 from curvafit.scan.tiles import measure
 from curvafit.volumes import ScanError, Volume, save
 
@@ -76,7 +75,7 @@ def check_alike(found: Measures, whole: Measures) -> None:
 def test_tiles_of_any_size_equal_the_whole(name: str, edge: int, shape: tuple[int, int, int]) -> None:
     """An edge of 48 leaves a last tile of 3 voxels along y, one of 51 along x, and 32 one of 1 voxel along z of 33."""
     scan, dark = scans(shape)[name], name.startswith("dark")
-    check_alike(measure(scan, tile=edge, dark=dark), measure_in_one(scan, dark=dark))
+    check_alike(measure(scan, tile=edge, dark=dark), measure(scan, dark=dark))
 
 
 def test_wide_balls_are_those_of_the_whole() -> None:
@@ -87,13 +86,13 @@ def test_wide_balls_are_those_of_the_whole() -> None:
         mask |= np.hypot(y - row, x - column - 3 * np.sin(z / 12)) < 5
     assert 24 < ball_radii(~mask, (1.0, 1.0, 1.0)).max() < tiles.WIDEST
     scan = Volume(mask.astype(np.uint8))
-    check_alike(measure(scan, tile=52), measure_in_one(scan))
+    check_alike(measure(scan, tile=52), measure(scan))
 
 
 def test_a_label_is_measured_in_tiles() -> None:
     labels = np.where(texture() > 0, 7, 3).astype(np.uint16)
     found = measure(labels, label=7, tile=64)
-    check_alike(found, measure_in_one(labels, label=7))
+    check_alike(found, measure(labels, label=7))
     with pytest.raises(ScanError, match="label 5"):
         measure(labels, label=5, tile=64)
 
@@ -157,7 +156,7 @@ def test_bad_input_ends_in_one_sentence(store: Path, tmp_path: Path) -> None:
     np.save(flat, np.full((64, 40, 40), 3, np.uint8))
     for arguments, word in (
         ((broken,), "finite"), ((flat,), "vary"), ((flat, "--label", 3), "label"), ((store, "--labels"), "tile"),
-        ((store, "--threshold", 1e6), "threshold"), ((store, "--tile", 8), "tile"), ((store, "--roi", flat), "tile"),
+        ((store, "--threshold", 1e6), "threshold"), ((store, "--tile", 8), "tile"), ((store, "--periodic"), "tile"),
     ):  # fmt: skip
         more = () if "--tile" in arguments else ("--tile", 40)
         refused(call("measure", *arguments, *more, "-o", out), word, progress=True)

@@ -1,7 +1,6 @@
 """`measure`: exact shapes, laws of units and symmetries, sums over blocks and their errors, tables and the command."""
 
 import csv
-import dataclasses
 import json
 import math
 from pathlib import Path
@@ -13,7 +12,8 @@ from calling import call, done, refused
 from curvafit.geometry.morphometry import morphometry
 from curvafit.geometry.topology import euler_number, euler_shares
 from curvafit.report.windows import check_windows
-from curvafit.scan.measure import LEAST, QUANTITIES, Blocks, Measures, errors, measure, measure_maps
+from curvafit.scan.measure import LEAST, QUANTITIES, Blocks, Measures, errors
+from curvafit.scan.tiles import measure
 from curvafit.studies.tables import COLUMNS, write_table
 from curvafit.studies.windows import NAMES, Windows, windows
 from curvafit.volumes.read import load
@@ -258,11 +258,25 @@ def test_each_half_of_a_scan_has_its_own_numbers(rods: tuple[np.ndarray, np.ndar
 
 
 def test_compartments_add_up_to_the_whole(cut: np.ndarray) -> None:
-    maps = measure_maps(Volume(cut), "mask", {"threshold": "otsu", "dark": False, "periodic": False})
-    blocks = maps.divide()
-    labels = np.random.default_rng(0).integers(0, 3, cut.shape)
-    parts = [maps.sum(dataclasses.replace(blocks, region=labels == k)) for k in range(3)]
-    assert np.sum(parts, axis=0) == pytest.approx(maps.sum(blocks), rel=1e-6, abs=1e-6)
+    """Volumes, areas and curvatures do, in one tile and in several, and in these they are those of the one."""
+    labels = np.ones(cut.shape, np.uint8)
+    labels[:, 20:], labels[:, :, 25:] = 2, 3
+    whole, found = measure(cut), measure(cut, roi=labels)
+    for each in (found, measure(cut, roi=labels, tile=32)):
+        parts, shares = each.compartments.values(), np.bincount(labels.ravel())[1:] / labels.size
+        for symbol in ("BV/TV", "BS/TV"):
+            assert np.dot(shares, [part[symbol].value for part in parts]) == pytest.approx(
+                whole[symbol].value, rel=1e-6
+            )
+        assert sum(part["χ"].value for part in parts) == pytest.approx(each["χ"].value, abs=1e-9)
+        areas = [part.diagram.area for part in parts]
+        assert sum(areas) == pytest.approx(whole.diagram.area, rel=1e-6)
+        assert np.dot(areas, [part["H"].value for part in parts]) / sum(areas) == pytest.approx(
+            whole["H"].value, rel=1e-5
+        )
+        for part, same in zip(parts, found.compartments.values(), strict=True):
+            values = [[quantity.value for quantity in one.quantities] for one in (part, same)]
+            assert values[0] == pytest.approx(values[1], rel=1e-6, abs=1e-9)
 
 
 def test_a_compartment_without_structure_has_none(cut: np.ndarray) -> None:
