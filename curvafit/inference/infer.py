@@ -33,7 +33,8 @@ from curvafit.priors.law import Law
 from curvafit.priors.profile import phase_field
 from curvafit.scan.measure import scan_diagram
 from curvafit.scan.prepare import HALF, NOISE, Prepared, coarser_level, prepare, read_scan, why_no_texture
-from curvafit.scan.structure import check_options, is_rounded, read_region, sample_mask
+from curvafit.scan.quality import sample_mask
+from curvafit.scan.structure import check_options, is_rounded, read_region
 from curvafit.volumes.boxes import Crop
 from curvafit.volumes.read import Source
 from curvafit.volumes.volume import Volume

@@ -18,7 +18,7 @@ from curvafit.geometry.descriptors import BLOCKS
 from curvafit.priors.coefficients import Coefficients
 from curvafit.scan.measure import Reading
 from curvafit.scan.prepare import thinner_thickness
-from curvafit.scan.structure import sample_mask
+from curvafit.scan.quality import sample_mask
 from curvafit.volumes.volume import Volume
 
 _REMEDY = "describe the stores into another file, or with --overwrite"

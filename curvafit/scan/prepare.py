@@ -15,7 +15,8 @@ from curvafit.geometry.diagram import Diagram
 from curvafit.geometry.topology import betti_numbers
 from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
 from curvafit.scan import grids, structure
-from curvafit.scan.structure import Kind, Quality
+from curvafit.scan.quality import Quality, measure_quality, sample_mask
+from curvafit.scan.structure import Kind
 from curvafit.volumes.boxes import Box, Crop
 from curvafit.volumes.read import Source, levels_of, load
 from curvafit.volumes.volume import ScanError, Volume
@@ -122,7 +123,7 @@ class Prepared:
         step = [thickness / (scale * self.thickness) for scale in self.scale]
         z, y, x = (self.working_voxel / scale for scale in self.scale)
         if quality is None:
-            values = structure.sample_mask(mask, step, keep_volume=True).astype(np.uint8)
+            values = sample_mask(mask, step, keep_volume=True).astype(np.uint8)
         else:
             values = quality.image(mask, step, seed).astype(np.float32)
         options = {"periodic": self.grid.periodic, "one_scale": self.one_scale, "quality": quality}
@@ -255,7 +256,7 @@ def prepare(
     noise = seen != "field" and structure.is_noise(mask)
     prepared = _put_on_grid(_Scan(seen, signed, periodic, region, noise, one_scale), most)
     if seen == "image" and quality is None:
-        quality = structure.measure_quality(-part.values if dark else part.values, mask, part.spacing)
+        quality = measure_quality(-part.values if dark else part.values, mask, part.spacing)
     corner = tuple(s.start + o for s, o in zip(where, prepared.origin, strict=True))
     return replace(prepared, quality=quality, origin=corner)  # type: ignore[arg-type]
 

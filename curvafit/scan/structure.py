@@ -1,7 +1,4 @@
-"""What in a scan is structure, how blurred it is and how noisy.
-
-`find_structure` decides the kind of a scan and splits structure from background. `Quality` is how the scan blurs and
-how noisy it is, measured from its grey levels (`measure_quality`), and images a grown shape alike (`Quality.image`).
+"""What in a scan is structure: its kind, and how structure and background are split, from blocks of any number.
 
 Two rooms split grey levels otherwise, on purpose. `segmentation.evidence` needs the noise of each voxel: it smooths as
 far as the noise asks, and splits half way between the means of the raw levels. `data_synth.imaging` follows brightness
@@ -12,7 +9,7 @@ threshold.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -22,13 +19,18 @@ from scipy import ndimage
 from skimage.filters import threshold_otsu
 
 from curvafit.core.checks import SEEDS, check_choice, check_float, check_int
-from curvafit.scan.grids import boxes_by_surface, centre_distance, resample, surface_voxels
-from curvafit.volumes.boxes import Box, Crop
+from curvafit.volumes.boxes import Box, Crop, cut_boxes, grow, within
 from curvafit.volumes.place import lay
 from curvafit.volumes.read import Source, load
+from curvafit.volumes.run import Record, Run
 from curvafit.volumes.volume import ScanError, Volume, round_labels
 
 Kind = Literal["field", "mask", "image"]
+
+#: Voxels that the first passes read at once.
+PIECE = 2**24
+#: The most grey levels of a volume of whole numbers whose threshold is found.
+_MOST_LEVELS = 2**22
 
 #: Median third difference of neighbours from which values are noisy; fields rounded to 1/100 reach 0.02.
 JITTER = 0.045
@@ -36,23 +38,8 @@ JITTER = 0.045
 PLATEAUS, PLATEAU = 0.6, 0.35
 #: Offsets in scan voxels, beyond the reach of smoothing, and the correlation that noise stays below there.
 LAGS, UNCORRELATED = (4, 5, 6, 7, 8), 0.06
-#: Blurs that are tried, in voxels of the finest axis.
-_BLURS = (0.0, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
-#: Shifts of the boundary that are tried, in voxels of the finest axis.
-_SHIFTS = (-0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5)
-#: Grains that are tried, in voxels of the finest axis.
-_GRAINS = (0.0, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0)
-#: Edge of the box in which a scan's noise and blur are measured.
-_MEASURED = 64
-#: Voxels this far from the surface lie deep within their phase; the least number of them; and the width beyond which
-#: grey levels vary by their lighting, in voxels of the finest axis.
-_DEEP, _FEWEST, _UNEVEN = 3.5, 500, 4.0
 #: Voxels that smoothing grey levels reaches.
 SMOOTHED = 3
-#: Median of the absolute value of a normal number.
-_NORMAL_MEDIAN = 0.6745
-#: Smoothed noise over contrast, and slices' thickness over the finest edge, from which on a scan is worse than a mask.
-NOISY, SLICED = 0.02, 1.5
 #: The least share of neighbours with labels that have the same one.
 _ALIKE = 0.25
 #: The most values of labels: grey levels of four bits have more.
@@ -71,6 +58,43 @@ PADDED, REACHED, TWO_PHASES = 0.1, 0.95, 0.45
 _ROUNDED_VALUES = 4096
 
 
+#: Values of a box that count for a threshold.
+Levels = Callable[[Box], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Request:
+    """A volume, and what the caller says of it."""
+
+    volume: Volume
+    label: int | None
+    kind: Literal["auto", "field", "mask", "image"]
+    threshold: Literal["otsu"] | float
+    dark: bool
+    region: Volume | None = (
+        None  # nonzero where the threshold of a padded scan is taken, or of any if that `alone` counts
+    )
+    alone: bool = False
+
+    def read(self, box: Box) -> np.ndarray:
+        """Return the values of a box; of a label, where it is."""
+        values = self.volume.read(box)
+        values = values if self.label is None else values == self.label
+        return values.view(np.uint8) if values.dtype.kind == "b" else values
+
+
+@dataclass(frozen=True)
+class Split:
+    """How a volume's structure is told from its background: the kind, the extremes, and the threshold of an image."""
+
+    kind: Kind
+    lowest: float
+    highest: float
+    two: bool
+    level: float = 0.0
+    padding: Padding | None = None
+
+
 def find_structure(
     field: Volume,
     *,
@@ -81,34 +105,45 @@ def find_structure(
     periodic: bool = False,
     extremes: tuple[float, float] | None = None,
 ) -> tuple[Kind, Volume]:
-    """Return the kind of a scan, and the scan as float32 values that are above 0 in its structure, with notes on how.
+    """Return the kind of a scan in memory, and it as float32 values that are above 0 in its structure, with notes.
 
     The parameters are as in `prepare.prepare`; `extremes` are the lowest and highest value of the whole that `field` is
     a part of: they tell a mask's two values. Raises ScanError if the threshold splits nothing or a phase is empty.
     """
-    values = field.values
-    lowest, highest = (values.min(), values.max()) if extremes is None else extremes
-    two = bool(np.all((values == lowest) | (values == highest)))
-    seen = _guess_kind(values, threshold, two) if kind == "auto" else kind
-    if seen == "field":
-        note = f"Taken for a phase field: values {values.min():.3g} to {values.max():.3g}."
-        values = (-values if dark else values).astype(np.float32)
-    elif seen == "mask":
-        note = f"Taken for a mask of the values {float(lowest):g} and {float(highest):g}." if two else SEVERAL
-        mask = values == highest if two and lowest < highest else values > 0
-        values = np.where(mask != dark, np.float32(1), np.float32(-1))
-    else:
-        padding, corner = None, values[0, 0, 0]
-        if np.count_nonzero(values == corner) > PADDED * values.size:
-            padding = judge_padding(corner, count_constant(values, corner))
-        values, note = _split_image(field, threshold, dark, region, periodic, padding)
-        note = " ".join([*describe_padding(padding, threshold == "otsu", region is not None), note])
-    counted = values > 0 if region is None else values[region] > 0
-    if not counted.any():
-        raise ScanError("expected a structure in the scan, got none: every voxel is background")
-    if counted.all():
-        raise ScanError("expected background in the scan, got none: every voxel is structure")
-    return seen, replace(field, array=values, notes=(*field.notes, note))
+    inside = None if region is None else replace(field, array=region)
+    request = Request(field, None, kind, threshold, dark, inside, alone=True)
+    split, note = find_split(request, Run(), extremes)
+    z, y, x = (slice(0, n) for n in field.shape)
+    values = find_levels(request, split, (z, y, x), periodic)
+    counted = values if region is None else values[region]
+    if split.kind == "image":
+        note = describe_image(request, split, float(counted.min()), float(counted.max()))
+    check_phases(int(np.count_nonzero(counted > 0)), counted.size)
+    return split.kind, replace(field, array=values, notes=(*field.notes, note))
+
+
+def check_phases(inside: int, count: int) -> None:
+    """Raise ScanError unless some of a scan's voxels are in the structure, and others in the background."""
+    if inside in (0, count):
+        what, other = ("background", "structure") if inside else ("a structure", "background")
+        raise ScanError(f"expected {what} in the scan, got none: every voxel is {other}")
+
+
+def find_levels(request: Request, split: Split, box: Box, periodic: bool = False) -> np.ndarray:
+    """Return a box of a volume, all of a `periodic` one, as float32 values that are above 0 in its structure.
+
+    Grey levels are smoothed by one voxel of the finest axis, less the raw levels' threshold.
+    """
+    # Smoothing lowers thin structures' grey: a threshold of the smoothed levels would sink and make them fat.
+    if split.kind == "image":
+        around, volume = grow(box, SMOOTHED, request.volume.shape), request.volume
+        smooth = smooth_levels(request.read(around), volume.spacing, periodic, split.padding)
+        return sign_levels(smooth[within(box, around)], split.level, request.dark, split.padding)
+    values = request.read(box)
+    if split.kind == "field":
+        return (-values if request.dark else values).astype(np.float32)
+    mask = values == split.highest if split.two else values > 0
+    return np.where(mask != request.dark, np.float32(1), np.float32(-1))
 
 
 def check_options(kind: str, threshold: float | str, label: int | None = None) -> None:
@@ -122,6 +157,9 @@ def check_options(kind: str, threshold: float | str, label: int | None = None) -
             raise ValueError("a label states the structure: leave out kind and threshold, got both")
     if kind in ("field", "mask") and level != "otsu":
         raise ValueError(f"a threshold splits grey levels: leave it out for kind {kind}")
+
+
+# ---- regions, labels, noise, padding ---------------------------------------------------------------------------------
 
 
 def read_region(
@@ -194,18 +232,6 @@ def pairs_of_noise(shape: Sequence[int], share: float, pairs: np.ndarray) -> boo
 def is_rounded(u: np.ndarray) -> bool:
     """Return whether a field holds so few values that it was quantised: second differences of it are then noise."""
     return len(np.unique(np.asarray(u))) <= min(_ROUNDED_VALUES, math.prod(u.shape) // 16)
-
-
-def _guess_kind(values: np.ndarray, threshold: Literal["otsu"] | float, two: bool) -> Kind:
-    """Guess the kind: two values are a mask, as are labels; floats from about -1 to about 1, without noise and mostly
-    far from 0, are a phase field; anything else is an image."""
-    if two or (threshold == "otsu" and are_labels(list_values(values))):
-        return "mask"
-    if may_be_field(values.dtype, threshold, values.min(), values.max()):
-        jitter = float(np.median(np.abs(np.diff(values, 3, axis=2)))) if values.shape[2] > 3 else 0.0
-        if jitter < JITTER and np.count_nonzero(np.abs(values) > PLATEAU) > PLATEAUS * values.size:
-            return "field"
-    return "image"
 
 
 def may_be_field(dtype: np.dtype, threshold: Literal["otsu"] | float, lowest: float, highest: float) -> bool:
@@ -283,13 +309,6 @@ def describe_padding(padding: Padding | None, otsu: bool, inside: bool = False) 
     return (f"{told}; the threshold is taken{how}." if how and otsu else f"{told}.",)
 
 
-def _find_threshold(values: np.ndarray) -> float:
-    """Return the middle of the means of the two phases that Otsu's threshold splits."""
-    # Between two sharp levels all thresholds split alike and Otsu's is the lowest; else the two agree.
-    high = values > threshold_otsu(values)
-    return float(values[high].mean(dtype=np.float64) + values[~high].mean(dtype=np.float64)) / 2
-
-
 def smooth_levels(
     values: np.ndarray, spacing: tuple[float, float, float], periodic: bool = False, padding: Padding | None = None
 ) -> np.ndarray:
@@ -311,160 +330,157 @@ def sign_levels(smooth: np.ndarray, level: float, dark: bool, padding: Padding |
     return signed
 
 
-def describe_split(level: float, otsu: bool, dark: bool, lowest: float, highest: float) -> str:
-    """Return the note on a threshold; raise ScanError where it is not between the extremes of the smoothed levels."""
-    if not lowest < level < highest:
-        levels = f"{lowest:.4g} to {highest:.4g}"
-        raise ScanError(f"expected a threshold within the smoothed scan's {levels}, got {level:.4g}")
-    how, side = "Otsu's" if otsu else "the given", "dark" if dark else "bright"
-    return f"Smoothed by one voxel, split at {how} threshold of {level:.4g}: the {side} phase is the structure."
+def describe_image(request: Request, split: Split, lowest: float, highest: float) -> str:
+    """Return the note on padding and threshold, given the extremes of `find_levels`; raise ScanError where the
+    threshold is not between those of the smoothed levels."""
+    otsu, level = request.threshold == "otsu", split.level
+    low, high = (level - highest, level - lowest) if request.dark else (level + lowest, level + highest)
+    if not low < level < high:
+        raise ScanError(f"expected a threshold within the smoothed scan's {low:.4g} to {high:.4g}, got {level:.4g}")
+    how, side = "Otsu's" if otsu else "the given", "dark" if request.dark else "bright"
+    note = f"Smoothed by one voxel, split at {how} threshold of {level:.4g}: the {side} phase is the structure."
+    return " ".join([*describe_padding(split.padding, otsu, request.region is not None), note])
+
+
+# ---- kind and threshold ----------------------------------------------------------------------------------------------
+
+
+def find_split(request: Request, run: Run, extremes: tuple[Any, Any] | None = None) -> tuple[Split, str]:
+    """Return how structure and background are split, and a note for fields and masks; `extremes` as `find_structure`.
+
+    Two values are a mask, as are labels; floats from about -1 to about 1, without noise and mostly far from 0, are a
+    phase field; anything else is an image.
+    """
+    volume = request.volume
+    side = max(1, math.isqrt(PIECE // volume.shape[2]))
+    bars = cut_boxes(volume.shape, (side, side, volume.shape[2]))
+    value = request.read((slice(0, 1), slice(0, 1), slice(0, 1)))[0, 0, 0]
+    found = list(run("reading", partial(_look_at_values, request, bars, value), len(bars)))
+    total = add_records({name: each[name] for name in each if name not in ("two", "values")} for each in found)
+    if faults := int(total["faults"]):
+        raise ScanError(f"a volume must be finite, got {faults} values that are not in {volume.source}")
+    lowest, highest = total["lowest"], total["highest"]
+    first, last = (lowest, highest) if extremes is None else extremes
+    if first == last and request.label is not None:
+        raise ScanError(f"label {request.label} is no label of the scan, or the only one")
+    if first == last and volume.source:
+        raise ScanError(f"every voxel of {volume.source} is {lowest}: a volume must vary")
+    ends = {float(first), float(last)}
+    two = all(bool(each["two"]) and {float(each["lowest"]), float(each["highest"])} <= ends for each in found)
+    kind, values = request.kind, np.unique(np.concatenate([each["values"] for each in found]))
+    if kind == "auto":
+        kind = "mask" if two or (request.threshold == "otsu" and are_labels(values)) else "image"
+        if kind == "image" and may_be_field(volume.dtype, request.threshold, float(lowest), float(highest)):
+            steady = 2 * total["steady"] > total["steps"] or not total["steps"]
+            kind = "field" if steady and total["plateau"] > PLATEAUS * math.prod(volume.shape) else "image"
+    split = Split(kind, float(first), float(last), two and bool(first < last))
+    if kind == "field":
+        return split, f"Taken for a phase field: values {float(lowest):.3g} to {float(highest):.3g}."
+    if kind == "mask":
+        note = f"Taken for a mask of the values {split.lowest:g} and {split.highest:g}."
+        return split, note if two else SEVERAL
+    size = math.prod(volume.shape)
+    return _split_image(request, bars, split, total, value, size, run), ""
 
 
 def _split_image(
-    field: Volume, threshold: Literal["otsu"] | float, dark: bool, region: Any, periodic: bool, padding: Padding | None
-) -> tuple[np.ndarray, str]:
-    """Return grey levels smoothed by one voxel of the finest axis, less the raw levels' threshold, and a note."""
-    # Smoothing lowers thin structures' grey: a threshold of the smoothed levels would sink and make them fat.
-    smooth = smooth_levels(field.values, field.spacing, periodic, padding)
-    counted = ... if region is None else region
-    if padding is not None and padding.sure:
-        counted = np.isfinite(smooth) & (True if region is None else region)
-    levels, raw = smooth[counted], field.values[counted]
-    if not raw.size or raw.min() == raw.max():
-        raise ScanError("expected grey levels that differ where they count, got one of them only")
-    level = _find_threshold(raw) if threshold == "otsu" else float(threshold)
-    note = describe_split(level, threshold == "otsu", dark, float(levels.min()), float(levels.max()))
-    return sign_levels(smooth, level, dark, padding), note
+    request: Request, bars: Sequence[Box], split: Split, total: Record, value: Any, size: int, run: Run
+) -> Split:
+    """Return the split with the padding and the threshold of an image of so many voxels, of which `total` is known."""
+    levels, ends = partial(_read_levels, request, None, False), (total["lowest"], total["highest"])
+    if total["constant"] > PADDED * size:
+        counted = add_records(run("looking for padding", partial(_count_padding, request, bars, value), len(bars)))
+        split = replace(split, padding=judge_padding(value, counted["padding"]))
+    if request.threshold != "otsu":
+        return replace(split, level=float(request.threshold))
+    sure, inside = split.padding is not None and split.padding.sure, split.padding is not None or request.alone
+    if sure or (inside and request.region is not None):
+        levels = partial(_read_levels, request, value if sure else None, True)
+        counted = add_records(run("looking at levels", partial(_look_at_levels, levels, bars), len(bars)))
+        if not counted or counted["lowest"] == counted["highest"]:
+            raise ScanError("expected grey levels that differ where they count, got one of them only")
+        ends = (counted["lowest"], counted["highest"])
+    return replace(split, level=_find_threshold(levels, bars, *ends, run))
 
 
-@dataclass(frozen=True)
-class Quality:
-    """Blur and noise of a scan.
-
-    Attributes
-    ----------
-    blur
-        Deviation of the Gaussian that blurs the structure, in voxels of the finest axis.
-    noise
-        Deviation of the noise over the contrast of the two phases.
-    grain
-        Deviation of the Gaussian that correlates the noise, in voxels of the finest axis; 0 of white noise.
-    boundary_shift
-        How far the split structure reaches beyond the true one, in voxels of the finest axis.
-    spacing
-        Voxel edges (z, y, x) of the scan.
-    """
-
-    blur: float
-    noise: float
-    grain: float
-    boundary_shift: float
-    spacing: tuple[float, float, float]
-
-    @property
-    def smoothed(self) -> float:
-        """Return the noise, over the contrast, that is left after smoothing by a voxel of the finest axis."""
-        return self.noise * _smoothing_factor(self.grain, self.spacing)
-
-    @property
-    def degraded(self) -> bool:
-        """Return whether a texture is harder to read from the scan than from a mask."""
-        return self.smoothed > NOISY or max(self.spacing) > SLICED * min(self.spacing)
-
-    def image(self, mask: np.ndarray, step: Sequence[float], seed: int) -> np.ndarray:
-        """Return grey levels of a periodic mask `(Z, Y, X)` as this scan would show it: blurred, sampled on voxels of
-        `step` of the mask's (z, y, x), and made noisy with noise of a seed."""
-        filled = np.clip(centre_distance(mask, (1.0, 1.0, 1.0), 2.0, periodic=True) + 0.5, 0, 1)
-        grey = resample(filled, step, (0, 0, 0), sampled_shape(mask.shape, step), periodic=True)
-        widths = [min(self.spacing) / h for h in self.spacing]
-        grey = ndimage.gaussian_filter(grey, [self.blur * width for width in widths], mode="wrap")
-        noise = np.random.default_rng(seed).standard_normal(grey.shape, dtype=np.float32)
-        noise = ndimage.gaussian_filter(noise, [self.grain * width for width in widths], mode="wrap")
-        return grey + np.float32(self.noise) * noise / noise.std()
+def _look_at_values(request: Request, bars: Sequence[Box], value: Any, number: int) -> Record:
+    """Return the extremes of a bar, how many voxels have a value, whether it has two values at most, and what tells
+    labels and a phase field."""
+    values = request.read(bars[number])
+    lowest, highest = values.min(), values.max()
+    found = {"lowest": lowest, "highest": highest, "two": np.all((values == lowest) | (values == highest))}
+    found["values"] = np.array([lowest, highest]) if found["two"] else list_values(values)
+    found["constant"] = np.int64(np.count_nonzero(values == value))
+    if values.dtype.kind != "f":
+        return {**found, "faults": np.int64(0)}
+    found["faults"] = np.int64(values.size - np.count_nonzero(np.isfinite(values)))
+    if request.kind == "auto" and not found["faults"] and lowest >= -2 and highest <= 2:
+        steps = np.abs(np.diff(values, 3, axis=2)) if values.shape[2] > 3 else np.empty(0)
+        found |= {"steady": np.count_nonzero(steps < JITTER), "steps": np.int64(steps.size)}
+        found["plateau"] = np.count_nonzero(np.abs(values) > PLATEAU)
+    return {name: np.asarray(value) for name, value in found.items()}
 
 
-def sample_mask(
-    mask: np.ndarray, step: Sequence[float], periodic: bool = True, *, keep_volume: bool = False
-) -> np.ndarray:
-    """Return a mask `(Z, Y, X)` on voxels of `step` of its own (z, y, x), by signed distances: a thin structure loses
-    some per cent of its volume, unless `keep_volume` moves its surface outwards by as much."""
-    distance = centre_distance(mask, (1.0, 1.0, 1.0), 4 * max(1.0, *step), periodic)
-    sampled = resample(distance, step, (0, 0, 0), sampled_shape(mask.shape, step), periodic=periodic)
-    return sampled > (np.quantile(sampled, 1 - mask.mean()) if keep_volume else 0)
+def _count_padding(request: Request, bars: Sequence[Box], value: Any, number: int) -> Record:
+    """Return what tells padding with a value in a bar."""
+    return {"padding": count_constant(request.read(bars[number]), value)}
 
 
-def sampled_shape(shape: Sequence[int], step: Sequence[float]) -> tuple[int, ...]:
-    """Return how many voxels of `step` lie along the axes of a box of voxels of 1."""
-    return tuple(max(4, int(n / h)) for n, h in zip(shape, step, strict=True))
+def _read_levels(request: Request, left: float | None, inside: bool, box: Box) -> np.ndarray:
+    """Return the values of a box but one that is left out, `inside` of the region, if there is one."""
+    values = request.read(box)
+    counted = np.ones(values.shape, dtype=bool) if left is None else values != left
+    if inside and request.region is not None:
+        counted &= request.region.read(box) != 0
+    return values[counted]
 
 
-def measure_quality(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, float, float]) -> Quality:
-    """Measure blur and noise of a scan from its structure.
-
-    Blur, contrast and shift of the boundary are those with which the structure, blurred, explains the grey levels best
-    (least squares over `_BLURS` and `_SHIFTS`); thin structures come out too fat where noise shifts the threshold. The
-    noise is the deviation of grey levels deep within the phases, less uneven lighting. Where nothing lies deep, the
-    noise is taken for white and read from second differences along three axes, which neither structure nor lighting
-    passes (Immerkær 1996). The mask of the structure is bool, of the image's shape `(Z, Y, X)`. Raises ScanError if the
-    grey levels have no contrast between structure and background.
-    """
-    box = next(iter(boxes_by_surface(surface_voxels(mask), _MEASURED)), (slice(None),) * 3)
-    image, mask = image[box].astype(np.float32), mask[box]
-    levels = image - image.mean()
-    edges = [h / min(spacing) for h in spacing]
-    blur, contrast, shift = _fit_blur(levels, mask, edges)
-    if not contrast > 0:
-        raise ScanError("expected grey levels that tell structure from background, got none that do")
-    noise, left = _measure_deep_noise(levels, mask, edges) or (_measure_white_noise(levels), 0.0)
-    grain = min(_GRAINS, key=lambda width: abs(_smoothing_factor(width, spacing) - left))
-    return Quality(blur, noise / contrast, grain, shift, spacing)
+def _look_at_levels(levels: Levels, bars: Sequence[Box], number: int) -> Record:
+    """Return the extremes of a bar's values that count."""
+    values = levels(bars[number])
+    return {"lowest": values.min(), "highest": values.max()} if values.size else {}
 
 
-def _fit_blur(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> tuple[float, float, float]:
-    """Return blur, contrast and boundary shift of levels of mean 0 on voxels with edges in units of the finest."""
-    distance = centre_distance(mask, edges, 4.0)
-    explained = []
-    for shift in _SHIFTS:
-        filled = np.clip(distance - shift + 0.5, 0, 1)
-        for blur in _BLURS:
-            model = ndimage.gaussian_filter(filled, [blur / h for h in edges])
-            model -= model.mean()
-            product, square = float((model * levels).mean()), float(np.square(model).mean())
-            if square > 0:
-                explained.append((product * abs(product) / square, blur, product / square, shift))
-    return max(explained)[1:]
+def _find_threshold(levels: Levels, bars: Sequence[Box], lowest: Any, highest: Any, run: Run) -> float:
+    """Return the threshold of the levels that count, as `find_structure` finds it."""
+    lowest, highest = lowest[()], highest[()]
+    whole = lowest.dtype.kind in "iu"
+    if whole and int(highest) - int(lowest) >= _MOST_LEVELS:
+        raise ScanError(f"expected at most {_MOST_LEVELS} grey levels, got {lowest} to {highest}: give a threshold")
+    name = "finding the threshold"
+    counts = add_records(run(name, partial(_count_levels, levels, bars, lowest, highest), len(bars)))["counts"]
+    if whole:
+        centres = np.arange(int(lowest), int(highest) + 1)
+        high = centres > threshold_otsu(hist=(counts, centres))
+        means = [np.dot(counts[side], centres[side].astype(np.float64)) / counts[side].sum() for side in (high, ~high)]
+        return float(sum(means)) / 2
+    edges = np.histogram_bin_edges(np.empty(0, lowest.dtype), 256, (lowest, highest))
+    otsu = threshold_otsu(hist=(counts, (edges[1:] + edges[:-1]) / 2))
+    sums = add_records(run(f"{name}'s sides", partial(_sum_sides, levels, bars, otsu), len(bars)))["sums"]
+    return float(sums[0, 1] / sums[0, 0] + sums[1, 1] / sums[1, 0]) / 2
 
 
-def _measure_deep_noise(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> tuple[float, float] | None:
-    """Return the deviation of levels deep within the phases and the share of it that smoothing leaves, or None."""
-    smoothing, uneven = ([width / h for h in edges] for width in (1.0, _UNEVEN))
-    both = (levels, ndimage.gaussian_filter(levels, smoothing))
-    squares, count = np.zeros(2), 0
-    for phase in (mask, ~mask):
-        deep = np.asarray(ndimage.distance_transform_edt(phase, sampling=edges)) >= _DEEP
-        around = np.maximum(ndimage.gaussian_filter(deep.astype(np.float32), uneven), 1e-6)
-        for k, each in enumerate(both):
-            mean = ndimage.gaussian_filter(np.where(deep, each, 0), uneven) / around
-            squares[k] += float(np.square((each - mean)[deep], dtype=np.float64).sum())
-        count += int(np.count_nonzero(deep))
-    if count < _FEWEST:
-        return None
-    noise, smoothed = np.sqrt(squares / count)
-    return float(noise), float(smoothed / max(noise, 1e-30))
+def _count_levels(levels: Levels, bars: Sequence[Box], lowest: Any, highest: Any, number: int) -> Record:
+    """Return a histogram of a bar: of each whole number, or of 256 bins."""
+    values = levels(bars[number])
+    if values.dtype.kind not in "iu":
+        return {"counts": np.histogram(values, 256, (lowest, highest))[0]}
+    return {"counts": np.bincount(values.astype(np.int64) - int(lowest), minlength=int(highest) - int(lowest) + 1)}
 
 
-def _measure_white_noise(levels: np.ndarray) -> float:
-    """Return the deviation of white noise in levels."""
-    for axis in range(3):
-        levels = np.diff(levels, 2, axis)
-    return float(np.median(np.abs(levels))) / _NORMAL_MEDIAN / 6**1.5
+def _sum_sides(levels: Levels, bars: Sequence[Box], level: float, number: int) -> Record:
+    """Return the numbers and sums of the values above a level, and of the others."""
+    values = levels(bars[number])
+    high = values > level
+    sides = [(values[side].size, values[side].sum(dtype=np.float64)) for side in (high, ~high)]
+    return {"sums": np.array(sides, dtype=np.float64)}
 
 
-def _smoothing_factor(grain: float, spacing: Sequence[float]) -> float:
-    """Return the factor by which smoothing by a voxel of the finest axis lowers the deviation of noise of a grain."""
-    spike, left = np.eye(1, 65, 32)[0], 1.0
-    for edge in spacing:
-        width = min(spacing) / edge
-        noise = ndimage.gaussian_filter(spike, grain * width)
-        left *= float(np.linalg.norm(ndimage.gaussian_filter(noise, width)) / np.linalg.norm(noise))
-    return left
+def add_records(found: Iterable[Record]) -> dict[str, np.ndarray]:
+    """Return the sums over pieces; of what is called lowest and highest the extremes."""
+    total: dict[str, np.ndarray] = {}
+    for each in found:
+        for name, value in each.items():
+            join = {"lowest": np.minimum, "highest": np.maximum}.get(name, np.add)
+            total[name] = join(total[name], value) if name in total else value
+    return total

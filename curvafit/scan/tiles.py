@@ -31,8 +31,8 @@ from curvafit.scan import measure as whole
 from curvafit.scan.grids import CutOut, centre_distance, profile_mask, remove_specks, resample
 from curvafit.scan.measure import Blocks, Measures
 from curvafit.scan.prepare import DROPPED, LARGEST_BOX, WORKED, Prepared, TooLarge, note_on_filling, smallest_piece
-from curvafit.scan.structure import check_options, read_labels, read_region
-from curvafit.scan.survey import Plan, Request, survey
+from curvafit.scan.structure import Request, check_options, read_labels, read_region
+from curvafit.scan.survey import Plan, survey
 from curvafit.volumes.boxes import Box, cut_boxes, grow, within
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.run import Record, open_run
@@ -138,39 +138,17 @@ def _measure_whole(field: Volume, periodic: bool, progress: Progress, kind: str,
     return whole.summarise_sums(field, maps.kind, blocks, table, connectivity, maps.diagram, maps.notes)
 
 
-@dataclass(frozen=True)
-class Tiling:
-    """The cores of a volume's tiles, and the factors of the coarser grids on which balls of both phases are painted."""
-
-    plan: Plan
-    cores: tuple[Box, ...]
-    factors: tuple[int, int] = (1, 1)
-
-    @property
-    def finest(self) -> Blocks:
-        """Return the division whose parts make up the blocks of any number along an axis up to `MOST`."""
-        starts = (
-            sorted({n * k // count for count in range(1, whole.MOST + 1) for k in range(count)}) for n in self.shape
-        )
-        return Blocks(self.shape, tuple(map(tuple, starts)))  # type: ignore[arg-type]
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Return the shape of the volume."""
-        return self.plan.volume.shape
-
-    def describe(self, processes: int) -> str:
-        """Return how many tiles there are, and how much memory they take at most, as a sentence."""
-        sides = " x ".join(str(max(core[axis].stop - core[axis].start for core in self.cores)) for axis in range(3))
-        spacing = self.plan.volume.spacing
-        reach = _reach(self.plan.reach, min(spacing))
-        most = 0
-        for core in self.cores:
-            around = grow(core, [math.ceil(reach / h) + 1 for h in spacing], self.shape)
-            worked = _around(self.plan, core)[0]
-            most = max(most, *(math.prod(edge.stop - edge.start for edge in box) for box in (around, worked)))
-        each, base = processes * _EACH * most, (processes + (processes > 1)) * _PROGRAM
-        return f"{len(self.cores)} tiles of {sides} voxels, in about {(each + base) / 1e9:.2g} GB of memory."
+def _describe_tiles(plan: Plan, processes: int) -> str:
+    """Return how many tiles there are, and how much memory they take at most, as a sentence."""
+    sides = " x ".join(str(max(core[axis].stop - core[axis].start for core in plan.cores)) for axis in range(3))
+    spacing, most = plan.volume.spacing, 0
+    reach = _reach(plan.reach, min(spacing))
+    for core in plan.cores:
+        around = grow(core, [math.ceil(reach / h) + 1 for h in spacing], plan.volume.shape)
+        boxes = (around, _around(plan, core)[0])
+        most = max(most, *(math.prod(edge.stop - edge.start for edge in box) for box in boxes))
+    each, base = processes * _EACH * most, (processes + (processes > 1)) * _PROGRAM
+    return f"Measured in {len(plan.cores)} tiles of {sides} voxels, in about {(each + base) / 1e9:.2g} GB of memory."
 
 
 def _choose_edges(plan: Plan) -> tuple[int, ...]:
@@ -192,11 +170,11 @@ def _reach(radius: float, edge: float) -> float:
 # ---- one tile --------------------------------------------------------------------------------------------------------
 
 
-def measure_tile(tiling: Tiling, number: int) -> Record:
+def measure_tile(plan: Plan, number: int) -> Record:
     """Return the sums over a tile's core, on the rows of the finest division that it touches, and what else adds up."""
-    plan, core = tiling.plan, tiling.cores[number]
-    sums = _Sums(tiling, core)
-    balls = _measure_balls(plan, core, tiling.factors)
+    core = plan.cores[number]
+    sums = _Sums(plan, core)
+    balls = _measure_balls(plan, core, plan.factors)
     mask, inner = balls.mask, within(core, balls.box)
     voxel = math.prod(plan.volume.spacing)
     sums.add("volume", np.ones(mask[inner].shape, dtype=bool), voxel)
@@ -205,7 +183,7 @@ def measure_tile(tiling: Tiling, number: int) -> Record:
     lower = tuple(slice(edge.start - (edge.start > 0), edge.stop) for edge in inner)
     first = tuple(slice(edge.start - part.start, None) for edge, part in zip(inner, lower, strict=True))
     sums.add("χ", euler_shares(mask[lower])[first], 1.0)
-    ends = tuple((edge.start == 0, edge.stop == n) for edge, n in zip(core, tiling.shape, strict=True))
+    ends = tuple((edge.start == 0, edge.stop == n) for edge, n in zip(core, plan.volume.shape, strict=True))
     found = {"euler": np.float64(euler_of_window(mask[lower], ends)), "pieces": np.array(balls.pieces)}
     found |= {"widest": np.array(balls.widest), "wide": np.array(balls.wide)}
     with_surface = _measure_surface(plan, mask, balls.box, core)
@@ -216,11 +194,11 @@ def measure_tile(tiling: Tiling, number: int) -> Record:
     return {**found, **sums.rows}
 
 
-def _measure_wide(tiling: Tiling, number: int) -> Record:
+def _measure_wide(plan: Plan, number: int) -> Record:
     """Return the sums over a tile's core that balls on a coarser grid change."""
-    plan, core = tiling.plan, tiling.cores[number]
-    sums, balls = _Sums(tiling, core), _measure_balls(plan, core, tiling.factors)
-    sums.add_thickness(balls.thickness, math.prod(plan.volume.spacing), *(factor > 1 for factor in tiling.factors))
+    core = plan.cores[number]
+    sums, balls = _Sums(plan, core), _measure_balls(plan, core, plan.factors)
+    sums.add_thickness(balls.thickness, math.prod(plan.volume.spacing), *(factor > 1 for factor in plan.factors))
     return sums.rows
 
 
@@ -230,8 +208,8 @@ class _Sums:
     The part of no name is all, `INSIDE` the region, and a number one of its labels.
     """
 
-    def __init__(self, tiling: Tiling, core: Box) -> None:
-        finest, plan, names = tiling.finest, tiling.plan, [_WHOLE]
+    def __init__(self, plan: Plan, core: Box) -> None:
+        finest, names = plan.finest, [_WHOLE]
         self._finest, self._core, self._near, self._labels = finest, core, core, None
         self._where, starts = [], []
         for edge, all_starts in zip(core, finest.starts, strict=True):
@@ -241,7 +219,7 @@ class _Sums:
         z, y, x = (edge.stop - edge.start for edge in core)
         self._local = Blocks((z, y, x), tuple(starts))  # type: ignore[arg-type]
         if plan.request.region is not None:  # surface lies up to a working voxel beyond the core
-            self._near = grow(core, [math.ceil(s) + 2 for s in plan.scale], tiling.shape)
+            self._near = grow(core, [math.ceil(s) + 2 for s in plan.scale], plan.volume.shape)
             self._labels = plan.request.region.read(self._near)
             names += [INSIDE, *(str(label) for label in np.unique(self._labels).tolist() if label)]
         self.tables = {name: np.zeros((finest.count, len(whole.SUMS))) for name in names}
@@ -488,23 +466,23 @@ def measure_tiles(
     same |= {"dark": request.dark, "tile": edge, "region": request.region and request.region.digest}
     with open_run(workers, store, same, progress, {_FIRST: 0.95, _AGAIN: 1.0}) as run, one_thread():
         plan = survey(request, run)
-        tiling = Tiling(plan, tuple(cut_boxes(plan.volume.shape, edge or _choose_edges(plan))))
-        stated = f"Measured in {tiling.describe(run.processes)}"
-        found = list(run(_FIRST, partial(measure_tile, tiling), len(tiling.cores), stated))
+        plan = replace(plan, cores=tuple(cut_boxes(plan.volume.shape, edge or _choose_edges(plan))))
+        stated = _describe_tiles(plan, run.processes)
+        found = list(run(_FIRST, partial(measure_tile, plan), len(plan.cores), stated))
         # the factors that `morphometry.local_thickness` chooses
         widest, finest = np.max([each["widest"] for each in found], axis=0), min(plan.volume.spacing)
-        wide = replace(tiling, factors=tuple(max(1, math.ceil(each / finest / COARSE)) for each in widest))
+        wide = replace(plan, factors=tuple(max(1, math.ceil(each / finest / COARSE)) for each in widest))
         again: list[Record] = []
         if max(wide.factors) > 1:
-            again = list(run(_AGAIN, partial(_measure_wide, wide), len(tiling.cores)))
+            again = list(run(_AGAIN, partial(_measure_wide, wide), len(plan.cores)))
     return _summarise(wide, found, again, stated)
 
 
-def _summarise(tiling: Tiling, found: Sequence[Record], again: Sequence[Record], stated: str) -> Measures:
+def _summarise(plan: Plan, found: Sequence[Record], again: Sequence[Record], stated: str) -> Measures:
     """Return the measures of a volume, and of the parts of its region, from what was found in its tiles."""
-    plan, finest, shape = tiling.plan, tiling.finest, tiling.shape
+    finest, shape = plan.finest, plan.volume.shape
     parts = {name.removeprefix("rows") for each in found for name in each if name.startswith("rows")}
-    tables = {part: _sum_tiles(tiling, found, again, part) for part in parts}
+    tables = {part: _sum_tiles(plan, found, again, part) for part in parts}
     total = dict(zip(whole.SUMS, tables[_WHOLE].sum(0), strict=True))
     if not 0 < total["inside"] < total["volume"]:
         raise ScanError("expected a structure and background in the scan, got one of them only")
@@ -516,7 +494,7 @@ def _summarise(tiling: Tiling, found: Sequence[Record], again: Sequence[Record],
     χ = float(sum(each["euler"] for each in found))
     sampled = math.prod(max(n - 1, 1) for n in shape) * math.prod(plan.volume.spacing)
     none = whole.no_curvature(plan.volume.unit, whole.TOO_THIN)
-    notes = (*_notes(tiling, found), *(() if curved else none[2]), *([stated] if len(tiling.cores) > 1 else []))
+    notes = (*_notes(plan, found), *(() if curved else none[2]), *([stated] if len(plan.cores) > 1 else []))
 
     def summarise(part: str, label: int | None = None) -> Measures:
         drawn = _draw(plan, found, part) if tables[part][:, whole.SUMS.index("curved")].any() else none[1]
@@ -530,13 +508,13 @@ def _summarise(tiling: Tiling, found: Sequence[Record], again: Sequence[Record],
     return replace(summarise(INSIDE), compartments={label: summarise(str(label), label) for label in labels})
 
 
-def _sum_tiles(tiling: Tiling, found: Sequence[Record], again: Sequence[Record], part: str) -> np.ndarray:
+def _sum_tiles(plan: Plan, found: Sequence[Record], again: Sequence[Record], part: str) -> np.ndarray:
     """Return the sums of all tiles over a part on the finest division."""
-    table, rows, sums = np.zeros((tiling.finest.count, len(whole.SUMS))), f"rows{part}", f"sums{part}"
+    table, rows, sums = np.zeros((plan.finest.count, len(whole.SUMS))), f"rows{part}", f"sums{part}"
     for each in found:
         if rows in each:
             table[each[rows]] += each[sums]
-    for factor, names in zip(tiling.factors, (("thickness", "thickness²"), ("gap",)), strict=True):
+    for factor, names in zip(plan.factors, (("thickness", "thickness²"), ("gap",)), strict=True):
         if factor > 1:
             table[:, [whole.SUMS.index(name) for name in names]] = 0
     for each in again:
@@ -566,9 +544,8 @@ def _draw(plan: Plan, found: Sequence[Record], part: str) -> Diagram:
     return Diagram(points, area, f"1/{plan.volume.unit}", math.sqrt(spread), lost)
 
 
-def _notes(tiling: Tiling, found: Sequence[Record]) -> tuple[str, ...]:
+def _notes(plan: Plan, found: Sequence[Record]) -> tuple[str, ...]:
     """Return notes on how a volume was measured, as `measure.measure` gives them."""
-    plan = tiling.plan
     notes = [f"{format_sampling(plan.volume.shape, plan.volume.spacing, plan.volume.unit)}.", *plan.notes]
     specks, holes = (int(n) for n in np.sum([each["pieces"] for each in found], axis=0))
     if specks or holes:

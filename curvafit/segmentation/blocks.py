@@ -24,7 +24,7 @@ from curvafit.core.files import remove
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.workers import Workers
 from curvafit.scan.prepare import LARGEST_BOX
-from curvafit.scan.survey import Request
+from curvafit.scan.structure import Request
 from curvafit.segmentation.filler import (
     REACH,
     SLOPE,

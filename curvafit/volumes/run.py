@@ -34,7 +34,7 @@ class Run:
     Parameters
     ----------
     crew
-        Who does it; each of several workers has one thread.
+        Who does it, by default this process; each of several workers has one thread.
     folder
         Where records stay, so that a killed run goes on; None for none.
     progress
@@ -43,7 +43,14 @@ class Run:
         The share of the work that is done after a pass, by its name; other passes take a fiftieth each.
     """
 
-    def __init__(self, crew: Workers, folder: Path | None, progress: Progress, ends: Mapping[str, float]) -> None:
+    def __init__(
+        self,
+        crew: Workers | None = None,
+        folder: Path | None = None,
+        progress: Progress = silent,
+        ends: Mapping[str, float] | None = None,
+    ) -> None:
+        crew, ends = crew or ThisProcess(), ends or {}
         self.alone = isinstance(crew, ThisProcess)
         self.processes = 1 if self.alone else max(1, crew.places // 2)
         self._crew, self._folder, self._progress, self._ends = crew, folder, progress, ends
@@ -118,7 +125,7 @@ def open_run(
     """
     mine = {name: str(each) for name, each in {**same, "curvafit": version("curvafit")}.items()}
     with join_workers(workers) as joined, nullcontext() if store is None else _lock(Path(store), mine) as folder:
-        yield Run(joined or ThisProcess(), folder, progress, ends or {})
+        yield Run(joined, folder, progress, ends)
 
 
 def open_mapped(path: Path, dtype: Any, shape: tuple[int, ...]) -> np.ndarray:

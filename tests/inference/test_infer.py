@@ -28,7 +28,7 @@ from curvafit.priors.law import FORMAT, Law, preset
 from curvafit.report.page import write_inference
 from curvafit.scan.measure import read_texture, scan_diagram
 from curvafit.scan.prepare import prepare
-from curvafit.scan.structure import Quality
+from curvafit.scan.quality import Quality
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 

@@ -15,7 +15,8 @@ from curvafit.priors import Grid, phase_field
 from curvafit.scan import prepare as preparing
 from curvafit.scan.grids import boxes_by_surface, centre_distance, median_thickness, remove_specks, resample
 from curvafit.scan.prepare import WORKING_THICKNESS, Prepared, coarser_level, is_ball, prepare, read_scan
-from curvafit.scan.structure import Quality, find_structure, is_noise, measure_quality, sample_mask
+from curvafit.scan.quality import Quality, measure_quality, sample_mask
+from curvafit.scan.structure import find_structure, is_noise
 from curvafit.volumes import ScanError, Volume, load, save
 
 

@@ -16,6 +16,7 @@ from curvafit.geometry.morphometry import local_thickness
 from curvafit.scan import tiles
 from curvafit.scan.instances import OF_BODIES, measure_instances
 from curvafit.scan.measure import Measures
+from curvafit.scan.survey import Plan
 from curvafit.scan.tiles import measure
 from curvafit.volumes import ScanError, Volume, save
 
@@ -130,7 +131,7 @@ def test_the_same_command_goes_on_after_a_kill(store: Path, tmp_path: Path, monk
     done("measure", store, "--tile", 40, "-o", whole)
     calls: list[int] = []
 
-    def stop(plan: tiles.Tiling, number: int, measured=tiles.measure_tile) -> object:
+    def stop(plan: Plan, number: int, measured=tiles.measure_tile) -> object:
         calls.append(number)
         if len(calls) == 3:
             raise KeyboardInterrupt
@@ -168,7 +169,7 @@ def test_a_store_that_ends_while_it_is_read(store: Path, tmp_path: Path, monkeyp
     scan, out = tmp_path / "scan.npy", tmp_path / "table.csv"
     np.save(scan, values)
 
-    def cut(plan: tiles.Tiling, number: int, measured=tiles.measure_tile) -> object:
+    def cut(plan: Plan, number: int, measured=tiles.measure_tile) -> object:
         if number == 1:
             scan.write_bytes(scan.read_bytes()[:5000])
         return measured(plan, number)
