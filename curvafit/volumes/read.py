@@ -33,8 +33,9 @@ from curvafit.volumes.formats.mrc import read_mrc
 from curvafit.volumes.formats.nifti import read_nifti
 from curvafit.volumes.formats.nrrd import read_metaimage, read_nrrd
 from curvafit.volumes.formats.scanco import read_aim, read_isq
-from curvafit.volumes.formats.tiff import SLICES, read_slices, read_tiff
-from curvafit.volumes.formats.zarr import list_levels, read_zarr
+from curvafit.volumes.formats.slices import SLICES, read_slices
+from curvafit.volumes.formats.tiff import read_tiff
+from curvafit.volumes.formats.zarr import list_levels, read_remote, read_zarr
 from curvafit.volumes.stated import to_volume
 from curvafit.volumes.volume import Volume, check_finite, check_varies, positive_triple
 
@@ -58,6 +59,9 @@ READERS: dict[str, Callable[..., Stated]] = {
     ".isq": read_isq,
     ".aim": read_aim,
 }
+
+#: The address of a store that is not on this machine.
+_ADDRESS = re.compile(r"[a-z][a-z0-9]+://")
 
 #: Readers of formats that can hold several arrays, by key.
 KEYED = (read_npz, read_hdf5, read_imaris, read_zarr, read_dicom)
@@ -156,7 +160,7 @@ def _open(
 class FileArray:
     """The array of a file, which each process opens for itself."""
 
-    def __init__(self, path: Path, how: Mapping[str, Any], array: Any) -> None:
+    def __init__(self, path: Path | str, how: Mapping[str, Any], array: Any) -> None:
         self.path, self.how, self.shape, self.dtype, self._array = path, how, tuple(array.shape), array.dtype, array
 
     def __getstate__(self) -> dict[str, Any]:
@@ -172,6 +176,8 @@ class FileArray:
     @property
     def digest(self) -> str:
         """A text that changes with the content, without reading it: of a folder the total size and latest time."""
+        if isinstance(self.path, str):
+            return f"{self.path} {self.how}"
         files = [path for path in self.path.rglob("*") if path.is_file()] if self.path.is_dir() else [self.path]
         states = [path.stat() for path in files]
         size, time = sum(state.st_size for state in states), max(state.st_mtime_ns for state in states)
@@ -195,9 +201,12 @@ def read_values(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def read_file(
-    path: Path, key: str | None = None, raw_shape: Sequence[int] | None = None, dtype: str | None = None
+    path: Path | str, key: str | None = None, raw_shape: Sequence[int] | None = None, dtype: str | None = None
 ) -> Stated:
-    """Return what a file or a folder states; what a library raises at damage is a ScanError."""
+    """Return what a file, a folder, or a store of an address states; what a library raises at damage is a ScanError."""
+    if isinstance(path, str):
+        with _name_damage(path):
+            return read_remote(path, key)
     if not path.exists():
         raise FileNotFoundError(one_line(f"no such file: {path}"))
     reader = pick_reader(check_regular(path), raw_shape is not None)
@@ -208,7 +217,7 @@ def read_file(
 
 
 @contextmanager
-def _name_damage(path: Path) -> Iterator[None]:
+def _name_damage(path: Path | str) -> Iterator[None]:
     """Turn what a library raises at damage into a ScanError that names the file, and keep what it prints."""
     try:
         with collect_complaints():
@@ -255,11 +264,14 @@ def _to_numpy(source: np.ndarray | torch.Tensor) -> np.ndarray:
     return source
 
 
-def split_key(path: str | os.PathLike[str], key: str | None) -> tuple[Path, str | None]:
-    """Return the file of a path, and the name of the array in the file, which the path may state after `::`."""
+def split_key(path: str | os.PathLike[str], key: str | None) -> tuple[Path | str, str | None]:
+    """Return the file of a path, and the name of the array in the file, which the path may state after `::`; of a store
+    that is not on this machine its address."""
     path = os.fspath(path)
     name, separator, inner = path.rpartition("::")
-    return (Path(path), key) if not separator or Path(path).exists() else (Path(name), key or inner or None)
+    if not separator or Path(path).exists():
+        name, inner = path, None
+    return (name if _ADDRESS.match(name) else Path(name)), key or inner or None
 
 
 def levels_of(source: object, key: str | None = None) -> dict[str, tuple[float, ...] | None]:
@@ -267,11 +279,11 @@ def levels_of(source: object, key: str | None = None) -> dict[str, tuple[float, 
     if not isinstance(source, str | os.PathLike):
         return {}
     path, key = split_key(source, key)
-    return list_levels(path, key) if path.is_dir() and pick_reader(path) is read_zarr else {}
+    return list_levels(path, key) if isinstance(path, Path) and path.is_dir() and pick_reader(path) is read_zarr else {}
 
 
 def _pick_folder(path: Path) -> Callable[..., Stated]:
-    """Return the reader of a folder: of a Zarr store, or of TIFF or DICOM slices."""
+    """Return the reader of a folder: of a Zarr store, or of slices, as images or DICOM."""
     inside = [p for p in path.iterdir() if not p.name.startswith(".")]
     if any(p.name in ("zarr.json", ".zarray", ".zgroup") for p in path.iterdir()) or path.suffix == ".zarr":
         return read_zarr
@@ -279,4 +291,4 @@ def _pick_folder(path: Path) -> Callable[..., Stated]:
         return read_slices
     if any(p.is_file() and is_dicom(p) for p in inside):
         return read_dicom
-    raise ScanError(f"the folder {path} holds neither TIFF or DICOM slices nor a Zarr store")
+    raise ScanError(f"the folder {path} holds neither slices (TIFF, BMP, PNG, JPEG, DICOM) nor a Zarr store")

@@ -11,6 +11,7 @@ import tifffile
 import zarr
 from calling import done
 from disk import unreadable
+from PIL import Image
 
 import curvafit
 from curvafit.segmentation.reconstruct import reconstruct_labels
@@ -129,15 +130,72 @@ def test_times(tmp_path: Path) -> None:
     unreadable(save(Volume(numbers()), tmp_path / "plain.tif"), "no axis of times", time=0)
 
 
+LOG = """[System]
+Scanner=Skyscan1172
+[Acquisition]
+Image Pixel Size (um)=3.99
+[Reconstruction]
+Reconstruction Program=NRecon
+Pixel Size (um)=7.98
+"""
+
+
 def test_odd_slices(tmp_path: Path) -> None:
-    """Hidden files among slices are left out, and slices of unlike types are said."""
+    """Hidden files, NRecon's preview and pictures of another kind among slices are left out; others must be alike."""
     values = numbers((6, 5, 7))
-    for k, plane in enumerate(values):
-        tifffile.imwrite(tmp_path / f"s{k}.tif", plane if k != 3 else plane.astype(np.uint16))
-        (tmp_path / f"._s{k}.tif").write_bytes(bytes.fromhex("0005160700020000") + bytes(200))
-    field = load(tmp_path)
-    assert np.array_equal(field.values, values)
-    assert any("s0.tif" in note and "s3.tif" in note for note in field.notes)
+    for name in ("tif", "bmp", "png", "palette", "types", "sizes", "logs"):
+        (tmp_path / name).mkdir()
+        for k, plane in enumerate(values):
+            place = tmp_path / name / f"s{k}"
+            if name in ("bmp", "png", "palette"):
+                image = Image.fromarray(plane)
+                if name == "palette":
+                    image = image.convert("P")
+                    image.putpalette([255 - grey for grey in range(256) for _ in range(3)])
+                image.save(place.with_suffix(".bmp" if name == "palette" else f".{name}"))
+            else:
+                odd = plane.astype(np.uint16) if (name, k) == ("types", 3) else plane
+                edge = 0.5 if (name, k) == ("sizes", 4) else 2.0
+                tifffile.imwrite(
+                    place.with_suffix(".tif"), odd, imagej=True, resolution=(edge,) * 2, metadata={"unit": "um"}
+                )
+            (place.parent / f"._s{k}.tif").write_bytes(bytes.fromhex("0005160700020000") + bytes(200))
+    for name in ("bmp", "logs"):
+        (tmp_path / name / "s_rec.log").write_text(LOG)
+    (tmp_path / "bmp" / "s__rec_spr.bmp").write_bytes(b"BM" + bytes(90))
+    Image.fromarray(values[0]).save(tmp_path / "tif" / "preview.png")
+    for name, expected, edge, note in (
+        ("tif", values, 0.5, "preview.png"), ("bmp", values, 7.98, "s_rec.log"), ("png", values, None, "no spacing"),
+        ("palette", 255 - values, None, "no spacing"),
+    ):  # fmt: skip
+        field = load(tmp_path / name)
+        assert np.array_equal(field.values, expected) and field.dtype == np.uint8
+        assert field.spacing == pytest.approx((edge or 1.0,) * 3) and field.unit == ("um" if edge else "voxel")
+        assert any(note in each for each in field.notes)
+    assert any("_spr" in each for each in load(tmp_path / "bmp").notes)
+    for name, word in (("types", "one type"), ("sizes", "one pixel size"), ("logs", "another pixel size")):
+        unreadable(tmp_path / name, word)
+    (tmp_path / "bmp" / "other.log").write_text("Pixel Size (um)=9")
+    unreadable(tmp_path / "bmp", "logs")
+
+
+def test_numbers_of_slices(tmp_path: Path) -> None:
+    """Deep grey levels and few annotated slices are kept; slices of a scan that lacks some are stacked."""
+    deep, labels = numbers((3, 5, 7), "uint16") * 200, np.zeros((31, 5, 7), np.uint8)
+    labels[[0, 4, 30], 1:3] = np.uint8([1, 2, 3])[:, None, None]
+    for name, which, planes in (
+        ("deep", (7, 8, 9), deep), ("few", (3, 7, 33), labels[[0, 4, 30]]), ("even", (10, 20, 30), deep),
+        ("lost", (1, 2, 5), deep),
+    ):  # fmt: skip
+        (tmp_path / name).mkdir()
+        for number, plane in zip(which, planes, strict=True):
+            Image.fromarray(plane).save(tmp_path / name / f"z{number:03d}.png")
+    few = load(tmp_path / "few")
+    assert np.array_equal(load(tmp_path / "deep").values, deep) and few.notes[0].startswith("3 slices lie")
+    assert np.array_equal(few.values, labels)
+    assert np.array_equal(load(tmp_path / "even").values, deep) and "step by 10" in load(tmp_path / "even").notes[0]
+    assert "after z002" in load(tmp_path / "lost").notes[0]
+    unreadable(tmp_path / "lost", "not whole", strict=True)
 
 
 def test_odd_dicom(tmp_path: Path) -> None:

@@ -13,11 +13,10 @@ import numpy as np
 
 from curvafit.core.checks import quoted
 from curvafit.core.records import read_member
+from curvafit.core.units import is_unit
 from curvafit.volumes.formats import base
 from curvafit.volumes.formats.base import ScanError, Stated
 
-#: Attributes that may state a spacing or its unit.
-_ATTRIBUTES = ("element_size_um", "spacing", "voxel_size", "unit", "units")
 _RAW_TYPES = "uint8, int8, uint16, int16, uint32, int32, float32, float64 (or with > for big-endian, as in >u2)"
 
 
@@ -44,16 +43,26 @@ def read_npz(path: Path, *, key: str | None = None, **_: object) -> Stated:
 
 
 def read_hdf5(path: Path, *, key: str | None = None, **_: object) -> Stated:
-    """Read a dataset, with spacing and unit (`element_size_um`, or `spacing` and `unit`) and ilastik's axes."""
+    """Read a dataset, with the axes of `axistags` or of its dimensions' labels, and what `read_spacing` finds."""
     import h5py
 
     file = h5py.File(path, "r")
     dataset: Any = file[base.pick_key(_list_datasets(file), key, path)]
     _check_dataset(dataset, path)
-    attributes = {name: dataset.attrs[name] for name in _ATTRIBUTES if name in dataset.attrs}
     tags = json.loads(dataset.attrs["axistags"])["axes"] if "axistags" in dataset.attrs else []
-    axes = base.name_axes([tag["key"] for tag in tags]) if len(tags) == dataset.ndim else "?" * dataset.ndim
-    return Stated(dataset, axes, **base.read_spacing(attributes, dataset.ndim), gaps=tuple(_gaps(dataset, path)))
+    tags = tags if len(tags) == dataset.ndim else []
+    labels = [dimension.label for dimension in dataset.dims]
+    names = [str(tag["key"]) for tag in tags] or labels
+    axes, place = base.name_axes(names), base.read_spacing(dataset.attrs, dataset.ndim)
+    if tags and any(labels) and base.name_axes(labels) != axes:
+        raise ScanError(
+            f"{path} calls its axes {', '.join(names)} in axistags, and {', '.join(labels)} in their labels"
+        )
+    steps = [float(tag.get("resolution") or 0) for tag in tags]
+    if "steps" not in place and tags and all(h > 0 for h, axis in zip(steps, axes, strict=True) if axis in "zyx"):
+        units = [text if is_unit(text := str(tag.get("description") or "")) else None for tag in tags]
+        place |= {"steps": [h or 1.0 for h in steps], "units": units}
+    return Stated(dataset, axes, **place, gaps=tuple(_gaps(dataset, path)))
 
 
 def read_imaris(path: Path, *, key: str | None = None, **_: object) -> Stated:

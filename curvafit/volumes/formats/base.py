@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,6 +19,8 @@ from curvafit.core.runtime import memory, one_line
 
 #: From DICOM's and ITK's patient frame (left, posterior, superior) to NIfTI's (right, anterior, superior).
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+#: A name like that of a spacing.
+_SPACING = re.compile("spacing|resolution|(voxel|pixel|element)_?size", re.IGNORECASE)
 #: Bytes of one read.
 _PIECE = 1 << 22
 
@@ -107,14 +110,28 @@ def pick_key(keys: list[str], key: str | None, path: object) -> str:
 
 
 def read_spacing(attributes: Mapping[str, Any], ndim: int) -> dict[str, Any]:
-    """Return steps and units from an array's attributes, unchecked; one number counts for all axes."""
-    for name, fixed_unit in (("element_size_um", "um"), ("spacing", None), ("voxel_size", None)):
-        if name in attributes:
-            sizes = _entries(attributes[name])
-            unit = fixed_unit or next(iter(_entries(attributes.get("unit", attributes.get("units")))), None)
-            sizes = sizes * ndim if len(sizes) == 1 else sizes
-            return {"steps": sizes, "units": (unit,) * len(sizes)}
-    return {}
+    """Return steps, units and origin from an array's attributes, unchecked; one number counts for all axes.
+
+    `resolution` and `offset` are CREMI's, in nm if no unit says otherwise. A note names what looks like a spacing and
+    is not used.
+    """
+    given = next(
+        (name for name in ("element_size_um", "spacing", "voxel_size", "resolution") if name in attributes), ""
+    )
+    like = [name for name in attributes if _SPACING.search(name) and name != given]
+    notes = (f"It has {', '.join(like)[:200]}, which is not used.",) if like else ()
+    if not given:
+        return {"notes": notes}
+    sizes = _entries(attributes[given])
+    unit = "um" if given == "element_size_um" else None
+    unit = unit or next(iter(_entries(attributes.get("unit", attributes.get("units")))), None)
+    sizes = sizes * ndim if len(sizes) == 1 else sizes
+    place: dict[str, Any] = {"steps": sizes, "units": (unit,) * len(sizes), "notes": notes}
+    if given == "resolution":
+        guess = "The file states no unit of its resolution: it is taken for nm."
+        place |= {"origin": _entries(attributes["offset"]) if "offset" in attributes else None}
+        place |= {} if unit else {"units": ("nm",) * len(sizes), "guesses": (guess,)}
+    return place
 
 
 def _entries(value: Any) -> tuple[Any, ...]:

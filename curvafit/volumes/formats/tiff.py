@@ -1,4 +1,4 @@
-"""TIFF, as a file or a folder of slices; the spacing is in ImageJ's, OME's or tifffile's description, or in tags."""
+"""TIFF; the spacing is in ImageJ's, OME's or tifffile's description, or in tags."""
 
 from __future__ import annotations
 
@@ -18,8 +18,6 @@ from curvafit.volumes.formats.base import ScanError, Stated
 if TYPE_CHECKING:
     import tifffile
 
-#: Suffixes of a folder's slices.
-SLICES = (".tif", ".tiff")
 #: Bytes beyond which ImageJ's TIFF cannot point.
 _IMAGEJ_LIMIT = 2**32 - 2**25
 #: Most voxels per unit that TIFF's resolution can state.
@@ -48,11 +46,13 @@ def read_tiff(path: Path, **_: object) -> Stated:
         steps, units, guesses = _read_spacing(file)
         axes = base.name_axes(series.axes)
         values, calibration = _calibrate(values, file.imagej_metadata or {})
-        count = len(file.series)
+        count, nodata = len(file.series), series.pages[0].tags.get(42113)  # type: ignore[union-attr]
     tags = [text for text in messages if text.startswith("<TiffTag")]
     if losses := [text for text in messages if text not in tags and _LOST.search(text)]:
         raise base.Damaged(losses[0])
     notes = (f"The file holds {count} images: the first is used.",) if count > 1 else ()
+    if nodata is not None:  # GDAL's
+        notes += (f"By the file, {nodata.value} stands where nothing was measured.",)
     notes += (f"{len(tags)} of the file's tags cannot be read: what they state is not known.",) if tags else ()
     return Stated(values, axes, steps, units, notes=(*notes, *calibration), guesses=guesses)
 
@@ -67,49 +67,6 @@ def _calibrate(values: np.ndarray, metadata: Mapping[str, Any]) -> tuple[np.ndar
     grey = np.maximum(values * np.float64(c1) + float(c0), 0 if metadata.get("zeroclip") else -np.inf)
     whole = float(c0).is_integer() and float(c1).is_integer()  # labels stay whole numbers
     return grey.astype(base.smallest_type(grey) if whole else np.float32), ()
-
-
-def read_slices(path: Path, **_: object) -> Stated:
-    """Read a folder of 2D slices in the natural order of their names, with the pixel size of the first slice."""
-    files = (p for p in path.iterdir() if p.suffix.lower() in SLICES and not p.name.startswith("."))
-    names = sorted(files, key=lambda p: natural_key(p.name))
-    first, planes = None, []
-    for name in names:
-        stated = read_tiff(base.check_regular(name))
-        first, plane = first or stated, _squeeze_plane(stated)
-        planes.append(plane)
-        if plane.ndim != 2 + ("s" in first.axes) or plane.shape != planes[0].shape:
-            got = f"{plane.shape} in {name.name} of {path}"
-            raise ScanError(f"slices must be 2D and of one shape {planes[0].shape}, got {got}")
-    assert first is not None
-    notes = first.notes
-    kinds = {str(plane.dtype): name.name for name, plane in zip(names[::-1], planes[::-1], strict=True)}
-    if len(kinds) > 1:
-        listed = ", ".join(f"{kind} in {name}" for kind, name in kinds.items())
-        notes += (f"The slices differ in type, {listed}: their values may not be of one scale.",)
-    gaps = _skipped_numbers([name.stem for name in names])
-    return first._replace(array=np.stack(planes), axes="zyxs"[: planes[0].ndim + 1], gaps=gaps, notes=notes)
-
-
-def _squeeze_plane(stated: Stated) -> np.ndarray:
-    """Return a slice (Y, X), or (Y, X, samples)."""
-    if "s" not in stated.axes:
-        return np.squeeze(stated.array)
-    values = np.moveaxis(stated.array, stated.axes.index("s"), -1)
-    return values.reshape([*(n for n in values.shape[:-1] if n != 1), values.shape[-1]])
-
-
-def _skipped_numbers(names: Sequence[str]) -> tuple[str, ...]:
-    """Return a sentence on numbers that are skipped, if the names of slices differ only in their last number."""
-    parts = [re.fullmatch(r"(.*?)(\d{1,15})(\D*)", name) for name in names]
-    if len(names) < 3 or None in parts or len({(part[1], part[3]) for part in parts if part}) > 1:
-        return ()
-    numbers = np.array([int(part[2]) for part in parts if part])
-    steps = np.diff(numbers)
-    at = int(steps.argmax())
-    if steps.min() < 1 or steps[at] == np.median(steps):
-        return ()
-    return (f"The numbers of the slices skip some, after {names[at]} for one: what is there is stacked.",)
 
 
 def _check_pages(file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> None:
@@ -176,11 +133,6 @@ def _to_tiff(values: np.ndarray) -> np.ndarray:
     if values.dtype.kind in "iu" and values.dtype.itemsize > 4:
         return values.astype(base.smallest_type(values))
     return values.astype(np.float32) if values.dtype == np.float16 else values
-
-
-def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Return a key that sorts slice2 before slice10."""
-    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name.casefold()))
 
 
 def _read_spacing(file: tifffile.TiffFile) -> _Spacing:

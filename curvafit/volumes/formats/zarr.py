@@ -14,12 +14,22 @@ from typing import Any
 
 import numpy as np
 
+from curvafit.core.extras import require
 from curvafit.core.files import move_into_place, write_content
 from curvafit.core.records import MARK, is_zarr
 from curvafit.core.runtime import hold_signals
 from curvafit.core.units import common_unit, format_sampling, parse_unit
 from curvafit.volumes.boxes import Box, cut_boxes
-from curvafit.volumes.formats.base import Damaged, ScanError, Stated, first_voxel, name_axes, pick_key, read_spacing
+from curvafit.volumes.formats.base import (
+    Damaged,
+    ScanError,
+    Stated,
+    affine_of,
+    first_voxel,
+    name_axes,
+    pick_key,
+    read_spacing,
+)
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
 CHUNK = 64
@@ -59,6 +69,35 @@ def read_zarr(path: Path, *, key: str | None = None, **_: object) -> Stated:
     return _state_array(array, path / array.path, place)
 
 
+def read_remote(address: str, key: str | None = None) -> Stated:
+    """Read an array, or a level of an image of OME-Zarr, of a store at `https://` or `s3://`, by the extra `[remote]`.
+
+    What is in such a store cannot be listed: without a key its image's finest level is read.
+    """
+    require("fsspec", "remote", "reading a store that is not on this machine")
+    require(
+        {"s3": "s3fs", "gs": "gcsfs"}.get(scheme := address.partition(":")[0], "aiohttp"),
+        "remote",
+        f"reading {scheme}://",
+    )
+    import zarr
+
+    node: Any = zarr.open(address, mode="r")
+    if isinstance(node, zarr.Array):
+        return _state_array(node, None, read_spacing(node.attrs.asdict(), node.ndim))
+    places = _levels("", node.attrs.asdict())
+    name = key or next(iter(places), None)
+    if name is None:
+        raise ScanError(f"{address} holds no image of OME-Zarr: name an array, as in {address}::KEY")
+    array = node[name]
+    if not isinstance(array, zarr.Array):
+        places = _levels(name, array.attrs.asdict())
+        name = next(iter(places), name)
+        array = node[name]
+    own = {**node.attrs.asdict(), **array.attrs.asdict()}
+    return _state_array(array, None, places[name] if name in places else read_spacing(own, array.ndim))
+
+
 def list_levels(path: Path, key: str | None) -> dict[str, tuple[float, ...] | None]:
     """Return the known spacing of each level of the image that is read of a store, by key; none of an array."""
     import zarr
@@ -92,11 +131,20 @@ def _pick_array(node: Any, key: str | None, path: Path) -> tuple[dict[str, Any],
     return arrays, next((each for each in levels.values() if name in each), {}), name, unasked
 
 
-def _state_array(array: Any, folder: Path, place: _Place) -> Stated:
+def _state_array(array: Any, folder: Path | None, place: _Place) -> Stated:
     """Return an array in a folder at its place, with a sentence on chunks that are not stored."""
     axes, units = place.get("axes", ""), place.get("units") or (None,) * 3
-    axes = axes if len(axes) == array.ndim else "?" * array.ndim
-    return Stated(array, **{**place, "axes": axes, "units": units}, gaps=_missing_chunks(array, folder))
+    named = getattr(array.metadata, "dimension_names", None) or array.attrs.get("_ARRAY_DIMENSIONS") or ()
+    own, notes = name_axes([str(each) for each in named]), tuple(place.get("notes", ()))
+    own = own if len(own) == array.ndim else "?" * array.ndim
+    if len(axes) == array.ndim and any(a != b and "?" not in (a, b) for a, b in zip(axes, own, strict=True)):
+        notes += (f"The array calls its axes {', '.join(map(str, named))}: those of the image count.",)
+    axes = axes if len(axes) == array.ndim else own
+    if isinstance(folder, Path):
+        gaps = _missing_chunks(array, folder)
+    else:
+        gaps = ("Whether chunks are missing in a store that is not on this machine is not known.",)
+    return Stated(array, **{**place, "axes": axes, "units": units, "notes": notes}, gaps=gaps)
 
 
 def write_zarr(field: Any, path: Path, version: str = "0.5", labels: bool = False) -> None:
@@ -295,23 +343,71 @@ def mark(folder: Path, kind: str) -> None:
 
 def _levels(name: str, attributes: Mapping[str, Any]) -> dict[str, _Place]:
     """Return the place of each level of an OME-Zarr image, by the level's path."""
-    image = next(iter(attributes.get("ome", attributes).get("multiscales") or []), {})
-    axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", [])]
-    names = (str(axis["type"] if axis.get("type") in ("channel", "time") else axis.get("name")) for axis in axes)
-    kinds = {"axes": name_axes(list(names)), "units": [axis.get("unit") for axis in axes]}
+    ome = attributes.get("ome", attributes)
+    images = ome.get("multiscales") or [{}]
+    image, systems = images[0], {each["name"]: each["axes"] for each in images[0].get("coordinateSystems", [])}
+    notes = (f"The group holds {len(images)} images: the first is used.",) if len(images) > 1 else ()
+    version = str(ome.get("version") or image.get("version") or "0.4")
+    notes += () if re.match(r"0\.[1-6]\b", version) else (f"It is of OME-Zarr {version}, and read as of 0.6.",)
     places: dict[str, _Place] = {}
     for level in image.get("datasets", []):
-        scale, first = None, None
-        # Those of all levels come after those of one.
-        for step in (*level.get("coordinateTransformations", []), *image.get("coordinateTransformations", [])):
-            if step.get("type") == "scale":
-                by = np.array(step["scale"], dtype=np.float64)
-                scale, first = by if scale is None else by * scale, None if first is None else by * first
-            elif step.get("type") == "translation":
-                first = np.array(step["translation"], dtype=np.float64) + (0.0 if first is None else first)
-        steps, origin = (None if each is None else each.tolist() for each in (scale, first))
-        places[f"{name}/{level['path']}".strip("/")] = {**kinds, "steps": steps, "origin": origin}
+        steps = list(level.get("coordinateTransformations", []))
+        listed = image.get("axes") or systems.get(steps[0].get("output") if steps else "") or []
+        # Those of all levels come after those of one; with systems of coordinates they lead to others than the first.
+        steps += [] if systems else image.get("coordinateTransformations", [])
+        axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in listed]
+        names = [str(axis["type"] if axis.get("type") in ("channel", "time") else axis.get("name")) for axis in axes]
+        place = {"axes": name_axes(names), "units": [axis.get("unit") for axis in axes], "notes": notes}
+        places[f"{name}/{level['path']}".strip("/")] = place | _place_of(steps, place["axes"])
     return places
+
+
+def _place_of(transforms: Sequence[Mapping[str, Any]], axes: str) -> _Place:
+    """Return steps and origin, or steps and affine, that transforms of indices state.
+
+    Of one that is not known the unit says so: it is refused unless the caller states spacing and unit.
+    """
+    lengths = [len(value) for step in transforms if isinstance(value := step.get(str(step.get("type"))), list)]
+    n = len(axes) or max(lengths, default=0)
+    matrix = _compose(transforms, n)
+    if isinstance(matrix, str):
+        return {"steps": None, "units": (f"coordinates of a transform {matrix}",) * n}
+    if not any(step.get("type") != "translation" for step in transforms):
+        return {"steps": None, "origin": matrix[:n, n].tolist() if transforms else None}
+    linear = matrix[:n, :n]
+    steps, space = np.linalg.norm(linear, axis=0), [axes.index(axis) for axis in "xyz" if axis in axes]
+    if np.array_equal(linear, np.diag(steps)):
+        return {"steps": steps.tolist(), "origin": matrix[:n, n].tolist() if matrix[:n, n].any() else None}
+    if len(space) < 3 or np.count_nonzero(linear) != n - 3 + np.count_nonzero(linear[np.ix_(space, space)]):
+        return {"steps": None, "units": ("coordinates of a transform of axes that are not of space",) * n}
+    return {"steps": steps.tolist(), "affine": affine_of(linear[np.ix_(space, space)], matrix[space, n])}
+
+
+def _compose(transforms: Sequence[Mapping[str, Any]], n: int) -> np.ndarray | str:
+    """Return the matrix (n + 1, n + 1) of transforms one after the other, or the type of one that is not known."""
+    matrix = np.eye(n + 1)
+    for step in transforms:
+        kind, part = str(step.get("type")), np.eye(n + 1)
+        value: Any = step.get({"sequence": "transformations"}.get(kind, kind))
+        if kind == "identity":
+            continue
+        if kind not in ("scale", "translation", "affine", "rotation", "mapAxis", "sequence") or value is None:
+            return repr(kind)
+        if kind == "scale":
+            part[:n, :n] = np.diag(np.array(value, dtype=np.float64))
+        elif kind == "translation":
+            part[:n, n] = value
+        elif kind == "affine":
+            part[:n] = value
+        elif kind == "sequence":
+            inner = _compose(value, n)
+            if isinstance(inner, str):
+                return inner
+            part = inner
+        else:
+            part[:n, :n] = value if kind == "rotation" else np.eye(n)[value]
+        matrix = part @ matrix
+    return matrix
 
 
 def _check_levels(arrays: Mapping[str, Any], places: Mapping[str, _Place], path: Path) -> None:
