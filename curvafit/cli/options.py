@@ -65,10 +65,12 @@ def command(*examples: str) -> Callable[[Callable[..., None]], Callable[..., Non
 
 def _check_inputs(arguments: Mapping[str, Any]) -> None:
     """Raise an error where a volume is missing or a law is none, before libraries are imported that need it."""
+    from curvafit.core.files import is_url
+
     for given in filter(None, map(arguments.get, _VOLUMES)):
         for path in map(str, given if isinstance(given, list) else [given]):
             file = path.rpartition("::")[0] or path
-            if not (os.path.exists(path) or os.path.exists(file)):
+            if not (os.path.exists(path) or os.path.exists(file) or is_url(path)):
                 raise FileNotFoundError(f"no such file: {file}")
     from curvafit.core.checks import quoted, simplify_name
     from curvafit.priors.published import PUBLISHED

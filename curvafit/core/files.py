@@ -101,6 +101,11 @@ def open_packaged(room: str, name: str) -> io.BytesIO:
 # ---- folders ---------------------------------------------------------------------------------------------------------
 
 
+def is_url(path: str) -> bool:
+    """Return whether a text is a URL by which a store can be read."""
+    return path.lower().startswith(("https://", "http://", "s3://"))
+
+
 def check_folder(path: str | Path) -> Path:
     """Return the path of a folder that can be written to, or made; raise ValueError where it cannot."""
     folder = Path(path)

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from curvafit.core.checks import quoted
+from curvafit.core.files import is_url
 from curvafit.core.runtime import one_line
 from curvafit.volumes.boxes import Crop, parse_box
 from curvafit.volumes.formats.arrays import read_hdf5, read_imaris, read_npy, read_npz, read_raw
@@ -60,9 +61,6 @@ READERS: dict[str, Callable[..., Stated]] = {
     ".aim": read_aim,
 }
 
-#: The address of a store that is not on this machine.
-_ADDRESS = re.compile(r"[a-z][a-z0-9]+://")
-
 #: Readers of formats that can hold several arrays, by key.
 KEYED = (read_npz, read_hdf5, read_imaris, read_zarr, read_dicom)
 
@@ -93,8 +91,9 @@ def load(
     ----------
     source
         A path; a `Volume`, which has its own spacing and unit; or an array or tensor (Z, Y, X). Files are NIfTI, TIFF,
-        NPY, NPZ, HDF5, Imaris, RAW, Zarr, Scanco's ISQ and AIM; with `curvafit[io]` also NRRD, MHA/MHD, MRC and DICOM
-        folders. `file.h5::key` names an array within a file; `key` does the same.
+        NPY, NPZ, HDF5, Imaris, RAW, Zarr, Scanco's ISQ and AIM; with `curvafit[io]` also NRRD, MHA/MHD, MRC and DICOM;
+        and with `curvafit[remote]` the URL (https, s3) of a Zarr store. Folders hold slices as TIFF, BMP, PNG, JPEG or
+        DICOM. `file.h5::key` names an array within a file; `key` does the same.
     spacing, unit
         Voxel edges (z, y, x), or one for all, and nm, um, mm or m, in place of what the file says; for an array the
         default is one voxel. A `unit` alone converts the lengths of a file that names their unit, and names that of
@@ -271,7 +270,7 @@ def split_key(path: str | os.PathLike[str], key: str | None) -> tuple[Path | str
     name, separator, inner = path.rpartition("::")
     if not separator or Path(path).exists():
         name, inner = path, None
-    return (name if _ADDRESS.match(name) else Path(name)), key or inner or None
+    return (name if is_url(name) else Path(name)), key or inner or None
 
 
 def levels_of(source: object, key: str | None = None) -> dict[str, tuple[float, ...] | None]:

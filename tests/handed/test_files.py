@@ -137,6 +137,7 @@ Image Pixel Size (um)=3.99
 [Reconstruction]
 Reconstruction Program=NRecon
 Pixel Size (um)=7.98
+Section to Section Step=2
 """
 
 
@@ -170,7 +171,9 @@ def test_odd_slices(tmp_path: Path) -> None:
     ):  # fmt: skip
         field = load(tmp_path / name)
         assert np.array_equal(field.values, expected) and field.dtype == np.uint8
-        assert field.spacing == pytest.approx((edge or 1.0,) * 3) and field.unit == ("um" if edge else "voxel")
+        step = 2 if name == "bmp" else 1  # its log has every second section
+        assert field.spacing == pytest.approx((step * (edge or 1.0), edge or 1.0, edge or 1.0))
+        assert field.unit == ("um" if edge else "voxel")
         assert any(note in each for each in field.notes)
     assert any("_spr" in each for each in load(tmp_path / "bmp").notes)
     for name, word in (("types", "one type"), ("sizes", "one pixel size"), ("logs", "another pixel size")):
@@ -326,3 +329,34 @@ def test_64_bit_ids_stay(ids: tuple[int, int], kind: type, chosen: str, tmp_path
     assert found.dtype.kind in "iu" and np.unique(found).tolist() == [0, *ids]
     assert np.array_equal(found[::8], truth[::8])
     assert found.dtype == (kind if ids[0] > 255 else np.uint8)
+
+
+TAGS = [(42113, "s", 0, "-9999", True)]
+
+
+def test_what_was_not_measured(tmp_path: Path) -> None:
+    """GDAL's value is said, also where the values' type does not hold it."""
+    for name, kind in (("a", "int16"), ("b", "uint8")):
+        values = numbers((4, 5, 6), kind)
+        tifffile.imwrite(tmp_path / f"{name}.tif", values, extratags=TAGS, photometric="minisblack")
+        field = load(tmp_path / f"{name}.tif", spacing=1.0)
+        assert np.array_equal(field.values, values) and any("-9999" in note for note in field.notes)
+
+
+def test_lengths_of_hdf5(tmp_path: Path) -> None:
+    """CREMI's resolution and offset, a size for an axis of channels, names that disagree, and one that is not used."""
+    values = numbers((3, 4, 5), "uint16")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, attributes in (
+            ("cremi", {"resolution": (40.0, 4.0, 4.0), "offset": (80.0, 8.0, 0.0), "unit": "nm"}),
+            ("four", {"element_size_um": (1.0, 0.5, 0.25, 0.125)}),
+            ("odd", {"pixel_size_mm": 3.0}), ("both", {"axistags": json.dumps({"axes": [{"key": k} for k in "zyx"]})}),
+        ):  # fmt: skip
+            file[name] = values[None] if name == "four" else values
+            file[name].attrs.update(attributes)
+        file["both"].dims[0].label, file["both"].dims[2].label = "x", "z"
+    cremi, four, odd = (load(tmp_path / f"a.h5::{name}") for name in ("cremi", "four", "odd"))
+    assert cremi.spacing == (40, 4, 4) and cremi.unit == "nm" and cremi.affine[:3, 3].tolist() == [0, 8, 80]  # type: ignore[index]
+    assert four.spacing == (0.5, 0.25, 0.125) and four.unit == "um"
+    assert odd.unit == "voxel" and any("pixel_size_mm" in note for note in odd.notes)
+    unreadable(tmp_path / "a.h5::both", "axistags")

@@ -12,7 +12,9 @@ from tests.golden import FOLDER
 from tests.golden.rows import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[2]
-EXTRAS = "jax jaxlib optimistix equinox zuko geomloss dask distributed networkx sklearn plotly pandas pyarrow nrrd"
+EXTRAS = (
+    "jax jaxlib optimistix equinox zuko geomloss dask distributed networkx sklearn plotly pandas pyarrow nrrd aiohttp"
+)
 
 SCRIPT = f"""
 import json, os, shutil, sys
@@ -43,11 +45,13 @@ print(json.dumps(answers))
 """
 #: The extra that a command asks for; the others need none.
 NEEDED = dict.fromkeys(("infer-fast", "infer-match", "python"), "infer") | {"workers": "synth", "map": "atlas"}
+NEEDED |= {"remote": "remote"}
 NEEDED |= dict.fromkeys(("reconstruct-image", "reconstruct-cells"), "image")
 MORE = {
     "mask": "measure mask.nii.gz",
     "workers": "synth -o out --preset tubes --modality micro-ct --count 1 --shape 16",
     "map": "atlas map store.zarr -o out",
+    "remote": "measure https://example.org/scan.zarr",
 }
 
 

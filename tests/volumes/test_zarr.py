@@ -1,9 +1,14 @@
 """Zarr: OME-NGFF level by level, chunks that are not stored, and labels on the voxels of an image."""
 
 import json
+import pickle
 import warnings
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -268,3 +273,103 @@ def test_a_command_writes_labels_and_the_rest_beside_the_store(image: tuple[Path
     refused(call(*command, "--spacing", 0.3, "--unit", "um", *target), "voxels of a level", progress=True)
     refused(call("segment", "scan.zarr::labels/tube", *command[4:], *target), "write over the input")
     assert tree(path.parent) == before
+
+
+# ---- axes, transforms, addresses -------------------------------------------------------------------------------------
+
+
+def states(folder: Path, ome: dict, values: np.ndarray, **options: Any) -> Volume:
+    group = zarr.open_group(folder, mode="w")
+    group.create_array("0", data=values)
+    group.attrs["ome"] = ome
+    return load(folder, **options)
+
+
+SPACE = [{"name": axis, "type": "space", "unit": "micrometer"} for axis in "zyx"]
+SCALE, ONE = {"type": "scale", "scale": [2, 1, 0.5]}, {"type": "translation", "translation": [1, 1, 1]}
+
+
+def test_transforms_of_coordinates_are_applied_or_refused(tmp_path: Path) -> None:
+    """Those of version 0.6 lead from a level to a system of coordinates; one that is not known is refused."""
+    values = np.arange(60, dtype=np.float32).reshape(3, 4, 5)
+    turn = np.eye(3)[[0, 2, 1]] * [1, -1, 1]  # about z, in the order z, y, x
+    for name, steps, spacing, corner in (
+        ("scale", [SCALE], (2, 1, 0.5), (0, 0, 0)),
+        ("identity", [{"type": "identity"}], (1, 1, 1), (0, 0, 0)),
+        ("both", [SCALE, {"type": "translation", "translation": [3, 4, 5]}], (2, 1, 0.5), (3, 4, 5)),
+        ("sequence", [{"type": "sequence", "transformations": [ONE, SCALE]}], (2, 1, 0.5), (2, 1, 0.5)),
+        ("affine", [{"type": "affine", "affine": [[2, 0, 0, 7], [0, 1, 0, 8], [0, 0, 3, 9]]}], (2, 1, 3), (7, 8, 9)),
+        ("rotation", [SCALE, {"type": "rotation", "rotation": turn.tolist()}], (2, 1, 0.5), (0, 0, 0)),
+    ):  # fmt: skip
+        for system in (False, True):
+            given = [{**step, "input": "0", "output": "world"} for step in steps]
+            level = {"path": "0", "coordinateTransformations": given}
+            axes = {"coordinateSystems": [{"name": "world", "axes": SPACE}]} if system else {"axes": SPACE}
+            ome = {"version": "0.6" if system else "0.5", "multiscales": [{**axes, "datasets": [level]}]}
+            field = states(tmp_path / f"{name}{system}.zarr", ome, values)
+            assert np.array_equal(field.values, values) and field.unit == "um" and not field.notes
+            assert field.spacing == pytest.approx(spacing)
+            place = np.diag([*spacing[::-1], 1.0]) if field.affine is None else field.affine
+            assert place[:3, 3] == pytest.approx(corner[::-1], abs=1e-12)
+            if name == "rotation":
+                assert place[:3, :3] == pytest.approx((turn * spacing)[::-1, ::-1])
+    odd = [{"type": "displacements", "path": "field"}]
+    image = {"axes": SPACE, "datasets": [{"path": "0", "coordinateTransformations": odd}]}
+    ome = {"version": "0.6", "multiscales": [image] * 2}
+    with pytest.raises(ScanError, match="displacements"):
+        states(tmp_path / "odd.zarr", ome, values)
+    field = states(tmp_path / "odd.zarr", ome, values, spacing=2.0, unit="um")
+    assert field.spacing == (2, 2, 2) and "2 images" in field.notes[0]
+    assert "0.9" in states(tmp_path / "new.zarr", {**ome, "version": "0.9"}, values, spacing=2.0, unit="um").notes[1]
+    tilted = [{"type": "affine", "affine": [[1, 0.3, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}]
+    image = {"axes": SPACE, "datasets": [{"path": "0", "coordinateTransformations": tilted}]}
+    with pytest.raises(ScanError, match="right angles"):
+        states(tmp_path / "tilted.zarr", {"version": "0.6", "multiscales": [image]}, values)
+
+
+def test_names_of_dimensions_order_axes(tmp_path: Path) -> None:
+    values = np.arange(24, dtype=np.int16).reshape(2, 3, 4)
+    zarr.create_array(tmp_path / "three.zarr", data=values, dimension_names=("x", "z", "y"))
+    old = zarr.create_array(tmp_path / "two.zarr", data=values, zarr_format=2)
+    old.attrs["_ARRAY_DIMENSIONS"] = ["x", "z", "y"]
+    for name in ("three", "two"):
+        assert np.array_equal(load(tmp_path / f"{name}.zarr").values, values.transpose(1, 2, 0))
+    group = zarr.create_group(tmp_path / "both.zarr")
+    group.create_array("0", data=values, dimension_names=("x", "z", "y"))
+    group.attrs["ome"] = {"version": "0.5", "multiscales": [{"axes": SPACE, "datasets": [{"path": "0"}]}]}
+    field = load(tmp_path / "both.zarr")
+    assert np.array_equal(field.values, values) and "x, z, y" in field.notes[0]
+
+
+@pytest.fixture
+def address(tmp_path: Path) -> Iterator[str]:
+    """The address of a folder that a server of this machine shows."""
+    pytest.importorskip("aiohttp")
+    handler = partial(SimpleHTTPRequestHandler, directory=str(tmp_path))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        handler.func.log_message = lambda *_: None  # type: ignore[assignment]
+        Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+def test_a_store_at_an_address_is_read_as_on_disk(tmp_path: Path, address: str) -> None:
+    """By boxes, by level, and by the command; a chunk that is cut short, or no store there, is one sentence."""
+    values = np.random.default_rng(0).random((70, 20, 20)).astype(np.float32)
+    save(Volume(values, (2.0, 1.0, 1.0), "um"), tmp_path / "scan.zarr")
+    here, there = load(tmp_path / "scan.zarr"), load(f"{address}/scan.zarr")
+    assert np.array_equal(there.values, here.values) and (there.spacing, there.unit) == (here.spacing, here.unit)
+    assert any("not on this machine" in note for note in there.notes)
+    assert load(f"{address}/scan.zarr::1").shape == (35, 10, 10)
+    lazy = pickle.loads(pickle.dumps(load(f"{address}/scan.zarr", lazy=True)))
+    assert lazy.in_file and np.array_equal(lazy.read((slice(60, 70), slice(0, 2), slice(3, 5))), values[60:, :2, 3:5])
+    zarr.create_array(tmp_path / "bare.zarr", data=values)
+    assert np.array_equal(load(f"{address}/bare.zarr", spacing=1.0).values, values)
+    result = done("measure", f"{address}/scan.zarr", "--threshold", 0.5, "--kind", "image")
+    assert "BV/TV" in result.stdout
+    unreadable(f"{address}/none.zarr", "none.zarr")
+    unreadable(f"{address}/scan.zarr::9", "scan.zarr")
+    unreadable(f"{address}/scan.zarr", "not whole", strict=True)
+    chunk = next(path for path in (tmp_path / "scan.zarr" / "0" / "c").rglob("*") if path.is_file())
+    chunk.write_bytes(chunk.read_bytes()[:100])
+    unreadable(f"{address}/scan.zarr", "scan.zarr")

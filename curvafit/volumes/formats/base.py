@@ -112,8 +112,7 @@ def pick_key(keys: list[str], key: str | None, path: object) -> str:
 def read_spacing(attributes: Mapping[str, Any], ndim: int) -> dict[str, Any]:
     """Return steps, units and origin from an array's attributes, unchecked; one number counts for all axes.
 
-    `resolution` and `offset` are CREMI's, in nm if no unit says otherwise. A note names what looks like a spacing and
-    is not used.
+    `resolution` and `offset` are CREMI's. A note names what looks like a spacing and is not used.
     """
     given = next(
         (name for name in ("element_size_um", "spacing", "voxel_size", "resolution") if name in attributes), ""
@@ -127,11 +126,7 @@ def read_spacing(attributes: Mapping[str, Any], ndim: int) -> dict[str, Any]:
     unit = unit or next(iter(_entries(attributes.get("unit", attributes.get("units")))), None)
     sizes = sizes * ndim if len(sizes) == 1 else sizes
     place: dict[str, Any] = {"steps": sizes, "units": (unit,) * len(sizes), "notes": notes}
-    if given == "resolution":
-        guess = "The file states no unit of its resolution: it is taken for nm."
-        place |= {"origin": _entries(attributes["offset"]) if "offset" in attributes else None}
-        place |= {} if unit else {"units": ("nm",) * len(sizes), "guesses": (guess,)}
-    return place
+    return place | ({"origin": _entries(attributes["offset"])} if "offset" in attributes else {})
 
 
 def _entries(value: Any) -> tuple[Any, ...]:

@@ -7,7 +7,9 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
+from PIL import Image
 
 from curvafit.core.units import convert_length, is_unit
 from curvafit.volumes.formats import base
@@ -44,11 +46,11 @@ def read_slices(path: Path, **_: object) -> Stated:
     assert first is not None
     logged = _read_logs(path)
     if logged is not None:
-        size, log = logged
+        size, step, log = logged
         own = first._replace(units=[unit or first.custom for unit in first.units])
         if first.steps is not None and not _are_same(own, Stated(None, "zyx", [size] * 3, ["um"] * 3)):
             raise ScanError(f"{names[0].name} states another pixel size than the {size:g} um of {log} in {path}")
-        first = first._replace(steps=[size] * 3, units=["um"] * 3, guesses=())
+        first = first._replace(steps=[step * size, size, size], units=["um"] * 3, guesses=())
         notes += (f"The voxel size is that of {log}.",)
     values, axes = np.stack(planes), "zyxs"[: planes[0].ndim + 1]
     values, gaps = _place_slices(values, [name.stem for name in names])
@@ -70,15 +72,17 @@ def _list_slices(path: Path) -> tuple[list[Path], tuple[str, ...]]:
 
 
 def _read_picture(path: Path) -> Stated:
-    """Read a BMP, PNG or JPEG, of which a grey palette is grey; transparency is left out."""
-    from PIL import Image
-
-    with Image.open(path) as image:
-        if image.mode in ("P", "PA"):
-            colours = np.reshape(image.getpalette() or [0, 0, 0], (-1, 3))
-            image = image.convert("L" if (colours == colours[:, :1]).all() else "RGB")
-        values = np.asarray(image.convert({"LA": "L", "RGBA": "RGB", "1": "L"}.get(image.mode, image.mode)))
-    return Stated(values, "yxs"[: values.ndim])
+    """Read a BMP, PNG or JPEG; equal colours are grey, and transparency is left out."""
+    if path.suffix.lower() == ".png":  # Pillow would cut deep colours to bytes
+        values = np.asarray(imagecodecs.png_decode(path.read_bytes()))
+    else:
+        with Image.open(path) as image:
+            values = np.asarray(image.convert({"P": "RGB", "PA": "RGBA", "1": "L"}.get(image.mode, image.mode)))
+    if values.ndim == 2:
+        return Stated(values, "yx")
+    values = values[..., : 3 if values.shape[2] > 2 else 1]
+    grey = bool((values == values[..., :1]).all())
+    return Stated(values[..., 0], "yx") if grey else Stated(values, "yxs")
 
 
 def _are_same(one: Stated, other: Stated) -> bool:
@@ -92,19 +96,21 @@ def _are_same(one: Stated, other: Stated) -> bool:
     return np.allclose(*lengths, rtol=_SAME)
 
 
-def _read_logs(path: Path) -> tuple[float, str] | None:
-    """Return the voxel size in um of NRecon's logs in a folder, and the name of one; None where there is none."""
-    sizes: dict[float, str] = {}
+def _read_logs(path: Path) -> tuple[float, float, str] | None:
+    """Return the pixel size in um of NRecon's logs in a folder, pixels from slice to slice, and the name of one; None
+    where there is none."""
+    sizes: dict[float, tuple[float, str]] = {}
     for log in sorted(p for p in path.iterdir() if p.suffix.lower() == ".log" and p.is_file()):
         text = log.read_text(encoding="latin-1")
         for name in ("Pixel Size", "Image Pixel Size"):  # of the reconstruction, or else of the projections
             if found := re.search(rf"^\s*{name} \(um\)\s*=\s*([\d.]+)", text, re.MULTILINE):
-                sizes[float(found[1])] = log.name
+                step = re.search(r"^\s*Section to Section Step\s*=\s*(\d+)", text, re.MULTILINE)
+                sizes[float(found[1])] = (float(step[1]) if step else 1.0, log.name)
                 break
     if len(sizes) > 1:
-        listed = " and ".join(f"{size:g} um in {log}" for size, log in list(sizes.items())[:2])
+        listed = " and ".join(f"{size:g} um in {log}" for size, (_, log) in list(sizes.items())[:2])
         raise ScanError(f"the logs in {path} state voxel sizes of {listed}: leave that of these slices there alone")
-    return next(iter(sizes.items()), None)
+    return next(((size, *rest) for size, rest in sizes.items()), None)
 
 
 def _squeeze_plane(stated: Stated) -> np.ndarray:

@@ -48,10 +48,11 @@ def read_tiff(path: Path, **_: object) -> Stated:
         values, calibration = _calibrate(values, file.imagej_metadata or {})
         count, nodata = len(file.series), series.pages[0].tags.get(42113)  # type: ignore[union-attr]
     tags = [text for text in messages if text.startswith("<TiffTag")]
-    if losses := [text for text in messages if text not in tags and _LOST.search(text)]:
+    # GDAL's value for what was not measured, tag 42113, may not fit the values' type.
+    if losses := [text for text in messages if text not in tags and _LOST.search(text) and "GDAL" not in text]:
         raise base.Damaged(losses[0])
     notes = (f"The file holds {count} images: the first is used.",) if count > 1 else ()
-    if nodata is not None:  # GDAL's
+    if nodata is not None:
         notes += (f"By the file, {nodata.value} stands where nothing was measured.",)
     notes += (f"{len(tags)} of the file's tags cannot be read: what they state is not known.",) if tags else ()
     return Stated(values, axes, steps, units, notes=(*notes, *calibration), guesses=guesses)

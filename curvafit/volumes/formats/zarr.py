@@ -69,26 +69,23 @@ def read_zarr(path: Path, *, key: str | None = None, **_: object) -> Stated:
     return _state_array(array, path / array.path, place)
 
 
-def read_remote(address: str, key: str | None = None) -> Stated:
-    """Read an array, or a level of an image of OME-Zarr, of a store at `https://` or `s3://`, by the extra `[remote]`.
+def read_remote(url: str, key: str | None = None) -> Stated:
+    """Read an array, or a level of an image of OME-Zarr, of a store at a URL, `https://` or `s3://`.
 
     What is in such a store cannot be listed: without a key its image's finest level is read.
     """
-    require("fsspec", "remote", "reading a store that is not on this machine")
-    require(
-        {"s3": "s3fs", "gs": "gcsfs"}.get(scheme := address.partition(":")[0], "aiohttp"),
-        "remote",
-        f"reading {scheme}://",
-    )
+    scheme = url.partition("://")[0]
+    for module in ("fsspec", "s3fs" if scheme == "s3" else "aiohttp"):
+        require(module, "remote", f"reading {scheme}://")
     import zarr
 
-    node: Any = zarr.open(address, mode="r")
+    node: Any = zarr.open(url, mode="r")
     if isinstance(node, zarr.Array):
         return _state_array(node, None, read_spacing(node.attrs.asdict(), node.ndim))
     places = _levels("", node.attrs.asdict())
     name = key or next(iter(places), None)
     if name is None:
-        raise ScanError(f"{address} holds no image of OME-Zarr: name an array, as in {address}::KEY")
+        raise ScanError(f"{url} holds no image of OME-Zarr: name an array, as in {url}::KEY")
     array = node[name]
     if not isinstance(array, zarr.Array):
         places = _levels(name, array.attrs.asdict())
