@@ -172,6 +172,8 @@ def _check_angles(matrix: np.ndarray, source: str) -> None:
     """Raise ScanError where the axes of voxels, columns of a matrix, are not at right angles."""
     directions = matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
     cosine = np.abs(directions.T @ directions - np.eye(3)).max()
+    if not np.isfinite(cosine):
+        raise ScanError(f"the axes of {source} are no numbers: give --spacing")
     if cosine > RIGHT:
         angle = np.degrees(np.arccos(min(cosine, 1.0)))
         raise ScanError(

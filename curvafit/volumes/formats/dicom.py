@@ -16,6 +16,18 @@ from curvafit.volumes.formats.base import LPS_TO_RAS, ScanError, Stated
 SUFFIXES = (".dcm", ".dicom", ".ima")
 
 
+#: Attributes that are said, not used: name, the value that is worth it, None for any, and the note.
+_SAID = (
+    ("PixelPaddingValue", None, "By the file, {} stands where nothing was measured."),
+    ("PhotometricInterpretation", "MONOCHROME1", "The file shows low values bright: its values are as stored."),
+    ("PhotometricInterpretation", "PALETTE COLOR", "The values are numbers of colours in the file's palette."),
+    ("ModalityLUTSequence", None, "The file's table of values, ModalityLUTSequence, is not used: they are as stored."),
+    ("LossyImageCompression", "01", "The file's values were compressed with loss."),
+    ("BurnedInAnnotation", "YES", "The file says that text is burnt into its values."),
+    ("ImagerPixelSpacing", None, "The file's ImagerPixelSpacing, {} mm, is that at the detector: it is not used."),
+)
+
+
 class _Plane(NamedTuple):
     """A slice: its values (Y, X) or (Y, X, samples), its number, and where it lies, None where nothing says that."""
 
@@ -49,10 +61,9 @@ def read_dicom(path: Path, *, key: str | None = None, **_: object) -> Stated:
         planes = [plane for image in images for plane in _list_planes(image)]
     if path.is_file() and len(images) > 1:
         notes.append(f"The {len(images)} files of its series in the folder are read.")
-    for name, word in (("PixelPaddingValue", "stands where nothing was measured"),):
-        notes += [f"By the file, {images[0][name].value} {word}."] if name in images[0] else []
-    if images[0].get("PhotometricInterpretation") == "MONOCHROME1":
-        notes.append("The file shows low values bright: its values are as stored.")
+    for name, worth, sentence in _SAID:
+        value = images[0].get(name)
+        notes += [sentence.format(value)] if value not in (None, "") and worth in (None, value) else []
     stated = _stack(planes, path)
     return stated._replace(notes=(*notes, *stated.notes))
 
@@ -77,8 +88,12 @@ def _stack(planes: list[_Plane], path: Path) -> Stated:
             raise ScanError(f"DICOM slices must have one {words[name]}, got several in {path}")
     if not any(placed):
         planes = sorted(planes, key=lambda plane: plane.number)
-        note = "The slices state no position: they are stacked in the order of their numbers."
-        return _pile(planes)._replace(notes=(note,))
+        notes = ["The slices state no position: they are stacked in the order of their numbers."]
+        if planes[0].spacing is not None:
+            notes.append(
+                f"Their PixelSpacing, {planes[0].spacing.tolist()} mm, is not used without a distance of them."
+            )
+        return _pile(planes)._replace(notes=tuple(notes))
     rows, columns = planes[0].directions  # type: ignore[misc]
     normal = np.cross(rows, columns)
     planes = sorted(planes, key=lambda plane: float(np.dot(normal, plane.position)))  # type: ignore[arg-type]
@@ -116,10 +131,11 @@ def _list_planes(image: Any) -> Iterator[_Plane]:
     """Yield the slices of an image, with slope and intercept applied."""
     pixels, count = image.pixel_array, _count_frames(image)
     pixels = pixels if count > 1 else pixels[None]
-    step = image.get("SpacingBetweenSlices")
+    step, dose = image.get("SpacingBetweenSlices"), float(image.get("DoseGridScaling") or 1)
+    offsets = np.array(image.get("GridFrameOffsetVector") or [float(step) * k for k in range(count) if step], float)
     for number, values in enumerate(pixels):
         look = _Attributes(image, number if count > 1 else None)
-        slope, intercept = float(look("RescaleSlope") or 1), float(look("RescaleIntercept") or 0)
+        slope, intercept = float(look("RescaleSlope") or dose), float(look("RescaleIntercept") or 0)
         values = values if (slope, intercept) == (1, 0) else (values * slope + intercept).astype(np.float32)
         position, directions, spacing = (
             None if (stated := look(name)) is None else np.array(stated, dtype=float)
@@ -127,8 +143,8 @@ def _list_planes(image: Any) -> Iterator[_Plane]:
         )
         directions = None if directions is None else directions.reshape(2, 3)
         if count > 1 and not look.by_frame:  # frames without a place of their own
-            known = None not in (position, step) if directions is not None else False
-            position = position + number * float(step) * np.cross(*directions) if known else None  # type: ignore[misc]
+            known = position is not None and directions is not None and len(offsets) == count
+            position = position + (offsets[number] - offsets[0]) * np.cross(*directions) if known else None  # type: ignore[misc]
         order = number if count > 1 else int(image.get("InstanceNumber") or 0)
         yield _Plane(values, order, position, directions, spacing)
 

@@ -21,7 +21,10 @@ _IMOD = 1146047817
 def read_mrc(path: Path, **_: object) -> Stated:
     """Read an MRC file: axes as the header orders them, at its origin or, without one, at the start of its part."""
     mrcfile = require("mrcfile", "io", "reading and writing MRC files")
-    with warnings.catch_warnings(record=True) as odd, mrcfile.open(path, permissive=True, header_only=True) as file:
+    with (
+        warnings.catch_warnings(record=True, action="always") as odd,
+        mrcfile.open(path, permissive=True, header_only=True) as file,
+    ):
         header, size = file.header, file.voxel_size
         shape, dtype = mrcfile.utils.data_shape_from_header(header), mrcfile.utils.data_dtype_from_header(header)
     notes = [f"The file's header is odd: {each.message}." for each in odd if issubclass(each.category, RuntimeWarning)]
@@ -40,13 +43,18 @@ def read_mrc(path: Path, **_: object) -> Stated:
     axes = "".join("xyz"[k - 1] for k in columns) if sorted(columns) == [1, 2, 3] else "zyx"
     edges = {letter: float(size[letter]) for letter in "xyz"}
     first = {letter: float(header.origin[letter]) for letter in "xyz"}
+    starts = (header.nzstart, header.nystart, header.nxstart)  # of sections, rows and columns
+    begin = {letter: float(n) * edges[letter] for letter, n in zip(axes, starts, strict=True)}
     if not any(first.values()):
-        starts = (header.nzstart, header.nystart, header.nxstart)  # of sections, rows and columns
-        first = {letter: float(n) * edges[letter] for letter, n in zip(axes, starts, strict=True)}
+        first = begin
+    elif any(begin.values()) and not np.allclose(list(first.values()), [begin[k] for k in first], rtol=1e-3):
+        notes.append("The header states an origin and another first voxel (nstart): the origin is used.")
+    if header.ispg == 0 and stamp != _IMOD and values.shape[0] > 1:
+        notes.append("By its header the file is a stack of images (space group 0): it is read as a volume.")
     several = values.ndim - 3
     steps, origin = ([0.0] * several + [each[letter] for letter in axes] for each in (edges, first))
     known = math.prod(edges.values()) > 0
-    axes, units = "c" * several + axes, ("angstrom",) * values.ndim
+    axes, units = "c" * several + axes, ("angstrom" if known else None,) * values.ndim
     return Stated(values, axes, steps if known else None, units, origin if known else None, notes=tuple(notes))
 
 

@@ -31,6 +31,8 @@ def read_nifti(path: Path, **_: object) -> Stated:
     zooms = tuple(float(f"{h:.7g}") for h in header.get_zooms())[:3]  # stored as float32
     if len(zooms) < 3:
         raise ScanError(f"a volume must be 3D, got {len(image.shape)}D of shape {image.shape[::-1]} in {path}")
+    forms = [image.get_sform(coded=True)[0], image.get_qform(coded=True)[0]]  # None where the code is 0
+    placed = any(form is not None for form in forms)
     steps, unit, custom = zooms[::-1], header.get_xyzt_units()[0], "voxel"
     guesses = [f"The file's header is mended: {text}." for text in dict.fromkeys(repairs)]
     if own := _own_unit(header):
@@ -38,16 +40,20 @@ def read_nifti(path: Path, **_: object) -> Stated:
         affine[:3] *= factor
         steps = tuple(h * factor for h in zooms[::-1])
     elif unit == "unknown":
-        unit, placed = None, header["qform_code"] > 0 or header["sform_code"] > 0
+        unit = None
         if any(h != 1 for h in zooms) or (placed and not np.allclose(affine, np.eye(4))):
             custom = "mm"
             guesses.append("The file names no unit of length: mm is assumed.")
         else:
             steps = None
-    if steps is not None and not np.allclose(np.linalg.norm(affine[:3, :3], axis=0)[::-1], steps, rtol=0.01):
+    if placed and steps is not None and not np.allclose(np.linalg.norm(affine[:3, :3], axis=0)[::-1], steps, rtol=0.01):
         guesses.append("The file's affine and voxel sizes disagree: the voxel sizes are used.")
+    notes: tuple[str, ...] = ()
+    if all(form is not None for form in forms) and not np.allclose(*forms, rtol=1e-3, atol=0.01 * min(zooms)):
+        notes = ("The file states two places that differ, an sform and a qform: the sform is used.",)
     array, axes = _open_values(image, path)
-    return Stated(array, axes, steps, (unit,) * 3, affine=affine, custom=custom, guesses=tuple(guesses))
+    affine = affine if placed else None  # nibabel would make one up, with x from right to left
+    return Stated(array, axes, steps, (unit,) * 3, None, affine, custom, notes, tuple(guesses))
 
 
 def _open_values(image: Any, path: Path) -> tuple[Any, str]:

@@ -27,7 +27,7 @@ _NRRD_ENCODINGS: dict[str, Callable[[Any], Any]] = {
     **dict.fromkeys(("bzip2", "bz2"), bz2.open),
 }
 #: NRRD's fields that are written with and without a space.
-_SPACED = ("data file", "line skip", "byte skip", "axis mins")
+_SPACED = ("data file", "line skip", "byte skip", "axis mins", "axis maxs", "old min", "old max")
 #: MetaImage's types -> numpy's.
 _META_TYPES = {"MET_CHAR": "i1", "MET_SHORT": "i2", "MET_INT": "i4", "MET_LONG": "i4", "MET_LONG_LONG": "i8"}
 _META_TYPES |= {name.replace("MET_", "MET_U"): f"u{kind[1]}" for name, kind in _META_TYPES.items()}
@@ -42,6 +42,9 @@ def read_nrrd(path: Path, **_: object) -> Stated:
     with path.open("rb") as file:
         header, names = _read_header(nrrd, file)
         values = _read_files(nrrd, header, names, path) if names else _read_values(nrrd, header, file, path)
+    notes: tuple[str, ...] = ()
+    if {"old min", "old max"} & header.keys():
+        notes = (f"The values stand for {header.get('old min')} to {header.get('old max')}: they are as stored.",)
     axes, units = _name_axes(header), list(header.get("space units", header.get("units", ())))
     units = [each or next(filter(None, units), None) for each in units]
     if "space directions" in header:
@@ -51,14 +54,26 @@ def read_nrrd(path: Path, **_: object) -> Stated:
         unit, factors = common_unit(units or [None])
         if len(factors) == 3:  # one for each axis of the world, x first
             affine[:3] *= np.array(factors)[:, None]
-        affine = _to_right_anterior_superior(str(header.get("space", ""))) @ affine
+        space = str(header.get("space", ""))
+        if (turned := _to_right_anterior_superior(space)) is None:
+            space = f"The file's space is {space!r}" if space else "The file names no space"
+            notes += (f"{space}: its directions are taken for right, anterior and superior.",)
+        affine = affine if turned is None else turned @ affine
         steps = np.linalg.norm(affine[:3, :3], axis=0)[::-1]
         steps = [steps["zyx".index(axis)] if axis in tuple("zyx") else None for axis in axes]
-        return Stated(values, axes, steps, (unit,) * len(steps), affine=affine, custom="mm")
+        guesses = () if unit else ("The file names no unit of length: mm is assumed.",)
+        return Stated(values, axes, steps, (unit,) * len(steps), None, affine, "mm", notes, guesses)
     if "spacings" in header:
         steps, units = header["spacings"][::-1], units[::-1] if len(units) == values.ndim else [None] * values.ndim
-        return Stated(values, axes, steps, units, origin=header.get("axis mins", np.zeros(values.ndim))[::-1])
-    return Stated(values, axes)
+        origin = header.get("axis mins", np.zeros(values.ndim))[::-1]
+        if "axis mins" in header:  # that of a cell is its face, half a step before its middle
+            centers = header.get("centerings") or str(header.get("centers", "none " * values.ndim)).split()
+            origin = origin + np.array([str(center) == "cell" for center in centers[::-1]]) * steps / 2
+        guesses = () if any(units) else ("The file names no unit of length: its spacings count in voxels.",)
+        return Stated(values, axes, steps, units, origin, notes=notes, guesses=guesses)
+    if {"axis mins", "axis maxs"} & header.keys():
+        notes += ("The file states where its axes begin or end, but no spacing: that is not used.",)
+    return Stated(values, axes, notes=notes)
 
 
 def _read_header(nrrd: Any, file: IO[bytes]) -> tuple[dict[str, Any], list[str]]:
@@ -78,13 +93,13 @@ def _read_header(nrrd: Any, file: IO[bytes]) -> tuple[dict[str, Any], list[str]]
     return header, [str(header["data file"])] if "data file" in header else []
 
 
-def _to_right_anterior_superior(space: str) -> np.ndarray:
-    """Return the map from a named space, such as left-posterior-superior or LPS, to NIfTI's; others are its own."""
+def _to_right_anterior_superior(space: str) -> np.ndarray | None:
+    """Return the map from a named space, such as left-posterior-superior or LPS, to NIfTI's, or None for others."""
     words = space.lower().removesuffix("-time").split("-")
     letters = [word[:1] for word in words] if len(words) == 3 else list(space.lower()[:3])
     signs = [-1.0 if letter in "lpi" else 1.0 for letter in letters]
     named = [letter in pair for letter, pair in zip(letters, ("rl", "ap", "si"), strict=False)] == [True] * 3
-    return np.diag([*signs, 1.0]) if named else np.eye(4)
+    return np.diag([*signs, 1.0]) if named else None
 
 
 def _read_files(nrrd: Any, header: dict[str, Any], names: Sequence[str], path: Path) -> np.ndarray:
@@ -107,6 +122,8 @@ def _read_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path)
     shape, encoding = [int(n) for n in header["sizes"]][::-1], str(header.get("encoding")).lower()
     no_values = {"dimension": 1, "sizes": np.zeros(1, int), "encoding": "raw", "type": header["type"]}
     dtype = nrrd.read_data({"endian": header.get("endian", "little"), **no_values}, io.BytesIO()).dtype
+    if dtype.itemsize > 1 and "endian" not in header:
+        raise base.Damaged("its numbers have several bytes, and it does not state their order, endian")
     if encoding not in _NRRD_ENCODINGS:
         raise ScanError(f"{path} has the encoding {encoding[:40]!r}: write it as raw, gzip or bzip2")
     for _ in range(int(header.get("line skip", 0))):
@@ -169,7 +186,23 @@ def _meta_image(header: dict[str, str], file: IO[bytes], path: Path) -> Stated:
         affine = LPS_TO_RAS @ base.affine_of(matrix.reshape(axes, axes).T[:3, :3] * spacing[:3], origin[:3])
     letters = ("?" if channels != 1 else "c") * (axes - 3) + "zyx"[-axes:] + "c" * (channels != 1)
     steps = [*spacing[::-1], *([1.0] if channels != 1 else [])]
-    return Stated(values, letters, steps, ("mm",) * len(steps), affine=affine)
+    unit = header.get("DistanceUnits", "mm")
+    return Stated(values, letters, steps, (unit,) * len(steps), affine=affine, notes=_meta_notes(header))
+
+
+def _meta_notes(header: dict[str, str]) -> tuple[str, ...]:
+    """Return what a header states and ITK passes over, as a note."""
+    plain = {"CenterOfRotation": 0.0, "ElementToIntensityFunctionSlope": 1.0, "ElementToIntensityFunctionOffset": 0.0}
+    odd = [name for name, value in plain.items() if any(float(k) != value for k in header.get(name, "").split())]
+    both = {"ElementSpacing", "ElementSize"} <= header.keys() and header["ElementSize"] != header["ElementSpacing"]
+    odd += ["ElementSize"] if both else []
+    axes = np.array(header.get("TransformMatrix", "1 0 0 0 1 0 0 0 1").split(), dtype=np.float64)
+    letters = header.get("AnatomicalOrientation", "???").upper()
+    if axes.size == 9 and "?" not in letters:
+        largest = [(k, int(axis[k] < 0)) for axis in axes.reshape(3, 3) for k in [int(np.abs(axis).argmax())]]
+        own = "".join(("RAI", "LPS")[back][k] for k, back in largest)  # where each axis comes from
+        odd += ["AnatomicalOrientation"] if letters != own else []
+    return (f"The file's {', '.join(odd)} {'is' if len(odd) == 1 else 'are'} not used, as in ITK.",) if odd else ()
 
 
 def _meta_values(header: dict[str, str], shape: list[int], file: IO[bytes], path: Path) -> np.ndarray:
