@@ -6,7 +6,7 @@ import logging
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -276,7 +276,7 @@ def test_dicom_slices_are_ordered_by_position(tmp_path: Path) -> None:
     unreadable(tmp_path, "evenly")
 
 
-def write_dicom(path: Path, plane: np.ndarray, position: float) -> None:
+def write_dicom(path: Path, plane: np.ndarray, position: float, spacing: Sequence[float] = (0.5, 0.25)) -> None:
     import pydicom
 
     image = pydicom.Dataset()
@@ -285,7 +285,7 @@ def write_dicom(path: Path, plane: np.ndarray, position: float) -> None:
     image.file_meta.MediaStorageSOPClassUID = image.SOPClassUID = pydicom.uid.CTImageStorage
     image.file_meta.MediaStorageSOPInstanceUID = image.SOPInstanceUID = pydicom.uid.generate_uid()
     for name, value in {
-        "SeriesInstanceUID": "1.2.3", "Rows": plane.shape[0], "Columns": plane.shape[1], "PixelSpacing": [0.5, 0.25],
+        "SeriesInstanceUID": "1.2.3", "Rows": plane.shape[0], "Columns": plane.shape[1], "PixelSpacing": list(spacing),
         "ImageOrientationPatient": [1, 0, 0, 0, 1, 0], "ImagePositionPatient": [0, 0, position], "RescaleSlope": 2,
         "RescaleIntercept": -10, "SamplesPerPixel": 1, "PhotometricInterpretation": "MONOCHROME2", "BitsAllocated": 16,
         "BitsStored": 16, "HighBit": 15, "PixelRepresentation": 0, "PixelData": plane.tobytes(),
