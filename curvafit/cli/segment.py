@@ -267,7 +267,7 @@ def _run(
     from curvafit.core.files import remove
     from curvafit.segmentation.result import hidden_store, write_mask
     from curvafit.segmentation.tiles import Tiling
-    from curvafit.volumes.write import check_labels
+    from curvafit.volumes.write import check_labels, note_lost
 
     record, reading = job.record, job.reading
     job.check()
@@ -279,6 +279,8 @@ def _run(
         if record.get("labels"):
             volume = volume.load()
             check_labels(job.out, volume)
+        lost = note_lost(job.out, volume)
+        say_notes(lost)
         tiling = Tiling.of(volume, record["epsilon"], record["tile"], periodic=record.get("periodic", False))
         store = hidden_store(job.out)
         tiles = tiling.count > 1 and (record["job"] == "segment" or job.prior is not None)
@@ -290,7 +292,8 @@ def _run(
         # The header is kept where it says where the voxels are; one of a file of channels is of all of them.
         stated = ("spacing", "crop") if job.image else ("spacing", "crop", "channel", "time")
         like = (job.image or job.source) if all(reading[name] is None for name in stated) else None
-        how = {"sure": labels, "like": like, "unit": reading["unit"], "record": job.content, "overwrite": job.overwrite}
+        how = {"sure": labels, "like": like, "unit": reading["unit"], "overwrite": job.overwrite}
+        how["record"] = job.content | ({"not_held": lost} if lost else {})
         paths = write_mask(result, volume.load(), job.out, **how)
         remove(store)
     _print_mask(result.notes, result.status, paths)

@@ -18,7 +18,7 @@ from scipy import ndimage, stats
 from curvafit.core.extras import require
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, silent
-from curvafit.core.units import convert_length, format_number, format_sampling, plain_unit, power_name
+from curvafit.core.units import convert_length, format_number, plain_unit, power_name
 from curvafit.geometry.descriptors import descriptors
 from curvafit.geometry.diagram import FAMILIES, MARGIN, Diagram, diagram, families
 from curvafit.geometry.mesh import NoSurface, Surface, area_vectors
@@ -181,14 +181,17 @@ class Measures(Pictured):
             return self
         if "voxel" in (unit, self.unit):
             raise ValueError(f"expected lengths in a unit that converts to {unit}, got {self.unit}")
-        factor = convert_length(1.0, self.unit, unit)
+        return self.scale(convert_length(1.0, self.unit, unit), unit)
+
+    def scale(self, factor: float, unit: str) -> Measures:
+        """Return the measures of the same scan whose lengths are longer by a factor, in a unit."""
         scaled = ((each, factor**each.power) for each in self.quantities)
         quantities = (replace(each, value=each.value * by, half=each.half * by) for each, by in scaled)
         old = self.diagram
         places = None if old.places is None else old.places * factor
         diagram = replace(old, points=old.points / factor, weights=old.weights * factor**2, places=places)
         diagram = replace(diagram, unit=f"1/{unit}", spread=old.spread / factor)
-        parts = {label: each.convert(unit) for label, each in self.compartments.items()}
+        parts = {label: each.scale(factor, unit) for label, each in self.compartments.items()}
         return replace(self, unit=unit, quantities=tuple(quantities), diagram=diagram, compartments=parts)
 
 
@@ -273,7 +276,6 @@ def measure_maps(
     periodic: bool = options["periodic"]
     progress("finding the structure", 0.0)
     mask, seen, notes = _find_structure(field, kind, options)
-    sampling = format_sampling(field.shape, field.spacing, field.unit)
     progress("measuring curvature", 0.1)
     try:
         prepared = prepare(field, kind=seen, most=most, **options)  # type: ignore[arg-type]
@@ -286,7 +288,7 @@ def measure_maps(
     progress("measuring thickness", 0.5)
     thickness, gap = (local_thickness(each, field.spacing, periodic=periodic) for each in (mask, ~mask))
     euler, surface = euler_shares(mask, periodic=periodic), measure_surface(mask, field.spacing, periodic)
-    voxels, notes = (mask, thickness, gap, euler), (f"{sampling}.", *notes, *working)
+    voxels, notes = (mask, thickness, gap, euler), (*notes, *working)
     return Maps(field.spacing, periodic, *voxels, surface, curved, diagram, seen, notes)
 
 

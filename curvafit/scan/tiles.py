@@ -115,17 +115,21 @@ def measure(
         if (count := len(np.unique(region.values))) > MOST_COMPARTMENTS:
             raise ScanError(f"expected at most {MOST_COMPARTMENTS} labels in a region of interest, got {count}")
         volume = replace(volume, notes=(*volume.notes, *laid))
-    elif periodic or (tile is None and max(volume.shape) <= LARGEST_BOX):
+    sampling, unit, edge = format_sampling(volume.shape, volume.spacing, volume.unit), volume.unit, min(volume.spacing)
+    # Lengths are counted in the finest edge: which of two lengths is greater must not depend on a unit.
+    spacing = tuple(round(h / edge, 12) for h in volume.spacing)
+    volume = replace(volume, spacing=spacing, unit="voxel", affine=None, notes=(f"{sampling}.", *volume.notes))  # type: ignore[arg-type]
+    if periodic or (region is None and tile is None and max(volume.shape) <= LARGEST_BOX):
         check_memory(volume.shape, WORKED, "a scan in one piece")
         field = volume.load() if label is None else volume.load().label(label)
         try:
-            return _measure_whole(field, periodic, progress, **options)  # type: ignore[arg-type]
+            return _measure_whole(field, periodic, progress, **options).scale(edge, unit)  # type: ignore[arg-type]
         except TooLarge:
             if periodic:
                 raise
     request = Request(volume, label, region=region, **options)  # type: ignore[arg-type]
     workers = workers if volume.in_file and (region is None or region.in_file) else None
-    return measure_tiles(request, edge=tile, workers=workers, store=store, progress=progress)
+    return measure_tiles(request, edge=tile, workers=workers, store=store, progress=progress).scale(edge, unit)
 
 
 def _measure_whole(field: Volume, periodic: bool, progress: Progress, kind: str, **options: Any) -> Measures:
@@ -546,7 +550,7 @@ def _draw(plan: Plan, found: Sequence[Record], part: str) -> Diagram:
 
 def _notes(plan: Plan, found: Sequence[Record]) -> tuple[str, ...]:
     """Return notes on how a volume was measured, as `measure.measure` gives them."""
-    notes = [f"{format_sampling(plan.volume.shape, plan.volume.spacing, plan.volume.unit)}.", *plan.notes]
+    notes = [*plan.notes]
     specks, holes = (int(n) for n in np.sum([each["pieces"] for each in found], axis=0))
     if specks or holes:
         notes.append(DROPPED.format(specks, holes))

@@ -13,7 +13,7 @@ from scipy.cluster.vq import kmeans, vq
 from curvafit.core.checks import as_tuple, check_int, check_seed
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, silent
-from curvafit.core.units import format_length, format_number, format_percent, unit_name
+from curvafit.core.units import format_length, format_number, format_percent, format_sampling, unit_name
 from curvafit.scan.measure import QUANTITIES, Blocks, combine, measure_maps
 from curvafit.scan.structure import check_options
 from curvafit.volumes.read import Source, load
@@ -151,6 +151,7 @@ def windows(
     sizes, strides = _check_grid(field.shape, size, stride)
     starts = tuple(tuple(range(0, n, step)) for n, step in zip(field.shape, strides, strict=True))
     options = {"threshold": threshold, "dark": dark, "periodic": periodic}
+    sampling = format_sampling(field.shape, field.spacing, field.unit)
     maps, blocks = measure_maps(field, kind, options, progress), Blocks(field.shape, starts)  # type: ignore[arg-type]
     values = _sum_windows(maps.sum(blocks).reshape(*blocks.counts, -1), field, sizes, strides)
     labels, explained = _cluster(values, clusters, seed)
@@ -165,9 +166,10 @@ def windows(
     structure = replace(field, array=shown, spacing=edges, affine=None)
     left = f"The last {', '.join(map(str, rest))} voxels along z, y, x are in no window."
     how = {"size": sizes, "stride": strides, "clusters": clusters, "seed": seed, "kind": kind}
+    notes = (f"{sampling}.", *maps.notes, *([left] if any(rest) else []))
     return Windows(
         kind=maps.kind, size=sizes, stride=strides, values=values, clusters=grid, explained=explained,
-        structure=structure, options=how | options | reading, notes=(*maps.notes, *([left] if any(rest) else [])),
+        structure=structure, options=how | options | reading, notes=notes,
     )  # fmt: skip
 
 

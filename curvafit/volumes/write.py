@@ -13,7 +13,7 @@ import numpy as np
 from curvafit.core.files import temporary_folder, write_atomically
 from curvafit.core.records import can_write, is_own_zarr
 from curvafit.volumes.formats.arrays import write_npy
-from curvafit.volumes.formats.base import ScanError, smallest_type
+from curvafit.volumes.formats.base import ScanError, first_voxel, smallest_type
 from curvafit.volumes.formats.mrc import check_mrc, write_mrc
 from curvafit.volumes.formats.nifti import write_nifti
 from curvafit.volumes.formats.tiff import check_ome_tiff, write_ome_tiff, write_tiff
@@ -47,9 +47,10 @@ def save(
     store that `save` wrote with the same `kind`, or with `overwrite`.
 
     NIfTI keeps the affine (qform and sform) and the unit. TIFF (ImageJ's or OME's metadata), MRC (in Å) and Zarr
-    (OME-Zarr 0.5, with halved copies of a large volume) keep spacing and unit, Zarr the first voxel's place, too. NPY
-    keeps the values only. TIFF has 64-bit whole numbers in the least type that holds them, float16 as float32. A path
-    `IMAGE/labels/NAME` in an image of OME-Zarr 0.4 or 0.5 gets labels on that image's voxels.
+    (OME-Zarr 0.5, with halved copies of a large volume) keep spacing and unit, Zarr and MRC the first voxel's place of
+    axes that are not turned, too. NPY keeps the values only. What is lost so `note_lost` says. TIFF has 64-bit whole
+    numbers in the least type that holds them, float16 as float32. A path `IMAGE/labels/NAME` in an image of OME-Zarr
+    0.4 or 0.5 gets labels on that image's voxels.
 
     Raises ValueError if the suffix is unknown, the format cannot hold the values' type or needs a unit and the volume
     has none, the source is not a volume, or another folder has that name.
@@ -100,6 +101,19 @@ def pick_writer(path: Path, unit: str, values: np.ndarray | None = None) -> Call
     if values is not None and values.dtype.itemsize > 8 and suffix != ".npy":
         raise ScanError(f"{suffix} holds numbers of at most 64 bits, got {values.dtype}")
     return WRITERS[suffix]
+
+
+def note_lost(path: Path, volume: Volume) -> tuple[str, ...]:
+    """Return a sentence on what a format does not hold of a volume's place, for the time before the work."""
+    name, at, straight = path.name.lower(), any(first_voxel(volume)), np.diag([*volume.spacing[::-1], 1.0])
+    turned = volume.affine is not None and not at and not np.allclose(volume.affine, straight, rtol=1e-5)
+    if name.endswith(".npy"):
+        lost = "voxel size and place" if volume.affine is not None or volume.unit != "voxel" else ""
+    elif name.endswith((".tif", ".tiff")):
+        lost = "the place" if turned or at else ""
+    else:
+        lost = "turned axes and the place" if turned and not name.endswith((".nii", ".nii.gz")) else ""
+    return (f"{path.name} does not hold {lost}: NIfTI does.",) if lost and image_of(path) is None else ()
 
 
 def check_labels(path: str | Path, labels: Volume) -> None:

@@ -285,3 +285,19 @@ def test_no_input_is_written_over(arguments, target, tmp_path, monkeypatch) -> N
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     refused(call(*arguments.split(), "-o", target), "input")
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+
+def test_what_a_format_does_not_hold_is_said_before_the_work(oblique: Path, tmp_path: Path) -> None:
+    """Turned axes go out in NIfTI; others say that they hold no place, or no voxel size."""
+    for name, word in (
+        ("mask.tif", "place"),
+        ("mask.zarr", "turned axes"),
+        ("mask.mrc", "turned axes"),
+        ("mask.npy", "voxel size"),
+    ):
+        result = done("segment", oblique, "--prior", "tubes", "--steps", 1, "-o", tmp_path / name, "--overwrite")
+        assert f"{name} does not hold" in result.stderr and word in result.stderr
+        assert word in json.loads((tmp_path / "mask.json").read_text())["not_held"][0]
+    plain = save(Volume(grey(), (0.3, 0.2, 0.1), "um"), tmp_path / "plain.tif")
+    for name in ("plain_mask.nii.gz", "plain_mask.zarr", "plain_mask.tif"):
+        assert "hold" not in done("segment", plain, "--prior", "tubes", "--steps", 1, "-o", tmp_path / name).stderr
