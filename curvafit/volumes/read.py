@@ -20,6 +20,7 @@ from curvafit.core.checks import quoted
 from curvafit.core.files import is_url
 from curvafit.core.runtime import one_line
 from curvafit.volumes.boxes import Crop, parse_box
+from curvafit.volumes.formats import microscopes
 from curvafit.volumes.formats.arrays import read_hdf5, read_imaris, read_npy, read_npz, read_raw
 from curvafit.volumes.formats.base import (
     Damaged,
@@ -57,12 +58,13 @@ READERS: dict[str, Callable[..., Stated]] = {
     **dict.fromkeys((".mha", ".mhd"), read_metaimage),
     **dict.fromkeys((".mrc", ".map", ".rec"), read_mrc),
     **dict.fromkeys(SUFFIXES, read_dicom),
+    **dict.fromkeys(microscopes.SUFFIXES, microscopes.read_microscope),
     ".isq": read_isq,
     ".aim": read_aim,
 }
 
 #: Readers of formats that can hold several arrays, by key.
-KEYED = (read_npz, read_hdf5, read_imaris, read_zarr, read_dicom)
+KEYED = (read_npz, read_hdf5, read_imaris, read_zarr, read_dicom, microscopes.read_microscope)
 
 
 def load(
@@ -92,8 +94,9 @@ def load(
     source
         A path; a `Volume`, which has its own spacing and unit; or an array or tensor (Z, Y, X). Files are NIfTI, TIFF,
         NPY, NPZ, HDF5, Imaris, RAW, Zarr, Scanco's ISQ and AIM; with `curvafit[io]` also NRRD, MHA/MHD, MRC and DICOM;
-        and with `curvafit[remote]` the URL (https, s3) of a Zarr store. Folders hold slices as TIFF, BMP, PNG, JPEG or
-        DICOM. `file.h5::key` names an array within a file; `key` does the same.
+        with `curvafit[microscopes]` CZI, LIF and ND2; with `curvafit[remote]` the URL (https, s3) of a Zarr store.
+        Folders hold slices as TIFF, BMP, PNG, JPEG or DICOM. `file.h5::key` names an array within a file; `key` does
+        the same.
     spacing, unit
         Voxel edges (z, y, x), or one for all, and nm, um, mm or m, in place of what the file says; for an array the
         default is one voxel. A `unit` alone converts the lengths of a file that names their unit, and names that of
@@ -170,7 +173,7 @@ class FileArray:
         if self._array is None or isinstance(getattr(self._array, "array", self._array), np.memmap):
             self._array = read_file(self.path, **self.how).array
         with _name_damage(self.path):
-            return self._array[index]
+            return np.asarray(self._array[index])
 
     @property
     def digest(self) -> str:
@@ -210,7 +213,9 @@ def read_file(
         raise FileNotFoundError(one_line(f"no such file: {path}"))
     reader = pick_reader(check_regular(path), raw_shape is not None)
     if key is not None and reader not in KEYED:
-        raise ScanError(f"a key applies to NPZ, HDF5, Imaris, Zarr and DICOM only, got {quoted(key)} for {path}")
+        raise ScanError(
+            f"a key applies to NPZ, HDF5, Imaris, Zarr, DICOM, CZI, LIF and ND2 only, got {quoted(key)} for {path}"
+        )
     with _name_damage(path):
         return reader(path, key=key, raw_shape=raw_shape, dtype=dtype)
 

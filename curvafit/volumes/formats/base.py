@@ -21,6 +21,8 @@ from curvafit.core.runtime import memory, one_line
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 #: A name like that of a spacing.
 _SPACING = re.compile("spacing|resolution|(voxel|pixel|element)_?size", re.IGNORECASE)
+#: What is assumed of slices whose distance a file does not state.
+NO_DISTANCE = "The file states no distance of slices: it is taken as the pixel's."
 #: Bytes of one read.
 _PIECE = 1 << 22
 

@@ -25,7 +25,6 @@ _RESOLUTION_LIMIT = 2**31
 #: Words of tifffile's messages where it skips a part of a file.
 _LOST = re.compile("invalid (page )?offset|missing|corrupted|not match|failed to|out of range|raised", re.IGNORECASE)
 _TAG_UNITS = {2: "inch", 3: "cm"}
-_NO_DISTANCE = "The file states no distance of slices: it is taken as the pixel's."
 #: Steps along (z, y, x) and their units, where the file states them, and notes on what is assumed.
 _Spacing = tuple[Sequence[float] | None, Sequence[str | None], tuple[str, ...]]
 #: Nothing is stated.
@@ -166,7 +165,7 @@ def _from_sizes(pixels: Mapping[str, Any]) -> _Spacing:
         return _UNKNOWN
     axes = [axis if sizes[axis] else "X" for axis in "ZYX"]
     units = [pixels.get("unit", pixels.get(f"PhysicalSize{axis}Unit", "um")) for axis in axes]
-    guesses = (_NO_DISTANCE,) if not sizes["Z"] and int(pixels.get("SizeZ", 1)) > 1 else ()
+    guesses = (base.NO_DISTANCE,) if not sizes["Z"] and int(pixels.get("SizeZ", 1)) > 1 else ()
     if "reference frame" in units:
         guesses += ("The file states sizes in a reference frame, not in a unit of length: they are taken for voxels.",)
     return [sizes[axis] for axis in axes], units, guesses
@@ -182,7 +181,7 @@ def _from_imagej(file: tifffile.TiffFile, description: dict[str, Any]) -> _Spaci
     if all(is_unit(unit) and parse_unit(unit)[0] == "voxel" for unit in units):
         steps = (z * x if z else 1.0, x / y, 1.0)
         return (None if np.allclose(steps, 1) else steps), _UNKNOWN[1], ()
-    return (z or 1 / x, 1 / y, 1 / x), units, () if z else (_NO_DISTANCE,)
+    return (z or 1 / x, 1 / y, 1 / x), units, () if z else (base.NO_DISTANCE,)
 
 
 def _from_tags(file: tifffile.TiffFile) -> _Spacing:
@@ -195,7 +194,7 @@ def _from_tags(file: tifffile.TiffFile) -> _Spacing:
     dots = x * (2.54 if unit == "cm" else 1.0)
     if any(abs(dots - screen) < 0.51 for screen in _SCREEN):
         return _UNKNOWN
-    return (1 / x, 1 / y, 1 / x), (unit,) * 3, (_NO_DISTANCE,)
+    return (1 / x, 1 / y, 1 / x), (unit,) * 3, (base.NO_DISTANCE,)
 
 
 def _pixels_per_unit(file: tifffile.TiffFile) -> tuple[float, float]:
