@@ -3,28 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from scipy import ndimage
 
 from curvafit.core.runtime import Progress, silent
+from curvafit.core.workers import Workers, join_workers
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.geometry.topology import euler_number
 from curvafit.priors.grid import WORKING_SPACING
 from curvafit.scan import measure
 from curvafit.scan.prepare import prepare
-from curvafit.scan.structure import read_labels
-from curvafit.volumes.boxes import Box, grow
+from curvafit.scan.structure import count_alike, judge_labels, whole_labels
+from curvafit.volumes.boxes import Box, cut_boxes, grow
 from curvafit.volumes.read import Source, load
-from curvafit.volumes.volume import ScanError, Volume
+from curvafit.volumes.run import Record, Run
+from curvafit.volumes.volume import ScanError, Volume, round_labels
 
 #: Symbols of the numbers that need a volume around a structure: a body has none.
 _OF_TEXTURES = ("BV/TV", "Tb.Sp", "Tb.N", "Conn.D", "BS/TV")
 #: Background around a body, in voxels beyond half its thickness, that the working grid's borders take.
 _AROUND = 5
+#: Voxels a side of the blocks in which labels are looked for, the names of the passes, and what is looked for.
+_BLOCK, _LOOK, _MEASURE, _WHAT = 256, "looking for instances", "measuring instances", "labels of instances"
 #: Name, symbol and power of each number of a body, and how it comes from sums.
 OF_BODIES: tuple[tuple[str, str, int, Callable[[measure.Sums], np.ndarray]], ...] = (
     ("volume", "V", 3, lambda s: s["inside"]),
@@ -36,57 +41,88 @@ OF_BODIES: tuple[tuple[str, str, int, Callable[[measure.Sums], np.ndarray]], ...
 )
 
 
-def measure_instances(labels: Source, *, progress: Progress = silent, **reading: Any) -> tuple[measure.Measures, ...]:
-    """Measure each body of a label image by itself, whatever it touches.
+def measure_instances(
+    labels: Source, *, workers: Workers | int | None = None, progress: Progress = silent, **reading: Any
+) -> tuple[measure.Measures, ...]:
+    """Measure each body of a label image of any size by itself, whatever it touches.
 
     The values but 0 are the bodies' labels, `part` of the result is `("instance", label)`, and intervals are NaN. What
     the image's border cuts is no surface. Curvature is NaN of a body that is nowhere 3 voxels thick, and a note says
-    so. Raises ValueError if the values are grey levels; and as `curvafit.load`.
+    so. Of a file that is read in boxes no more than a body is in memory. Raises ValueError if the values are grey
+    levels; and as `curvafit.load`.
 
     Parameters
     ----------
     labels
         The path of a file, a `Volume`, or an array or tensor (Z, Y, X).
+    workers
+        Processes that measure bodies of a file, or dask's workers; by default this process does.
     reading
         Options of reading a file, or the place of an array: see `curvafit.load`.
     """
     if reading.get("label") is not None:
         raise ValueError("instances are all labels of an image: leave out the label of one")
-    field = load(labels, **reading)
-    values = read_labels(field, "labels of instances")
-    names = np.unique(values[values != 0])
-    if len(names) == 1 and values.all():
+    volume = load(labels, **reading, lazy=True)
+    blocks = cut_boxes(volume.shape, _BLOCK)
+    with join_workers(workers if volume.in_file else None) as crew:
+        run = Run(crew, progress=progress, ends={_LOOK: 0.1, _MEASURE: 1.0})
+        boxes = _join_boxes(list(run(_LOOK, partial(_look_for_labels, volume, blocks), len(blocks))), volume.shape)
+        bodies = run(_MEASURE, partial(_measure_body, volume, list(boxes.items())), len(boxes))
+        return tuple(body["measures"] for body in bodies)
+
+
+def _look_for_labels(volume: Volume, blocks: Sequence[Box], number: int) -> Record:
+    """Return the labels of a block, the first and last voxels of each, whether there are others, and `count_alike`."""
+    block = blocks[number]
+    values = whole_labels(volume.read(block), _WHAT)
+    names, index = np.unique(values, return_inverse=True)
+    found = ndimage.find_objects(index.reshape(values.shape) + 1)
+    corner = [edge.start for edge in block]
+    ends = [[(c + e.start, c + e.stop) for c, e in zip(corner, box, strict=True)] for box in found]
+    kept = names != 0
+    return {"names": names[kept], "ends": np.array(ends)[kept], "alike": count_alike(values), "other": not kept.all()}
+
+
+def _join_boxes(looked: Sequence[Record], shape: Sequence[int]) -> dict[int, Box]:
+    """Return the box of each label of a volume, ascending; raise ScanError where the values are no labels."""
+    judge_labels(np.sum([each["alike"] for each in looked], axis=0), _WHAT)
+    names, index = np.unique(np.concatenate([each["names"] for each in looked]), return_inverse=True)
+    ends = np.concatenate([each["ends"] for each in looked])
+    first, last = np.full((len(names), 3), np.iinfo(np.int64).max), np.zeros((len(names), 3), dtype=np.int64)
+    np.minimum.at(first, index, ends[..., 0])
+    np.maximum.at(last, index, ends[..., 1])
+    if len(names) == 1 and not any(each["other"] for each in looked):
         raise ScanError("expected background or several instances, got one that fills the volume")
-    numbers = np.where(values != 0, np.searchsorted(names, values) + 1, 0).astype(np.int32)
-    found = []
-    for k, (name, box) in enumerate(zip(names.tolist(), ndimage.find_objects(numbers), strict=True)):
-        progress(f"instance {k + 1} of {len(names)}", k / len(names))
-        found.append(_measure_body(field, numbers, k + 1, box, name))
-    return tuple(found)
+    rows = zip(names.tolist(), first.tolist(), last.tolist(), strict=True)
+    return {name: tuple(map(slice, low, high)) for name, low, high in rows}  # type: ignore[misc]
 
 
-def _measure_body(field: Volume, numbers: np.ndarray, number: int, box: Box, label: int) -> measure.Measures:
-    """Return the measures of the body of a number, which lies in a box."""
-    mask = numbers[grow(box, 3, numbers.shape)] == number  # the reach of the blur before marching cubes
-    thickness = local_thickness(mask, field.spacing)
-    around = [math.ceil(float(thickness.max()) / 2 / h) + _AROUND for h in field.spacing]
+def _measure_body(volume: Volume, boxes: Sequence[tuple[int, Box]], number: int) -> Record:
+    """Return the measures of the body of a label, which lies in a box."""
+    label, box = boxes[number]
+
+    def read(margins: int | Sequence[int]) -> np.ndarray:
+        return round_labels(volume.read(grow(box, margins, volume.shape))) == label
+
+    mask = read(3)  # the reach of the blur before marching cubes
+    thickness = local_thickness(mask, volume.spacing)
+    around = [math.ceil(float(thickness.max()) / 2 / h) + _AROUND for h in volume.spacing]
     try:
-        body = numbers[grow(box, around, numbers.shape)] == number
-        prepared = prepare(Volume(body, field.spacing, field.unit), kind="mask")
+        prepared = prepare(Volume(read(around), volume.spacing, volume.unit), kind="mask")
         (curved, drawn), notes = measure.measure_curvatures(prepared), prepared.notes
         drawn = drawn.thin(BIN_WIDTH / prepared.working_voxel * WORKING_SPACING, TAIL_SHARE)  # there may be thousands
     except ValueError as reason:  # too thin, or without a surface away from the image's borders
-        curved, drawn, notes = measure.no_curvature(field.unit, reason)
-    surface = measure.measure_surface(mask, field.spacing, False)
+        curved, drawn, notes = measure.no_curvature(volume.unit, reason)
+    surface = measure.measure_surface(mask, volume.spacing, False)
     empty = np.zeros_like(thickness)
-    maps = measure.Maps(field.spacing, False, mask, thickness, empty, empty, surface, curved, drawn, "mask", notes)
+    maps = measure.Maps(volume.spacing, False, mask, thickness, empty, empty, surface, curved, drawn, "mask", notes)
     total = dict(zip(measure.SUMS, maps.sum(measure.Blocks(mask.shape, ((0,),) * 3))[0], strict=True))  # type: ignore[arg-type]
-    total |= {"χ": euler_number(mask), **_measure_extent(numbers[box] == number, box, field)}
+    total |= {"χ": euler_number(mask), **_measure_extent(read(0), box, volume)}
     with np.errstate(divide="ignore", invalid="ignore"):  # without curvature
         values = [(name, symbol, float(figure(total)), math.nan, power) for name, symbol, power, figure in OF_BODIES]
     quantities, direction = tuple(measure.Quantity(*each) for each in values), measure.find_direction(total)
-    part = ("instance", label)
-    return measure.Measures(field.source, field.unit, "mask", quantities, direction, drawn, (1, 1, 1), notes, part)
+    place = (quantities, direction, drawn, (1, 1, 1), notes, ("instance", label))
+    return {"measures": measure.Measures(volume.source, volume.unit, "mask", *place)}
 
 
 def _measure_extent(body: np.ndarray, box: Box, field: Volume) -> dict[str, float]:

@@ -182,16 +182,34 @@ def read_region(
 
 def read_labels(labels: Volume, what: str) -> np.ndarray:
     """Return a volume's labels, whole numbers (Z, Y, X); ScanError if all are 0, or the values are grey levels."""
-    rounded = round_labels(labels.values)
-    values = rounded.astype(np.int64) if rounded.dtype.kind == "f" else rounded
-    left, right = values[..., :-1], values[..., 1:]
-    pairs = (left != 0) & (right != 0)
-    if not values.any():
-        raise ScanError(f"expected {what}, got none: every voxel is 0")
-    alike = np.count_nonzero(pairs & (left == right)) >= _ALIKE * np.count_nonzero(pairs)
-    if not alike or (values != rounded).any():
-        raise ScanError(f"expected {what}, whole numbers that neighbours share, got grey levels")
+    values = whole_labels(labels.values, what)
+    judge_labels(count_alike(values), what)
     return values
+
+
+def whole_labels(values: np.ndarray, what: str) -> np.ndarray:
+    """Return nearly whole numbers as whole ones; raise ScanError if some are not."""
+    rounded = round_labels(values)
+    whole = rounded.astype(np.int64) if rounded.dtype.kind == "f" else rounded
+    if (whole != rounded).any():
+        raise ScanError(f"expected {what}, whole numbers that neighbours share, got grey levels")
+    return whole
+
+
+def count_alike(labels: np.ndarray) -> np.ndarray:
+    """Return how many voxels have a label, how many pairs along x have two, and how many the same one twice."""
+    pairs = (labels[..., :-1] != 0) & (labels[..., 1:] != 0)
+    same = pairs & (labels[..., :-1] == labels[..., 1:])
+    return np.array([np.count_nonzero(each) for each in (labels, pairs, same)])
+
+
+def judge_labels(counts: np.ndarray, what: str) -> None:
+    """Raise ScanError where there are no labels, by `count_alike`, or neighbours do not share them."""
+    labelled, pairs, same = counts.tolist()
+    if not labelled:
+        raise ScanError(f"expected {what}, got none: every voxel is 0")
+    if same < _ALIKE * pairs:
+        raise ScanError(f"expected {what}, whole numbers that neighbours share, got grey levels")
 
 
 def is_noise(mask: np.ndarray) -> bool:

@@ -72,7 +72,7 @@ def measure_each(
     memory. Raises ValueError as those do.
     """
     several = len(scans) > 1
-    options |= {} if labels else {"workers": 0 if several else workers}
+    options |= {"workers": 0 if several else workers}
     tasks: dict[int, Task] = {}
     for k, scan in enumerate(scans):
         tiles = {} if labels or store is None else {"store": store / f"{k:04d}"}

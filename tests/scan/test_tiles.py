@@ -251,4 +251,4 @@ def test_the_command_writes_rows_for_each_instance(labels: np.ndarray, tmp_path:
         (("grey.npy",), "grey"), (("part.npy",), "whole"), (("labels.npy", "--dark"), "--dark"),
         (("labels.npy", "--roi", path), "--roi"), (("labels.npy", "--label", 5), "label"),
     ):  # fmt: skip
-        refused(call("measure", tmp_path / arguments[0], "--labels", *arguments[1:]), word)
+        refused(call("measure", tmp_path / arguments[0], "--labels", *arguments[1:]), word, progress=True)

@@ -213,7 +213,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["mask.npy", *(pytest.param(f"mask.{suffix}", marks=pytest.mark.slow) for suffix in ("zarr", "nii.gz"))]
+    "name", ["mask.tif", *(pytest.param(f"mask.{suffix}", marks=pytest.mark.slow) for suffix in ("zarr", "nii.gz"))]
 )
 def test_the_same_command_goes_on_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """One, two or no worker processes: other processes may add up otherwise."""

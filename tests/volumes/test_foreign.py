@@ -103,6 +103,7 @@ def nifti(case: Case, folder: Path) -> None:
     image = nibabel.Nifti1Image(case.values.T, case.affine)
     image.header.set_xyzt_units(unit)
     if case.rng.random() < 0.5:
+        image.set_qform(case.affine, code=1)
         image.set_sform(None, code=0)
     nibabel.save(image, folder / "a.nii.gz")
     seen = nibabel.load(folder / "a.nii.gz")

@@ -75,8 +75,8 @@ def read_remote(url: str, key: str | None = None) -> Stated:
     What is in such a store cannot be listed: without a key its image's finest level is read.
     """
     scheme = url.partition("://")[0]
-    for module in ("fsspec", "s3fs" if scheme == "s3" else "aiohttp"):
-        require(module, "remote", f"reading {scheme}://")
+    for module, extra in (("fsspec", "remote"), ("s3fs", "") if scheme == "s3" else ("aiohttp", "remote")):
+        require(module, extra, f"reading {scheme}://")
     import zarr
 
     node: Any = zarr.open(url, mode="r")
