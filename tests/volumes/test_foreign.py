@@ -1,7 +1,8 @@
 """Files that other programs wrote hold the same values at the same places in the world here, and back out again."""
 
 import json
-from collections.abc import Callable
+import locale
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -222,6 +223,14 @@ def dicom(case: Case, folder: Path) -> None:
     files = sitk.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder / "d"))
     seen = sitk.ReadImage(files)
     check(load(folder / "d"), sitk.GetArrayFromImage(seen), itk_affine(seen), "mm", 1e-3)
+
+
+@pytest.fixture(autouse=True)
+def kept_locale() -> Iterator[None]:
+    """GDCM takes the environment's locale, in which Python would read its own sources as ASCII."""
+    before = locale.setlocale(locale.LC_ALL)
+    yield
+    locale.setlocale(locale.LC_ALL, before)
 
 
 READERS = {
