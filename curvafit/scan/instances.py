@@ -28,6 +28,8 @@ from curvafit.volumes.volume import ScanError, Volume, round_labels
 _OF_TEXTURES = ("BV/TV", "Tb.Sp", "Tb.N", "Conn.D", "BS/TV")
 #: Background around a body, in voxels beyond half its thickness, that the working grid's borders take.
 _AROUND = 5
+#: Labels below this are counted without sorting the voxels.
+_DENSE = 2**20
 #: Voxels a side of the blocks in which labels are looked for, the names of the passes, and what is looked for.
 _BLOCK, _LOOK, _MEASURE, _WHAT = 256, "looking for instances", "measuring instances", "labels of instances"
 #: Name, symbol and power of each number of a body, and how it comes from sums.
@@ -75,8 +77,12 @@ def _look_for_labels(volume: Volume, blocks: Sequence[Box], number: int) -> Reco
     """Return the labels of a block, the first and last voxels of each, whether there are others, and `count_alike`."""
     block = blocks[number]
     values = whole_labels(volume.read(block), _WHAT)
-    names, index = np.unique(values, return_inverse=True)
-    found = ndimage.find_objects(index.reshape(values.shape) + 1)
+    if values.min() >= 0 and values.max() < _DENSE:
+        names, index = np.flatnonzero(np.bincount(values.ravel())), values.astype(np.int32) + 1
+    else:
+        names, index = np.unique(values, return_inverse=True)
+        index = index.reshape(values.shape) + 1
+    found = [box for box in ndimage.find_objects(index) if box is not None]
     corner = [edge.start for edge in block]
     ends = [[(c + e.start, c + e.stop) for c, e in zip(corner, box, strict=True)] for box in found]
     kept = names != 0

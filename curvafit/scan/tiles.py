@@ -466,8 +466,10 @@ def measure_tiles(
     progress: Progress = silent,
 ) -> Measures:
     """Measure a volume in tiles of `edge` voxels a side, as `measure` says; raise as it does."""
-    same = {"scan": request.volume.digest, "label": request.label, "kind": request.kind, "threshold": request.threshold}
-    same |= {"dark": request.dark, "tile": edge, "region": request.region and request.region.digest}
+    same: dict[str, Any] = {}
+    if store is not None:  # digests take a while
+        same = {"scan": request.volume.digest, "region": request.region and request.region.digest, "tile": edge}
+        same |= {name: getattr(request, name) for name in ("label", "kind", "threshold", "dark")}
     with open_run(workers, store, same, progress, {_FIRST: 0.95, _AGAIN: 1.0}) as run, one_thread():
         plan = survey(request, run)
         plan = replace(plan, cores=tuple(cut_boxes(plan.volume.shape, edge or _choose_edges(plan))))

@@ -13,6 +13,7 @@ from functools import partial
 from itertools import pairwise, product
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -166,7 +167,8 @@ def lower_volume(
     ones stay, those of an earlier, killed run too, and workers."""
     trial, tiles = problem.trial, tiling.tiles
     folder, workers = (None, None) if tiling.count == 1 else (None if store is None else Path(store), workers)
-    same = identity(**problem.inputs, law=trial.law, steps=trial.steps, tiles=tiling.counts, place=tiling.place)
+    parts: dict[str, Any] = {"law": trial.law, "steps": trial.steps, "tiles": tiling.counts, "place": tiling.place}
+    same = {} if folder is None else identity(**problem.inputs, **parts)  # digests take a while
     with open_run(workers, folder, same, progress, {_LOWER: 1.0}) as run:
         mask, phase = (
             np.empty(tiling.shape, kind) if folder is None else open_mapped(folder / name, kind, tiling.shape)
