@@ -44,7 +44,7 @@ _out = partial(typer.Option, rich_help_panel="What to write")
 )
 def generate(
     out: Annotated[
-        Path, _out("-o", "--output", help="Input (.nii.gz .nii .tif .npy .mrc .zarr) or surface (.stl .ply .vtp).")
+        Path, _out("-o", "--output", help="Volume (.nii.gz .nii .tif .npy .mrc .zarr) or surface (.stl .ply .vtp).")
     ],
     preset: Annotated[str | None, _what(help="A published shape; see `curvafit presets`.")] = None,
     coefficients: Annotated[str | None, _what(help="a20,a11,a02,a10,a01,a00 in working units; needs a mass.")] = None,

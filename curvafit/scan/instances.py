@@ -68,7 +68,7 @@ def measure_instances(
     blocks = cut_boxes(volume.shape, _BLOCK)
     with join_workers(workers if volume.in_file else None) as crew:
         run = Run(crew, progress=progress, ends={_LOOK: 0.1, _MEASURE: 1.0})
-        boxes = _join_boxes(list(run(_LOOK, partial(_look_for_labels, volume, blocks), len(blocks))), volume.shape)
+        boxes = _join_boxes(run(_LOOK, partial(_look_for_labels, volume, blocks), len(blocks)))
         bodies = run(_MEASURE, partial(_measure_body, volume, list(boxes.items())), len(boxes))
         return tuple(body["measures"] for body in bodies)
 
@@ -78,7 +78,8 @@ def _look_for_labels(volume: Volume, blocks: Sequence[Box], number: int) -> Reco
     block = blocks[number]
     values = whole_labels(volume.read(block), _WHAT)
     if values.min() >= 0 and values.max() < _DENSE:
-        names, index = np.flatnonzero(np.bincount(values.ravel())), values.astype(np.int32) + 1
+        index = values.astype(np.int32)
+        names, index = np.flatnonzero(np.bincount(index.ravel())).astype(values.dtype), index + 1
     else:
         names, index = np.unique(values, return_inverse=True)
         index = index.reshape(values.shape) + 1
@@ -89,7 +90,7 @@ def _look_for_labels(volume: Volume, blocks: Sequence[Box], number: int) -> Reco
     return {"names": names[kept], "ends": np.array(ends)[kept], "alike": count_alike(values), "other": not kept.all()}
 
 
-def _join_boxes(looked: Sequence[Record], shape: Sequence[int]) -> dict[int, Box]:
+def _join_boxes(looked: Sequence[Record]) -> dict[int, Box]:
     """Return the box of each label of a volume, ascending; raise ScanError where the values are no labels."""
     judge_labels(np.sum([each["alike"] for each in looked], axis=0), _WHAT)
     names, index = np.unique(np.concatenate([each["names"] for each in looked]), return_inverse=True)

@@ -64,16 +64,17 @@ Levels = Callable[[Box], np.ndarray]
 
 @dataclass(frozen=True)
 class Request:
-    """A volume, and what the caller says of it."""
+    """A volume, and what the caller says of it.
+
+    A `region` is not 0 where the threshold of a padded scan is taken; if that `alone` counts, it is that of any scan.
+    """
 
     volume: Volume
     label: int | None
     kind: Literal["auto", "field", "mask", "image"]
     threshold: Literal["otsu"] | float
     dark: bool
-    region: Volume | None = (
-        None  # nonzero where the threshold of a padded scan is taken, or of any if that `alone` counts
-    )
+    region: Volume | None = None
     alone: bool = False
 
     def read(self, box: Box) -> np.ndarray:
@@ -373,7 +374,7 @@ def find_split(request: Request, run: Run, extremes: tuple[Any, Any] | None = No
     side = max(1, math.isqrt(PIECE // volume.shape[2]))
     bars = cut_boxes(volume.shape, (side, side, volume.shape[2]))
     value = request.read((slice(0, 1), slice(0, 1), slice(0, 1)))[0, 0, 0]
-    found = list(run("reading", partial(_look_at_values, request, bars, value), len(bars)))
+    found = run("reading", partial(_look_at_values, request, bars, value), len(bars))
     total = add_records({name: each[name] for name in each if name not in ("two", "values")} for each in found)
     if faults := int(total["faults"]):
         raise ScanError(f"a volume must be finite, got {faults} values that are not in {volume.source}")
@@ -397,16 +398,13 @@ def find_split(request: Request, run: Run, extremes: tuple[Any, Any] | None = No
     if kind == "mask":
         note = f"Taken for a mask of the values {split.lowest:g} and {split.highest:g}."
         return split, note if two else SEVERAL
-    size = math.prod(volume.shape)
-    return _split_image(request, bars, split, total, value, size, run), ""
+    return _split_image(request, bars, split, total, value, run), ""
 
 
-def _split_image(
-    request: Request, bars: Sequence[Box], split: Split, total: Record, value: Any, size: int, run: Run
-) -> Split:
-    """Return the split with the padding and the threshold of an image of so many voxels, of which `total` is known."""
+def _split_image(request: Request, bars: Sequence[Box], split: Split, total: Record, value: Any, run: Run) -> Split:
+    """Return the split with the padding and the threshold of an image, of which `total` is known."""
     levels, ends = partial(_read_levels, request, None, False), (total["lowest"], total["highest"])
-    if total["constant"] > PADDED * size:
+    if total["constant"] > PADDED * math.prod(request.volume.shape):
         counted = add_records(run("looking for padding", partial(_count_padding, request, bars, value), len(bars)))
         split = replace(split, padding=judge_padding(value, counted["padding"]))
     if request.threshold != "otsu":

@@ -73,13 +73,13 @@ def measure(
 ) -> Measures:
     """Measure the structure in a scan of any size, with an interval for each number.
 
-    Request fraction, thickness, spacing, connectivity, surface and fabric are those of the structure on the scan's own
+    Volume fraction, thickness, spacing, connectivity, surface and fabric are those of the structure on the scan's own
     voxels, all of them. Curvature is that of the scan on the working grid, as `infer` reads it. Intervals are 95 %, by
     a jackknife over blocks of a period (thickness and spacing) of the structure (`errors`); a scan with fewer than
     eight has none. A stack of under ten slices may have no curvature (NaN, and a note). A scan with a side of more than
     `LARGEST_BOX` voxels is measured in tiles, which have the numbers of the scan in one piece; of Zarr, HDF5, NPY, RAW
     and uncompressed NIfTI no more than a tile is in memory. Raises ValueError if the scan has no structure, or none
-    that the voxels resolve, a region does not fit it, or a large scan has a region or is periodic and does not fit into
+    that the voxels resolve, a region does not fit it or it repeats, or a large scan repeats and does not fit into
     memory; or as `curvafit.load`, and FileNotFoundError if there is no such file.
 
     Parameters
@@ -95,7 +95,7 @@ def measure(
     tile
         Voxels a side of a tile, of a scan of any size; by default a large scan's memory decides.
     workers
-        Processes that measure tiles of a file, or dask's workers; by default this process does.
+        Processes that measure tiles of a file without a region, or dask's workers; by default this process does.
     store
         A folder where finished tiles stay, so that a killed run goes on; by default there is none.
     reading
@@ -128,7 +128,7 @@ def measure(
             if periodic:
                 raise
     request = Request(volume, label, region=region, **options)  # type: ignore[arg-type]
-    workers = workers if volume.in_file and (region is None or region.in_file) else None
+    workers = workers if volume.in_file and region is None else None
     return measure_tiles(request, edge=tile, workers=workers, store=store, progress=progress).scale(edge, unit)
 
 
@@ -138,8 +138,7 @@ def _measure_whole(field: Volume, periodic: bool, progress: Progress, kind: str,
     maps = whole.measure_maps(field, kind, {**options, "periodic": periodic}, progress, most)
     connectivity = measure_connectivity(maps.mask, field.spacing, periodic=periodic)
     blocks = maps.divide()
-    table = maps.sum(blocks)
-    return whole.summarise_sums(field, maps.kind, blocks, table, connectivity, maps.diagram, maps.notes)
+    return whole.summarise_sums(field, maps.kind, blocks, maps.sum(blocks), connectivity, maps.diagram, maps.notes)
 
 
 def _describe_tiles(plan: Plan, processes: int) -> str:
@@ -474,13 +473,13 @@ def measure_tiles(
         plan = survey(request, run)
         plan = replace(plan, cores=tuple(cut_boxes(plan.volume.shape, edge or _choose_edges(plan))))
         stated = _describe_tiles(plan, run.processes)
-        found = list(run(_FIRST, partial(measure_tile, plan), len(plan.cores), stated))
+        found = run(_FIRST, partial(measure_tile, plan), len(plan.cores), stated)
         # the factors that `morphometry.local_thickness` chooses
         widest, finest = np.max([each["widest"] for each in found], axis=0), min(plan.volume.spacing)
         wide = replace(plan, factors=tuple(max(1, math.ceil(each / finest / COARSE)) for each in widest))
         again: list[Record] = []
         if max(wide.factors) > 1:
-            again = list(run(_AGAIN, partial(_measure_wide, wide), len(plan.cores)))
+            again = run(_AGAIN, partial(_measure_wide, wide), len(plan.cores))
     return _summarise(wide, found, again, stated)
 
 

@@ -337,7 +337,7 @@ def _read_known(job: Job, run: Run, doubted: bool) -> tuple[Job, tuple[str, ...]
     places too, if they are `doubted`."""
     shape = (len(job.places), *job.shape[1:])
     open_mapped(job.folder / _KNOWN, np.bool_, shape)
-    found = list(run(_READ, partial(read_slab, job), job.slabs))
+    found = run(_READ, partial(read_slab, job), job.slabs)
     values = np.unique(np.concatenate([each["values"] for each in found]))
     if len(values) > LABELS:
         raise ScanError(f"the known slices must be a mask or have at most {LABELS} labels, got {len(values)} values")

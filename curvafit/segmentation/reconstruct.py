@@ -49,6 +49,7 @@ from curvafit.segmentation.slices import (
     find_labelled,
     index_labels,
     known_places,
+    load_with,
     mark_known,
     reach_of,
     require_labels,
@@ -420,11 +421,7 @@ def _describe_gain(best: Trial, where: str) -> str:
 def _load_image(image: Source, volume: Volume, reading: dict[str, Any]) -> Volume:
     """Load the grey levels of the volume that the slices are of."""
     require("sklearn.ensemble", "image", "reading an image")
-    placed: dict[str, Any] = (
-        {} if isinstance(image, Volume) else {name: reading.get(name) for name in ("spacing", "unit", "crop")}
-    )
-    field = load(image, **placed)
-    field, laid = lay(field, volume, "the image", "the slices", exact=True)
+    field, laid = lay(load_with(image, reading, "crop"), volume, "the image", "the slices", exact=True)
     if (count := len(np.unique(field.values.ravel()[:: -(-field.values.size // SAMPLED)]))) < GREY:
         raise ScanError(f"the image must have grey levels, but has {count} values: is it a mask?")
     return replace(field, notes=laid)
@@ -442,10 +439,7 @@ def _read_evidence(
 
 def _load_example(example: Source, volume: Volume, reading: dict[str, Any]) -> Volume:
     """Load an example with the spacing and unit of the slices, which are of `volume`."""
-    placed: dict[str, Any] = (
-        {} if isinstance(example, Volume) else {name: reading.get(name) for name in ("spacing", "unit")}
-    )
-    field = load(example, **placed)
+    field = load_with(example, reading)
     check_spacing(field, volume, "the slices")
     require_labels(field.values, "the example")
     return field

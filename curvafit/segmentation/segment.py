@@ -19,7 +19,7 @@ from curvafit.scan.structure import check_options
 from curvafit.segmentation.evidence import GreyEvidence, VolumeEvidence, load_probabilities, probability_evidence
 from curvafit.segmentation.flow import BENDING, STEPS, WorkingGrid, bending
 from curvafit.segmentation.result import Segmentation, flow_summary
-from curvafit.segmentation.slices import check_spacing, require_labels
+from curvafit.segmentation.slices import check_spacing, load_with, require_labels
 from curvafit.segmentation.tiles import LoweredVolume, Problem, Tiling, lower_volume
 from curvafit.segmentation.trials import Task, Trial, choose_by_masks, law_of, laws_of
 from curvafit.volumes.boxes import Box, cut_boxes
@@ -294,10 +294,8 @@ def calibrate(
     `label` is the value of the structure in the mask. See `segment` for the other parameters, and for errors.
     """
     field = load_probabilities(probabilities, **reading)
-    placed: dict[str, Any] = (
-        {} if isinstance(mask, Volume) else {name: reading.get(name) for name in ("spacing", "unit")}
-    )
-    truth, laid = lay(load(mask, label=label, **placed), field, "the mask", "the probabilities", exact=True)
+    truth = load_with(mask, reading, label=label)
+    truth, laid = lay(truth, field, "the mask", "the probabilities", exact=True)
     inside = require_labels(truth.values, "the example") > 0
     if inside.all() or not inside.any():
         state = "full" if inside.all() else "empty"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,6 +14,7 @@ from curvafit.core.units import format_sampling
 from curvafit.priors.grid import MOST
 from curvafit.scan.grids import centre_distance
 from curvafit.volumes.boxes import Box
+from curvafit.volumes.read import Source, load
 from curvafit.volumes.volume import ScanError, Volume, round_labels
 
 #: Plain interpolations, the usual one first: signed distances on a cubic spline and on lines; the nearest slice.
@@ -299,6 +300,14 @@ def require_outline(inside: int, count: int, name: str) -> None:
             f"{name} must have voxels inside and outside, but all are {'full' if inside else 'empty'}; is another "
             "slice the first, is there a label that nobody annotated, or are there several labels?"
         )
+
+
+def load_with(source: Source, reading: Mapping[str, Any], *more: str, label: int | None = None) -> Volume:
+    """Load what goes with another volume: a file or an array with that one's spacing and unit, and `more` of its
+    options of reading."""
+    names = () if isinstance(source, Volume) else ("spacing", "unit", *more)
+    options: dict[str, Any] = {name: reading.get(name) for name in names}
+    return load(source, label=label, **options)
 
 
 def check_spacing(example: Volume, volume: Volume, name: str) -> None:

@@ -63,7 +63,7 @@ class Run:
         count: int,
         shown: str = "",
         keep: Callable[[int, Record], Record] = lambda _, record: record,
-    ) -> Iterator[Record]:
+    ) -> list[Record]:
         """Return the records of blocks 0 to `count` - 1, in their order.
 
         The progress says the pass's name, or what is `shown`. `keep` is called here with each new record, to store its
@@ -80,7 +80,7 @@ class Run:
             if self._folder is not None:
                 _write_record(self._folder, name, number, records[number])
             self._progress(shown or name, start + (stop - start) * done / count)
-        return iter([records[number] for number in range(count)])
+        return [records[number] for number in range(count)]
 
 
 def _do(function: Callable[[int], Record], shared: bool, number: int) -> tuple[int, Record]:

@@ -130,6 +130,17 @@ def test_times(tmp_path: Path) -> None:
     unreadable(save(Volume(numbers()), tmp_path / "plain.tif"), "no axis of times", time=0)
 
 
+def test_ids_of_instances_in_other_blocks() -> None:
+    """Ids are looked for in blocks, of which some have small ones alone: those of 64 bits keep every digit."""
+    z, y, x = np.indices((14, 14, 300))
+    labels = np.zeros(z.shape, np.uint64)
+    for centre, name in ((20, 7), (280, 2**63 + 11)):
+        labels[(z - 7) ** 2 + (y - 7) ** 2 + (x - centre) ** 2 < 25] = name
+    found = curvafit.measure_instances(labels)
+    assert [each.part for each in found] == [("instance", 7), ("instance", 2**63 + 11)]
+    assert [each["V"].value for each in found] == [np.count_nonzero(labels == name) for name in (7, 2**63 + 11)]
+
+
 LOG = """[System]
 Scanner=Skyscan1172
 [Acquisition]

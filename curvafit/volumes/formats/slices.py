@@ -7,9 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-import imagecodecs
 import numpy as np
-from PIL import Image
 
 from curvafit.core.units import convert_length, is_unit
 from curvafit.volumes.formats import base
@@ -73,6 +71,9 @@ def _list_slices(path: Path) -> tuple[list[Path], tuple[str, ...]]:
 
 def _read_picture(path: Path) -> Stated:
     """Read a BMP, PNG or JPEG; equal colours are grey, and transparency is left out."""
+    import imagecodecs
+    from PIL import Image
+
     if path.suffix.lower() == ".png":  # Pillow would cut deep colours to bytes
         values = np.asarray(imagecodecs.png_decode(path.read_bytes()))
     else:

@@ -137,10 +137,8 @@ def _state_array(array: Any, folder: Path | None, place: _Place) -> Stated:
     if len(axes) == array.ndim and any(a != b and "?" not in (a, b) for a, b in zip(axes, own, strict=True)):
         notes += (f"The array calls its axes {', '.join(map(str, named))}: those of the image count.",)
     axes = axes if len(axes) == array.ndim else own
-    if isinstance(folder, Path):
-        gaps = _missing_chunks(array, folder)
-    else:
-        gaps = ("Whether chunks are missing in a store that is not on this machine is not known.",)
+    unknown = ("Whether chunks are missing in a store that is not on this machine is not known.",)
+    gaps = unknown if folder is None else _missing_chunks(array, folder)
     return Stated(array, **{**place, "axes": axes, "units": units, "notes": notes}, gaps=gaps)
 
 
