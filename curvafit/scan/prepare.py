@@ -164,15 +164,13 @@ def read_scan(
 ) -> tuple[Volume, tuple[int, int, int]]:
     """Return a scan as `load`, and its shape; of a large file no more is read than `prepare` uses, which a note
     says, unless `whole`."""
-    volume = load(scan, crop=crop, **reading, lazy=True)
+    volume = load(scan, crop=crop, label=label, **reading, lazy=True)
     shape = volume.shape
     if whole or not volume.in_file or max(shape) <= LARGEST_SCAN:
-        volume = volume.load()
-        return volume if label is None else volume.label(label), shape
+        return volume.load(), shape
     where, notes = grids.bounding_box(shape, None, LARGEST_SCAN)
     try:
         part = volume.crop(where).load()
-        part = part if label is None else part.label(label)
     except ScanError as error:
         raise ScanError(f"{error}, in the middle of this large scan: name another part with crop") from error
     return replace(part, notes=part.notes + notes), shape
@@ -201,7 +199,7 @@ def coarser_level(
 def prepare(
     field: Volume,
     *,
-    kind: Literal["auto", "field", "mask", "image"] = "auto",
+    kind: Kind = "auto",
     periodic: bool = False,
     threshold: Literal["otsu"] | float = "otsu",
     dark: bool = False,

@@ -25,7 +25,8 @@ from curvafit.volumes.read import Source, load
 from curvafit.volumes.run import Record, Run
 from curvafit.volumes.volume import ScanError, Volume, round_labels
 
-Kind = Literal["field", "mask", "image"]
+#: What a scan is; `auto` until it is found.
+Kind = Literal["auto", "field", "mask", "image"]
 
 #: Voxels that the first passes read at once.
 PIECE = 2**24
@@ -63,43 +64,35 @@ Levels = Callable[[Box], np.ndarray]
 
 
 @dataclass(frozen=True)
-class Request:
-    """A volume, and what the caller says of it.
+class Structure:
+    """What in a volume is structure: as the caller says it, and as it is once `find_split` has looked.
 
     A `region` is not 0 where the threshold of a padded scan is taken; if that `alone` counts, it is that of any scan.
+    Found are the kind, the extremes, whether they are the only two values, and the threshold and padding of an image.
     """
 
     volume: Volume
-    label: int | None
-    kind: Literal["auto", "field", "mask", "image"]
-    threshold: Literal["otsu"] | float
-    dark: bool
+    kind: Kind = "auto"
+    threshold: Literal["otsu"] | float = "otsu"
+    dark: bool = False
     region: Volume | None = None
     alone: bool = False
-
-    def read(self, box: Box) -> np.ndarray:
-        """Return the values of a box; of a label, where it is."""
-        values = self.volume.read(box)
-        values = values if self.label is None else values == self.label
-        return values.view(np.uint8) if values.dtype.kind == "b" else values
-
-
-@dataclass(frozen=True)
-class Split:
-    """How a volume's structure is told from its background: the kind, the extremes, and the threshold of an image."""
-
-    kind: Kind
-    lowest: float
-    highest: float
-    two: bool
+    lowest: float = 0.0
+    highest: float = 0.0
+    two: bool = False
     level: float = 0.0
     padding: Padding | None = None
+
+    def read(self, box: Box) -> np.ndarray:
+        """Return the values of a box."""
+        values = self.volume.read(box)
+        return values.view(np.uint8) if values.dtype.kind == "b" else values
 
 
 def find_structure(
     field: Volume,
     *,
-    kind: Literal["auto", "field", "mask", "image"] = "auto",
+    kind: Kind = "auto",
     threshold: Literal["otsu"] | float = "otsu",
     dark: bool = False,
     region: np.ndarray | None = None,
@@ -112,15 +105,14 @@ def find_structure(
     a part of: they tell a mask's two values. Raises ScanError if the threshold splits nothing or a phase is empty.
     """
     inside = None if region is None else replace(field, array=region)
-    request = Request(field, None, kind, threshold, dark, inside, alone=True)
-    split, note = find_split(request, Run(), extremes)
+    structure, note = find_split(Structure(field, kind, threshold, dark, inside, alone=True), Run(), extremes)
     z, y, x = (slice(0, n) for n in field.shape)
-    values = find_levels(request, split, (z, y, x), periodic)
+    values = find_levels(structure, (z, y, x), periodic)
     counted = values if region is None else values[region]
-    if split.kind == "image":
-        note = describe_image(request, split, float(counted.min()), float(counted.max()))
+    if structure.kind == "image":
+        note = describe_image(structure, float(counted.min()), float(counted.max()))
     check_phases(int(np.count_nonzero(counted > 0)), counted.size)
-    return split.kind, replace(field, array=values, notes=(*field.notes, note))
+    return structure.kind, replace(field, array=values, notes=(*field.notes, note))
 
 
 def check_phases(inside: int, count: int) -> None:
@@ -130,21 +122,21 @@ def check_phases(inside: int, count: int) -> None:
         raise ScanError(f"expected {what} in the scan, got none: every voxel is {other}")
 
 
-def find_levels(request: Request, split: Split, box: Box, periodic: bool = False) -> np.ndarray:
+def find_levels(structure: Structure, box: Box, periodic: bool = False) -> np.ndarray:
     """Return a box of a volume, all of a `periodic` one, as float32 values that are above 0 in its structure.
 
     Grey levels are smoothed by one voxel of the finest axis, less the raw levels' threshold.
     """
     # Smoothing lowers thin structures' grey: a threshold of the smoothed levels would sink and make them fat.
-    if split.kind == "image":
-        around, volume = grow(box, SMOOTHED, request.volume.shape), request.volume
-        smooth = smooth_levels(request.read(around), volume.spacing, periodic, split.padding)
-        return sign_levels(smooth[within(box, around)], split.level, request.dark, split.padding)
-    values = request.read(box)
-    if split.kind == "field":
-        return (-values if request.dark else values).astype(np.float32)
-    mask = values == split.highest if split.two else values > 0
-    return np.where(mask != request.dark, np.float32(1), np.float32(-1))
+    if structure.kind == "image":
+        around, volume = grow(box, SMOOTHED, structure.volume.shape), structure.volume
+        smooth = smooth_levels(structure.read(around), volume.spacing, periodic, structure.padding)
+        return sign_levels(smooth[within(box, around)], structure.level, structure.dark, structure.padding)
+    values = structure.read(box)
+    if structure.kind == "field":
+        return (-values if structure.dark else values).astype(np.float32)
+    mask = values == structure.highest if structure.two else values > 0
+    return np.where(mask != structure.dark, np.float32(1), np.float32(-1))
 
 
 def check_options(kind: str, threshold: float | str, label: int | None = None) -> None:
@@ -349,80 +341,83 @@ def sign_levels(smooth: np.ndarray, level: float, dark: bool, padding: Padding |
     return signed
 
 
-def describe_image(request: Request, split: Split, lowest: float, highest: float) -> str:
+def describe_image(structure: Structure, lowest: float, highest: float) -> str:
     """Return the note on padding and threshold, given the extremes of `find_levels`; raise ScanError where the
     threshold is not between those of the smoothed levels."""
-    otsu, level = request.threshold == "otsu", split.level
-    low, high = (level - highest, level - lowest) if request.dark else (level + lowest, level + highest)
+    otsu, level = structure.threshold == "otsu", structure.level
+    low, high = (level - highest, level - lowest) if structure.dark else (level + lowest, level + highest)
     if not low < level < high:
         raise ScanError(f"expected a threshold within the smoothed scan's {low:.4g} to {high:.4g}, got {level:.4g}")
-    how, side = "Otsu's" if otsu else "the given", "dark" if request.dark else "bright"
+    how, side = "Otsu's" if otsu else "the given", "dark" if structure.dark else "bright"
     note = f"Smoothed by one voxel, split at {how} threshold of {level:.4g}: the {side} phase is the structure."
-    return " ".join([*describe_padding(split.padding, otsu, request.region is not None), note])
+    return " ".join([*describe_padding(structure.padding, otsu, structure.region is not None), note])
 
 
 # ---- kind and threshold ----------------------------------------------------------------------------------------------
 
 
-def find_split(request: Request, run: Run, extremes: tuple[Any, Any] | None = None) -> tuple[Split, str]:
-    """Return how structure and background are split, and a note for fields and masks; `extremes` as `find_structure`.
+def find_split(structure: Structure, run: Run, extremes: tuple[Any, Any] | None = None) -> tuple[Structure, str]:
+    """Find how structure and background are split; return it, and a note for fields and masks. `extremes` are those of
+    `find_structure`.
 
     Two values are a mask, as are labels; floats from about -1 to about 1, without noise and mostly far from 0, are a
     phase field; anything else is an image.
     """
-    volume = request.volume
+    volume = structure.volume
     side = max(1, math.isqrt(PIECE // volume.shape[2]))
     bars = cut_boxes(volume.shape, (side, side, volume.shape[2]))
-    value = request.read((slice(0, 1), slice(0, 1), slice(0, 1)))[0, 0, 0]
-    found = run("reading", partial(_look_at_values, request, bars, value), len(bars))
+    value = structure.read((slice(0, 1), slice(0, 1), slice(0, 1)))[0, 0, 0]
+    found = run("reading", partial(_look_at_values, structure, bars, value), len(bars))
     total = add_records({name: each[name] for name in each if name not in ("two", "values")} for each in found)
     if faults := int(total["faults"]):
         raise ScanError(f"a volume must be finite, got {faults} values that are not in {volume.source}")
     lowest, highest = total["lowest"], total["highest"]
     first, last = (lowest, highest) if extremes is None else extremes
-    if first == last and request.label is not None:
-        raise ScanError(f"label {request.label} is no label of the scan, or the only one")
+    if first == last and volume.in_file and (label := volume.array.label) is not None:
+        raise ScanError(f"label {label} is no label of the scan, or the only one")
     if first == last and volume.source:
         raise ScanError(f"every voxel of {volume.source} is {lowest}: a volume must vary")
     ends = {float(first), float(last)}
     two = all(bool(each["two"]) and {float(each["lowest"]), float(each["highest"])} <= ends for each in found)
-    kind, values = request.kind, np.unique(np.concatenate([each["values"] for each in found]))
+    kind, values = structure.kind, np.unique(np.concatenate([each["values"] for each in found]))
     if kind == "auto":
-        kind = "mask" if two or (request.threshold == "otsu" and are_labels(values)) else "image"
-        if kind == "image" and may_be_field(volume.dtype, request.threshold, float(lowest), float(highest)):
+        kind = "mask" if two or (structure.threshold == "otsu" and are_labels(values)) else "image"
+        if kind == "image" and may_be_field(volume.dtype, structure.threshold, float(lowest), float(highest)):
             steady = 2 * total["steady"] > total["steps"] or not total["steps"]
             kind = "field" if steady and total["plateau"] > PLATEAUS * math.prod(volume.shape) else "image"
-    split = Split(kind, float(first), float(last), two and bool(first < last))
+    ends = {"lowest": float(first), "highest": float(last)}
+    structure = replace(structure, kind=kind, **ends, two=two and bool(first < last))
     if kind == "field":
-        return split, f"Taken for a phase field: values {float(lowest):.3g} to {float(highest):.3g}."
+        return structure, f"Taken for a phase field: values {float(lowest):.3g} to {float(highest):.3g}."
     if kind == "mask":
-        note = f"Taken for a mask of the values {split.lowest:g} and {split.highest:g}."
-        return split, note if two else SEVERAL
-    return _split_image(request, bars, split, total, value, run), ""
+        note = f"Taken for a mask of the values {structure.lowest:g} and {structure.highest:g}."
+        return structure, note if two else SEVERAL
+    return _split_image(structure, bars, total, value, run), ""
 
 
-def _split_image(request: Request, bars: Sequence[Box], split: Split, total: Record, value: Any, run: Run) -> Split:
-    """Return the split with the padding and the threshold of an image, of which `total` is known."""
-    levels, ends = partial(_read_levels, request, None, False), (total["lowest"], total["highest"])
-    if total["constant"] > PADDED * math.prod(request.volume.shape):
-        counted = add_records(run("looking for padding", partial(_count_padding, request, bars, value), len(bars)))
-        split = replace(split, padding=judge_padding(value, counted["padding"]))
-    if request.threshold != "otsu":
-        return replace(split, level=float(request.threshold))
-    sure, inside = split.padding is not None and split.padding.sure, split.padding is not None or request.alone
-    if sure or (inside and request.region is not None):
-        levels = partial(_read_levels, request, value if sure else None, True)
+def _split_image(structure: Structure, bars: Sequence[Box], total: Record, value: Any, run: Run) -> Structure:
+    """Return the structure with the padding and the threshold of an image, of which `total` is known."""
+    levels, ends = partial(_read_levels, structure, None, False), (total["lowest"], total["highest"])
+    if total["constant"] > PADDED * math.prod(structure.volume.shape):
+        counted = add_records(run("looking for padding", partial(_count_padding, structure, bars, value), len(bars)))
+        structure = replace(structure, padding=judge_padding(value, counted["padding"]))
+    padding = structure.padding
+    if structure.threshold != "otsu":
+        return replace(structure, level=float(structure.threshold))
+    sure, inside = padding is not None and padding.sure, padding is not None or structure.alone
+    if sure or (inside and structure.region is not None):
+        levels = partial(_read_levels, structure, value if sure else None, True)
         counted = add_records(run("looking at levels", partial(_look_at_levels, levels, bars), len(bars)))
         if not counted or counted["lowest"] == counted["highest"]:
             raise ScanError("expected grey levels that differ where they count, got one of them only")
         ends = (counted["lowest"], counted["highest"])
-    return replace(split, level=_find_threshold(levels, bars, *ends, run))
+    return replace(structure, level=_find_threshold(levels, bars, *ends, run))
 
 
-def _look_at_values(request: Request, bars: Sequence[Box], value: Any, number: int) -> Record:
+def _look_at_values(structure: Structure, bars: Sequence[Box], value: Any, number: int) -> Record:
     """Return the extremes of a bar, how many voxels have a value, whether it has two values at most, and what tells
     labels and a phase field."""
-    values = request.read(bars[number])
+    values = structure.read(bars[number])
     lowest, highest = values.min(), values.max()
     found = {"lowest": lowest, "highest": highest, "two": np.all((values == lowest) | (values == highest))}
     found["values"] = np.array([lowest, highest]) if found["two"] else list_values(values)
@@ -430,24 +425,24 @@ def _look_at_values(request: Request, bars: Sequence[Box], value: Any, number: i
     if values.dtype.kind != "f":
         return {**found, "faults": np.int64(0)}
     found["faults"] = np.int64(values.size - np.count_nonzero(np.isfinite(values)))
-    if request.kind == "auto" and not found["faults"] and lowest >= -2 and highest <= 2:
+    if structure.kind == "auto" and not found["faults"] and lowest >= -2 and highest <= 2:
         steps = np.abs(np.diff(values, 3, axis=2)) if values.shape[2] > 3 else np.empty(0)
         found |= {"steady": np.count_nonzero(steps < JITTER), "steps": np.int64(steps.size)}
         found["plateau"] = np.count_nonzero(np.abs(values) > PLATEAU)
     return {name: np.asarray(value) for name, value in found.items()}
 
 
-def _count_padding(request: Request, bars: Sequence[Box], value: Any, number: int) -> Record:
+def _count_padding(structure: Structure, bars: Sequence[Box], value: Any, number: int) -> Record:
     """Return what tells padding with a value in a bar."""
-    return {"padding": count_constant(request.read(bars[number]), value)}
+    return {"padding": count_constant(structure.read(bars[number]), value)}
 
 
-def _read_levels(request: Request, left: float | None, inside: bool, box: Box) -> np.ndarray:
+def _read_levels(structure: Structure, left: float | None, inside: bool, box: Box) -> np.ndarray:
     """Return the values of a box but one that is left out, `inside` of the region, if there is one."""
-    values = request.read(box)
+    values = structure.read(box)
     counted = np.ones(values.shape, dtype=bool) if left is None else values != left
-    if inside and request.region is not None:
-        counted &= request.region.read(box) != 0
+    if inside and structure.region is not None:
+        counted &= structure.region.read(box) != 0
     return values[counted]
 
 

@@ -15,9 +15,21 @@ from functools import partial
 import numpy as np
 
 from curvafit.geometry.balls import ball_radii
-from curvafit.scan import prepare, structure
+from curvafit.scan import prepare
 from curvafit.scan.grids import MEASURED, candidate_boxes, order_boxes, surface_voxels, thickness_beneath
 from curvafit.scan.measure import MOST, Blocks
+from curvafit.scan.structure import (
+    LAGS,
+    PIECE,
+    Structure,
+    add_records,
+    check_phases,
+    count_pairs,
+    describe_image,
+    find_levels,
+    find_split,
+    pairs_of_noise,
+)
 from curvafit.volumes.boxes import Box, cut_boxes, grow, within
 from curvafit.volumes.run import Record, Run
 from curvafit.volumes.volume import Volume
@@ -33,8 +45,7 @@ class Plan:
     have `cores`, and balls of both phases are painted on grids coarser by `factors`.
     """
 
-    request: structure.Request
-    split: structure.Split
+    structure: Structure
     noise: bool
     notes: tuple[str, ...]
     smallest: float = 0.0
@@ -50,7 +61,7 @@ class Plan:
     @property
     def volume(self) -> Volume:
         """The volume that is measured."""
-        return self.request.volume
+        return self.structure.volume
 
     @property
     def finest(self) -> Blocks:
@@ -61,28 +72,25 @@ class Plan:
 
     def levels(self, box: Box) -> np.ndarray:
         """Return a box of the volume as float32 values that are above 0 in its structure."""
-        return structure.find_levels(self.request, self.split, box)
+        return find_levels(self.structure, box)
 
 
-def survey(request: structure.Request, run: Run) -> Plan:
+def survey(structure: Structure, run: Run) -> Plan:
     """Find what the tiles of a volume have in common; raise ScanError as `measure.measure`."""
-    volume = request.volume
-    split, note = structure.find_split(request, run)
-    pieces = cut_boxes(volume.shape, round(structure.PIECE ** (1 / 3)))
-    total = structure.add_records(
-        run("counting the structure", partial(_count_structure, request, split, pieces), len(pieces))
-    )
-    if split.kind == "image":
-        note = structure.describe_image(request, split, float(total["lowest"]), float(total["highest"]))
+    volume = structure.volume
+    structure, note = find_split(structure, run)
+    pieces = cut_boxes(volume.shape, round(PIECE ** (1 / 3)))
+    total = add_records(run("counting the structure", partial(_count_structure, structure, pieces), len(pieces)))
+    if structure.kind == "image":
+        note = describe_image(structure, float(total["lowest"]), float(total["highest"]))
     size, filled = math.prod(volume.shape), int(total["filled"])
-    structure.check_phases(filled, size)
-    labelled = () if request.label is None else (f"The structure is label {request.label}.",)
-    noise = split.kind != "field" and structure.pairs_of_noise(volume.shape, filled / size, total["pairs"])
-    plan = Plan(request, split, noise, (*volume.notes, *labelled, note))
+    check_phases(filled, size)
+    noise = structure.kind != "field" and pairs_of_noise(volume.shape, filled / size, total["pairs"])
+    plan = Plan(structure, noise, (*volume.notes, note))
     thinner = filled <= prepare.HALF * size
     candidates = candidate_boxes(volume.shape, MEASURED)
     median, thick, plan = _measure_thickness(plan, order_boxes(candidates, total["surface"].tolist()), True)
-    if split.kind == "image":
+    if structure.kind == "image":
         plan = replace(plan, smallest=prepare.smallest_piece(median) / math.prod(volume.spacing))
     if not thinner:
         order = order_boxes(candidates, total["other surface"].tolist())
@@ -92,7 +100,7 @@ def survey(request: structure.Request, run: Run) -> Plan:
 
 def _choose_grid(plan: Plan, median: float, thick: float, name: str) -> Plan:
     """Return the plan with its working grid, as `prepare.prepare` chooses it."""
-    kind, volume = plan.split.kind, plan.volume
+    kind, volume = plan.structure.kind, plan.volume
     note = prepare.judge_thickness(name, median, thick, volume.spacing, kind == "field" or plan.noise)
     scale, why = prepare.choose_scale(kind, volume, plan.noise, median)
     return replace(
@@ -120,11 +128,11 @@ def _measure_thickness(plan: Plan, order: Sequence[Box], inside: bool) -> tuple[
 # ---- structure -------------------------------------------------------------------------------------------------------
 
 
-def _count_structure(request: structure.Request, split: structure.Split, pieces: Sequence[Box], number: int) -> Record:
+def _count_structure(structure: Structure, pieces: Sequence[Box], number: int) -> Record:
     """Return the structure's voxels in a piece, its surface in boxes that may be measured, and `count_pairs`."""
-    core, shape = pieces[number], request.volume.shape
-    box = grow(core, max(structure.LAGS), shape)
-    levels = structure.find_levels(request, split, box)
+    core, shape = pieces[number], structure.volume.shape
+    box = grow(core, max(LAGS), shape)
+    levels = find_levels(structure, box)
     inner = within(core, box)
     found = {"lowest": levels[inner].min(), "highest": levels[inner].max()}
     mask = levels > 0
@@ -134,7 +142,7 @@ def _count_structure(request: structure.Request, split: structure.Split, pieces:
         shared = [_overlap(core, each) for each in candidate_boxes(shape, MEASURED)]
         counts = [0 if each is None else np.count_nonzero(surface[within(each, core)]) for each in shared]
         found[name] = np.array(counts, dtype=np.int64)
-    found["pairs"] = structure.count_pairs(mask, inner, core, shape)
+    found["pairs"] = count_pairs(mask, inner, core, shape)
     return {name: np.asarray(value) for name, value in found.items()}
 
 

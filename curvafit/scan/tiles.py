@@ -31,7 +31,7 @@ from curvafit.scan import measure as whole
 from curvafit.scan.grids import CutOut, centre_distance, profile_mask, remove_specks, resample
 from curvafit.scan.measure import Blocks, Measures
 from curvafit.scan.prepare import DROPPED, LARGEST_BOX, WORKED, Prepared, TooLarge, note_on_filling, smallest_piece
-from curvafit.scan.structure import Request, check_options, read_labels, read_region
+from curvafit.scan.structure import Structure, check_options, read_labels, read_region
 from curvafit.scan.survey import Plan, survey
 from curvafit.volumes.boxes import Box, cut_boxes, grow, within
 from curvafit.volumes.read import Source, load
@@ -108,7 +108,7 @@ def measure(
     if periodic and (roi is not None or tile is not None):
         raise ValueError("a scan that repeats is measured in one piece and without a region: leave out tile and roi")
     label, region = reading.pop("label", None), None
-    volume = load(scan, **reading, lazy=True)
+    volume = load(scan, label=label, **reading, lazy=True)
     if roi is not None:
         region, laid = read_region(roi, volume, scan, **reading)
         region = replace(region, array=read_labels(region, "a region of interest with labels"))
@@ -121,15 +121,14 @@ def measure(
     volume = replace(volume, spacing=spacing, unit="voxel", affine=None, notes=(f"{sampling}.", *volume.notes))  # type: ignore[arg-type]
     if periodic or (region is None and tile is None and max(volume.shape) <= LARGEST_BOX):
         check_memory(volume.shape, WORKED, "a scan in one piece")
-        field = volume.load() if label is None else volume.load().label(label)
         try:
-            return _measure_whole(field, periodic, progress, **options).scale(edge, unit)  # type: ignore[arg-type]
+            return _measure_whole(volume.load(), periodic, progress, **options).scale(edge, unit)  # type: ignore[arg-type]
         except TooLarge:
             if periodic:
                 raise
-    request = Request(volume, label, region=region, **options)  # type: ignore[arg-type]
+    structure = Structure(volume, region=region, **options)  # type: ignore[arg-type]
     workers = workers if volume.in_file and region is None else None
-    return measure_tiles(request, edge=tile, workers=workers, store=store, progress=progress).scale(edge, unit)
+    return measure_tiles(structure, edge=tile, workers=workers, store=store, progress=progress).scale(edge, unit)
 
 
 def _measure_whole(field: Volume, periodic: bool, progress: Progress, kind: str, **options: Any) -> Measures:
@@ -221,9 +220,9 @@ class _Sums:
             starts.append(tuple(max(all_starts[k] - edge.start, 0) for k in range(first, last + 1)))
         z, y, x = (edge.stop - edge.start for edge in core)
         self._local = Blocks((z, y, x), tuple(starts))  # type: ignore[arg-type]
-        if plan.request.region is not None:  # surface lies up to a working voxel beyond the core
+        if plan.structure.region is not None:  # surface lies up to a working voxel beyond the core
             self._near = grow(core, [math.ceil(s) + 2 for s in plan.scale], plan.volume.shape)
-            self._labels = plan.request.region.read(self._near)
+            self._labels = plan.structure.region.read(self._near)
             names += [INSIDE, *(str(label) for label in np.unique(self._labels).tolist() if label)]
         self.tables = {name: np.zeros((finest.count, len(whole.SUMS))) for name in names}
 
@@ -380,7 +379,7 @@ def _measure_curvature(plan: Plan, core: Box, sums: _Sums) -> Record:
         return found
     values = _find_working_levels(plan, box)
     mask, inner = values > 0, within(owned, box)
-    if plan.split.kind != "field":
+    if plan.structure.kind != "field":
         smallest, cut = smallest_piece(plan.thickness / plan.edge), _cut_out(owned, box, plan.working)
         cleaned, *specks = remove_specks(mask, smallest, False, cut)
         found |= {"specks": np.array(specks), "changed": np.count_nonzero((cleaned != mask)[inner])}
@@ -397,7 +396,7 @@ def _measure_curvature(plan: Plan, core: Box, sums: _Sums) -> Record:
     seen = mask[within(part, box)]
     if seen.all() or not seen.any():
         return found
-    if plan.split.kind != "field":
+    if plan.structure.kind != "field":
         values = profile_mask(mask)
     try:
         (places, columns), drawn = whole.measure_curvatures(_prepare_part(plan, values[within(part, box)], seen, part))
@@ -420,10 +419,10 @@ def _find_working_levels(plan: Plan, box: Box) -> np.ndarray:
     z, y, x = (slice(min(a, n), min(b, n)) for (a, b), n in zip(ends, volume.shape, strict=True))
     blurred = [math.ceil(4 * max(0.0, (s - 1) / 2)) + 2 for s in plan.scale]
     limit = 4 * max(max(s * h, h) for s, h in zip(plan.scale, volume.spacing, strict=True))
-    far = [math.ceil(limit / h) + 1 for h in volume.spacing] if plan.split.kind == "mask" else [0] * 3
+    far = [math.ceil(limit / h) + 1 for h in volume.spacing] if plan.structure.kind == "mask" else [0] * 3
     around = grow((z, y, x), [a + b for a, b in zip(blurred, far, strict=True)], volume.shape)
     values = plan.levels(around)
-    if plan.split.kind == "mask":
+    if plan.structure.kind == "mask":
         values = centre_distance(values > 0, volume.spacing, limit)
     start, shape = [edge.start for edge in box], [edge.stop - edge.start for edge in box]
     return resample(values, plan.scale, start, shape, corner=[edge.start for edge in around])
@@ -435,7 +434,7 @@ def _prepare_part(plan: Plan, phase: np.ndarray, mask: np.ndarray, part: Box) ->
     z, y, x = (slice(0, n) for n in phase.shape)
     size = (plan.scale, plan.edge, plan.volume.unit, plan.thickness / plan.edge)
     origin = tuple(edge.start * s for edge, s in zip(part, plan.scale, strict=True))
-    return Prepared(plan.split.kind, phase, mask, grid, *size, ((z, y, x),), (), origin)  # type: ignore[arg-type]
+    return Prepared(plan.structure.kind, phase, mask, grid, *size, ((z, y, x),), (), origin)  # type: ignore[arg-type]
 
 
 def _bin(plan: Plan, drawn: Diagram, kept: np.ndarray, part: str) -> Record:
@@ -457,7 +456,7 @@ def _bin(plan: Plan, drawn: Diagram, kept: np.ndarray, part: str) -> Record:
 
 
 def measure_tiles(
-    request: Request,
+    structure: Structure,
     *,
     edge: int | None = None,
     workers: Workers | int | None = None,
@@ -467,10 +466,10 @@ def measure_tiles(
     """Measure a volume in tiles of `edge` voxels a side, as `measure` says; raise as it does."""
     same: dict[str, Any] = {}
     if store is not None:  # digests take a while
-        same = {"scan": request.volume.digest, "region": request.region and request.region.digest, "tile": edge}
-        same |= {name: getattr(request, name) for name in ("label", "kind", "threshold", "dark")}
+        same = {"scan": structure.volume.digest, "region": structure.region and structure.region.digest, "tile": edge}
+        same |= {name: getattr(structure, name) for name in ("kind", "threshold", "dark")}
     with open_run(workers, store, same, progress, {_FIRST: 0.95, _AGAIN: 1.0}) as run, one_thread():
-        plan = survey(request, run)
+        plan = survey(structure, run)
         plan = replace(plan, cores=tuple(cut_boxes(plan.volume.shape, edge or _choose_edges(plan))))
         stated = _describe_tiles(plan, run.processes)
         found = run(_FIRST, partial(measure_tile, plan), len(plan.cores), stated)
@@ -505,9 +504,11 @@ def _summarise(plan: Plan, found: Sequence[Record], again: Sequence[Record], sta
         drawn = _draw(plan, found, part) if tables[part][:, whole.SUMS.index("curved")].any() else none[1]
         connectivity = (χ, (1 - χ) / sampled) if part == _WHOLE else None
         table, named = _merge(tables[part], finest, blocks), None if label is None else ("compartment", label)
-        return whole.summarise_sums(plan.volume, plan.split.kind, blocks, table, connectivity, drawn, notes, part=named)
+        return whole.summarise_sums(
+            plan.volume, plan.structure.kind, blocks, table, connectivity, drawn, notes, part=named
+        )
 
-    if plan.request.region is None:
+    if plan.structure.region is None:
         return summarise(_WHOLE)
     labels = sorted(int(part) for part in parts - {_WHOLE, INSIDE})
     return replace(summarise(INSIDE), compartments={label: summarise(str(label), label) for label in labels})

@@ -133,11 +133,10 @@ def load(
     else:
         raise ScanError(f"a volume must be the path of a file, a Volume, an array or a tensor, got {quoted(source)}")
     volume = volume if box is None else volume.crop(box)
-    if volume.in_file and not (lazy and label is None):
-        volume = volume.load()
-    elif isinstance(source, str | os.PathLike) and not (lazy or volume.in_file):
+    if isinstance(source, str | os.PathLike) and not (lazy or volume.in_file):
         check_varies(volume.values, volume.source)
-    return volume if label is None else volume.label(label)
+    volume = volume if label is None else volume.label(label)
+    return volume if lazy else volume.load()
 
 
 def _open(

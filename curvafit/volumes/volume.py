@@ -108,10 +108,13 @@ class Volume(Pictured):
 
     def load(self) -> Volume:
         """Return the volume in memory; ScanError where that of a file does not fit, is not finite, or constant."""
+        if not self.in_file:
+            return self
+        if (label := self.array.label) is not None:
+            return replace(self, array=replace(self.array, label=None), notes=self.notes[:-1]).load().label(label)
         values = self.values
-        if self.source:
-            check_varies(values, self.source)
-        return replace(self, array=values) if self.in_file else self
+        check_varies(values, self.source)
+        return replace(self, array=values)
 
     def check_fits(self) -> None:
         """Raise ScanError where all values do not fit into memory."""
@@ -128,15 +131,18 @@ class Volume(Pictured):
         return replace(self, array=array).move_origin([edge.start for edge in box])
 
     def label(self, label: int) -> Volume:
-        """Return the mask of the voxels with this value; none or all of them are a ScanError."""
+        """Return the mask of the voxels with this value; none or all of them are a ScanError, once they are read."""
         label = check_int(label, "a label that is a whole number", -SEEDS, 2 * SEEDS - 1)
+        notes = (*self.notes, f"The structure is label {label}.")
+        if self.in_file:
+            return replace(self, array=replace(self.array, label=label), notes=notes)
         mask = round_labels(self.values) == label
         if mask.all() or not mask.any():
             values = np.unique(self.values)
             listed = ", ".join(map(str, values[:12].tolist())) + (", …" if len(values) > 12 else "")
             fault = "is the only label" if mask.any() else "is no label"
             raise ScanError(f"label {label} {fault} of the scan, which has {listed}")
-        return replace(self, array=mask, notes=(*self.notes, f"The structure is label {label}."))
+        return replace(self, array=mask, notes=notes)
 
     def move_origin(self, start: Sequence[float]) -> Volume:
         """Return the volume with its first voxel placed where its voxel `start` (z, y, x) is."""
@@ -151,12 +157,13 @@ class StoredArray:
     """Three axes of an array in a file, read where boxes of them are asked for.
 
     `file` has `shape`, `dtype`, `file[index]` and a `digest`; `index` has a number or a slice for each of its axes, and
-    `order` names those of z, y and x.
+    `order` names those of z, y and x. With a `label` the array is a mask, of the voxels that have this value.
     """
 
     file: Any
     index: tuple[int | slice, ...]
     order: tuple[int, int, int]
+    label: int | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -165,12 +172,12 @@ class StoredArray:
 
     @property
     def dtype(self) -> np.dtype:
-        return self.file.dtype.newbyteorder("=")
+        return self.file.dtype.newbyteorder("=") if self.label is None else np.dtype(np.bool_)
 
     @property
     def digest(self) -> str:
         """A text that changes with the content."""
-        return f"{self.file.digest} {self.index} {self.order}"
+        return f"{self.file.digest} {self.index} {self.order} {self.label}"
 
     def crop(self, box: Box) -> StoredArray:
         """Return a box of voxels."""
@@ -183,6 +190,7 @@ class StoredArray:
 
     def __getitem__(self, box: Box) -> np.ndarray:
         values = np.asarray(self.file[self.crop(box).index])
+        values = values if self.label is None else round_labels(values) == self.label
         turned = values.transpose([sorted(self.order).index(axis) for axis in self.order])
         return np.array(turned, self.dtype, order="C", copy=None if values.flags.owndata else True)  # not a mapped file
 
