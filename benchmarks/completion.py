@@ -34,11 +34,13 @@ from curvafit.generation.flow import generate
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer
 from curvafit.priors.coefficients import Coefficients
+from curvafit.segmentation.known import Known
 from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.trials import dice
 from curvafit.segmentation.uncertainty import calibration_error, near_surface
 from curvafit.volumes.read import load
+from curvafit.volumes.run import Run
 from curvafit.volumes.volume import Volume
 
 LAWS = ("tubes", "trabec", "sponge", "metatubes", "pearls", "sieve", "flow", "bilayers")
@@ -127,7 +129,7 @@ def filled(
         mask, likely = (np.moveaxis(each.values, axis, 0) for each in (found.mask, found.probability))
         status = found.status
     else:
-        mask = interpolated(Slices.of(truth, places, axis), way)
+        mask = interpolated(Known(truth, axis, tuple(places)).read(Run())[0], way)
     last = places[-1] + 1
     unknown = [k for k in range(last) if k not in places]
     values = {**scores(mask[:last], first[:last]), "dice": dice(mask[unknown], first[unknown]), "status": status}

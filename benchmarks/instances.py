@@ -29,7 +29,7 @@ from skimage import measure
 from skimage.segmentation import find_boundaries
 
 from benchmarks.harness import CACHE, Cases, Figure, Values, data, show
-from curvafit.segmentation.reconstruct import reconstruct_labels
+from curvafit.segmentation.labels import reconstruct_labels
 from curvafit.segmentation.trials import dice
 from curvafit.volumes.volume import Volume
 

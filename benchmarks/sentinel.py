@@ -33,7 +33,8 @@ from curvafit.priors.grid import Grid
 from curvafit.priors.profile import SIGMA, phase_field
 from curvafit.scan.prepare import prepare
 from curvafit.scan.tiles import measure
-from curvafit.segmentation.reconstruct import reconstruct, reconstruct_labels
+from curvafit.segmentation.labels import reconstruct_labels
+from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.segmentation.segment import segment
 from curvafit.segmentation.trials import dice
 from curvafit.studies.compare import compare

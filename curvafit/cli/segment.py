@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -156,7 +155,9 @@ def reconstruct(
     sure: Annotated[float | None, _what(help="Also write labels, ignored where less sure.", min=0.5, max=1)] = None,
     epsilon: Epsilon = None,
     steps: Steps = 400,
-    tile: Annotated[int | None, _what(help="Side of a block into Zarr; with a law as in segment.", min=8)] = None,
+    tile: Annotated[
+        int | None, _what(help="Side of a block: large files have some; with a law as in segment.", min=8)
+    ] = None,
     workers: Annotated[int | None, _what(help="Processes for blocks or tiles; by default one.", min=0)] = None,
     reading: Reading,
     overwrite: OverwriteOption = False,
@@ -181,53 +182,30 @@ def reconstruct(
     numbers = None if known is None else list(parse_whole_numbers(known, "--known"))
     options: dict[str, Any] = {"every": every, "first": first or 0, "known": numbers, "axis": "zyx".index(axis.lower())}
     options |= {"epsilon": epsilon, "suggest": suggest, "filler": None if filler is None else str(filler)}
-    whole = {"ignore": ignore, "stiffness": stiffness, "periodic": periodic}  # what is not filled in blocks
+    options |= {"steps": steps, "tile": tile, "ignore": ignore, "stiffness": stiffness, "periodic": periodic}
     shown = {"image": image, "example": None if example is None else str(example)}
-    common = {"steps": steps, "tile": tile, **options, **whole}
-    record: dict[str, Any] = {"job": "reconstruct", "sure": sure, **common, **shown}
+    record: dict[str, Any] = {"job": "reconstruct", "sure": sure, **options, **shown}
     record |= {"labels": labels, "instances": instances} if labels else {}
     inputs = [each for each in (*shown.values(), filler) if each is not None]
     maps = ("probability",) if sure is None else ("probability", "sure")
-    job = _Job(slices, out, prior, reading, record, overwrite, inputs, maps)
-    alone = not (prior or labels or sure or any(whole.values()) or any(shown.values())) and ignore is None
-    if alone and _fill_blocks(job, {**options, "tile": tile, "workers": workers}):
-        return
 
     def compute(volume: Volume, **tools: Any) -> Segmentation:
+        from curvafit.segmentation.labels import reconstruct_labels
         from curvafit.segmentation.reconstruct import reconstruct as fill
-        from curvafit.segmentation.reconstruct import reconstruct_labels
 
         alike = {"example": ("spacing", "unit", "label", "strict"), "image": ("spacing", "unit", "crop")}
         for name, path in shown.items():
             if path is not None:
                 tools[name] = load(path, **{each: reading[each] for each in alike[name]})
                 say_notes(tools[name].notes)
-        tools |= {"workers": workers, **common}
+        tools |= {"workers": workers, **options}
+        volume = volume if sure is None else volume.load()
         if labels is None:
-            return fill(volume.load(), prior, **tools)
+            return fill(volume, prior, **tools)
         return reconstruct_labels(volume.load(), prior, chosen=several, instances=instances, **tools)
 
+    job = _Job(slices, out, prior, reading, record, overwrite, inputs, maps)
     _run(job, compute, partial(load, slices, **reading, lazy=True), sure=sure)
-
-
-def _fill_blocks(job: _Job, options: dict[str, Any]) -> bool:
-    """Fill a volume between known slices in blocks, if it is so large, and return whether it is."""
-    from curvafit.segmentation.blocks import fits_blocks, reconstruct_file
-    from curvafit.volumes.read import load
-
-    if not fits_blocks(job.out, (), 1):
-        return False
-    job.check()
-    reading = {name: value for name, value in job.reading.items() if name != "label"}
-    with show_stages() as progress:
-        progress("reading", 0.0)
-        if not fits_blocks(job.out, load(job.source, **reading, lazy=True).shape, options["tile"]):
-            return False
-        options |= {"record": job.content, "inputs": job.inputs, "overwrite": job.overwrite, "progress": progress}
-        with resumable():
-            filled = reconstruct_file(job.source, job.out, **options, **job.reading)
-    _print_mask(filled.notes, filled.status, filled.paths)
-    return True
 
 
 @dataclass(frozen=True)
@@ -266,7 +244,6 @@ def _run(
     """Check, read, compute, write and print. Finished tiles are kept beside the output until it is written."""
     from curvafit.core.files import remove
     from curvafit.segmentation.result import hidden_store, write_mask
-    from curvafit.segmentation.tiles import Tiling
     from curvafit.volumes.write import check_labels, note_lost
 
     record, reading = job.record, job.reading
@@ -274,17 +251,14 @@ def _run(
     with show_stages() as progress:
         progress("reading", 0.0)
         volume = read()
-        volume.check_fits()  # the mask is written from memory
         job.check(volume)  # again, as a format may not hold the unit
         if record.get("labels"):
             volume = volume.load()
             check_labels(job.out, volume)
         lost = note_lost(job.out, volume)
         say_notes(lost)
-        tiling = Tiling.of(volume, record["epsilon"], record["tile"], periodic=record.get("periodic", False))
         store = hidden_store(job.out)
-        tiles = tiling.count > 1 and (record["job"] == "segment" or job.prior is not None)
-        with resumable() if tiles else nullcontext():
+        with resumable(lambda: "the same command" if store.exists() else ""):
             result = compute(volume, progress=progress, store=store)
         progress("writing", 1.0)
         labels = None if sure is None else result.keep_sure(sure)
@@ -294,15 +268,10 @@ def _run(
         like = (job.image or job.source) if all(reading[name] is None for name in stated) else None
         how = {"sure": labels, "like": like, "unit": reading["unit"], "overwrite": job.overwrite}
         how["record"] = job.content | ({"not_held": lost} if lost else {})
-        paths = write_mask(result, volume.load(), job.out, **how)
+        paths = write_mask(result, volume, job.out, **how)
         remove(store)
-    _print_mask(result.notes, result.status, paths)
-
-
-def _print_mask(notes: Sequence[str], status: str, paths: Sequence[Path]) -> None:
-    """Print what is said of a mask, and where it is."""
-    for note in notes:
+    for note in result.notes:
         say(note)
-    say(f"{status[0].upper()}{status[1:]}.", style="bold")
+    say(f"{result.status[0].upper()}{result.status[1:]}.", style="bold")
     for path in paths:
         say(str(path))

@@ -236,26 +236,26 @@ def section_figure(
     rows: Mapping[str, tuple[np.ndarray, np.ndarray | None]],
     spacing: Sequence[float],
     unit: str,
-    places: Sequence[int] | None = None,
-    labelled: Sequence[str] = (),
 ) -> Figure:
-    """Return a figure of slices across z, y and x, with the scale.
+    """Return a figure of the middle slices across z, y and x, with the scale.
 
     `rows` holds for each row of pictures, by its title, values (Z, Y, X) and the mask that is outlined over them, or
-    None. The spacing is voxel edges (z, y, x) in `unit`; `places` are the numbers of the slices, by default the middle
-    ones. Rows of the titles in `labelled` hold labels, each drawn in a colour of its own.
+    None. The spacing is voxel edges (z, y, x) in `unit`.
     """
-    places = [n // 2 for n in next(iter(rows.values()))[0].shape] if places is None else places
+    places = [n // 2 for n in next(iter(rows.values()))[0].shape]
     drawn = {}
     for title, (values, mask) in rows.items():
         if not values.size or (values.dtype.kind == "f" and not np.isfinite(values).all()):
             raise ValueError("a volume to draw needs voxels, all of finite values")
         planes = [np.take(values, place, axis) for axis, place in enumerate(places)]
-        if title in labelled:
-            planes = [LABELS[np.where(plane, (plane - 1) % (len(LABELS) - 1) + 1, 0)] for plane in planes]
         outlines = None if mask is None else [np.take(mask, place, axis) for axis, place in enumerate(places)]
         drawn[title] = Sections(planes, outlines, grey_limits(values))
     return draw_sections(drawn, spacing, unit, places)
+
+
+def colour_labels(plane: np.ndarray) -> np.ndarray:
+    """Return a slice of labels as colours (Y, X, RGBA), one for each label."""
+    return LABELS[np.where(plane, (plane - 1) % (len(LABELS) - 1) + 1, 0)]
 
 
 class Sections(NamedTuple):

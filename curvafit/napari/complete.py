@@ -15,9 +15,11 @@ from magicgui.widgets import ComboBox, Container, LineEdit, PushButton, SpinBox,
 from curvafit.core.runtime import Progress
 from curvafit.napari.dock import Dock
 from curvafit.napari.layers import drop_layer, field_of_layer, list_layers, place_of_layer, put_layer
-from curvafit.segmentation.reconstruct import reconstruct, reconstruct_labels
-from curvafit.segmentation.result import Segmentation, note_empty
-from curvafit.segmentation.slices import check_shared, index_labels, next_in_rhythm, require_labels
+from curvafit.segmentation.known import check_shared, next_in_rhythm, note_empty
+from curvafit.segmentation.labels import reconstruct_labels
+from curvafit.segmentation.reconstruct import reconstruct
+from curvafit.segmentation.result import Segmentation
+from curvafit.segmentation.slices import index_labels, require_labels
 from curvafit.segmentation.uncertainty import entropy
 from curvafit.volumes.volume import ScanError, Volume
 

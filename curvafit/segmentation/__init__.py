@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from curvafit.core.faces import attach_lazy_names
 
 if TYPE_CHECKING:
+    from curvafit.segmentation.labels import reconstruct_labels as reconstruct_labels
     from curvafit.segmentation.reconstruct import reconstruct as reconstruct
-    from curvafit.segmentation.reconstruct import reconstruct_labels as reconstruct_labels
     from curvafit.segmentation.result import Segmentation as Segmentation
     from curvafit.segmentation.segment import Calibration as Calibration
     from curvafit.segmentation.segment import calibrate as calibrate

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -26,7 +26,8 @@ from curvafit.core.files import open_packaged
 from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, silent
 from curvafit.scan.grids import centre_distance
-from curvafit.segmentation.slices import Slices
+from curvafit.segmentation.slices import WHOLE, Slices, plane_distances
+from curvafit.volumes.boxes import Box
 
 FILLER_FILE = Format("curvafit filler", 1, "weights of a filler", "teach them again with `curvafit atlas teach`")
 #: Signed distances are cut here, in pixels: what is further away does not matter for a gap of 24 pixels at most.
@@ -39,6 +40,8 @@ RIM = 8
 _DISTANCE, _GAP = 8.0, 16.0
 #: Log-odds of the inside for a pixel of the cubic interpolation, before anything is learnt.
 SLOPE = 0.6
+#: Log-odds of the inside in known slices, beyond what the network gives: their probability is 1 in float32.
+CERTAIN = 100.0
 #: The weight of an image's log-odds before anything is learnt, and where they are cut.
 TRUST, SUREST = 0.7, 8.0
 #: Numbers that tell a height: place in the gap, distance to the nearer end, the gap and a step from slice to slice.
@@ -234,23 +237,40 @@ TILE = 256
 
 
 def fill(
-    slices: Slices, taught: Taught, *, evidence: np.ndarray | None = None, progress: Progress = silent
+    slices: Slices,
+    taught: Taught,
+    box: Box = WHOLE,
+    *,
+    raster: Raster | None = None,
+    evidence: np.ndarray | None = None,
+    progress: Progress = silent,
 ) -> np.ndarray:
-    """Return calibrated log-odds of the inside of a volume between known slices, float32 (length, Y, X).
+    """Return calibrated log-odds of the inside in a box of a volume between known slices, float32 (Z, Y, X).
 
-    In known slices, and in those before the first and beyond the last, they are `SLOPE` times the signed distance in
-    pixels from the outline in the nearest known slice, but at most 0 in slices that are not filled (`Slices.outside`).
-    `evidence` is what an image says, as log-odds (length, Y, X); slices before the first and beyond the last then have
-    that.
+    In known slices they are `CERTAIN` or minus that. Before the first and beyond the last they are `SLOPE` times the
+    signed distance in pixels from the outline in the nearest known slice, but at most 0 in slices that are not filled
+    (`Slices.outside`). `evidence` is what an image says, as log-odds (length, Y, X); slices before the first and beyond
+    the last then have that. `raster` has the network's pixels, by default those of the slices.
     """
-    raster = Raster.of(slices)
-    logits = (SLOPE / raster.pixel) * slices.level("nearest")
-    logits[slices.outside] = np.minimum(logits[slices.outside], 0)
-    if evidence is not None and not slices.periodic:
-        for outer in (slice(0, slices.places[0]), slice(slices.places[-1] + 1, None)):
-            logits[outer] = evidence[outer]
-    for numbers, inside in fill_gaps(slices, taught, raster, evidence=evidence, progress=progress):
-        logits[numbers] = inside
+    rows, *core = (slice(*edge.indices(n)[:2]) for edge, n in zip(box, slices.shape, strict=True))
+    raster = replace(raster or Raster.of(slices), core=tuple(core))  # type: ignore[arg-type]
+    logits = np.empty([edge.stop - edge.start for edge in (rows, *core)], dtype=np.float32)
+    for k, outer in ((0, slice(0, slices.places[0])), (-1, slice(slices.places[-1] + 1, slices.length))):
+        start, stop = max(outer.start, rows.start), min(outer.stop, rows.stop)
+        if start < stop and not slices.periodic:
+            here = slice(start - rows.start, stop - rows.start)
+            if evidence is not None:
+                logits[here] = evidence[(slice(start, stop), *core)]
+                continue
+            depth = plane_distances(slices.inside[[k]], slices.spacing[1:], slices.gap * slices.spacing[0])[0]
+            logits[here] = (SLOPE / raster.pixel) * depth[tuple(core)].astype(np.float32)
+            far = slices.outside[start:stop]
+            logits[here][far] = np.minimum(logits[here][far], 0)
+    for numbers, inside in fill_gaps(slices, taught, raster, rows, evidence=evidence, progress=progress):
+        here = (numbers >= rows.start) & (numbers < rows.stop)
+        logits[numbers[here] - rows.start] = inside[here]
+    places, inside = slices.known((rows, *core))  # type: ignore[arg-type]
+    logits[places] = np.where(inside, CERTAIN, -CERTAIN)
     return logits
 
 
@@ -258,7 +278,7 @@ def fill_gaps(
     slices: Slices,
     taught: Taught,
     raster: Raster,
-    rows: slice = slice(None),
+    rows: slice,
     *,
     evidence: np.ndarray | None = None,
     progress: Progress = silent,
@@ -300,8 +320,9 @@ class Raster:
     @classmethod
     def of(cls, slices: Slices) -> Raster:
         """Return the pixels of whole slices."""
-        edges, shape = slices.spacing[1:], slices.shape[1:]
-        pixel = choose_pixel(plane_thickness(slices.inside, edges), edges, slices.gap * slices.spacing[0])
+        edges, shape, known = slices.spacing[1:], slices.shape[1:], range(len(slices.places))
+        thickness = plane_thickness((slices.inside[k] for k in known), edges)
+        pixel = choose_pixel(thickness, edges, slices.gap * slices.spacing[0])
         return cls(shape, edges, pixel, (slice(0, shape[0]), slice(0, shape[1])))
 
     @property
@@ -398,23 +419,14 @@ def _sample(plane: np.ndarray, shape: Sequence[int], step: Sequence[float], star
     return ndimage.affine_transform(plane, matrix, offset, shape, np.float32, order=1, mode="nearest")  # type: ignore[arg-type]
 
 
-def plane_thickness(masks: np.ndarray, edges: Sequence[float]) -> float:
-    """Return the mean thickness of a structure in planes (N, Y, X) with voxel edges (y, x), in their unit."""
-    return thickness_of_sums([sum_depths(mask, edges) for mask in masks])
-
-
-def sum_depths(mask: np.ndarray, edges: Sequence[float]) -> tuple[float, int]:
-    """Return the sum of the distances to the outline inside a plane (Y, X), and the pixels there; 0 without outline."""
-    if not mask.any() or mask.all():
-        return 0.0, 0
-    inside = centre_distance(mask, edges)[mask]
-    return float(inside.sum(dtype=np.float64)), len(inside)
-
-
-def thickness_of_sums(sums: Sequence[tuple[float, int]]) -> float:
-    """Return the mean thickness in planes whose `sum_depths` these are: four times the mean distance to the outline
-    inside, which is the width of a strip."""
-    total, count = (sum(each) for each in zip(*sums, strict=True))
+def plane_thickness(masks: Iterable[np.ndarray], edges: Sequence[float]) -> float:
+    """Return the mean thickness of a structure in planes (Y, X) with voxel edges (y, x), in their unit: four times the
+    mean distance to the outline inside, which is the width of a strip; infinite where there is no outline."""
+    total, count = 0.0, 0
+    for mask in masks:
+        if mask.any() and not mask.all():
+            inside = centre_distance(mask, edges)[mask]
+            total, count = total + float(inside.sum(dtype=np.float64)), count + len(inside)
     return 4 * total / count if count else math.inf
 
 

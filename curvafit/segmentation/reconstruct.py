@@ -1,10 +1,17 @@
-"""A volume between known slices: filled by a network, and by F_ε where a law is better; one structure or several."""
+"""A volume between known slices: filled by a network, block by block, and by F_ε where a law is better.
+
+The network reads four known slices for each gap, and no more than `REACH` pixels around each pixel: a block with what
+lies around it is filled as the whole is, and a volume that fits into memory is one block. Three numbers are those of
+the whole: the thickness of the structure in known slices, which says how large a pixel is; the probability from which
+voxels are inside; and the expected Dice. All follow from sums over slices or blocks.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import product
 from os import PathLike
 from pathlib import Path
@@ -12,50 +19,35 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy import ndimage
 from scipy.special import expit
-from skimage import measure
 
-from curvafit.core.checks import SEEDS, check_float, check_int
+from curvafit.core.checks import check_float, check_int
 from curvafit.core.extras import require
 from curvafit.core.runtime import Progress, check_memory, silent, sub_progress
 from curvafit.core.workers import Workers
 from curvafit.generation import data
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.priors.law import LawLike
 from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import profile_distance
-from curvafit.segmentation.filler import Taught, fill
+from curvafit.scan.prepare import LARGEST_BOX
+from curvafit.segmentation.filler import REACH, SLOPE, TILE, Raster, Taught, fill
 from curvafit.segmentation.flow import STEPS, WorkingGrid, choose_epsilon
 from curvafit.segmentation.image import find_shift, read_image
-from curvafit.segmentation.result import (
-    FEW,
-    Segmentation,
-    Uncertainty,
-    describe_filled,
-    doubt_labels,
-    doubt_places,
-    flow_summary,
-    note_labelled,
-)
+from curvafit.segmentation.known import SLAB, Known, doubt_labels
+from curvafit.segmentation.result import Segmentation, Uncertainty, describe_filled, flow_summary
 from curvafit.segmentation.slices import (
-    IDS,
     WHOLE,
     Slices,
-    annotated_slices,
-    check_shared,
     check_spacing,
-    choose_labelled,
-    find_labelled,
-    index_labels,
-    known_places,
     load_with,
-    mark_known,
-    reach_of,
+    plane_distances,
     require_labels,
+    turn_axes,
 )
 from curvafit.segmentation.teach import tune
-from curvafit.segmentation.tiles import Problem, Tiling, check_edge, lower_volume
+from curvafit.segmentation.tiles import LoweredVolume, Problem, Tiling, check_edge, lower_volume
 from curvafit.segmentation.trials import (
     PART,
     Example,
@@ -67,21 +59,24 @@ from curvafit.segmentation.trials import (
     leave_out_slices,
 )
 from curvafit.segmentation.uncertainty import (
+    LEAST,
     best_log_odds,
+    best_threshold,
     calibration_error,
+    count_probabilities,
     doubt,
-    expected_dice,
     fit_weights,
     near_surface,
     probability,
     share_by_slices,
     suggest_slices,
 )
-from curvafit.volumes.boxes import Box
-from curvafit.volumes.formats.base import smallest_type
+from curvafit.volumes.boxes import Box, cut_boxes
+from curvafit.volumes.formats.zarr import CHUNK
 from curvafit.volumes.place import lay
 from curvafit.volumes.read import Source, load
-from curvafit.volumes.volume import ScanError, Volume, digest_of, round_labels
+from curvafit.volumes.run import Record, Run, RunArray, open_run
+from curvafit.volumes.volume import ScanError, StoredArray, Volume, digest_of, round_labels
 
 #: Stiffness of the springs on known voxels, in working units: a tenth of it gives way, ten times as much stalls.
 STIFFNESS = 1e7
@@ -91,28 +86,21 @@ MARGIN = math.tanh(WORKING_SPACING / 2 / (math.sqrt(2) * WORKING_EPSILON))
 STIFFEST = (1e-9, 1e12)
 #: Stiffness of the springs on unknown voxels, in working units, for each nat of their log-odds: all are tried.
 PULLS = (0.0, 1e4, 3e4)
-#: Which slices are known, and how many to suggest, unless it is said.
-WHICH: dict[str, Any] = {"every": None, "first": 0, "known": None, "ignore": None, "axis": 0, "suggest": 0}
-#: Label of unknown voxels in the mask of one structure.
-UNKNOWN = 255
 #: Fewest grey levels of an image, and most voxels in which they are counted.
 GREY, SAMPLED = 8, 1_000_000
 #: Bytes that each voxel takes at least while a volume is filled at once.
 LEAST_BYTES = 30
 #: Least share of the entropy of slices held out that an image takes away: that of the structure takes half or more.
 TOLD = 0.1
-ONCE = "The labels are read in the image as instances of one structure (--no-instances reads each by itself)."
-APIECE = "Each label is read in the image by itself (--instances reads those of one kind, such as cells, as one)."
 SHIFTED = "The image seems to lie off the annotated slices by {} voxels along {}: it fits them better when it is moved."
 UNTOLD = "The image does not tell the structure in annotated slices held out: it is left out."
-#: Voxels around a label's box.
-ROOM = 16
-#: Of instances, labels of one kind that an image tells from the background but not from each other: the share of a
-#: label's area that is in one piece in each slice, the share of labels of which that holds, and the greatest share of
-#: the variance of grey levels that is due to which label they have.
-PIECE, MOST, ALIKE = 0.9, 0.9, 0.5
-#: Probabilities of labels are at least this.
-SURE = 1e-6
+#: Slices of a block by default, and voxels a side across them at most.
+DEEP, WIDE = 2 * CHUNK, 4 * CHUNK
+#: Bytes that a pixel of a slice takes in the network, those of a voxel of a block, and of the program itself.
+_EACH, _VOXEL, _PROGRAM = 800, 24, 600 * 2**20
+#: The pass that fills, and the share of the work that is done after each.
+_FILL = "filling blocks"
+_ENDS = {"looking for labels": 0.02, "reading known slices": 0.07, _FILL: 0.98}
 
 
 def reconstruct(
@@ -188,100 +176,76 @@ def reconstruct(
     ImportError
         If an image is given, and scikit-learn is not installed.
     """
-    which: dict[str, Any] = dict(zip(WHICH, (every, first, known, ignore, axis, suggest), strict=True))
-    given = _Given.read(slices, reading, **which)
-    volume, axis = given.volume, given.axis
-    check_memory(volume.shape, LEAST_BYTES, "a volume that is filled at once, not in blocks into Zarr,")
-    target = Slices.of(volume, given.places, axis, periodic, given.marks)
+    volume = load(slices, **reading, lazy=True)
+    which: dict[str, Any] = {"every": every, "first": first, "known": known, "ignore": ignore, "axis": axis}
+    tile, width = check_edge(tile), choose_epsilon(volume, epsilon)
     if stiffness is not None:
         stiffness = check_float(stiffness, "a positive stiffness", *STIFFEST)
+    large = tile is not None or (volume.in_file and max(volume.shape) > LARGEST_BOX)
+    blocks = large and prior is None and image is None and ignore is None and not periodic
+    if not blocks:
+        check_memory(volume.shape, LEAST_BYTES, "a volume that is filled at once, not in blocks,")
+        volume = replace(volume := volume.load(), array=round_labels(volume.values))
     laws, notes = ((), ()) if prior is None else laws_of(prior, volume)
-    width, tile = choose_epsilon(volume, epsilon), check_edge(tile)
-    taught, other, evidence, seen = Taught.load(filler, image=image is not None), None, None, None
-    if image is not None:
-        if example is not None or laws:
-            raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
-        seen = _load_image(image, volume, reading)
-        evidence, doubts = _read_evidence(given.turn(seen.values), target, axis, sub_progress(progress, 0.0, 0.5))
-        taught, notes = Taught.load() if evidence is None else taught, (*notes, *seen.notes, *doubts)
-    if example is not None:
-        other = Example.of(_load_example(example, volume, reading), given.places, axis)
-        taught = tune(taught, other, sub_progress(progress, 0.0, 0.5))
-        notes = (*notes, *other.notes)
-    engine = _Engine(taught, evidence, epsilon, progress)
-    chosen, said, task = Trial(), taught.status, None if other is None else other.task
-    if stiffness is not None and laws:
-        chosen, said = Trial(laws[0], stiffness, steps), "the law is lowered from the network's volume"
-    elif laws:
-        one_tile = Tiling.of(target.frame, epsilon, tile, periodic=periodic).count == 1
-        task = _pose_task(target if one_tile else crop_to_surface(target, PART)[0], other)
-        trials = [Trial(law, STIFFNESS, steps, pull) for law, pull in product(laws, PULLS)]
-        chosen = choose_by_masks(task, trials, lambda slices, trial: engine.run(slices, trial) > 0)
-        said = _describe_gain(chosen, "left out" if other is None else "of the example")
-    if chosen.law is None:
-        phase = engine.run(target, chosen)
-        mask, likely = target.keep_known(phase > 0), (expit(engine.logits(target)), taught.error)
-        summary = flow_summary(float(mask.mean()))
-    else:
-        tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic)
-        problem = SlicesProblem(chosen, target, engine.level(target))
-        found = lower_volume(problem, tiling, store=store, workers=workers, progress=progress)
-        mask, phase = target.keep_known(found.mask & ~target.outside[:, None, None]), found.phase
-        summary = flow_summary(float(found.mask.mean()), found.energies, found.steps)
-        notes = (*notes, *tiling.place.notes)
-        likely = _weigh_evidence(engine, chosen, task, target, phase)
-    uncertain = _uncertainty(*likely, mask, target, given, told=evidence is not None)
-    tested = "the example" if other else "slices left out" if chosen.law else "generated shapes"
+    if image is not None and (example is not None or laws):
+        raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
+    taught, evidence, seen = Taught.load(filler, image=image is not None), None, None
+    other = None if example is None else load_example(example, volume, reading)
+    same: dict[str, Any] = {}
+    if blocks and store is not None:  # digests take a while
+        same = {"labels": volume.digest, **which, "filler": taught.digest, "tile": tile}
+        same |= {"example": other and other.digest}
+    crew, folder, shown = (workers if volume.in_file else None, store, progress) if blocks else (None, None, silent)
+    with open_run(crew, folder, same, shown, _ENDS) as run:
+        given = Known.find(volume, run, **which)
+        suggest = check_int(suggest, "a number of slices from 0", 0, volume.shape[given.axis] - len(given.places))
+        target, labels = given.read(run, periodic)
+        notes = (*given.notes, *doubt_labels(labels, ignore), *notes)
+        part = None if other is None else Example.of(other, given.places, given.axis)
+        if image is not None:
+            seen = load_image(image, volume, reading)
+            step = sub_progress(progress, 0.0, 0.5)
+            evidence, doubts = _read_evidence(given.turn(seen.values), target, given.axis, step)
+            taught, notes = Taught.load() if evidence is None else taught, (*notes, *seen.notes, *doubts)
+        if part is not None:
+            taught, notes = tune(taught, part, sub_progress(progress, 0.0, 0.5)), (*notes, *part.notes)
+        engine = _Engine(taught, evidence, epsilon, progress)
+        tiling = Tiling.of(target.frame, epsilon, tile if laws else None, periodic=periodic)
+        chosen, task, said = _choose_law(engine, target, laws, part, (stiffness, steps), tiling)
+        if chosen.law is None:
+            filled = _fill_volume(given, target, engine, run, tile, blocks)
+            phase, inside = None if blocks else engine.run(target, chosen), flow_summary(filled.share)
+        else:
+            problem = SlicesProblem(chosen, target, engine.level(target))
+            found = lower_volume(problem, tiling, store=store, workers=workers, progress=progress)
+            filled, engine = _weigh_evidence(engine, chosen, task, given, target, found)
+            phase, notes = found.phase, (*notes, *tiling.place.notes)
+            inside = flow_summary(float(found.mask.mean()), found.energies, found.steps)
+    uncertain = filled.judge(given, target, engine, suggest)
+    tested = "the example" if part else "slices left out" if chosen.law else "generated shapes"
     ways = {"tested": tested, "image": evidence is not None, "periodic": periodic}
-    status, doubts = describe_filled(said, summary, float(mask.mean()), uncertain, given.places, target.length, **ways)
-    labels = doubt_labels(np.unique(given.turn(volume.values)[given.places]), ignore)
+    status, doubts = describe_filled(said, inside, filled.share, uncertain, given.places, target.length, **ways)
     return Segmentation.of(
-        volume, given.turn_back(mask), given.turn_back(phase), chosen.law, width,
-        (*given.notes, *labels, *notes, *doubts),
-        weight=None, status=status, uncertainty=uncertain, image=seen,
+        volume, filled.mask, None if phase is None else given.turn_back(phase), chosen.law, width,
+        (*notes, *doubts), weight=None, status=status, uncertainty=uncertain, image=seen,
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class _Given:
-    """Labels of a volume, the slices across an axis that are known, marks of known voxels in others, notes, and how
-    many slices to suggest."""
-
-    volume: Volume
-    axis: int
-    places: list[int]
-    marks: np.ndarray | None
-    notes: tuple[str, ...]
-    suggest: int
-
-    @classmethod
-    def read(
-        cls, slices: Source, reading: dict[str, Any], *, every: int | None, first: int, known: Sequence[int] | None,
-        ignore: int | None, axis: int, suggest: int,
-    ) -> _Given:  # fmt: skip
-        volume = load(slices, **reading)
-        volume = replace(volume, array=round_labels(volume.values))
-        axis = check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)
-        values, marks, notes = np.moveaxis(volume.values, axis, 0), None, ()
-        if ignore is not None:
-            if every is not None or known is not None:
-                raise ScanError("give either every, known or ignore")
-            places, marks = annotated_slices(values, check_int(ignore, "a label to ignore", -SEEDS, IDS))
-        elif every is None and known is None:
-            places = choose_labelled(there := find_labelled(values))
-            notes = note_labelled(places, there)
-        else:
-            places = known_places(len(values), every, first, known)
-            notes = () if every is None else doubt_places(find_labelled(values), places)
-        suggest = check_int(suggest, "a number of slices from 0", 0, len(values) - len(places))
-        return cls(volume, axis, places, marks, notes, suggest)
-
-    def turn(self, values: np.ndarray) -> np.ndarray:
-        """Move the axis across the slices to the front."""
-        return np.moveaxis(values, self.axis, 0)
-
-    def turn_back(self, values: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(np.moveaxis(values, 0, self.axis))
+def _choose_law(
+    engine: _Engine, slices: Slices, laws: Sequence[Coefficients], example: Example | None,
+    strength: tuple[float | None, int], tiling: Tiling,
+) -> tuple[Trial, Task[Slices] | None, str]:  # fmt: skip
+    """Return the law to lower, if one is better than the network alone, what it was tried out on, and a sentence's
+    beginning; with a stiffness and steps as `strength` the first is not tried out."""
+    (stiffness, steps), task = strength, None if example is None else example.task
+    if not laws:
+        return Trial(), task, engine.taught.status
+    if stiffness is not None:
+        return Trial(laws[0], stiffness, steps), task, "the law is lowered from the network's volume"
+    task = _pose_task(slices if tiling.count == 1 else crop_to_surface(slices, PART)[0], example)
+    trials = [Trial(law, STIFFNESS, steps, pull) for law, pull in product(laws, PULLS)]
+    chosen = choose_by_masks(task, trials, lambda slices, trial: engine.run(slices, trial) > 0)
+    return chosen, task, _describe_gain(chosen, "left out" if example is None else "of the example")
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,22 +256,28 @@ class _Engine:
     evidence: np.ndarray | None
     epsilon: float | None
     progress: Progress
-    filled: dict[Slices, np.ndarray] = field(default_factory=dict)
+    filled: dict[Slices, tuple[Raster, np.ndarray]] = field(default_factory=dict)
     lowered: dict[tuple[Any, ...], np.ndarray] = field(default_factory=dict)
 
     def logits(self, slices: Slices) -> np.ndarray:
         """Return the network's log-odds of the inside (Z, Y, X), computed once."""
-        if slices not in self.filled:
-            step = sub_progress(self.progress, 0.5, 1.0)
-            self.filled[slices] = fill(slices, self.taught, evidence=self.evidence, progress=step)
-        return self.filled[slices]
+        return self._fill(slices)[1]
+
+    def told(self, slices: Slices) -> np.ndarray:
+        """Return which slices have a threshold of their own: those between known ones, and by an image all."""
+        return slices.between | (self.evidence is not None)
 
     def level(self, slices: Slices) -> np.ndarray:
-        """Return log-odds over those of the best threshold (Z, Y, X), times the edge of a voxel. Slices before the
-        first known one and beyond the last have no threshold, unless an image tells them."""
-        logits, told = self.logits(slices), slices.between | (self.evidence is not None)
+        """Return log-odds over those of the best threshold (Z, Y, X), times the edge of a voxel; in known slices the
+        signed distance from the outline tells them."""
+        raster, logits = self._fill(slices)
+        depth = plane_distances(slices.inside, slices.spacing[1:], slices.gap * slices.spacing[0])
+        level = logits.copy()
+        level[list(slices.places)] = (SLOPE / raster.pixel) * depth.astype(np.float32)
         least = best_log_odds(logits[slices.between]) if slices.between.any() else 0.0
-        return (min(slices.spacing[1:]) * (logits - np.where(told, least, 0)[:, None, None])).astype(np.float32)
+        return (min(slices.spacing[1:]) * (level - np.where(self.told(slices), least, 0)[:, None, None])).astype(
+            np.float32
+        )
 
     def run(self, slices: Slices, trial: Trial) -> np.ndarray:
         """Return the phase field (Z, Y, X) of a trial; a law is lowered once, whatever the trial's scores."""
@@ -320,6 +290,146 @@ class _Engine:
             problem = SlicesProblem(trial, slices, self.level(slices))
             self.lowered[key] = lower_volume(problem, tiling, progress=step).phase
         return self.lowered[key]
+
+    def _fill(self, slices: Slices) -> tuple[Raster, np.ndarray]:
+        """Return the network's pixels, and log-odds."""
+        if slices not in self.filled:
+            raster, step = Raster.of(slices), sub_progress(self.progress, 0.5, 1.0)
+            logits = fill(slices, self.taught, raster=raster, evidence=self.evidence, progress=step)
+            self.filled[slices] = raster, logits
+        return self.filled[slices]
+
+
+# ---- blocks ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Filled:
+    """A volume's probabilities and mask, in its own axes, and the sums over its blocks that say how sure they are."""
+
+    likely: Any
+    mask: Any
+    sums: dict[str, Any]
+
+    @classmethod
+    def of(cls, given: Known, slices: Slices, likely: np.ndarray, mask: np.ndarray) -> _Filled:
+        """Return what is known of probabilities and a mask (length, Y, X) in memory."""
+        record = dict(look_at(likely, slices, WHOLE))
+        sums = _add_records(slices.shape, [WHOLE], [record | _compare(record["likely"], mask, slices.between)])
+        return cls(given.turn_back(sums.pop("likely")), given.turn_back(mask), sums)
+
+    @property
+    def share(self) -> float:
+        """The mask's share of the volume."""
+        return float(self.sums["inside"] / math.prod(self.mask.shape))
+
+    def judge(self, given: Known, slices: Slices, engine: _Engine, suggest: int) -> Uncertainty:
+        """Return how sure the volume is, and which slices to annotate next."""
+        sums, ends = self.sums, {"periodic": slices.periodic, "whole": engine.evidence is not None}
+        dice = float(2 * sums["both"] / max(sums["told"] + sums["sum"], 1e-9)) if slices.between.any() else 1.0
+        order = turn_axes((0, 1, 2), given.axis)
+        return Uncertainty(
+            replace(given.volume, array=self.likely, notes=()),
+            engine.taught.error,
+            suggest_slices(sums["along 0"], slices.places, suggest, slices.periodic),
+            dice,
+            known_share=share_by_slices(slices.areas, slices.places, slices.length, **ends),
+            mean_probability=float(sums["total"]) / math.prod(slices.shape),
+            entropies=tuple(sums[f"along {order.index(axis)}"] for axis in range(3)),
+        )
+
+
+def _fill_volume(given: Known, slices: Slices, engine: _Engine, run: Run, tile: int | None, blocks: bool) -> _Filled:
+    """Fill a volume by the network alone, at once or in blocks; no mask is cut before all of it is filled."""
+    shape, raster = given.volume.shape, Raster.of(slices) if blocks else None
+    cores = cut_boxes(slices.shape, slices.shape if raster is None else _choose_edges(raster, tile))
+    likely, mask = run.open("probability", np.float32, shape), run.open("mask", np.bool_, shape)
+
+    def keep(number: int, record: Record) -> Record:
+        likely[given.turn_box(cores[number])] = np.moveaxis(record["likely"], 0, given.axis)
+        return {name: value for name, value in record.items() if name != "likely"}
+
+    def look(_: int) -> Record:
+        return look_at(expit(engine.logits(slices)), slices, cores[0], whole=engine.evidence is not None)
+
+    function, stated = (
+        (look, "")
+        if raster is None
+        else (
+            partial(fill_block, slices, engine.taught, raster, cores),
+            _describe_blocks(slices, raster, cores, run.processes),
+        )
+    )
+    sums = _add_records(slices.shape, cores, run(_FILL, function, len(cores), stated, keep))
+    least = max(best_threshold(sums["counts"]), LEAST) if slices.between.any() else 0.5
+    least = np.where(engine.told(slices), least, 0.5).astype(np.float32)[:, None, None]
+    for core in cores:
+        box = given.turn_box(core)
+        part = np.moveaxis(likely[box], given.axis, 0)
+        inside = part > least[core[0]]
+        mask[box] = np.moveaxis(inside, 0, given.axis)
+        sums |= {name: sums.get(name, 0) + n for name, n in _compare(part, inside, slices.between[core[0]]).items()}
+    return _Filled(_voxels(likely), _voxels(mask), sums)
+
+
+def fill_block(slices: Slices, taught: Taught, raster: Raster, cores: Sequence[Box], number: int) -> Record:
+    """Return what `look_at` says of a block that the network fills."""
+    return look_at(expit(fill(slices, taught, cores[number], raster=raster)), slices, cores[number])
+
+
+def look_at(likely: np.ndarray, slices: Slices, core: Box, *, whole: bool = False) -> Record:
+    """Return the probabilities of a block, float32, those of known voxels 0 or 1; of the voxels between known slices
+    the counts and the sum; the sum of all that are filled, or of the `whole`; and the entropy of slices along each
+    axis."""
+    rows, likely = core[0], slices.keep_known(likely.astype(np.float32), core)
+    unsure, told = doubt(likely), likely[slices.between[rows]]
+    along = {f"along {k}": unsure.sum(tuple({0, 1, 2} - {k})) for k in range(3)}
+    total = likely if whole else likely[~slices.outside[rows]]
+    sums = {"sum": told.sum(dtype=np.float64), "total": total.sum(dtype=np.float64)}
+    return {"likely": likely, "counts": count_probabilities(told), **sums, **along}
+
+
+def _compare(likely: np.ndarray, mask: np.ndarray, between: np.ndarray) -> dict[str, Any]:
+    """Return how many voxels of a mask there are, and between known slices their number and probabilities."""
+    told = mask[between]
+    both = likely[between][told].sum(dtype=np.float64)
+    return {"inside": np.count_nonzero(mask), "told": np.count_nonzero(told), "both": both}
+
+
+def _add_records(shape: Sequence[int], cores: Sequence[Box], found: Sequence[Record]) -> dict[str, Any]:
+    """Return the sums over blocks; of what is along an axis, in its slices."""
+    total: dict[str, Any] = {f"along {k}": np.zeros(n) for k, n in enumerate(shape)}
+    for core, record in zip(cores, found, strict=True):
+        for name, values in record.items():
+            if name.startswith("along"):
+                total[name][core[int(name[-1])]] += values
+            else:
+                total[name] = total.get(name, 0) + values
+    return total
+
+
+def _choose_edges(raster: Raster, tile: int | None) -> tuple[int, ...]:
+    """Return the edges of blocks: `tile`, or as many voxels as the network fills at once."""
+    wide = (min(max(int(TILE / scale) // CHUNK, 1) * CHUNK, WIDE) for scale in raster.scale)
+    return (tile,) * 3 if tile is not None else (DEEP, *wide)
+
+
+def _describe_blocks(slices: Slices, raster: Raster, cores: Sequence[Box], processes: int) -> str:
+    """Return how many blocks there are, and how much memory they take at most, as a sentence."""
+    sides = [edge.stop - edge.start for edge in cores[0]]
+    pixels = [min(TILE, n * scale) + 2 * REACH for n, scale in zip(sides[1:], raster.scale, strict=True)]
+    network, known = _EACH * math.prod(pixels) * (slices.gap - 1), math.prod(slices.inside.shape)
+    total = processes * (network + _VOXEL * math.prod(sides) + SLAB) + (processes + (processes > 1)) * _PROGRAM + known
+    return f"{len(cores)} blocks of {' x '.join(map(str, sides))} voxels, in about {total / 1e9:.2g} GB of memory."
+
+
+def _voxels(array: RunArray) -> Any:
+    """Return what a volume reads an array from, in memory or in the file of a run."""
+    stored, (z, y, x) = array.stored, (slice(0, n) for n in array.shape)
+    return stored if isinstance(stored, np.ndarray) else StoredArray(stored, (z, y, x), (0, 1, 2))
+
+
+# ---- a law -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,39 +485,25 @@ def _pose_task(slices: Slices, example: Example | None) -> Task[Slices]:
 
 
 def _weigh_evidence(
-    engine: _Engine, trial: Trial, task: Task[Slices] | None, target: Slices, phase: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """Return the probability of the inside (Z, Y, X) where a law was lowered, by the network's log-odds and the depth
-    below the law's surface, with weights fitted to the task if there is one; and its calibration error there."""
+    engine: _Engine, trial: Trial, task: Task[Slices] | None, given: Known, target: Slices, found: LoweredVolume
+) -> tuple[_Filled, _Engine]:
+    """Return the volume where a law was lowered: its probabilities are by the network's log-odds and the depth below
+    the law's surface, with weights fitted to the task if there is one; and the engine with their calibration error."""
 
     def evidence(slices: Slices, phase: np.ndarray, rows: list[int]) -> np.ndarray:
         depth = profile_distance(torch.from_numpy(phase[rows]), float(RESOLVED)).numpy()
         return np.stack([engine.logits(slices)[rows].ravel(), depth.ravel()], axis=-1)
 
+    mask = target.keep_known(found.mask & ~target.outside[:, None, None])
     if task is None:
-        return expit(engine.logits(target)), engine.taught.error
+        return _Filled.of(given, target, expit(engine.logits(target)), mask), engine
     rows, tried = list(task.places), engine.run(task.given, trial)
-    known = evidence(task.given, tried, rows)
-    weights = fit_weights(known, task.truth.ravel())
+    weights = fit_weights(known := evidence(task.given, tried, rows), task.truth.ravel())
     told, near = probability(known, weights).reshape(task.truth.shape), near_surface(tried > 0)[rows]
-    values = probability(evidence(target, phase, list(range(target.length))), weights).reshape(target.shape)
-    values[target.outside] = np.minimum(values[target.outside], 0.5)
-    return values, calibration_error(told[near], task.truth[near])
-
-
-def _uncertainty(
-    likely: np.ndarray, error: float, mask: np.ndarray, slices: Slices, given: _Given, *, told: bool
-) -> Uncertainty:
-    """Return what probabilities (Z, Y, X) say; `told` says whether an image tells the ends."""
-    inside = slices.keep_known(np.zeros(slices.shape, dtype=bool))
-    values = np.where(slices.known_voxels, inside, likely).astype(np.float32)
-    suggestions = suggest_slices(doubt(values).sum((1, 2)), slices.places, given.suggest, slices.periodic)
-    dice = expected_dice(likely[slices.between], mask[slices.between]) if slices.between.any() else 1.0
-    areas, ends = slices.inside.mean((1, 2)), {"periodic": slices.periodic, "whole": told}
-    known = share_by_slices(areas, slices.places, slices.length, **ends)
-    likely_field = replace(given.volume, array=given.turn_back(values), notes=())
-    mean = float(values[slice(None) if told else ~slices.outside].sum(dtype=np.float64)) / values.size
-    return Uncertainty(likely_field, error, suggestions, dice, known_share=known, mean_probability=mean)
+    likely = probability(evidence(target, found.phase, list(range(target.length))), weights).reshape(target.shape)
+    likely[target.outside] = np.minimum(likely[target.outside], 0.5)
+    error = calibration_error(told[near], task.truth[near])
+    return _Filled.of(given, target, likely, mask), replace(engine, taught=replace(engine.taught, error=error))
 
 
 def _describe_gain(best: Trial, where: str) -> str:
@@ -418,7 +514,7 @@ def _describe_gain(best: Trial, where: str) -> str:
     return f"a law helps: {score} on slices {where}, {plain} by the network alone"
 
 
-def _load_image(image: Source, volume: Volume, reading: dict[str, Any]) -> Volume:
+def load_image(image: Source, volume: Volume, reading: dict[str, Any]) -> Volume:
     """Load the grey levels of the volume that the slices are of."""
     require("sklearn.ensemble", "image", "reading an image")
     field, laid = lay(load_with(image, reading, "crop"), volume, "the image", "the slices", exact=True)
@@ -437,307 +533,9 @@ def _read_evidence(
     return (None, (*doubts, UNTOLD)) if told < TOLD else (evidence, doubts)
 
 
-def _load_example(example: Source, volume: Volume, reading: dict[str, Any]) -> Volume:
+def load_example(example: Source, volume: Volume, reading: dict[str, Any]) -> Volume:
     """Load an example with the spacing and unit of the slices, which are of `volume`."""
     field = load_with(example, reading)
     check_spacing(field, volume, "the slices")
     require_labels(field.values, "the example")
     return field
-
-
-# ---- several structures ----------------------------------------------------------------------------------------------
-
-
-def reconstruct_labels(
-    slices: Source,
-    prior: LawLike | Mapping[int, LawLike] | None = None,
-    *,
-    chosen: Sequence[int] | None = None,
-    image: Source | None = None,
-    instances: bool | None = None,
-    example: Source | None = None,
-    store: str | PathLike[str] | None = None,
-    progress: Progress = silent,
-    spacing: Sequence[float] | float | None = None,
-    unit: str | None = None,
-    **options: Any,
-) -> Segmentation:
-    """Fill several structures between known slices, each by `reconstruct`; a voxel that two of them claim goes to the
-    one with the greater phase field there.
-
-    With an image, labels that are instances, such as cells, are filled as one structure, in which each voxel has the
-    label that is nearest as filled without the image, and each label is kept in one piece.
-
-    Each label is filled in the box where it may be. Where every voxel of the known slices is labelled, so is every
-    voxel that is filled: an unclaimed voxel goes to the label with the largest phase value, or to the nearest. A label
-    for which slices or example are too few for what is asked is filled by the network alone, and a note says why.
-
-    Parameters
-    ----------
-    slices
-        Labels of the whole volume's shape, whole numbers, 0 where there is nothing; only the known slices count.
-    prior
-        A law for all labels, or one for each, to be tried; by default none.
-    chosen
-        The labels that are structures, by default all but 0; the others count as nothing.
-    example
-        Labels of another volume of the same kind, known whole, with the same values for the same structures.
-    instances
-        Whether labels are of one kind that the image tells from the background, but not from each other; else it is
-        read for each by itself. By default they are if nine in ten are one piece in each known slice and grey levels
-        vary more within them than between them. Where every voxel is labelled, or the volume repeats, each is read by
-        itself.
-    options
-        Those of `reconstruct`, as are the others.
-
-    Returns
-    -------
-    Segmentation
-        `labels` has the label of the structure at each voxel, `mask` whether there is one, `phase` the greatest phase
-        field, `probability` that of the voxel's label; there are no coefficients. Its `status` is that of `reconstruct`
-        for each label, or of many a summary.
-
-    Raises
-    ------
-    ValueError
-        As `reconstruct`, if it refuses all labels; or if the known slices do not have a label, or none but 0.
-    """
-    reading = {"spacing": spacing, "unit": unit}
-    which = {name: options.pop(name, usual) for name, usual in WHICH.items()}
-    given = _Given.read(slices, reading, **which)
-    volume, places, notes, moved = given.volume, given.places, given.notes, given.turn(given.volume.values)
-    numbers = find_labels(moved[places], chosen)
-    if which["every"] is None and which["known"] is None and which["ignore"] is None:
-        check_shared(moved, places, numbers)
-    index = replace(volume, array=index_labels(volume.values, numbers, which["ignore"]), notes=())
-    there = given.turn_back(mark_known(moved.shape, places, given.marks))
-    labels = _Labels(replace(given, volume=index), there, which["ignore"] is not None, options)
-    other = None if example is None else _load_example(example, volume, reading)
-    seen = None if image is None else _load_image(image, volume, reading)
-    laws = prior if isinstance(prior, Mapping) else dict.fromkeys(numbers, prior)
-    drawn, whole, alone = given.turn(index.values)[places].clip(0), None, seen
-    full, periodic = bool(drawn.all()), bool(options.get("periodic"))
-    if seen is not None and not full and not periodic:
-        if instances is None:
-            instances = are_instances(drawn, given.turn(seen.values)[places], len(numbers))
-        notes = (*notes, *seen.notes, ONCE if instances else APIECE)
-        if instances:
-            bare = replace(seen, affine=None, notes=())
-            whole = labels.fill(None, WHOLE, image=bare, progress=sub_progress(progress, 0.0, 0.5))
-            progress, alone = sub_progress(progress, 0.5, 1.0), None
-            options.pop("filler", None)  # that one reads images
-            notes = (*notes, *(note for note in whole.notes if note.startswith(SHIFTED.partition("{")[0])))
-        if whole is not None and UNTOLD in whole.notes:
-            whole, notes = None, (*notes[:-1], UNTOLD)
-    parts, said = _fill_each(labels, numbers, laws, (alone, other, store), progress)
-    far = np.ones(moved.shape, dtype=bool)
-    far[slice(None) if periodic or seen is not None else reach_of(places, len(moved))] = False
-    values, likely, phase, odds = _join_parts(labels, parts, full, given.turn_back(far))
-    doubts = {number: part.uncertainty for number, (_, part) in zip(numbers, parts, strict=True)}
-    dice = {number: doubt.expected_dice for number, doubt in doubts.items() if doubt is not None}
-    if whole is not None:
-        values, likely, found = _split_instances(labels, parts, whole, values, odds)
-        dice, phase, said = dict(zip(numbers, found, strict=True)), whole.phase.values, whole.notes
-    likely = np.where(labels.known, 1.0, likely).astype(np.float32)
-    error = max(doubt.calibration_error for doubt in (whole and whole.uncertainty, *doubts.values()) if doubt)
-    following = suggest_slices(doubt(given.turn(likely)).sum((1, 2)), places, given.suggest, periodic)
-    likely = replace(volume, array=likely, notes=())
-    table = np.array([0, *numbers], volume.values.dtype if volume.values.dtype.kind in "iu" else np.int64)
-    if (kind := smallest_type(table)).itemsize < 8:  # of 64 bits the given one
-        table = table.astype(kind)
-    return Segmentation.of(
-        volume, values != 0, np.maximum(phase, -1), None, max(part.epsilon for _, part in parts), (*notes, *said),
-        weight=None, status=_describe_labels(parts, dice, whole, following), image=seen,
-        labels=replace(volume, array=table[values], notes=()),
-        uncertainty=Uncertainty(likely, error, following, min(dice.values()), dice),
-    )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class _Labels:
-    """What is given, with labels by their places (`index_labels`), the known voxels, whether others are marked as such,
-    and options of `reconstruct`."""
-
-    given: _Given
-    known: np.ndarray
-    marked: bool
-    options: dict[str, Any]
-
-    @property
-    def values(self) -> np.ndarray:
-        """The places of the labels (Z, Y, X)."""
-        return self.given.volume.values
-
-    def fill(self, place: int | None, box: Box, law: LawLike | None = None, **more: Any) -> Segmentation:
-        """Fill one label in a box, by its place, or all as one structure."""
-        values, given = self.values[box], self.given
-        inside = (values > 0 if place is None else values == place).astype(np.uint8)
-        start, stop, _ = box[given.axis].indices(self.values.shape[given.axis])
-        which: dict[str, Any] = {"known": [k - start for k in given.places if start <= k < stop]}
-        if self.marked:
-            inside[values < 0], which = UNKNOWN, {"ignore": UNKNOWN}
-        mask = replace(given.volume, array=inside, affine=None)
-        return reconstruct(mask, law, axis=given.axis, **which, **self.options, **more)
-
-
-_Parts = list[tuple[Box, Segmentation]]
-
-
-def _fill_each(
-    labels: _Labels, numbers: Sequence[int], laws: Mapping[int, Any], tools: tuple[Any, Any, Any], progress: Progress
-) -> tuple[_Parts, Sequence[str]]:
-    """Fill each label in its box, with image, example and store as `tools`, or by the network alone where it is refused
-    so; return boxes and labels, and notes."""
-    parts, notes, (image, example, store) = [], dict[str, list[int]](), tools
-    for place, number in enumerate(numbers, 1):
-        inside = (labels.values == place) & labels.known
-        box = WHOLE if labels.options.get("periodic") else _box_of_label(inside, labels)
-        more = {
-            "image": image and replace(image, array=image.values[box], affine=None, notes=()),
-            "example": example and replace(example, array=(example.values == number).astype(np.uint8), notes=()),
-            "store": store and Path(store) / str(number),
-        }
-        step = sub_progress(progress, (place - 1) / len(numbers), place / len(numbers))
-        try:
-            part = labels.fill(place, box, laws.get(number), progress=step, **more)
-        except ScanError as reason:
-            part = labels.fill(place, box, progress=step)
-            notes[f"Filled by the network alone: {reason}."] = [number]
-        parts.append((box, part))
-        for note in part.notes:
-            notes.setdefault(note, []).append(number)
-    named = {text: f"Label{'s' * (len(of) > 1)} {', '.join(map(str, of))}: {text}" for text, of in notes.items()}
-    return parts, [text if len(notes[text]) == len(numbers) else said for text, said in named.items()]
-
-
-def _join_parts(labels: _Labels, parts: _Parts, full: bool, far: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the place of the label with the greatest phase field at each voxel, 0 where there is none or `far` from
-    known slices; how likely that is; this phase field; and the sum of the labels' odds."""
-    shape = labels.values.shape
-    deepest, owner = np.full(shape, -np.inf, dtype=np.float32), np.zeros(shape, dtype=np.int16)
-    largest, odds = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
-    for place, (box, part) in enumerate(parts, 1):
-        owner[box] = np.where(part.phase.values > deepest[box], place, owner[box])
-        deepest[box] = np.maximum(deepest[box], part.phase.values)
-        own = _odds(part)
-        largest[box], odds[box] = np.maximum(largest[box], own), odds[box] + own
-    if full and (unseen := np.isneginf(deepest)).any():  # in no label's box
-        spacing = labels.given.volume.spacing
-        near = ndimage.distance_transform_edt(unseen, spacing, return_distances=False, return_indices=True)
-        owner = owner[tuple(near)]  # type: ignore[arg-type]
-    values = np.where(labels.known, labels.values, np.where(((deepest > 0) | full) & ~far, owner, 0))
-    likely = np.where(values, largest, 1.0) / np.maximum(odds + ((values == 0) | (not full)), SURE)
-    return values, likely, deepest, odds
-
-
-def _split_instances(
-    labels: _Labels, parts: _Parts, whole: Segmentation, values: np.ndarray, odds: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, list[float]]:
-    """Split what all labels fill as one structure by where each is alone; return places, their probabilities (that of
-    the structure times the label's share in the odds of all), and the Dice to expect of each."""
-    assert whole.probability is not None
-    values = split_structure(whole.mask.values, values, labels.known, labels.given.volume.spacing)
-    inside, given = whole.probability.values, labels.given
-    likely, dice = np.where(values, inside, 1 - inside), []
-    between = np.zeros(values.shape[given.axis], dtype=bool)
-    between[given.places[0] : given.places[-1]] = True
-    between[given.places] = False
-    for place, (box, part) in enumerate(parts, 1):
-        own, mine = inside[box] * _odds(part) / np.maximum(odds[box], SURE), values[box] == place
-        likely[box] = np.where(mine, own, likely[box])
-        own, mine = (given.turn(each)[between[box[given.axis]]] for each in (own, mine))
-        dice.append(expected_dice(own, mine) if own.size else 1.0)
-    return values, likely, dice
-
-
-def _box_of_label(inside: np.ndarray, labels: _Labels) -> Box:
-    """Return the box in which a label may be, given where it is known to be (Z, Y, X): along the axis up to the known
-    slices without it, and across it `ROOM` voxels and two gaps beyond."""
-    places, axis, spacing = labels.given.places, labels.given.axis, labels.given.volume.spacing
-    step = 2 * max(np.diff(places)) * spacing[axis]
-    box: list[slice] = []
-    for k in range(3):
-        found = np.flatnonzero(inside.any(tuple({0, 1, 2} - {k})))
-        low, high = int(found[0]), int(found[-1])
-        if k == axis:
-            before, beyond = [p for p in places if p < low], [p for p in places if p > high]
-            box.append(slice(before[-1] if before else 0, beyond[0] + 1 if beyond else inside.shape[k]))
-        else:
-            margin = ROOM + math.ceil(step / spacing[k])
-            box.append(slice(max(low - margin, 0), min(high + 1 + margin, inside.shape[k])))
-    return box[0], box[1], box[2]
-
-
-def _describe_labels(
-    parts: _Parts, dice: Mapping[int, float], whole: Segmentation | None, following: Sequence[int]
-) -> str:
-    """Say how some labels were filled, and of many or of instances how well in the median and in the worst case."""
-    end = f"; annotate next: {', '.join(map(str, following))}" if following else ""
-    if len(parts) <= FEW and whole is None:
-        each = zip(dice, parts, strict=True)
-        return "; ".join(f"label {number}: {part.status}" for number, (_, part) in each) + end
-    worst = ", ".join(f"label {number} {dice[number]:.2f}" for number in sorted(dice, key=lambda n: dice[n])[:FEW])
-    median = f"expect a Dice of {np.median(list(dice.values())):.2f} between known slices in the median; least: {worst}"
-    how = "filled:" if whole is None else f"filled as instances of one structure, {whole.status}; of labels,"
-    return f"{len(parts)} labels {how} {median}{end}"
-
-
-def _odds(part: Segmentation) -> np.ndarray:
-    """Return the odds of the inside, finite."""
-    likely = np.clip(part.mask.values if part.probability is None else part.probability.values, SURE, 1 - SURE)
-    return likely / (1 - likely)
-
-
-def find_labels(values: np.ndarray, chosen: Sequence[int] | None) -> list[int]:
-    """Return the labels in known slices that are structures, ascending: the chosen ones, or all but 0. Raises
-    `ScanError` if the values are grey levels, a chosen label is missing, or there is none but 0."""
-    if chosen is not None:
-        chosen = sorted({check_int(n, "labels that are whole numbers", -SEEDS, IDS) for n in chosen})
-        others = require_labels(values, "the known slices", math.inf)  # of those that are not chosen any number
-        values = np.where(index_labels(others, chosen), others, 0)
-    found = [int(value) for value in np.unique(require_labels(values, "the known slices"))]
-    numbers = [number for number in found if number] if chosen is None else chosen
-    listed = ", ".join(map(str, found[:12])) + (", …" if len(found) > 12 else "")
-    if not numbers or 0 in numbers:
-        raise ScanError(f"labels must be other than 0, got {'0' if numbers else f'{listed} in the known slices'}")
-    if missing := [number for number in numbers if number not in found]:
-        raise ScanError(f"the known slices have the labels {listed}, but not {', '.join(map(str, missing))}")
-    return numbers
-
-
-def are_instances(labels: np.ndarray, levels: np.ndarray, count: int) -> bool:
-    """Return whether labels from 1 to `count` in slices (N, Y, X) are instances, as they are drawn and by grey levels
-    there: nine in ten are, but for a tenth of their area, one piece in each slice, and grey levels vary more within
-    labels than between them."""
-    own, grey = labels[labels > 0], levels[labels > 0].astype(np.float64)
-    total, largest = np.bincount(own, minlength=count + 1), np.zeros(count + 1)
-    for plane in labels:
-        pieces = np.asarray(measure.label(plane, connectivity=2))
-        owner = np.zeros(pieces.max() + 1, dtype=np.intp)
-        owner[pieces] = plane
-        best = np.zeros(count + 1)
-        np.maximum.at(best, owner, np.bincount(pieces.ravel()))
-        largest += best
-    means = np.bincount(own, grey, minlength=count + 1) / np.maximum(total, 1)
-    whole = (largest >= PIECE * total)[1:].mean() >= MOST
-    return bool(whole and means[own].var() <= ALIKE * grey.var())
-
-
-def split_structure(mask: np.ndarray, labels: np.ndarray, known: np.ndarray, spacing: Sequence[float]) -> np.ndarray:
-    """Return labels of a structure's mask (Z, Y, X): each voxel has the nearest of the `labels` (Z, Y, X), which are 0
-    where there is none, and those of `known` voxels stay. Each label is kept in one piece: of the pieces that it has,
-    those without a known voxel go to the label that they touch most, or to the background."""
-    near = ndimage.distance_transform_edt(labels == 0, spacing, return_distances=False, return_indices=True)
-    found = np.where(known, labels, np.where(mask, labels[tuple(near)], 0))  # type: ignore[arg-type]
-    pieces = np.asarray(measure.label(found, connectivity=3))
-    owner, stays = np.zeros(pieces.max() + 1, dtype=found.dtype), np.zeros(pieces.max() + 1, dtype=bool)
-    owner[pieces], stays[pieces[known]], stays[0] = found, True, True
-    row = np.cumsum(~stays) - 1
-    touched = np.zeros((np.count_nonzero(~stays), int(labels.max()) + 1), dtype=np.intp)
-    for axis in range(3):
-        turned = np.moveaxis(pieces, axis, 0)
-        for one, other in ((turned[1:], turned[:-1]), (turned[:-1], turned[1:])):
-            meet = ~stays[one] & stays[other] & (other > 0)
-            np.add.at(touched, (row[one[meet]], owner[other[meet]]), 1)
-    owner[~stays] = touched.argmax(1)  # that is 0 where nothing is touched
-    return owner[pieces]

@@ -21,10 +21,11 @@ from curvafit.core.units import format_sampling
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.slices import IDS, reach_of
 from curvafit.segmentation.uncertainty import doubt
+from curvafit.volumes.formats.base import check_array
 from curvafit.volumes.formats.nifti import write_nifti_like
 from curvafit.volumes.formats.zarr import add_labels, check_place, image_of, mark, store_of, write_labels
 from curvafit.volumes.volume import Volume
-from curvafit.volumes.write import pick_writer, save
+from curvafit.volumes.write import is_streamed, pick_writer, save
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,6 +70,8 @@ class Uncertainty:
         Of one structure: its share of the volume by the known slices alone, with its 95 % interval where there is one.
     mean_probability
         Of one structure: its share of the volume by the probabilities, 0 in slices that are not filled.
+    entropies
+        The sums of the entropies of probabilities, in nats, over the slices across z, y and x.
     """
 
     probability: Volume
@@ -78,6 +81,7 @@ class Uncertainty:
     dice_of_labels: Mapping[int, float] = field(default_factory=dict)
     known_share: tuple[float, ...] = ()
     mean_probability: float = math.nan
+    entropies: tuple[np.ndarray, ...] = ()
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -87,7 +91,8 @@ class Segmentation(Pictured):
     Attributes
     ----------
     mask, phase
-        The mask, bool, and the phase field u, float32, with the scan's grid, spacing, unit and affine.
+        The mask, bool, and the phase field u, float32, with the scan's grid, spacing, unit and affine; no phase field
+        of a volume that is filled in blocks.
     weight
         λ, in nats per unit of F_ε; None for a reconstruction from known slices.
     coefficients, epsilon
@@ -105,7 +110,7 @@ class Segmentation(Pictured):
     """
 
     mask: Volume
-    phase: Volume
+    phase: Volume | None
     weight: float | None
     coefficients: Coefficients | None
     epsilon: float
@@ -115,19 +120,26 @@ class Segmentation(Pictured):
     labels: Volume | None = None
     image: Volume | None = None
 
+    @property
+    def share(self) -> float:
+        """The mask's share of the volume, from 0 to 1."""
+        slabs = (self.mask.read((slice(z, z + 1), slice(None), slice(None))) for z in range(self.mask.shape[0]))
+        return sum(np.count_nonzero(slab) for slab in slabs) / math.prod(self.mask.shape)
+
     @classmethod
     def of(
         cls,
         scan: Volume,
-        mask: np.ndarray,
-        phase: np.ndarray,
+        mask: Any,
+        phase: np.ndarray | None,
         law: Coefficients | None,
         epsilon: float,
         notes: tuple[str, ...],
         **more: Any,
     ) -> Segmentation:
         """Return a segmentation whose mask and phase field (Z, Y, X) lie as the scan does; `more` are attributes."""
-        inside, field = (replace(scan, array=values, notes=()) for values in (mask, phase))
+        inside, field = (None if v is None else replace(scan, array=v, notes=()) for v in (mask, phase))
+        assert inside is not None
         return cls(inside, field, coefficients=law, epsilon=epsilon, notes=(*scan.notes, *notes), **more)
 
     @property
@@ -162,10 +174,8 @@ class Segmentation(Pictured):
         return replace(self.mask, array=values, notes=(note,))
 
     def __repr__(self) -> str:
-        mask = self.mask.values
-        count = f"{np.count_nonzero(mask)} inside ({100 * mask.mean():.3g} %)"
         size = format_sampling(self.mask.shape, self.mask.spacing, self.mask.unit)
-        return f"Segmentation({size}, {count}: {self.status})"
+        return f"Segmentation({size}: {self.status})"
 
 
 def flow_summary(share: float, energy: Sequence[float] = (), steps: int = 0) -> str:
@@ -193,6 +203,8 @@ def check_mask_target(
     files of other origin may be replaced, `maps` which of `MAPS` go beside the mask."""
     target, image = Path(path), image_of(Path(path))
     pick_writer(target, "mm" if scan is None else scan.unit)
+    if scan is not None and not is_streamed(target):
+        check_array(scan.shape, np.dtype(np.float32), str(target))
     first, *more = beside(target, ".json"), beside(target, ".png"), *(map_path(target, name) for name in maps)
     if image is None:
         return can_write(target, FORMAT, more=(first, *more), inputs=inputs, overwrite=overwrite)
@@ -239,37 +251,34 @@ def write_mask(
     are NIfTI, the mask gets the same header but for type and range, and `unit`. `record` has entries to add to the
     record; with `overwrite` files of other origin may be replaced.
     """
-    maps = {
-        name: each.values for name, each in zip(MAPS, (segmentation.probability, sure), strict=True) if each is not None
-    }
+    maps = {name: each for name, each in zip(MAPS, (segmentation.probability, sure), strict=True) if each is not None}
     inputs = () if like is None else (like,)
     target = check_mask_target(path, scan, inputs, overwrite, maps=list(maps))
     image = image_of(target)
 
-    def write(values: np.ndarray, place: Path) -> None:
+    def write(volume: Volume, place: Path) -> None:
         if like is not None and all(str(each).lower().endswith(_NIFTI) for each in (like, target)):
-            write_nifti_like(values, Path(like), place, unit)
+            write_nifti_like(volume.values, Path(like), place, unit)
         else:
-            save(Volume(values, scan.spacing, scan.unit, scan.affine), place, kind=FORMAT.name)
+            save(replace(volume, spacing=scan.spacing, unit=scan.unit, affine=scan.affine), place, kind=FORMAT.name)
 
     with temporary_folder(beside(target, ".json")) as work:
-        mask, labels = segmentation.mask.values, segmentation.labels
-        values = mask.view(np.uint8) if labels is None else labels.values
+        mask, values = segmentation.mask, segmentation.labels
+        if values is None:
+            values = mask if is_streamed(target) else replace(mask, array=mask.values.view(np.uint8))
         for name, each in maps.items():
             write(each, work / map_path(target, name).name)
         if image is None:
             write(values, work / target.name)
         else:
-            write_labels(replace(scan, array=values), work / target.name, image=image)
+            write_labels(replace(scan, array=values.array), work / target.name, image=image)
             mark(work / target.name, FORMAT.name)
-        rows = {"scan": (scan.values, None), "mask": (scan.values, mask)}
-        content = describe_run(segmentation, record or {}, scan, float(mask.mean()))
-        return finish_mask(work, target, list(maps), _figure(segmentation, rows), content)
+        rows = {} if maps else {"scan": (scan.values, None), "mask": (scan.values, mask.values)}
+        content = describe_run(segmentation, record or {}, scan)
+        return _finish(work, target, list(maps), _figure(segmentation, rows), content)
 
 
-def finish_mask(
-    work: Path, target: Path, maps: Sequence[str], figure: Figure, content: dict[str, Any]
-) -> tuple[Path, ...]:
+def _finish(work: Path, target: Path, maps: Sequence[str], figure: Figure, content: dict[str, Any]) -> tuple[Path, ...]:
     """Write picture and record into a folder beside a target where the mask and its `maps` are, move all together to
     where they belong, remove former maps, and return the paths."""
     from curvafit.drawing.plot import DPI
@@ -292,29 +301,41 @@ def finish_mask(
 
 def segmentation_figure(segmentation: Segmentation) -> Figure:
     """Draw the mask's outline on the phase field, in the middle slices or the most uncertain ones."""
-    return _figure(segmentation, {"mask": (segmentation.phase.values, segmentation.mask.values)})
+    phase = segmentation.phase or segmentation.mask
+    return _figure(segmentation, {"mask": (phase.values, segmentation.mask.values)})
 
 
 def _figure(segmentation: Segmentation, rows: Mapping[str, tuple[np.ndarray, np.ndarray | None]]) -> Figure:
     """Draw rows of middle slices; or of a volume between known slices the most uncertain ones. There the outline is
     drawn over the image, if there is one, or else over what is known; below is how unsure it is."""
-    from curvafit.drawing.plot import section_figure
+    from curvafit.drawing.plot import Sections, colour_labels, draw_sections, grey_limits, section_figure
 
-    mask, labels, probability = segmentation.mask, segmentation.labels, segmentation.probability
-    if probability is None:
+    mask, labels, image = segmentation.mask, segmentation.labels, segmentation.image
+    uncertain = segmentation.uncertainty
+    if uncertain is None:
         return section_figure(rows, mask.spacing, mask.unit)
-    unsure = doubt(probability.values)
-    places = [int(unsure.sum(tuple({0, 1, 2} - {axis})).argmax()) for axis in range(3)]
-    shown: dict[str, tuple[np.ndarray, np.ndarray | None]] = {}
-    if labels is not None:
-        shown = {"filled": (labels.values, None)}
-    if segmentation.image is not None:
-        shown = {"image, filled": (segmentation.image.values, mask.values), **shown}
+    places = [int(sums.argmax()) for sums in uncertain.entropies]
+    outlines, likely = _read_planes(mask, places), _read_planes(uncertain.probability, places)
+    unsure, shown = [doubt(plane) for plane in likely], {}
+    if image is not None:
+        shown["image, filled"] = Sections(_read_planes(image, places), outlines, grey_limits(image.values))
     elif labels is None:
-        known = np.where(probability.values % 1 == 0, 2 * mask.values.astype(np.int8) - 1, 0)
-        shown = {"known, filled": (known, mask.values)}
-    shown["how unsure"] = (unsure, mask.values)
-    return section_figure(shown, mask.spacing, mask.unit, places, ["filled"])
+        known = [np.where(p % 1 == 0, 2 * m.astype(np.int8) - 1, 0) for p, m in zip(likely, outlines, strict=True)]
+        shown["known, filled"] = Sections(known, outlines, (-1.0, 1.0))
+    if labels is not None:
+        shown["filled"] = Sections([colour_labels(plane) for plane in _read_planes(labels, places)], None, (0.0, 1.0))
+    shown["how unsure"] = Sections(unsure, outlines, grey_limits(np.concatenate([plane.ravel() for plane in unsure])))
+    return draw_sections(shown, mask.spacing, mask.unit, places)
+
+
+def _read_planes(volume: Volume, places: Sequence[int]) -> list[np.ndarray]:
+    """Return slices of a volume across z, y and x."""
+    boxes = ([slice(0, n) for n in volume.shape] for _ in range(3))
+    planes = []
+    for axis, (box, place) in enumerate(zip(boxes, places, strict=True)):
+        box[axis] = slice(place, place + 1)
+        planes.append(volume.read(tuple(box)).squeeze(axis))  # type: ignore[arg-type]
+    return planes
 
 
 def map_path(target: Path, name: str) -> Path:
@@ -323,9 +344,8 @@ def map_path(target: Path, name: str) -> Path:
     return beside(target, f"_{name}{suffix}")
 
 
-def describe_run(found: Segmentation, options: Mapping[str, Any], scan: Volume, share: float) -> dict[str, Any]:
-    """Return the record of a mask of a scan: its status, the run's options, what was found, and notes; `share` is the
-    mask's of the volume."""
+def describe_run(found: Segmentation, options: Mapping[str, Any], scan: Volume) -> dict[str, Any]:
+    """Return the record of a mask of a scan: its status, the run's options, what was found, and notes."""
     uncertain, doubts = found.uncertainty, {}
     if uncertain is not None:
         doubts = {name: getattr(uncertain, name) for name in ("calibration_error", "suggestions", "expected_dice")}
@@ -343,50 +363,13 @@ def describe_run(found: Segmentation, options: Mapping[str, Any], scan: Volume, 
         "coefficients": None if found.coefficients is None else found.coefficients.as_dict(),
         "epsilon": found.epsilon,
         "weight": found.weight,
-        "volume_fraction": share,
+        "volume_fraction": found.share,
         **doubts,
         "notes": list(found.notes),
         "curvafit": version("curvafit"),
         "torch": version("torch"),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
-
-
-def list_numbers(numbers: Sequence[int], most: int = FEW) -> str:
-    """Return the first of some numbers as a list."""
-    return ", ".join(map(str, numbers[:most])) + (", …" if len(numbers) > most else "")
-
-
-def note_labelled(places: Sequence[int], there: np.ndarray) -> tuple[str, ...]:
-    """Return sentences on the known slices at `places`: those with labels, where `there`, and empty ones in their
-    rhythm."""
-    drawn, empty = ([k for k in places if there[k] == full] for full in (True, False))
-    which = f"The {len(drawn)} slices with labels are known: {list_numbers(drawn, 24)}."
-    return (f"{which} Another one that is rightly empty must be named.", *note_empty(empty))
-
-
-def note_empty(empty: Sequence[int]) -> tuple[str, ...]:
-    """Return a sentence on slices that are taken for rightly empty."""
-    which = f"Taken for rightly empty, as next in the rhythm of those with labels: {list_numbers(empty)}."
-    return (f"{which} If that is wrong, name the known slices.",) if empty else ()
-
-
-def doubt_places(there: np.ndarray, places: Sequence[int]) -> tuple[str, ...]:
-    """Return a sentence where few slices have labels, and some of them are not among the known ones at `places`.
-    `there` says of each slice whether it has labels, (Z,)."""
-    labelled = np.flatnonzero(there)
-    strange = sorted(set(labelled.tolist()) - set(places))
-    if not strange or 2 * len(labelled) > np.ptp(labelled) + 1:
-        return ()
-    few = f"Only {len(labelled)} of {len(there)} slices have labels, but {list_numbers(strange)} are not among the"
-    return (f"{few} known ones: if those are what you annotated, another every or first is meant, or known.",)
-
-
-def doubt_labels(values: np.ndarray, ignore: int | None = None) -> tuple[str, ...]:
-    """Return a sentence where known slices have several labels, given their values, each once."""
-    count = np.count_nonzero((values > 0) & (values != ignore))
-    how = "reconstruct_labels, or --labels all, fills each by itself"
-    return (f"The known slices have {count} labels, which are filled as one structure: {how}.",) if count > 1 else ()
 
 
 def describe_filled(

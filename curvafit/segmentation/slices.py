@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline, make_interp_spline
 
-from curvafit.core.checks import check_int
 from curvafit.core.units import format_sampling
-from curvafit.priors.grid import MOST
 from curvafit.scan.grids import centre_distance
 from curvafit.volumes.boxes import Box
 from curvafit.volumes.read import Source, load
@@ -26,17 +24,16 @@ LABELS, FEW = 256, 16
 IDS = 2**64 - 1
 #: Share by which the voxel sizes of two files may differ.
 SAME = 1e-3
-#: Share of slices with labels, between a label's first and last, that may lack it if all count as known to all.
-APART = 1 / 3
 #: The box that is all of a volume.
 WHOLE: Box = (slice(0, None), slice(0, None), slice(0, None))
 
 
 @dataclass(frozen=True, eq=False)
 class Slices:
-    """The known slices across the first axis of a volume of `length` slices: their masks, bool (N, Y, X), and their
-    numbers, ascending. In a `periodic` volume the first slice follows the last. `marks` say what is known in the other
-    slices, int8 (length, Y, X): 1 inside, -1 outside, 0 unknown; None if nothing is."""
+    """The known slices across the first axis of a volume of `length` slices: their masks, bool (N, Y, X), which may be
+    read from a file where they are asked for, and their numbers, ascending. In a `periodic` volume the first slice
+    follows the last. `marks` say what is known in the other slices, int8 (length, Y, X): 1 inside, -1 outside, 0
+    unknown; None if nothing is."""
 
     inside: np.ndarray
     places: tuple[int, ...]
@@ -45,25 +42,6 @@ class Slices:
     unit: str = "voxel"
     periodic: bool = False
     marks: np.ndarray | None = None
-
-    @classmethod
-    def of(
-        cls,
-        volume: Volume,
-        places: Sequence[int],
-        axis: int,
-        periodic: bool = False,
-        marks: np.ndarray | None = None,
-        name: str = "the known slices",
-    ) -> Slices:
-        """Take the known slices of a volume across an axis, which becomes the first; `marks` have it first already.
-
-        Raises `ScanError` if they hold grey levels, or are all empty or all full; the message calls them `name`.
-        """
-        inside = require_labels(np.moveaxis(volume.values, axis, 0)[list(places)], name) > 0
-        require_outline(int(np.count_nonzero(inside)), inside.size, name)
-        edges = turn_axes(volume.spacing, axis)
-        return cls(inside, tuple(places), volume.shape[axis], edges, volume.unit, periodic, marks)
 
     def crop(self, box: Box) -> Slices:
         """Return what is known in a box, whose first edge begins and ends with known slices."""
@@ -95,6 +73,11 @@ class Slices:
     def frame(self) -> Volume:
         """A field of zeros, without memory of its own, with the volume's shape and spacing."""
         return Volume(np.broadcast_to(np.float32(0), self.shape), self.spacing, self.unit)
+
+    @property
+    def areas(self) -> np.ndarray:
+        """The share of each known slice that is inside, (N,)."""
+        return np.array([self.inside[k].mean() for k in range(len(self.places))])
 
     def numbers(self, box: Box) -> list[np.ndarray]:
         """Return the indices of a box's voxels along each axis; in a periodic volume a box may cross the ends."""
@@ -151,55 +134,10 @@ class Slices:
         return unknown
 
 
-def known_places(length: int, every: int | None, first: int, known: Sequence[int] | None) -> list[int]:
-    """Return the numbers of the known slices, ascending: every `every`-th from `first` on, and those listed in `known`.
-    Raises `ValueError` if neither is given, or they are not two or more slices of the volume."""
-    if every is None and known is None:
-        raise ScanError("give every or known: which slices are known")
-    known = [*(known or ())]
-    if every is not None:
-        every = check_int(_to_int(every), "every, a whole number from 1", 1, MOST)
-        known += range(check_int(_to_int(first), "first, a whole number from 0", 0, MOST), length, every)
-    form = f"known slices that are whole numbers from 0 to {length - 1}"
-    places = sorted({check_int(_to_int(number), form, 0, length - 1) for number in known})
-    if len(places) < 2:
-        raise ScanError(f"two or more slices within 0 to {length - 1} must be known, got {places}")
-    return places
-
-
 def turn_axes(numbers: Sequence[Any], axis: int) -> tuple[Any, Any, Any]:
     """Return what there is along each axis, that of `axis` first."""
     first, second, third = (numbers[k] for k in (axis, *(k for k in range(3) if k != axis)))
     return first, second, third
-
-
-def find_labelled(values: np.ndarray) -> np.ndarray:
-    """Return whether each slice (Z, Y, X) has labels, (Z,)."""
-    return np.asarray((values > 0).any((1, 2)))
-
-
-def choose_labelled(there: np.ndarray) -> list[int]:
-    """Return the numbers of the known slices, given whether each has labels, (Z,): those that have, and by their rhythm
-    (`next_in_rhythm`) the empty ones beside them."""
-    places = np.flatnonzero(there)
-    if len(places) < 2:
-        raise ScanError(f"two or more slices must have labels, got {len(places)}; or give every or known")
-    if np.diff(places).max() == 1:
-        raise ScanError(
-            "no slice without labels lies between those with labels: give every or known, which slices count; slices "
-            "that nobody annotated must be there too, empty"
-        )
-    return sorted([*places.tolist(), *next_in_rhythm(places, len(there))])
-
-
-def next_in_rhythm(places: Sequence[int] | np.ndarray, length: int) -> list[int]:
-    """Return the slices before the first and beyond the last of those with labels, if these are three or more, every
-    n-th: they are taken for rightly empty."""
-    steps = set(np.diff(places).tolist())
-    if len(places) < 3 or len(steps) > 1:
-        return []
-    step = steps.pop()
-    return [k for k in (int(places[0]) - step, int(places[-1]) + step) if 0 <= k < length]
 
 
 def index_labels(values: np.ndarray, numbers: Sequence[int], ignore: int | None = None) -> np.ndarray:
@@ -217,37 +155,6 @@ def reach_of(places: Sequence[int], length: int) -> slice:
     """Return the slices that are filled: those between known ones, and beyond each end half the gap next to it."""
     before, beyond = (places[1] - places[0]) // 2, (places[-1] - places[-2]) // 2
     return slice(max(places[0] - before, 0), min(places[-1] + beyond + 1, length))
-
-
-def check_shared(values: np.ndarray, places: Sequence[int], labels: Sequence[int]) -> None:
-    """Raise ScanError where labels are drawn on slices (Z, Y, X) of their own, so that one's absence says nothing."""
-    for label in labels:
-        there = (values[list(places)] == label).any((1, 2))
-        span = there[there.argmax() : len(there) - there[::-1].argmax()]
-        if (missing := np.count_nonzero(~span)) > APART * len(span):
-            some = f"label {label} is on {len(span) - missing} of the {len(span)} slices with labels that it spans"
-            raise ScanError(
-                f"{some}: fill labels that have slices of their own one after the other, or name known slices"
-            )
-
-
-def _to_int(number: Any) -> Any:
-    """Return a float that is a whole number as an int."""
-    return int(number) if isinstance(number, float) and number.is_integer() else number
-
-
-def annotated_slices(values: np.ndarray, ignore: int) -> tuple[list[int], np.ndarray | None]:
-    """Return the numbers of the slices (Z, Y, X) that are annotated whole, and marks of the others. `ignore` is the
-    label of voxels that nobody annotated; 0 is known to be empty. Marks are those of `Slices`."""
-    seen = values != ignore
-    if seen.all():
-        raise ScanError(f"no voxel has the label {ignore}, which tells what nobody annotated")
-    whole = seen.all((1, 2))
-    places = np.flatnonzero(whole).tolist()
-    if len(places) < 2:
-        raise ScanError(f"two or more slices must have no voxel of the label {ignore}, got {places}")
-    seen[whole] = False
-    return places, np.where(seen, np.where(values > 0, 1, -1), 0).astype(np.int8) if seen.any() else None
 
 
 def mark_known(shape: Sequence[int], places: Sequence[int], marks: np.ndarray | None) -> np.ndarray:

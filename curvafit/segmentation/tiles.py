@@ -26,7 +26,7 @@ from curvafit.priors.grid import MOST
 from curvafit.segmentation.flow import HALO, Ends, WorkingGrid, lower_energy
 from curvafit.segmentation.trials import Trial
 from curvafit.volumes.boxes import Box, within
-from curvafit.volumes.run import Record, open_mapped, open_run
+from curvafit.volumes.run import Record, open_run
 from curvafit.volumes.volume import Volume
 
 #: Working voxels beyond a tile that are lowered with it: at that distance the cut is not felt any more.
@@ -35,8 +35,8 @@ OVERLAP = 24
 WHOLE, EDGE = 256**3, 192
 #: Shortest edge of a tile, in working voxels.
 SHORTEST = 8
-#: The name of the pass, and the volume's arrays in a run's folder.
-_LOWER, _MASK, _PHASE = "lowering the energy", "mask.npy", "phase.npy"
+#: The name of the pass.
+_LOWER = "lowering the energy"
 
 
 @dataclass(frozen=True)
@@ -170,25 +170,17 @@ def lower_volume(
     parts: dict[str, Any] = {"law": trial.law, "steps": trial.steps, "tiles": tiling.counts, "place": tiling.place}
     same = {} if folder is None else identity(**problem.inputs, **parts)  # digests take a while
     with open_run(workers, folder, same, progress, {_LOWER: 1.0}) as run:
-        mask, phase = (
-            np.empty(tiling.shape, kind) if folder is None else open_mapped(folder / name, kind, tiling.shape)
-            for name, kind in ((_MASK, np.bool_), (_PHASE, np.float32))
-        )
+        mask, phase = run.open("mask", np.bool_, tiling.shape), run.open("phase", np.float32, tiling.shape)
 
         def keep(number: int, record: Record) -> Record:
             core = tiles[number].core
-            for array, name in ((mask, "mask"), (phase, "phase")):
-                array[core] = record[name]
-                if isinstance(array, np.memmap):
-                    array.flush()
+            mask[core], phase[core] = record["mask"], record["phase"]
             return {"energies": record["energies"]}
 
         lower = partial(_lower_tile, problem, tiling, progress if run.alone else silent)
         records = run(_LOWER, lower, tiling.count, keep=keep)
         energies = np.sum([record["energies"] for record in records], axis=0)
-    if folder is not None:  # what is done with the result must not change the tiles
-        mask.flags.writeable = phase.flags.writeable = False
-    return LoweredVolume(mask, phase, tuple(energies.tolist()), 0 if trial.law is None else trial.steps)
+    return LoweredVolume(mask.values, phase.values, tuple(energies.tolist()), 0 if trial.law is None else trial.steps)
 
 
 def _lower_tile(problem: Problem, tiling: Tiling, progress: Progress, number: int) -> Record:

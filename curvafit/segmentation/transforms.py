@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.segmentation.reconstruct import reconstruct, reconstruct_labels
+from curvafit.segmentation.labels import reconstruct_labels
+from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.volumes.volume import ScanError, Volume
 
 try:

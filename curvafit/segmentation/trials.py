@@ -18,8 +18,10 @@ from curvafit.inference.fit import load_candidates
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import Law, LawLike
 from curvafit.scan.grids import box_with_most_surface
+from curvafit.segmentation.known import Known
 from curvafit.segmentation.slices import Slices
 from curvafit.volumes.boxes import Box
+from curvafit.volumes.run import Run
 from curvafit.volumes.volume import ScanError, Volume
 
 #: The known part of a volume.
@@ -128,7 +130,7 @@ class Example:
                 "expected known slices with others between them, and an example longer than their distance, got slices "
                 f"{gap} apart and an example of {length}"
             )
-        whole = Slices.of(volume, range(length), axis, name="the example's slices")
+        whole, _ = Known(volume, axis, tuple(range(length))).read(Run(), name="the example's slices")
         inside = whole.inside[box_with_most_surface(whole.inside, LARGEST)]
         notes = (f"Of the example {' x '.join(map(str, inside.shape))} voxels are read, where most of its surface is.",)
         cut = inside.size < whole.inside.size

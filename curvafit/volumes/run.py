@@ -21,6 +21,7 @@ from curvafit.core.runtime import Progress, silent
 from curvafit.core.workers import ThisProcess, Workers, join_workers, run_jobs
 from curvafit.priors.kernels.threads import one_thread
 from curvafit.volumes.formats.base import ScanError
+from curvafit.volumes.read import FileArray
 
 #: Arrays and numbers of a block of a volume, by name.
 Record = Mapping[str, Any]
@@ -82,6 +83,42 @@ class Run:
             self._progress(shown or name, start + (stop - start) * done / count)
         return [records[number] for number in range(count)]
 
+    def open(self, name: str, dtype: Any, shape: tuple[int, ...]) -> RunArray:
+        """Return an array that blocks fill, in memory or in a mapped file where records stay."""
+        return RunArray(None if self._folder is None else self._folder / f"{name}.npy", dtype, shape)
+
+
+class RunArray:
+    """An array that a run fills box by box: in memory, or in a file that is mapped for each box alone."""
+
+    def __init__(self, path: Path | None, dtype: Any, shape: tuple[int, ...]) -> None:
+        self._path, self.shape = path, shape
+        if path is None:
+            self._array = np.empty(shape, dtype)
+        elif not path.exists():
+            new = path.with_name(f"{path.name}.new")
+            np.lib.format.open_memmap(new, mode="w+", dtype=dtype, shape=shape).flush()
+            os.replace(new, path)
+
+    def __setitem__(self, box: Any, values: np.ndarray) -> None:
+        array = self._array if self._path is None else np.load(self._path, mmap_mode="r+")
+        array[box] = values
+        if isinstance(array, np.memmap):
+            array.flush()
+
+    def __getitem__(self, box: Any) -> np.ndarray:
+        return self.values[box]
+
+    @property
+    def values(self) -> np.ndarray:
+        """The array, or the mapped file, which is not to be written to."""
+        return self._array if self._path is None else np.load(self._path, mmap_mode="r")
+
+    @property
+    def stored(self) -> Any:
+        """The array, or what reads boxes of it from the file, in any process."""
+        return self._array if self._path is None else FileArray(self._path, {}, self.values)
+
 
 def _do(function: Callable[[int], Record], shared: bool, number: int) -> tuple[int, Record]:
     """Return the record of a block, made on one thread where workers share the cores."""
@@ -126,15 +163,6 @@ def open_run(
     mine = {name: str(each) for name, each in {**same, "curvafit": version("curvafit")}.items()}
     with join_workers(workers) as joined, nullcontext() if store is None else _lock(Path(store), mine) as folder:
         yield Run(joined, folder, progress, ends)
-
-
-def open_mapped(path: Path, dtype: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Open an array in a mapped file to write to, which is made, whole or not at all, where there is none."""
-    if not path.exists():
-        new = path.with_name(f"{path.name}.new")
-        np.lib.format.open_memmap(new, mode="w+", dtype=dtype, shape=shape).flush()
-        os.replace(new, path)
-    return np.load(path, mmap_mode="r+")
 
 
 @contextmanager

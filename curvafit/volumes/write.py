@@ -66,9 +66,9 @@ def save(
     overwrite
         Whether any other folder of that name may be replaced.
     """
-    field = load(source, spacing=spacing, unit=unit)
-    target = Path(path)
-    writer = pick_writer(target, field.unit, field.values)
+    field, target = load(source, spacing=spacing, unit=unit, lazy=True), Path(path)
+    field = field if is_streamed(target) else field.load()
+    writer = pick_writer(target, field.unit, np.empty(0, field.dtype) if field.in_file else field.values)
     can_write(target, lambda there: not there.is_dir() or is_own_zarr(there, kind), overwrite=overwrite)
 
     def write(temporary: Path) -> None:
@@ -101,6 +101,11 @@ def pick_writer(path: Path, unit: str, values: np.ndarray | None = None) -> Call
     if values is not None and values.dtype.itemsize > 8 and suffix != ".npy":
         raise ScanError(f"{suffix} holds numbers of at most 64 bits, got {values.dtype}")
     return WRITERS[suffix]
+
+
+def is_streamed(path: Path) -> bool:
+    """Return whether a volume is written box by box, and need not fit into memory."""
+    return path.name.lower().endswith(".zarr") or image_of(path) is not None
 
 
 def note_lost(path: Path, volume: Volume) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from disk import unreadable
 from PIL import Image
 
 import curvafit
-from curvafit.segmentation.reconstruct import reconstruct_labels
+from curvafit.segmentation.labels import reconstruct_labels
 from curvafit.volumes import ScanError, Volume, load, save
 from curvafit.volumes.write import check_labels
 

@@ -19,7 +19,8 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import preset
 from curvafit.scan.grids import box_with_most_surface
 from curvafit.segmentation.flow import WorkingGrid
-from curvafit.segmentation.reconstruct import MARGIN, STIFFNESS, reconstruct, reconstruct_labels
+from curvafit.segmentation.labels import reconstruct_labels
+from curvafit.segmentation.reconstruct import MARGIN, STIFFNESS, reconstruct
 from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.segmentation.segment import FIRST, NATS, calibrate
 from curvafit.segmentation.slices import WAYS, Slices

@@ -9,7 +9,8 @@ import pytest
 import torch
 from annotated import organelles
 
-from curvafit.segmentation.reconstruct import reconstruct, reconstruct_labels
+from curvafit.segmentation.labels import reconstruct_labels
+from curvafit.segmentation.reconstruct import reconstruct
 from curvafit.volumes.volume import Volume
 
 pytest.importorskip("monai", reason="needs monai, of the group dev")

@@ -8,7 +8,6 @@ import os
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -147,24 +146,21 @@ def write_zarr(field: Any, path: Path, version: str = "0.5", labels: bool = Fals
 
     `labels` says that its whole numbers are labels of the image two folders above.
     """
-    values = np.asarray(field.values)
     with hold_signals():  # Zarr's own threads would go on to write while the folder is deleted
-        group = create_zarr(field, values.dtype, path, version, labels)
-        level_of(group, 0)[...] = values
+        group = _create_zarr(field, path, version, labels)
+        finest = _level_of(group, 0)
+        for core in _cores_of(group, 0):
+            finest[core] = field.read(core).astype(finest.dtype, copy=False)
         for level in range(1, len(group)):
-            for core in cores_of(group, level):
-                halve_level(group, level, core)
+            for core in _cores_of(group, level):
+                _halve_level(group, level, core)
 
 
-def create_zarr(
-    frame: Any, dtype: np.dtype, path: Path, version: str = "0.5", labels: bool = False, chunk: int = CHUNK
-) -> Any:
-    """Create an image of OME-Zarr with a volume's shape and place, in chunks of an edge, and return its group.
-
-    Level `0` is to be written by whole chunks, in any order, and each level after it by `halve_level`.
-    """
+def _create_zarr(frame: Any, path: Path, version: str, labels: bool) -> Any:
+    """Create an image of OME-Zarr with a volume's shape, type and place, and return its group."""
     import zarr
 
+    dtype = np.dtype(np.uint8) if frame.dtype.kind == "b" else frame.dtype
     shapes = [tuple(frame.shape)]
     while max(shapes[-1]) > CHUNK:
         shapes.append(tuple(-(-n // 2) for n in shapes[-1]))
@@ -193,31 +189,24 @@ def create_zarr(
             str(k),
             shape=shape,
             dtype=np.dtype(dtype.newbyteorder("=").str),  # of the two 64-bit types of C, Zarr knows one
-            chunks=tuple(min(chunk, n) for n in shape),
+            chunks=tuple(min(CHUNK, n) for n in shape),
             **naming,
         )
     return group
 
 
-def open_zarr(path: Path) -> Any:
-    """Open a group that `create_zarr` made, to write its levels."""
-    import zarr
-
-    return zarr.open_group(path, mode="r+")
-
-
-def level_of(group: Any, level: int) -> Any:
+def _level_of(group: Any, level: int) -> Any:
     """Return a level of an image to write to: a chunk that is not there afterwards is one that was lost."""
     return group[str(level)].with_config({"write_empty_chunks": True})
 
 
-def cores_of(group: Any, level: int) -> list[Box]:
-    """Return the boxes of whole chunks by which `halve_level` makes a level."""
+def _cores_of(group: Any, level: int) -> list[Box]:
+    """Return the boxes of whole chunks by which a level is written."""
     array = group[str(level)]
     return cut_boxes(array.shape, [_HALVED * edge for edge in array.chunks])
 
 
-def halve_level(group: Any, level: int, core: Box) -> None:
+def _halve_level(group: Any, level: int, core: Box) -> None:
     """Write a core of whole chunks of a level: of floats means of 2³ voxels of the level before it (the last voxels
     count twice where the number is odd), of whole numbers, which may be labels, every second value."""
     finer = group[str(level - 1)]
@@ -228,7 +217,7 @@ def halve_level(group: Any, level: int, core: Box) -> None:
         values = even.reshape(nz, 2, ny, 2, nx, 2).mean((1, 3, 5), dtype=np.float32).astype(values.dtype)
     else:
         values = values[::2, ::2, ::2]
-    level_of(group, level)[core] = values
+    _level_of(group, level)[core] = values
 
 
 # ---- labels of an image ----------------------------------------------------------------------------------------------
@@ -261,11 +250,10 @@ def store_of(image: Path) -> Path:
 
 def write_labels(field: Any, path: Path, *, image: Path) -> None:
     """Write whole numbers, or a mask, as labels of an image; `path` may be anywhere until `add_labels`."""
-    if field.values.dtype.kind not in "biu":
-        raise ScanError(f"labels must be whole numbers, got values of type {field.values.dtype}")
+    if field.dtype.kind not in "biu":
+        raise ScanError(f"labels must be whole numbers, got values of type {field.dtype}")
     check_place(field, image)
-    whole = replace(field, array=field.values.view(np.uint8)) if field.values.dtype.kind == "b" else field
-    write_zarr(whole, path, version_of(image) or "", labels=True)
+    write_zarr(field, path, version_of(image) or "", labels=True)
 
 
 def check_place(field: Any, image: Path) -> None:

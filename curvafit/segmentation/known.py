@@ -1,0 +1,246 @@
+"""Which slices of a volume of labels are known, read some at once, and what is said of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from curvafit.core.checks import SEEDS, check_int
+from curvafit.priors.grid import MOST
+from curvafit.segmentation.slices import (
+    IDS,
+    LABELS,
+    Slices,
+    require_labels,
+    require_outline,
+    turn_axes,
+)
+from curvafit.volumes.boxes import Box
+from curvafit.volumes.formats.zarr import CHUNK
+from curvafit.volumes.run import Record, Run
+from curvafit.volumes.volume import ScanError, Volume, check_finite, round_labels
+
+#: Slices of a file that are read at once, and their bytes at most.
+THICK, SLAB = CHUNK, 2**26
+#: Share of slices with labels, between a label's first and last, that may lack it if all count as known to all.
+APART = 1 / 3
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Labels of a volume, the numbers of its known slices across an axis, ascending, and notes on which those are.
+    `marks` say what is known in the other slices, as those of `Slices`."""
+
+    volume: Volume
+    axis: int
+    places: tuple[int, ...] = ()
+    marks: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def find(
+        cls, volume: Volume, run: Run, *, every: int | None, first: int, known: Sequence[int] | None,
+        ignore: int | None, axis: int,
+    ) -> Known:  # fmt: skip
+        """Find which slices of a volume are known, as `reconstruct` says; with `ignore` in memory."""
+        whole = cls(volume, check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2))
+        if ignore is not None:
+            if every is not None or known is not None:
+                raise ScanError("give either every, known or ignore")
+            ignore = check_int(ignore, "a label to ignore", -SEEDS, IDS)
+            places, marks = annotated_slices(whole.turn(volume.values), ignore)
+            return replace(whole, places=tuple(places), marks=marks)
+        if every is None and known is None:
+            places = choose_labelled(there := whole._look(run))
+            return replace(whole, places=tuple(places), notes=note_labelled(places, there))
+        places = known_places(volume.shape[axis], every, first, known)
+        notes = () if every is None else doubt_places(whole._look(run), places)
+        return replace(whole, places=tuple(places), notes=notes)
+
+    def read(self, run: Run, periodic: bool = False, name: str = "the known slices") -> tuple[Slices, np.ndarray]:
+        """Read the known slices; return them, where the run keeps its work, and the labels that they have.
+
+        Raises `ScanError` if they hold grey levels, or are all empty or all full; the message calls them `name`.
+        """
+        length, *plane = turn_axes(self.volume.shape, self.axis)
+        inside = run.open("known", np.bool_, (len(self.places), *plane))
+
+        def keep(number: int, record: Record) -> Record:
+            which = record["which"]
+            if len(which):
+                inside[which[0] : which[-1] + 1] = record["inside"]
+            return {"values": record["values"], "count": np.count_nonzero(record["inside"])}
+
+        found = run("reading known slices", partial(_read_slab, self, name), len(self._slabs), keep=keep)
+        values = np.unique(np.concatenate([each["values"] for each in found]))
+        if len(values) > LABELS:
+            raise ScanError(f"{name} must be a mask or have at most {LABELS} labels, got {len(values)} values")
+        require_outline(sum(int(each["count"]) for each in found), len(self.places) * plane[0] * plane[1], name)
+        edges = turn_axes(self.volume.spacing, self.axis)
+        return Slices(inside.stored, self.places, length, edges, self.volume.unit, periodic, self.marks), values
+
+    def turn(self, values: np.ndarray) -> np.ndarray:
+        """Move the axis across the slices to the front."""
+        return np.moveaxis(values, self.axis, 0)
+
+    def turn_back(self, values: np.ndarray) -> np.ndarray:
+        """Move the axis across the slices from the front to its place."""
+        return np.ascontiguousarray(np.moveaxis(values, 0, self.axis))
+
+    def turn_box(self, box: Box) -> Box:
+        """Return a box, whose first edge is across the slices, in the volume's axes."""
+        rest = list(box)
+        rest.insert(self.axis, rest.pop(0))
+        return rest[0], rest[1], rest[2]
+
+    @property
+    def _slabs(self) -> list[slice]:
+        """The slices that are read at once: of a volume in memory all."""
+        length, *plane = turn_axes(self.volume.shape, self.axis)
+        thick = length
+        if self.volume.in_file:
+            thick = min(THICK, max(1, SLAB // (plane[0] * plane[1] * self.volume.dtype.itemsize)))
+        return [slice(start, min(start + thick, length)) for start in range(0, length, thick)]
+
+    def _slab(self, rows: slice) -> np.ndarray:
+        """Return the values (n, Y, X) of some slices."""
+        _, *plane = turn_axes(self.volume.shape, self.axis)
+        values = self.volume.read(self.turn_box((rows, slice(0, plane[0]), slice(0, plane[1]))))
+        if self.volume.in_file:
+            check_finite(values, self.volume.source)
+        return self.turn(round_labels(values))
+
+    def _look(self, run: Run) -> np.ndarray:
+        """Return whether each slice has labels, (length,)."""
+        found = run("looking for labels", partial(_look_at_slab, self), len(self._slabs))
+        return np.concatenate([each["there"] for each in found])
+
+
+def _look_at_slab(whole: Known, number: int) -> Record:
+    """Return which slices of a slab have labels."""
+    return {"there": (whole._slab(whole._slabs[number]) > 0).any((1, 2))}
+
+
+def _read_slab(known: Known, name: str, number: int) -> Record:
+    """Return the numbers of a slab's known slices among all, which voxels are inside, and which labels they have."""
+    rows = known._slabs[number]
+    which = np.array([k for k, place in enumerate(known.places) if rows.start <= place < rows.stop], dtype=np.intp)
+    if not len(which):
+        return {"which": which, "inside": np.empty(0, dtype=bool), "values": np.empty(0, dtype=known.volume.dtype)}
+    values = require_labels(known._slab(rows)[[known.places[k] - rows.start for k in which]], name)
+    return {"which": which, "inside": values > 0, "values": np.unique(values)}
+
+
+# ---- which slices ----------------------------------------------------------------------------------------------------
+
+
+def known_places(length: int, every: int | None, first: int, known: Sequence[int] | None) -> list[int]:
+    """Return the numbers of the known slices, ascending: every `every`-th from `first` on, and those listed in `known`.
+    Raises `ValueError` if neither is given, or they are not two or more slices of the volume."""
+    if every is None and known is None:
+        raise ScanError("give every or known: which slices are known")
+    known = [*(known or ())]
+    if every is not None:
+        every = check_int(_to_int(every), "every, a whole number from 1", 1, MOST)
+        known += range(check_int(_to_int(first), "first, a whole number from 0", 0, MOST), length, every)
+    form = f"known slices that are whole numbers from 0 to {length - 1}"
+    places = sorted({check_int(_to_int(number), form, 0, length - 1) for number in known})
+    if len(places) < 2:
+        raise ScanError(f"two or more slices within 0 to {length - 1} must be known, got {places}")
+    return places
+
+
+def choose_labelled(there: np.ndarray) -> list[int]:
+    """Return the numbers of the known slices, given whether each has labels, (Z,): those that have, and by their rhythm
+    (`next_in_rhythm`) the empty ones beside them."""
+    places = np.flatnonzero(there)
+    if len(places) < 2:
+        raise ScanError(f"two or more slices must have labels, got {len(places)}; or give every or known")
+    if np.diff(places).max() == 1:
+        raise ScanError(
+            "no slice without labels lies between those with labels: give every or known, which slices count; slices "
+            "that nobody annotated must be there too, empty"
+        )
+    return sorted([*places.tolist(), *next_in_rhythm(places, len(there))])
+
+
+def next_in_rhythm(places: Sequence[int] | np.ndarray, length: int) -> list[int]:
+    """Return the slices before the first and beyond the last of those with labels, if these are three or more, every
+    n-th: they are taken for rightly empty."""
+    steps = set(np.diff(places).tolist())
+    if len(places) < 3 or len(steps) > 1:
+        return []
+    step = steps.pop()
+    return [k for k in (int(places[0]) - step, int(places[-1]) + step) if 0 <= k < length]
+
+
+def annotated_slices(values: np.ndarray, ignore: int) -> tuple[list[int], np.ndarray | None]:
+    """Return the numbers of the slices (Z, Y, X) that are annotated whole, and marks of the others. `ignore` is the
+    label of voxels that nobody annotated; 0 is known to be empty. Marks are those of `Slices`."""
+    seen = values != ignore
+    if seen.all():
+        raise ScanError(f"no voxel has the label {ignore}, which tells what nobody annotated")
+    whole = seen.all((1, 2))
+    places = np.flatnonzero(whole).tolist()
+    if len(places) < 2:
+        raise ScanError(f"two or more slices must have no voxel of the label {ignore}, got {places}")
+    seen[whole] = False
+    return places, np.where(seen, np.where(values > 0, 1, -1), 0).astype(np.int8) if seen.any() else None
+
+
+def check_shared(values: np.ndarray, places: Sequence[int], labels: Sequence[int]) -> None:
+    """Raise ScanError where labels are drawn on slices (Z, Y, X) of their own, so that one's absence says nothing."""
+    for label in labels:
+        there = (values[list(places)] == label).any((1, 2))
+        span = there[there.argmax() : len(there) - there[::-1].argmax()]
+        if (missing := np.count_nonzero(~span)) > APART * len(span):
+            some = f"label {label} is on {len(span) - missing} of the {len(span)} slices with labels that it spans"
+            raise ScanError(
+                f"{some}: fill labels that have slices of their own one after the other, or name known slices"
+            )
+
+
+def _to_int(number: Any) -> Any:
+    """Return a float that is a whole number as an int."""
+    return int(number) if isinstance(number, float) and number.is_integer() else number
+
+
+def note_labelled(places: Sequence[int], there: np.ndarray) -> tuple[str, ...]:
+    """Return sentences on the known slices at `places`: those with labels, where `there`, and empty ones in their
+    rhythm."""
+    drawn, empty = ([k for k in places if there[k] == full] for full in (True, False))
+    which = f"The {len(drawn)} slices with labels are known: {list_numbers(drawn, 24)}."
+    return (f"{which} Another one that is rightly empty must be named.", *note_empty(empty))
+
+
+def note_empty(empty: Sequence[int]) -> tuple[str, ...]:
+    """Return a sentence on slices that are taken for rightly empty."""
+    which = f"Taken for rightly empty, as next in the rhythm of those with labels: {list_numbers(empty)}."
+    return (f"{which} If that is wrong, name the known slices.",) if empty else ()
+
+
+def doubt_places(there: np.ndarray, places: Sequence[int]) -> tuple[str, ...]:
+    """Return a sentence where few slices have labels, and some of them are not among the known ones at `places`.
+    `there` says of each slice whether it has labels, (Z,)."""
+    labelled = np.flatnonzero(there)
+    strange = sorted(set(labelled.tolist()) - set(places))
+    if not strange or 2 * len(labelled) > np.ptp(labelled) + 1:
+        return ()
+    few = f"Only {len(labelled)} of {len(there)} slices have labels, but {list_numbers(strange)} are not among the"
+    return (f"{few} known ones: if those are what you annotated, another every or first is meant, or known.",)
+
+
+def doubt_labels(values: np.ndarray, ignore: int | None = None) -> tuple[str, ...]:
+    """Return a sentence where known slices have several labels, given their values, each once."""
+    count = np.count_nonzero((values > 0) & (values != ignore))
+    how = "reconstruct_labels, or --labels all, fills each by itself"
+    return (f"The known slices have {count} labels, which are filled as one structure: {how}.",) if count > 1 else ()
+
+
+def list_numbers(numbers: Sequence[int], most: int = 4) -> str:
+    """Return the first of some numbers as a list."""
+    return ", ".join(map(str, numbers[:most])) + (", …" if len(numbers) > most else "")
