@@ -46,7 +46,7 @@ def write_inputs(folder: Path) -> None:
         save(Volume(values, (0.5, 0.5, 0.5), "um"), folder / name)
 
 
-def start(words: str, folder: Path) -> subprocess.Popen[bytes]:
+def start(words: str, folder: Path) -> subprocess.Popen:
     """Start a command in a folder, in a group of its own."""
     (folder / "out").mkdir(exist_ok=True)
     program, threads = [sys.executable, "-m", "curvafit", *words.split()], {"OMP_NUM_THREADS": "1"}

@@ -18,7 +18,7 @@ from curvafit.cli.console import plain_errors, resumable, show_stages
 
 if TYPE_CHECKING:
     from curvafit.core.runtime import Progress
-    from curvafit.core.workers import Workers
+    from curvafit.core.workers import Cluster
 
 #: Whether files of other programs, or of other commands, may be replaced.
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace files that another command wrote.")]
@@ -178,7 +178,7 @@ class Crew:
             check_memory(shape, FLOW, "a shape")
 
     @contextmanager
-    def start(self, again: Callable[[], str] = lambda: "the same command") -> Iterator[tuple[Workers, Progress]]:
+    def start(self, again: Callable[[], str] = lambda: "the same command") -> Iterator[tuple[Cluster | None, Progress]]:
         """Start the workers and their progress bar; `again` returns the command that resumes after an interrupt."""
         from curvafit.core.workers import cluster
 

@@ -29,22 +29,6 @@ _ENVIRONMENT = {
 _IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 
 
-class ThisProcess:
-    """This process, as the only worker: `submit` takes a job, `collect` does it."""
-
-    places = 1
-
-    def __init__(self) -> None:
-        self._jobs: list[tuple[Callable[[Any], Any], Any]] = []
-
-    def submit(self, function: Callable[[Any], Any], job: Any) -> None:
-        self._jobs.append((function, job))
-
-    def collect(self) -> Any:
-        function, job = self._jobs.pop(0)
-        return function(job)
-
-
 class Cluster:
     """The workers of a dask cluster, which must see folders under the same names.
 
@@ -78,16 +62,15 @@ class Cluster:
             raise OSError(f"a part of the work killed several workers: {error}") from error
 
 
-#: Who does jobs, such as the draws of an atlas.
-Workers = ThisProcess | Cluster
-
-
-def run_jobs(function: Callable[[Any], Any], jobs: Iterable[Any], workers: Workers | None = None) -> Iterator[Any]:
+def run_jobs(function: Callable[[Any], Any], jobs: Iterable[Any], workers: Cluster | None = None) -> Iterator[Any]:
     """Yield the results of a function of each job in the order they come; by default this process does them.
 
     As many jobs wait at once as the workers have places. The function has a module's name, or is a partial of one.
     """
-    queue, waiting, workers = iter(jobs), 0, workers or ThisProcess()
+    if workers is None:
+        yield from map(function, jobs)
+        return
+    queue, waiting = iter(jobs), 0
     while True:
         while waiting < workers.places and (job := next(queue, None)) is not None:
             workers.submit(function, job)
@@ -107,7 +90,9 @@ def check_workers(count: int | None, scheduler: str | None) -> None:
 
 
 @contextmanager
-def cluster(count: int | None = None, scheduler: str | None = None, dashboard: int | None = None) -> Iterator[Workers]:
+def cluster(
+    count: int | None = None, scheduler: str | None = None, dashboard: int | None = None
+) -> Iterator[Cluster | None]:
     """Start `count` workers on this machine, or take those of a dask scheduler; end them with the block.
 
     Raises ImportError if dask.distributed is not installed and more than this process is wanted, and OSError if there
@@ -117,7 +102,7 @@ def cluster(count: int | None = None, scheduler: str | None = None, dashboard: i
     ----------
     count
         Processes on this machine, which talk over the loopback alone; by default one for each core that a container or
-        the scheduler leaves to this process. 0 is this process.
+        the scheduler leaves to this process. 0 is this process, and None in place of workers.
     scheduler
         Address of a scheduler, whose workers are used.
     dashboard
@@ -125,7 +110,7 @@ def cluster(count: int | None = None, scheduler: str | None = None, dashboard: i
     """
     check_workers(count, scheduler)
     if count == 0 and scheduler is None:
-        yield ThisProcess()
+        yield None
         return
     require("distributed", "synth", "work by several processes")
     with _connect(scheduler) if scheduler is not None else _start(count, dashboard) as client:
@@ -133,13 +118,13 @@ def cluster(count: int | None = None, scheduler: str | None = None, dashboard: i
 
 
 @contextmanager
-def join_workers(workers: Workers | int | None) -> Iterator[Workers | None]:
+def join_workers(workers: Cluster | int | None) -> Iterator[Cluster | None]:
     """Take the workers that are given, or start a number of processes on this machine; None where there are none."""
-    if isinstance(workers, int) and workers:
+    if isinstance(workers, int):
         with cluster(workers) as crew:
             yield crew
     else:
-        yield workers or None  # type: ignore[misc]
+        yield workers
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from llvmlite import binding
 
 from curvafit.core.checks import check_int, check_seed, check_type
 from curvafit.core.runtime import FILE, FLOW, Progress, check_memory, silent
-from curvafit.core.workers import Workers, run_jobs
+from curvafit.core.workers import Cluster, run_jobs
 from curvafit.data_synth.design import Design, design_box
 from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.generation.flow import WORKING_BLUR, generate
@@ -43,7 +43,7 @@ def build(
     progress: Progress = silent,
     *,
     design: Design | None = None,
-    workers: Workers | None = None,
+    workers: Cluster | None = None,
 ) -> Store:
     """Generate draws 0, 1, 2 … of a design until `count` are viable; a store that has some already is resumed.
 
@@ -64,7 +64,7 @@ def build(
     return _fill(open_store(store_path, settings), count, workers, progress)
 
 
-def extend(store_path: str | Path, count: int, progress: Progress = silent, *, workers: Workers | None = None) -> Store:
+def extend(store_path: str | Path, count: int, progress: Progress = silent, *, workers: Cluster | None = None) -> Store:
     """Continue a store, by its own settings, until it has `count` more viable shapes than were wanted so far.
 
     A count of 0 finishes a build that was stopped. Raises FileNotFoundError where there is no store, and as `build`.
@@ -86,7 +86,7 @@ def make_settings(
     return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, design.as_dict(), check_seed(seed), plan)
 
 
-def _fill(store: Store, count: int, workers: Workers | None, progress: Progress) -> Store:
+def _fill(store: Store, count: int, workers: Cluster | None, progress: Progress) -> Store:
     """Make draws in order, in rounds of as many as are needed at least, so that the last draw is viable."""
     store.want(count)
     viable = {index: store.viable(index) for index in store.indices()}

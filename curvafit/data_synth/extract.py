@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from curvafit.core.runtime import Progress, silent
-from curvafit.core.workers import Workers, run_jobs
+from curvafit.core.workers import Cluster, run_jobs
 from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.design import design_box
 from curvafit.data_synth.store import Record, Store, open_store
@@ -144,7 +144,7 @@ def describe(
     views: Sequence[str] = tuple(VIEWS),
     progress: Progress = silent,
     *,
-    workers: Workers | None = None,
+    workers: Cluster | None = None,
     command: Sequence[str] = (),
     overwrite: bool = False,
 ) -> Table:

@@ -17,7 +17,7 @@ from curvafit.core.files import remove, write_content
 from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, hold_signals, silent
 from curvafit.core.units import format_number, unit_name
-from curvafit.core.workers import Workers, run_jobs
+from curvafit.core.workers import Cluster, run_jobs
 from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.case import Case, Recipe
 from curvafit.data_synth.centreline import centreline, write_graphml
@@ -92,7 +92,7 @@ class SetSpec:
 
 
 def build_set(
-    folder: str | Path, spec: SetSpec, count: int, progress: Progress = silent, *, workers: Workers | None = None
+    folder: str | Path, spec: SetSpec, count: int, progress: Progress = silent, *, workers: Cluster | None = None
 ) -> Path:
     """Make the missing ones of cases 0 to `count` - 1 of a set, and the list that readers of its layout look for.
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from curvafit.core.runtime import Progress, silent
-from curvafit.core.workers import Workers, join_workers
+from curvafit.core.workers import Cluster, join_workers
 from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE
 from curvafit.geometry.morphometry import local_thickness
 from curvafit.geometry.topology import euler_number
@@ -44,7 +44,7 @@ OF_BODIES: tuple[tuple[str, str, int, Callable[[measure.Sums], np.ndarray]], ...
 
 
 def measure_instances(
-    labels: Source, *, workers: Workers | int | None = None, progress: Progress = silent, **reading: Any
+    labels: Source, *, workers: Cluster | int | None = None, progress: Progress = silent, **reading: Any
 ) -> tuple[measure.Measures, ...]:
     """Measure each body of a label image of any size by itself, whatever it touches.
 

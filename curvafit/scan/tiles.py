@@ -19,7 +19,7 @@ import numpy as np
 from curvafit.core.checks import check_int
 from curvafit.core.runtime import Progress, check_memory, memory, silent
 from curvafit.core.units import format_sampling
-from curvafit.core.workers import Workers
+from curvafit.core.workers import Cluster
 from curvafit.geometry.balls import NEAR, ball_radii, paint_balls, paint_coarse_balls, reaching_radius
 from curvafit.geometry.diagram import BIN_WIDTH, MARGIN, Diagram
 from curvafit.geometry.mesh import NoSurface, march
@@ -66,7 +66,7 @@ def measure(
     dark: bool = False,
     roi: Source | None = None,
     tile: int | None = None,
-    workers: Workers | int | None = None,
+    workers: Cluster | int | None = None,
     store: str | PathLike[str] | None = None,
     progress: Progress = silent,
     **reading: Any,
@@ -459,7 +459,7 @@ def measure_tiles(
     structure: Structure,
     *,
     edge: int | None = None,
-    workers: Workers | int | None = None,
+    workers: Cluster | int | None = None,
     store: str | PathLike[str] | None = None,
     progress: Progress = silent,
 ) -> Measures:

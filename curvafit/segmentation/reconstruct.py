@@ -24,7 +24,7 @@ from scipy.special import expit
 from curvafit.core.checks import check_float, check_int
 from curvafit.core.extras import require
 from curvafit.core.runtime import Progress, check_memory, silent, sub_progress
-from curvafit.core.workers import Workers
+from curvafit.core.workers import Cluster
 from curvafit.generation import data
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
@@ -122,7 +122,7 @@ def reconstruct(
     steps: int = STEPS,
     tile: int | None = None,
     store: str | PathLike[str] | None = None,
-    workers: Workers | int | None = None,
+    workers: Cluster | int | None = None,
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:
@@ -210,9 +210,9 @@ def reconstruct(
         if part is not None:
             taught, notes = tune(taught, part, sub_progress(progress, 0.0, 0.5)), (*notes, *part.notes)
         engine = _Engine(taught, evidence, epsilon, progress)
-        tiling = Tiling.of(target.frame, epsilon, tile if laws else None, periodic=periodic)
+        tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic) if laws else None
         chosen, task, said = _choose_law(engine, target, laws, part, (stiffness, steps), tiling)
-        if chosen.law is None:
+        if chosen.law is None or tiling is None:
             filled = _fill_volume(given, target, engine, run, tile, blocks)
             phase, inside = None if blocks else engine.run(target, chosen), flow_summary(filled.share)
         else:
@@ -233,12 +233,12 @@ def reconstruct(
 
 def _choose_law(
     engine: _Engine, slices: Slices, laws: Sequence[Coefficients], example: Example | None,
-    strength: tuple[float | None, int], tiling: Tiling,
+    strength: tuple[float | None, int], tiling: Tiling | None,
 ) -> tuple[Trial, Task[Slices] | None, str]:  # fmt: skip
     """Return the law to lower, if one is better than the network alone, what it was tried out on, and a sentence's
     beginning; with a stiffness and steps as `strength` the first is not tried out."""
     (stiffness, steps), task = strength, None if example is None else example.task
-    if not laws:
+    if not laws or tiling is None:
         return Trial(), task, engine.taught.status
     if stiffness is not None:
         return Trial(laws[0], stiffness, steps), task, "the law is lowered from the network's volume"
@@ -275,9 +275,8 @@ class _Engine:
         level = logits.copy()
         level[list(slices.places)] = (SLOPE / raster.pixel) * depth.astype(np.float32)
         least = best_log_odds(logits[slices.between]) if slices.between.any() else 0.0
-        return (min(slices.spacing[1:]) * (level - np.where(self.told(slices), least, 0)[:, None, None])).astype(
-            np.float32
-        )
+        level = level - np.where(self.told(slices), least, 0)[:, None, None]
+        return (min(slices.spacing[1:]) * level).astype(np.float32)
 
     def run(self, slices: Slices, trial: Trial) -> np.ndarray:
         """Return the phase field (Z, Y, X) of a trial; a law is lowered once, whatever the trial's scores."""
@@ -349,18 +348,15 @@ def _fill_volume(given: Known, slices: Slices, engine: _Engine, run: Run, tile: 
         likely[given.turn_box(cores[number])] = np.moveaxis(record["likely"], 0, given.axis)
         return {name: value for name, value in record.items() if name != "likely"}
 
-    def look(_: int) -> Record:
+    def fill_all(_: int) -> Record:
         return look_at(expit(engine.logits(slices)), slices, cores[0], whole=engine.evidence is not None)
 
-    function, stated = (
-        (look, "")
-        if raster is None
-        else (
-            partial(fill_block, slices, engine.taught, raster, cores),
-            _describe_blocks(slices, raster, cores, run.processes),
-        )
-    )
-    sums = _add_records(slices.shape, cores, run(_FILL, function, len(cores), stated, keep))
+    if raster is None:
+        found = run(_FILL, fill_all, 1, keep=keep)
+    else:
+        stated = _describe_blocks(slices, raster, cores, run.processes)
+        found = run(_FILL, partial(fill_block, slices, engine.taught, raster, cores), len(cores), stated, keep)
+    sums = _add_records(slices.shape, cores, found)
     least = max(best_threshold(sums["counts"]), LEAST) if slices.between.any() else 0.5
     least = np.where(engine.told(slices), least, 0.5).astype(np.float32)[:, None, None]
     for core in cores:
@@ -381,12 +377,14 @@ def look_at(likely: np.ndarray, slices: Slices, core: Box, *, whole: bool = Fals
     """Return the probabilities of a block, float32, those of known voxels 0 or 1; of the voxels between known slices
     the counts and the sum; the sum of all that are filled, or of the `whole`; and the entropy of slices along each
     axis."""
-    rows, likely = core[0], slices.keep_known(likely.astype(np.float32), core)
+    rows = core[0]
+    counts = count_probabilities(likely[slices.between[rows]])  # marked voxels too, as those of the phase field
+    likely = slices.keep_known(likely.astype(np.float32), core)
     unsure, told = doubt(likely), likely[slices.between[rows]]
     along = {f"along {k}": unsure.sum(tuple({0, 1, 2} - {k})) for k in range(3)}
     total = likely if whole else likely[~slices.outside[rows]]
     sums = {"sum": told.sum(dtype=np.float64), "total": total.sum(dtype=np.float64)}
-    return {"likely": likely, "counts": count_probabilities(told), **sums, **along}
+    return {"likely": likely, "counts": counts, **sums, **along}
 
 
 def _compare(likely: np.ndarray, mask: np.ndarray, between: np.ndarray) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from curvafit.core.checks import check_float, quoted
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.workers import Workers
+from curvafit.core.workers import Cluster
 from curvafit.generation.data import Evidence
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import LawLike
@@ -59,7 +59,7 @@ def segment(
     steps: int = STEPS,
     tile: int | None = None,
     store: str | PathLike[str] | None = None,
-    workers: Workers | int | None = None,
+    workers: Cluster | int | None = None,
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:

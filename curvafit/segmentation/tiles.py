@@ -19,7 +19,7 @@ import numpy as np
 
 from curvafit.core.checks import check_int
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.workers import Workers
+from curvafit.core.workers import Cluster
 from curvafit.generation.checkpoint import identity
 from curvafit.generation.data import Data
 from curvafit.priors.grid import MOST
@@ -160,7 +160,7 @@ def lower_volume(
     tiling: Tiling,
     *,
     store: str | PathLike[str] | None = None,
-    workers: Workers | int | None = None,
+    workers: Cluster | int | None = None,
     progress: Progress = silent,
 ) -> LoweredVolume:
     """Lower a problem on each tile of a volume, and return the whole; several tiles may have a `store`, where finished

@@ -18,7 +18,7 @@ from filelock import FileLock, Timeout
 
 from curvafit.core.files import remove, write_content
 from curvafit.core.runtime import Progress, silent
-from curvafit.core.workers import ThisProcess, Workers, join_workers, run_jobs
+from curvafit.core.workers import Cluster, join_workers, run_jobs
 from curvafit.priors.kernels.threads import one_thread
 from curvafit.volumes.formats.base import ScanError
 from curvafit.volumes.read import FileArray
@@ -46,15 +46,14 @@ class Run:
 
     def __init__(
         self,
-        crew: Workers | None = None,
+        crew: Cluster | None = None,
         folder: Path | None = None,
         progress: Progress = silent,
         ends: Mapping[str, float] | None = None,
     ) -> None:
-        crew, ends = crew or ThisProcess(), ends or {}
-        self.alone = isinstance(crew, ThisProcess)
-        self.processes = 1 if self.alone else max(1, crew.places // 2)
-        self._crew, self._folder, self._progress, self._ends = crew, folder, progress, ends
+        self.alone = crew is None
+        self.processes = 1 if crew is None else max(1, crew.places // 2)
+        self._crew, self._folder, self._progress, self._ends = crew, folder, progress, ends or {}
         self._share = 0.0
 
     def __call__(
@@ -149,7 +148,7 @@ def _write_record(folder: Path, name: str, number: int, record: Mapping[str, np.
 
 @contextmanager
 def open_run(
-    workers: Workers | int | None,
+    workers: Cluster | int | None,
     store: str | PathLike[str] | None,
     same: Mapping[str, Any],
     progress: Progress = silent,
