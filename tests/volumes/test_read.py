@@ -614,3 +614,21 @@ def test_a_spacing_needs_a_unit_unless_it_is_a_ratio(tmp_path: Path) -> None:
     unreadable(tmp_path / "scan.npy", "unit of the spacing", spacing=0.0195)
     assert load(tmp_path / "scan.npy", spacing=(2.5, 1, 1)).unit == "voxel"
     assert load(tmp_path / "scan.npy", spacing=0.0195, unit="mm").spacing == pytest.approx((0.0195,) * 3)
+
+
+@pytest.mark.parametrize(
+    ("place", "spacing", "unit"),
+    [
+        ({"spacing": [2.0, 1.0, 0.5], "unit": "um"}, (2.0, 1.0, 0.5), "um"),
+        ({"voxel_size": 0.5, "units": ["mm"]}, (0.5, 0.5, 0.5), "mm"),
+        ({"pixel_size": 3.0}, (1.0, 1.0, 1.0), "voxel"),
+    ],
+)
+def test_arrays_beside_that_of_an_npz_file_state_its_voxels(
+    tmp_path: Path, place: dict, spacing: tuple[float, ...], unit: str
+) -> None:
+    values = np.arange(60, dtype=np.uint8).reshape(3, 4, 5)
+    np.savez(tmp_path / "scan.npz", image=values, **place)
+    volume = load(tmp_path / "scan.npz")
+    assert (volume.values == values).all() and (volume.spacing, volume.unit) == (spacing, unit)
+    assert any("pixel_size" in note for note in volume.notes) == ("pixel_size" in place)

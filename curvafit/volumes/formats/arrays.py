@@ -35,11 +35,13 @@ def write_npy(field: Any, path: Path) -> None:
 
 
 def read_npz(path: Path, *, key: str | None = None, **_: object) -> Stated:
-    """Read the array of an NPZ file that a key names."""
+    """Read the array of an NPZ file that a key names, and what arrays named like `spacing` say of its voxels."""
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
-        values = read_member(archive, f"{base.pick_key(names, key, path)}.npy")
-    return Stated(values, "?" * values.ndim)
+        said = [name for name in names if base.is_place_name(name) and name != key]
+        values = read_member(archive, f"{base.pick_key([n for n in names if n not in said], key, path)}.npy")
+        place = {name: read_member(archive, f"{name}.npy") for name in said}
+    return Stated(values, "?" * values.ndim, **base.read_spacing(place, values.ndim))
 
 
 def read_hdf5(path: Path, *, key: str | None = None, **_: object) -> Stated:

@@ -131,6 +131,11 @@ def read_spacing(attributes: Mapping[str, Any], ndim: int) -> dict[str, Any]:
     return place | ({"origin": _entries(attributes["offset"])} if "offset" in attributes else {})
 
 
+def is_place_name(name: str) -> bool:
+    """Return whether `read_spacing` knows an attribute, or says that it is not used."""
+    return name in ("unit", "units", "offset", "resolution") or _SPACING.search(name) is not None
+
+
 def _entries(value: Any) -> tuple[Any, ...]:
     """Return the first entries of an attribute as a tuple, bytes as text."""
     array = np.asarray(value, dtype=object) if isinstance(value, list | tuple) else np.asarray(value)
