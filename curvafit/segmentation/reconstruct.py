@@ -342,7 +342,7 @@ def _fill_volume(given: Known, slices: Slices, engine: _Engine, run: Run, tile: 
     """Fill a volume by the network alone, at once or in blocks; no mask is cut before all of it is filled."""
     shape, raster = given.volume.shape, Raster.of(slices) if blocks else None
     cores = cut_boxes(slices.shape, slices.shape if raster is None else _choose_edges(raster, tile))
-    likely, mask = run.open("probability", np.float32, shape), run.open("mask", np.bool_, shape)
+    likely, mask = run.open("probability", np.float32, shape), run.open("mask", np.uint8, shape)
 
     def keep(number: int, record: Record) -> Record:
         likely[given.turn_box(cores[number])] = np.moveaxis(record["likely"], 0, given.axis)
@@ -365,7 +365,7 @@ def _fill_volume(given: Known, slices: Slices, engine: _Engine, run: Run, tile: 
         inside = part > least[core[0]]
         mask[box] = np.moveaxis(inside, 0, given.axis)
         sums |= {name: sums.get(name, 0) + n for name, n in _compare(part, inside, slices.between[core[0]]).items()}
-    return _Filled(_voxels(likely), _voxels(mask), sums)
+    return _Filled(_voxels(likely), _voxels(mask, label=1), sums)
 
 
 def fill_block(slices: Slices, taught: Taught, raster: Raster, cores: Sequence[Box], number: int) -> Record:
@@ -421,10 +421,12 @@ def _describe_blocks(slices: Slices, raster: Raster, cores: Sequence[Box], proce
     return f"{len(cores)} blocks of {' x '.join(map(str, sides))} voxels, in about {total / 1e9:.2g} GB of memory."
 
 
-def _voxels(array: RunArray) -> Any:
-    """Return what a volume reads an array from, in memory or in the file of a run."""
+def _voxels(array: RunArray, label: int | None = None) -> Any:
+    """Return what a volume reads an array from, in memory or in the file of a run, or the mask of a label."""
     stored, (z, y, x) = array.stored, (slice(0, n) for n in array.shape)
-    return stored if isinstance(stored, np.ndarray) else StoredArray(stored, (z, y, x), (0, 1, 2))
+    if isinstance(stored, np.ndarray):
+        return stored if label is None else stored == label
+    return StoredArray(stored, (z, y, x), (0, 1, 2), label)
 
 
 # ---- a law -----------------------------------------------------------------------------------------------------------

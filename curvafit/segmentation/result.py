@@ -265,7 +265,9 @@ def write_mask(
     with temporary_folder(beside(target, ".json")) as work:
         mask, values = segmentation.mask, segmentation.labels
         if values is None:
-            values = mask if is_streamed(target) else replace(mask, array=mask.values.view(np.uint8))
+            values = replace(
+                mask, array=replace(mask.array, label=None) if mask.in_file else mask.values.view(np.uint8)
+            )
         for name, each in maps.items():
             write(each, work / map_path(target, name).name)
         if image is None:

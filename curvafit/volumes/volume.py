@@ -18,6 +18,9 @@ from curvafit.core.units import format_sampling, parse_unit
 from curvafit.volumes.boxes import Box, Crop, parse_box, resolve_box
 from curvafit.volumes.formats.base import ScanError, check_array
 
+#: A note on the mask of a label.
+_LABELLED = "The structure is label {}."
+
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Volume(Pictured):
@@ -110,10 +113,11 @@ class Volume(Pictured):
         """Return the volume in memory; ScanError where that of a file does not fit, is not finite, or constant."""
         if not self.in_file:
             return self
-        if (label := self.array.label) is not None:
-            return replace(self, array=replace(self.array, label=None), notes=self.notes[:-1]).load().label(label)
-        values = self.values
-        check_varies(values, self.source)
+        values, label = self.values, self.array.label
+        if label is None:
+            check_varies(values, self.source)
+        elif _LABELLED.format(label) in self.notes and (values.all() or not values.any()):
+            replace(self, array=replace(self.array, label=None)).load().label(label)  # says which labels there are
         return replace(self, array=values)
 
     def check_fits(self) -> None:
@@ -133,7 +137,7 @@ class Volume(Pictured):
     def label(self, label: int) -> Volume:
         """Return the mask of the voxels with this value; none or all of them are a ScanError, once they are read."""
         label = check_int(label, "a label that is a whole number", -SEEDS, 2 * SEEDS - 1)
-        notes = (*self.notes, f"The structure is label {label}.")
+        notes = (*self.notes, _LABELLED.format(label))
         if self.in_file:
             return replace(self, array=replace(self.array, label=label), notes=notes)
         mask = round_labels(self.values) == label

@@ -160,7 +160,7 @@ def _create_zarr(frame: Any, path: Path, version: str, labels: bool) -> Any:
     """Create an image of OME-Zarr with a volume's shape, type and place, and return its group."""
     import zarr
 
-    dtype = np.dtype(np.uint8) if frame.dtype.kind == "b" else frame.dtype
+    dtype = np.dtype(np.uint8) if labels and frame.dtype.kind == "b" else frame.dtype
     shapes = [tuple(frame.shape)]
     while max(shapes[-1]) > CHUNK:
         shapes.append(tuple(-(-n // 2) for n in shapes[-1]))
