@@ -265,9 +265,8 @@ def write_mask(
     with temporary_folder(beside(target, ".json")) as work:
         mask, values = segmentation.mask, segmentation.labels
         if values is None:
-            values = replace(
-                mask, array=replace(mask.array, label=None) if mask.in_file else mask.values.view(np.uint8)
-            )
+            whole = replace(mask.array, label=None) if mask.in_file else mask.values.view(np.uint8)
+            values = replace(mask, array=whole)
         for name, each in maps.items():
             write(each, work / map_path(target, name).name)
         if image is None:
