@@ -33,7 +33,7 @@ from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import profile_distance
 from curvafit.scan.prepare import LARGEST_BOX
 from curvafit.segmentation.filler import REACH, SLOPE, TILE, Raster, Taught, fill
-from curvafit.segmentation.flow import STEPS, WorkingGrid, choose_epsilon
+from curvafit.segmentation.flow import HALO, STEPS, WorkingGrid, choose_epsilon
 from curvafit.segmentation.image import find_shift, read_image
 from curvafit.segmentation.known import SLAB, Known, doubt_labels
 from curvafit.segmentation.result import Segmentation, Uncertainty, describe_filled, flow_summary
@@ -47,7 +47,7 @@ from curvafit.segmentation.slices import (
     turn_axes,
 )
 from curvafit.segmentation.teach import tune
-from curvafit.segmentation.tiles import LoweredVolume, Problem, Tiling, check_edge, lower_volume
+from curvafit.segmentation.tiles import LoweredVolume, Problem, check_edge, cut_tiles, lower_volume
 from curvafit.segmentation.trials import (
     PART,
     Example,
@@ -210,16 +210,16 @@ def reconstruct(
         if part is not None:
             taught, notes = tune(taught, part, sub_progress(progress, 0.0, 0.5)), (*notes, *part.notes)
         engine = _Engine(taught, evidence, epsilon, progress)
-        tiling = Tiling.of(target.frame, epsilon, tile, periodic=periodic) if laws else None
-        chosen, task, said = _choose_law(engine, target, laws, part, (stiffness, steps), tiling)
-        if chosen.law is None or tiling is None:
+        place, tiles = engine.cut(target, tile) if laws else (None, [])
+        chosen, task, said = _choose_law(engine, target, laws, part, (stiffness, steps), len(tiles))
+        if place is None or chosen.law is None:
             filled = _fill_volume(given, target, engine, run, tile, blocks)
             phase, inside = None if blocks else engine.run(target, chosen), flow_summary(filled.share)
         else:
             problem = SlicesProblem(chosen, target, engine.level(target))
-            found = lower_volume(problem, tiling, store=store, workers=workers, progress=progress)
+            found = lower_volume(problem, place, tiles, store=store, workers=workers, progress=progress)
             filled, engine = _weigh_evidence(engine, chosen, task, given, target, found)
-            phase, notes = found.phase, (*notes, *tiling.place.notes)
+            phase, notes = found.phase, (*notes, *place.notes)
             inside = flow_summary(float(found.mask.mean()), found.energies, found.steps)
     uncertain = filled.judge(given, target, engine, suggest)
     tested = "the example" if part else "slices left out" if chosen.law else "generated shapes"
@@ -233,16 +233,16 @@ def reconstruct(
 
 def _choose_law(
     engine: _Engine, slices: Slices, laws: Sequence[Coefficients], example: Example | None,
-    strength: tuple[float | None, int], tiling: Tiling | None,
+    strength: tuple[float | None, int], tiles: int,
 ) -> tuple[Trial, Task[Slices] | None, str]:  # fmt: skip
     """Return the law to lower, if one is better than the network alone, what it was tried out on, and a sentence's
-    beginning; with a stiffness and steps as `strength` the first is not tried out."""
+    beginning; with a stiffness and steps as `strength` the first is not tried out. There are so many `tiles`."""
     (stiffness, steps), task = strength, None if example is None else example.task
-    if not laws or tiling is None:
+    if not laws:
         return Trial(), task, engine.taught.status
     if stiffness is not None:
         return Trial(laws[0], stiffness, steps), task, "the law is lowered from the network's volume"
-    task = _pose_task(slices if tiling.count == 1 else crop_to_surface(slices, PART)[0], example)
+    task = _pose_task(slices if tiles == 1 else crop_to_surface(slices, PART)[0], example)
     trials = [Trial(law, STIFFNESS, steps, pull) for law, pull in product(laws, PULLS)]
     chosen = choose_by_masks(task, trials, lambda slices, trial: engine.run(slices, trial) > 0)
     return chosen, task, _describe_gain(chosen, "left out" if example is None else "of the example")
@@ -282,13 +282,17 @@ class _Engine:
         """Return the phase field (Z, Y, X) of a trial; a law is lowered once, whatever the trial's scores."""
         if trial.law is None:
             return _profile(self.level(slices), choose_epsilon(slices.frame, self.epsilon))
-        tiling = Tiling.of(slices.frame, self.epsilon, periodic=slices.periodic)
         key = (slices, trial.law, trial.strength, trial.steps, trial.pull)
         if key not in self.lowered:
             step: Progress = lambda _, share: self.progress("trying the law out", share)  # noqa: E731
             problem = SlicesProblem(trial, slices, self.level(slices))
-            self.lowered[key] = lower_volume(problem, tiling, progress=step).phase
+            self.lowered[key] = lower_volume(problem, *self.cut(slices), progress=step).phase
         return self.lowered[key]
+
+    def cut(self, slices: Slices, edge: int | None = None) -> tuple[WorkingGrid, list[Box]]:
+        """Return the working grid on which a law is lowered, and the tiles."""
+        place = WorkingGrid.of(slices.frame, self.epsilon, halo=HALO, periodic=slices.periodic)
+        return place, cut_tiles(place, slices.shape, edge)
 
     def _fill(self, slices: Slices) -> tuple[Raster, np.ndarray]:
         """Return the network's pixels, and log-odds."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
@@ -17,10 +18,10 @@ from curvafit.priors.law import LawLike
 from curvafit.scan.grids import box_with_most_surface
 from curvafit.scan.structure import check_options
 from curvafit.segmentation.evidence import GreyEvidence, VolumeEvidence, load_probabilities, probability_evidence
-from curvafit.segmentation.flow import BENDING, STEPS, WorkingGrid, bending
+from curvafit.segmentation.flow import BENDING, HALO, STEPS, WorkingGrid, bending
 from curvafit.segmentation.result import Segmentation, flow_summary
 from curvafit.segmentation.slices import check_spacing, load_with, require_labels
-from curvafit.segmentation.tiles import LoweredVolume, Problem, Tiling, lower_volume
+from curvafit.segmentation.tiles import LoweredVolume, Problem, cut_tiles, lower_volume
 from curvafit.segmentation.trials import Task, Trial, choose_by_masks, law_of, laws_of
 from curvafit.volumes.boxes import Box, cut_boxes
 from curvafit.volumes.place import lay
@@ -124,7 +125,8 @@ def segment(
         scan, reading = load_probabilities(scan, **reading), {}  # type: ignore[arg-type]
     volume = load(scan, **reading, lazy=True)
     volume.check_fits()
-    tiling, said = Tiling.of(volume, epsilon, tile), ""
+    place = WorkingGrid.of(volume, epsilon, halo=HALO)
+    tiles, said = cut_tiles(place, volume.shape, tile), ""
     if example is None:
         law, notes = law_of(WILLMORE if prior is None else prior, volume)
         notes = notes if prior is not None else ("No prior is given: the Willmore energy is lowered.",)
@@ -143,16 +145,16 @@ def segment(
         evidence = GreyEvidence.of(volume, threshold, dark, apart=weight is None)
         classes, trial = evidence.classes, trial if weight else replace(trial, strength=USUAL)
         notes = (*notes, *(FAINT,) * (classes.faint and threshold == "otsu"), f"{str(classes).capitalize()}.")
-    missing = trial.law is not None and _missing_phase(evidence, tiling)
+    missing = trial.law is not None and _missing_phase(evidence, tiles)
     if missing and not probabilities:
         raise ScanError(f"the scan shows no {missing}: every voxel is on one side")
     stays = replace(trial, law=None) if missing else trial  # without a surface there is nothing to lower
-    found = lower(evidence, stays, tiling, store=store, workers=workers, progress=progress)
-    if not probabilities and weight is None and not _explains(evidence, found.mask, tiling):
+    found = lower(evidence, stays, place, tiles, store=store, workers=workers, progress=progress)
+    if not probabilities and weight is None and not _explains(evidence, found.mask, tiles):
         trial, said = replace(trial, law=None), "no prior helps here, the first guess explains the scan better: "
-        found = lower(evidence, trial, tiling)
+        found = lower(evidence, trial, place, tiles)
     return Segmentation.of(
-        volume, found.mask, found.phase, trial.law, tiling.place.epsilon, (*notes, *tiling.place.notes),
+        volume, found.mask, found.phase, trial.law, place.epsilon, (*notes, *place.notes),
         weight=None if trial.law is None else trial.strength * BENDING / bending(trial.law),
         status=f"{said}{flow_summary(float(found.mask.mean()), found.energies, found.steps)}",
     )  # fmt: skip
@@ -185,10 +187,12 @@ def check_given(
         raise ScanError("a label chooses the voxels of an example's mask: give an example, or leave the label out")
 
 
-def lower(evidence: VolumeEvidence, trial: Trial, tiling: Tiling, **tools: Any) -> LoweredVolume:
+def lower(
+    evidence: VolumeEvidence, trial: Trial, place: WorkingGrid, tiles: Sequence[Box], **tools: Any
+) -> LoweredVolume:
     """Lower -log p(data | mask) + λ F_ε from the evidence's first guess, which is the result without a law; `trial` has
     λ, in nats of a unit of F_ε if a20 + a02 = 2."""
-    return lower_volume(EvidenceProblem(trial, evidence), tiling, **tools)
+    return lower_volume(EvidenceProblem(trial, evidence), place, tiles, **tools)
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,13 +213,13 @@ class EvidenceProblem(Problem):
         return np.clip(2 * level, -1, 1)  # the level of probabilities is p - 1/2, of grey levels in contrasts
 
 
-def _explains(evidence: VolumeEvidence, mask: np.ndarray, tiling: Tiling) -> bool:
+def _explains(evidence: VolumeEvidence, mask: np.ndarray, tiles: Sequence[Box]) -> bool:
     """Return whether a mask keeps nearly all the evidence for the rarer phase of the first guess: so it does, unless
     thin structures, or pores, got lost, since the energy is lowered together with -log p."""
     kept, guessed, voxels = np.zeros((3, 2))
-    for tile in tiling.tiles:
-        found = evidence.of_box(tile.core)
-        for sums, inside in ((kept, mask[tile.core] > 0), (guessed, found.level > 0)):
+    for tile in tiles:
+        found = evidence.of_box(tile)
+        for sums, inside in ((kept, mask[tile] > 0), (guessed, found.level > 0)):
             sums += [found.ratio[inside].sum(dtype=np.float64), -found.ratio[~inside].sum(dtype=np.float64)]
         voxels += [np.count_nonzero(found.level > 0), np.count_nonzero(found.level <= 0)]
     rarer = int(voxels.argmin())
@@ -230,11 +234,11 @@ def _check_finite(volume: Volume) -> None:
         raise ScanError(f"a volume must be finite, got {faults} values that are not")
 
 
-def _missing_phase(evidence: VolumeEvidence, tiling: Tiling) -> str:
+def _missing_phase(evidence: VolumeEvidence, tiles: Sequence[Box]) -> str:
     """Return which phase the first guess lacks, or nothing; the first tiles that have both end the search."""
     seen: set[bool] = set()
-    for tile in tiling.tiles:
-        inside = evidence.of_box(tile.core).level > 0
+    for tile in tiles:
+        inside = evidence.of_box(tile).level > 0
         seen |= {bool(inside.any()), bool(inside.all())}
         if len(seen) == 2:
             return ""
@@ -311,7 +315,8 @@ def calibrate(
     probability_evidence(field)  # refuses values outside [0, 1] beyond the part, too
     where = box_with_most_surface(inside, EDGE)
     part = replace(field, array=field.values[where])
-    tiling = Tiling.of(part, epsilon)
+    place = WorkingGrid.of(part, epsilon, halo=HALO)
+    tiles = cut_tiles(place, part.shape)
     count, expected = 0, 2 * len(tried) + 3
 
     def fill(evidence: VolumeEvidence, trial: Trial) -> np.ndarray:
@@ -319,7 +324,7 @@ def calibrate(
         count += 1
         progress("trying the prior out", min(count / expected, 1.0))
         try:
-            return lower(evidence, trial, tiling).mask
+            return lower(evidence, trial, place, tiles).mask
         except ScanError:  # the energy does not stay finite
             return np.zeros(part.shape, dtype=bool)
 

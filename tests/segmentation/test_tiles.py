@@ -19,8 +19,9 @@ from filelock import FileLock
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation import Segmentation, reconstruct, segment, tiles
 from curvafit.segmentation.evidence import subsample
+from curvafit.segmentation.flow import HALO, WorkingGrid
 from curvafit.segmentation.slices import Slices
-from curvafit.segmentation.tiles import EDGE, OVERLAP, WHOLE, Tiling
+from curvafit.segmentation.tiles import EDGE, OVERLAP, WHOLE, cut_tiles, surround
 from curvafit.volumes import ScanError, load, save
 from curvafit.volumes.volume import Volume
 
@@ -52,45 +53,53 @@ def grey(mask: np.ndarray, noise: float = 40) -> Volume:
     ],
 )  # fmt: skip
 def test_tiles_hold_each_voxel_once(shape, spacing, edge: int, periodic: bool) -> None:
-    tiling = Tiling.of(frame(shape, spacing), None, edge, periodic=periodic)
-    times, count = tiling.place.times, np.zeros(shape, dtype=np.uint8)
-    assert [tile.number for tile in tiling.tiles] == list(range(tiling.count))
-    for tile in tiling.tiles:
-        count[tile.core] += 1
-        assert all((c.stop - c.start) * n <= max(edge, n) for c, n in zip(tile.core, times, strict=True))
-        box = np.empty(tile.shape)
-        assert box[tile.inner].shape == count[tile.core].shape
-        for axis, (before, beyond) in enumerate(tile.ends):
-            core, whole = tile.core[axis], tile.box[axis]
-            assert before == (whole.start == 0 and not periodic) or tiling.count == 1
-            assert before or (core.start - whole.start) * times[axis] >= OVERLAP
-            assert beyond or (whole.stop - core.stop) * times[axis] >= OVERLAP
+    place = WorkingGrid.of(frame(shape, spacing), None, halo=HALO, periodic=periodic)
+    tiles, count = cut_tiles(place, shape, edge), np.zeros(shape, dtype=np.uint8)
+    for tile in tiles:
+        count[tile] += 1
+        assert all((c.stop - c.start) * n <= max(edge, n) for c, n in zip(tile, place.times, strict=True))
+        box, own = surround(tile, place, shape)
+        assert own.grid.shape == tuple(
+            (edge.stop - edge.start) * n + own.halo * sum(ends)
+            for edge, n, ends in zip(box, place.times, own.ends, strict=True)
+        )
+        for axis, (before, beyond) in enumerate(own.ends):
+            core, whole, n = tile[axis], box[axis], place.times[axis]
+            assert before == (whole.start == 0 and not periodic) or len(tiles) == 1
+            assert before or (core.start - whole.start) * n >= OVERLAP
+            assert beyond or (whole.stop - core.stop) * n >= OVERLAP
     assert count.min() == count.max() == 1
     for axis in range(3):
-        sizes = {tile.core[axis].stop - tile.core[axis].start for tile in tiling.tiles}
+        sizes = {tile[axis].stop - tile[axis].start for tile in tiles}
         assert max(sizes) - min(sizes) <= 1
 
 
 def test_a_tile_s_grid_has_the_halo_where_the_volume_ends() -> None:
-    tiling = Tiling.of(frame((75, 40, 9), (1.0, 1.0, 2.0)), None, 40)
-    values = np.random.default_rng(0).random((75, 40, 9)).astype(np.float32)
-    whole = tiling.place.to_grid(values)
-    for tile in tiling.tiles:
-        place = tiling.place_of(tile)
-        part = place.to_grid(values[tile.box])
-        assert tuple(part.shape) == place.grid.shape
-        np.testing.assert_allclose(place.to_scan(part), tiling.place.to_scan(whole)[tile.box], atol=1e-6)
-        np.testing.assert_array_equal(
-            place.to_scan(place.spread(values[tile.box])), tiling.place.to_scan(tiling.place.spread(values))[tile.box]
-        )
+    shape = (75, 40, 9)
+    values = np.random.default_rng(0).random(shape).astype(np.float32)
+    place = WorkingGrid.of(frame(shape, (1.0, 1.0, 2.0)), None, halo=HALO)
+    whole = place.to_grid(values)
+    for tile in cut_tiles(place, shape, 40):
+        box, own = surround(tile, place, shape)
+        part = own.to_grid(values[box])
+        assert tuple(part.shape) == own.grid.shape
+        np.testing.assert_allclose(own.to_scan(part), place.to_scan(whole)[box], atol=1e-6)
+        np.testing.assert_array_equal(own.to_scan(own.spread(values[box])), place.to_scan(place.spread(values))[box])
 
 
 def test_large_volumes_have_tiles() -> None:
     edge = round(WHOLE ** (1 / 3)) - 12
-    assert Tiling.of(frame((edge, edge, edge)), None).count == 1
-    large = Tiling.of(frame((512, 500, edge + 1)), None)
-    assert large.counts == (3, 3, 2)
-    assert max(np.prod(large.place_of(tile).grid.shape) for tile in large.tiles) <= (EDGE + 2 * OVERLAP) ** 3
+
+    def cut(*shape: int) -> tuple[WorkingGrid, list]:
+        place = WorkingGrid.of(frame(shape), None, halo=HALO)  # type: ignore[arg-type]
+        return place, cut_tiles(place, shape)
+
+    assert len(cut(edge, edge, edge)[1]) == 1
+    shape = (512, 500, edge + 1)
+    place, tiles = cut(*shape)
+    assert [len({tile[axis].start for tile in tiles}) for axis in range(3)] == [3, 3, 2]
+    sizes = [np.prod(surround(tile, place, shape)[1].grid.shape) for tile in tiles]
+    assert max(sizes) <= (EDGE + 2 * OVERLAP) ** 3
     with pytest.raises(ValueError, match="tile"):
         reconstruct(beads(), every=8, tile=7)
 
