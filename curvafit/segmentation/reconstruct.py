@@ -165,7 +165,12 @@ def reconstruct(
         Weights of `curvafit atlas teach`, for an image those of `--images`; by default the packaged ones.
     stiffness
         Stiffness of the springs on known voxels, in working units: the first law is lowered without being tried out.
-    epsilon, steps, tile, store, workers, progress, reading
+    tile, store, workers
+        With a law as in `segment`. Else labels in a file with a side of more than 256 voxels, or any with a `tile`, the
+        voxels a side of a block, are filled in blocks: mask and probability are then read from the folder `store`, with
+        which the same call goes on after a kill, and there is no phase field. With an image, `ignore` or `periodic`
+        volumes are filled at once.
+    epsilon, steps, progress, reading
         As in `segment`.
 
     Raises

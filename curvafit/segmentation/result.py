@@ -16,12 +16,11 @@ from curvafit.core.checks import check_float, check_int
 from curvafit.core.files import move_together, remove, temporary_folder
 from curvafit.core.pictures import Pictured
 from curvafit.core.records import Format, can_write, is_own_zarr, sibling
-from curvafit.core.runtime import hold_signals
+from curvafit.core.runtime import check_memory, hold_signals
 from curvafit.core.units import format_sampling
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.slices import IDS, reach_of
 from curvafit.segmentation.uncertainty import doubt
-from curvafit.volumes.formats.base import check_array
 from curvafit.volumes.formats.nifti import write_nifti_like
 from curvafit.volumes.formats.zarr import add_labels, check_place, image_of, mark, store_of, write_labels
 from curvafit.volumes.volume import Volume
@@ -204,7 +203,7 @@ def check_mask_target(
     target, image = Path(path), image_of(Path(path))
     pick_writer(target, "mm" if scan is None else scan.unit)
     if scan is not None and not is_streamed(target):
-        check_array(scan.shape, np.dtype(np.float32), str(target))
+        check_memory(scan.shape, 4, "a result that is not written into Zarr")
     first, *more = beside(target, ".json"), beside(target, ".png"), *(map_path(target, name) for name in maps)
     if image is None:
         return can_write(target, FORMAT, more=(first, *more), inputs=inputs, overwrite=overwrite)
