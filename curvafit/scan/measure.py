@@ -26,8 +26,16 @@ from curvafit.geometry.morphometry import border_weights, local_thickness, smoot
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.scan.grids import median_thickness, remove_specks
-from curvafit.scan.prepare import DROPPED, LARGEST_WINDOW, Prepared, TooLarge, prepare, smallest_piece
-from curvafit.scan.structure import find_structure, is_rounded
+from curvafit.scan.prepare import (
+    DROPPED,
+    LARGEST_WINDOW,
+    Prepared,
+    TooLarge,
+    prepare,
+    prepare_whole,
+    smallest_piece,
+)
+from curvafit.scan.structure import Kind, find_structure, is_rounded
 from curvafit.volumes.boxes import cut_boxes
 from curvafit.volumes.volume import ScanError, Volume
 
@@ -269,16 +277,17 @@ class Maps(NamedTuple):
 
 
 def measure_maps(
-    field: Volume, kind: str, options: dict[str, Any], progress: Progress = silent, most: int | None = None
+    field: Volume, kind: Kind, options: dict[str, Any], progress: Progress = silent, most: int | None = None
 ) -> Maps:
-    """Measure what is summed of a scan; `options` are the threshold, dark and periodic of `measure`; `most` as in
-    `prepare.prepare`, which raises TooLarge."""
+    """Measure what is summed of a scan; `options` are the threshold, dark and periodic of `measure`. Curvature is
+    that of a part of a large scan (`prepare.prepare`), or with `most` of all of it (`prepare.prepare_whole`)."""
     periodic: bool = options["periodic"]
     progress("finding the structure", 0.0)
-    mask, seen, notes = _find_structure(field, kind, options)
+    seen, signed = find_structure(field, kind=kind, **options)  # type: ignore[arg-type]
+    mask, notes = _drop_specks(seen, signed, periodic)
     progress("measuring curvature", 0.1)
     try:
-        prepared = prepare(field, kind=seen, most=most, **options)  # type: ignore[arg-type]
+        prepared = prepare(field, kind=seen, **options) if most is None else prepare_whole(seen, signed, periodic, most)
         curved, diagram = measure_curvatures(prepared)
         working = tuple(f"Of curvature: {note}" for note in prepared.notes if note not in notes)
     except ValueError as reason:
@@ -299,19 +308,18 @@ def no_curvature(unit: str, reason: object) -> tuple[tuple[np.ndarray, np.ndarra
     return (np.zeros((0, 3)), columns), drawn, (f"No curvature: {reason}.",)
 
 
-def _find_structure(field: Volume, kind: str, options: dict[str, Any]) -> tuple[np.ndarray, str, tuple[str, ...]]:
-    """Return the structure on the scan's voxels, its kind, and notes; specks of an image are dropped."""
-    seen, signed = find_structure(field, kind=kind, **options)  # type: ignore[arg-type]
+def _drop_specks(kind: Kind, signed: Volume, periodic: bool) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the structure on the scan's voxels, of an image without specks, and notes."""
     mask, notes = signed.values > 0, signed.notes
-    if seen == "image":
-        thickness = median_thickness(mask, field.spacing, options["periodic"])[0]
-        smallest = smallest_piece(thickness) / math.prod(field.spacing)
-        mask, specks, holes = remove_specks(mask, smallest, options["periodic"])
+    if kind == "image":
+        thickness = median_thickness(mask, signed.spacing, periodic)[0]
+        smallest = smallest_piece(thickness) / math.prod(signed.spacing)
+        mask, specks, holes = remove_specks(mask, smallest, periodic)
         if specks or holes:
             notes = (*notes, DROPPED.format(specks, holes))
     if mask.all() or not mask.any():
         raise ScanError("expected a structure and background in the scan, got one of them only")
-    return mask, seen, notes
+    return mask, notes
 
 
 def measure_surface(

@@ -205,7 +205,6 @@ def prepare(
     dark: bool = False,
     roi: Source | None = None,
     one_scale: bool = False,
-    most: int | None = None,
     quality: Quality | None = None,
 ) -> Prepared:
     """Find the structure and put it on the working grid, where its median thickness is a known number of voxels.
@@ -234,16 +233,13 @@ def prepare(
         Nonzero where the scan counts (array, field or file): see `volumes.place.lay`.
     one_scale
         Keep no grid but a phase field's: laws are read where structures are of one thickness in voxels.
-    most
-        Use all of the scan, or raise TooLarge where that is more than so many working voxels. By default a large scan
-        is cut, and a note says so.
     quality
         Blur and noise of an image, where they are known; else they are measured.
     """
     structure.check_options(kind, threshold)
     region, laid = (None, ()) if roi is None else structure.read_region(roi, field)
     region = None if region is None else region.values != 0
-    where, notes = grids.bounding_box(field.shape, region, LARGEST_SCAN if most is None else max(field.shape))
+    where, notes = grids.bounding_box(field.shape, region, LARGEST_SCAN)
     region = None if region is None else region[where]
     part = replace(field, array=field.values[where], affine=None, notes=field.notes + laid + notes)
     periodic = periodic and part.shape == field.shape
@@ -252,11 +248,18 @@ def prepare(
     seen, signed = structure.find_structure(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
     mask = signed.values > 0
     noise = seen != "field" and structure.is_noise(mask)
-    prepared = _put_on_grid(_Scan(seen, signed, periodic, region, noise, one_scale), most)
+    prepared = _put_on_grid(_Scan(seen, signed, periodic, region, noise, one_scale))
     if seen == "image" and quality is None:
         quality = measure_quality(-part.values if dark else part.values, mask, part.spacing)
     corner = tuple(s.start + o for s, o in zip(where, prepared.origin, strict=True))
     return replace(prepared, quality=quality, origin=corner)  # type: ignore[arg-type]
+
+
+def prepare_whole(kind: Kind, signed: Volume, periodic: bool, most: int) -> Prepared:
+    """Put all of a scan on the working grid, without blur and noise, given its kind and what is above 0 in its
+    structure (`structure.find_structure`); raise TooLarge where that is more than `most` working voxels."""
+    noise = kind != "field" and structure.is_noise(signed.values > 0)
+    return _put_on_grid(_Scan(kind, signed, periodic, None, noise, one_scale=False), most)
 
 
 @dataclass(frozen=True)
@@ -294,8 +297,9 @@ class _Scan:
         return self.mask if self.region is None else self.mask & self.region
 
 
-def _put_on_grid(scan: _Scan, most: int | None) -> Prepared:
-    """Choose the working voxel, move the scan to it, drop specks, profile the mask, choose windows."""
+def _put_on_grid(scan: _Scan, most: int | None = None) -> Prepared:
+    """Choose the working voxel, move the scan to it, drop specks, profile the mask, choose windows; `most` as in
+    `prepare_whole`, else a large scan is cut."""
     phase, name = scan.thinner
     thickness, thick = grids.median_thickness(phase, scan.field.spacing, scan.periodic)
     note = judge_thickness(name, thickness, thick, scan.field.spacing, scan.keeps_grid)

@@ -31,7 +31,7 @@ from curvafit.scan import measure as whole
 from curvafit.scan.grids import CutOut, centre_distance, profile_mask, remove_specks, resample
 from curvafit.scan.measure import Blocks, Measures
 from curvafit.scan.prepare import DROPPED, LARGEST_BOX, WORKED, Prepared, TooLarge, note_on_filling, smallest_piece
-from curvafit.scan.structure import Structure, check_options, read_labels, read_region
+from curvafit.scan.structure import Kind, Structure, check_options, read_labels, read_region
 from curvafit.scan.survey import Plan, survey
 from curvafit.volumes.boxes import Box, cut_boxes, grow, within
 from curvafit.volumes.read import Source, load
@@ -60,7 +60,7 @@ _FIRST, _AGAIN = "measuring tiles", "measuring wide balls"
 def measure(
     scan: Source,
     *,
-    kind: Literal["auto", "field", "mask", "image"] = "auto",
+    kind: Kind = "auto",
     periodic: bool = False,
     threshold: Literal["otsu"] | float = "otsu",
     dark: bool = False,
@@ -131,7 +131,7 @@ def measure(
     return measure_tiles(structure, edge=tile, workers=workers, store=store, progress=progress).scale(edge, unit)
 
 
-def _measure_whole(field: Volume, periodic: bool, progress: Progress, kind: str, **options: Any) -> Measures:
+def _measure_whole(field: Volume, periodic: bool, progress: Progress, kind: Kind, **options: Any) -> Measures:
     """Measure a scan in one piece."""
     most = memory() // WORKED if periodic else LARGEST_BOX**3
     maps = whole.measure_maps(field, kind, {**options, "periodic": periodic}, progress, most)
