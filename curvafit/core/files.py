@@ -87,8 +87,13 @@ def move_into_place(temporary: Path, target: Path) -> Path:
 def remove(path: Path) -> None:
     """Delete a file, a link, or a folder with its content, if there is one; a signal waits until all is gone."""
     if path.is_dir() and not path.is_symlink():
-        with hold_signals():  # half a folder of tiles is nobody's, and the same command would refuse it
-            shutil.rmtree(path)
+        aside = path.with_name(f".{_random_digits()}.old.{path.name[:200]}")
+        with hold_signals():  # half a folder of tiles is nobody's: under its name there is all of it or nothing
+            try:
+                os.replace(path, aside)
+            except OSError:  # a file of it is open on Windows, or the folder around it is not ours
+                aside = path
+            shutil.rmtree(aside)
     else:
         path.unlink(missing_ok=True)
 

@@ -3,6 +3,7 @@
 import io
 import os
 import random
+import shutil
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -12,7 +13,15 @@ from damage import damaged
 from disk import tree
 
 from curvafit.core import files
-from curvafit.core.files import check_folder, is_empty, move_together, temporary_folder, write_atomically, write_content
+from curvafit.core.files import (
+    check_folder,
+    is_empty,
+    move_together,
+    remove,
+    temporary_folder,
+    write_atomically,
+    write_content,
+)
 from curvafit.core.records import Format, can_write, has_mark, parse_json, sibling
 from curvafit.volumes import Volume, load, save
 
@@ -264,3 +273,14 @@ def test_json_that_is_read_is_sound(text: str | bytes, word: str) -> None:
     assert parse_json(b'\xef\xbb\xbf{"a": [1, 2.5, null]}', "JSON", "here") == {"a": [1, 2.5, None]}
     with pytest.raises(ValueError, match=word):
         parse_json(text, "a header", "here")
+
+
+def test_a_folder_that_goes_is_never_there_in_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that is killed while it deletes leaves nothing under the folder's name."""
+    folder = tmp_path / "tiles"
+    folder.mkdir()
+    (folder / "run.json").write_text("{}")
+    monkeypatch.setattr(shutil, "rmtree", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        remove(folder)
+    assert not folder.exists() and all(path.name.startswith(".") for path in tmp_path.iterdir())
