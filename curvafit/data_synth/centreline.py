@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Sequence
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -236,12 +237,13 @@ def _dissolve(graph: nx.MultiGraph, node: int) -> None:
 
 def _move_to_axis(graph: nx.MultiGraph, distance: np.ndarray, steps: np.ndarray) -> None:
     """Move each line sideways to the middle of its tube, and each node by the mean move of its lines' ends."""
+    at = partial(ndimage.map_coordinates, distance, order=1, mode="nearest")
     moves: dict[int, list[np.ndarray]] = defaultdict(list)
     for one, other, of in graph.edges(data=True):
         line = of["line"] = _smooth(of["line"]).copy()
         along = _tangents(line, steps)
         # Half the difference of the distances one voxel to either side is how far a point is off the axis.
-        push = np.stack([_interpolate(distance, line + e) - _interpolate(distance, line - e) for e in np.eye(3)], 1) / 2
+        push = np.stack([at((line + e).T) - at((line - e).T) for e in np.eye(3)], 1) / 2
         push -= (push * along).sum(1, keepdims=True) * along
         line += push / steps
         moves[min(one, other)].append(push[0] / steps)
@@ -269,11 +271,6 @@ def _measure_radii(distance: np.ndarray, line: np.ndarray, steps: np.ndarray) ->
         # The axis of a tube misses the voxels, whose distance is too small by how far they are off the line.
         radii += weight * (distance[tuple(voxel.T)] + np.linalg.norm(off, axis=1))
     return np.maximum(radii, 0)
-
-
-def _interpolate(values: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the values at points (N, 3) in voxels, interpolated linearly."""
-    return ndimage.map_coordinates(values, points.T, order=1, mode="nearest")
 
 
 def _finish(traced: nx.MultiGraph, distance: np.ndarray, steps: np.ndarray) -> nx.MultiGraph:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_choice, check_float, check_int, check_seed
-from curvafit.data_synth.case import Layers, check_calibres, check_crop, check_shape, draw_voxel, image_and_labels
+from curvafit.data_synth.case import Composition, check_calibres, check_crop, check_shape, draw_voxel, image_and_labels
 from curvafit.data_synth.imaging.image import field_shape
 from curvafit.data_synth.imaging.modality import Modality, modality
 from curvafit.data_synth.sources import Generated, Pool, Stored, choose_voxel
@@ -162,9 +162,7 @@ class TextureDataset(IterableDataset):
         kind = self.modalities[turn]
         imaging, voxel = kind.draw(for_imaging), draw_voxel(self.voxels[turn], self.calibres, rng)
         voxels = field_shape(self.size, voxel, imaging)
-        shape = self.source.shape(voxels, 0, rng)
-        u = torch.from_numpy(shape.values)
-        shown = Layers(u[None], u, shape.epsilon, [shape.origin])
+        shown = Composition().draw(self.source, voxels, voxel, 0, rng)  # type: ignore[arg-type]
         grey, _, mask = image_and_labels(shown, voxel, imaging, for_image, self.size, (1.0,))
         record = {"number": number, "source": shown.origins, "modality": kind.name, "imaging": imaging.as_dict()}
         record |= {"image_seed": for_image, "voxel": voxel}

@@ -160,10 +160,8 @@ def design_around(point: Sequence[float], spread: float, sampling: Sampling = "r
 
 def _seed_stream(seed: int, index: int, purpose: str) -> np.random.SeedSequence:
     """Return the random stream of a draw for its `parameters` or for the `start` of its flow."""
-    seed, index = (
-        check_int(number, f"{name} that is a whole number from 0", 0, SEEDS - 1)
-        for name, number in (("a seed", seed), ("an index", index))
-    )
+    seed = check_int(seed, "a seed that is a whole number from 0", 0, SEEDS - 1)
+    index = check_int(index, "an index that is a whole number from 0", 0, SEEDS - 1)
     return np.random.SeedSequence(seed, spawn_key=(index, ("parameters", "start").index(purpose)))
 
 

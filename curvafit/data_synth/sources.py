@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import permutations
 from multiprocessing.util import get_temp_dir
 from os import PathLike
 from pathlib import Path
@@ -40,7 +41,6 @@ from curvafit.priors.law import LawLike, read_laws
 TRIES, CROPS = 8, 32
 #: Rotations and reflections of the cube: orders of the three axes times their directions.
 SYMMETRIES = 48
-_ORDERS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
 
 
 class PhaseField(NamedTuple):
@@ -289,17 +289,14 @@ def _crop_shape(choose: Callable[[], PhaseField], voxels: Sequence[int], rng: np
 def apply_symmetry(values: np.ndarray, symmetry: int) -> np.ndarray:
     """Return a view of a volume (…, Z, Y, X) under one of the cube's symmetries, 0 to 47; 0 leaves it as it is."""
     order, flips = divmod(symmetry, 8)
-    lead = values.ndim - 3
-    axes = (*range(lead), *(lead + axis for axis in _ORDERS[order]))
-    moved = values.transpose(axes)
-    return moved[(..., *(slice(None, None, -1 if flips >> axis & 1 else 1) for axis in range(3)))]
+    moved = np.moveaxis(values, list(permutations((-3, -2, -1)))[order], (-3, -2, -1))
+    return np.flip(moved, tuple(axis - 3 for axis in range(3) if flips >> axis & 1))
 
 
 def crop_periodic(values: np.ndarray, corner: Sequence[int], shape: Sequence[int]) -> np.ndarray:
     """Return the part of a periodic volume (Z, Y, X) that begins at a corner; it goes on across the faces."""
-    for axis, (first, part) in enumerate(zip(corner, shape, strict=True)):
-        values = np.take(values, np.arange(first, first + part), axis, mode="wrap")
-    return values
+    parts = zip(corner, shape, values.shape, strict=True)
+    return values[np.ix_(*(np.arange(first, first + part) % whole for first, part, whole in parts))]
 
 
 def random_crop(

@@ -267,7 +267,9 @@ def _create(path: Path, settings: Settings) -> None:
 
 @hold_signals()  # Zarr writes in threads of its own, which would go on beside what cleans up
 def _write_draw(folder: Path, record: Record, field: np.ndarray | None) -> None:
-    attributes = _to_json(dataclasses.asdict(record) | {"coefficients": record.coefficients.as_dict()})
+    content = dataclasses.asdict(record) | {"coefficients": record.coefficients.as_dict()}
+    # NumPy's numbers become Python's, and NaN and infinity null.
+    attributes = json.loads(json.dumps(content, default=np.generic.item), parse_constant=lambda _: None)
     zarr.create_group(store=str(folder), attributes=attributes | {"sha256": _digest(attributes, field)})
     if field is not None:
         codecs = [BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"), Crc32cCodec()]
@@ -306,14 +308,6 @@ def _digest(attributes: dict[str, Any], field: np.ndarray | None) -> str:
     checksum = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
     checksum.update(b"" if field is None else np.ascontiguousarray(field).tobytes())
     return checksum.hexdigest()
-
-
-def _to_json(value: Any) -> Any:
-    """Return a value as JSON holds it: NumPy's numbers as Python's, and None for NaN and infinity."""
-    if isinstance(value, dict):
-        return {name: _to_json(item) for name, item in value.items()}
-    plain = value.item() if isinstance(value, np.generic) else value
-    return None if isinstance(plain, float) and not math.isfinite(plain) else plain
 
 
 def _decode(attributes: dict[str, Any]) -> Record:

@@ -64,7 +64,7 @@ def texture(like: Voxels, spacing: Lengths, deviation: float, length: float, see
     independent.
     """
     spread = math.sqrt(math.log1p(deviation**2))
-    return _field(like, spacing, length, seed, purpose).mul_(spread).sub_(spread**2 / 2).exp_()
+    return correlated_field(like, spacing, length, seed, purpose).mul_(spread).sub_(spread**2 / 2).exp_()
 
 
 def blur(image: Voxels, spacing: Lengths, widths: Lengths) -> Voxels:
@@ -81,13 +81,11 @@ def blur_with_depth(
     Its deviations are σ(z) = σ(0) (1 + growth z), and light from depth z is weakened by exp(-attenuation z).
     """
     steps = as_triple(spacing)
-    depth = (torch.arange(image.shape[0], device=image.device, dtype=image.dtype) + 0.5) * steps[0]
-    wider = 1 + growth * depth[:, None]
-    z, y, x = (σ / h * wider if σ else None for σ, h in zip(as_triple(widths), steps, strict=True))
-    lateral = ((n, 0.0 if w is None else w[..., None]) for n, w in zip(image.shape[1:], (y, x), strict=True))
-    axial = gaussian_matrix(image.shape[0], 0.0 if z is None else z, image)
-    blurred = apply_matrices(image, axial, *(gaussian_matrix(n, width, image) for n, width in lateral))
-    return blurred * torch.exp(-attenuation * depth)[:, None, None]
+    depth = _centres(len(image), steps[0], image)[:, None]
+    wider = 1 + growth * depth
+    every = zip(image.shape, as_triple(widths), steps, (wider, wider[..., None], wider[..., None]), strict=True)
+    maps = (gaussian_matrix(n, σ / h * factor if σ else 0.0, image) for n, σ, h, factor in every)
+    return apply_matrices(image, *maps) * torch.exp(-attenuation * depth)[..., None]
 
 
 def sample(image: Voxels, spacing: Lengths, onto: Lengths, window: Lengths = 0.0) -> Float[Tensor, "Z Y X"]:
@@ -106,7 +104,7 @@ def sample(image: Voxels, spacing: Lengths, onto: Lengths, window: Lengths = 0.0
 
 def bias(like: Voxels, spacing: Lengths, strength: float, length: float, seed: int) -> Voxels:
     """Return the factor of uneven illumination: smooth, from 1 - strength to 1 + strength, correlated by `length`."""
-    field = _field(like, spacing, length, seed, "bias")
+    field = correlated_field(like, spacing, length, seed, "bias")
     low, high = field.aminmax()
     middle, half = (high + low) / 2, ((high - low) / 2).clamp_min(torch.finfo(field.dtype).tiny)
     return (field - middle).mul_(strength / half).add_(1)
@@ -117,8 +115,7 @@ def stripes(like: Voxels, spacing: Lengths, strength: float, width: float, seed:
 
     It has mean 1 and deviation `strength`, is not below 0, constant along x, and correlated by `width` across it.
     """
-    z, y, _ = (width / h for h in as_triple(spacing))
-    field = correlated_field(like, (z, y, math.inf), seed, "stripes")
+    field = correlated_field(like, spacing, (width, width, math.inf), seed, "stripes")
     return field.mul_(strength).add_(1).clamp_min_(0).expand(like.shape)
 
 
@@ -132,14 +129,11 @@ def rings(like: Voxels, spacing: Lengths, strength: float, width: float, seed: i
     depth, *sides = like.shape
     _, *steps = as_triple(spacing)
     shares = uniform(2, seed, "ring centre", like).tolist()
-    y, x = (
-        (torch.arange(n, device=like.device, dtype=like.dtype) + 0.5) * h - (2 * share - 0.5) * n * h
-        for share, n, h in zip(shares, sides, steps, strict=True)
-    )
+    y, x = (_centres(n, h, like) - (2 * share - 0.5) * n * h for share, n, h in zip(shares, sides, steps, strict=True))
     step = min(width, *steps)
     radius = torch.hypot(y[:, None], x) / step
     count = int(radius.amax()) + 2
-    normal = correlated_field(like.new_empty(depth, 1, count), (0, 0, width / step), seed, "rings")[:, 0]
+    normal = correlated_field(like.new_empty(depth, 1, count), step, (0, 0, width), seed, "rings")[:, 0]
     profile = normal * normal.abs() / math.sqrt(3)
     near = radius.long()
     return torch.lerp(profile[:, near], profile[:, near + 1], radius - near) * strength
@@ -151,7 +145,7 @@ def dropout(occupied: Voxels, spacing: Lengths, share: float, length: float, los
     A random field of correlation `length` decides: where that is over a tube's radius, stretches of tube fade. Of the
     structure (voxels at least half full), `share` loses more than half of `loss`.
     """
-    field = _field(occupied, spacing, length, seed, "dropout")
+    field = correlated_field(occupied, spacing, length, seed, "dropout")
     threshold = _find_level(field[occupied >= 0.5], share)
     return 1 - loss * torch.sigmoid((field - threshold) / FADING)
 
@@ -174,18 +168,10 @@ def clutter(occupied: Voxels, spacing: Lengths, density: float, radius: float, s
     place = tried[torch.arange(count, device=tried.device), free.long().argmax(1)] * sides
     height = (0.5 + 0.5 * drawn[:, 0]) * free.any(1)
     width = radius * (0.5 + drawn[:, 1:4])
-    centres = (
-        (torch.arange(n, device=place.device, dtype=place.dtype) + 0.5) * h
-        for n, h in zip(occupied.shape, steps, strict=True)
-    )
+    centres = (_centres(n, h, place) for n, h in zip(occupied.shape, steps, strict=True))
     z, y, x = (bell((at - place[:, k, None]) / width[:, k, None]) for k, at in enumerate(centres))
     planes = (height[:, None, None] * z[:, :, None] * y[:, None, :]).flatten(1)
     return (planes.mT @ x).reshape(occupied.shape).clamp_max_(1) * (1 - occupied)
-
-
-def _field(like: Voxels, spacing: Lengths, length: float, seed: int, purpose: str) -> Voxels:
-    """Return a `correlated_field` with one length along all axes, in the spacing's unit."""
-    return correlated_field(like, [length / h for h in as_triple(spacing)], seed, purpose)
 
 
 def _find_level(values: Tensor, share: float) -> Tensor:
@@ -210,7 +196,7 @@ def poisson_gaussian(
     and denoising do; every voxel's own law stays as it is.
     """
     if gain:
-        photons = gain * poisson_quantile(photons, grainy_noise(photons, as_triple(width), seed, "photons"))
+        photons = gain * poisson_quantile(photons, grainy_noise(photons, width, seed, "photons"))
     return gaussian_noise(photons + offset, read_noise, seed, width)
 
 
@@ -234,7 +220,7 @@ def poisson_quantile(mean: Tensor, z: Tensor) -> Tensor:
 
 def gaussian_noise(image: Voxels, deviation: float, seed: int, width: Lengths = 0.0) -> Voxels:
     """Return the image plus normal noise of a standard deviation, smoothed by `width` voxels at that deviation."""
-    return image + deviation * grainy_noise(image, as_triple(width), seed, "read noise") if deviation else image
+    return image + deviation * grainy_noise(image, width, seed, "read noise") if deviation else image
 
 
 def rician(image: Voxels, deviation: float, seed: int, width: Lengths = 0.0) -> Voxels:
@@ -242,7 +228,7 @@ def rician(image: Voxels, deviation: float, seed: int, width: Lengths = 0.0) -> 
 
     The mean square is v² + 2σ²; where there is no signal, the mean is σ √(π/2) (Gudbjartsson and Patz 1995).
     """
-    real, imaginary = (grainy_noise(image, as_triple(width), seed, f"{part} channel") for part in ("real", "imaginary"))
+    real, imaginary = (grainy_noise(image, width, seed, f"{part} channel") for part in ("real", "imaginary"))
     return torch.hypot(image + deviation * real, deviation * imaginary)
 
 
@@ -324,28 +310,27 @@ def stream(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch
     return torch.Generator(device).manual_seed(int(words.generate_state(1)[0]))
 
 
-def white_noise(shape: tuple[int, ...], like: Tensor, seed: int, purpose: str) -> Tensor:
-    """Return independent standard normal numbers of a shape, of the type and on the device of `like`."""
-    return torch.randn(shape, generator=stream(seed, purpose, like.device), device=like.device, dtype=like.dtype)
-
-
-def correlated_field(like: Voxels, lengths: Sequence[float], seed: int, purpose: str) -> Voxels:
+def correlated_field(like: Voxels, spacing: Lengths, lengths: Lengths, seed: int, purpose: str) -> Voxels:
     """Return a Gaussian random field of mean 0, variance 1 and correlation exp(-½ Σ (d/length)²) over a distance d.
 
-    Lengths are along (z, y, x), in voxels; under half a voxel there is no correlation, and infinity means constant.
-    White noise on nodes is interpolated by Gaussians; each row's weights have a sum of squares of one, so that the
-    variance is one near the faces too.
+    Lengths are along (z, y, x); under half a voxel there is no correlation, and infinity means constant. White noise on
+    nodes is interpolated by Gaussians.
     """
-    maps = [_interpolate_nodes(n, length, like) for n, length in zip(like.shape, lengths, strict=True)]
-    nodes = tuple(n if weights is None else weights.shape[-1] for n, weights in zip(like.shape, maps, strict=True))
-    return apply_matrices(white_noise(nodes, like, seed, purpose), *maps)
+    every = zip(like.shape, as_triple(lengths), as_triple(spacing), strict=True)
+    return _map_noise(like, [_interpolate_nodes(n, length / h, like) for n, length, h in every], seed, purpose)
 
 
-def grainy_noise(like: Voxels, widths: Sequence[float], seed: int, purpose: str) -> Voxels:
+def grainy_noise(like: Voxels, widths: Lengths, seed: int, purpose: str) -> Voxels:
     """Return noise of mean 0 and variance 1, smoothed by a Gaussian of deviations `widths` (z, y, x) in voxels."""
-    noise = white_noise(tuple(like.shape), like, seed, purpose)
-    maps = [gaussian_matrix(n, width, like) for n, width in zip(like.shape, widths, strict=True)]
-    return apply_matrices(noise, *(None if weights is None else _normalise_rows(weights) for weights in maps))
+    every = zip(like.shape, as_triple(widths), strict=True)
+    return _map_noise(like, [gaussian_matrix(n, width, like) for n, width in every], seed, purpose)
+
+
+def _map_noise(like: Voxels, maps: Sequence[Tensor | None], seed: int, purpose: str) -> Voxels:
+    """Return white noise under a matrix, or None, along each axis, whose rows are scaled to keep a variance of 1."""
+    nodes = tuple(n if weights is None else weights.shape[-1] for n, weights in zip(like.shape, maps, strict=True))
+    noise = torch.randn(nodes, generator=stream(seed, purpose, like.device), device=like.device, dtype=like.dtype)
+    return apply_matrices(noise, *(w if w is None else w / w.square().sum(-1, keepdim=True).sqrt() for w in maps))
 
 
 def uniform(count: int, seed: int, purpose: str, like: Tensor) -> Tensor:
@@ -365,9 +350,9 @@ def _interpolate_nodes(count: int, length: float, like: Tensor) -> Tensor | None
     step, beyond = max(width, 1.0), math.ceil(4 * width)
     nodes = torch.arange(0, count + 2 * beyond, step, device=like.device, dtype=like.dtype) - beyond
     place = torch.arange(count, device=like.device, dtype=like.dtype)
-    return _normalise_rows(bell((place[:, None] - nodes) / width))
+    return bell((place[:, None] - nodes) / width)
 
 
-def _normalise_rows(weights: Tensor) -> Tensor:
-    """Return weights whose rows have a sum of squares of one, which keeps the variance of white noise."""
-    return weights / weights.square().sum(-1, keepdim=True).sqrt()
+def _centres(count: int, step: float, like: Tensor) -> Tensor:
+    """Return the centres of voxels along an axis, of the type and on the device of `like`."""
+    return (torch.arange(count, device=like.device, dtype=like.dtype) + 0.5) * step

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 
 from curvafit.data_synth.imaging import effects
-from curvafit.data_synth.imaging.effects import EPSILON, Triple, Voxels
+from curvafit.data_synth.imaging.effects import EPSILON, Voxels
 from curvafit.data_synth.imaging.modality import Imaging
 from curvafit.priors.grid import Float
 
@@ -34,7 +34,7 @@ def image(
         light = effects.blur_with_depth(light, spacing, optics.blur, optics.growth, optics.attenuation)
     else:
         light = effects.blur(light, spacing, optics.blur)
-    light = effects.sample(light, spacing, imaging.spacing, _window(imaging))
+    light = effects.sample(light, spacing, imaging.spacing, (imaging.thickness, *imaging.spacing[1:]))
     lamp = imaging.illumination
     if lamp.bias:
         light = light * effects.bias(light, imaging.spacing, lamp.bias, lamp.bias_length, seed)
@@ -58,12 +58,10 @@ def label_voxels(
     all classes reaches, stained alike, and a voxel is of the class with most of it.
     """
     if imaging.visible:
-        optics, onto = imaging.optics, (imaging.spacing, _window(imaging))
-        lights = (
-            effects.blur_with_depth(share, spacing, optics.blur, optics.growth)
-            for share in share_voxels(fields, epsilon)
-        )
-        shares = torch.stack([effects.sample(light, spacing, *onto) for light in lights])
+        optics, window = imaging.optics, (imaging.thickness, *imaging.spacing[1:])
+        stains = share_voxels(fields, epsilon)
+        lights = (effects.blur_with_depth(stain, spacing, optics.blur, optics.growth) for stain in stains)
+        shares = torch.stack([effects.sample(light, spacing, imaging.spacing, window) for light in lights])
         return torch.where(shares.sum(0) > imaging.visible, shares.argmax(0) + 1, 0).to(torch.uint8)
     if len(fields) == 1:
         return (sampled > 0).to(torch.uint8)
@@ -87,11 +85,6 @@ def field_shape(shape: Sequence[int], spacing: float, imaging: Imaging) -> tuple
     """Return the number of voxels (z, y, x) of edge `spacing` that an image of `shape` is made from."""
     z, y, x = (math.ceil(n * h / spacing - 1e-6) for n, h in zip(shape, imaging.spacing, strict=True))
     return z, y, x
-
-
-def _window(how: Imaging) -> Triple:
-    """Return the box (z, y, x) over which a voxel averages."""
-    return how.thickness, *how.spacing[1:]
 
 
 def share_voxels(fields: torch.Tensor, epsilon: float) -> list[torch.Tensor]:

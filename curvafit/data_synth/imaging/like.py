@@ -78,7 +78,7 @@ def fit_modality(scan: Volume, mask: np.ndarray | None = None) -> Modality:
     ground = _measure_background(values, inside, steps)
     structure = _measure_structure(values, inside, steps, ground.level)
     noise = _measure_noise(values, inside, ground, steps, ground.level + structure.contrast)
-    base = _to_imaging(scan, structure, ground, noise)
+    base = _to_imaging(scan, structure, ground, *noise)
     known = {name: np.asarray(base[name]) for name in SPREAD if np.any(base[name])}
     ranges = {name: tuple((end * value).tolist() for end in SPREAD[name]) for name, value in known.items()}
     if base.illumination.bias:
@@ -88,14 +88,17 @@ def fit_modality(scan: Volume, mask: np.ndarray | None = None) -> Modality:
     return Modality("like", about, float(min(scan.spacing)), base, ranges)
 
 
-def _to_imaging(scan: Volume, structure: Structure, ground: Background, noise: NoiseLine) -> Imaging:
+def _to_imaging(
+    scan: Volume, structure: Structure, ground: Background, gain: float, read_noise: float, offset: float
+) -> Imaging:
     """Return the estimates as parameters of an image: levels in photons where there is a gain, textures before blur."""
-    unit = noise.gain or 1.0
-    low = max(ground.level - noise.offset, 0.0) / unit
-    high = max(ground.level + structure.contrast - noise.offset, 0.0) / unit
+    unit = gain or 1.0
+    low = max(ground.level - offset, 0.0) / unit
+    high = max(ground.level + structure.contrast - offset, 0.0) / unit
     shrunk = math.prod(1 + 2 * (σ / ground.length) ** 2 for σ in structure.blur) ** 0.25
     length = math.sqrt(max(ground.length**2 - 2 * min(structure.blur) ** 2, min(scan.spacing) ** 2))
     counts = scan.values.dtype.kind in "ui" and scan.values.min() >= 0
+    ceiling = float(np.iinfo(scan.values.dtype).max) if counts else None
     return Imaging(
         unit=scan.unit,
         spacing=scan.spacing,
@@ -112,10 +115,8 @@ def _to_imaging(scan: Volume, structure: Structure, ground: Background, noise: N
             bias=min(ground.bias * abs(ground.level) / max(low * unit, 1e-9), 0.9),
             bias_length=max(n * h for n, h in zip(scan.shape, scan.spacing, strict=True)) / 2,
         ),
-        noise=Noise(gaussian=noise.read_noise, width=ground.width),
-        detector=Detector(
-            gain=noise.gain, offset=noise.offset, ceiling=float(np.iinfo(scan.values.dtype).max) if counts else None
-        ),
+        noise=Noise(gaussian=read_noise, width=ground.width),
+        detector=Detector(gain=gain, offset=offset, ceiling=ceiling),
     )
 
 
@@ -207,14 +208,6 @@ class Background(NamedTuple):
     bias: float
 
 
-class NoiseLine(NamedTuple):
-    """The variance of counts over their mean: gain · (mean - offset) + read_noise²."""
-
-    gain: float
-    read_noise: float
-    offset: float
-
-
 def _measure_background(values: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> Background:
     """Return the background's level and correlations, measured some voxels away from the structure."""
     finest = steps.min() / steps
@@ -239,11 +232,11 @@ def _measure_background(values: np.ndarray, inside: np.ndarray, steps: np.ndarra
 
 def _measure_noise(
     values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray, high: float
-) -> NoiseLine:
-    """Return the line of variance over mean through the background and the residuals' bins over the structure."""
-    # A line gain · mean + constant does not tell offset from read noise: a negative constant is taken as an offset, a
-    # positive one as read noise. The slope is limited so that the offset is no brighter than the background's darkest
-    # voxels, since fine structure may pass for noise.
+) -> tuple[float, float, float]:
+    """Return gain, read noise and offset: the counts' variance is gain · (mean - offset) + read_noise²."""
+    # The line goes through the background and the residuals' bins over the structure; it does not tell offset from read
+    # noise. A negative constant is taken as an offset, a positive one as read noise. The slope is limited so that the
+    # offset is no brighter than the background's darkest voxels, since fine structure may pass for noise.
     lines = _measure_bins(values, inside, ground, steps)
     gain = 0.0
     if len(lines) > 2:
@@ -255,10 +248,9 @@ def _measure_noise(
     gain = min(gain, ground.noise / max(ground.level - darkest, 1e-12))
     if not gain or gain * abs(high - ground.level) < (GROWS - 1) * ground.noise:
         floor = 0.0 if ground.level > 2 * ground.texture else ground.level - abs(high - ground.level)
-        return NoiseLine(0.0, math.sqrt(ground.noise), floor)
+        return 0.0, math.sqrt(ground.noise), floor
     constant = ground.noise - gain * ground.level
-    offset = max(-constant / gain, 0.0)
-    return NoiseLine(gain, math.sqrt(max(constant, 0.0)), offset)
+    return gain, math.sqrt(max(constant, 0.0)), max(-constant / gain, 0.0)
 
 
 def _autocovariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
