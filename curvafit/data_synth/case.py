@@ -24,8 +24,6 @@ from curvafit.priors.kernels.threads import one_thread
 TRIES = 8
 #: The most voxels of a shape; and the least along each edge of a grown one, or along the longest edge of a crop.
 MOST, FEWEST = 10**9, 4
-#: Least and greatest calibre.
-CALIBRES = (1e-3, 1e3)
 #: The brightest that a class can be, as a multiple of the structure's contrast; and the most classes of a set.
 BRIGHTEST, MOST_CLASSES = 100.0, 200
 
@@ -262,7 +260,7 @@ def draw_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generator
 def check_calibres(calibres: Sequence[float]) -> tuple[float, float]:
     """Return calibres as two positive factors, the lower first, or raise ValueError."""
     words, pair = "calibres as two positive factors, the lower first", as_tuple(calibres, "two factors")
-    low, high = (check_float(n, words, *CALIBRES, of=pair) for n in (pair if len(pair) == 2 else (None, None)))
+    low, high = (check_float(n, words, 1e-3, 1e3, of=pair) for n in (pair if len(pair) == 2 else (None, None)))
     if low > high:
         raise ValueError(f"expected {words}, got {quoted(pair)}")
     return low, high

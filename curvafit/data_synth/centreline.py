@@ -26,10 +26,6 @@ if TYPE_CHECKING:
 
 #: A spur is shorter than a voxel and so many radii of its other node.
 SPUR = 1.0
-#: Weights of the moving average along a line, applied twice, that removes the steps between voxels.
-SMOOTH = (1 / 9, 2 / 9, 3 / 9, 2 / 9, 1 / 9)
-#: Number of moves of the lines towards the middle.
-CENTRING = 2
 #: Voxels of a 3×3×3 block have numbers along x, y, z, and sets of them are bits: `FACES` and `EIGHTEEN` are the 6 and
 #: the 18 nearest to the middle; `CORNERS[k]` touch voxel k by a corner at least, `SIDES[k]` by a face within the 18.
 MIDDLE = 13
@@ -96,11 +92,9 @@ def _thin(mask, fixed, order, periodic):  # pragma: no cover
 
 @njit(cache=True)
 def _is_simple(around):  # pragma: no cover
-    """Return whether deleting the middle of 3×3×3 voxels keeps the topology; `around` are the mask's other voxels.
-
-    This is a simple point (Bertrand and Malandain 1994): the mask around it is one 26-connected piece, and the outside
-    voxels that touch the middle by a face are in one 6-connected piece of the 18 nearest.
-    """
+    """Return whether deleting the middle of 3×3×3 voxels keeps the topology; `around` are the mask's other voxels."""
+    # This is a simple point (Bertrand and Malandain 1994): the mask around it is one 26-connected piece, and the
+    # outside voxels that touch the middle by a face are in one 6-connected piece of the 18 nearest.
     outside = ~around & EIGHTEEN
     one_outside = outside & FACES != 0 and _is_connected(outside, outside & FACES, SIDES)
     return one_outside and _is_connected(around, around, CORNERS)
@@ -141,7 +135,7 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, spacing: Sequence[flo
     for node in list(graph):
         _dissolve(graph, node)
     _prune(graph, steps)
-    for _ in range(CENTRING):
+    for _ in range(2):
         _move_to_axis(graph, distance, steps)
     return _finish(graph, distance, steps)
 
@@ -202,7 +196,6 @@ def _add_edge(graph: nx.MultiGraph, one: int, other: int, line: np.ndarray) -> N
 
 
 def _prune(graph: nx.MultiGraph, steps: np.ndarray) -> None:
-    """Remove spurs, shortest first, until there are none."""
     while spurs := sorted(_find_spurs(graph, steps)):
         for _, tip, root in spurs:
             if tip in graph and root in graph and graph.degree(tip) == 1 and graph.has_edge(tip, root):
@@ -296,5 +289,5 @@ def _smooth(line: np.ndarray) -> np.ndarray:
     """Return the line after two moving averages; it is continued as a point reflection, so that its ends stay."""
     for _ in range(2 if len(line) > 2 else 0):
         longer = np.pad(line, ((2, 2), (0, 0)), mode="reflect", reflect_type="odd")
-        line = ndimage.convolve1d(longer, SMOOTH, axis=0)[2:-2]
+        line = ndimage.convolve1d(longer, (1 / 9, 2 / 9, 3 / 9, 2 / 9, 1 / 9), axis=0)[2:-2]
     return line

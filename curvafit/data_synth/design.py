@@ -29,8 +29,8 @@ INTERVALS: dict[str, tuple[float, float]] = {
 }
 #: Parameters of a draw, in the order of a point.
 PARAMETERS: tuple[str, ...] = (*NAMES, "mass")
-#: Width of a box around a point as a multiple of Experiment 4's: default, least and greatest.
-SPREAD, SPREADS = 0.1, (1e-9, 100.0)
+#: Width of a box around a point as a multiple of Experiment 4's.
+SPREAD = 0.1
 #: The kinds of file by their main key, with the optional keys of each.
 KEYS: dict[str, tuple[str, ...]] = {"box": ("law", "log"), "around": ("law", "spread"), "list": ()}
 
@@ -144,7 +144,7 @@ def design_around(point: Sequence[float], spread: float, sampling: Sampling = "r
 
     The point is scaled to a20 = 1, and the box is cut to a02 ≥ 1/15 and m₀ in [-0.99, 0.99].
     """
-    spread = check_float(spread, "a positive spread", *SPREADS)
+    spread = check_float(spread, "a positive spread", 1e-9, 100.0)
     point = as_tuple(point, "seven numbers as a point")
     if len(point) != len(PARAMETERS):
         raise ValueError(f"a point is {len(PARAMETERS)} numbers ({', '.join(PARAMETERS)}), got {len(point)}")

@@ -30,8 +30,6 @@ from curvafit.scan.measure import Reading, read_texture, scan_diagram
 from curvafit.scan.prepare import prepare, thinner_thickness
 from curvafit.volumes.volume import ScanError, Volume
 
-#: Seconds between two writings of a table that grows.
-PAUSE = 60.0
 #: A row of a table: its columns in their order.
 Row = tuple[str, str, np.ndarray, float, np.ndarray, float]
 
@@ -88,18 +86,15 @@ def shape_id(store: Store, index: int) -> str:
 
 
 def _measure_shape(store: Store, record: Record) -> tuple[float, float, Diagram, Diagram]:
-    """Return the volume fraction of {u > 0}, its thickness in voxels, and the diagrams of the field, and of its mask as
-    that of a scan is measured."""
-    field = store.field(record.index)
-    grid, epsilon = Grid(store.settings.shape, store.settings.spacing), store.settings.epsilon
-    mask = prepare(Volume((field > 0).astype(np.uint8)), kind="mask", periodic=True, one_scale=True)
-    both = (diagram(torch.from_numpy(field), grid, epsilon), scan_diagram(mask))
-    as_field, as_mask = (each.thin(BIN_WIDTH, TAIL_SHARE) for each in both)
-    return float((field > 0).mean()), thinner_thickness(field > 0), as_field, as_mask
+    """Return the volume fraction, the thickness in voxels, and the diagrams of the field and of its mask as a scan."""
+    u, settings = store.field(record.index), store.settings
+    whole = diagram(torch.from_numpy(u), Grid(settings.shape, settings.spacing), settings.epsilon)
+    mask = prepare(Volume((u > 0).astype(np.uint8)), kind="mask", periodic=True, one_scale=True)
+    as_field, as_mask = (one.thin(BIN_WIDTH, TAIL_SHARE) for one in (whole, scan_diagram(mask)))
+    return float((u > 0).mean()), thinner_thickness(u > 0), as_field, as_mask
 
 
 def _provenance(draws: Sequence[tuple[Store, Record]], command: Sequence[str]) -> dict[str, Any]:
-    """Return how an atlas was made."""
     stores = list({store.name: store for store, _ in draws}.values())
     accounts = {}
     for store in stores:
@@ -111,9 +106,8 @@ def _provenance(draws: Sequence[tuple[Store, Record]], command: Sequence[str]) -
             "settings": dataclasses.asdict(store.settings),
             "generated_with": [json.loads(text) for text in generators],
         }
-    builds = (_build_command(store, accounts[store.name]["viable"]) for store in stores)
     return {
-        "command": [*builds, *command],
+        "command": [*(_build_command(store, accounts[store.name]["viable"]) for store in stores), *command],
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "selection": {"extent_of_both_phases": FORMED},
         "settings": {name: getattr(stores[0].settings, name) for name in ("shape", "spacing", "epsilon")},
@@ -165,59 +159,52 @@ def describe(
     begun = load_table(path) if path.exists() and not overwrite else None
     provenance, rows = _table_provenance(begun, sources, command), []
     if begun is not None:
-        rows += zip(begun.shapes.tolist(), begun.views.tolist(), begun.parameters, begun.thickness.tolist(),
-                    begun.descriptors, begun.amount.tolist(), strict=True)  # fmt: skip
+        rows += zip(*(getattr(begun, column.name) for column in dataclasses.fields(begun)[:-1]), strict=True)
     present = {row[:2] for row in rows}
     jobs: list[tuple[Path, int, tuple[str, ...]]] = []  # shapes that lack views in the table
     for store, index in ((own, k) for own in sources for k in own.indices()):
-        missing = tuple(name for name in views if (_shape(store, index), name) not in present)
+        missing = tuple(name for name in views if (f"{store.name}/{index:06d}", name) not in present)
         with suppress(KeyError):  # a draw that was removed since it was listed
             if missing and store.viable(index) and is_well_formed(store.record(index).viability):
                 jobs.append((store.path.resolve(), index, missing))
-    if not jobs and not rows:
-        raise ValueError(f"no well-formed shape in {', '.join(store.name for store in sources)}")
     last_save = time.monotonic()
     try:
-        for count, shape in enumerate(run_jobs(measure, jobs, workers), 1):
-            rows += (
-                (shape["shape"], view, shape["parameters"], shape["thickness"], to_row(reading).astype(np.float32),
-                 math.nan if reading is None else reading.amount)
-                for view, reading in shape["views"].items()
-            )  # fmt: skip
+        for count, found in enumerate(run_jobs(measure, jobs, workers), 1):
+            rows += found
             progress(f"measured {count} of {len(jobs)} shapes", count / len(jobs))
-            if time.monotonic() - last_save > PAUSE:
+            if time.monotonic() - last_save > 60:
                 save_table(_to_table(rows, provenance), path)
                 last_save = time.monotonic()
     finally:
         if rows:
             save_table(_to_table(rows, provenance), path)
+    if not rows:
+        raise ValueError(f"no well-formed shape in {', '.join(store.name for store in sources)}")
     return _to_table(rows, provenance)
 
 
-def measure(job: tuple[Path, int, Sequence[str]]) -> dict[str, Any]:
-    """Measure a shape, by its store, index and views, and return its parameters and its descriptors by view, None
-    without a surface.
+def measure(job: tuple[Path, int, Sequence[str]]) -> list[Row]:
+    """Measure a shape, by its store, index and views; return no row where it is no longer in the store.
 
-    A shape that is no longer in the store has no views. One that is damaged is a ValueError.
+    A shape that is damaged is a ValueError.
     """
     path, index, views = job
     store = open_store(path)
-    row = {"shape": _shape(store, index), "views": {}}
     try:
         record, u = store.record(index), store.field(index)
     except KeyError:
-        return row
-    row |= {"parameters": parameters_of(record.coefficients, record.mass), "thickness": thinner_thickness(u > 0)}
-    return row | {"views": {name: _read_view(u, name, record.seed) for name in views}}
+        return []
+    numbers = parameters_of(record.coefficients, record.mass), thinner_thickness(u > 0)
+    return [(f"{store.name}/{index:06d}", name, *numbers, *_measure_view(u, name, record.seed)) for name in views]
 
 
-def _read_view(u: np.ndarray, name: str, seed: int) -> Reading | None:
-    """Return what is read of a field in one view, as `infer` reads a scan; None where that shows no surface."""
-    try:
+def _measure_view(u: np.ndarray, name: str, seed: int) -> tuple[np.ndarray, float]:
+    """Return descriptors and amount of a field in one view, as `infer` reads a scan; NaN where that has no surface."""
+    reading: Reading | None = None
+    with suppress(ScanError):
         seen = VIEWS[name](u, np.random.default_rng([seed, *name.encode()]))
-        return read_texture(prepare(seen.scan, kind=seen.kind, periodic=seen.periodic, one_scale=True))
-    except ScanError:
-        return None
+        reading = read_texture(prepare(seen.scan, kind=seen.kind, periodic=seen.periodic, one_scale=True))
+    return to_row(reading).astype(np.float32), math.nan if reading is None else reading.amount
 
 
 def _table_provenance(table: Table | None, stores: Sequence[Store], command: Sequence[str]) -> dict[str, Any]:
@@ -235,12 +222,4 @@ def _table_provenance(table: Table | None, stores: Sequence[Store], command: Seq
 
 
 def _to_table(rows: Sequence[Row], provenance: dict[str, Any]) -> Table:
-    """Return rows as a table."""
-    shapes, views, *numbers = (np.array(column) for column in zip(*rows, strict=True)) if rows else [np.array(())] * 6
-    parameters, thickness, found, amount = numbers
-    return Table(shapes.astype(str), views.astype(str), parameters, thickness, found, amount, provenance)
-
-
-def _shape(store: Store, index: int) -> str:
-    """Return a shape's name in a table: the store's name and the index of the draw."""
-    return f"{store.name}/{index:06d}"
+    return Table(*map(np.array, zip(*rows, strict=True)), provenance=provenance)

@@ -24,9 +24,6 @@ from curvafit.priors.profile import profile_distance
 
 #: Pieces that touch are two where the neck between them is thinner than this part of the thinner one.
 NECK = 0.5
-#: The least slope of the profile's distance (1 where it is perfect) at which it holds off the surface too. Curvature
-#: and normals need the level set's direction alone, for which `LEAST_SLOPE` is enough.
-STEEP = 0.5
 #: Radius (voxels) of the sphere that stands for the surface as seen from far points.
 BEND = 4.0
 #: Names of all labels.
@@ -101,20 +98,17 @@ def instances_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def _find_necks(basins: np.ndarray, distance: np.ndarray, grid: Grid) -> list[tuple[float, int, int]]:
-    """Return necks, widest first: the greatest distance at which two basins touch (by faces), and both basins."""
-    pairs, widths = [], []
+    """Return necks, widest first: the distance at which two basins touch (by faces), and both basins."""
+    # Of two basins only the widest neck matters: where it does not join them, no other does.
+    necks = []
     for axis in range(3):
         next_basins, next_distance = np.roll(basins, -1, axis), np.roll(distance, -1, axis)
         touch = (basins > 0) & (next_basins > 0) & (basins != next_basins)
         if not grid.periodic:
             np.moveaxis(touch, axis, 0)[-1] = False
-        pairs.append(np.sort(np.stack([basins[touch], next_basins[touch]], 1), axis=1))
-        widths.append(np.minimum(distance[touch], next_distance[touch]))
-    found, index = np.unique(np.concatenate(pairs), axis=0, return_inverse=True)
-    widest = np.zeros(len(found), dtype=np.float32)
-    np.maximum.at(widest, index.reshape(-1), np.concatenate(widths))
-    order = np.argsort(-widest, kind="stable")
-    return [(float(widest[k]), int(found[k, 0]), int(found[k, 1])) for k in order]
+        pair = np.sort([basins[touch], next_basins[touch]], axis=0)
+        necks.append(np.stack([-np.minimum(distance[touch], next_distance[touch]), *pair], 1))
+    return [(-width, int(a), int(b)) for width, a, b in np.unique(np.concatenate(necks), axis=0).tolist()]
 
 
 def _measure_curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float) -> tuple[np.ndarray, np.ndarray]:
@@ -134,7 +128,6 @@ def _measure_curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float)
 
 
 def _check_field(field: Tensor | np.ndarray, grid: Grid, epsilon: float) -> Tensor:
-    """Return a field in float32, or raise ValueError."""
     u = torch.as_tensor(field).detach().cpu()
     if tuple(u.shape) != grid.shape:
         raise ValueError(f"the field must have the shape {grid.shape}, got {tuple(u.shape)}")
@@ -212,7 +205,8 @@ def _measure_near(near, edges, periodic, touching, feet, distance):  # pragma: n
         steep = np.sqrt(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2)
         sign = 1 if here > 0 else -1
         if side < 0:
-            if steep > STEEP and abs(here) <= 1.5 * steep * widest:
+            # Off the surface the slope must be nearer 1, which it is where the profile is perfect, than for a normal.
+            if steep > 0.5 and abs(here) <= 1.5 * steep * widest:
                 distance[z, y, x] = here / steep
             continue
         touching[z, y, x] = True

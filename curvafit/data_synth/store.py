@@ -44,8 +44,8 @@ from curvafit.priors.grid import Grid
 
 FORMAT = "curvafit shapes"
 VERSION = 2
-#: Name, behind a dot, of an unfinished draw's folder; one older than so many seconds was left by a killed process.
-PARTIAL, STALE = "partial", 600.0
+#: Name, behind a dot, of an unfinished draw's folder.
+PARTIAL = "partial"
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class Store:
         if self.has(record.index):
             return False
         for left in (self.path / "draws").glob(f".{PARTIAL}*"):
-            if time.time() - left.stat().st_mtime > STALE:
+            if time.time() - left.stat().st_mtime > 600:  # a killed process left it
                 shutil.rmtree(left, ignore_errors=True)
         with temporary_folder(self.path / "draws" / PARTIAL) as partial:
             _write_draw(partial / place.name, record, field)
@@ -311,12 +311,10 @@ def _digest(attributes: dict[str, Any], field: np.ndarray | None) -> str:
 
 
 def _decode(attributes: dict[str, Any]) -> Record:
-    """Return the record in a draw's attributes."""
     viability = {field.name: attributes["viability"][field.name] for field in dataclasses.fields(Viability)}
     figures = {name: _number(value) for name, value in viability.items() if name not in ("viable", "reason")}
-    counts = {name: check_int(attributes[name], name, 0, SEEDS - 1) for name in ("index", "seed", "steps")}
     return Record(
-        **counts,
+        **{name: check_int(attributes[name], name, 0, SEEDS - 1) for name in ("index", "seed", "steps")},
         **{name: _number(attributes[name]) for name in ("mass", "energy", "seconds")},
         coefficients=Coefficients(*(_number(attributes["coefficients"][name]) for name in NAMES)),
         viability=Viability(**viability | figures),

@@ -32,16 +32,12 @@ Voxels = Float[Tensor, "z y x"]
 
 #: ε of a generated shape, in its voxels.
 EPSILON = WORKING_EPSILON / WORKING_SPACING
-#: How fast the stain fades at the end of a lost stretch: a part of the random field's deviation.
-FADING = 0.2
 #: Places that a speck tries before it is given up as having none outside the structure.
 TRIES = 8
 #: Below this mean a Poisson quantile is summed up; above it, Giles's expansion is within a count.
 FEW = 2.0
 #: Counts that the sum goes to: P(X > 12) is 2e-7 at a mean of 2.
 MOST = 12
-#: Squared deviations at which a Gaussian ends.
-CUT = 16.0
 
 
 # ---- optics ----------------------------------------------------------------------------------------------------------
@@ -146,8 +142,10 @@ def dropout(occupied: Voxels, spacing: Lengths, share: float, length: float, los
     structure (voxels at least half full), `share` loses more than half of `loss`.
     """
     field = correlated_field(occupied, spacing, length, seed, "dropout")
-    threshold = _find_level(field[occupied >= 0.5], share)
-    return 1 - loss * torch.sigmoid((field - threshold) / FADING)
+    inside = field[occupied >= 0.5]
+    lost = round(share * len(inside))
+    level = math.inf if lost == 0 else -math.inf if lost == len(inside) else inside.kthvalue(len(inside) - lost).values
+    return 1 - loss * torch.sigmoid((field - level) / 0.2)  # the stain fades at the end of a stretch
 
 
 def clutter(occupied: Voxels, spacing: Lengths, density: float, radius: float, seed: int) -> Voxels:
@@ -172,15 +170,6 @@ def clutter(occupied: Voxels, spacing: Lengths, density: float, radius: float, s
     z, y, x = (bell((at - place[:, k, None]) / width[:, k, None]) for k, at in enumerate(centres))
     planes = (height[:, None, None] * z[:, :, None] * y[:, None, :]).flatten(1)
     return (planes.mT @ x).reshape(occupied.shape).clamp_max_(1) * (1 - occupied)
-
-
-def _find_level(values: Tensor, share: float) -> Tensor:
-    """Return the level that a share of the values exceeds: infinity for a share of 0, -infinity for 1."""
-    count = values.numel()
-    passed = round(share * count)
-    if passed == 0 or passed == count:
-        return values.new_tensor(math.inf if passed == 0 else -math.inf)
-    return values.kthvalue(count - passed).values
 
 
 # ---- noise -----------------------------------------------------------------------------------------------------------
@@ -278,8 +267,8 @@ def gaussian_matrix(count: int, width: float | Tensor, like: Tensor) -> Tensor |
 def bell(far: Tensor) -> Tensor:
     """Return exp(-½ far²), and 0 where far is over four."""
     # The square is clipped first, since arithmetic with denormal numbers is slow.
-    square = far.square().clamp_max_(CUT)
-    return torch.exp(-0.5 * square).masked_fill_(square == CUT, 0)
+    square = far.square().clamp_max_(16)
+    return torch.exp(-0.5 * square).masked_fill_(square == 16, 0)
 
 
 def sampling_matrix(count: int, spacing: float, onto: float, window: float, like: Tensor) -> Tensor | None:

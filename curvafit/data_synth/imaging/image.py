@@ -100,7 +100,6 @@ def share_voxels(fields: torch.Tensor, epsilon: float) -> list[torch.Tensor]:
 
 
 def _emit(occupied: torch.Tensor, spacing: float, how: Imaging, seed: int) -> torch.Tensor:
-    """Return the light that the specimen emits."""
     contrast, specimen = how.contrast, how.specimen
     inside = occupied
     if specimen.dropout:
@@ -122,7 +121,6 @@ def _emit(occupied: torch.Tensor, spacing: float, how: Imaging, seed: int) -> to
 
 
 def _detect(light: torch.Tensor, how: Imaging, seed: int) -> torch.Tensor:
-    """Return the counts that a detector makes of light."""
     detector, noise, contrast = how.detector, how.noise, how.contrast
     counts = effects.poisson_gaussian(light, detector.gain, noise.gaussian, detector.offset, seed, noise.width)
     if noise.rician:
