@@ -28,16 +28,6 @@ MOST, FEWEST = 10**9, 4
 BRIGHTEST, MOST_CLASSES = 100.0, 200
 
 
-class Layers(NamedTuple):
-    """Phase fields (C, Z, Y, X) of classes 1 to C, the first in front; that of the whole, of all together (Z, Y, X);
-    their ε in voxels; and the shapes' origins."""
-
-    values: Tensor
-    whole: Tensor
-    epsilon: float
-    origins: list[dict[str, Any]]
-
-
 @dataclass(frozen=True)
 class Composition:
     """What a case shows: one structure by default.
@@ -82,20 +72,36 @@ class Composition:
 
     def draw(
         self, source: ShapeSource, voxels: Sequence[int], voxel: float, index: int, rng: np.random.Generator
-    ) -> Layers:
-        """Return the classes of case `index` on voxels of the edge `voxel`, which is in the wall's unit."""
+    ) -> tuple[Tensor, Tensor, float, list[dict[str, Any]]]:
+        """Return the phase fields (C, Z, Y, X) of the classes of case `index`, the first in front, on voxels of the
+        edge `voxel`, which is in the wall's unit; that of all together; their ε in voxels; and the shapes' origins."""
         if self.classes:
             shapes = [source.shape(voxels, k, rng) for k in range(len(self.names(source)))]
             values = torch.from_numpy(np.stack([shape.values for shape in shapes]))
-            return Layers(values, values.amax(0), shapes[0].epsilon, [shape.origin for shape in shapes])
+            return values, values.amax(0), shapes[0].epsilon, [shape.origin for shape in shapes]
         margin = self.margin(source, voxel)
         shape = source.shape([n + 2 * margin for n in voxels], index, rng)
         u, origin = torch.from_numpy(shape.values), shape.origin | ({"margin": margin} if margin else {})
         if self.wall is None:
-            return Layers(u[None], u, shape.epsilon, [origin])
+            return u[None], u, shape.epsilon, [origin]
         shell = shell_of(u, shape.epsilon, self.wall / voxel, periodic=source.edge == math.inf)
         inner = (..., *(slice(margin, margin + n) for n in voxels))
-        return Layers(shell[inner], u[inner], shape.epsilon, [origin])
+        return shell[inner], u[inner], shape.epsilon, [origin]
+
+    def show(
+        self, source: ShapeSource, shape: Sequence[int], voxel: float, imaging: Imaging, seed: int, index: int, rng: Any
+    ) -> Case:
+        """Return case `index` of `shape`, its image in real numbers; `voxel` is the edge of a shape's voxels."""
+        voxels = field_shape(shape, voxel, imaging)
+        fields, whole, epsilon, origins = self.draw(source, voxels, voxel, index, rng)
+        levels = self.levels or ((1.0,) * len(fields) if self.wall is None else (1.0, 0.0))
+        sampled = regrid(whole, voxel, imaging)
+        grey = image(fields, voxel, imaging, seed, epsilon, levels)
+        labels = label_voxels(fields, sampled, voxel, imaging, epsilon)
+        z, y, x = shape  # a field of whole voxels may give a few voxels more
+        grey, sampled, labels = (part[:z, :y, :x].contiguous().numpy() for part in (grey, sampled, labels))
+        record = {"source": origins, "imaging": imaging.as_dict(), "image_seed": seed, "voxel": voxel}
+        return Case(grey, sampled, labels, imaging.spacing, imaging.unit, epsilon * voxel, record)
 
     def margin(self, source: ShapeSource, voxel: float) -> int:
         """Return by how many voxels a crop is larger on every side: walls of surfaces outside reach into it."""
@@ -184,26 +190,22 @@ class Recipe:
         imaging = self.modality.draw(for_imaging)
         scales = self.source.scales or (1.0,)
         voxel = draw_voxel(self.voxel, self.calibres, rng) * scales[index % len(scales)]
-        voxels, names = field_shape(self.shape, voxel, imaging), self.classes
-        levels = self.composition.levels or ((1.0,) * len(names) if self.composition.wall is None else (1.0, 0.0))
+        names = self.classes
         with one_thread():
             for _ in range(TRIES):
-                layers = self.composition.draw(self.source, voxels, voxel, index, rng)
-                parts = image_and_labels(layers, voxel, imaging, seed, self.shape, levels)
-                grey, sampled, labels = (part.numpy() for part in parts)
-                counts = np.bincount(labels.ravel(), minlength=len(names) + 1)
-                if sampled.min() <= 0 < sampled.max() and counts.all():
+                case = self.composition.show(self.source, self.shape, voxel, imaging, seed, index, rng)
+                counts = np.bincount(case.labels.ravel(), minlength=len(names) + 1)
+                if case.field.min() <= 0 < case.field.max() and counts.all():
                     break
             else:
                 edges = " x ".join(map(str, self.shape))
                 missing = "structure" if counts.all() else ("background", *names)[int(counts.argmin())]
                 mend = "take more voxels" + (", a thinner wall, or laws that fill less" if len(names) > 1 else "")
                 raise ValueError(f"{TRIES} shapes showed no {missing} on {edges} voxels: {mend}")
-        record = {"index": index, "source": layers.origins, "imaging": imaging.as_dict(), "image_seed": seed}
-        shares = (counts[1:] / labels.size).tolist()
-        record |= {"voxel": voxel, "volume_fraction": float((sampled > 0).mean()), "class_fractions": shares}
-        grey = grey.astype(np.uint16 if (imaging.detector.ceiling or math.inf) < 2**16 else np.float32)
-        return Case(grey, sampled, labels, imaging.spacing, imaging.unit, layers.epsilon * voxel, record)
+        shares = {"volume_fraction": float((case.field > 0).mean())}
+        shares["class_fractions"] = (counts[1:] / case.labels.size).tolist()
+        grey = case.image.astype(np.uint16 if (imaging.detector.ceiling or math.inf) < 2**16 else np.float32)
+        return case._replace(image=grey, record={"index": index} | case.record | shares)
 
     def as_dict(self) -> dict[str, Any]:
         """Return all of the recipe in JSON's types."""
@@ -227,21 +229,6 @@ def shell_of(u: Tensor, epsilon: float, thickness: float, *, periodic: bool = Fa
     depth = torch.from_numpy(field_distance(u, grid, epsilon))
     distances = torch.stack([torch.minimum(depth, thickness - depth), depth - thickness])
     return torch.tanh(distances / (math.sqrt(2) * epsilon)).to(u.dtype)
-
-
-def image_and_labels(
-    layers: Layers, voxel: float, imaging: Imaging, seed: int, shape: Sequence[int], levels: Sequence[float]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the image of some classes, and on its voxels the field of the whole and the labels, all of `shape`.
-
-    `voxel` is the edge of the fields' voxels. See `imaging.image` for the levels, and `label_voxels`.
-    """
-    z, y, x = shape  # a field of whole voxels may give a few voxels more
-    whole = regrid(layers.whole, voxel, imaging)
-    grey = image(layers.values, voxel, imaging, seed, layers.epsilon, levels)
-    labels = label_voxels(layers.values, whole, voxel, imaging, layers.epsilon)
-    grey, whole, labels = (part[:z, :y, :x].contiguous() for part in (grey, whole, labels))
-    return grey, whole, labels
 
 
 def check_shape(shape: Sequence[int]) -> tuple[int, int, int]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_choice, check_float, check_int, check_seed
-from curvafit.data_synth.case import Composition, check_calibres, check_crop, check_shape, draw_voxel, image_and_labels
+from curvafit.data_synth.case import Composition, check_calibres, check_crop, check_shape, draw_voxel
 from curvafit.data_synth.imaging.image import field_shape
 from curvafit.data_synth.imaging.modality import Modality, modality
 from curvafit.data_synth.sources import Generated, Pool, Stored, choose_voxel
@@ -161,14 +161,11 @@ class TextureDataset(IterableDataset):
         turn = int(rng.integers(len(self.modalities)))
         kind = self.modalities[turn]
         imaging, voxel = kind.draw(for_imaging), draw_voxel(self.voxels[turn], self.calibres, rng)
-        voxels = field_shape(self.size, voxel, imaging)
-        shown = Composition().draw(self.source, voxels, voxel, 0, rng)  # type: ignore[arg-type]
-        grey, _, mask = image_and_labels(shown, voxel, imaging, for_image, self.size, (1.0,))
-        record = {"number": number, "source": shown.origins, "modality": kind.name, "imaging": imaging.as_dict()}
-        record |= {"image_seed": for_image, "voxel": voxel}
-        image = grey[None].float()
+        case = Composition().show(self.source, self.size, voxel, imaging, for_image, 0, rng)  # type: ignore[arg-type]
+        image = torch.from_numpy(case.image)[None].float()
         image = image if self.normalise is None else self.normalise(image)
-        return Sample(image, mask[None], imaging.spacing, record)
+        record = {"number": number, "modality": kind.name} | case.record
+        return Sample(image, torch.from_numpy(case.labels)[None], imaging.spacing, record)
 
 
 def as_dict(sample: Sample) -> dict[str, Tensor]:

@@ -99,16 +99,12 @@ def synthetic_scan(path: str | os.PathLike[str], *, edge: int = 96) -> Path:
     flow = generate(bone.coefficients, bone.mass, Grid((edge, edge, edge)), schedule=plan, seed=0)
     if not flow.viability.viable:
         raise ValueError(f"no shape grows at an edge of {edge} voxels ({flow.viability.reason}): take another")
-    return save(Volume(_ct_image(flow.field.numpy()), (0.02, 0.02, 0.02), "mm", source="synthetic"), path)
-
-
-def _ct_image(phase: np.ndarray) -> np.ndarray:
-    """Return grey levels 60 and 170 with a blur of 0.8 voxels, 5 % cupping, and noise of 12 levels over 0.6 voxels."""
-    sharp = ndimage.gaussian_filter((phase > 0).astype(np.float32), 0.8, mode="wrap")
-    radius = sum(axis**2 for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in phase.shape), indexing="ij"))
-    noise = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal(phase.shape), 0.6, mode="wrap")
+    sharp = ndimage.gaussian_filter((flow.field.numpy() > 0).astype(np.float32), 0.8, mode="wrap")
+    radius = sum(axis**2 for axis in np.meshgrid(*[np.linspace(-1, 1, edge)] * 3, indexing="ij"))
+    noise = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal(sharp.shape), 0.6, mode="wrap")
     image = (60 + 110 * sharp) * (0.95 + 0.05 * radius) + 12 * noise / noise.std()
-    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+    values = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+    return save(Volume(values, (0.02, 0.02, 0.02), "mm", source="synthetic"), path)
 
 
 def _download(file: str) -> bytes:

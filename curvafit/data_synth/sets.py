@@ -87,6 +87,10 @@ class SetSpec:
     def as_dict(self) -> dict[str, Any]:
         return {"recipe": self.recipe.as_dict(), "layout": self.layout, "parts": list(self.parts)}
 
+    @staticmethod
+    def from_dict(content: Any) -> SetSpec:
+        return SetSpec(**content | {"recipe": Recipe.from_dict(content["recipe"])})
+
 
 # ---- build -----------------------------------------------------------------------------------------------------------
 
@@ -139,11 +143,8 @@ def make_case(folder: str | Path, index: int) -> int:
 def read_spec(folder: str | Path) -> SetSpec:
     """Return the specification that a set was begun with, or raise ValueError."""
 
-    def decode(header: dict[str, Any], _: dict[str, np.ndarray]) -> SetSpec:
-        return SetSpec(**header["order"] | {"recipe": Recipe.from_dict(header["order"]["recipe"])})
-
     try:
-        return SET.read(Path(folder) / HEADER, decode)
+        return SET.read(Path(folder) / HEADER, lambda header, _: SetSpec.from_dict(header["order"]))
     except FileNotFoundError as error:
         raise ValueError(f"{folder} is not a set of curvafit: it has no {HEADER}") from error
 
@@ -185,7 +186,7 @@ def _write_list(folder: Path, spec: SetSpec) -> None:
         labels = {str(number): name for number, name in enumerate(classes)}
         listed = {**about, "tensorImageSize": "3D", "modality": channel, "labels": labels}
         listed |= {"numTest": 0, "training": pairs, "test": []}
-    _write_json(folder / LIST, listed)
+    write_content(folder / LIST, json.dumps(listed, indent=2) + "\n")
 
 
 def _write_case(folder: Path, spec: SetSpec, index: int, case: Case) -> None:
@@ -202,7 +203,8 @@ def _write_case(folder: Path, spec: SetSpec, index: int, case: Case) -> None:
             save(Volume(values, case.spacing, case.unit), places[-1])
         both = {"image": case.image, "label": case.labels}
         sums = {part: hashlib.sha256(np.ascontiguousarray(of).tobytes()).hexdigest() for part, of in both.items()}
-        _write_json(record, case.record | known | {"sha256": sums, "versions": versions()})
+        content = case.record | known | {"sha256": sums, "versions": versions()}
+        write_content(record, json.dumps(content, indent=2) + "\n")
     except BaseException:
         with hold_signals():
             for place in () if record.exists() else places:  # another process may have completed the case
@@ -229,10 +231,6 @@ def _write_parts(folder: Path, spec: SetSpec, name: str, case: Case, places: lis
             places.append(place)
             save(Volume(labels[part], case.spacing, case.unit), place)
     return known
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    write_content(path, json.dumps(content, indent=2) + "\n")
 
 
 # ---- picture and card ------------------------------------------------------------------------------------------------

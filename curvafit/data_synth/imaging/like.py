@@ -97,24 +97,18 @@ def _to_imaging(
     high = max(ground.level + structure.contrast - offset, 0.0) / unit
     shrunk = math.prod(1 + 2 * (σ / ground.length) ** 2 for σ in structure.blur) ** 0.25
     length = math.sqrt(max(ground.length**2 - 2 * min(structure.blur) ** 2, min(scan.spacing) ** 2))
+    dark, bright = max(low * unit, 1e-9), max(high * unit, 1e-9)
+    below = min(ground.texture * shrunk / dark, 2.0)
+    above = min(structure.texture * abs(structure.contrast) / bright, 2.0)
+    sides = (n * h for n, h in zip(scan.shape, scan.spacing, strict=True))
     counts = scan.values.dtype.kind in "ui" and scan.values.min() >= 0
     ceiling = float(np.iinfo(scan.values.dtype).max) if counts else None
     return Imaging(
         unit=scan.unit,
         spacing=scan.spacing,
-        contrast=Contrast(
-            background=low,
-            foreground=high,
-            background_texture=min(ground.texture * shrunk / max(low * unit, 1e-9), 2.0),
-            background_length=length,
-            foreground_texture=min(structure.texture * abs(structure.contrast) / max(high * unit, 1e-9), 2.0),
-            foreground_length=structure.length * min(scan.spacing),
-        ),
+        contrast=Contrast(low, high, below, length, above, structure.length * min(scan.spacing)),
         optics=Optics(structure.blur),
-        illumination=Illumination(
-            bias=min(ground.bias * abs(ground.level) / max(low * unit, 1e-9), 0.9),
-            bias_length=max(n * h for n, h in zip(scan.shape, scan.spacing, strict=True)) / 2,
-        ),
+        illumination=Illumination(min(ground.bias * abs(ground.level) / dark, 0.9), max(sides) / 2),
         noise=Noise(gaussian=read_noise, width=ground.width),
         detector=Detector(gain=gain, offset=offset, ceiling=ceiling),
     )
