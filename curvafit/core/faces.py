@@ -15,6 +15,9 @@ def attach_lazy_names(package: str) -> None:
     The imports stand once, as `from room.module import name as name`, where type checkers and editors read them. Python
     compiles them without running them: the names and their modules are in the package's bytecode.
     """
+    if not package.startswith("curvafit"):
+        here = "the folder at the project's root is a link into the package"
+        raise ImportError(f"import curvafit.{package}, not {package}: {here}")
     face = sys.modules[package]
     assert face.__spec__ is not None
     homes, module = {}, ""

@@ -86,9 +86,11 @@ class Design:
 
     def draw(self, seed: int, index: int) -> Draw:
         """Return the parameters of draw `index` of a seed, both whole numbers from 0."""
-        start = int(_seed_stream(seed, index, "start").generate_state(1)[0])
+        seed = check_int(seed, "a seed that is a whole number from 0", 0, SEEDS - 1)
+        index = check_int(index, "an index that is a whole number from 0", 0, SEEDS - 1)
+        start = np.random.SeedSequence(seed, spawn_key=(index, 1)).generate_state(1)[0]
         values = self.points[index % len(self.points)] if self.sampling == "list" else self._draw_from_box(seed, index)
-        return Draw(Coefficients(*map(float, values[:-1])), float(values[-1]), start)
+        return Draw(Coefficients(*map(float, values[:-1])), float(values[-1]), int(start))
 
     def __str__(self) -> str:
         """Return the sampling with the number of points, or with the box."""
@@ -109,11 +111,12 @@ class Design:
 
     def _draw_from_box(self, seed: int, index: int) -> list[float]:
         """Return the parameters of a draw; one that is fixed takes no random number."""
-        free = sum(low < high for low, high in self.box)
+        free, own = sum(low < high for low, high in self.box), index if self.sampling == "random" else 0
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(own, 0)))
         if self.sampling == "random":
-            drawn = np.random.default_rng(_seed_stream(seed, index, "parameters")).random(free)
+            drawn = rng.random(free)
         else:
-            engine = qmc.Sobol(free, scramble=True, rng=np.random.default_rng(_seed_stream(seed, 0, "parameters")))
+            engine = qmc.Sobol(free, scramble=True, rng=rng)
             drawn = (engine.fast_forward(index) if index else engine).random(1)[0]
         shares, values = iter(drawn.tolist()), []
         for name, (low, high) in zip(PARAMETERS, self.box, strict=True):
@@ -156,13 +159,6 @@ def design_around(point: Sequence[float], spread: float, sampling: Sampling = "r
     box["a02"] = (max(box["a02"][0], least), max(box["a02"][1], least))
     box["mass"] = (max(box["mass"][0], -0.99), min(box["mass"][1], 0.99))
     return design_box(sampling, **box)
-
-
-def _seed_stream(seed: int, index: int, purpose: str) -> np.random.SeedSequence:
-    """Return the random stream of a draw for its `parameters` or for the `start` of its flow."""
-    seed = check_int(seed, "a seed that is a whole number from 0", 0, SEEDS - 1)
-    index = check_int(index, "an index that is a whole number from 0", 0, SEEDS - 1)
-    return np.random.SeedSequence(seed, spawn_key=(index, ("parameters", "start").index(purpose)))
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------

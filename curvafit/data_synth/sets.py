@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -38,8 +40,6 @@ CARD, MARK = "card.md", "<!-- written by curvafit synth, which replaces it; with
 MOST = 10**7
 #: Labels besides the mask that a set can have.
 PARTS = (*(name for name in NAMES if name != "mask"), "centreline")
-#: Seconds between two lists of the cases.
-LISTED_EVERY = 1.0
 #: Cases in the picture, and in a row of it.
 SHOWN, ROW = 8, 4
 #: Colours of the classes' outlines, which begin again after the last (Okabe & Ito 2008).
@@ -115,13 +115,13 @@ def build_set(
         SET.write(folder / HEADER, {"versions": versions(), "order": spec.as_dict()})
         check_set(folder, spec)  # another process may have begun it meanwhile
         _write_case(folder, spec, 0, first)
-    cases, listed = set(list_cases(folder)), -LISTED_EVERY
+    cases, listed = set(list_cases(folder)), -math.inf
     rest = (index for index in range(count) if index not in cases)
     try:
         for case in run_jobs(partial(make_case, folder.resolve()), rest, workers):
             cases.add(case)
             progress(f"{min(len(cases), count)} of {count} cases", min(len(cases), count) / count)
-            if time.monotonic() > listed + LISTED_EVERY:
+            if time.monotonic() > listed + 1:
                 _write_list(folder, spec)
                 listed = time.monotonic()
         return folder
@@ -195,42 +195,35 @@ def _write_case(folder: Path, spec: SetSpec, index: int, case: Case) -> None:
     record = folder / RECORDS / f"{name}.json"
     if record.exists():
         return
-    places: list[Path] = []
+    labels = _measure_labels(case, spec.parts) if spec.parts else {}
+    known, graph = {part: labels.pop(part) for part in ("betti",) if part in labels}, labels.pop("centreline", None)
+    lines = layout.part.partition("{case}")[0].format(part="centreline") + f"{name}.graphml"
+    volumes = {layout.part.format(part=part, case=name): values for part, values in labels.items()}
+    volumes |= {layout.label.format(case=name): case.labels, layout.image.format(case=name): case.image}
     try:
-        known = _write_parts(folder, spec, name, case, places)
-        for values, pattern in ((case.labels, layout.label), (case.image, layout.image)):
-            places.append(folder / pattern.format(case=name))
-            save(Volume(values, case.spacing, case.unit), places[-1])
+        if graph is not None:
+            write_graphml(graph, folder / lines, case.unit)
+        for path, values in volumes.items():
+            save(Volume(values, case.spacing, case.unit), folder / path)
         both = {"image": case.image, "label": case.labels}
         sums = {part: hashlib.sha256(np.ascontiguousarray(of).tobytes()).hexdigest() for part, of in both.items()}
         content = case.record | known | {"sha256": sums, "versions": versions()}
         write_content(record, json.dumps(content, indent=2) + "\n")
     except BaseException:
         with hold_signals():
-            for place in () if record.exists() else places:  # another process may have completed the case
-                remove(place)
+            for path in () if record.exists() else (lines, *volumes):  # another process may have completed the case
+                remove(folder / path)
         raise
 
 
-def _write_parts(folder: Path, spec: SetSpec, name: str, case: Case, places: list[Path]) -> dict[str, Any]:
-    """Write the labels besides the mask, appending their files to `places`; return the labels for the record."""
-    if not spec.parts:
-        return {}
-    grid, known = Grid(case.image.shape, case.spacing, "replicate"), {}  # type: ignore[arg-type]
-    wanted = set(spec.parts) - {"centreline"} | ({"skeleton", "distance"} if "centreline" in spec.parts else set())
-    labels = labels_of(case.field, grid, case.epsilon, wanted)
-    for part in spec.parts:
-        place = folder / LAYOUTS[spec.layout].part.format(part=part, case=name)
-        if part == "betti":
-            known[part] = list(labels[part])
-        elif part == "centreline":
-            places.append(place.with_name(f"{name}.graphml"))
-            graph = centreline(labels["skeleton"], labels["distance"], case.spacing)
-            write_graphml(graph, places[-1], case.unit)
-        else:
-            places.append(place)
-            save(Volume(labels[part], case.spacing, case.unit), place)
-    return known
+def _measure_labels(case: Case, parts: Sequence[str]) -> dict[str, Any]:
+    """Return the labels besides the mask: arrays, Betti numbers, and the centreline as a graph."""
+    grid = Grid(case.image.shape, case.spacing, "replicate")  # type: ignore[arg-type]
+    needed = set(parts) - {"centreline"} | ({"skeleton", "distance"} if "centreline" in parts else set())
+    labels = labels_of(case.field, grid, case.epsilon, needed)
+    if "centreline" in parts:
+        labels["centreline"] = centreline(labels["skeleton"], labels["distance"], case.spacing)
+    return {part: labels[part] for part in parts}
 
 
 # ---- picture and card ------------------------------------------------------------------------------------------------

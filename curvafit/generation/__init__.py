@@ -1,10 +1,5 @@
 """Generation: flows that lower the energy of a phase field."""
 
-if __name__ != "curvafit.generation":
-    raise ImportError(
-        "import curvafit.generation, not generation: the folder at the project's root is a link into the package"
-    )
-
 from typing import TYPE_CHECKING
 
 from curvafit.core.faces import attach_lazy_names

@@ -1,8 +1,5 @@
 """Priors: the energy of a phase field, laws and the training loss. The folder needs torch and numpy only."""
 
-if __name__ != "curvafit.priors":
-    raise ImportError("import curvafit.priors, not priors: the folder at the project's root is a link into the package")
-
 from typing import TYPE_CHECKING
 
 from curvafit.core.faces import attach_lazy_names

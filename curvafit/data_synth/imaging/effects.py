@@ -56,17 +56,17 @@ def occupancy(field: Voxels, epsilon: float = EPSILON) -> Voxels:
 def texture(like: Voxels, spacing: Lengths, deviation: float, length: float, seed: int, purpose: str) -> Voxels:
     """Return a random factor of mean 1 and standard deviation `deviation`, correlated by `length`.
 
-    The factor is lognormal; its logarithm is a `correlated_field`. Textures of another `purpose` (a name) are
+    The factor is lognormal; its logarithm is a `_correlated_field`. Textures of another `purpose` (a name) are
     independent.
     """
     spread = math.sqrt(math.log1p(deviation**2))
-    return correlated_field(like, spacing, length, seed, purpose).mul_(spread).sub_(spread**2 / 2).exp_()
+    return _correlated_field(like, spacing, length, seed, purpose).mul_(spread).sub_(spread**2 / 2).exp_()
 
 
 def blur(image: Voxels, spacing: Lengths, widths: Lengths) -> Voxels:
     """Return the image under a Gaussian point-spread function of standard deviations `widths` along (z, y, x)."""
-    every = zip(image.shape, as_triple(widths), as_triple(spacing), strict=True)
-    return apply_matrices(image, *(gaussian_matrix(n, σ / h, image) for n, σ, h in every))
+    every = zip(image.shape, _as_triple(widths), _as_triple(spacing), strict=True)
+    return _apply_matrices(image, *(_gaussian_matrix(n, σ / h, image) for n, σ, h in every))
 
 
 def blur_with_depth(
@@ -76,12 +76,12 @@ def blur_with_depth(
 
     Its deviations are σ(z) = σ(0) (1 + growth z), and light from depth z is weakened by exp(-attenuation z).
     """
-    steps = as_triple(spacing)
+    steps = _as_triple(spacing)
     depth = _centres(len(image), steps[0], image)[:, None]
     wider = 1 + growth * depth
-    every = zip(image.shape, as_triple(widths), steps, (wider, wider[..., None], wider[..., None]), strict=True)
-    maps = (gaussian_matrix(n, σ / h * factor if σ else 0.0, image) for n, σ, h, factor in every)
-    return apply_matrices(image, *maps) * torch.exp(-attenuation * depth)[..., None]
+    every = zip(image.shape, _as_triple(widths), steps, (wider, wider[..., None], wider[..., None]), strict=True)
+    maps = (_gaussian_matrix(n, σ / h * factor if σ else 0.0, image) for n, σ, h, factor in every)
+    return _apply_matrices(image, *maps) * torch.exp(-attenuation * depth)[..., None]
 
 
 def sample(image: Voxels, spacing: Lengths, onto: Lengths, window: Lengths = 0.0) -> Float[Tensor, "Z Y X"]:
@@ -91,8 +91,8 @@ def sample(image: Voxels, spacing: Lengths, onto: Lengths, window: Lengths = 0.0
     voxels that do not fit into the box are left out. Along an axis whose window is narrower than an old voxel, the
     value is interpolated linearly.
     """
-    every = zip(image.shape, *map(as_triple, (spacing, onto, window)), strict=True)
-    return apply_matrices(image, *(sampling_matrix(n, old, new, wide, image) for n, old, new, wide in every))
+    every = zip(image.shape, *map(_as_triple, (spacing, onto, window)), strict=True)
+    return _apply_matrices(image, *(_sampling_matrix(n, old, new, wide, image) for n, old, new, wide in every))
 
 
 # ---- specimen, light and detector ------------------------------------------------------------------------------------
@@ -100,7 +100,7 @@ def sample(image: Voxels, spacing: Lengths, onto: Lengths, window: Lengths = 0.0
 
 def bias(like: Voxels, spacing: Lengths, strength: float, length: float, seed: int) -> Voxels:
     """Return the factor of uneven illumination: smooth, from 1 - strength to 1 + strength, correlated by `length`."""
-    field = correlated_field(like, spacing, length, seed, "bias")
+    field = _correlated_field(like, spacing, length, seed, "bias")
     low, high = field.aminmax()
     middle, half = (high + low) / 2, ((high - low) / 2).clamp_min(torch.finfo(field.dtype).tiny)
     return (field - middle).mul_(strength / half).add_(1)
@@ -111,7 +111,7 @@ def stripes(like: Voxels, spacing: Lengths, strength: float, width: float, seed:
 
     It has mean 1 and deviation `strength`, is not below 0, constant along x, and correlated by `width` across it.
     """
-    field = correlated_field(like, spacing, (width, width, math.inf), seed, "stripes")
+    field = _correlated_field(like, spacing, (width, width, math.inf), seed, "stripes")
     return field.mul_(strength).add_(1).clamp_min_(0).expand(like.shape)
 
 
@@ -123,13 +123,13 @@ def rings(like: Voxels, spacing: Lengths, strength: float, width: float, seed: i
     as far again on each side.
     """
     depth, *sides = like.shape
-    _, *steps = as_triple(spacing)
+    _, *steps = _as_triple(spacing)
     shares = uniform(2, seed, "ring centre", like).tolist()
     y, x = (_centres(n, h, like) - (2 * share - 0.5) * n * h for share, n, h in zip(shares, sides, steps, strict=True))
     step = min(width, *steps)
     radius = torch.hypot(y[:, None], x) / step
     count = int(radius.amax()) + 2
-    normal = correlated_field(like.new_empty(depth, 1, count), step, (0, 0, width), seed, "rings")[:, 0]
+    normal = _correlated_field(like.new_empty(depth, 1, count), step, (0, 0, width), seed, "rings")[:, 0]
     profile = normal * normal.abs() / math.sqrt(3)
     near = radius.long()
     return torch.lerp(profile[:, near], profile[:, near + 1], radius - near) * strength
@@ -141,7 +141,7 @@ def dropout(occupied: Voxels, spacing: Lengths, share: float, length: float, los
     A random field of correlation `length` decides: where that is over a tube's radius, stretches of tube fade. Of the
     structure (voxels at least half full), `share` loses more than half of `loss`.
     """
-    field = correlated_field(occupied, spacing, length, seed, "dropout")
+    field = _correlated_field(occupied, spacing, length, seed, "dropout")
     inside = field[occupied >= 0.5]
     lost = round(share * len(inside))
     level = math.inf if lost == 0 else -math.inf if lost == len(inside) else inside.kthvalue(len(inside) - lost).values
@@ -154,10 +154,10 @@ def clutter(occupied: Voxels, spacing: Lengths, density: float, radius: float, s
     Their number is Poisson's, at `density` a unit of volume; half-widths (deviations) along each axis are uniform in
     (½, 1½) radius, heights in (½, 1).
     """
-    steps = as_triple(spacing)
+    steps = _as_triple(spacing)
     sides = occupied.new_tensor([n * h for n, h in zip(occupied.shape, steps, strict=True)])
     mean = occupied.new_tensor(density * math.prod(sides.tolist()))
-    count = int(torch.poisson(mean, generator=stream(seed, "clutter count", occupied.device)))
+    count = int(torch.poisson(mean, generator=_stream(seed, "clutter count", occupied.device)))
     drawn = uniform(count * (3 * TRIES + 4), seed, "clutter", occupied).reshape(count, 3 * TRIES + 4)
     # A speck stands at the first of its tries that is empty; without one it has no height.
     tried = drawn[:, 4:].reshape(count, TRIES, 3)
@@ -167,7 +167,7 @@ def clutter(occupied: Voxels, spacing: Lengths, density: float, radius: float, s
     height = (0.5 + 0.5 * drawn[:, 0]) * free.any(1)
     width = radius * (0.5 + drawn[:, 1:4])
     centres = (_centres(n, h, place) for n, h in zip(occupied.shape, steps, strict=True))
-    z, y, x = (bell((at - place[:, k, None]) / width[:, k, None]) for k, at in enumerate(centres))
+    z, y, x = (_bell((at - place[:, k, None]) / width[:, k, None]) for k, at in enumerate(centres))
     planes = (height[:, None, None] * z[:, :, None] * y[:, None, :]).flatten(1)
     return (planes.mT @ x).reshape(occupied.shape).clamp_max_(1) * (1 - occupied)
 
@@ -185,7 +185,7 @@ def poisson_gaussian(
     and denoising do; every voxel's own law stays as it is.
     """
     if gain:
-        photons = gain * poisson_quantile(photons, grainy_noise(photons, width, seed, "photons"))
+        photons = gain * poisson_quantile(photons, _grainy_noise(photons, width, seed, "photons"))
     return gaussian_noise(photons + offset, read_noise, seed, width)
 
 
@@ -209,7 +209,7 @@ def poisson_quantile(mean: Tensor, z: Tensor) -> Tensor:
 
 def gaussian_noise(image: Voxels, deviation: float, seed: int, width: Lengths = 0.0) -> Voxels:
     """Return the image plus normal noise of a standard deviation, smoothed by `width` voxels at that deviation."""
-    return image + deviation * grainy_noise(image, width, seed, "read noise") if deviation else image
+    return image + deviation * _grainy_noise(image, width, seed, "read noise") if deviation else image
 
 
 def rician(image: Voxels, deviation: float, seed: int, width: Lengths = 0.0) -> Voxels:
@@ -217,7 +217,7 @@ def rician(image: Voxels, deviation: float, seed: int, width: Lengths = 0.0) -> 
 
     The mean square is v² + 2σ²; where there is no signal, the mean is σ √(π/2) (Gudbjartsson and Patz 1995).
     """
-    real, imaginary = (grainy_noise(image, width, seed, f"{part} channel") for part in ("real", "imaginary"))
+    real, imaginary = (_grainy_noise(image, width, seed, f"{part} channel") for part in ("real", "imaginary"))
     return torch.hypot(image + deviation * real, deviation * imaginary)
 
 
@@ -239,44 +239,33 @@ def _sum_quantile(mean: Tensor, z: Tensor) -> Tensor:
 # ---- maps and random fields ------------------------------------------------------------------------------------------
 
 
-def apply_matrices(
-    volume: Voxels, z: Tensor | None = None, y: Tensor | None = None, x: Tensor | None = None
-) -> Float[Tensor, "Z Y X"]:
+def _apply_matrices(volume: Voxels, z: Tensor | None, y: Tensor | None, x: Tensor | None) -> Float[Tensor, "Z Y X"]:
     """Apply a matrix (out, in), or None, along each axis; those of y and x may differ by slice, (Z, out, in)."""
-    if x is not None:
-        volume = volume @ x.mT
-    if y is not None:
-        volume = y @ volume
-    if z is not None:
-        volume = torch.tensordot(z, volume, 1)
-    return volume
+    volume = volume if x is None else volume @ x.mT
+    volume = volume if y is None else y @ volume
+    return volume if z is None else torch.tensordot(z, volume, 1)
 
 
-def gaussian_matrix(count: int, width: float | Tensor, like: Tensor) -> Tensor | None:
+def _gaussian_matrix(count: int, width: float | Tensor, like: Tensor) -> Tensor | None:
     """Return the matrix (count, count) of a blur by a Gaussian of deviation `width` voxels, cut at four; None for 0.
-
-    Widths (…, 1, 1) give a matrix each; widths (count, 1) are those of the rows.
-    """
+    Widths (…, 1, 1) give a matrix each; widths (count, 1) are those of the rows."""
     if not isinstance(width, Tensor) and width == 0:
         return None
     place = torch.arange(count, device=like.device, dtype=like.dtype)
-    weight = bell((place[:, None] - place) / width)
+    weight = _bell((place[:, None] - place) / width)
     return weight / weight.sum(-1, keepdim=True)
 
 
-def bell(far: Tensor) -> Tensor:
+def _bell(far: Tensor) -> Tensor:
     """Return exp(-½ far²), and 0 where far is over four."""
     # The square is clipped first, since arithmetic with denormal numbers is slow.
     square = far.square().clamp_max_(16)
     return torch.exp(-0.5 * square).masked_fill_(square == 16, 0)
 
 
-def sampling_matrix(count: int, spacing: float, onto: float, window: float, like: Tensor) -> Tensor | None:
-    """Return the matrix that samples voxels of edge `spacing` at voxels of edge `onto`, each the mean over a `window`.
-
-    The corners of both grids' first voxels coincide. A window narrower than a voxel is as wide as one: the means are
-    then linear interpolations. `None` where nothing changes.
-    """
+def _sampling_matrix(count: int, spacing: float, onto: float, window: float, like: Tensor) -> Tensor | None:
+    """Return the matrix of `sample` along an axis, None where nothing changes."""
+    # A window narrower than a voxel is as wide as one: the means are then linear interpolations.
     window, fits = max(window, spacing), max(1, math.floor(count * spacing / onto + 1e-6))
     if fits == count and math.isclose(spacing, onto) and math.isclose(window, spacing):
         return None
@@ -287,44 +276,41 @@ def sampling_matrix(count: int, spacing: float, onto: float, window: float, like
     return (weight / weight.sum(-1, keepdim=True)).to(like)
 
 
-def as_triple(value: Lengths) -> Triple:
+def _as_triple(value: Lengths) -> Triple:
     """Return three numbers (z, y, x); one number counts for all."""
     z, y, x = (value,) * 3 if isinstance(value, (int, float)) else value
     return z, y, x
 
 
-def stream(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
+def _stream(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
     """Return the random generator of a seed for one purpose; another device draws other numbers."""
     words = np.random.SeedSequence(seed, spawn_key=(zlib.crc32(purpose.encode()),))
     return torch.Generator(device).manual_seed(int(words.generate_state(1)[0]))
 
 
-def correlated_field(like: Voxels, spacing: Lengths, lengths: Lengths, seed: int, purpose: str) -> Voxels:
-    """Return a Gaussian random field of mean 0, variance 1 and correlation exp(-½ Σ (d/length)²) over a distance d.
-
-    Lengths are along (z, y, x); under half a voxel there is no correlation, and infinity means constant. White noise on
-    nodes is interpolated by Gaussians.
-    """
-    every = zip(like.shape, as_triple(lengths), as_triple(spacing), strict=True)
+def _correlated_field(like: Voxels, spacing: Lengths, lengths: Lengths, seed: int, purpose: str) -> Voxels:
+    """Return a Gaussian random field of mean 0, variance 1 and correlation exp(-½ Σ (d/length)²) over a distance d; a
+    length under half a voxel means no correlation, infinity a constant."""
+    every = zip(like.shape, _as_triple(lengths), _as_triple(spacing), strict=True)
     return _map_noise(like, [_interpolate_nodes(n, length / h, like) for n, length, h in every], seed, purpose)
 
 
-def grainy_noise(like: Voxels, widths: Lengths, seed: int, purpose: str) -> Voxels:
+def _grainy_noise(like: Voxels, widths: Lengths, seed: int, purpose: str) -> Voxels:
     """Return noise of mean 0 and variance 1, smoothed by a Gaussian of deviations `widths` (z, y, x) in voxels."""
-    every = zip(like.shape, as_triple(widths), strict=True)
-    return _map_noise(like, [gaussian_matrix(n, width, like) for n, width in every], seed, purpose)
+    every = zip(like.shape, _as_triple(widths), strict=True)
+    return _map_noise(like, [_gaussian_matrix(n, width, like) for n, width in every], seed, purpose)
 
 
 def _map_noise(like: Voxels, maps: Sequence[Tensor | None], seed: int, purpose: str) -> Voxels:
     """Return white noise under a matrix, or None, along each axis, whose rows are scaled to keep a variance of 1."""
     nodes = tuple(n if weights is None else weights.shape[-1] for n, weights in zip(like.shape, maps, strict=True))
-    noise = torch.randn(nodes, generator=stream(seed, purpose, like.device), device=like.device, dtype=like.dtype)
-    return apply_matrices(noise, *(w if w is None else w / w.square().sum(-1, keepdim=True).sqrt() for w in maps))
+    noise = torch.randn(nodes, generator=_stream(seed, purpose, like.device), device=like.device, dtype=like.dtype)
+    return _apply_matrices(noise, *(w if w is None else w / w.square().sum(-1, keepdim=True).sqrt() for w in maps))
 
 
 def uniform(count: int, seed: int, purpose: str, like: Tensor) -> Tensor:
     """Return `count` random numbers in [0, 1), of the type and on the device of `like`."""
-    generator = stream(seed, purpose, like.device)
+    generator = _stream(seed, purpose, like.device)
     return torch.rand(count, generator=generator, device=like.device, dtype=like.dtype)
 
 
@@ -339,7 +325,7 @@ def _interpolate_nodes(count: int, length: float, like: Tensor) -> Tensor | None
     step, beyond = max(width, 1.0), math.ceil(4 * width)
     nodes = torch.arange(0, count + 2 * beyond, step, device=like.device, dtype=like.dtype) - beyond
     place = torch.arange(count, device=like.device, dtype=like.dtype)
-    return bell((place[:, None] - nodes) / width)
+    return _bell((place[:, None] - nodes) / width)
 
 
 def _centres(count: int, step: float, like: Tensor) -> Tensor:

@@ -23,8 +23,6 @@ MOST = 2_000_000
 WINDOW = 4.0
 #: Correlation lengths of that brightness that are tried, in voxels of the finest edge: a dozen lags show no others.
 BRIGHTNESS_LENGTHS = np.geomspace(WINDOW, 6 * WINDOW, 50)
-#: Deviation, in voxels of the finest edge, of the smoothing before the threshold.
-SMOOTH = 0.8
 #: The ends of the range that a parameter is drawn from, as multiples of the estimate.
 SPREAD: dict[str, tuple[float, float]] = {
     "contrast.background": (0.8, 1.25),
@@ -39,14 +37,10 @@ SPREAD: dict[str, tuple[float, float]] = {
 #: Deviations (voxels) of the smoothing of noise, and correlation lengths of texture, whose sum is the covariance.
 GRAINS = (0.0, 0.4, 0.5, 0.6, 0.75, 0.9, 1.1)
 TEXTURE_LENGTHS = (3.0, 4.0, 6.0, 8.0, 12.0, 20.0)
-#: The greatest lag of the background's correlation, in voxels.
-LAGS = 12
 #: Bins of the mean in which the variance is measured, and the least voxels of a bin.
 BINS, LEAST = 24, 50
 #: Noise grows with the signal where the structure's variance is so many times the background's.
 GROWS = 1.3
-#: Second differences along both axes of the plane: no plane passes, and nothing else that a blur lets through much.
-RESIDUAL = np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32)[None]
 
 
 class Structure(NamedTuple):
@@ -136,7 +130,7 @@ def _find_bright(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
     # over nearby voxels above Otsu's threshold. So an edge does not depend on the structure's brightness. The threshold
     # is found among square roots, which shows dim structures.
     finest = steps.min() / steps
-    smooth = ndimage.gaussian_filter(values, SMOOTH * finest)
+    smooth = ndimage.gaussian_filter(values, 0.8 * finest)
     root = np.sqrt(np.maximum(smooth - np.quantile(smooth, 0.001), 0))
     above: np.ndarray = root > threshold_otsu(root)
     contrast = smooth - np.median(smooth[~above])
@@ -250,7 +244,7 @@ def _measure_noise(
 def _autocovariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
     """Return the autocovariance along an axis, at lags from 0, of a residual times its `weight`, which is 1 or 0."""
     a, w = np.moveaxis(rest, axis, 0), np.moveaxis(weight, axis, 0)
-    lags = min(LAGS, len(a) // 3)
+    lags = min(12, len(a) // 3)
     sums = [(float((a[: len(a) - k] * a[k:]).sum()), float((w[: len(w) - k] * w[k:]).sum())) for k in range(lags + 1)]
     return np.array([product / max(pairs, 1.0) for product, pairs in sums])
 
@@ -273,7 +267,8 @@ def _measure_bins(
     values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray
 ) -> list[tuple[float, float, int]]:
     """Return mean level, noise variance and number of voxels of the structure, in bins of its smoothed level."""
-    residual = ndimage.convolve(values, RESIDUAL)
+    # Second differences along both axes of the plane: no plane passes, and nothing else that a blur lets through much.
+    residual = ndimage.convolve(values, np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32)[None])
     mean = ndimage.gaussian_filter(values, 1.5 * steps.min() / steps)
     top = values.max()
     # Saturated voxels and their neighbours have no noise to measure.

@@ -39,8 +39,8 @@ class Checked:
 @cache
 def _ranges(part: type) -> dict[str, tuple[Any, Range]]:
     """Return the type and the range of each parameter of a class."""
-    hints = {name: get_args(hint) for name, hint in get_type_hints(part, include_extras=True).items()}
-    return {name: (hint[0], hint[1]) for name, hint in hints.items() if len(hint) == 2 and isinstance(hint[1], tuple)}
+    hints = get_type_hints(part, include_extras=True).items()
+    return {name: (hint.__origin__, *hint.__metadata__) for name, hint in hints if hasattr(hint, "__metadata__")}
 
 
 def _number(name: str, value: Any, kind: Any, allowed: Range) -> Any:
