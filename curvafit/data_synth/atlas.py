@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import itertools
 import math
 import platform
@@ -11,6 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
 
@@ -141,13 +141,8 @@ def _make_draw(store: Store, index: int) -> None:
 
 def versions() -> dict[str, str]:
     """Return the versions that a generated field's bits depend on: Python, libraries, processor."""
-    found = {"python": platform.python_version(), "processor": binding.get_host_cpu_name()}
-    for name in ("curvafit", "torch", "numpy", "numba"):
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    here = {"python": platform.python_version(), "processor": binding.get_host_cpu_name()}
+    return here | {name: version(name) for name in ("curvafit", "torch", "numpy", "numba")}
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_seed, check_type, quoted
-from curvafit.core.schema import encode
+from curvafit.core.schema import decode, encode
 from curvafit.data_synth.imaging.image import field_shape, image, label_voxels, regrid
 from curvafit.data_synth.imaging.modality import Imaging, Modality
 from curvafit.data_synth.labels import field_distance
@@ -106,13 +106,6 @@ class Composition:
     def margin(self, source: ShapeSource, voxel: float) -> int:
         """Return by how many voxels a crop is larger on every side: walls of surfaces outside reach into it."""
         return 0 if self.wall is None or source.edge == math.inf else math.ceil(self.wall / voxel) + 2
-
-    @staticmethod
-    def from_dict(content: Mapping[str, Any]) -> Composition:
-        """Return the composition that `core.schema.encode` wrote, maybe with a `blend` of 0."""
-        if content.get("blend"):
-            raise ValueError("it blends textures, which curvafit does not do: it cannot be continued, begin another")
-        return Composition(**{name: value for name, value in content.items() if name != "blend"})
 
 
 class Case(NamedTuple):
@@ -214,10 +207,11 @@ class Recipe:
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Recipe:
         """Return the recipe that `as_dict` wrote."""
+        if content["composition"].get("blend"):
+            raise ValueError("it blends textures, which curvafit does not do: it cannot be continued, begin another")
         source, modality = decode_source(content["source"]), Modality.from_dict(content["modality"])
-        shown = Composition.from_dict(content["composition"])
-        numbers = (content[name] for name in ("shape", "voxel", "seed", "calibres"))
-        return Recipe(source, modality, *numbers, composition=shown)
+        composition = decode(Composition, content["composition"])
+        return Recipe(**{**content, "source": source, "modality": modality, "composition": composition})
 
 
 def shell_of(u: Tensor, epsilon: float, thickness: float, *, periodic: bool = False) -> Tensor:

@@ -184,10 +184,7 @@ def describe(
 
 
 def measure(job: tuple[Path, int, Sequence[str]]) -> list[Row]:
-    """Measure a shape, by its store, index and views; return no row where it is no longer in the store.
-
-    A shape that is damaged is a ValueError.
-    """
+    """Measure a shape, by its store, index and views; return no row where it is no longer in the store."""
     path, index, views = job
     store = open_store(path)
     try:

@@ -182,13 +182,10 @@ class Store:
     def _attributes(self, index: int) -> dict[str, Any] | None:
         """Return a draw's attributes, None where a part of it is missing; the field is not read."""
         place = self._place(index)
-        attributes = _read_attributes(place)
-        if attributes is None or attributes.get("index") != index or "sha256" not in attributes:
-            return None
-        viability = attributes.get("viability")
-        if not isinstance(viability, dict) or not isinstance(viability.get("viable"), bool):
-            return None
-        return attributes if not viability["viable"] or (place / "field/c/0/0/0").is_file() else None
+        attributes = _read_attributes(place) or {}
+        viable = end.get("viable") if isinstance(end := attributes.get("viability"), dict) else None
+        whole = viable is False or (viable is True and (place / "field/c/0/0/0").is_file())
+        return attributes if whole and attributes.get("index") == index and "sha256" in attributes else None
 
 
 def open_store(path: str | Path, settings: Settings | None = None) -> Store:

@@ -11,7 +11,7 @@ import torch
 from scipy import ndimage, optimize
 from skimage.filters import threshold_otsu
 
-from curvafit.data_synth.imaging.effects import blur
+from curvafit.data_synth.imaging.effects import Triple, blur
 from curvafit.data_synth.imaging.modality import Contrast, Detector, Illumination, Imaging, Modality, Noise, Optics
 from curvafit.volumes.volume import Volume
 
@@ -39,18 +39,10 @@ GRAINS = (0.0, 0.4, 0.5, 0.6, 0.75, 0.9, 1.1)
 TEXTURE_LENGTHS = (3.0, 4.0, 6.0, 8.0, 12.0, 20.0)
 #: Bins of the mean in which the variance is measured, and the least voxels of a bin.
 BINS, LEAST = 24, 50
+#: Blur, contrast, texture and its length: see `_measure_structure`.
+Structure = tuple[Triple, float, float, float]
 #: Noise grows with the signal where the structure's variance is so many times the background's.
 GROWS = 1.3
-
-
-class Structure(NamedTuple):
-    """A scan's structure: blur in lengths (z, y, x), mean contrast, the contrast's relative deviation (texture) and
-    its correlation length in voxels of the finest edge."""
-
-    blur: tuple[float, float, float]
-    contrast: float
-    texture: float
-    length: float
 
 
 def fit_modality(scan: Volume, mask: np.ndarray | None = None) -> Modality:
@@ -71,8 +63,8 @@ def fit_modality(scan: Volume, mask: np.ndarray | None = None) -> Modality:
         raise ValueError("the mask must have voxels inside and outside, got an empty or a full one")
     ground = _measure_background(values, inside, steps)
     structure = _measure_structure(values, inside, steps, ground.level)
-    noise = _measure_noise(values, inside, ground, steps, ground.level + structure.contrast)
-    base = _to_imaging(scan, structure, ground, *noise)
+    noise = _measure_noise(values, inside, ground, steps, ground.level + structure[1])
+    base = _to_imaging(scan, ground, structure, noise)
     known = {name: np.asarray(base[name]) for name in SPREAD if np.any(base[name])}
     ranges = {name: tuple((end * value).tolist() for end in SPREAD[name]) for name, value in known.items()}
     if base.illumination.bias:
@@ -82,26 +74,24 @@ def fit_modality(scan: Volume, mask: np.ndarray | None = None) -> Modality:
     return Modality("like", about, float(min(scan.spacing)), base, ranges)
 
 
-def _to_imaging(
-    scan: Volume, structure: Structure, ground: Background, gain: float, read_noise: float, offset: float
-) -> Imaging:
+def _to_imaging(scan: Volume, ground: Background, structure: Structure, noise: tuple[float, float, float]) -> Imaging:
     """Return the estimates as parameters of an image: levels in photons where there is a gain, textures before blur."""
+    (widths, contrast, texture, grain), (gain, read_noise, offset) = structure, noise
     unit = gain or 1.0
     low = max(ground.level - offset, 0.0) / unit
-    high = max(ground.level + structure.contrast - offset, 0.0) / unit
-    shrunk = math.prod(1 + 2 * (σ / ground.length) ** 2 for σ in structure.blur) ** 0.25
-    length = math.sqrt(max(ground.length**2 - 2 * min(structure.blur) ** 2, min(scan.spacing) ** 2))
+    high = max(ground.level + contrast - offset, 0.0) / unit
+    shrunk = math.prod(1 + 2 * (σ / ground.length) ** 2 for σ in widths) ** 0.25
+    length = math.sqrt(max(ground.length**2 - 2 * min(widths) ** 2, min(scan.spacing) ** 2))
     dark, bright = max(low * unit, 1e-9), max(high * unit, 1e-9)
-    below = min(ground.texture * shrunk / dark, 2.0)
-    above = min(structure.texture * abs(structure.contrast) / bright, 2.0)
+    below, above = min(ground.texture * shrunk / dark, 2.0), min(texture * abs(contrast) / bright, 2.0)
     sides = (n * h for n, h in zip(scan.shape, scan.spacing, strict=True))
     counts = scan.values.dtype.kind in "ui" and scan.values.min() >= 0
     ceiling = float(np.iinfo(scan.values.dtype).max) if counts else None
     return Imaging(
         unit=scan.unit,
         spacing=scan.spacing,
-        contrast=Contrast(low, high, below, length, above, structure.length * min(scan.spacing)),
-        optics=Optics(structure.blur),
+        contrast=Contrast(low, high, below, length, above, grain * min(scan.spacing)),
+        optics=Optics(widths),
         illumination=Illumination(min(ground.bias * abs(ground.level) / dark, 0.9), max(sides) / 2),
         noise=Noise(gaussian=read_noise, width=ground.width),
         detector=Detector(gain=gain, offset=offset, ceiling=ceiling),
@@ -141,7 +131,8 @@ def _find_bright(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def _measure_structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level: float) -> Structure:
-    """Return the blur (z, and y = x) by which the mask explains the scan near it best, and the contrast inside."""
+    """Return the blur (z, y = x) by which the mask explains the scan near it best; the mean contrast inside, its
+    relative deviation (texture), and the texture's correlation length in voxels of the finest edge."""
     finest = steps.min() / steps
     window = tuple(WINDOW * finest)
     signal, mask = (torch.from_numpy(volume).float() for volume in (values - level, inside))
@@ -162,7 +153,7 @@ def _measure_structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray
     contrast = brightness(blur(mask, 1.0, tuple(widths))).numpy()
     mean = float(contrast[inside].mean())
     z, y, x = (np.sqrt(np.maximum(widths**2 - 1 / 12, 0)) * steps).tolist()
-    return Structure((z, y, x), mean, *_measure_texture(contrast / mean, inside, steps))
+    return (z, y, x), mean, *_measure_texture(contrast / mean, inside, steps)
 
 
 def _measure_texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> tuple[float, float]:

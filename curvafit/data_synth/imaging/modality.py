@@ -253,8 +253,7 @@ class Modality:
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Modality:
         """Return the modality that `as_dict` wrote."""
-        base = Imaging.from_dict(content["base"])
-        return Modality(content["name"], content["about"], content["voxel"], base, content["ranges"])
+        return Modality(**{**content, "base": Imaging.from_dict(content["base"])})
 
 
 _PRESETS = yaml.safe_load(files("curvafit.data_synth.imaging").joinpath("modalities.yaml").read_text("utf-8"))
