@@ -108,18 +108,10 @@ def make_draw(path: str | Path, index: int) -> Record:
     It is made on one thread, so that a field depends on nothing but its store's settings, its index and the kind of
     processor.
     """
-    store = open_store(path)
-    try:
-        if not store.has(index):
-            _make_draw(store, index)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror or str(error), error.filename or str(store.path)) from error
-    return store.record(index)
-
-
-def _make_draw(store: Store, index: int) -> None:
-    """Generate a draw and write it to the store."""
-    settings, began = store.settings, time.perf_counter()
+    store, began = open_store(path), time.perf_counter()
+    if store.has(index):
+        return store.record(index)
+    settings = store.settings
     draw = Design.from_dict(settings.design).draw(settings.seed, index)
     grid, plan = Grid(settings.shape, settings.spacing), Schedule(**settings.schedule)
     how = {"epsilon": settings.epsilon, "blur": settings.blur, "reject_early": True}
@@ -136,7 +128,11 @@ def _make_draw(store: Store, index: int) -> None:
         versions=versions(),
         seconds=time.perf_counter() - began,
     )
-    store.write(record, flow.field.numpy().astype("float32") if record.viability.viable else None)
+    try:
+        store.write(record, flow.field.numpy().astype("float32") if record.viability.viable else None)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), error.filename or str(store.path)) from error
+    return store.record(index)
 
 
 def versions() -> dict[str, str]:

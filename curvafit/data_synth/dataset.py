@@ -24,8 +24,6 @@ from curvafit.volumes.volume import Volume
 
 #: Percentiles that `percentile` makes 0 and 1.
 PERCENTILES = (0.5, 99.5)
-#: The most shapes of a pool, and the number of voxels to a multiple of which their edge is rounded up.
-MOST_POOLED, ROUND = 4096, 8
 
 
 class Sample(NamedTuple):
@@ -111,9 +109,9 @@ class TextureDataset(IterableDataset):
             self.source = Stored(tuple(paths))
         else:
             generated = Generated.of(sources, volume_fraction)
-            check_int(shapes, "a pool of at least 1 shape", 1, MOST_POOLED)
+            check_int(shapes, "a pool of at least 1 shape", 1, 4096)
             largest = max(max(field_shape(self.size, voxel, kind.base)) for kind, voxel in thinnest)
-            self.source = Pool(generated, max(shapes, len(generated.points)), ROUND * -(-largest // ROUND))
+            self.source = Pool(generated, max(shapes, len(generated.points)), 8 * -(-largest // 8))
         for kind, voxel in thinnest:
             check_crop(self.source.edge, self.size, voxel, kind)
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()

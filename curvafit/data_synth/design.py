@@ -161,9 +161,6 @@ def design_around(point: Sequence[float], spread: float, sampling: Sampling = "r
     return design_box(sampling, **box)
 
 
-# ---- files -----------------------------------------------------------------------------------------------------------
-
-
 def read_design(path: str | PathLike[str]) -> Design:
     """Read a design from a YAML file; docs/howto/atlas.md has its keys. Raises FileNotFoundError or ValueError."""
     path = Path(path)

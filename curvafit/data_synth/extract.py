@@ -34,9 +34,6 @@ from curvafit.volumes.volume import ScanError, Volume
 Row = tuple[str, str, np.ndarray, float, np.ndarray, float]
 
 
-# ---- atlases ---------------------------------------------------------------------------------------------------------
-
-
 def extract(stores: Sequence[str | Path | Store], command: Sequence[str] = (), progress: Progress = silent) -> Atlas:
     """Measure every well-formed shape of stores (`generation.result.is_well_formed`), as field and as mask.
 
@@ -127,9 +124,6 @@ def _build_command(store: Store, viable: int) -> str:
     if name in SCHEDULES and settings.schedule["steps"] != SCHEDULES[name].steps:
         options += f" --steps {settings.schedule['steps']}"
     return f"curvafit atlas build {store.path.name} {options}"
-
-
-# ---- tables of descriptors -------------------------------------------------------------------------------------------
 
 
 def describe(

@@ -36,8 +36,6 @@ SET = Format("curvafit set", 3, "a set of curvafit", remedy="begin it anew in an
 HEADER, RECORDS, LIST = "curvafit.json", "cases", "dataset.json"
 #: The data card, and its first line: a card without it is somebody's own, and is left alone.
 CARD, MARK = "card.md", "<!-- written by curvafit synth, which replaces it; without this line it stays as it is -->"
-#: Cases that a set may be asked for.
-MOST = 10**7
 #: Labels besides the mask that a set can have.
 PARTS = (*(name for name in NAMES if name != "mask"), "centreline")
 #: Cases in the picture, and in a row of it.
@@ -92,9 +90,6 @@ class SetSpec:
         return SetSpec(**content | {"recipe": Recipe.from_dict(content["recipe"])})
 
 
-# ---- build -----------------------------------------------------------------------------------------------------------
-
-
 def build_set(
     folder: str | Path, spec: SetSpec, count: int, progress: Progress = silent, *, workers: Cluster | None = None
 ) -> Path:
@@ -107,7 +102,7 @@ def build_set(
     Raises ValueError where the folder holds something else or a set of another spec; OSError where it can't be written
     or the workers are gone. Finished cases are kept.
     """
-    check_int(count, "a count of at least 1 case", 1, MOST)
+    check_int(count, "a count of at least 1 case", 1, 10**7)
     folder = Path(folder)
     check_set(folder, spec)
     if not (folder / HEADER).exists():
@@ -224,9 +219,6 @@ def _measure_labels(case: Case, parts: Sequence[str]) -> dict[str, Any]:
     if "centreline" in parts:
         labels["centreline"] = centreline(labels["skeleton"], labels["distance"], case.spacing)
     return {part: labels[part] for part in parts}
-
-
-# ---- picture and card ------------------------------------------------------------------------------------------------
 
 
 def write_preview(folder: str | Path) -> Path:

@@ -109,7 +109,7 @@ class Store:
 
     def has(self, index: int) -> bool:
         """Return whether a draw is there, complete."""
-        return self._attributes(index) is not None
+        return bool(self._attributes(index))
 
     def record(self, index: int) -> Record:
         """Return the record of a draw; KeyError where the draw is missing, ValueError where it is damaged."""
@@ -171,21 +171,20 @@ class Store:
 
     def _require(self, index: int) -> dict[str, Any]:
         """Return a draw's attributes, or raise KeyError."""
-        attributes = self._attributes(index)
-        if attributes is None:
-            raise KeyError(f"{self.path} has no complete draw {index}")
-        return attributes
+        if attributes := self._attributes(index):
+            return attributes
+        raise KeyError(f"{self.path} has no complete draw {index}")
 
     def _place(self, index: int) -> Path:
         return self.path / "draws" / f"{index:06d}"
 
-    def _attributes(self, index: int) -> dict[str, Any] | None:
-        """Return a draw's attributes, None where a part of it is missing; the field is not read."""
+    def _attributes(self, index: int) -> dict[str, Any]:
+        """Return a draw's attributes, none where a part of it is missing; the field is not read."""
         place = self._place(index)
         attributes = _read_attributes(place) or {}
         viable = end.get("viable") if isinstance(end := attributes.get("viability"), dict) else None
         whole = viable is False or (viable is True and (place / "field/c/0/0/0").is_file())
-        return attributes if whole and attributes.get("index") == index and "sha256" in attributes else None
+        return attributes if whole and attributes.get("index") == index and "sha256" in attributes else {}
 
 
 def open_store(path: str | Path, settings: Settings | None = None) -> Store:
