@@ -187,7 +187,6 @@ def read_point(source: Any, folder: Path = Path()) -> tuple[float, ...]:
 
 
 def _decode_design(content: Any, folder: Path) -> Design:
-    """Return the design that a YAML file states, or raise ValueError, also for an unknown key."""
     kinds = [key for key in KEYS if key in content] if isinstance(content, Mapping) else []
     if len(kinds) != 1:
         raise ValueError(f"a design has one of the keys {', '.join(KEYS)}, got {quoted(content)}")

@@ -167,20 +167,20 @@ def check_set(folder: Path, spec: SetSpec) -> None:
 
 
 def _write_list(folder: Path, spec: SetSpec) -> None:
-    """Write the list of the complete cases, in the form of the layout."""
     names, layout = list(map(case_name, list_cases(folder))), LAYOUTS[spec.layout]
-    pairs = [{"image": layout.image.format(case=name), "label": layout.label.format(case=name)} for name in names]
+    files = {name: (layout.image.format(case=name), layout.label.format(case=name)) for name in names}
     about = {"name": folder.resolve().name, "description": "synthetic; made by curvafit", "numTraining": len(names)}
     channel, classes = {"0": spec.recipe.modality.name}, ("background", *spec.recipe.classes)
     if layout.nnunet:  # cases by name, since the folders may hold a killed run's temporary files too
         numbers = {name: number for number, name in enumerate(classes)}
-        listed = {"channel_names": channel, "labels": numbers, "file_ending": ".nii.gz"}
-        files = [{"images": [pair["image"]], "label": pair["label"]} for pair in pairs]
-        listed |= {**about, "dataset": dict(zip(names, files, strict=True))}
+        cases = {name: {"images": [image], "label": label} for name, (image, label) in files.items()}
+        kinds = {"channel_names": channel, "labels": numbers, "file_ending": ".nii.gz"}
+        listed = {**kinds, **about, "dataset": cases}
     else:
+        pairs = [{"image": image, "label": label} for image, label in files.values()]
         labels = {str(number): name for number, name in enumerate(classes)}
-        listed = {**about, "tensorImageSize": "3D", "modality": channel, "labels": labels}
-        listed |= {"numTest": 0, "training": pairs, "test": []}
+        kinds = {"tensorImageSize": "3D", "modality": channel, "labels": labels}
+        listed = {**about, **kinds, "numTest": 0, "training": pairs, "test": []}
     write_content(folder / LIST, json.dumps(listed, indent=2) + "\n")
 
 

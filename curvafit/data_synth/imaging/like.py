@@ -37,8 +37,6 @@ SPREAD: dict[str, tuple[float, float]] = {
 #: Deviations (voxels) of the smoothing of noise, and correlation lengths of texture, whose sum is the covariance.
 GRAINS = (0.0, 0.4, 0.5, 0.6, 0.75, 0.9, 1.1)
 TEXTURE_LENGTHS = (3.0, 4.0, 6.0, 8.0, 12.0, 20.0)
-#: Bins of the mean in which the variance is measured, and the least voxels of a bin.
-BINS, LEAST = 24, 50
 #: Blur, contrast, texture and its length: see `_measure_structure`.
 Structure = tuple[Triple, float, float, float]
 #: Noise grows with the signal where the structure's variance is so many times the background's.
@@ -267,10 +265,10 @@ def _measure_bins(
     # The share of the noise's variance that the filter lets through.
     passed = max(_robust_square(residual[ground.where]), 1e-12) / max(ground.noise, 1e-12)
     found = []
-    edges = np.quantile(mean[used], np.linspace(0, 1, BINS + 1)) if used.any() else np.zeros(1)
+    edges = np.quantile(mean[used], np.linspace(0, 1, 25)) if used.any() else np.zeros(1)
     for low, high in itertools.pairwise(edges):
         bin_ = used & (mean >= low) & (mean <= high)
-        if (count := int(bin_.sum())) >= LEAST:
+        if (count := int(bin_.sum())) >= 50:
             found.append((float(values[bin_].mean()), _robust_square(residual[bin_]) / passed, count))
     return found
 

@@ -38,7 +38,6 @@ class Checked:
 
 @cache
 def _ranges(part: type) -> dict[str, tuple[Any, Range]]:
-    """Return the type and the range of each parameter of a class."""
     hints = get_type_hints(part, include_extras=True).items()
     return {name: (hint.__origin__, *hint.__metadata__) for name, hint in hints if hasattr(hint, "__metadata__")}
 
