@@ -49,8 +49,7 @@ class Composition:
 
     def __post_init__(self) -> None:
         if self.wall is not None:
-            wall = check_float(self.wall, "a wall of positive thickness", SHORTEST, LONGEST)
-            object.__setattr__(self, "wall", wall)
+            object.__setattr__(self, "wall", check_float(self.wall, "a wall of positive thickness", SHORTEST, LONGEST))
         if self.classes and self.wall is not None:
             raise ValueError("give either classes or a wall, not both")
         if self.levels is not None:
