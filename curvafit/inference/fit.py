@@ -32,8 +32,6 @@ KINDS = {"field": "a phase field", "mask": "a mask", "image": "an image"}
 COLUMNS = ("a11", "a02", "a10", "a01", "a00", "mass", "thickness")
 #: Levels of the intervals, in percent.
 LEVELS = (50, 90)
-#: How draws come about, in words, and the significant digits of a draw, as a file has them.
-_METHOD, _DIGITS = "amortised: conditional flows given the descriptors", 6
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -165,7 +163,19 @@ class Fit(Pictured):
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers, strings, lists and dicts, as `fit.json` holds them."""
-        return encode(_file_of(self))
+        own: dict[str, Any] = {"format": FORMAT, "posterior": None, "diagram": None}
+        own |= {"intervals": self.intervals(), "intervals_physical": self.intervals(physical=True)}
+        if self.draws is not None:
+            columns = ([float(f"{x:.6g}") for x in column] for column in to_columns(self.draws))
+            method = "amortised: conditional flows given the descriptors"
+            own["posterior"] = {"view": self.view, "method": method, "draws": dict(zip(COLUMNS, columns, strict=True))}
+        if (seen := self.diagram) is not None:
+            (κ1, κ2), shares = seen.points.round(2).T.tolist(), seen.normalised.weights.round(7).tolist()
+            own["diagram"] = {"seen_as": "field" if self.kind == "field" else "mask", "unit": seen.unit}
+            own["diagram"] |= {"kappa1": κ1, "kappa2": κ2, "share": shares}
+            own["diagram"] |= {"spread": seen.spread, "excluded": seen.excluded}
+        names = (field.name for field in fields(_File))
+        return {name: encode(own[name] if name in own else getattr(self, name)) for name in names}
 
     def to_json(self) -> str:
         """Return the text of a `fit.json`, indented; raise ValueError where `from_json` would not take it."""
@@ -204,8 +214,6 @@ def to_columns(draws: np.ndarray) -> np.ndarray:
 
 Column = Annotated[tuple[float, ...], Rule(filled=True)]
 
-
-#: Columns of draws.
 _DrawColumns: Any = make_dataclass("_DrawColumns", [(name, Column) for name in COLUMNS], frozen=True)
 
 
@@ -271,12 +279,6 @@ class _Candidates:
     candidates: tuple[Candidate, ...] = ()
 
 
-#: The fields that are the same in a `Fit` and its file.
-_SAME = tuple({field.name for field in fields(Fit)} & {field.name for field in fields(_File)} - {"diagram"})
-#: Properties of a `Fit` that its file has for other programs.
-_FOLLOWING = ("coefficients", "mass", "uncertainty", "coefficients_physical", "epsilon_physical")
-
-
 def load_candidates(law: LawLike) -> tuple[Candidate, ...]:
     """Return the candidates of a fit, an inference or a `fit.json`; none of any other law.
 
@@ -308,30 +310,8 @@ def draw_laws(law: LawLike, count: int) -> list[Law]:
     return laws
 
 
-def _file_of(fit: Fit) -> _File:
-    """Return the content of a fit's file; draws have `_DIGITS` digits."""
-    columns = None
-    if fit.draws is not None:
-        columns = [tuple(float(f"{x:.{_DIGITS}g}") for x in column) for column in to_columns(fit.draws)]
-    seen = fit.diagram
-    if seen is not None:
-        shares = seen.normalised.weights.round(7)
-        κ1, κ2, share = (tuple(column.tolist()) for column in (*seen.points.round(2).T, shares))
-        told = {"unit": seen.unit, "spread": seen.spread, "excluded": seen.excluded}
-        seen = _Columns(seen_as="field" if fit.kind == "field" else "mask", kappa1=κ1, kappa2=κ2, share=share, **told)
-    return _File(
-        **{name: getattr(fit, name) for name in (*_SAME, *_FOLLOWING)},
-        format=FORMAT,
-        intervals=fit.intervals(),
-        intervals_physical=fit.intervals(physical=True),
-        posterior=None if columns is None else _Posterior(fit.view, _METHOD, _DrawColumns(*columns)),
-        diagram=seen,
-    )  # type: ignore[arg-type]
-
-
 def _fit_of(file: _File) -> Fit:
     """Return the fit of a file."""
-    same = {name: getattr(file, name) for name in _SAME}
     draws, view, seen = None, "", file.diagram
     if file.posterior is not None:
         columns, view = [getattr(file.posterior.draws, name) for name in COLUMNS], file.posterior.view
@@ -342,7 +322,9 @@ def _fit_of(file: _File) -> Fit:
         _check_lengths([seen.kappa1, seen.kappa2, seen.share], "kappa1, kappa2 and share", "diagram")
         points = np.stack([seen.kappa1, seen.kappa2], 1)
         seen = Diagram(points, np.array(seen.share), seen.unit, seen.spread, seen.excluded)
-    fit = Fit(**same, draws=draws, view=view, diagram=seen)
+    read = {"draws": draws, "view": view, "diagram": seen}
+    same = {field.name for field in fields(Fit)} - set(read)
+    fit = Fit(**{name: getattr(file, name) for name in same}, **read)
     if (fit.chosen is None) != (fit.best is None):
         raise ValueError(f"expected a chosen law among the fit's candidates, got {fit.chosen!r}")
     return fit
