@@ -67,7 +67,6 @@ def comparison_figure(comparison: Any) -> Figure:
 
 
 def _bar_on(axes: Axes, picture: QuadMesh, **options: Any) -> None:
-    """Draw a colour bar of the surface in each bin beside a diagram."""
     bar = axes.figure.colorbar(picture, ax=axes, shrink=0.7, pad=0.02, **options)
     bar.set_label("% of the surface a bin", fontsize=8)
     bar.ax.tick_params(labelsize=8, length=2)

@@ -141,10 +141,8 @@ def _mesh(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _draw(points: np.ndarray, faces: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the number of the nearest face at each pixel, -1 for none, and the weights of that face's corners.
-
-    Points `(V, 3)` are row, column and nearness.
-    """
+    """Return the nearest face, -1 for none, and the weights of its corners at each pixel, of points (row, column,
+    nearness) `(V, 3)`."""
     front, weights = np.full(shape, -1), np.zeros((*shape, 3), np.float32)
     _fill_depth(points, faces, front, np.full(shape, -np.inf), weights)
     return front, weights

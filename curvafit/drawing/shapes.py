@@ -175,7 +175,6 @@ def shape_record(
 
 
 def _number_or_range(value: float | Tensor) -> float | dict[str, float]:
-    """Return a number, or the range of a map."""
     if not isinstance(value, Tensor) or value.numel() == 1:
         return float(value)
     return {"least": float(value.min()), "greatest": float(value.max())}

@@ -214,14 +214,10 @@ def _columns(atlas: Atlas) -> dict[str, np.ndarray]:
 def _describe_fit(fit: Fit, far: bool) -> list[tuple[str, str]]:
     """Return what is said of a scan; `far` is whether it lies farther from shapes than these from each other."""
     inverted = fit.morphometry.volume_fraction > HALF
-    distance = "farther from shapes than 95 % of them from" if far else "as near to shapes as they to"
     part = "background, which fills less" if inverted else "structure"
-    return [
-        ("family", fit.family),
-        ("placed by its", part),
-        ("lies", f"{distance} each other"),
-        ("verdict", fit.status),
-    ]
+    distance = "farther from shapes than 95 % of them from" if far else "as near to shapes as they to"
+    lies = f"{distance} each other"
+    return [("family", fit.family), ("placed by its", part), ("lies", lies), ("verdict", fit.status)]
 
 
 def _map_figure(

@@ -154,7 +154,6 @@ def _count_scans(comparison: Comparison) -> list[str]:
 
 
 def _format_row(number: Number, comparison: Comparison) -> dict[str, Any]:
-    """Return a row of the page's table."""
     means = [
         f"{format_number(mean)} ± {format_number(sd, 2)}"
         for mean, sd in zip(number.means, number.deviations, strict=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -20,20 +20,12 @@ from curvafit.drawing.plot import INK, diagram_on, gallery_figure, make_figure, 
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import LEARNED
 from curvafit.geometry.distances import sliced_embedding
-from curvafit.inference.atlas import load_atlas
-from curvafit.inference.infer import infer
+from curvafit.inference.atlas import Atlas, load_atlas
+from curvafit.inference.infer import Inference, infer
 from curvafit.inference.verdict import UNBELIEVABLE
+from curvafit.report import page
 from curvafit.report.atlas import map_on
-from curvafit.report.page import (
-    MARK,
-    check_report,
-    describe,
-    describe_scan,
-    list_strips,
-    picture_of,
-    render_template,
-    write_inference,
-)
+from curvafit.scan.measure import Measures
 from curvafit.scan.structure import find_structure
 from curvafit.scan.tiles import measure
 from curvafit.segmentation.reconstruct import reconstruct
@@ -41,19 +33,12 @@ from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.trials import dice
 from curvafit.volumes.volume import ScanError, Volume
 
-if TYPE_CHECKING:
-    from curvafit.inference.atlas import Atlas
-    from curvafit.inference.infer import Inference
-    from curvafit.scan.measure import Measures
-
 #: The page's name in its folder.
 PAGE = "demo.html"
 #: Of this many slices one is kept.
 EVERY = 8
 #: The nearest textures that are grown, by name, and their voxels a side.
 PLACES, EDGE = ("nearest", "second", "third"), 64
-#: The symbols of the measures on the page.
-_MEASURES = ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D", "BS/BV", "DA", "H", "K")
 
 
 class Completion(NamedTuple):
@@ -87,9 +72,9 @@ def write_demo(
     atlas's, and the nearest textures are grown. `fit.json` and `report.html` are written beside the page. Raises
     ValueError if the scan has no structure, or as `report.page.check_report`.
     """
-    folder = check_report(directory, [scan.source] if scan.source else (), overwrite)
-    page = folder / PAGE
-    can_write(page, lambda path: has_mark(path, MARK), overwrite=overwrite)
+    folder = page.check_report(directory, [scan.source] if scan.source else (), overwrite)
+    target = folder / PAGE
+    can_write(target, lambda path: has_mark(path, page.MARK), overwrite=overwrite)
     progress("measuring", 0.0)
     measures = measure(scan, progress=sub_progress(progress, 0.0, 0.1))
     atlas = load_atlas()
@@ -110,8 +95,8 @@ def write_demo(
             textures += [flow.field.numpy()] * flow.viability.viable
     progress("drawing the page", 0.95)
     text = demo_page(inference, measures, completion, textures, atlas)
-    write_inference(inference, folder, overwrite=overwrite)
-    return write_content(page, text), completion
+    page.write_inference(inference, folder, overwrite=overwrite)
+    return write_content(target, text), completion
 
 
 def score_completion(truth: np.ndarray, filled: np.ndarray, axis: int = 0) -> Completion:
@@ -129,11 +114,7 @@ def score_completion(truth: np.ndarray, filled: np.ndarray, axis: int = 0) -> Co
 
 
 def demo_page(
-    inference: Inference,
-    measures: Measures,
-    completion: Completion,
-    textures: Sequence[np.ndarray],
-    atlas: Atlas,
+    inference: Inference, measures: Measures, completion: Completion, textures: Sequence[np.ndarray], atlas: Atlas
 ) -> str:
     """Return the page: a self-contained HTML text.
 
@@ -141,21 +122,23 @@ def demo_page(
     """
     fit = inference.fit
     grown = {f"{place} texture": u for place, u in zip(PLACES, textures, strict=False)}
-    return render_template(
-        "demo.html", version=version("curvafit"), sentence=describe(inference), scan=describe_scan(inference),
-        shapes=picture_of(
+    placed = _map_figure(inference, atlas)
+    shown = ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D", "BS/BV", "DA", "H", "K")
+    return page.render_template(
+        "demo.html", version=version("curvafit"), sentence=page.describe(inference), scan=page.describe_scan(inference),
+        shapes=page.picture_of(
             _shape_figure(completion, inference.scan.spacing), "Known slices, the filled volume, and the scan"
         ),
-        slices=picture_of(_slice_figure(inference.scan, completion), "A left-out slice, as it is and as filled"),
+        slices=page.picture_of(_slice_figure(inference.scan, completion), "A left-out slice, as it is and as filled"),
         every=EVERY, axis="zyx"[completion.axis],
         scores=[(name, f"{score:.3f}") for name, score in completion.dice.items()],
-        measures=[(measures[symbol].name, symbol, *measures[symbol].format(measures.unit)) for symbol in _MEASURES],
+        measures=[(measures[symbol].name, symbol, *measures[symbol].format(measures.unit)) for symbol in shown],
         blocks=int(np.prod(measures.blocks)) if np.isfinite(measures["BV/TV"].half) else 0, count=len(atlas),
-        map=picture_of(_map_figure(inference, atlas), "The scan's curvature diagram, and its place on the atlas's map"),
-        near=picture_of(gallery_figure(grown, columns=3, width=1500), "The nearest textures") if grown else None,
+        map=page.picture_of(placed, "The scan's curvature diagram, and its place on the atlas's map"),
+        near=page.picture_of(gallery_figure(grown, columns=3, width=1500), "The nearest textures") if grown else None,
         misfit=fit.misfit, status=fit.status,
         believed=fit.misfit is not None and fit.misfit.probability >= UNBELIEVABLE, number=format_number,
-        strips=list_strips(fit), notes=dict.fromkeys((*inference.scan.notes, *fit.notes)),
+        strips=page.list_strips(fit), notes=dict.fromkeys((*inference.scan.notes, *fit.notes)),
     )  # fmt: skip
 
 
@@ -189,19 +172,16 @@ def _slice_figure(scan: Volume, completion: Completion) -> Figure:
     figure = make_figure(10.2, 0.7 + 3.4 * aspect * truth.shape[0] / truth.shape[1], layout="constrained")
     axes = figure.subplots(1, 3)
     low, high = np.percentile(plane, (0.5, 99.5))
-    for each, mask, name in (
-        (axes[0], truth, "a slice that was left out"),
-        (axes[1], filled, "filled, on the same slice"),
-    ):
+    names = ("a slice that was left out", "filled, on the same slice", "missing (blue), too much (orange)")
+    for each, mask in zip(axes, (truth, filled), strict=False):
         section_on(each, plane, mask, (low, high), aspect)
-        each.set_title(name, fontsize=11)
     difference = np.ones((*truth.shape, 3), np.float32)
     difference[truth & filled] = (0.72, 0.74, 0.78)
     difference[truth & ~filled] = (0.0, 0.45, 0.70)
     difference[~truth & filled] = (0.84, 0.37, 0.0)
     axes[2].imshow(difference, aspect=aspect, interpolation="nearest")
-    axes[2].set_title("missing (blue), too much (orange)", fontsize=11)
-    for each in axes:
+    for each, name in zip(axes, names, strict=True):
+        each.set_title(name, fontsize=11)
         each.set(xticks=[], yticks=[])
     words = f"{'zyx'[axis]} = {place}, {EVERY // 2} slices from the nearest known one"
     figure.suptitle(words, fontsize=9, color="#5b616b")

@@ -13,15 +13,7 @@ from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, silent
 from curvafit.inference.fit import Fit
 from curvafit.inference.infer import infer
-from curvafit.report.page import (
-    check_report,
-    check_result_folder,
-    list_strips,
-    start_record,
-    with_command,
-    write_inference,
-    write_study,
-)
+from curvafit.report import page
 from curvafit.studies.scans import Task, name_errors, share_out
 
 #: `format` of the record.
@@ -46,9 +38,9 @@ def infer_scans(
     Raises ValueError as `infer`, with the scan's name, and where a folder has others' files.
     """
     target, folders = Path(directory), name_folders(scans)
-    check_result_folder(FORMAT, FILES, target, scans, overwrite, command)
+    page.check_result_folder(FORMAT, FILES, target, scans, overwrite, command)
     for folder in folders:
-        check_report(target / folder, scans, overwrite, command)
+        page.check_report(target / folder, scans, overwrite, command)
     left: dict[int, Task] = {
         k: partial(_infer_one, scans[k], target / folder, command, overwrite, options)
         for k, folder in enumerate(folders)
@@ -57,14 +49,14 @@ def infer_scans(
     target.mkdir(parents=True, exist_ok=True)
     share_out(left, folders, workers, progress)
     fits = {folder: Fit.load(target / folder / "fit.json") for folder in folders}
-    record = start_record(command, scans={name: fit.provenance.get("scan", "") for name, fit in fits.items()})
+    record = page.start_record(command, scans={name: fit.provenance.get("scan", "") for name, fit in fits.items()})
     rows = [row for name, fit in fits.items() for row in _rows(name, fit)]
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for name, fit in fits.items():
-        for strip in filter(itemgetter("low"), list_strips(fit)):
+        for strip in filter(itemgetter("low"), page.list_strips(fit)):
             groups.setdefault((strip["low"], strip["high"]), []).append(strip | {"scan": name})
-    page = {"title": f"The laws of {len(fits)} scans", "fits": fits, "groups": groups}
-    return write_study(target, FORMAT, FILES, record, page, {"laws.csv": rows})
+    shown = {"title": f"The laws of {len(fits)} scans", "fits": fits, "groups": groups}
+    return page.write_study(target, FORMAT, FILES, record, shown, {"laws.csv": rows})
 
 
 def name_folders(scans: Sequence[str]) -> list[str]:
@@ -80,10 +72,9 @@ def name_folders(scans: Sequence[str]) -> list[str]:
 def _infer_one(
     scan: str, folder: Path, command: str, overwrite: bool, options: dict[str, Any], progress: Progress
 ) -> None:
-    """Infer one of the scans, and write its report into its folder."""
     with name_errors(scan):
         found = infer(scan, progress=progress, **options)
-    write_inference(with_command(found, command), folder, overwrite=overwrite)
+    page.write_inference(page.with_command(found, command), folder, overwrite=overwrite)
 
 
 def _is_done(folder: Path, command: str) -> bool:

@@ -75,10 +75,11 @@ def write_measures(
         "shows the mean of the structure that it was cut from.",
         *describe_measures(measures),
     ]
-    cells = [
-        {"name": name, "told": [more.get(head, "") for head in heads], "cells": _format_cells(part)}
-        for name, (part, more) in zip(names, rows, strict=True)
-    ]
+    cells = []
+    for name, (part, more) in zip(names, rows, strict=True):
+        pairs = [(each.value, each.half) for each in (part[symbol] for symbol in FIRST_SHOWN)]
+        pairs = [(format_number(x), f"± {format_number(half, 2)}" if math.isfinite(half) else "") for x, half in pairs]
+        cells.append({"name": name, "told": [more.get(head, "") for head in heads], "cells": pairs})
     page = {
         "title": f"{len(measures)} scans measured" if len(measures) > 1 else "One scan measured", "status": status,
         "symbols": [(symbol, power_name(unit, measures[0][symbol].power)) for symbol in FIRST_SHOWN],
@@ -121,15 +122,6 @@ def name_parts(parts: Sequence[Measures]) -> list[str]:
     )
     return [f"{name}, {' '.join(map(str, each.part))}" if each.part else name
             for name, each in zip(names, parts, strict=True)]  # fmt: skip
-
-
-def _format_cells(part: Measures) -> list[tuple[str, str]]:
-    """Return the numbers that the page shows, and half the widths of their intervals, as text."""
-    found = (part[symbol] for symbol in FIRST_SHOWN)
-    return [
-        (format_number(each.value), f"± {format_number(each.half, 2)}" if math.isfinite(each.half) else "")
-        for each in found
-    ]
 
 
 # ---- figures ---------------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -45,19 +45,17 @@ from curvafit.drawing.plot import (
     surface_figure,
     svg,
 )
+from curvafit.geometry.diagram import Diagram
 from curvafit.inference.candidates import TITLES, Candidate, seed_noise_of
 from curvafit.inference.combinations import KNOWN
+from curvafit.inference.fit import Fit
+from curvafit.inference.infer import Inference
 from curvafit.inference.table import parameters_of
 from curvafit.inference.verdict import UNBELIEVED, UNDECIDED
 from curvafit.priors.law import FORMAT
 from curvafit.studies.tables import format_csv
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
-
-if TYPE_CHECKING:
-    from curvafit.geometry.diagram import Diagram
-    from curvafit.inference.fit import Fit
-    from curvafit.inference.infer import Inference
 
 #: The mark by which a page is known as this program's.
 MARK = '<meta name="generator" content="curvafit'
@@ -75,9 +73,8 @@ _AXES = "zyx"
 STRIP = 2.5
 #: tan 22.5°: how far in direction a point may lie from a family's ideal one.
 _NARROW = math.tan(math.pi / 8)
-_Radii = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 #: For each round family: which points (κ1, κ2) are its own, and the curvature that its radius is one over.
-_ROUND: dict[str, _Radii] = {
+_ROUND: dict[str, Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
     "spheres": lambda k1, k2: (k2 > _NARROW * k1, (k1 + k2) / 2),
     "tubes": lambda k1, k2: ((k1 > 0) & (np.abs(k2) < _NARROW * k1), k1),
     "tubular cavities": lambda k1, k2: ((k2 < 0) & (np.abs(k1) < -_NARROW * k2), -k2),
@@ -222,11 +219,12 @@ def render_template(name: str, **values: Any) -> str:
 
 def report_html(inference: Inference) -> str:
     """Return the report of an inference as the text of its page."""
-    fit = inference.fit
+    fit, limits = inference.fit, grey_limits(inference.scan.values)
     return render_template(
         "report.html", version=fit.provenance.get("curvafit", ""), glossary=GLOSSARY, number=format_number, fit=fit,
         sentence=describe(inference), scan=describe_scan(inference),
-        voxel=format_length(inference.prepared.working_voxel, fit.length_unit, 3), slices=_slices(inference),
+        voxel=format_length(inference.prepared.working_voxel, fit.length_unit, 3),
+        slices=[_slice(inference, axis, limits) for axis in range(3)],
         framed=_is_framed(inference), windows=len(inference.prepared.windows),
         shapes=_shapes(inference) if inference.twins else [],
         diagrams=[] if inference.diagram is None else _diagrams(inference),
@@ -382,19 +380,16 @@ def _law(inference: Inference) -> dict[str, Any] | None:
 
 
 def _to_words(value: object) -> str:
-    """Return a value of JSON's types as words."""
     if isinstance(value, dict):
         return ", ".join(f"{name} {_to_words(part)}" for name, part in value.items())
     return ", ".join(map(_to_words, value)) if isinstance(value, (list, tuple)) else str(value)
 
 
 def _chosen_first(inference: Inference) -> list[Candidate]:
-    """Return the candidates, the chosen one first."""
     return sorted(inference.fit.candidates, key=lambda each: each.name != inference.fit.chosen)
 
 
 def _title(candidate: Candidate) -> str:
-    """Return a candidate's title, with a capital."""
     title = TITLES.get(candidate.name, candidate.name)
     return title[0].upper() + title[1:]
 
@@ -418,17 +413,11 @@ def picture_of(figure: Figure, alt: str, **words: str) -> Picture:
     return Picture(base64.b64encode(png(figure)).decode("ascii"), alt, **words)
 
 
-def _slices(inference: Inference) -> list[Picture]:
-    """Return pictures of slices across z, y and x through the main window's middle, with the surface's contour."""
-    limits = grey_limits(inference.scan.values)
-    middle = [(edge.start + edge.stop) // 2 for edge in inference.prepared.windows[0]]
-    return [_slice(inference, axis, middle[axis], limits) for axis in range(3)]
-
-
-def _slice(inference: Inference, axis: int, index: int, limits: tuple[float, float]) -> Picture:
-    """Return a picture of one slice: scan and structure are placed by the edges of their voxels, in the scan's unit."""
+def _slice(inference: Inference, axis: int, limits: tuple[float, float]) -> Picture:
+    """Return a picture of the slice across the main window's middle, by the edges of voxels, in the scan's unit."""
     scan, prepared = inference.scan, inference.prepared
     down, across = (k for k in range(3) if k != axis)
+    index = (prepared.windows[0][axis].start + prepared.windows[0][axis].stop) // 2
     place = prepared.origin[axis] + (index + 0.5) * prepared.scale[axis]
     row = int(np.clip(place, 0, scan.values.shape[axis] - 1))
     start, step = np.array(prepared.origin) * scan.spacing, np.array(prepared.scale) * scan.spacing
@@ -497,22 +486,21 @@ def _diagrams(inference: Inference) -> list[Picture]:
             diagrams.append((f"{_title(each)}, regrown", next(grown, None)))
     λ, unit = inference.prepared.length, inference.fit.length_unit
     limits = shared_limits([diagram for _, diagram in diagrams if diagram is not None], length=λ)
-    return [
-        Picture(None, "", title)
-        if diagram is None
-        else picture_of(
-            diagram_figure(diagram, limits=limits, unit=unit, length=λ), f"Curvature diagram: {title}", title=title
-        )
-        for title, diagram in diagrams
-    ]
+    pictures = []
+    for title, diagram in diagrams:
+        drawn = None if diagram is None else diagram_figure(diagram, limits=limits, unit=unit, length=λ)
+        alt = f"Curvature diagram: {title}"
+        pictures.append(Picture(None, "", title) if drawn is None else picture_of(drawn, alt, title=title))
+    return pictures
 
 
 def _corner(inference: Inference) -> Picture | None:
     """Return a corner plot of the posterior's draws, in working units, with marks for the chosen law and the match."""
-    if inference.fit.draws is None or inference.fit.best is None:
+    fit = inference.fit
+    if fit.draws is None or fit.best is None:
         return None
-    draws = inference.fit.draws[:, : len(SYMBOLS)]
-    shown = [each for each in inference.fit.candidates if each.name in (inference.fit.chosen, "match")]
+    draws = fit.draws[:, : len(SYMBOLS)]
+    shown = [each for each in fit.candidates if each.name in (fit.chosen, "match")]
     marks = {_title(each): parameters_of(each.coefficients, each.mass) for each in shown}
     rows = [np.percentile(draws, (0.5, 99.5), axis=0), *(mark[None] for mark in marks.values())]
     low, high = np.concatenate(rows).min(0), np.concatenate(rows).max(0)

@@ -13,19 +13,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.distance import cdist, pdist
 from scipy.stats import false_discovery_control, rankdata
 
+from curvafit.core import permutation
 from curvafit.core.checks import check_choice, check_int, check_seed
-from curvafit.core.permutation import (
-    center,
-    correct_by_most,
-    correct_holm,
-    correlate,
-    measure_dependence,
-    measure_effect,
-    measure_energy,
-    measure_slope,
-    relabel,
-    share_beyond,
-)
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number, format_percent, per_unit, power_name
@@ -317,7 +306,6 @@ def compare(
 def _compare_measures(
     measures: Sequence[Measures], cases: Sequence[Case], options: dict[str, Any], notes: Sequence[str]
 ) -> Comparison:
-    """Compare scans that are measured, in one unit, by their labels."""
     keys = [(case.label, case.subject) for case in cases]
     subjects = list(dict.fromkeys(keys))
     scans = [[k for k, key in enumerate(keys) if key == subject] for subject in subjects]
@@ -326,8 +314,8 @@ def _compare_measures(
     blocks = np.unique([name for _, name in subjects], return_inverse=True)[1] if options["paired"] else None
     # What goes with a number may go straight or level off: its rank loses little of the first and sees the second.
     tested = labels if groups else rankdata(labels)
-    arranged, exact = relabel(tested, options["permutations"], options["seed"], blocks)
-    test = measure_energy if groups else measure_dependence
+    arranged, exact = permutation.relabel(tested, options["permutations"], options["seed"], blocks)
+    test = permutation.measure_energy if groups else permutation.measure_dependence
     pooled = [_pool([measures[k].diagram for k in own]) for own in scans]
     rows = np.stack([sliced_embedding(each) for each in pooled])
     away = cdist(rows, rows)
@@ -339,12 +327,13 @@ def _compare_measures(
     alike = (sides[:, None] == sides) & ~np.eye(len(sides), dtype=bool)
     edges, differences, p = _compare_bins(pooled, labels, arranged, blocks)
     values, errors, halves = _average(measures, scans)
-    least = share_beyond(correlate(tested[:, None], arranged, blocks))[0]  # of a number that is the label
+    # Of a number that is the label.
+    least = permutation.share_beyond(permutation.correlate(tested[:, None], arranged, blocks))[0]
     return Comparison(
         by=options["by"], groups=groups, unit=measures[0].unit, cases=tuple(cases), measures=tuple(measures),
         subjects=tuple(subjects), labels=labels, blocks=blocks, values=values, errors=errors, halves=halves,
         numbers=_compare_numbers(measures[0], values, errors, labels, arranged, blocks),
-        statistic=float(statistics[0]), p=float(share_beyond(statistics)), least=float(least), sides=sides,
+        statistic=float(statistics[0]), p=float(permutation.share_beyond(statistics)), least=float(least), sides=sides,
         diagrams=means, apart=float(pdist(np.stack([sliced_embedding(each) for each in means])).max()),
         within=float(away[alike].mean()), edges=edges, differences=differences, bins_p=p, permutations=len(arranged),
         exact=exact, options=options, notes=(*notes, *gather_notes(measures, cases)),
@@ -378,9 +367,9 @@ def _compare_bins(
     mean = shares.mean(0)
     tested = (mean >= LEAST_SHARE * mean.max()) & (edges[1:, None] <= edges[None, 1:])
     p = np.full(mean.shape, np.nan)
-    p[tested] = correct_by_most(shares[:, tested], arranged, blocks)
+    p[tested] = permutation.correct_by_most(shares[:, tested], arranged, blocks)
     if np.issubdtype(labels.dtype, np.floating):
-        x = center(labels, blocks)
+        x = permutation.center(labels, blocks)
         return edges, np.ptp(labels) * np.tensordot(x, shares, 1)[None] / (x @ x), p
     means = np.stack([shares[labels == group].mean(0) for group in np.unique(labels)])
     return edges, means[1:] - means[:1] if len(means) == 2 else means - mean, p
@@ -407,9 +396,9 @@ def _compare_numbers(
     """Test each quantity of subjects' values (S, K); `scan` has the quantities' names."""
     known = np.asarray(np.isfinite(values).all(0))
     p, family, holm, discovery = np.full((4, len(known)), np.nan)
-    p[known] = share_beyond(correlate(values[:, known], arranged, blocks))
-    holm[known], discovery[known] = correct_holm(p[known]), false_discovery_control(p[known])
-    family[known] = correct_by_most(values[:, known], arranged, blocks)
+    p[known] = permutation.share_beyond(permutation.correlate(values[:, known], arranged, blocks))
+    holm[known], discovery[known] = permutation.correct_holm(p[known]), false_discovery_control(p[known])
+    family[known] = permutation.correct_by_most(values[:, known], arranged, blocks)
     rows, corrected = [], np.stack([p, family, holm, discovery], axis=1).tolist()
     for quantity, own, error, tested in zip(scan.quantities, values.T, errors.T, corrected, strict=True):
         means, deviations, difference, effect, left = _measure_change(own, labels, arranged[0], blocks)
@@ -425,16 +414,17 @@ def _measure_change(
     """Return means, deviations, difference and effect with its interval of a `Number`, and the variance left over."""
     if np.issubdtype(labels.dtype, np.floating):
         parts, freed = [], 1
-        difference, effect = measure_slope(values, labels, blocks)[0], measure_slope(values, ranks, blocks)[1]
+        difference, _ = permutation.measure_slope(values, labels, blocks)
+        _, effect = permutation.measure_slope(values, ranks, blocks)
         share = effect[0]
     else:
         order = np.arange(len(labels)) if blocks is None else np.argsort(blocks, kind="stable")
         parts = [values[order][labels[order] == group] for group in np.unique(labels)]
         freed, two = len(parts) - 1, len(parts) == 2
-        share = float(correlate(values[:, None], labels[None], blocks)[0, 0])
+        share = float(permutation.correlate(values[:, None], labels[None], blocks)[0, 0])
         difference = float(parts[1].mean() - parts[0].mean()) if two else math.nan
-        effect = measure_effect(*parts, paired=blocks is not None) if two else (share, math.nan, math.nan)
-    squares = float((center(values, blocks) ** 2).sum())
+        effect = permutation.measure_effect(*parts, paired=blocks is not None) if two else (share, math.nan, math.nan)
+    squares = float((permutation.center(values, blocks) ** 2).sum())
     freedom = len(labels) - (1 if blocks is None else len(np.unique(blocks))) - freed
     effect = effect if squares > 0 else (math.nan, math.nan, math.nan)
     left = squares * (1 - share**2) / freedom if freedom > 0 and math.isfinite(effect[0]) else math.nan

@@ -116,7 +116,6 @@ def _check(cases: Sequence[Case], paired: bool) -> None:
 
 
 def _list_labelled(scans: Any, by: Any) -> list[Case]:
-    """Return the scans of a sequence, with a label for each."""
     if by is None or isinstance(by, str) or isinstance(scans, Mapping):
         raise ValueError("expected two groups or more, a table, or scans with a label for each")
     labels, cases = as_tuple(by, "labels"), _gather(as_tuple(scans, "scans"), "scan ", [])
@@ -163,13 +162,11 @@ def _gather(group: Group, name: str, notes: list[str]) -> list[Case]:
         pairs: list[tuple[str, Any]] = [(str(subject), scan) for subject, scans in group.items() for scan in scans]
     else:
         pairs = [(f"{name}{k}", scan) for k, scan in enumerate(group, 1)]
-    return [Case(scan, _name_scan(scan) or f"{name}{k}", subject, name) for k, (subject, scan) in enumerate(pairs, 1)]
-
-
-def _name_scan(scan: Any) -> str:
-    """Return the name of a scan's file; an empty one for an array."""
-    source = scan if isinstance(scan, str | PathLike) else getattr(scan, "source", "")
-    return Path(str(source)).name
+    cases = []
+    for k, (subject, scan) in enumerate(pairs, 1):
+        source = scan if isinstance(scan, str | PathLike) else getattr(scan, "source", "")  # empty of an array
+        cases.append(Case(scan, Path(str(source)).name or f"{name}{k}", subject, name))
+    return cases
 
 
 def _list_folder(folder: Path, group: str, notes: list[str]) -> list[Case]:

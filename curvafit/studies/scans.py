@@ -107,13 +107,11 @@ def share_out(tasks: Mapping[int, Task], names: Sequence[str], workers: int, pro
 
 
 def _do(job: tuple[int, Task, Progress]) -> tuple[int, Any]:
-    """Do the task of a scan, as a worker does."""
     number, task, progress = job
     return number, task(progress)
 
 
 def _bin_diagrams(measures: Measures) -> Measures:
-    """Return measures whose diagram, and those of its compartments, are binned finely."""
     width = FINE / measures["thickness"].value
     fine = {label: replace(each, diagram=each.diagram.bin(width)) for label, each in measures.compartments.items()}
     return replace(measures, diagram=measures.diagram.bin(width), compartments=fine)
@@ -162,7 +160,12 @@ def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progr
             field = load(case.source, **reading)
         units.setdefault(field.unit, case.name)
         edges.setdefault(case.label, []).append(float(np.prod(field.spacing) ** (1 / 3)))
-    _check_mixture(units)
+    if len(units) > 1 and "voxel" in units:
+        other = next(name for name in units if name != "voxel")
+        raise ValueError(
+            f"expected a physical spacing in all scans or in none, got none in {units['voxel']} and {other} in "
+            f"{units[other]}: say it with --spacing and --unit"
+        )
     notes = ["Lengths are counted in voxels: compare only scans of one voxel size."] if "voxel" in units else []
     medians = [float(np.median(each)) for each in edges.values()]
     if medians and len(units) == 1 and min(medians) < (1 - ALIKE_EDGES) * max(medians):
@@ -173,22 +176,7 @@ def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progr
 
 def check_units(scans: Sequence[str], progress: Progress = silent, **reading: Any) -> None:
     """Raise ValueError where only some scans have a physical unit; of files that can be read in boxes no voxel is."""
-    units: dict[str, str] = {}
-    for k, scan in enumerate(scans):
-        progress(f"{scan}: reading", k / len(scans))
-        with name_errors(scan):
-            units.setdefault(load(scan, **reading, lazy=True).unit, scan)
-    _check_mixture(units)
-
-
-def _check_mixture(units: Mapping[str, str]) -> None:
-    """Raise ValueError where the voxel is one of several units, each with the name of a scan that has it."""
-    if len(units) > 1 and "voxel" in units:
-        other = next(name for name in units if name != "voxel")
-        raise ValueError(
-            f"expected a physical spacing in all scans or in none, got none in {units['voxel']} and {other} in "
-            f"{units[other]}: say it with --spacing and --unit"
-        )
+    _check_scans([Case(scan, scan, "", "") for scan in scans], {**reading, "lazy": True}, progress)
 
 
 @contextmanager

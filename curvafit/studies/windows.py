@@ -210,13 +210,10 @@ def _sum_windows(table: np.ndarray, field: Volume, size: Sequence[int], stride: 
 
 
 def _cluster(values: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, float]:
-    """Return labels (nz, ny, nx) uint8, and the part of the variance between clusters, of windows that are all known.
-
-    χ is left out, as with Conn.D it would count twice, and so is what no window has.
-    """
+    """Return labels (nz, ny, nx) uint8, and the part of the variance between clusters, of windows that are known."""
     columns = np.logical_or.reduce(np.isfinite(values.reshape(-1, len(NAMES))))  # a thin stack has no curvature
     thickness = int(columns[: NAMES.index("thickness")].sum())
-    columns[NAMES.index("Euler number")] = False
+    columns[NAMES.index("Euler number")] = False  # with Conn.D it would count twice
     rows = values[..., columns]
     known = np.isfinite(rows).all(-1)
     labels, rows = np.zeros(known.shape, dtype=np.uint8), rows[known]
