@@ -88,7 +88,17 @@ def save_atlas(atlas: Atlas, path: str | Path) -> None:
     """
     arrays = {name: getattr(atlas, name) for name in ARRAYS}
     for view in SEEN_AS:
-        arrays |= {f"{view}_{name}": value for name, value in _pack_diagrams(atlas.diagrams(view)).items()}
+        diagrams = atlas.diagrams(view)
+        areas = np.array([d.weights.sum() for d in diagrams])
+        packed = {
+            "points": np.concatenate([d.points for d in diagrams]).astype(np.float16),
+            "weights": np.concatenate([d.weights / a for d, a in zip(diagrams, areas, strict=True)]).astype(np.float32),
+            "offsets": np.cumsum([0] + [len(d.weights) for d in diagrams]),  # number i's rows end before the (i + 1)th
+            "areas": areas,
+            "spreads": np.array([d.spread for d in diagrams]),
+            "excluded": np.array([d.excluded for d in diagrams]),
+        }
+        arrays |= {f"{view}_{name}": value for name, value in packed.items()}
     ATLAS_FILE.write(path, {"ids": list(atlas.ids), "provenance": atlas.provenance}, arrays)
 
 
@@ -105,21 +115,7 @@ def load_atlas(path: str | Path | None = None) -> Atlas:
     return ATLAS_FILE.read(path, _from_arrays)
 
 
-def _pack_diagrams(diagrams: tuple[Diagram, ...]) -> dict[str, np.ndarray]:
-    """Return the diagrams as flat arrays: the points of number i are rows offsets[i] to offsets[i + 1]."""
-    areas = np.array([d.weights.sum() for d in diagrams])
-    return {
-        "points": np.concatenate([d.points for d in diagrams]).astype(np.float16),
-        "weights": np.concatenate([d.weights / a for d, a in zip(diagrams, areas, strict=True)]).astype(np.float32),
-        "offsets": np.cumsum([0] + [len(d.weights) for d in diagrams]),
-        "areas": areas,
-        "spreads": np.array([d.spread for d in diagrams]),
-        "excluded": np.array([d.excluded for d in diagrams]),
-    }
-
-
 def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Atlas:
-    """Return the atlas of a file's header and arrays."""
     sound = all(x.dtype.kind in "iuf" and np.isfinite(x).all() for x in arrays.values())
     if not (sound and (np.abs(arrays["masses"]) < 1).all() and all(isinstance(one, str) for one in header["ids"])):
         raise ValueError("expected finite numbers, masses in (-1, 1) and ids that are texts, got others")

@@ -87,8 +87,8 @@ class Candidate:
         if self.name == "match":
             mass = float(np.clip(np.mean([each.mass for each in twins if each.phase is not None]), -RARE, RARE))
         thickness = float(np.mean([thinner_thickness(each.phase > 0) for each in twins if each.phase is not None]))
-        found = replace(self, mass=mass, thickness=thickness)
-        return replace(found, distance=distance, seed_noise=noise, twins=numbers)
+        found = {"distance": distance, "seed_noise": noise, "twins": numbers}
+        return replace(self, mass=mass, thickness=thickness, **found)
 
 
 def best_candidate(candidates: Sequence[Candidate]) -> Candidate | None:

@@ -27,8 +27,6 @@ NAMED = 2
 #: An end is described by no look whose correlation with the combination is less.
 FAINT = 0.18
 
-Share = Annotated[float, Rule(least=0, most=1)]
-
 
 @dataclass(frozen=True)
 class Combination:
@@ -51,7 +49,7 @@ class Combination:
     weights: dict[str, float]
     median: float
     interval: tuple[float, float]
-    known: Share
+    known: Annotated[float, Rule(least=0, most=1)]
 
     def __str__(self) -> str:
         low, high = (format_number(end, 2) for end in self.interval)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from curvafit.inference.stationarity import double_precision_on_cpu
+from curvafit.inference.stationarity import call_in_double
 from curvafit.inference.table import PARAMETERS, Compression, encode_seen
 from curvafit.scan.measure import Reading
 
@@ -76,7 +76,7 @@ class Emulator:
 
     def inputs(self, parameters: np.ndarray, views: np.ndarray, amount: np.ndarray) -> np.ndarray:
         """Return what the networks read: the parameters in deviations of the prior, how much is seen, and in what."""
-        scaled = (np.atleast_2d(parameters) - self.centre) / self.deviation
+        scaled = self.standardise(np.atleast_2d(parameters))
         seen = encode_seen(self.views, views, amount)
         return np.concatenate([scaled, np.broadcast_to(seen, (len(scaled), seen.shape[1]))], 1)
 
@@ -90,13 +90,18 @@ class Emulator:
         """Return the deviations `(6,)` of parameters uniform in the box."""
         return (self.box[:, 1] - self.box[:, 0]) / np.sqrt(12)
 
+    def standardise(self, parameters: np.ndarray) -> np.ndarray:
+        """Return parameters in deviations of the prior."""
+        return (parameters - self.centre) / self.deviation
+
+    def decorrelate(self, descriptors: np.ndarray) -> np.ndarray:
+        """Return descriptors `(N, 351)` along the rows of the basis `(N, k)`."""
+        return self.compression(descriptors) @ self.basis.T
+
     def slopes(self, parameters: np.ndarray, views: np.ndarray, amount: np.ndarray) -> np.ndarray:
         """Return the derivatives `(N, k, 6)` of the whitened mean by parameters `(N, 6)` in deviations of the prior."""
-        with double_precision_on_cpu():
-            import jax.numpy as jnp
-
-            places = jnp.asarray(self.inputs(parameters, views, amount))
-            slopes = np.asarray(_jacobian()(_as_jax(self.mean), places))[..., : len(PARAMETERS)]
+        places = self.inputs(parameters, views, amount)
+        slopes = call_in_double(_jacobian, self.mean, places)[..., : len(PARAMETERS)]
         return (self.basis @ slopes) / self(parameters, views, amount).deviation[..., None]
 
 
@@ -142,29 +147,18 @@ def forward(layers: tuple[Layer, ...], inputs: Any) -> Any:
 def _minimise(
     emulator: Emulator, descriptors: np.ndarray, views: np.ndarray, amount: np.ndarray, starts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return where the solver ends, for N rows of descriptors from n starts `(N, n, 6)` each: parameters, slopes of the
-    whitened descriptors (by parameters in deviations of the prior), squares that are left, and -2 log posterior."""
+    """Return where the solver ends, for N rows from n starts `(N, n, 6)` each: parameters, slopes of the whitened
+    descriptors by parameters in deviations of the prior, squares that are left, and -2 log posterior."""
     target = emulator.compression(descriptors)
     each = [np.repeat(column, starts.shape[1]) for column in (views, amount)]
     emulated = emulator(starts.reshape(-1, starts.shape[-1]), *each)
     deviation = np.sqrt(np.square(emulated.deviation).reshape(*starts.shape[:2], -1).mean(1))
     low, high = emulator.box.T
     share = np.clip((starts - low) / (high - low), 0.01, 0.99)
-    with double_precision_on_cpu():
-        import jax.numpy as jnp
-
-        deviation *= np.sqrt(emulator.inflation)
-        kinds = encode_seen(emulator.views, views, amount)
-        rest = (emulator.basis, target, deviation, kinds, np.log(share / (1 - share)))
-        ends = _minimiser()(_as_jax(emulator.mean), *(jnp.asarray(part, float) for part in rest))
-        free, jacobian, misfit, value = (np.asarray(part) for part in ends)
+    rest = (deviation * np.sqrt(emulator.inflation), encode_seen(emulator.views, views, amount))
+    ends = call_in_double(_minimiser, emulator.mean, emulator.basis, target, *rest, np.log(share / (1 - share)))
+    free, jacobian, misfit, value = ends
     return low + (high - low) / (1 + np.exp(-free)), jacobian, misfit, value
-
-
-def _as_jax(layers: tuple[Layer, ...]) -> tuple[Layer, ...]:
-    import jax.numpy as jnp
-
-    return tuple(Layer(jnp.asarray(layer.weight, float), jnp.asarray(layer.bias, float)) for layer in layers)
 
 
 @functools.cache
@@ -180,7 +174,6 @@ def _jacobian() -> Callable[..., Any]:
 
 @functools.cache
 def _minimiser() -> Callable[..., Any]:
-    """Return the solver of many rows from many starts, compiled once for each number of them."""
     import jax
     import jax.numpy as jnp
     import optimistix

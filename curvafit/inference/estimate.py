@@ -61,7 +61,7 @@ def measure_descriptors(prepared: Prepared) -> Described | None:
 
 
 def estimate_law(
-    described: Described | None,
+    described: Described,
     posterior: Posterior,
     *,
     seed: int,
@@ -73,16 +73,13 @@ def estimate_law(
     """Read the law of a scan from its descriptors: draw from the posterior, grow some draws, and compare.
 
     The parameters are as in `infer`; without simulations the scan is compared with what training left unexplained.
-    Returns the draws, view, combinations and candidates of a `Fit` by name, none where the descriptors cannot be
-    measured; and by block of descriptors the scan's numbers `(k,)` and those of the simulations `(n, k)`, if any.
+    Returns the draws, view, combinations and candidates of a `Fit` by name; and by block of descriptors the scan's
+    numbers `(k,)` and those of the simulations `(n, k)`, if any.
     """
-    if described is None:
-        return {}, None
     reading, turn = described.reading, described.turn
     progress("reading the posterior", 0.0)
     draws = posterior.draw(reading, DRAWS, seed)
     parameters = draws[:, :-1]
-    best = best_parameters(posterior.emulator, reading, parameters[:STARTS])
     law: dict[str, Any] = {"draws": np.column_stack([turn(parameters), draws[:, -1]]), "view": reading.view}
     law["combinations"] = posterior.combinations.read(parameters, background=described.background)
     thickness = float(np.exp(np.median(draws[:, -1])))
@@ -96,7 +93,7 @@ def estimate_law(
         left = misfits(posterior.emulator, *reading.columns, parameters[None, :STARTS])[0]
         p, level_cut = _join_level_cut(tail_probability(posterior.misfits[reading.view], left), posterior, reading)
         law["misfit"] = Misfit(p, {}, "by the best fit, nothing grown", level_cut=level_cut)
-        return law | {"candidates": (likely, _best_fit(posterior, *best, described, thickness))}, None
+        return law | {"candidates": (likely, _best_fit(posterior, described, parameters[:STARTS], thickness))}, None
     pool = posterior.draw(reading, POOL, seed)[:, :-1]
     search = Search(posterior.emulator, reading)
     part = sub_progress(progress, 0.45, 1.0)
@@ -109,19 +106,13 @@ def estimate_law(
     return law | {"candidates": (refined, likely, *others)}, blocks
 
 
-def refine_matches(
-    described: Described | None, posterior: Posterior, matches: Sequence[Match]
-) -> tuple[Candidate, ...]:
+def refine_matches(described: Described, posterior: Posterior, matches: Sequence[Match]) -> Candidate:
     """Refine the parameters of the nearest matches until the emulated descriptors fit the scan's best.
 
     Levenberg and Marquardt's method, by optimistix, starts from each match, with the exact derivatives of the emulator.
-    Returns one law; none where the descriptors of the scan cannot be measured.
     """
-    if described is None:
-        return ()
     starts = described.turn(np.stack([parameters_of(each.coefficients, each.mass) for each in matches]))
-    best = best_parameters(posterior.emulator, described.reading, starts)
-    return (_best_fit(posterior, *best, described, matches[0].thickness),)
+    return _best_fit(posterior, described, starts, matches[0].thickness)
 
 
 def middle_of(parameters: np.ndarray) -> np.ndarray:
@@ -130,10 +121,9 @@ def middle_of(parameters: np.ndarray) -> np.ndarray:
     return parameters[np.square(away).sum(1).argmin()]
 
 
-def _best_fit(
-    posterior: Posterior, best: np.ndarray, covariance: np.ndarray, described: Described, thickness: float
-) -> Candidate:
+def _best_fit(posterior: Posterior, described: Described, starts: np.ndarray, thickness: float) -> Candidate:
     """Return the best fit of the descriptors, with deviations by draws from the normal distribution around it."""
+    best, covariance = best_parameters(posterior.emulator, described.reading, starts)
     near = np.random.default_rng(0).multivariate_normal(best, covariance, DRAWS, check_valid="ignore")
     deviations = _deviations(described.turn(np.clip(near, *posterior.emulator.box.T)))
     return Candidate("optimum", *law_of(described.turn(best)), deviations, thickness)
@@ -168,7 +158,7 @@ def tail_probability(usual: np.ndarray, own: float) -> float:
 def check_law(
     law: Candidate,
     prepared: Prepared,
-    described: Described | None,
+    described: Described,
     posterior: Posterior,
     *,
     seed: int = 0,
@@ -181,10 +171,8 @@ def check_law(
     each of which has the mass of the law. As many shapes are grown as show `TESTED` windows; where some are not well
     formed, up to as many again are tried.
 
-    Returns None where the scan's descriptors cannot be measured, or fewer than two shapes, or `FEWEST` windows, grow.
+    Returns None where fewer than two shapes, or `FEWEST` windows, grow.
     """
-    if described is None:
-        return None
     reading, background = described.reading, described.background
     across = windows_along(prepared, [edge.stop - edge.start for edge in prepared.windows[0]])
     count, rows = -(-TESTED // math.prod(across)), []
@@ -236,17 +224,15 @@ def compare_windows(posterior: Posterior, reading: Reading, twins: np.ndarray) -
     deviations of the twins, the probability is that of a law named beforehand.
     """
     scan, known = reading.windows, posterior.departures
-    seen, grown = (posterior.emulator.compression(rows) @ posterior.emulator.basis.T for rows in (scan, twins))
+    seen, grown = map(posterior.emulator.decorrelate, (scan, twins))
     departure = float(cdist(seen, grown).mean() - pdist(grown).mean())
     p = tail_probability(known, departure) if len(known) else probability_alike(seen, grown)
     p, level_cut = _join_level_cut(p, posterior, reading)
+    blocks = {}
+    for name in BLOCKS:
+        own, others = (columns_of(rows, [name]) for rows in (scan, twins))
+        spread = others.std(0) + FAINTEST * others.std(0).mean() + 1e-12
+        blocks[name] = probability_alike(own / spread, others / spread)
     ranked = f", ranked among {len(known)} shapes" if len(known) else ""
     method = f"{len(twins)} windows of shapes of the law, {len(scan)} of the scan{ranked}"
-    return Misfit(p, {name: _compare_block(name, scan, twins) for name in BLOCKS}, method, departure, level_cut)
-
-
-def _compare_block(name: str, scan: np.ndarray, twins: np.ndarray) -> float:
-    """Return `probability_alike` of one block of windows, in deviations of the twins."""
-    own, others = columns_of(scan, [name]), columns_of(twins, [name])
-    spread = others.std(0) + FAINTEST * others.std(0).mean() + 1e-12
-    return probability_alike(own / spread, others / spread)
+    return Misfit(p, blocks, method, departure, level_cut)

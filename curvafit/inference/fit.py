@@ -311,7 +311,6 @@ def draw_laws(law: LawLike, count: int) -> list[Law]:
 
 
 def _fit_of(file: _File) -> Fit:
-    """Return the fit of a file."""
     draws, view, seen = None, "", file.diagram
     if file.posterior is not None:
         columns, view = [getattr(file.posterior.draws, name) for name in COLUMNS], file.posterior.view
@@ -331,7 +330,6 @@ def _fit_of(file: _File) -> Fit:
 
 
 def _check_lengths(columns: list[tuple[float, ...]], names: str, place: str) -> None:
-    """Raise ValueError where columns have several lengths."""
     if len({len(column) for column in columns}) > 1:
         lengths = ", ".join(str(len(column)) for column in columns)
         raise ValueError(f"expected {names} of one length in a fit's {place}, got {lengths}")

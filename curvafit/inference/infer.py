@@ -180,23 +180,25 @@ def infer(
         return Inference(volume, prepared, measured, {}, fit)
     progress("measuring descriptors", 0.1)
     described, simulated, law = measure_descriptors(prepared), None, {}
-    if method == "posterior":
+    if described is not None and method == "posterior":
         part = sub_progress(progress, 0.15, 0.5)
         options = {"simulations": 0 if fast else simulations, "rounds": rounds, "schedule": schedule}
         law, simulated = estimate_law(described, posterior, seed=seed, progress=part, **options)
     progress("searching the atlas", 0.5)
     # An atlas holds shapes that fill less than half: of one that fills more the background is looked up.
-    query, seen_as = {"count": MATCHES, "exact": method == "match"}, "field" if prepared.kind == "field" else "mask"
-    inverted = prepared.volume_fraction > HALF
-    matches = nearest(measured.mirrored if inverted else measured, atlas, seen_as=seen_as, **query)
+    seen_as, inverted = "field" if prepared.kind == "field" else "mask", prepared.volume_fraction > HALF
+    query = measured.mirrored if inverted else measured
+    matches = nearest(query, atlas, seen_as=seen_as, count=MATCHES, exact=method == "match")
     matches = tuple(map(mirror_match, matches)) if inverted else matches
-    read = refine_matches(described, posterior, matches) if method == "match" else law.get("candidates", ())
+    read = law.get("candidates", ())
+    if described is not None and method == "match":
+        read = (refine_matches(described, posterior, matches),)
     laws, grown = _list_laws(prepared, read, matches, seed, sub_progress(progress, 0.5, 0.6)), {}
     if not fast:
         part = sub_progress(progress, 0.6, 0.8 if test else 1.0)
         laws, grown = _grow(laws, measured, prepared, count=twins, schedule=schedule, seed=seed, progress=part)
     law |= {"candidates": laws, "matches": matches}
-    if test and not fast and (best := best_candidate(laws)) is not None:
+    if test and not fast and described is not None and (best := best_candidate(laws)) is not None:
         part = sub_progress(progress, 0.8, 1.0)
         options = {"seed": seed + TWINS, "schedule": schedule, "progress": part}
         law["misfit"] = check_law(best, prepared, described, posterior, **options)
@@ -215,8 +217,7 @@ def infer(
 def _list_laws(
     prepared: Prepared, read: tuple[Candidate, ...], matches: tuple[Match, ...], seed: int, progress: Progress
 ) -> tuple[Candidate, ...]:
-    """Return the laws to grow: of a phase field its stationarity, those that were read from the descriptors, and the
-    nearest match."""
+    """Return the laws to grow: of a phase field its stationarity, those read from descriptors, the nearest match."""
     laws = (*read, Candidate("match", matches[0].coefficients, matches[0].mass, {}, matches[0].thickness))
     if prepared.kind != "field" or is_rounded(prepared.phase):
         return laws
@@ -249,7 +250,6 @@ def _grow(
     twins: dict[str, tuple[Twin, ...]] = {}
 
     def grow(law: Candidate, share: float) -> Candidate:
-        """Grow another twin of a law."""
         start = seed + len(twins.get(law.name, ()))
         progress(f"growing: {TITLES[law.name]}, seed {start}", share)
         twins[law.name] = (*twins.get(law.name, ()), twin(law, prepared, start, schedule))
@@ -267,8 +267,7 @@ def _grow(
 def _read_and_prepare(
     scan: Source, label: int | None, crop: Crop | None, options: Mapping[str, Any], reading: Mapping[str, Any]
 ) -> tuple[Volume, tuple[int, int, int], Prepared]:
-    """Return a scan, or the middle of a large one at the level of its pyramid that suits its structure, the shape of
-    that level, and the scan prepared."""
+    """Return a scan, or a large one's middle at the level that suits its structure, the level's shape, and prepared."""
     whole = options["roi"] is not None or options["periodic"]
     volume, shape = read_scan(scan, label=label, crop=crop, whole=whole, **reading)
     if (roi := options["roi"]) is not None:

@@ -217,7 +217,6 @@ def load_posterior(path: str | Path | None = None) -> Posterior:
 
 
 def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posterior:
-    """Return the posterior of a file's header and arrays."""
     if not all(np.isfinite(each).all() for each in arrays.values() if each.dtype.kind == "f"):
         raise ValueError("numbers that are not finite")
     sizes = header["architecture"]

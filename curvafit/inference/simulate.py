@@ -113,7 +113,7 @@ class Search:
     def nearest(self, simulated: Simulations) -> np.ndarray:
         """Return the numbers of the simulations, those whose descriptors are nearest to the query's first."""
         deviation = self.emulator(simulated.parameters, *simulated.columns[1:]).deviation.mean(0)
-        away = self._decorrelate(simulated.columns[0]) - self._decorrelate(self.query.columns[0])
+        away = self.emulator.decorrelate(simulated.columns[0]) - self.emulator.decorrelate(self.query.columns[0])
         return np.square(away / deviation).sum(1).argsort(kind="stable")
 
     def run(
@@ -157,8 +157,8 @@ class Search:
         widths = np.resize(np.repeat(WIDTHS, AROUND), len(centres))[:, None]
         near = centres + widths * emulator.deviation * rng.standard_normal(centres.shape)
         candidates = np.concatenate([draws, np.clip(near, *emulator.box.T)])
-        avoided = BARREN * _correlate(self._standardise(candidates), self._standardise(barren), REACH).sum(1)
-        return candidates, self.deviance(candidates, simulated) + avoided
+        close = _correlate(emulator.standardise(candidates), emulator.standardise(barren), REACH)
+        return candidates, self.deviance(candidates, simulated) + BARREN * close.sum(1)
 
     def deviance(self, candidates: np.ndarray, simulated: Simulations) -> np.ndarray:
         """Return twice the negative log likelihood of each candidate `(m,)`, up to a constant."""
@@ -166,22 +166,15 @@ class Search:
         # Descriptors are compared in uncorrelated directions, in units of the emulator's mean deviation along each;
         # that is the same for all candidates, so its logarithm is left out.
         descriptors, *seen = simulated.columns
-        emulated = self.emulator(simulated.parameters, *seen)
-        basis, deviation = self.emulator.basis, emulated.deviation.mean(0)
-        residuals = (self._decorrelate(descriptors) - emulated.mean @ basis.T) / deviation
-        mean, variance = Process.fit(self._standardise(simulated.parameters), residuals)(self._standardise(candidates))
         row, *asked = self.query.columns
-        expected = self.emulator(candidates, *asked).mean @ basis.T / deviation + mean
-        scan_residual = self._decorrelate(row) / deviation - expected
+        emulator, emulated = self.emulator, self.emulator(simulated.parameters, *seen)
+        basis, deviation = emulator.basis, emulated.deviation.mean(0)
+        residuals = (emulator.decorrelate(descriptors) - emulated.mean @ basis.T) / deviation
+        process = Process.fit(emulator.standardise(simulated.parameters), residuals)
+        mean, variance = process(emulator.standardise(candidates))
+        expected = emulator(candidates, *asked).mean @ basis.T / deviation + mean
+        scan_residual = emulator.decorrelate(row) / deviation - expected
         return np.square(scan_residual).sum(1) / variance + scan_residual.shape[1] * np.log(variance)
-
-    def _decorrelate(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return rows of descriptors in the emulator's uncorrelated directions `(N, k)`."""
-        return self.emulator.compression(descriptors) @ self.emulator.basis.T
-
-    def _standardise(self, parameters: np.ndarray) -> np.ndarray:
-        """Return parameters in deviations of the prior."""
-        return (parameters - self.emulator.centre) / self.emulator.deviation
 
 
 def _correlate(first: np.ndarray, second: np.ndarray, length: float) -> np.ndarray:

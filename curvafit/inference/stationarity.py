@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -46,8 +45,6 @@ _SLAB = 24
 _STRIDE = 2
 #: The field's error is modelled as white noise of this width (voxels); its amplitude is searched from the first value.
 _ERROR_WIDTH, _ERROR_START, _ERROR_LIMITS, _ERROR_STEPS = 1.0, 1e-3, (1e-6, 3e-2), 4
-#: A field error above which stationarity says little.
-_LARGE_ERROR = 0.005
 #: A share of a20 + a02 that a start is kept away from the domain's edges, a20 = 0 and a02 = 0.
 _EDGE = 0.01
 #: The short flow: Adam steps of 1e-3 as published.
@@ -144,7 +141,10 @@ def weak_form(
 ) -> tuple[np.ndarray, Problem, float]:
     """Return the weak form of a field's stationarity: octants' triangles `(8, 7, 7)`, the problem of them all, and the
     root mean square of the field error that explains the misfit."""
-    width = _test_width(grid)
+    if not grid.periodic and min(grid.shape) < SMALLEST_CROP:
+        raise ValueError(f"expected a crop of at least {SMALLEST_CROP} voxels along each axis, got {grid.shape}")
+    # In a small crop test functions leave a core of eight voxels.
+    width = TEST_WIDTH if grid.periodic else min(CROP_WIDTH, (min(grid.shape) - 8 - 2 * _REACH) // 2 / 4)
     progress("differentiating the energy", 0.0)
     gradients = energy_gradients(values, grid, epsilon)
     tested = integrate_columns(gradients, grid, epsilon, width)
@@ -155,15 +155,6 @@ def weak_form(
     progress("propagating the field's error", 0.2)
     problem, size = _propagate_error(values, gradients, _join_triangles(octants), grid, epsilon, width, seed)
     return octants, problem, size
-
-
-def _test_width(grid: Grid) -> float:
-    """Return the width of the test functions; in a small crop the one that leaves a core of eight voxels."""
-    if grid.periodic:
-        return TEST_WIDTH
-    if min(grid.shape) < SMALLEST_CROP:
-        raise ValueError(f"expected a crop of at least {SMALLEST_CROP} voxels along each axis, got {grid.shape}")
-    return min(CROP_WIDTH, (min(grid.shape) - 8 - 2 * _REACH) // 2 / 4)
 
 
 def integrate_columns(columns: Tensor, grid: Grid, epsilon: float, width: float) -> np.ndarray:
@@ -194,8 +185,7 @@ def _join_triangles(stack: np.ndarray) -> np.ndarray:
 def _propagate_error(
     u: Tensor, clean: Tensor, columns: np.ndarray, grid: Grid, epsilon: float, width: float, seed: int
 ) -> tuple[Problem, float]:
-    """Return the problem whitened by a field error, and that error's root mean square, with which the error causes the
-    misfit (smallest singular value 1)."""
+    """Return the problem whitened by a field error, and the size of that error that alone causes the misfit."""
     # A finite error, not its linearisation: the columns are singular where ∇u = 0 and at umbilics.
     error = torch.randn(u.shape, generator=torch.Generator().manual_seed(seed), dtype=u.dtype)
     error = gaussian_blur(error, grid, _ERROR_WIDTH * max(grid.spacing))
@@ -223,12 +213,8 @@ def total_least_squares(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
 
 def solve(problems: Sequence[Problem], origins: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the minimisers `(n, 6)` of |R a| / |N a| with a20 + a02 = 2, both positive, and their values `(n,)`."""
-    with double_precision_on_cpu():
-        import jax.numpy as jnp
-
-        columns, errors = (jnp.asarray(np.stack(part)) for part in zip(*problems, strict=True))
-        solutions, residuals = _minimiser()(columns, errors, jnp.asarray(origins))
-        return np.asarray(solutions), np.asarray(residuals)
+    columns, errors = (np.stack(part) for part in zip(*problems, strict=True))
+    return call_in_double(_minimiser, columns, errors, origins)
 
 
 @cache
@@ -263,7 +249,7 @@ def _status(coefficients: Coefficients, deviations: np.ndarray, fixed: int, resi
         return f"Stationarity is not supported: {why}."
     weak = [name for name, value, d in zip(NAMES, coefficients, deviations, strict=True) if d > abs(value) / 2]
     gauge = "" if fixed == 0 else " a20 is at the edge of the domain, so a02 = 1 fixes the scale."
-    verdict = "Stationarity is weakly supported" if residual > _LARGE_ERROR else "Stationarity is supported"
+    verdict = "Stationarity is weakly supported" if residual > 0.005 else "Stationarity is supported"
     weakness = f"; weakly held: {', '.join(weak)}" if weak else ""
     return f"{verdict}: a field error of {residual:.1e} would explain the misfit{weakness}.{gauge}"
 
@@ -350,9 +336,11 @@ def _import_jax() -> None:
         np.random.set_state(state)  # noqa: NPY002
 
 
-@contextmanager
-def double_precision_on_cpu():
-    """Run JAX in float64 on the CPU while inside, in this thread alone; a program's other use of JAX is not touched."""
+def call_in_double(make: Callable[[], Callable[..., Any]], *arguments: Any) -> Any:
+    """Call the JAX function that `make` returns in float64 on the CPU, and return NumPy's arrays.
+
+    The precision is set in this thread alone: a program's other use of JAX is not touched.
+    """
     _import_jax()
     import jax
 
@@ -361,4 +349,5 @@ def double_precision_on_cpu():
     else:  # an earlier JAX
         from jax.experimental import enable_x64 as double_precision  # pyright: ignore[reportAttributeAccessIssue]
     with double_precision(True), jax.default_device(jax.devices("cpu")[0]):
-        yield
+        ready = jax.tree.map(lambda part: jax.numpy.asarray(part, float), arguments)
+        return jax.tree.map(np.asarray, make()(*ready))

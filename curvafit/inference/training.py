@@ -105,10 +105,10 @@ def train_posterior(
     untested = (np.zeros(0), np.zeros(0), {})
     posterior = Posterior(sizes, (), compression, views, box, zero, one, emulator, left, none, provenance, *untested)
     logits = posterior.to_logits(table.targets)
-    centre, spread = logits.mean(0), logits.std(0)
-    target = torch.from_numpy((logits - centre) / spread).float()
+    posterior = dataclasses.replace(posterior, centre=logits.mean(0), spread=logits.std(0))
+    target = torch.from_numpy(posterior.standardise(table.targets)).float()
     context = posterior.context(table.descriptors, table.views, table.amount)
-    flows, apart = [], []
+    flows, apart, missed = [], [], []
     for k in range(members):
         rng = np.random.default_rng([seed, k])
         holdout = rng.permutation(laws)[: max(1, round(VALIDATION * laws))]
@@ -118,16 +118,14 @@ def train_posterior(
             torch.manual_seed(int(rng.integers(2**31)))
             flow = Member(sizes, len(views))
             flows.append(_fit(flow, context, target, validation, flow_plan, f"member {k + 1} of {members}", part))
+        # What the flow misses of the rows that it has not learnt.
         apart.append(np.flatnonzero(validation.numpy()))
-    posterior = dataclasses.replace(posterior, members=tuple(flows), centre=centre, spread=spread)
-    missed = []
-    for flow, rows in zip(flows, apart, strict=True):  # what each flow misses of the rows that it has not learnt
-        alone, asked = dataclasses.replace(posterior, members=(flow,)), table.rows(rows)
+        alone, asked = dataclasses.replace(posterior, members=(flow,)), table.rows(apart[-1])
         draws = alone.sample(asked.descriptors, asked.views, asked.amount, DRAWS)
         missed.append(draws[..., : len(PARAMETERS)].mean(1) - asked.parameters)
     asked = table.rows(np.concatenate(apart))
     sums = find_combinations(np.concatenate(missed), asked.parameters, asked.descriptors)
-    return dataclasses.replace(posterior, combinations=sums)
+    return dataclasses.replace(posterior, members=tuple(flows), combinations=sums)
 
 
 def _fit(
@@ -222,7 +220,6 @@ def _inflation(emulator: Emulator, table: Table, left: np.ndarray) -> float:
 
 
 def _mean_square(network: nn.Module, x: Tensor, target: Tensor) -> Tensor:
-    """Return the mean square of what a network's outputs miss."""
     return (network(x) - target).square().mean()
 
 

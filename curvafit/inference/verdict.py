@@ -49,7 +49,6 @@ def verdict(
 
 
 def _join(*sentences: str) -> str:
-    """Return the sentences that are not empty, one after the other."""
     return " ".join(filter(None, sentences))
 
 

@@ -53,11 +53,10 @@ def write_comparison(
     record |= {"energy" if c.groups else "distance_correlation": c.statistic, "apart": c.apart, "within": c.within}
     record |= {"tests": tests, "methods": describe_methods(c)}
     page = {
-        "title": c.verdict, "scans": "; ".join(_count_scans(c)) + ".", "status": c.status, "groups": c.groups,
-        "effect": c.effect, "differs": bool(c.significant.any()),
+        "title": c.verdict, "scans": "; ".join(_count_scans(c)) + ".", "effect": c.effect,
         "head": [*c.groups, "difference" if c.groups else "slope", c.effect, "95 %", *TESTS, "known error"],
         "rows": [_format_row(number, c) for number in c.numbers], "level": f"{LEVEL:.2g}",
-        "methods": record["methods"], "notes": c.notes,
+        "differs": bool(c.significant.any()),
     }  # fmt: skip
     drawn = {
         "difference": (comparison_figure(c), "Mean curvature diagrams and their difference"),

@@ -33,8 +33,6 @@ from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.trials import dice
 from curvafit.volumes.volume import ScanError, Volume
 
-#: The page's name in its folder.
-PAGE = "demo.html"
 #: Of this many slices one is kept.
 EVERY = 8
 #: The nearest textures that are grown, by name, and their voxels a side.
@@ -73,7 +71,7 @@ def write_demo(
     ValueError if the scan has no structure, or as `report.page.check_report`.
     """
     folder = page.check_report(directory, [scan.source] if scan.source else (), overwrite)
-    target = folder / PAGE
+    target = folder / "demo.html"
     can_write(target, lambda path: has_mark(path, page.MARK), overwrite=overwrite)
     progress("measuring", 0.0)
     measures = measure(scan, progress=sub_progress(progress, 0.0, 0.1))

@@ -63,11 +63,9 @@ def write_measures(
     ]
     parts = [part for part, _ in rows]
     names, heads = name_parts(parts), list(dict.fromkeys(name for _, more in rows for name in more))
-    status, notes, unit = describe_range(parts), list(count_notes(parts)), measures[0].unit
-    record = start_record(
-        command, unit=unit, options=dict(options or {}), status=status,
-        scans=[{"scan": each.source, "kind": each.kind, "notes": each.notes} for each in measures], notes=notes,
-    )  # fmt: skip
+    scans, unit = [{"scan": each.source, "kind": each.kind, "notes": each.notes} for each in measures], measures[0].unit
+    more = {"status": describe_range(parts), "scans": scans, "notes": list(count_notes(parts))}
+    record = start_record(command, unit=unit, options=dict(options or {}), **more)
     count = f"{len(measures)} scans were" if len(measures) > 1 else "A scan was"
     methods = [
         f"{count} measured with curvafit {version('curvafit')}; {say_kinds(measures)}.",
@@ -81,10 +79,10 @@ def write_measures(
         pairs = [(format_number(x), f"± {format_number(half, 2)}" if math.isfinite(half) else "") for x, half in pairs]
         cells.append({"name": name, "told": [more.get(head, "") for head in heads], "cells": pairs})
     page = {
-        "title": f"{len(measures)} scans measured" if len(measures) > 1 else "One scan measured", "status": status,
+        "title": f"{len(measures)} scans measured" if len(measures) > 1 else "One scan measured",
         "symbols": [(symbol, power_name(unit, measures[0][symbol].power)) for symbol in FIRST_SHOWN],
         "left": {"diagrams": max(0, len(rows) - MOST_DIAGRAMS), "numbers": max(0, len(rows) - MOST_ROWS)},
-        "heads": heads, "rows": cells, "methods": " ".join(methods), "notes": notes,
+        "heads": heads, "rows": cells, "methods": " ".join(methods),
     }  # fmt: skip
     diagrams = diagrams_figure(names[:MOST_DIAGRAMS], parts[:MOST_DIAGRAMS])
     numbers = intervals_figure(names[:MOST_ROWS], parts[:MOST_ROWS])

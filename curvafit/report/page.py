@@ -68,7 +68,6 @@ _TERMS = {
 }  # fmt: skip
 #: The parameters as a corner plot names them.
 SYMBOLS = ("a₁₁", "log a₀₂", "a₁₀", "a₀₁", "a₀₀", "m₀")
-_AXES = "zyx"
 #: Deviations among laws from the middle of a strip to its end.
 STRIP = 2.5
 #: tan 22.5°: how far in direction a point may lie from a family's ideal one.
@@ -158,12 +157,13 @@ def write_study(
 ) -> Path:
     """Write a study's record, page, tables, maps, and figures as PNG and SVG, into a folder together.
 
-    Return the page's path. `values` fill the template of the page's name, besides the figures, each with what it shows
-    in words, and the entries of the record that are `told`.
+    Return the page's path. The record and `values` fill the template of the page's name, besides the figures, each with
+    what it shows in words; entries of the record that are `told` stand at the page's end.
     """
     pictures = {name: picture_of(*each) for name, each in (figures or {}).items()}
     provenance = [(name, record[name]) for name in told if record[name] not in ("", {})]
-    page = render_template(files[1], version=record["curvafit"], provenance=provenance, **pictures, **values)
+    shown = {"version": record["curvafit"], "provenance": provenance, **record, **pictures, **values}
+    page = render_template(files[1], **shown)
     with fill_folder(target, files) as work:
         for name, field in (maps or {}).items():
             save(field, work / name, kind=form.name)
@@ -430,13 +430,13 @@ def _slice(inference: Inference, axis: int, limits: tuple[float, float]) -> Pict
         np.asarray(scan.values.take(row, axis), dtype=np.float32), prepared.phase.take(index, axis),
         image_extent=(0.0, size[across], size[down], 0.0),
         extent=(start[across], stop[across], stop[down], start[down]), limits=limits, unit=scan.unit,
-        axes_names=(_AXES[down], _AXES[across]), window=framed,
+        axes_names=("zyx"[down], "zyx"[across]), window=framed,
     )  # fmt: skip
     depth = format_length((row + 0.5) * scan.spacing[axis], scan.unit)
     part = list(scan.values.shape) != inference.fit.provenance.get("scan_shape", list(scan.values.shape))
     of = " of the part that was read" if part else ""
-    title, text = f"Across {_AXES[axis]}", f"Slice {row} of {scan.values.shape[axis]}{of}, at {depth}"
-    return picture_of(figure, f"Slice across {_AXES[axis]} with the surface's outline", title=title, text=text)
+    title, text = f"Across {'zyx'[axis]}", f"Slice {row} of {scan.values.shape[axis]}{of}, at {depth}"
+    return picture_of(figure, f"Slice across {'zyx'[axis]} with the surface's outline", title=title, text=text)
 
 
 def _is_framed(inference: Inference) -> bool:

@@ -53,11 +53,9 @@ def write_windows(windows: Windows, directory: str | Path, *, command: str = "",
         command, unit=windows.unit, options=windows.options, status=windows.status, notes=windows.notes,
         scan=source, kind=windows.kind, explained=windows.explained,
     )  # fmt: skip
-    page = {
-        "title": "A scan in windows", "status": windows.status,
-        "clusters": range(1, 1 + int(windows.clusters.values.max())),
-        "rows": [_format_row(windows, k) for k in range(len(NAMES))], "notes": windows.notes,
-    }  # fmt: skip
+    rows = [_format_row(windows, k) for k in range(len(NAMES))]
+    clusters = range(1, 1 + int(windows.clusters.values.max()))
+    page = {"title": "A scan in windows", "clusters": clusters, "rows": rows}
     drawn = {"windows": (windows_figure(windows), "The structure, coloured by clusters and by six numbers")}
     fields = (windows.clusters, *map(windows.__getitem__, NAMES))
     maps = dict(zip(files[len(FILES) :], fields, strict=True))
