@@ -41,22 +41,14 @@ SMALLEST_CROP = 28
 _REACH = 2
 #: Planes treated at once, which bounds the memory.
 _SLAB = 24
-#: Test functions are centred on every second voxel.
-_STRIDE = 2
 #: The field's error is modelled as white noise of this width (voxels); its amplitude is searched from the first value.
 _ERROR_WIDTH, _ERROR_START, _ERROR_LIMITS, _ERROR_STEPS = 1.0, 1e-3, (1e-6, 3e-2), 4
-#: A share of a20 + a02 that a start is kept away from the domain's edges, a20 = 0 and a02 = 0.
-_EDGE = 0.01
 #: The short flow: Adam steps of 1e-3 as published.
 SHORT_FLOW = Schedule("short", 150, 1e-3, 1e-3, "constant")
 #: Longest edge of the box that is flowed, and the width of the halo that is held at the sides of a crop, in voxels.
 LARGEST_BOX, HALO = 64, 8
 #: Standard deviation in voxels of the low-pass on the displacement, and every how many voxels it is read.
 LOW_PASS, STRIDE = 2.0, 2
-#: Voxels whose share of interface is under this part of the largest are not read.
-_FAINT = 0.02
-#: Residual of a flow that diverged, in voxels.
-_LOST = 10.0
 
 
 class Problem(NamedTuple):
@@ -166,7 +158,7 @@ def integrate_columns(columns: Tensor, grid: Grid, epsilon: float, width: float)
     core = []
     for n, h in zip(grid.shape, grid.spacing, strict=True):
         margin = 0 if grid.periodic else math.ceil(4 * deviation / h) + _REACH
-        core.append(slice(margin, n - margin, _STRIDE))
+        core.append(slice(margin, n - margin, 2))
     smooth = [gaussian_blur(column, grid, deviation)[tuple(core)].numpy() for column in columns]
     return np.stack(smooth) * unit_factors(epsilon).reshape(6, 1, 1, 1)
 
@@ -267,8 +259,8 @@ def fix_gauge(values: np.ndarray) -> tuple[Coefficients, int]:
 
 def clip_to_domain(values: np.ndarray) -> np.ndarray:
     """Return the nearest coefficients `(6,)` with a20 + a02 = 2 and both positive, away from the edge."""
-    share = np.clip(values[0] / max(values[0] + values[2], 1e-12), _EDGE, 1 - _EDGE)
     scaled = 2 * values / max(values[0] + values[2], 1e-12)
+    share = np.clip(scaled[0] / 2, 0.01, 0.99)
     return np.concatenate(([2 * share, scaled[1], 2 - 2 * share], scaled[3:]))
 
 
@@ -295,13 +287,13 @@ def drift(phase: Float[Tensor, "z y x"], grid: Grid, epsilon: float, coefficient
     before = gaussian_blur(start, grid, epsilon)
     moved = (flow.field - before).double()
     if not bool(torch.isfinite(moved).all()):
-        return _LOST
+        return 10.0  # the flow diverged
     margin = 0 if grid.periodic else HALO
     read = tuple(slice(margin, n - margin, STRIDE) for n in grid.shape)
     # The displacement is the low-passed change of u over `share`, the low-passed |∇u|, and weighs by `share`.
     slope = gradient(before.double(), grid).square().sum(-4).sqrt()
     share, change = (gaussian_blur(each, grid, LOW_PASS * voxel)[read] for each in (slope, moved))
-    kept = share > _FAINT * share.max()
+    kept = share > 0.02 * share.max()  # the others hold little interface
     return float((change[kept].square() / share[kept]).sum() / share[kept].sum()) ** 0.5 / voxel
 
 

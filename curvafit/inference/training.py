@@ -37,8 +37,6 @@ REFERENCE = 400
 BATCH, PACE = (64, 512), 100
 #: Draws of a flow whose mean is compared with the truth.
 DRAWS = 200
-#: Largest norm of a step's gradient.
-STEEPEST = 5.0
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -293,7 +291,7 @@ def learn(
         for chosen in torch.randperm(len(x)).split(batch_size(len(x))):
             optimiser.zero_grad()
             cost(network, x[chosen], y[chosen]).backward()
-            nn.utils.clip_grad_norm_(network.parameters(), STEEPEST)
+            nn.utils.clip_grad_norm_(network.parameters(), 5.0)
             optimiser.step()
         network.eval()
         with torch.no_grad():
