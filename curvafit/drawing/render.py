@@ -192,15 +192,13 @@ def _surface_glow(
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     times = -(-max(field.shape) // COARSE)
     inside = block_reduce((field > 0).astype(np.float32), times, np.mean)
-    close, wide = (
-        map_coordinates(
-            gaussian_filter(inside, distance / times / edges, mode="constant"),
-            ((at + distance * normal / edges - (times - 1) / 2) / times).T,
-            order=1,
-            mode="nearest",
-        )
-        for distance in (NEAR, FAR)
-    )
+
+    def occupy(distance: float) -> np.ndarray:
+        blurred = gaussian_filter(inside, distance / times / edges, mode="constant")
+        places = (at + distance * normal / edges - (times - 1) / 2) / times
+        return map_coordinates(blurred, places.T, order=1, mode="nearest")
+
+    close, wide = occupy(NEAR), occupy(FAR)
     # The more of the phase there is in front of a point, near and far, the less of the sky it sees.
     sky = (1 - np.clip((close - 0.12) * 1.5, 0, 0.7)) * (1 - np.clip((wide - 0.05) * 1.3, 0, 0.6))
     shadow = _shadow(vertices * edges, faces, light, at * edges + 1.5 * normal + 2.0 * light)

@@ -142,16 +142,12 @@ def demo_page(
 
 def _shape_figure(completion: Completion, spacing: tuple[float, float, float]) -> Figure:
     """Return a figure of the known slices, the filled volume and the scan, cut open, the slices lying."""
-    shapes = {
-        f"every {EVERY}th slice": completion.known,
-        "filled between them": completion.filled,
-        "the scan": completion.truth,
-    }
     shape, axis = completion.truth.shape, completion.axis
     order = (axis, *sorted({0, 1, 2} - {axis}, key=lambda each: shape[each] * spacing[each]))
-    turned = {name: mask.transpose(order) for name, mask in shapes.items()}
-    (box,) = ndimage.find_objects(turned["the scan"].view(np.uint8))
-    halves = {name: mask[box][:, (box[1].stop - box[1].start) // 2 :] for name, mask in turned.items()}
+    known, filled, scan = (mask.transpose(order) for mask in (completion.known, completion.filled, completion.truth))
+    (box,) = ndimage.find_objects(scan.view(np.uint8))
+    shapes = {f"every {EVERY}th slice": known, "filled between them": filled, "the scan": scan}
+    halves = {name: mask[box][:, (box[1].stop - box[1].start) // 2 :] for name, mask in shapes.items()}
     return gallery_figure(halves, columns=3, width=1500, spacing=tuple(spacing[k] for k in order))
 
 

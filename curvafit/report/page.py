@@ -285,15 +285,13 @@ def name_source(source: str | None) -> str:
 def _bars(inference: Inference) -> list[dict[str, Any]]:
     """Return the bars of the distances: one for each candidate's shape, and one for two seeds."""
     fit, noise = inference.fit, seed_noise_of(inference.fit.candidates)
-    rows = [
-        (_title(each), each.distance, "best" if each.name == fit.chosen else "") for each in _chosen_first(inference)
-    ]
-    rows.append(("Two seeds", noise, "noise"))
-    longest = max((value for _, value, _ in rows if value is not None), default=0.0) or 1.0
+    laws = [(_title(each), each.distance, each.name == fit.chosen) for each in _chosen_first(inference)]
+    rows = [(name, value, "best" if chosen else "", "nothing grew") for name, value, chosen in laws]
+    rows.append(("Two seeds", noise, "noise", "not known"))
+    longest = max((value for _, value, _, _ in rows if value is not None), default=0.0) or 1.0
     bars = []
-    for name, value, kind in rows:
-        text = format_number(value, 2) if value is not None else "not known" if kind == "noise" else "nothing grew"
-        width = None if value is None else f"{100 * value / longest:.1f}"
+    for name, value, kind, lacking in rows:
+        text, width = (lacking, None) if value is None else (format_number(value, 2), f"{100 * value / longest:.1f}")
         bars.append({"name": name, "kind": kind, "text": text, "width": width})
     return bars
 
