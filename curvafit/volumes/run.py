@@ -167,7 +167,8 @@ def open_run(
 @contextmanager
 def _lock(folder: Path, mine: Mapping[str, str]) -> Iterator[Path]:
     """Make the folder of a run, if there is none, and lock it."""
-    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    # What begins with a dot is a file that a killed run was writing.
+    names = {path.name for path in folder.iterdir() if path.name[0] != "."} if folder.is_dir() else set()
     if (_RUN not in names and names - {"lock"}) or (folder.exists() and not folder.is_dir()):
         raise ValueError(f"tiles need a new folder, but {folder} holds something else")
     folder.mkdir(parents=True, exist_ok=True)

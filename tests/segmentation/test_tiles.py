@@ -292,6 +292,8 @@ def test_a_store_is_no_other_folder_and_no_one_else_s(tmp_path: Path) -> None:
             found(scan(), tmp_path / name)
     assert (tmp_path / "mine" / "notes.txt").read_text() == (tmp_path / "file").read_text() == "keep"
     (tmp_path / "tiles").mkdir()
+    (tmp_path / "tiles" / ".0a1b2c3d.run.json").write_text("{")  # a run was killed while it said whose it is
+    assert same(found(scan(), tmp_path / "tiles"), found(scan()))
     with FileLock(tmp_path / "tiles" / "lock"), pytest.raises(ValueError, match="in use"):
         found(scan(), tmp_path / "tiles")
 
