@@ -260,15 +260,15 @@ def _run(
         store = hidden_store(job.out)
         with resumable(lambda: "the same command" if store.exists() else ""):
             result = compute(volume, progress=progress, store=store)
-        progress("writing", 1.0)
-        labels = None if sure is None else result.keep_sure(sure)
-        result = result if labels is None else replace(result, notes=(*result.notes, *labels.notes))
-        # The header is kept where it says where the voxels are; one of a file of channels is of all of them.
-        stated = ("spacing", "crop") if job.image else ("spacing", "crop", "channel", "time")
-        like = (job.image or job.source) if all(reading[name] is None for name in stated) else None
-        how = {"sure": labels, "like": like, "unit": reading["unit"], "overwrite": job.overwrite}
-        how["record"] = job.content | ({"not_held": lost} if lost else {})
-        paths = write_mask(result, volume, job.out, **how)
+            progress("writing", 1.0)
+            labels = None if sure is None else result.keep_sure(sure)
+            result = result if labels is None else replace(result, notes=(*result.notes, *labels.notes))
+            # The header is kept where it says where the voxels are; one of a file of channels is of all of them.
+            stated = ("spacing", "crop") if job.image else ("spacing", "crop", "channel", "time")
+            like = (job.image or job.source) if all(reading[name] is None for name in stated) else None
+            how = {"sure": labels, "like": like, "unit": reading["unit"], "overwrite": job.overwrite}
+            how["record"] = job.content | ({"not_held": lost} if lost else {})
+            paths = write_mask(result, volume, job.out, **how)
         remove(store)
     for note in result.notes:
         say(note)

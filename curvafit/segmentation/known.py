@@ -47,22 +47,21 @@ class Known:
         ignore: int | None, axis: int,
     ) -> Known:  # fmt: skip
         """Find which slices of a volume are known, as `reconstruct` says; with `ignore` in memory."""
-        whole = cls(volume, check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2))
+        whole = cls(volume, axis)
         if ignore is not None:
-            if every is not None or known is not None:
-                raise ScanError("give either every, known or ignore")
             ignore = check_int(ignore, "a label to ignore", -SEEDS, IDS)
             places, marks = annotated_slices(whole.turn(volume.values), ignore)
             return replace(whole, places=tuple(places), marks=marks)
         if every is None and known is None:
             places = choose_labelled(there := whole._look(run))
             return replace(whole, places=tuple(places), notes=note_labelled(places, there))
-        places = known_places(volume.shape[axis], every, first, known)
-        notes = () if every is None else doubt_places(whole._look(run), places)
-        return replace(whole, places=tuple(places), notes=notes)
+        return replace(whole, places=tuple(known_places(volume.shape[whole.axis], every, first, known)))
 
-    def read(self, run: Run, periodic: bool = False, name: str = "the known slices") -> tuple[Slices, np.ndarray]:
-        """Read the known slices; return them, where the run keeps its work, and the labels that they have.
+    def read(
+        self, run: Run, periodic: bool = False, name: str = "the known slices"
+    ) -> tuple[Slices, np.ndarray, np.ndarray]:
+        """Read the known slices; return them, where the run keeps its work, the labels that they have, and whether each
+        slice of the volume has labels.
 
         Raises `ScanError` if they hold grey levels, or are all empty or all full; the message calls them `name`.
         """
@@ -73,15 +72,19 @@ class Known:
             which = record["which"]
             if len(which):
                 inside[which[0] : which[-1] + 1] = record["inside"]
-            return {"values": record["values"], "count": np.count_nonzero(record["inside"])}
+            found = {"there": record["there"], "values": record["values"]}
+            return {**found, "count": np.count_nonzero(record["inside"])}
 
         found = run("reading known slices", partial(_read_slab, self, name), len(self._slabs), keep=keep)
         values = np.unique(np.concatenate([each["values"] for each in found]))
         if len(values) > LABELS:
             raise ScanError(f"{name} must be a mask or have at most {LABELS} labels, got {len(values)} values")
-        require_outline(sum(int(each["count"]) for each in found), len(self.places) * plane[0] * plane[1], name)
+        count = sum(int(each["count"]) for each in found)
+        self._check_label(count > 0)
+        require_outline(count, len(self.places) * plane[0] * plane[1], name)
         edges = turn_axes(self.volume.spacing, self.axis)
-        return Slices(inside.stored, self.places, length, edges, self.volume.unit, periodic, self.marks), values
+        slices = Slices(inside.stored, self.places, length, edges, self.volume.unit, periodic, self.marks)
+        return slices, values, np.concatenate([each["there"] for each in found])
 
     def turn(self, values: np.ndarray) -> np.ndarray:
         """Move the axis across the slices to the front."""
@@ -103,7 +106,7 @@ class Known:
         length, *plane = turn_axes(self.volume.shape, self.axis)
         thick = length
         if self.volume.in_file:
-            thick = min(THICK, max(1, SLAB // (plane[0] * plane[1] * self.volume.dtype.itemsize)))
+            thick = min(THICK, max(1, SLAB // (plane[0] * plane[1] * self.volume.array.file.dtype.itemsize)))
         return [slice(start, min(start + thick, length)) for start in range(0, length, thick)]
 
     def _slab(self, rows: slice) -> np.ndarray:
@@ -117,7 +120,14 @@ class Known:
     def _look(self, run: Run) -> np.ndarray:
         """Return whether each slice has labels, (length,)."""
         found = run("looking for labels", partial(_look_at_slab, self), len(self._slabs))
-        return np.concatenate([each["there"] for each in found])
+        there = np.concatenate([each["there"] for each in found])
+        self._check_label(bool(there.any()))
+        return there
+
+    def _check_label(self, found: bool) -> None:
+        """Raise ScanError where a label was not found in a file."""
+        if not found and self.volume.in_file and self.volume.array.label is not None:
+            raise ScanError(f"label {self.volume.array.label} is in none of the known slices")
 
 
 def _look_at_slab(whole: Known, number: int) -> Record:
@@ -126,13 +136,28 @@ def _look_at_slab(whole: Known, number: int) -> Record:
 
 
 def _read_slab(known: Known, name: str, number: int) -> Record:
-    """Return the numbers of a slab's known slices among all, which voxels are inside, and which labels they have."""
+    """Return which slices of a slab have labels, the numbers of the known ones among all, and of these which voxels
+    are inside, and which labels they have."""
     rows = known._slabs[number]
+    values = known._slab(rows)
+    there = (values > 0).any((1, 2))
     which = np.array([k for k, place in enumerate(known.places) if rows.start <= place < rows.stop], dtype=np.intp)
     if not len(which):
-        return {"which": which, "inside": np.empty(0, dtype=bool), "values": np.empty(0, dtype=known.volume.dtype)}
-    values = require_labels(known._slab(rows)[[known.places[k] - rows.start for k in which]], name)
-    return {"which": which, "inside": values > 0, "values": np.unique(values)}
+        return {"there": there, "which": which, "inside": np.empty(0, dtype=bool), "values": values[:0, 0, 0]}
+    values = require_labels(values[[known.places[k] - rows.start for k in which]], name)
+    return {"there": there, "which": which, "inside": values > 0, "values": np.unique(values)}
+
+
+def check_which(
+    shape: Sequence[int], every: int | None, first: int, known: Sequence[int] | None, ignore: int | None, axis: int,
+    suggest: int,
+) -> None:  # fmt: skip
+    """Raise ValueError where what is said of the known slices of a volume of a shape cannot be, before it is read."""
+    length = shape[check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)]
+    if ignore is not None and (every is not None or known is not None):
+        raise ScanError("give either every, known or ignore")
+    places = [] if every is None and known is None else known_places(length, every, first, known)
+    check_int(suggest, "a number of slices from 0", 0, length - len(places))
 
 
 # ---- which slices ----------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from skimage import measure
 from curvafit.core.checks import SEEDS, check_int
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.priors.law import LawLike
-from curvafit.segmentation.known import Known, check_shared
+from curvafit.segmentation.known import Known, check_shared, check_which, doubt_places
 from curvafit.segmentation.reconstruct import SHIFTED, UNTOLD, load_example, load_image, reconstruct
 from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.segmentation.slices import IDS, WHOLE, index_labels, mark_known, reach_of, require_labels
@@ -102,11 +102,12 @@ def reconstruct_labels(
     reading = {"spacing": spacing, "unit": unit}
     which = {name: options.pop(name, usual) for name, usual in WHICH.items()}
     volume, suggest = load(slices, **reading), options.pop("suggest", 0)
-    volume = replace(volume, array=round_labels(volume.values))
-    given = Known.find(volume, Run(), **which)
-    places, notes, moved = list(given.places), given.notes, given.turn(volume.values)
+    check_which(volume.shape, **which, suggest=suggest)
+    given = Known.find(volume := replace(volume, array=round_labels(volume.values)), Run(), **which)
+    places, moved = list(given.places), given.turn(volume.values)
+    doubtful = () if which["every"] is None else doubt_places(np.asarray((moved > 0).any((1, 2))), places)
     suggest = check_int(suggest, "a number of slices from 0", 0, len(moved) - len(places))
-    numbers = find_labels(moved[places], chosen)
+    notes, numbers = (*given.notes, *doubtful), find_labels(moved[places], chosen)
     if which["every"] is None and which["known"] is None and which["ignore"] is None:
         check_shared(moved, places, numbers)
     index = replace(volume, array=index_labels(volume.values, numbers, which["ignore"]), notes=())
@@ -137,7 +138,6 @@ def reconstruct_labels(
     dice = {number: doubt.expected_dice for number, doubt in doubts.items() if doubt is not None}
     if whole is not None:
         values, likely, found = _split_instances(labels, parts, whole, values, odds)
-        assert whole.phase is not None
         dice, phase, said = dict(zip(numbers, found, strict=True)), whole.phase.values, whole.notes
     likely = np.where(labels.known, 1.0, likely).astype(np.float32)
     error = max(doubt.calibration_error for doubt in (whole and whole.uncertainty, *doubts.values()) if doubt)
@@ -181,7 +181,7 @@ class _Labels:
             inside[values < 0], which = UNKNOWN, {"ignore": UNKNOWN}
         mask, options = replace(given.volume, array=inside, affine=None), dict(self.options)
         if law is None:
-            options.pop("tile", None)  # in blocks there is no phase field
+            options.pop("tile", None)  # a box of a label is filled at once
         return reconstruct(mask, law, axis=given.axis, **which, **options, **more)
 
 
@@ -222,7 +222,6 @@ def _join_parts(labels: _Labels, parts: _Parts, full: bool, far: np.ndarray) -> 
     deepest, owner = np.full(shape, -np.inf, dtype=np.float32), np.zeros(shape, dtype=np.int16)
     largest, odds = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
     for place, (box, part) in enumerate(parts, 1):
-        assert part.phase is not None
         owner[box] = np.where(part.phase.values > deepest[box], place, owner[box])
         deepest[box] = np.maximum(deepest[box], part.phase.values)
         own = _odds(part)

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.special import expit
+from scipy.special import expit, logit
 
 from curvafit.core.checks import check_float, check_int
 from curvafit.core.extras import require
@@ -35,7 +35,7 @@ from curvafit.scan.prepare import LARGEST_BOX
 from curvafit.segmentation.filler import REACH, SLOPE, TILE, Raster, Taught, fill
 from curvafit.segmentation.flow import HALO, STEPS, WorkingGrid, choose_epsilon
 from curvafit.segmentation.image import find_shift, read_image
-from curvafit.segmentation.known import SLAB, Known, doubt_labels
+from curvafit.segmentation.known import SLAB, Known, check_which, doubt_labels, doubt_places
 from curvafit.segmentation.result import Segmentation, Uncertainty, describe_filled, flow_summary
 from curvafit.segmentation.slices import (
     WHOLE,
@@ -75,7 +75,7 @@ from curvafit.volumes.boxes import Box, cut_boxes
 from curvafit.volumes.formats.zarr import CHUNK
 from curvafit.volumes.place import lay
 from curvafit.volumes.read import Source, load
-from curvafit.volumes.run import Record, Run, RunArray, open_run
+from curvafit.volumes.run import Record, Run, open_run
 from curvafit.volumes.volume import ScanError, StoredArray, Volume, digest_of, round_labels
 
 #: Stiffness of the springs on known voxels, in working units: a tenth of it gives way, ten times as much stalls.
@@ -94,13 +94,15 @@ LEAST_BYTES = 30
 TOLD = 0.1
 SHIFTED = "The image seems to lie off the annotated slices by {} voxels along {}: it fits them better when it is moved."
 UNTOLD = "The image does not tell the structure in annotated slices held out: it is left out."
+#: Probabilities of a phase field are at least this.
+SURE = 1e-6
 #: Slices of a block by default, and voxels a side across them at most.
 DEEP, WIDE = 2 * CHUNK, 4 * CHUNK
 #: Bytes that a pixel of a slice takes in the network, those of a voxel of a block, and of the program itself.
 _EACH, _VOXEL, _PROGRAM = 800, 24, 600 * 2**20
-#: The pass that fills, and the share of the work that is done after each.
-_FILL = "filling blocks"
-_ENDS = {"looking for labels": 0.02, "reading known slices": 0.07, _FILL: 0.98}
+#: The pass that fills, and the share of the work that is done after each pass.
+_FILL, _READ = "filling blocks", 0.07
+_ENDS = {"looking for labels": 0.02, "reading known slices": _READ, _FILL: 0.98}
 
 
 def reconstruct(
@@ -167,9 +169,9 @@ def reconstruct(
         Stiffness of the springs on known voxels, in working units: the first law is lowered without being tried out.
     tile, store, workers
         With a law as in `segment`. Else labels in a file with a side of more than 256 voxels, or any with a `tile`, the
-        voxels a side of a block, are filled in blocks: mask and probability are then read from the folder `store`, with
-        which the same call goes on after a kill, and there is no phase field. With an image, `ignore` or `periodic`
-        volumes are filled at once.
+        voxels a side of a block, are filled in blocks: the result is then read from the folder `store`, if there is
+        one, with which the same call goes on after a kill, and workers share the blocks of a file. With an image,
+        `ignore` or `periodic` volumes are filled at once, and these three do nothing.
     epsilon, steps, progress, reading
         As in `segment`.
 
@@ -183,6 +185,7 @@ def reconstruct(
     """
     volume = load(slices, **reading, lazy=True)
     which: dict[str, Any] = {"every": every, "first": first, "known": known, "ignore": ignore, "axis": axis}
+    check_which(volume.shape, **which, suggest=suggest)
     tile, width = check_edge(tile), choose_epsilon(volume, epsilon)
     if stiffness is not None:
         stiffness = check_float(stiffness, "a positive stiffness", *STIFFEST)
@@ -194,46 +197,57 @@ def reconstruct(
     laws, notes = ((), ()) if prior is None else laws_of(prior, volume)
     if image is not None and (example is not None or laws):
         raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
-    taught, evidence, seen = Taught.load(filler, image=image is not None), None, None
+    taught = Taught.load(filler, image=image is not None)
+    seen = None if image is None else load_image(image, volume, reading)
     other = None if example is None else load_example(example, volume, reading)
     same: dict[str, Any] = {}
     if blocks and store is not None:  # digests take a while
         same = {"labels": volume.digest, **which, "filler": taught.digest, "tile": tile}
         same |= {"example": other and other.digest}
-    crew, folder, shown = (workers if volume.in_file else None, store, progress) if blocks else (None, None, silent)
+    crew = workers if blocks and volume.in_file and store is not None else None
+    folder, shown = (store, progress) if blocks else (None, silent)
     with open_run(crew, folder, same, shown, _ENDS) as run:
         given = Known.find(volume, run, **which)
         suggest = check_int(suggest, "a number of slices from 0", 0, volume.shape[given.axis] - len(given.places))
-        target, labels = given.read(run, periodic)
-        notes = (*given.notes, *doubt_labels(labels, ignore), *notes)
+        target, labels, there = given.read(run, periodic)
+        doubts = () if every is None else doubt_places(there, given.places)
+        notes = (*given.notes, *doubts, *doubt_labels(labels, ignore), *notes)
         part = None if other is None else Example.of(other, given.places, given.axis)
-        if image is not None:
-            seen = load_image(image, volume, reading)
-            step = sub_progress(progress, 0.0, 0.5)
-            evidence, doubts = _read_evidence(given.turn(seen.values), target, given.axis, step)
-            taught, notes = Taught.load() if evidence is None else taught, (*notes, *seen.notes, *doubts)
-        if part is not None:
-            taught, notes = tune(taught, part, sub_progress(progress, 0.0, 0.5)), (*notes, *part.notes)
+        shown_part = sub_progress(progress, *((_READ, _READ) if blocks else (0.0, 0.5)))
+        taught, evidence, learned = _learn(taught, given, target, seen, part, shown_part)
+        notes = (*notes, *learned)
         engine = _Engine(taught, evidence, epsilon, progress)
         place, tiles = engine.cut(target, tile) if laws else (None, [])
         chosen, task, said = _choose_law(engine, target, laws, part, (stiffness, steps), len(tiles))
         if place is None or chosen.law is None:
-            filled = _fill_volume(given, target, engine, run, tile, blocks)
-            phase, inside = None if blocks else engine.run(target, chosen), flow_summary(filled.share)
+            filled, phase = _fill_volume(given, target, engine, run, tile, blocks)
+            inside = flow_summary(filled.share)
         else:
             problem = SlicesProblem(chosen, target, engine.level(target))
             found = lower_volume(problem, place, tiles, store=store, workers=workers, progress=progress)
             filled, engine = _weigh_evidence(engine, chosen, task, given, target, found)
-            phase, notes = found.phase, (*notes, *place.notes)
+            phase, notes = given.turn_back(found.phase), (*notes, *place.notes)
             inside = flow_summary(float(found.mask.mean()), found.energies, found.steps)
     uncertain = filled.judge(given, target, engine, suggest)
     tested = "the example" if part else "slices left out" if chosen.law else "generated shapes"
     ways = {"tested": tested, "image": evidence is not None, "periodic": periodic}
     status, doubts = describe_filled(said, inside, filled.share, uncertain, given.places, target.length, **ways)
     return Segmentation.of(
-        volume, filled.mask, None if phase is None else given.turn_back(phase), chosen.law, width,
+        volume, filled.mask, phase, chosen.law, width,
         (*notes, *doubts), weight=None, status=status, uncertainty=uncertain, image=seen,
     )  # fmt: skip
+
+
+def _learn(
+    taught: Taught, given: Known, slices: Slices, image: Volume | None, example: Example | None, progress: Progress
+) -> tuple[Taught, np.ndarray | None, tuple[str, ...]]:
+    """Return the network, which an example tunes; what an image says; and notes on either."""
+    if image is not None:
+        evidence, doubts = _read_evidence(given.turn(image.values), slices, given.axis, progress)
+        return Taught.load() if evidence is None else taught, evidence, (*image.notes, *doubts)
+    if example is not None:
+        return tune(taught, example, progress), None, example.notes
+    return taught, None, ()
 
 
 def _choose_law(
@@ -347,8 +361,11 @@ class _Filled:
         )
 
 
-def _fill_volume(given: Known, slices: Slices, engine: _Engine, run: Run, tile: int | None, blocks: bool) -> _Filled:
-    """Fill a volume by the network alone, at once or in blocks; no mask is cut before all of it is filled."""
+def _fill_volume(
+    given: Known, slices: Slices, engine: _Engine, run: Run, tile: int | None, blocks: bool
+) -> tuple[_Filled, Any]:
+    """Fill a volume by the network alone, at once or in blocks; no mask is cut before all of it is filled. Return the
+    phase field too."""
     shape, raster = given.volume.shape, Raster.of(slices) if blocks else None
     cores = cut_boxes(slices.shape, slices.shape if raster is None else _choose_edges(raster, tile))
     likely, mask = run.open("probability", np.float32, shape), run.open("mask", np.uint8, shape)
@@ -374,7 +391,28 @@ def _fill_volume(given: Known, slices: Slices, engine: _Engine, run: Run, tile: 
         inside = part > least[core[0]]
         mask[box] = np.moveaxis(inside, 0, given.axis)
         sums |= {name: sums.get(name, 0) + n for name, n in _compare(part, inside, slices.between[core[0]]).items()}
-    return _Filled(_voxels(likely), _voxels(mask, label=1), sums)
+    filled = _Filled(_voxels(likely.stored), _voxels(mask.stored, label=1), sums)
+    if raster is None:
+        return filled, given.turn_back(engine.run(slices, Trial()))
+    epsilon = choose_epsilon(slices.frame, engine.epsilon)
+    profile = _Profile(likely.stored, np.moveaxis(least, 0, given.axis), min(slices.spacing[1:]), epsilon)
+    return filled, _voxels(profile)
+
+
+class _Profile:
+    """The phase field of probabilities, computed where it is asked for: the profile of their log-odds over those of
+    `least`, times the edge of a voxel."""
+
+    dtype, digest = np.dtype(np.float32), ""
+
+    def __init__(self, likely: Any, least: np.ndarray, edge: float, epsilon: float) -> None:
+        self.likely, self.least, self.edge, self.epsilon, self.shape = likely, least, edge, epsilon, likely.shape
+
+    def __getitem__(self, index: tuple[slice, ...]) -> np.ndarray:
+        likely = np.clip(self.likely[index], SURE, 1 - SURE)
+        own = (edge if n > 1 else slice(None) for edge, n in zip(index, self.least.shape, strict=True))
+        level = self.edge * (logit(likely) - logit(self.least[tuple(own)]))
+        return _profile(level, self.epsilon).astype(np.float32)
 
 
 def fill_block(slices: Slices, taught: Taught, raster: Raster, cores: Sequence[Box], number: int) -> Record:
@@ -430,9 +468,9 @@ def _describe_blocks(slices: Slices, raster: Raster, cores: Sequence[Box], proce
     return f"{len(cores)} blocks of {' x '.join(map(str, sides))} voxels, in about {total / 1e9:.2g} GB of memory."
 
 
-def _voxels(array: RunArray, label: int | None = None) -> Any:
-    """Return what a volume reads an array from, in memory or in the file of a run, or the mask of a label."""
-    stored, (z, y, x) = array.stored, (slice(0, n) for n in array.shape)
+def _voxels(stored: Any, label: int | None = None) -> Any:
+    """Return what a volume reads an array from, in memory or stored, or the mask of a label."""
+    z, y, x = (slice(0, n) for n in stored.shape)
     if isinstance(stored, np.ndarray):
         return stored if label is None else stored == label
     return StoredArray(stored, (z, y, x), (0, 1, 2), label)

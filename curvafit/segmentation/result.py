@@ -35,8 +35,8 @@ SETTLED = 0.001
 FORMAT = Format("curvafit-mask-1", title="the record of a mask")
 #: Volumes that may lie beside a mask, by the ending of their names.
 MAPS = ("probability", "sure")
-#: Numbers or labels that are told one by one, and the least expected Dice of a volume that slices tell.
-FEW, HALF = 4, 0.5
+#: The least expected Dice of a volume that slices tell.
+HALF = 0.5
 #: Least relative difference of two shares of a volume that is told.
 LITTLE = 0.01
 #: What is said of a mask that is no estimate of a volume.
@@ -90,8 +90,7 @@ class Segmentation(Pictured):
     Attributes
     ----------
     mask, phase
-        The mask, bool, and the phase field u, float32, with the scan's grid, spacing, unit and affine; no phase field
-        of a volume that is filled in blocks.
+        The mask, bool, and the phase field u, float32, with the scan's grid, spacing, unit and affine.
     weight
         λ, in nats per unit of F_ε; None for a reconstruction from known slices.
     coefficients, epsilon
@@ -109,7 +108,7 @@ class Segmentation(Pictured):
     """
 
     mask: Volume
-    phase: Volume | None
+    phase: Volume
     weight: float | None
     coefficients: Coefficients | None
     epsilon: float
@@ -130,15 +129,14 @@ class Segmentation(Pictured):
         cls,
         scan: Volume,
         mask: Any,
-        phase: np.ndarray | None,
+        phase: Any,
         law: Coefficients | None,
         epsilon: float,
         notes: tuple[str, ...],
         **more: Any,
     ) -> Segmentation:
         """Return a segmentation whose mask and phase field (Z, Y, X) lie as the scan does; `more` are attributes."""
-        inside, field = (None if v is None else replace(scan, array=v, notes=()) for v in (mask, phase))
-        assert inside is not None
+        inside, field = (replace(scan, array=values, notes=()) for values in (mask, phase))
         return cls(inside, field, coefficients=law, epsilon=epsilon, notes=(*scan.notes, *notes), **more)
 
     @property
@@ -273,7 +271,8 @@ def write_mask(
         else:
             write_labels(replace(scan, array=values.array), work / target.name, image=image)
             mark(work / target.name, FORMAT.name)
-        rows = {} if maps else {"scan": (scan.values, None), "mask": (scan.values, mask.values)}
+        shown = None if maps else scan.values
+        rows = {} if shown is None else {"scan": (shown, None), "mask": (shown, mask.values)}
         content = describe_run(segmentation, record or {}, scan)
         return _finish(work, target, list(maps), _figure(segmentation, rows), content)
 
@@ -301,8 +300,7 @@ def _finish(work: Path, target: Path, maps: Sequence[str], figure: Figure, conte
 
 def segmentation_figure(segmentation: Segmentation) -> Figure:
     """Draw the mask's outline on the phase field, in the middle slices or the most uncertain ones."""
-    phase = segmentation.phase or segmentation.mask
-    return _figure(segmentation, {"mask": (phase.values, segmentation.mask.values)})
+    return _figure(segmentation, {"mask": (segmentation.phase.values, segmentation.mask.values)})
 
 
 def _figure(segmentation: Segmentation, rows: Mapping[str, tuple[np.ndarray, np.ndarray | None]]) -> Figure:

@@ -39,7 +39,7 @@ from curvafit.volumes.formats.slices import SLICES, read_slices
 from curvafit.volumes.formats.tiff import read_tiff
 from curvafit.volumes.formats.zarr import list_levels, read_remote, read_zarr
 from curvafit.volumes.stated import to_volume
-from curvafit.volumes.volume import Volume, check_finite, check_varies, positive_triple
+from curvafit.volumes.volume import Volume, check_finite, positive_triple
 
 #: A volume as a caller gives it.
 Source = str | os.PathLike[str] | Volume | np.ndarray | torch.Tensor
@@ -133,10 +133,9 @@ def load(
     else:
         raise ScanError(f"a volume must be the path of a file, a Volume, an array or a tensor, got {quoted(source)}")
     volume = volume if box is None else volume.crop(box)
-    if isinstance(source, str | os.PathLike) and not (lazy or volume.in_file):
-        check_varies(volume.values, volume.source)
-    volume = volume if label is None else volume.label(label)
-    return volume if lazy else volume.load()
+    if not lazy and (volume.in_file or isinstance(source, str | os.PathLike)):
+        volume = volume.load()
+    return volume if label is None else volume.label(label)
 
 
 def _open(

@@ -111,18 +111,17 @@ class Volume(Pictured):
 
     def load(self) -> Volume:
         """Return the volume in memory; ScanError where that of a file does not fit, is not finite, or constant."""
-        if not self.in_file:
-            return self
-        values, label = self.values, self.array.label
-        if label is None:
+        values, label = self.values, self.array.label if self.in_file else None
+        if label is None and self.source:
             check_varies(values, self.source)
-        elif _LABELLED.format(label) in self.notes and (values.all() or not values.any()):
+        elif label is not None and _LABELLED.format(label) in self.notes and (values.all() or not values.any()):
             replace(self, array=replace(self.array, label=None)).load().label(label)  # says which labels there are
-        return replace(self, array=values)
+        return replace(self, array=values) if self.in_file else self
 
     def check_fits(self) -> None:
-        """Raise ScanError where all values do not fit into memory."""
-        check_array(self.shape, self.dtype, self.source or "the volume")
+        """Raise ScanError where all values do not fit into memory; of a label, those that it is looked for in."""
+        kind = self.array.file.dtype if self.in_file else self.dtype
+        check_array(self.shape, kind, self.source or "the volume")
 
     def crop(self, crop: Crop) -> Volume:
         """Return a box of voxels, whose affine says where the box lies in the volume.
@@ -138,9 +137,9 @@ class Volume(Pictured):
         """Return the mask of the voxels with this value; none or all of them are a ScanError, once they are read."""
         label = check_int(label, "a label that is a whole number", -SEEDS, 2 * SEEDS - 1)
         notes = (*self.notes, _LABELLED.format(label))
-        if self.in_file:
+        if self.in_file and self.array.label is None:
             return replace(self, array=replace(self.array, label=label), notes=notes)
-        mask = round_labels(self.values) == label
+        mask = is_label(self.values, label)
         if mask.all() or not mask.any():
             values = np.unique(self.values)
             listed = ", ".join(map(str, values[:12].tolist())) + (", …" if len(values) > 12 else "")
@@ -194,7 +193,9 @@ class StoredArray:
 
     def __getitem__(self, box: Box) -> np.ndarray:
         values = np.asarray(self.file[self.crop(box).index])
-        values = values if self.label is None else round_labels(values) == self.label
+        if self.label is not None:
+            check_finite(values, "a volume with labels")
+            values = is_label(values, self.label)
         turned = values.transpose([sorted(self.order).index(axis) for axis in self.order])
         return np.array(turned, self.dtype, order="C", copy=None if values.flags.owndata else True)  # not a mapped file
 
@@ -208,7 +209,7 @@ def check_varies(values: np.ndarray, place: object) -> None:
 
 def check_finite(values: np.ndarray, place: object) -> tuple[float, float]:
     """Return the lowest and the highest value, or raise ScanError where one is not finite."""
-    lowest, highest = values.min(), values.max()
+    lowest, highest = (values.min(), values.max()) if values.size else (0.0, 0.0)
     if values.dtype.kind == "f" and not (math.isfinite(lowest) and math.isfinite(highest)):
         what = "NaN" if math.isnan(lowest) else "infinite"
         count = np.count_nonzero(np.isnan(values) if what == "NaN" else np.isinf(values))
@@ -220,6 +221,11 @@ def digest_of(values: np.ndarray) -> str:
     """Return a text that differs between arrays: type, shape and a part of the SHA-256."""
     content = np.ascontiguousarray(values)
     return f"{content.dtype} {content.shape} {hashlib.sha256(content.view(np.uint8).data).hexdigest()[:16]}"
+
+
+def is_label(values: np.ndarray, label: int) -> np.ndarray:
+    """Return where values are a label, bool; floats within 1e-3 of it are."""
+    return np.abs(values - label) <= 1e-3 if values.dtype.kind == "f" else values == label
 
 
 def round_labels(values: np.ndarray) -> np.ndarray:

@@ -66,8 +66,9 @@ def save(
     overwrite
         Whether any other folder of that name may be replaced.
     """
-    field, target = load(source, spacing=spacing, unit=unit, lazy=True), Path(path)
-    field = field if is_streamed(target) else field.load()
+    target = Path(path)
+    lazy = is_streamed(target) and isinstance(source, Volume)  # what a file has is checked
+    field = load(source, spacing=spacing, unit=unit, lazy=lazy)
     writer = pick_writer(target, field.unit, np.empty(0, field.dtype) if field.in_file else field.values)
     can_write(target, lambda there: not there.is_dir() or is_own_zarr(there, kind), overwrite=overwrite)
 

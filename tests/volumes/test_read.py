@@ -632,3 +632,41 @@ def test_arrays_beside_that_of_an_npz_file_state_its_voxels(
     volume = load(tmp_path / "scan.npz")
     assert (volume.values == values).all() and (volume.spacing, volume.unit) == (spacing, unit)
     assert any("pixel_size" in note for note in volume.notes) == ("pixel_size" in place)
+
+
+@pytest.mark.parametrize(
+    "beside", [{}, {"unit": None}, {"resolution": "high"}, {"high_resolution": np.zeros((3, 4, 6), np.uint8)}]
+)
+def test_an_npz_file_s_volume_is_no_spacing_whatever_its_name(tmp_path: Path, beside: dict) -> None:
+    values = np.arange(60, dtype=np.uint8).reshape(3, 4, 5)
+    np.savez(tmp_path / "scan.npz", low_resolution=values, **beside)
+    assert (load(tmp_path / "scan.npz", key="low_resolution").values == values).all()
+
+
+def test_a_label_of_a_label_and_of_a_file_larger_than_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    labels = np.repeat(np.arange(4.0), 2)[:, None, None] + np.zeros((8, 3, 4))
+    np.save(tmp_path / "labels.npy", labels)
+    lazy = load(tmp_path / "labels.npy", label=2, lazy=True)
+    assert lazy.in_file and lazy.dtype == bool and (lazy.values == (labels == 2)).all()
+    assert (lazy.label(1).values == (labels == 2)).all()
+    with pytest.raises(ScanError, match="which has 0"):
+        load(tmp_path / "labels.npy", label=9, lazy=True).load()
+    monkeypatch.setattr("curvafit.volumes.formats.base.memory", lambda: 500)
+    for label in (None, 2):
+        with pytest.raises(ScanError, match="memory"):
+            load(tmp_path / "labels.npy", label=label)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".nii", ".nii.gz"])
+@pytest.mark.parametrize("target", ["copy.zarr", "copy.npy"])
+@pytest.mark.parametrize("value", [1.0, np.nan])
+def test_a_file_without_a_structure_is_not_copied(tmp_path: Path, suffix: str, target: str, value: float) -> None:
+    values = np.ones((5, 5, 5), dtype=np.float32)
+    values[2, 2, 2] = value
+    source = tmp_path / f"scan{suffix}"
+    if suffix == ".npy":
+        np.save(source, values)
+    else:
+        nibabel.save(nibabel.Nifti1Image(values, np.eye(4)), source)
+    with pytest.raises(ScanError, match="vary|finite"):
+        save(source, tmp_path / target)

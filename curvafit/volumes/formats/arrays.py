@@ -38,10 +38,21 @@ def read_npz(path: Path, *, key: str | None = None, **_: object) -> Stated:
     """Read the array of an NPZ file that a key names, and what arrays named like `spacing` say of its voxels."""
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
-        said = [name for name in names if base.is_place_name(name) and name != key]
+        said = [name for name in names if name != key and _states_place(archive, name)]
         values = read_member(archive, f"{base.pick_key([n for n in names if n not in said], key, path)}.npy")
         place = {name: read_member(archive, f"{name}.npy") for name in said}
     return Stated(values, "?" * values.ndim, **base.read_spacing(place, values.ndim))
+
+
+def _states_place(archive: zipfile.ZipFile, name: str) -> bool:
+    """Return whether an array is named like a spacing or a unit, and is a few numbers, or text."""
+    if not (unit := name in ("unit", "units")) and not base.is_place_name(name):
+        return False
+    with archive.open(f"{name}.npy") as stream:
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(stream)
+    return dtype.kind in ("US" if unit else "iuf") and len(shape) <= 1 and math.prod(shape) <= 99
 
 
 def read_hdf5(path: Path, *, key: str | None = None, **_: object) -> Stated:

@@ -132,8 +132,8 @@ def read_spacing(attributes: Mapping[str, Any], ndim: int) -> dict[str, Any]:
 
 
 def is_place_name(name: str) -> bool:
-    """Return whether `read_spacing` knows an attribute, or says that it is not used."""
-    return name in ("unit", "units", "offset", "resolution") or _SPACING.search(name) is not None
+    """Return whether `read_spacing` uses an attribute as lengths, or says that it is not used."""
+    return name == "offset" or _SPACING.search(name) is not None
 
 
 def _entries(value: Any) -> tuple[Any, ...]:

@@ -146,13 +146,16 @@ def write_zarr(field: Any, path: Path, version: str = "0.5", labels: bool = Fals
 
     `labels` says that its whole numbers are labels of the image two folders above.
     """
-    with hold_signals():  # Zarr's own threads would go on to write while the folder is deleted
+    with hold_signals():
         group = _create_zarr(field, path, version, labels)
-        finest = _level_of(group, 0)
-        for core in _cores_of(group, 0):
-            finest[core] = field.read(core).astype(finest.dtype, copy=False)
-        for level in range(1, len(group)):
-            for core in _cores_of(group, level):
+    finest = _level_of(group, 0)
+    for core in _cores_of(group, 0):
+        values = field.read(core).astype(finest.dtype, copy=False)
+        with hold_signals():  # Zarr's own threads would go on to write while the folder is deleted
+            finest[core] = values
+    for level in range(1, len(group)):
+        for core in _cores_of(group, level):
+            with hold_signals():
                 _halve_level(group, level, core)
 
 
