@@ -26,15 +26,7 @@ from curvafit.geometry.morphometry import border_weights, local_thickness, smoot
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.scan.grids import median_thickness, remove_specks
-from curvafit.scan.prepare import (
-    DROPPED,
-    LARGEST_WINDOW,
-    Prepared,
-    TooLarge,
-    prepare,
-    prepare_whole,
-    smallest_piece,
-)
+from curvafit.scan.prepare import DROPPED, LARGEST_WINDOW, Prepared, TooLarge, prepare, prepare_whole, smallest_piece
 from curvafit.scan.structure import Kind, find_structure, is_rounded
 from curvafit.volumes.boxes import cut_boxes
 from curvafit.volumes.volume import ScanError, Volume

@@ -11,14 +11,7 @@ import numpy as np
 
 from curvafit.core.checks import SEEDS, check_int
 from curvafit.priors.grid import MOST
-from curvafit.segmentation.slices import (
-    IDS,
-    LABELS,
-    Slices,
-    require_labels,
-    require_outline,
-    turn_axes,
-)
+from curvafit.segmentation.slices import IDS, LABELS, Slices, require_labels, require_outline, turn_axes
 from curvafit.volumes.boxes import Box
 from curvafit.volumes.formats.zarr import CHUNK
 from curvafit.volumes.run import Record, Run

@@ -22,14 +22,7 @@ from curvafit.core.runtime import one_line
 from curvafit.volumes.boxes import Crop, parse_box
 from curvafit.volumes.formats import microscopes
 from curvafit.volumes.formats.arrays import read_hdf5, read_imaris, read_npy, read_npz, read_raw
-from curvafit.volumes.formats.base import (
-    Damaged,
-    ScanError,
-    Stated,
-    check_array,
-    check_regular,
-    collect_complaints,
-)
+from curvafit.volumes.formats.base import Damaged, ScanError, Stated, check_array, check_regular, collect_complaints
 from curvafit.volumes.formats.dicom import SUFFIXES, is_dicom, read_dicom
 from curvafit.volumes.formats.mrc import read_mrc
 from curvafit.volumes.formats.nifti import read_nifti
