@@ -22,7 +22,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.slices import IDS, reach_of
 from curvafit.segmentation.uncertainty import doubt
 from curvafit.volumes.formats.nifti import write_nifti_like
-from curvafit.volumes.formats.zarr import add_labels, check_place, image_of, mark, store_of, write_labels
+from curvafit.volumes.formats.zarr import CHUNK, add_labels, check_place, image_of, mark, store_of, write_labels
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import is_streamed, pick_writer, save
 
@@ -332,7 +332,9 @@ def _read_planes(volume: Volume, places: Sequence[int]) -> list[np.ndarray]:
     planes = []
     for axis, (box, place) in enumerate(zip(boxes, places, strict=True)):
         box[axis] = slice(place, place + 1)
-        planes.append(volume.read(tuple(box)).squeeze(axis))  # type: ignore[arg-type]
+        # A plane across y or x has a voxel in each page of a mapped file: it is read a few slices at once.
+        slabs = [slice(z, z + CHUNK) for z in range(0, volume.shape[0], CHUNK)] if axis else box[:1]
+        planes.append(np.concatenate([volume.read((slab, box[1], box[2])) for slab in slabs]).squeeze(axis))
     return planes
 
 
