@@ -112,7 +112,7 @@ class Known:
 
     def _look(self, run: Run) -> np.ndarray:
         """Return whether each slice has labels, (length,)."""
-        found = run("looking for labels", partial(_look_at_slab, self), len(self._slabs))
+        found = run("looking for labels", partial(_read_slab, self, ""), len(self._slabs))
         there = np.concatenate([each["there"] for each in found])
         self._check_label(bool(there.any()))
         return there
@@ -121,11 +121,6 @@ class Known:
         """Raise ScanError where a label was not found in a file."""
         if not found and self.volume.in_file and self.volume.array.label is not None:
             raise ScanError(f"label {self.volume.array.label} is in none of the known slices")
-
-
-def _look_at_slab(whole: Known, number: int) -> Record:
-    """Return which slices of a slab have labels."""
-    return {"there": (whole._slab(whole._slabs[number]) > 0).any((1, 2))}
 
 
 def _read_slab(known: Known, name: str, number: int) -> Record:

@@ -17,7 +17,7 @@ from curvafit.core.checks import SEEDS, check_int
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.priors.law import LawLike
 from curvafit.segmentation.known import Known, check_shared, check_which, doubt_places
-from curvafit.segmentation.reconstruct import SHIFTED, UNTOLD, load_example, load_image, reconstruct
+from curvafit.segmentation.reconstruct import SHIFTED, SURE, UNTOLD, load_example, load_image, reconstruct
 from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.segmentation.slices import IDS, WHOLE, index_labels, mark_known, reach_of, require_labels
 from curvafit.segmentation.uncertainty import doubt, expected_dice, suggest_slices
@@ -41,8 +41,6 @@ ROOM = 16
 #: label's area that is in one piece in each slice, the share of labels of which that holds, and the greatest share of
 #: the variance of grey levels that is due to which label they have.
 PIECE, MOST, ALIKE = 0.9, 0.9, 0.5
-#: Probabilities of labels are at least this.
-SURE = 1e-6
 
 
 def reconstruct_labels(

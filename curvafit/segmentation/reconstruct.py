@@ -32,6 +32,7 @@ from curvafit.priors.law import LawLike
 from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import profile_distance
 from curvafit.scan.prepare import LARGEST_BOX
+from curvafit.scan.structure import add_records
 from curvafit.segmentation.filler import REACH, SLOPE, TILE, Raster, Taught, fill
 from curvafit.segmentation.flow import HALO, STEPS, WorkingGrid, choose_epsilon
 from curvafit.segmentation.image import find_shift, read_image
@@ -94,7 +95,7 @@ LEAST_BYTES = 30
 TOLD = 0.1
 SHIFTED = "The image seems to lie off the annotated slices by {} voxels along {}: it fits them better when it is moved."
 UNTOLD = "The image does not tell the structure in annotated slices held out: it is left out."
-#: Probabilities of a phase field are at least this.
+#: Least probability whose odds or log-odds are taken.
 SURE = 1e-6
 #: Slices of a block by default, and voxels a side across them at most.
 DEEP, WIDE = 2 * CHUNK, 4 * CHUNK
@@ -336,9 +337,9 @@ class _Filled:
     @classmethod
     def of(cls, given: Known, slices: Slices, likely: np.ndarray, mask: np.ndarray) -> _Filled:
         """Return what is known of probabilities and a mask (length, Y, X) in memory."""
-        record = dict(look_at(likely, slices, WHOLE))
-        sums = _add_records(slices.shape, [WHOLE], [record | _compare(record["likely"], mask, slices.between)])
-        return cls(given.turn_back(sums.pop("likely")), given.turn_back(mask), sums)
+        sums = dict(look_at(likely, slices, WHOLE))
+        likely = sums.pop("likely")
+        return cls(given.turn_back(likely), given.turn_back(mask), sums | _compare(likely, mask, slices.between))
 
     @property
     def share(self) -> float:
@@ -382,7 +383,8 @@ def _fill_volume(
     else:
         stated = _describe_blocks(slices, raster, cores, run.processes)
         found = run(_FILL, partial(fill_block, slices, engine.taught, raster, cores), len(cores), stated, keep)
-    sums = _add_records(slices.shape, cores, found)
+    sums = add_records(_widen(record, core, slices.shape) for core, record in zip(cores, found, strict=True))
+    compared: list[Record] = []
     least = max(best_threshold(sums["counts"]), LEAST) if slices.between.any() else 0.5
     least = np.where(engine.told(slices), least, 0.5).astype(np.float32)[:, None, None]
     for core in cores:
@@ -390,8 +392,8 @@ def _fill_volume(
         part = np.moveaxis(likely[box], given.axis, 0)
         inside = part > least[core[0]]
         mask[box] = np.moveaxis(inside, 0, given.axis)
-        sums |= {name: sums.get(name, 0) + n for name, n in _compare(part, inside, slices.between[core[0]]).items()}
-    filled = _Filled(_voxels(likely.stored), _voxels(mask.stored, label=1), sums)
+        compared.append(_compare(part, inside, slices.between[core[0]]))
+    filled = _Filled(_voxels(likely.stored), _voxels(mask.stored, label=1), sums | add_records(compared))
     if raster is None:
         return filled, given.turn_back(engine.run(slices, Trial()))
     epsilon = choose_epsilon(slices.frame, engine.epsilon)
@@ -441,16 +443,13 @@ def _compare(likely: np.ndarray, mask: np.ndarray, between: np.ndarray) -> dict[
     return {"inside": np.count_nonzero(mask), "told": np.count_nonzero(told), "both": both}
 
 
-def _add_records(shape: Sequence[int], cores: Sequence[Box], found: Sequence[Record]) -> dict[str, Any]:
-    """Return the sums over blocks; of what is along an axis, in its slices."""
-    total: dict[str, Any] = {f"along {k}": np.zeros(n) for k, n in enumerate(shape)}
-    for core, record in zip(cores, found, strict=True):
-        for name, values in record.items():
-            if name.startswith("along"):
-                total[name][core[int(name[-1])]] += values
-            else:
-                total[name] = total.get(name, 0) + values
-    return total
+def _widen(record: Record, core: Box, shape: Sequence[int]) -> Record:
+    """Return a block's record with what is along an axis on all slices of the volume, 0 beyond the block."""
+    wide = dict(record)
+    for axis, n in enumerate(shape):
+        wide[f"along {axis}"] = np.zeros(n)
+        wide[f"along {axis}"][core[axis]] = record[f"along {axis}"]
+    return wide
 
 
 def _choose_edges(raster: Raster, tile: int | None) -> tuple[int, ...]:
