@@ -1,6 +1,6 @@
-"""Time and peak memory of `curvafit measure`, `infer` or `reconstruct` on a volume in Zarr, as large as wanted.
+"""Time and peak memory of `curvafit measure`, `infer`, `segment` or `reconstruct` on a volume in Zarr, of any size.
 
-A generated shape of 64³ is repeated along each axis: for `measure` and `infer` blurred, under noise of a quarter of its
+A generated shape of 64³ is repeated along each axis: for all but `reconstruct` blurred, under noise of a quarter of its
 contrast; for `reconstruct` as labels, of which every eighth slice is known. The store is written chunk by chunk. The
 command runs in a process of its own with its workers; the memory is that of the largest worker times their number, and
 the main process's.
@@ -23,6 +23,8 @@ from curvafit.segmentation.result import hidden_store
 
 #: Distance of known slices, and the longest side of a volume that is filled at once unless blocks have an edge.
 EVERY, WHOLE = 8, 256
+#: Steps of `segment`: the time of one step does not depend on their number.
+STEPS = 5
 #: Runs the command line, and prints the peak memory of the main process and of its largest worker in KiB.
 PROGRAM = """
 from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
@@ -60,6 +62,7 @@ def timed(job: str, edge: int, workers: int, cases: Cases, flag: str = "") -> Va
     how = {
         "measure": (*crew, "-o", cases.folder / f"measured-{edge}.csv"),
         "infer": ("-o", cases.folder / f"fit-{edge}", *filter(None, [flag])),
+        "segment": (*crew, "--steps", STEPS, "-o", cases.folder / f"segmented-{edge}.zarr"),
         "reconstruct": (*crew, "--every", EVERY, *tile, "-o", cases.folder / f"filled-{edge}.zarr"),
     }[job]
     remove(hidden_store(cases.folder / f"filled-{edge}.zarr"))  # of a run that was stopped
@@ -70,7 +73,7 @@ def timed(job: str, edge: int, workers: int, cases: Cases, flag: str = "") -> Va
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--command", choices=["measure", "infer", "reconstruct"], default="measure")
+    parser.add_argument("--command", choices=["measure", "infer", "segment", "reconstruct"], default="measure")
     parser.add_argument("--edge", type=int, default=1024)
     parser.add_argument("--of-infer", choices=["fast", "no-test"], default="", help="an option that `infer` is given")
 
@@ -79,7 +82,7 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     job, edge, workers = options.command, options.edge, 0 if options.command == "infer" else 2
     if options.quick:
         edge, workers = 64 if job == "reconstruct" else 208, 0
-    before = {"measure": "", "infer": "inferred-", "reconstruct": "filled-"}[job]
+    before = {"measure": "", "infer": "inferred-", "segment": "segmented-", "reconstruct": "filled-"}[job]
     before += f"{options.of_infer}-" if options.of_infer else ""
     flag = f"--{options.of_infer}" if options.of_infer else ""
     found = cases.all({f"{before}tubes-{edge}-{workers}": lambda: timed(job, edge, workers, cases, flag)})
