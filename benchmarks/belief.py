@@ -30,11 +30,11 @@ from benchmarks.harness import Cases, Figure, Values, bootstrap, show
 from curvafit.data_synth.store import Store, find_well_formed
 from curvafit.inference.candidates import join_tests
 from curvafit.inference.estimate import measure_descriptors, rank_level_cut, tail_probability
-from curvafit.inference.infer import infer
+from curvafit.inference.inference import infer
 from curvafit.inference.posterior import Posterior, load_posterior, save_posterior
 from curvafit.inference.table import column_names, load_table, parameters_of
 from curvafit.priors.grid import WORKING_EPSILON, Grid
-from curvafit.scan.prepare import prepare
+from curvafit.scan.preparation import prepare
 from curvafit.volumes.volume import Volume
 
 KINDS = ("shape", "cut")

@@ -35,8 +35,8 @@ from curvafit.inference.table import (
     parameters_of,
     to_row,
 )
-from curvafit.scan.measure import read_texture
-from curvafit.scan.prepare import prepare, thinner_thickness
+from curvafit.scan.measures import read_texture
+from curvafit.scan.preparation import prepare, thinner_thickness
 from curvafit.volumes.volume import ScanError
 
 DRAWS = 400

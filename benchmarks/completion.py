@@ -32,10 +32,10 @@ from benchmarks.harness import Cases, Figure, Values, bootstrap, data, scores, s
 from curvafit.data_synth.design import design_box
 from curvafit.generation.flow import generate
 from curvafit.inference.fit import Fit
-from curvafit.inference.infer import infer
+from curvafit.inference.inference import infer
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.known import Known
-from curvafit.segmentation.reconstruct import reconstruct
+from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.trials import dice
 from curvafit.segmentation.uncertainty import calibration_error, near_surface

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from benchmarks.harness import Cases, Figure, Values, show
-from curvafit.geometry.diagram import diagram
+from curvafit.geometry.diagrams import diagram
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import phase_field
 from tests.exact import Cylinder, Shape, Sphere, Torus, centres, profile

@@ -40,12 +40,12 @@ from benchmarks.harness import Cases, Figure, Values, show
 from curvafit.core import permutation as tests
 from curvafit.data_synth.design import INTERVALS
 from curvafit.generation.flow import generate
-from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.diagrams import Diagram
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.priors.law import Law
-from curvafit.scan.measure import QUANTITIES, Measures, Quantity
+from curvafit.scan.measures import QUANTITIES, Measures, Quantity
 from curvafit.scan.tiles import measure
-from curvafit.studies.compare import LEVEL, compare
+from curvafit.studies.comparison import LEVEL, compare
 from curvafit.studies.scans import FINE
 from curvafit.volumes.volume import ScanError, Volume
 

@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.completion import STRUCTURES, mask_of
 from benchmarks.harness import Cases, Figure, Values, data, show
 from curvafit.segmentation.image import read_image
-from curvafit.segmentation.reconstruct import reconstruct
+from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.trials import dice_of, gain_of, tally
 from curvafit.segmentation.uncertainty import calibration_error, near_surface

@@ -24,7 +24,7 @@ from benchmarks.completion import EDGE, LAWS, fitted, shape
 from benchmarks.harness import Cases, Figure, Values, best, bootstrap, scores, show
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.evidence import estimate_classes, grey_evidence, grey_levels
-from curvafit.segmentation.segment import segment
+from curvafit.segmentation.segmentation import segment
 from curvafit.volumes.volume import Volume
 
 #: Laws and ways of the grey levels (bilayers do not finish), and of the probabilities.

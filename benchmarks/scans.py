@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.harness import Cases, Figure, Values, data, show
-from curvafit.inference.infer import infer
+from curvafit.inference.inference import infer
 from curvafit.volumes.read import load
 from curvafit.volumes.volume import ScanError, Volume
 

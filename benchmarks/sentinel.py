@@ -22,22 +22,22 @@ from scipy import ndimage
 
 from benchmarks import belief, completion, convergence, curvature, prior, step, transductive
 from benchmarks.harness import SENTINEL, append_lines, provenance, read_lines, show
-from curvafit.geometry.diagram import diagram
+from curvafit.geometry.diagrams import diagram
 from curvafit.geometry.distances import wasserstein
 from curvafit.inference.estimate import measure_descriptors
 from curvafit.inference.posterior import load_posterior
 from curvafit.priors import CurvaturePrior
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.energy import energy
+from curvafit.priors.energies import energy
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import SIGMA, phase_field
-from curvafit.scan.prepare import prepare
+from curvafit.scan.preparation import prepare
 from curvafit.scan.tiles import measure
 from curvafit.segmentation.labels import reconstruct_labels
-from curvafit.segmentation.reconstruct import reconstruct
-from curvafit.segmentation.segment import segment
+from curvafit.segmentation.reconstruction import reconstruct
+from curvafit.segmentation.segmentation import segment
 from curvafit.segmentation.trials import dice
-from curvafit.studies.compare import compare
+from curvafit.studies.comparison import compare
 from curvafit.volumes.volume import Volume
 from tests.exact import Sphere, centres, profile
 

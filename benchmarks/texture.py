@@ -24,7 +24,7 @@ import torch
 from benchmarks.harness import Cases, Figure, Values, show
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import SCHEDULES
-from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.diagrams import Diagram, diagram
 from curvafit.geometry.distances import wasserstein
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import preset_name

@@ -28,11 +28,11 @@ from torch.nn import functional
 from benchmarks.completion import EDGE, LAWS_TRIED, fitted, shape
 from benchmarks.harness import Cases, Figure, Values, bootstrap, data, scores, show
 from curvafit.inference.fit import Fit
-from curvafit.inference.infer import infer
+from curvafit.inference.inference import infer
 from curvafit.priors import CombinedLoss, CurvaturePrior
 from curvafit.priors.law import LawLike
-from curvafit.segmentation.reconstruct import reconstruct
-from curvafit.segmentation.segment import segment
+from curvafit.segmentation.reconstruction import reconstruct
+from curvafit.segmentation.segmentation import segment
 from curvafit.segmentation.trials import dice
 
 TEXTURES = ("draw-0", "draw-5", "trabec", "bone")

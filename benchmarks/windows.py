@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.harness import Cases, Figure, Values, bootstrap, show
-from curvafit.studies.windows import windows
+from curvafit.studies.windowed import windows
 
 #: Voxels along z, y, x; the widths at both ends; windows; and seeds.
 SHAPE, ENDS, SIZE, STRIDE, SEEDS = (128, 80, 80), (2.5, 4.5), 32, 16, 4

@@ -19,36 +19,7 @@ they are first used: importing the package imports nothing.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from curvafit.core.faces import attach_lazy_names
-
-if TYPE_CHECKING:
-    from curvafit.generation.flow import descend as descend
-    from curvafit.generation.flow import generate as generate
-    from curvafit.generation.result import Flow as Flow
-    from curvafit.geometry.diagram import Diagram as Diagram
-    from curvafit.geometry.diagram import diagram as diagram
-    from curvafit.geometry.distances import wasserstein as wasserstein
-    from curvafit.inference.fit import Fit as Fit
-    from curvafit.inference.infer import Inference as Inference
-    from curvafit.inference.infer import infer as infer
-    from curvafit.priors.coefficients import Coefficients as Coefficients
-    from curvafit.priors.grid import Grid as Grid
-    from curvafit.priors.law import preset as preset
-    from curvafit.scan.instances import measure_instances as measure_instances
-    from curvafit.scan.measure import Measures as Measures
-    from curvafit.scan.tiles import measure as measure
-    from curvafit.segmentation.reconstruct import reconstruct as reconstruct
-    from curvafit.segmentation.result import Segmentation as Segmentation
-    from curvafit.segmentation.segment import segment as segment
-    from curvafit.studies.compare import Comparison as Comparison
-    from curvafit.studies.compare import compare as compare
-    from curvafit.studies.windows import Windows as Windows
-    from curvafit.studies.windows import windows as windows
-    from curvafit.volumes.read import load as load
-    from curvafit.volumes.volume import Volume as Volume
-    from curvafit.volumes.write import save as save
+import lazy_loader
 
 __version__ = "0.1.0"
 
@@ -65,4 +36,4 @@ _FIGURES = {
     "Windows": "curvafit.report.windows:windows_figure",
 }
 
-attach_lazy_names(__name__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

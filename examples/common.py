@@ -15,10 +15,10 @@ from matplotlib.figure import FigureBase
 from curvafit.core.files import write_atomically
 from curvafit.data_synth.atlas import versions
 from curvafit.drawing.plot import diagram_on, shared_limits, surface_on
-from curvafit.drawing.render import QUIET
+from curvafit.drawing.rendering import QUIET
 from curvafit.generation.flow import Flow, generate
 from curvafit.generation.schedule import Schedule, schedule
-from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.diagrams import Diagram, diagram
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from curvafit.drawing.plot import write_picture
 from curvafit.generation.flow import Flow, generate
 from curvafit.generation.result import viability
-from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.diagrams import Diagram, diagram
 from curvafit.geometry.distances import wasserstein
 from curvafit.geometry.mesh import NoSurface
 from curvafit.priors.grid import WORKING_EPSILON, Grid

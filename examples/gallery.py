@@ -17,7 +17,7 @@ from common import CELL, DIAGRAM, KINDS, SURFACE, Shape, draw, grown, parser, wr
 from matplotlib.figure import Figure
 
 from curvafit.drawing.plot import write_picture
-from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.diagrams import Diagram, diagram
 from curvafit.geometry.distances import wasserstein
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import PRESETS

@@ -21,7 +21,7 @@ from scipy.ndimage import zoom
 
 from curvafit.drawing.plot import CONTOUR, gallery_figure, write_picture
 from curvafit.generation.flow import generate
-from curvafit.segmentation.reconstruct import reconstruct
+from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.trials import dice
 

@@ -16,7 +16,7 @@ from common import CELL, KINDS, Shape, grown, parser, write_table
 from matplotlib.figure import Figure
 
 from curvafit.drawing.plot import diagram_on, shared_limits, surface_on, write_picture
-from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.diagrams import Diagram
 from curvafit.geometry.distances import wasserstein
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import preset

@@ -17,9 +17,9 @@ from common import CELL, DIAGRAM, KINDS, SURFACE, draw, grown, parser, write_tab
 from matplotlib.figure import Figure
 
 from curvafit.drawing.plot import DIAGONAL, write_picture
-from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.diagrams import Diagram
 from curvafit.geometry.mesh import area_vectors, surface
-from curvafit.priors.energy import orientation
+from curvafit.priors.energies import orientation
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import preset
 

@@ -20,9 +20,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
 from curvafit.drawing.plot import INK, diagram_on, shared_limits, surface_on, write_picture
-from curvafit.drawing.render import view
+from curvafit.drawing.rendering import view
 from curvafit.generation.flow import Flow, generate
-from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.diagrams import Diagram, diagram
 from curvafit.geometry.distances import wasserstein
 from curvafit.geometry.mesh import NoSurface
 from curvafit.priors.coefficients import Coefficients

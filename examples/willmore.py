@@ -26,7 +26,7 @@ from curvafit.drawing.plot import gallery_figure, write_picture
 from curvafit.generation.flow import Flow, descend
 from curvafit.geometry.mesh import surface
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.energy import cahn_hilliard_area
+from curvafit.priors.energies import cahn_hilliard_area
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import SIGMA, optimal_profile
 from curvafit.priors.stencils import refine_axis

@@ -11,7 +11,7 @@ except ImportError:  # the development extra is not installed: shapes go uncheck
     pass
 else:
     install_import_hook(
-        ["curvafit.priors.stencils", "curvafit.priors.profile", "curvafit.priors.energy"], "beartype.beartype"
+        ["curvafit.priors.stencils", "curvafit.priors.profile", "curvafit.priors.energies"], "beartype.beartype"
     )
 
 

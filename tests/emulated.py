@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from curvafit.geometry.descriptors import BLOCKS
+from curvafit.geometry.description import BLOCKS
 from curvafit.inference.emulator import Emulator, Layer
 from curvafit.inference.table import USUAL, Compression
-from curvafit.scan.measure import Reading
+from curvafit.scan.measures import Reading
 
 LOW, HIGH = np.array([-4, -2.7, -200, -200, -3000, -0.75]), np.array([4, 2.7, 200, 200, 3000, -0.15])
 BOX = np.stack([LOW, HIGH], 1)

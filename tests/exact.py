@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from curvafit.priors.curvature import Jet, jet
-from curvafit.priors.energy import energy_terms
+from curvafit.priors.energies import energy_terms
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import SIGMA, optimal_profile
 from curvafit.priors.stencils import HESSIAN_AXES

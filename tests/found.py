@@ -8,15 +8,15 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from curvafit.geometry.diagram import Diagram, diagram
-from curvafit.geometry.morphometry import Morphometry
+from curvafit.geometry.diagrams import Diagram, diagram
+from curvafit.geometry.morphology import Morphometry
 from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Misfit, Twin
 from curvafit.inference.combinations import Combination
 from curvafit.inference.fit import Fit
-from curvafit.inference.infer import Inference
+from curvafit.inference.inference import Inference
 from curvafit.priors import Coefficients, Grid, preset
-from curvafit.scan.prepare import Prepared
+from curvafit.scan.preparation import Prepared
 from curvafit.volumes.volume import Volume
 
 EPSILON = 0.02

@@ -43,7 +43,7 @@ def compare(
     """Tell whether groups of scans differ, or what goes with a number: in which curvature, and by how much."""
     with show_stages() as progress:
         from curvafit.report.comparison import check_comparison, write_comparison
-        from curvafit.studies.compare import compare as compare_scans
+        from curvafit.studies.comparison import compare as compare_scans
 
         check_comparison(out, [*scans, *([] if subjects is None else [subjects])], overwrite, command_line())
         how = {"primary": primary, "permutations": permutations, "seed": seed, "subjects": subjects}

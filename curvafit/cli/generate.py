@@ -80,7 +80,7 @@ def generate(
     from curvafit.drawing.shapes import check_target, shape_record
     from curvafit.generation.schedule import choose_schedule
     from curvafit.generation.schedule import schedule as named
-    from curvafit.priors.energy import orientation as orient
+    from curvafit.priors.energies import orientation as orient
     from curvafit.priors.grid import Grid
     from curvafit.volumes.parameter_maps import map_shape, read_maps
 

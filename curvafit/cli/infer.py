@@ -11,7 +11,7 @@ from curvafit.cli.console import command_line, print_table, say, say_notes, show
 from curvafit.cli.options import FILES, OverwriteOption, Reading, Structure, command
 
 if TYPE_CHECKING:
-    from curvafit.inference.infer import Inference
+    from curvafit.inference.inference import Inference
 
 
 @command(
@@ -41,7 +41,7 @@ def infer(
     """Infer the parameters of scanned volumes, and write a report of each; of several, a table and a page of all."""
     files = {"roi": roi, "atlas": atlas, "posterior": posterior}
     with show_stages() as progress:
-        from curvafit.inference.infer import infer as infer_scan
+        from curvafit.inference.inference import infer as infer_scan
         from curvafit.report.laws import infer_scans
         from curvafit.report.page import check_report, with_command, write_inference
 

@@ -23,7 +23,7 @@ from curvafit.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from curvafit.scan.measure import Measures
+    from curvafit.scan.measures import Measures
 
 
 @command(
@@ -134,7 +134,7 @@ def _map_windows(
     steps = halves if stride is None else parse_whole_triple(stride, "--stride")
     with show_stages() as progress:
         from curvafit.report.windows import check_windows, write_windows
-        from curvafit.studies.windows import windows as measure_windows
+        from curvafit.studies.windowed import windows as measure_windows
 
         check_windows(folder, scan, overwrite, command_line())
         found = measure_windows(scan, size, steps, progress=progress, **how)

@@ -59,8 +59,8 @@ def segment(
     example; where p > 1/2 does best there, that is the mask. Of nnU-Net's NPZ files --channel takes the class; a folder
     of them becomes a folder of masks. --label is the example's.
     """
-    from curvafit.segmentation.segment import calibrate, check_given
-    from curvafit.segmentation.segment import segment as segment_scan
+    from curvafit.segmentation.segmentation import calibrate, check_given
+    from curvafit.segmentation.segmentation import segment as segment_scan
     from curvafit.volumes.read import load
 
     kind: bool | str = "logits" if logits else probabilities
@@ -191,7 +191,7 @@ def reconstruct(
 
     def compute(volume: Volume, **tools: Any) -> Segmentation:
         from curvafit.segmentation.labels import reconstruct_labels
-        from curvafit.segmentation.reconstruct import reconstruct as fill
+        from curvafit.segmentation.reconstruction import reconstruct as fill
 
         alike = {"example": ("spacing", "unit", "label", "strict"), "image": ("spacing", "unit", "crop")}
         for name, path in shown.items():

@@ -1,4 +1,4 @@
-"""Packages that only some uses need."""
+"""Packages that only some uses need, and links that are no packages."""
 
 from __future__ import annotations
 
@@ -19,3 +19,10 @@ def require(module: str, extra: str, purpose: str) -> ModuleType:
             raise  # the module is there, and what it imports itself is not
         install = f'pip install "curvafit[{extra}]"' if extra else f"pip install {module}"
         raise ImportError(f"{purpose} needs {error.name}, which is not installed: {install}", name=error.name) from None
+
+
+def refuse_link(package: str) -> None:
+    """Raise ImportError for `import priors` where the project's root has a link of that name into the package."""
+    if not package.startswith("curvafit"):
+        here = "the folder at the project's root is a link into the package"
+        raise ImportError(f"import curvafit.{package}, not {package}: {here}")

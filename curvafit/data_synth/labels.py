@@ -14,9 +14,9 @@ from skimage.segmentation import find_boundaries, watershed
 from torch import Tensor
 
 from curvafit.data_synth.centreline import skeleton_of
-from curvafit.geometry.diagram import LEAST_SLOPE, MARGIN, find_resolved
+from curvafit.geometry.diagrams import LEAST_SLOPE, MARGIN, find_resolved
 from curvafit.geometry.mesh import NoSurface
-from curvafit.geometry.morphometry import local_thickness
+from curvafit.geometry.morphology import local_thickness
 from curvafit.geometry.topology import betti_numbers, number_pieces
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import Grid

@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from curvafit.core.units import format_number, power_name
 from curvafit.drawing.plot import FAMILIAR, INK, diagram_on, frame_diagram, make_figure
-from curvafit.drawing.render import QUIET
+from curvafit.drawing.rendering import QUIET
 
 #: Colours of groups, which begin again after the last, and of what is more in the first two (Okabe & Ito 2008).
 GROUPS = FIRST, SECOND, *_ = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"

@@ -26,9 +26,9 @@ from scipy.ndimage import gaussian_filter
 
 from curvafit.core.files import write_content
 from curvafit.core.units import format_length, unit_name
-from curvafit.drawing.render import DPI, QUIET, render_in_box
+from curvafit.drawing.rendering import DPI, QUIET, render_in_box
 from curvafit.generation.result import Flow
-from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.diagrams import Diagram
 from curvafit.volumes.volume import Volume
 
 #: Colours that stay apart for the colour-blind (Okabe & Ito 2008).

@@ -20,7 +20,7 @@ from curvafit.core.files import move_together, remove, temporary_folder
 from curvafit.core.records import Format, can_write, sibling
 from curvafit.core.runtime import FILE, check_memory, hold_signals
 from curvafit.core.units import parse_unit
-from curvafit.drawing.render import surface_picture
+from curvafit.drawing.rendering import surface_picture
 from curvafit.generation.flow import Flow
 from curvafit.geometry.mesh import SUFFIXES, Surface, solid_surface, write_surface
 from curvafit.priors.coefficients import NAMES

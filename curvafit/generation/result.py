@@ -14,7 +14,7 @@ from curvafit.core.pictures import Pictured
 from curvafit.core.units import format_sampling
 from curvafit.generation.schedule import Schedule
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.energy import cahn_hilliard_parts
+from curvafit.priors.energies import cahn_hilliard_parts
 from curvafit.priors.grid import Float, Grid
 
 #: Steps between two entries of the history (and two calls of the callbacks).

@@ -12,7 +12,7 @@ from torch import Tensor
 from curvafit.generation.cost import Cost
 from curvafit.generation.forms import DivergenceForm, Form
 from curvafit.priors import kernels
-from curvafit.priors.energy import energy_gradient, energy_gradient_by_autograd
+from curvafit.priors.energies import energy_gradient, energy_gradient_by_autograd
 
 #: The number that Adam adds to the root, as published instead of the usual 1e-8; shapes depend on it.
 ADAM_EPS = 1e-2

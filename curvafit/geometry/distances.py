@@ -17,7 +17,7 @@ import torch
 from numba import njit, prange
 
 from curvafit.core.checks import check_type
-from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram
+from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE, Diagram
 from curvafit.priors.kernels.threads import Kernel, count_threads
 
 #: Pairs that are taken at once: a few seconds on a processor.

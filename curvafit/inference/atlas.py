@@ -11,10 +11,10 @@ import numpy as np
 from curvafit.core.files import open_packaged
 from curvafit.core.records import Format
 from curvafit.core.schema import Rule
-from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.diagrams import Diagram
 from curvafit.geometry.distances import one_to_many, sliced_embedding, wasserstein
 from curvafit.priors.coefficients import Coefficients
-from curvafit.scan.prepare import WORKING_THICKNESS
+from curvafit.scan.preparation import WORKING_THICKNESS
 
 VERSION = 2
 ATLAS_FILE = Format("curvafit atlas", VERSION, "an atlas file", remedy="extract it again from its store")

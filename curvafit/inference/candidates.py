@@ -12,13 +12,13 @@ import numpy as np
 from curvafit.core.schema import Rule
 from curvafit.generation.flow import Flow, generate
 from curvafit.generation.schedule import LEARNED, Schedule
-from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.diagrams import Diagram
 from curvafit.geometry.distances import one_to_many
-from curvafit.geometry.morphometry import Morphometry, morphometry
+from curvafit.geometry.morphology import Morphometry, morphometry
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import Grid
-from curvafit.scan.measure import scan_diagram
-from curvafit.scan.prepare import Prepared, thinner_thickness
+from curvafit.scan.measures import scan_diagram
+from curvafit.scan.preparation import Prepared, thinner_thickness
 
 #: Greatest mass of either sign: a rare structure's field lies a little beyond ±1 in the mean.
 RARE = 1 - 1e-6

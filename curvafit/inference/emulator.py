@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from curvafit.inference.stationarity import call_in_double
+from curvafit.inference.stationary import call_in_double
 from curvafit.inference.table import PARAMETERS, Compression, encode_seen
-from curvafit.scan.measure import Reading
+from curvafit.scan.measures import Reading
 
 #: Most steps from a start.
 STEPS = 60

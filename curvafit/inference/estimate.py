@@ -13,7 +13,7 @@ from curvafit.core.permutation import measure_energy, relabel, share_beyond
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import LEARNED, Schedule
-from curvafit.geometry.descriptors import BLOCKS
+from curvafit.geometry.description import BLOCKS
 from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Misfit, join_tests, twin
 from curvafit.inference.emulator import best_parameters, misfits
@@ -22,8 +22,8 @@ from curvafit.inference.posterior import Posterior
 from curvafit.inference.simulate import Search, Simulate, simulate_draws
 from curvafit.inference.table import column_names, columns_of, law_of, mirror_parameters, parameters_of
 from curvafit.priors.grid import Grid
-from curvafit.scan.measure import Reading, read_texture, windows_along
-from curvafit.scan.prepare import HALF, Prepared
+from curvafit.scan.measures import Reading, read_texture, windows_along
+from curvafit.scan.preparation import HALF, Prepared
 
 #: Draws from the posterior, and those among which more are chosen to be grown.
 DRAWS, POOL = 400, 2000

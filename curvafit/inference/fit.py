@@ -17,8 +17,8 @@ from curvafit.core.files import write_content
 from curvafit.core.pictures import Pictured
 from curvafit.core.schema import Rule, decode, encode
 from curvafit.core.units import METRES
-from curvafit.geometry.diagram import Diagram
-from curvafit.geometry.morphometry import Morphometry
+from curvafit.geometry.diagrams import Diagram
+from curvafit.geometry.morphology import Morphometry
 from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Deviations, Misfit, NotNegative
 from curvafit.inference.combinations import Combination

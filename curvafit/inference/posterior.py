@@ -14,11 +14,11 @@ from curvafit.core.checks import check_float, check_int, quoted
 from curvafit.core.extras import require
 from curvafit.core.files import open_packaged
 from curvafit.core.records import Format
-from curvafit.geometry.descriptors import BLOCKS
+from curvafit.geometry.description import BLOCKS
 from curvafit.inference.combinations import Combinations
 from curvafit.inference.emulator import Emulator, Layer
 from curvafit.inference.table import PARAMETERS, TARGETS, Compression, column_names, encode_seen
-from curvafit.scan.measure import Reading
+from curvafit.scan.measures import Reading
 
 POSTERIOR_FILE = Format("curvafit posterior", 4, "a posterior", "train it again", {"blocks": BLOCKS})
 #: Largest size of a flow, and most flows of an ensemble.

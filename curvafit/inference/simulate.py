@@ -18,7 +18,7 @@ from scipy import linalg
 from curvafit.core.checks import check_int
 from curvafit.core.runtime import Progress, silent
 from curvafit.inference.emulator import Emulator
-from curvafit.scan.measure import Reading
+from curvafit.scan.measures import Reading
 
 #: Rounds, simulations in a round, and most rounds at the end that simulate the likeliest parameters alone.
 ROUNDS, BATCH, LAST = 7, 3, 4

@@ -14,10 +14,10 @@ import numpy as np
 from scipy import ndimage
 
 from curvafit.core.records import Format, encode_json
-from curvafit.geometry.descriptors import BLOCKS
+from curvafit.geometry.description import BLOCKS
 from curvafit.priors.coefficients import Coefficients
-from curvafit.scan.measure import Reading
-from curvafit.scan.prepare import thinner_thickness
+from curvafit.scan.measures import Reading
+from curvafit.scan.preparation import thinner_thickness
 from curvafit.scan.quality import sample_mask
 from curvafit.volumes.volume import Volume
 

@@ -9,7 +9,7 @@ from operator import itemgetter
 import numpy as np
 
 from curvafit.core.units import format_number
-from curvafit.geometry.morphometry import Morphometry
+from curvafit.geometry.morphology import Morphometry
 from curvafit.inference.candidates import TITLES, Candidate, Misfit, best_candidate, join_tests, seed_noise_of
 
 #: The probability below which a law is not believed to have made a scan.

@@ -17,7 +17,7 @@ from curvafit.napari.dock import Dock
 from curvafit.napari.layers import drop_layer, field_of_layer, list_layers, place_of_layer, put_layer
 from curvafit.segmentation.known import check_shared, next_in_rhythm, note_empty
 from curvafit.segmentation.labels import reconstruct_labels
-from curvafit.segmentation.reconstruct import reconstruct
+from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.result import Segmentation
 from curvafit.segmentation.slices import index_labels, require_labels
 from curvafit.segmentation.uncertainty import entropy

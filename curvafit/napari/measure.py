@@ -16,11 +16,11 @@ from qtpy.QtWidgets import QSizePolicy
 from curvafit.core.runtime import Progress
 from curvafit.core.units import format_number, power_name
 from curvafit.drawing.plot import diagram_figure
-from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.diagrams import Diagram
 from curvafit.napari.dock import Dock
 from curvafit.napari.layers import field_of_layer, list_layers
 from curvafit.scan.instances import measure_instances
-from curvafit.scan.measure import Measures
+from curvafit.scan.measures import Measures
 from curvafit.scan.tiles import measure as measure_scan
 from curvafit.studies.tables import check_table, write_table
 

@@ -32,18 +32,18 @@ from curvafit.core.records import can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number
 from curvafit.data_synth.atlas import summarise
-from curvafit.data_synth.extract import extract, open_all, shape_id
+from curvafit.data_synth.extraction import extract, open_all, shape_id
 from curvafit.data_synth.store import Store
 from curvafit.drawing.plot import DENSITY, DIAGONAL, FAMILY_COLOURS, INK, shared_limits
-from curvafit.drawing.render import CAP, SURFACE, render
-from curvafit.geometry.diagram import FAMILIES, Diagram, family_shares, half_thickness, leading_family
+from curvafit.drawing.rendering import CAP, SURFACE, render
+from curvafit.geometry.diagrams import FAMILIES, Diagram, family_shares, half_thickness, leading_family
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.geometry.mesh import capped_surface
 from curvafit.inference.atlas import Atlas
 from curvafit.inference.fit import Fit
 from curvafit.priors.grid import WORKING_SPACING, Grid
 from curvafit.report.page import MARK, name_source, render_template
-from curvafit.scan.prepare import HALF, WORKING_THICKNESS
+from curvafit.scan.preparation import HALF, WORKING_THICKNESS
 
 #: Below this, there is nothing to lay out; the nearest shapes that are named beside one.
 LEAST_SHAPES, NEIGHBOURS = 6, 5

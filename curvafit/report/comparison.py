@@ -18,8 +18,8 @@ from curvafit.core.units import format_number, format_percent, per_unit, plain_u
 from curvafit.drawing.groups import comparison_figure, numbers_figure
 from curvafit.geometry.distances import DIRECTIONS, QUANTILES
 from curvafit.report.page import check_result_folder, start_record, write_study
-from curvafit.scan.measure import Measures
-from curvafit.studies.compare import BINS, LEVEL, SMOOTH, Comparison, Number, join_names
+from curvafit.scan.measures import Measures
+from curvafit.studies.comparison import BINS, LEVEL, SMOOTH, Comparison, Number, join_names
 from curvafit.studies.scans import count_notes
 
 #: `format` of a comparison's record.

@@ -21,14 +21,14 @@ from curvafit.generation.flow import generate
 from curvafit.generation.schedule import LEARNED
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.inference.atlas import Atlas, load_atlas
-from curvafit.inference.infer import Inference, infer
+from curvafit.inference.inference import Inference, infer
 from curvafit.inference.verdict import UNBELIEVABLE
 from curvafit.report import page
 from curvafit.report.atlas import map_on
-from curvafit.scan.measure import Measures
+from curvafit.scan.measures import Measures
 from curvafit.scan.structure import find_structure
 from curvafit.scan.tiles import measure
-from curvafit.segmentation.reconstruct import reconstruct
+from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.trials import dice
 from curvafit.volumes.volume import ScanError, Volume

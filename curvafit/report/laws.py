@@ -12,7 +12,7 @@ from typing import Any
 from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, silent
 from curvafit.inference.fit import Fit
-from curvafit.inference.infer import infer
+from curvafit.inference.inference import infer
 from curvafit.report import page
 from curvafit.studies.scans import Task, name_errors, share_out
 

@@ -19,7 +19,7 @@ from curvafit.drawing.groups import FIRST, FIRST_SHOWN, SIGNED, plain, shown_win
 from curvafit.drawing.plot import QUIET, diagram_on, make_figure
 from curvafit.report.comparison import describe_measures, say_kinds
 from curvafit.report.page import check_result_folder, start_record, write_study
-from curvafit.scan.measure import Measures
+from curvafit.scan.measures import Measures
 from curvafit.studies.scans import count_notes
 from curvafit.studies.tables import list_rows
 

@@ -45,11 +45,11 @@ from curvafit.drawing.plot import (
     surface_figure,
     svg,
 )
-from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.diagrams import Diagram
 from curvafit.inference.candidates import TITLES, Candidate, seed_noise_of
 from curvafit.inference.combinations import KNOWN
 from curvafit.inference.fit import Fit
-from curvafit.inference.infer import Inference
+from curvafit.inference.inference import Inference
 from curvafit.inference.table import parameters_of
 from curvafit.inference.verdict import UNBELIEVED, UNDECIDED
 from curvafit.priors.law import FORMAT

@@ -17,8 +17,8 @@ from curvafit.core.units import format_length, format_number, format_percent, po
 from curvafit.drawing.plot import FAMILIAR, INK, LABELS, QUIET, make_figure, scale_on
 from curvafit.report.comparison import name_quantity
 from curvafit.report.page import check_result_folder, start_record, write_study
-from curvafit.scan.measure import QUANTITIES
-from curvafit.studies.windows import NAMES, Windows
+from curvafit.scan.measures import QUANTITIES
+from curvafit.studies.windowed import NAMES, Windows
 
 #: `format` of the record.
 FORMAT = Format("curvafit windows", 1, title="the record of a scan measured in windows")

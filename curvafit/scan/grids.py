@@ -11,7 +11,7 @@ from numba import njit
 from scipy import ndimage
 
 from curvafit.geometry.distance_transform import square_face_distances
-from curvafit.geometry.morphometry import local_thickness
+from curvafit.geometry.morphology import local_thickness
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.kernels.cpu import gaussian_blur
 from curvafit.priors.profile import PULL, PULL_WIDTH, STAIRS, SWEEPS

@@ -12,12 +12,12 @@ from scipy import ndimage
 
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.workers import Cluster, join_workers
-from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE
-from curvafit.geometry.morphometry import local_thickness
+from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE
+from curvafit.geometry.morphology import local_thickness
 from curvafit.geometry.topology import euler_number
 from curvafit.priors.grid import WORKING_SPACING
-from curvafit.scan import measure
-from curvafit.scan.prepare import prepare
+from curvafit.scan import measures as whole
+from curvafit.scan.preparation import prepare
 from curvafit.scan.structure import count_alike, judge_labels, whole_labels
 from curvafit.volumes.boxes import Box, cut_boxes, grow
 from curvafit.volumes.read import Source, load
@@ -33,19 +33,19 @@ _DENSE = 2**20
 #: Voxels a side of the blocks in which labels are looked for, the names of the passes, and what is looked for.
 _BLOCK, _LOOK, _MEASURE, _WHAT = 256, "looking for instances", "measuring instances", "labels of instances"
 #: Name, symbol and power of each number of a body, and how it comes from sums.
-OF_BODIES: tuple[tuple[str, str, int, Callable[[measure.Sums], np.ndarray]], ...] = (
+OF_BODIES: tuple[tuple[str, str, int, Callable[[whole.Sums], np.ndarray]], ...] = (
     ("volume", "V", 3, lambda s: s["inside"]),
     ("surface", "S", 2, lambda s: s["area"]),
     ("sphericity", "Ψ", 0, lambda s: math.pi ** (1 / 3) * (6 * s["inside"]) ** (2 / 3) / (s["area"] + s["cut"])),
     ("elongation", "E", 0, lambda s: s["elongation"]),
     ("area at the border", "S.cut", 2, lambda s: s["cut"]),
-    *(each for each in measure.QUANTITIES if each[1] not in _OF_TEXTURES),
+    *(each for each in whole.QUANTITIES if each[1] not in _OF_TEXTURES),
 )
 
 
 def measure_instances(
     labels: Source, *, workers: Cluster | int | None = None, progress: Progress = silent, **reading: Any
-) -> tuple[measure.Measures, ...]:
+) -> tuple[whole.Measures, ...]:
     """Measure each body of a label image of any size by itself, whatever it touches.
 
     The values but 0 are the bodies' labels, `part` of the result is `("instance", label)`, and intervals are NaN. What
@@ -116,20 +116,20 @@ def _measure_body(volume: Volume, boxes: Sequence[tuple[int, Box]], number: int)
     around = [math.ceil(float(thickness.max()) / 2 / h) + _AROUND for h in volume.spacing]
     try:
         prepared = prepare(Volume(read(around), volume.spacing, volume.unit), kind="mask")
-        (curved, drawn), notes = measure.measure_curvatures(prepared), prepared.notes
+        (curved, drawn), notes = whole.measure_curvatures(prepared), prepared.notes
         drawn = drawn.thin(BIN_WIDTH / prepared.working_voxel * WORKING_SPACING, TAIL_SHARE)  # there may be thousands
     except ValueError as reason:  # too thin, or without a surface away from the image's borders
-        curved, drawn, notes = measure.no_curvature(volume.unit, reason)
-    surface = measure.measure_surface(mask, volume.spacing, False)
+        curved, drawn, notes = whole.no_curvature(volume.unit, reason)
+    surface = whole.measure_surface(mask, volume.spacing, False)
     empty = np.zeros_like(thickness)
-    maps = measure.Maps(volume.spacing, False, mask, thickness, empty, empty, surface, curved, drawn, "mask", notes)
-    total = dict(zip(measure.SUMS, maps.sum(measure.Blocks(mask.shape, ((0,),) * 3))[0], strict=True))  # type: ignore[arg-type]
+    maps = whole.Maps(volume.spacing, False, mask, thickness, empty, empty, surface, curved, drawn, "mask", notes)
+    total = dict(zip(whole.SUMS, maps.sum(whole.Blocks(mask.shape, ((0,),) * 3))[0], strict=True))  # type: ignore[arg-type]
     total |= {"χ": euler_number(mask), **_measure_extent(read(0), box, volume)}
     with np.errstate(divide="ignore", invalid="ignore"):  # without curvature
         values = [(name, symbol, float(figure(total)), math.nan, power) for name, symbol, power, figure in OF_BODIES]
-    quantities, direction = tuple(measure.Quantity(*each) for each in values), measure.find_direction(total)
+    quantities, direction = tuple(whole.Quantity(*each) for each in values), whole.find_direction(total)
     place = (quantities, direction, drawn, (1, 1, 1), notes, ("instance", label))
-    return {"measures": measure.Measures(volume.source, volume.unit, "mask", *place)}
+    return {"measures": whole.Measures(volume.source, volume.unit, "mask", *place)}
 
 
 def _measure_extent(body: np.ndarray, box: Box, field: Volume) -> dict[str, float]:

@@ -15,9 +15,9 @@ from functools import partial
 import numpy as np
 
 from curvafit.geometry.balls import ball_radii
-from curvafit.scan import prepare
+from curvafit.scan import preparation
 from curvafit.scan.grids import MEASURED, candidate_boxes, order_boxes, surface_voxels, thickness_beneath
-from curvafit.scan.measure import MOST, Blocks
+from curvafit.scan.measures import MOST, Blocks
 from curvafit.scan.structure import (
     LAGS,
     PIECE,
@@ -87,11 +87,11 @@ def survey(structure: Structure, run: Run) -> Plan:
     check_phases(filled, size)
     noise = structure.kind != "field" and pairs_of_noise(volume.shape, filled / size, total["pairs"])
     plan = Plan(structure, noise, (*volume.notes, note))
-    thinner = filled <= prepare.HALF * size
+    thinner = filled <= preparation.HALF * size
     candidates = candidate_boxes(volume.shape, MEASURED)
     median, thick, plan = _measure_thickness(plan, order_boxes(candidates, total["surface"].tolist()), True)
     if structure.kind == "image":
-        plan = replace(plan, smallest=prepare.smallest_piece(median) / math.prod(volume.spacing))
+        plan = replace(plan, smallest=preparation.smallest_piece(median) / math.prod(volume.spacing))
     if not thinner:
         order = order_boxes(candidates, total["other surface"].tolist())
         median, thick, plan = _measure_thickness(plan, order, False)
@@ -99,16 +99,16 @@ def survey(structure: Structure, run: Run) -> Plan:
 
 
 def _choose_grid(plan: Plan, median: float, thick: float, name: str) -> Plan:
-    """Return the plan with its working grid, as `prepare.prepare` chooses it."""
+    """Return the plan with its working grid, as `preparation.prepare` chooses it."""
     kind, volume = plan.structure.kind, plan.volume
-    note = prepare.judge_thickness(name, median, thick, volume.spacing, kind == "field" or plan.noise)
-    scale, why = prepare.choose_scale(kind, volume, plan.noise, median)
+    note = preparation.judge_thickness(name, median, thick, volume.spacing, kind == "field" or plan.noise)
+    scale, why = preparation.choose_scale(kind, volume, plan.noise, median)
     return replace(
         plan,
         thickness=median,
         scale=scale,
-        working=prepare.count_voxels(volume.shape, scale) if min(volume.shape) > 3 else (0, 0, 0),  # no curvature
-        edge=prepare.working_edge(scale, volume.spacing),
+        working=preparation.count_voxels(volume.shape, scale) if min(volume.shape) > 3 else (0, 0, 0),  # no curvature
+        edge=preparation.working_edge(scale, volume.spacing),
         working_notes=(note, *why),
     )
 

@@ -21,16 +21,16 @@ from curvafit.core.runtime import Progress, check_memory, memory, silent
 from curvafit.core.units import format_sampling
 from curvafit.core.workers import Cluster
 from curvafit.geometry.balls import NEAR, ball_radii, paint_balls, paint_coarse_balls, reaching_radius
-from curvafit.geometry.diagram import BIN_WIDTH, MARGIN, Diagram
+from curvafit.geometry.diagrams import BIN_WIDTH, MARGIN, Diagram
 from curvafit.geometry.mesh import NoSurface, march
-from curvafit.geometry.morphometry import SOFTENED, border_weights, measure_connectivity, soften
+from curvafit.geometry.morphology import SOFTENED, border_weights, measure_connectivity, soften
 from curvafit.geometry.topology import euler_of_window, euler_shares
 from curvafit.priors.grid import WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread
-from curvafit.scan import measure as whole
+from curvafit.scan import measures as whole
 from curvafit.scan.grids import CutOut, centre_distance, profile_mask, remove_specks, resample
-from curvafit.scan.measure import Blocks, Measures
-from curvafit.scan.prepare import DROPPED, LARGEST_BOX, WORKED, Prepared, TooLarge, note_on_filling, smallest_piece
+from curvafit.scan.measures import Blocks, Measures
+from curvafit.scan.preparation import DROPPED, LARGEST_BOX, WORKED, Prepared, TooLarge, note_on_filling, smallest_piece
 from curvafit.scan.structure import Kind, Structure, check_options, read_labels, read_region
 from curvafit.scan.survey import Plan, survey
 from curvafit.volumes.boxes import Box, cut_boxes, grow, within

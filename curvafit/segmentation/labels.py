@@ -17,7 +17,7 @@ from curvafit.core.checks import SEEDS, check_int
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.priors.law import LawLike
 from curvafit.segmentation.known import Known, check_shared, check_which, doubt_places
-from curvafit.segmentation.reconstruct import SHIFTED, SURE, UNTOLD, load_example, load_image, reconstruct
+from curvafit.segmentation.reconstruction import SHIFTED, SURE, UNTOLD, load_example, load_image, reconstruct
 from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.segmentation.slices import IDS, WHOLE, index_labels, mark_known, reach_of, require_labels
 from curvafit.segmentation.uncertainty import doubt, expected_dice, suggest_slices

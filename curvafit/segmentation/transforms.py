@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from curvafit.segmentation.labels import reconstruct_labels
-from curvafit.segmentation.reconstruct import reconstruct
+from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.volumes.volume import ScanError, Volume
 
 try:

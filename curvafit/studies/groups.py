@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from curvafit.core.checks import as_tuple, quoted
-from curvafit.scan.measure import Measures
+from curvafit.scan.measures import Measures
 from curvafit.volumes.read import Source, pick_reader
 from curvafit.volumes.volume import ScanError
 

@@ -16,7 +16,7 @@ from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number
 from curvafit.core.workers import cluster, run_jobs
 from curvafit.scan.instances import measure_instances
-from curvafit.scan.measure import Measures
+from curvafit.scan.measures import Measures
 from curvafit.scan.tiles import measure
 from curvafit.studies.groups import Case
 from curvafit.volumes.read import load

@@ -13,7 +13,7 @@ from typing import Any
 from curvafit.core.extras import require
 from curvafit.core.files import write_atomically, write_content
 from curvafit.core.records import Format, can_write, has_mark
-from curvafit.scan.measure import COLUMNS, Measures
+from curvafit.scan.measures import COLUMNS, Measures
 
 #: Suffixes of the files that are written.
 SUFFIXES = (".csv", ".json", ".parquet")

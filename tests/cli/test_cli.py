@@ -145,7 +145,7 @@ def finding(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         calls.update(scan=scan, **given)
         return made_inference()
 
-    monkeypatch.setattr(importlib.import_module("curvafit.inference.infer"), "infer", find)
+    monkeypatch.setattr(importlib.import_module("curvafit.inference.inference"), "infer", find)
     return calls
 
 

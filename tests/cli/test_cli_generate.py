@@ -17,7 +17,7 @@ from calling import LAW, QUICK, call, done, made, refused
 from found import made_fit
 
 from curvafit.generation.schedule import schedule
-from curvafit.priors.energy import orientation
+from curvafit.priors.energies import orientation
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import preset
 from curvafit.volumes.read import load

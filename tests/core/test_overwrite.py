@@ -91,7 +91,9 @@ def test_a_record_speaks_for_its_own_files_alone(tmp_path: Path) -> None:
 def test_infer_leaves_other_peoples_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = '<meta name="generator" content="curvafit 0">'
     monkeypatch.setattr("curvafit.report.page.write_report", lambda found, path: path.write_text(page))
-    monkeypatch.setattr(importlib.import_module("curvafit.inference.infer"), "infer", lambda *_, **__: made_inference())
+    monkeypatch.setattr(
+        importlib.import_module("curvafit.inference.inference"), "infer", lambda *_, **__: made_inference()
+    )
     told = ["infer", save(MASK, tmp_path / "scan.npy")]
     for name in FILES:
         folder = thesis(tmp_path / name.replace(".", ""))

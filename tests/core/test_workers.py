@@ -14,7 +14,8 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from curvafit.data_synth import Design, build, cluster, open_store
+from curvafit.core.workers import cluster
+from curvafit.data_synth import Design, build, open_store
 from curvafit.data_synth import store as storing
 from curvafit.data_synth.atlas import verify
 from curvafit.generation.schedule import schedule
@@ -27,7 +28,8 @@ COUNT, EDGE, PLAN = 8, 16, schedule("cosine", steps=60)
 #: As a script: builds with two workers, and says where it is.
 SCRIPT = f"""
 import sys
-from curvafit.data_synth import build, cluster
+from curvafit.core.workers import cluster
+from curvafit.data_synth import build
 from curvafit.generation.schedule import schedule
 if __name__ == "__main__":
     with cluster(2) as crew:

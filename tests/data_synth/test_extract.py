@@ -10,13 +10,13 @@ from exact import Gyroid, centres, profile
 from exact_store import exact_record, exact_store
 
 from curvafit.core.workers import cluster
-from curvafit.data_synth.extract import describe
-from curvafit.geometry.descriptors import BLOCKS, descriptors
+from curvafit.data_synth.extraction import describe
+from curvafit.geometry.description import BLOCKS, descriptors
 from curvafit.inference import table as tables
 from curvafit.inference.table import VIEWS, Table, column_names, law_of, load_table, parameters_of, save_table
 from curvafit.priors import Coefficients, Grid, preset
-from curvafit.scan.measure import read_texture
-from curvafit.scan.prepare import WORKING_THICKNESS, prepare, thinner_thickness
+from curvafit.scan.measures import read_texture
+from curvafit.scan.preparation import WORKING_THICKNESS, prepare, thinner_thickness
 from curvafit.volumes.volume import ScanError
 
 FAST = ("field", "mask")

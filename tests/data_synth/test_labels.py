@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from curvafit.data_synth.centreline import skeleton_of
 from curvafit.data_synth.labels import NAMES, field_distance, instances_of, labels_of
 from curvafit.geometry import betti_numbers, surface
-from curvafit.geometry.diagram import MARGIN
+from curvafit.geometry.diagrams import MARGIN
 from curvafit.priors.grid import Grid
 
 pytestmark = pytest.mark.slow

@@ -72,7 +72,7 @@ def test_a_set_goes_on_and_ends_the_same(tmp_path, order):
 @pytest.mark.slow
 def test_a_worker_makes_the_same_set(tmp_path, order):
     pytest.importorskip("distributed", reason="needs dask.distributed")
-    from curvafit.data_synth import cluster
+    from curvafit.core.workers import cluster
 
     with cluster(1) as crew:
         theirs = build_set(tmp_path / "theirs", order, 3, workers=crew)

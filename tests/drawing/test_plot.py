@@ -15,9 +15,9 @@ import torch
 import curvafit
 from curvafit.core.pictures import Pictured
 from curvafit.drawing import plot
-from curvafit.drawing.render import render, surface_picture, view
+from curvafit.drawing.rendering import render, surface_picture, view
 from curvafit.generation import Schedule, generate
-from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.diagrams import Diagram
 from curvafit.volumes.volume import Volume
 
 
@@ -86,7 +86,7 @@ def shaded(z0: float, y0: float, x0: float) -> float:
 @pytest.mark.parametrize("coarse", [128, 24])
 def test_a_ball_between_a_plate_and_the_light_shades_it(monkeypatch: pytest.MonkeyPatch, coarse: int) -> None:
     """The light comes from the upper left; on a grid of its own, too, where the volume is large."""
-    monkeypatch.setattr(import_module("curvafit.drawing.render"), "COARSE", coarse)
+    monkeypatch.setattr(import_module("curvafit.drawing.rendering"), "COARSE", coarse)
     assert shaded(30, 24 + 20, 24 - 12.6) < shaded(30, 24 - 20, 24 + 12.6) - 15
 
 

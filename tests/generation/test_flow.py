@@ -18,7 +18,7 @@ from curvafit.generation.loop import first_mass
 from curvafit.generation.result import RECORD_EVERY, viability
 from curvafit.generation.schedule import SCHEDULES, Phase, Schedule, choose_schedule, present_name, schedule
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.energy import energy, energy_gradient_by_autograd, orientation
+from curvafit.priors.energies import energy, energy_gradient_by_autograd, orientation
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import Law, preset
 from curvafit.priors.profile import optimal_profile

@@ -20,14 +20,14 @@ from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import LbfgsStepper, TorchStepper
 from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.energy import energy, orientation
+from curvafit.priors.energies import energy, orientation
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import preset
 from curvafit.priors.profile import SIGMA, optimal_profile
 from curvafit.priors.stencils import gaussian_blur
 from curvafit.segmentation.evidence import probability_evidence
-from curvafit.segmentation.reconstruct import reconstruct
-from curvafit.segmentation.segment import segment
+from curvafit.segmentation.reconstruction import reconstruct
+from curvafit.segmentation.segmentation import segment
 from curvafit.volumes.volume import Volume
 
 boundaries = pytest.mark.parametrize("boundary", ["periodic", "replicate"])

@@ -7,7 +7,7 @@ import pytest
 from exact import Cylinder, Gyroid, Shape, Sphere, centres, profile
 from scipy import ndimage
 
-from curvafit.geometry.descriptors import BLOCKS, LEVELS, RADII, Descriptors, descriptors
+from curvafit.geometry.description import BLOCKS, LEVELS, RADII, Descriptors, descriptors
 from curvafit.geometry.topology import euler_number
 from curvafit.priors.grid import Grid
 

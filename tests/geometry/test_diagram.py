@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from curvafit.geometry import distances as module
-from curvafit.geometry.diagram import Diagram, diagram, family_of, family_shares, half_thickness
+from curvafit.geometry.diagrams import Diagram, diagram, family_of, family_shares, half_thickness
 from curvafit.geometry.distances import one_to_many, pairwise, sliced_embedding, wasserstein
 from curvafit.inference.atlas import load_atlas
 from curvafit.priors.grid import Grid

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from curvafit.geometry.morphometry import local_thickness, morphometry
+from curvafit.geometry.morphology import local_thickness, morphometry
 from curvafit.geometry.topology import betti_numbers, components, euler_number, euler_of_window
 from curvafit.volumes.read import load
 

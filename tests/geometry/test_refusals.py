@@ -9,11 +9,11 @@ import pytest
 import torch
 from exact import Cylinder, Sphere, centres, profile
 
-from curvafit.geometry.descriptors import descriptors
-from curvafit.geometry.diagram import Diagram, diagram
+from curvafit.geometry.description import descriptors
+from curvafit.geometry.diagrams import Diagram, diagram
 from curvafit.geometry.distances import one_to_many, pairwise, wasserstein
 from curvafit.geometry.mesh import NoSurface, solid_surface, surface, write_surface
-from curvafit.geometry.morphometry import morphometry
+from curvafit.geometry.morphology import morphometry
 from curvafit.priors.grid import Grid
 
 GRID, CUBE = Grid((28, 28, 28), (1.0, 1.0, 1.0), "replicate"), Grid((16, 16, 16))

@@ -11,11 +11,11 @@ import torch
 
 from curvafit.data_synth import atlas as building
 from curvafit.data_synth.design import INTERVALS, Design, design_box
-from curvafit.data_synth.extract import extract
+from curvafit.data_synth.extraction import extract
 from curvafit.data_synth.store import open_store
 from curvafit.generation.result import Viability
 from curvafit.generation.schedule import LEARNED, present_name, schedule
-from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.diagrams import Diagram
 from curvafit.geometry.distances import one_to_many, wasserstein
 from curvafit.inference import atlas as matching
 from curvafit.inference.atlas import ARRAYS, Atlas, load_atlas, nearest, save_atlas

@@ -12,7 +12,7 @@ from emulated import BOX, COLUMNS, HIDDEN, HIGH, LOW, NOISE, PLAIN, linear, read
 from exact import Gyroid, centres
 
 from curvafit.generation.schedule import LEARNED
-from curvafit.geometry.descriptors import BLOCKS
+from curvafit.geometry.description import BLOCKS
 from curvafit.inference import estimate
 from curvafit.inference.candidates import Candidate, Misfit, Twin
 from curvafit.inference.combinations import Combinations, find_combinations
@@ -24,8 +24,8 @@ from curvafit.inference.table import PARAMETERS, Table, column_names
 from curvafit.inference.training import PLANS, train_emulator
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
-from curvafit.scan.measure import Reading, windows_along
-from curvafit.scan.prepare import Prepared, prepare
+from curvafit.scan.measures import Reading, windows_along
+from curvafit.scan.preparation import Prepared, prepare
 from curvafit.volumes.volume import Volume
 
 DEVIATION = (HIGH - LOW) / np.sqrt(12)

@@ -12,8 +12,8 @@ from found import BROKEN, NUMBERS, broken, lattice, made_fit, measured
 
 from curvafit.core.records import quoted
 from curvafit.core.schema import decode, encode
-from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram
-from curvafit.geometry.morphometry import Morphometry
+from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE, Diagram
+from curvafit.geometry.morphology import Morphometry
 from curvafit.inference.candidates import Candidate, Misfit, Twin, best_candidate, seed_noise_of
 from curvafit.inference.estimate import middle_of
 from curvafit.inference.fit import COLUMNS, Fit, to_columns

@@ -13,21 +13,21 @@ from scipy import ndimage
 from shapes import grown
 
 from curvafit.generation.schedule import LEARNED, SCHEDULES, schedule
-from curvafit.geometry.descriptors import BLOCKS, descriptors
-from curvafit.geometry.diagram import diagram
+from curvafit.geometry.description import BLOCKS, descriptors
+from curvafit.geometry.diagrams import diagram
 from curvafit.geometry.distances import wasserstein
 from curvafit.inference import estimate
 from curvafit.inference.atlas import load_atlas
 from curvafit.inference.candidates import EDGES, TITLES
 from curvafit.inference.fit import Fit
-from curvafit.inference.infer import Inference, infer
+from curvafit.inference.inference import Inference, infer
 from curvafit.inference.posterior import load_posterior
 from curvafit.inference.table import PARAMETERS, mirror_parameters, parameters_of
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import FORMAT, Law, preset
 from curvafit.report.page import write_inference
-from curvafit.scan.measure import read_texture, scan_diagram
-from curvafit.scan.prepare import prepare
+from curvafit.scan.measures import read_texture, scan_diagram
+from curvafit.scan.preparation import prepare
 from curvafit.scan.quality import Quality
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
@@ -244,7 +244,7 @@ def test_a_region_of_interest_hides_the_surface_that_it_cuts() -> None:
 
 def test_of_a_large_pyramid_the_level_that_suits_the_structure_is_read(tmp_path, monkeypatch) -> None:
     """Tubes 24 voxels thick: of the finest level a quarter would be read, of the next one all."""
-    monkeypatch.setattr("curvafit.scan.prepare.LARGEST_SCAN", 64)
+    monkeypatch.setattr("curvafit.scan.preparation.LARGEST_SCAN", 64)
     monkeypatch.setattr("curvafit.volumes.formats.zarr.CHUNK", 48)
     mask = (lattice(96, 48, 12.0) > 0).astype(np.uint8)
     path = save(Volume(mask, (0.5, 0.5, 0.5), "um"), tmp_path / "scan.zarr")

@@ -10,11 +10,11 @@ from emulated import HIGH, LOW
 
 import curvafit.inference.table as room
 import curvafit.inference.training as training
-from curvafit.geometry.descriptors import BLOCKS
+from curvafit.geometry.description import BLOCKS
 from curvafit.inference.posterior import Architecture, Posterior, load_posterior, save_posterior
 from curvafit.inference.table import columns_of, mirror_parameters
 from curvafit.inference.training import PLANS, train_posterior
-from curvafit.scan.measure import Reading
+from curvafit.scan.measures import Reading
 
 SMALL = Architecture(components=4, hidden=(64,), transforms=1, dropout=0.0)
 NOISE = 0.2

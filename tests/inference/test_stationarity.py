@@ -15,7 +15,7 @@ from shapes import grown
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
 from curvafit.inference.emulator import best_parameters
-from curvafit.inference.stationarity import clip_to_domain, drift, energy_gradients, integrate_columns, stationarity
+from curvafit.inference.stationary import clip_to_domain, drift, energy_gradients, integrate_columns, stationarity
 from curvafit.priors import WORKING_EPSILON, Coefficients, Grid, energy_terms, jet, phase_field, preset
 from curvafit.priors.stencils import gaussian_blur
 from curvafit.scan.structure import is_rounded
@@ -25,7 +25,7 @@ GRID = Grid((EDGE,) * 3)
 FAR = Coefficients(1, 0.5, 3, 30, -20, 100)
 TRUTH = preset("sponge")
 #: The module, which has a function of its own name.
-room = import_module("curvafit.inference.stationarity")
+room = import_module("curvafit.inference.stationary")
 
 
 @pytest.fixture(scope="module")

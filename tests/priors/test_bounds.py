@@ -23,7 +23,7 @@ from curvafit.generation.schedule import Phase, schedule
 from curvafit.generation.slabs import divide
 from curvafit.priors import kernels, stencils
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.energy import energy, orientation
+from curvafit.priors.energies import energy, orientation
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import Law, preset
 

@@ -13,7 +13,7 @@ from torch.testing import assert_close
 from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.curvature import Jet, diffuse_curvatures, jet, second_form
-from curvafit.priors.energy import (
+from curvafit.priors.energies import (
     cahn_hilliard_area,
     discrepancy_ratio,
     energy,

@@ -11,7 +11,7 @@ import torch
 from kernel_cases import ADAM_EPS, BETAS, BLUR, BOUNDARIES, EPSILON, SPACINGS, TUBES, smooth_field
 
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.energy import energy, energy_gradient_by_autograd
+from curvafit.priors.energies import energy, energy_gradient_by_autograd
 from curvafit.priors.grid import Grid
 from curvafit.priors.stencils import divergence, gaussian_blur, gradient
 

@@ -10,7 +10,7 @@ from found import broken, made_fit, made_inference
 from hypothesis import given
 from hypothesis import strategies as st
 
-from curvafit.inference.infer import Inference
+from curvafit.inference.inference import Inference
 from curvafit.priors import PRESETS, Coefficients, CurvaturePrior, Law, LawLike, preset, read_laws
 from curvafit.priors.law import preset_name
 

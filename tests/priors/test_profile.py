@@ -14,7 +14,7 @@ from loss_cases import noise
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 from torch.testing import assert_close
 
-from curvafit.geometry.diagram import diagram
+from curvafit.geometry.diagrams import diagram
 from curvafit.geometry.mesh import surface
 from curvafit.priors import profile, stencils
 from curvafit.priors.grid import Grid

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.curvature import ROOT_FLOOR, ROOT_ROUNDING, jet, positive_root, second_form
-from curvafit.priors.energy import energy, energy_gradient, energy_gradient_by_autograd
+from curvafit.priors.energies import energy, energy_gradient, energy_gradient_by_autograd
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 

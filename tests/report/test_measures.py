@@ -10,7 +10,7 @@ from found import lattice, without_drawing
 
 from curvafit.report.laws import infer_scans, name_folders
 from curvafit.report.measures import WORD, describe_range, name_parts, shorten
-from curvafit.scan.measure import Measures
+from curvafit.scan.measures import Measures
 from curvafit.scan.tiles import measure
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save

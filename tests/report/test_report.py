@@ -13,8 +13,8 @@ import torch
 from found import EPSILON, RADIUS, SCALE, made_fit, made_inference, without_drawing
 
 from curvafit.core.units import GLOSSARY, format_density, format_length, format_number
-from curvafit.geometry.diagram import diagram
-from curvafit.inference.infer import Inference
+from curvafit.geometry.diagrams import diagram
+from curvafit.inference.inference import Inference
 from curvafit.priors import Grid
 from curvafit.priors.law import FORMAT, Law
 from curvafit.report.page import describe, family_radius, parameter_table, report_html, with_command, write_inference

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from curvafit.priors import Grid, phase_field
-from curvafit.scan import prepare as preparing
+from curvafit.scan import preparation as preparing
 from curvafit.scan.grids import boxes_by_surface, centre_distance, median_thickness, remove_specks, resample
-from curvafit.scan.prepare import WORKING_THICKNESS, Prepared, coarser_level, is_ball, prepare, read_scan
+from curvafit.scan.preparation import WORKING_THICKNESS, Prepared, coarser_level, is_ball, prepare, read_scan
 from curvafit.scan.quality import Quality, measure_quality, sample_mask
 from curvafit.scan.structure import find_structure, is_noise
 from curvafit.volumes import ScanError, Volume, load, save
@@ -40,7 +40,7 @@ def threshold_of(scan: Prepared | Volume) -> float:
 
 @pytest.mark.parametrize("crop", [None, ":,4:20,:"])
 def test_of_a_large_file_the_middle_is_read(tmp_path, monkeypatch, crop) -> None:
-    monkeypatch.setattr("curvafit.scan.prepare.LARGEST_SCAN", 24)
+    monkeypatch.setattr("curvafit.scan.preparation.LARGEST_SCAN", 24)
     mask = tube_mask((20, 24, 60), (1, 1, 1), 6)
     grey = image_of(mask)
     path = save(Volume(grey, (1.0, 1.0, 1.0), "um"), tmp_path / "scan.zarr")
@@ -59,7 +59,7 @@ def test_of_a_large_file_the_middle_is_read(tmp_path, monkeypatch, crop) -> None
 @pytest.mark.parametrize(("radius", "level"), [(3, None), (12, "1"), (22, "2")])
 def test_a_coarser_level_is_chosen_where_the_structure_is_thick_there(tmp_path, monkeypatch, radius, level) -> None:
     """24 voxels of thickness leave 12 at the first level, 44 leave 11 at the second."""
-    monkeypatch.setattr("curvafit.scan.prepare.LARGEST_SCAN", 64)
+    monkeypatch.setattr("curvafit.scan.preparation.LARGEST_SCAN", 64)
     monkeypatch.setattr("curvafit.volumes.formats.zarr.CHUNK", 48)
     mask = tube_mask((96, 96, 200), (1, 1, 1), radius)
     path = save(Volume(mask.astype(np.uint8), (0.5, 0.5, 0.5), "um"), tmp_path / "scan.zarr")
@@ -73,7 +73,7 @@ def test_a_coarser_level_is_chosen_where_the_structure_is_thick_there(tmp_path, 
 
 def test_a_level_keeps_the_structure_s_voxels_and_the_slab_s(tmp_path, monkeypatch) -> None:
     """A pyramid of fourths leaves 6 of 24 voxels, and a half of a slab of 40 slices too few slices."""
-    monkeypatch.setattr("curvafit.scan.prepare.LARGEST_SCAN", 64)
+    monkeypatch.setattr("curvafit.scan.preparation.LARGEST_SCAN", 64)
     store = tmp_path / "scan.zarr"
     save(Volume(tube_mask((96, 96, 200), (1, 1, 1), 12).astype(np.uint8), (1.0, 1.0, 1.0), "um"), store)
     prepared = prepare(load(store), one_scale=True)
@@ -86,7 +86,7 @@ def test_a_level_keeps_the_structure_s_voxels_and_the_slab_s(tmp_path, monkeypat
 
 
 def test_a_file_larger_than_memory_is_read_in_its_middle(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("curvafit.scan.prepare.LARGEST_SCAN", 64)
+    monkeypatch.setattr("curvafit.scan.preparation.LARGEST_SCAN", 64)
     shape = (600, 40_000, 40_000)  # a terabyte, of which nothing but the middle is on the disk
     array = np.lib.format.open_memmap(tmp_path / "scan.npy", mode="w+", dtype=np.uint8, shape=shape)
     array[300, 20_000, 19_990:20_010] = 7

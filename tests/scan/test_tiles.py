@@ -12,10 +12,10 @@ from shapes import grown
 
 from curvafit.core.workers import cluster
 from curvafit.geometry.balls import ball_radii, paint_balls, paint_coarse_balls
-from curvafit.geometry.morphometry import local_thickness
+from curvafit.geometry.morphology import local_thickness
 from curvafit.scan import tiles
 from curvafit.scan.instances import OF_BODIES, measure_instances
-from curvafit.scan.measure import Measures
+from curvafit.scan.measures import Measures
 from curvafit.scan.survey import Plan
 from curvafit.scan.tiles import measure
 from curvafit.volumes import ScanError, Volume, save

@@ -14,7 +14,7 @@ from calling import call, done, refused
 from shapes import grown
 
 from curvafit.core.workers import cluster
-from curvafit.segmentation.reconstruct import reconstruct
+from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.result import write_mask
 from curvafit.volumes import Volume, load, save
 from curvafit.volumes.formats.zarr import write_zarr
@@ -120,7 +120,7 @@ def test_the_same_command_goes_on_after_a_kill(labels: Path, tmp_path: Path, mon
     done(*command("whole"))
     filled: list[int] = []
 
-    room = sys.modules["curvafit.segmentation.reconstruct"]  # the package's name of the module is the function
+    room = sys.modules["curvafit.segmentation.reconstruction"]  # the package's name of the module is the function
 
     def stop(*job: Any, fill=room.fill_block) -> object:
         filled.append(job[-1])

@@ -12,7 +12,7 @@ import curvafit.segmentation.image as room
 from curvafit.segmentation.filler import Filler, Gaps, Taught, fill
 from curvafit.segmentation.image import find_shift, read_image
 from curvafit.segmentation.labels import are_instances, reconstruct_labels, split_structure
-from curvafit.segmentation.reconstruct import reconstruct
+from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.teach import ImageMix, Texture, image_shape, teach
 from curvafit.segmentation.trials import dice
 from curvafit.volumes.volume import Volume

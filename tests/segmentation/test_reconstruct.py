@@ -20,9 +20,9 @@ from curvafit.priors.law import preset
 from curvafit.scan.grids import box_with_most_surface
 from curvafit.segmentation.flow import WorkingGrid
 from curvafit.segmentation.labels import reconstruct_labels
-from curvafit.segmentation.reconstruct import MARGIN, STIFFNESS, reconstruct
+from curvafit.segmentation.reconstruction import MARGIN, STIFFNESS, reconstruct
 from curvafit.segmentation.result import Segmentation, Uncertainty
-from curvafit.segmentation.segment import FIRST, NATS, calibrate
+from curvafit.segmentation.segmentation import FIRST, NATS, calibrate
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.trials import Task, Trial, choose_by_masks, dice, laws_of
 from curvafit.volumes.volume import ScanError, Volume

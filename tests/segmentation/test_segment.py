@@ -20,7 +20,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import preset
 from curvafit.segmentation.evidence import load_probabilities
 from curvafit.segmentation.flow import WorkingGrid
-from curvafit.segmentation.segment import calibrate, segment
+from curvafit.segmentation.segmentation import calibrate, segment
 from curvafit.segmentation.trials import dice, law_of
 from curvafit.volumes.read import load
 from curvafit.volumes.volume import Volume

@@ -10,7 +10,7 @@ import torch
 from annotated import organelles
 
 from curvafit.segmentation.labels import reconstruct_labels
-from curvafit.segmentation.reconstruct import reconstruct
+from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.volumes.volume import Volume
 
 pytest.importorskip("monai", reason="needs monai, of the group dev")

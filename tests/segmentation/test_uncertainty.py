@@ -6,7 +6,7 @@ from annotated import ball
 from scipy.ndimage import gaussian_filter
 
 import curvafit.segmentation.uncertainty as room
-from curvafit.segmentation.reconstruct import reconstruct
+from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.slices import harmonic_distance
 from curvafit.segmentation.uncertainty import calibration_error, probability
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from curvafit.priors import kernels
-from curvafit.priors.energy import energy, energy_gradient
+from curvafit.priors.energies import energy, energy_gradient
 from curvafit.priors.grid import Float, Grid
 
 _LOG = logging.getLogger("curvafit")

@@ -16,7 +16,7 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 
 from curvafit.core.checks import check_type
-from curvafit.geometry.diagram import diagram
+from curvafit.geometry.diagrams import diagram
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.geometry.mesh import NoSurface, area_vectors, surface
 from curvafit.geometry.topology import euler_shares

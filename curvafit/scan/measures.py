@@ -19,14 +19,22 @@ from curvafit.core.extras import require
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import convert_length, format_number, plain_unit, power_name
-from curvafit.geometry.descriptors import descriptors
-from curvafit.geometry.diagram import FAMILIES, MARGIN, Diagram, diagram, families
+from curvafit.geometry.description import descriptors
+from curvafit.geometry.diagrams import FAMILIES, MARGIN, Diagram, diagram, families
 from curvafit.geometry.mesh import NoSurface, Surface, area_vectors
-from curvafit.geometry.morphometry import border_weights, local_thickness, smooth_surface
+from curvafit.geometry.morphology import border_weights, local_thickness, smooth_surface
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.scan.grids import median_thickness, remove_specks
-from curvafit.scan.prepare import DROPPED, LARGEST_WINDOW, Prepared, TooLarge, prepare, prepare_whole, smallest_piece
+from curvafit.scan.preparation import (
+    DROPPED,
+    LARGEST_WINDOW,
+    Prepared,
+    TooLarge,
+    prepare,
+    prepare_whole,
+    smallest_piece,
+)
 from curvafit.scan.structure import Kind, find_structure, is_rounded
 from curvafit.volumes.boxes import cut_boxes
 from curvafit.volumes.volume import ScanError, Volume

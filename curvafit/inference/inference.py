@@ -18,21 +18,21 @@ from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, log_stages, sub_progress
 from curvafit.core.units import format_number
 from curvafit.generation.schedule import LEARNED, SCHEDULES, Schedule
-from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, family_of
-from curvafit.geometry.morphometry import morphometry
+from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE, Diagram, family_of
+from curvafit.geometry.morphology import morphometry
 from curvafit.inference.atlas import VERSION, Atlas, Match, load_atlas, mirror_match, nearest
 from curvafit.inference.candidates import TITLES, Candidate, Twin, best_candidate, twin
 from curvafit.inference.estimate import check_law, estimate_law, measure_descriptors, refine_matches
 from curvafit.inference.fit import KINDS, Fit
 from curvafit.inference.posterior import Posterior, load_posterior
 from curvafit.inference.simulate import ROUNDS
-from curvafit.inference.stationarity import drift, stationarity
+from curvafit.inference.stationary import drift, stationarity
 from curvafit.inference.verdict import verdict
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law
 from curvafit.priors.profile import phase_field
-from curvafit.scan.measure import scan_diagram
-from curvafit.scan.prepare import HALF, NOISE, Prepared, coarser_level, prepare, read_scan, why_no_texture
+from curvafit.scan.measures import scan_diagram
+from curvafit.scan.preparation import HALF, NOISE, Prepared, coarser_level, prepare, read_scan, why_no_texture
 from curvafit.scan.quality import sample_mask
 from curvafit.scan.structure import check_options, is_rounded, read_region
 from curvafit.volumes.boxes import Crop
@@ -142,7 +142,7 @@ def infer(
     fast
         Grow nothing: seconds instead of minutes, but nothing is checked by a twin.
     threshold, dark, roi
-        How structure and background are split: see `curvafit.scan.prepare.prepare`.
+        How structure and background are split: see `curvafit.scan.prepare`.
     label, crop
         The voxels of one value as a mask; a box of voxels, of the scan and of `roi`: see `curvafit.load`.
     simulations, rounds

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from curvafit.geometry.diagram import Diagram
+from curvafit.geometry.diagrams import Diagram
 from curvafit.geometry.topology import betti_numbers
 from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
 from curvafit.scan import grids, structure

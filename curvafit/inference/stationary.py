@@ -27,7 +27,7 @@ from curvafit.generation.schedule import Schedule
 from curvafit.inference.candidates import Candidate
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.curvature import jet
-from curvafit.priors.energy import energy_terms
+from curvafit.priors.energies import energy_terms
 from curvafit.priors.grid import Float, Grid
 from curvafit.priors.stencils import gaussian_blur, gradient, pad
 from curvafit.scan.grids import boxes_by_surface, surface_voxels

@@ -31,7 +31,7 @@ from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.priors.law import LawLike
 from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import profile_distance
-from curvafit.scan.prepare import LARGEST_BOX
+from curvafit.scan.preparation import LARGEST_BOX
 from curvafit.scan.structure import add_records
 from curvafit.segmentation.filler import REACH, SLOPE, TILE, Raster, Taught, fill
 from curvafit.segmentation.flow import HALO, STEPS, WorkingGrid, choose_epsilon

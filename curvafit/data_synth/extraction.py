@@ -22,12 +22,12 @@ from curvafit.data_synth.design import design_box
 from curvafit.data_synth.store import Record, Store, open_store
 from curvafit.generation.result import FORMED, is_well_formed
 from curvafit.generation.schedule import SCHEDULES, present_name
-from curvafit.geometry.diagram import BIN_WIDTH, TAIL_SHARE, Diagram, diagram
+from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE, Diagram, diagram
 from curvafit.inference.atlas import Atlas
 from curvafit.inference.table import VIEWS, Table, load_table, parameters_of, save_table, to_row
 from curvafit.priors.grid import Grid
-from curvafit.scan.measure import Reading, read_texture, scan_diagram
-from curvafit.scan.prepare import prepare, thinner_thickness
+from curvafit.scan.measures import Reading, read_texture, scan_diagram
+from curvafit.scan.preparation import prepare, thinner_thickness
 from curvafit.volumes.volume import ScanError, Volume
 
 #: A row of a table: its columns in their order.

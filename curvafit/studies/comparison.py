@@ -19,9 +19,9 @@ from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number, format_percent, per_unit, power_name
 from curvafit.drawing.plot import shared_limits
-from curvafit.geometry.diagram import FAMILIES, Diagram
+from curvafit.geometry.diagrams import FAMILIES, Diagram
 from curvafit.geometry.distances import sliced_embedding
-from curvafit.scan.measure import QUANTITIES, SURE, Measures, find_quantity, interval_reach
+from curvafit.scan.measures import QUANTITIES, SURE, Measures, find_quantity, interval_reach
 from curvafit.scan.structure import check_options
 from curvafit.studies.groups import Case, Group, list_cases
 from curvafit.studies.scans import gather_notes, measure_scans

@@ -14,7 +14,7 @@ from curvafit.core.checks import as_tuple, check_int, check_seed
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import format_length, format_number, format_percent, format_sampling, unit_name
-from curvafit.scan.measure import QUANTITIES, Blocks, combine, measure_maps
+from curvafit.scan.measures import QUANTITIES, Blocks, combine, measure_maps
 from curvafit.scan.structure import check_options
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.volume import Volume

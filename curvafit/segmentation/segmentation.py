@@ -305,7 +305,7 @@ def calibrate(
         state = "full" if inside.all() else "empty"
         raise ScanError(f"the example must have voxels inside and outside, but is {state}")
     if prior is None:
-        from curvafit.inference.infer import infer  # takes long to import
+        from curvafit.inference.inference import infer  # takes long to import
 
         prior = infer(truth, kind="mask", fast=True, progress=progress)
     laws, notes = laws_of(prior, field)

@@ -1,0 +1,12 @@
+from .data import Data as Data
+from .data import Evidence as Evidence
+from .data import Hinge as Hinge
+from .flow import descend as descend
+from .flow import generate as generate
+from .forms import white_noise as white_noise
+from .result import Flow as Flow
+from .result import History as History
+from .result import State as State
+from .result import Viability as Viability
+from .schedule import SCHEDULES as SCHEDULES
+from .schedule import Schedule as Schedule
