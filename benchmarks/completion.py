@@ -112,7 +112,7 @@ def fitted(law: str, seed: int, cases: Cases) -> Fit:
     """Return the fit of a mask, inferred once without growing anything."""
 
     def read() -> str:
-        return infer(shape(law, seed, cases).astype(np.uint8), kind="mask", fast=True, periodic=True).fit.to_json()
+        return infer(shape(law, seed, cases).astype(np.uint8), kind="mask", growth=None, periodic=True).fit.to_json()
 
     return Fit.load(cases.of("completion").text(f"fit-{law}-{seed}.json", read))
 
@@ -261,7 +261,7 @@ def scan_case(name: str, side: int, block: int, every: int, way: str, cases: Cas
     axis = int(target.shape[0] < FEW)
 
     def prior() -> Fit:
-        read = lambda: infer(sides(name)[1 - side], kind="mask", fast=True).fit.to_json()  # noqa: E731
+        read = lambda: infer(sides(name)[1 - side], kind="mask", growth=None).fit.to_json()  # noqa: E731
         return Fit.load(cases.text(f"fit-{name}-{1 - side}.json", read))
 
     return filled(way, target, range(0, target.shape[axis], every), axis, prior, lambda: sides(name)[1 - side])

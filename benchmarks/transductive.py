@@ -87,7 +87,7 @@ def law_of(texture: str, cases: Cases) -> Fit:
 
     def read() -> str:
         mask = truth_of(texture, OTHER, cases).astype(np.uint8)
-        return infer(mask, kind="mask", fast=True).fit.to_json()
+        return infer(mask, kind="mask", growth=None).fit.to_json()
 
     return Fit.load(cases.text(f"fit-{texture}.json", read))
 

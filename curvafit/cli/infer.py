@@ -42,10 +42,12 @@ def infer(
     files = {"roi": roi, "atlas": atlas, "posterior": posterior}
     with show_stages() as progress:
         from curvafit.inference.inference import infer as infer_scan
+        from curvafit.inference.simulate import Growth
         from curvafit.report.laws import infer_scans
         from curvafit.report.page import check_report, with_command, write_inference
 
-        what = {**structure, **files, "method": method, "fast": fast, "test": test, "seed": seed, **reading}
+        growth = None if fast else Growth(test=test)
+        what = {**structure, **files, "method": method, "growth": growth, "seed": seed, **reading}
         if len(scans) > 1:
             how = {"workers": workers, "command": command_line(), "overwrite": overwrite, "progress": progress}
             page = infer_scans(scans, out, **how, **what)

@@ -11,6 +11,7 @@ from .inference import infer as infer
 from .posterior import Posterior as Posterior
 from .posterior import load_posterior as load_posterior
 from .posterior import save_posterior as save_posterior
+from .simulate import Growth as Growth
 from .stationary import stationarity as stationarity
 from .table import Table as Table
 from .table import load_table as load_table

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.distance import cdist, pdist
@@ -16,10 +17,11 @@ from curvafit.generation.schedule import LEARNED, Schedule
 from curvafit.geometry.description import BLOCKS
 from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Misfit, join_tests, twin
+from curvafit.inference.combinations import Combination
 from curvafit.inference.emulator import best_parameters, misfits
 from curvafit.inference.fit import COLUMNS, to_columns
 from curvafit.inference.posterior import Posterior
-from curvafit.inference.simulate import Search, Simulate, simulate_draws
+from curvafit.inference.simulate import Growth, Search, Simulate, simulate_draws
 from curvafit.inference.table import column_names, columns_of, law_of, mirror_parameters, parameters_of
 from curvafit.priors.grid import Grid
 from curvafit.scan.measures import Reading, read_texture, windows_along
@@ -51,6 +53,23 @@ class Described(NamedTuple):
         return mirror_parameters(parameters) if self.background else parameters
 
 
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What is read of a scan's law: draws, view, combinations, candidates, misfit and matches, as a `Fit` has them.
+
+    `simulated` has, by block of descriptors, the scan's numbers `(k,)` and those of shapes grown from draws `(n, k)`;
+    None where none grew.
+    """
+
+    draws: np.ndarray | None = None
+    view: str = ""
+    combinations: tuple[Combination, ...] = ()
+    candidates: tuple[Candidate, ...] = ()
+    misfit: Misfit | None = None
+    matches: tuple[Match, ...] = ()
+    simulated: dict[str, tuple[np.ndarray, np.ndarray]] | None = None
+
+
 def measure_descriptors(prepared: Prepared) -> Described | None:
     """Measure the descriptors of a scan; None where they cannot be measured."""
     # Of a structure that fills most of the volume the background is described, as the training's shapes were thin.
@@ -61,49 +80,40 @@ def measure_descriptors(prepared: Prepared) -> Described | None:
 
 
 def estimate_law(
-    described: Described,
-    posterior: Posterior,
-    *,
-    seed: int,
-    simulations: int,
-    rounds: int,
-    schedule: Schedule | str,
-    progress: Progress,
-) -> tuple[dict[str, Any], dict[str, tuple[np.ndarray, np.ndarray]] | None]:
+    described: Described, posterior: Posterior, *, growth: Growth | None, seed: int, progress: Progress
+) -> Estimate:
     """Read the law of a scan from its descriptors: draw from the posterior, grow some draws, and compare.
 
-    The parameters are as in `infer`; without simulations the scan is compared with what training left unexplained.
-    Returns the draws, view, combinations and candidates of a `Fit` by name; and by block of descriptors the scan's
-    numbers `(k,)` and those of the simulations `(n, k)`, if any.
+    The parameters are as in `infer`; where nothing grows the scan is compared with what training left unexplained.
     """
     reading, turn = described.reading, described.turn
     progress("reading the posterior", 0.0)
     draws = posterior.draw(reading, DRAWS, seed)
     parameters = draws[:, :-1]
-    law: dict[str, Any] = {"draws": np.column_stack([turn(parameters), draws[:, -1]]), "view": reading.view}
-    law["combinations"] = posterior.combinations.read(parameters, background=described.background)
+    combinations = posterior.combinations.read(parameters, background=described.background)
+    estimate = Estimate(np.column_stack([turn(parameters), draws[:, -1]]), reading.view, combinations)
     thickness = float(np.exp(np.median(draws[:, -1])))
     likely = Candidate("posterior", *law_of(turn(middle_of(parameters))), _deviations(turn(parameters)), thickness)
-    simulate = _simulator(described.seen, reading.view, schedule)
     grown = None
-    if simulations:
-        part = sub_progress(progress, 0.15, 0.45)
-        grown = simulate_draws(parameters, simulate, simulations, seed=seed, progress=part)
-    if grown is None or len(grown.parameters) < FEWEST:
+    if growth is not None and growth.simulations:
+        simulate, part = _simulator(described.seen, reading.view, growth.schedule), sub_progress(progress, 0.15, 0.45)
+        grown = simulate_draws(parameters, simulate, growth.simulations, seed=seed, progress=part)
+    if growth is None or grown is None or len(grown.parameters) < FEWEST:
         left = misfits(posterior.emulator, *reading.columns, parameters[None, :STARTS])[0]
         p, level_cut = _join_level_cut(tail_probability(posterior.misfits[reading.view], left), posterior, reading)
-        law["misfit"] = Misfit(p, {}, "by the best fit, nothing grown", level_cut=level_cut)
-        return law | {"candidates": (likely, _best_fit(posterior, described, parameters[:STARTS], thickness))}, None
+        misfit = Misfit(p, {}, "by the best fit, nothing grown", level_cut=level_cut)
+        candidates = (likely, _best_fit(posterior, described, parameters[:STARTS], thickness))
+        return replace(estimate, candidates=candidates, misfit=misfit)
     pool = posterior.draw(reading, POOL, seed)[:, :-1]
     search = Search(posterior.emulator, reading)
     part = sub_progress(progress, 0.45, 1.0)
-    likeliest, every = search.run(pool, grown, simulate, rounds=rounds, seed=seed, progress=part)
+    likeliest, every = search.run(pool, grown, simulate, rounds=growth.rounds, seed=seed, progress=part)
     nearest = every.parameters[search.nearest(every)[0]]
     laws = {"refined": likeliest} | ({} if np.array_equal(nearest, likeliest) else {"simulation": nearest})
     refined, *others = (Candidate(name, *law_of(turn(each)), {}, thickness) for name, each in laws.items())
     names, row, rows = np.array(column_names()), reading.descriptors, grown.columns[0]
     blocks = {name: (row[names == name], rows[:, names == name]) for name in BLOCKS}
-    return law | {"candidates": (refined, likely, *others)}, blocks
+    return replace(estimate, candidates=(refined, likely, *others), simulated=blocks)
 
 
 def refine_matches(described: Described, posterior: Posterior, matches: Sequence[Match]) -> Candidate:

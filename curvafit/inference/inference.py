@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -17,15 +17,22 @@ from curvafit.core.checks import SEEDS, check_choice, check_int, check_type
 from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Progress, log_stages, sub_progress
 from curvafit.core.units import format_number
-from curvafit.generation.schedule import LEARNED, SCHEDULES, Schedule
+from curvafit.generation.schedule import LEARNED, SCHEDULES
 from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE, Diagram, family_of
-from curvafit.geometry.morphology import morphometry
+from curvafit.geometry.morphology import Morphometry, morphometry
 from curvafit.inference.atlas import VERSION, Atlas, Match, load_atlas, mirror_match, nearest
-from curvafit.inference.candidates import TITLES, Candidate, Twin, best_candidate, twin
-from curvafit.inference.estimate import check_law, estimate_law, measure_descriptors, refine_matches
+from curvafit.inference.candidates import TITLES, Candidate, Misfit, Twin, best_candidate, twin
+from curvafit.inference.estimate import (
+    Described,
+    Estimate,
+    check_law,
+    estimate_law,
+    measure_descriptors,
+    refine_matches,
+)
 from curvafit.inference.fit import KINDS, Fit
 from curvafit.inference.posterior import Posterior, load_posterior
-from curvafit.inference.simulate import ROUNDS
+from curvafit.inference.simulate import Growth
 from curvafit.inference.stationary import drift, stationarity
 from curvafit.inference.verdict import verdict
 from curvafit.priors.grid import WORKING_EPSILON, Grid
@@ -35,12 +42,13 @@ from curvafit.scan.measures import scan_diagram
 from curvafit.scan.preparation import HALF, NOISE, Prepared, coarser_level, prepare, read_scan, why_no_texture
 from curvafit.scan.quality import sample_mask
 from curvafit.scan.structure import check_options, is_rounded, read_region
-from curvafit.volumes.boxes import Crop
 from curvafit.volumes.read import Source
 from curvafit.volumes.volume import Volume
 
 #: Number of nearest shapes, and of those from which stationarity starts.
 MATCHES, STARTS = 5, 3
+#: Whether a method refines the nearest match, in place of draws from the posterior.
+REFINED = {"posterior": False, "match": True}
 #: The seeds of the shapes that test a law come so much later than those of its twins.
 TWINS = 1000
 
@@ -96,21 +104,14 @@ def infer(
     *,
     kind: Literal["auto", "field", "mask", "image"] = "auto",
     periodic: bool = False,
-    atlas: str | Path | Atlas | None = None,
-    posterior: str | Path | Posterior | None = None,
-    method: Literal["posterior", "match"] = "posterior",
-    fast: bool = False,
     threshold: float | Literal["otsu"] = "otsu",
     dark: bool = False,
     roi: Source | None = None,
-    label: int | None = None,
-    crop: Crop | None = None,
+    atlas: str | Path | Atlas | None = None,
+    posterior: str | Path | Posterior | None = None,
+    method: Literal["posterior", "match"] = "posterior",
+    growth: Growth | None = Growth(),  # noqa: B008
     seed: int = 0,
-    simulations: int = 16,
-    rounds: int = ROUNDS,
-    twins: int = 3,
-    test: bool = True,
-    schedule: Schedule | str = LEARNED,
     progress: Progress | None = None,
     **reading: Any,
 ) -> Inference:
@@ -133,97 +134,106 @@ def infer(
         `"field"`, `"mask"`, `"image"`, or `"auto"`: two values are a mask, plateaus near ±1 a phase field.
     periodic
         Whether the box repeats, as generated fields do and scans hardly ever.
-    atlas
-        The shapes to match against; by default the packaged ones.
-    posterior
-        What reads the descriptors; by default the packaged one (`curvafit atlas train` makes others).
-    method
-        `"posterior"`, or `"match"`: nearest match, then gradient refinement. A match alone has no intervals.
-    fast
-        Grow nothing: seconds instead of minutes, but nothing is checked by a twin.
     threshold, dark, roi
         How structure and background are split: see `curvafit.scan.prepare`.
-    label, crop
-        The voxels of one value as a mask; a box of voxels, of the scan and of `roi`: see `curvafit.load`.
-    simulations, rounds
-        How many draws of the posterior are grown, and then rounds of three shapes whose parameters the shapes before
-        them suggest.
-    twins
-        How many shapes of the best law are grown.
-    test
-        Whether further shapes of the best law are grown to test whether it can have made the scan.
-    schedule
-        Steps of each shape.
-    progress
-        Called with a sentence and the share done; by default the logger `curvafit` gets each stage once, at level INFO.
+    atlas, posterior
+        The shapes to match against, and what reads the descriptors; by default the packaged ones.
+    method
+        `"posterior"`, or `"match"`: nearest match, then gradient refinement. A match alone has no intervals.
+    growth
+        Which shapes are grown to refine, compare and test laws. None grows nothing: seconds instead of minutes, but
+        nothing is checked by a twin.
+    seed, progress
+        Seed of draws and shapes. `progress` is called with a sentence and the share done; by default the logger
+        `curvafit` gets each stage once, at level INFO.
     reading
-        Options of reading a file, or the place of an array: spacing, unit and the others of `curvafit.load`.
+        Options of reading a file, or the place of an array: spacing, unit, label, crop and the others of
+        `curvafit.load`. A `crop` is of the scan and of `roi`.
     """
-    check_options(kind, threshold, label)
-    check_choice(method, ("posterior", "match"), "method posterior or match")
-    if atlas is not None:
-        check_type(atlas, (str, Path, Atlas), "an atlas, as the path of a file or as Atlas")
-    if posterior is not None:
-        check_type(posterior, (str, Path, Posterior), "a posterior, as the path of a file or as Posterior")
+    check_options(kind, threshold, reading.get("label"))
+    check_choice(method, REFINED, "method posterior or match")
     seed = check_int(seed, "a seed that is a whole number from 0", 0, SEEDS - 2)  # and the next one
     progress = progress or log_stages()
     progress("reading the scan", 0.0)
-    atlas = atlas if isinstance(atlas, Atlas) else load_atlas(atlas)
-    posterior = posterior if isinstance(posterior, Posterior) else load_posterior(posterior)
-    how = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark, "roi": roi}
-    volume, shape, prepared = _read_and_prepare(scan, label, crop, how, reading)
+    known = _Known.load(atlas, posterior)
+    structure = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark, "roi": roi}
+    scanned = _read_and_prepare(scan, structure, reading)
+    return _infer_prepared(*scanned, known, refined=REFINED[method], growth=growth, seed=seed, progress=progress)
+
+
+def _infer_prepared(
+    volume: Volume, shape: tuple[int, int, int], prepared: Prepared, known: _Known, *, refined: bool,
+    growth: Growth | None, seed: int, progress: Progress,
+) -> Inference:  # fmt: skip
+    """Measure a prepared scan, read its law, grow shapes, judge, and join all in one result."""
     progress("measuring curvature", 0.05)
-    measured = None if prepared.noise else scan_diagram(prepared)
-    reason = NOISE if measured is None else why_no_texture(prepared, measured)
-    fit = _describe(prepared, measured, _provenance(volume, shape, atlas, posterior, seed), reason)
-    if measured is None or reason:
-        return Inference(volume, prepared, measured, {}, fit)
-    progress("measuring descriptors", 0.1)
-    described, simulated, law = measure_descriptors(prepared), None, {}
-    if described is not None and method == "posterior":
+    diagram = None if prepared.noise else scan_diagram(prepared)
+    numbers = morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=prepared.grid.periodic)
+    reason = NOISE if diagram is None else why_no_texture(prepared, diagram)
+    estimate, twins, judgement = Estimate(), dict[str, tuple[Twin, ...]](), Judgement(reason)
+    if diagram is not None and not reason:
+        progress("measuring descriptors", 0.1)
+        described = measure_descriptors(prepared)
+        how = {"refined": refined, "growth": growth, "seed": seed, "progress": progress}
+        estimate = _estimate(prepared, diagram, described, known, **how)
+        if growth is not None:
+            estimate, twins = _grow(estimate, diagram, prepared, growth, seed, progress)
+            misfit = _test_law(estimate, prepared, described, known, growth, seed, progress)
+            estimate = estimate if misfit is None else replace(estimate, misfit=misfit)
+        judgement = _judge(estimate, prepared, numbers, checked=growth is not None)
+    progress("done", 1.0)
+    provenance = _describe_provenance(volume, shape, known, seed)
+    fit = _build_fit(prepared, diagram, numbers, estimate, judgement, provenance)
+    return Inference(volume, prepared, diagram, twins, fit, estimate.simulated)
+
+
+class _Known(NamedTuple):
+    """What a scan is compared with."""
+
+    atlas: Atlas
+    posterior: Posterior
+
+    @classmethod
+    def load(cls, atlas: str | Path | Atlas | None, posterior: str | Path | Posterior | None) -> _Known:
+        """Return both, by their paths or as they are given; by default the packaged ones."""
+        if atlas is not None:
+            check_type(atlas, (str, Path, Atlas), "an atlas, as the path of a file or as Atlas")
+        if posterior is not None:
+            check_type(posterior, (str, Path, Posterior), "a posterior, as the path of a file or as Posterior")
+        atlas = atlas if isinstance(atlas, Atlas) else load_atlas(atlas)
+        return cls(atlas, posterior if isinstance(posterior, Posterior) else load_posterior(posterior))
+
+
+def _estimate(
+    prepared: Prepared, diagram: Diagram, described: Described | None, known: _Known, *, refined: bool,
+    growth: Growth | None, seed: int, progress: Progress,
+) -> Estimate:  # fmt: skip
+    """Return what descriptors say of the law, and the laws to grow: of a phase field its stationarity, those read from
+    descriptors, the nearest match."""
+    estimate = Estimate()
+    if described is not None and not refined:
         part = sub_progress(progress, 0.15, 0.5)
-        options = {"simulations": 0 if fast else simulations, "rounds": rounds, "schedule": schedule}
-        law, simulated = estimate_law(described, posterior, seed=seed, progress=part, **options)
+        estimate = estimate_law(described, known.posterior, growth=growth, seed=seed, progress=part)
     progress("searching the atlas", 0.5)
+    matches = _find_matches(prepared, diagram, known.atlas, exact=refined)
+    read = estimate.candidates
+    if described is not None and refined:
+        read = (refine_matches(described, known.posterior, matches),)
+    laws = (*read, Candidate("match", matches[0].coefficients, matches[0].mass, {}, matches[0].thickness))
+    if prepared.kind == "field" and not is_rounded(prepared.phase):
+        starts = [law.coefficients for law in (*read[:1], *matches[:STARTS])]
+        field, part = _main_window(prepared), sub_progress(progress, 0.5, 0.6)
+        laws = (stationarity(*field, WORKING_EPSILON, starts=starts, seed=seed, progress=part), *laws)
+    return replace(estimate, candidates=laws, matches=matches)
+
+
+def _find_matches(prepared: Prepared, diagram: Diagram, atlas: Atlas, *, exact: bool) -> tuple[Match, ...]:
+    """Return the shapes of the atlas that are nearest to a scan."""
     # An atlas holds shapes that fill less than half: of one that fills more the background is looked up.
     seen_as, inverted = "field" if prepared.kind == "field" else "mask", prepared.volume_fraction > HALF
-    query = measured.mirrored if inverted else measured
-    matches = nearest(query, atlas, seen_as=seen_as, count=MATCHES, exact=method == "match")
-    matches = tuple(map(mirror_match, matches)) if inverted else matches
-    read = law.get("candidates", ())
-    if described is not None and method == "match":
-        read = (refine_matches(described, posterior, matches),)
-    laws, grown = _list_laws(prepared, read, matches, seed, sub_progress(progress, 0.5, 0.6)), {}
-    if not fast:
-        part = sub_progress(progress, 0.6, 0.8 if test else 1.0)
-        laws, grown = _grow(laws, measured, prepared, count=twins, schedule=schedule, seed=seed, progress=part)
-    law |= {"candidates": laws, "matches": matches}
-    if test and not fast and described is not None and (best := best_candidate(laws)) is not None:
-        part = sub_progress(progress, 0.8, 1.0)
-        options = {"seed": seed + TWINS, "schedule": schedule, "progress": part}
-        law["misfit"] = check_law(best, prepared, described, posterior, **options)
-    law["chosen"], law["status"] = verdict(laws, law.get("misfit"), fit.morphometry, fast=fast)
-    if (best := next((each for each in laws if each.name == law["chosen"]), None)) is not None:
-        # A voxel of the law's shapes is as long on the scan as makes them as thick as its structure.
-        known = prepared.kind != "field" and best.thickness is not None
-        ratio = prepared.thickness / best.thickness if known else 1.0  # type: ignore[operator]
-        law |= {"working_voxel": ratio * prepared.working_voxel, "scale": tuple(ratio * h for h in prepared.scale)}
-        step = law["working_voxel"] / prepared.working_voxel
-        law["drift"] = drift(*_main_window(prepared, step), WORKING_EPSILON, best.coefficients)
-    progress("done", 1.0)
-    return Inference(volume, prepared, measured, grown, replace(fit, **law), simulated)
-
-
-def _list_laws(
-    prepared: Prepared, read: tuple[Candidate, ...], matches: tuple[Match, ...], seed: int, progress: Progress
-) -> tuple[Candidate, ...]:
-    """Return the laws to grow: of a phase field its stationarity, those read from descriptors, the nearest match."""
-    laws = (*read, Candidate("match", matches[0].coefficients, matches[0].mass, {}, matches[0].thickness))
-    if prepared.kind != "field" or is_rounded(prepared.phase):
-        return laws
-    starts = [each.coefficients for each in (*read[:1], *matches[:STARTS])]
-    field = _main_window(prepared)
-    return (stationarity(*field, WORKING_EPSILON, starts=starts, seed=seed, progress=progress), *laws)
+    query = diagram.mirrored if inverted else diagram
+    matches = nearest(query, atlas, seen_as=seen_as, count=MATCHES, exact=exact)
+    return tuple(map(mirror_match, matches)) if inverted else tuple(matches)
 
 
 def _main_window(prepared: Prepared, step: float = 1.0) -> tuple[torch.Tensor, Grid]:
@@ -237,44 +247,76 @@ def _main_window(prepared: Prepared, step: float = 1.0) -> tuple[torch.Tensor, G
 
 
 def _grow(
-    laws: tuple[Candidate, ...],
-    measured: Diagram,
-    prepared: Prepared,
-    *,
-    count: int,
-    schedule: Schedule | str,
-    seed: int,
-    progress: Progress,
-) -> tuple[tuple[Candidate, ...], dict[str, tuple[Twin, ...]]]:
-    """Grow a twin of each law, and `count` of the best (`best_candidate`)."""
-    twins: dict[str, tuple[Twin, ...]] = {}
+    estimate: Estimate, diagram: Diagram, prepared: Prepared, growth: Growth, seed: int, progress: Progress
+) -> tuple[Estimate, dict[str, tuple[Twin, ...]]]:
+    """Grow a twin of each law, and `growth.twins` of the best (`best_candidate`)."""
+    twins, laws = dict[str, tuple[Twin, ...]](), estimate.candidates
+    part = sub_progress(progress, 0.6, 0.8 if growth.test else 1.0)
 
     def grow(law: Candidate, share: float) -> Candidate:
         start = seed + len(twins.get(law.name, ()))
-        progress(f"growing: {TITLES[law.name]}, seed {start}", share)
-        twins[law.name] = (*twins.get(law.name, ()), twin(law, prepared, start, schedule))
-        return law.compare(measured, twins[law.name])
+        part(f"growing: {TITLES[law.name]}, seed {start}", share)
+        twins[law.name] = (*twins.get(law.name, ()), twin(law, prepared, start, growth.schedule))
+        return law.compare(diagram, twins[law.name])
 
     laws = tuple(grow(law, 0.7 * k / len(laws)) for k, law in enumerate(laws))
-    most = 2 * count  # another twin may make another law the best
+    most = 2 * growth.twins  # another twin may make another law the best
     for k in range(most):
         best = best_candidate(laws)
-        if best is not None and len(twins[best.name]) < count:
+        if best is not None and len(twins[best.name]) < growth.twins:
             laws = tuple(grow(law, 0.7 + 0.3 * k / most) if law is best else law for law in laws)
-    return laws, twins
+    return replace(estimate, candidates=laws), twins
+
+
+def _test_law(
+    estimate: Estimate, prepared: Prepared, described: Described | None, known: _Known, growth: Growth, seed: int,
+    progress: Progress,
+) -> Misfit | None:  # fmt: skip
+    """Return the test of the best law, if it is asked for, and both the law and the scan can be described."""
+    best = best_candidate(estimate.candidates)
+    if best is None or described is None or not growth.test:
+        return None
+    options = {"seed": seed + TWINS, "schedule": growth.schedule, "progress": sub_progress(progress, 0.8, 1.0)}
+    return check_law(best, prepared, described, known.posterior, **options)
+
+
+class Judgement(NamedTuple):
+    """The verdict on a scan, and the name of the law that was chosen, if any.
+
+    `ratio` is the edge of a voxel of the law's shapes, in working voxels of the scan: with it they are as thick as the
+    scan's structure. `drift` is how far a flow of the law moves the scan's surface.
+    """
+
+    status: str
+    chosen: str | None = None
+    ratio: float = 1.0
+    drift: float | None = None
+
+
+def _judge(estimate: Estimate, prepared: Prepared, numbers: Morphometry, *, checked: bool) -> Judgement:
+    """Choose a law and say what supports it; `checked` says whether shapes were grown."""
+    chosen, status = verdict(estimate.candidates, estimate.misfit, numbers, fast=not checked)
+    law = next((law for law in estimate.candidates if law.name == chosen), None)
+    if law is None:
+        return Judgement(status, chosen)
+    scaled = prepared.kind != "field" and law.thickness is not None
+    ratio = prepared.thickness / law.thickness if scaled else 1.0  # type: ignore[operator]
+    moved = drift(*_main_window(prepared, ratio), WORKING_EPSILON, law.coefficients)
+    return Judgement(status, chosen, ratio, moved)
 
 
 def _read_and_prepare(
-    scan: Source, label: int | None, crop: Crop | None, options: Mapping[str, Any], reading: Mapping[str, Any]
+    scan: Source, options: Mapping[str, Any], reading: Mapping[str, Any]
 ) -> tuple[Volume, tuple[int, int, int], Prepared]:
     """Return a scan, or a large one's middle at the level that suits its structure, the level's shape, and prepared."""
-    whole = options["roi"] is not None or options["periodic"]
-    volume, shape = read_scan(scan, label=label, crop=crop, whole=whole, **reading)
-    if (roi := options["roi"]) is not None:
-        region, laid = read_region(roi, volume, scan, crop, **reading)
+    roi, crop = options["roi"], reading.get("crop")
+    volume, shape = read_scan(scan, whole=roi is not None or options["periodic"], **reading)
+    if roi is not None:
+        place = {name: value for name, value in reading.items() if name not in ("label", "crop")}
+        region, laid = read_region(roi, volume, scan, crop, **place)
         volume, options = replace(volume, notes=volume.notes + laid), {**options, "roi": region}
     prepared = prepare(volume, one_scale=True, **options)
-    if crop is None and label is None and volume.shape != shape:
+    if crop is None and reading.get("label") is None and volume.shape != shape:
         level = coarser_level(scan, shape, prepared, **reading)
         if level is not None:
             other, size = read_scan(scan, **{**reading, "key": level})
@@ -286,27 +328,36 @@ def _read_and_prepare(
     return volume, shape, prepared
 
 
-def _describe(prepared: Prepared, measured: Diagram | None, provenance: dict[str, Any], status: str) -> Fit:
-    """Return the fit of a scan before its law is sought: what was measured."""
-    grid = prepared.grid
+def _build_fit(
+    prepared: Prepared, diagram: Diagram | None, numbers: Morphometry, estimate: Estimate, judgement: Judgement,
+    provenance: dict[str, Any],
+) -> Fit:  # fmt: skip
+    """Return the fit of a scan: what was measured, read of it, grown and judged."""
+    grid, ratio = prepared.grid, judgement.ratio
     return Fit(
         kind=prepared.kind,
-        family="noise" if measured is None else family_of(measured, prepared.thickness / 2 * grid.spacing[0]),
-        scale=prepared.scale,
-        working_voxel=prepared.working_voxel,
+        family="noise" if diagram is None else family_of(diagram, prepared.thickness / 2 * grid.spacing[0]),
+        scale=tuple(ratio * step for step in prepared.scale),  # type: ignore[arg-type]
+        working_voxel=ratio * prepared.working_voxel,
         length_unit=prepared.unit,
         thickness=prepared.thickness * prepared.working_voxel,
-        status=status,
-        morphometry=morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=grid.periodic),
+        status=judgement.status,
+        morphometry=numbers,
         notes=prepared.notes,
         provenance=provenance,
-        diagram=None if measured is None else measured.thin(BIN_WIDTH, TAIL_SHARE),
+        diagram=None if diagram is None else diagram.thin(BIN_WIDTH, TAIL_SHARE),
+        candidates=estimate.candidates,
+        chosen=judgement.chosen,
+        draws=estimate.draws,
+        view=estimate.view,
+        combinations=estimate.combinations,
+        misfit=estimate.misfit,
+        drift=judgement.drift,
+        matches=estimate.matches,
     )
 
 
-def _provenance(
-    volume: Volume, shape: tuple[int, ...], atlas: Atlas, posterior: Posterior, seed: int
-) -> dict[str, Any]:
+def _describe_provenance(volume: Volume, shape: tuple[int, ...], known: _Known, seed: int) -> dict[str, Any]:
     return {
         "curvafit": version("curvafit"),
         "scan": str(volume.source),
@@ -315,8 +366,8 @@ def _provenance(
         "seed": seed,
         "schedule": SCHEDULES[LEARNED].as_dict(),
         "epsilon": WORKING_EPSILON,
-        "atlas": {"format": VERSION, "shapes": len(atlas.ids)},
-        "posterior": {name: value for name, value in posterior.provenance.items() if name != "table"},
+        "atlas": {"format": VERSION, "shapes": len(known.atlas.ids)},
+        "posterior": {name: value for name, value in known.posterior.provenance.items() if name != "table"},
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "python": platform.python_version(),
         "torch": version("torch"),

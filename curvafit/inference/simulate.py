@@ -17,6 +17,7 @@ from scipy import linalg
 
 from curvafit.core.checks import check_int
 from curvafit.core.runtime import Progress, silent
+from curvafit.generation.schedule import LEARNED, Schedule
 from curvafit.inference.emulator import Emulator
 from curvafit.scan.measures import Reading
 
@@ -29,6 +30,30 @@ NEAREST, AROUND, WIDTHS = 4, 300, (0.15, 0.4)
 LENGTHS, VARIANCES, NOISES = (0.5, 1.0, 2.0, 4.0), (0.1, 0.3, 1.0, 3.0), (0.05, 0.1, 0.2, 0.4, 0.8)
 #: Added to the deviance at parameters that grew nothing, and how far around, in deviations of the prior.
 BARREN, REACH = 50.0, 0.3
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Which shapes are grown to refine, compare and test the laws that are read of a scan.
+
+    Attributes
+    ----------
+    simulations, rounds
+        How many draws of the posterior are grown, and then rounds of three shapes whose parameters the shapes before
+        them suggest.
+    twins
+        How many shapes of the best law are grown.
+    test
+        Whether further shapes of the best law are grown to test whether it can have made the scan.
+    schedule
+        Steps of each shape.
+    """
+
+    simulations: int = 16
+    rounds: int = ROUNDS
+    twins: int = 3
+    test: bool = True
+    schedule: Schedule | str = LEARNED
 
 
 class Simulations(NamedTuple):

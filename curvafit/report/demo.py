@@ -66,7 +66,7 @@ def write_demo(
     """Measure a scan, fill it from every 8th slice, find textures like it, and write one page on it into a folder.
 
     The structure is measured (`measure`). The volume is filled from slices across its shortest axis (`reconstruct`) and
-    compared with those left out. The law is inferred (`infer(fast=True)`), the curvature diagram placed among the
+    compared with those left out. The law is inferred (`infer(growth=None)`), the curvature diagram placed among the
     atlas's, and the nearest textures are grown. `fit.json` and `report.html` are written beside the page. Raises
     ValueError if the scan has no structure, or as `report.page.check_report`.
     """
@@ -77,7 +77,7 @@ def write_demo(
     measures = measure(scan, progress=sub_progress(progress, 0.0, 0.1))
     atlas = load_atlas()
     reading = sub_progress(progress, 0.1, 0.3)
-    inference = infer(scan, fast=True, seed=seed, atlas=atlas, progress=reading)
+    inference = infer(scan, growth=None, seed=seed, atlas=atlas, progress=reading)
     if inference.diagram is None:
         raise ScanError(f"expected a scan with a structure: {inference.fit.status}")
     _, signed = find_structure(scan)

@@ -307,7 +307,7 @@ def calibrate(
     if prior is None:
         from curvafit.inference.inference import infer  # takes long to import
 
-        prior = infer(truth, kind="mask", fast=True, progress=progress)
+        prior = infer(truth, kind="mask", growth=None, progress=progress)
     laws, notes = laws_of(prior, field)
     tried = laws if WILLMORE in laws else (*laws, WILLMORE)
     for law in tried:

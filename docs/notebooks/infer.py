@@ -17,6 +17,7 @@
 # %%
 # %matplotlib inline
 import curvafit
+from curvafit.inference import Growth
 
 truth = curvafit.preset("sponge")
 flow = curvafit.generate("sponge", grid=40, seed=0)
@@ -28,8 +29,8 @@ print(flow.status)
 
 # %%
 scan = curvafit.Volume(flow.field.numpy(), (20.0, 20.0, 20.0), "um")
-fewer = {"simulations": 4, "rounds": 1, "twins": 2}  # shapes than by default, so that this page is made soon
-inference = curvafit.infer(scan, kind="field", periodic=True, seed=1, **fewer)
+fewer = Growth(simulations=4, rounds=1, twins=2)  # shapes than by default, so that this page is made soon
+inference = curvafit.infer(scan, kind="field", periodic=True, seed=1, growth=fewer)
 fit = inference.fit
 print(fit.status)
 

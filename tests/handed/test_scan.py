@@ -219,7 +219,7 @@ def test_measures_show_in_a_notebook() -> None:
 
 def test_the_stages_of_an_inference_are_logged(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, "curvafit"):
-        curvafit.infer(np.indices((32, 32, 32)).sum(0) % 16 < 5, fast=True)  # layers are told that they have no law
+        curvafit.infer(np.indices((32, 32, 32)).sum(0) % 16 < 5, growth=None)  # layers are told that they have no law
         log = log_stages()
         for share in (0.5, 0.6):
             log(f"shape {share}", share)

@@ -123,7 +123,7 @@ def test_fit_json_holds_what_the_generator_needs(inference: Inference, tmp_path)
 def quick(values: np.ndarray, spacing: float = 1.0, unit: str = "um", **options) -> Fit:
     """The fit of a mask without any shape grown."""
     scan = Volume(values.astype(np.uint8), (spacing,) * 3, unit)
-    return infer(scan, kind="mask", periodic=True, fast=True, **options).fit
+    return infer(scan, kind="mask", periodic=True, growth=None, **options).fit
 
 
 def places(fit: Fit) -> np.ndarray:
@@ -248,7 +248,7 @@ def test_of_a_large_pyramid_the_level_that_suits_the_structure_is_read(tmp_path,
     monkeypatch.setattr("curvafit.volumes.formats.zarr.CHUNK", 48)
     mask = (lattice(96, 48, 12.0) > 0).astype(np.uint8)
     path = save(Volume(mask, (0.5, 0.5, 0.5), "um"), tmp_path / "scan.zarr")
-    found = infer(path, fast=True)
+    found = infer(path, growth=None)
     assert found.scan.shape == (48, 48, 48) and found.scan.spacing == (1.0, 1.0, 1.0)
     assert any("the level 1 of its pyramid" in note for note in found.fit.notes)
     assert found.fit.morphometry.thickness_mean == pytest.approx(12, rel=0.2)
@@ -304,7 +304,7 @@ def test_the_nearest_match_is_refined_by_gradients(tubes: np.ndarray) -> None:
     """By its descriptors as a mask, by its stationarity as a field; distances are geomloss's."""
     mask = Volume((tubes > 0).astype(np.uint8), (1.0,) * 3, "um")
     for scan, name in ((mask, "optimum"), (Volume(tubes, (1.0,) * 3, "um"), "stationarity")):
-        inference = infer(scan, periodic=True, method="match", fast=True)
+        inference = infer(scan, periodic=True, method="match", growth=None)
         fit = inference.fit
         assert fit.chosen == name and [each.name for each in fit.candidates][-1] == "match" and fit.draws is None
         assert fit.best is not None and fit.best.uncertainty and fit.best.coefficients.a20 == pytest.approx(1)

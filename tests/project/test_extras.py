@@ -38,7 +38,7 @@ for name, line in json.loads(sys.stdin.read()).items():
     answers[name] = [result.exit_code, result.output, sorted(set(os.listdir()) - before)]
     os.chdir("..")
 try:
-    curvafit.infer("mask/mask.nii.gz", fast=True)
+    curvafit.infer("mask/mask.nii.gz", growth=None)
 except ImportError as error:
     answers["python"] = [2, str(error), []]
 print(json.dumps(answers))

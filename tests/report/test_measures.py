@@ -98,22 +98,22 @@ def test_names_and_the_sentence_of_the_range(scans: list[Path]) -> None:
 def test_each_scan_has_its_report_and_its_rows(scans: list[Path], tmp_path: Path, monkeypatch) -> None:
     without_drawing(monkeypatch)
     names = list(map(str, scans))
-    page = infer_scans(names, tmp_path / "out", fast=True, command="one")
+    page = infer_scans(names, tmp_path / "out", growth=None, command="one")
     rows = rows_of(tmp_path / "out" / "laws.csv")
     assert {row["scan"] for row in rows} == {"r45", "r60"}
     assert all(float(row["low"]) <= float(row["value"]) <= float(row["high"]) for row in rows if row["low"])
     assert 'href="r45/report.html"' in page.read_text(encoding="utf-8")
     times = [(tmp_path / "out" / name / "fit.json").stat().st_mtime_ns for name in ("r45", "r60")]
-    infer_scans(names, tmp_path / "out", fast=True, command="one")
+    infer_scans(names, tmp_path / "out", growth=None, command="one")
     assert times == [(tmp_path / "out" / name / "fit.json").stat().st_mtime_ns for name in ("r45", "r60")]
-    infer_scans(names[:1], tmp_path / "out", fast=True, command="another", overwrite=True)
+    infer_scans(names[:1], tmp_path / "out", growth=None, command="another", overwrite=True)
     assert times[0] != (tmp_path / "out" / "r45" / "fit.json").stat().st_mtime_ns
 
 
 def test_what_is_wrong_is_said_with_the_scan(scans: list[Path], tmp_path: Path) -> None:
     empty = save(Volume(np.zeros((40, 40, 40), np.uint8)), tmp_path / "empty.nii.gz")
     with pytest.raises(ValueError, match="empty.nii.gz"):
-        infer_scans([str(empty), str(scans[0])], tmp_path / "out", fast=True, command="one")
+        infer_scans([str(empty), str(scans[0])], tmp_path / "out", growth=None, command="one")
     assert not (tmp_path / "out" / "laws.html").exists()
 
 
