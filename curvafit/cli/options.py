@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args
 
 import typer
 
@@ -36,20 +36,23 @@ _LAWS = {"preset": "preset", "prior": "prior", "laws": "preset"}
 def command(*examples: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Return a decorator that makes a function a command, with examples at the end of its help.
 
-    The command prints expected errors as one sentence. In place of a parameter named in `_GROUPS` it has the options
-    from which the group's value is made.
+    The command prints expected errors as one sentence. In place of a parameter that is a `Group` it has the
+    options from which the group's value is made.
     """
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         own = inspect.signature(function, eval_str=True).parameters
-        groups = {name: inspect.signature(_GROUPS[name], eval_str=True).parameters for name in own if name in _GROUPS}
+        makers = {name: maker for name, each in own.items() if (maker := _maker_of(each.annotation)) is not None}
+        groups = {name: inspect.signature(maker, eval_str=True).parameters for name, maker in makers.items()}
 
         @functools.wraps(function)
         def run(**arguments: Any) -> None:
             with plain_errors():
+                inputs = dict(arguments)
                 for name, options in groups.items():
-                    arguments[name] = _GROUPS[name](**{option: arguments.pop(option) for option in options})
-                _check_inputs(arguments)
+                    given = {option: arguments.pop(option) for option in options}
+                    inputs, arguments[name] = inputs | given, makers[name](**given)
+                _check_inputs(inputs)
                 function(**arguments)
 
         parameters = [each for name in own for each in groups.get(name, {name: own[name]}).values()]
@@ -61,6 +64,17 @@ def command(*examples: str) -> Callable[[Callable[..., None]], Callable[..., Non
         return run
 
     return decorate
+
+
+class Group(NamedTuple):
+    """A parameter that is made from several options, `Annotated[dict[str, Any], Group(make)]`: those of `make`."""
+
+    make: Callable[..., Any]
+
+
+def _maker_of(annotation: Any) -> Callable[..., Any] | None:
+    """Return the function that makes the value of a group of options; None for a single option."""
+    return next((part.make for part in get_args(annotation)[1:] if isinstance(part, Group)), None)
 
 
 def _check_inputs(arguments: Mapping[str, Any]) -> None:
@@ -99,11 +113,10 @@ def add_gone(app: typer.Typer, name: str, instead: str) -> None:
 
 
 _read = partial(typer.Option, rich_help_panel="How to read the file")
+_work = partial(typer.Option, rich_help_panel="How to work")
 
 FILES = "NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr …"
 Input = Annotated[str, typer.Argument(help=FILES)]
-#: The options of the group `reading`, as `curvafit.load` takes them.
-Reading = dict[str, Any]
 
 
 def parse_reading(
@@ -117,7 +130,7 @@ def parse_reading(
     dtype: Annotated[str | None, _read(help="Type of the numbers in a RAW file: u1, u2, f4 …")] = None,
     key: Annotated[str | None, _read(help="Name of the array in an NPZ, HDF5 or Zarr file.")] = None,
     strict: Annotated[bool, _read("--strict", help="Refuse a volume with missing chunks or slices.")] = False,
-) -> Reading:
+) -> dict[str, Any]:
     """Return the options as `curvafit.load` takes them; raise ValueError where one is malformed."""
     if unit is not None:
         from curvafit.core.units import parse_unit
@@ -141,8 +154,7 @@ def parse_reading(
     }
 
 
-#: The options of the group `structure`, as `curvafit.measure` and `infer` take them.
-Structure = dict[str, Any]
+Reading = Annotated[dict[str, Any], Group(parse_reading)]
 
 
 def parse_structure(
@@ -150,9 +162,25 @@ def parse_structure(
     periodic: Annotated[bool, typer.Option("--periodic", help="The box repeats (generated fields).")] = False,
     threshold: Annotated[str, typer.Option(help="Grey level between the phases, or otsu.")] = "otsu",
     dark: Annotated[bool, typer.Option("--dark", help="The structure is the dark phase.")] = False,
-) -> Structure:
+) -> dict[str, Any]:
     """Return the options on what is structure in a scan; raise ValueError where one is malformed."""
     return {"kind": kind, "periodic": periodic, "threshold": parse_threshold(threshold), "dark": dark}
+
+
+Structure = Annotated[dict[str, Any], Group(parse_structure)]
+
+
+def parse_working(
+    epsilon: Annotated[float | None, _work(help="ε in the scan's unit; by default twice the smallest edge.")] = None,
+    steps: Annotated[int, _work(help="Steps of the flow.", min=1)] = 400,
+    tile: Annotated[int | None, _work(help="Side of a tile or block in voxels: large files have some.", min=8)] = None,
+    workers: Annotated[int | None, _work(help="Processes for tiles; by default this one.", min=0)] = None,
+) -> dict[str, Any]:
+    """Return how a volume is worked on, as `curvafit.segmentation.Working` takes it."""
+    return {"epsilon": epsilon, "steps": steps, "tile": tile, "workers": workers}
+
+
+Working = Annotated[dict[str, Any], Group(parse_working)]
 
 
 @dataclass(frozen=True)
@@ -186,10 +214,6 @@ class Crew:
             progress("starting workers", 0.0)
             with cluster(self.workers, self.scheduler, self.dashboard) as workers:
                 yield workers, progress
-
-
-#: Groups of options by the name of the parameter that takes their value.
-_GROUPS: dict[str, Callable[..., Any]] = {"reading": parse_reading, "structure": parse_structure, "crew": Crew}
 
 
 # ---- parsing ---------------------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli.console import command_line, resumable, say, say_notes, show_stages
-from curvafit.cli.options import Input, OverwriteOption, Reading, command, parse_threshold, parse_whole_numbers
+from curvafit.cli.options import (
+    Group,
+    Input,
+    OverwriteOption,
+    Reading,
+    Working,
+    command,
+    parse_threshold,
+    parse_whole_numbers,
+)
 
 if TYPE_CHECKING:
     from curvafit.segmentation.result import Segmentation
@@ -23,8 +32,71 @@ Target = Annotated[
     Path,
     typer.Option("-o", "--output", help="Mask to write: .nii.gz .nii .tif .npy .mrc .zarr; or IMAGE.zarr/labels/NAME."),
 ]
-Epsilon = Annotated[float | None, _what(help="ε in the scan's unit; by default twice the smallest voxel edge.")]
-Steps = Annotated[int, _what(help="Steps of the flow.", min=1)]
+
+
+def parse_network(
+    probabilities: Annotated[bool, _what("--probabilities", help="The values are a network's probabilities.")] = False,
+    logits: Annotated[bool, _what("--logits", help="They are log-odds, before the sigmoid.")] = False,
+    example: Annotated[Path | None, _what(help="True mask of another volume, to try law and weight out on it.")] = None,
+    example_probabilities: Annotated[Path | None, _what(help="The network's probabilities for the example.")] = None,
+    like: Annotated[Path | None, _what(help="Image of the same voxels; by default one of the NPZ's name.")] = None,
+) -> dict[str, Any]:
+    """Return what `segment` is to know of a network's output; raise ValueError where options do not go together."""
+    if (example is None) != (example_probabilities is None):
+        raise ValueError("--example and --example-probabilities go together, got one of them")
+    kind: bool | str = "logits" if logits else probabilities
+    if like is not None and not kind:
+        raise ValueError("--like goes with --probabilities")
+    return {"kind": kind, "example": example, "example_probabilities": example_probabilities, "like": like}
+
+
+def parse_known(
+    every: Annotated[int | None, _what(help="Distance of known slices; by default those with labels.")] = None,
+    first: Annotated[int | None, _what(help="Number of the first known slice, with --every; by default 0.")] = None,
+    known: Annotated[str | None, _what(help="Or also: numbers of known slices, 0,7,15.")] = None,
+    ignore: Annotated[int | None, _what(help="Or: the label of voxels that nobody annotated.")] = None,
+    axis: Annotated[str, _what(help="Axis across the slices: z, y or x (first, second, last axis of an array).")] = "z",
+    periodic: Annotated[bool, _what("--periodic", help="The volume repeats, as generated ones do.")] = False,
+) -> dict[str, Any]:
+    """Return which slices are known, as `reconstruct` takes it; raise ValueError where options do not go together."""
+    if axis.lower() not in ("z", "y", "x"):
+        raise ValueError(f"--axis must be z, y or x, got {axis!r}")
+    if ignore is not None and (every, known) != (None, None):
+        raise ValueError("give either --every and --known, which slices are known, or --ignore, what is not")
+    if every is None and first is not None:
+        raise ValueError(f"--first {first} goes with --every")
+    numbers = None if known is None else list(parse_whole_numbers(known, "--known"))
+    rhythm = every if first is None else slice(first, None, every)
+    return {
+        "every": rhythm,
+        "known": numbers,
+        "ignore": ignore,
+        "axis": "zyx".index(axis.lower()),
+        "periodic": periodic,
+    }
+
+
+def parse_labels(
+    labels: Annotated[str | None, _what(help="Several structures: all, or their labels, 1,2,5; writes labels.")] = None,
+    instances: Annotated[bool | None, _what(help="Labels are of one kind, such as cells; by default as drawn.")] = None,
+) -> dict[str, Any] | None:
+    """Return which structures are filled, as `reconstruct_labels` takes it; None for one."""
+    if labels is None:
+        if instances is not None:
+            raise ValueError("--instances goes with --labels and --image")
+        return None
+    chosen = None if labels == "all" else list(parse_whole_numbers(labels, "--labels"))
+    return {"labels": labels, "chosen": chosen, "instances": instances}
+
+
+def parse_learning(
+    image: Annotated[str | None, _what(help="The grey levels of the volume, on the same voxels.")] = None,
+    example: Annotated[Path | None, _what(help="Mask of another such volume: it tunes the network.")] = None,
+    filler: Annotated[Path | None, _what(help="Weights of `curvafit atlas teach`, not the packaged ones.")] = None,
+) -> dict[str, str | None]:
+    """Return the files from which is learned what lies between slices."""
+    paths = {"image": image, "example": example, "filler": filler}
+    return {name: None if path is None else str(path) for name, path in paths.items()}
 
 
 @command(
@@ -40,16 +112,9 @@ def segment(
     weight: Annotated[float | None, _what(help="Nats of a unit of the energy; else 0.3 for a20 + a02 = 2.")] = None,
     threshold: Annotated[str, _what(help="Grey level between the phases, or otsu.")] = "otsu",
     dark: Annotated[bool, _what("--dark", help="The structure is the dark phase.")] = False,
-    probabilities: Annotated[bool, _what("--probabilities", help="The values are a network's probabilities.")] = False,
-    logits: Annotated[bool, _what("--logits", help="They are log-odds, before the sigmoid.")] = False,
     *,
-    example: Annotated[Path | None, _what(help="True mask of another volume, to try law and weight out on it.")] = None,
-    example_probabilities: Annotated[Path | None, _what(help="The network's probabilities for the example.")] = None,
-    like: Annotated[Path | None, _what(help="Image of the same voxels; by default one of the NPZ's name.")] = None,
-    epsilon: Epsilon = None,
-    steps: Steps = 400,
-    tile: Annotated[int | None, _what(help="Side of a tile, in working voxels: 192 beyond 256³.", min=8)] = None,
-    workers: Annotated[int | None, _what(help="Processes that lower tiles; by default one.", min=0)] = None,
+    network: Annotated[dict[str, Any], Group(parse_network)],
+    working: Working,
     reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -59,40 +124,43 @@ def segment(
     example; where p > 1/2 does best there, that is the mask. Of nnU-Net's NPZ files --channel takes the class; a folder
     of them becomes a folder of masks. --label is the example's.
     """
+    from curvafit.segmentation.flow import Working as Settings
     from curvafit.segmentation.segmentation import calibrate, check_given
     from curvafit.segmentation.segmentation import segment as segment_scan
     from curvafit.volumes.read import load
 
-    kind: bool | str = "logits" if logits else probabilities
+    kind, example = network["kind"], network["example"]
     split: dict[str, Any] = {"threshold": parse_threshold(threshold), "dark": dark}
     check_given(kind, weight, example, **split, label=reading["label"])
-    if (example is None) != (example_probabilities is None):
-        raise ValueError("--example and --example-probabilities go together, got one of them")
-    if like is not None and not kind:
-        raise ValueError("--like goes with --probabilities")
-    options: dict[str, Any] = {"weight": weight, "epsilon": epsilon, "steps": steps}
-    record = {"job": "segment", "tile": tile, **options}
-    tools: dict[str, Any] = {"tile": tile, "workers": workers}
+    options: dict[str, Any] = {"weight": weight}
+    record = {"job": "segment", **options, **_without(working, "workers")}
     if not kind:
         job = _Job(scan, out, prior, reading, {**record, **split}, overwrite)
-        compute = partial(segment_scan, prior=prior, **options, **split, **tools)
-        _run(job, compute, partial(load, scan, **reading, lazy=True))
+        _run(
+            job,
+            partial(segment_scan, prior=prior, **options, **split),
+            partial(load, scan, **reading, lazy=True),
+            working,
+        )
         return
-    given = {"example": example, "example_probabilities": example_probabilities, "like": like}
-    texts = {name: None if path is None else str(path) for name, path in given.items()}
+    texts = {name: None if path is None else str(path) for name, path in _without(network, "kind").items()}
     record |= {"probabilities": kind, **texts}
     jobs, read = _list_maps(_Job(scan, out, prior, reading, record, overwrite), texts)
     if example is not None:
-        chances = read(example_probabilities, like=None, crop=None)
+        chances = read(network["example_probabilities"], like=None, crop=None)
         mask = load(example, **{name: reading[name] for name in ("spacing", "unit", "label", "strict")})
         say_notes((*chances.notes, *mask.notes))
         with show_stages() as progress:
-            learned = calibrate(chances, mask, prior, epsilon=epsilon, steps=steps, progress=progress)
+            learned = calibrate(chances, mask, prior, working=Settings(**working), progress=progress)
         options["example"] = learned
         jobs = [replace(job, record={**job.record, "calibration": learned.as_dict()}) for job in jobs]
     for job in jobs:
-        compute = partial(segment_scan, prior=prior, probabilities=True, **options, **tools)
-        _run(job, compute, partial(read, job.source))
+        compute = partial(segment_scan, prior=prior, probabilities=True, **options)
+        _run(job, compute, partial(read, job.source), working)
+
+
+def _without(options: Mapping[str, Any], name: str) -> dict[str, Any]:
+    return {key: value for key, value in options.items() if key != name}
 
 
 def _list_maps(job: _Job, given: dict[str, str | None]) -> tuple[list[_Job], Callable[..., Volume]]:
@@ -138,55 +206,31 @@ def reconstruct(
     slices: Input,
     out: Target,
     prior: Annotated[str | None, _what(help="A law as in segment, to be tried; by default none.")] = None,
-    every: Annotated[int | None, _what(help="Distance of known slices; by default those with labels.")] = None,
-    first: Annotated[int | None, _what(help="Number of the first known slice, with --every; by default 0.")] = None,
-    known: Annotated[str | None, _what(help="Or also: numbers of known slices, 0,7,15.")] = None,
-    ignore: Annotated[int | None, _what(help="Or: the label of voxels that nobody annotated.")] = None,
-    axis: Annotated[str, _what(help="Axis across the slices: z, y or x (first, second, last axis of an array).")] = "z",
     *,
-    labels: Annotated[str | None, _what(help="Several structures: all, or their labels, 1,2,5; writes labels.")] = None,
-    image: Annotated[str | None, _what(help="The grey levels of the volume, on the same voxels.")] = None,
-    instances: Annotated[bool | None, _what(help="Labels are of one kind, such as cells; by default as drawn.")] = None,
-    example: Annotated[Path | None, _what(help="Mask of another such volume: it tunes the network.")] = None,
-    filler: Annotated[Path | None, _what(help="Weights of `curvafit atlas teach`, not the packaged ones.")] = None,
+    which: Annotated[dict[str, Any], Group(parse_known)],
+    several: Annotated[dict[str, Any] | None, Group(parse_labels)],
+    learning: Annotated[dict[str, Any], Group(parse_learning)],
     stiffness: Annotated[float | None, _what(help="Stiffness of springs on the known slices: try nothing out.")] = None,
-    periodic: Annotated[bool, _what("--periodic", help="The volume repeats, as generated ones do.")] = False,
     suggest: Annotated[int, _what(help="Number of slices to suggest for annotation next.", min=0)] = 0,
     sure: Annotated[float | None, _what(help="Also write labels, ignored where less sure.", min=0.5, max=1)] = None,
-    epsilon: Epsilon = None,
-    steps: Steps = 400,
-    tile: Annotated[
-        int | None, _what(help="Side of a block: large files have some; with a law as in segment.", min=8)
-    ] = None,
-    workers: Annotated[int | None, _what(help="Processes for blocks or tiles; by default one.", min=0)] = None,
+    working: Working,
     reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Fill a mask between known slices; write it, the probability of each voxel, a picture and a record."""
     from curvafit.volumes.read import load
 
-    named = every is not None or known is not None
-    for wrong, sentence in (
-        (axis.lower() not in ("z", "y", "x"), f"--axis must be z, y or x, got {axis!r}"),
-        (
-            named and ignore is not None,
-            "give either --every and --known, which slices are known, or --ignore, what is not",
-        ),
-        (None not in (labels, reading["label"]), "--labels is for several structures; --label is for one"),
-        (every is None and first is not None, f"--first {first} goes with --every"),
-        (instances is not None and None in (labels, image), "--instances goes with --labels and --image"),
-    ):
-        if wrong:
-            raise ValueError(sentence)
-    several = None if labels in (None, "all") else list(parse_whole_numbers(labels, "--labels"))
-    numbers = None if known is None else list(parse_whole_numbers(known, "--known"))
-    options: dict[str, Any] = {"every": every, "first": first or 0, "known": numbers, "axis": "zyx".index(axis.lower())}
-    options |= {"epsilon": epsilon, "suggest": suggest, "filler": None if filler is None else str(filler)}
-    options |= {"steps": steps, "tile": tile, "ignore": ignore, "stiffness": stiffness, "periodic": periodic}
-    shown = {"image": image, "example": None if example is None else str(example)}
-    record: dict[str, Any] = {"job": "reconstruct", "sure": sure, **options, **shown}
-    record |= {"labels": labels, "instances": instances} if labels else {}
-    inputs = [each for each in (*shown.values(), filler) if each is not None]
+    if several is not None and reading["label"] is not None:
+        raise ValueError("--labels is for several structures; --label is for one")
+    if several is not None and several["instances"] is not None and learning["image"] is None:
+        raise ValueError("--instances goes with --labels and --image")
+    filler, every = learning["filler"], which["every"]
+    shown = _without(learning, "filler")
+    record: dict[str, Any] = {"job": "reconstruct", "sure": sure, "suggest": suggest, **which, **shown}
+    record |= {"filler": filler, "stiffness": stiffness, **_without(working, "workers")}
+    record |= {"every": every.step, "first": every.start} if isinstance(every, slice) else {"first": 0}
+    record |= {} if several is None else _without(several, "chosen")
+    inputs = [path for path in learning.values() if path is not None]
     maps = ("probability",) if sure is None else ("probability", "sure")
 
     def compute(volume: Volume, **tools: Any) -> Segmentation:
@@ -196,16 +240,17 @@ def reconstruct(
         alike = {"example": ("spacing", "unit", "label", "strict"), "image": ("spacing", "unit", "crop")}
         for name, path in shown.items():
             if path is not None:
-                tools[name] = load(path, **{each: reading[each] for each in alike[name]})
+                tools[name] = load(path, **{option: reading[option] for option in alike[name]})
                 say_notes(tools[name].notes)
-        tools |= {"workers": workers, **options}
         volume = volume if sure is None else volume.load()
-        if labels is None:
+        tools |= {**which, "suggest": suggest}
+        if several is None:
             return fill(volume, prior, **tools)
-        return reconstruct_labels(volume.load(), prior, chosen=several, instances=instances, **tools)
+        return reconstruct_labels(volume.load(), prior, **_without(several, "labels"), **tools)
 
     job = _Job(slices, out, prior, reading, record, overwrite, inputs, maps)
-    _run(job, compute, partial(load, slices, **reading, lazy=True), sure=sure)
+    working |= {"filler": filler, "stiffness": stiffness}
+    _run(job, compute, partial(load, slices, **reading, lazy=True), working, sure)
 
 
 @dataclass(frozen=True)
@@ -239,10 +284,12 @@ class _Job:
 
 
 def _run(
-    job: _Job, compute: Callable[..., Segmentation], read: Callable[[], Volume], sure: float | None = None
-) -> None:
+    job: _Job, compute: Callable[..., Segmentation], read: Callable[[], Volume], working: dict[str, Any],
+    sure: float | None = None,
+) -> None:  # fmt: skip
     """Check, read, compute, write and print. Finished tiles are kept beside the output until it is written."""
     from curvafit.core.files import remove
+    from curvafit.segmentation.flow import Working
     from curvafit.segmentation.result import hidden_store, write_mask
     from curvafit.volumes.write import check_labels, note_lost
 
@@ -259,7 +306,7 @@ def _run(
         say_notes(lost)
         store = hidden_store(job.out)
         with resumable(lambda: "the same command" if store.exists() else ""):
-            result = compute(volume, progress=progress, store=store)
+            result = compute(volume, progress=progress, working=Working(**working, store=store))
             progress("writing", 1.0)
             labels = None if sure is None else result.keep_sure(sure)
             result = result if labels is None else replace(result, notes=(*result.notes, *labels.notes))

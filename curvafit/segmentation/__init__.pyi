@@ -1,3 +1,4 @@
+from .flow import Working as Working
 from .labels import reconstruct_labels as reconstruct_labels
 from .reconstruction import reconstruct as reconstruct
 from .result import Segmentation as Segmentation

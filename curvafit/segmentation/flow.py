@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from curvafit.core.checks import LONGEST, SHORTEST, check_float
+from curvafit.core.checks import LONGEST, SHORTEST, check_float, check_int
 from curvafit.core.runtime import Progress, silent
+from curvafit.core.workers import Cluster
 from curvafit.generation.data import Data
 from curvafit.generation.flow import WORKING_BLUR, Flow, descend
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.priors.grid import MOST, WORKING_EPSILON, Grid
 from curvafit.priors.loss import RESOLVED, choose_refinement
 from curvafit.priors.profile import phase_field
 from curvafit.priors.stencils import refine_axis
@@ -23,12 +26,61 @@ from curvafit.volumes.volume import ScanError, Volume
 
 #: Default steps of Adam.
 STEPS = 400
+#: Shortest edge of a tile, in working voxels.
+SMALLEST = 8
+#: Least and greatest stiffness.
+STIFFEST = (1e-9, 1e12)
 #: Voxels of the grid around a volume that does not repeat: far enough for the border's right angles not to reach it.
 HALO = 6
 #: a20 + a02 of the law in a flow, on which the steps of Adam depend; the Willmore energy has it.
 BENDING = 2.0
 #: Whether there is a halo before and beyond the voxels, along each axis.
 Ends = tuple[tuple[bool, bool], tuple[bool, bool], tuple[bool, bool]]
+
+
+@dataclass(frozen=True)
+class Working:
+    """How a volume is worked on: settings of `segment` and `reconstruct` whose defaults suit nearly always.
+
+    Raises ValueError where one is out of range.
+
+    Attributes
+    ----------
+    epsilon
+        ε in the scan's unit; by default twice the smallest voxel edge. Thinner structures do not survive.
+    steps
+        Steps of Adam.
+    stiffness
+        Stiffness of the springs on known voxels, in working units: `reconstruct` lowers the first law with it, and
+        tries nothing out.
+    filler
+        Weights of the network that fills, of `curvafit atlas teach`, for an image those of `--images`; by default the
+        packaged ones.
+    tile
+        The energy is lowered on overlapping tiles of at most this many working voxels a side, which bounds the memory;
+        the result depends on the tiles by a few voxels of the surface at most. By default a volume is one tile up to
+        256³ working voxels; larger ones have tiles of 192³. A network fills blocks of so many voxels a side.
+    store
+        A folder for finished tiles or blocks, with which the same call goes on after a kill, and whose mapped files the
+        result's arrays are.
+    workers
+        Processes that share the tiles, or workers such as `curvafit.core.workers.cluster`.
+    """
+
+    epsilon: float | None = None
+    steps: int = STEPS
+    stiffness: float | None = None
+    filler: str | Path | None = None
+    tile: int | None = None
+    store: str | PathLike[str] | None = None
+    workers: Cluster | int | None = None
+
+    def __post_init__(self) -> None:
+        if self.stiffness is not None:
+            object.__setattr__(self, "stiffness", check_float(self.stiffness, "a positive stiffness", *STIFFEST))
+        if self.tile is not None:
+            form = f"a tile of {SMALLEST} or more working voxels a side"
+            object.__setattr__(self, "tile", check_int(self.tile, form, SMALLEST, MOST))
 
 
 def lower_energy(

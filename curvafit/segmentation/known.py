@@ -36,8 +36,8 @@ class Known:
 
     @classmethod
     def find(
-        cls, volume: Volume, run: Run, *, every: int | None, first: int, known: Sequence[int] | None,
-        ignore: int | None, axis: int,
+        cls, volume: Volume, run: Run, *, every: int | slice | None, known: Sequence[int] | None, ignore: int | None,
+        axis: int,
     ) -> Known:  # fmt: skip
         """Find which slices of a volume are known, as `reconstruct` says; with `ignore` in memory."""
         whole = cls(volume, axis)
@@ -48,7 +48,7 @@ class Known:
         if every is None and known is None:
             places = choose_labelled(there := whole._look(run))
             return replace(whole, places=tuple(places), notes=note_labelled(places, there))
-        return replace(whole, places=tuple(known_places(volume.shape[whole.axis], every, first, known)))
+        return replace(whole, places=tuple(known_places(volume.shape[whole.axis], every, known)))
 
     def read(
         self, run: Run, periodic: bool = False, name: str = "the known slices"
@@ -137,29 +137,30 @@ def _read_slab(known: Known, name: str, number: int) -> Record:
 
 
 def check_which(
-    shape: Sequence[int], every: int | None, first: int, known: Sequence[int] | None, ignore: int | None, axis: int,
+    shape: Sequence[int], every: int | slice | None, known: Sequence[int] | None, ignore: int | None, axis: int,
     suggest: int,
 ) -> None:  # fmt: skip
     """Raise ValueError where what is said of the known slices of a volume of a shape cannot be, before it is read."""
     length = shape[check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)]
     if ignore is not None and (every is not None or known is not None):
         raise ScanError("give either every, known or ignore")
-    places = [] if every is None and known is None else known_places(length, every, first, known)
+    places = [] if every is None and known is None else known_places(length, every, known)
     check_int(suggest, "a number of slices from 0", 0, length - len(places))
 
 
 # ---- which slices ----------------------------------------------------------------------------------------------------
 
 
-def known_places(length: int, every: int | None, first: int, known: Sequence[int] | None) -> list[int]:
-    """Return the numbers of the known slices, ascending: every `every`-th from `first` on, and those listed in `known`.
-    Raises `ValueError` if neither is given, or they are not two or more slices of the volume."""
+def known_places(length: int, every: int | slice | None, known: Sequence[int] | None) -> list[int]:
+    """Return the numbers of the known slices, ascending: every `every`-th, and those listed in `known`. Raises
+    `ValueError` if neither is given, or they are not two or more slices of the volume."""
     if every is None and known is None:
         raise ScanError("give every or known: which slices are known")
     known = [*(known or ())]
     if every is not None:
-        every = check_int(_to_int(every), "every, a whole number from 1", 1, MOST)
-        known += range(check_int(_to_int(first), "first, a whole number from 0", 0, MOST), length, every)
+        first, step = (every.start or 0, every.step or 1) if isinstance(every, slice) else (0, every)
+        step = check_int(_to_int(step), "every, a whole number from 1", 1, MOST)
+        known += range(check_int(_to_int(first), "first, a whole number from 0", 0, MOST), length, step)
     form = f"known slices that are whole numbers from 0 to {length - 1}"
     places = sorted({check_int(_to_int(number), form, 0, length - 1) for number in known})
     if len(places) < 2:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from skimage import measure
 from curvafit.core.checks import SEEDS, check_int
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.priors.law import LawLike
+from curvafit.segmentation.flow import Working
 from curvafit.segmentation.known import Known, check_shared, check_which, doubt_places
 from curvafit.segmentation.reconstruction import SHIFTED, SURE, UNTOLD, load_example, load_image, reconstruct
 from curvafit.segmentation.result import Segmentation, Uncertainty
@@ -25,10 +25,10 @@ from curvafit.volumes.boxes import Box
 from curvafit.volumes.formats.base import smallest_type
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.run import Run
-from curvafit.volumes.volume import ScanError, round_labels
+from curvafit.volumes.volume import ScanError, Volume, round_labels
 
 #: Which slices are known, unless it is said.
-WHICH: dict[str, Any] = {"every": None, "first": 0, "known": None, "ignore": None, "axis": 0}
+WHICH: dict[str, Any] = {"every": None, "known": None, "ignore": None, "axis": 0}
 #: Label of unknown voxels in the mask of one structure.
 UNKNOWN = 255
 #: Labels that are described one by one.
@@ -51,7 +51,7 @@ def reconstruct_labels(
     image: Source | None = None,
     instances: bool | None = None,
     example: Source | None = None,
-    store: str | PathLike[str] | None = None,
+    working: Working = Working(),  # noqa: B008
     progress: Progress = silent,
     spacing: Sequence[float] | float | None = None,
     unit: str | None = None,
@@ -83,134 +83,170 @@ def reconstruct_labels(
         vary more within them than between them. Where every voxel is labelled, or the volume repeats, each is read by
         itself.
     options
-        Those of `reconstruct`, as are the others.
+        Those of `reconstruct`, as are the others: every, known, ignore, axis, suggest and periodic.
 
-    Returns
-    -------
-    Segmentation
-        `labels` has the label of the structure at each voxel, `mask` whether there is one, `phase` the greatest phase
-        field, `probability` that of the voxel's label; there are no coefficients. Its `status` is that of `reconstruct`
-        for each label, or of many a summary.
-
-    Raises
-    ------
-    ValueError
-        As `reconstruct`, if it refuses all labels; or if the known slices do not have a label, or none but 0.
+    In the result `labels` has the label of the structure at each voxel, `mask` whether there is one, `phase` the
+    greatest phase field, `probability` that of the voxel's label; there are no coefficients. Its `status` is that of
+    `reconstruct` for each label, or of many a summary. Raises ValueError as `reconstruct`, if it refuses all labels; or
+    if the known slices do not have a label, or none but 0.
     """
     reading = {"spacing": spacing, "unit": unit}
-    which = {name: options.pop(name, usual) for name, usual in WHICH.items()}
-    volume, suggest = load(slices, **reading), options.pop("suggest", 0)
-    check_which(volume.shape, **which, suggest=suggest)
-    given = Known.find(volume := replace(volume, array=round_labels(volume.values)), Run(), **which)
-    places, moved = list(given.places), given.turn(volume.values)
-    doubtful = () if which["every"] is None else doubt_places(np.asarray((moved > 0).any((1, 2))), places)
-    suggest = check_int(suggest, "a number of slices from 0", 0, len(moved) - len(places))
-    notes, numbers = (*given.notes, *doubtful), find_labels(moved[places], chosen)
-    if which["every"] is None and which["known"] is None and which["ignore"] is None:
-        check_shared(moved, places, numbers)
-    index = replace(volume, array=index_labels(volume.values, numbers, which["ignore"]), notes=())
-    there = given.turn_back(mark_known(moved.shape, places, given.marks))
-    labels = _Labels(replace(given, volume=index), there, which["ignore"] is not None, options)
-    other = None if example is None else load_example(example, volume, reading)
-    seen = None if image is None else load_image(image, volume, reading)
-    laws = prior if isinstance(prior, Mapping) else dict.fromkeys(numbers, prior)
-    drawn, whole, alone = given.turn(index.values)[places].clip(0), None, seen
-    full, periodic = bool(drawn.all()), bool(options.get("periodic"))
-    if seen is not None and not full and not periodic:
-        if instances is None:
-            instances = are_instances(drawn, given.turn(seen.values)[places], len(numbers))
-        notes = (*notes, *seen.notes, ONCE if instances else APIECE)
-        if instances:
-            bare = replace(seen, affine=None, notes=())
-            whole = labels.fill(None, WHOLE, image=bare, progress=sub_progress(progress, 0.0, 0.5))
-            progress, alone = sub_progress(progress, 0.5, 1.0), None
-            options.pop("filler", None)  # that one reads images
-            notes = (*notes, *(note for note in whole.notes if note.startswith(SHIFTED.partition("{")[0])))
-        if whole is not None and UNTOLD in whole.notes:
-            whole, notes = None, (*notes[:-1], UNTOLD)
-    parts, said = _fill_each(labels, numbers, laws, (alone, other, store), progress)
-    far = np.ones(moved.shape, dtype=bool)
-    far[slice(None) if periodic or seen is not None else reach_of(places, len(moved))] = False
-    values, likely, phase, odds = _join_parts(labels, parts, full, given.turn_back(far))
-    doubts = {number: part.uncertainty for number, (_, part) in zip(numbers, parts, strict=True)}
-    dice = {number: doubt.expected_dice for number, doubt in doubts.items() if doubt is not None}
-    if whole is not None:
-        values, likely, found = _split_instances(labels, parts, whole, values, odds)
-        dice, phase, said = dict(zip(numbers, found, strict=True)), whole.phase.values, whole.notes
-    likely = np.where(labels.known, 1.0, likely).astype(np.float32)
-    error = max(doubt.calibration_error for doubt in (whole and whole.uncertainty, *doubts.values()) if doubt)
-    unsure = doubt(likely)
-    entropies = tuple(unsure.sum(tuple({0, 1, 2} - {axis})) for axis in range(3))
-    following = suggest_slices(entropies[given.axis], places, suggest, periodic)
-    likely = replace(volume, array=likely, notes=())
-    table = np.array([0, *numbers], volume.values.dtype if volume.values.dtype.kind in "iu" else np.int64)
-    if (kind := smallest_type(table)).itemsize < 8:  # of 64 bits the given one
-        table = table.astype(kind)
-    return Segmentation.of(
-        volume, values != 0, np.maximum(phase, -1), None, max(part.epsilon for _, part in parts), (*notes, *said),
-        weight=None, status=_describe_labels(parts, dice, whole, following), image=seen,
-        labels=replace(volume, array=table[values], notes=()),
-        uncertainty=Uncertainty(likely, error, following, min(dice.values()), dice, entropies=entropies),
-    )  # fmt: skip
+    labels = _Labels.load(slices, chosen, image, example, working=working, reading=reading, **options)
+    first, rest = sub_progress(progress, 0.0, 0.5), sub_progress(progress, 0.5, 1.0)
+    whole, alone, notes = _fill_instances(labels, instances, first)
+    parts, reasons = _fill_each(alone, prior, progress if alone is labels else rest)
+    return _join_labels(labels, parts, whole, notes, reasons)
 
 
 @dataclass(frozen=True, eq=False)
 class _Labels:
-    """What is given, with labels by their places (`index_labels`), the known voxels, whether others are marked as such,
-    and options of `reconstruct`."""
+    """What labels are filled from: known slices with labels by their places (`index_labels`), the labels' numbers, the
+    known voxels (Z, Y, X), whether others are marked as such, and what goes to `reconstruct` for each."""
 
     given: Known
+    values: np.ndarray
+    numbers: list[int]
     known: np.ndarray
     marked: bool
-    options: dict[str, Any]
+    periodic: bool
+    suggest: int
+    image: Volume | None
+    example: Volume | None
+    working: Working
+
+    @classmethod
+    def load(
+        cls, slices: Source, chosen: Sequence[int] | None, image: Source | None, example: Source | None, *,
+        working: Working, reading: dict[str, Any], suggest: int = 0, periodic: bool = False, **which: Any,
+    ) -> _Labels:  # fmt: skip
+        """Read labels, image and example, and find which slices and which labels are known."""
+        which, volume = {**WHICH, **which}, load(slices, **reading)
+        check_which(volume.shape, **which, suggest=suggest)
+        volume = replace(volume, array=round_labels(volume.values))
+        given, ignore = Known.find(volume, Run(), **which), which["ignore"]
+        places, turned = list(given.places), given.turn(volume.values)
+        doubts = () if which["every"] is None else doubt_places(np.asarray((turned > 0).any((1, 2))), places)
+        suggest = check_int(suggest, "a number of slices from 0", 0, len(turned) - len(places))
+        numbers = find_labels(turned[places], chosen)
+        if which["every"] is None and which["known"] is None and ignore is None:
+            check_shared(turned, places, numbers)
+        given = replace(given, notes=(*given.notes, *doubts))
+        values = index_labels(volume.values, numbers, ignore)
+        known = given.turn_back(mark_known(turned.shape, places, given.marks))
+        other = None if example is None else load_example(example, volume, reading)
+        levels = None if image is None else load_image(image, volume, reading)
+        return cls(
+            given, values, numbers, known, ignore is not None, periodic, suggest, levels, other, working
+        )  # fmt: skip
 
     @property
-    def values(self) -> np.ndarray:
-        """The places of the labels (Z, Y, X)."""
-        return self.given.volume.values
+    def drawn(self) -> np.ndarray:
+        """The places of labels in the known slices, from 1, 0 where there is none."""
+        return self.given.turn(self.values)[list(self.given.places)].clip(0)
+
+    @property
+    def full(self) -> bool:
+        """Whether every voxel of the known slices is labelled."""
+        return bool(self.drawn.all())
 
     def fill(self, place: int | None, box: Box, law: LawLike | None = None, **more: Any) -> Segmentation:
         """Fill one label in a box, by its place, or all as one structure."""
-        values, given = self.values[box], self.given
+        values, given, working = self.values[box], self.given, more.pop("working", self.working)
         inside = (values > 0 if place is None else values == place).astype(np.uint8)
         start, stop, _ = box[given.axis].indices(self.values.shape[given.axis])
         which: dict[str, Any] = {"known": [k - start for k in given.places if start <= k < stop]}
         if self.marked:
             inside[values < 0], which = UNKNOWN, {"ignore": UNKNOWN}
-        mask, options = replace(given.volume, array=inside, affine=None), dict(self.options)
+        mask = replace(given.volume, array=inside, affine=None, notes=())
         if law is None:
-            options.pop("tile", None)  # a box of a label is filled at once
-        return reconstruct(mask, law, axis=given.axis, **which, **options, **more)
+            working = replace(working, tile=None)  # a box of a label is filled at once
+        return reconstruct(mask, law, axis=given.axis, periodic=self.periodic, working=working, **which, **more)
+
+
+def _fill_instances(
+    labels: _Labels, instances: bool | None, progress: Progress
+) -> tuple[Segmentation | None, _Labels, tuple[str, ...]]:
+    """Fill labels that are instances as one structure that the image tells, if there is one; return the structure, what
+    the labels are filled from then, and notes."""
+    image = labels.image
+    if image is None or labels.full or labels.periodic:
+        return None, labels, ()
+    if instances is None:
+        levels = labels.given.turn(image.values)[list(labels.given.places)]
+        instances = are_instances(labels.drawn, levels, len(labels.numbers))
+    if not instances:
+        return None, labels, (*image.notes, APIECE)
+    whole = labels.fill(None, WHOLE, image=replace(image, affine=None, notes=()), progress=progress)
+    alone = replace(labels, image=None, working=replace(labels.working, filler=None))  # that one reads images
+    shifted = [note for note in whole.notes if note.startswith(SHIFTED.partition("{")[0])]
+    if UNTOLD in whole.notes:
+        return None, alone, (*image.notes, *shifted, UNTOLD)
+    return whole, alone, (*image.notes, ONCE, *shifted)
+
+
+def _join_labels(
+    labels: _Labels, parts: _Parts, whole: Segmentation | None, notes: Sequence[str], reasons: Sequence[str]
+) -> Segmentation:
+    """Return the result of labels that are filled one by one, or as parts of a whole."""
+    given, image, numbers = labels.given, labels.image, labels.numbers
+    volume, places = given.volume, list(given.places)
+    length = volume.shape[given.axis]
+    far = np.ones(given.turn(labels.values).shape, dtype=bool)
+    far[slice(None) if labels.periodic or image is not None else reach_of(places, length)] = False
+    values, likely, phase, odds = _join_parts(labels, parts, labels.full, given.turn_back(far))
+    doubts = {number: part.uncertainty for number, (_, part) in zip(numbers, parts, strict=True)}
+    dice = {number: doubt.expected_dice for number, doubt in doubts.items() if doubt is not None}
+    if whole is not None:
+        values, likely, expected = _split_instances(labels, parts, whole, values, odds)
+        dice, phase, reasons = dict(zip(numbers, expected, strict=True)), whole.phase.values, whole.notes
+    likely = np.where(labels.known, 1.0, likely).astype(np.float32)
+    error = max(doubt.calibration_error for doubt in (whole and whole.uncertainty, *doubts.values()) if doubt)
+    unsure = doubt(likely)
+    entropies = tuple(unsure.sum(tuple({0, 1, 2} - {axis})) for axis in range(3))
+    following = suggest_slices(entropies[given.axis], places, labels.suggest, labels.periodic)
+    table = np.array([0, *numbers], volume.values.dtype if volume.values.dtype.kind in "iu" else np.int64)
+    if (kind := smallest_type(table)).itemsize < 8:  # of 64 bits the given one
+        table = table.astype(kind)
+    uncertain = Uncertainty(
+        replace(volume, array=likely, notes=()), error, following, min(dice.values()), dice, entropies=entropies
+    )
+    return Segmentation.of(
+        volume, values != 0, np.maximum(phase, -1), None, max(part.epsilon for _, part in parts),
+        (*given.notes, *notes, *reasons), weight=None, status=_describe_labels(parts, dice, whole, following),
+        image=image, labels=replace(volume, array=table[values], notes=()), uncertainty=uncertain,
+    )  # fmt: skip
 
 
 _Parts = list[tuple[Box, Segmentation]]
 
 
 def _fill_each(
-    labels: _Labels, numbers: Sequence[int], laws: Mapping[int, Any], tools: tuple[Any, Any, Any], progress: Progress
+    labels: _Labels, prior: LawLike | Mapping[int, LawLike] | None, progress: Progress
 ) -> tuple[_Parts, Sequence[str]]:
-    """Fill each label in its box, with image, example and store as `tools`, or by the network alone where it is refused
-    so; return boxes and labels, and notes."""
-    parts, notes, (image, example, store) = [], dict[str, list[int]](), tools
-    for place, number in enumerate(numbers, 1):
+    """Fill each label in its box, or by the network alone where it is refused so; return boxes and labels, and
+    notes."""
+    parts, notes, count = [], dict[str, list[int]](), len(labels.numbers)
+    image, example, store = labels.image, labels.example, labels.working.store
+    laws = prior if isinstance(prior, Mapping) else dict.fromkeys(labels.numbers, prior)
+    for place, number in enumerate(labels.numbers, 1):
         inside = (labels.values == place) & labels.known
-        box = WHOLE if labels.options.get("periodic") else _box_of_label(inside, labels)
+        box = WHOLE if labels.periodic else _box_of_label(inside, labels)
         more = {
             "image": image and replace(image, array=image.values[box], affine=None, notes=()),
             "example": example and replace(example, array=(example.values == number).astype(np.uint8), notes=()),
-            "store": store and Path(store) / str(number),
+            "working": replace(labels.working, store=store and Path(store) / str(number)),
         }
-        step = sub_progress(progress, (place - 1) / len(numbers), place / len(numbers))
+        step = sub_progress(progress, (place - 1) / count, place / count)
         try:
             part = labels.fill(place, box, laws.get(number), progress=step, **more)
         except ScanError as reason:
-            part = labels.fill(place, box, progress=step)
+            part = labels.fill(place, box, progress=step, working=replace(labels.working, store=None))
             notes[f"Filled by the network alone: {reason}."] = [number]
         parts.append((box, part))
         for note in part.notes:
             notes.setdefault(note, []).append(number)
     named = {text: f"Label{'s' * (len(of) > 1)} {', '.join(map(str, of))}: {text}" for text, of in notes.items()}
-    return parts, [text if len(notes[text]) == len(numbers) else said for text, said in named.items()]
+    return parts, [text if len(notes[text]) == count else line for text, line in named.items()]
 
 
 def _join_parts(labels: _Labels, parts: _Parts, full: bool, far: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -10,21 +10,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
-from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from scipy.special import expit, logit
 
-from curvafit.core.checks import check_float, check_int
+from curvafit.core.checks import check_int
 from curvafit.core.extras import require
 from curvafit.core.runtime import Progress, check_memory, silent, sub_progress
-from curvafit.core.workers import Cluster
 from curvafit.generation import data
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
@@ -34,7 +32,7 @@ from curvafit.priors.profile import profile_distance
 from curvafit.scan.preparation import LARGEST_BOX
 from curvafit.scan.structure import add_records
 from curvafit.segmentation.filler import REACH, SLOPE, TILE, Raster, Taught, fill
-from curvafit.segmentation.flow import HALO, STEPS, WorkingGrid, choose_epsilon
+from curvafit.segmentation.flow import HALO, Working, WorkingGrid, choose_epsilon
 from curvafit.segmentation.image import find_shift, read_image
 from curvafit.segmentation.known import SLAB, Known, check_which, doubt_labels, doubt_places
 from curvafit.segmentation.result import Segmentation, Uncertainty, describe_filled, flow_summary
@@ -48,7 +46,7 @@ from curvafit.segmentation.slices import (
     turn_axes,
 )
 from curvafit.segmentation.teach import tune
-from curvafit.segmentation.tiles import LoweredVolume, Problem, check_edge, cut_tiles, lower_volume
+from curvafit.segmentation.tiles import LoweredVolume, Problem, cut_tiles, lower_volume
 from curvafit.segmentation.trials import (
     PART,
     Example,
@@ -83,8 +81,6 @@ from curvafit.volumes.volume import ScanError, StoredArray, Volume, digest_of, r
 STIFFNESS = 1e7
 #: Margin of the springs: u of the optimal profile half a voxel from the surface, as known voxels next to it are.
 MARGIN = math.tanh(WORKING_SPACING / 2 / (math.sqrt(2) * WORKING_EPSILON))
-#: Least and greatest stiffness.
-STIFFEST = (1e-9, 1e12)
 #: Stiffness of the springs on unknown voxels, in working units, for each nat of their log-odds: all are tried.
 PULLS = (0.0, 1e4, 3e4)
 #: Fewest grey levels of an image, and most voxels in which they are counted.
@@ -110,8 +106,7 @@ def reconstruct(
     slices: Source,
     prior: LawLike | None = None,
     *,
-    every: int | None = None,
-    first: int = 0,
+    every: int | slice | None = None,
     known: Sequence[int] | None = None,
     ignore: int | None = None,
     axis: int = 0,
@@ -119,13 +114,7 @@ def reconstruct(
     example: Source | None = None,
     suggest: int = 0,
     periodic: bool = False,
-    filler: str | Path | None = None,
-    stiffness: float | None = None,
-    epsilon: float | None = None,
-    steps: int = STEPS,
-    tile: int | None = None,
-    store: str | PathLike[str] | None = None,
-    workers: Cluster | int | None = None,
+    working: Working = Working(),  # noqa: B008
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:
@@ -135,7 +124,11 @@ def reconstruct(
     makes it better by more than the noise. With an image, trees learn from the known slices which grey levels are
     inside, and the network weighs what they say of the others. With a law, F_ε is lowered from there if this is better:
     it is tried out on the part of the example that did not tune, or else on every second known slice. Known slices stay
-    as they are.
+    as they are. Labels in a file with a side of more than 256 voxels, or any with a `tile`, are filled in blocks, but
+    with a law, an image, `ignore` or `periodic`, where `store` and `workers` serve a law alone.
+
+    Raises ValueError and FileNotFoundError as `segment`; or if known slices are fewer than two, or than a law is tried
+    out on, all empty, all full or grey levels; or if an example's spacing or an image's voxels are other ones.
 
     Parameters
     ----------
@@ -144,17 +137,14 @@ def reconstruct(
         only the known slices count.
     prior
         A law as in `segment`, to be tried; by default none. Each law that a fit trusts is tried.
-    every, first
-        Slices `first`, `first + every`, … along `axis` are known. Before the first known slice and beyond the last, the
-        volume goes on as that slice is for half a gap, or as an image tells. By default the slices with labels are
-        known, and where they are every n-th, three or more, the empty ones next to them in this rhythm.
-    known
-        The numbers of known slices, in place of `every` or besides.
+    every, known, axis
+        Slices 0, `every`, 2 `every` … are known, or those of `slice(3, None, every)`, and those numbered in `known`,
+        across the axis 0, 1 or 2 of the array, that is z, y or x. Before the first and beyond the last, the volume goes
+        on as that slice is for half a gap, or as an image tells. By default the slices with labels are known, and where
+        they are every n-th, three or more, the empty ones next to them in this rhythm.
     ignore
         The label of voxels that nobody annotated, in place of `every` and `known`: slices without it are known, two or
         more, and so is each other voxel, in slices along any axis or in parts of slices.
-    axis
-        The axis of the array across the slices, 0, 1 or 2, that is z, y or x.
     image
         Grey levels of the volume, on the same voxels (the affines tell their pose); needs `curvafit[image]`. It goes
         with neither example nor law.
@@ -164,87 +154,104 @@ def reconstruct(
         Number of slices to suggest for annotation next.
     periodic
         Whether the volume repeats, as generated ones do.
-    filler
-        Weights of `curvafit atlas teach`, for an image those of `--images`; by default the packaged ones.
-    stiffness
-        Stiffness of the springs on known voxels, in working units: the first law is lowered without being tried out.
-    tile, store, workers
-        With a law as in `segment`. Else labels in a file with a side of more than 256 voxels, or any with a `tile`, the
-        voxels a side of a block, are filled in blocks: the result is then read from the folder `store`, if there is
-        one, with which the same call goes on after a kill, and workers share the blocks of a file. With an image,
-        `ignore` or `periodic` volumes are filled at once, and these three do nothing.
-    epsilon, steps, progress, reading
+    working, progress, reading
         As in `segment`.
-
-    Raises
-    ------
-    ValueError, FileNotFoundError
-        As `segment`; or if known slices are fewer than two, or than a law is tried out on, all empty, all full or grey
-        levels; or if an example's spacing or an image's voxels are other ones.
-    ImportError
-        If an image is given, and scikit-learn is not installed.
     """
     volume = load(slices, **reading, lazy=True)
-    which: dict[str, Any] = {"every": every, "first": first, "known": known, "ignore": ignore, "axis": axis}
-    check_which(volume.shape, **which, suggest=suggest)
-    tile, width = check_edge(tile), choose_epsilon(volume, epsilon)
-    if stiffness is not None:
-        stiffness = check_float(stiffness, "a positive stiffness", *STIFFEST)
-    large = tile is not None or (volume.in_file and max(volume.shape) > LARGEST_BOX)
-    blocks = large and prior is None and image is None and ignore is None and not periodic
-    if not blocks:
-        check_memory(volume.shape, LEAST_BYTES, "a volume that is filled at once, not in blocks,")
-        volume = replace(volume := volume.load(), array=round_labels(volume.values))
-    laws, notes = ((), ()) if prior is None else laws_of(prior, volume)
-    if image is not None and (example is not None or laws):
-        raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
-    taught = Taught.load(filler, image=image is not None)
-    seen = None if image is None else load_image(image, volume, reading)
-    other = None if example is None else load_example(example, volume, reading)
-    same: dict[str, Any] = {}
-    if blocks and store is not None:  # digests take a while
-        same = {"labels": volume.digest, **which, "filler": taught.digest, "tile": tile}
-        same |= {"example": other and other.digest}
-    crew = workers if blocks and volume.in_file and store is not None else None
-    folder, shown = (store, progress) if blocks else (None, silent)
-    with open_run(crew, folder, same, shown, _ENDS) as run:
-        given = Known.find(volume, run, **which)
-        suggest = check_int(suggest, "a number of slices from 0", 0, volume.shape[given.axis] - len(given.places))
-        target, labels, there = given.read(run, periodic)
-        doubts = () if every is None else doubt_places(there, given.places)
-        notes = (*given.notes, *doubts, *doubt_labels(labels, ignore), *notes)
-        part = None if other is None else Example.of(other, given.places, given.axis)
-        shown_part = sub_progress(progress, *((_READ, _READ) if blocks else (0.0, 0.5)))
-        taught, evidence, learned = _learn(taught, given, target, seen, part, shown_part)
-        notes = (*notes, *learned)
-        engine = _Engine(taught, evidence, epsilon, progress)
-        place, tiles = engine.cut(target, tile) if laws else (None, [])
-        chosen, task, said = _choose_law(engine, target, laws, part, (stiffness, steps), len(tiles))
-        if place is None or chosen.law is None:
-            filled, phase = _fill_volume(given, target, engine, run, tile, blocks)
-            inside = flow_summary(filled.share)
-        else:
-            problem = SlicesProblem(chosen, target, engine.level(target))
-            found = lower_volume(problem, place, tiles, store=store, workers=workers, progress=progress)
-            filled, engine = _weigh_evidence(engine, chosen, task, given, target, found)
-            phase, notes = given.turn_back(found.phase), (*notes, *place.notes)
-            inside = flow_summary(float(found.mask.mean()), found.energies, found.steps)
-    uncertain = filled.judge(given, target, engine, suggest)
+    which = {"every": every, "known": known, "ignore": ignore, "axis": axis}
+    check_which(volume.shape, **which, suggest=suggest)  # type: ignore[arg-type]
+    given = _Given.load(volume, which, prior, image, example, periodic, working=working, reading=reading)
+    with given.open_run(working, progress) as run:
+        return _fill_between(given, suggest, run, working, progress)
+
+
+@dataclass(frozen=True, eq=False)
+class _Given:
+    """What a volume is filled from: labels and which of them are known, laws with notes on them, the network, an image
+    and an example; and whether it is filled in blocks."""
+
+    volume: Volume
+    which: dict[str, Any]
+    laws: Sequence[Coefficients]
+    notes: tuple[str, ...]
+    taught: Taught
+    image: Volume | None
+    example: Volume | None
+    periodic: bool
+    in_blocks: bool
+
+    @classmethod
+    def load(
+        cls, volume: Volume, which: dict[str, Any], prior: LawLike | None, image: Source | None,
+        example: Source | None, periodic: bool, *, working: Working, reading: dict[str, Any],
+    ) -> _Given:  # fmt: skip
+        """Read what is not read yet; raise ScanError where parts do not go together."""
+        choose_epsilon(volume, working.epsilon)
+        large = working.tile is not None or (volume.in_file and max(volume.shape) > LARGEST_BOX)
+        in_blocks = large and prior is None and image is None and which["ignore"] is None and not periodic
+        if not in_blocks:
+            check_memory(volume.shape, LEAST_BYTES, "a volume that is filled at once, not in blocks,")
+            volume = replace(volume := volume.load(), array=round_labels(volume.values))
+        laws, notes = ((), ()) if prior is None else laws_of(prior, volume)
+        if image is not None and (example is not None or laws):
+            raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
+        taught = Taught.load(working.filler, image=image is not None)
+        levels = None if image is None else load_image(image, volume, reading)
+        other = None if example is None else load_example(example, volume, reading)
+        return cls(volume, which, laws, notes, taught, levels, other, periodic, in_blocks)
+
+    def open_run(self, working: Working, progress: Progress) -> AbstractContextManager[Run]:
+        """Open the run of the blocks; a volume that is filled at once is one block in memory."""
+        if not self.in_blocks:
+            return open_run(None, None, {}, silent, _ENDS)
+        same: dict[str, Any] = {}
+        if working.store is not None:  # digests take a while
+            same = {"labels": self.volume.digest, **self.which, "filler": self.taught.digest, "tile": working.tile}
+            same |= {"example": self.example and self.example.digest}
+        crew = working.workers if self.volume.in_file and working.store is not None else None
+        return open_run(crew, working.store, same, progress, _ENDS)
+
+
+def _fill_between(given: _Given, suggest: int, run: Run, working: Working, progress: Progress) -> Segmentation:
+    """Read the known slices, learn from what is given, choose a law, fill the volume, and say how sure it is."""
+    volume, periodic = given.volume, given.periodic
+    known = Known.find(volume, run, **given.which)
+    suggest = check_int(suggest, "a number of slices from 0", 0, volume.shape[known.axis] - len(known.places))
+    target, labels, there = known.read(run, periodic)
+    doubts = () if given.which["every"] is None else doubt_places(there, known.places)
+    notes = (*known.notes, *doubts, *doubt_labels(labels, given.which["ignore"]), *given.notes)
+    part = None if given.example is None else Example.of(given.example, known.places, known.axis)
+    step = sub_progress(progress, *((_READ, _READ) if given.in_blocks else (0.0, 0.5)))
+    taught, evidence, learned = _learn(given.taught, known, target, given.image, part, step)
+    engine = _Engine(taught, evidence, working.epsilon, progress)
+    place, tiles = engine.cut(target, working.tile) if given.laws else (None, [])
+    chosen, task, said = _choose_law(engine, target, given.laws, part, (working.stiffness, working.steps), len(tiles))
+    notes = (*notes, *learned)
+    if place is None or chosen.law is None:
+        filled, phase = _fill_volume(known, target, engine, run, working.tile, given.in_blocks)
+        inside = flow_summary(filled.share)
+    else:
+        problem, tools = SlicesProblem(chosen, target, engine.level(target)), (working.store, working.workers)
+        found = lower_volume(problem, place, tiles, store=tools[0], workers=tools[1], progress=progress)
+        filled, engine = _weigh_evidence(engine, chosen, task, known, target, found)
+        phase, notes = known.turn_back(found.phase), (*notes, *place.notes)
+        inside = flow_summary(float(found.mask.mean()), found.energies, found.steps)
+    uncertain = filled.judge(known, target, engine, suggest)
     tested = "the example" if part else "slices left out" if chosen.law else "generated shapes"
     ways = {"tested": tested, "image": evidence is not None, "periodic": periodic}
-    status, doubts = describe_filled(said, inside, filled.share, uncertain, given.places, target.length, **ways)
+    status, doubts = describe_filled(said, inside, filled.share, uncertain, known.places, target.length, **ways)
     return Segmentation.of(
-        volume, filled.mask, phase, chosen.law, width,
-        (*notes, *doubts), weight=None, status=status, uncertainty=uncertain, image=seen,
+        volume, filled.mask, phase, chosen.law, choose_epsilon(volume, working.epsilon), (*notes, *doubts),
+        weight=None, status=status, uncertainty=uncertain, image=given.image,
     )  # fmt: skip
 
 
 def _learn(
-    taught: Taught, given: Known, slices: Slices, image: Volume | None, example: Example | None, progress: Progress
+    taught: Taught, known: Known, slices: Slices, image: Volume | None, example: Example | None, progress: Progress
 ) -> tuple[Taught, np.ndarray | None, tuple[str, ...]]:
     """Return the network, which an example tunes; what an image says; and notes on either."""
     if image is not None:
-        evidence, doubts = _read_evidence(given.turn(image.values), slices, given.axis, progress)
+        evidence, doubts = _read_evidence(known.turn(image.values), slices, known.axis, progress)
         return Taught.load() if evidence is None else taught, evidence, (*image.notes, *doubts)
     if example is not None:
         return tune(taught, example, progress), None, example.notes

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from os import PathLike
 from typing import Any
 
 import numpy as np
 
 from curvafit.core.checks import check_float, quoted
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.workers import Cluster
 from curvafit.generation.data import Evidence
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import LawLike
 from curvafit.scan.grids import box_with_most_surface
 from curvafit.scan.structure import check_options
 from curvafit.segmentation.evidence import GreyEvidence, VolumeEvidence, load_probabilities, probability_evidence
-from curvafit.segmentation.flow import BENDING, HALO, STEPS, WorkingGrid, bending
+from curvafit.segmentation.flow import BENDING, HALO, Working, WorkingGrid, bending
 from curvafit.segmentation.result import Segmentation, flow_summary
 from curvafit.segmentation.slices import check_spacing, load_with, require_labels
 from curvafit.segmentation.tiles import LoweredVolume, Problem, cut_tiles, lower_volume
@@ -56,11 +54,7 @@ def segment(
     example: tuple[Source, Source] | Calibration | None = None,
     threshold: float | str = "otsu",
     dark: bool = False,
-    epsilon: float | None = None,
-    steps: int = STEPS,
-    tile: int | None = None,
-    store: str | PathLike[str] | None = None,
-    workers: Cluster | int | None = None,
+    working: Working = Working(),  # noqa: B008
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:
@@ -91,20 +85,9 @@ def segment(
         as the scan is.
     threshold, dark
         The grey level between the phases, or `"otsu"`; whether the structure is the dark one.
-    epsilon
-        ε in the scan's unit; by default twice the smallest voxel edge. Thinner structures do not survive.
-    steps
-        Steps of Adam.
-    tile
-        The energy is lowered on overlapping tiles of at most this many working voxels a side, which bounds the memory;
-        the result depends on the tiles by a few voxels of the surface at most. By default the scan is one tile up to
-        256³ working voxels; larger ones have tiles of 192³.
-    store, workers
-        Where there are several tiles: a folder for finished ones, with which the same call goes on after a kill, and
-        whose mapped files the result's arrays are; and the number of processes that lower tiles, or workers such as
-        `curvafit.core.workers.cluster`.
-    progress
-        Called with a sentence and the share done.
+    working, progress
+        The width of the surface, the steps of the flow, and how a large scan is worked on. `progress` is called with a
+        sentence and the share done.
     reading
         Options of reading a file, or the place of an array: spacing, unit, crop and the others of `curvafit.load`; and
         of probabilities `like`, the path of an image of the same voxels that says where they are (by default one that
@@ -117,42 +100,67 @@ def segment(
         such `fit.json`; if probabilities are not in [0, 1], or have neither a weight nor an example, or both.
     """
     check_given(probabilities, weight, example, threshold, dark, reading.get("label"))
-    alike: dict[str, Any] = {}
     if probabilities:
         reading["logits"] = probabilities == "logits"
-        alike = {name: value for name, value in reading.items() if name not in ("like", "crop")}
-        reading.pop("label", None)  # that of the example
-        scan, reading = load_probabilities(scan, **reading), {}  # type: ignore[arg-type]
+        return _segment_probabilities(scan, prior, weight, example, working=working, progress=progress, reading=reading)
     volume = load(scan, **reading, lazy=True)
     volume.check_fits()
-    place = WorkingGrid.of(volume, epsilon, halo=HALO)
-    tiles, said = cut_tiles(place, volume.shape, tile), ""
-    if example is None:
-        law, notes = law_of(WILLMORE if prior is None else prior, volume)
-        notes = notes if prior is not None else ("No prior is given: the Willmore energy is lowered.",)
-        trial = Trial(law, (weight or 0.0) * bending(law) / BENDING, steps)
-    else:
-        if not isinstance(example, Calibration):
-            trials, progress = sub_progress(progress, 0.0, TRIALS), sub_progress(progress, TRIALS, 1.0)
-            example = calibrate(*example, prior, epsilon=epsilon, steps=steps, progress=trials, **alike)
-        check_spacing(example.example, volume, "the probabilities")
-        trial, notes, said = example.trial, example.notes, f"{example}; "
-    if probabilities:
-        evidence: VolumeEvidence = probability_evidence(likely := volume.load())
-        notes = (*notes, f"Probabilities from {likely.values.min():.3g} to {likely.values.max():.3g}.")
-    else:
-        _check_finite(volume)
-        evidence = GreyEvidence.of(volume, threshold, dark, apart=weight is None)
-        classes, trial = evidence.classes, trial if weight else replace(trial, strength=USUAL)
-        notes = (*notes, *(FAINT,) * (classes.faint and threshold == "otsu"), f"{str(classes).capitalize()}.")
-    missing = trial.law is not None and _missing_phase(evidence, tiles)
-    if missing and not probabilities:
+    place = WorkingGrid.of(volume, working.epsilon, halo=HALO)
+    tiles, said = cut_tiles(place, volume.shape, working.tile), ""
+    trial, notes = _weigh_law(prior, weight, volume, working)
+    _check_finite(volume)
+    evidence = GreyEvidence.of(volume, threshold, dark, apart=weight is None)
+    classes, trial = evidence.classes, trial if weight else replace(trial, strength=USUAL)
+    notes = (*notes, *(FAINT,) * (classes.faint and threshold == "otsu"), f"{str(classes).capitalize()}.")
+    if missing := _missing_phase(evidence, tiles):
         raise ScanError(f"the scan shows no {missing}: every voxel is on one side")
-    stays = replace(trial, law=None) if missing else trial  # without a surface there is nothing to lower
-    found = lower(evidence, stays, place, tiles, store=store, workers=workers, progress=progress)
-    if not probabilities and weight is None and not _explains(evidence, found.mask, tiles):
+    found = lower(evidence, trial, place, tiles, store=working.store, workers=working.workers, progress=progress)
+    if weight is None and not _explains(evidence, found.mask, tiles):
         trial, said = replace(trial, law=None), "no prior helps here, the first guess explains the scan better: "
         found = lower(evidence, trial, place, tiles)
+    return _describe(volume, found, trial, place, notes, said)
+
+
+def _segment_probabilities(
+    scan: Source, prior: LawLike | None, weight: float | None, example: tuple[Source, Source] | Calibration | None, *,
+    working: Working, progress: Progress, reading: dict[str, Any],
+) -> Segmentation:  # fmt: skip
+    """Return the mask of a network's probabilities; the law's weight is given, or an example chooses both."""
+    given = {name: value for name, value in reading.items() if name != "label"}  # that is of the example
+    volume = load(load_probabilities(scan, **given), lazy=True)
+    volume.check_fits()
+    place = WorkingGrid.of(volume, working.epsilon, halo=HALO)
+    tiles, said = cut_tiles(place, volume.shape, working.tile), ""
+    if example is None:
+        trial, notes = _weigh_law(prior, weight, volume, working)
+    else:
+        if not isinstance(example, Calibration):
+            same = {name: value for name, value in reading.items() if name not in ("like", "crop")}
+            trials, progress = sub_progress(progress, 0.0, TRIALS), sub_progress(progress, TRIALS, 1.0)
+            example = calibrate(*example, prior, working=working, progress=trials, **same)
+        check_spacing(example.example, volume, "the probabilities")
+        trial, notes, said = example.trial, example.notes, f"{example}; "
+    evidence = probability_evidence(likely := volume.load())
+    notes = (*notes, f"Probabilities from {likely.values.min():.3g} to {likely.values.max():.3g}.")
+    flat = trial.law is not None and _missing_phase(evidence, tiles)  # without a surface there is nothing to lower
+    stays = replace(trial, law=None) if flat else trial
+    found = lower(evidence, stays, place, tiles, store=working.store, workers=working.workers, progress=progress)
+    return _describe(volume, found, trial, place, notes, said)
+
+
+def _weigh_law(
+    prior: LawLike | None, weight: float | None, volume: Volume, working: Working
+) -> tuple[Trial, tuple[str, ...]]:
+    """Return the law to lower with its weight, 0 where none is given, and notes on its origin."""
+    law, notes = law_of(WILLMORE if prior is None else prior, volume)
+    notes = notes if prior is not None else ("No prior is given: the Willmore energy is lowered.",)
+    return Trial(law, (weight or 0.0) * bending(law) / BENDING, working.steps), notes
+
+
+def _describe(
+    volume: Volume, found: LoweredVolume, trial: Trial, place: WorkingGrid, notes: tuple[str, ...], said: str
+) -> Segmentation:
+    """Return the result with its status, which begins with what is `said`."""
     return Segmentation.of(
         volume, found.mask, found.phase, trial.law, place.epsilon, (*notes, *place.notes),
         weight=None if trial.law is None else trial.strength * BENDING / bending(trial.law),
@@ -285,8 +293,7 @@ def calibrate(
     prior: LawLike | None = None,
     *,
     label: int | None = None,
-    epsilon: float | None = None,
-    steps: int = STEPS,
+    working: Working = Working(),  # noqa: B008
     progress: Progress = silent,
     **reading: Any,
 ) -> Calibration:
@@ -315,7 +322,7 @@ def calibrate(
     probability_evidence(field)  # refuses values outside [0, 1] beyond the part, too
     where = box_with_most_surface(inside, EDGE)
     part = replace(field, array=field.values[where])
-    place = WorkingGrid.of(part, epsilon, halo=HALO)
+    place = WorkingGrid.of(part, working.epsilon, halo=HALO)
     tiles = cut_tiles(place, part.shape)
     count, expected = 0, 2 * len(tried) + 3
 
@@ -329,5 +336,5 @@ def calibrate(
             return np.zeros(part.shape, dtype=bool)
 
     task = Task(probability_evidence(part), inside[where], range(part.shape[0]))
-    best = choose_by_masks(task, [Trial(law, FIRST, steps) for law in tried], fill, NATS)
+    best = choose_by_masks(task, [Trial(law, FIRST, working.steps) for law in tried], fill, NATS)
     return Calibration(best, best.law in laws, field, (*notes, *truth.notes, *laid))

@@ -18,12 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.core.checks import check_int
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.workers import Cluster
 from curvafit.generation.checkpoint import identity
 from curvafit.generation.data import Data
-from curvafit.priors.grid import MOST
 from curvafit.segmentation.flow import WorkingGrid, lower_energy
 from curvafit.segmentation.trials import Trial
 from curvafit.volumes.boxes import Box, within
@@ -33,26 +31,17 @@ from curvafit.volumes.run import Record, open_run
 OVERLAP = 24
 #: Most working voxels that are lowered at once by default, and the edge of a tile where there are more.
 WHOLE, EDGE = 256**3, 192
-#: Shortest edge of a tile, in working voxels.
-SHORTEST = 8
 #: The name of the pass.
 _LOWER = "lowering the energy"
-
-
-def check_edge(edge: int | None) -> int | None:
-    """Return the edge of a tile in working voxels, if one is given; raise ValueError unless it is from `SHORTEST`."""
-    form = f"a tile of {SHORTEST} or more working voxels a side"
-    return None if edge is None else check_int(edge, form, SHORTEST, MOST)
 
 
 def cut_tiles(place: WorkingGrid, shape: Sequence[int], edge: int | None = None) -> list[Box]:
     """Cut a volume of a shape into tiles of at most `edge` working voxels a side, which differ by a voxel at most.
 
-    By default the volume is one tile up to `WHOLE` working voxels, else tiles of `EDGE`. Raises `ValueError` if the
-    edge is not a whole number from `SHORTEST`.
+    By default the volume is one tile up to `WHOLE` working voxels, else tiles of `EDGE`.
     """
     whole = max(place.grid.shape) if math.prod(place.grid.shape) <= WHOLE else EDGE
-    edge = check_edge(edge) or whole
+    edge = edge or whole
     counts = [-(-n // max(1, edge // times)) for n, times in zip(shape, place.times, strict=True)]
     ends = ([k * n // count for k in range(count + 1)] for n, count in zip(shape, counts, strict=True))
     axes = ([slice(*pair) for pair in pairwise(axis)] for axis in ends)

@@ -26,6 +26,7 @@ from curvafit.priors.law import preset
 from curvafit.priors.profile import SIGMA, optimal_profile
 from curvafit.priors.stencils import gaussian_blur
 from curvafit.segmentation.evidence import probability_evidence
+from curvafit.segmentation.flow import Working
 from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.segmentation import segment
 from curvafit.volumes.volume import Volume
@@ -227,7 +228,9 @@ def test_known_slices_hold_whatever_the_axis_and_the_spacing(along: int) -> None
     known, ε, fields = list(range(0, SHAPE[along], (2, 4, 3)[along])), 3.0, []
     for turn in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         truth = Volume((DISTANCE > 0).transpose(turn), tuple(EDGES[k] for k in turn))  # type: ignore[arg-type]
-        found = reconstruct(truth, WILLMORE, known=known, axis=turn.index(along), epsilon=ε, steps=8, stiffness=1e7)
+        found = reconstruct(
+            truth, WILLMORE, known=known, axis=turn.index(along), working=Working(epsilon=ε, steps=8, stiffness=1e7)
+        )
         assert found.epsilon == ε and any("2-fold" in note for note in found.notes)
         kept = (found.mask.values == truth.values).all(tuple(k for k in range(3) if k != turn.index(along)))
         assert kept[known].all()
@@ -251,7 +254,7 @@ def test_evidence_counts_its_nats_once_whatever_the_volume_of_a_part(epsilon: fl
     errors = np.random.default_rng(0).standard_normal(SHAPE)
     likely = Volume((1 / (1 + np.exp(-DISTANCE - errors))).astype(np.float32), EDGES)
     law = Coefficients(1.5, 0.5, 2.5)
-    found = segment(likely, law, weight=0.3, probabilities=True, epsilon=epsilon, steps=1)
+    found = segment(likely, law, weight=0.3, probabilities=True, working=Working(epsilon=epsilon, steps=1))
     assert found.epsilon == epsilon
     nats = float(probability_evidence(likely).ratio.sum(dtype=np.float64))
     assert 0.3 * 2 * gained[0] == pytest.approx(nats, rel=1e-4)  # λ times the stiffness, 0.3 (1.5 + 2.5) / 2

@@ -14,6 +14,7 @@ from calling import call, done, refused
 from shapes import grown
 
 from curvafit.core.workers import cluster
+from curvafit.segmentation.flow import Working
 from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.result import write_mask
 from curvafit.volumes import Volume, load, save
@@ -92,7 +93,7 @@ def test_slices_across_any_axis(tmp_path: Path, axis: int) -> None:
     volume = load(source, spacing=(1.5, 1.0, 0.8), unit="mm")
     write_mask(reconstruct(volume, axis=axis, suggest=2), volume, tmp_path / "whole.zarr")
     (tmp_path / "blocks").mkdir()
-    found = reconstruct(source, tile=40, store=tmp_path / "store", **options)
+    found = reconstruct(source, working=Working(tile=40, store=tmp_path / "store"), **options)
     assert "annotate next" in found.status and found.mask.in_file
     write_mask(found, volume, tmp_path / "blocks" / "whole.zarr")
     check_alike(tmp_path / "blocks" / "whole.zarr", tmp_path / "whole.zarr")
@@ -143,8 +144,8 @@ def test_the_same_command_goes_on_after_a_kill(labels: Path, tmp_path: Path, mon
 @pytest.mark.slow
 def test_workers_that_are_killed_lose_no_voxel(labels: Path, tmp_path: Path) -> None:
     """Each of two workers is killed once, while blocks are filled."""
-    options: dict[str, Any] = {"every": 8, "tile": 32}
-    one = reconstruct(labels, **options, store=tmp_path / "one")
+    options: dict[str, Any] = {"every": 8}
+    one = reconstruct(labels, **options, working=Working(tile=32, store=tmp_path / "one"))
     killed: list[int] = []
     with cluster(2) as crew:
         found: Any = crew._client.run(os.getpid)  # type: ignore[union-attr]
@@ -155,7 +156,9 @@ def test_workers_that_are_killed_lose_no_voxel(labels: Path, tmp_path: Path) -> 
                 killed.append(pids[len(killed)])
                 os.kill(killed[-1], signal.SIGKILL)
 
-        two = reconstruct(labels, **options, store=tmp_path / "two", workers=crew, progress=kill)
+        two = reconstruct(
+            labels, **options, working=Working(tile=32, store=tmp_path / "two", workers=crew), progress=kill
+        )
     assert len(killed) == 2 and two.status == one.status
     assert one.probability is not None and two.probability is not None
     assert np.abs(two.probability.values - one.probability.values).max() < 1e-6
@@ -173,7 +176,7 @@ def test_what_is_mistyped_leaves_no_folder_that_refuses_what_is_right(labels: Pa
 
 def test_blocks_have_a_phase_field_read_where_it_is_asked_for(labels: Path, tmp_path: Path) -> None:
     whole = reconstruct(load(labels), every=8)
-    found = reconstruct(labels, every=8, tile=33, store=tmp_path / "store")
+    found = reconstruct(labels, every=8, working=Working(tile=33, store=tmp_path / "store"))
     between = [k for k in range(SHAPE[0]) if k % 8]
     assert found.phase.in_file and found.phase.dtype == np.float32
     sure = np.abs(whole.phase.values[between]) < 0.9

@@ -18,7 +18,7 @@ from curvafit.inference.candidates import Candidate
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import preset
 from curvafit.scan.grids import box_with_most_surface
-from curvafit.segmentation.flow import WorkingGrid
+from curvafit.segmentation.flow import Working, WorkingGrid
 from curvafit.segmentation.labels import reconstruct_labels
 from curvafit.segmentation.reconstruction import MARGIN, STIFFNESS, reconstruct
 from curvafit.segmentation.result import Segmentation, Uncertainty
@@ -26,12 +26,13 @@ from curvafit.segmentation.segmentation import FIRST, NATS, calibrate
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.trials import Task, Trial, choose_by_masks, dice, laws_of
 from curvafit.volumes.volume import ScanError, Volume
+from tests.options import grouped
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
 WILLMORE = Coefficients.willmore()
 #: Nothing is tried out, and few steps.
-QUICK = {"stiffness": 1e7, "steps": 30}
+QUICK = grouped(stiffness=1e7, steps=30)
 
 
 def straight(length: int = 24) -> np.ndarray:
@@ -141,7 +142,7 @@ def test_there_may_be_too_few_slices_to_leave_any_out() -> None:
 
 def test_a_straight_tube_is_filled_exactly_and_no_law_helps() -> None:
     truth = straight(25)
-    found = reconstruct(truth, WILLMORE, every=6, steps=3)
+    found = reconstruct(truth, WILLMORE, every=6, working=Working(steps=3))
     assert np.array_equal(found.mask.values, truth)
     assert found.status.startswith("no law helps here: Dice 1.000 on slices left out by the network")
     assert found.coefficients is None and np.array_equal(found.phase.values > 0, truth)
@@ -163,7 +164,7 @@ def test_what_is_annotated_along_another_axis_is_kept_and_helps() -> None:
 
 
 def test_the_same_slices_make_the_same_choice() -> None:
-    one, other = (reconstruct(ball(), WILLMORE, every=6, steps=10) for _ in range(2))
+    one, other = (reconstruct(ball(), WILLMORE, every=6, working=Working(steps=10)) for _ in range(2))
     assert one.status == other.status and np.array_equal(one.mask.values, other.mask.values)
     assert np.array_equal(one.mask.values[::6], ball()[::6])
 
@@ -173,7 +174,7 @@ def test_known_slices_are_kept_and_the_rest_beats_interpolation() -> None:
     n, every = 41, 8
     truth = np.linalg.norm(np.mgrid[:n, :n, :n] - 20.0, axis=0) < 15.2
     places = np.arange(0, n, every)
-    found = reconstruct(Volume(truth.astype(np.uint8)), WILLMORE, every=every, stiffness=STIFFNESS)
+    found = reconstruct(Volume(truth.astype(np.uint8)), WILLMORE, every=every, working=Working(stiffness=STIFFNESS))
     lines = Slices(truth[places], tuple(places), n, (1.0, 1.0, 1.0)).level("linear") > 0
     assert np.array_equal(found.mask.values[places], truth[places])
     assert dice(found.mask.values, truth) > dice(lines, truth) + 0.01
@@ -190,7 +191,7 @@ REFUSALS: dict[str, list[dict]] = {
     "12.5": [{"every": None, "known": [0.0, 12.5]}],
     "whole numbers": [{"example": BALL * np.float32(0.5)}, {"slices": BALL * np.float32(0.5)}],
     "every": [{"every": None}, {"every": 0}], "ignore": [{"every": None, "known": [3], "ignore": 1}, {"ignore": 1}],
-    "31": [{"every": None, "known": [3, 99]}], "whole number": [{"every": math.nan}, {"first": 0.5}],
+    "31": [{"every": None, "known": [3, 99]}], "whole number": [{"every": math.nan}, {"every": slice(0.5, None, 8)}],
     "axis": [{"axis": 3}], "epsilon": [{"epsilon": -1.0}], "three or more": [{"every": None, "known": [8, 24]}],
     "stiffness": [{"stiffness": 0.0}], "no voxel": [{"every": None, "ignore": 2}], "no.npz": [{"filler": "no.npz"}],
     "256": [{"slices": RANDOM.integers(0, 999, (32, 32, 32), np.int16)}], "grey image": [{"slices": GREY}],
@@ -204,7 +205,7 @@ REFUSALS: dict[str, list[dict]] = {
 def test_bad_slices_and_examples_are_refused(word: str) -> None:
     for options in REFUSALS[word]:
         with pytest.raises((ValueError, FileNotFoundError), match=word):
-            reconstruct(**{"slices": BALL, "prior": WILLMORE, "every": 8, **options})
+            reconstruct(**grouped(**{"slices": BALL, "prior": WILLMORE, "every": 8, **options}))
 
 
 def test_a_fit_has_the_laws_that_it_trusts(tmp_path: Path) -> None:
@@ -233,7 +234,7 @@ def test_known_voxels_leave_the_profile_free() -> None:
 
 def test_slices_beyond_the_known_ones_are_as_those_are_for_half_a_gap() -> None:
     truth = leaning()
-    found = reconstruct(truth.astype(np.uint8), every=8, first=3).mask.values
+    found = reconstruct(truth.astype(np.uint8), every=slice(3, None, 8)).mask.values
     assert np.array_equal(found[:3], np.stack([truth[3]] * 3)) and np.array_equal(found[-4:], np.stack([truth[27]] * 4))
     far = reconstruct(truth.astype(np.uint8), known=[10, 14, 18])
     assert np.array_equal(far.mask.values[8:11], np.stack([truth[10]] * 3)) and not far.mask.values[:8].any()
@@ -264,14 +265,14 @@ def test_labels_count_as_inside_and_what_is_extrapolated_is_said() -> None:
     truth = leaning()
     labels = np.where(truth, np.random.default_rng(0).integers(1, 200, truth.shape), 0).astype(np.float32)
     labels[1::2] += 0.5  # these are not read
-    found = reconstruct(Volume(labels), WILLMORE, every=8.0, first=2, steps=1, stiffness=1e7)  # type: ignore[arg-type]
-    plain = reconstruct(Volume(truth), WILLMORE, known=[2, 10, 18, 26], steps=1, stiffness=1e7)
+    found = reconstruct(Volume(labels), WILLMORE, every=slice(2, None, 8.0), working=Working(steps=1, stiffness=1e7))  # type: ignore[arg-type]
+    plain = reconstruct(Volume(truth), WILLMORE, known=[2, 10, 18, 26], working=Working(steps=1, stiffness=1e7))
     assert np.array_equal(found.mask.values, plain.mask.values) and set(plain.notes) <= set(found.notes)
     assert [note for note in found.notes if "one structure" in note] and len(found.notes) == len(plain.notes) + 1
     assert any("Before" in note and "2" in note for note in found.notes)
     assert any("Beyond" in note and "4 slices" in note and "1 further" in note for note in found.notes)
     assert "after 1 step:" in found.status
-    whole = reconstruct(Volume(truth), WILLMORE, known=[0, 15, 31], steps=1, stiffness=1e7)
+    whole = reconstruct(Volume(truth), WILLMORE, known=[0, 15, 31], working=Working(steps=1, stiffness=1e7))
     assert not any("Beyond" in note for note in whole.notes)
 
 
@@ -324,7 +325,9 @@ def test_where_all_is_labelled_no_voxel_is_left_out() -> None:
 def test_a_label_that_is_refused_is_filled_by_the_network_and_said() -> None:
     truth = organelles()
     truth[0, :4, :4] = 9
-    found = reconstruct_labels(truth, WILLMORE, known=[0, 24], chosen=[2, 9], steps=30)  # none can be left out
+    found = reconstruct_labels(
+        truth, WILLMORE, known=[0, 24], chosen=[2, 9], working=Working(steps=30)
+    )  # none can be left out
     assert found.labels is not None
     assert np.array_equal(found.labels.values[0] == 9, truth[0] == 9)
     assert not (found.labels.values == 7).any()
@@ -498,5 +501,5 @@ def test_a_flow_that_fails_is_no_choice(monkeypatch: pytest.MonkeyPatch) -> None
         raise ScanError("expected an energy that stays finite")
 
     monkeypatch.setattr("curvafit.segmentation.tiles.lower_energy", failing)
-    found = calibrate(0.2 + 0.6 * ball(20), ball(20), WILLMORE, steps=1)
+    found = calibrate(0.2 + 0.6 * ball(20), ball(20), WILLMORE, working=Working(steps=1))
     assert found.trial.law is None and (found.trial.score, found.trial.plain) == (0, 1)

@@ -19,12 +19,13 @@ import curvafit.segmentation.evidence as room
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import preset
 from curvafit.segmentation.evidence import load_probabilities
-from curvafit.segmentation.flow import WorkingGrid
+from curvafit.segmentation.flow import Working, WorkingGrid
 from curvafit.segmentation.segmentation import calibrate, segment
 from curvafit.segmentation.trials import dice, law_of
 from curvafit.volumes.read import load
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
+from tests.options import grouped
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
@@ -73,9 +74,9 @@ def test_classes_that_overlap_are_measured_apart() -> None:
 def test_a_rare_structure_needs_a_threshold_and_is_told_so() -> None:
     ball = np.linalg.norm(np.mgrid[:48, :48, :48] - 23.5, axis=0) < 2.9
     scan, said = noisy(ball, 10), "give a threshold"
-    assert said in " ".join(segment(scan, weight=1.0, steps=1).notes)
-    assert said not in " ".join(segment(noisy(tubes(), 60), weight=1.0, steps=1).notes)
-    given = segment(scan, threshold=80.0, steps=30)
+    assert said in " ".join(segment(scan, weight=1.0, working=Working(steps=1)).notes)
+    assert said not in " ".join(segment(noisy(tubes(), 60), weight=1.0, working=Working(steps=1)).notes)
+    given = segment(scan, threshold=80.0, working=Working(steps=30))
     assert said not in " ".join(given.notes) and dice(given.mask.values, ball) > 0.9
     assert given.status.startswith("no prior helps here") and given.coefficients is None and given.weight is None
     found = of_intensities(scan, 80.0)
@@ -126,8 +127,10 @@ def test_axes_are_refined_and_brought_back() -> None:
 def test_a_segmentation_does_not_depend_on_the_unit_of_length(scale: float) -> None:
     truth = tubes(24)
     law = preset("tubes").coefficients.in_unit(0.01)
-    one = segment(noisy(truth, 60), law, weight=2.0, steps=100)
-    other = segment(noisy(truth, 60, spacing=(scale,) * 3), law.in_unit(1 / scale), weight=2.0, steps=100)
+    one = segment(noisy(truth, 60), law, weight=2.0, working=Working(steps=100))
+    other = segment(
+        noisy(truth, 60, spacing=(scale,) * 3), law.in_unit(1 / scale), weight=2.0, working=Working(steps=100)
+    )
     assert one.weight == pytest.approx(other.weight, rel=1e-4)
     assert (one.mask.values != other.mask.values).mean() < 1e-3
 
@@ -136,7 +139,7 @@ def test_a_segmentation_does_not_depend_on_the_unit_of_length(scale: float) -> N
 def test_noisy_tubes_come_out_better_than_from_a_threshold_at_any_smoothing() -> None:
     truth = tubes()
     scan = noisy(truth, 90, spacing=(0.02,) * 3, unit="mm", affine=np.diag([-0.02, 0.02, 0.02, 1]))
-    found = segment(scan, steps=100)
+    found = segment(scan, working=Working(steps=100))
     others = []
     for width in (0, 0.7, 1, 1.5, 2, 3):
         smooth = ndimage.gaussian_filter(scan.values, width)
@@ -152,7 +155,7 @@ def test_noisy_tubes_come_out_better_than_from_a_threshold_at_any_smoothing() ->
 def test_anisotropic_scans_keep_their_grid() -> None:
     truth = tubes(36)[1::3]
     scan = noisy(truth, 40, spacing=(3.0, 1.0, 1.0))
-    found = segment(scan, WILLMORE, steps=100)
+    found = segment(scan, WILLMORE, working=Working(steps=100))
     assert found.mask.shape == truth.shape and found.mask.spacing == (3.0, 1.0, 1.0)
     assert any("z 3-fold" in note for note in found.notes)
     assert dice(found.mask.values, truth) > 0.93
@@ -161,16 +164,18 @@ def test_anisotropic_scans_keep_their_grid() -> None:
 def test_a_prior_s_scale_does_not_matter_but_its_weight_does() -> None:
     """But for voxels at the surface: the two flows round otherwise."""
     scan = noisy(tubes(), 60)
-    one, thrice = (segment(scan, WILLMORE.scale(by), weight=1 / by, steps=100) for by in (1, 3))
+    one, thrice = (segment(scan, WILLMORE.scale(by), weight=1 / by, working=Working(steps=100)) for by in (1, 3))
     assert (one.mask.values != thrice.mask.values).mean() < 1e-3
-    weak, strong = (segment(scan, WILLMORE, weight=weight, steps=100).mask.values for weight in (0.01, 30))
+    weak, strong = (
+        segment(scan, WILLMORE, weight=weight, working=Working(steps=100)).mask.values for weight in (0.01, 30)
+    )
     bright = scan.values > 80
     assert (weak == bright).mean() > (strong == bright).mean() + 0.001
 
 
 def test_a_prior_that_is_too_strong_says_so() -> None:
     ball = np.linalg.norm(np.mgrid[:20, :20, :20] - 9.5, axis=0) < 4
-    found = segment(noisy(ball, 30), Coefficients(1, 2, 1, 0, 0, 1.0), weight=1e4, steps=400)
+    found = segment(noisy(ball, 30), Coefficients(1, 2, 1, 0, 0, 1.0), weight=1e4, working=Working(steps=400))
     assert found.status.startswith("no surface is left") and not found.mask.values.any()
 
 
@@ -244,12 +249,12 @@ def test_nnu_net_s_probabilities_lie_where_its_segmentation_does(tmp_path: Path)
 def test_perfect_probabilities_stay() -> None:
     truth = crossed()
     p = truth.astype(np.float32)
-    found = refine(p, "tubes", example=(p, truth), steps=5)
+    found = refine(p, "tubes", example=(p, truth), working=Working(steps=5))
     assert np.array_equal(found.mask.values, truth) and found.coefficients is None and found.weight is None
     assert found.status.startswith("no prior helps here: Dice 1.000 on the example, ")
     assert np.array_equal(found.phase.values > 0, truth)
     assert dice(refine(p, WILLMORE, weight=1e-3).mask.values, truth) > 0.98
-    learned = calibrate(p, truth, WILLMORE, steps=5)
+    learned = calibrate(p, truth, WILLMORE, working=Working(steps=5))
     p = np.random.default_rng(0).random((12, 13, 14)).astype(np.float32)
     p[0] = 0.5
     found = refine(p, WILLMORE, example=learned)  # where no prior helps, the mask is what is likely
@@ -260,12 +265,12 @@ def test_perfect_probabilities_stay() -> None:
 def test_an_example_chooses_a_weight_that_helps_elsewhere() -> None:
     one, other = crossed(), crossed(at=1.5)
     p = network(other, 1)
-    learned = calibrate(network(one, 0), one, WILLMORE, steps=150)
-    found = refine(p, WILLMORE, example=learned, steps=150)
+    learned = calibrate(network(one, 0), one, WILLMORE, working=Working(steps=150))
+    found = refine(p, WILLMORE, example=learned, working=Working(steps=150))
     assert dice(found.mask.values, other) > dice(p > 0.5, other) + 0.05
     assert found.coefficients == WILLMORE and found.weight == learned.trial.strength
     assert f"the prior helps, at {found.weight:g} nats: Dice {learned.trial.score:.3f} on the example" in found.status
-    again = refine(p, WILLMORE, example=(network(one, 0), one), steps=150)
+    again = refine(p, WILLMORE, example=(network(one, 0), one), working=Working(steps=150))
     assert np.array_equal(again.mask.values, found.mask.values) and again.status == found.status
 
 
@@ -273,9 +278,9 @@ def test_law_and_weight_together_or_evidence_and_weight_together_change_nothing(
     """But for voxels at the surface: the flows round otherwise."""
     p = network(crossed(), 0).clip(0.02, 0.98)
     odds = (p / (1 - p)) ** 2
-    one = refine(p, WILLMORE, weight=6.0, steps=100)
+    one = refine(p, WILLMORE, weight=6.0, working=Working(steps=100))
     for sure, law, weight in ((p, WILLMORE.scale(3), 2.0), (odds / (1 + odds), WILLMORE, 12.0)):
-        other = refine(sure, law, weight=weight, steps=100)
+        other = refine(sure, law, weight=weight, working=Working(steps=100))
         assert other.weight == pytest.approx(weight) and (one.mask.values != other.mask.values).mean() < 1e-3
 
 
@@ -312,7 +317,7 @@ def test_what_cannot_be_judged_is_refused(word: str) -> None:
         prior = options.get("prior", WILLMORE)
         prior = Coefficients(*prior) if isinstance(prior, tuple) else prior
         with pytest.raises(ValueError, match=word):
-            refine(**{"scan": MAP, "steps": 1, **options, "prior": prior})
+            refine(**grouped(**{"scan": MAP, "steps": 1, **options, "prior": prior}))
 
 
 def test_a_mask_is_at_the_probabilities_place() -> None:
@@ -321,18 +326,18 @@ def test_a_mask_is_at_the_probabilities_place() -> None:
     for unit, factor in (("mm", 1), ("um", 1e3), ("voxel", 1)):
         spacing = (1.2 * factor, 0.4 * factor, 0.5 * factor)
         there = np.diag([factor] * 3 + [1]) @ TURNED
-        learned = calibrate(chances, Volume(truth, spacing, unit, there), WILLMORE, steps=1)
+        learned = calibrate(chances, Volume(truth, spacing, unit, there), WILLMORE, working=Working(steps=1))
         assert learned.example is chances
         moved = there.copy()
         moved[0, 3] += 0.5 * factor
         with pytest.raises(ValueError, match="affine"):
-            calibrate(chances, Volume(truth, spacing, unit, moved), WILLMORE, steps=1)
+            calibrate(chances, Volume(truth, spacing, unit, moved), WILLMORE, working=Working(steps=1))
 
 
 def test_a_map_is_segmented_in_monai_s_chain() -> None:
     monai = pytest.importorskip("monai.transforms", reason="needs monai, of the group dev")
     logits = torch.from_numpy(np.log(np.stack((1 - MAP, MAP)) + 1e-6))
-    options = {"weight": 3.0, "steps": 5}
+    options = grouped(weight=3.0, steps=5)
     step = monai.Lambda(lambda p: torch.from_numpy(refine(p[1], WILLMORE, **options).mask.values)[None])
     mask = monai.Compose([monai.Activations(softmax=True), step])(logits)
     odds = segment(torch.logit(torch.softmax(logits, 0)[1]), WILLMORE, probabilities="logits", **options)

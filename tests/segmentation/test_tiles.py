@@ -19,11 +19,12 @@ from filelock import FileLock
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation import Segmentation, reconstruct, segment, tiles
 from curvafit.segmentation.evidence import subsample
-from curvafit.segmentation.flow import HALO, WorkingGrid
+from curvafit.segmentation.flow import HALO, Working, WorkingGrid
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.tiles import EDGE, OVERLAP, WHOLE, cut_tiles, surround
 from curvafit.volumes import ScanError, load, save
 from curvafit.volumes.volume import Volume
+from tests.options import grouped
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
@@ -101,7 +102,7 @@ def test_large_volumes_have_tiles() -> None:
     sizes = [np.prod(surround(tile, place, shape)[1].grid.shape) for tile in tiles]
     assert max(sizes) <= (EDGE + 2 * OVERLAP) ** 3
     with pytest.raises(ValueError, match="tile"):
-        reconstruct(beads(), every=8, tile=7)
+        reconstruct(beads(), every=8, working=Working(tile=7))
 
 
 def test_a_box_has_the_known_slices_of_the_whole() -> None:
@@ -127,11 +128,11 @@ def close(one, other) -> None:
 def test_the_tiles_do_not_show_between_slices(law: Coefficients) -> None:
     truth = beads()
     options = {"every": 8, "stiffness": 1e7, "steps": 50}
-    whole = reconstruct(truth, law, **options)
-    same = reconstruct(truth, law, tile=200, **options)
+    whole = reconstruct(truth, law, **grouped(**options))
+    same = reconstruct(truth, law, **grouped(tile=200, **options))
     assert np.array_equal(whole.phase.values, same.phase.values) and same.status == whole.status
     for tile in (26, 34):
-        found = reconstruct(truth, law, tile=tile, **options)
+        found = reconstruct(truth, law, **grouped(tile=tile, **options))
         assert np.array_equal(found.mask.values[::8], truth[::8])
         close(found, whole)
         assert found.status.split(":")[0] == whole.status.split(":")[0]
@@ -141,14 +142,14 @@ def test_the_tiles_do_not_show_between_slices(law: Coefficients) -> None:
 def test_the_tiles_do_not_show_along_another_axis_or_around() -> None:
     truth = np.moveaxis(beads(88), 0, 2)  # two turns of the swing
     options = {"every": 8, "stiffness": 1e7, "steps": 50, "axis": 2, "periodic": True}
-    whole, found = (reconstruct(truth, WILLMORE, tile=tile, **options) for tile in (None, 30))
+    whole, found = (reconstruct(truth, WILLMORE, **grouped(tile=tile, **options)) for tile in (None, 30))
     assert np.array_equal(found.mask.values[..., ::8], truth[..., ::8])
     close(found, whole)
 
 
 def test_the_tiles_do_not_show_in_a_scan() -> None:
     scan = grey(beads())
-    whole, found = (segment(scan, WILLMORE, weight=1.0, steps=50, tile=tile) for tile in (None, 34))
+    whole, found = (segment(scan, WILLMORE, weight=1.0, working=Working(steps=50, tile=tile)) for tile in (None, 34))
     close(found, whole)
     assert found.notes == whole.notes
 
@@ -157,7 +158,7 @@ def test_a_tile_of_background_alone_stays_empty() -> None:
     mask = np.zeros((120, 16, 16), dtype=bool)
     mask[4:20, 4:12, 4:12] = True
     likely = Volume(np.where(mask, 0.9, 0.1).astype(np.float32))
-    options = {"probabilities": True, "weight": 1.0, "steps": 50, "tile": 24}
+    options = grouped(probabilities=True, weight=1.0, steps=50, tile=24)
     result = segment(likely, WILLMORE, **options)
     assert result.mask.values[:20].any() and not result.mask.values[30:].any()
     for value in (0.1, 0.9):
@@ -173,7 +174,7 @@ def scan(shape: tuple[int, int, int] = (66, 12, 14)) -> np.ndarray:
 
 
 def found(source: Any, store: Path | None = None, **more: Any) -> Segmentation:
-    return segment(source, WILLMORE, **{"weight": 1.0, "steps": 5, "tile": 14, "store": store, **more})
+    return segment(source, WILLMORE, **grouped(**{"weight": 1.0, "steps": 5, "tile": 14, "store": store, **more}))
 
 
 def same(one: Segmentation, other: Segmentation) -> bool:
@@ -257,7 +258,7 @@ def test_the_same_command_goes_on_after_a_kill(tmp_path: Path, monkeypatch: pyte
 
 def test_known_slices_stay_exact_after_a_kill(tmp_path: Path) -> None:
     truth = scan() > 50
-    options = {"every": 6, "stiffness": 1e7, "steps": 5, "tile": 14, "store": tmp_path / "tiles"}
+    options = grouped(every=6, stiffness=1e7, steps=5, tile=14, store=tmp_path / "tiles")
     with pytest.raises(KeyboardInterrupt):
         reconstruct(truth, WILLMORE, progress=killed_after(2, tmp_path / "tiles"), **options)
     made = reconstruct(truth, WILLMORE, **options)
