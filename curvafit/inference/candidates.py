@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
+from os import PathLike
 from typing import Annotated
 
 import numpy as np
@@ -17,6 +18,7 @@ from curvafit.geometry.distances import one_to_many
 from curvafit.geometry.morphology import Morphometry, morphometry
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import Grid
+from curvafit.priors.law import LawLike, read_fit
 from curvafit.scan.measures import scan_diagram
 from curvafit.scan.preparation import Prepared, thinner_thickness
 
@@ -110,6 +112,24 @@ def seed_noise_of(candidates: Sequence[Candidate]) -> float | None:
     best = best_candidate(candidates)
     known = [each.seed_noise for each in candidates if each.seed_noise is not None]
     return best.seed_noise if best is not None and best.seed_noise is not None else next(iter(known), None)
+
+
+@dataclass(frozen=True)
+class _File:
+    """The candidates of a `fit.json`, whatever else the file holds."""
+
+    format: str
+    candidates: tuple[Candidate, ...] = ()
+
+
+def load_candidates(law: LawLike) -> tuple[Candidate, ...]:
+    """Return the candidates of a fit, an inference or a `fit.json`; none of any other law.
+
+    Of a file no other entries are read: it may lack them. Raises FileNotFoundError or ValueError as `Fit.load`.
+    """
+    if not isinstance(law, (str, PathLike)):
+        return getattr(getattr(law, "fit", law), "candidates", ())
+    return read_fit(law, _File).candidates
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,10 +19,17 @@ from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Misfit, join_tests, twin
 from curvafit.inference.combinations import Combination
 from curvafit.inference.emulator import best_parameters, misfits
-from curvafit.inference.fit import COLUMNS, to_columns
 from curvafit.inference.posterior import Posterior
 from curvafit.inference.simulate import Growth, Search, Simulate, simulate_draws
-from curvafit.inference.table import column_names, columns_of, law_of, mirror_parameters, parameters_of
+from curvafit.inference.table import (
+    COLUMNS,
+    column_names,
+    columns_of,
+    law_of,
+    mirror_parameters,
+    parameters_of,
+    to_columns,
+)  # fmt: skip
 from curvafit.priors.grid import Grid
 from curvafit.scan.measures import Reading, read_texture, windows_along
 from curvafit.scan.preparation import HALF, Prepared

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import os
 import re
-from dataclasses import dataclass, fields, make_dataclass
+from dataclasses import dataclass, fields, make_dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
 import numpy as np
 
@@ -22,14 +22,13 @@ from curvafit.geometry.morphology import Morphometry
 from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Deviations, Misfit, NotNegative
 from curvafit.inference.combinations import Combination
-from curvafit.priors.coefficients import NAMES, POWERS, Coefficients
+from curvafit.inference.table import COLUMNS, to_columns
+from curvafit.priors.coefficients import POWERS, Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.priors.law import FORMAT, Law, LawLike, Mass, Positive, parse_fit, preset_name, read_fit
 
 #: What a scan was taken for, in words.
 KINDS = {"field": "a phase field", "mask": "a mask", "image": "an image"}
-#: What is drawn, in the order of the columns; a20 = 1 is the gauge.
-COLUMNS = ("a11", "a02", "a10", "a01", "a00", "mass", "thickness")
 #: Levels of the intervals, in percent.
 LEVELS = (50, 90)
 
@@ -72,16 +71,16 @@ class Fit(Pictured):
         an atlas's map. Of masks and images a working unit is 100 voxels of which the structure is eight thick.
     """
 
-    kind: str
+    kind: Literal[*KINDS]  # type: ignore[valid-type]
     family: str
-    scale: tuple[float, float, float]
-    working_voxel: float
-    length_unit: str
-    thickness: float
+    scale: tuple[Positive, Positive, Positive]
+    working_voxel: Positive
+    length_unit: Literal["voxel", *METRES]  # type: ignore[valid-type]
+    thickness: Positive
     status: str
     morphometry: Morphometry
     notes: tuple[str, ...]
-    provenance: dict[str, Any]
+    provenance: Annotated[dict[str, Any], Rule(keys=(("scan", str | None),))]
     diagram: Diagram | None = None
     candidates: tuple[Candidate, ...] = ()
     chosen: str | None = None
@@ -89,7 +88,7 @@ class Fit(Pictured):
     view: str = ""
     combinations: tuple[Combination, ...] = ()
     misfit: Misfit | None = None
-    drift: float | None = None
+    drift: Annotated[float | None, Rule(least=0)] = None
     matches: tuple[Match, ...] = ()
 
     def __repr__(self) -> str:
@@ -142,40 +141,37 @@ class Fit(Pictured):
             return None
         parts, columns = {}, to_columns(self.draws)
         lengths = self.thickness / columns[-1] / WORKING_SPACING if physical else 1.0
-        powers = (*(POWERS[name] for name in NAMES[1:]), 0)
-        for name, power, column in zip(COLUMNS, powers, columns, strict=False):
-            values = column * lengths**-power
-            parts[name] = {"median": float(np.median(values))} | {
-                str(level): [float(x) for x in np.percentile(values, (50 - level / 2, 50 + level / 2))]
-                for level in LEVELS
-            }
+        for name, column in zip(COLUMNS[:-1], columns[:-1], strict=True):
+            values = column * lengths ** -(POWERS | {"mass": 0})[name]
+            parts[name] = {"median": float(np.median(values))}
+            parts[name] |= {str(n): np.percentile(values, (50 - n / 2, 50 + n / 2)).tolist() for n in LEVELS}
         return parts
 
     def to_law(self) -> Law:
         """Return the chosen law; raise ValueError if the fit has none."""
-        six, mass = self.coefficients, self.mass
-        if six is None or mass is None:
+        if self.best is None:
             raise ValueError(f"expected a fit with a law, got one without: {self.status}")
-        filled = self.morphometry.volume_fraction
         width = self.epsilon_physical * WORKING_SPACING / self.working_voxel
-        own = {"working_voxel": self.working_voxel, "length_unit": self.length_unit, "volume_fraction": filled}
-        return Law(six, mass, "prior", epsilon=width, status=self.status, **own)  # type: ignore[arg-type]
+        return replace(self._law(self.best.coefficients, self.best.mass, "prior", self.working_voxel), epsilon=width)
+
+    def _law(self, six: Coefficients, mass: float, origin: str, edge: float) -> Law:
+        """Return a law whose working voxel is `edge` long, with what is known of the scan."""
+        filled = self.morphometry.volume_fraction
+        own = {"length_unit": self.length_unit, "volume_fraction": filled, "status": self.status}
+        return Law(six, mass, origin, working_voxel=edge, **own)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers, strings, lists and dicts, as `fit.json` holds them."""
         own: dict[str, Any] = {"format": FORMAT, "posterior": None, "diagram": None}
         own |= {"intervals": self.intervals(), "intervals_physical": self.intervals(physical=True)}
         if self.draws is not None:
-            columns = ([float(f"{x:.6g}") for x in column] for column in to_columns(self.draws))
-            method = "amortised: conditional flows given the descriptors"
-            own["posterior"] = {"view": self.view, "method": method, "draws": dict(zip(COLUMNS, columns, strict=True))}
+            draws = _Draws(*([float(f"{x:.6g}") for x in column] for column in to_columns(self.draws)))
+            own["posterior"] = _Posterior(self.view, "amortised: conditional flows given the descriptors", draws)
         if (seen := self.diagram) is not None:
             (κ1, κ2), shares = seen.points.round(2).T.tolist(), seen.normalised.weights.round(7).tolist()
-            own["diagram"] = {"seen_as": "field" if self.kind == "field" else "mask", "unit": seen.unit}
-            own["diagram"] |= {"kappa1": κ1, "kappa2": κ2, "share": shares}
-            own["diagram"] |= {"spread": seen.spread, "excluded": seen.excluded}
-        names = (field.name for field in fields(_File))
-        return {name: encode(own[name] if name in own else getattr(self, name)) for name in names}
+            columns = {"kappa1": κ1, "kappa2": κ2, "share": shares, "spread": seen.spread, "excluded": seen.excluded}
+            own["diagram"] = _Columns(seen_as="field" if self.kind == "field" else "mask", unit=seen.unit, **columns)
+        return {name: encode(own[name] if name in own else getattr(self, name)) for name in ENTRIES}
 
     def to_json(self) -> str:
         """Return the text of a `fit.json`, indented; raise ValueError where `from_json` would not take it."""
@@ -202,28 +198,40 @@ class Fit(Pictured):
         return _fit_of(read_fit(path, _File))
 
 
-def to_columns(draws: np.ndarray) -> np.ndarray:
-    """Return draws of `table.TARGETS` `(n, 7)`, or of the parameters alone, as `COLUMNS`: without logarithms."""
-    columns = draws.T.copy()
-    for k in {1, 6} & set(range(len(columns))):
-        columns[k] = np.exp(columns[k])
-    return columns
+def draw_laws(law: LawLike, count: int) -> list[Law]:
+    """Return `count` laws of the posterior of a fit, an inference or a `fit.json`, evenly from among its draws.
+
+    Each has the voxel in which its shapes are as thick as the scan's structure, and the scan's volume fraction. Raises
+    ValueError where there are no draws, or fewer.
+    """
+    named = preset_name(law) is None and isinstance(law, (str, PathLike))
+    fit = Fit.load(law) if named else getattr(law, "fit", law)  # type: ignore[arg-type]
+    if not isinstance(fit, Fit) or fit.draws is None:
+        raise ValueError(f"expected a fit with draws of a posterior, got {quoted(law)}")
+    check_int(count, f"from 1 to {len(fit.draws)} draws", 1, len(fit.draws))
+    rows = np.linspace(0, len(fit.draws) - 1, count).round().astype(int).tolist()
+    source = f" of {os.fspath(law)}" if named else ""  # type: ignore[arg-type]
+    return [
+        fit._law(Coefficients(1.0, *five), mass, f"draw {row}{source}", fit.thickness / thickness)
+        for row, (*five, mass, thickness) in zip(rows, to_columns(fit.draws[rows]).T.tolist(), strict=True)
+    ]
 
 
 # ---- the file --------------------------------------------------------------------------------------------------------
 
+#: The entries of a `fit.json`, in order.
+ENTRIES = (
+    "format", "status", "kind", "family", "coefficients", "mass", "uncertainty", "chosen", "scale", "working_voxel",
+    "length_unit", "thickness", "coefficients_physical", "epsilon_physical", "intervals", "intervals_physical",
+    "combinations", "misfit", "drift", "candidates", "matches", "morphometry", "notes", "provenance", "posterior",
+    "diagram",
+)  # fmt: skip
+
 Column = Annotated[tuple[float, ...], Rule(filled=True)]
 
-_DrawColumns: Any = make_dataclass("_DrawColumns", [(name, Column) for name in COLUMNS], frozen=True)
-
-
-@dataclass(frozen=True)
-class _Posterior:
-    """Draws with what was read: a kind of view, and how."""
-
-    view: str
-    method: str
-    draws: _DrawColumns  # type: ignore[valid-type]
+# Draws by parameter; and with what was read, a kind of view, and how.
+_Draws: Any = make_dataclass("_Draws", [(name, Column) for name in COLUMNS])
+_Posterior: Any = make_dataclass("_Posterior", [("view", str), ("method", str), ("draws", _Draws)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,97 +247,32 @@ class _Columns:
     excluded: NotNegative = 0.0
 
 
-@dataclass(frozen=True)
-class _File:
-    """The content of a `fit.json`, entry by entry: a `Fit`, and what follows from it for other programs."""
-
-    format: Literal["curvafit-fit-3"]
-    status: str
-    kind: Literal["field", "mask", "image"]
-    family: str
-    coefficients: Coefficients | None
-    mass: Mass
-    uncertainty: Deviations
-    chosen: str | None
-    scale: tuple[Positive, Positive, Positive]
-    working_voxel: Positive
-    length_unit: Literal["voxel", *METRES]  # type: ignore[valid-type]
-    thickness: Positive
-    coefficients_physical: Coefficients | None
-    epsilon_physical: Positive
-    intervals: dict[str, Any] | None
-    intervals_physical: dict[str, Any] | None
-    combinations: tuple[Combination, ...]
-    misfit: Misfit | None
-    drift: Annotated[float | None, Rule(least=0)]
-    candidates: tuple[Candidate, ...]
-    matches: tuple[Match, ...]
-    morphometry: Morphometry
-    notes: tuple[str, ...]
-    provenance: Annotated[dict[str, Any], Rule(keys=(("scan", str | None),))]
-    posterior: _Posterior | None
-    diagram: _Columns | None
+# Entries that are no fields of a `Fit` follow from its fields, for other programs, or hold its arrays.
+_HINTS = get_type_hints(Fit, include_extras=True) | {
+    "format": str, "coefficients": Coefficients | None, "mass": Mass, "uncertainty": Deviations,
+    "coefficients_physical": Coefficients | None, "epsilon_physical": Positive, "intervals": dict[str, Any] | None,
+    "intervals_physical": dict[str, Any] | None, "posterior": _Posterior | None, "diagram": _Columns | None,
+}  # fmt: skip
+_File: Any = make_dataclass("_File", [(name, _HINTS[name]) for name in ENTRIES])
 
 
-@dataclass(frozen=True)
-class _Candidates:
-    """The candidates of a `fit.json`, whatever else the file holds."""
-
-    format: Literal["curvafit-fit-3"]
-    candidates: tuple[Candidate, ...] = ()
-
-
-def load_candidates(law: LawLike) -> tuple[Candidate, ...]:
-    """Return the candidates of a fit, an inference or a `fit.json`; none of any other law.
-
-    Of a file no other entries are read: it may lack them. Raises FileNotFoundError or ValueError as `Fit.load`.
-    """
-    if not isinstance(law, (str, PathLike)):
-        return getattr(getattr(law, "fit", law), "candidates", ())
-    return read_fit(law, _Candidates).candidates
-
-
-def draw_laws(law: LawLike, count: int) -> list[Law]:
-    """Return `count` laws of the posterior of a fit, an inference or a `fit.json`, evenly from among its draws.
-
-    Each has the voxel in which its shapes are as thick as the scan's structure, and the scan's volume fraction. Raises
-    ValueError where there are no draws, or fewer.
-    """
-    named = preset_name(law) is None and isinstance(law, (str, PathLike))
-    fit = Fit.load(law) if named else getattr(law, "fit", law)  # type: ignore[arg-type]
-    if not isinstance(fit, Fit) or fit.draws is None:
-        raise ValueError(f"expected a fit with draws of a posterior, got {quoted(law)}")
-    check_int(count, f"from 1 to {len(fit.draws)} draws", 1, len(fit.draws))
-    rows = np.linspace(0, len(fit.draws) - 1, count).round().astype(int)
-    filled = fit.morphometry.volume_fraction
-    own = {"length_unit": fit.length_unit, "volume_fraction": filled, "status": fit.status}
-    source, laws = f" of {os.fspath(law)}" if named else "", []  # type: ignore[arg-type]
-    for row, (*five, mass, thickness) in zip(rows, to_columns(fit.draws[rows]).T.tolist(), strict=True):
-        edge, origin = fit.thickness / thickness, f"draw {row}{source}"
-        laws.append(Law(Coefficients(1.0, *five), mass, origin, working_voxel=edge, **own))  # type: ignore[arg-type]
-    return laws
-
-
-def _fit_of(file: _File) -> Fit:
-    draws, view, seen = None, "", file.diagram
+def _fit_of(file: Any) -> Fit:
+    read = {field.name: getattr(file, field.name) for field in fields(Fit) if field.name in ENTRIES}
     if file.posterior is not None:
-        columns, view = [getattr(file.posterior.draws, name) for name in COLUMNS], file.posterior.view
-        _check_lengths(columns, "draws", "posterior")
-        draws = np.array(columns, dtype=np.float64).T
+        draws = _stack([getattr(file.posterior.draws, name) for name in COLUMNS], "draws", "posterior")
         draws[:, [1, 6]] = np.log(draws[:, [1, 6]])
-    if seen is not None:
-        _check_lengths([seen.kappa1, seen.kappa2, seen.share], "kappa1, kappa2 and share", "diagram")
-        points = np.stack([seen.kappa1, seen.kappa2], 1)
-        seen = Diagram(points, np.array(seen.share), seen.unit, seen.spread, seen.excluded)
-    read = {"draws": draws, "view": view, "diagram": seen}
-    same = {field.name for field in fields(Fit)} - set(read)
-    fit = Fit(**{name: getattr(file, name) for name in same}, **read)
+        read |= {"draws": draws, "view": file.posterior.view}
+    if (seen := file.diagram) is not None:
+        rows = _stack([seen.kappa1, seen.kappa2, seen.share], "kappa1, kappa2 and share", "diagram")
+        read["diagram"] = Diagram(rows[:, :2], rows[:, 2], seen.unit, seen.spread, seen.excluded)
+    fit = Fit(**read)
     if (fit.chosen is None) != (fit.best is None):
         raise ValueError(f"expected a chosen law among the fit's candidates, got {fit.chosen!r}")
     return fit
 
 
-def _check_lengths(columns: list[tuple[float, ...]], names: str, place: str) -> None:
+def _stack(columns: list[tuple[float, ...]], names: str, place: str) -> np.ndarray:
     if len({len(column) for column in columns}) > 1:
         lengths = ", ".join(str(len(column)) for column in columns)
         raise ValueError(f"expected {names} of one length in a fit's {place}, got {lengths}")
+    return np.stack(columns, 1, dtype=np.float64)

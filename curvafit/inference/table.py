@@ -27,6 +27,8 @@ TABLE_FILE = Format("curvafit descriptors", 2, "a table of descriptors", _REMEDY
 #: own voxels, which says how long those are on a scan.
 PARAMETERS = ("a11", "log a02", "a10", "a01", "a00", "m0")
 TARGETS = (*PARAMETERS, "log thickness")
+#: The same without logarithms, as columns of draws.
+COLUMNS = ("a11", "a02", "a10", "a01", "a00", "mass", "thickness")
 #: Voxels that a mask's scanner puts into a thickness, and its least and greatest voxel, in voxels of the field.
 SAMPLED, SCALES = (4.0, 16.0), (0.5, 2.0)
 #: A degraded scan: deviation of the blur in voxels, contrast over the noise's deviation, and voxels a slice is thick.
@@ -131,6 +133,14 @@ def law_of(parameters: Sequence[float] | np.ndarray) -> tuple[Coefficients, floa
     """Return the law and the mass of six parameters."""
     a11, log_a02, a10, a01, a00, mass = map(float, parameters)
     return Coefficients(1.0, a11, float(np.exp(log_a02)), a10, a01, a00), mass
+
+
+def to_columns(draws: np.ndarray) -> np.ndarray:
+    """Return draws of `TARGETS` `(n, 7)`, or of the parameters alone, as `COLUMNS`: without logarithms."""
+    columns = draws.T.copy()
+    for k in {1, 6} & set(range(len(columns))):
+        columns[k] = np.exp(columns[k])
+    return columns
 
 
 def mirror_parameters(parameters: np.ndarray) -> np.ndarray:

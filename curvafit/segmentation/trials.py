@@ -14,7 +14,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from curvafit.core.units import METRES
-from curvafit.inference.fit import load_candidates
+from curvafit.inference.candidates import load_candidates
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import Law, LawLike
 from curvafit.scan.grids import box_with_most_surface

@@ -10,7 +10,7 @@ from calling import call, done, refused
 from exact_store import exact_store
 from found import made_fit
 
-from curvafit.inference.fit import to_columns
+from curvafit.inference.table import to_columns
 from curvafit.priors.law import FORMAT
 from curvafit.volumes.read import load
 from curvafit.volumes.volume import Volume

@@ -16,7 +16,8 @@ from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE, Diagram
 from curvafit.geometry.morphology import Morphometry
 from curvafit.inference.candidates import Candidate, Misfit, Twin, best_candidate, seed_noise_of
 from curvafit.inference.estimate import middle_of
-from curvafit.inference.fit import COLUMNS, Fit, to_columns
+from curvafit.inference.fit import Fit
+from curvafit.inference.table import COLUMNS, to_columns
 from curvafit.inference.verdict import UNBELIEVABLE, find_differences, verdict
 from curvafit.priors import Law
 from curvafit.priors.coefficients import Coefficients
