@@ -21,7 +21,7 @@ from curvafit.generation.schedule import LEARNED, SCHEDULES
 from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE, Diagram, family_of
 from curvafit.geometry.morphology import Morphometry, morphometry
 from curvafit.inference.atlas import VERSION, Atlas, Match, load_atlas, mirror_match, nearest
-from curvafit.inference.candidates import TITLES, Candidate, Misfit, Twin, best_candidate, twin
+from curvafit.inference.candidates import TITLES, Candidate, Misfit, Twin, best_candidate, twin, verdict
 from curvafit.inference.estimate import (
     Described,
     Estimate,
@@ -34,7 +34,6 @@ from curvafit.inference.fit import KINDS, Fit
 from curvafit.inference.posterior import Posterior, load_posterior
 from curvafit.inference.simulate import Growth
 from curvafit.inference.stationary import drift, stationarity
-from curvafit.inference.verdict import verdict
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import Law
 from curvafit.priors.profile import phase_field

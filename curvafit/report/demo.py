@@ -21,8 +21,8 @@ from curvafit.generation.flow import generate
 from curvafit.generation.schedule import LEARNED
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.inference.atlas import Atlas, load_atlas
+from curvafit.inference.candidates import UNBELIEVABLE
 from curvafit.inference.inference import Inference, infer
-from curvafit.inference.verdict import UNBELIEVABLE
 from curvafit.report import page
 from curvafit.report.atlas import map_on
 from curvafit.scan.measures import Measures

@@ -14,11 +14,19 @@ from curvafit.core.records import quoted
 from curvafit.core.schema import decode, encode
 from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE, Diagram
 from curvafit.geometry.morphology import Morphometry
-from curvafit.inference.candidates import Candidate, Misfit, Twin, best_candidate, seed_noise_of
+from curvafit.inference.candidates import (
+    UNBELIEVABLE,
+    Candidate,
+    Misfit,
+    Twin,
+    best_candidate,
+    find_differences,
+    seed_noise_of,
+    verdict,
+)
 from curvafit.inference.estimate import middle_of
 from curvafit.inference.fit import Fit
 from curvafit.inference.table import COLUMNS, to_columns
-from curvafit.inference.verdict import UNBELIEVABLE, find_differences, verdict
 from curvafit.priors import Law
 from curvafit.priors.coefficients import Coefficients
 
