@@ -12,9 +12,9 @@ from curvafit.geometry.diagrams import Diagram, diagram
 from curvafit.geometry.morphology import Morphometry
 from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Misfit, Twin
-from curvafit.inference.combinations import Combination
 from curvafit.inference.fit import Fit
 from curvafit.inference.inference import Inference
+from curvafit.inference.posterior import Combination
 from curvafit.priors import Coefficients, Grid, preset
 from curvafit.scan.preparation import Prepared
 from curvafit.volumes.volume import Volume

@@ -17,9 +17,8 @@ from curvafit.generation.schedule import LEARNED, Schedule
 from curvafit.geometry.description import BLOCKS
 from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Misfit, join_tests, twin
-from curvafit.inference.combinations import Combination
 from curvafit.inference.emulator import best_parameters, misfits
-from curvafit.inference.posterior import Posterior
+from curvafit.inference.posterior import Combination, Posterior
 from curvafit.inference.simulate import Growth, Search, Simulate, simulate_draws
 from curvafit.inference.table import (
     COLUMNS,

@@ -21,7 +21,7 @@ from curvafit.geometry.diagrams import Diagram
 from curvafit.geometry.morphology import Morphometry
 from curvafit.inference.atlas import Match
 from curvafit.inference.candidates import Candidate, Deviations, Misfit, NotNegative
-from curvafit.inference.combinations import Combination
+from curvafit.inference.posterior import Combination
 from curvafit.inference.table import COLUMNS, to_columns
 from curvafit.priors.coefficients import POWERS, Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING

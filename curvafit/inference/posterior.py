@@ -1,10 +1,14 @@
-"""What the descriptors of a texture say about its parameters: an ensemble of conditional normalising flows."""
+"""What the descriptors of a texture say about its parameters: an ensemble of conditional normalising flows.
+
+Sums of parameters that a texture tells well are its combinations: the best known come first, in words for what they do
+to shapes.
+"""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -14,8 +18,9 @@ from curvafit.core.checks import check_float, check_int, quoted
 from curvafit.core.extras import require
 from curvafit.core.files import open_packaged
 from curvafit.core.records import Format
+from curvafit.core.schema import Rule
+from curvafit.core.units import format_number
 from curvafit.geometry.description import BLOCKS
-from curvafit.inference.combinations import Combinations
 from curvafit.inference.emulator import Emulator, Layer
 from curvafit.inference.table import PARAMETERS, TARGETS, Compression, column_names, encode_seen
 from curvafit.scan.measures import Reading
@@ -27,6 +32,8 @@ WIDEST, MOST = 2048, 64
 MASS = PARAMETERS.index("m0")
 #: Part by which the box of the parameters is wider, on each side, than what was drawn.
 RIM = 0.02
+#: A combination is known where its draws have at most the other part of its variance among laws.
+KNOWN = 0.5
 
 
 @dataclass(frozen=True)
@@ -178,6 +185,67 @@ class Posterior:
         """Return the least parameters of the box, widened by its rim, and its lengths."""
         low, high = self.box.T
         return low - RIM * (high - low), (1 + 2 * RIM) * (high - low)
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A sum of parameters, in deviations among laws, and what a scan tells of it.
+
+    Attributes
+    ----------
+    low, high
+        What shapes look like at its ends, in words; empty where it hardly changes how they look.
+    weights
+        What is added for each parameter's distance from the laws' mean, by name (`table.PARAMETERS`).
+    median, interval
+        Median, and central 90 % interval, of the posterior's draws.
+    known
+        Part of its variance among laws that the scan takes away.
+    """
+
+    low: str
+    high: str
+    weights: dict[str, float]
+    median: float
+    interval: tuple[float, float]
+    known: Annotated[float, Rule(least=0, most=1)]
+
+    def __str__(self) -> str:
+        low, high = (format_number(end, 2) for end in self.interval)
+        value = format_number(self.median, 2) if self.known >= KNOWN else "not known"
+        if not self.low:
+            return f"A sum that hardly changes how shapes look: {value} ({low} to {high})."
+        return f"From {self.low} (-2) to {self.high} (+2): {value} ({low} to {high})."
+
+
+@dataclass(frozen=True, eq=False)
+class Combinations:
+    """Six sums of the parameters, uncorrelated among laws.
+
+    `weights` `(6, 6)` has a row for each, `centre` `(6,)` the laws' mean; a sum's deviation among laws is 1. `ends` has
+    the words for its low and its high end, empty where it hardly changes how shapes look.
+    """
+
+    weights: np.ndarray
+    centre: np.ndarray
+    ends: tuple[tuple[str, str], ...]
+
+    def __call__(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the sums `(…, 6)` of parameters `(…, 6)`."""
+        return (parameters - self.centre) @ self.weights.T
+
+    def read(self, draws: np.ndarray, *, background: bool = False) -> tuple[Combination, ...]:
+        """Return what draws `(n, 6)` tell of each, the best known first; of the background's shapes where that is what
+        was described."""
+        sums, of = self(draws), " (the background)" if background else ""
+        ranges = np.quantile(sums, (0.05, 0.5, 0.95), axis=0).T
+        read = [
+            Combination(low and low + of, high and high + of, dict(zip(PARAMETERS, map(float, weights), strict=True)),
+                        float(middle), (float(least), float(most)), float(np.clip(1 - column.var(), 0, 1)))
+            for (low, high), weights, (least, middle, most), column in zip(
+                self.ends, self.weights, ranges, sums.T, strict=True)
+        ]  # fmt: skip
+        return tuple(sorted(read, key=lambda combination: -combination.known))
 
 
 def save_posterior(posterior: Posterior, path: str | Path) -> None:

@@ -1,4 +1,4 @@
-"""Train a posterior, with the emulator that it holds, on a table of descriptors."""
+"""Train a posterior, with the emulator and the combinations that it holds, on a table of descriptors."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
+from scipy import linalg
 from torch import Tensor, nn
 
 from curvafit.core.checks import check_int, check_seed
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.inference.combinations import Combinations, find_combinations
 from curvafit.inference.emulator import FAINTEST, Emulator, Layer, misfits
-from curvafit.inference.posterior import MASS, MOST, Architecture, Member, Posterior
-from curvafit.inference.table import PARAMETERS, TARGETS, Compression, Table, compression_of
+from curvafit.inference.posterior import MASS, MOST, Architecture, Combinations, Member, Posterior
+from curvafit.inference.table import LEAST, PARAMETERS, TARGETS, Compression, Table, column_names, compression_of
 
 #: Part of the shapes, of all of whose views a member learns nothing: they tell when it has learnt enough.
 VALIDATION = 0.1
@@ -37,6 +37,18 @@ REFERENCE = 400
 BATCH, PACE = (64, 512), 100
 #: Draws of a flow whose mean is compared with the truth.
 DRAWS = 200
+#: What tells shapes apart, with the words for little and for much of it, and how many of them describe an end.
+LOOKS = {
+    "filled": ("sparse", "full"),
+    "roundness": ("flat", "round"),
+    "bend": ("hollow", "bulging"),
+    "bodies": ("joined by tunnels", "in separate bodies"),
+    "thickness": ("even in thickness", "uneven in thickness"),
+    "gaps": ("even in spacing", "uneven in spacing"),
+}
+NAMED = 2
+#: An end is described by no look whose correlation with the combination is less.
+FAINT = 0.18
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -305,3 +317,44 @@ def learn(
             break
     network.load_state_dict(state)
     return network.eval()
+
+
+# ---- combinations ----------------------------------------------------------------------------------------------------
+
+
+def find_combinations(errors: np.ndarray, parameters: np.ndarray, descriptors: np.ndarray) -> Combinations:
+    """Return the combinations whose mean square error, against their variance among laws, is least, then next.
+
+    `errors` `(N, 6)` are what a posterior's means miss of laws that it has not learnt, `parameters` `(N, 6)` theirs,
+    and `descriptors` `(N, 351)` those of their shapes.
+    """
+    centre = parameters.mean(0)
+    deviations = parameters - centre
+    weights = linalg.eigh(errors.T @ errors / len(errors), deviations.T @ deviations / len(deviations))[1].T
+    scores, looks = deviations @ weights.T, np.array(list(LOOKS.values()), dtype=object)
+    shown = _look(descriptors)
+    correlations = scores.T @ ((shown - shown.mean(0)) / np.maximum(shown.std(0), 1e-9)) / len(scores)
+    signs = np.sign(np.take_along_axis(correlations, np.abs(correlations).argmax(1)[:, None], 1))
+    ends = []
+    for row in signs * correlations:
+        chosen = [k for k in np.argsort(-np.abs(row))[:NAMED] if np.abs(row[k]) >= FAINT]
+        ends.append(tuple(", ".join(looks[k, int((row[k] > 0) == high)] for k in chosen) for high in (False, True)))
+    return Combinations(signs * weights, centre, tuple(ends))
+
+
+def _look(descriptors: np.ndarray) -> np.ndarray:
+    """Return the numbers `(N, 6)` of `LOOKS` of descriptors `(N, 351)`."""
+    names = np.array(column_names())
+    fraction, (area, bend, euler), depths, gaps = (
+        np.maximum(descriptors[:, names == name].T, LEAST if name != "densities" else -np.inf)
+        for name in ("fraction", "densities", "depths", "clearances")
+    )
+
+    def spread(lengths: np.ndarray) -> np.ndarray:
+        return np.log(lengths[8] / lengths[5])
+
+    area = np.maximum(area, LEAST)
+    return np.column_stack([
+        np.log(fraction[0]), np.log(area / fraction[0]), np.arcsinh(bend / area / 10), np.arcsinh(euler / area),
+        spread(depths), spread(gaps),
+    ])  # fmt: skip

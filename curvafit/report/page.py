@@ -47,9 +47,9 @@ from curvafit.drawing.plot import (
 )
 from curvafit.geometry.diagrams import Diagram
 from curvafit.inference.candidates import TITLES, UNBELIEVED, UNDECIDED, Candidate, seed_noise_of
-from curvafit.inference.combinations import KNOWN
 from curvafit.inference.fit import Fit
 from curvafit.inference.inference import Inference
+from curvafit.inference.posterior import KNOWN
 from curvafit.inference.table import parameters_of
 from curvafit.priors.law import FORMAT
 from curvafit.studies.tables import format_csv

@@ -15,13 +15,12 @@ from curvafit.generation.schedule import LEARNED
 from curvafit.geometry.description import BLOCKS
 from curvafit.inference import estimate
 from curvafit.inference.candidates import Candidate, Misfit, Twin
-from curvafit.inference.combinations import Combinations, find_combinations
 from curvafit.inference.emulator import best_parameters, misfits
 from curvafit.inference.estimate import STARTS, compare_windows, probability_alike, tail_probability
-from curvafit.inference.posterior import Posterior
+from curvafit.inference.posterior import Combinations, Posterior
 from curvafit.inference.simulate import BATCH, LAST, ROUNDS, Process, Search, Simulate, Simulations, simulate_draws
 from curvafit.inference.table import PARAMETERS, Table, column_names
-from curvafit.inference.training import PLANS, train_emulator
+from curvafit.inference.training import PLANS, find_combinations, train_emulator
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.scan.measures import Reading, windows_along
