@@ -23,7 +23,7 @@ import lazy_loader
 
 __version__ = "0.1.0"
 
-#: The function that draws each type with a picture, as `module:function`; see `curvafit.core.pictures`.
+#: The function that draws each type with a picture, as `module:function`; see `curvafit.core.runtime`.
 _FIGURES = {
     "Comparison": "curvafit.drawing.groups:comparison_figure",
     "Diagram": "curvafit.drawing.plot:diagram_figure",

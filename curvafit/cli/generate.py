@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from curvafit.priors.grid import Grid
     from curvafit.priors.law import Law
 
-    #: Parameters that vary in space, by name; see `volumes.parameter_maps`.
+    #: Parameters that vary in space, by name; see `volumes.read_maps`.
     Maps3D = dict[str, float | Tensor]
 
 #: Number of voxels along an edge by default.
@@ -82,7 +82,7 @@ def generate(
     from curvafit.generation.schedule import schedule as named
     from curvafit.priors.energies import orientation as orient
     from curvafit.priors.grid import Grid
-    from curvafit.volumes.parameter_maps import map_shape, read_maps
+    from curvafit.volumes.read import map_shape, read_maps
 
     box = None if shape is None else parse_whole_triple(shape, "--shape")
     volumes = {} if maps is None else read_maps(maps, box)

@@ -137,7 +137,7 @@ def parse_reading(
 
         parse_unit(unit)
     if crop is not None:
-        from curvafit.volumes.boxes import parse_box
+        from curvafit.volumes.volume import parse_box
 
         parse_box(crop)
     return {

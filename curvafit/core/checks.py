@@ -1,4 +1,4 @@
-"""Checks of arguments (numbers within bounds, names, sequences), and short quotes of values for messages."""
+"""Checks of arguments (numbers within bounds, names, sequences) and of packages, and short quotes for messages."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import operator
 import re
 import reprlib
 from collections.abc import Iterable
+from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 #: Seeds are below this: what a signed 64-bit number holds.
@@ -103,3 +105,28 @@ def _bound_words(number: float | None, least: float, most: float) -> str:
     if number is None or not -math.inf < number < math.inf or (number <= most and not 0 < number < least):
         return ""
     return f", at most {most:g}" if number > most else f", at least {least:g}"
+
+
+# ---- packages that only some uses need, and links that are no packages -----------------------------------------------
+
+
+def require(module: str, extra: str, purpose: str) -> ModuleType:
+    """Import an optional module, or raise ImportError with the command that installs the `extra` that has it.
+
+    `purpose` is what needs the module, for the message: `"reading NRRD files"`. A module that no extra has, `""`, is
+    installed by its own name.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        if error.name is None or not module.startswith(error.name.partition(".")[0]):
+            raise  # the module is there, and what it imports itself is not
+        install = f'pip install "curvafit[{extra}]"' if extra else f"pip install {module}"
+        raise ImportError(f"{purpose} needs {error.name}, which is not installed: {install}", name=error.name) from None
+
+
+def refuse_link(package: str) -> None:
+    """Raise ImportError for `import priors` where the project's root has a link of that name into the package."""
+    if not package.startswith("curvafit"):
+        here = "the folder at the project's root is a link into the package"
+        raise ImportError(f"import curvafit.{package}, not {package}: {here}")

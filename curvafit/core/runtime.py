@@ -1,4 +1,4 @@
-"""The program that runs: its progress, its messages on one line, the machine's memory, and the signals that end it.
+"""The program that runs: its progress, messages, pictures, memory, and the signals that end it.
 
 Ctrl-C, SIGTERM and a closed terminal become exceptions, which clean up on their way and wait while files change. The
 program listens from its first line (`listen`); the library changes no signal's handler.
@@ -6,6 +6,7 @@ program listens from its first line (`listen`); the library changes no signal's 
 
 from __future__ import annotations
 
+import io
 import logging
 import math
 import os
@@ -15,9 +16,13 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # ---- progress and messages -------------------------------------------------------------------------------------------
 
@@ -58,6 +63,45 @@ def one_line(text: str) -> str:
     """Return a text on one line; characters that do not show, such as a line break in a name, are escaped."""
     plain = text.replace("\u00a0", " ").replace("\u202f", " ")
     return "".join(sign if sign.isprintable() else sign.encode("unicode_escape").decode() for sign in plain)
+
+
+# ---- pictures --------------------------------------------------------------------------------------------------------
+
+#: Pixels along the width of a picture in a notebook's cell.
+SMALL = 320
+
+
+class Pictured:
+    """A result with a picture: `.plot()` returns a figure, and a notebook shows a small one.
+
+    Functions in rooms above the result's draw it: `_FIGURES` in `curvafit/__init__.py` names that of each type. The
+    first picture imports it, so that the rooms below import neither matplotlib nor the room that draws.
+    """
+
+    def plot(self, **options: Any) -> Figure:
+        """Return a matplotlib `Figure`; the options are those of the function that draws this type.
+
+        Raises ValueError if there is nothing to draw: no surface, or a field that is not finite.
+        """
+        figures = sys.modules[__name__.partition(".")[0]]._FIGURES
+        place = next(figures[each.__name__] for each in type(self).__mro__ if each.__name__ in figures)
+        module, _, function = place.partition(":")
+        return getattr(import_module(module), function)(self, **options)
+
+    def _repr_html_(self) -> str:
+        """Return one line and, where there is something to draw, a small picture."""
+        import base64
+        from html import escape
+
+        line = f"<code>{escape(repr(self))}</code>"
+        try:
+            figure = self.plot()
+        except ValueError:
+            return line
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=2 * SMALL / figure.get_figwidth())
+        content = base64.b64encode(buffer.getvalue()).decode("ascii")
+        return f'{line}<br><img src="data:image/png;base64,{content}" width="{SMALL}" alt="">'
 
 
 # ---- forks -----------------------------------------------------------------------------------------------------------

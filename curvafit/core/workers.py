@@ -8,8 +8,7 @@ from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from curvafit.core.checks import check_int
-from curvafit.core.extras import require
+from curvafit.core.checks import check_int, require
 
 if TYPE_CHECKING:
     from distributed import Client

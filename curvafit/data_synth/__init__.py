@@ -2,7 +2,7 @@
 
 import lazy_loader
 
-from curvafit.core.extras import refuse_link
+from curvafit.core.checks import refuse_link
 
 refuse_link(__name__)
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -16,7 +16,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 from skimage.morphology import skeletonize
 
-from curvafit.core.extras import require
+from curvafit.core.checks import require
 from curvafit.core.files import write_atomically
 from curvafit.geometry.topology import betti_numbers
 from curvafit.priors.grid import Grid

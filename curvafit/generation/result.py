@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.core.pictures import Pictured
+from curvafit.core.runtime import Pictured
 from curvafit.core.units import format_sampling
 from curvafit.generation.schedule import Schedule
 from curvafit.priors.coefficients import Coefficients

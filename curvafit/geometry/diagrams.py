@@ -13,7 +13,7 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from curvafit.core.checks import LONGEST, SHORTEST, check_choice, check_float, check_type
-from curvafit.core.pictures import Pictured
+from curvafit.core.runtime import Pictured
 from curvafit.geometry.mesh import NoSurface, Surface, areas, surface
 from curvafit.priors.curvature import diffuse_curvatures, geometric_curvatures, jet
 from curvafit.priors.grid import Grid

@@ -14,7 +14,7 @@ import numpy as np
 
 from curvafit.core.checks import check_int, quoted
 from curvafit.core.files import write_content
-from curvafit.core.pictures import Pictured
+from curvafit.core.runtime import Pictured
 from curvafit.core.schema import Rule, decode, encode
 from curvafit.core.units import METRES
 from curvafit.geometry.diagrams import Diagram

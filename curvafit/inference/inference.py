@@ -14,8 +14,7 @@ import numpy as np
 import torch
 
 from curvafit.core.checks import SEEDS, check_choice, check_int, check_type
-from curvafit.core.pictures import Pictured
-from curvafit.core.runtime import Progress, log_stages, sub_progress
+from curvafit.core.runtime import Pictured, Progress, log_stages, sub_progress
 from curvafit.core.units import format_number
 from curvafit.generation.schedule import LEARNED, SCHEDULES
 from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE, Diagram, family_of
@@ -42,7 +41,7 @@ from curvafit.scan.preparation import HALF, NOISE, Prepared, coarser_level, prep
 from curvafit.scan.quality import sample_mask
 from curvafit.scan.structure import check_options, is_rounded, read_region
 from curvafit.volumes.read import Source
-from curvafit.volumes.volume import Volume
+from curvafit.volumes.volume import Crop, Volume
 
 #: Number of nearest shapes, and of those from which stationarity starts.
 MATCHES, STARTS = 5, 3

@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from curvafit.core.checks import check_float, check_int, quoted
-from curvafit.core.extras import require
+from curvafit.core.checks import check_float, check_int, quoted, require
 from curvafit.core.files import open_packaged
 from curvafit.core.records import Format
 from curvafit.core.schema import Rule

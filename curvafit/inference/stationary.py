@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.core.extras import require
+from curvafit.core.checks import require
 from curvafit.core.runtime import Progress, silent
 from curvafit.generation.flow import WORKING_BLUR, descend
 from curvafit.generation.schedule import Schedule

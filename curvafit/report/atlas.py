@@ -26,7 +26,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.signal import resample
 from scipy.spatial.distance import cdist
 
-from curvafit.core.extras import require
+from curvafit.core.checks import require
 from curvafit.core.files import write_content
 from curvafit.core.records import can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress

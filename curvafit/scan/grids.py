@@ -10,12 +10,12 @@ import numpy as np
 from numba import njit
 from scipy import ndimage
 
-from curvafit.geometry.distance_transform import square_face_distances
+from curvafit.geometry.balls import square_face_distances
 from curvafit.geometry.morphology import local_thickness
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.kernels.cpu import gaussian_blur
 from curvafit.priors.profile import PULL, PULL_WIDTH, STAIRS, SWEEPS
-from curvafit.volumes.boxes import Box
+from curvafit.volumes.volume import Box
 
 #: Median thickness is measured in a box of at most this many voxels a side.
 MEASURED = 160

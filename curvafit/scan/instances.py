@@ -19,10 +19,9 @@ from curvafit.priors.grid import WORKING_SPACING
 from curvafit.scan import measures as whole
 from curvafit.scan.preparation import prepare
 from curvafit.scan.structure import count_alike, judge_labels, whole_labels
-from curvafit.volumes.boxes import Box, cut_boxes, grow
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.run import Record, Run
-from curvafit.volumes.volume import ScanError, Volume, round_labels
+from curvafit.volumes.volume import Box, ScanError, Volume, cut_boxes, grow, round_labels
 
 #: Symbols of the numbers that need a volume around a structure: a body has none.
 _OF_TEXTURES = ("BV/TV", "Tb.Sp", "Tb.N", "Conn.D", "BS/TV")

@@ -15,9 +15,8 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from scipy import ndimage, stats
 
-from curvafit.core.extras import require
-from curvafit.core.pictures import Pictured
-from curvafit.core.runtime import Progress, silent
+from curvafit.core.checks import require
+from curvafit.core.runtime import Pictured, Progress, silent
 from curvafit.core.units import convert_length, format_number, plain_unit, power_name
 from curvafit.geometry.description import descriptors
 from curvafit.geometry.diagrams import FAMILIES, MARGIN, Diagram, diagram, families
@@ -36,8 +35,7 @@ from curvafit.scan.preparation import (
     smallest_piece,
 )
 from curvafit.scan.structure import Kind, find_structure, is_rounded
-from curvafit.volumes.boxes import cut_boxes
-from curvafit.volumes.volume import ScanError, Volume
+from curvafit.volumes.volume import ScanError, Volume, cut_boxes
 
 #: Columns of a table of measures; a CSV file begins with them.
 COLUMNS = ("scan", "quantity", "symbol", "value", "low", "high", "unit", "direction", "version")

@@ -17,9 +17,8 @@ from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
 from curvafit.scan import grids, structure
 from curvafit.scan.quality import Quality, measure_quality, sample_mask
 from curvafit.scan.structure import Kind
-from curvafit.volumes.boxes import Box, Crop
 from curvafit.volumes.read import Source, levels_of, load
-from curvafit.volumes.volume import ScanError, Volume
+from curvafit.volumes.volume import Box, Crop, ScanError, Volume
 
 #: Median thickness in voxels that a scan is resampled to; those of isotropic scans whose grid is kept: where a shape is
 #: measured, and where a law is read.
@@ -230,7 +229,7 @@ def prepare(
     dark
         The structure is the dark phase (of a mask: its lower value; of a field: where it is negative).
     roi
-        Nonzero where the scan counts (array, field or file): see `volumes.place.lay`.
+        Nonzero where the scan counts (array, field or file): see `volumes.volume.lay`.
     one_scale
         Keep no grid but a phase field's: laws are read where structures are of one thickness in voxels.
     quality

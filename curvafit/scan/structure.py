@@ -19,11 +19,9 @@ from scipy import ndimage
 from skimage.filters import threshold_otsu
 
 from curvafit.core.checks import SEEDS, check_choice, check_float, check_int
-from curvafit.volumes.boxes import Box, Crop, cut_boxes, grow, within
-from curvafit.volumes.place import lay
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.run import Record, Run
-from curvafit.volumes.volume import ScanError, Volume, round_labels
+from curvafit.volumes.volume import Box, Crop, ScanError, Volume, cut_boxes, grow, lay, round_labels, within
 
 #: What a scan is; `auto` until it is found.
 Kind = Literal["auto", "field", "mask", "image"]

@@ -30,9 +30,8 @@ from curvafit.scan.structure import (
     find_split,
     pairs_of_noise,
 )
-from curvafit.volumes.boxes import Box, cut_boxes, grow, within
 from curvafit.volumes.run import Record, Run
-from curvafit.volumes.volume import Volume
+from curvafit.volumes.volume import Box, Volume, cut_boxes, grow, within
 
 
 @dataclass(frozen=True)

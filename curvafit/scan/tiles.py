@@ -33,10 +33,9 @@ from curvafit.scan.measures import Blocks, Measures
 from curvafit.scan.preparation import DROPPED, LARGEST_BOX, WORKED, Prepared, TooLarge, note_on_filling, smallest_piece
 from curvafit.scan.structure import Kind, Structure, check_options, read_labels, read_region
 from curvafit.scan.survey import Plan, survey
-from curvafit.volumes.boxes import Box, cut_boxes, grow, within
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.run import Record, open_run
-from curvafit.volumes.volume import ScanError, Volume
+from curvafit.volumes.volume import Box, ScanError, Volume, cut_boxes, grow, within
 
 #: Radius, in voxels of the finest axis, from which balls are painted on a coarser grid, and the largest ball's.
 COARSE, WIDEST = 24, 48

@@ -20,9 +20,8 @@ from scipy import ndimage
 from scipy.special import expit
 from skimage.filters import threshold_otsu
 
-from curvafit.volumes.boxes import Box, Crop, cut_boxes
 from curvafit.volumes.read import Source, load
-from curvafit.volumes.volume import ScanError, Volume, digest_of
+from curvafit.volumes.volume import Box, Crop, ScanError, Volume, cut_boxes, digest_of
 
 #: Percentiles to which grey levels are clipped for Otsu's threshold.
 TAILS = (0.1, 99.9)

@@ -27,7 +27,7 @@ from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, silent
 from curvafit.scan.grids import centre_distance
 from curvafit.segmentation.slices import WHOLE, Slices, plane_distances
-from curvafit.volumes.boxes import Box
+from curvafit.volumes.volume import Box
 
 FILLER_FILE = Format("curvafit filler", 1, "weights of a filler", "teach them again with `curvafit atlas teach`")
 #: Signed distances are cut here, in pixels: what is further away does not matter for a gap of 24 pixels at most.

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from curvafit.core.extras import require
+from curvafit.core.checks import require
 from curvafit.core.runtime import Progress, silent
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.uncertainty import entropy, fit_weights

@@ -12,10 +12,9 @@ import numpy as np
 from curvafit.core.checks import SEEDS, check_int
 from curvafit.priors.grid import MOST
 from curvafit.segmentation.slices import IDS, LABELS, Slices, require_labels, require_outline, turn_axes
-from curvafit.volumes.boxes import Box
 from curvafit.volumes.formats.zarr import CHUNK
 from curvafit.volumes.run import Record, Run
-from curvafit.volumes.volume import ScanError, Volume, check_finite, round_labels
+from curvafit.volumes.volume import Box, ScanError, Volume, check_finite, round_labels
 
 #: Slices of a file that are read at once, and their bytes at most.
 THICK, SLAB = CHUNK, 2**26

@@ -21,11 +21,10 @@ from curvafit.segmentation.reconstruction import SHIFTED, SURE, UNTOLD, load_exa
 from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.segmentation.slices import IDS, WHOLE, index_labels, mark_known, reach_of, require_labels
 from curvafit.segmentation.uncertainty import doubt, expected_dice, suggest_slices
-from curvafit.volumes.boxes import Box
 from curvafit.volumes.formats.base import smallest_type
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.run import Run
-from curvafit.volumes.volume import ScanError, Volume, round_labels
+from curvafit.volumes.volume import Box, ScanError, Volume, round_labels
 
 #: Which slices are known, unless it is said.
 WHICH: dict[str, Any] = {"every": None, "known": None, "ignore": None, "axis": 0}

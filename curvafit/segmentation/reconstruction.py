@@ -20,8 +20,7 @@ import numpy as np
 import torch
 from scipy.special import expit, logit
 
-from curvafit.core.checks import check_int
-from curvafit.core.extras import require
+from curvafit.core.checks import check_float, check_int, require
 from curvafit.core.runtime import Progress, check_memory, silent, sub_progress
 from curvafit.generation import data
 from curvafit.priors.coefficients import Coefficients
@@ -70,12 +69,10 @@ from curvafit.segmentation.uncertainty import (
     share_by_slices,
     suggest_slices,
 )
-from curvafit.volumes.boxes import Box, cut_boxes
 from curvafit.volumes.formats.zarr import CHUNK
-from curvafit.volumes.place import lay
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.run import Record, Run, open_run
-from curvafit.volumes.volume import ScanError, StoredArray, Volume, digest_of, round_labels
+from curvafit.volumes.volume import Box, ScanError, StoredArray, Volume, cut_boxes, digest_of, lay, round_labels
 
 #: Stiffness of the springs on known voxels, in working units: a tenth of it gives way, ten times as much stalls.
 STIFFNESS = 1e7

@@ -14,9 +14,8 @@ import numpy as np
 
 from curvafit.core.checks import check_float, check_int
 from curvafit.core.files import move_together, remove, temporary_folder
-from curvafit.core.pictures import Pictured
 from curvafit.core.records import Format, can_write, is_own_zarr, sibling
-from curvafit.core.runtime import check_memory, hold_signals
+from curvafit.core.runtime import Pictured, check_memory, hold_signals
 from curvafit.core.units import format_sampling
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.slices import IDS, reach_of

@@ -21,10 +21,8 @@ from curvafit.segmentation.result import Segmentation, flow_summary
 from curvafit.segmentation.slices import check_spacing, load_with, require_labels
 from curvafit.segmentation.tiles import LoweredVolume, Problem, cut_tiles, lower_volume
 from curvafit.segmentation.trials import Task, Trial, choose_by_masks, law_of, laws_of
-from curvafit.volumes.boxes import Box, cut_boxes
-from curvafit.volumes.place import lay
 from curvafit.volumes.read import Source, load
-from curvafit.volumes.volume import ScanError, Volume
+from curvafit.volumes.volume import Box, ScanError, Volume, cut_boxes, lay
 
 #: The law where none is given; it is also tried beside those of a prior.
 WILLMORE = Coefficients.willmore()

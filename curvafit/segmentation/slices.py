@@ -11,9 +11,8 @@ from scipy.interpolate import CubicSpline, make_interp_spline
 
 from curvafit.core.units import format_sampling
 from curvafit.scan.grids import centre_distance
-from curvafit.volumes.boxes import Box
 from curvafit.volumes.read import Source, load
-from curvafit.volumes.volume import ScanError, Volume, round_labels
+from curvafit.volumes.volume import Box, ScanError, Volume, round_labels
 
 #: Plain interpolations, the usual one first: signed distances on a cubic spline and on lines; the nearest slice.
 WAYS = ("spline", "linear", "nearest")

@@ -24,8 +24,8 @@ from curvafit.generation.checkpoint import identity
 from curvafit.generation.data import Data
 from curvafit.segmentation.flow import WorkingGrid, lower_energy
 from curvafit.segmentation.trials import Trial
-from curvafit.volumes.boxes import Box, within
 from curvafit.volumes.run import Record, open_run
+from curvafit.volumes.volume import Box, within
 
 #: Working voxels beyond a tile that are lowered with it: at that distance the cut is not felt any more.
 OVERLAP = 24

@@ -20,9 +20,8 @@ from curvafit.priors.law import Law, LawLike
 from curvafit.scan.grids import box_with_most_surface
 from curvafit.segmentation.known import Known
 from curvafit.segmentation.slices import Slices
-from curvafit.volumes.boxes import Box
 from curvafit.volumes.run import Run
-from curvafit.volumes.volume import ScanError, Volume
+from curvafit.volumes.volume import Box, ScanError, Volume
 
 #: The known part of a volume.
 Given = TypeVar("Given")

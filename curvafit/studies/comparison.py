@@ -15,8 +15,7 @@ from scipy.stats import false_discovery_control, rankdata
 
 from curvafit.core import permutation
 from curvafit.core.checks import check_choice, check_int, check_seed
-from curvafit.core.pictures import Pictured
-from curvafit.core.runtime import Progress, silent, sub_progress
+from curvafit.core.runtime import Pictured, Progress, silent, sub_progress
 from curvafit.core.units import format_number, format_percent, per_unit, power_name
 from curvafit.drawing.plot import shared_limits
 from curvafit.geometry.diagrams import FAMILIES, Diagram

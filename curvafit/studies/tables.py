@@ -10,7 +10,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from curvafit.core.extras import require
+from curvafit.core.checks import require
 from curvafit.core.files import write_atomically, write_content
 from curvafit.core.records import Format, can_write, has_mark
 from curvafit.scan.measures import COLUMNS, Measures

@@ -11,8 +11,7 @@ import numpy as np
 from scipy.cluster.vq import kmeans, vq
 
 from curvafit.core.checks import as_tuple, check_int, check_seed
-from curvafit.core.pictures import Pictured
-from curvafit.core.runtime import Progress, silent
+from curvafit.core.runtime import Pictured, Progress, silent
 from curvafit.core.units import format_length, format_number, format_percent, format_sampling, unit_name
 from curvafit.scan.measures import QUANTITIES, Blocks, combine, measure_maps
 from curvafit.scan.structure import check_options

@@ -1,25 +1,94 @@
-"""A volume and its place in the world: values in z, y, x, in memory or read where they are asked for."""
+"""A volume and its place in the world, values in z, y, x, in memory or read where asked for; boxes of its voxels."""
 
 from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
+from numbers import Integral
 from typing import Any
 
 import numpy as np
 
 from curvafit.core.checks import SEEDS, check_int, quoted
-from curvafit.core.pictures import Pictured
-from curvafit.core.runtime import one_line
-from curvafit.core.units import format_sampling, parse_unit
-from curvafit.volumes.boxes import Box, Crop, parse_box, resolve_box
+from curvafit.core.runtime import Pictured, one_line
+from curvafit.core.units import METRES, format_sampling, parse_unit
 from curvafit.volumes.formats.base import ScanError, check_array
 
 #: A note on the mask of a label.
 _LABELLED = "The structure is label {}."
+#: Voxels by which places may differ that are one.
+ASTRAY = 0.1
+#: Voxels by which a voxel that lies half way between two others is nearer to the first.
+_TIE = 1e-3
+
+# ---- boxes -----------------------------------------------------------------------------------------------------------
+
+#: A box of voxels along (z, y, x).
+Box = tuple[slice, slice, slice]
+#: A box as a caller gives it: `"z0:z1,y0:y1,x0:x1"`, or three slices.
+Crop = str | Sequence[slice]
+
+
+def parse_box(crop: Crop) -> Box:
+    """Return a crop as three slices."""
+    parts: Any = list(map(_parse_slice, crop.split(","))) if isinstance(crop, str) else crop
+    if not isinstance(parts, Sequence) or len(parts) != 3 or not all(map(_is_plain, parts)):
+        raise ScanError(f'crop must be "z0:z1,y0:y1,x0:x1" or three slices, got {quoted(crop)}')
+    return parts[0], parts[1], parts[2]
+
+
+def resolve_box(box: Box, shape: Sequence[int], place: object) -> Box:
+    """Return a box in a volume of a shape (z, y, x), with all its ends counted from the first voxel."""
+    edges = []
+    for name, edge, n in zip("zyx", box, shape, strict=True):
+        start, stop = (0 if edge.start is None else edge.start), (n if edge.stop is None else edge.stop)
+        first, last = (start + n if start < 0 else start), (stop + n if stop < 0 else stop)
+        if not 0 <= first < last <= n:
+            raise ScanError(f"crop must lie within 0:{n} along {name} of {place}, got {start}:{stop}")
+        edges.append(slice(first, last))
+    return edges[0], edges[1], edges[2]
+
+
+def cut_boxes(shape: Sequence[int], edge: int | Sequence[int]) -> list[Box]:
+    """Cut a volume into boxes of an edge, or of one along each axis, z slowest; the last ones may be smaller."""
+    edges = (edge,) * 3 if isinstance(edge, int) else edge
+    axes = ([slice(a, min(a + e, n)) for a in range(0, n, e)] for n, e in zip(shape, edges, strict=True))
+    return [(z, y, x) for z, y, x in product(*axes)]
+
+
+def grow(box: Box, by: int | Sequence[int], shape: Sequence[int]) -> Box:
+    """Return a box with more voxels on every side, as far as the volume has them."""
+    more = (by,) * 3 if isinstance(by, int) else by
+    z, y, x = (slice(max(0, e.start - m), min(n, e.stop + m)) for e, m, n in zip(box, more, shape, strict=True))
+    return z, y, x
+
+
+def within(inner: Box, outer: Box) -> Box:
+    """Return a box in the voxels of another."""
+    z, y, x = (slice(a.start - b.start, a.stop - b.start) for a, b in zip(inner, outer, strict=True))
+    return z, y, x
+
+
+def _parse_slice(text: str) -> slice | None:
+    """Return the slice of a text such as `"3:7"`, `":7"` or `":"`, None for another text."""
+    match = re.fullmatch(r"\s*(-?\d{1,18})?\s*:\s*(-?\d{1,18})?\s*", text)
+    return slice(*(None if edge is None else int(edge) for edge in match.groups())) if match else None
+
+
+def _is_plain(edge: Any) -> bool:
+    """Return whether this is a slice that has whole numbers, or nothing, as ends, and no step."""
+    if not isinstance(edge, slice) or edge.step not in (None, 1):
+        return False
+    ends = (edge.start, edge.stop)
+    return all(end is None or (isinstance(end, Integral) and not isinstance(end, bool)) for end in ends)
+
+
+# ---- volumes ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -243,3 +312,75 @@ def positive_triple(spacing: object) -> tuple[float, float, float]:
     if len(triple) != 3 or any(not math.isfinite(h) or h <= 0 for h in triple):
         raise ScanError(f"spacing must be 3 positive numbers (z, y, x), got {quoted(spacing)}")
     return triple  # type: ignore[return-value]
+
+
+# ---- a volume on the voxels of another -------------------------------------------------------------------------------
+
+
+def lay(field: Volume, on: Volume, name: str, kind: str, *, exact: bool = False) -> tuple[Volume, tuple[str, ...]]:
+    """Return a volume on the voxels of another, and a note on how it was laid where the two differ.
+
+    Where both state where they lie, the affines decide: axes change places and directions, and voxels move. On other
+    voxels a value is that of the nearest one, and 0 beyond them; `exact` refuses both. Where one states no place, equal
+    shapes are laid voxel by voxel. Messages call the volume `name`, and the other's voxels those of `kind`. Raises
+    ScanError where the two do not meet, or have no place and other shapes.
+    """
+    step, note = _find_step(field, on), f"{name[0].upper()}{name[1:]} is laid on {kind}"
+    if step is None:
+        if field.shape != on.shape:
+            raise ScanError(f"{name} must have the shape of {kind} {on.shape}, got {field.shape} without a place in it")
+        neither = field.affine is None and on.affine is None
+        both = field.affine is not None and on.affine is not None
+        why = "their units do not convert" if both else "one of the two states no place"
+        return field, () if neither else (f"{note} voxel by voxel: {why}.",)
+    matrix, offset = step
+    whole, moved = np.rint(matrix), np.rint(offset)
+    corners = np.array(list(product(*((0, n - 1) for n in on.shape))))
+    far = np.abs(corners @ (matrix - whole).T + offset - moved).max()
+    on_voxels = far < ASTRAY and np.array_equal(whole @ whole.T, np.eye(3))
+    if on_voxels and field.shape == on.shape and np.array_equal(whole, np.eye(3)) and not moved.any():
+        return field, ()
+    sampling = format_sampling(field.shape, field.spacing, field.unit)
+    if exact and not on_voxels:
+        raise ScanError(f"{name} must have the voxels of {kind}, got {sampling} that lie between them: resample it")
+    laid, share = _take_nearest(field.values, *((whole, moved) if on_voxels else step), on.shape)
+    if share == 0 or (exact and share < 1):
+        what = f"{'shape and ' * exact}place of {kind}"
+        raise ScanError(f"{name} must have the {what}, but by the affines covers {share:.0%} of it")
+    note += f" by its affine: {'whole voxels are moved' if on_voxels else f'the nearest of its {sampling} counts'}"
+    note += "" if share == 1 else f"; {1 - share:.2g} of {kind} lies beyond it, and counts as 0"
+    return replace(field, array=laid, spacing=on.spacing, unit=on.unit, affine=on.affine), (f"{note}.",)
+
+
+def _find_step(field: Volume, on: Volume) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return matrix and offset from voxels (z, y, x) of a volume to those of another, None where no place tells it.
+
+    A length in voxels is one in any unit where the voxels are as long: a file may not name its unit.
+    """
+    if field.affine is None or on.affine is None or not np.linalg.det(field.affine[:3, :3]):
+        return None
+    factor = 1.0
+    if field.unit != on.unit:
+        if {field.unit, on.unit} <= METRES.keys():
+            factor = METRES[on.unit] / METRES[field.unit]
+        elif not np.allclose(sorted(field.spacing), sorted(on.spacing), rtol=1e-3):
+            return None
+    step = np.linalg.inv(field.affine) @ np.diag([factor] * 3 + [1.0]) @ on.affine
+    return step[2::-1, 2::-1], step[2::-1, 3]
+
+
+def _take_nearest(
+    values: np.ndarray, matrix: np.ndarray, offset: np.ndarray, shape: tuple[int, int, int]
+) -> tuple[np.ndarray, float]:
+    """Return the value nearest to each voxel of a shape, 0 beyond them, and the share of voxels that has one."""
+    found, count = np.zeros(shape, values.dtype), 0
+    y, x = np.ogrid[: shape[1], : shape[2]]
+    for z, plane in enumerate(found):
+        at = [
+            np.floor(a * z + b * y + c * x + d + 0.5 - _TIE).astype(np.int64)
+            for (a, b, c), d in zip(matrix, offset, strict=True)
+        ]
+        inside = np.logical_and.reduce([(k >= 0) & (k < n) for k, n in zip(at, values.shape, strict=True)])
+        plane[inside] = values[tuple(k[inside] for k in at)]
+        count += np.count_nonzero(inside)
+    return found, count / found.size

@@ -14,7 +14,7 @@ from curvafit.core.files import temporary_folder, write_atomically
 from curvafit.core.records import can_write, is_own_zarr
 from curvafit.volumes.formats.arrays import write_npy
 from curvafit.volumes.formats.base import ScanError, first_voxel, smallest_type
-from curvafit.volumes.formats.mrc import check_mrc, write_mrc
+from curvafit.volumes.formats.headers import check_mrc, write_mrc
 from curvafit.volumes.formats.nifti import write_nifti
 from curvafit.volumes.formats.tiff import check_ome_tiff, write_ome_tiff, write_tiff
 from curvafit.volumes.formats.zarr import add_labels, image_of, mark, store_of, write_labels, write_zarr

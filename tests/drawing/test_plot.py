@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import curvafit
-from curvafit.core.pictures import Pictured
+from curvafit.core.runtime import Pictured
 from curvafit.drawing import plot
 from curvafit.drawing.rendering import render, surface_picture, view
 from curvafit.generation import Schedule, generate

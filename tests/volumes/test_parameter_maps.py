@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from curvafit.volumes import Volume, save
-from curvafit.volumes.parameter_maps import map_shape, read_maps
+from curvafit.volumes.read import map_shape, read_maps
 
 RAMP = np.linspace(1, 2, 4 * 5 * 6).reshape(4, 5, 6)
 

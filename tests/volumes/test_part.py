@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 
 from curvafit.scan.structure import read_region
 from curvafit.volumes import ScanError, Volume, load, save
-from curvafit.volumes.boxes import parse_box
-from curvafit.volumes.place import lay
+from curvafit.volumes.volume import lay, parse_box
 
 SHAPE = (6, 7, 8)
 VALUES = np.arange(np.prod(SHAPE), dtype=np.float32).reshape(SHAPE)

@@ -23,8 +23,8 @@ from hypothesis import strategies as st
 from curvafit import infer, segment
 from curvafit.core.units import parse_unit
 from curvafit.volumes import ScanError, Volume, load, save
-from curvafit.volumes.formats.microscopes import read_microscope
-from curvafit.volumes.formats.slices import natural_key
+from curvafit.volumes.formats.arrays import read_microscope
+from curvafit.volumes.formats.tiff import natural_key
 from curvafit.volumes.read import READERS
 
 TYPES = ("bool", "uint8", "int16", "uint16", "int32", "float32", "float64")

@@ -1,4 +1,4 @@
-"""NPY, NPZ, HDF5, Imaris and RAW files."""
+"""NPY, NPZ, HDF5 and RAW files, and microscopes': Imaris; CZI, LIF and ND2 by bioio, of the extra `[microscopes]`."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.core.checks import quoted
+from curvafit.core.checks import quoted, require
 from curvafit.core.records import read_member
 from curvafit.core.units import is_unit
 from curvafit.volumes.formats import base
 from curvafit.volumes.formats.base import ScanError, Stated
 
+#: Suffix of a microscope's own file -> the package that reads it.
+MICROSCOPES = {".czi": "bioio_czi", ".lif": "bioio_lif", ".nd2": "bioio_nd2"}
 _RAW_TYPES = "uint8, int8, uint16, int16, uint32, int32, float32, float64 (or with > for big-endian, as in >u2)"
 
 
@@ -170,3 +172,17 @@ def read_raw(
     if size != (nbytes := math.prod(shape) * kind.itemsize):
         raise ScanError(f"shape {shape} of {kind} takes {nbytes} bytes, got {size} in {path}")
     return Stated(base.map_numbers(path, 0, shape, kind), "zyx")
+
+
+def read_microscope(path: Path, *, key: str | None = None, **_: object) -> Stated:
+    """Read a scene (`key`), by default the only one, with the voxel size in um that its file states."""
+    for module in (MICROSCOPES[path.suffix.lower()], "bioio"):
+        bioio = require(module, "microscopes", f"reading {path.suffix}")
+    image = bioio.BioImage(path)
+    image.set_scene(base.pick_key(list(image.scenes), key, path))
+    axes, sizes = base.name_axes(image.dims.order), image.physical_pixel_sizes
+    if not (sizes.X and sizes.Y):
+        return Stated(image.dask_data, axes)
+    guesses = () if sizes.Z or image.dims.Z == 1 else (base.NO_DISTANCE,)
+    edges = {"z": sizes.Z or sizes.X, "y": sizes.Y, "x": sizes.X}
+    return Stated(image.dask_data, axes, [edges.get(axis) for axis in axes], ("um",) * len(axes), guesses=guesses)

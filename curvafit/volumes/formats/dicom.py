@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from curvafit.core.extras import require
+from curvafit.core.checks import require
 from curvafit.volumes.formats import base
 from curvafit.volumes.formats.base import LPS_TO_RAS, ScanError, Stated
 

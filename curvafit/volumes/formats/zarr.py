@@ -13,12 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from curvafit.core.extras import require
+from curvafit.core.checks import require
 from curvafit.core.files import move_into_place, write_content
 from curvafit.core.records import MARK, is_zarr
 from curvafit.core.runtime import hold_signals
 from curvafit.core.units import common_unit, format_sampling, parse_unit
-from curvafit.volumes.boxes import Box, cut_boxes
 from curvafit.volumes.formats.base import (
     Damaged,
     ScanError,
@@ -29,6 +28,7 @@ from curvafit.volumes.formats.base import (
     pick_key,
     read_spacing,
 )
+from curvafit.volumes.volume import Box, cut_boxes
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
 CHUNK = 64

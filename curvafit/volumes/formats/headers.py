@@ -1,4 +1,9 @@
-"""NRRD and MetaImage, as ITK and 3D Slicer write them; NRRD with a library of the extra `[io]`."""
+"""Numbers behind a header: NRRD and MetaImage, as ITK and 3D Slicer write them; MRC and CCP4 maps; Scanco's micro-CT.
+
+NRRD and MRC are read with libraries of the extra `[io]`. ITK's reader of Scanco's ISQ and AIM, itk-ioscanco, is not
+used: it rounds the values of some files to whole Hounsfield units, takes some truncated files for whole, and from
+Python reads no masks.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +13,7 @@ import io
 import math
 import os
 import re
+import warnings
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,8 +21,8 @@ from typing import IO, Any
 
 import numpy as np
 
-from curvafit.core.extras import require
-from curvafit.core.units import common_unit
+from curvafit.core.checks import require
+from curvafit.core.units import common_unit, convert_length
 from curvafit.volumes.formats import base
 from curvafit.volumes.formats.base import LPS_TO_RAS, ScanError, Stated
 
@@ -34,6 +40,16 @@ _META_TYPES |= {name.replace("MET_", "MET_U"): f"u{kind[1]}" for name, kind in _
 _META_TYPES |= {"MET_FLOAT": "f4", "MET_DOUBLE": "f8"}
 #: What a MetaImage may write for True, and the most bytes of a header.
 _TRUE, _HEADER = ("true", "t", "1"), 1 << 20
+#: IMOD's stamp, from byte 152 on: its flags follow, the first of which says that bytes are signed.
+_IMOD = 1146047817
+#: AIM's types -> numpy's.
+_AIM_TYPES = {0x00010001: "i1", 0x00160001: "u1", 0x000D0001: "u1", 0x00020002: "<i2"}
+_AIM_TYPES |= {0x00170002: "<u2", 0x00030004: "<i4", 0x001A0004: "<f4"}
+#: AIM's types of masks: run lengths of two values in turn, and pairs of a run length and a value.
+_TWO_VALUES, _PAIRS = 0x00150001, 0x00080002
+
+
+# ---- NRRD ------------------------------------------------------------------------------------------------------------
 
 
 def read_nrrd(path: Path, **_: object) -> Stated:
@@ -151,6 +167,9 @@ def _name_axes(header: dict[str, Any]) -> str:
     return "".join(letters)[::-1]
 
 
+# ---- MetaImage -------------------------------------------------------------------------------------------------------
+
+
 def read_metaimage(path: Path, **_: object) -> Stated:
     """Read a MetaImage (MHA, or MHD with the file of values that it names), whose unit is the millimetre."""
     with path.open("rb") as file:
@@ -240,3 +259,150 @@ def _meta_numbers(header: dict[str, str], names: Sequence[str], default: np.ndar
                 raise base.Damaged(f"{name} of {len(numbers)} numbers, not {len(default)}")
             return numbers
     return default
+
+
+# ---- MRC: lengths are in Å -------------------------------------------------------------------------------------------
+
+
+def read_mrc(path: Path, **_: object) -> Stated:
+    """Read an MRC file: axes as the header orders them, at its origin or, without one, at the start of its part."""
+    mrcfile = require("mrcfile", "io", "reading and writing MRC files")
+    with (
+        warnings.catch_warnings(record=True, action="always") as odd,
+        mrcfile.open(path, permissive=True, header_only=True) as file,
+    ):
+        header, size = file.header, file.voxel_size
+        shape, dtype = mrcfile.utils.data_shape_from_header(header), mrcfile.utils.data_dtype_from_header(header)
+    notes = [f"The file's header is odd: {each.message}." for each in odd if issubclass(each.category, RuntimeWarning)]
+    angles = [float(angle) for angle in header.cellb.tolist()]
+    if any(angle and abs(angle - 90) > 0.5 for angle in angles):
+        raise ScanError(f"the axes of {path} meet at {angles}°, not at right angles: resample it")
+    start = header.nbytes + int(header.nsymbt)
+    stamp, flags = np.frombuffer(header.extra2.tobytes()[40:48], header.mode.dtype)
+    values = base.map_numbers(path, start, [int(n) for n in shape], dtype)
+    # Bytes are signed, as is standard, unless IMOD's stamp says otherwise, or the header's maximum is above theirs.
+    if dtype == np.int8 and (not flags & 1 if stamp == _IMOD else header.dmax > 127):
+        values = values.view(np.uint8)
+        if stamp != _IMOD:
+            notes.append("The bytes are taken for numbers from 0 to 255, as the header's maximum is above 127.")
+    columns = [int(header[name]) for name in ("maps", "mapr", "mapc")]  # 1 is x
+    axes = "".join("xyz"[k - 1] for k in columns) if sorted(columns) == [1, 2, 3] else "zyx"
+    edges = {letter: float(size[letter]) for letter in "xyz"}
+    first = {letter: float(header.origin[letter]) for letter in "xyz"}
+    starts = (header.nzstart, header.nystart, header.nxstart)  # of sections, rows and columns
+    begin = {letter: float(n) * edges[letter] for letter, n in zip(axes, starts, strict=True)}
+    if not any(first.values()):
+        first = begin
+    elif any(begin.values()) and not np.allclose(list(first.values()), [begin[k] for k in first], rtol=1e-3):
+        notes.append("The header states an origin and another first voxel (nstart): the origin is used.")
+    if header.ispg == 0 and stamp != _IMOD and values.shape[0] > 1:
+        notes.append("By its header the file is a stack of images (space group 0): it is read as a volume.")
+    several = values.ndim - 3
+    steps, origin = ([0.0] * several + [each[letter] for letter in axes] for each in (edges, first))
+    known = math.prod(edges.values()) > 0
+    axes, units = "c" * several + axes, ("angstrom" if known else None,) * values.ndim
+    return Stated(values, axes, steps if known else None, units, origin if known else None, notes=tuple(notes))
+
+
+def check_mrc(unit: str, values: np.ndarray | None = None) -> None:
+    """Raise ScanError if lengths have no unit or values no type of MRC's, and ImportError without the library, before
+    `write_mrc`."""
+    require("mrcfile", "io", "reading and writing MRC files")
+    if unit == "voxel":
+        raise ScanError("an MRC file holds voxel sizes in Å: give the unit, nm, um, mm or m")
+    if values is not None and values.dtype.kind in "iu" and values.dtype.itemsize > 2:
+        raise ScanError(f"an MRC file holds whole numbers of at most 16 bits or floats, got {values.dtype}")
+
+
+def write_mrc(field: Any, path: Path) -> None:
+    """Write a volume with its voxel sizes and its place in Å; instead of float64, bool, uint8 write float32, int8,
+    uint16."""
+    kind = {"bool": "int8", "float64": "float32", "uint8": "uint16"}.get(field.values.dtype.name)
+    values = field.values if kind is None else field.values.astype(kind)
+    with require("mrcfile", "io", "reading and writing MRC files").new(path, values, overwrite=True) as file:
+        file.voxel_size = tuple(convert_length(h, field.unit, "angstrom") for h in field.spacing[::-1])
+        file.header.origin = tuple(convert_length(x, field.unit, "angstrom") for x in base.first_voxel(field)[::-1])
+
+
+# ---- Scanco's ISQ and AIM, read where they lie on disk and placed as by ITK ------------------------------------------
+
+
+def read_isq(path: Path, **_: object) -> Stated:
+    """Read an ISQ scan, whose header states the edges of the whole volume in µm."""
+    head = _read_head(path, 512)
+    if head[:16] != b"CTDATA-HEADER_V1":
+        raise base.Damaged("it does not begin as an ISQ file")
+    numbers = np.frombuffer(head, "<i4", 124, 16)
+    shape, edges, blocks = numbers[7:10], numbers[10:13], int(numbers[123])
+    if min(*shape, *edges, blocks + 1) < 1:
+        raise base.Damaged(f"{shape.tolist()} voxels with edges of {edges.tolist()} µm in all")
+    values = base.map_numbers(path, 512 * (blocks + 1), shape[::-1].tolist(), np.dtype("<i2"), tail=True)
+    return _place(values, edges / shape / 1000, np.zeros(3), int(numbers[18]))
+
+
+def read_aim(path: Path, **_: object) -> Stated:
+    """Read an AIM scan or mask of version 020 or 030, at its position in the scan that it was cut from."""
+    head = _read_head(path, 264)
+    old = head[:16] != b"AIMDATA_V030   \0"
+    integer, first, sizes_end, place = ("<i4", 0, 20, 44) if old else ("<i8", 16, 56, 72)
+    sizes = [int(n) for n in np.frombuffer(head, integer, 5, first)]
+    if sizes[:2] != ([20, 140] if old else [40, 224]) or min(sizes) < 0:
+        raise base.Damaged("it does not begin as an AIM file of version 020 or 030")
+    kind = int.from_bytes(head[place - 4 : place], "little")
+    triples = np.frombuffer(head, integer, 24, place).reshape(8, 3)
+    position, shape = triples[0], triples[1][::-1].tolist()
+    spacing = _vax_floats(triples[7]) if old else triples[7] * 1e-6
+    start = first + sum(sizes[:3])
+    if min(shape) < 1:
+        raise base.Damaged(f"{shape} voxels")
+    log = bytes(base.map_numbers(path, sizes_end + sizes[1], [sizes[2]], np.dtype("u1"), tail=True))
+    if kind in _AIM_TYPES:
+        values = base.map_numbers(path, start, shape, np.dtype(_AIM_TYPES[kind]), tail=True)
+    elif kind in (_TWO_VALUES, _PAIRS):
+        values = _unpack_runs(path, start, shape, np.dtype(integer), kind)
+    else:
+        raise ScanError(f"{path} has values of AIM's type {kind:#010x}, which are not read")
+    scaling = re.search(rb"Mu_Scaling +(\d{1,9})\b", log)
+    return _place(values, spacing, position * spacing, int(scaling[1]) if scaling else 0)
+
+
+def _read_head(path: Path, size: int) -> bytes:
+    """Return the first bytes of a file."""
+    with path.open("rb") as file:
+        head = file.read(size)
+    if len(head) < size:
+        raise base.Damaged(f"{size} bytes of header expected, {len(head)} in the file")
+    return head
+
+
+def _vax_floats(words: np.ndarray) -> np.ndarray:
+    """Return the floats of VAX in four bytes each: halves in the other order, the exponent larger by two."""
+    return np.ascontiguousarray(words).view("<u2").reshape(-1, 2)[:, ::-1].copy().view("<f4")[:, 0].astype(float) / 4
+
+
+def _unpack_runs(path: Path, start: int, shape: Sequence[int], integer: np.dtype, kind: int) -> np.ndarray:
+    """Return the voxels of a mask that is stored as runs, behind the size of the runs in bytes."""
+    base.check_array(shape, np.dtype("i1"), path)
+    size = int(base.map_numbers(path, start, [1], integer, tail=True)[0]) - integer.itemsize
+    if size < 2:
+        raise base.Damaged(f"{size} bytes of runs")
+    runs = base.map_numbers(path, start + integer.itemsize, [size], np.dtype("i1"), tail=True)
+    if kind == _PAIRS:
+        lengths, values = runs[: size // 2 * 2 : 2].view("u1"), runs[1::2]
+    else:  # a run that is longer than 254 goes on after each 255
+        codes = runs[2:].view("u1")
+        turns = np.cumsum(codes != 255) - (codes != 255)
+        lengths, values = np.minimum(codes, 254), runs[:2][turns % 2]
+    count, total = math.prod(shape), int(lengths.sum(dtype=np.int64))
+    if not count <= total < count + 255:
+        raise base.Damaged(f"{count} voxels by its header, {total} in its runs")
+    return np.repeat(values, lengths)[:count].reshape(tuple(shape))
+
+
+def _place(values: np.ndarray, spacing: np.ndarray, origin: np.ndarray, scaling: int) -> Stated:
+    """Return the content with its place, of numbers (x, y, z) in mm in ITK's frame, and with what its values are."""
+    flip = np.array([-1, -1, 1])  # from ITK's frame to NIfTI's
+    affine = base.affine_of(np.diag(flip * spacing), flip * origin)
+    note = f"The values are the file's own: divided by {scaling}, they are the attenuation in 1/cm."
+    notes = (note,) if scaling > 1 and values.dtype.itemsize > 1 else ()
+    return Stated(values, "zyx", spacing[::-1].tolist(), ("mm",) * 3, affine=affine, notes=notes)
