@@ -13,8 +13,7 @@ import numpy as np
 from magicgui.widgets import ComboBox, Container, LineEdit, PushButton, SpinBox, create_widget
 
 from curvafit.core.runtime import Progress
-from curvafit.napari.dock import Dock
-from curvafit.napari.layers import drop_layer, field_of_layer, list_layers, place_of_layer, put_layer
+from curvafit.napari.widgets import Dock, drop_layer, field_of_layer, list_layers, place_of_layer, put_layer
 from curvafit.segmentation.known import check_shared, next_in_rhythm, note_empty
 from curvafit.segmentation.labels import reconstruct_labels
 from curvafit.segmentation.reconstruction import reconstruct

@@ -17,9 +17,7 @@ from qtpy.QtTest import QTest  # noqa: E402
 from qtpy.QtWidgets import QApplication  # noqa: E402
 
 from curvafit.napari.complete import Complete  # noqa: E402
-from curvafit.napari.generate import Generate, annotated_tubes  # noqa: E402
-from curvafit.napari.layers import field_of_layer  # noqa: E402
-from curvafit.napari.measure import Measure  # noqa: E402
+from curvafit.napari.widgets import Generate, Measure, annotated_tubes, field_of_layer  # noqa: E402
 from curvafit.volumes import ScanError  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]

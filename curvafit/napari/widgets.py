@@ -1,0 +1,360 @@
+"""What all widgets share: layers as volumes, work in a thread; and those that measure a layer and grow a texture."""
+
+from __future__ import annotations
+
+import math
+import threading
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from magicgui.widgets import (
+    CheckBox,
+    ComboBox,
+    Container,
+    FileEdit,
+    FloatSpinBox,
+    Label,
+    ProgressBar,
+    PushButton,
+    SpinBox,
+    Table,
+)
+from matplotlib.backends.backend_qtagg import FigureCanvasQTAgg
+from napari.qt.threading import create_worker
+from qtpy.QtCore import QTimer
+from qtpy.QtWidgets import QSizePolicy
+from scipy import ndimage
+
+from curvafit.core.runtime import Progress
+from curvafit.core.units import METRES, convert_length, format_number, is_unit, parse_unit, power_name
+from curvafit.drawing.plot import diagram_figure
+from curvafit.generation.flow import generate
+from curvafit.generation.result import Flow
+from curvafit.generation.schedule import schedule
+from curvafit.geometry.diagrams import Diagram
+from curvafit.priors.law import PRESETS
+from curvafit.scan.instances import measure_instances
+from curvafit.scan.measures import Measures
+from curvafit.scan.tiles import measure as measure_scan
+from curvafit.studies.tables import check_table, write_table
+from curvafit.volumes.volume import ScanError, Volume
+
+#: Our unit -> napari's.
+_UNITS = {"voxel": "pixel", "nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter"}
+#: Milliseconds between looks at the work's progress.
+_PAUSE = 100
+
+
+# ---- a layer as a volume, and a volume as a layer: values, voxel edges and their unit --------------------------------
+
+
+def field_of_layer(layer: Any, kind: str = "a layer") -> Volume:
+    """Return the values of a layer, of its finest level, with its scale and unit; else ScanError, which names the kind.
+
+    The layer has three axes, besides any of length one before them, and no colours. A turned or sheared layer is read
+    on its own axes.
+    """
+    if layer is None:
+        raise ScanError(f"expected {kind}, got none: add one")
+    if getattr(layer, "rgb", False):
+        raise ScanError(f"expected grey levels or labels, got colours in the layer {layer.name}")
+    data = layer.data[0] if layer.multiscale else layer.data
+    if len(data.shape) < 3 or any(n != 1 for n in data.shape[:-3]):
+        raise ScanError(f"expected a layer of three axes, got {layer.name} of shape {tuple(data.shape)}")
+    values = np.asarray(data).reshape(data.shape[-3:])
+    if faults := np.count_nonzero(~np.isfinite(values)):
+        raise ScanError(f"expected finite values in the layer {layer.name}, got {faults} that are not")
+    spacing, unit = _lengths(layer)
+    return Volume(values, spacing, unit, source=layer.name)
+
+
+def _lengths(layer: Any) -> tuple[tuple[float, float, float], str]:
+    """Return voxel edges (z, y, x) and their unit, that of the last axis."""
+    names = [str(each) for each in layer.units[-3:]]
+    if wrong := next((name for name in names if not is_unit(name)), None):
+        raise ScanError(f"expected lengths along the axes of {layer.name}, got the unit {wrong}")
+    found = [parse_unit(name)[0] for name in names]
+    if 0 < found.count("voxel") < 3:
+        raise ScanError(f"expected one kind of unit along the axes of {layer.name}, got pixels and lengths")
+    pairs = zip(layer.scale[-3:], names, strict=True)
+    z, y, x = (convert_length(abs(float(length)), own, found[-1]) for length, own in pairs)
+    return (z, y, x), found[-1]
+
+
+def place_of_layer(layer: Any) -> dict[str, Any]:
+    """Return options of a new layer that lies, with its three last axes, where a layer does."""
+    return {
+        "scale": layer.scale[-3:],
+        "translate": layer.translate[-3:],
+        "rotate": layer.rotate[-3:, -3:],
+        "shear": layer.shear if len(layer.scale) == 3 else None,
+        "units": layer.units[-3:],
+    }
+
+
+def place_of_field(field: Volume) -> dict[str, Any]:
+    """Return options of a layer for a field."""
+    return {"scale": field.spacing, "units": (_UNITS[field.unit],) * 3}
+
+
+def list_layers(viewer: Any, *kinds: str) -> list[tuple[str, Any]]:
+    """Return the layers of kinds such as `"Image"`, by name, without the images that the plugin added."""
+    found = [each for each in viewer.layers if type(each).__name__ in kinds]
+    return [(each.name, each) for each in found if type(each).__name__ != "Image" or "curvafit" not in each.metadata]
+
+
+def put_layer(viewer: Any, kind: str, data: Any, name: str, **options: Any) -> Any:
+    """Add a layer of a kind, such as `"labels"`, in the place of one of its name that the plugin added."""
+    drop_layer(viewer, name)
+    return getattr(viewer, f"add_{kind}")(data, name=name, metadata={"curvafit": name}, **options)
+
+
+def drop_layer(viewer: Any, name: str) -> None:
+    """Remove the layer of a name that the plugin added, if it is there."""
+    for old in list(viewer.layers):
+        if old.metadata.get("curvafit") == name:
+            viewer.layers.remove(old)
+
+
+# ---- work in a thread, with progress, a button that stops it, and a sentence at the end ------------------------------
+
+
+class Stopped(Exception):
+    """The user stopped the work."""
+
+
+class Dock(Container):
+    """A widget that works: `prepare` reads the choices, its result runs in a thread, `show_result` takes what it gives.
+
+    The widgets of the choices come first, then the buttons, the progress and a sentence.
+    """
+
+    def __init__(self, viewer: Any, choices: list[Any], verb: str) -> None:
+        self.viewer = viewer
+        self.run_button, self.stop_button = PushButton(text=verb), PushButton(text="Stop", enabled=False)
+        self.progress, self.status = ProgressBar(value=0, max=100, visible=False), Label(value="")
+        buttons = Container(widgets=[self.run_button, self.stop_button], layout="horizontal", labels=False)
+        super().__init__(widgets=[*choices, buttons, self.progress, self.status])
+        self.status.native.setWordWrap(True)
+        self.status.native.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.MinimumExpanding)
+        self.run_button.changed.connect(self.run)
+        self.stop_button.changed.connect(self.stop)
+        self._stopping, self._told, self.worker = threading.Event(), ("", 0.0), None
+        self._timer = QTimer(self.native)
+        self._timer.setInterval(_PAUSE)
+        self._timer.timeout.connect(self._show_progress)
+        self.native.destroyed.connect(self._stopping.set)
+
+    @abstractmethod
+    def prepare(self) -> Callable[[Progress], Any]:
+        """Return the work, by the choices; raise ValueError where they are none."""
+
+    @abstractmethod
+    def show_result(self, result: Any) -> str:
+        """Show the result of the work, and return a sentence on it."""
+
+    def run(self) -> None:
+        """Begin the work, or say why not."""
+        try:
+            work = self.prepare()
+        except (ValueError, ImportError) as reason:
+            self.say(f"{reason}.")
+            return
+        self._stopping.clear()
+        self._told = ("beginning", 0.0)
+        self.run_button.enabled, self.stop_button.enabled = False, True
+        self.progress.visible = True
+        self._show_progress()
+        self._timer.start()
+        connect = {"returned": self._end, "errored": self._fail, "finished": self._finish}
+        self.worker = create_worker(work, self._hear, _connect=connect, _ignore_errors=True)
+
+    def stop(self) -> None:
+        """Stop the work at its next step."""
+        self._stopping.set()
+        self.say("Stopping.")
+
+    def say(self, text: str) -> None:
+        """Show a sentence."""
+        self.status.value = text[:1].upper() + text[1:]
+
+    def _hear(self, text: str, share: float) -> None:
+        """Note how far the work is, in its thread."""
+        if self._stopping.is_set():
+            raise Stopped
+        self._told = (text, share)
+
+    def _show_progress(self) -> None:
+        text, share = self._told
+        self.progress.value = round(100 * share)
+        if not self._stopping.is_set():
+            self.say(f"{text} …")
+
+    def _end(self, result: Any) -> None:
+        self._timer.stop()
+        try:
+            self.say("Stopped." if self._stopping.is_set() else self.show_result(result))
+        except (ValueError, OSError) as reason:
+            self.say(f"{reason}.")
+
+    def _fail(self, error: Exception) -> None:
+        self._timer.stop()
+        if isinstance(error, Stopped):
+            self.say("Stopped.")
+        elif isinstance(error, (ValueError, ImportError, MemoryError)):
+            self.say(f"{error}.")
+        else:
+            self.say(f"{type(error).__name__}: {error}.")
+            raise error
+
+    def _finish(self) -> None:
+        self._timer.stop()
+        self.run_button.enabled, self.stop_button.enabled = True, False
+        self.progress.visible = False
+
+
+# ---- measuring: a table, by label where there are several, and the curvature diagram ---------------------------------
+
+
+class Measure(Dock):
+    """Measure a labels layer, by label, or an image; the table can be saved."""
+
+    def __init__(self, napari_viewer: Any) -> None:
+        self.layer = ComboBox(label="layer", choices=lambda _: list_layers(napari_viewer, "Labels", "Image"))
+        self.dark = CheckBox(text="dark", tooltip="Of an image: the structure is darker than what is around it.")
+        self.file = FileEdit(label="save as", mode="w", filter="*.csv *.json *.parquet", nullable=True)
+        super().__init__(napari_viewer, [self.layer, self.dark, self.file], "Measure")
+        self.table, self.canvas = Table(), None
+        self.append(self.table)
+        self.table.native.setMinimumHeight(160)
+        self.measures: tuple[Measures, ...] = ()
+
+    def prepare(self) -> Callable[[Progress], tuple[Measures, ...]]:
+        """Read the layer, and check the file."""
+        layer, path = self.layer.value, self._path
+        self.table.value = {"data": [], "columns": []}
+        self._draw(None)
+        field = field_of_layer(layer)
+        if path is not None:
+            check_table(path)
+        if type(layer).__name__ == "Image":
+            return partial(_measure_one, field, {"dark": self.dark.value})
+        numbers = np.unique(field.values[field.values != 0])
+        places = np.flatnonzero((field.values != 0).any((1, 2)))
+        if len(numbers) == 0 or (len(places) > 1 and np.diff(places).min() > 1):
+            what = "labels" if len(numbers) == 0 else "labels on neighbouring slices: complete the layer first"
+            raise ValueError(f"expected {what}, got none in {layer.name}")
+        if len(numbers) > 1:
+            return lambda progress: measure_instances(field, progress=progress)
+        return partial(_measure_one, field, {"kind": "mask"})
+
+    def show_result(self, result: tuple[Measures, ...]) -> str:
+        """Fill the table, draw the diagram, write the file, and let napari show a label's numbers beneath the mouse."""
+        self.measures, first, layer = result, result[0], self.layer.value
+        several = first.part is not None
+        powers = [power_name(first.unit, each.power) for each in first.quantities]
+        pairs = zip(first.quantities, powers, strict=True)
+        names = [f"{each.symbol} ({power})" if power else each.symbol for each, power in pairs]
+        if several:
+            labels = [each.part[1] for each in result if each.part]
+            cells = [[format_number(q.value, 4) for q in each.quantities] for each in result]
+            self.table.value = {"data": cells, "columns": names, "index": list(map(str, labels))}
+        else:
+            cells = [[format_number(q.value, 4), f"± {format_number(q.half, 2)}"] for q in first.quantities]
+            self.table.value = {"data": cells, "columns": ["value", "95 %"], "index": names}
+        self.table.native.resizeColumnsToContents()
+        self._draw(_join([each.diagram for each in result]))
+        if several and type(layer).__name__ == "Labels":
+            import pandas
+
+            values = [[q.value for q in each.quantities] for each in result]
+            layer.features = pandas.DataFrame(values, columns=names).assign(index=labels)
+        if self._path is None:
+            why = [note for each in result for note in each.notes if note.startswith("No intervals")]
+            return f"{len(result)} labels measured." if several else " ".join(["Measured.", *why[:1]])
+        return f"{write_table(result, self._path)} written."
+
+    @property
+    def _path(self) -> Path | None:
+        chosen = self.file.value
+        return None if chosen is None or str(chosen) in ("", ".") else Path(chosen)
+
+    def _draw(self, diagram: Diagram | None) -> None:
+        """Show a curvature diagram below the table, or none."""
+        if self.canvas is not None:
+            self.native.layout().removeWidget(self.canvas)
+            self.canvas.deleteLater()
+            self.canvas = None
+        if diagram is not None and len(diagram.points):
+            figure = diagram_figure(diagram)
+            figure.set_layout_engine("tight")
+            self.canvas = FigureCanvasQTAgg(figure)
+            self.canvas.setMinimumHeight(280)
+            # As wide as the dock is: its own width would widen the window.
+            self.canvas.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
+            self.native.layout().addWidget(self.canvas)
+
+
+def _measure_one(field: Any, options: dict[str, Any], progress: Progress) -> tuple[Measures, ...]:
+    return (measure_scan(field, progress=progress, **options),)
+
+
+def _join(diagrams: Sequence[Diagram]) -> Diagram:
+    """Return the diagram of several surfaces together."""
+    total = sum(float(each.weights.sum()) for each in diagrams)
+    lost = sum(each.excluded * float(each.weights.sum()) for each in diagrams) / total if total else math.nan
+    points, weights = (np.concatenate([getattr(each, name) for each in diagrams]) for name in ("points", "weights"))
+    return Diagram(points, weights, diagrams[0].unit, excluded=lost if total else 0.0)
+
+
+# ---- growing, and the plugin's sample: tubes in noise, of which every 8th slice is annotated -------------------------
+
+
+class Generate(Dock):
+    """Grow a shape of a published texture, as labels."""
+
+    def __init__(self, napari_viewer: Any) -> None:
+        self.preset = ComboBox(label="texture", choices=sorted(PRESETS), value="tubes")
+        self.edge = SpinBox(label="voxels a side", value=64, min=24, max=512)
+        self.seed = SpinBox(label="seed", value=0, min=0, max=2**31 - 1)
+        self.steps = SpinBox(label="steps", value=1000, min=1, max=20000, tooltip="More give a smoother shape.")
+        self.spacing = FloatSpinBox(label="voxel edge", value=1.0, min=1e-6, max=1e6, step=0.1)
+        self.unit = ComboBox(label="unit", choices=["voxel", *METRES], value="voxel")
+        choices = [self.preset, self.edge, self.seed, self.steps, self.spacing, self.unit]
+        super().__init__(napari_viewer, choices, "Grow")
+
+    def prepare(self) -> Callable[[Progress], Flow]:
+        """Read the choices."""
+        options = {"grid": self.edge.value, "seed": self.seed.value, "schedule": schedule("fast", self.steps.value)}
+        return partial(_grow, self.preset.value, options)
+
+    def show_result(self, result: Flow) -> str:
+        """Add the shape."""
+        edge = 1.0 if self.unit.value == "voxel" else self.spacing.value
+        shape = Volume((result.field.numpy() > 0).astype(np.uint8), (edge, edge, edge), self.unit.value)
+        name = f"{self.preset.value}, seed {self.seed.value}"
+        put_layer(self.viewer, "labels", shape.values, name, **place_of_field(shape))
+        return f"{result.status}."
+
+
+def _grow(law: str, options: dict[str, Any], progress: Progress) -> Flow:
+    return generate(law, callbacks=[lambda step, total, _: progress("growing", step / total)], **options)
+
+
+def annotated_tubes() -> list[tuple[Any, dict[str, Any], str]]:
+    """Return layers: an image of grown tubes in noise, every 8th slice of them as labels, and all of them, hidden."""
+    tubes = generate("tubes", grid=(65, 80, 80), seed=0, schedule=schedule("fast", 400)).field.numpy() > 0
+    noise = np.random.default_rng(0).standard_normal(tubes.shape)
+    image = (100 + 60 * ndimage.gaussian_filter(tubes.astype(np.float32), 1.0) + 12 * noise).clip(0, 255)
+    some = np.zeros(tubes.shape, np.uint8)
+    some[::8] = tubes[::8]
+    place = {"scale": (0.5, 0.5, 0.5), "units": ("micrometer",) * 3}
+    return [
+        (image.astype(np.uint8), {"name": "tubes", **place}, "image"),
+        (some, {"name": "every 8th slice", **place}, "labels"),
+        (tubes.astype(np.uint8), {"name": "all of them", "visible": False, **place}, "labels"),
+    ]
