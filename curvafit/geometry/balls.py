@@ -23,26 +23,15 @@ NEAR = 8
 # ---- distances -------------------------------------------------------------------------------------------------------
 
 
-def square_distances(mask: np.ndarray, steps: Sequence[float] | np.ndarray, reach: float) -> np.ndarray:
-    """Return the squared distance of each voxel of a mask to the nearest voxel outside, from centre to centre.
-
-    `steps` are the voxel's edges along z, y and x, `reach` is in their unit, and squares are at most its own. Outside
-    they are 0; float32 (Z, Y, X).
-    """
-    return _transform(mask, steps, reach, 0.0, False)
-
-
-def square_face_distances(mask: np.ndarray, reach: float) -> np.ndarray:
-    """Return the squared distance of each voxel's centre to the faces between a mask and the rest, negative outside.
-
-    In voxels, with squares of at most `reach`²; float32 (Z, Y, X).
-    """
-    return _transform(mask, (1.0, 1.0, 1.0), reach, 0.5, True)
-
-
-def _transform(
-    mask: np.ndarray, steps: Sequence[float] | np.ndarray, reach: float, offset: float, both: bool
+def square_distances(
+    mask: np.ndarray, steps: Sequence[float] | np.ndarray, reach: float, *, offset: float = 0.0, both: bool = False
 ) -> np.ndarray:
+    """Return the squared distance of each voxel's centre in a mask to the rest; float32 (Z, Y, X).
+
+    `steps` are the voxel's edges along z, y and x, `reach` is in their unit, and squares are at most its own. The rest
+    begins `offset` voxels before the centres of its voxels: 0.5 is at their faces. Outside the mask squares are 0, or
+    with `both` those to the mask, negative.
+    """
     squares = np.empty(mask.shape, dtype=np.float32)
     scratch = np.empty((max(mask.shape), _COLUMNS), dtype=np.float32)
     edges = np.asarray(steps, dtype=np.float32)

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from scipy import ndimage
 
-from curvafit.geometry.balls import square_face_distances
+from curvafit.geometry.balls import square_distances
 from curvafit.geometry.morphology import local_thickness
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.kernels.cpu import gaussian_blur
@@ -135,7 +135,8 @@ def profile_mask(mask: np.ndarray) -> np.ndarray:
     The mask is neither empty nor full, and continues as a mirror image beyond its box.
     """
     voxels = Grid(mask.shape, (1.0, 1.0, 1.0), "replicate")  # type: ignore[arg-type]
-    squares = square_face_distances(mask, 6 * WORKING_EPSILON / WORKING_SPACING + math.ceil(4 * STAIRS))
+    reach = 6 * WORKING_EPSILON / WORKING_SPACING + math.ceil(4 * STAIRS)
+    squares = square_distances(mask, (1.0, 1.0, 1.0), reach, offset=0.5, both=True)
     distance = np.copysign(np.sqrt(np.abs(squares)), squares)
     del squares
     once = gaussian_blur(distance, voxels, STAIRS)
@@ -192,6 +193,26 @@ def resample(
         places = (np.arange(a, a + n) + 0.5) * s - 0.5
         smooth = _interpolate(smooth, axis, np.floor(places + 0.5) if nearest else places, f, periodic)
     return smooth
+
+
+def resample_mask(
+    mask: np.ndarray,
+    spacing: Sequence[float],
+    scale: Sequence[float],
+    start: Sequence[int],
+    shape: Sequence[int],
+    *,
+    periodic: bool = False,
+    corner: Sequence[int] = (0, 0, 0),
+) -> np.ndarray:
+    """Return the signed distances to a mask's border, on voxels of `spacing`, on another grid: see `resample`."""
+    distance = centre_distance(mask, spacing, distance_reach(spacing, scale), periodic)
+    return resample(distance, scale, start, shape, periodic=periodic, corner=corner)
+
+
+def distance_reach(spacing: Sequence[float], scale: Sequence[float]) -> float:
+    """Return how far signed distances are taken to resample a mask: four of the longest voxel, old or new."""
+    return 4 * max(max(s * h, h) for s, h in zip(scale, spacing, strict=True))
 
 
 def _interpolate(values: np.ndarray, axis: int, places: np.ndarray, first: int, periodic: bool) -> np.ndarray:

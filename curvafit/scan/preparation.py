@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -245,11 +245,9 @@ def prepare(
     options = {"kind": kind, "threshold": threshold, "dark": dark}
     extremes = (field.values.min(), field.values.max())
     seen, signed = structure.find_structure(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
-    mask = signed.values > 0
-    noise = seen != "field" and structure.is_noise(mask)
-    prepared = _put_on_grid(_Scan(seen, signed, periodic, region, noise, one_scale))
+    prepared = _put_on_grid(_Scan(seen, signed, periodic, region, one_scale), _choose_box, _profile)
     if seen == "image" and quality is None:
-        quality = measure_quality(-part.values if dark else part.values, mask, part.spacing)
+        quality = measure_quality(-part.values if dark else part.values, signed.values > 0, part.spacing)
     corner = tuple(s.start + o for s, o in zip(where, prepared.origin, strict=True))
     return replace(prepared, quality=quality, origin=corner)  # type: ignore[arg-type]
 
@@ -257,8 +255,16 @@ def prepare(
 def prepare_whole(kind: Kind, signed: Volume, periodic: bool, most: int) -> Prepared:
     """Put all of a scan on the working grid, without blur and noise, given its kind and what is above 0 in its
     structure (`structure.find_structure`); raise TooLarge where that is more than `most` working voxels."""
-    noise = kind != "field" and structure.is_noise(signed.values > 0)
-    return _put_on_grid(_Scan(kind, signed, periodic, None, noise, one_scale=False), most)
+
+    def take_all(scan: _Scan, scale: tuple[float, float, float]) -> _Extent:
+        full = count_voxels(scan.field.shape, scale)
+        if math.prod(full) > most:
+            raise TooLarge(f"expected at most {most} working voxels in one piece, got {_join_sides(full)}")
+        return (0, 0, 0), full, ()
+
+    # These scans may be large: compiled loops, which know no periodic box, need less memory. They differ by some 1e-7.
+    profile = _profile if periodic else lambda mask, _: grids.profile_mask(mask)
+    return _put_on_grid(_Scan(kind, signed, periodic, None, one_scale=False), take_all, profile)
 
 
 @dataclass(frozen=True)
@@ -269,17 +275,13 @@ class _Scan:
     field: Volume
     periodic: bool
     region: np.ndarray | None
-    noise: bool
     one_scale: bool
 
     @property
-    def mask(self) -> np.ndarray:
-        return self.field.values > 0
-
-    @property
-    def keeps_grid(self) -> bool:
-        """Return whether the grid is kept whatever the thickness: a phase field has its ε, and noise no thickness."""
-        return self.kind == "field" or self.noise
+    def counted(self) -> np.ndarray:
+        """Return the structure within the region of interest."""
+        mask = self.field.values > 0
+        return mask if self.region is None else mask & self.region
 
     @property
     def thinner(self) -> tuple[np.ndarray, str]:
@@ -290,21 +292,27 @@ class _Scan:
             return inside, "structure"
         return (~inside if self.region is None else ~inside & self.region), "background"
 
-    @property
-    def counted(self) -> np.ndarray:
-        """Return the structure within the region of interest."""
-        return self.mask if self.region is None else self.mask & self.region
+
+#: First working voxel, number of voxels along (z, y, x), and a note where that is not all of the scan.
+_Extent = tuple[tuple[int, int, int], tuple[int, int, int], tuple[str, ...]]
 
 
-def _put_on_grid(scan: _Scan, most: int | None = None) -> Prepared:
-    """Choose the working voxel, move the scan to it, drop specks, profile the mask, choose windows; `most` as in
-    `prepare_whole`, else a large scan is cut."""
+def _put_on_grid(
+    scan: _Scan,
+    choose_box: Callable[[_Scan, tuple[float, float, float]], _Extent],
+    profile: Callable[[np.ndarray, Grid], np.ndarray],
+) -> Prepared:
+    """Choose the working voxel, move a scan to it, as far as `choose_box` says, drop specks, `profile` the mask, choose
+    windows."""
+    spacing, noise = scan.field.spacing, scan.kind != "field" and structure.is_noise(scan.field.values > 0)
+    keeps_grid = scan.kind == "field" or noise  # a phase field has its ε, and noise no thickness
     phase, name = scan.thinner
-    thickness, thick = grids.median_thickness(phase, scan.field.spacing, scan.periodic)
-    note = judge_thickness(name, thickness, thick, scan.field.spacing, scan.keeps_grid)
-    scale, why = _choose_scale(scan, thickness)
-    start, shape, cut = _choose_box(scan, scale, most)
-    edge = working_edge(scale, scan.field.spacing)
+    thickness, thick = grids.median_thickness(phase, spacing, scan.periodic)
+    note = judge_thickness(name, thickness, thick, spacing, keeps_grid)
+    kept = KEPT_FOR_LAWS if scan.one_scale else KEPT
+    scale, why = choose_scale(scan.field.shape, spacing, thickness, keeps_grid, kept=kept, periodic=scan.periodic)
+    start, shape, cut = choose_box(scan, scale)
+    edge = working_edge(scale, spacing)
     values, region = _move(scan, scale, start, shape)
     grid = Grid(shape, boundary="periodic" if scan.periodic and not cut else "replicate")
     mask, dropped = _clean_mask(scan.kind, values, region, thickness / edge, grid.periodic)
@@ -312,20 +320,19 @@ def _put_on_grid(scan: _Scan, most: int | None = None) -> Prepared:
     inverted = note_on_filling(float((mask if region is None else mask[region]).mean()))
     if not windows:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
-
-    def profile(mask: np.ndarray) -> np.ndarray:
-        return phase_field(torch.from_numpy(mask), grid, WORKING_EPSILON).numpy()
-
     if scan.kind != "field":
-        # the profile of `measure`, whose scans may be large: the same to some 1e-7
-        phase = profile(mask) if most is None or grid.periodic else grids.profile_mask(mask)
+        phase = profile(mask, grid)
     else:
-        phase = values if region is None or region.all() else np.minimum(values, profile(region))
+        phase = values if region is None or region.all() else np.minimum(values, profile(region, grid))
     values, size = np.ascontiguousarray(phase, dtype=np.float32), (scale, edge, scan.field.unit, thickness / edge)
     notes = (*scan.field.notes, note, *why, *cut, *dropped, *inverted)
     origin = tuple(a * s for a, s in zip(start, scale, strict=True))
-    told = {"roi": region, "noise": scan.noise, "one_scale": scan.one_scale}
-    return Prepared(scan.kind, values, mask, grid, *size, tuple(windows), notes, origin, **told)  # type: ignore[arg-type]
+    known = {"roi": region, "noise": noise, "one_scale": scan.one_scale}
+    return Prepared(scan.kind, values, mask, grid, *size, tuple(windows), notes, origin, **known)  # type: ignore[arg-type]
+
+
+def _profile(mask: np.ndarray, grid: Grid) -> np.ndarray:
+    return phase_field(torch.from_numpy(mask), grid, WORKING_EPSILON).numpy()
 
 
 def note_on_filling(share: float) -> tuple[str, ...]:
@@ -347,36 +354,39 @@ def judge_thickness(
 
 
 def choose_scale(
-    kind: Kind, frame: Volume, noise: bool, thickness: float
+    shape: Sequence[int],
+    spacing: tuple[float, float, float],
+    thickness: float,
+    keeps_grid: bool,
+    *,
+    kept: tuple[float, float] = KEPT,
+    periodic: bool = False,
 ) -> tuple[tuple[float, float, float], tuple[str, ...]]:
-    """Return the working voxel of a scan in its own voxels (z, y, x), and notes; of `frame` only the place counts."""
-    return _choose_scale(_Scan(kind, frame, False, None, noise, one_scale=False), thickness)
+    """Return the working voxel of a scan in its own voxels (z, y, x), and notes; all ones where its grid is kept.
+
+    The grid of isotropic voxels is kept where it `keeps_grid`, whatever the thickness, or where the median thickness is
+    between the two numbers of voxels that are `kept`.
+    """
+    finest = min(spacing)
+    if max(spacing) <= 1.01 * finest and (keeps_grid or kept[0] <= thickness / finest <= kept[1]):
+        return (1.0, 1.0, 1.0), ("The scan's grid is kept.",)
+    edge = finest if keeps_grid else thickness / WORKING_THICKNESS
+    extent = min(n * h for n, h in zip(shape, spacing, strict=True))
+    note = f"Resampled to {thickness / edge:.3g} voxels a thickness"
+    if extent < FEWEST * edge and edge > finest:
+        edge = max(extent / FEWEST, finest)
+        note = f"Resampled as far as leaves {FEWEST} voxels a side"
+    scale = [edge / h for h in spacing]
+    if periodic:
+        scale = [n / max(4, round(n / s)) for n, s in zip(shape, scale, strict=True)]
+    edges = " x ".join(f"{s:.3g}" for s in scale)
+    return (scale[0], scale[1], scale[2]), (f"{note}: a working voxel is {edges} scan voxels (z, y, x).",)
 
 
 def working_edge(scale: Sequence[float], spacing: Sequence[float]) -> float:
     """Return the edge of a working voxel in the scan's unit; the mean of edges that are not quite alike."""
     edges = [s * h for s, h in zip(scale, spacing, strict=True)]
     return edges[0] if max(edges) <= (1 + 1e-9) * min(edges) else math.prod(edges) ** (1 / 3)
-
-
-def _choose_scale(scan: _Scan, thickness: float) -> tuple[tuple[float, float, float], tuple[str, ...]]:
-    """Return the working voxel in scan voxels, per axis; all ones where the scan's grid is kept."""
-    spacing, finest = scan.field.spacing, min(scan.field.spacing)
-    isotropic = max(spacing) <= 1.01 * finest
-    low, high = KEPT_FOR_LAWS if scan.one_scale else KEPT
-    if isotropic and (scan.keeps_grid or low <= thickness / finest <= high):
-        return (1.0, 1.0, 1.0), ("The scan's grid is kept.",)
-    edge = finest if scan.keeps_grid else thickness / WORKING_THICKNESS
-    extent = min(n * h for n, h in zip(scan.field.shape, spacing, strict=True))
-    note = f"Resampled to {thickness / edge:.3g} voxels a thickness"
-    if extent < FEWEST * edge and edge > finest:
-        edge = max(extent / FEWEST, finest)
-        note = f"Resampled as far as leaves {FEWEST} voxels a side"
-    scale = [edge / h for h in spacing]
-    if scan.periodic:
-        scale = [n / max(4, round(n / s)) for n, s in zip(scan.field.shape, scale, strict=True)]
-    edges = " x ".join(f"{s:.3g}" for s in scale)
-    return (scale[0], scale[1], scale[2]), (f"{note}: a working voxel is {edges} scan voxels (z, y, x).",)
 
 
 def count_voxels(shape: Sequence[int], scale: Sequence[float]) -> tuple[int, int, int]:
@@ -387,14 +397,10 @@ def count_voxels(shape: Sequence[int], scale: Sequence[float]) -> tuple[int, int
     return z, y, x
 
 
-def _choose_box(
-    scan: _Scan, scale: tuple[float, float, float], most: int | None
-) -> tuple[tuple[int, int, int], tuple[int, int, int], tuple[str, ...]]:
-    """Return the first working voxel, number of voxels, and a note where that is not all of the scan."""
+def _choose_box(scan: _Scan, scale: tuple[float, float, float]) -> _Extent:
+    """Return all of a scan, or the part of a large one that holds most of its surface."""
     full = count_voxels(scan.field.shape, scale)
-    if most is not None and math.prod(full) > most:
-        raise TooLarge(f"expected at most {most} working voxels in one piece, got {_join_sides(full)}")
-    if most is not None or max(full) <= LARGEST_BOX:
+    if max(full) <= LARGEST_BOX:
         return (0, 0, 0), full, ()
     sides = [min(n, LARGEST_BOX) for n in full]
     size = [math.ceil(n * s) for n, s in zip(sides, scale, strict=True)]
@@ -409,17 +415,18 @@ def _move(
     scan: _Scan, scale: tuple[float, float, float], start: tuple[int, int, int], shape: tuple[int, int, int]
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the level values and region of interest on the working grid."""
-    values, region = scan.field.values, scan.region
+    values, region, spacing = scan.field.values, scan.region, scan.field.spacing
     if scale == (1.0, 1.0, 1.0):
         box = tuple(slice(a, a + n) for a, n in zip(start, shape, strict=True))
         return values[box], None if region is None else region[box]
+    target: Any = (scale, start, shape)
     if scan.kind == "mask":
-        reach = 4 * max(max(s * h, h) for s, h in zip(scale, scan.field.spacing, strict=True))
-        values = grids.centre_distance(scan.mask, scan.field.spacing, reach, scan.periodic)
-    moved = grids.resample(values, scale, start, shape, periodic=scan.periodic)
+        values = grids.resample_mask(values > 0, spacing, *target, periodic=scan.periodic)
+    else:
+        values = grids.resample(values, *target, periodic=scan.periodic)
     if region is None:
-        return moved, None
-    return moved, grids.resample(region.astype(np.uint8), scale, start, shape, periodic=scan.periodic, nearest=True) > 0
+        return values, None
+    return values, grids.resample(region.astype(np.uint8), *target, periodic=scan.periodic, nearest=True) > 0
 
 
 def _clean_mask(

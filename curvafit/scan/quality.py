@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from curvafit.scan.grids import boxes_by_surface, centre_distance, resample, surface_voxels
+from curvafit.scan.grids import boxes_by_surface, centre_distance, resample, resample_mask, surface_voxels
 from curvafit.volumes.volume import ScanError
 
 #: Blurs that are tried, in voxels of the finest axis.
@@ -21,7 +21,7 @@ _GRAINS = (0.0, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, 1.4, 1.7, 2.0, 2.5,
 _MEASURED = 64
 #: Voxels this far from the surface lie deep within their phase; the least number of them; and the width beyond which
 #: grey levels vary by their lighting, in voxels of the finest axis.
-_DEEP, _FEWEST, _UNEVEN = 3.5, 500, 4.0
+_DEEP, _FEWEST, _UNEVEN = 3.0, 500, 4.0
 #: Median of the absolute value of a normal number.
 _NORMAL_MEDIAN = 0.6745
 #: Smoothed noise over contrast, and slices' thickness over the finest edge, from which on a scan is worse than a mask.
@@ -79,8 +79,8 @@ def sample_mask(
 ) -> np.ndarray:
     """Return a mask `(Z, Y, X)` on voxels of `step` of its own (z, y, x), by signed distances: a thin structure loses
     some per cent of its volume, unless `keep_volume` moves its surface outwards by as much."""
-    distance = centre_distance(mask, (1.0, 1.0, 1.0), 4 * max(1.0, *step), periodic)
-    sampled = resample(distance, step, (0, 0, 0), sampled_shape(mask.shape, step), periodic=periodic)
+    shape = sampled_shape(mask.shape, step)
+    sampled = resample_mask(mask, (1.0, 1.0, 1.0), step, (0, 0, 0), shape, periodic=periodic)
     return sampled > (np.quantile(sampled, 1 - mask.mean()) if keep_volume else 0)
 
 
@@ -103,17 +103,17 @@ def measure_quality(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, f
     image, mask = image[box].astype(np.float32), mask[box]
     levels = image - image.mean()
     edges = [h / min(spacing) for h in spacing]
-    blur, contrast, shift = _fit_blur(levels, mask, edges)
+    distance = centre_distance(mask, edges, dtype=np.float64)
+    blur, contrast, shift = _fit_blur(levels, distance.astype(np.float32), edges)
     if not contrast > 0:
         raise ScanError("expected grey levels that tell structure from background, got none that do")
-    noise, left = _measure_deep_noise(levels, mask, edges) or (_measure_white_noise(levels), 0.0)
+    noise, left = _measure_deep_noise(levels, distance, edges) or (_measure_white_noise(levels), 0.0)
     grain = min(_GRAINS, key=lambda width: abs(_smoothing_factor(width, spacing) - left))
     return Quality(blur, noise / contrast, grain, shift, spacing)
 
 
-def _fit_blur(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> tuple[float, float, float]:
+def _fit_blur(levels: np.ndarray, distance: np.ndarray, edges: Sequence[float]) -> tuple[float, float, float]:
     """Return blur, contrast and boundary shift of levels of mean 0 on voxels with edges in units of the finest."""
-    distance = centre_distance(mask, edges, 4.0)
     explained = []
     for shift in _SHIFTS:
         filled = np.clip(distance - shift + 0.5, 0, 1)
@@ -126,13 +126,12 @@ def _fit_blur(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> t
     return max(explained)[1:]
 
 
-def _measure_deep_noise(levels: np.ndarray, mask: np.ndarray, edges: Sequence[float]) -> tuple[float, float] | None:
+def _measure_deep_noise(levels: np.ndarray, distance: np.ndarray, edges: Sequence[float]) -> tuple[float, float] | None:
     """Return the deviation of levels deep within the phases and the share of it that smoothing leaves, or None."""
     smoothing, uneven = ([width / h for h in edges] for width in (1.0, _UNEVEN))
     both = (levels, ndimage.gaussian_filter(levels, smoothing))
     squares, count = np.zeros(2), 0
-    for phase in (mask, ~mask):
-        deep = np.asarray(ndimage.distance_transform_edt(phase, sampling=edges)) >= _DEEP
+    for deep in (distance >= _DEEP, distance <= -_DEEP):
         around = np.maximum(ndimage.gaussian_filter(deep.astype(np.float32), uneven), 1e-6)
         for k, each in enumerate(both):
             mean = ndimage.gaussian_filter(np.where(deep, each, 0), uneven) / around

@@ -99,9 +99,9 @@ def survey(structure: Structure, run: Run) -> Plan:
 
 def _choose_grid(plan: Plan, median: float, thick: float, name: str) -> Plan:
     """Return the plan with its working grid, as `preparation.prepare` chooses it."""
-    kind, volume = plan.structure.kind, plan.volume
-    note = preparation.judge_thickness(name, median, thick, volume.spacing, kind == "field" or plan.noise)
-    scale, why = preparation.choose_scale(kind, volume, plan.noise, median)
+    volume, keeps_grid = plan.volume, plan.structure.kind == "field" or plan.noise
+    note = preparation.judge_thickness(name, median, thick, volume.spacing, keeps_grid)
+    scale, why = preparation.choose_scale(volume.shape, volume.spacing, median, keeps_grid)
     return replace(
         plan,
         thickness=median,

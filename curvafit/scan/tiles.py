@@ -28,7 +28,7 @@ from curvafit.geometry.topology import euler_of_window, euler_shares
 from curvafit.priors.grid import WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread
 from curvafit.scan import measures as whole
-from curvafit.scan.grids import CutOut, centre_distance, profile_mask, remove_specks, resample
+from curvafit.scan.grids import CutOut, distance_reach, profile_mask, remove_specks, resample, resample_mask
 from curvafit.scan.measures import Blocks, Measures
 from curvafit.scan.preparation import DROPPED, LARGEST_BOX, WORKED, Prepared, TooLarge, note_on_filling, smallest_piece
 from curvafit.scan.structure import Kind, Structure, check_options, read_labels, read_region
@@ -417,14 +417,14 @@ def _find_working_levels(plan: Plan, box: Box) -> np.ndarray:
     ends = [(math.floor(e.start * s), math.ceil(e.stop * s)) for e, s in zip(box, plan.scale, strict=True)]
     z, y, x = (slice(min(a, n), min(b, n)) for (a, b), n in zip(ends, volume.shape, strict=True))
     blurred = [math.ceil(4 * max(0.0, (s - 1) / 2)) + 2 for s in plan.scale]
-    limit = 4 * max(max(s * h, h) for s, h in zip(plan.scale, volume.spacing, strict=True))
-    far = [math.ceil(limit / h) + 1 for h in volume.spacing] if plan.structure.kind == "mask" else [0] * 3
+    reach = distance_reach(volume.spacing, plan.scale) if plan.structure.kind == "mask" else None
+    far = [0 if reach is None else math.ceil(reach / h) + 1 for h in volume.spacing]
     around = grow((z, y, x), [a + b for a, b in zip(blurred, far, strict=True)], volume.shape)
-    values = plan.levels(around)
-    if plan.structure.kind == "mask":
-        values = centre_distance(values > 0, volume.spacing, limit)
+    values, corner = plan.levels(around), [edge.start for edge in around]
     start, shape = [edge.start for edge in box], [edge.stop - edge.start for edge in box]
-    return resample(values, plan.scale, start, shape, corner=[edge.start for edge in around])
+    if plan.structure.kind == "mask":
+        return resample_mask(values > 0, volume.spacing, plan.scale, start, shape, corner=corner)
+    return resample(values, plan.scale, start, shape, corner=corner)
 
 
 def _prepare_part(plan: Plan, phase: np.ndarray, mask: np.ndarray, part: Box) -> Prepared:
