@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -145,6 +146,15 @@ class Diagram(Pictured):
         added = float(self.weights @ square) / self.area if self.area > 0 else 0.0
         spread = math.sqrt(self.spread**2 + added)
         return replace(self, points=means[heavy], weights=weights[heavy], spread=spread, places=None)
+
+
+def join_diagrams(parts: Sequence[Diagram]) -> Diagram:
+    """Return the diagram of several surfaces together, in the unit of the first."""
+    points, weights = (np.concatenate([getattr(part, name) for part in parts]) for name in ("points", "weights"))
+    lost = sum(part.excluded * part.area for part in parts) / weights.sum() if weights.any() else 0.0
+    known = [part.places for part in parts if part.places is not None]
+    places = np.concatenate(known) if len(known) == len(parts) else None
+    return Diagram(points, weights, parts[0].unit, excluded=float(lost), places=places)
 
 
 def diagram(

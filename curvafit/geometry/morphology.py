@@ -87,10 +87,15 @@ def morphometry(
 def measure_connectivity(
     mask: np.ndarray, spacing: tuple[float, float, float], *, periodic: bool = False
 ) -> tuple[float, float]:
-    """Return χ, and the connectivity density: 1 - χ over the volume in which χ is counted (see `morphometry`)."""
+    """Return χ, and the connectivity density."""
     euler = float(euler_number(mask, periodic=True)) if periodic else euler_of_window(mask)
-    sampled = math.prod(mask.shape if periodic else (max(n - 1, 1) for n in mask.shape))
-    return euler, (1 - euler) / (sampled * math.prod(spacing))
+    return euler, connectivity_density(euler, mask.shape, spacing, periodic=periodic)
+
+
+def connectivity_density(euler: float, shape: Sequence[int], spacing: Sequence[float], *, periodic: bool) -> float:
+    """Return 1 - χ over the volume of a box in which χ is counted (see `morphometry`)."""
+    sampled = math.prod(shape if periodic else (max(n - 1, 1) for n in shape))
+    return (1 - euler) / (sampled * math.prod(spacing))
 
 
 def local_thickness(

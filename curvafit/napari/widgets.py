@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,7 +34,7 @@ from curvafit.drawing.plot import diagram_figure
 from curvafit.generation.flow import generate
 from curvafit.generation.result import Flow
 from curvafit.generation.schedule import schedule
-from curvafit.geometry.diagrams import Diagram
+from curvafit.geometry.diagrams import Diagram, join_diagrams
 from curvafit.priors.law import PRESETS
 from curvafit.scan.instances import measure_instances
 from curvafit.scan.measures import Measures
@@ -267,7 +266,7 @@ class Measure(Dock):
             cells = [[format_number(q.value, 4), f"± {format_number(q.half, 2)}"] for q in first.quantities]
             self.table.value = {"data": cells, "columns": ["value", "95 %"], "index": names}
         self.table.native.resizeColumnsToContents()
-        self._draw(_join([each.diagram for each in result]))
+        self._draw(join_diagrams([each.diagram for each in result]))
         if several and type(layer).__name__ == "Labels":
             import pandas
 
@@ -301,14 +300,6 @@ class Measure(Dock):
 
 def _measure_one(field: Any, options: dict[str, Any], progress: Progress) -> tuple[Measures, ...]:
     return (measure_scan(field, progress=progress, **options),)
-
-
-def _join(diagrams: Sequence[Diagram]) -> Diagram:
-    """Return the diagram of several surfaces together."""
-    total = sum(float(each.weights.sum()) for each in diagrams)
-    lost = sum(each.excluded * float(each.weights.sum()) for each in diagrams) / total if total else math.nan
-    points, weights = (np.concatenate([getattr(each, name) for each in diagrams]) for name in ("points", "weights"))
-    return Diagram(points, weights, diagrams[0].unit, excluded=lost if total else 0.0)
 
 
 # ---- growing, and the plugin's sample: tubes in noise, of which every 8th slice is annotated -------------------------

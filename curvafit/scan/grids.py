@@ -19,7 +19,6 @@ from curvafit.volumes.volume import Box
 
 #: Median thickness is measured in a box of at most this many voxels a side.
 MEASURED = 160
-_CONNECTED_26 = np.ones((3, 3, 3), dtype=bool)
 
 
 def bounding_box(shape: tuple[int, int, int], region: np.ndarray | None, longest: int) -> tuple[Box, tuple[str, ...]]:
@@ -88,19 +87,13 @@ def box_with_most_surface(mask: np.ndarray, edge: int | Sequence[int]) -> Box:
     """Return the box, of at most `edge` voxels a side, that holds most of a mask's surface: it slides by voxels."""
     edges = [edge] * 3 if isinstance(edge, int) else edge
     box = [min(n, side) for n, side in zip(mask.shape, edges, strict=True)]
-    held = count_faces(mask).astype(np.float32)
+    sides = mask.astype(np.int8)  # of each voxel, its next neighbours beyond the border count
+    held = np.sum([np.abs(np.diff(sides, axis=axis, append=0)) for axis in range(3)], axis=0).astype(np.float32)
     for axis, side in enumerate(box):
         held = ndimage.uniform_filter1d(held, side, axis, mode="constant")
     inner = tuple(slice(b // 2, n - (b - 1) // 2) for n, b in zip(mask.shape, box, strict=True))
     z, y, x = (int(k) for k in np.unravel_index(int(held[inner].argmax()), held[inner].shape))
     return slice(z, z + box[0]), slice(y, y + box[1]), slice(x, x + box[2])
-
-
-def count_faces(mask: np.ndarray) -> np.ndarray:
-    """Count, for each voxel, its next neighbours along +z, +y and +x that lie on the other side of the border."""
-    sides = mask.astype(np.int8)
-    z, y, x = (np.abs(np.diff(sides, axis=axis, append=0)) for axis in range(3))
-    return z + y + x
 
 
 def centre_distance(
@@ -234,7 +227,7 @@ def remove_specks(
     stay. Of a part, pieces are counted whose first voxel lies in its core.
     """
     part = part or CutOut(tuple(slice(0, n) for n in mask.shape), ((periodic, periodic),) * 3)  # type: ignore[arg-type]
-    specks, count = _small_pieces(mask, smallest, part, _CONNECTED_26)
+    specks, count = _small_pieces(mask, smallest, part, np.ones((3, 3, 3), dtype=bool))
     cleaned = mask & ~specks
     pinholes, holes = _small_pieces(~cleaned, smallest, part, None)
     return cleaned | pinholes, count, holes

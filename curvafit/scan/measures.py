@@ -19,21 +19,14 @@ from curvafit.core.checks import require
 from curvafit.core.runtime import Pictured, Progress, silent
 from curvafit.core.units import convert_length, format_number, plain_unit, power_name
 from curvafit.geometry.description import descriptors
-from curvafit.geometry.diagrams import FAMILIES, MARGIN, Diagram, diagram, families
+from curvafit.geometry.diagrams import FAMILIES, MARGIN, Diagram, diagram, families, join_diagrams
 from curvafit.geometry.mesh import NoSurface, Surface, area_vectors
 from curvafit.geometry.morphology import border_weights, local_thickness, smooth_surface
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
+from curvafit.scan import preparation
 from curvafit.scan.grids import median_thickness, remove_specks
-from curvafit.scan.preparation import (
-    DROPPED,
-    LARGEST_WINDOW,
-    Prepared,
-    TooLarge,
-    prepare,
-    prepare_whole,
-    smallest_piece,
-)
+from curvafit.scan.preparation import LARGEST_WINDOW, Prepared
 from curvafit.scan.structure import Kind, find_structure, is_rounded
 from curvafit.volumes.volume import ScanError, Volume, cut_boxes
 
@@ -277,19 +270,22 @@ class Maps(NamedTuple):
 def measure_maps(
     field: Volume, kind: Kind, options: dict[str, Any], progress: Progress = silent, most: int | None = None
 ) -> Maps:
-    """Measure what is summed of a scan; `options` are the threshold, dark and periodic of `measure`. Curvature is
-    that of a part of a large scan (`prepare.prepare`), or with `most` of all of it (`prepare.prepare_whole`)."""
+    """Measure what is summed of a scan; `options` are the threshold, dark and periodic of `measure`. Curvature is that
+    of a part of a large scan (`preparation.prepare`), or of all of it, of up to `most` working voxels."""
     periodic: bool = options["periodic"]
     progress("finding the structure", 0.0)
     seen, signed = find_structure(field, kind=kind, **options)  # type: ignore[arg-type]
     mask, notes = _drop_specks(seen, signed, periodic)
     progress("measuring curvature", 0.1)
     try:
-        prepared = prepare(field, kind=seen, **options) if most is None else prepare_whole(seen, signed, periodic, most)
+        if most is None:
+            prepared = preparation.prepare(field, kind=seen, **options)
+        else:
+            prepared = preparation.prepare_whole(seen, signed, periodic, most)
         curved, diagram = measure_curvatures(prepared)
         working = tuple(f"Of curvature: {note}" for note in prepared.notes if note not in notes)
     except ValueError as reason:
-        if isinstance(reason, TooLarge) or min(field.shape) >= FEWEST_SLICES:
+        if isinstance(reason, preparation.TooLarge) or min(field.shape) >= FEWEST_SLICES:
             raise
         curved, diagram, working = no_curvature(field.unit, TOO_THIN)
     progress("measuring thickness", 0.5)
@@ -311,10 +307,10 @@ def _drop_specks(kind: Kind, signed: Volume, periodic: bool) -> tuple[np.ndarray
     mask, notes = signed.values > 0, signed.notes
     if kind == "image":
         thickness = median_thickness(mask, signed.spacing, periodic)[0]
-        smallest = smallest_piece(thickness) / math.prod(signed.spacing)
+        smallest = preparation.smallest_piece(thickness) / math.prod(signed.spacing)
         mask, specks, holes = remove_specks(mask, smallest, periodic)
         if specks or holes:
-            notes = (*notes, DROPPED.format(specks, holes))
+            notes = (*notes, preparation.DROPPED.format(specks, holes))
     if mask.all() or not mask.any():
         raise ScanError("expected a structure and background in the scan, got one of them only")
     return mask, notes
@@ -399,11 +395,7 @@ def scan_diagram(prepared: Prepared) -> Diagram:
             parts.append(_measure_tile(prepared, tile))
     if not parts:
         raise NoSurface("expected a surface inside the scan, got none away from its borders")
-    points, areas, places = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("points", "weights", "places")
-    )
-    lost = sum(part.excluded * float(part.weights.sum()) for part in parts) / areas.sum()
-    return Diagram(points, areas, excluded=float(lost), places=places)
+    return join_diagrams(parts)
 
 
 def _cut_axis(n: int) -> list[slice]:
@@ -521,16 +513,13 @@ class Blocks:
 
     def gather(self, places: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return sums over each block, (N, …), of weights (M, …) at places (M, 3) in voxels from the first centre."""
-        voxels, numbers = self.locate(places), np.zeros(len(places), dtype=np.int64)
+        voxels = np.clip(np.rint(places), 0, np.array(self.shape) - 1).astype(np.int64).T
+        numbers = np.zeros(len(places), dtype=np.int64)
         for axis, starts in enumerate(self.starts):
             numbers = numbers * len(starts) + np.searchsorted(starts, voxels[axis], side="right") - 1
         columns = weights.reshape(len(weights), math.prod(weights.shape[1:]))
         sums = [np.bincount(numbers, column, minlength=self.count) for column in columns.T]
         return np.stack(sums, axis=1).reshape(self.count, *weights.shape[1:])
-
-    def locate(self, places: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the indices (z, y, x) of the voxels nearest to places (M, 3) in voxels from the first centre."""
-        return tuple(np.clip(np.rint(places), 0, np.array(self.shape) - 1).astype(np.int64).T)
 
 
 def errors(

@@ -87,6 +87,16 @@ class Structure:
         return values.view(np.uint8) if values.dtype.kind == "b" else values
 
 
+class Padding(NamedTuple):
+    """A constant around what was imaged, its share of the scan, the deviation of the other levels, and whether it is
+    `sure` that it is no background."""
+
+    value: float
+    share: float
+    deviation: float
+    sure: bool
+
+
 def find_structure(
     field: Volume,
     *,
@@ -99,8 +109,9 @@ def find_structure(
 ) -> tuple[Kind, Volume]:
     """Return the kind of a scan in memory, and it as float32 values that are above 0 in its structure, with notes.
 
-    The parameters are as in `prepare.prepare`; `extremes` are the lowest and highest value of the whole that `field` is
-    a part of: they tell a mask's two values. Raises ScanError if the threshold splits nothing or a phase is empty.
+    The parameters are as in `preparation.prepare`; `extremes` are the lowest and the highest value of the whole that
+    `field` is a part of: they tell a mask's two values. Raises ScanError if the threshold splits nothing or a phase is
+    empty.
     """
     inside = None if region is None else replace(field, array=region)
     structure, note = find_split(Structure(field, kind, threshold, dark, inside, alone=True), Run(), extremes)
@@ -127,14 +138,30 @@ def find_levels(structure: Structure, box: Box, periodic: bool = False) -> np.nd
     """
     # Smoothing lowers thin structures' grey: a threshold of the smoothed levels would sink and make them fat.
     if structure.kind == "image":
-        around, volume = grow(box, SMOOTHED, structure.volume.shape), structure.volume
-        smooth = smooth_levels(structure.read(around), volume.spacing, periodic, structure.padding)
-        return sign_levels(smooth[within(box, around)], structure.level, structure.dark, structure.padding)
+        around, padding = grow(box, SMOOTHED, structure.volume.shape), structure.padding
+        smooth = _smooth_levels(structure.read(around), structure.volume.spacing, periodic, padding)
+        signed = (structure.level - smooth if structure.dark else smooth - structure.level)[within(box, around)]
+        if padding is not None and padding.sure:
+            signed[np.isnan(signed)] = -padding.deviation  # padding is background
+        return signed
     values = structure.read(box)
     if structure.kind == "field":
         return (-values if structure.dark else values).astype(np.float32)
     mask = values == structure.highest if structure.two else values > 0
     return np.where(mask != structure.dark, np.float32(1), np.float32(-1))
+
+
+def _smooth_levels(
+    values: np.ndarray, spacing: tuple[float, float, float], periodic: bool, padding: Padding | None
+) -> np.ndarray:
+    """Return grey levels (Z, Y, X) smoothed by one voxel of the finest axis, float32; sure padding is NaN."""
+    width = [min(spacing) / h for h in spacing]
+    smooth = partial(ndimage.gaussian_filter, sigma=width, mode="wrap" if periodic else "nearest", truncate=3.0)
+    if padding is None or not padding.sure:
+        return smooth(values.astype(np.float32))
+    known = values != padding.value
+    weights = smooth(known.astype(np.float32))
+    return smooth(np.where(known, values, 0).astype(np.float32)) / np.where(known, weights, np.nan)
 
 
 def check_options(kind: str, threshold: float | str, label: int | None = None) -> None:
@@ -150,7 +177,7 @@ def check_options(kind: str, threshold: float | str, label: int | None = None) -
         raise ValueError(f"a threshold splits grey levels: leave it out for kind {kind}")
 
 
-# ---- regions, labels, noise, padding ---------------------------------------------------------------------------------
+# ---- regions, labels, noise ------------------------------------------------------------------------------------------
 
 
 def read_region(
@@ -243,102 +270,6 @@ def is_rounded(u: np.ndarray) -> bool:
     return len(np.unique(np.asarray(u))) <= min(_ROUNDED_VALUES, math.prod(u.shape) // 16)
 
 
-def may_be_field(dtype: np.dtype, threshold: Literal["otsu"] | float, lowest: float, highest: float) -> bool:
-    """Return whether a phase field may have this type of numbers and these extremes."""
-    return dtype.kind == "f" and threshold == "otsu" and -2 <= lowest <= -0.7 and 0.3 <= highest <= 2
-
-
-def list_values(values: np.ndarray) -> np.ndarray:
-    """Return the values of a volume, ascending, or some of them where they are more than labels have."""
-    some = np.unique(values.ravel()[:: 1 + values.size // _SAMPLED])
-    return (some if len(some) > _FEW else np.unique(values))[: _FEW + 1]
-
-
-def are_labels(found: np.ndarray) -> bool:
-    """Return whether `list_values` of a volume are those of labels: few whole numbers from 0."""
-    return 2 < len(found) <= _FEW and bool(found[0] >= 0 and (found == np.rint(found)).all())
-
-
-class Padding(NamedTuple):
-    """A constant around what was imaged, its share of the scan, the deviation of the other levels, and whether it is
-    `sure` that it is no background."""
-
-    value: float
-    share: float
-    deviation: float
-    sure: bool
-
-
-def count_constant(values: np.ndarray, value: Any) -> np.ndarray:
-    """Return sums that tell padding with a value, from whole rows (Z, Y, X): how many voxels have it, and how many in
-    runs from the ends of rows; then sums of powers 0 to 4 of the levels next to those runs, and of all others."""
-    constant = values == value
-    ahead = np.logical_and.accumulate(constant, axis=2)
-    behind = np.logical_and.accumulate(constant[..., ::-1], axis=2)[..., ::-1]
-    rim = np.zeros_like(constant)
-    rim[..., 1:] = ahead[..., :-1]
-    rim[..., :-1] |= behind[..., 1:]
-    levels = [values[part].astype(np.float64) for part in (rim & ~constant, ~constant)]
-    sums = [np.count_nonzero(constant), np.count_nonzero(ahead | behind)]
-    with np.errstate(all="ignore"):  # huge numbers tell nothing
-        for each in levels:
-            squares = np.square(each)
-            sums += [each.size, each.sum(), squares.sum(), np.dot(squares, each), np.dot(squares, squares)]
-    return np.array(sums, dtype=np.float64)
-
-
-def judge_padding(value: Any, counts: np.ndarray) -> Padding | None:
-    """Return the padding of a scan by its `count_constant`; None where there is none.
-
-    It is sure where the other levels have two phases (Sarle's coefficient; of a normal distribution it is 1/3), and
-    what lies next to it is like them; or is far from it, and it is below 0, to which no background is cut. A background
-    ends in the low levels of blurred edges.
-    """
-    total, reached, size = counts[0], counts[1], counts[0] + counts[7]
-    if total <= PADDED * size or reached < REACHED * total or total == size:
-        return None
-    near, m, (p2, p3, p4) = counts[3] / max(counts[2], 1), counts[8] / counts[7], counts[9:] / counts[7]
-    with np.errstate(all="ignore"):
-        spread, variance = counts[4] / max(counts[2], 1) - near**2, max(p2 - m**2, 0.0)
-        third, fourth = p3 - 3 * m * p2 + 2 * m**3, p4 - 4 * m * p3 + 6 * m**2 * p2 - 3 * m**4
-        alike = 4 * (near - m) ** 2 < variance < 4 * spread
-        far = value < 0 and (near - float(value)) ** 2 > variance
-        phases = third**2 + variance**3 > TWO_PHASES * fourth * variance
-    return Padding(float(value), total / size, math.sqrt(variance), bool(phases and (alike or far)))
-
-
-def describe_padding(padding: Padding | None, otsu: bool, inside: bool = False) -> tuple[str, ...]:
-    """Return a note on padding; `inside` says whether Otsu's threshold is taken inside of a region."""
-    if padding is None:
-        return ()
-    told = f"{padding.share:.0%} of the voxels, reached from the borders, are exactly {padding.value:g}"
-    told += ", and count as background" * padding.sure
-    told += "" if inside else ": if nothing was imaged there, a region of interest leaves them out"
-    how = " without them" * padding.sure + " inside the region" * inside
-    return (f"{told}; the threshold is taken{how}." if how and otsu else f"{told}.",)
-
-
-def smooth_levels(
-    values: np.ndarray, spacing: tuple[float, float, float], periodic: bool = False, padding: Padding | None = None
-) -> np.ndarray:
-    """Return grey levels (Z, Y, X) smoothed by one voxel of the finest axis, float32; sure padding is NaN."""
-    width = [min(spacing) / h for h in spacing]
-    smooth = partial(ndimage.gaussian_filter, sigma=width, mode="wrap" if periodic else "nearest", truncate=3.0)
-    if padding is None or not padding.sure:
-        return smooth(values.astype(np.float32))
-    known = values != padding.value
-    weights = smooth(known.astype(np.float32))
-    return smooth(np.where(known, values, 0).astype(np.float32)) / np.where(known, weights, np.nan)
-
-
-def sign_levels(smooth: np.ndarray, level: float, dark: bool, padding: Padding | None) -> np.ndarray:
-    """Return smoothed levels less a threshold, above 0 in the structure; padding is background."""
-    signed = level - smooth if dark else smooth - level
-    if padding is not None and padding.sure:
-        signed[np.isnan(signed)] = -padding.deviation
-    return signed
-
-
 def describe_image(structure: Structure, lowest: float, highest: float) -> str:
     """Return the note on padding and threshold, given the extremes of `find_levels`; raise ScanError where the
     threshold is not between those of the smoothed levels."""
@@ -346,9 +277,20 @@ def describe_image(structure: Structure, lowest: float, highest: float) -> str:
     low, high = (level - highest, level - lowest) if structure.dark else (level + lowest, level + highest)
     if not low < level < high:
         raise ScanError(f"expected a threshold within the smoothed scan's {low:.4g} to {high:.4g}, got {level:.4g}")
-    how, side = "Otsu's" if otsu else "the given", "dark" if structure.dark else "bright"
-    note = f"Smoothed by one voxel, split at {how} threshold of {level:.4g}: the {side} phase is the structure."
-    return " ".join([*describe_padding(structure.padding, otsu, structure.region is not None), note])
+    source, side = "Otsu's" if otsu else "the given", "dark" if structure.dark else "bright"
+    padding, inside = structure.padding, structure.region is not None
+    note = "" if padding is None else _describe_padding(padding, otsu, inside)
+    note += f"Smoothed by one voxel, split at {source} threshold of {level:.4g}: the {side} phase is the structure."
+    return note
+
+
+def _describe_padding(padding: Padding, otsu: bool, inside: bool) -> str:
+    """Return a note on padding; `inside` says whether Otsu's threshold is taken inside of a region."""
+    text = f"{padding.share:.0%} of the voxels, reached from the borders, are exactly {padding.value:g}"
+    text += ", and count as background" * padding.sure
+    text += "" if inside else ": if nothing was imaged there, a region of interest leaves them out"
+    levels = " without them" * padding.sure + " inside the region" * inside
+    return f"{text}; the threshold is taken{levels}. " if levels and otsu else f"{text}. "
 
 
 # ---- kind and threshold ----------------------------------------------------------------------------------------------
@@ -377,12 +319,9 @@ def find_split(structure: Structure, run: Run, extremes: tuple[Any, Any] | None 
         raise ScanError(f"every voxel of {volume.source} is {lowest}: a volume must vary")
     ends = {float(first), float(last)}
     two = all(bool(each["two"]) and {float(each["lowest"]), float(each["highest"])} <= ends for each in found)
-    kind, values = structure.kind, np.unique(np.concatenate([each["values"] for each in found]))
+    kind = structure.kind
     if kind == "auto":
-        kind = "mask" if two or (structure.threshold == "otsu" and are_labels(values)) else "image"
-        if kind == "image" and may_be_field(volume.dtype, structure.threshold, float(lowest), float(highest)):
-            steady = 2 * total["steady"] > total["steps"] or not total["steps"]
-            kind = "field" if steady and total["plateau"] > PLATEAUS * math.prod(volume.shape) else "image"
+        kind = _guess_kind(structure, total, np.unique(np.concatenate([each["values"] for each in found])), two)
     ends = {"lowest": float(first), "highest": float(last)}
     structure = replace(structure, kind=kind, **ends, two=two and bool(first < last))
     if kind == "field":
@@ -393,12 +332,23 @@ def find_split(structure: Structure, run: Run, extremes: tuple[Any, Any] | None 
     return _split_image(structure, bars, total, value, run), ""
 
 
+def _guess_kind(structure: Structure, total: Record, values: np.ndarray, two: bool) -> Kind:
+    """Return what a scan is, by the sums of `_look_at_values` and its values, or as many as labels never have."""
+    lowest, highest, otsu = float(total["lowest"]), float(total["highest"]), structure.threshold == "otsu"
+    if two or (otsu and 2 < len(values) <= _FEW and values[0] >= 0 and (values == np.rint(values)).all()):
+        return "mask"
+    if not (structure.volume.dtype.kind == "f" and otsu and -2 <= lowest <= -0.7 and 0.3 <= highest <= 2):
+        return "image"
+    steady = 2 * total["steady"] > total["steps"] or not total["steps"]
+    return "field" if steady and total["plateau"] > PLATEAUS * math.prod(structure.volume.shape) else "image"
+
+
 def _split_image(structure: Structure, bars: Sequence[Box], total: Record, value: Any, run: Run) -> Structure:
     """Return the structure with the padding and the threshold of an image, of which `total` is known."""
     levels, ends = partial(_read_levels, structure, None, False), (total["lowest"], total["highest"])
     if total["constant"] > PADDED * math.prod(structure.volume.shape):
         counted = add_records(run("looking for padding", partial(_count_padding, structure, bars, value), len(bars)))
-        structure = replace(structure, padding=judge_padding(value, counted["padding"]))
+        structure = replace(structure, padding=_judge_padding(value, counted["padding"]))
     padding = structure.padding
     if structure.threshold != "otsu":
         return replace(structure, level=float(structure.threshold))
@@ -413,12 +363,12 @@ def _split_image(structure: Structure, bars: Sequence[Box], total: Record, value
 
 
 def _look_at_values(structure: Structure, bars: Sequence[Box], value: Any, number: int) -> Record:
-    """Return the extremes of a bar, how many voxels have a value, whether it has two values at most, and what tells
-    labels and a phase field."""
+    """Return the extremes of a bar, how many voxels have a value, whether there are two at most, and sums by kind."""
     values = structure.read(bars[number])
     lowest, highest = values.min(), values.max()
     found = {"lowest": lowest, "highest": highest, "two": np.all((values == lowest) | (values == highest))}
-    found["values"] = np.array([lowest, highest]) if found["two"] else list_values(values)
+    some = np.array([lowest, highest]) if found["two"] else np.unique(values.ravel()[:: 1 + values.size // _SAMPLED])
+    found["values"] = (some if found["two"] or len(some) > _FEW else np.unique(values))[: _FEW + 1]
     found["constant"] = np.int64(np.count_nonzero(values == value))
     if values.dtype.kind != "f":
         return {**found, "faults": np.int64(0)}
@@ -431,8 +381,42 @@ def _look_at_values(structure: Structure, bars: Sequence[Box], value: Any, numbe
 
 
 def _count_padding(structure: Structure, bars: Sequence[Box], value: Any, number: int) -> Record:
-    """Return what tells padding with a value in a bar."""
-    return {"padding": count_constant(structure.read(bars[number]), value)}
+    """Return sums that tell padding with a value in a bar of whole rows: how many voxels have it, and how many in runs
+    from the ends of rows; then sums of powers 0 to 4 of the levels next to those runs, and of all others."""
+    values = structure.read(bars[number])
+    constant = values == value
+    ahead = np.logical_and.accumulate(constant, axis=2)
+    behind = np.logical_and.accumulate(constant[..., ::-1], axis=2)[..., ::-1]
+    rim = np.zeros_like(constant)
+    rim[..., 1:] = ahead[..., :-1]
+    rim[..., :-1] |= behind[..., 1:]
+    levels = [values[part].astype(np.float64) for part in (rim & ~constant, ~constant)]
+    sums = [np.count_nonzero(constant), np.count_nonzero(ahead | behind)]
+    with np.errstate(all="ignore"):  # huge numbers tell nothing
+        for each in levels:
+            squares = np.square(each)
+            sums += [each.size, each.sum(), squares.sum(), np.dot(squares, each), np.dot(squares, squares)]
+    return {"padding": np.array(sums, dtype=np.float64)}
+
+
+def _judge_padding(value: Any, counts: np.ndarray) -> Padding | None:
+    """Return the padding of a scan by its `_count_padding`; None where there is none.
+
+    It is sure where the other levels have two phases (Sarle's coefficient; of a normal distribution it is 1/3), and
+    what lies next to it is like them; or is far from it, and it is below 0, to which no background is cut. A background
+    ends in the low levels of blurred edges.
+    """
+    total, reached, size = counts[0], counts[1], counts[0] + counts[7]
+    if total <= PADDED * size or reached < REACHED * total or total == size:
+        return None
+    near, m, (p2, p3, p4) = counts[3] / max(counts[2], 1), counts[8] / counts[7], counts[9:] / counts[7]
+    with np.errstate(all="ignore"):
+        spread, variance = counts[4] / max(counts[2], 1) - near**2, max(p2 - m**2, 0.0)
+        third, fourth = p3 - 3 * m * p2 + 2 * m**3, p4 - 4 * m * p3 + 6 * m**2 * p2 - 3 * m**4
+        alike = 4 * (near - m) ** 2 < variance < 4 * spread
+        far = value < 0 and (near - float(value)) ** 2 > variance
+        phases = third**2 + variance**3 > TWO_PHASES * fourth * variance
+    return Padding(float(value), total / size, math.sqrt(variance), bool(phases and (alike or far)))
 
 
 def _read_levels(structure: Structure, left: float | None, inside: bool, box: Box) -> np.ndarray:

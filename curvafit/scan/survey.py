@@ -16,20 +16,10 @@ import numpy as np
 
 from curvafit.geometry.balls import ball_radii
 from curvafit.scan import preparation
+from curvafit.scan import structure as splitting
 from curvafit.scan.grids import MEASURED, candidate_boxes, order_boxes, surface_voxels, thickness_beneath
 from curvafit.scan.measures import MOST, Blocks
-from curvafit.scan.structure import (
-    LAGS,
-    PIECE,
-    Structure,
-    add_records,
-    check_phases,
-    count_pairs,
-    describe_image,
-    find_levels,
-    find_split,
-    pairs_of_noise,
-)
+from curvafit.scan.structure import LAGS, Structure, add_records, find_levels
 from curvafit.volumes.run import Record, Run
 from curvafit.volumes.volume import Box, Volume, cut_boxes, grow, within
 
@@ -75,16 +65,16 @@ class Plan:
 
 
 def survey(structure: Structure, run: Run) -> Plan:
-    """Find what the tiles of a volume have in common; raise ScanError as `measure.measure`."""
+    """Find what the tiles of a volume have in common; raise ScanError as `tiles.measure`."""
     volume = structure.volume
-    structure, note = find_split(structure, run)
-    pieces = cut_boxes(volume.shape, round(PIECE ** (1 / 3)))
+    structure, note = splitting.find_split(structure, run)
+    pieces = cut_boxes(volume.shape, round(splitting.PIECE ** (1 / 3)))
     total = add_records(run("counting the structure", partial(_count_structure, structure, pieces), len(pieces)))
     if structure.kind == "image":
-        note = describe_image(structure, float(total["lowest"]), float(total["highest"]))
+        note = splitting.describe_image(structure, float(total["lowest"]), float(total["highest"]))
     size, filled = math.prod(volume.shape), int(total["filled"])
-    check_phases(filled, size)
-    noise = structure.kind != "field" and pairs_of_noise(volume.shape, filled / size, total["pairs"])
+    splitting.check_phases(filled, size)
+    noise = structure.kind != "field" and splitting.pairs_of_noise(volume.shape, filled / size, total["pairs"])
     plan = Plan(structure, noise, (*volume.notes, note))
     thinner = filled <= preparation.HALF * size
     candidates = candidate_boxes(volume.shape, MEASURED)
@@ -141,7 +131,7 @@ def _count_structure(structure: Structure, pieces: Sequence[Box], number: int) -
         shared = [_overlap(core, each) for each in candidate_boxes(shape, MEASURED)]
         counts = [0 if each is None else np.count_nonzero(surface[within(each, core)]) for each in shared]
         found[name] = np.array(counts, dtype=np.int64)
-    found["pairs"] = count_pairs(mask, inner, core, shape)
+    found["pairs"] = splitting.count_pairs(mask, inner, core, shape)
     return {name: np.asarray(value) for name, value in found.items()}
 
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from os import PathLike
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from curvafit.core.workers import Cluster
 from curvafit.geometry.balls import NEAR, ball_radii, paint_balls, paint_coarse_balls, reaching_radius
 from curvafit.geometry.diagrams import BIN_WIDTH, MARGIN, Diagram
 from curvafit.geometry.mesh import NoSurface, march
-from curvafit.geometry.morphology import SOFTENED, border_weights, measure_connectivity, soften
+from curvafit.geometry.morphology import SOFTENED, border_weights, connectivity_density, measure_connectivity, soften
 from curvafit.geometry.topology import euler_of_window, euler_shares
 from curvafit.priors.grid import WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread
@@ -46,7 +46,7 @@ HALO = 32
 LARGEST_TILE, SHORTEST = 224**3, 32
 #: Bytes that a voxel of a tile with its surroundings takes, and those of the program itself.
 _EACH, _PROGRAM = 100, 300 * 2**20
-#: Bins of the stored curvature diagram, in `diagram.BIN_WIDTH`.
+#: Bins of the stored curvature diagram, in `diagrams.BIN_WIDTH`.
 _BIN = 0.25
 #: Parts of a volume: all of it, and its region of interest; the region's labels are others.
 _WHOLE, INSIDE = "", "inside"
@@ -268,8 +268,7 @@ class _Sums:
         return {**{f"rows{part}": numbers for part, numbers in rows.items()}, **sums}
 
 
-@dataclass(frozen=True)
-class _Balls:
+class _Balls(NamedTuple):
     """The structure in what was read around a core, specks and pinholes that were dropped, and of both phases the
     thickness on the core, the largest ball's radius, and the voxels around which it is larger than `WIDEST`."""
 
@@ -285,7 +284,7 @@ def _measure_balls(plan: Plan, core: Box, factors: tuple[int, int]) -> _Balls:
     """Measure the thickness of both phases on a core, from as much around it as its balls reach; it is left out (0)
     where balls are wider than `COARSE` and yet to be painted on the finer grid."""
     spacing, finest = plan.volume.spacing, min(plan.volume.spacing)
-    reach = min(_reach(plan.reach, finest), _reach(WIDEST * finest, finest))
+    reach = _reach(min(plan.reach, WIDEST * finest), finest)
     while True:
         box, mask, pieces = _find_structure(plan, core, reach)
         inner = within(core, box)
@@ -325,16 +324,14 @@ def _find_structure(plan: Plan, core: Box, reach: float) -> tuple[Box, np.ndarra
 
 
 def _cut_out(core: Box, box: Box, shape: Sequence[int]) -> CutOut:
-    cut = [(edge.start > 0, edge.stop < n) for edge, n in zip(box, shape, strict=True)]
-    return CutOut(within(core, box), cut)
+    return CutOut(within(core, box), [(edge.start > 0, edge.stop < n) for edge, n in zip(box, shape, strict=True)])
 
 
 # ---- surface and curvature -------------------------------------------------------------------------------------------
 
 
 def _measure_surface(plan: Plan, mask: np.ndarray, box: Box, core: Box) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return places and columns, as `measure.measure_surface`, of the cells that begin in a core; None if there are
-    none."""
+    """Return what `measures.measure_surface` does, of the cells that begin in a core; None if there are none."""
     shape, spacing = plan.volume.shape, plan.volume.spacing
     own = [(edge.start, min(edge.stop, n - 1)) for edge, n in zip(core, shape, strict=True)]
     if any(start >= stop for start, stop in own):
@@ -354,9 +351,9 @@ def _measure_surface(plan: Plan, mask: np.ndarray, box: Box, core: Box) -> tuple
 def _find_own(places: np.ndarray, own: Sequence[tuple[int, int]], wide: Sequence[tuple[int, int]]) -> np.ndarray:
     """Return which places lie in a tile's own cells, of places in more."""
     kept = np.ones(len(places), dtype=bool)
-    for axis, (cells, more) in enumerate(zip(own, wide, strict=True)):
+    for at, cells, more in zip(places.T, own, wide, strict=True):
         if cells != more:
-            kept &= (places[:, axis] >= cells[0]) & (places[:, axis] < cells[1])
+            kept &= (at >= cells[0]) & (at < cells[1])
     return kept
 
 
@@ -410,7 +407,7 @@ def _measure_curvature(plan: Plan, core: Box, sums: _Sums) -> Record:
 
 
 def _find_working_levels(plan: Plan, box: Box) -> np.ndarray:
-    """Return values that are above 0 in the structure on a box of the working grid, as `prepare.prepare` makes them."""
+    """Return a box of the working grid above 0 in the structure, as `preparation.prepare` makes it."""
     if plan.scale == (1.0, 1.0, 1.0):
         return plan.levels(box)
     volume = plan.volume
@@ -495,13 +492,13 @@ def _summarise(plan: Plan, found: Sequence[Record], again: Sequence[Record], sta
     period = total["thickness"] / total["inside"] + total["gap"] / (total["volume"] - total["inside"])
     blocks = Blocks.divide(shape, plan.volume.spacing, period)
     χ = float(sum(each["euler"] for each in found))
-    sampled = math.prod(max(n - 1, 1) for n in shape) * math.prod(plan.volume.spacing)
+    density = connectivity_density(χ, shape, plan.volume.spacing, periodic=False)
     none = whole.no_curvature(plan.volume.unit, whole.TOO_THIN)
     notes = (*_notes(plan, found), *(() if curved else none[2]), *([stated] if len(plan.cores) > 1 else []))
 
     def summarise(part: str, label: int | None = None) -> Measures:
         drawn = _draw(plan, found, part) if tables[part][:, whole.SUMS.index("curved")].any() else none[1]
-        connectivity = (χ, (1 - χ) / sampled) if part == _WHOLE else None
+        connectivity = (χ, density) if part == _WHOLE else None
         table, named = _merge(tables[part], finest, blocks), None if label is None else ("compartment", label)
         return whole.summarise_sums(
             plan.volume, plan.structure.kind, blocks, table, connectivity, drawn, notes, part=named
@@ -550,7 +547,7 @@ def _draw(plan: Plan, found: Sequence[Record], part: str) -> Diagram:
 
 
 def _notes(plan: Plan, found: Sequence[Record]) -> tuple[str, ...]:
-    """Return notes on how a volume was measured, as `measure.measure` gives them."""
+    """Return notes on how a volume was measured, as `_measure_whole` gives them."""
     notes = [*plan.notes]
     specks, holes = (int(n) for n in np.sum([each["pieces"] for each in found], axis=0))
     if specks or holes:
