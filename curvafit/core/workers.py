@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 from curvafit.core.checks import check_int, require
@@ -116,14 +116,9 @@ def cluster(
         yield Cluster(client)
 
 
-@contextmanager
-def join_workers(workers: Cluster | int | None) -> Iterator[Cluster | None]:
+def join_workers(workers: Cluster | int | None) -> AbstractContextManager[Cluster | None]:
     """Take the workers that are given, or start a number of processes on this machine; None where there are none."""
-    if isinstance(workers, int):
-        with cluster(workers) as crew:
-            yield crew
-    else:
-        yield workers
+    return cluster(workers) if isinstance(workers, int) else nullcontext(workers)
 
 
 @contextmanager

@@ -241,7 +241,8 @@ class Measure(Dock):
         if path is not None:
             check_table(path)
         if type(layer).__name__ == "Image":
-            return partial(_measure_one, field, {"dark": self.dark.value})
+            options = {"dark": self.dark.value}
+            return lambda progress: (measure_scan(field, progress=progress, **options),)
         numbers = np.unique(field.values[field.values != 0])
         places = np.flatnonzero((field.values != 0).any((1, 2)))
         if len(numbers) == 0 or (len(places) > 1 and np.diff(places).min() > 1):
@@ -249,7 +250,7 @@ class Measure(Dock):
             raise ValueError(f"expected {what}, got none in {layer.name}")
         if len(numbers) > 1:
             return lambda progress: measure_instances(field, progress=progress)
-        return partial(_measure_one, field, {"kind": "mask"})
+        return lambda progress: (measure_scan(field, progress=progress, kind="mask"),)
 
     def show_result(self, result: tuple[Measures, ...]) -> str:
         """Fill the table, draw the diagram, write the file, and let napari show a label's numbers beneath the mouse."""
@@ -296,10 +297,6 @@ class Measure(Dock):
             # As wide as the dock is: its own width would widen the window.
             self.canvas.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
             self.native.layout().addWidget(self.canvas)
-
-
-def _measure_one(field: Any, options: dict[str, Any], progress: Progress) -> tuple[Measures, ...]:
-    return (measure_scan(field, progress=progress, **options),)
 
 
 # ---- growing, and the plugin's sample: tubes in noise, of which every 8th slice is annotated -------------------------

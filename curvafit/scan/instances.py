@@ -121,7 +121,7 @@ def _measure_body(volume: Volume, boxes: Sequence[tuple[int, Box]], number: int)
         curved, drawn, notes = whole.no_curvature(volume.unit, reason)
     surface = whole.measure_surface(mask, volume.spacing, False)
     empty = np.zeros_like(thickness)
-    maps = whole.Maps(volume.spacing, False, mask, thickness, empty, empty, surface, curved, drawn, "mask", notes)
+    maps = whole.Maps(volume.spacing, mask, thickness, empty, empty, surface, curved, drawn, "mask", notes)
     total = dict(zip(whole.SUMS, maps.sum(whole.Blocks(mask.shape, ((0,),) * 3))[0], strict=True))  # type: ignore[arg-type]
     total |= {"χ": euler_number(mask), **_measure_extent(read(0), box, volume)}
     with np.errstate(divide="ignore", invalid="ignore"):  # without curvature

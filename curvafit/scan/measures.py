@@ -242,7 +242,6 @@ class Maps(NamedTuple):
     """
 
     spacing: tuple[float, float, float]
-    periodic: bool
     mask: np.ndarray
     thickness: np.ndarray
     gap: np.ndarray
@@ -292,7 +291,7 @@ def measure_maps(
     thickness, gap = (local_thickness(each, field.spacing, periodic=periodic) for each in (mask, ~mask))
     euler, surface = euler_shares(mask, periodic=periodic), measure_surface(mask, field.spacing, periodic)
     voxels, notes = (mask, thickness, gap, euler), (*notes, *working)
-    return Maps(field.spacing, periodic, *voxels, surface, curved, diagram, seen, notes)
+    return Maps(field.spacing, *voxels, surface, curved, diagram, seen, notes)
 
 
 def no_curvature(unit: str, reason: object) -> tuple[tuple[np.ndarray, np.ndarray], Diagram, tuple[str, ...]]:

@@ -244,11 +244,8 @@ def count_pairs(mask: np.ndarray, inner: Box, core: Box, shape: Sequence[int]) -
         start = core[axis].start
         for k, lag in enumerate(LAGS):
             stop = edge.start + max(0, min(core[axis].stop, n - lag) - start)
-            here = [*inner]
-            here[axis] = slice(edge.start, stop)
-            there = [*inner]
-            there[axis] = slice(edge.start + lag, stop + lag)
-            first, last = mask[tuple(here)], mask[tuple(there)]
+            moved = (slice(edge.start + shift, stop + shift) for shift in (0, lag))
+            first, last = (mask[(*inner[:axis], part, *inner[axis + 1 :])] for part in moved)
             counts[axis, k] = [np.count_nonzero(first & last), np.count_nonzero(first), np.count_nonzero(last)]
     return counts
 

@@ -59,10 +59,6 @@ class Plan:
         starts = (sorted({n * k // count for count in range(1, MOST + 1) for k in range(count)}) for n in shape)
         return Blocks(shape, tuple(map(tuple, starts)))  # type: ignore[arg-type]
 
-    def levels(self, box: Box) -> np.ndarray:
-        """Return a box of the volume as float32 values that are above 0 in its structure."""
-        return find_levels(self.structure, box)
-
 
 def survey(structure: Structure, run: Run) -> Plan:
     """Find what the tiles of a volume have in common; raise ScanError as `tiles.measure`."""
@@ -106,15 +102,12 @@ def _measure_thickness(plan: Plan, order: Sequence[Box], inside: bool) -> tuple[
     """Return median and 95th percentile of a phase's thickness, as `grids.median_thickness`, and the plan's reach."""
     spacing, box = plan.volume.spacing, order[0]
     around = grow(box, 1, plan.volume.shape)
-    mask = (plan.levels(around) > 0) == inside
+    mask = (find_levels(plan.structure, around) > 0) == inside
     part, surface = (each[within(box, around)] for each in (mask, surface_voxels(mask)))
     median, thick = thickness_beneath(part, surface, spacing)
     half = max(n * h for n, h in zip(part.shape, spacing, strict=True)) / 2
     finite = [float(ball_radii(each, spacing, half).max()) for each in (part, ~part) if each.any()]
     return median, thick, replace(plan, reach=max(plan.reach, *finite))
-
-
-# ---- structure -------------------------------------------------------------------------------------------------------
 
 
 def _count_structure(structure: Structure, pieces: Sequence[Box], number: int) -> Record:
@@ -126,16 +119,12 @@ def _count_structure(structure: Structure, pieces: Sequence[Box], number: int) -
     found = {"lowest": levels[inner].min(), "highest": levels[inner].max()}
     mask = levels > 0
     found["filled"] = np.int64(np.count_nonzero(mask[inner]))
+    boxes = [
+        tuple(slice(max(a.start - b.start, 0), max(a.stop - b.start, 0)) for a, b in zip(measured, core, strict=True))
+        for measured in candidate_boxes(shape, MEASURED)
+    ]
     for name, phase in (("surface", mask), ("other surface", ~mask)):
         surface = surface_voxels(phase)[inner]
-        shared = [_overlap(core, each) for each in candidate_boxes(shape, MEASURED)]
-        counts = [0 if each is None else np.count_nonzero(surface[within(each, core)]) for each in shared]
-        found[name] = np.array(counts, dtype=np.int64)
+        found[name] = np.array([np.count_nonzero(surface[shared]) for shared in boxes], dtype=np.int64)
     found["pairs"] = splitting.count_pairs(mask, inner, core, shape)
     return {name: np.asarray(value) for name, value in found.items()}
-
-
-def _overlap(one: Box, other: Box) -> Box | None:
-    """Return what two boxes share."""
-    z, y, x = (slice(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(one, other, strict=True))
-    return (z, y, x) if all(edge.start < edge.stop for edge in (z, y, x)) else None

@@ -31,7 +31,7 @@ from curvafit.scan import measures as whole
 from curvafit.scan.grids import CutOut, distance_reach, profile_mask, remove_specks, resample, resample_mask
 from curvafit.scan.measures import Blocks, Measures
 from curvafit.scan.preparation import DROPPED, LARGEST_BOX, WORKED, Prepared, TooLarge, note_on_filling, smallest_piece
-from curvafit.scan.structure import Kind, Structure, check_options, read_labels, read_region
+from curvafit.scan.structure import Kind, Structure, check_options, find_levels, read_labels, read_region
 from curvafit.scan.survey import Plan, survey
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.run import Record, open_run
@@ -127,7 +127,7 @@ def measure(
                 raise
     structure = Structure(volume, region=region, **options)  # type: ignore[arg-type]
     workers = workers if volume.in_file and region is None else None
-    return measure_tiles(structure, edge=tile, workers=workers, store=store, progress=progress).scale(edge, unit)
+    return _measure_tiles(structure, tile, workers, store, progress).scale(edge, unit)
 
 
 def _measure_whole(field: Volume, periodic: bool, progress: Progress, kind: Kind, **options: Any) -> Measures:
@@ -317,7 +317,7 @@ def _find_structure(plan: Plan, core: Box, reach: float) -> tuple[Box, np.ndarra
         slice(e.start // 2 * 2, min(-(-e.stop // 2) * 2, n)) for e, n in zip(around, plan.volume.shape, strict=True)
     )
     box, pieces = (z, y, x), (0, 0)
-    mask = plan.levels(box) > 0
+    mask = find_levels(plan.structure, box) > 0
     if plan.smallest:
         mask, *pieces = remove_specks(mask, plan.smallest, False, _cut_out(core, box, plan.volume.shape))
     return box, mask, tuple(pieces)  # type: ignore[return-value]
@@ -346,15 +346,6 @@ def _measure_surface(plan: Plan, mask: np.ndarray, box: Box, core: Box) -> tuple
     places, columns = whole.tabulate_surface(mesh, spacing)
     places = places + [edge.start for edge in part]
     return places, columns * border_weights(places, shape)[:, None]
-
-
-def _find_own(places: np.ndarray, own: Sequence[tuple[int, int]], wide: Sequence[tuple[int, int]]) -> np.ndarray:
-    """Return which places lie in a tile's own cells, of places in more."""
-    kept = np.ones(len(places), dtype=bool)
-    for at, cells, more in zip(places.T, own, wide, strict=True):
-        if cells != more:
-            kept &= (at >= cells[0]) & (at < cells[1])
-    return kept
 
 
 def _around(plan: Plan, core: Box) -> tuple[Box, Box]:
@@ -399,7 +390,9 @@ def _measure_curvature(plan: Plan, core: Box, sums: _Sums) -> Record:
     except NoSurface:
         return found
     corner = np.asarray(drawn.places) / WORKING_SPACING + [edge.start for edge in part]
-    kept = _find_own(corner, own, wide)
+    kept = np.ones(len(places), dtype=bool)
+    for at, cells, more in zip(corner.T, own, wide, strict=True):
+        kept &= (cells == more) | ((at >= cells[0]) & (at < cells[1]))
     sums.gather("curved", places[kept], columns[kept])
     for name in sums.tables:
         found |= _bin(plan, drawn, kept & sums.select(name, places), name)
@@ -409,7 +402,7 @@ def _measure_curvature(plan: Plan, core: Box, sums: _Sums) -> Record:
 def _find_working_levels(plan: Plan, box: Box) -> np.ndarray:
     """Return a box of the working grid above 0 in the structure, as `preparation.prepare` makes it."""
     if plan.scale == (1.0, 1.0, 1.0):
-        return plan.levels(box)
+        return find_levels(plan.structure, box)
     volume = plan.volume
     ends = [(math.floor(e.start * s), math.ceil(e.stop * s)) for e, s in zip(box, plan.scale, strict=True)]
     z, y, x = (slice(min(a, n), min(b, n)) for (a, b), n in zip(ends, volume.shape, strict=True))
@@ -417,7 +410,7 @@ def _find_working_levels(plan: Plan, box: Box) -> np.ndarray:
     reach = distance_reach(volume.spacing, plan.scale) if plan.structure.kind == "mask" else None
     far = [0 if reach is None else math.ceil(reach / h) + 1 for h in volume.spacing]
     around = grow((z, y, x), [a + b for a, b in zip(blurred, far, strict=True)], volume.shape)
-    values, corner = plan.levels(around), [edge.start for edge in around]
+    values, corner = find_levels(plan.structure, around), [edge.start for edge in around]
     start, shape = [edge.start for edge in box], [edge.stop - edge.start for edge in box]
     if plan.structure.kind == "mask":
         return resample_mask(values > 0, volume.spacing, plan.scale, start, shape, corner=corner)
@@ -451,15 +444,13 @@ def _bin(plan: Plan, drawn: Diagram, kept: np.ndarray, part: str) -> Record:
 # ---- all tiles -------------------------------------------------------------------------------------------------------
 
 
-def measure_tiles(
+def _measure_tiles(
     structure: Structure,
-    *,
-    edge: int | None = None,
-    workers: Cluster | int | None = None,
-    store: str | PathLike[str] | None = None,
-    progress: Progress = silent,
+    edge: int | None,
+    workers: Cluster | int | None,
+    store: str | PathLike[str] | None,
+    progress: Progress,
 ) -> Measures:
-    """Measure a volume in tiles of `edge` voxels a side, as `measure` says; raise as it does."""
     same: dict[str, Any] = {}
     if store is not None:  # digests take a while
         same = {"scan": structure.volume.digest, "region": structure.region and structure.region.digest, "tile": edge}

@@ -25,29 +25,8 @@ from curvafit.core.records import read_archive
 from curvafit.core.runtime import one_line
 from curvafit.core.units import common_unit, convert_length, is_unit, parse_unit
 from curvafit.priors.coefficients import NAMES
-from curvafit.volumes.formats.arrays import (
-    MICROSCOPES,
-    read_hdf5,
-    read_imaris,
-    read_microscope,
-    read_npy,
-    read_npz,
-    read_raw,
-)
-from curvafit.volumes.formats.base import (
-    Damaged,
-    ScanError,
-    Stated,
-    affine_of,
-    check_array,
-    check_regular,
-    collect_complaints,
-)
-from curvafit.volumes.formats.dicom import SUFFIXES, is_dicom, read_dicom
-from curvafit.volumes.formats.headers import read_aim, read_isq, read_metaimage, read_mrc, read_nrrd
-from curvafit.volumes.formats.nifti import read_nifti
-from curvafit.volumes.formats.tiff import SLICES, read_slices, read_tiff
-from curvafit.volumes.formats.zarr import list_levels, read_remote, read_zarr
+from curvafit.volumes.formats import arrays, base, dicom, headers, nifti, tiff, zarr
+from curvafit.volumes.formats.base import ScanError, Stated
 from curvafit.volumes.volume import Crop, StoredArray, Volume, check_finite, parse_box, positive_triple
 
 #: A volume as a caller gives it.
@@ -55,21 +34,21 @@ Source = str | os.PathLike[str] | Volume | np.ndarray | torch.Tensor
 
 #: Suffix -> reader(path, key=, raw_shape=, dtype=).
 READERS: dict[str, Callable[..., Stated]] = {
-    **dict.fromkeys((".nii", ".nii.gz"), read_nifti),
-    **dict.fromkeys((".tif", ".tiff"), read_tiff),
-    ".npy": read_npy,
-    ".npz": read_npz,
-    **dict.fromkeys((".h5", ".hdf5"), read_hdf5),
-    ".ims": read_imaris,
-    **dict.fromkeys((".raw", ".bin", ".vol"), read_raw),
-    ".zarr": read_zarr,
-    **dict.fromkeys((".nrrd", ".nhdr"), read_nrrd),
-    **dict.fromkeys((".mha", ".mhd"), read_metaimage),
-    **dict.fromkeys((".mrc", ".map", ".rec"), read_mrc),
-    **dict.fromkeys(SUFFIXES, read_dicom),
-    **dict.fromkeys(MICROSCOPES, read_microscope),
-    ".isq": read_isq,
-    ".aim": read_aim,
+    **dict.fromkeys((".nii", ".nii.gz"), nifti.read_nifti),
+    **dict.fromkeys((".tif", ".tiff"), tiff.read_tiff),
+    ".npy": arrays.read_npy,
+    ".npz": arrays.read_npz,
+    **dict.fromkeys((".h5", ".hdf5"), arrays.read_hdf5),
+    ".ims": arrays.read_imaris,
+    **dict.fromkeys((".raw", ".bin", ".vol"), arrays.read_raw),
+    ".zarr": zarr.read_zarr,
+    **dict.fromkeys((".nrrd", ".nhdr"), headers.read_nrrd),
+    **dict.fromkeys((".mha", ".mhd"), headers.read_metaimage),
+    **dict.fromkeys((".mrc", ".map", ".rec"), headers.read_mrc),
+    **dict.fromkeys(dicom.SUFFIXES, dicom.read_dicom),
+    **dict.fromkeys(arrays.MICROSCOPES, arrays.read_microscope),
+    ".isq": headers.read_isq,
+    ".aim": headers.read_aim,
 }
 
 #: Cosine of the angle of two axes up to which they count as at right angles: a shear of 2 % turns normals by a degree.
@@ -77,7 +56,8 @@ RIGHT = 0.02
 #: What may vary in space: the six coefficients, the mass and ε, all in working units.
 PARAMETERS = (*NAMES, "mass", "epsilon")
 #: Readers of formats that can hold several arrays, by key.
-KEYED = (read_npz, read_hdf5, read_imaris, read_zarr, read_dicom, read_microscope)
+KEYED = (arrays.read_npz, arrays.read_hdf5, arrays.read_imaris, arrays.read_microscope)
+KEYED += (zarr.read_zarr, dicom.read_dicom)
 
 
 def load(
@@ -161,20 +141,21 @@ def _open(
 ) -> Volume:
     """Return the volume of a file, whose values are read where they are asked for where the format has them so."""
     location, key = split_key(path, key)
-    how = {"key": key, "raw_shape": raw_shape, "dtype": dtype}
-    stated = read_file(location, **how)  # type: ignore[arg-type]
+    reading = {"key": key, "raw_shape": raw_shape, "dtype": dtype}
+    stated = read_file(location, **reading)  # type: ignore[arg-type]
     if strict and stated.gaps:
         raise ScanError(f"{location} is not whole: {stated.gaps[0]}")
     if not isinstance(stated.array, np.ndarray) or isinstance(stated.array, np.memmap):
-        stated = stated._replace(array=FileArray(location, how, stated.array))
+        stated = stated._replace(array=FileArray(location, reading, stated.array))
     return to_volume(stated, f"{location}::{key}" if key else str(location), **options)
 
 
 class FileArray:
     """The array of a file, which each process opens for itself."""
 
-    def __init__(self, path: Path | str, how: Mapping[str, Any], array: Any) -> None:
-        self.path, self.how, self.shape, self.dtype, self._array = path, how, tuple(array.shape), array.dtype, array
+    def __init__(self, path: Path | str, reading: Mapping[str, Any], array: Any) -> None:
+        self.path, self.reading, self.shape, self.dtype = path, reading, tuple(array.shape), array.dtype
+        self._array = array
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_array": None}
@@ -182,7 +163,7 @@ class FileArray:
     def __getitem__(self, index: Any) -> np.ndarray:
         # A mapped file that became shorter would end the process: what is mapped is opened, and checked, each time.
         if self._array is None or isinstance(getattr(self._array, "array", self._array), np.memmap):
-            self._array = read_file(self.path, **self.how).array
+            self._array = read_file(self.path, **self.reading).array
         with _name_damage(self.path):
             return np.asarray(self._array[index])
 
@@ -190,11 +171,11 @@ class FileArray:
     def digest(self) -> str:
         """A text that changes with the content, without reading it: of a folder the total size and latest time."""
         if isinstance(self.path, str):
-            return f"{self.path} {self.how}"
+            return f"{self.path} {self.reading}"
         files = [path for path in self.path.rglob("*") if path.is_file()] if self.path.is_dir() else [self.path]
         states = [path.stat() for path in files]
         size, time = sum(state.st_size for state in states), max(state.st_mtime_ns for state in states)
-        return f"{self.path.resolve()} {self.how}: {size} bytes at {time}"
+        return f"{self.path.resolve()} {self.reading}: {size} bytes at {time}"
 
 
 def read_values(path: str | os.PathLike[str]) -> np.ndarray:
@@ -205,7 +186,7 @@ def read_values(path: str | os.PathLike[str]) -> np.ndarray:
     stated = read_file(Path(path))
     for gap in stated.gaps:
         warnings.warn(f"{path}: {gap}", UserWarning, stacklevel=2)
-    check_array(stated.array.shape, stated.array.dtype, path)
+    base.check_array(stated.array.shape, stated.array.dtype, path)
     with _name_damage(Path(path)):
         values = np.asarray(stated.array[...])
     while values.ndim > 3 and values.shape[0] == 1:
@@ -219,10 +200,10 @@ def read_file(
     """Return what a file, a folder, or a store of an address states; what a library raises at damage is a ScanError."""
     if isinstance(path, str):
         with _name_damage(path):
-            return read_remote(path, key)
+            return zarr.read_remote(path, key)
     if not path.exists():
         raise FileNotFoundError(one_line(f"no such file: {path}"))
-    reader = pick_reader(check_regular(path), raw_shape is not None)
+    reader = pick_reader(base.check_regular(path), raw_shape is not None)
     if key is not None and reader not in KEYED:
         raise ScanError(
             f"a key applies to NPZ, HDF5, Imaris, Zarr, DICOM, CZI, LIF and ND2 only, got {quoted(key)} for {path}"
@@ -235,14 +216,14 @@ def read_file(
 def _name_damage(path: Path | str) -> Iterator[None]:
     """Turn what a library raises at damage into a ScanError that names the file, and keep what it prints."""
     try:
-        with collect_complaints():
+        with base.collect_complaints():
             yield
     except (ScanError, ImportError):  # a library that is not installed says so itself
         raise
     except MemoryError as reason:
         raise ScanError(f"{path} does not fit into memory") from reason
     except Exception as reason:  # every library has its own way to say that a file is damaged
-        kind = "" if isinstance(reason, Damaged | ValueError) else f"{type(reason).__name__}: "
+        kind = "" if isinstance(reason, base.Damaged | ValueError) else f"{type(reason).__name__}: "
         text = " ".join(f"{kind}{reason}"[:2000].split())[:200]
         raise ScanError(f"{path} cannot be read, it is damaged or something else ({text})") from reason
 
@@ -256,7 +237,7 @@ def pick_reader(path: Path, shape_given: bool = False) -> Callable[..., Stated]:
         if name.endswith(suffix):
             return READERS[suffix]
     if shape_given:
-        return read_raw
+        return arrays.read_raw
     raise ScanError(f"a volume's name must end in one of {', '.join(READERS)}, got {path.name!r}")
 
 
@@ -294,18 +275,20 @@ def levels_of(source: object, key: str | None = None) -> dict[str, tuple[float, 
     if not isinstance(source, str | os.PathLike):
         return {}
     path, key = split_key(source, key)
-    return list_levels(path, key) if isinstance(path, Path) and path.is_dir() and pick_reader(path) is read_zarr else {}
+    if not (isinstance(path, Path) and path.is_dir() and pick_reader(path) is zarr.read_zarr):
+        return {}
+    return zarr.list_levels(path, key)
 
 
 def _pick_folder(path: Path) -> Callable[..., Stated]:
     """Return the reader of a folder: of a Zarr store, or of slices, as images or DICOM."""
     inside = [p for p in path.iterdir() if not p.name.startswith(".")]
     if any(p.name in ("zarr.json", ".zarray", ".zgroup") for p in path.iterdir()) or path.suffix == ".zarr":
-        return read_zarr
-    if any(p.suffix.lower() in SLICES for p in inside):
-        return read_slices
-    if any(p.is_file() and is_dicom(p) for p in inside):
-        return read_dicom
+        return zarr.read_zarr
+    if any(p.suffix.lower() in tiff.SLICES for p in inside):
+        return tiff.read_slices
+    if any(p.is_file() and dicom.is_dicom(p) for p in inside):
+        return dicom.read_dicom
     raise ScanError(f"the folder {path} holds neither slices (TIFF, BMP, PNG, JPEG, DICOM) nor a Zarr store")
 
 
@@ -344,7 +327,7 @@ def to_volume(
             lengths = np.linalg.norm(affine[:3, :3], axis=0)
             affine[:3, :3] *= edges[::-1] / np.where(lengths > 0, lengths, 1)
     elif origin is not None and any(origin):
-        affine = affine_of(np.diag(edges[::-1]), (scale * origin)[::-1])
+        affine = base.affine_of(np.diag(edges[::-1]), (scale * origin)[::-1])
     notes = (*stated.gaps, *stated.notes, *notes, *more)
     notes += stated.guesses if spacing is None and unit is None else ()
     volume = Volume(array, tuple(edges.tolist()), name, affine, source, notes)
@@ -394,11 +377,7 @@ def _find_axes(
 
 
 def _pick_numbers(
-    shape: Sequence[int],
-    axes: Mapping[str, int | None],
-    asked: Mapping[str, int | None],
-    source: str,
-    count: int,
+    shape: Sequence[int], axes: Mapping[str, int | None], asked: Mapping[str, int | None], source: str, count: int
 ) -> dict[int, int | None]:
     """Return the number to take of the axis of channels and that of times, None where none is asked for."""
     numbers: dict[int, int | None] = {}
@@ -495,15 +474,15 @@ def read_maps(path: str | Path, shape: tuple[int, int, int] | None = None) -> di
     if not place.exists():
         raise FileNotFoundError(f"no such file or folder of maps: {place}")
     try:
-        arrays = None if place.is_dir() else read_archive(place)
+        content = None if place.is_dir() else read_archive(place)
     except (ValueError, OSError) as reason:
         raise ValueError(f"{place} is neither an NPZ file nor a folder of maps") from reason
-    arrays = _read_folder(place) if arrays is None else arrays
-    unknown = sorted(arrays.keys() - set(PARAMETERS))
-    if unknown or not arrays:
+    content = _read_folder(place) if content is None else content
+    unknown = sorted(content.keys() - set(PARAMETERS))
+    if unknown or not content:
         listed = ", ".join(unknown) or "none"
         raise ValueError(f"maps must be named {', '.join(PARAMETERS)}, got {listed} in {place}")
-    for name, values in arrays.items():
+    for name, values in content.items():
         numbers = values.dtype.kind in "iuf"
         if not numbers or not np.isfinite(values).all() or np.abs(values).max(initial=0) > np.finfo(np.float32).max:
             raise ValueError(f"the map {name} must hold finite numbers, got others in {place}")
@@ -513,7 +492,7 @@ def read_maps(path: str | Path, shape: tuple[int, int, int] | None = None) -> di
                 raise ValueError(f"the map {name} must have the shape {shape}, got {values.shape} in {place}")
     return {
         name: float(values.reshape(())) if values.size == 1 else torch.from_numpy(values.astype(np.float32))
-        for name, values in arrays.items()
+        for name, values in content.items()
     }
 
 
@@ -527,10 +506,10 @@ def _read_folder(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays of a folder's volume files by name; files of other names are not read, and get empty arrays."""
     suffixes = tuple(READERS)
     files = [p for p in sorted(path.iterdir()) if p.name.lower().endswith(suffixes) and not p.name.startswith(".")]
-    arrays: dict[str, np.ndarray] = {}
+    content: dict[str, np.ndarray] = {}
     for file in files:
         name = file.name.split(".")[0]
-        if name in arrays:
+        if name in content:
             raise ScanError(f"{path} holds two maps {name}")
-        arrays[name] = read_values(file) if name in PARAMETERS else np.empty(0)
-    return arrays
+        content[name] = read_values(file) if name in PARAMETERS else np.empty(0)
+    return content

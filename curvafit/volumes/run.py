@@ -78,7 +78,9 @@ class Run:
         for done, (number, record) in enumerate(run_jobs(do, rest, self._crew), count - len(rest) + 1):
             records[number] = keep(number, record)
             if self._folder is not None:
-                _write_record(self._folder, name, number, records[number])
+                buffer = io.BytesIO()
+                np.savez(buffer, allow_pickle=False, **records[number])
+                write_content(_file_of(self._folder, name, number), buffer.getvalue())
             self._progress(shown or name, start + (stop - start) * done / count)
         return [records[number] for number in range(count)]
 
@@ -138,12 +140,6 @@ def _read_records(folder: Path, name: str, count: int) -> dict[int, Record]:
             with np.load(path, allow_pickle=False) as arrays:
                 records[number] = dict(arrays)
     return records
-
-
-def _write_record(folder: Path, name: str, number: int, record: Mapping[str, np.ndarray]) -> None:
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **record)
-    write_content(_file_of(folder, name, number), buffer.getvalue())
 
 
 @contextmanager

@@ -182,7 +182,9 @@ class Volume(Pictured):
         """Return the volume in memory; ScanError where that of a file does not fit, is not finite, or constant."""
         values, label = self.values, self.array.label if self.in_file else None
         if label is None and self.source:
-            check_varies(values, self.source)
+            lowest, highest = check_finite(values, self.source)
+            if lowest == highest:
+                raise ScanError(f"every voxel of {self.source} is {lowest}: a volume must vary")
         elif label is not None and _LABELLED.format(label) in self.notes and (values.all() or not values.any()):
             replace(self, array=replace(self.array, label=None)).load().label(label)  # says which labels there are
         return replace(self, array=values) if self.in_file else self
@@ -267,13 +269,6 @@ class StoredArray:
             values = is_label(values, self.label)
         turned = values.transpose([sorted(self.order).index(axis) for axis in self.order])
         return np.array(turned, self.dtype, order="C", copy=None if values.flags.owndata else True)  # not a mapped file
-
-
-def check_varies(values: np.ndarray, place: object) -> None:
-    """Raise ScanError where values are not finite, or all the same."""
-    lowest, highest = check_finite(values, place)
-    if lowest == highest:
-        raise ScanError(f"every voxel of {place} is {lowest}: a volume must vary")
 
 
 def check_finite(values: np.ndarray, place: object) -> tuple[float, float]:

@@ -149,13 +149,7 @@ def _gaps(dataset: Any, path: Path) -> Iterator[str]:
         yield f"No values are stored: {fill}"
 
 
-def read_raw(
-    path: Path,
-    *,
-    raw_shape: Sequence[int] | None = None,
-    dtype: str | None = None,
-    **_: object,
-) -> Stated:
+def read_raw(path: Path, *, raw_shape: Sequence[int] | None = None, dtype: str | None = None, **_: object) -> Stated:
     """Read bare numbers, x fastest; shape and type come from the caller (one byte per voxel needs no type)."""
     if raw_shape is None:
         raise ScanError(f"{path} holds bare numbers: give raw_shape (--raw-shape Z,Y,X)")

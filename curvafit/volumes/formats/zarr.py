@@ -18,16 +18,8 @@ from curvafit.core.files import move_into_place, write_content
 from curvafit.core.records import MARK, is_zarr
 from curvafit.core.runtime import hold_signals
 from curvafit.core.units import common_unit, format_sampling, parse_unit
-from curvafit.volumes.formats.base import (
-    Damaged,
-    ScanError,
-    Stated,
-    affine_of,
-    first_voxel,
-    name_axes,
-    pick_key,
-    read_spacing,
-)
+from curvafit.volumes.formats import base
+from curvafit.volumes.formats.base import ScanError, Stated
 from curvafit.volumes.volume import Box, cut_boxes
 
 #: Edge of a chunk, and of the largest volume that is not halved any more, in voxels.
@@ -40,8 +32,6 @@ _HALVED = 2
 _UNITS = {"nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter"}
 #: Version of OME-Zarr -> Zarr's format, for writing.
 _FORMATS = {"0.4": 2, "0.5": 3}
-
-
 #: The letters of the axes of a level of an image, and the steps, units and origin along them, as `Stated` has them.
 _Place = dict[str, Any]
 
@@ -57,15 +47,11 @@ def read_zarr(path: Path, *, key: str | None = None, **_: object) -> Stated:
     _check_store(path)
     node: Any = zarr.open(path, mode="r")
     if isinstance(node, zarr.Array):
-        return _state_array(node, path, read_spacing(node.attrs.asdict(), node.ndim))
-    arrays, places, name, unasked = _pick_array(node, key, path)
-    array = arrays[name]
-    if unasked:
+        return _state_array(node, path)
+    arrays, places, name = _pick_array(node, key, path)
+    if key is None:
         _check_levels(arrays, places, path)
-    place = places.get(name)
-    if place is None:
-        place = read_spacing({**node.attrs.asdict(), **array.attrs.asdict()}, array.ndim)
-    return _state_array(array, path / array.path, place)
+    return _state_array(arrays[name], path / arrays[name].path, places.get(name), node)
 
 
 def read_remote(url: str, key: str | None = None) -> Stated:
@@ -80,7 +66,7 @@ def read_remote(url: str, key: str | None = None) -> Stated:
 
     node: Any = zarr.open(url, mode="r")
     if isinstance(node, zarr.Array):
-        return _state_array(node, None, read_spacing(node.attrs.asdict(), node.ndim))
+        return _state_array(node, None)
     places = _levels("", node.attrs.asdict())
     name = key or next(iter(places), None)
     if name is None:
@@ -90,8 +76,7 @@ def read_remote(url: str, key: str | None = None) -> Stated:
         places = _levels(name, array.attrs.asdict())
         name = next(iter(places), name)
         array = node[name]
-    own = {**node.attrs.asdict(), **array.attrs.asdict()}
-    return _state_array(array, None, places[name] if name in places else read_spacing(own, array.ndim))
+    return _state_array(array, None, places.get(name), node)
 
 
 def list_levels(path: Path, key: str | None) -> dict[str, tuple[float, ...] | None]:
@@ -102,15 +87,14 @@ def list_levels(path: Path, key: str | None) -> dict[str, tuple[float, ...] | No
     node: Any = zarr.open(path, mode="r")
     if isinstance(node, zarr.Array):
         return {}
-    arrays, places, name, _ = _pick_array(node, key, path)
+    arrays, places, name = _pick_array(node, key, path)
     if key is not None and key.strip("/") == name:
         return {}
     return {each: place["steps"] for each, place in places.items() if each in arrays}
 
 
-def _pick_array(node: Any, key: str | None, path: Path) -> tuple[dict[str, Any], dict[str, _Place], str, bool]:
-    """Return the arrays of a group, the places of the levels of the image that is read, its array's name, and whether
-    no key named it."""
+def _pick_array(node: Any, key: str | None, path: Path) -> tuple[dict[str, Any], dict[str, _Place], str]:
+    """Return the arrays of a group, the places of the levels of the image that is read, and its array's name."""
     import zarr
 
     members = dict(node.members(max_depth=None))
@@ -118,20 +102,23 @@ def _pick_array(node: Any, key: str | None, path: Path) -> tuple[dict[str, Any],
     images = {"": node} | {name: member for name, member in members.items() if name not in arrays}
     levels = {name: _levels(name, group.attrs.asdict()) for name, group in images.items()}
     firsts = {name: next(iter(places)) for name, places in levels.items() if places}
-    if unasked := key is None:
+    if key is None:
         volumes = [name for name in firsts if "labels" not in name.split("/")]
         key = firsts.get("") or (firsts[volumes[0]] if len(volumes) == 1 else None)
     elif key.strip("/") in firsts:
         key = firsts[key.strip("/")]
-    name = pick_key(sorted(arrays), key, path)
-    return arrays, next((each for each in levels.values() if name in each), {}), name, unasked
+    name = base.pick_key(sorted(arrays), key, path)
+    return arrays, next((each for each in levels.values() if name in each), {}), name
 
 
-def _state_array(array: Any, folder: Path | None, place: _Place) -> Stated:
-    """Return an array in a folder at its place, with a sentence on chunks that are not stored."""
+def _state_array(array: Any, folder: Path | None, place: _Place | None = None, group: Any = None) -> Stated:
+    """Return an array in a folder at its place, by default that of its or its group's attributes."""
+    if place is None:
+        shared = {} if group is None else group.attrs.asdict()
+        place = base.read_spacing({**shared, **array.attrs.asdict()}, array.ndim)
     axes, units = place.get("axes", ""), place.get("units") or (None,) * 3
     named = getattr(array.metadata, "dimension_names", None) or array.attrs.get("_ARRAY_DIMENSIONS") or ()
-    own, notes = name_axes([str(each) for each in named]), tuple(place.get("notes", ()))
+    own, notes = base.name_axes([str(each) for each in named]), tuple(place.get("notes", ()))
     own = own if len(own) == array.ndim else "?" * array.ndim
     if len(axes) == array.ndim and any(a != b and "?" not in (a, b) for a, b in zip(axes, own, strict=True)):
         notes += (f"The array calls its axes {', '.join(map(str, named))}: those of the image count.",)
@@ -173,7 +160,7 @@ def _create_zarr(frame: Any, path: Path, version: str, labels: bool) -> Any:
     datasets = []
     for k in range(len(shapes)):
         transforms = [{"type": "scale", "scale": [2**k * h for h in frame.spacing]}]
-        first = [x + shift * (2**k - 1) * h for x, h in zip(first_voxel(frame), frame.spacing, strict=True)]
+        first = [x + shift * (2**k - 1) * h for x, h in zip(base.first_voxel(frame), frame.spacing, strict=True)]
         if any(first):
             transforms += [{"type": "translation", "translation": first}]
         datasets.append({"path": str(k), "coordinateTransformations": transforms})
@@ -245,10 +232,9 @@ def image_of(path: Path) -> Path | None:
 
 def store_of(image: Path) -> Path:
     """Return the outermost Zarr group around an image."""
-    groups = [image]
-    while is_zarr(groups[-1].parent):
-        groups.append(groups[-1].parent)
-    return groups[-1]
+    while is_zarr(image.parent):
+        image = image.parent
+    return image
 
 
 def write_labels(field: Any, path: Path, *, image: Path) -> None:
@@ -272,7 +258,7 @@ def check_place(field: Any, image: Path) -> None:
         common, factors = common_unit([place["units"][axis] for axis in where] if place["units"] else [None] * 3)
         unit, factor = parse_unit(common)
         alike = np.allclose(np.array(field.spacing) / factor, edges * factors, rtol=1e-3, atol=0)
-        first = (np.array(first_voxel(field)) / factor / factors - start) / edges
+        first = (np.array(base.first_voxel(field)) / factor / factors - start) / edges
         if unit == field.unit and alike and (first > -0.01).all() and (first + field.shape < shape + 0.01).all():
             return
     size = format_sampling(field.shape, field.spacing, field.unit)
@@ -343,7 +329,7 @@ def _levels(name: str, attributes: Mapping[str, Any]) -> dict[str, _Place]:
         steps += [] if systems else image.get("coordinateTransformations", [])
         axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in listed]
         names = [str(axis["type"] if axis.get("type") in ("channel", "time") else axis.get("name")) for axis in axes]
-        place = {"axes": name_axes(names), "units": [axis.get("unit") for axis in axes], "notes": notes}
+        place = {"axes": base.name_axes(names), "units": [axis.get("unit") for axis in axes], "notes": notes}
         places[f"{name}/{level['path']}".strip("/")] = place | _place_of(steps, place["axes"])
     return places
 
@@ -366,7 +352,7 @@ def _place_of(transforms: Sequence[Mapping[str, Any]], axes: str) -> _Place:
         return {"steps": steps.tolist(), "origin": matrix[:n, n].tolist() if matrix[:n, n].any() else None}
     if len(space) < 3 or np.count_nonzero(linear) != n - 3 + np.count_nonzero(linear[np.ix_(space, space)]):
         return {"steps": None, "units": ("coordinates of a transform of axes that are not of space",) * n}
-    return {"steps": steps.tolist(), "affine": affine_of(linear[np.ix_(space, space)], matrix[space, n])}
+    return {"steps": steps.tolist(), "affine": base.affine_of(linear[np.ix_(space, space)], matrix[space, n])}
 
 
 def _compose(transforms: Sequence[Mapping[str, Any]], n: int) -> np.ndarray | str:
@@ -457,7 +443,7 @@ def _check_blosc(chunk: Path) -> None:
     with chunk.open("rb") as stream:
         nbytes = int.from_bytes(stream.read(16)[12:], "little")
     if nbytes != (size := chunk.stat().st_size):
-        raise Damaged(f"{nbytes} bytes by the header of chunk {chunk.name}, {size} in the file")
+        raise base.Damaged(f"{nbytes} bytes by the header of chunk {chunk.name}, {size} in the file")
 
 
 def _counts(shape: Sequence[int], edges: Sequence[int]) -> list[int]:
