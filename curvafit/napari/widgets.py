@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from abc import abstractmethod
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -76,12 +75,12 @@ def _lengths(layer: Any) -> tuple[tuple[float, float, float], str]:
     names = [str(each) for each in layer.units[-3:]]
     if wrong := next((name for name in names if not is_unit(name)), None):
         raise ScanError(f"expected lengths along the axes of {layer.name}, got the unit {wrong}")
-    found = [parse_unit(name)[0] for name in names]
-    if 0 < found.count("voxel") < 3:
+    units = [parse_unit(name)[0] for name in names]
+    if 0 < units.count("voxel") < 3:
         raise ScanError(f"expected one kind of unit along the axes of {layer.name}, got pixels and lengths")
     pairs = zip(layer.scale[-3:], names, strict=True)
-    z, y, x = (convert_length(abs(float(length)), own, found[-1]) for length, own in pairs)
-    return (z, y, x), found[-1]
+    z, y, x = (convert_length(abs(float(length)), own, units[-1]) for length, own in pairs)
+    return (z, y, x), units[-1]
 
 
 def place_of_layer(layer: Any) -> dict[str, Any]:
@@ -102,8 +101,8 @@ def place_of_field(field: Volume) -> dict[str, Any]:
 
 def list_layers(viewer: Any, *kinds: str) -> list[tuple[str, Any]]:
     """Return the layers of kinds such as `"Image"`, by name, without the images that the plugin added."""
-    found = [each for each in viewer.layers if type(each).__name__ in kinds]
-    return [(each.name, each) for each in found if type(each).__name__ != "Image" or "curvafit" not in each.metadata]
+    layers = [each for each in viewer.layers if type(each).__name__ in kinds]
+    return [(each.name, each) for each in layers if type(each).__name__ != "Image" or "curvafit" not in each.metadata]
 
 
 def put_layer(viewer: Any, kind: str, data: Any, name: str, **options: Any) -> Any:
@@ -318,7 +317,12 @@ class Generate(Dock):
     def prepare(self) -> Callable[[Progress], Flow]:
         """Read the choices."""
         options = {"grid": self.edge.value, "seed": self.seed.value, "schedule": schedule("fast", self.steps.value)}
-        return partial(_grow, self.preset.value, options)
+        law = self.preset.value
+
+        def grow(progress: Progress) -> Flow:
+            return generate(law, callbacks=[lambda step, total, _: progress("growing", step / total)], **options)
+
+        return grow
 
     def show_result(self, result: Flow) -> str:
         """Add the shape."""
@@ -327,10 +331,6 @@ class Generate(Dock):
         name = f"{self.preset.value}, seed {self.seed.value}"
         put_layer(self.viewer, "labels", shape.values, name, **place_of_field(shape))
         return f"{result.status}."
-
-
-def _grow(law: str, options: dict[str, Any], progress: Progress) -> Flow:
-    return generate(law, callbacks=[lambda step, total, _: progress("growing", step / total)], **options)
 
 
 def annotated_tubes() -> list[tuple[Any, dict[str, Any], str]]:

@@ -147,14 +147,14 @@ def profile_mask(mask: np.ndarray) -> np.ndarray:
 @njit(cache=True)
 def _find_errors(distance, mask, error):  # pragma: no cover
     """Fill the distances whose sign is not the mask's, 0 elsewhere; return whether there are any."""
-    found = False
+    wrong_signs = False
     values, inside, wrong = distance.ravel(), mask.ravel(), error.ravel()
     for i in range(len(values)):
         value = min(values[i], np.float32(0)) if inside[i] else max(values[i], np.float32(0))
         wrong[i] = value
         if value != 0:
-            found = True
-    return found
+            wrong_signs = True
+    return wrong_signs
 
 
 def resample(

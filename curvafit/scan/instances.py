@@ -82,9 +82,9 @@ def _look_for_labels(volume: Volume, blocks: Sequence[Box], number: int) -> Reco
     else:
         names, index = np.unique(values, return_inverse=True)
         index = index.reshape(values.shape) + 1
-    found = [box for box in ndimage.find_objects(index) if box is not None]
+    boxes = [box for box in ndimage.find_objects(index) if box is not None]
     corner = [edge.start for edge in block]
-    ends = [[(c + e.start, c + e.stop) for c, e in zip(corner, box, strict=True)] for box in found]
+    ends = [[(c + e.start, c + e.stop) for c, e in zip(corner, box, strict=True)] for box in boxes]
     kept = names != 0
     return {"names": names[kept], "ends": np.array(ends)[kept], "alike": count_alike(values), "other": not kept.all()}
 

@@ -273,14 +273,14 @@ def measure_maps(
     of a part of a large scan (`preparation.prepare`), or of all of it, of up to `most` working voxels."""
     periodic: bool = options["periodic"]
     progress("finding the structure", 0.0)
-    seen, signed = find_structure(field, kind=kind, **options)  # type: ignore[arg-type]
-    mask, notes = _drop_specks(seen, signed, periodic)
+    detected, signed = find_structure(field, kind=kind, **options)  # type: ignore[arg-type]
+    mask, notes = _drop_specks(detected, signed, periodic)
     progress("measuring curvature", 0.1)
     try:
         if most is None:
-            prepared = preparation.prepare(field, kind=seen, **options)
+            prepared = preparation.prepare(field, kind=detected, **options)
         else:
-            prepared = preparation.prepare_whole(seen, signed, periodic, most)
+            prepared = preparation.prepare_whole(detected, signed, periodic, most)
         curved, diagram = measure_curvatures(prepared)
         working = tuple(f"Of curvature: {note}" for note in prepared.notes if note not in notes)
     except ValueError as reason:
@@ -291,7 +291,7 @@ def measure_maps(
     thickness, gap = (local_thickness(each, field.spacing, periodic=periodic) for each in (mask, ~mask))
     euler, surface = euler_shares(mask, periodic=periodic), measure_surface(mask, field.spacing, periodic)
     voxels, notes = (mask, thickness, gap, euler), (*notes, *working)
-    return Maps(field.spacing, *voxels, surface, curved, diagram, seen, notes)
+    return Maps(field.spacing, *voxels, surface, curved, diagram, detected, notes)
 
 
 def no_curvature(unit: str, reason: object) -> tuple[tuple[np.ndarray, np.ndarray], Diagram, tuple[str, ...]]:
@@ -446,9 +446,9 @@ def read_texture(prepared: Prepared, view: str | None = None, across: Sequence[i
     windows = cut_boxes([n * count for n, count in zip(edges, across, strict=True)], edges)
     windows = windows if prepared.roi is None else filter(None, [_largest_cube(prepared.roi)])
     for where in windows:
-        seen = prepared.phase if view == "field" else prepared.mask
+        values = prepared.phase if view == "field" else prepared.mask
         with contextlib.suppress(NoSurface):
-            rows.append(descriptors(np.ascontiguousarray(seen[where]), prepared.part(where)).vector())
+            rows.append(descriptors(np.ascontiguousarray(values[where]), prepared.part(where)).vector())
             size = prepared.mask[where].size
     return Reading(np.array(rows), view, len(rows) * size / prepared.thickness**3) if rows else None
 

@@ -139,10 +139,10 @@ class Prepared:
         shift = 0.0 if self.quality is None else self.quality.boundary_shift / max(self.scale)
         inside = grids.centre_distance(self.mask[self.windows[0]], (1.0, 1.0, 1.0), 4.0) > shift
         try:
-            seen = self.scan_alike(inside, 0).volume_fraction
+            rescanned = self.scan_alike(inside, 0).volume_fraction
         except ScanError:
             return self.volume_fraction
-        share = self.volume_fraction * inside.mean() / seen
+        share = self.volume_fraction * inside.mean() / rescanned
         return share if 0 < share < 1 else self.volume_fraction
 
     def part(self, where: Box) -> Grid:
@@ -185,14 +185,14 @@ def coarser_level(
     if prepared.noise or prepared.kind == "field" or reading.get("spacing") is not None or None in levels.values():
         return None
     edges = [(name, np.array(spacing)[-3:]) for name, spacing in levels.items()]
-    found, size = None, np.array(shape, dtype=float)
+    best, size = None, np.array(shape, dtype=float)
     for name, edge in edges[1:]:
         finest, fits = edges[0][1], size.max() <= LARGEST_SCAN
         thickness, size = prepared.thickness * prepared.scale[0] * finest[0] / edge.max(), shape * finest / edge
         if fits or thickness < SUITED or size.min() < FEWEST:
             break
-        found = name
-    return found
+        best = name
+    return best
 
 
 def prepare(
@@ -244,9 +244,9 @@ def prepare(
     periodic = periodic and part.shape == field.shape
     options = {"kind": kind, "threshold": threshold, "dark": dark}
     extremes = (field.values.min(), field.values.max())
-    seen, signed = structure.find_structure(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
-    prepared = _put_on_grid(_Scan(seen, signed, periodic, region, one_scale), _choose_box, _profile)
-    if seen == "image" and quality is None:
+    detected, signed = structure.find_structure(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
+    prepared = _put_on_grid(_Scan(detected, signed, periodic, region, one_scale), _choose_box, _profile)
+    if detected == "image" and quality is None:
         quality = measure_quality(-part.values if dark else part.values, signed.values > 0, part.spacing)
     corner = tuple(s.start + o for s, o in zip(where, prepared.origin, strict=True))
     return replace(prepared, quality=quality, origin=corner)  # type: ignore[arg-type]

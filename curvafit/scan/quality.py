@@ -107,8 +107,8 @@ def measure_quality(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, f
     blur, contrast, shift = _fit_blur(levels, distance.astype(np.float32), edges)
     if not contrast > 0:
         raise ScanError("expected grey levels that tell structure from background, got none that do")
-    noise, left = _measure_deep_noise(levels, distance, edges) or (_measure_white_noise(levels), 0.0)
-    grain = min(_GRAINS, key=lambda width: abs(_smoothing_factor(width, spacing) - left))
+    noise, rest = _measure_deep_noise(levels, distance, edges) or (_measure_white_noise(levels), 0.0)
+    grain = min(_GRAINS, key=lambda width: abs(_smoothing_factor(width, spacing) - rest))
     return Quality(blur, noise / contrast, grain, shift, spacing)
 
 
@@ -152,9 +152,9 @@ def _measure_white_noise(levels: np.ndarray) -> float:
 
 def _smoothing_factor(grain: float, spacing: Sequence[float]) -> float:
     """Return the factor by which smoothing by a voxel of the finest axis lowers the deviation of noise of a grain."""
-    spike, left = np.eye(1, 65, 32)[0], 1.0
+    spike, factor = np.eye(1, 65, 32)[0], 1.0
     for edge in spacing:
         width = min(spacing) / edge
         noise = ndimage.gaussian_filter(spike, grain * width)
-        left *= float(np.linalg.norm(ndimage.gaussian_filter(noise, width)) / np.linalg.norm(noise))
-    return left
+        factor *= float(np.linalg.norm(ndimage.gaussian_filter(noise, width)) / np.linalg.norm(noise))
+    return factor

@@ -25,12 +25,10 @@ from curvafit.volumes.volume import Box, Crop, ScanError, Volume, cut_boxes, gro
 
 #: What a scan is; `auto` until it is found.
 Kind = Literal["auto", "field", "mask", "image"]
-
 #: Voxels that the first passes read at once.
 PIECE = 2**24
 #: The most grey levels of a volume of whole numbers whose threshold is found.
 _MOST_LEVELS = 2**22
-
 #: Median third difference of neighbours from which values are noisy; fields rounded to 1/100 reach 0.02.
 JITTER = 0.045
 #: The share of a phase field's voxels that lie in its plateaus, further from 0 than this.
@@ -55,8 +53,6 @@ SEVERAL = (
 PADDED, REACHED, TWO_PHASES = 0.1, 0.95, 0.45
 #: A field of a few thousand values was rounded.
 _ROUNDED_VALUES = 4096
-
-
 #: Values of a box that count for a threshold.
 Levels = Callable[[Box], np.ndarray]
 
@@ -304,8 +300,8 @@ def find_split(structure: Structure, run: Run, extremes: tuple[Any, Any] | None 
     side = max(1, math.isqrt(PIECE // volume.shape[2]))
     bars = cut_boxes(volume.shape, (side, side, volume.shape[2]))
     value = structure.read((slice(0, 1), slice(0, 1), slice(0, 1)))[0, 0, 0]
-    found = run("reading", partial(_look_at_values, structure, bars, value), len(bars))
-    total = add_records({name: each[name] for name in each if name not in ("two", "values")} for each in found)
+    records = run("reading", partial(_look_at_values, structure, bars, value), len(bars))
+    total = add_records({name: each[name] for name in each if name not in ("two", "values")} for each in records)
     if faults := int(total["faults"]):
         raise ScanError(f"a volume must be finite, got {faults} values that are not in {volume.source}")
     lowest, highest = total["lowest"], total["highest"]
@@ -315,10 +311,10 @@ def find_split(structure: Structure, run: Run, extremes: tuple[Any, Any] | None 
     if first == last and volume.source:
         raise ScanError(f"every voxel of {volume.source} is {lowest}: a volume must vary")
     ends = {float(first), float(last)}
-    two = all(bool(each["two"]) and {float(each["lowest"]), float(each["highest"])} <= ends for each in found)
+    two = all(bool(each["two"]) and {float(each["lowest"]), float(each["highest"])} <= ends for each in records)
     kind = structure.kind
     if kind == "auto":
-        kind = _guess_kind(structure, total, np.unique(np.concatenate([each["values"] for each in found])), two)
+        kind = _guess_kind(structure, total, np.unique(np.concatenate([each["values"] for each in records])), two)
     ends = {"lowest": float(first), "highest": float(last)}
     structure = replace(structure, kind=kind, **ends, two=two and bool(first < last))
     if kind == "field":
@@ -363,18 +359,18 @@ def _look_at_values(structure: Structure, bars: Sequence[Box], value: Any, numbe
     """Return the extremes of a bar, how many voxels have a value, whether there are two at most, and sums by kind."""
     values = structure.read(bars[number])
     lowest, highest = values.min(), values.max()
-    found = {"lowest": lowest, "highest": highest, "two": np.all((values == lowest) | (values == highest))}
-    some = np.array([lowest, highest]) if found["two"] else np.unique(values.ravel()[:: 1 + values.size // _SAMPLED])
-    found["values"] = (some if found["two"] or len(some) > _FEW else np.unique(values))[: _FEW + 1]
-    found["constant"] = np.int64(np.count_nonzero(values == value))
+    record = {"lowest": lowest, "highest": highest, "two": np.all((values == lowest) | (values == highest))}
+    some = np.array([lowest, highest]) if record["two"] else np.unique(values.ravel()[:: 1 + values.size // _SAMPLED])
+    record["values"] = (some if record["two"] or len(some) > _FEW else np.unique(values))[: _FEW + 1]
+    record["constant"] = np.int64(np.count_nonzero(values == value))
     if values.dtype.kind != "f":
-        return {**found, "faults": np.int64(0)}
-    found["faults"] = np.int64(values.size - np.count_nonzero(np.isfinite(values)))
-    if structure.kind == "auto" and not found["faults"] and lowest >= -2 and highest <= 2:
+        return {**record, "faults": np.int64(0)}
+    record["faults"] = np.int64(values.size - np.count_nonzero(np.isfinite(values)))
+    if structure.kind == "auto" and not record["faults"] and lowest >= -2 and highest <= 2:
         steps = np.abs(np.diff(values, 3, axis=2)) if values.shape[2] > 3 else np.empty(0)
-        found |= {"steady": np.count_nonzero(steps < JITTER), "steps": np.int64(steps.size)}
-        found["plateau"] = np.count_nonzero(np.abs(values) > PLATEAU)
-    return {name: np.asarray(value) for name, value in found.items()}
+        record |= {"steady": np.count_nonzero(steps < JITTER), "steps": np.int64(steps.size)}
+        record["plateau"] = np.count_nonzero(np.abs(values) > PLATEAU)
+    return {name: np.asarray(value) for name, value in record.items()}
 
 
 def _count_padding(structure: Structure, bars: Sequence[Box], value: Any, number: int) -> Record:
@@ -410,16 +406,16 @@ def _judge_padding(value: Any, counts: np.ndarray) -> Padding | None:
     with np.errstate(all="ignore"):
         spread, variance = counts[4] / max(counts[2], 1) - near**2, max(p2 - m**2, 0.0)
         third, fourth = p3 - 3 * m * p2 + 2 * m**3, p4 - 4 * m * p3 + 6 * m**2 * p2 - 3 * m**4
-        alike = 4 * (near - m) ** 2 < variance < 4 * spread
+        similar = 4 * (near - m) ** 2 < variance < 4 * spread
         far = value < 0 and (near - float(value)) ** 2 > variance
         phases = third**2 + variance**3 > TWO_PHASES * fourth * variance
-    return Padding(float(value), total / size, math.sqrt(variance), bool(phases and (alike or far)))
+    return Padding(float(value), total / size, math.sqrt(variance), bool(phases and (similar or far)))
 
 
-def _read_levels(structure: Structure, left: float | None, inside: bool, box: Box) -> np.ndarray:
+def _read_levels(structure: Structure, skipped: float | None, inside: bool, box: Box) -> np.ndarray:
     """Return the values of a box but one that is left out, `inside` of the region, if there is one."""
     values = structure.read(box)
-    counted = np.ones(values.shape, dtype=bool) if left is None else values != left
+    counted = np.ones(values.shape, dtype=bool) if skipped is None else values != skipped
     if inside and structure.region is not None:
         counted &= structure.region.read(box) != 0
     return values[counted]
@@ -466,10 +462,10 @@ def _sum_sides(levels: Levels, bars: Sequence[Box], level: float, number: int) -
     return {"sums": np.array(sides, dtype=np.float64)}
 
 
-def add_records(found: Iterable[Record]) -> dict[str, np.ndarray]:
+def add_records(records: Iterable[Record]) -> dict[str, np.ndarray]:
     """Return the sums over pieces; of what is called lowest and highest the extremes."""
     total: dict[str, np.ndarray] = {}
-    for each in found:
+    for each in records:
         for name, value in each.items():
             join = {"lowest": np.minimum, "highest": np.maximum}.get(name, np.add)
             total[name] = join(total[name], value) if name in total else value

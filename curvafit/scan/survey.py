@@ -80,12 +80,8 @@ def survey(structure: Structure, run: Run) -> Plan:
     if not thinner:
         order = order_boxes(candidates, total["other surface"].tolist())
         median, thick, plan = _measure_thickness(plan, order, False)
-    return _choose_grid(plan, median, thick, "structure" if thinner else "background")
-
-
-def _choose_grid(plan: Plan, median: float, thick: float, name: str) -> Plan:
-    """Return the plan with its working grid, as `preparation.prepare` chooses it."""
-    volume, keeps_grid = plan.volume, plan.structure.kind == "field" or plan.noise
+    # the working grid, as `preparation.prepare` chooses it
+    keeps_grid, name = structure.kind == "field" or noise, "structure" if thinner else "background"
     note = preparation.judge_thickness(name, median, thick, volume.spacing, keeps_grid)
     scale, why = preparation.choose_scale(volume.shape, volume.spacing, median, keeps_grid)
     return replace(
@@ -116,15 +112,15 @@ def _count_structure(structure: Structure, pieces: Sequence[Box], number: int) -
     box = grow(core, max(LAGS), shape)
     levels = find_levels(structure, box)
     inner = within(core, box)
-    found = {"lowest": levels[inner].min(), "highest": levels[inner].max()}
+    record = {"lowest": levels[inner].min(), "highest": levels[inner].max()}
     mask = levels > 0
-    found["filled"] = np.int64(np.count_nonzero(mask[inner]))
+    record["filled"] = np.int64(np.count_nonzero(mask[inner]))
     boxes = [
         tuple(slice(max(a.start - b.start, 0), max(a.stop - b.start, 0)) for a, b in zip(measured, core, strict=True))
         for measured in candidate_boxes(shape, MEASURED)
     ]
     for name, phase in (("surface", mask), ("other surface", ~mask)):
         surface = surface_voxels(phase)[inner]
-        found[name] = np.array([np.count_nonzero(surface[shared]) for shared in boxes], dtype=np.int64)
-    found["pairs"] = splitting.count_pairs(mask, inner, core, shape)
-    return {name: np.asarray(value) for name, value in found.items()}
+        record[name] = np.array([np.count_nonzero(surface[shared]) for shared in boxes], dtype=np.int64)
+    record["pairs"] = splitting.count_pairs(mask, inner, core, shape)
+    return {name: np.asarray(value) for name, value in record.items()}

@@ -185,14 +185,14 @@ def measure_tile(plan: Plan, number: int) -> Record:
     first = tuple(slice(edge.start - part.start, None) for edge, part in zip(inner, lower, strict=True))
     sums.add("χ", euler_shares(mask[lower])[first], 1.0)
     ends = tuple((edge.start == 0, edge.stop == n) for edge, n in zip(core, plan.volume.shape, strict=True))
-    found = {"euler": np.float64(euler_of_window(mask[lower], ends)), "pieces": np.array(balls.pieces)}
-    found |= {"widest": np.array(balls.widest), "wide": np.array(balls.wide)}
+    record = {"euler": np.float64(euler_of_window(mask[lower], ends)), "pieces": np.array(balls.pieces)}
+    record |= {"widest": np.array(balls.widest), "wide": np.array(balls.wide)}
     with_surface = _measure_surface(plan, mask, balls.box, core)
     if with_surface is not None:
         sums.gather("area", *with_surface)
     del mask, balls
-    found |= _measure_curvature(plan, core, sums)
-    return {**found, **sums.rows}
+    record |= _measure_curvature(plan, core, sums)
+    return {**record, **sums.rows}
 
 
 def _measure_wide(plan: Plan, number: int) -> Record:
@@ -361,42 +361,42 @@ def _around(plan: Plan, core: Box) -> tuple[Box, Box]:
 def _measure_curvature(plan: Plan, core: Box, sums: _Sums) -> Record:
     """Sum the curvatures in the working cells that begin in a core; return the bins of the diagram and other counts."""
     box, owned = _around(plan, core)
-    found: dict[str, Any] = {"specks": np.zeros(2, np.int64), "changed": np.int64(0), "filled": np.int64(0)}
+    record: dict[str, Any] = {"specks": np.zeros(2, np.int64), "changed": np.int64(0), "filled": np.int64(0)}
     if min(plan.working) < whole.FEWEST_SLICES or any(edge.start >= edge.stop for edge in owned):
-        return found
+        return record
     values = _find_working_levels(plan, box)
     mask, inner = values > 0, within(owned, box)
     if plan.structure.kind != "field":
         smallest, cut = smallest_piece(plan.thickness / plan.edge), _cut_out(owned, box, plan.working)
         cleaned, *specks = remove_specks(mask, smallest, False, cut)
-        found |= {"specks": np.array(specks), "changed": np.count_nonzero((cleaned != mask)[inner])}
+        record |= {"specks": np.array(specks), "changed": np.count_nonzero((cleaned != mask)[inner])}
         mask, values = cleaned, values[:0]
         del cleaned
-    found["filled"] = np.count_nonzero(mask[inner])
+    record["filled"] = np.count_nonzero(mask[inner])
     own = [(max(e.start, MARGIN), min(e.stop, n - 1 - MARGIN)) for e, n in zip(owned, plan.working, strict=True)]
     if any(start >= stop for start, stop in own) or mask.all() or not mask.any():
-        return found
+        return record
     # three cells along an axis at least: fewer make no grid
     stops = [min(max(stop, start + 3), n - 1 - MARGIN) for (start, stop), n in zip(own, plan.working, strict=True)]
     wide = [(max(min(start, stop - 3), MARGIN), stop) for (start, _), stop in zip(own, stops, strict=True)]
     part: Box = tuple(slice(start - MARGIN, stop + MARGIN + 1) for start, stop in wide)  # type: ignore[assignment]
-    seen = mask[within(part, box)]
-    if seen.all() or not seen.any():
-        return found
+    piece = mask[within(part, box)]
+    if piece.all() or not piece.any():
+        return record
     if plan.structure.kind != "field":
         values = profile_mask(mask)
     try:
-        (places, columns), drawn = whole.measure_curvatures(_prepare_part(plan, values[within(part, box)], seen, part))
+        (places, columns), drawn = whole.measure_curvatures(_prepare_part(plan, values[within(part, box)], piece, part))
     except NoSurface:
-        return found
+        return record
     corner = np.asarray(drawn.places) / WORKING_SPACING + [edge.start for edge in part]
     kept = np.ones(len(places), dtype=bool)
     for at, cells, more in zip(corner.T, own, wide, strict=True):
         kept &= (cells == more) | ((at >= cells[0]) & (at < cells[1]))
     sums.gather("curved", places[kept], columns[kept])
     for name in sums.tables:
-        found |= _bin(plan, drawn, kept & sums.select(name, places), name)
-    return found
+        record |= _bin(plan, drawn, kept & sums.select(name, places), name)
+    return record
 
 
 def _find_working_levels(plan: Plan, box: Box) -> np.ndarray:
@@ -459,21 +459,21 @@ def _measure_tiles(
         plan = survey(structure, run)
         plan = replace(plan, cores=tuple(cut_boxes(plan.volume.shape, edge or _choose_edges(plan))))
         stated = _describe_tiles(plan, run.processes)
-        found = run(_FIRST, partial(measure_tile, plan), len(plan.cores), stated)
+        records = run(_FIRST, partial(measure_tile, plan), len(plan.cores), stated)
         # the factors that `morphometry.local_thickness` chooses
-        widest, finest = np.max([each["widest"] for each in found], axis=0), min(plan.volume.spacing)
+        widest, finest = np.max([each["widest"] for each in records], axis=0), min(plan.volume.spacing)
         wide = replace(plan, factors=tuple(max(1, math.ceil(each / finest / COARSE)) for each in widest))
         again: list[Record] = []
         if max(wide.factors) > 1:
             again = run(_AGAIN, partial(_measure_wide, wide), len(plan.cores))
-    return _summarise(wide, found, again, stated)
+    return _summarise(wide, records, again, stated)
 
 
-def _summarise(plan: Plan, found: Sequence[Record], again: Sequence[Record], stated: str) -> Measures:
+def _summarise(plan: Plan, records: Sequence[Record], again: Sequence[Record], stated: str) -> Measures:
     """Return the measures of a volume, and of the parts of its region, from what was found in its tiles."""
     finest, shape = plan.finest, plan.volume.shape
-    parts = {name.removeprefix("rows") for each in found for name in each if name.startswith("rows")}
-    tables = {part: _sum_tiles(plan, found, again, part) for part in parts}
+    parts = {name.removeprefix("rows") for each in records for name in each if name.startswith("rows")}
+    tables = {part: _sum_tiles(plan, records, again, part) for part in parts}
     total = dict(zip(whole.SUMS, tables[_WHOLE].sum(0), strict=True))
     if not 0 < total["inside"] < total["volume"]:
         raise ScanError("expected a structure and background in the scan, got one of them only")
@@ -482,13 +482,13 @@ def _summarise(plan: Plan, found: Sequence[Record], again: Sequence[Record], sta
         raise ScanError("expected a surface between structure and background, got none on the working grid")
     period = total["thickness"] / total["inside"] + total["gap"] / (total["volume"] - total["inside"])
     blocks = Blocks.divide(shape, plan.volume.spacing, period)
-    χ = float(sum(each["euler"] for each in found))
+    χ = float(sum(each["euler"] for each in records))
     density = connectivity_density(χ, shape, plan.volume.spacing, periodic=False)
     none = whole.no_curvature(plan.volume.unit, whole.TOO_THIN)
-    notes = (*_notes(plan, found), *(() if curved else none[2]), *([stated] if len(plan.cores) > 1 else []))
+    notes = (*_notes(plan, records), *(() if curved else none[2]), *([stated] if len(plan.cores) > 1 else []))
 
     def summarise(part: str, label: int | None = None) -> Measures:
-        drawn = _draw(plan, found, part) if tables[part][:, whole.SUMS.index("curved")].any() else none[1]
+        drawn = _draw(plan, records, part) if tables[part][:, whole.SUMS.index("curved")].any() else none[1]
         connectivity = (χ, density) if part == _WHOLE else None
         table, named = _merge(tables[part], finest, blocks), None if label is None else ("compartment", label)
         return whole.summarise_sums(
@@ -501,10 +501,10 @@ def _summarise(plan: Plan, found: Sequence[Record], again: Sequence[Record], sta
     return replace(summarise(INSIDE), compartments={label: summarise(str(label), label) for label in labels})
 
 
-def _sum_tiles(plan: Plan, found: Sequence[Record], again: Sequence[Record], part: str) -> np.ndarray:
+def _sum_tiles(plan: Plan, records: Sequence[Record], again: Sequence[Record], part: str) -> np.ndarray:
     """Return the sums of all tiles over a part on the finest division."""
     table, rows, sums = np.zeros((plan.finest.count, len(whole.SUMS))), f"rows{part}", f"sums{part}"
-    for each in found:
+    for each in records:
         if rows in each:
             table[each[rows]] += each[sums]
     for factor, names in zip(plan.factors, (("thickness", "thickness²"), ("gap",)), strict=True):
@@ -524,9 +524,9 @@ def _merge(table: np.ndarray, finest: Blocks, blocks: Blocks) -> np.ndarray:
     return sums.reshape(blocks.count, -1)
 
 
-def _draw(plan: Plan, found: Sequence[Record], part: str) -> Diagram:
+def _draw(plan: Plan, records: Sequence[Record], part: str) -> Diagram:
     """Return the diagram of a part over all tiles: the barycentres of its bins."""
-    parts = [each for each in found if f"bins{part}" in each]
+    parts = [each for each in records if f"bins{part}" in each]
     bins, areas = (np.concatenate([each[f"{name}{part}"] for each in parts]) for name in ("bins", "areas"))
     bins, index = np.unique(bins, axis=0, return_inverse=True)
     index = index.reshape(-1)
@@ -537,21 +537,21 @@ def _draw(plan: Plan, found: Sequence[Record], part: str) -> Diagram:
     return Diagram(points, area, f"1/{plan.volume.unit}", math.sqrt(spread), lost)
 
 
-def _notes(plan: Plan, found: Sequence[Record]) -> tuple[str, ...]:
+def _notes(plan: Plan, records: Sequence[Record]) -> tuple[str, ...]:
     """Return notes on how a volume was measured, as `_measure_whole` gives them."""
     notes = [*plan.notes]
-    specks, holes = (int(n) for n in np.sum([each["pieces"] for each in found], axis=0))
+    specks, holes = (int(n) for n in np.sum([each["pieces"] for each in records], axis=0))
     if specks or holes:
         notes.append(DROPPED.format(specks, holes))
-    wide = np.sum([each["wide"] for each in found], axis=0)
+    wide = np.sum([each["wide"] for each in records], axis=0)
     for name, count in zip(("structure", "background"), wide, strict=True):
         if count:
             share = f"around {count / math.prod(plan.volume.shape):.2g} of the voxels, in the {name}"
             notes.append(f"Balls wider than {2 * WIDEST} voxels count as that wide: {share}.")
     working, count = [*plan.working_notes], max(1, math.prod(plan.working))
-    specks, holes = (int(n) for n in np.sum([each["specks"] for each in found], axis=0))
+    specks, holes = (int(n) for n in np.sum([each["specks"] for each in records], axis=0))
     if specks or holes:
-        changed = sum(int(each["changed"]) for each in found) / count
+        changed = sum(int(each["changed"]) for each in records) / count
         working.append(DROPPED.format(specks, f"{holes}, {changed:.2g} of the volume"))
-    working.extend(note_on_filling(sum(int(each["filled"]) for each in found) / count))
+    working.extend(note_on_filling(sum(int(each["filled"]) for each in records) / count))
     return (*notes, *(f"Of curvature: {note}" for note in working))

@@ -31,7 +31,6 @@ from curvafit.volumes.volume import Crop, StoredArray, Volume, check_finite, par
 
 #: A volume as a caller gives it.
 Source = str | os.PathLike[str] | Volume | np.ndarray | torch.Tensor
-
 #: Suffix -> reader(path, key=, raw_shape=, dtype=).
 READERS: dict[str, Callable[..., Stated]] = {
     **dict.fromkeys((".nii", ".nii.gz"), nifti.read_nifti),
@@ -50,7 +49,6 @@ READERS: dict[str, Callable[..., Stated]] = {
     ".isq": headers.read_isq,
     ".aim": headers.read_aim,
 }
-
 #: Cosine of the angle of two axes up to which they count as at right angles: a shear of 2 % turns normals by a degree.
 RIGHT = 0.02
 #: What may vary in space: the six coefficients, the mass and ε, all in working units.

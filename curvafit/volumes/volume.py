@@ -368,9 +368,9 @@ def _take_nearest(
     values: np.ndarray, matrix: np.ndarray, offset: np.ndarray, shape: tuple[int, int, int]
 ) -> tuple[np.ndarray, float]:
     """Return the value nearest to each voxel of a shape, 0 beyond them, and the share of voxels that has one."""
-    found, count = np.zeros(shape, values.dtype), 0
+    nearest, count = np.zeros(shape, values.dtype), 0
     y, x = np.ogrid[: shape[1], : shape[2]]
-    for z, plane in enumerate(found):
+    for z, plane in enumerate(nearest):
         at = [
             np.floor(a * z + b * y + c * x + d + 0.5 - _TIE).astype(np.int64)
             for (a, b, c), d in zip(matrix, offset, strict=True)
@@ -378,4 +378,4 @@ def _take_nearest(
         inside = np.logical_and.reduce([(k >= 0) & (k < n) for k, n in zip(at, values.shape, strict=True)])
         plane[inside] = values[tuple(k[inside] for k in at)]
         count += np.count_nonzero(inside)
-    return found, count / found.size
+    return nearest, count / nearest.size

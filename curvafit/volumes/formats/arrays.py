@@ -40,9 +40,9 @@ def read_npz(path: Path, *, key: str | None = None, **_: object) -> Stated:
     """Read the array of an NPZ file that a key names, and what arrays named like `spacing` say of its voxels."""
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
-        said = [name for name in names if name != key and _states_place(archive, name)]
-        values = read_member(archive, f"{base.pick_key([n for n in names if n not in said], key, path)}.npy")
-        place = {name: read_member(archive, f"{name}.npy") for name in said}
+        described = [name for name in names if name != key and _states_place(archive, name)]
+        values = read_member(archive, f"{base.pick_key([n for n in names if n not in described], key, path)}.npy")
+        place = {name: read_member(archive, f"{name}.npy") for name in described}
     return Stated(values, "?" * values.ndim, **base.read_spacing(place, values.ndim))
 
 

@@ -14,8 +14,6 @@ from curvafit.volumes.formats.base import LPS_TO_RAS, ScanError, Stated
 
 #: Suffixes of files that must be DICOM's.
 SUFFIXES = (".dcm", ".dicom", ".ima")
-
-
 #: Attributes that are said, not used: name, the value that is worth it, None for any, and the note.
 _SAID = (
     ("PixelPaddingValue", None, "By the file, {} stands where nothing was measured."),

@@ -301,9 +301,9 @@ def _read_logs(path: Path) -> tuple[float, float, str] | None:
     for log in sorted(p for p in path.iterdir() if p.suffix.lower() == ".log" and p.is_file()):
         text = log.read_text(encoding="latin-1")
         for name in ("Pixel Size", "Image Pixel Size"):  # of the reconstruction, or else of the projections
-            if found := re.search(rf"^\s*{name} \(um\)\s*=\s*([\d.]+)", text, re.MULTILINE):
+            if match := re.search(rf"^\s*{name} \(um\)\s*=\s*([\d.]+)", text, re.MULTILINE):
                 step = re.search(r"^\s*Section to Section Step\s*=\s*(\d+)", text, re.MULTILINE)
-                sizes[float(found[1])] = (float(step[1]) if step else 1.0, log.name)
+                sizes[float(match[1])] = (float(step[1]) if step else 1.0, log.name)
                 break
     if len(sizes) > 1:
         listed = " and ".join(f"{size:g} um in {log}" for size, (_, log) in list(sizes.items())[:2])

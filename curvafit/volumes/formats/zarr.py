@@ -221,10 +221,10 @@ def image_of(path: Path) -> Path | None:
     image = path.parent.parent
     if path.parent.name != "labels" or not is_zarr(image):
         return None
-    found = version_of(image)
-    if found not in _FORMATS:
-        said = "no image of OME-Zarr" if found is None else f"OME-Zarr {found}"
-        raise ScanError(f"labels are written into an image of OME-Zarr 0.4 or 0.5, {image} is {said}")
+    version = version_of(image)
+    if version not in _FORMATS:
+        kind = "no image of OME-Zarr" if version is None else f"OME-Zarr {version}"
+        raise ScanError(f"labels are written into an image of OME-Zarr 0.4 or 0.5, {image} is {kind}")
     if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", path.name):
         raise ScanError(f"a name of labels has letters, digits and _ . - alone, got {path.name!r}")
     return image
@@ -257,9 +257,9 @@ def check_place(field: Any, image: Path) -> None:
         edges, start, shape = (np.array([each[axis] for axis in where]) for each in stated)
         common, factors = common_unit([place["units"][axis] for axis in where] if place["units"] else [None] * 3)
         unit, factor = parse_unit(common)
-        alike = np.allclose(np.array(field.spacing) / factor, edges * factors, rtol=1e-3, atol=0)
+        similar = np.allclose(np.array(field.spacing) / factor, edges * factors, rtol=1e-3, atol=0)
         first = (np.array(base.first_voxel(field)) / factor / factors - start) / edges
-        if unit == field.unit and alike and (first > -0.01).all() and (first + field.shape < shape + 0.01).all():
+        if unit == field.unit and similar and (first > -0.01).all() and (first + field.shape < shape + 0.01).all():
             return
     size = format_sampling(field.shape, field.spacing, field.unit)
     raise ScanError(f"labels must have the voxels of a level of {image} or of a part of one, got {size}")
@@ -394,8 +394,8 @@ def _check_levels(arrays: Mapping[str, Any], places: Mapping[str, _Place], path:
         first = next(iter(extents))
         if (np.abs(extents[name] - extents[first]) > 1.01 * np.array(place["steps"])).any():
             sizes = (" x ".join(f"{edge:g}" for edge in extents[each]) for each in (first, name))
-            said = " and ".join(f"{size} of {each}" for size, each in zip(sizes, (first, name), strict=True))
-            raise ScanError(f"the levels of {path} disagree in extent, {said}: name one, as in {path}::{first}")
+            listed = " and ".join(f"{size} of {each}" for size, each in zip(sizes, (first, name), strict=True))
+            raise ScanError(f"the levels of {path} disagree in extent, {listed}: name one, as in {path}::{first}")
 
 
 # ---- chunks that are not stored --------------------------------------------------------------------------------------
