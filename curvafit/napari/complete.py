@@ -160,7 +160,10 @@ class Complete(Dock):
         after = np.where(now == result.before, result.after, now)  # what was painted meanwhile stays
         fills = _standing(self.fills.get(layer, []), result.before)
         self.fills[layer] = [*fills, _remember(result, now, after, fills)]
-        write_labels(layer, after)
+        new = after.astype(layer.data.dtype).reshape(layer.data.shape)
+        where = np.nonzero(new != layer.data)
+        if len(where[0]):
+            layer.data_setitem(where, new[where])  # which napari can undo as one step
         if layer.selected_label not in task.numbers:
             layer.selected_label = task.numbers[0]  # the one to correct with
         assert found.uncertainty is not None
@@ -190,14 +193,6 @@ class Complete(Dock):
         place = layer.data_to_world(corner)
         dims = self.viewer.dims
         dims.set_point(dims.ndim - 3 + axis, place[layer.ndim - 3 + axis])
-
-
-def write_labels(layer: Any, values: np.ndarray) -> None:
-    """Write values (Z, Y, X) into a labels layer, as one step that napari can undo."""
-    new = values.astype(layer.data.dtype).reshape(layer.data.shape)
-    where = np.nonzero(new != layer.data)
-    if len(where[0]):
-        layer.data_setitem(where, new[where])
 
 
 def _fill(task: Task, progress: Progress) -> Filled:

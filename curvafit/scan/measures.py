@@ -252,11 +252,6 @@ class Maps(NamedTuple):
     kind: str
     notes: tuple[str, ...]
 
-    def divide(self) -> Blocks:
-        """Divide the scan into blocks of a period."""
-        period = sum(float(each[each > 0].mean(dtype=np.float64)) for each in (self.thickness, self.gap))
-        return Blocks.divide(self.mask.shape, self.spacing, period)
-
     def sum(self, blocks: Blocks) -> np.ndarray:
         """Return sums (N, C): a row for each block, a column for each of `SUMS`."""
         ones = np.ones(self.mask.shape, dtype=bool)

@@ -43,6 +43,8 @@ DROPPED = "Dropped what is smaller than a ball of half the median thickness (spe
 FEWEST = 24
 #: Least mean of √(κ1² + κ2²) times the window's edge at which a surface is not flat; a ball that fits has 2.8.
 FLATTEST = 2.0
+#: First working voxel, number of voxels along (z, y, x), and a note where that is not all of the scan.
+_Extent = tuple[tuple[int, int, int], tuple[int, int, int], tuple[str, ...]]
 NOISE = "No law: the scan is noise, its voxels have nothing to do with those a few voxels away."
 
 
@@ -211,7 +213,7 @@ def prepare(
     A mask is a volume of two values, a phase field a float volume with plateaus near ±1, anything else an image: it is
     smoothed (Gaussian, one voxel of the finest axis) and thresholded. The grid is kept where it is a phase field's, or
     isotropic with a median thickness of 5 to 16 voxels; else it is resampled to a thickness of 8: images as smoothed
-    grey levels, masks as signed distances. Thickness is the local thickness (`morphometry.local_thickness`), its median
+    grey levels, masks as signed distances. Thickness is the local thickness (`morphology.local_thickness`), its median
     over the structure's surface. Specks and pinholes smaller than a ball of half that diameter are dropped. Raises
     ValueError if a kind or threshold is none, and ScanError if there is no structure, nothing else, no surface, or
     nothing at least 3 voxels thick; or if `roi` or `threshold` do not fit the scan.
@@ -291,10 +293,6 @@ class _Scan:
         if np.count_nonzero(inside) <= HALF * counted:
             return inside, "structure"
         return (~inside if self.region is None else ~inside & self.region), "background"
-
-
-#: First working voxel, number of voxels along (z, y, x), and a note where that is not all of the scan.
-_Extent = tuple[tuple[int, int, int], tuple[int, int, int], tuple[str, ...]]
 
 
 def _put_on_grid(

@@ -135,7 +135,8 @@ def _measure_whole(field: Volume, periodic: bool, progress: Progress, kind: Kind
     most = memory() // WORKED if periodic else LARGEST_BOX**3
     maps = whole.measure_maps(field, kind, {**options, "periodic": periodic}, progress, most)
     connectivity = measure_connectivity(maps.mask, field.spacing, periodic=periodic)
-    blocks = maps.divide()
+    period = sum(float(phase[phase > 0].mean(dtype=np.float64)) for phase in (maps.thickness, maps.gap))
+    blocks = Blocks.divide(maps.mask.shape, field.spacing, period)
     return whole.summarise_sums(field, maps.kind, blocks, maps.sum(blocks), connectivity, maps.diagram, maps.notes)
 
 
@@ -460,7 +461,7 @@ def _measure_tiles(
         plan = replace(plan, cores=tuple(cut_boxes(plan.volume.shape, edge or _choose_edges(plan))))
         stated = _describe_tiles(plan, run.processes)
         records = run(_FIRST, partial(measure_tile, plan), len(plan.cores), stated)
-        # the factors that `morphometry.local_thickness` chooses
+        # the factors that `morphology.local_thickness` chooses
         widest, finest = np.max([each["widest"] for each in records], axis=0), min(plan.volume.spacing)
         wide = replace(plan, factors=tuple(max(1, math.ceil(each / finest / COARSE)) for each in widest))
         again: list[Record] = []
