@@ -88,12 +88,14 @@ def box_with_most_surface(mask: np.ndarray, edge: int | Sequence[int]) -> Box:
     edges = [edge] * 3 if isinstance(edge, int) else edge
     box = [min(n, side) for n, side in zip(mask.shape, edges, strict=True)]
     sides = mask.astype(np.int8)  # of each voxel, its next neighbours beyond the border count
-    held = np.sum([np.abs(np.diff(sides, axis=axis, append=0)) for axis in range(3)], axis=0).astype(np.float32)
+    z, y, x = (np.abs(np.diff(sides, axis=axis, append=0)) for axis in range(3))
+    held = (z + y + x).astype(np.float32)
     for axis, side in enumerate(box):
         held = ndimage.uniform_filter1d(held, side, axis, mode="constant")
     inner = tuple(slice(b // 2, n - (b - 1) // 2) for n, b in zip(mask.shape, box, strict=True))
-    z, y, x = (int(k) for k in np.unravel_index(int(held[inner].argmax()), held[inner].shape))
-    return slice(z, z + box[0]), slice(y, y + box[1]), slice(x, x + box[2])
+    first = (int(k) for k in np.unravel_index(int(held[inner].argmax()), held[inner].shape))
+    z, y, x = (slice(k, k + side) for k, side in zip(first, box, strict=True))
+    return z, y, x
 
 
 def centre_distance(

@@ -136,7 +136,8 @@ def find_levels(structure: Structure, box: Box, periodic: bool = False) -> np.nd
     if structure.kind == "image":
         around, padding = grow(box, SMOOTHED, structure.volume.shape), structure.padding
         smooth = _smooth_levels(structure.read(around), structure.volume.spacing, periodic, padding)
-        signed = (structure.level - smooth if structure.dark else smooth - structure.level)[within(box, around)]
+        smooth = smooth[within(box, around)]
+        signed = structure.level - smooth if structure.dark else smooth - structure.level
         if padding is not None and padding.sure:
             signed[np.isnan(signed)] = -padding.deviation  # padding is background
         return signed

@@ -101,8 +101,7 @@ def measure(
         Options of reading a file, or the place of an array: see `curvafit.load`.
     """
     check_options(kind, threshold, reading.get("label"))
-    if tile is not None:
-        check_int(tile, f"a tile of {SHORTEST} or more voxels a side", SHORTEST, 2**31)
+    check_int(SHORTEST if tile is None else tile, f"a tile of {SHORTEST} or more voxels a side", SHORTEST, 2**31)
     options = {"kind": kind, "threshold": threshold, "dark": dark}
     if periodic and (roi is not None or tile is not None):
         raise ValueError("a scan that repeats is measured in one piece and without a region: leave out tile and roi")
@@ -126,7 +125,6 @@ def measure(
             if periodic:
                 raise
     structure = Structure(volume, region=region, **options)  # type: ignore[arg-type]
-    workers = workers if volume.in_file and region is None else None
     return _measure_tiles(structure, tile, workers, store, progress).scale(edge, unit)
 
 
@@ -453,6 +451,7 @@ def _measure_tiles(
     progress: Progress,
 ) -> Measures:
     same: dict[str, Any] = {}
+    workers = workers if structure.volume.in_file and structure.region is None else None
     if store is not None:  # digests take a while
         same = {"scan": structure.volume.digest, "region": structure.region and structure.region.digest, "tile": edge}
         same |= {name: getattr(structure, name) for name in ("kind", "threshold", "dark")}
