@@ -16,8 +16,7 @@ import numpy as np
 import torch
 
 from benchmarks.harness import Cases, Figure, in_turns, run_python, show
-from curvafit.generation.cost import Cost
-from curvafit.generation.forms import DivergenceForm, white_noise
+from curvafit.generation.problem import Cost, DivergenceForm, white_noise
 from curvafit.generation.schedule import SCHEDULES
 from curvafit.generation.stepper import ADAM_EPS, TorchStepper
 from curvafit.priors.grid import WORKING_EPSILON, Grid

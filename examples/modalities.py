@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from curvafit.data_synth.imaging.image import image, regrid
-from curvafit.data_synth.imaging.modality import MODALITIES, Modality
+from curvafit.data_synth.imaging.modality import MODALITIES, Modality, image, regrid
 from curvafit.drawing.plot import CONTOUR, write_picture
 from curvafit.generation.flow import generate
 from curvafit.priors.grid import Grid

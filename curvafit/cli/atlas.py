@@ -110,7 +110,7 @@ def extract_atlas(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure the shapes of stores, and write the atlas that `infer --atlas` reads."""
-    from curvafit.data_synth.extraction import extract
+    from curvafit.data_synth.atlas import extract
     from curvafit.inference.atlas import ATLAS_FILE, save_atlas
 
     _check_archive(out, ATLAS_FILE, stores, overwrite)
@@ -134,7 +134,7 @@ def describe_atlas(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure each shape of stores as field, mask and scan: the table that `atlas train` reads."""
-    from curvafit.data_synth.extraction import describe
+    from curvafit.data_synth.atlas import describe
     from curvafit.inference.table import TABLE_FILE, VIEWS
 
     _check_archive(out, TABLE_FILE, stores, overwrite)

@@ -156,7 +156,7 @@ def _choose_parameters(
 def _place_checkpoint(file: Path | None, every: float | None, out: Path) -> dict[str, Any]:
     """Return the options of the checkpoint as `generate` takes them; refuse the place of an output."""
     from curvafit.core.records import sibling
-    from curvafit.generation.checkpoint import resolve_place
+    from curvafit.generation.loop import resolve_place
 
     if file is None:
         if every is not None:

@@ -80,7 +80,7 @@ def synth(
     from curvafit.core.files import check_folder
     from curvafit.core.units import convert_length
     from curvafit.data_synth import sets
-    from curvafit.data_synth.case import Composition, Recipe
+    from curvafit.data_synth.dataset import Composition, Recipe
     from curvafit.data_synth.sources import choose_voxel
 
     edge = choose_voxel(sized, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
@@ -165,7 +165,7 @@ def _choose_modality(
         kind = _fit_to_scan(like, mask, reading)
     if visible is None:
         return kind
-    from curvafit.data_synth.imaging.image import annotator_threshold
+    from curvafit.data_synth.imaging.modality import annotator_threshold
 
     share = annotator_threshold(kind.base) if visible == "auto" else parse_numbers(visible, "--visible", 1)[0]
     return replace(kind, base=replace(kind.base, visible=share))

@@ -1,5 +1,7 @@
 from .atlas import build as build
+from .atlas import describe as describe
 from .atlas import extend as extend
+from .atlas import extract as extract
 from .dataset import TextureDataset as TextureDataset
 from .dataset import as_dict as as_dict
 from .dataset import as_monai as as_monai
@@ -9,8 +11,6 @@ from .design import Draw as Draw
 from .design import design_around as design_around
 from .design import design_box as design_box
 from .design import read_design as read_design
-from .extraction import describe as describe
-from .extraction import extract as extract
 from .imaging.modality import MODALITIES as MODALITIES
 from .imaging.modality import Contrast as Contrast
 from .imaging.modality import Detector as Detector

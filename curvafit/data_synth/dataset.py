@@ -1,8 +1,10 @@
-"""Training pairs without end: random crops of generated shapes, turned and imaged on demand."""
+"""Cases of a training set, each an image with exact labels: by a recipe, or without end for a network's training."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from numbers import Real
 from os import PathLike
 from pathlib import Path
@@ -13,17 +15,275 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
-from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_choice, check_float, check_int, check_seed
-from curvafit.data_synth.case import Composition, check_calibres, check_crop, check_shape, draw_voxel
-from curvafit.data_synth.imaging.image import field_shape
-from curvafit.data_synth.imaging.modality import Modality, modality
-from curvafit.data_synth.sources import Generated, Pool, Stored, choose_voxel
+from curvafit.core.checks import (
+    LONGEST,
+    SHORTEST,
+    as_tuple,
+    check_choice,
+    check_float,
+    check_int,
+    check_seed,
+    check_type,
+    quoted,
+)
+from curvafit.core.schema import decode, encode
+from curvafit.data_synth.imaging.modality import Imaging, Modality, field_shape, image, label_voxels, modality, regrid
+from curvafit.data_synth.labels import field_distance
+from curvafit.data_synth.sources import Generated, Pool, ShapeSource, Stored, choose_voxel, decode_source
+from curvafit.priors.grid import Grid
+from curvafit.priors.kernels.threads import one_thread
 from curvafit.priors.law import LAW_TYPES, LawLike
 from curvafit.volumes.formats.nifti import affine_in_file
 from curvafit.volumes.volume import Volume
 
+#: Shapes that are tried for a case until one is seen on the image's voxels, which may be coarse.
+TRIES = 8
+#: The most voxels of a shape; and the least along each edge of a grown one, or along the longest edge of a crop.
+MOST, FEWEST = 10**9, 4
+#: The brightest that a class can be, as a multiple of the structure's contrast; and the most classes of a set.
+BRIGHTEST, MOST_CLASSES = 100.0, 200
 #: Percentiles that `percentile` makes 0 and 1.
 PERCENTILES = (0.5, 99.5)
+
+
+@dataclass(frozen=True)
+class Composition:
+    """What a case shows: one structure by default.
+
+    Attributes
+    ----------
+    classes
+        Every case shows a shape of each law, in front of those of later laws; the classes of the labels.
+    wall
+        Thickness of a wall along the surface of the shape, inside it, in the modality's unit: the labels' class 1; what
+        the wall encloses is class 2, the lumen.
+    levels
+        Light of each class: 0 is as dark as the background, 1 as bright as the structure. By default 1, the lumen 0.
+    """
+
+    classes: bool = False
+    wall: float | None = None
+    levels: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.wall is not None:
+            object.__setattr__(self, "wall", check_float(self.wall, "a wall of positive thickness", SHORTEST, LONGEST))
+        if self.classes and self.wall is not None:
+            raise ValueError("give either classes or a wall, not both")
+        if self.levels is not None:
+            levels = as_tuple(self.levels, "a level of each class")
+            checked = tuple(check_float(n, f"levels from 0 to {BRIGHTEST:g}", 0, BRIGHTEST, of=levels) for n in levels)
+            object.__setattr__(self, "levels", checked)
+
+    def names(self, source: ShapeSource) -> tuple[str, ...]:
+        """Return the names of the classes, 1, 2, …; ValueError where the source or the levels do not fit."""
+        names: tuple[str, ...] = ("structure",) if self.wall is None else ("wall", "lumen")
+        if self.classes:
+            if not isinstance(source, Generated) or not 2 <= len(source.names) <= MOST_CLASSES:
+                raise ValueError(f"classes need from 2 to {MOST_CLASSES} laws to grow shapes of, one for each class")
+            alike = len(set(source.names)) < len(source.names)
+            names = tuple(f"{name} {k}" if alike else name for k, name in enumerate(source.names, 1))
+        if self.levels is not None and len(self.levels) != len(names):
+            raise ValueError(f"give a level for each of {', '.join(names)}, got {len(self.levels)} levels")
+        return names
+
+    def draw(
+        self, source: ShapeSource, voxels: Sequence[int], voxel: float, index: int, rng: np.random.Generator
+    ) -> tuple[Tensor, Tensor, float, list[dict[str, Any]]]:
+        """Return the phase fields (C, Z, Y, X) of the classes of case `index`, the first in front, on voxels of the
+        edge `voxel`, which is in the wall's unit; that of all together; their ε in voxels; and the shapes' origins."""
+        if self.classes:
+            shapes = [source.shape(voxels, k, rng) for k in range(len(self.names(source)))]
+            values = torch.from_numpy(np.stack([shape.values for shape in shapes]))
+            return values, values.amax(0), shapes[0].epsilon, [shape.origin for shape in shapes]
+        margin = self.margin(source, voxel)
+        shape = source.shape([n + 2 * margin for n in voxels], index, rng)
+        u, origin = torch.from_numpy(shape.values), shape.origin | ({"margin": margin} if margin else {})
+        if self.wall is None:
+            return u[None], u, shape.epsilon, [origin]
+        shell = shell_of(u, shape.epsilon, self.wall / voxel, periodic=source.edge == math.inf)
+        inner = (..., *(slice(margin, margin + n) for n in voxels))
+        return shell[inner], u[inner], shape.epsilon, [origin]
+
+    def show(
+        self, source: ShapeSource, shape: Sequence[int], voxel: float, imaging: Imaging, seed: int, index: int, rng: Any
+    ) -> Case:
+        """Return case `index` of `shape`, its image in real numbers; `voxel` is the edge of a shape's voxels."""
+        voxels = field_shape(shape, voxel, imaging)
+        fields, whole, epsilon, origins = self.draw(source, voxels, voxel, index, rng)
+        levels = self.levels or ((1.0,) * len(fields) if self.wall is None else (1.0, 0.0))
+        sampled = regrid(whole, voxel, imaging)
+        grey = image(fields, voxel, imaging, seed, epsilon, levels)
+        labels = label_voxels(fields, sampled, voxel, imaging, epsilon)
+        z, y, x = shape  # a field of whole voxels may give a few voxels more
+        grey, sampled, labels = (part[:z, :y, :x].contiguous().numpy() for part in (grey, sampled, labels))
+        record = {"source": origins, "imaging": imaging.as_dict(), "image_seed": seed, "voxel": voxel}
+        return Case(grey, sampled, labels, imaging.spacing, imaging.unit, epsilon * voxel, record)
+
+    def margin(self, source: ShapeSource, voxel: float) -> int:
+        """Return by how many voxels a crop is larger on every side: walls of surfaces outside reach into it."""
+        return 0 if self.wall is None or source.edge == math.inf else math.ceil(self.wall / voxel) + 2
+
+
+class Case(NamedTuple):
+    """An image, the phase field of what it shows and its labels, (Z, Y, X) on one grid of `spacing`.
+
+    The field is that of all classes together. Labels are uint8: 0 outside, 1, 2, … in the classes. ε is in spacing's
+    unit; `record` says how the case was made, in JSON's types.
+    """
+
+    image: np.ndarray
+    field: np.ndarray
+    labels: np.ndarray
+    spacing: tuple[float, float, float]
+    unit: str
+    epsilon: float
+    record: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """The recipe of all cases of a set: case i depends on the recipe and i alone.
+
+    `shape` is the voxels (z, y, x) of the images; `voxel` is the edge of a shape's voxels in the modality's unit, which
+    sets how thick structures are in the images; `calibres` are the least and the greatest factor of it, between which
+    every case draws its own; `composition` is what a case shows of the source's shapes.
+    """
+
+    source: ShapeSource
+    modality: Modality
+    shape: tuple[int, int, int]
+    voxel: float
+    seed: int = 0
+    calibres: tuple[float, float] = (1.0, 1.0)
+    composition: Composition = field(default_factory=Composition)
+
+    def __post_init__(self) -> None:
+        check_type(self.modality, Modality, "a Modality")
+        if not callable(getattr(self.source, "shape", None)):
+            raise ValueError(f"the source must be a source of shapes, got {quoted(self.source)}")
+        object.__setattr__(self, "shape", check_shape(self.shape))
+        voxel = check_float(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
+        object.__setattr__(self, "voxel", voxel)
+        object.__setattr__(self, "seed", check_seed(self.seed))
+        object.__setattr__(self, "calibres", check_calibres(self.calibres))
+        check_type(self.composition, Composition, "a Composition")
+        self.composition.names(self.source)
+        wall, thickest = self.composition.wall, self._voxels[1]
+        if wall is not None and wall < thickest:
+            words = f"{thickest:g} {self.modality.base.unit}, got {wall:g}"
+            raise ValueError(f"a wall must be at least a shape's voxel thick, {words}")
+        for voxel in self._voxels:
+            check_crop(self.source.edge, self.shape, voxel, self.modality, self.composition.margin(self.source, voxel))
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Return the names of the labels' classes 1, 2, …"""
+        return self.composition.names(self.source)
+
+    @property
+    def largest(self) -> tuple[int, int, int]:
+        """Return the most voxels (z, y, x) that a shape can have: those at the least calibre."""
+        return field_shape(self.shape, self._voxels[0], self.modality.base)
+
+    @property
+    def _voxels(self) -> tuple[float, float]:
+        """The shortest and the longest edge that a shape's voxels can have."""
+        low, high = self.calibres
+        least, most = (end(self.source.scales, default=1.0) for end in (min, max))
+        return self.voxel * low * least, self.voxel * high * most
+
+    def case(self, index: int) -> Case:
+        """Make case number `index`, on one thread; ValueError where a class is not seen on the image's voxels."""
+        words = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(3)
+        rng, (for_imaging, seed) = np.random.default_rng(words[0]), (int(one.generate_state(1)[0]) for one in words[1:])
+        imaging = self.modality.draw(for_imaging)
+        scales = self.source.scales or (1.0,)
+        voxel = draw_voxel(self.voxel, self.calibres, rng) * scales[index % len(scales)]
+        names = self.classes
+        with one_thread():
+            for _ in range(TRIES):
+                case = self.composition.show(self.source, self.shape, voxel, imaging, seed, index, rng)
+                counts = np.bincount(case.labels.ravel(), minlength=len(names) + 1)
+                if case.field.min() <= 0 < case.field.max() and counts.all():
+                    break
+            else:
+                edges = " x ".join(map(str, self.shape))
+                missing = "structure" if counts.all() else ("background", *names)[int(counts.argmin())]
+                mend = "take more voxels" + (", a thinner wall, or laws that fill less" if len(names) > 1 else "")
+                raise ValueError(f"{TRIES} shapes showed no {missing} on {edges} voxels: {mend}")
+        shares = {"volume_fraction": float((case.field > 0).mean())}
+        shares["class_fractions"] = (counts[1:] / case.labels.size).tolist()
+        grey = case.image.astype(np.uint16 if (imaging.detector.ceiling or math.inf) < 2**16 else np.float32)
+        return case._replace(image=grey, record={"index": index} | case.record | shares)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all of the recipe in JSON's types."""
+        return encode(vars(self) | {"source": self.source.as_dict()})
+
+    @staticmethod
+    def from_dict(content: Mapping[str, Any]) -> Recipe:
+        """Return the recipe that `as_dict` wrote."""
+        if content["composition"].get("blend"):
+            raise ValueError("it blends textures, which curvafit does not do: it cannot be continued, begin another")
+        source, modality = decode_source(content["source"]), Modality.from_dict(content["modality"])
+        composition = decode(Composition, content["composition"])
+        return Recipe(**{**content, "source": source, "modality": modality, "composition": composition})
+
+
+def shell_of(u: Tensor, epsilon: float, thickness: float, *, periodic: bool = False) -> Tensor:
+    """Return the phase fields (2, Z, Y, X) of a wall inside the surface of a shape, and of what it encloses.
+
+    All are in voxels, of the shape's profile. Where the shape is thinner than two walls, the wall fills it.
+    """
+    grid = Grid(tuple(u.shape), (1.0,) * 3, "periodic" if periodic else "replicate")  # type: ignore[arg-type]
+    depth = torch.from_numpy(field_distance(u, grid, epsilon))
+    distances = torch.stack([torch.minimum(depth, thickness - depth), depth - thickness])
+    return torch.tanh(distances / (math.sqrt(2) * epsilon)).to(u.dtype)
+
+
+def check_shape(shape: Sequence[int]) -> tuple[int, int, int]:
+    """Return the voxels (z, y, x) of an image as whole numbers above 0, or raise ValueError."""
+    words, edges = "3 whole numbers of voxels above 0 (z, y, x)", as_tuple(shape, "3 whole numbers of voxels")
+    z, y, x = (check_int(n, words, 1, MOST, of=edges) for n in (edges if len(edges) == 3 else (None,) * 3))
+    return z, y, x
+
+
+def draw_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generator) -> float:
+    """Draw the edge of a shape's voxel, even in the logarithm between calibres; equal ones take no random number."""
+    low, high = calibres
+    return voxel * (low if low == high else math.exp(rng.uniform(math.log(low), math.log(high))))
+
+
+def check_calibres(calibres: Sequence[float]) -> tuple[float, float]:
+    """Return calibres as two positive factors, the lower first, or raise ValueError."""
+    words, pair = "calibres as two positive factors, the lower first", as_tuple(calibres, "two factors")
+    low, high = (check_float(n, words, 1e-3, 1e3, of=pair) for n in (pair if len(pair) == 2 else (None, None)))
+    if low > high:
+        raise ValueError(f"expected {words}, got {quoted(pair)}")
+    return low, high
+
+
+def check_crop(longest: float, shape: Sequence[int], voxel: float, modality: Modality, margin: int = 0) -> None:
+    """Raise ValueError where images of `shape`, with a margin of voxels around their shapes, need shapes that are too
+    small, too large, or longer than `longest`."""
+    need = tuple(n + 2 * margin for n in field_shape(shape, voxel, modality.base))
+    images, crops = " x ".join(map(str, shape)), " x ".join(map(str, need))
+    if not 1 < math.prod(shape) <= MOST:
+        raise ValueError(f"images must have 2 to {MOST:.0e} voxels, got {images}")
+    if (min if longest == math.inf else max)(need) < FEWEST or math.prod(need) > MOST:
+        raise ValueError(
+            f"shapes must have from {FEWEST} voxels along an edge to {MOST:.0e} in all, but images of {images} voxels "
+            f"need {crops}: is a voxel of {voxel:g} {modality.base.unit} meant?"
+        )
+    if max(need) > longest:
+        raise ValueError(
+            f"the stored shapes have {longest} voxels along an edge, but images of {images} voxels of {modality.name} "
+            f"need {crops}: take smaller images, or build a store with a larger --shape"
+        )
+
+
+# ---- samples without end ---------------------------------------------------------------------------------------------
 
 
 class Sample(NamedTuple):

@@ -1,9 +1,9 @@
-from .data import Data as Data
-from .data import Evidence as Evidence
-from .data import Hinge as Hinge
 from .flow import descend as descend
 from .flow import generate as generate
-from .forms import white_noise as white_noise
+from .problem import Data as Data
+from .problem import Evidence as Evidence
+from .problem import Hinge as Hinge
+from .problem import white_noise as white_noise
 from .result import Flow as Flow
 from .result import History as History
 from .result import State as State

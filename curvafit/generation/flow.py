@@ -12,11 +12,8 @@ import torch
 from torch import Tensor
 
 from curvafit.core.checks import check_choice, check_float, check_open_interval, check_seed, check_type, quoted
-from curvafit.generation.checkpoint import Checkpoint, identity
-from curvafit.generation.cost import Cost, check_shape
-from curvafit.generation.data import Data
-from curvafit.generation.forms import FORMS, Blur, DivergenceForm, Form, white_noise
-from curvafit.generation.loop import FlowOptions, first_mass, run
+from curvafit.generation.loop import Checkpoint, FlowOptions, first_mass, identity, run
+from curvafit.generation.problem import FORMS, Blur, Cost, Data, DivergenceForm, Form, check_shape, white_noise
 from curvafit.generation.result import Callback, Flow
 from curvafit.generation.schedule import Schedule, choose_schedule
 from curvafit.generation.schedule import schedule as named_schedule
@@ -156,7 +153,7 @@ def descend(
     blur
         Standard deviation of k; None takes a voxel's shortest edge, as published.
     data
-        A term D(u) that is added to F_ε, such as `generation.data.Evidence`; the history's energies include it.
+        A term D(u) that is added to F_ε, such as `generation.problem.Evidence`; the history's energies include it.
     frozen
         Voxels whose v, or A, stays.
 

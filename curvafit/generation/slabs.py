@@ -23,9 +23,8 @@ import torch.distributed as dist
 from torch import Tensor
 
 from curvafit.core.runtime import one_line
-from curvafit.generation.cost import Cost
-from curvafit.generation.forms import DivergenceForm
-from curvafit.generation.stepper import ADAM_EPS, Statistics, Stepper
+from curvafit.generation.problem import Cost, DivergenceForm
+from curvafit.generation.stepper import ADAM_EPS, FusedStepper, Statistics, Stepper
 from curvafit.priors import kernels
 from curvafit.priors.grid import Grid
 
@@ -172,7 +171,7 @@ class SlabStepper(Stepper):
         return self._all("statistics")
 
     def field(self) -> Tensor:
-        return torch.from_numpy(self._all("field"))
+        return self._all("field")
 
     def mass(self) -> float:
         return self._all("mass")
@@ -181,8 +180,7 @@ class SlabStepper(Stepper):
         self._all("shift", amount)
 
     def state(self) -> dict[str, Any]:
-        state = self._all("state")
-        return {name: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for name, v in state.items()}
+        return self._all("state")
 
     def restore(self, state: dict[str, Any]) -> None:
         numbers = {name: value for name, value in state.items() if not isinstance(value, Tensor)}
@@ -195,7 +193,7 @@ class SlabStepper(Stepper):
 _ARRAYS = ("vector", "first", "second")
 
 
-class _Part:
+class _Part(FusedStepper):
     """The slab of a process. All processes call the same method at once; the first one's gives the whole's results."""
 
     def __init__(
@@ -222,16 +220,6 @@ class _Part:
             self._flow = FusedFlow(begin, base, a, local, epsilon, own=slab.own, exchange=exchange, **options)
         self._statistics = Statistics(0.0, 0.0, 0.0)
 
-    def run(self, rates: Sequence[float]) -> None:
-        for rate in rates:
-            self._statistics = Statistics(self._flow.evaluate(), *self._flow.update(rate))
-
-    def set_betas(self, betas: tuple[float, float]) -> None:
-        self._flow.betas = betas
-
-    def shift(self, amount: float) -> None:
-        self._flow.shift(amount)
-
     def statistics(self) -> Statistics:
         energy, most, mean = self._statistics
         share = (self._slab.last - self._slab.first) / self._shape[0]
@@ -245,12 +233,11 @@ class _Part:
         dist.all_reduce(total)
         return float(total) / math.prod(self._shape)
 
-    def field(self) -> np.ndarray | None:
-        return self._gather(self._flow.field)
+    def field(self) -> Any:
+        return self._gather(torch.from_numpy(self._flow.field))
 
     def state(self) -> dict[str, Any]:
-        state = self._flow.state()
-        return {name: self._gather(value) if name in _ARRAYS else value for name, value in state.items()}
+        return {name: self._gather(v) if isinstance(v, Tensor) else v for name, v in super().state().items()}
 
     def restore(self, numbers: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> None:
         parts = {name: self._scatter(None if arrays is None else arrays[name]) for name in _ARRAYS}
@@ -268,18 +255,18 @@ class _Part:
             component[...] = self._slab.cut(whole[k])
         return part
 
-    def _gather(self, values: np.ndarray) -> np.ndarray | None:
-        """Bring the own planes of an array `(…, Z, Y, X)` of all processes together in the first one."""
+    def _gather(self, values: Tensor) -> Tensor | None:
+        """Bring the own planes of a tensor `(…, Z, Y, X)` of all processes together in the first one."""
         own = values[..., self._slab.own, :, :]
         if self._rank:
-            dist.send(torch.from_numpy(np.ascontiguousarray(own)), 0)
+            dist.send(own.contiguous(), 0)
             return None
-        whole = np.empty((*values.shape[:-3], *self._shape), np.float32)
+        whole = torch.empty((*values.shape[:-3], *self._shape))
         whole[..., : self._slab.last, :, :] = own
         for rank, slab in enumerate(self._slabs[1:], 1):
             part = torch.empty((*values.shape[:-3], slab.last - slab.first, *values.shape[-2:]))
             dist.recv(part, rank)
-            whole[..., slab.first : slab.last, :, :] = part.numpy()
+            whole[..., slab.first : slab.last, :, :] = part
         return whole
 
 

@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.generation.cost import Cost
-from curvafit.generation.forms import DivergenceForm, Form
+from curvafit.generation.problem import Cost, DivergenceForm, Form
 from curvafit.priors import kernels
 from curvafit.priors.energies import energy_gradient, energy_gradient_by_autograd
 

@@ -31,8 +31,7 @@ from curvafit.core.files import write_content
 from curvafit.core.records import can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number
-from curvafit.data_synth.atlas import summarise
-from curvafit.data_synth.extraction import extract, open_all, shape_id
+from curvafit.data_synth.atlas import extract, open_all, shape_id, summarise
 from curvafit.data_synth.store import Store
 from curvafit.drawing.plot import DENSITY, DIAGONAL, FAMILY_COLOURS, INK, shared_limits
 from curvafit.drawing.rendering import CAP, SURFACE, render

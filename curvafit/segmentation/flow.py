@@ -17,6 +17,7 @@ from curvafit.core.runtime import Progress, silent
 from curvafit.core.workers import Cluster
 from curvafit.generation.data import Data
 from curvafit.generation.flow import WORKING_BLUR, Flow, descend
+from curvafit.generation.problem import Data
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import MOST, WORKING_EPSILON, Grid
 from curvafit.priors.loss import RESOLVED, choose_refinement

@@ -22,7 +22,9 @@ from scipy.special import expit, logit
 
 from curvafit.core.checks import check_float, check_int, require
 from curvafit.core.runtime import Progress, check_memory, silent, sub_progress
+from curvafit.core.workers import Cluster
 from curvafit.generation import data
+from curvafit.generation.problem import Data, Hinge
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.priors.law import LawLike
@@ -497,7 +499,7 @@ class SlicesProblem(Problem):
         springs = {"strength": trial.strength, "pull": trial.pull}
         return {"slices": digest_of(slices.inside), **numbers, "start": digest_of(self.level), **springs}
 
-    def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, data.Data]:
+    def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Data]:
         """Return the level on a box, and the hinge term that holds known voxels, and by the pull those between."""
         slices, trial, (rows, inside) = self.slices, self.trial, self.slices.known(box)
         numbers = slices.numbers(box)
@@ -508,7 +510,7 @@ class SlicesProblem(Problem):
         if slices.marks is not None:
             marks = slices.marks[np.ix_(*numbers)]
             pull = np.where(marks == 0, pull, trial.strength * marks).astype(np.float32)
-        return level, data.Hinge(place.spread(pull, centre=0), MARGIN)
+        return level, Hinge(place.spread(pull, centre=0), MARGIN)
 
     def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
         """Return the optimal profile of the level."""

@@ -10,7 +10,9 @@ import numpy as np
 
 from curvafit.core.checks import check_float, quoted
 from curvafit.core.runtime import Progress, silent, sub_progress
+from curvafit.core.workers import Cluster
 from curvafit.generation.data import Evidence
+from curvafit.generation.problem import Evidence
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import LawLike
 from curvafit.scan.grids import box_with_most_surface

@@ -344,8 +344,7 @@ class ImageMix:
 
 def image_shape(textures: Sequence[Sequence[Texture]], mix: ImageMix, seed: Sequence[int]) -> Whole:
     """Return a shape and what an image of it says where every `gap`-th slice is known, in pixels; any axis is first."""
-    from curvafit.data_synth.imaging.image import field_shape, image, regrid
-    from curvafit.data_synth.imaging.modality import MODALITIES
+    from curvafit.data_synth.imaging.modality import MODALITIES, field_shape, image, regrid
 
     rng = np.random.default_rng(seed)
     while True:

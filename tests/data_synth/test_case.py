@@ -10,10 +10,9 @@ from exact_store import CROP as SHAPE
 from exact_store import flat_recipe
 
 from curvafit.data_synth import sources
-from curvafit.data_synth.case import Composition, Recipe, shell_of
+from curvafit.data_synth.dataset import Composition, Recipe, shell_of
 from curvafit.data_synth.imaging.effects import occupancy
-from curvafit.data_synth.imaging.image import share_voxels
-from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality
+from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality, share_voxels
 from curvafit.data_synth.sources import SYMMETRIES, Generated, PhaseField, apply_symmetry, crop_periodic, random_crop
 from curvafit.generation import loop as steering
 from curvafit.priors.grid import Grid

@@ -10,7 +10,7 @@ from exact import Gyroid, centres, profile
 from exact_store import exact_record, exact_store
 
 from curvafit.core.workers import cluster
-from curvafit.data_synth.extraction import describe
+from curvafit.data_synth.atlas import describe
 from curvafit.geometry.description import BLOCKS, descriptors
 from curvafit.inference import table as tables
 from curvafit.inference.table import VIEWS, Table, column_names, law_of, load_table, parameters_of, save_table

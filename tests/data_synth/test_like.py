@@ -9,9 +9,8 @@ import torch
 from exact import Cylinder, centres
 
 from curvafit.data_synth.imaging.effects import EPSILON
-from curvafit.data_synth.imaging.image import image, regrid
 from curvafit.data_synth.imaging.like import fit_modality
-from curvafit.data_synth.imaging.modality import Contrast, Detector, Imaging, Noise, Optics
+from curvafit.data_synth.imaging.modality import Contrast, Detector, Imaging, Noise, Optics, image, regrid
 from curvafit.priors import Grid, optimal_profile
 from curvafit.volumes import Volume, load
 

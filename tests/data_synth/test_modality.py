@@ -8,8 +8,19 @@ import torch
 from exact import Cylinder, Sphere, centres, profile
 
 from curvafit.data_synth.imaging import effects
-from curvafit.data_synth.imaging.image import annotator_threshold, field_shape, image, label_voxels, regrid
-from curvafit.data_synth.imaging.modality import MODALITIES, Contrast, Imaging, Modality, Optics, modality
+from curvafit.data_synth.imaging.modality import (
+    MODALITIES,
+    Contrast,
+    Imaging,
+    Modality,
+    Optics,
+    annotator_threshold,
+    field_shape,
+    image,
+    label_voxels,
+    modality,
+    regrid,
+)
 from curvafit.priors.grid import Grid
 
 N = 32

@@ -12,8 +12,8 @@ import torch
 from exact_store import FLAT, flat_recipe
 
 from curvafit.data_synth import Contrast, Imaging, Modality, TextureDataset, design_box, labels_of, open_store
-from curvafit.data_synth.case import Composition, Recipe
 from curvafit.data_synth.centreline import centreline
+from curvafit.data_synth.dataset import Composition, Recipe
 from curvafit.data_synth.imaging.like import fit_modality
 from curvafit.data_synth.samples import fetch
 from curvafit.data_synth.sets import SetSpec, build_set, make_case, read_spec

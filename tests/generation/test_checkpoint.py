@@ -14,8 +14,8 @@ import pytest
 import torch
 from kernel_cases import assert_same
 
-from curvafit.generation.checkpoint import Checkpoint, identity
 from curvafit.generation.flow import descend, generate
+from curvafit.generation.loop import Checkpoint, identity
 from curvafit.generation.schedule import SCHEDULES, Schedule
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid

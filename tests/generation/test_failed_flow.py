@@ -14,8 +14,8 @@ from torch import Tensor
 from curvafit.data_synth import atlas
 from curvafit.data_synth.store import open_store
 from curvafit.generation import SCHEDULES, Schedule, descend
-from curvafit.generation.cost import Cost
 from curvafit.generation.loop import FlowOptions, run
+from curvafit.generation.problem import Cost
 from curvafit.generation.result import viability
 from curvafit.generation.stepper import Statistics, Stepper
 from curvafit.priors.grid import Grid

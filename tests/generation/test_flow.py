@@ -13,8 +13,8 @@ from kernel_cases import relax, short
 
 from curvafit.generation import loop
 from curvafit.generation.flow import choose_base, generate
-from curvafit.generation.forms import DivergenceForm, white_noise
 from curvafit.generation.loop import first_mass
+from curvafit.generation.problem import DivergenceForm, white_noise
 from curvafit.generation.result import RECORD_EVERY, viability
 from curvafit.generation.schedule import SCHEDULES, Phase, Schedule, choose_schedule, present_name, schedule
 from curvafit.priors.coefficients import Coefficients

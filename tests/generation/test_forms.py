@@ -11,11 +11,9 @@ import torch
 from loss_cases import noise
 
 from curvafit.generation import stepper
-from curvafit.generation.checkpoint import identity
-from curvafit.generation.cost import Cost
-from curvafit.generation.data import Evidence, Hinge
 from curvafit.generation.flow import descend
-from curvafit.generation.forms import FORMS, DivergenceForm
+from curvafit.generation.loop import identity
+from curvafit.generation.problem import FORMS, Cost, DivergenceForm, Evidence, Hinge
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import LbfgsStepper, TorchStepper
 from curvafit.priors import kernels

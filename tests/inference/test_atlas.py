@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from curvafit.data_synth import atlas as building
+from curvafit.data_synth.atlas import extract
 from curvafit.data_synth.design import INTERVALS, Design, design_box
-from curvafit.data_synth.extraction import extract
 from curvafit.data_synth.store import open_store
 from curvafit.generation.result import Viability
 from curvafit.generation.schedule import LEARNED, present_name, schedule

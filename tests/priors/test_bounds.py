@@ -12,13 +12,13 @@ import torch
 from curvafit.core.checks import SHOWN, check_float, check_int, quoted
 from curvafit.core.runtime import check_memory, device_memory
 from curvafit.core.workers import check_workers
-from curvafit.data_synth.case import Recipe
+from curvafit.data_synth.dataset import Recipe
 from curvafit.data_synth.design import Design, design_around, design_box
 from curvafit.data_synth.imaging.modality import MODALITIES
 from curvafit.data_synth.sources import Generated
 from curvafit.drawing.shapes import Output
 from curvafit.generation import Schedule, descend, generate, white_noise
-from curvafit.generation.data import Evidence, Hinge
+from curvafit.generation.problem import Evidence, Hinge
 from curvafit.generation.schedule import Phase, schedule
 from curvafit.generation.slabs import divide
 from curvafit.priors import kernels, stencils

@@ -17,7 +17,7 @@ from calling import call, refused
 from exact_store import FAMILIES, exact_field, exact_store
 from found import made_fit
 
-from curvafit.data_synth.extraction import extract
+from curvafit.data_synth.atlas import extract
 from curvafit.inference.atlas import Atlas
 from curvafit.report.atlas import families_of, farthest_points, make_solid, place_on_plane, scale_fit
 from curvafit.report.atlas import write_map as write

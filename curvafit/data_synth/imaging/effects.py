@@ -1,6 +1,6 @@
 """The effects of an image, in the order of the physics: optics, artefacts of specimen and light, noise.
 
-Pure, seeded functions of `(Z, Y, X)` tensors of a floating type, on any device; `imaging.image` chains them. Lengths
+Pure, seeded functions of `(Z, Y, X)` tensors of a floating type, on any device; `modality.image` chains them. Lengths
 are in the unit of the spacing, which is one number for cubic voxels or three (z, y, x). Values are photons where noise
 is counted in photons, grey values elsewhere. Depth grows along z, from 0 at the face of the first voxel. The random
 numbers of an effect depend on its seed alone, whatever else is applied. Parameters are not checked here: `Imaging` says
