@@ -16,7 +16,7 @@ from curvafit.core.files import write_atomically
 from curvafit.data_synth.atlas import versions
 from curvafit.drawing.plot import diagram_on, shared_limits, surface_on
 from curvafit.drawing.rendering import QUIET
-from curvafit.generation.flow import Flow, generate
+from curvafit.generation.flow import Execution, Flow, generate
 from curvafit.generation.schedule import Schedule, schedule
 from curvafit.geometry.diagrams import Diagram, diagram
 from curvafit.priors.coefficients import Coefficients
@@ -72,9 +72,8 @@ def grown(
     grid, plan = Grid((options.edge,) * 3), plan_of(options)
     stated = {name: value.tolist() if hasattr(value, "tolist") else value for name, value in told.items()}
     about = {"a": coefficients.as_dict(), "mass": mass, "grid": grid.shape, "plan": plan.as_dict(), **stated}
-    return kept(
-        path, about, lambda: generate(coefficients, mass, grid, schedule=plan, device=options.device, **told), keep
-    )
+    told |= {"schedule": plan, "execution": Execution(device=options.device)}
+    return kept(path, about, lambda: generate(coefficients, mass, grid, **told), keep)
 
 
 def kept(path: Path, about: dict[str, Any], make: Callable[[], Flow], keep: bool = True) -> Shape:

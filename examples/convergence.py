@@ -12,8 +12,8 @@ from common import CELL, DIAGRAM, SURFACE, draw, parser, plan_of, program, write
 from matplotlib.figure import Figure
 
 from curvafit.drawing.plot import write_picture
-from curvafit.generation.flow import Flow, generate
-from curvafit.generation.result import viability
+from curvafit.generation.flow import Execution, Flow, generate
+from curvafit.generation.result import Watch, viability
 from curvafit.geometry.diagrams import Diagram, diagram
 from curvafit.geometry.distances import wasserstein
 from curvafit.geometry.mesh import NoSurface
@@ -36,9 +36,8 @@ def main() -> None:
         grid,
         schedule=plan,
         seed=options.seed,
-        snapshots=marks,
-        checkpoint=options.output / "convergence.checkpoint",
-        device=options.device,
+        watch=Watch(snapshots=marks),
+        execution=Execution(device=options.device, checkpoint=options.output / "convergence.checkpoint"),
     )
     diagrams = {step: diagram_of(u.numpy(), grid, options.curvature) for step, u in flow.snapshots.items()}
     write_table(options, "convergence", [*table(flow, diagrams), flow.status], [program()])

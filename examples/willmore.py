@@ -23,7 +23,8 @@ import torch
 from rich.progress import Progress
 
 from curvafit.drawing.plot import gallery_figure, write_picture
-from curvafit.generation.flow import Flow, descend
+from curvafit.generation.flow import Execution, Flow, Optimiser, descend
+from curvafit.generation.result import Watch
 from curvafit.geometry.mesh import surface
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energies import cahn_hilliard_area
@@ -99,10 +100,10 @@ def flow_of(name: str, edge: int, width: float, steps: int, folder: Path) -> Row
             field,
             Coefficients.willmore(),
             grid,
-            steps=steps,
+            optimiser=Optimiser(steps=steps),
             epsilon=ε,
-            checkpoint=folder / f"{name}-{edge}-{width:.3g}.checkpoint",
-            callbacks=[lambda made, total, state: progress.update(task, completed=made)],
+            watch=Watch(callbacks=[lambda made, total, state: progress.update(task, completed=made)]),
+            execution=Execution(checkpoint=folder / f"{name}-{edge}-{width:.3g}.checkpoint"),
         )
     area = float(cahn_hilliard_area(flow.field, grid, ε)) / SIGMA
     return Row(ε, float(flow.history.energy[-1]) / SIGMA, area, _radius_ratio(flow), flow)

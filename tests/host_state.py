@@ -31,6 +31,7 @@ import torch
 
 import curvafit
 from curvafit import priors
+from curvafit.generation.flow import Optimiser
 from curvafit.generation.schedule import schedule
 
 #: Numbers of threads that are nobody's default.
@@ -117,8 +118,8 @@ def calls(folder: Path) -> dict[str, Callable[[], object]]:
         value = noise.clone().requires_grad_()
         loss(value, noise.round()).backward()
 
-    def descend(**options: Any) -> object:
-        return curvafit.descend(kept["flow"].field, law, grid, steps=2, **options)
+    def descend(method: Any = "lbfgs", **options: Any) -> object:
+        return curvafit.descend(kept["flow"].field, law, grid, optimiser=Optimiser(method, 2), **options)
 
     def plot() -> None:
         from curvafit.drawing import plot
@@ -152,7 +153,7 @@ def calls(folder: Path) -> dict[str, Callable[[], object]]:
         "CurvaturePrior": lambda: train(priors.CurvaturePrior("tubes")),
         "CombinedLoss": lambda: train(priors.CombinedLoss(mse, priors.CurvaturePrior("tubes"), 0.1, 2)),
         "generate": lambda: keep("flow", curvafit.generate("tubes", grid=grid, seed=1)),
-        "descend": lambda: (descend(), descend(flow="h-1", optimiser="adam")),
+        "descend": lambda: (descend(), descend("adam", flow="h-1")),
         "diagram": lambda: keep("diagram", curvafit.diagram(kept["flow"].field, grid, 0.02)),
         "Diagram": lambda: curvafit.Diagram(np.zeros((1, 2)), np.ones(1)),
         "wasserstein": lambda: curvafit.wasserstein(kept["diagram"], kept["diagram"]), "plot": plot,

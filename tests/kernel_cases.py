@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from curvafit.generation.flow import WORKING_BLUR, descend
+from curvafit.generation.flow import WORKING_BLUR, Optimiser, descend
 from curvafit.generation.result import Flow
 from curvafit.generation.schedule import Schedule
 from curvafit.priors.coefficients import Coefficients
@@ -46,5 +46,5 @@ def assert_same(one: Flow, other: Flow) -> None:
 
 def relax(field: torch.Tensor, law: Coefficients, grid: Grid, schedule: Schedule, **options) -> Flow:
     """The flow of `generate` from a field: u = k ∗ (div A + field) from A = 0, under Adam."""
-    options = {"blur": WORKING_BLUR, "steps": schedule.steps} | options
-    return descend(field, law, grid, flow="h-1", optimiser="adam", schedule=schedule, **options)
+    optimiser = Optimiser("adam", schedule.steps, schedule)
+    return descend(field, law, grid, flow="h-1", optimiser=optimiser, blur=WORKING_BLUR, **options)

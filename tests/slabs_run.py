@@ -12,21 +12,20 @@ import numpy as np
 import torch
 
 from curvafit.generation import slabs
-from curvafit.generation.flow import generate
-from curvafit.generation.result import Flow
+from curvafit.generation.flow import Execution, generate
+from curvafit.generation.result import Flow, Watch
 from curvafit.generation.schedule import schedule
 from curvafit.priors.grid import Grid
 
 STEPS = 24
 
 
-def grow(grid: Grid, **options) -> Flow:
+def grow(grid: Grid, callbacks=(), **execution) -> Flow:
     """A shape whose mass is corrected on the way, with a map of ε."""
     ε = torch.linspace(0.018, 0.022, grid.shape[0])[:, None, None].expand(grid.shape)
     plan = schedule("fast", STEPS)
-    return generate(
-        "tubes", None, grid, volume_fraction=0.3, epsilon=ε, schedule=plan, seed=1, snapshots=(0, 1, 12), **options
-    )
+    options = {"watch": Watch((0, 1, 12), callbacks), "execution": Execution(**execution)}
+    return generate("tubes", None, grid, volume_fraction=0.3, epsilon=ε, schedule=plan, seed=1, **options)
 
 
 def stop_halfway(step: int, total: int, state: object) -> bool:

@@ -78,6 +78,7 @@ def generate(
         serve()
         return
     from curvafit.drawing.shapes import check_target, shape_record
+    from curvafit.generation.flow import Execution
     from curvafit.generation.schedule import choose_schedule
     from curvafit.generation.schedule import schedule as named
     from curvafit.priors.energies import orientation as orient
@@ -94,7 +95,8 @@ def generate(
         *direction, strength = parse_numbers(orientation, "--orientation", 4)
         Q = options["orientation"] = orient(direction, strength)
     options["schedule"] = named(choose_schedule([law], schedule), steps)
-    options |= {"seed": seed, "device": device, **_place_checkpoint(checkpoint, checkpoint_every, out)}
+    place = _place_checkpoint(checkpoint, checkpoint_every, out)
+    options |= {"seed": seed, "execution": Execution(device=device, keep_checkpoint=True, **place)}
     output = _plan_output(law, grid, spacing, unit, tile)
     law_file = None if not law.fitted else prior or preset
     inputs = [str(path) for path in (law_file, maps) if path is not None]
@@ -105,7 +107,7 @@ def generate(
     more |= {"origin": law.origin, "wanted_volume_fraction": volume_fraction, "command": command_line()}
     record = shape_record(flow, mass=options["mass"], output=output, **more)
     _write(flow, out, record, output=output, **writing)
-    _remove(options["checkpoint"])
+    _remove(place["checkpoint"])
 
 
 @command()
@@ -154,7 +156,7 @@ def _choose_parameters(
 
 
 def _place_checkpoint(file: Path | None, every: float | None, out: Path) -> dict[str, Any]:
-    """Return the options of the checkpoint as `generate` takes them; refuse the place of an output."""
+    """Return the options of the checkpoint as `Execution` takes them; refuse the place of an output."""
     from curvafit.core.records import sibling
     from curvafit.generation.loop import resolve_place
 
@@ -184,9 +186,12 @@ def _plan_output(law: Law, grid: Grid, spacing: str | None, unit: str | None, ti
 def _grow(options: dict[str, Any]) -> Flow:
     """Run the flow with progress; exit with code 1 where it failed or has no surface."""
     from curvafit.generation.flow import generate as make
+    from curvafit.generation.result import Watch
     from curvafit.generation.slabs import count_processes, lead
 
-    saved, several = options["checkpoint"], count_processes()[1] > 1
+    saved, several = options["execution"].checkpoint, count_processes()[1] > 1
+    if several:
+        options["execution"] = replace(options["execution"], backend="slabs")
 
     def again() -> str:
         return "the same command" if saved is not None and saved.exists() else ""
@@ -197,10 +202,9 @@ def _grow(options: dict[str, Any]) -> Flow:
         def watch(step: int, total: int, state: State) -> None:
             progress("growing", step / total)
 
-        backend = "slabs" if several else "auto"
-        flow = make(**options, callbacks=[watch], keep_checkpoint=True, backend=backend)
+        flow = make(**options, watch=Watch(callbacks=[watch]))
     if not (flow.finite and flow.viability.lowest < 0 < flow.viability.highest):
-        _remove(options["checkpoint"])
+        _remove(saved)
         say(f"{flow.status}; nothing was written", to=error_console())
         raise typer.Exit(1)
     return flow

@@ -1,3 +1,5 @@
+from .flow import Execution as Execution
+from .flow import Optimiser as Optimiser
 from .flow import descend as descend
 from .flow import generate as generate
 from .problem import Data as Data
@@ -8,5 +10,6 @@ from .result import Flow as Flow
 from .result import History as History
 from .result import State as State
 from .result import Viability as Viability
+from .result import Watch as Watch
 from .schedule import SCHEDULES as SCHEDULES
 from .schedule import Schedule as Schedule

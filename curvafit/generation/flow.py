@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -14,7 +13,7 @@ from torch import Tensor
 from curvafit.core.checks import check_choice, check_float, check_open_interval, check_seed, check_type, quoted
 from curvafit.generation.loop import Checkpoint, FlowOptions, first_mass, identity, run
 from curvafit.generation.problem import FORMS, Blur, Cost, Data, DivergenceForm, Form, check_shape, white_noise
-from curvafit.generation.result import Callback, Flow
+from curvafit.generation.result import Flow, Watch
 from curvafit.generation.schedule import Schedule, choose_schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.generation.slabs import SlabStepper
@@ -25,11 +24,85 @@ from curvafit.priors.law import Law, LawLike
 
 #: Standard deviation of the published blur, in working units (two voxels).
 WORKING_BLUR = 0.02
-#: Seconds between two checkpoints by default.
-CHECKPOINT_EVERY = 60.0
-#: The ways to run a flow: see `generate`.
+#: The ways to run a flow: see `Execution`.
 Backend = Literal["auto", "torch", "fused", "slabs"]
 BACKENDS = get_args(Backend)
+
+
+@dataclass(frozen=True)
+class Execution:
+    """How a flow is computed and saved.
+
+    Parameters
+    ----------
+    backend
+        `"auto"` takes the fused step on processors and plain torch elsewhere; `"torch"` and `"fused"` take only that
+        step. `"slabs"` is the fused step over the processes of `slabs.lead`.
+    device
+        Where torch runs, such as `"cpu"` or `"cuda"`.
+    checkpoint, checkpoint_every
+        A file in which the run is saved at intervals of that many seconds, and from which it resumes where the file
+        exists: the result is the same bit for bit on one machine and number of threads. The file is removed at the end
+        unless `keep_checkpoint`, but stays where a callback stopped the flow.
+
+    Raises ValueError if a value is out of range, or torch cannot compute on the device.
+    """
+
+    backend: Backend = "auto"
+    device: torch.device | str = "cpu"
+    checkpoint: str | Path | None = None
+    checkpoint_every: float = 60.0
+    keep_checkpoint: bool = False
+
+    def __post_init__(self) -> None:
+        check_choice(self.backend, BACKENDS, f"a backend among {', '.join(BACKENDS)}")
+        check_device(self.device)
+        check_type(self.checkpoint, (str, Path, type(None)), "a path for the checkpoint")
+        check_float(self.checkpoint_every, "a finite number of seconds between checkpoints, at least 0", 0)
+
+
+def check_device(device: torch.device | str) -> None:
+    """Raise ValueError where torch cannot compute on a device."""
+    try:
+        usable = device is not None and torch.zeros(1, device=device).add(1).item() == 1
+    except (RuntimeError, TypeError, ValueError, AssertionError):
+        usable = False
+    if not usable:
+        raise ValueError(
+            f"torch cannot compute on the device {quoted(device)} here: take 'cpu', or a GPU that is there"
+        )
+
+
+@dataclass(frozen=True)
+class Optimiser:
+    """The steps of `descend`: their method, their number, and the schedule of their lengths.
+
+    Parameters
+    ----------
+    method
+        `"lbfgs"` (a history of 10, and a strong Wolfe line search from length 1) or `"adam"`.
+    steps
+        Number of steps. A step of L-BFGS is one iteration with its line search.
+    schedule
+        Step lengths of Adam; `steps` replaces the schedule's number of steps.
+
+    Raises ValueError if a value is out of range.
+    """
+
+    method: Literal["lbfgs", "adam"] = "lbfgs"
+    steps: int = 200
+    schedule: str | Schedule = "cosine"
+
+    def __post_init__(self) -> None:
+        check_choice(self.method, ("adam", "lbfgs"), "an optimiser 'adam' or 'lbfgs'")
+        named_schedule(self.schedule, self.steps)
+
+    @property
+    def plan(self) -> Schedule:
+        """The schedule of the method."""
+        if self.method == "lbfgs":
+            return Schedule("lbfgs", self.steps, 1.0, 1.0, "constant")
+        return named_schedule(self.schedule, self.steps)
 
 
 def generate(
@@ -43,14 +116,9 @@ def generate(
     epsilon: float | Tensor = WORKING_EPSILON,
     blur: float = WORKING_BLUR,
     orientation: Float[Tensor, "3 3"] | None = None,
-    snapshots: Sequence[int] = (),
-    callbacks: Sequence[Callback] = (),
+    watch: Watch = Watch(),
     reject_early: bool = False,
-    checkpoint: str | Path | None = None,
-    checkpoint_every: float = CHECKPOINT_EVERY,
-    keep_checkpoint: bool = False,
-    backend: Backend = "auto",
-    device: torch.device | str = "cpu",
+    execution: Execution = Execution(),
 ) -> Flow:
     """Make a shape: lower F_ε from white noise at constant mass (paper, Algorithm 1).
 
@@ -78,36 +146,28 @@ def generate(
         Seed of the start. The same seed, grid and number of threads make the same field, bit for bit.
     orientation
         Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x; see `priors.energy.orientation`.
-    snapshots, callbacks
-        Numbers of steps after which `Flow.snapshots` keeps the field; functions as `Callback` describes them.
+    watch
+        What is taken from the flow while it runs: snapshots, and calls of functions.
     reject_early
         Stop as soon as a viability check fails (see `Schedule.checks`) instead of after the last step.
-    checkpoint, checkpoint_every
-        A file in which the run is saved at intervals of that many seconds, and from which it resumes where the file
-        exists: the result is the same bit for bit on one machine and number of threads. The file is removed at the end
-        unless `keep_checkpoint`, but stays where a callback stopped the flow.
-    backend
-        `"auto"` takes the fused step on processors and plain torch elsewhere; `"torch"` and `"fused"` take only that
-        step. `"slabs"` is the fused step over the processes of `slabs.lead`.
-    device
-        Where torch runs, such as `"cpu"` or `"cuda"`.
+    execution
+        How the flow is computed and saved: backend, device, checkpoint.
 
     Where the field is not a shape, or the energy diverged, `Flow.viability.viable` is False and `Flow.status` says why.
     Raises ValueError if an argument is out of range or does not fit the voxels, a file is not this run's checkpoint, or
     the device has no fused step.
     """
+    check_type(execution, Execution, "an Execution")
     known = Law.of(law)
     mass = known.mass if mass is None and volume_fraction is None else mass
     grid, seed = grid if isinstance(grid, Grid) else Grid(grid), check_seed(seed)  # type: ignore[arg-type]
-    execution = _Execution(backend, device, checkpoint, checkpoint_every, keep_checkpoint)
-    plan = choose_schedule([known], schedule)
     cost = Cost(known.coefficients, grid, epsilon, orientation, blur)
-    options = FlowOptions(cost, plan, callbacks, snapshots, reject_early, volume_fraction)
-    options.check_memory(device)
+    options = FlowOptions(cost, choose_schedule([known], schedule), watch, reject_early, volume_fraction)
+    options.check_memory(execution.device)
     base = choose_base(mass, volume_fraction, grid)
-    form = DivergenceForm.of(grid, cost.blur, base, execution.blur)
-    stepper = execution.stepper(white_noise(grid, seed), form, options)
-    return run(stepper, options, seed, execution.checkpoint_file(stepper, options, seed=seed, mass=base))
+    form = DivergenceForm.of(grid, cost.blur, base, _choose_blur(execution))
+    stepper = _make_stepper(execution, white_noise(grid, seed), form, options)
+    return run(stepper, options, seed, _open_checkpoint(execution, stepper, options, seed=seed, mass=base))
 
 
 def descend(
@@ -116,19 +176,14 @@ def descend(
     grid: Grid,
     *,
     flow: Literal["l2", "h-1"] = "l2",
-    optimiser: Literal["lbfgs", "adam"] = "lbfgs",
-    steps: int = 200,
-    schedule: str | Schedule = "cosine",
+    optimiser: Optimiser = Optimiser(),
     epsilon: float | Tensor = WORKING_EPSILON,
     blur: float | None = None,
     orientation: Float[Tensor, "3 3"] | None = None,
     data: Data | None = None,
     frozen: Bool[Tensor, "z y x"] | None = None,
-    callbacks: Sequence[Callback] = (),
-    checkpoint: str | Path | None = None,
-    checkpoint_every: float = CHECKPOINT_EVERY,
-    backend: Backend = "auto",
-    device: torch.device | str = "cpu",
+    watch: Watch = Watch(),
+    execution: Execution = Execution(),
 ) -> Flow:
     """Lower F_ε, or F_ε + D, from a field v₀ to a minimum near it (paper, Algorithm 2: the L² flow under L-BFGS).
 
@@ -144,12 +199,7 @@ def descend(
         the energy is one function of v. `"h-1"`: u = k ∗ (div A + v₀) from A = 0, the flow of `generate`, at constant
         mass.
     optimiser
-        `"lbfgs"` (a history of 10, and a strong Wolfe line search from length 1) or `"adam"`.
-    steps
-        Number of steps. A step of L-BFGS is one iteration with its line search, and the flow stops earlier where the
-        line search finds no lower energy.
-    schedule
-        Step lengths of Adam; `steps` replaces the schedule's number of steps.
+        L-BFGS or Adam, and its steps. The flow stops earlier where a line search finds no lower energy.
     blur
         Standard deviation of k; None takes a voxel's shortest edge, as published.
     data
@@ -160,14 +210,11 @@ def descend(
     Raises ValueError as `generate` does, and if the field or the mask is not of the grid's shape or not finite.
     """
     check_choice(flow, FORMS, f"a flow among {', '.join(FORMS)}")
-    check_choice(optimiser, ("adam", "lbfgs"), "an optimiser 'adam' or 'lbfgs'")
-    plan = named_schedule(schedule, steps)
-    if optimiser == "lbfgs":
-        plan = Schedule("lbfgs", steps, 1.0, 1.0, "constant")
+    for value, kind in ((optimiser, Optimiser), (execution, Execution)):
+        check_type(value, kind, f"an {kind.__name__}")
     width = min(grid.spacing) if blur is None and isinstance(grid, Grid) else blur
     cost = Cost(Law.of(law).coefficients, grid, epsilon, orientation, width, data)  # type: ignore[arg-type]
-    execution = _Execution(backend, device, checkpoint, checkpoint_every)
-    options = FlowOptions(cost, plan, callbacks)
+    options = FlowOptions(cost, optimiser.plan, watch)
     _check_voxels("field", field, grid)
     if frozen is not None:
         _check_voxels("frozen mask", frozen, grid)
@@ -175,10 +222,10 @@ def descend(
     field = torch.as_tensor(field).detach().to("cpu", torch.float32).contiguous()
     if not bool(torch.isfinite(field).all()):
         raise ValueError("the field must be finite, got NaN or infinity")
-    form, start = FORMS[flow].start_at(field, grid, cost.blur, execution.blur)
-    stepper = execution.stepper(start, form, options, optimiser, frozen)
-    checkpoint_file = execution.checkpoint_file(stepper, options, flow=flow, field=field, frozen=frozen)
-    return run(stepper, options, None, checkpoint_file)
+    form, start = FORMS[flow].start_at(field, grid, cost.blur, _choose_blur(execution))
+    stepper = _make_stepper(execution, start, form, options, optimiser.method, frozen)
+    checkpoint = _open_checkpoint(execution, stepper, options, flow=flow, field=field, frozen=frozen)
+    return run(stepper, options, None, checkpoint)
 
 
 def _check_voxels(name: str, values: Tensor, grid: Grid) -> None:
@@ -187,72 +234,42 @@ def _check_voxels(name: str, values: Tensor, grid: Grid) -> None:
         raise ValueError(f"the {name} must have the grid's shape {grid.shape}, got {tuple(values.shape)}")
 
 
-@dataclass(frozen=True)
-class _Execution:
-    """How a flow is computed and saved: the arguments of `generate`, which are checked here."""
-
-    backend: str
-    device: torch.device | str
-    checkpoint: str | Path | None
-    every: float
-    keep: bool = False
-
-    def __post_init__(self) -> None:
-        check_choice(self.backend, BACKENDS, f"a backend among {', '.join(BACKENDS)}")
-        check_device(self.device)
-        check_type(self.checkpoint, (str, Path, type(None)), "a path for the checkpoint")
-        check_float(self.every, "a finite number of seconds between checkpoints, at least 0", 0)
-
-    @property
-    def plain(self) -> bool:
-        """Whether the step is plain torch wherever it runs."""
-        return self.backend == "torch"
-
-    @property
-    def blur(self) -> Blur:
-        """The function that blurs in forms."""
-        return stencils.gaussian_blur if self.plain else kernels.gaussian_blur
-
-    def stepper(
-        self, start: Tensor, form: Form, options: FlowOptions, optimiser: str = "adam", frozen: Tensor | None = None
-    ) -> Stepper:
-        """Return the stepper of one shape: fused where there is a kernel, unless the backend is plain torch."""
-        cost, betas = options.cost, options.plan.betas_at(0)
-        has_kernel = kernels.has_kernel(self.device)
-        if self.backend == "fused" and not has_kernel:
-            raise ValueError(f"the device {self.device} has no fused step: take backend='torch', or the device 'cpu'")
-        if self.backend == "slabs":
-            if not has_kernel or not isinstance(form, DivergenceForm) or optimiser != "adam" or frozen is not None:
-                raise ValueError("slabs are for a flow of `generate` on processors: leave the backend out")
-            return SlabStepper(start, form, cost, betas)
-        fusible = optimiser == "adam" and cost.data is None and not self.plain
-        if fusible and has_kernel and isinstance(form, DivergenceForm):
-            return FusedStepper(start, form, cost, betas, frozen)
-        kind = LbfgsStepper if optimiser == "lbfgs" else TorchStepper
-        return kind(start, form, cost, betas, frozen, self.device, fused=not self.plain)
-
-    def checkpoint_file(self, stepper: Stepper, options: FlowOptions, **start: object) -> Checkpoint | None:
-        """Return the checkpoint of a run from a start, or None where the run has none."""
-        if self.checkpoint is None:
-            return None
-        plan, share, snapshots = options.plan, options.volume_fraction, [*options.snapshots]
-        job = {**vars(options.cost), "schedule": plan, "volume_fraction": share, "snapshots": snapshots, **start}
-        # Slabs go on from what one process saved, and the other way round.
-        name = FusedStepper.__name__ if isinstance(stepper, SlabStepper) else type(stepper).__name__
-        place = {"stepper": name, "backend": self.backend.replace("slabs", "auto"), "device": self.device}
-        return Checkpoint(self.checkpoint, self.every, identity(**job, **place), self.keep)
+def _choose_blur(execution: Execution) -> Blur:
+    return stencils.gaussian_blur if execution.backend == "torch" else kernels.gaussian_blur
 
 
-def check_device(device: torch.device | str) -> None:
-    """Raise ValueError where torch cannot compute on a device."""
-    try:
-        usable = device is not None and torch.zeros(1, device=device).add(1).item() == 1
-    except (RuntimeError, TypeError, ValueError, AssertionError):
-        usable = False
-    if not usable:
-        raise ValueError(
-            f"torch cannot compute on the device {quoted(device)} here: take 'cpu', or a GPU that is there"
-        )
+def _make_stepper(
+    execution: Execution, start: Tensor, form: Form, options: FlowOptions, method: str = "adam",
+    frozen: Tensor | None = None,
+) -> Stepper:  # fmt: skip
+    """Return the stepper of one shape: fused where there is a kernel, unless the backend is plain torch."""
+    cost, betas, device = options.cost, options.plan.betas_at(0), execution.device
+    has_kernel, plain = kernels.has_kernel(device), execution.backend == "torch"
+    if execution.backend == "fused" and not has_kernel:
+        raise ValueError(f"the device {device} has no fused step: take backend='torch', or the device 'cpu'")
+    if execution.backend == "slabs":
+        if not has_kernel or not isinstance(form, DivergenceForm) or method != "adam" or frozen is not None:
+            raise ValueError("slabs are for a flow of `generate` on processors: leave the backend out")
+        return SlabStepper(start, form, cost, betas)
+    if method == "adam" and cost.data is None and not plain and has_kernel and isinstance(form, DivergenceForm):
+        return FusedStepper(start, form, cost, betas, frozen)
+    kind = LbfgsStepper if method == "lbfgs" else TorchStepper
+    return kind(start, form, cost, betas, frozen, device, fused=not plain)
+
+
+def _open_checkpoint(
+    execution: Execution, stepper: Stepper, options: FlowOptions, **start: object
+) -> Checkpoint | None:
+    """Return the checkpoint of a run from a start, or None where the run has none."""
+    if execution.checkpoint is None:
+        return None
+    plan, share, snapshots = options.plan, options.volume_fraction, [*options.watch.snapshots]
+    job = {**vars(options.cost), "schedule": plan, "volume_fraction": share, "snapshots": snapshots, **start}
+    # Slabs go on from what one process saved, and the other way round.
+    name = FusedStepper.__name__ if isinstance(stepper, SlabStepper) else type(stepper).__name__
+    place = {"stepper": name, "backend": execution.backend.replace("slabs", "auto"), "device": execution.device}
+    every, keep = execution.checkpoint_every, execution.keep_checkpoint
+    return Checkpoint(execution.checkpoint, every, identity(**job, **place), keep)
 
 
 def choose_base(mass: float | Tensor | None, share: float | None, grid: Grid) -> float | Tensor:

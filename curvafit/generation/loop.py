@@ -7,7 +7,7 @@ import hashlib
 import io
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -19,11 +19,11 @@ import torch
 from filelock import FileLock, Timeout
 from torch import Tensor
 
-from curvafit.core.checks import as_tuple, check_open_interval, quoted
+from curvafit.core.checks import check_open_interval, check_type
 from curvafit.core.files import remove_leftovers, write_content
 from curvafit.core.runtime import FIELD, FLOW, check_memory, hold_signals
 from curvafit.generation.problem import Cost
-from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, State, Viability, viability
+from curvafit.generation.result import RECORD_EVERY, Flow, History, State, Viability, Watch, viability
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import Statistics, Stepper
 from curvafit.priors.coefficients import Coefficients
@@ -52,29 +52,26 @@ class FlowOptions:
 
     cost: Cost
     plan: Schedule
-    callbacks: Sequence[Callback] = ()
-    snapshots: Sequence[int] = ()
+    watch: Watch = Watch()
     reject_early: bool = False
     volume_fraction: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("snapshots", "callbacks"):
-            object.__setattr__(self, name, as_tuple(getattr(self, name), name))
-        if faults := [callback for callback in self.callbacks if not callable(callback)]:
-            raise ValueError(f"expected callbacks that can be called, got {quoted(faults[0])}")
-        object.__setattr__(self, "snapshots", tuple(map(self.plan.check_step, self.snapshots)))
+        check_type(self.watch, Watch, "a Watch")
+        snapshots = tuple(map(self.plan.check_step, self.watch.snapshots))
+        object.__setattr__(self, "watch", dataclasses.replace(self.watch, snapshots=snapshots))
 
     def check_memory(self, device: torch.device | str) -> None:
         """Raise ValueError where a flow does not fit into the device's memory, or its snapshots into the machine's."""
         check_memory(self.cost.grid.shape, FLOW, "a box", device)
-        snapshots = len(set(self.snapshots))
+        snapshots = len(set(self.watch.snapshots))
         check_memory(self.cost.grid.shape, FIELD * snapshots, f"a box with {snapshots} snapshots")
 
     def next_mark(self, steps: int) -> int:
         """Return the number of steps after which the next record, snapshot, check or phase of the plan is due."""
         regular = steps + RECORD_EVERY - steps % RECORD_EVERY
         checks = self.plan.checks if self.reject_early else ()
-        marks = (regular, self.plan.steps, *self.plan.bounds, *self.snapshots, *checks)
+        marks = (regular, self.plan.steps, *self.plan.bounds, *self.watch.snapshots, *checks)
         return min(mark for mark in marks if mark > steps)
 
 
@@ -154,14 +151,14 @@ class _Run:
 
     def _observe(self, steps: int, last: bool) -> None:
         """Take the snapshot, record and check that are due after `steps` steps."""
-        options, total = self._options, self._options.plan.steps
-        if steps in options.snapshots:
+        watch, plan = self._options.watch, self._options.plan
+        if steps in watch.snapshots:
             self._snapshots[steps] = self._stepper.field()
         if last or steps % RECORD_EVERY == 0:
             self._record(steps, last)
-        if not self._stop and options.reject_early and steps in options.plan.checks:
+        if not self._stop and self._options.reject_early and steps in plan.checks:
             check = self._viability(self._stepper.field())
-            self._stop = "" if check.viable else f"stopped after {steps} of {total} steps: {check.reason}"
+            self._stop = "" if check.viable else f"stopped after {steps} of {plan.steps} steps: {check.reason}"
 
     def flow(self) -> Flow:
         """Return the result of a run that has stopped."""
@@ -185,9 +182,9 @@ class _Run:
             self._failure = f"{subject} is not finite"
             self._stop = f"stopped after {steps} of {total} steps: {self._failure}"
             return
-        if options.callbacks:
+        if options.watch.callbacks:
             state = State(stepper.field(), *statistics, mass)
-            answers = [bool(callback(steps, total, state)) for callback in options.callbacks]
+            answers = [bool(callback(steps, total, state)) for callback in options.watch.callbacks]
             if any(answers):
                 self._stop, self._stopped_by_callback = f"stopped by a callback after {steps} of {total} steps", True
         share = options.volume_fraction

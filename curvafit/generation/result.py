@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from curvafit.core.checks import as_tuple, quoted
+from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Pictured
 from curvafit.core.units import format_sampling
 from curvafit.generation.schedule import Schedule
@@ -67,6 +69,24 @@ class State:
 #: A function that a flow calls every `RECORD_EVERY` steps and at the end, with the number of steps so far, the total
 #: and the state; True stops the flow.
 Callback = Callable[[int, int, State], bool | None]
+
+
+@dataclass(frozen=True)
+class Watch:
+    """What is taken from a flow while it runs.
+
+    `snapshots` are numbers of steps after which `Flow.snapshots` keeps the field; `callbacks` are functions as
+    `Callback` describes them. A callback that cannot be called is a ValueError.
+    """
+
+    snapshots: Sequence[int] = ()
+    callbacks: Sequence[Callback] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("snapshots", "callbacks"):
+            object.__setattr__(self, name, as_tuple(getattr(self, name), name))
+        if faults := [callback for callback in self.callbacks if not callable(callback)]:
+            raise ValueError(f"expected callbacks that can be called, got {quoted(faults[0])}")
 
 
 @dataclass(frozen=True, repr=False, eq=False)

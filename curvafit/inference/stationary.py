@@ -22,7 +22,7 @@ from torch import Tensor
 
 from curvafit.core.checks import require
 from curvafit.core.runtime import Progress, silent
-from curvafit.generation.flow import WORKING_BLUR, descend
+from curvafit.generation.flow import WORKING_BLUR, Optimiser, descend
 from curvafit.generation.schedule import Schedule
 from curvafit.inference.candidates import Candidate
 from curvafit.priors.coefficients import NAMES, Coefficients
@@ -282,8 +282,8 @@ def drift(phase: Float[Tensor, "z y x"], grid: Grid, epsilon: float, coefficient
         grid = Grid(tuple(values.shape), grid.spacing, "replicate")  # type: ignore[arg-type]
     start, voxel = deblur(values, grid, epsilon), grid.spacing[0]
     law, _ = fix_gauge(np.array([float(value) for value in coefficients]))
-    options = {"steps": SHORT_FLOW.steps, "schedule": SHORT_FLOW, "epsilon": epsilon, "blur": WORKING_BLUR}
-    flow = descend(start, law, grid, flow="h-1", optimiser="adam", frozen=halo_of(grid), **options)
+    options = {"optimiser": Optimiser("adam", SHORT_FLOW.steps, SHORT_FLOW), "epsilon": epsilon, "blur": WORKING_BLUR}
+    flow = descend(start, law, grid, flow="h-1", frozen=halo_of(grid), **options)
     before = gaussian_blur(start, grid, epsilon)
     moved = (flow.field - before).double()
     if not bool(torch.isfinite(moved).all()):

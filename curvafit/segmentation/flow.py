@@ -16,8 +16,9 @@ from curvafit.core.checks import LONGEST, SHORTEST, check_float, check_int
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.workers import Cluster
 from curvafit.generation.data import Data
-from curvafit.generation.flow import WORKING_BLUR, Flow, descend
+from curvafit.generation.flow import Flow, Optimiser, WORKING_BLUR, descend
 from curvafit.generation.problem import Data
+from curvafit.generation.result import Watch
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import MOST, WORKING_EPSILON, Grid
 from curvafit.priors.loss import RESOLVED, choose_refinement
@@ -96,11 +97,9 @@ def lower_energy(
         law.scale(BENDING / bending(law)).in_unit(place.unit),
         place.grid,
         data=data,
-        optimiser="adam",
-        steps=steps,
-        schedule="cosine",
+        optimiser=Optimiser("adam", steps),
         blur=WORKING_BLUR,
-        callbacks=[lambda step, total, _: progress("lowering the energy", step / total)],
+        watch=Watch(callbacks=[lambda step, total, _: progress("lowering the energy", step / total)]),
     )
     if not flow.finite:
         raise ScanError(f"the energy did not stay finite ({flow.status}): lower the weight")

@@ -87,8 +87,9 @@ def test_every_option_reaches_the_generator(tmp_path: Path, handed: dict[str, An
     assert handed["grid"] == Grid((8, 10, 12), boundary="replicate")
     assert (handed["schedule"].name, handed["schedule"].steps) == ("paper", 77)
     assert torch.equal(handed["orientation"], orientation((0, 0.6, 0.8), 25))
-    assert (handed["checkpoint"], handed["checkpoint_every"]) == (tmp_path / "run.pt", 5)
-    assert (handed["epsilon"], handed["device"]) == (0.03, "cpu")
+    execution = handed["execution"]
+    assert (execution.checkpoint, execution.checkpoint_every) == (tmp_path / "run.pt", 5)
+    assert (handed["epsilon"], execution.device) == (0.03, "cpu")
     slope, maps = np.linspace(0.1, 0.9, 5 * 6 * 7, dtype=np.float32).reshape(5, 6, 7), tmp_path / "maps.npz"
     np.savez(maps, a00=900 * slope, mass=-slope, a11=1.5)
     call("generate", "--preset", "tubes", "--maps", maps, "-o", tmp_path / "out.npy")

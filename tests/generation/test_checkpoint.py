@@ -14,8 +14,9 @@ import pytest
 import torch
 from kernel_cases import assert_same
 
-from curvafit.generation.flow import descend, generate
+from curvafit.generation.flow import Execution, Optimiser, descend, generate
 from curvafit.generation.loop import Checkpoint, identity
+from curvafit.generation.result import Watch
 from curvafit.generation.schedule import SCHEDULES, Schedule
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
@@ -29,11 +30,12 @@ make = partial(generate, TUBES, grid=GRID, schedule=PLAN)
 #: Makes a shape, saves after every step and tells of every tenth.
 SCRIPT = """
 import sys
-from curvafit.generation import Schedule, generate
+from curvafit.generation import Execution, Schedule, Watch, generate
 plan = Schedule("test", 200, 1e-2, 1e-3, "cosine")
 generate(
-    "tubes", grid=(14, 15, 16), volume_fraction=0.2, schedule=plan, seed=5, backend=sys.argv[1], checkpoint=sys.argv[2],
-    checkpoint_every=0, callbacks=[lambda step, *rest: print(step, flush=True)], snapshots=(10, 100),
+    "tubes", grid=(14, 15, 16), volume_fraction=0.2, schedule=plan, seed=5,
+    watch=Watch((10, 100), [lambda step, *rest: print(step, flush=True)]),
+    execution=Execution(sys.argv[1], checkpoint=sys.argv[2], checkpoint_every=0),
 )
 """
 
@@ -45,20 +47,21 @@ def start() -> torch.Tensor:
 
 def stop(at: int) -> dict:
     """The option of a callback that stops a flow after some steps."""
-    return {"callbacks": [lambda step, *rest: step == at]}
+    return {"watch": Watch(callbacks=[lambda step, *rest: step == at])}
 
 
-def interrupted(make, path: Path, after: int):
+def interrupted(make, path: Path, after: int, backend="auto"):
     """The flow's end, made in two runs: the first dies at a step."""
 
     def die(step, total, state):
         if step == after:
             raise InterruptedError
 
+    saved = Execution(backend, checkpoint=path, checkpoint_every=0)
     with pytest.raises(InterruptedError):
-        make(checkpoint=path, checkpoint_every=0, callbacks=[die])
+        make(execution=saved, watch=Watch(callbacks=[die]))
     assert path.exists()
-    flow = make(checkpoint=path, checkpoint_every=0)
+    flow = make(execution=saved)
     assert list(path.parent.iterdir()) == []
     return flow
 
@@ -83,11 +86,12 @@ def test_a_killed_program_goes_on(backend, tmp_path):
     saved, seen = steps_in(path), []
     assert 10 * (steps - 1) <= saved < 200
     plan = Schedule("test", 200, 1e-2, 1e-3, "cosine")
-    whole = partial(make, volume_fraction=0.2, schedule=plan, seed=5, backend=backend, snapshots=(10, 100))
-    resumed = whole(checkpoint=path, callbacks=[lambda step, *rest: seen.append(step) or None])
+    whole = partial(make, volume_fraction=0.2, schedule=plan, seed=5)
+    watch = Watch((10, 100), [lambda step, *rest: seen.append(step) or None])
+    resumed = whole(watch=watch, execution=Execution(backend, checkpoint=path))
     assert seen[0] == -(-saved // 10) * 10
     assert list(tmp_path.iterdir()) == []
-    assert_same(resumed, whole())
+    assert_same(resumed, whole(watch=Watch((10, 100)), execution=Execution(backend)))
 
 
 @pytest.mark.parametrize("optimiser", ["adam", "lbfgs", "frozen"])
@@ -95,8 +99,9 @@ def test_a_killed_program_goes_on(backend, tmp_path):
 def test_flows_from_a_field_go_on(flow, optimiser, start, tmp_path):
     frozen = torch.zeros(GRID.shape, dtype=torch.bool)
     frozen[:4] = True
-    options = {"optimiser": "adam", "frozen": frozen} if optimiser == "frozen" else {"optimiser": optimiser}
-    make = partial(descend, start, TUBES, GRID, flow=flow, steps=40, **options)
+    options = {"frozen": frozen} if optimiser == "frozen" else {}
+    steps = Optimiser("adam" if optimiser == "frozen" else optimiser, 40)
+    make = partial(descend, start, TUBES, GRID, flow=flow, optimiser=steps, **options)
     assert_same(interrupted(make, tmp_path / "run", 20), make())
 
 
@@ -104,19 +109,19 @@ def test_flows_from_a_field_go_on(flow, optimiser, start, tmp_path):
 def test_a_flow_goes_on_within_any_phase(backend, tmp_path):
     plan = dataclasses.replace(SCHEDULES["fast"], steps=60)
     assert plan.bounds == (12, 24)
-    phased = partial(make, MASS, schedule=plan, backend=backend)
-    whole = phased()
+    phased = partial(make, MASS, schedule=plan)
+    whole = phased(execution=Execution(backend))
     for after in (10, 20, 30):
-        assert_same(interrupted(phased, tmp_path / "run", after), whole)
+        assert_same(interrupted(phased, tmp_path / "run", after, backend), whole)
 
 
 @pytest.mark.parametrize(
     ("name", "changed"),
     [
         ("seed", {"seed": 1}), ("mass", {"mass": -0.5}), ("epsilon", {"epsilon": 0.021}),
-        ("snapshots", {"snapshots": (3,)}),
+        ("snapshots", {"watch": Watch((3,))}),
         ("coefficients", {"law": Coefficients(1, 2, 6, -40, -40, torch.full(GRID.shape, 400.0))}),
-        ("schedule", {"schedule": Schedule("test", 61, 1e-2, 1e-3, "cosine")}), ("stepper", {"backend": "torch"}),
+        ("schedule", {"schedule": Schedule("test", 61, 1e-2, 1e-3, "cosine")}), ("stepper", {}),
     ],
 )  # fmt: skip
 def test_another_runs_checkpoint_is_refused(name, changed, tmp_path):
@@ -124,10 +129,10 @@ def test_another_runs_checkpoint_is_refused(name, changed, tmp_path):
     if name == "stepper":
         pytest.importorskip("numba")
     path, given = tmp_path / "run", {"law": TUBES, "mass": MASS, "grid": GRID, "schedule": PLAN}
-    generate(**given, checkpoint=path, **stop(20))
+    generate(**given, **stop(20), execution=Execution(checkpoint=path))
     kept = path.read_bytes()
     with pytest.raises(ValueError, match=rf"\b{name} .* instead"):
-        generate(**given | changed, checkpoint=path)
+        generate(**given | changed, execution=Execution("torch" if name == "stepper" else "auto", checkpoint=path))
     assert path.read_bytes() == kept
 
 
@@ -148,7 +153,8 @@ def test_what_is_no_checkpoint_is_refused(tmp_path):
 
 
 def test_a_checkpoint_may_be_kept(tmp_path):
-    kept = partial(make, MASS, checkpoint=tmp_path / "run", checkpoint_every=0, keep_checkpoint=True)
+    execution = Execution(checkpoint=tmp_path / "run", checkpoint_every=0, keep_checkpoint=True)
+    kept = partial(make, MASS, execution=execution)
     first = kept()
     assert (tmp_path / "run").exists()
     assert_same(first, kept())
@@ -157,10 +163,10 @@ def test_a_checkpoint_may_be_kept(tmp_path):
 def test_a_callback_pauses_a_run(tmp_path):
     """It stops with the state of that step saved, however long ago the last checkpoint was; a done run leaves none."""
     path = tmp_path / "deep" / "run"
-    paused = make(MASS, checkpoint=path, **stop(30))
+    paused = make(MASS, execution=Execution(checkpoint=path), **stop(30))
     assert paused.status == "stopped by a callback after 30 of 60 steps"
     assert steps_in(path) == 31
-    resumed = make(MASS, checkpoint=path)
+    resumed = make(MASS, execution=Execution(checkpoint=path))
     assert not path.exists()
     assert_same(resumed, make(MASS))
 
@@ -185,9 +191,9 @@ def test_links_are_followed_and_stay(tmp_path):
     """One that leads nowhere yet, too; what is no file is refused."""
     (tmp_path / "run").symlink_to(tmp_path / "there" / "run")
     (tmp_path / "there").mkdir()
-    make(MASS, checkpoint=tmp_path / "run", **stop(20))
+    make(MASS, execution=Execution(checkpoint=tmp_path / "run"), **stop(20))
     assert steps_in(tmp_path / "there" / "run") == 21 and (tmp_path / "run").is_symlink()
-    make(MASS, checkpoint=tmp_path / "run")
+    make(MASS, execution=Execution(checkpoint=tmp_path / "run"))
     assert list((tmp_path / "there").iterdir()) == [] and (tmp_path / "run").is_symlink()
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
@@ -204,8 +210,8 @@ def test_two_runs_do_not_share_a_file_and_what_is_not_theirs_stays(tmp_path):
 
     def other(step, total, state):
         with pytest.raises(ValueError, match="in use"):
-            make(MASS, checkpoint=path)
+            make(MASS, execution=Execution(checkpoint=path))
 
-    make(MASS, checkpoint=path, callbacks=[other])
-    make(MASS, checkpoint=path)
+    make(MASS, watch=Watch(callbacks=[other]), execution=Execution(checkpoint=path))
+    make(MASS, execution=Execution(checkpoint=path))
     assert sorted(each.name for each in tmp_path.iterdir()) == [".0123abcd.run2", "run.lock"]

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from curvafit.data_synth import atlas
 from curvafit.data_synth.store import open_store
-from curvafit.generation import SCHEDULES, Schedule, descend
+from curvafit.generation import SCHEDULES, Execution, Optimiser, Schedule, descend
 from curvafit.generation.loop import FlowOptions, run
 from curvafit.generation.problem import Cost
 from curvafit.generation.result import viability
@@ -73,11 +73,11 @@ def test_figures_that_are_not_finite_end_a_flow(part: str, step: int, bad: float
 @pytest.mark.parametrize("backend", ["torch", "auto"])
 def test_every_flow_tells_of_a_field_too_large_for_float32(backend) -> None:
     """Its energy is finite in float64."""
-    huge = 1e30 * ball()
+    huge, execution = 1e30 * ball(), Execution(backend)
     flows = [
-        relax(huge, TUBES, GRID, schedule=RUNAWAY, backend=backend),
-        descend(huge, TUBES, GRID, steps=3, backend=backend),
-        descend(huge, TUBES, GRID, steps=3, optimiser="adam", backend=backend),
+        relax(huge, TUBES, GRID, schedule=RUNAWAY, execution=execution),
+        descend(huge, TUBES, GRID, optimiser=Optimiser(steps=3), execution=execution),
+        descend(huge, TUBES, GRID, optimiser=Optimiser("adam", 3), execution=execution),
     ]
     for flow in flows:
         assert "not finite" in flow.status and not flow.viability.viable and not flow.finite

@@ -12,10 +12,10 @@ from found import made_fit
 from kernel_cases import relax, short
 
 from curvafit.generation import loop
-from curvafit.generation.flow import choose_base, generate
+from curvafit.generation.flow import Execution, choose_base, generate
 from curvafit.generation.loop import first_mass
 from curvafit.generation.problem import DivergenceForm, white_noise
-from curvafit.generation.result import RECORD_EVERY, viability
+from curvafit.generation.result import RECORD_EVERY, Watch, viability
 from curvafit.generation.schedule import SCHEDULES, Phase, Schedule, choose_schedule, present_name, schedule
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energies import energy, energy_gradient_by_autograd, orientation
@@ -42,7 +42,7 @@ def gyroid(grid: Grid) -> torch.Tensor:
 @boundaries
 def test_mass_is_exact_the_energy_falls_and_history_tells_it(boundary, backend):
     grid = Grid((16, 18, 20), 0.01, boundary)
-    flow = generate(TUBES, MASS, grid, schedule=short(75), backend=backend)
+    flow = generate(TUBES, MASS, grid, schedule=short(75), execution=Execution(backend))
     history = flow.history
     assert history.step.tolist() == [*range(0, 80, RECORD_EVERY), 75]
     assert np.abs(history.mass - MASS).max() < 1e-6
@@ -58,7 +58,9 @@ def test_backends_agree_step_by_step():
     at once from noise, rounding decides the direction where X is near zero, and any two float32 programs part.)"""
     pytest.importorskip("numba")
     grid, plan = Grid((20, 22, 24)), Schedule("test", 20, 1e-3, 1e-3, "constant")
-    plain, fused = (relax(gyroid(grid), TUBES, grid, schedule=plan, backend=backend) for backend in BACKENDS)
+    plain, fused = (
+        relax(gyroid(grid), TUBES, grid, schedule=plan, execution=Execution(backend)) for backend in BACKENDS
+    )
     moved = float((plain.field - gaussian_blur(gyroid(grid), grid, BLUR)).abs().max())
     assert moved > 0.1
     assert float((plain.field - fused.field).abs().max()) < 1e-4 * moved
@@ -71,10 +73,12 @@ def test_backends_agree_step_by_step():
 @backends
 def test_a_seed_is_a_shape(backend):
     torch.manual_seed(0)
-    first, other = (generate(TUBES, MASS, (12, 13, 14), schedule=short(20), seed=k, backend=backend) for k in (3, 4))
+    first, other = (
+        generate(TUBES, MASS, (12, 13, 14), schedule=short(20), seed=k, execution=Execution(backend)) for k in (3, 4)
+    )
     torch.rand(7)
     state = torch.get_rng_state()
-    again = generate(TUBES, MASS, (12, 13, 14), schedule=short(20), seed=3, backend=backend)
+    again = generate(TUBES, MASS, (12, 13, 14), schedule=short(20), seed=3, execution=Execution(backend))
     assert torch.equal(torch.get_rng_state(), state)
     assert torch.equal(first.field, again.field)
     assert first.seed == 3
@@ -97,7 +101,7 @@ def test_callbacks_see_and_stop():
         seen.append((step, total, state.energy, float(state.field.mean())))
         return step >= 20
 
-    flow = generate(TUBES, MASS, 12, schedule=short(50), callbacks=[watch, lambda *_: None])
+    flow = generate(TUBES, MASS, 12, schedule=short(50), watch=Watch((), [watch, lambda *_: None]))
     assert [row[:2] for row in seen] == [(0, 50), (10, 50), (20, 50)]
     assert [row[2] for row in seen] == flow.history.energy.tolist()
     assert all(row[3] == pytest.approx(MASS, abs=1e-6) for row in seen)
@@ -190,7 +194,7 @@ def test_steps_are_those_of_torch_s_adam_bit_for_bit(boundary):
         vector.grad = form.pullback(slope)
         adam.param_groups[0].update(lr=PHASES.rate(step), betas=PHASES.betas_at(step))
         adam.step()
-    flow = generate(TUBES, MASS, grid, schedule=PHASES, seed=3, backend="torch")
+    flow = generate(TUBES, MASS, grid, schedule=PHASES, seed=3, execution=Execution("torch"))
     assert torch.equal(flow.field, form.field(vector))
 
 
@@ -198,8 +202,10 @@ def test_fused_phases_are_those_of_torch():
     """Rounding moves the end far less than the decay rates of the last phase do."""
     pytest.importorskip("numba")
     grid, other = Grid((8, 9, 10)), dataclasses.replace(PHASES, momentum=0.95, memory=0.995)
-    fused = generate(TUBES, MASS, grid, schedule=PHASES, backend="fused").field
-    plain, far = (generate(TUBES, MASS, grid, schedule=plan, backend="torch").field for plan in (PHASES, other))
+    fused = generate(TUBES, MASS, grid, schedule=PHASES, execution=Execution("fused")).field
+    plain, far = (
+        generate(TUBES, MASS, grid, schedule=plan, execution=Execution("torch")).field for plan in (PHASES, other)
+    )
     assert (fused - plain).abs().max() < (far - plain).abs().max() / 20
 
 
@@ -208,7 +214,9 @@ def test_fused_phases_are_those_of_torch():
 def test_relax_starts_at_the_field(boundary, backend):
     grid, fields = Grid((16, 17, 18), 0.01, boundary), []
     watch = [lambda step, total, state: fields.append(state.field.clone())]
-    flow = relax(gyroid(grid), TUBES, grid, schedule=short(20, 1e-3), backend=backend, callbacks=watch)
+    flow = relax(
+        gyroid(grid), TUBES, grid, schedule=short(20, 1e-3), watch=Watch((), watch), execution=Execution(backend)
+    )
     assert float((fields[0] - gaussian_blur(gyroid(grid), grid, BLUR)).abs().max()) < 1e-5
     assert float((flow.field - fields[0]).abs().max()) > 0.01
     assert flow.history.energy[-1] < flow.history.energy[0]
@@ -222,7 +230,7 @@ def test_relax_leaves_what_is_frozen(backend):
     grid = Grid((40, 12, 12))
     frozen = torch.ones(grid.shape, dtype=torch.bool)
     frozen[18:22] = False
-    flow = relax(gyroid(grid), TUBES, grid, schedule=short(20, 1e-3), frozen=frozen, backend=backend)
+    flow = relax(gyroid(grid), TUBES, grid, schedule=short(20, 1e-3), frozen=frozen, execution=Execution(backend))
     change = (flow.field - gaussian_blur(gyroid(grid), grid, BLUR)).abs().amax((1, 2))
     assert float(torch.cat([change[:9], change[31:]]).max()) < 1e-5
     assert float(change[18:22].min()) > 1e-3
@@ -272,7 +280,7 @@ def test_a_mass_that_varies_in_space(backend):
     """u = k ∗ (div A + m(x)): it starts with m, and keeps m's mean."""
     grid = Grid((16, 16, 32))
     here = -0.45 - 0.3 * torch.cos(2 * math.pi * (torch.arange(32) + 0.5) / 32)
-    told = {"schedule": short(20), "backend": backend, "snapshots": (0,)}
+    told = {"schedule": short(20), "watch": Watch((0,)), "execution": Execution(backend)}
     flow, flat = (generate(TUBES, mass, grid, **told) for mass in (here, -0.45))
     assert np.abs(flow.history.mass + 0.45).max() < 1e-6
     assert flow.mass == flow.history.mass[-1]
@@ -292,11 +300,11 @@ def test_an_orientation_turns_the_shape():
 def test_snapshots(backend):
     """The field after so many steps, also between two entries of the history; asking changes nothing."""
     grid = Grid((12, 13, 14))
-    flow = generate(TUBES, MASS, grid, schedule=short(40), snapshots=(0, 13, 40), backend=backend)
+    flow = generate(TUBES, MASS, grid, schedule=short(40), watch=Watch((0, 13, 40)), execution=Execution(backend))
     assert list(flow.snapshots) == [0, 13, 40]
     assert torch.equal(flow.snapshots[40], flow.field)
     assert flow.history.step.tolist() == [0, 10, 20, 30, 40]
-    assert torch.equal(flow.field, generate(TUBES, MASS, grid, schedule=short(40), backend=backend).field)
+    assert torch.equal(flow.field, generate(TUBES, MASS, grid, schedule=short(40), execution=Execution(backend)).field)
     start = gaussian_blur(divergence(white_noise(grid, 0), grid), grid, BLUR) + MASS
     assert float((flow.snapshots[0] - start).abs().max()) < 1e-5
 
@@ -328,7 +336,7 @@ def test_backends_steer_alike():
     pytest.importorskip("numba")
     told = {"volume_fraction": 0.3, "schedule": schedule("cosine", steps=100)}
     a, grid = preset("sponge").coefficients, Grid((20, 20, 20))
-    ends = [generate(a, None, grid, **told, backend=backend) for backend in ("torch", "fused")]
+    ends = [generate(a, None, grid, **told, execution=Execution(backend)) for backend in ("torch", "fused")]
     assert all(share(end.field) == pytest.approx(0.3, rel=2e-3) for end in ends)
     assert abs(ends[0].mass - ends[1].mass) < 0.1
 

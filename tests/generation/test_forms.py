@@ -11,9 +11,10 @@ import torch
 from loss_cases import noise
 
 from curvafit.generation import stepper
-from curvafit.generation.flow import descend
+from curvafit.generation.flow import Execution, Optimiser, descend
 from curvafit.generation.loop import identity
 from curvafit.generation.problem import FORMS, Cost, DivergenceForm, Evidence, Hinge
+from curvafit.generation.result import Watch
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import LbfgsStepper, TorchStepper
 from curvafit.priors import kernels
@@ -72,7 +73,7 @@ def test_every_flow_lowers_the_energy_and_keeps_what_it_keeps(boundary, flow, op
     grid = Grid((16, 17, 18), 0.01, boundary)
     start = ball(grid, 0.05, 0.02) + 0.1 * noise(*grid.shape).float()
     plan = Schedule("test", 1, 1e-3, 1e-3, "constant")
-    end = descend(start, TUBES, grid, flow=flow, optimiser=optimiser, steps=30, schedule=plan)
+    end = descend(start, TUBES, grid, flow=flow, optimiser=Optimiser(optimiser, 30, plan))
     history = end.history
     assert history.step.tolist() == [0, 10, 20, 30]
     first = float(energy(gaussian_blur(start, grid, 0.01).double(), TUBES, grid, 0.02))
@@ -90,12 +91,13 @@ def test_backends_descend_alike():
     """Adam step by step. L-BFGS in the energy reached: its line search hangs on the energies' last digits."""
     pytest.importorskip("numba")
     grid = Grid((28, 30, 32), 0.01, "replicate")
-    start, backends = ball(grid, 0.09, 0.03), ("torch", "fused")
-    plain, fused = (descend(start, WILLMORE, grid, optimiser="adam", steps=10, backend=each) for each in backends)
+    start, backends = ball(grid, 0.09, 0.03), (Execution("torch"), Execution("fused"))
+    brief, longer = Optimiser("adam", 10), Optimiser(steps=30)
+    plain, fused = (descend(start, WILLMORE, grid, optimiser=brief, execution=each) for each in backends)
     moved = float((plain.field - gaussian_blur(start, grid, 0.01)).abs().max())
     assert moved > 0.02
     assert float((plain.field - fused.field).abs().max()) < 1e-4 * moved
-    plain, fused = (descend(start, WILLMORE, grid, steps=30, backend=each) for each in backends)
+    plain, fused = (descend(start, WILLMORE, grid, optimiser=longer, execution=each) for each in backends)
     assert plain.history.energy[-1] < 0.5 * plain.history.energy[0]
     assert plain.history.energy[-1] == pytest.approx(fused.history.energy[-1], rel=0.02)
 
@@ -103,7 +105,7 @@ def test_backends_descend_alike():
 def test_willmore_flow_of_a_wide_ball_is_a_sphere():
     """16π in the limit ε → 0. The profile, a third too wide at first, is mended."""
     grid, ε = Grid((40, 40, 40), 0.01, "replicate"), 0.02
-    end = descend(ball(grid, 0.12, 1.3 * ε), WILLMORE, grid, steps=60, epsilon=ε)
+    end = descend(ball(grid, 0.12, 1.3 * ε), WILLMORE, grid, optimiser=Optimiser(steps=60), epsilon=ε)
     assert end.history.energy[0] / SIGMA > 100
     assert end.history.energy[-1] / SIGMA == pytest.approx(16 * math.pi, rel=0.02)
     assert end.viability.discrepancy < 0.05
@@ -132,8 +134,9 @@ def test_orientation_tells_layers_from_layers():
     """One across θ flattens until nothing is left; one along θ does not feel it."""
     grid, Q = Grid((16, 16, 16)), orientation((1, 0, 0), 20000.0)
     along = torch.sin(2 * math.pi * (torch.arange(16) + 0.5) / 16).expand(16, 16, 16)
-    bent, kept = (descend(u, WILLMORE, grid, steps=30, orientation=Q) for u in (along.permute(2, 0, 1), along))
-    free = descend(along, WILLMORE, grid, steps=30)
+    lower = partial(descend, law=WILLMORE, grid=grid, optimiser=Optimiser(steps=30))
+    bent, kept = (lower(u, orientation=Q) for u in (along.permute(2, 0, 1), along))
+    free = lower(along)
     assert float(bent.field.std()) < 0.1 * float(kept.field.std())
     assert float((kept.field - free.field).abs().max()) < 1e-3
 
@@ -142,7 +145,8 @@ def test_without_a_blur_the_field_is_what_moves():
     """The field seen is the one before the step, also where it is the parameters themselves."""
     grid, fields = Grid((12, 12, 12)), []
     start, watch = ball(grid, 0.04, 0.02), lambda step, total, state: fields.append(state.field.clone())
-    end = descend(start, WILLMORE, grid, blur=0.0, optimiser="adam", steps=10, backend="torch", callbacks=[watch])
+    options = {"optimiser": Optimiser("adam", 10), "watch": Watch((), [watch]), "execution": Execution("torch")}
+    end = descend(start, WILLMORE, grid, blur=0.0, **options)
     assert torch.equal(fields[0], start)
     assert end.history.energy[-1] < end.history.energy[0]
 
@@ -186,8 +190,9 @@ def test_every_flow_lowers_energy_and_data_as_plain_torch_does(flow, optimiser) 
     grid = Grid((12, 12, 12), boundary="replicate")
     start = optimal_profile(0.04 - torch.from_numpy(np.linalg.norm(np.mgrid[:12, :12, :12] - 5.5, axis=0)) * 0.01, 0.02)
     term = Evidence(1e6 * noise(12, 12, 12))
-    options = {"flow": flow, "optimiser": optimiser, "steps": 10, "schedule": "paper", "data": term}
-    fast, plain = (descend(start, WILLMORE, grid, backend=each, **options) for each in ("auto", "torch"))
+    options = {"flow": flow, "optimiser": Optimiser(optimiser, 10, "paper"), "data": term}
+    backends = Execution("auto"), Execution("torch")
+    fast, plain = (descend(start, WILLMORE, grid, execution=each, **options) for each in backends)
     fall = fast.history.energy[0] - fast.history.energy[-1]
     assert fall > 0
     if optimiser == "adam":
@@ -202,9 +207,9 @@ def test_a_checkpoint_is_its_data_s(tmp_path: Path) -> None:
     one, same, other = (identity(data=Evidence(noise(4, 4, 4, seed=k))) for k in (0, 0, 1))
     assert one == same != other
     assert one != identity(data=Hinge(noise(4, 4, 4))) and one != identity(data=None)
-    r, saved = noise(8, 8, 8), {"checkpoint": tmp_path / "run.pt", "checkpoint_every": 0.0}
-    run = partial(descend, 0.5 * r, WILLMORE, Grid(8), steps=20, optimiser="adam")  # type: ignore[arg-type]
-    run(data=Evidence(r), callbacks=[lambda made, total, state: made >= 10], **saved)
+    r, saved = noise(8, 8, 8), {"execution": Execution(checkpoint=tmp_path / "run.pt", checkpoint_every=0.0)}
+    run = partial(descend, 0.5 * r, WILLMORE, Grid(8), optimiser=Optimiser("adam", 20))  # type: ignore[arg-type]
+    run(data=Evidence(r), watch=Watch(callbacks=[lambda made, total, state: made >= 10]), **saved)
     with pytest.raises(ValueError, match="checkpoint"):
         run(data=Evidence(2 * r), **saved)
     assert torch.equal(run(data=Evidence(r), **saved).field, run(data=Evidence(r)).field)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
@@ -17,7 +18,7 @@ from curvafit.data_synth.design import Design, design_around, design_box
 from curvafit.data_synth.imaging.modality import MODALITIES
 from curvafit.data_synth.sources import Generated
 from curvafit.drawing.shapes import Output
-from curvafit.generation import Schedule, descend, generate, white_noise
+from curvafit.generation import Execution, Optimiser, Schedule, Watch, descend, generate, white_noise
 from curvafit.generation.problem import Evidence, Hinge
 from curvafit.generation.schedule import Phase, schedule
 from curvafit.generation.slabs import divide
@@ -76,11 +77,14 @@ def test_numpy_numbers_make_the_same_shape() -> None:
     assert Schedule("x", np.int64(5), np.float32(0.5), 1, "constant").steps == 5
     assert Output(np.float64(2), tile=(np.int64(1), 2, 3)).tile == (1, 2, 3)
     assert design_box(a11=np.float64(1)).draw(np.int64(1), np.int64(2)) == design_box(a11=1).draw(1, 2)
-    assert list(generate(TUBES, MASS, 8, schedule=BRIEF, snapshots=np.array([0, 2])).snapshots) == [0, 2]
+    assert list(generate(TUBES, MASS, 8, schedule=BRIEF, watch=Watch(np.array([0, 2]))).snapshots) == [0, 2]
 
 
 def flow(**wrong: Any) -> None:
-    generate(**{"law": TUBES, "mass": MASS, "grid": 8, "schedule": BRIEF} | wrong)
+    options = {"law": TUBES, "mass": MASS, "grid": 8, "schedule": BRIEF} | wrong
+    for name, kind in (("watch", Watch), ("execution", Execution)):
+        options[name] = kind(**{field.name: options.pop(field.name) for field in fields(kind) if field.name in options})
+    generate(**options)
 
 
 def lower(**wrong: Any) -> None:
@@ -120,7 +124,9 @@ REFUSALS: list[tuple[Callable, str, Sequence[Any], str]] = [
     (partial(Grid, 5), "boundary", ["mirror"], "'periodic' or 'replicate', got 'mirror'"),
     (flow, "seed", NO_SEEDS, "seed"), (partial(white_noise, BOX), "seed", NO_SEEDS, "seed"),
     (lower, "field", NO_FIELDS, "field"), (lower, "field", [torch.full((8, 8, 8), math.inf)], "finite"),
-    (lower, "flow", ["h1"], "flow"), (lower, "optimiser", ["sgd"], "optimiser"), (lower, "steps", [0], "steps"),
+    (lower, "flow", ["h1"], "flow"), (lower, "optimiser", ["adam"], "an Optimiser"),
+    (lower, "execution", ["cuda"], "an Execution"), (lower, "watch", [()], "a Watch"),
+    (Optimiser, "method", ["sgd"], "optimiser"), (Optimiser, "steps", [0], "steps"),
     (lower, "frozen", [torch.zeros(3, 3, 3, dtype=torch.bool)], "frozen"),
     (lower, "data", [Evidence(torch.ones(7, 8, 8))], "ratio"),
     (Evidence, "ratio", [torch.full((4, 4, 4), math.nan), torch.zeros(4, 4)], "evidence"),
