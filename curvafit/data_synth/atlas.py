@@ -132,9 +132,9 @@ def make_draw(path: str | Path, index: int) -> Record:
     settings = store.settings
     draw = Design.from_dict(settings.design).draw(settings.seed, index)
     grid, plan = Grid(settings.shape, settings.spacing), Schedule(**settings.schedule)
-    how = {"epsilon": settings.epsilon, "blur": settings.blur, "reject_early": True}
+    options = {"epsilon": settings.epsilon, "blur": settings.blur, "reject_early": True}
     with one_thread():
-        flow = generate(draw.coefficients, draw.mass, grid, seed=draw.seed, schedule=plan, **how)
+        flow = generate(draw.coefficients, draw.mass, grid, seed=draw.seed, schedule=plan, **options)
     history = flow.history
     record = Record(
         index=index,
@@ -346,8 +346,8 @@ def describe(
                 jobs.append((store.path.resolve(), index, missing))
     last_save = time.monotonic()
     try:
-        for count, found in enumerate(run_jobs(measure, jobs, workers), 1):
-            rows += found
+        for count, measured in enumerate(run_jobs(measure, jobs, workers), 1):
+            rows += measured
             progress(f"measured {count} of {len(jobs)} shapes", count / len(jobs))
             if time.monotonic() - last_save > 60:
                 save_table(_to_table(rows, provenance), path)
@@ -376,8 +376,8 @@ def _measure_view(u: np.ndarray, name: str, seed: int) -> tuple[np.ndarray, floa
     """Return descriptors and amount of a field in one view, as `infer` reads a scan; NaN where that has no surface."""
     reading: Reading | None = None
     with suppress(ScanError):
-        seen = VIEWS[name](u, np.random.default_rng([seed, *name.encode()]))
-        reading = read_texture(prepare(seen.scan, kind=seen.kind, periodic=seen.periodic, one_scale=True))
+        view = VIEWS[name](u, np.random.default_rng([seed, *name.encode()]))
+        reading = read_texture(prepare(view.scan, kind=view.kind, periodic=view.periodic, one_scale=True))
     return to_row(reading).astype(np.float32), math.nan if reading is None else reading.amount
 
 

@@ -81,8 +81,8 @@ class Composition:
         if self.classes:
             if not isinstance(source, Generated) or not 2 <= len(source.names) <= MOST_CLASSES:
                 raise ValueError(f"classes need from 2 to {MOST_CLASSES} laws to grow shapes of, one for each class")
-            alike = len(set(source.names)) < len(source.names)
-            names = tuple(f"{name} {k}" if alike else name for k, name in enumerate(source.names, 1))
+            ambiguous = len(set(source.names)) < len(source.names)
+            names = tuple(f"{name} {k}" if ambiguous else name for k, name in enumerate(source.names, 1))
         if self.levels is not None and len(self.levels) != len(names):
             raise ValueError(f"give a level for each of {', '.join(names)}, got {len(self.levels)} levels")
         return names
@@ -358,7 +358,7 @@ class TextureDataset(IterableDataset):
             check_choice(normalise, NORMALISATIONS, names)
             normalise = NORMALISATIONS[normalise]
         self.normalise = normalise
-        paths = [Path(each) for each in sources if isinstance(each, (str, PathLike))]
+        paths = [Path(item) for item in sources if isinstance(item, (str, PathLike))]
         stores = len(paths) == len(sources) and all(path.is_dir() or path.suffix == ".zarr" for path in paths)
         edge = None if voxel is None else check_float(voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
         self.voxels = [edge or choose_voxel([] if stores else sources, kind) for kind in self.modalities]
@@ -416,9 +416,9 @@ class TextureDataset(IterableDataset):
         """Return sample `number`, from 0, before the transform."""
         words = np.random.SeedSequence(self.seed, spawn_key=(number,))
         rng, (for_imaging, for_image) = np.random.default_rng(words), map(int, words.generate_state(2))
-        turn = int(rng.integers(len(self.modalities)))
-        kind = self.modalities[turn]
-        imaging, voxel = kind.draw(for_imaging), draw_voxel(self.voxels[turn], self.calibres, rng)
+        which = int(rng.integers(len(self.modalities)))
+        kind = self.modalities[which]
+        imaging, voxel = kind.draw(for_imaging), draw_voxel(self.voxels[which], self.calibres, rng)
         case = Composition().show(self.source, self.size, voxel, imaging, for_image, 0, rng)  # type: ignore[arg-type]
         image = torch.from_numpy(case.image)[None].float()
         image = image if self.normalise is None else self.normalise(image)

@@ -251,13 +251,13 @@ def write_preview(folder: str | Path) -> Path:
 
 def write_card(folder: str | Path, command: str = "") -> Path:
     """Write `card.md` into a set's folder, unless somebody else's is there, and return its path."""
-    place, spec = Path(folder) / CARD, read_spec(folder)
-    if place.exists() and not place.read_text(encoding="utf-8", errors="replace").startswith(MARK):
-        return place
+    card, spec = Path(folder) / CARD, read_spec(folder)
+    if card.exists() and not card.read_text(encoding="utf-8", errors="replace").startswith(MARK):
+        return card
     recipe, made = spec.recipe, versions()
     kind = recipe.modality
     facts = {
-        "cases": len(list_cases(place.parent)),
+        "cases": len(list_cases(card.parent)),
         "voxels of an image": " x ".join(map(str, recipe.shape)),
         "edges of a voxel": f"{' x '.join(map(format_number, kind.base.spacing))} {unit_name(kind.base.unit, 2)}",
         "labels": ", ".join(f"{number} {name}" for number, name in enumerate(("background", *recipe.classes))),
@@ -269,7 +269,7 @@ def write_card(folder: str | Path, command: str = "") -> Path:
         "made with": ", ".join(f"{name} {made[name]}" for name in ("curvafit", "torch", "numpy")),
     }
     lines = (
-        *(MARK, f"# {place.parent.resolve().name}\n"),
+        *(MARK, f"# {card.parent.resolve().name}\n"),
         "Synthetic 3D images of generated shapes, with labels that are exact because the shapes are known.\n",
         "![Some of the cases](preview.png)\n",
         *(f"- {name}: {fact}" for name, fact in facts.items()),
@@ -278,4 +278,4 @@ def write_card(folder: str | Path, command: str = "") -> Path:
         "Images are simulated: a network that has seen these alone has seen no scan. A mask is where the structure is,",
         "not what an annotator would draw on the image. No person, animal or sample is shown.\n",
     )
-    return write_content(place, "\n".join(lines))
+    return write_content(card, "\n".join(lines))

@@ -83,22 +83,22 @@ class Generated:
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
         """Return a well-formed shape, from the first of some seeds that gives one; ValueError where none does."""
-        turn = index % len(self.points)
-        *six, mass = self.points[turn]
+        number = index % len(self.points)
+        *six, mass = self.points[number]
         grid, status = Grid(tuple(voxels)), ""  # type: ignore[arg-type]
+        options = {"volume_fraction": self.fraction, "schedule": self.schedule, "reject_early": True}
         for _ in range(TRIES):
             seed = int(rng.integers(2**32))
-            how = {"volume_fraction": self.fraction, "schedule": self.schedule, "reject_early": True}
             with one_thread():
-                flow = generate(Coefficients(*six), mass if self.fraction is None else None, grid, seed=seed, **how)
+                flow = generate(Coefficients(*six), mass if self.fraction is None else None, grid, seed=seed, **options)
             if is_well_formed(flow.viability):
                 point = dict(zip(PARAMETERS, (*six, flow.mass), strict=True))
                 grown = {"seed": seed, "schedule": flow.schedule.as_dict(), "status": flow.status}
-                origin = {"name": self.names[turn], "parameters": point, **grown}
+                origin = {"name": self.names[number], "parameters": point, **grown}
                 return PhaseField(flow.field.numpy(), WORKING_EPSILON / WORKING_SPACING, origin)
             status = flow.status
         raise ValueError(
-            f"{self.names[turn]} grew from none of {TRIES} seeds ({status}): try another volume fraction or law"
+            f"{self.names[number]} grew from none of {TRIES} seeds ({status}): try another volume fraction or law"
         )
 
     @staticmethod

@@ -150,20 +150,20 @@ class Store:
 
         The phase field is float32 of the store's shape, or None where the draw is not viable.
         """
-        place = self._place(record.index)
+        folder = self._place(record.index)
         if self.has(record.index):
             return False
-        for left in (self.path / "draws").glob(f".{PARTIAL}*"):
-            if time.time() - left.stat().st_mtime > 600:  # a killed process left it
-                shutil.rmtree(left, ignore_errors=True)
+        for leftover in (self.path / "draws").glob(f".{PARTIAL}*"):
+            if time.time() - leftover.stat().st_mtime > 600:  # a killed process left it
+                shutil.rmtree(leftover, ignore_errors=True)
         with temporary_folder(self.path / "draws" / PARTIAL) as partial:
-            _write_draw(partial / place.name, record, field)
-            if _publish(partial / place.name, place):
+            _write_draw(partial / folder.name, record, field)
+            if _publish(partial / folder.name, folder):
                 return True
             if self.has(record.index):
                 return False
-            shutil.rmtree(place)  # what is there is torn
-            return _publish(partial / place.name, place)
+            shutil.rmtree(folder)  # what is there is torn
+            return _publish(partial / folder.name, folder)
 
     def _describe_damage(self, part: str, index: int, error: Exception) -> ValueError:
         what = f"the {part} of draw {index} in {self.path} is damaged ({quoted(str(error))})"
@@ -180,10 +180,10 @@ class Store:
 
     def _attributes(self, index: int) -> dict[str, Any]:
         """Return a draw's attributes, none where a part of it is missing; the field is not read."""
-        place = self._place(index)
-        attributes = _read_attributes(place) or {}
+        folder = self._place(index)
+        attributes = _read_attributes(folder) or {}
         viable = end.get("viable") if isinstance(end := attributes.get("viability"), dict) else None
-        whole = viable is False or (viable is True and (place / "field/c/0/0/0").is_file())
+        whole = viable is False or (viable is True and (folder / "field/c/0/0/0").is_file())
         return attributes if whole and attributes.get("index") == index and "sha256" in attributes else {}
 
 
@@ -269,20 +269,20 @@ def _write_draw(folder: Path, record: Record, field: np.ndarray | None) -> None:
     zarr.create_group(store=str(folder), attributes=attributes | {"sha256": _digest(attributes, field)})
     if field is not None:
         codecs = [BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"), Crc32cCodec()]
-        how = {"chunks": field.shape, "compressors": codecs, "dimension_names": ("z", "y", "x")}
-        zarr.create_array(store=str(folder / "field"), data=field, **how)
+        options = {"chunks": field.shape, "compressors": codecs, "dimension_names": ("z", "y", "x")}
+        zarr.create_array(store=str(folder / "field"), data=field, **options)
 
 
-def _publish(partial: Path, place: Path) -> bool:
+def _publish(partial: Path, target: Path) -> bool:
     """Flush a folder's files and rename it into its place; False where another process was first."""
     for file in partial.rglob("*"):
         if file.is_file():
             with file.open("rb+") as handle:
                 os.fsync(handle.fileno())
     try:
-        os.replace(partial, place)
+        os.replace(partial, target)
     except OSError:
-        if not place.is_dir():
+        if not target.is_dir():
             raise
         return False
     return True

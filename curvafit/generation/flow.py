@@ -56,21 +56,15 @@ class Execution:
 
     def __post_init__(self) -> None:
         check_choice(self.backend, BACKENDS, f"a backend among {', '.join(BACKENDS)}")
-        check_device(self.device)
+        try:
+            usable = self.device is not None and torch.zeros(1, device=self.device).add(1).item() == 1
+        except (RuntimeError, TypeError, ValueError, AssertionError):
+            usable = False
+        if not usable:
+            text = f"torch cannot compute on the device {quoted(self.device)} here"
+            raise ValueError(f"{text}: take 'cpu', or a GPU that is there")
         check_type(self.checkpoint, (str, Path, type(None)), "a path for the checkpoint")
         check_float(self.checkpoint_every, "a finite number of seconds between checkpoints, at least 0", 0)
-
-
-def check_device(device: torch.device | str) -> None:
-    """Raise ValueError where torch cannot compute on a device."""
-    try:
-        usable = device is not None and torch.zeros(1, device=device).add(1).item() == 1
-    except (RuntimeError, TypeError, ValueError, AssertionError):
-        usable = False
-    if not usable:
-        raise ValueError(
-            f"torch cannot compute on the device {quoted(device)} here: take 'cpu', or a GPU that is there"
-        )
 
 
 @dataclass(frozen=True)
@@ -203,7 +197,7 @@ def descend(
     blur
         Standard deviation of k; None takes a voxel's shortest edge, as published.
     data
-        A term D(u) that is added to F_ε, such as `generation.problem.Evidence`; the history's energies include it.
+        A term D(u) that is added to F_ε, such as `generation.Evidence`; the history's energies include it.
     frozen
         Voxels whose v, or A, stays.
 
@@ -263,13 +257,12 @@ def _open_checkpoint(
     """Return the checkpoint of a run from a start, or None where the run has none."""
     if execution.checkpoint is None:
         return None
-    plan, share, snapshots = options.plan, options.volume_fraction, [*options.watch.snapshots]
-    job = {**vars(options.cost), "schedule": plan, "volume_fraction": share, "snapshots": snapshots, **start}
+    job = {**vars(options.cost), "schedule": options.plan, "volume_fraction": options.volume_fraction, **start}
+    job |= {"snapshots": [*options.watch.snapshots], "device": execution.device}
     # Slabs go on from what one process saved, and the other way round.
     name = FusedStepper.__name__ if isinstance(stepper, SlabStepper) else type(stepper).__name__
-    place = {"stepper": name, "backend": execution.backend.replace("slabs", "auto"), "device": execution.device}
-    every, keep = execution.checkpoint_every, execution.keep_checkpoint
-    return Checkpoint(execution.checkpoint, every, identity(**job, **place), keep)
+    job |= {"stepper": name, "backend": execution.backend.replace("slabs", "auto")}
+    return Checkpoint(execution.checkpoint, execution.checkpoint_every, identity(**job), execution.keep_checkpoint)
 
 
 def choose_base(mass: float | Tensor | None, share: float | None, grid: Grid) -> float | Tensor:

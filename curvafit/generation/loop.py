@@ -25,7 +25,7 @@ from curvafit.core.runtime import FIELD, FLOW, check_memory, hold_signals
 from curvafit.generation.problem import Cost
 from curvafit.generation.result import RECORD_EVERY, Flow, History, State, Viability, Watch, viability
 from curvafit.generation.schedule import Schedule
-from curvafit.generation.stepper import Statistics, Stepper
+from curvafit.generation.stepper import Stepper
 from curvafit.priors.coefficients import Coefficients
 
 #: A flow is called converged where its energy changes by less than this share over the last tenth of the steps.
@@ -101,11 +101,9 @@ class _Run:
     def advance(self, checkpoint: Checkpoint | None) -> None:
         """Step until the plan ends or the shape stops, and save checkpoints."""
         stepper, plan = self._stepper, self._options.plan
-        steps, betas = self._resume(checkpoint), plan.betas_at(0)
+        steps = self._resume(checkpoint)
         while True:
-            if steps < plan.steps and plan.betas_at(steps) != betas:
-                betas = plan.betas_at(steps)
-                stepper.set_betas(betas)
+            stepper.betas = plan.betas_at(steps)
             last = steps == plan.steps or stepper.stalled
             stepper.step(None if last else plan.rate(steps))
             if last and self._set_fraction():
@@ -133,7 +131,6 @@ class _Run:
         return content["made"]
 
     def _pack_state(self, steps: int) -> dict[str, Any]:
-        """Return the content of a checkpoint."""
         return {"made": steps, "lanes": [(self._rows, self._snapshots)], "stepper": self._stepper.state()}
 
     def _set_fraction(self) -> bool:
@@ -178,8 +175,9 @@ class _Run:
         options, stepper, total = self._options, self._stepper, self._options.plan.steps
         statistics, mass = stepper.statistics(), stepper.mass()
         self._rows.append([steps, *statistics, mass])
-        if subject := _find_infinite(statistics, mass):
-            self._failure = f"{subject} is not finite"
+        figures = {"the energy": [statistics.energy], "the gradient": statistics[1:], "the field": [mass]}
+        if infinite := [name for name, values in figures.items() if not all(map(math.isfinite, values))]:
+            self._failure = f"{infinite[0]} is not finite"
             self._stop = f"stopped after {steps} of {total} steps: {self._failure}"
             return
         if options.watch.callbacks:
@@ -210,12 +208,6 @@ class _Run:
         return f"{word} after {steps} steps: {change}{self._shortfall}"
 
 
-def _find_infinite(statistics: Statistics, mass: float) -> str:
-    """Return the name of the first of a flow's figures that is infinite or NaN; empty where all are finite."""
-    figures = {"the energy": [statistics.energy], "the gradient": statistics[1:], "the field": [mass]}
-    return next((name for name, values in figures.items() if not all(map(math.isfinite, values))), "")
-
-
 # ---- a share of volume in place of a mass ----------------------------------------------------------------------------
 
 
@@ -242,8 +234,8 @@ def correct_mass(u: Tensor, share: float, mass: float, steps: int) -> float:
 def last_shift(u: Tensor, share: float) -> float:
     """Return the constant c such that u + c is positive in round(share × voxels) voxels, at least 1 and not all."""
     values, inside = u.numpy().ravel(), round(share * u.numel())
-    place = min(max(u.numel() - inside, 1), u.numel() - 1)
-    below, above = np.partition(values, (place - 1, place))[place - 1 : place + 1]
+    rank = min(max(u.numel() - inside, 1), u.numel() - 1)
+    below, above = np.partition(values, (rank - 1, rank))[rank - 1 : rank + 1]
     return -(float(below) + float(above)) / 2
 
 
@@ -266,8 +258,8 @@ class Checkpoint:
     def lock(self) -> Iterator[None]:
         """Lock the file against other runs by a file `.NAME.curvafit-lock`; raise ValueError if one uses it."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        place = self.path.with_name(f".{self.path.name}.curvafit-lock")
-        lock = FileLock(place)
+        lock_file = self.path.with_name(f".{self.path.name}.curvafit-lock")
+        lock = FileLock(lock_file)
         try:
             lock.acquire(timeout=0)
         except Timeout:
@@ -281,7 +273,7 @@ class Checkpoint:
             with hold_signals():
                 # Before the release: a process that waits for the lock then sees that its file is gone.
                 with suppress(PermissionError):  # Windows deletes no file that is open
-                    place.unlink(missing_ok=True)
+                    lock_file.unlink(missing_ok=True)
                 lock.release()
 
     def load(self) -> dict[str, Any] | None:
@@ -324,13 +316,13 @@ class Checkpoint:
 def resolve_place(path: str | Path) -> Path:
     """Return the file to which a checkpoint's path leads; raise ValueError for a folder, a pipe or a loop of links."""
     try:
-        place = Path(path).resolve()
-        regular = place.is_file() or not place.exists()
+        target = Path(path).resolve()
+        regular = target.is_file() or not target.exists()
     except (OSError, RuntimeError):
         regular = False
-    if not regular or (Path(path).is_symlink() and place.is_symlink()):
+    if not regular or (Path(path).is_symlink() and target.is_symlink()):
         raise ValueError(f"the checkpoint {path} is not a regular file: name another file")
-    return place
+    return target
 
 
 def identity(**parts: object) -> dict[str, str]:
@@ -340,7 +332,6 @@ def identity(**parts: object) -> dict[str, str]:
 
 
 def _to_text(value: object) -> str:
-    """Return a text that identifies a value."""
     if isinstance(value, Coefficients):
         return f"({', '.join(map(_to_text, value))})"
     if isinstance(value, Tensor):

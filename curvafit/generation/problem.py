@@ -205,10 +205,6 @@ class DivergenceForm:
         """Return -∇(k ∗ slope), as the blur is its own adjoint and div = -∇ᵀ."""
         return -gradient(self.blur(slope, self.grid, self.width), self.grid)
 
-    def to(self, device: torch.device | str) -> DivergenceForm:
-        """Return the same form on a device."""
-        return replace(self, base=self.base.to(device)) if isinstance(self.base, Tensor) else self
-
 
 @dataclass(frozen=True)
 class DirectForm:
@@ -230,10 +226,6 @@ class DirectForm:
     def pullback(self, slope: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
         """Return k ∗ slope."""
         return self.blur(slope, self.grid, self.width)
-
-    def to(self, device: torch.device | str) -> DirectForm:
-        """Return the form itself, which holds no tensor."""
-        return self
 
 
 Form = DivergenceForm | DirectForm

@@ -102,9 +102,9 @@ class Schedule:
 
     def _find_phase(self, step: int) -> tuple[Phase | Schedule, int, int]:
         """Return the phase of a step, the first step of that phase, and its number of steps."""
-        place = bisect_right(self.bounds, step)
-        first, end = (0, *self.bounds)[place], (*self.bounds, self.steps)[place]
-        return (*self.opening, self)[place], first, end - first
+        k = bisect_right(self.bounds, step)
+        first, end = (0, *self.bounds)[k], (*self.bounds, self.steps)[k]
+        return (*self.opening, self)[k], first, end - first
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields in JSON's types, for records: `Schedule(**fields)` is the schedule again."""
@@ -175,5 +175,5 @@ def present_name(fields: dict[str, Any]) -> str:
     The name and the number of steps of a record do not count: schedules were renamed, and users choose the steps.
     """
     plan = Schedule(**fields)
-    alike = (dataclasses.replace(known, name=plan.name, steps=plan.steps) == plan for known in SCHEDULES.values())
-    return next((name for name, same in zip(SCHEDULES, alike, strict=True) if same), plan.name)
+    matches = (dataclasses.replace(known, name=plan.name, steps=plan.steps) == plan for known in SCHEDULES.values())
+    return next((name for name, same in zip(SCHEDULES, matches, strict=True) if same), plan.name)

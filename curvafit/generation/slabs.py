@@ -147,7 +147,7 @@ class SlabStepper(Stepper):
         from curvafit.priors.kernels import cpu
 
         slabs = divide(cost.grid, dist.get_world_size(), cpu.halo(cost.grid, cost.blur))
-        options = {"width": cost.blur, "betas": betas, "adam_eps": ADAM_EPS, "orientation": Q}
+        self.betas, options = betas, {"width": cost.blur, "betas": betas, "adam_eps": ADAM_EPS, "orientation": Q}
         _tell("begin", slabs, cost.grid, options)
         with _together():
             self._part = _Part(slabs, cost.grid, options, [*a, epsilon, base], start.numpy())
@@ -158,14 +158,11 @@ class SlabStepper(Stepper):
             return getattr(self._part, name)(*arguments)
 
     def step(self, rate: float | None) -> None:
-        self._all("run", [rate or 0.0])
+        self.run([rate or 0.0])
 
     def run(self, rates: Sequence[float]) -> int:
-        self._all("run", list(rates))
+        self._all("advance", list(rates), self.betas)
         return len(rates)
-
-    def set_betas(self, betas: tuple[float, float]) -> None:
-        self._all("set_betas", betas)
 
     def statistics(self) -> Statistics:
         return self._all("statistics")
@@ -211,14 +208,17 @@ class _Part(FusedStepper):
         self._slab = slab = slabs[self._rank]
         self._shape = grid.shape
         mine: list[Any] = [None]
-        dist.scatter_object_list(mine, None if numbers is None else [[*map(each.cut, numbers)] for each in slabs])
+        dist.scatter_object_list(mine, None if numbers is None else [[*map(part.cut, numbers)] for part in slabs])
         *a, epsilon, base = mine[0]
         local = Grid((len(slab.places), *self._shape[1:]), grid.spacing, grid.boundary)
         begin, exchange = self._scatter(start), partial(_exchange, slab, self._rank, len(slabs))
         # Processes of one machine share its cores.
         with limit_threads(max(1, count_threads() // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))):
             self._flow = FusedFlow(begin, base, a, local, epsilon, own=slab.own, exchange=exchange, **options)
-        self._statistics = Statistics(0.0, 0.0, 0.0)
+
+    def advance(self, rates: Sequence[float], betas: tuple[float, float]) -> None:
+        self.betas = betas
+        self.run(rates)
 
     def statistics(self) -> Statistics:
         energy, most, mean = self._statistics
@@ -278,5 +278,5 @@ def _exchange(slab: Slab, rank: int, count: int, volume: np.ndarray) -> None:
         other, halo = (rank + step) % count, len(beyond)
         mine = own[:halo] if way == _DOWN else own[-halo:]
         waiting += [dist.irecv(beyond, other, tag=1 - way), dist.isend(mine, other, tag=way)]
-    for each in waiting:
-        each.wait()
+    for transfer in waiting:
+        transfer.wait()

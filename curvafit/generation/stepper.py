@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -36,6 +37,8 @@ class Stepper(Protocol):
 
     #: Whether the optimiser found no lower point and therefore stopped.
     stalled: bool = False
+    #: Adam's decay rates (momentum, memory) from the next step on.
+    betas: tuple[float, float]
 
     def step(self, rate: float | None) -> None:
         """Compute u and the gradient, then step by `rate`, or not if it is None, after which no rate may come."""
@@ -48,10 +51,6 @@ class Stepper(Protocol):
                 return count
             self.step(rate)
         return len(rates)
-
-    def set_betas(self, betas: tuple[float, float]) -> None:
-        """Set Adam's decay rates (momentum, memory) from the next step on."""
-        ...
 
     def statistics(self) -> Statistics:
         """Return the statistics before the last `step` moved the shape."""
@@ -93,13 +92,11 @@ class FusedStepper(Stepper):
             start.numpy(), base, a, cost.grid, epsilon, cost.blur, fixed,
             betas=betas, adam_eps=ADAM_EPS, orientation=Q,
         )  # fmt: skip
-        self._statistics = Statistics(0.0, 0.0, 0.0)
+        self.betas, self._statistics = betas, Statistics(0.0, 0.0, 0.0)
 
     def step(self, rate: float | None) -> None:
+        self._flow.betas = self.betas
         self._statistics = Statistics(self._flow.evaluate(), *self._flow.update(rate or 0.0))
-
-    def set_betas(self, betas: tuple[float, float]) -> None:
-        self._flow.betas = betas
 
     def statistics(self) -> Statistics:
         return self._statistics
@@ -121,20 +118,6 @@ class FusedStepper(Stepper):
         self._flow.restore(state)
 
 
-def step_by_adam(
-    parameters: Tensor, slope: Tensor, first: Tensor, second: Tensor, betas: tuple[float, float], lengths: Tensor
-) -> None:
-    """Make one step of Adam in place, the one of `torch.optim.Adam`.
-
-    `lengths` are two numbers on the device, so that a step does not wait for the host: minus the step's
-    length over the first moment's bias correction, and the root of the second moment's correction.
-    """
-    momentum, memory = betas
-    first.lerp_(slope, 1 - momentum)
-    second.mul_(memory).addcmul_(slope, slope, value=1 - memory)
-    parameters.addcdiv_(first * lengths[0], second.sqrt().div_(lengths[1]).add_(ADAM_EPS))
-
-
 class TorchStepper(Stepper):
     """Adam on the parameters of a form, on any device, where its whole state stays.
 
@@ -149,7 +132,8 @@ class TorchStepper(Stepper):
         def move(value):
             return value.to(device, torch.float32) if isinstance(value, Tensor) and value.dim() > 0 else value
 
-        self._form, self._betas = form.to(device), betas
+        self._form = replace(form, base=move(form.base)) if isinstance(form, DivergenceForm) else form
+        self.betas = betas
         self._data = None if cost.data is None else cost.data.to(device)
         self._cost = [*map(move, cost.coefficients)], cost.grid, move(cost.epsilon), move(cost.orientation)
         self._energy_gradient = energy_gradient if fused else energy_gradient_by_autograd
@@ -184,18 +168,19 @@ class TorchStepper(Stepper):
             self._value, self._u, self._slope = self._evaluate(self._parameters, self._offset)
 
     def run(self, rates: Sequence[float]) -> int:
-        """Make steps without statistics, and return their number; nothing waits for the device."""
-        momentum, memory = self._betas
+        """Make steps of `torch.optim.Adam`, without statistics, and return their number."""
+        (momentum, memory), (first, second) = self.betas, self._moments
         taken = range(self._taken + 1, self._taken + len(rates) + 1)
+        # Minus a step's length over the first moment's bias correction, and the root of the second's: on the device, so
+        # that no step waits for the host.
         lengths = [(-rate / (1 - momentum**k), (1 - memory**k) ** 0.5) for rate, k in zip(rates, taken, strict=True)]
         for numbers in torch.tensor(lengths, dtype=torch.float32).to(self._parameters.device):
             self._value, self._u, self._slope = self._evaluate(self._parameters, self._offset)
-            step_by_adam(self._parameters, self._slope, *self._moments, self._betas, numbers)
+            first.lerp_(self._slope, 1 - momentum)
+            second.mul_(memory).addcmul_(self._slope, self._slope, value=1 - memory)
+            self._parameters.addcdiv_(first * numbers[0], second.sqrt().div_(numbers[1]).add_(ADAM_EPS))
         self._taken += len(rates)
         return len(rates)
-
-    def set_betas(self, betas: tuple[float, float]) -> None:
-        self._betas = betas
 
     def statistics(self) -> Statistics:
         if self._statistics is None:

@@ -163,11 +163,11 @@ def clutter(occupied: Voxels, spacing: Lengths, density: float, radius: float, s
     tried = drawn[:, 4:].reshape(count, TRIES, 3)
     voxel = (tried * torch.tensor(occupied.shape, device=tried.device)).long().unbind(-1)
     free = occupied[voxel] == 0
-    place = tried[torch.arange(count, device=tried.device), free.long().argmax(1)] * sides
+    position = tried[torch.arange(count, device=tried.device), free.long().argmax(1)] * sides
     height = (0.5 + 0.5 * drawn[:, 0]) * free.any(1)
     width = radius * (0.5 + drawn[:, 1:4])
-    centres = (_centres(n, h, place) for n, h in zip(occupied.shape, steps, strict=True))
-    z, y, x = (_bell((at - place[:, k, None]) / width[:, k, None]) for k, at in enumerate(centres))
+    centres = (_centres(n, h, position) for n, h in zip(occupied.shape, steps, strict=True))
+    z, y, x = (_bell((at - position[:, k, None]) / width[:, k, None]) for k, at in enumerate(centres))
     planes = (height[:, None, None] * z[:, :, None] * y[:, None, :]).flatten(1)
     return (planes.mT @ x).reshape(occupied.shape).clamp_max_(1) * (1 - occupied)
 
@@ -251,8 +251,8 @@ def _gaussian_matrix(count: int, width: float | Tensor, like: Tensor) -> Tensor 
     Widths (…, 1, 1) give a matrix each; widths (count, 1) are those of the rows."""
     if not isinstance(width, Tensor) and width == 0:
         return None
-    place = torch.arange(count, device=like.device, dtype=like.dtype)
-    weight = _bell((place[:, None] - place) / width)
+    position = torch.arange(count, device=like.device, dtype=like.dtype)
+    weight = _bell((position[:, None] - position) / width)
     return weight / weight.sum(-1, keepdim=True)
 
 
@@ -324,8 +324,8 @@ def _interpolate_nodes(count: int, length: float, like: Tensor) -> Tensor | None
     width = length / math.sqrt(2)
     step, beyond = max(width, 1.0), math.ceil(4 * width)
     nodes = torch.arange(0, count + 2 * beyond, step, device=like.device, dtype=like.dtype) - beyond
-    place = torch.arange(count, device=like.device, dtype=like.dtype)
-    return _bell((place[:, None] - nodes) / width)
+    position = torch.arange(count, device=like.device, dtype=like.dtype)
+    return _bell((position[:, None] - nodes) / width)
 
 
 def _centres(count: int, step: float, like: Tensor) -> Tensor:

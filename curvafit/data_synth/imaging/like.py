@@ -264,13 +264,13 @@ def _measure_bins(
     used = inside & (ndimage.maximum_filter(values, 3) < top) if (values == top).mean() > 1e-5 else inside
     # The share of the noise's variance that the filter lets through.
     passed = max(_robust_square(residual[ground.where]), 1e-12) / max(ground.noise, 1e-12)
-    found = []
+    bins = []
     edges = np.quantile(mean[used], np.linspace(0, 1, 25)) if used.any() else np.zeros(1)
     for low, high in itertools.pairwise(edges):
         bin_ = used & (mean >= low) & (mean <= high)
         if (count := int(bin_.sum())) >= 50:
-            found.append((float(values[bin_].mean()), _robust_square(residual[bin_]) / passed, count))
-    return found
+            bins.append((float(values[bin_].mean()), _robust_square(residual[bin_]) / passed, count))
+    return bins
 
 
 def _robust_square(residual: np.ndarray) -> float:
