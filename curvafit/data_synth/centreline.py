@@ -137,7 +137,8 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, spacing: Sequence[flo
     _prune(graph, steps)
     for _ in range(2):
         _move_to_axis(graph, distance, steps)
-    return _finish(graph, distance, steps)
+    _finish(graph, distance, steps)
+    return require("networkx", "synth", "a centreline").convert_node_labels_to_integers(graph, ordering="sorted")
 
 
 def write_graphml(graph: nx.MultiGraph, path: str | Path, unit: str = "voxel") -> Path:
@@ -266,23 +267,19 @@ def _measure_radii(distance: np.ndarray, line: np.ndarray, steps: np.ndarray) ->
     return np.maximum(radii, 0)
 
 
-def _finish(traced: nx.MultiGraph, distance: np.ndarray, steps: np.ndarray) -> nx.MultiGraph:
-    """Return the graph with nodes 0, 1, … and lengths in spacing's unit."""
-    graph = type(traced)()
-    number = {node: k for k, node in enumerate(sorted(traced))}
-    for node, k in number.items():
-        of, degree = traced.nodes[node], traced.degree(node)
-        kind = ("point", "end", "loop" if traced.has_edge(node, node) else "junction", "junction")[min(degree, 3)]
-        graph.add_node(k, position=of["place"] * steps, kind=kind, radius=of["radius"], rings=of["rings"])
-    for one, other, line in traced.edges(data="line"):
-        ends, line = sorted((number[one], number[other])), _smooth(line)
+def _finish(graph: nx.MultiGraph, distance: np.ndarray, steps: np.ndarray) -> None:
+    """Give nodes and edges what `centreline` promises of them, with lengths in spacing's unit."""
+    for node, of in graph.nodes(data=True):
+        kinds = ("point", "end", "loop" if graph.has_edge(node, node) else "junction", "junction")
+        of |= {"position": of.pop("place") * steps, "kind": kinds[min(graph.degree(node), 3)]}
+    for *ends, of in graph.edges(data=True):
+        line = _smooth(of.pop("line"))
         points, radii = line * steps, _measure_radii(distance, line, steps)
         pieces = np.linalg.norm(np.diff(points, axis=0), axis=1)
         mean = float(np.average((radii[1:] + radii[:-1]) / 2, weights=pieces)) if pieces.sum() else float(radii.mean())
-        graph.add_edge(*ends, points=points, radii=radii, length=float(pieces.sum()), radius=mean)
-        for node, radius in zip(ends, (radii[0], radii[-1]), strict=True):
+        of |= {"points": points, "radii": radii, "length": float(pieces.sum()), "radius": mean}
+        for node, radius in zip(sorted(ends), (radii[0], radii[-1]), strict=True):
             graph.nodes[node]["radius"] = max(graph.nodes[node]["radius"], float(radius))
-    return graph
 
 
 def _smooth(line: np.ndarray) -> np.ndarray:
