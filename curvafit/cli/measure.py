@@ -93,36 +93,35 @@ def measure(
     with _keep_tiles(store):
         with show_stages() as progress:
             from curvafit.core.runtime import sub_progress
-            from curvafit.studies.groups import read_columns
-            from curvafit.studies.scans import check_units, count_notes, measure_each
-            from curvafit.studies.tables import COLUMNS, OF_PARTS, check_table, write_table
+            from curvafit.scan.measures import COLUMNS
+            from curvafit.studies import scans as study
 
             inputs = [*scans, *(each for each in (roi, subjects) if each is not None)]
             if folder is not None:
                 from curvafit.report.measures import check_measures, write_measures
 
                 check_measures(folder, inputs, overwrite, command_line())
-                check_units(scans, sub_progress(progress, 0.0, 0.05), **reading)
+                study.check_units(scans, sub_progress(progress, 0.0, 0.05), **reading)
                 progress = sub_progress(progress, 0.05, 1.0)
             elif out is not None:
-                check_table(out, inputs, overwrite)
-            told = None if subjects is None else read_columns(subjects, scans, (*COLUMNS, *OF_PARTS))
+                study.check_table(out, inputs, overwrite)
+            told = None if subjects is None else study.read_columns(subjects, scans, (*COLUMNS, *study.OF_PARTS))
             how = {} if labels else {"roi": roi, "tile": tile, "store": store, **structure}
-            found = measure_each(scans, labels=labels, workers=workers, progress=progress, **how, **reading)
+            found = study.measure_each(scans, labels=labels, workers=workers, progress=progress, **how, **reading)
             if folder is not None:
                 progress("drawing the page", 1.0)
                 what = {"columns": told, "options": {"roi": roi, "tile": tile} | structure | reading}
                 whole = [each for (each,) in found]
                 written = write_measures(whole, folder, command=command_line(), overwrite=overwrite, **what)
         if folder is not None:
-            say_notes(tuple(count_notes(whole)))
+            say_notes(tuple(study.count_notes(whole)))
             say(str(written))
             return
         _print_found(found, labels)
         if out is not None:
             columns = None if told is None else [row for row, each in zip(told, found, strict=True) for _ in each]
             table = [each for measures in found for each in measures]
-            say(str(write_table(table, out, columns=columns, overwrite=overwrite)))
+            say(str(study.write_table(table, out, columns=columns, overwrite=overwrite)))
 
 
 def _map_windows(

@@ -20,8 +20,7 @@ from curvafit.drawing.plot import QUIET, diagram_on, make_figure
 from curvafit.report.comparison import describe_measures, say_kinds
 from curvafit.report.page import check_result_folder, start_record, write_study
 from curvafit.scan.measures import Measures
-from curvafit.studies.scans import count_notes
-from curvafit.studies.tables import list_rows
+from curvafit.studies.scans import count_notes, list_rows
 
 #: `format` of the record.
 FORMAT = Format("curvafit measured scans", 1, title="the record of measured scans")

@@ -52,7 +52,7 @@ from curvafit.inference.inference import Inference
 from curvafit.inference.posterior import KNOWN
 from curvafit.inference.table import parameters_of
 from curvafit.priors.law import FORMAT
-from curvafit.studies.tables import format_csv
+from curvafit.studies.scans import format_csv
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 

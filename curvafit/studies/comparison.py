@@ -22,8 +22,7 @@ from curvafit.geometry.diagrams import FAMILIES, Diagram
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.scan.measures import QUANTITIES, SURE, Measures, find_quantity, interval_reach
 from curvafit.scan.structure import check_options
-from curvafit.studies.groups import Case, Group, list_cases
-from curvafit.studies.scans import gather_notes, measure_scans
+from curvafit.studies.scans import Case, Group, gather_notes, list_cases, measure_scans
 
 #: Arrangements of the labels that are tried: all where there are no more.
 PERMUTATIONS = 9999

@@ -12,9 +12,9 @@ from calling import call, done, refused
 from curvafit.geometry.morphology import morphometry
 from curvafit.geometry.topology import euler_number, euler_shares
 from curvafit.report.windows import check_windows
-from curvafit.scan.measures import LEAST, QUANTITIES, Blocks, Measures, errors
+from curvafit.scan.measures import COLUMNS, LEAST, QUANTITIES, Blocks, Measures, errors
 from curvafit.scan.tiles import measure
-from curvafit.studies.tables import COLUMNS, write_table
+from curvafit.studies.scans import write_table
 from curvafit.studies.windowed import NAMES, Windows, windows
 from curvafit.volumes.read import load
 from curvafit.volumes.volume import Volume
