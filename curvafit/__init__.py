@@ -25,15 +25,15 @@ __version__ = "0.1.0"
 
 #: The function that draws each type with a picture, as `module:function`; see `curvafit.core.runtime`.
 _FIGURES = {
-    "Comparison": "curvafit.drawing.groups:comparison_figure",
+    "Comparison": "curvafit.report.comparison:comparison_figure",
     "Diagram": "curvafit.drawing.plot:diagram_figure",
     "Volume": "curvafit.drawing.plot:field_figure",
     "Fit": "curvafit.drawing.plot:fit_figure",
     "Flow": "curvafit.drawing.plot:flow_figure",
-    "Inference": "curvafit.report.page:inference_figure",
+    "Inference": "curvafit.report.inference:inference_figure",
     "Measures": "curvafit.report.measures:measures_figure",
     "Segmentation": "curvafit.segmentation.result:segmentation_figure",
-    "Windows": "curvafit.report.windows:windows_figure",
+    "Windows": "curvafit.report.measures:windows_figure",
 }
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

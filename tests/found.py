@@ -103,15 +103,16 @@ def made_fit(chosen: str | None = "posterior", lost: bool = False) -> Fit:
 
 def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports with empty pictures, where their text is what matters. What cannot be drawn is still refused."""
-    import curvafit.report.page as pictures
+    from curvafit.drawing import plot
+    from curvafit.report import page
 
     def blank(u: np.ndarray) -> Figure:
         if not np.isfinite(u).all():
             raise ValueError("expected a finite volume to draw, got NaN or infinite values")
         return Figure()
 
-    monkeypatch.setattr(pictures, "surface_figure", blank)
-    monkeypatch.setattr(pictures, "png", lambda figure: b"\x89PNG")
+    monkeypatch.setattr(plot, "surface_figure", blank)
+    monkeypatch.setattr(page, "png", lambda figure: b"\x89PNG")
 
 
 COLUMNS = (("true", "1"), ("2", "-1"), ("2", ""))

@@ -43,8 +43,7 @@ def infer(
     with show_stages() as progress:
         from curvafit.inference.inference import infer as infer_scan
         from curvafit.inference.simulate import Growth
-        from curvafit.report.laws import infer_scans
-        from curvafit.report.page import check_report, with_command, write_inference
+        from curvafit.report.inference import check_report, infer_scans, with_command, write_inference
 
         growth = None if fast else Growth(test=test)
         what = {**structure, **files, "method": method, "growth": growth, "seed": seed, **reading}
@@ -67,7 +66,7 @@ def _print_result(inference: Inference) -> None:
     """Print the description, the verdict and a small table."""
     from curvafit.core.units import format_length, format_number
     from curvafit.inference.candidates import TITLES
-    from curvafit.report.page import describe, parameter_table
+    from curvafit.report.inference import describe, parameter_table
 
     fit = inference.fit
     say(f"{describe(inference)}.", style="bold")

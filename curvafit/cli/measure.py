@@ -132,7 +132,7 @@ def _map_windows(
     halves = tuple(n if n % 2 else n // 2 for n in size)
     steps = halves if stride is None else parse_whole_triple(stride, "--stride")
     with show_stages() as progress:
-        from curvafit.report.windows import check_windows, write_windows
+        from curvafit.report.measures import check_windows, write_windows
         from curvafit.studies.windowed import windows as measure_windows
 
         check_windows(folder, scan, overwrite, command_line())

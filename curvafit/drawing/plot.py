@@ -38,6 +38,8 @@ FAMILY_COLOURS = {
     "spheres": "#0072B2", "layers": "#E69F00", "tubes": "#009E73", "sponge": "#CC79A7", "tubular cavities": "#56B4E9",
     "bubbles": "#D55E00",
 }  # fmt: skip
+#: Colours of groups, which begin again after the last (Okabe & Ito 2008).
+GROUPS = FIRST, SECOND, *_ = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
 #: Area density in a diagram: light where little, dark where much.
 DENSITY = LinearSegmentedColormap.from_list(
     "density", ["#E3ECF5", "#A9CBE3", "#5AA2CB", "#2B6FA8", "#1B3F7A", "#16193F"]
@@ -50,8 +52,11 @@ BINS, DECADES = 72, 3.0
 _DRAWN, _SQUARE = "#2B6FA8", 1.25
 #: Percent of the voxels that are drawn black, white; most voxels along an axis of which these are taken.
 TAILS, THIN = (0.5, 99.5), 256
-#: Symbols of the numbers that a figure of numbers shows first.
+#: Symbols of the familiar numbers, of those that a figure of numbers shows first, and of those that can be negative.
 FAMILIAR = ("BV/TV", "Tb.Th", "Tb.Sp", "Tb.N", "Conn.D", "DA")
+FIRST_SHOWN, SIGNED = (*FAMILIAR, "H", "K"), ("χ", "Conn.D", "H", "K", "κ1", "κ2")
+#: Share of each curvature's area that a diagram's axis holds at the least.
+SHOWN = 0.995
 #: Most values of masks and labels, which are drawn from the least to the greatest.
 FEW = 3
 
@@ -207,6 +212,18 @@ def shared_limits(diagrams: Sequence[Diagram], *, length: float = 1.0) -> Limits
             bounds = [min(bounds[0], float(low)), max(bounds[1], float(high))]
     width = max(bounds[1] - bounds[0], 1e-9)
     return bounds[0] - 0.08 * width, bounds[1] + 0.08 * width
+
+
+def shown_window(diagrams: Sequence[Any]) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the intervals of κ1 and of κ2 that hold 0 and `SHOWN` of each diagram's area, with a margin."""
+    ends = np.zeros((2, 2))
+    for diagram in diagrams:
+        for bounds, kappa in zip(ends, np.asarray(diagram.points).T, strict=True):
+            tails = [(1 - SHOWN) / 2, (1 + SHOWN) / 2]
+            low, high = np.quantile(kappa, tails, weights=diagram.weights, method="inverted_cdf")
+            bounds[:] = min(bounds[0], low), max(bounds[1], high)
+    low, high = ends.T + 0.08 * np.ptp(ends) * np.array([[-1], [1]])
+    return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
 
 
 def _name_families(axes: Axes, across: Limits, up: Limits) -> None:
@@ -424,3 +441,8 @@ def make_figure(width: float, height: float, **options: Any) -> Figure:
     figure = Figure(figsize=(width, height), facecolor="white", **options)
     FigureCanvasAgg(figure)
     return figure
+
+
+def plain(name: str) -> str:
+    """Return a name that matplotlib does not take for a formula."""
+    return name.replace("$", "\\$")

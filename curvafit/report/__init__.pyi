@@ -1,7 +1,7 @@
 from .atlas import write_map as write_map
 from .comparison import write_comparison as write_comparison
+from .inference import describe as describe
+from .inference import report_html as report_html
+from .inference import write_inference as write_inference
+from .inference import write_report as write_report
 from .measures import write_measures as write_measures
-from .page import describe as describe
-from .page import report_html as report_html
-from .page import write_inference as write_inference
-from .page import write_report as write_report

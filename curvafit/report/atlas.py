@@ -13,7 +13,6 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from html import escape
-from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -41,7 +40,8 @@ from curvafit.geometry.mesh import capped_surface
 from curvafit.inference.atlas import Atlas
 from curvafit.inference.fit import Fit
 from curvafit.priors.grid import WORKING_SPACING, Grid
-from curvafit.report.page import MARK, name_source, render_template
+from curvafit.report import page
+from curvafit.report.inference import name_source
 from curvafit.scan.preparation import HALF, WORKING_THICKNESS
 
 #: Below this, there is nothing to lay out; the nearest shapes that are named beside one.
@@ -123,7 +123,7 @@ def write_map(
     if (target := Path(path)).suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"the name of a map must end in .html, got {target.name!r}")
     inputs = [*(store.path for store in sources), *map(Path, read)]
-    can_write(target, lambda there: has_mark(there, MARK), inputs=inputs, overwrite=overwrite)
+    can_write(target, lambda there: has_mark(there, page.MARK), inputs=inputs, overwrite=overwrite)
     scans = [each if isinstance(each, Fit) else Fit.load(each) for each in fits]
     names = [name_source(fit.provenance.get("scan")) or f"scan {k}" for k, fit in enumerate(scans, 1)]
     if bare := [name for name, fit in zip(names, scans, strict=True) if fit.diagram is None]:
@@ -170,12 +170,12 @@ def write_map(
         rows |= {f"{store.name}: {name}": words for name, words in facts.items()}
     rows["measured with"] = ", ".join(f"{name} {number}" for name, number in atlas.provenance["measured_with"].items())
     rows["measured on"] = atlas.provenance["date"]
-    text = render_template(
-        "atlas.html", version=version("curvafit"), title=f"Atlas of {n} shapes", plotly=script,
+    text = page.render(
+        "atlas.html", title=f"Atlas of {n} shapes", made={name: words for name, words in rows.items() if words},
+        plotly=script,
         data=json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
         names=[*enumerate(names, n), *enumerate(atlas.ids)], scans=len(names), solids=len(turned),
         missing=n - len(turned),
-        provenance=[each for each in rows.items() if each[1]],
     )  # fmt: skip
     return write_content(target, text)
 

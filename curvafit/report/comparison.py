@@ -1,23 +1,30 @@
-"""The page of scans that are compared, its figures and tables, and a paragraph on the methods."""
+"""The page of scans that are compared, its tables and figures, and a paragraph on the methods."""
 
 from __future__ import annotations
 
+import itertools
 import math
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from string import ascii_lowercase
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, QuadMesh
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from curvafit.core.records import Format
 from curvafit.core.units import format_number, format_percent, per_unit, plain_unit, power_name
-from curvafit.drawing.groups import comparison_figure, numbers_figure
+from curvafit.drawing import plot
 from curvafit.geometry.distances import DIRECTIONS, QUANTILES
-from curvafit.report.page import check_result_folder, start_record, write_study
+from curvafit.report.page import Chosen, check_result_folder, render, start_record, write_study
 from curvafit.scan.measures import Measures
 from curvafit.studies.comparison import BINS, LEVEL, SMOOTH, Comparison, Number, join_names
 from curvafit.studies.scans import count_notes
@@ -29,6 +36,12 @@ TESTS = ("p", "family-wise", "Holm", "BH")
 #: What a comparison writes into its folder.
 FILES = ("compare.json", "compare.html", "measures.csv", "numbers.csv")
 FILES += ("difference.svg", "difference.png", "numbers.svg", "numbers.png")
+#: Colours of what is less and of what is more.
+MORE = LinearSegmentedColormap.from_list("more", [plot.FIRST, "#8CC0E0", "#FFFFFF", "#F0B48A", plot.SECOND])
+#: Larger and smaller panels of numbers in a row.
+LARGE, SMALL = 4, 7
+#: Letters of groups' names that a panel has room for, and diagrams that a row has.
+WORDS, ROW = 28, 4
 #: Returns the folder if `write_comparison` can write there, else raises ValueError; call it before the work.
 check_comparison = partial(check_result_folder, FORMAT, FILES)
 
@@ -54,7 +67,7 @@ def write_comparison(
     record |= {"tests": tests, "methods": describe_methods(c)}
     page = {
         "title": c.verdict, "scans": "; ".join(_count_scans(c)) + ".", "effect": c.effect,
-        "head": [*c.groups, "difference" if c.groups else "slope", c.effect, "95 %", *TESTS, "known error"],
+        "head": ["", "", *c.groups, "difference" if c.groups else "slope", c.effect, "95 %", *TESTS, "known error"],
         "rows": [_format_row(number, c) for number in c.numbers], "level": f"{LEVEL:.2g}",
         "differs": bool(c.significant.any()),
     }  # fmt: skip
@@ -63,83 +76,30 @@ def write_comparison(
         "numbers": (numbers_figure(c), f"Each number by {c.by}"),
     }
     whose = [{"subject": case.subject, label: case.label} for case in c.cases]
-    rows = (row for each, told in zip(c.measures, whose, strict=True) for row in each.rows(**told))
+    rows = (row for each, more in zip(c.measures, whose, strict=True) for row in each.rows(**more))
     tables = {"measures.csv": rows, "numbers.csv": tests}
-    return write_study(target, FORMAT, FILES, record, page, tables, figures=drawn, told=("command", "date", *tried))
+    return write_study(target, FORMAT, FILES, record, page, tables, figures=drawn, shown=("command", "date", *tried))
 
 
 def describe_methods(comparison: Comparison) -> str:
     """Return a paragraph, for a paper, on what was done and what came of it."""
-    c, unit = comparison, per_unit(comparison.unit, 1)
-    tried = f"all {c.permutations}" if c.exact else f"{c.permutations} random (seed {c.options['seed']})"
-    tried += f" permutations of {'groups' if c.groups else c.by}{' within subjects' * (c.blocks is not None)}"
-    differ = [each for each in c.numbers if each.family <= LEVEL]
-    found = ", ".join(f"{each.symbol} ({c.effect} = {format_number(each.effect, 2)})" for each in differ)
-    found = f"{len(differ)} of them differ{f': {found}' if differ else ''}."
-    named = "Named beforehand and tested alone was {0.symbol}: p = {1}."
-    statistic = format_number(c.statistic, 3)
-    over = f"the sliced Wasserstein distance of subjects' diagrams ({DIRECTIONS} directions, {QUANTILES} quantiles)"
-    tests = {
-        "g": (
-            f"the energy distance (Székely & Rizzo 2004) of the groups, over {over}: E = {statistic} {unit}",
-            "the difference of means" if c.blocks is None else "the mean difference of pairs",
-            "Effect sizes are Hedges' g, with 95 % intervals of the noncentral t distribution (normal subjects).",
-        ),
-        "η": (
-            f"the dispersion between groups (Rizzo & Székely 2010) over {over}: E = {statistic} {unit}",
-            "the variance between groups",
-            "Effect sizes are correlation ratios.",
-        ),
-        "r": (
-            f"the distance correlation (Székely, Rizzo & Bakirov 2007) with the rank of {c.by}, over {over}: R = "
-            f"{statistic}",
-            f"the correlation with the rank of {c.by}",
-            "Effect sizes are correlations, with 95 % intervals by Fisher's z (normal subjects).",
-        ),
-    }
-    diagrams, numbers, effects = tests[c.effect]
-    return " ".join(
-        [
-            f"Scans of {join_names(_count_scans(c))} were measured with curvafit {version('curvafit')}; "
-            f"{say_kinds(c.measures)}.",
-            *describe_measures(c.measures),
-            "Scans of a subject were averaged; subjects are what all tests count.",
-            f"Diagrams were compared by {diagrams}, p = {format_number(c.p, 2)}, the share of {tried} with at least as "
-            "much.",
-            f"Each of {len(c.numbers)} numbers was tested by {numbers} over the same permutations, and corrected for "
-            "all of them by the greatest correlation with the label in each permutation (Westfall & Young 1993), "
-            "besides the corrections of Holm and of Benjamini and Hochberg.",
-            f"At a family-wise level of {LEVEL:.2g}, {found}",
-            *([named.format(c.primary, format_number(c.primary.p, 2))] if c.primary else []),
-            effects,
-            f"The difference of the mean diagrams, over {BINS} × {BINS} bins and smoothed by a Gaussian of {SMOOTH:g} "
-            f"bins, was tested in the {int(np.isfinite(c.bins_p).sum())} with area, corrected likewise; "
-            f"{int(c.significant.sum())} differ.",
-        ]
-    )
+    c = comparison
+    return describe_measures(
+        c.measures, c=c, scans=join_names(_count_scans(c)), unit=per_unit(c.unit, 1), level=f"{LEVEL:.2g}",
+        directions=DIRECTIONS, quantiles=QUANTILES, bins=BINS, smooth=f"{SMOOTH:g}",
+        differ=[each for each in c.numbers if each.family <= LEVEL], tested=int(np.isfinite(c.bins_p).sum()),
+    )  # fmt: skip
 
 
-def say_kinds(measures: Sequence[Measures]) -> str:
-    """Return what scans were taken for."""
-    return " and ".join(f"{n} were taken for {kind}s" for kind, n in Counter(each.kind for each in measures).items())
+def describe_measures(measures: Sequence[Measures], **values: Any) -> str:
+    """Return a paragraph, for a paper, on what was done to scans, how their numbers are made, and what to cite.
 
-
-def describe_measures(measures: Sequence[Measures]) -> list[str]:
-    """Return sentences, for a paper, on what was done to scans, how their numbers are made, and what to cite."""
-    return [
-        *count_notes(measures),
-        "Thickness (Tb.Th) and spacing (Tb.Sp) are mean diameters of the largest balls that fit (Hildebrand & "
-        "Rüegsegger 1997); the number per length (Tb.N) is (BV/TV) / Tb.Th; connectivity is that of the Euler number "
-        "(Odgaard & Gundersen 1993); the surface (BS) is that of marching cubes of the mask after a Gaussian of "
-        "0.7 voxels; anisotropy (DA) is 1 less the ratio of the smallest eigenvalue to the largest of the "
-        "mean of n⊗n over the surface's normals n.",
-        "Curvatures are those of the level set of a smooth profile of the mask; the curvature diagram of a scan is the "
-        "share of its surface's area over the principal curvatures κ₁ ≥ κ₂, and its families part "
-        "that area by the direction of (κ₁, κ₂), but for layers, where both are small.",
-        f"The program: the curvafit authors, curvafit, version {version('curvafit')} (software); with Song (2022), "
-        "Generation of Tubular and Membranous Shape Textures with Curvature Functionals, Journal of Mathematical "
-        "Imaging and Vision 64, 17, doi:10.1007/s10851-021-01049-9.",
-    ]
+    It is `templates/methods.txt`, filled with `values`.
+    """
+    counts = Counter(each.kind for each in measures).items()
+    kinds = " and ".join(f"{n} were taken for {kind}s" for kind, n in counts)
+    text = render("methods.txt", measures=measures, kinds=kinds, notes=list(count_notes(measures)), **values)
+    return re.sub("[ \n]+", " ", text).strip()
 
 
 def _count_scans(comparison: Comparison) -> list[str]:
@@ -152,23 +112,25 @@ def _count_scans(comparison: Comparison) -> list[str]:
     ]
 
 
-def _format_row(number: Number, comparison: Comparison) -> dict[str, Any]:
+def _format_row(number: Number, comparison: Comparison) -> list[str]:
+    """Return a row of the page's table, of which some cells stand out where the number differs among all."""
     means = [
         f"{format_number(mean)} ± {format_number(sd, 2)}"
         for mean, sd in zip(number.means, number.deviations, strict=True)
     ]
     interval = "–" if math.isnan(number.low) else f"{format_number(number.low, 2)} to {format_number(number.high, 2)}"
-    ps = (format_number(each, 2) for each in (number.p, number.family, number.holm, number.discovery))
+    holm, discovery = (format_number(each, 2) for each in (number.holm, number.discovery))
     known = "–" if math.isnan(number.known) else "all" if number.known >= 1 else format_percent(number.known)
     named = name_quantity(number.name, number.symbol, number.power, comparison.unit)
-    cells = (*means, format_number(number.difference), format_number(number.effect, 2), interval, *ps, known)
-    return {**named, "cells": cells, "chosen": number.family <= LEVEL}
+    main = format_number(number.difference), format_number(number.effect, 2), format_number(number.family, 2)
+    difference, effect, family = map(Chosen, main) if number.family <= LEVEL else main
+    return [*named, *means, difference, effect, interval, format_number(number.p, 2), family, holm, discovery, known]
 
 
-def name_quantity(name: str, symbol: str, power: int, unit: str) -> dict[str, str]:
+def name_quantity(name: str, symbol: str, power: int, unit: str) -> tuple[str, str]:
     """Return the name of a quantity, and its symbol and unit, as a table has them."""
     parts = ("" if symbol in name else symbol, power_name(unit, power))
-    return {"name": name[0].upper() + name[1:], "symbol": ", ".join(part for part in parts if part)}
+    return name[0].upper() + name[1:], ", ".join(part for part in parts if part)
 
 
 # ---- tables and record -----------------------------------------------------------------------------------------------
@@ -190,3 +152,133 @@ def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
         cells += (each.p, each.family, each.holm, each.discovery, each.known)
         known = (None if isinstance(cell, float) and not math.isfinite(cell) else cell for cell in cells)
         yield dict(zip(columns, known, strict=True))
+
+
+# ---- figures ---------------------------------------------------------------------------------------------------------
+
+
+def comparison_figure(comparison: Comparison) -> Figure:
+    """Return a figure of the mean curvature diagrams of groups, or halves of numbers, and their differences.
+
+    Of two the second less the first, of more each less the mean of all, by a number from the least to the greatest. The
+    outline holds the bins that differ significantly among all.
+    """
+    c, names, edges = comparison, [plot.plain(name) for name in comparison.parts], comparison.edges
+    limits, unit, window = (edges[0], edges[-1]), c.unit, plot.shown_window(c.diagrams)
+    one = len(c.differences) == 1
+    columns = 3 if one else min(len(names), ROW)
+    rows = 1 if one else 2 * math.ceil(len(names) / columns)
+    figure = plot.make_figure(13.2, 3.6 * rows * 3 / max(columns, 3), layout="constrained")
+    for k, (name, diagram) in enumerate(zip(names, c.diagrams, strict=True)):
+        axes = figure.add_subplot(rows, columns, k + 1)
+        picture = plot.diagram_on(axes, diagram, limits=limits, unit=unit, window=window)
+        axes.set_title(f"{name}, {c.counts[k]} subjects", fontsize=11, color=plot.GROUPS[k % len(plot.GROUPS)])
+        _bar_on(axes, picture, format=FuncFormatter(lambda share, _: f"{100 * share:g}"))
+    p = f"p = {format_number(c.p, 2)}"
+    titles = [f"{names[1]} less {names[0]}, {p}"] if c.groups else [f"from the least to the most, {p}"]
+    titles = [f"{name} less all, {p}" for name in names] if len(names) > 2 else titles
+    shown = 100 * c.differences
+    most = max(float(np.abs(shown).max()), 1e-9)
+    for k, (title, difference) in enumerate(zip(titles, shown, strict=True)):
+        axes = figure.add_subplot(rows, columns, k + (3 if one else rows // 2 * columns + 1))
+        picture = axes.pcolormesh(
+            edges, edges, difference, cmap=MORE, norm=Normalize(-most, most), rasterized=True, zorder=0.5
+        )
+        plot.frame_diagram(axes, limits, unit, window)
+        _outline_on(axes, edges, c.significant)
+        axes.set_title(title, fontsize=11)
+        _bar_on(axes, picture, ticks=MaxNLocator(4, symmetric=True))
+    return figure
+
+
+def _bar_on(axes: Axes, picture: QuadMesh, **options: Any) -> None:
+    bar = axes.figure.colorbar(picture, ax=axes, shrink=0.7, pad=0.02, **options)
+    bar.set_label("% of the surface a bin", fontsize=8)
+    bar.ax.tick_params(labelsize=8, length=2)
+    bar.outline.set_linewidth(0.5)
+
+
+def _outline_on(axes: Axes, edges: np.ndarray, inside: np.ndarray) -> None:
+    """Draw the border of a set of bins, bool (rows, columns), along the bins' edges."""
+    lines = []
+    for turned, where in ((False, inside), (True, inside.T)):
+        rows, columns = np.nonzero(np.diff(np.pad(where, ((1, 1), (0, 0))).astype(int), axis=0))
+        ends = np.stack([edges[columns], edges[columns + 1]], axis=1)
+        level = np.repeat(edges[rows][:, None], 2, axis=1)
+        lines.append(np.stack([level, ends] if turned else [ends, level], axis=-1))
+    axes.add_collection(LineCollection(list(np.concatenate(lines)), colors=plot.INK, linewidths=1.2, zorder=3.5))
+
+
+def numbers_figure(comparison: Comparison) -> Figure:
+    """Return a figure of each quantity: subjects by group or over the number, with the 95 % intervals of their scans.
+
+    A long line is a group's mean, or the fitted one; a thin line joins a subject's own where they are paired. The names
+    of quantities that differ significantly among all are bold.
+    """
+    c = comparison
+    figure, panels = _panels(c)
+    joined = [] if c.blocks is None else [np.flatnonzero(c.blocks == block) for block in np.unique(c.blocks)]
+    places = np.array(c.labels, dtype=float)
+    for group, count in enumerate(c.counts if c.groups and not joined else ()):
+        places[c.sides == group] += np.linspace(-0.18, 0.18, count)
+    for k, (axes, number) in enumerate(zip(panels, c.numbers, strict=True)):
+        values, halves = c.values[:, k], c.halves[:, k]
+        low = values - halves if number.symbol in plot.SIGNED else np.maximum(values - halves, 0)
+        for own in joined:
+            own = own[np.argsort(places[own])]
+            axes.plot(places[own], values[own], color=plot.QUIET, linewidth=0.8, zorder=1)
+        for group, colour in zip(range(len(c.counts)) if c.groups else (None,), itertools.cycle(plot.GROUPS)):
+            own = slice(None) if group is None else c.sides == group
+            axes.vlines(places[own], low[own], (values + halves)[own], color=colour, alpha=0.35, linewidth=1.4)
+            axes.plot(places[own], values[own], "o", color=colour, markersize=4, markeredgewidth=0)
+        for group, mean in enumerate(number.means):
+            axes.hlines(mean, group - 0.32, group + 0.32, color=plot.INK, linewidth=1.4)
+        if c.groups:
+            letters = WORDS // len(c.groups)
+            names = [f"{plot.plain(name[:letters])}\nn = {n}" for name, n in zip(c.groups, c.counts, strict=True)]
+            axes.set_xticks(range(len(names)), names, fontsize=8)
+            axes.set_xlim(-0.6, len(names) - 0.4)
+        else:
+            ends = np.array([places.min(), places.max()])
+            axes.plot(ends, values.mean() + number.difference * (ends - places.mean()), color=plot.INK, linewidth=1.4)
+            axes.set_xlabel(plot.plain(c.by), fontsize=8)
+        if number.symbol not in plot.SIGNED and axes.get_ylim()[0] < 0:
+            axes.set_ylim(bottom=0)
+    marks = [
+        Line2D([], [], color=plot.QUIET, marker="o", linestyle="", markersize=4, label="a subject"),
+        Line2D([], [], color=plot.QUIET, linewidth=1.4, label="95 % interval of the subject's own scans"),
+        Line2D([], [], color=plot.INK, linewidth=1.4, label="mean of the group" if c.groups else "slope"),
+        *[Line2D([], [], color=plot.QUIET, linewidth=0.8, label="of one subject")] * bool(joined),
+    ]
+    figure.legend(handles=marks, loc="outside lower center", ncols=len(marks), frameon=False, fontsize=9)
+    return figure
+
+
+def _panels(comparison: Comparison) -> tuple[Figure, list[Axes]]:
+    """Return a figure and a panel for each quantity, its symbol and tests above it; the familiar first and larger."""
+    numbers, ranks = comparison.numbers, {symbol: k for k, symbol in enumerate(plot.FIRST_SHOWN)}
+    order = sorted(range(len(numbers)), key=lambda k: ranks.get(numbers[k].symbol, len(ranks)))
+    first = sum(number.symbol in ranks for number in numbers)
+    large, small = -(-first // LARGE), -(-(len(numbers) - first) // SMALL)
+    figure = plot.make_figure(13.2, 3.1 * large + 2.5 * small, layout="constrained")
+    parts = figure.add_gridspec(2, 1, height_ratios=(max(3.1 * large, 0.01), max(2.5 * small, 0.01)))
+    grids = parts[0].subgridspec(max(large, 1), LARGE), parts[1].subgridspec(max(small, 1), SMALL)
+    panels: dict[int, Axes] = {}
+    for place, k in enumerate(order):
+        grid, columns, here = (grids[0], LARGE, place) if place < first else (grids[1], SMALL, place - first)
+        axes, number = figure.add_subplot(grid[divmod(here, columns)]), numbers[k]
+        name = power_name(comparison.unit, number.power)
+        label = f"{comparison.effect} = {format_number(number.effect, 2)}, p = {format_number(number.p, 2)}"
+        axes.set_title(
+            number.symbol + (f" ({name})" if name else ""),
+            fontsize=11 if place < first else 9.5,
+            fontweight="bold" if number.family <= comparison.level else "normal",
+            pad=26,
+        )
+        label += f"\nfamily-wise p = {format_number(number.family, 2)}"
+        axes.annotate(label, (0.5, 1), (0, 3), "axes fraction", "offset points", ha="center", va="bottom", fontsize=7.5)
+        axes.yaxis.set_major_locator(MaxNLocator(4))
+        axes.tick_params(length=2, labelsize=8)
+        axes.spines[:].set_color(plot.QUIET)
+        panels[k] = axes
+    return figure, [panels[k] for k in range(len(numbers))]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +14,6 @@ from scipy import ndimage
 from curvafit.core.files import write_content
 from curvafit.core.records import can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.units import format_number
 from curvafit.drawing.plot import INK, diagram_on, gallery_figure, make_figure, section_on, shared_limits
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import LEARNED
@@ -23,8 +21,11 @@ from curvafit.geometry.distances import sliced_embedding
 from curvafit.inference.atlas import Atlas, load_atlas
 from curvafit.inference.candidates import UNBELIEVABLE
 from curvafit.inference.inference import Inference, infer
+from curvafit.inference.verdict import UNBELIEVABLE
 from curvafit.report import page
 from curvafit.report.atlas import map_on
+from curvafit.report.inference import check_report, describe, describe_scan, list_strips, write_inference
+from curvafit.report.page import MARK, Chosen, picture_of, render
 from curvafit.scan.measures import Measures
 from curvafit.scan.structure import find_structure
 from curvafit.scan.tiles import measure
@@ -68,11 +69,11 @@ def write_demo(
     The structure is measured (`measure`). The volume is filled from slices across its shortest axis (`reconstruct`) and
     compared with those left out. The law is inferred (`infer(growth=None)`), the curvature diagram placed among the
     atlas's, and the nearest textures are grown. `fit.json` and `report.html` are written beside the page. Raises
-    ValueError if the scan has no structure, or as `report.page.check_report`.
+    ValueError if the scan has no structure, or as `report.inference.check_report`.
     """
-    folder = page.check_report(directory, [scan.source] if scan.source else (), overwrite)
+    folder = check_report(directory, [scan.source] if scan.source else (), overwrite)
     target = folder / "demo.html"
-    can_write(target, lambda path: has_mark(path, page.MARK), overwrite=overwrite)
+    can_write(target, lambda path: has_mark(path, MARK), overwrite=overwrite)
     progress("measuring", 0.0)
     measures = measure(scan, progress=sub_progress(progress, 0.0, 0.1))
     atlas = load_atlas()
@@ -93,7 +94,7 @@ def write_demo(
             textures += [flow.field.numpy()] * flow.viability.viable
     progress("drawing the page", 0.95)
     text = demo_page(inference, measures, completion, textures, atlas)
-    page.write_inference(inference, folder, overwrite=overwrite)
+    write_inference(inference, folder, overwrite=overwrite)
     return write_content(target, text), completion
 
 
@@ -122,21 +123,23 @@ def demo_page(
     grown = {f"{place} texture": u for place, u in zip(PLACES, textures, strict=False)}
     placed = _map_figure(inference, atlas)
     shown = ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D", "BS/BV", "DA", "H", "K")
-    return page.render_template(
-        "demo.html", version=version("curvafit"), sentence=page.describe(inference), scan=page.describe_scan(inference),
-        shapes=page.picture_of(
-            _shape_figure(completion, inference.scan.spacing), "Known slices, the filled volume, and the scan"
-        ),
-        slices=page.picture_of(_slice_figure(inference.scan, completion), "A left-out slice, as it is and as filled"),
-        every=EVERY, axis="zyx"[completion.axis],
-        scores=[(name, f"{score:.3f}") for name, score in completion.dice.items()],
-        measures=[(measures[symbol].name, symbol, *measures[symbol].format(measures.unit)) for symbol in shown],
-        blocks=int(np.prod(measures.blocks)) if np.isfinite(measures["BV/TV"].half) else 0, count=len(atlas),
-        map=page.picture_of(placed, "The scan's curvature diagram, and its place on the atlas's map"),
-        near=page.picture_of(gallery_figure(grown, columns=3, width=1500), "The nearest textures") if grown else None,
-        misfit=fit.misfit, status=fit.status,
-        believed=fit.misfit is not None and fit.misfit.probability >= UNBELIEVABLE, number=format_number,
-        strips=page.list_strips(fit), notes=dict.fromkeys((*inference.scan.notes, *fit.notes)),
+    shapes, slices = _shape_figure(completion, inference.scan.spacing), _slice_figure(inference.scan, completion)
+    blocks = int(np.prod(measures.blocks)) if np.isfinite(measures["BV/TV"].half) else 0
+    rows = [(each.name, each.symbol, *each.format(measures.unit)) for each in map(measures.__getitem__, shown)]
+    (_, own), *plain = ((name, f"{score:.3f}") for name, score in completion.dice.items())
+    return render(
+        "demo.html", title=f"{describe(inference)}.", made={}, scan=describe_scan(inference), every=EVERY,
+        axis="zyx"[completion.axis],
+        shapes=picture_of(shapes, "Known slices, the filled volume, and the scan"),
+        slices=picture_of(slices, "A left-out slice, as it is and as filled"),
+        scores=[("the network", Chosen(own)), *((f"plain interpolation, {name}", score) for name, score in plain)],
+        measures=[(name, symbol, value, half if blocks else "", unit) for name, symbol, value, half, unit in rows],
+        blocks=blocks, count=len(atlas),
+        map=picture_of(placed, "The scan's curvature diagram, and its place on the atlas's map"),
+        near=picture_of(gallery_figure(grown, columns=3, width=1500), "The nearest textures") if grown else None,
+        misfit=fit.misfit, reading=fit.status,
+        believed=fit.misfit is not None and fit.misfit.probability >= UNBELIEVABLE,
+        strips=list_strips(fit), notes=dict.fromkeys((*inference.scan.notes, *fit.notes)),
     )  # fmt: skip
 
 

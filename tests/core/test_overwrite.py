@@ -12,7 +12,7 @@ from exact_store import exact_store
 from found import made_inference
 
 from curvafit.data_synth.store import open_store
-from curvafit.report.page import FILES, write_inference
+from curvafit.report.inference import FILES, write_inference
 from curvafit.volumes import Volume, load, save
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
@@ -90,7 +90,7 @@ def test_a_record_speaks_for_its_own_files_alone(tmp_path: Path) -> None:
 
 def test_infer_leaves_other_peoples_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = '<meta name="generator" content="curvafit 0">'
-    monkeypatch.setattr("curvafit.report.page.write_report", lambda found, path: path.write_text(page))
+    monkeypatch.setattr("curvafit.report.inference.write_report", lambda found, path: path.write_text(page))
     monkeypatch.setattr(
         importlib.import_module("curvafit.inference.inference"), "infer", lambda *_, **__: made_inference()
     )

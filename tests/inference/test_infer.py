@@ -25,7 +25,7 @@ from curvafit.inference.posterior import load_posterior
 from curvafit.inference.table import PARAMETERS, mirror_parameters, parameters_of
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.law import FORMAT, Law, preset
-from curvafit.report.page import write_inference
+from curvafit.report.inference import write_inference
 from curvafit.scan.measures import read_texture, scan_diagram
 from curvafit.scan.preparation import prepare
 from curvafit.scan.quality import Quality

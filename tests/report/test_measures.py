@@ -8,7 +8,7 @@ import pytest
 from calling import call, done, refused
 from found import lattice, without_drawing
 
-from curvafit.report.laws import infer_scans, name_folders
+from curvafit.report.inference import infer_scans, name_folders
 from curvafit.report.measures import WORD, describe_range, name_parts, shorten
 from curvafit.scan.measures import Measures
 from curvafit.scan.tiles import measure

@@ -17,7 +17,14 @@ from curvafit.geometry.diagrams import diagram
 from curvafit.inference.inference import Inference
 from curvafit.priors import Grid
 from curvafit.priors.law import FORMAT, Law
-from curvafit.report.page import describe, family_radius, parameter_table, report_html, with_command, write_inference
+from curvafit.report.inference import (
+    describe,
+    family_radius,
+    parameter_table,
+    report_html,
+    with_command,
+    write_inference,
+)
 from curvafit.volumes.read import load
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}

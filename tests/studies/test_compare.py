@@ -18,9 +18,8 @@ from scipy.spatial.distance import cdist
 import curvafit
 from curvafit.core import permutation
 from curvafit.core.permutation import correct_by_most, correct_holm, correlate, measure_effect, relabel
-from curvafit.drawing.groups import numbers_figure
 from curvafit.geometry.diagrams import Diagram
-from curvafit.report.comparison import FILES, check_comparison, describe_methods
+from curvafit.report.comparison import FILES, check_comparison, describe_methods, numbers_figure
 from curvafit.scan.measures import QUANTITIES, Measures, Quantity
 from curvafit.studies.comparison import Comparison, compare
 from curvafit.studies.scans import merge_notes

@@ -11,7 +11,7 @@ from calling import call, done, refused
 
 from curvafit.geometry.morphology import morphometry
 from curvafit.geometry.topology import euler_number, euler_shares
-from curvafit.report.windows import check_windows
+from curvafit.report.measures import check_windows
 from curvafit.scan.measures import COLUMNS, LEAST, QUANTITIES, Blocks, Measures, errors
 from curvafit.scan.tiles import measure
 from curvafit.studies.scans import write_table
