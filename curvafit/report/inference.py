@@ -437,18 +437,18 @@ def name_folders(scans: Sequence[str]) -> list[str]:
     """Return a folder's name for each scan: its file's, without suffixes unless two would be alike."""
     names = [Path(scan.partition("::")[0]).name for scan in scans]
     stems = [name.partition(".")[0] or name for name in names]
-    found = [stem if stems.count(stem) == 1 else name for stem, name in zip(stems, names, strict=True)]
-    if twice := sorted({name for name in found if found.count(name) > 1}):
+    folders = [stem if stems.count(stem) == 1 else name for stem, name in zip(stems, names, strict=True)]
+    if twice := sorted({name for name in folders if folders.count(name) > 1}):
         raise ValueError(f"expected scans with names of their own, got several named {twice[0]}")
-    return found
+    return folders
 
 
 def _infer_one(
     scan: str, folder: Path, command: str, overwrite: bool, options: dict[str, Any], progress: Progress
 ) -> None:
     with name_errors(scan):
-        found = infer(scan, progress=progress, **options)
-    write_inference(with_command(found, command), folder, overwrite=overwrite)
+        inference = infer(scan, progress=progress, **options)
+    write_inference(with_command(inference, command), folder, overwrite=overwrite)
 
 
 def _is_done(folder: Path, command: str) -> bool:
@@ -462,9 +462,9 @@ def _is_done(folder: Path, command: str) -> bool:
 def _rows(name: str, fit: Fit) -> Iterator[dict[str, Any]]:
     """Yield a row for each number of a fit; None where it is not known."""
     columns = ("scan", "quantity", "value", "low", "high", "known", "version")
-    told = [(f"from {each.low} to {each.high}", each.median, *each.interval, each.known)
+    numbers = [(f"from {each.low} to {each.high}", each.median, *each.interval, each.known)
             for each in fit.combinations if each.low]  # fmt: skip
-    told += [(key, each["median"], *each["90"], None) for key, each in (fit.intervals() or {}).items()]
-    told.append(("p of the law", None if fit.misfit is None else fit.misfit.probability, None, None, None))
-    for row in told:
+    numbers += [(key, each["median"], *each["90"], None) for key, each in (fit.intervals() or {}).items()]
+    numbers.append(("p of the law", None if fit.misfit is None else fit.misfit.probability, None, None, None))
+    for row in numbers:
         yield dict(zip(columns, (name, *row, version("curvafit")), strict=True))

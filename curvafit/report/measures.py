@@ -82,7 +82,7 @@ def write_measures(
             [name, *(more.get(head, "") for head in further), *(_format_cell(part[each]) for each in plot.FIRST_SHOWN)]
             for name, (part, more) in zip(names, rows, strict=True)
         ],
-        "left": {"diagrams": max(0, len(rows) - MOST_DIAGRAMS), "numbers": max(0, len(rows) - MOST_ROWS)},
+        "omitted": {"diagrams": max(0, len(rows) - MOST_DIAGRAMS), "numbers": max(0, len(rows) - MOST_ROWS)},
     }  # fmt: skip
     diagrams = diagrams_figure(names[:MOST_DIAGRAMS], parts[:MOST_DIAGRAMS])
     numbers = intervals_figure(names[:MOST_ROWS], parts[:MOST_ROWS])
@@ -101,7 +101,7 @@ def _format_cell(quantity: Quantity) -> tuple[str, str]:
 
 def describe_range(parts: Sequence[Measures]) -> str:
     """Return what the numbers of scans of one unit span, in some sentences."""
-    said, names = [], name_parts(parts)
+    sentences, names = [], name_parts(parts)
     for symbol in ("BV/TV", "Tb.Th", "Tb.Sp"):
         known = [(part[symbol], name) for name, part in zip(names, parts, strict=True)]
         known = [each for each in known if math.isfinite(each[0].value)]
@@ -111,8 +111,8 @@ def describe_range(parts: Sequence[Measures]) -> str:
         unit = power_name(parts[0].unit, least.power)
         values = [f"{format_number(each.value)} {unit}".strip() for each in (least, most)]
         span = f"from {values[0]} ({first}) to {values[1]} ({last})" if len(known) > 1 else values[0]
-        said.append(f"{least.name[0].upper()}{least.name[1:]} {span}.")
-    return " ".join(said)
+        sentences.append(f"{least.name[0].upper()}{least.name[1:]} {span}.")
+    return " ".join(sentences)
 
 
 def name_parts(parts: Sequence[Measures]) -> list[str]:

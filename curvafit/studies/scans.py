@@ -82,12 +82,12 @@ def list_cases(
     else:
         cases = _list_labelled(groups[0], by) if len(groups) == 1 else _list_groups(groups, by, paired, notes)
         if table is not None:
-            told = _read_table(Path(table), ("scan", "subject"))
-            if "group" in told[0]:
+            listed = _read_table(Path(table), ("scan", "subject"))
+            if "group" in listed[0]:
                 raise ValueError(
                     f"expected the groups once, got two folders and a column group in {table}: leave one out"
                 )
-            rows = {row["scan"]: row["subject"] for row in told}
+            rows = {row["scan"]: row["subject"] for row in listed}
             cases = [case._replace(subject=_find_row(case.source, case.name, rows, Path(table))) for case in cases]
         elif not paired and not any(isinstance(group, Mapping) for group in groups):
             notes.append("Each scan counts as a subject; a table (--subjects) tells if several are of one.")
@@ -262,8 +262,8 @@ def read_columns(table: str | PathLike[str], scans: Sequence[str], taken: Sequen
 def _find_row(source: object, name: str, rows: Mapping[str, Any], table: Path) -> Any:
     """Return the row of a scan, which the table names by its path or by the name of its file."""
     place = Path(str(source))
-    for said, row in rows.items():
-        if said == name or place.resolve() in (Path(said).resolve(), (table.parent / said).resolve()):
+    for path, row in rows.items():
+        if path == name or place.resolve() in (Path(path).resolve(), (table.parent / path).resolve()):
             return row
     raise ValueError(f"expected a row for each scan in {table}, got none for {name}")
 
