@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from curvafit.core.checks import as_tuple, quoted
-from curvafit.core.pictures import Pictured
 from curvafit.core.runtime import Pictured
 from curvafit.core.units import format_sampling
 from curvafit.generation.schedule import Schedule

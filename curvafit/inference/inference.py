@@ -41,7 +41,7 @@ from curvafit.scan.preparation import HALF, NOISE, Prepared, coarser_level, prep
 from curvafit.scan.quality import sample_mask
 from curvafit.scan.structure import check_options, is_rounded, read_region
 from curvafit.volumes.read import Source
-from curvafit.volumes.volume import Crop, Volume
+from curvafit.volumes.volume import Volume
 
 #: Number of nearest shapes, and of those from which stationarity starts.
 MATCHES, STARTS = 5, 3
@@ -108,7 +108,7 @@ def infer(
     atlas: str | Path | Atlas | None = None,
     posterior: str | Path | Posterior | None = None,
     method: Literal["posterior", "match"] = "posterior",
-    growth: Growth | None = Growth(),  # noqa: B008
+    growth: Growth | None = Growth(),
     seed: int = 0,
     progress: Progress | None = None,
     **reading: Any,

@@ -31,14 +31,14 @@ from curvafit.core.runtime import Progress
 from curvafit.core.units import METRES, convert_length, format_number, is_unit, parse_unit, power_name
 from curvafit.drawing.plot import diagram_figure
 from curvafit.generation.flow import generate
-from curvafit.generation.result import Flow
+from curvafit.generation.result import Flow, Watch
 from curvafit.generation.schedule import schedule
 from curvafit.geometry.diagrams import Diagram, join_diagrams
 from curvafit.priors.law import PRESETS
 from curvafit.scan.instances import measure_instances
 from curvafit.scan.measures import Measures
 from curvafit.scan.tiles import measure as measure_scan
-from curvafit.studies.tables import check_table, write_table
+from curvafit.studies.scans import check_table, write_table
 from curvafit.volumes.volume import ScanError, Volume
 
 #: Our unit -> napari's.
@@ -320,7 +320,8 @@ class Generate(Dock):
         law = self.preset.value
 
         def grow(progress: Progress) -> Flow:
-            return generate(law, callbacks=[lambda step, total, _: progress("growing", step / total)], **options)
+            watch = Watch(callbacks=[lambda step, total, _: progress("growing", step / total)])
+            return generate(law, watch=watch, **options)
 
         return grow
 

@@ -21,8 +21,6 @@ from curvafit.geometry.distances import sliced_embedding
 from curvafit.inference.atlas import Atlas, load_atlas
 from curvafit.inference.candidates import UNBELIEVABLE
 from curvafit.inference.inference import Inference, infer
-from curvafit.inference.verdict import UNBELIEVABLE
-from curvafit.report import page
 from curvafit.report.atlas import map_on
 from curvafit.report.inference import check_report, describe, describe_scan, list_strips, write_inference
 from curvafit.report.page import MARK, Chosen, picture_of, render

@@ -28,12 +28,11 @@ from curvafit.core.units import (
 )
 from curvafit.drawing import plot
 from curvafit.geometry.diagrams import Diagram
-from curvafit.inference.candidates import TITLES, Candidate, seed_noise_of
-from curvafit.inference.combinations import KNOWN
+from curvafit.inference.candidates import TITLES, UNBELIEVED, UNDECIDED, Candidate, seed_noise_of
 from curvafit.inference.fit import Fit
 from curvafit.inference.inference import Inference, infer
+from curvafit.inference.posterior import KNOWN
 from curvafit.inference.table import parameters_of
-from curvafit.inference.verdict import UNBELIEVED, UNDECIDED
 from curvafit.priors.law import FORMAT
 from curvafit.report import page
 from curvafit.studies.scans import Task, name_errors, share_out

@@ -21,15 +21,13 @@ from matplotlib.figure import Figure
 from curvafit.core.files import move_together, remove, temporary_folder
 from curvafit.core.records import Format, can_write, has_mark
 from curvafit.core.runtime import hold_signals
-from curvafit.core.units import GLOSSARY, format_density, format_length, format_number, format_percent, per_unit, unit_name
-from curvafit.drawing.plot import bands_figure, corner_figure, diagram_figure, gallery_figure, grey_limits, png, shared_limits, slice_figure, surface_figure, svg
-from curvafit.geometry.diagrams import Diagram
-from curvafit.inference.candidates import Candidate, TITLES, UNBELIEVED, UNDECIDED, seed_noise_of
-from curvafit.inference.fit import Fit
-from curvafit.inference.inference import Inference
-from curvafit.inference.posterior import KNOWN
-from curvafit.inference.table import parameters_of
-from curvafit.priors.law import FORMAT
+from curvafit.core.units import (
+    format_number,
+)
+from curvafit.drawing.plot import (
+    png,
+    svg,
+)
 from curvafit.studies.scans import format_csv
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save

@@ -15,8 +15,7 @@ from torch.nn.functional import pad
 from curvafit.core.checks import LONGEST, SHORTEST, check_float, check_int
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.workers import Cluster
-from curvafit.generation.data import Data
-from curvafit.generation.flow import Flow, Optimiser, WORKING_BLUR, descend
+from curvafit.generation.flow import WORKING_BLUR, Flow, Optimiser, descend
 from curvafit.generation.problem import Data
 from curvafit.generation.result import Watch
 from curvafit.priors.coefficients import Coefficients

@@ -50,7 +50,7 @@ def reconstruct_labels(
     image: Source | None = None,
     instances: bool | None = None,
     example: Source | None = None,
-    working: Working = Working(),  # noqa: B008
+    working: Working = Working(),
     progress: Progress = silent,
     spacing: Sequence[float] | float | None = None,
     unit: str | None = None,

@@ -20,10 +20,8 @@ import numpy as np
 import torch
 from scipy.special import expit, logit
 
-from curvafit.core.checks import check_float, check_int, require
+from curvafit.core.checks import check_int, require
 from curvafit.core.runtime import Progress, check_memory, silent, sub_progress
-from curvafit.core.workers import Cluster
-from curvafit.generation import data
 from curvafit.generation.problem import Data, Hinge
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
@@ -113,7 +111,7 @@ def reconstruct(
     example: Source | None = None,
     suggest: int = 0,
     periodic: bool = False,
-    working: Working = Working(),  # noqa: B008
+    working: Working = Working(),
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:

@@ -10,8 +10,6 @@ import numpy as np
 
 from curvafit.core.checks import check_float, quoted
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.workers import Cluster
-from curvafit.generation.data import Evidence
 from curvafit.generation.problem import Evidence
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import LawLike
@@ -54,7 +52,7 @@ def segment(
     example: tuple[Source, Source] | Calibration | None = None,
     threshold: float | str = "otsu",
     dark: bool = False,
-    working: Working = Working(),  # noqa: B008
+    working: Working = Working(),
     progress: Progress = silent,
     **reading: Any,
 ) -> Segmentation:
@@ -293,7 +291,7 @@ def calibrate(
     prior: LawLike | None = None,
     *,
     label: int | None = None,
-    working: Working = Working(),  # noqa: B008
+    working: Working = Working(),
     progress: Progress = silent,
     **reading: Any,
 ) -> Calibration:

@@ -20,11 +20,8 @@ import numpy as np
 
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.workers import Cluster
-from curvafit.generation.checkpoint import identity
-from curvafit.generation.data import Data
 from curvafit.generation.loop import identity
 from curvafit.generation.problem import Data
-from curvafit.priors.grid import MOST
 from curvafit.segmentation.flow import WorkingGrid, lower_energy
 from curvafit.segmentation.trials import Trial
 from curvafit.volumes.run import Record, open_run

@@ -22,8 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from curvafit.core.checks import as_tuple, quoted
-from curvafit.core.extras import require
+from curvafit.core.checks import as_tuple, quoted, require
 from curvafit.core.files import write_atomically, write_content
 from curvafit.core.records import Format, can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
