@@ -11,14 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli.console import command_line, error_console, print_table, resumable, say, say_notes, show_stages
-from curvafit.cli.options import OverwriteOption, command, parse_numbers, parse_whole_triple
+from curvafit.cli.options import Group, OverwriteOption, command, parse_numbers, parse_whole_triple
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from curvafit.drawing.shapes import Output
     from curvafit.generation.result import Flow, State
-    from curvafit.priors.grid import Grid
     from curvafit.priors.law import Law
 
     #: Parameters that vary in space, by name; see `volumes.read_maps`.
@@ -32,20 +30,7 @@ _how = partial(typer.Option, rich_help_panel="How")
 _out = partial(typer.Option, rich_help_panel="What to write")
 
 
-@command(
-    "curvafit generate --preset tubes -o tubes.nii.gz",
-    "curvafit generate --preset tubes --spacing 0.0195 --unit mm -o tubes.stl",
-    "curvafit generate --preset sponge --volume-fraction 0.3 --shape 64,64,128 --tile 1,2,2 -o sponge.zarr",
-    "curvafit generate --coefficients 1,2,6,-40,-40,400 --mass -0.6 --orientation 0,0,1,50 -o lying.vtp",
-    "curvafit generate --prior bone/fit.json --shape 128 --seed 3 -o more_bone.tif",
-    "curvafit generate --preset tubes --maps maps.npz -o graded.nii.gz",
-    "curvafit generate --preset tubes --shape 300 --checkpoint run.pt -o large.nii.gz",
-    "torchrun --nproc-per-node 2 -m curvafit generate --preset tubes --shape 512 -o larger.zarr",
-)
-def generate(
-    out: Annotated[
-        Path, _out("-o", "--output", help="Volume (.nii.gz .nii .tif .npy .mrc .zarr) or surface (.stl .ply .vtp).")
-    ],
+def parse_law(
     preset: Annotated[str | None, _what(help="A published shape; see `curvafit presets`.")] = None,
     coefficients: Annotated[str | None, _what(help="a20,a11,a02,a10,a01,a00 in working units; needs a mass.")] = None,
     prior: Annotated[str | None, _what(help="fit.json of `curvafit infer`, or a preset's name.")] = None,
@@ -53,10 +38,14 @@ def generate(
     volume_fraction: Annotated[float | None, _what(help="Share of the volume inside, instead of a mass.")] = None,
     orientation: Annotated[str | None, _what(help="θz,θy,θx,μ: tubes and layers lie along θ if μ is large.")] = None,
     maps: Annotated[Path | None, _what(help="Volumes a20 … a00, mass, epsilon that vary: an .npz or a folder.")] = None,
-    shape: Annotated[str | None, _what(help=f"Voxels: N or Z,Y,X; {EDGE} or the maps' by default.")] = None,
-    boundary: Annotated[str, _what(help="periodic, or replicate (walls, met at right angles).")] = "periodic",
     epsilon: Annotated[float | None, _what(help="Interface width in working units; by default 0.02.")] = None,
-    seed: Annotated[int, _what(help="Seed of the noise that the shape grows from.")] = 0,
+) -> dict[str, Any]:
+    """Return what says which shape is grown."""
+    given = {"preset": preset, "coefficients": coefficients, "prior": prior, "mass": mass, "epsilon": epsilon}
+    return given | {"volume_fraction": volume_fraction, "orientation": orientation, "maps": maps}
+
+
+def parse_run(
     schedule: Annotated[
         str | None,
         _how(help="fast (1500 steps), deep (1500, longer; a fit's default), paper (8000) or cosine (1000)."),
@@ -65,9 +54,45 @@ def generate(
     device: Annotated[str, _how(help="cpu, cuda, cuda:1 …")] = "cpu",
     checkpoint: Annotated[Path | None, _how(help="File to save the run in, and to resume it from.")] = None,
     checkpoint_every: Annotated[float | None, _how(help="Seconds between two checkpoints; 60 by default.")] = None,
+) -> dict[str, Any]:
+    """Return how a shape is grown; raise ValueError where options do not go together."""
+    if checkpoint is None and checkpoint_every is not None:
+        raise ValueError(f"--checkpoint-every {checkpoint_every:g} needs --checkpoint")
+    every = {} if checkpoint_every is None else {"checkpoint_every": checkpoint_every}
+    return {"schedule": schedule, "steps": steps, "device": device, "checkpoint": checkpoint, **every}
+
+
+def parse_output(
     spacing: Annotated[str | None, _out(help="Edge of a voxel, in --unit; by default 1, or the prior's.")] = None,
     unit: Annotated[str | None, _out(help="nm, um, mm or m; needs --spacing.")] = None,
     tile: Annotated[str | None, _out(help="Repeat a periodic box N or Z,Y,X times.")] = None,
+) -> dict[str, Any]:
+    """Return the size of what is written; raise ValueError where options do not go together."""
+    if unit is not None and spacing is None:
+        raise ValueError("--unit needs --spacing")
+    edge = None if spacing is None else parse_numbers(spacing, "--spacing", 1)[0]
+    return {"edge": edge, "unit": unit, "repeats": (1, 1, 1) if tile is None else parse_whole_triple(tile, "--tile")}
+
+
+@command(
+    "curvafit generate --preset tubes -o tubes.nii.gz",
+    "curvafit generate --preset tubes --spacing 0.0195 --unit mm -o tubes.stl",
+    "curvafit generate --preset sponge --volume-fraction 0.3 --shape 64 -o sponge.zarr",
+    "curvafit generate --prior bone/fit.json --shape 128 --seed 3 -o more_bone.tif",
+    "curvafit generate --preset tubes --shape 300 --checkpoint run.pt -o large.nii.gz",
+    "torchrun --nproc-per-node 2 -m curvafit generate --preset tubes -o large.zarr",
+)
+def generate(
+    out: Annotated[
+        Path, _out("-o", "--output", help="Volume (.nii.gz .nii .tif .npy .mrc .zarr) or surface (.stl .ply .vtp).")
+    ],
+    wanted: Annotated[dict[str, Any], Group(parse_law)],
+    shape: Annotated[str | None, _what(help=f"Voxels: N or Z,Y,X; {EDGE} or the maps' by default.")] = None,
+    boundary: Annotated[str, _what(help="periodic, or replicate (walls, met at right angles).")] = "periodic",
+    seed: Annotated[int, _what(help="Seed of the noise that the shape grows from.")] = 0,
+    *,
+    running: Annotated[dict[str, Any], Group(parse_run)],
+    writing: Annotated[dict[str, Any], Group(parse_output)],
     picture: Annotated[bool, _out("--picture/--no-picture", help="Draw a picture (.png), or do not.")] = True,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -77,37 +102,33 @@ def generate(
     if count_processes()[0]:
         serve()
         return
-    from curvafit.drawing.shapes import check_target, shape_record
+    from curvafit.drawing.shapes import Output, check_target, shape_record
     from curvafit.generation.flow import Execution
     from curvafit.generation.schedule import choose_schedule
     from curvafit.generation.schedule import schedule as named
-    from curvafit.priors.energies import orientation as orient
     from curvafit.priors.grid import Grid
     from curvafit.volumes.read import map_shape, read_maps
 
-    box = None if shape is None else parse_whole_triple(shape, "--shape")
+    box, maps = None if shape is None else parse_whole_triple(shape, "--shape"), wanted["maps"]
     volumes = {} if maps is None else read_maps(maps, box)
-    law = _read_law(preset, coefficients, prior, volumes)
-    options = _choose_parameters(law, volumes, mass, volume_fraction, epsilon)
+    law = _read_law(wanted["preset"], wanted["coefficients"], wanted["prior"], volumes)
+    options = _choose_parameters(law, volumes, wanted)
     options["grid"] = grid = Grid(box or map_shape(volumes) or EDGE, boundary=boundary)  # type: ignore[arg-type]
-    Q = None
-    if orientation is not None:
-        *direction, strength = parse_numbers(orientation, "--orientation", 4)
-        Q = options["orientation"] = orient(direction, strength)
-    options["schedule"] = named(choose_schedule([law], schedule), steps)
-    place = _place_checkpoint(checkpoint, checkpoint_every, out)
-    options |= {"seed": seed, "execution": Execution(device=device, keep_checkpoint=True, **place)}
-    output = _plan_output(law, grid, spacing, unit, tile)
-    law_file = None if not law.fitted else prior or preset
+    options["schedule"] = named(choose_schedule([law], running.pop("schedule")), running.pop("steps"))
+    running["checkpoint"] = place = _place_checkpoint(running["checkpoint"], out)
+    options |= {"seed": seed, "execution": Execution(keep_checkpoint=True, **running)}
+    edge, unit = writing["edge"] or law.working_voxel or 1.0, writing["unit"] or law.length_unit or "voxel"
+    output = Output(edge, unit, writing["repeats"])
+    output.shape(grid)
+    law_file = None if not law.fitted else wanted["prior"] or wanted["preset"]
     inputs = [str(path) for path in (law_file, maps) if path is not None]
-    writing = {"picture": picture, "overwrite": overwrite}
-    check_target(out, output, inputs=inputs, **writing)
-    flow = _grow(options)
-    more = {"orientation": Q if Q is None else Q.tolist(), "maps": maps if maps is None else str(maps)}
-    more |= {"origin": law.origin, "wanted_volume_fraction": volume_fraction, "command": command_line()}
+    check_target(out, output, inputs=inputs, picture=picture, overwrite=overwrite)
+    flow, Q = _grow(options), options["orientation"]
+    more = {"orientation": None if Q is None else Q.tolist(), "maps": None if maps is None else str(maps)}
+    more |= {"origin": law.origin, "wanted_volume_fraction": wanted["volume_fraction"], "command": command_line()}
     record = shape_record(flow, mass=options["mass"], output=output, **more)
-    _write(flow, out, record, output=output, **writing)
-    _remove(place["checkpoint"])
+    _write(flow, out, record, output=output, picture=picture, overwrite=overwrite)
+    _remove(place)
 
 
 @command()
@@ -136,51 +157,39 @@ def _read_law(preset: str | None, six: str | None, prior: str | None, maps: Maps
     return Law.of(laws[0] if six is None else Coefficients(*parse_numbers(six, "--coefficients", 6)))
 
 
-def _choose_parameters(
-    law: Law, maps: Maps3D, mass: float | None, share: float | None, epsilon: float | None
-) -> dict[str, Any]:
-    """Return the law, the mass or the share, and ε as `generate` takes them, with maps in place of numbers."""
+def _choose_parameters(law: Law, maps: Maps3D, wanted: dict[str, Any]) -> dict[str, Any]:
+    """Return the law, the mass or the share, ε and Q as `generate` takes them, with maps in place of numbers."""
     from curvafit.priors.coefficients import NAMES
+    from curvafit.priors.energies import orientation
     from curvafit.priors.grid import WORKING_EPSILON
 
+    mass, share, epsilon = wanted["mass"], wanted["volume_fraction"], wanted["epsilon"]
     for name, value in (("mass", mass), ("epsilon", epsilon)):
         if value is not None and name in maps:
             raise ValueError(f"give either --{name} or a map of it, got both")
-    mean = maps.get("mass", mass)
+    mean, Q = maps.get("mass", mass), None
     if mean is not None and share is not None:
         raise ValueError("give either a mass or --volume-fraction, got both")
+    if wanted["orientation"] is not None:
+        *direction, strength = parse_numbers(wanted["orientation"], "--orientation", 4)
+        Q = orientation(direction, strength)
     coefficients = replace(law.coefficients, **{name: maps[name] for name in NAMES if name in maps})
     width = maps.get("epsilon", WORKING_EPSILON if epsilon is None else epsilon)
     mean = law.mass if mean is None and share is None else mean
-    return {"law": coefficients, "mass": mean, "volume_fraction": share, "epsilon": width}
+    return {"law": coefficients, "mass": mean, "volume_fraction": share, "epsilon": width, "orientation": Q}
 
 
-def _place_checkpoint(file: Path | None, every: float | None, out: Path) -> dict[str, Any]:
-    """Return the options of the checkpoint as `Execution` takes them; refuse the place of an output."""
+def _place_checkpoint(file: Path | None, out: Path) -> Path | None:
+    """Return the place of the checkpoint, if there is one; refuse that of an output."""
     from curvafit.core.records import sibling
     from curvafit.generation.loop import resolve_place
 
     if file is None:
-        if every is not None:
-            raise ValueError(f"--checkpoint-every {every:g} needs --checkpoint")
-        return {"checkpoint": None}
+        return None
     place = resolve_place(file)
     if place in [path.resolve() for path in (out, sibling(out, ".json"), sibling(out, ".png"))]:
         raise ValueError(f"the checkpoint {place} would be written over by an output: choose another name")
-    return {"checkpoint": place} | ({} if every is None else {"checkpoint_every": every})
-
-
-def _plan_output(law: Law, grid: Grid, spacing: str | None, unit: str | None, tile: str | None) -> Output:
-    """Return how to write the shape: voxels as large as the options say, else as the fit's."""
-    from curvafit.drawing.shapes import Output
-
-    if unit is not None and spacing is None:
-        raise ValueError("--unit needs --spacing")
-    edge = law.working_voxel or 1.0 if spacing is None else parse_numbers(spacing, "--spacing", 1)[0]
-    repeats = (1, 1, 1) if tile is None else parse_whole_triple(tile, "--tile")
-    output = Output(edge, unit or law.length_unit or "voxel", repeats)
-    output.shape(grid)
-    return output
+    return place
 
 
 def _grow(options: dict[str, Any]) -> Flow:

@@ -3,35 +3,41 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from curvafit.cli.console import command_line, print_table, say, say_notes, show_stages
-from curvafit.cli.options import FILES, OverwriteOption, Reading, Structure, command
+from curvafit.cli.options import FILES, Group, OverwriteOption, Reading, Structure, command
 
 if TYPE_CHECKING:
     from curvafit.inference.inference import Inference
+
+
+def parse_inference(
+    atlas: Annotated[Path | None, typer.Option(help="Atlas (.npz) instead of the packaged one.")] = None,
+    posterior: Annotated[Path | None, typer.Option(help="Posterior (.npz) instead of the packaged one.")] = None,
+    method: Annotated[str, typer.Option(help="posterior, or match: the nearest shape, refined.")] = "posterior",
+    fast: Annotated[bool, typer.Option("--fast", help="Seconds, not minutes: nothing is grown or checked.")] = False,
+    test: Annotated[bool, typer.Option(help="Grow shapes to test whether the law can have made the scan.")] = True,
+) -> dict[str, Any]:
+    """Return by what a law is read of a scan, and which shapes are grown for it."""
+    return {"atlas": atlas, "posterior": posterior, "method": method, "fast": fast, "test": test}
 
 
 @command(
     "curvafit infer bone.tif --spacing 0.0195 --unit mm -o bone",
     "curvafit infer vessels.nii.gz --kind mask -o vessels",
     "curvafit infer cells.ome.zarr --channel 1 --crop 0:64,100:300,100:300 --dark --threshold 90 -o cells",
-    "curvafit infer vessels.nii.gz --method match -o vessels",
     "curvafit infer fibres.raw --raw-shape 128,128,128 --dtype u1 -o fibres",
     "curvafit infer mouse1.nii.gz mouse2.nii.gz mouse3.nii.gz --fast -o mice",
 )
 def infer(
     scans: Annotated[list[str], typer.Argument(help=FILES)],
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for the report; of several scans, for theirs.")],
-    atlas: Annotated[Path | None, typer.Option(help="Atlas (.npz) instead of the packaged one.")] = None,
-    posterior: Annotated[Path | None, typer.Option(help="Posterior (.npz) instead of the packaged one.")] = None,
-    method: Annotated[str, typer.Option(help="posterior, or match: the nearest shape, refined.")] = "posterior",
-    fast: Annotated[bool, typer.Option("--fast", help="Seconds, not minutes: nothing is grown or checked.")] = False,
-    test: Annotated[bool, typer.Option(help="Grow shapes to test whether the law can have made the scan.")] = True,
-    roi: Annotated[Path | None, typer.Option(help="Mask of the region to measure, placed by its affine.")] = None,
     *,
+    law: Annotated[dict[str, Any], Group(parse_inference)],
+    roi: Annotated[Path | None, typer.Option(help="Mask of the region to measure, placed by its affine.")] = None,
     structure: Structure,
     reading: Reading,
     seed: Annotated[int, typer.Option(help="Seed of the shapes that are generated for comparison.")] = 0,
@@ -39,21 +45,21 @@ def infer(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Infer the parameters of scanned volumes, and write a report of each; of several, a table and a page of all."""
-    files = {"roi": roi, "atlas": atlas, "posterior": posterior}
+    files = [path for path in (roi, law["atlas"], law["posterior"]) if path is not None]
     with show_stages() as progress:
         from curvafit.inference.inference import infer as infer_scan
         from curvafit.inference.simulate import Growth
         from curvafit.report.inference import check_report, infer_scans, with_command, write_inference
 
-        growth = None if fast else Growth(test=test)
-        what = {**structure, **files, "method": method, "growth": growth, "seed": seed, **reading}
+        grown = Growth(test=law.pop("test"))
+        law["growth"] = None if law.pop("fast") else grown
+        what = {**structure, **law, "roi": roi, "seed": seed, **reading}
         if len(scans) > 1:
             how = {"workers": workers, "command": command_line(), "overwrite": overwrite, "progress": progress}
             page = infer_scans(scans, out, **how, **what)
             say(str(page))
             return
-        inputs = [*scans, *(file for file in files.values() if file is not None)]
-        check_report(out, inputs, overwrite, command_line())
+        check_report(out, [*scans, *files], overwrite, command_line())
         inference = infer_scan(scans[0], progress=progress, **what)
         progress("drawing the report", 1.0)
         say_notes(inference.scan.notes)

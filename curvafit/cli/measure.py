@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from inspect import signature
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,10 +15,12 @@ import typer
 from curvafit.cli.console import command_line, print_table, resumable, say, say_notes, show_stages
 from curvafit.cli.options import (
     FILES,
+    Group,
     OverwriteOption,
     Reading,
     Structure,
     command,
+    parse_reading,
     parse_structure,
     parse_whole_triple,
 )
@@ -26,16 +29,35 @@ if TYPE_CHECKING:
     from curvafit.scan.measures import Measures
 
 
+def parse_windows(
+    windows: Annotated[
+        str | None,
+        typer.Option(help="Map the numbers over windows of so many voxels, or Z,Y,X, into a folder: -o.", metavar="N"),
+    ] = None,
+    stride: Annotated[
+        str | None,
+        typer.Option(help="Voxels from window to window, by default half of one; divides --windows.", metavar="N"),
+    ] = None,
+    clusters: Annotated[int | None, typer.Option(help="Clusters of windows, by default 2.")] = None,
+) -> dict[str, Any] | None:
+    """Return the windows over which numbers are mapped, as `curvafit.windows` takes them; None for none."""
+    if windows is None:
+        if (stride, clusters) != (None, None):
+            raise ValueError("--stride and --clusters go with --windows")
+        return None
+    size = parse_whole_triple(windows, "--windows")
+    halves = tuple(n if n % 2 else n // 2 for n in size)
+    steps = halves if stride is None else parse_whole_triple(stride, "--stride")
+    return {"size": size, "stride": steps, "clusters": 2 if clusters is None else clusters}
+
+
 @command(
     "curvafit measure bone.tif --spacing 0.0195 --unit mm",
     "curvafit measure mouse1.nii.gz mouse2.nii.gz mouse3.nii.gz --subjects mice.csv -o measures.csv",
-    "curvafit measure mouse*.nii.gz --subjects mice.csv --workers 4 -o measured",
-    "curvafit measure femur.nii.gz --roi cortex_and_marrow.nii.gz -o compartments.csv",
+    "curvafit measure femur.nii.gz --roi compartments.nii.gz -o femur.csv",
     "curvafit measure mitochondria_labels.tif --labels --spacing 5 --unit nm -o mitochondria.csv",
-    "curvafit measure cells.ome.zarr --channel 1 --dark --threshold 90 -o measures.parquet",
     "curvafit measure lung_2048.ome.zarr --workers 2 -o lung.csv",
     "curvafit measure bone.tif --windows 64 --stride 32 -o maps",
-    "curvafit measure lung.ome.zarr --windows 16,64,64 --stride 8,32,32 --clusters 3 -o maps",
 )
 def measure(
     scans: Annotated[list[str], typer.Argument(help=FILES)],
@@ -50,15 +72,8 @@ def measure(
     subjects: Annotated[
         Path | None, typer.Option(help="CSV: scan, and columns for the table, such as subject, group, time.")
     ] = None,
-    windows: Annotated[
-        str | None,
-        typer.Option(help="Map the numbers over windows of so many voxels, or Z,Y,X, into a folder: -o.", metavar="N"),
-    ] = None,
-    stride: Annotated[
-        str | None,
-        typer.Option(help="Voxels from window to window, by default half of one; divides --windows.", metavar="N"),
-    ] = None,
-    clusters: Annotated[int | None, typer.Option(help="Clusters of windows, by default 2.")] = None,
+    *,
+    grid: Annotated[dict[str, Any] | None, Group(parse_windows)],
     tile: Annotated[
         int | None,
         typer.Option(help="Voxels a side of a tile; by default so many that a process takes a good GB.", min=32),
@@ -66,7 +81,6 @@ def measure(
     workers: Annotated[
         int, typer.Option(help="Processes that share scans, or one scan's tiles; 0 is this one.", min=0)
     ] = 0,
-    *,
     structure: Structure,
     reading: Reading,
     overwrite: OverwriteOption = False,
@@ -78,65 +92,85 @@ def measure(
             "--labels states the structure of instances, each in a box of its own: leave out --roi, --tile, --kind, "
             "--periodic, --threshold and --dark"
         )
-    if windows is None and (stride, clusters) != (None, None):
-        raise ValueError("--stride and --clusters go with --windows")
-    if windows is not None:
+    if grid is not None:
         if folder is None or len(scans) > 1 or labels or workers or roi or subjects or tile:
             raise ValueError(
                 "--windows maps one scan as a whole into a folder: give one scan, and a name without a suffix with -o; "
                 "leave out --labels, --roi, --subjects, --tile and --workers"
             )
-        how = {"clusters": 2 if clusters is None else clusters, **structure, **reading}
-        _map_windows(scans[0], folder, windows, stride, overwrite, how)
+        _map_windows(scans[0], folder, overwrite, {**grid, **structure, **reading})
         return
     store = None if out is None else out.with_name(f".{out.name}.curvafit-tiles")
+    options = {} if labels else {"roi": roi, "tile": tile, "store": store, **structure}
+    options |= {"labels": labels, "workers": workers, **reading}
     with _keep_tiles(store):
-        with show_stages() as progress:
-            from curvafit.core.runtime import sub_progress
-            from curvafit.scan.measures import COLUMNS
-            from curvafit.studies import scans as study
-
-            inputs = [*scans, *(each for each in (roi, subjects) if each is not None)]
-            if folder is not None:
-                from curvafit.report.measures import check_measures, write_measures
-
-                check_measures(folder, inputs, overwrite, command_line())
-                study.check_units(scans, sub_progress(progress, 0.0, 0.05), **reading)
-                progress = sub_progress(progress, 0.05, 1.0)
-            elif out is not None:
-                study.check_table(out, inputs, overwrite)
-            told = None if subjects is None else study.read_columns(subjects, scans, (*COLUMNS, *study.OF_PARTS))
-            how = {} if labels else {"roi": roi, "tile": tile, "store": store, **structure}
-            found = study.measure_each(scans, labels=labels, workers=workers, progress=progress, **how, **reading)
-            if folder is not None:
-                progress("drawing the page", 1.0)
-                what = {"columns": told, "options": {"roi": roi, "tile": tile} | structure | reading}
-                whole = [each for (each,) in found]
-                written = write_measures(whole, folder, command=command_line(), overwrite=overwrite, **what)
-        if folder is not None:
-            say_notes(tuple(study.count_notes(whole)))
-            say(str(written))
-            return
-        _print_found(found, labels)
-        if out is not None:
-            columns = None if told is None else [row for row, each in zip(told, found, strict=True) for _ in each]
-            table = [each for measures in found for each in measures]
-            say(str(study.write_table(table, out, columns=columns, overwrite=overwrite)))
+        if folder is None:
+            _write_table(scans, out, subjects, overwrite, options)
+        else:
+            shown = {"roi": roi, "tile": tile, **structure, **reading}
+            _write_page(scans, folder, subjects, overwrite, options, shown)
 
 
-def _map_windows(
-    scan: str, folder: Path, windows: str, stride: str | None, overwrite: bool, how: dict[str, Any]
+def _write_page(
+    scans: list[str], folder: Path, subjects: Path | None, overwrite: bool, options: dict[str, Any],
+    shown: dict[str, Any],
+) -> None:  # fmt: skip
+    """Measure scans, and write a page of them, which tells the options that are `shown`."""
+    with show_stages() as progress:
+        from curvafit.core.runtime import sub_progress
+        from curvafit.report.measures import check_measures, write_measures
+        from curvafit.studies.scans import check_units, count_notes, measure_each
+
+        check_measures(folder, [*scans, *_files(options.get("roi"), subjects)], overwrite, command_line())
+        reading = {name: value for name, value in options.items() if name in signature(parse_reading).parameters}
+        check_units(scans, sub_progress(progress, 0.0, 0.05), **reading)
+        columns = _read_subjects(subjects, scans)
+        part = sub_progress(progress, 0.05, 1.0)
+        whole = [measures for (measures,) in measure_each(scans, progress=part, **options)]
+        progress("drawing the page", 1.0)
+        more = {"columns": columns, "options": shown, "command": command_line(), "overwrite": overwrite}
+        page = write_measures(whole, folder, **more)
+    say_notes(tuple(count_notes(whole)))
+    say(str(page))
+
+
+def _write_table(
+    scans: list[str], out: Path | None, subjects: Path | None, overwrite: bool, options: dict[str, Any]
 ) -> None:
+    """Measure scans, print the numbers, and write them into a table, if there is an output."""
+    with show_stages() as progress:
+        from curvafit.studies.scans import check_table, measure_each, write_table
+
+        if out is not None:
+            check_table(out, [*scans, *_files(options.get("roi"), subjects)], overwrite)
+        columns = _read_subjects(subjects, scans)
+        measured = measure_each(scans, progress=progress, **options)
+    _print_measured(measured, options["labels"])
+    if out is not None:
+        rows = None if columns is None else [row for row, parts in zip(columns, measured, strict=True) for _ in parts]
+        say(str(write_table([part for parts in measured for part in parts], out, columns=rows, overwrite=overwrite)))
+
+
+def _files(*paths: Path | None) -> list[Path]:
+    return [path for path in paths if path is not None]
+
+
+def _read_subjects(subjects: Path | None, scans: list[str]) -> Any:
+    """Return the columns that a table of subjects has for each scan, None without a table."""
+    from curvafit.scan.measures import COLUMNS
+    from curvafit.studies.scans import OF_PARTS, read_columns
+
+    return None if subjects is None else read_columns(subjects, scans, (*COLUMNS, *OF_PARTS))
+
+
+def _map_windows(scan: str, folder: Path, overwrite: bool, options: dict[str, Any]) -> None:
     """Measure a scan in windows, and write its maps."""
-    size = parse_whole_triple(windows, "--windows")
-    halves = tuple(n if n % 2 else n // 2 for n in size)
-    steps = halves if stride is None else parse_whole_triple(stride, "--stride")
     with show_stages() as progress:
         from curvafit.report.measures import check_windows, write_windows
         from curvafit.studies.windowed import windows as measure_windows
 
         check_windows(folder, scan, overwrite, command_line())
-        found = measure_windows(scan, size, steps, progress=progress, **how)
+        found = measure_windows(scan, progress=progress, **options)
         progress("drawing the page", 1.0)
         page = write_windows(found, folder, command=command_line(), overwrite=overwrite)
     say_notes(found.notes)
@@ -174,7 +208,7 @@ def _keep_tiles(store: Path | None) -> Iterator[None]:
         remove(store)
 
 
-def _print_found(found: Sequence[tuple[Measures, ...]], labels: bool) -> None:
+def _print_measured(found: Sequence[tuple[Measures, ...]], labels: bool) -> None:
     """Print the notes and the numbers of scans and compartments, or of the bodies of label images."""
     for measures in found:
         if len(found) > 1:

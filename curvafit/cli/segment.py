@@ -103,7 +103,6 @@ def parse_learning(
     "curvafit segment bone.nii.gz --prior bone/fit.json -o mask.nii.gz",
     "curvafit segment cells.h5 --key raw --dark --prior sponge --spacing 0.2 --unit um -o mask.tif",
     "curvafit segment p.nii.gz --probabilities --example mask2.nii.gz --example-probabilities p2.nii.gz -o mask.nii.gz",
-    "curvafit segment predicted --probabilities --channel 1 --prior vessels/fit.json --weight 10 -o masks",
 )
 def segment(
     scan: Input,
@@ -120,9 +119,8 @@ def segment(
 ) -> None:
     """Find the structure of a noisy scan under a curvature prior; write its mask, a picture and a record.
 
-    With --probabilities a better mask is made of a network's output. Law and weight are those that do best on an
-    example; where p > 1/2 does best there, that is the mask. Of nnU-Net's NPZ files --channel takes the class; a folder
-    of them becomes a folder of masks. --label is the example's.
+    With --probabilities a network's output is improved: law and weight are those that do best on an example, or p > 1/2
+    is. Of nnU-Net's NPZ files --channel takes the class; a folder of them becomes a folder of masks.
     """
     from curvafit.segmentation.flow import Working as Settings
     from curvafit.segmentation.segmentation import calibrate, check_given
@@ -198,9 +196,7 @@ def _list_maps(job: _Job, given: dict[str, str | None]) -> tuple[list[_Job], Cal
     "curvafit reconstruct labels.nii.gz --every 8 --image scan.nii.gz -o volume.nii.gz",
     "curvafit reconstruct labels.nii.gz --every 8 --example whole.nii.gz -o volume.nii.gz",
     "curvafit reconstruct labels.tif --known 0,7,15 --axis x --suggest 3 -o volume.tif",
-    "curvafit reconstruct labels.nii.gz --ignore 255 -o volume.nii.gz",
     "curvafit reconstruct organelles.nii.gz --every 8 --labels all -o volume.nii.gz",
-    "curvafit reconstruct labels.nii.gz --every 8 --prior bone/fit.json -o volume.nii.gz",
 )
 def reconstruct(
     slices: Input,

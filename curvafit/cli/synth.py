@@ -34,10 +34,40 @@ Parts = Annotated[
 ]
 
 
+def parse_shapes(
+    laws: Laws = None,
+    atlas: Annotated[Path | None, _what(help="Store of shapes to crop, or atlas (.npz) of laws to grow.")] = None,
+    volume_fraction: Annotated[float | None, _what(help="Share of the volume inside; by default the fit's.")] = None,
+    draws: Annotated[int | None, _what(help="Laws drawn from each fit's posterior, in place of its best.")] = None,
+) -> dict[str, Any]:
+    """Return which shapes are shown."""
+    names = [] if laws is None else laws.split(",")
+    return {"laws": names, "atlas": atlas, "filled": volume_fraction, "draws": draws}
+
+
+def parse_composition(
+    classes: Annotated[bool, _show("--classes", help="A shape of each law in every image, one class each.")] = False,
+    wall: Annotated[float | None, _show(help="Shells: thickness of a wall around a lumen, in --unit.")] = None,
+    levels: Annotated[str | None, _show(help="Light of each class: 0 as background, 1 as structure.")] = None,
+) -> dict[str, Any]:
+    """Return what an image shows of its shapes."""
+    lights = None if levels is None else tuple(parse_numbers(levels, "--levels", levels.count(",") + 1))
+    return {"classes": classes, "wall": wall, "levels": lights}
+
+
+def parse_imaging(
+    modality: Kind = None,
+    like: Annotated[str | None, _image(help="Scan to take noise, blur and contrast from.")] = None,
+    like_mask: Annotated[str | None, _image(help="Mask of the structure in --like, for better estimates.")] = None,
+    visible: Annotated[str | None, _image(help="Masks as seen: where this share of light arrives, or auto.")] = None,
+) -> dict[str, Any]:
+    """Return how shapes are imaged."""
+    return {"name": modality, "like": like, "mask": like_mask, "visible": visible}
+
+
 @command(
     "curvafit synth -o Dataset101_Tubes --preset tubes,sponge --modality confocal --count 200 --shape 96",
     "curvafit synth -o Dataset102_Bone --prior bone/fit.json --like bone.nii.gz --count 200 --shape 64",
-    "curvafit synth -o Dataset103_Ducts --preset tubes --wall 2 --modality two-photon --count 200 --shape 48",
     "curvafit synth -o Dataset104_Cell --presets sponge,tubes --classes --levels 1,0.6 --modality confocal --shape 64",
     "curvafit synth -o set --atlas store.zarr --modality micro-ct --layout monai --labels distance --shape 48",
 )
@@ -45,20 +75,12 @@ def synth(
     out: Annotated[Path, _out("-o", "--output", help="Folder of the set; a set that exists is resumed.")],
     count: Annotated[int, _out(help="Number of cases in the set at the end.")] = 200,
     shape: Annotated[str, _out(help="Voxels of an image: N or Z,Y,X.")] = "96",
-    laws: Laws = None,
-    atlas: Annotated[Path | None, _what(help="Store of shapes to crop, or atlas (.npz) of laws to grow.")] = None,
-    volume_fraction: Annotated[float | None, _what(help="Share of the volume inside; by default the fit's.")] = None,
-    modality: Kind = None,
-    like: Annotated[str | None, _image(help="Scan to take noise, blur and contrast from.")] = None,
-    like_mask: Annotated[str | None, _image(help="Mask of the structure in --like, for better estimates.")] = None,
-    visible: Annotated[str | None, _image(help="Masks as seen: where this share of light arrives, or auto.")] = None,
+    *,
+    shapes: Annotated[dict[str, Any], Group(parse_shapes)],
+    composition: Annotated[dict[str, Any], Group(parse_composition)],
+    imaging: Annotated[dict[str, Any], Group(parse_imaging)],
     voxel: Annotated[float | None, _image(help="Edge of a shape's voxel, in --unit; by default the law's.")] = None,
     calibres: Annotated[str, _image(help="LOW,HIGH: a case is thicker by a factor in between.")] = "1,1",
-    draws: Annotated[int | None, _what(help="Laws drawn from each fit's posterior, in place of its best.")] = None,
-    classes: Annotated[bool, _show("--classes", help="A shape of each law in every image, one class each.")] = False,
-    wall: Annotated[float | None, _show(help="Shells: thickness of a wall around a lumen, in --unit.")] = None,
-    levels: Annotated[str | None, _show(help="Light of each class: 0 as background, 1 as structure.")] = None,
-    *,
     reading: Reading,
     layout: Annotated[str, _out(help="nnunet (v2, raw), monai (decathlon's list) or zarr.")] = "nnunet",
     labels: Parts = None,
@@ -67,16 +89,15 @@ def synth(
 ) -> None:
     """Make a training set: images of generated shapes with exact labels."""
     box = parse_whole_triple(shape, "--shape")
-    unit = reading["unit"]
+    unit, wall = reading["unit"], composition["wall"]
     if unit is not None and reading["spacing"] is None:
         if voxel is None and wall is None:
             raise ValueError("--unit needs --spacing, --voxel or --wall")
         reading["unit"] = None  # it is that of --voxel and --wall, not of --like
-    names = [] if laws is None else laws.split(",")
-    source, sized = _choose_source(names, atlas, volume_fraction, draws)
-    if classes and draws is not None:
+    source, sized = _choose_source(**shapes)
+    if composition["classes"] and shapes["draws"] is not None:
         raise ValueError("--classes takes one law for each class: leave out --draws")
-    kind = _choose_modality(modality, like, like_mask, visible, reading)
+    kind = _choose_modality(**imaging, reading=reading)
     from curvafit.core.files import check_folder
     from curvafit.core.units import convert_length
     from curvafit.data_synth import sets
@@ -86,8 +107,7 @@ def synth(
     edge = choose_voxel(sized, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
     low, high = parse_numbers(calibres, "--calibres", 2)
     thickness = None if wall is None else convert_length(wall, unit, kind.base.unit)
-    lights = None if levels is None else tuple(parse_numbers(levels, "--levels", levels.count(",") + 1))
-    shown = Composition(classes, thickness, lights)
+    shown = Composition(composition["classes"], thickness, composition["levels"])
     recipe = Recipe(source, kind, box, edge, seed, (low, high), shown)
     spec = sets.SetSpec(recipe, layout, tuple(labels.split(",")) if labels else ())
     check_folder(out)
