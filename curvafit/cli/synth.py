@@ -65,6 +65,16 @@ def parse_imaging(
     return {"name": modality, "like": like, "mask": like_mask, "visible": visible}
 
 
+def parse_sampling(
+    shape: Annotated[str, _out(help="Voxels of an image: N or Z,Y,X.")] = "96",
+    voxel: Annotated[float | None, _image(help="Edge of a shape's voxel, in --unit; by default the law's.")] = None,
+    calibres: Annotated[str, _image(help="LOW,HIGH: a case is thicker by a factor in between.")] = "1,1",
+) -> dict[str, Any]:
+    """Return the size of images and of the shapes in them."""
+    low, high = parse_numbers(calibres, "--calibres", 2)
+    return {"shape": parse_whole_triple(shape, "--shape"), "voxel": voxel, "calibres": (low, high)}
+
+
 @command(
     "curvafit synth -o Dataset101_Tubes --preset tubes,sponge --modality confocal --count 200 --shape 96",
     "curvafit synth -o Dataset102_Bone --prior bone/fit.json --like bone.nii.gz --count 200 --shape 64",
@@ -74,13 +84,11 @@ def parse_imaging(
 def synth(
     out: Annotated[Path, _out("-o", "--output", help="Folder of the set; a set that exists is resumed.")],
     count: Annotated[int, _out(help="Number of cases in the set at the end.")] = 200,
-    shape: Annotated[str, _out(help="Voxels of an image: N or Z,Y,X.")] = "96",
     *,
     shapes: Annotated[dict[str, Any], Group(parse_shapes)],
     composition: Annotated[dict[str, Any], Group(parse_composition)],
     imaging: Annotated[dict[str, Any], Group(parse_imaging)],
-    voxel: Annotated[float | None, _image(help="Edge of a shape's voxel, in --unit; by default the law's.")] = None,
-    calibres: Annotated[str, _image(help="LOW,HIGH: a case is thicker by a factor in between.")] = "1,1",
+    sampling: Annotated[dict[str, Any], Group(parse_sampling)],
     reading: Reading,
     layout: Annotated[str, _out(help="nnunet (v2, raw), monai (decathlon's list) or zarr.")] = "nnunet",
     labels: Parts = None,
@@ -88,8 +96,7 @@ def synth(
     crew: Annotated[Crew, Group(Crew)],
 ) -> None:
     """Make a training set: images of generated shapes with exact labels."""
-    box = parse_whole_triple(shape, "--shape")
-    unit, wall = reading["unit"], composition["wall"]
+    unit, wall, voxel = reading["unit"], composition["wall"], sampling["voxel"]
     if unit is not None and reading["spacing"] is None:
         if voxel is None and wall is None:
             raise ValueError("--unit needs --spacing, --voxel or --wall")
@@ -105,10 +112,9 @@ def synth(
     from curvafit.data_synth.sources import choose_voxel
 
     edge = choose_voxel(sized, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
-    low, high = parse_numbers(calibres, "--calibres", 2)
     thickness = None if wall is None else convert_length(wall, unit, kind.base.unit)
     shown = Composition(composition["classes"], thickness, composition["levels"])
-    recipe = Recipe(source, kind, box, edge, seed, (low, high), shown)
+    recipe = Recipe(source, kind, sampling["shape"], edge, seed, sampling["calibres"], shown)
     spec = sets.SetSpec(recipe, layout, tuple(labels.split(",")) if labels else ())
     check_folder(out)
     sets.check_set(out, spec)

@@ -124,10 +124,7 @@ def write_map(
         raise ValueError(f"the name of a map must end in .html, got {target.name!r}")
     inputs = [*(store.path for store in sources), *map(Path, read)]
     can_write(target, lambda there: has_mark(there, page.MARK), inputs=inputs, overwrite=overwrite)
-    scans = [each if isinstance(each, Fit) else Fit.load(each) for each in fits]
-    names = [name_source(fit.provenance.get("scan")) or f"scan {k}" for k, fit in enumerate(scans, 1)]
-    if bare := [name for name, fit in zip(names, scans, strict=True) if fit.diagram is None]:
-        raise ValueError(f"the fit of {bare[0]} has no curvature diagram: {scans[names.index(bare[0])].status}")
+    names, scans = _read_fits(fits)
     atlas = extract(sources, progress=sub_progress(progress, 0.0, 0.6))
     if (n := len(atlas)) < LEAST_SHAPES:
         raise ValueError(f"a map needs at least {LEAST_SHAPES} shapes, got {n}")
@@ -143,19 +140,8 @@ def write_map(
     ends = np.array([shared_limits([each]) for each in diagrams])
     limits = float(np.quantile(ends[:, 0], 0.05)), float(np.quantile(ends[:, 1], 0.95))
     kinds, columns = families_of(atlas), _columns(atlas)
-    fields = {shape_id(store, index): (store, index) for store in sources for index in store.indices()}
     turned = set(farthest_points(places[:n], SOLIDS).tolist())
-    shapes = []
-    for k, name in enumerate(atlas.ids):
-        progress(f"drawing {n} shapes", 0.6 + 0.4 * k / n)
-        store, index = fields[name]
-        u, numbers = store.field(index), {words: format_number(float(x[k]), 4) for words, x in columns.items()}
-        origin = {"seed": str(atlas.seeds[k]), "field": f"draw {index} of {store.name}"}
-        shapes.append({
-            "rows": list(({"family": kinds[k]} | numbers | origin).items()),
-            "picture": _draw_small(u),
-            "solid": make_solid(u) if k in turned else None,
-        })  # fmt: skip
+    shapes = _draw_shapes(sources, atlas, kinds, columns, turned, sub_progress(progress, 0.6, 1.0))
     shapes += [{"rows": _describe_fit(fit, distances[n + k, 0] > usual)} for k, fit in enumerate(scans)]
     for k, shape in enumerate(shapes):
         shape |= {"name": [*atlas.ids, *names][k], "place": places[k].round(4).tolist(), "near": near[k].tolist()}
@@ -178,6 +164,36 @@ def write_map(
         missing=n - len(turned),
     )  # fmt: skip
     return write_content(target, text)
+
+
+def _read_fits(fits: Sequence[str | PathLike[str] | Fit]) -> tuple[list[str], list[Fit]]:
+    """Return the names of scans and their fits; raise ValueError where a fit has no diagram."""
+    scans = [fit if isinstance(fit, Fit) else Fit.load(fit) for fit in fits]
+    names = [name_source(fit.provenance.get("scan")) or f"scan {k}" for k, fit in enumerate(scans, 1)]
+    for name, fit in zip(names, scans, strict=True):
+        if fit.diagram is None:
+            raise ValueError(f"the fit of {name} has no curvature diagram: {fit.status}")
+    return names, scans
+
+
+def _draw_shapes(
+    sources: Sequence[Store], atlas: Atlas, kinds: Sequence[str], columns: dict[str, np.ndarray], turned: set[int],
+    progress: Progress,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Return what the page shows of each shape: its numbers, a picture, and of those to be turned a solid."""
+    fields = {shape_id(store, index): (store, index) for store in sources for index in store.indices()}
+    shapes = []
+    for k, name in enumerate(atlas.ids):
+        progress(f"drawing {len(atlas)} shapes", k / len(atlas))
+        store, index = fields[name]
+        u, numbers = store.field(index), {words: format_number(float(x[k]), 4) for words, x in columns.items()}
+        origin = {"seed": str(atlas.seeds[k]), "field": f"draw {index} of {store.name}"}
+        shapes.append({
+            "rows": list(({"family": kinds[k]} | numbers | origin).items()),
+            "picture": _draw_small(u),
+            "solid": make_solid(u) if k in turned else None,
+        })  # fmt: skip
+    return shapes
 
 
 def scale_fit(fit: Fit) -> Diagram:

@@ -84,18 +84,15 @@ def segment(
     threshold, dark
         The grey level between the phases, or `"otsu"`; whether the structure is the dark one.
     working, progress
-        The width of the surface, the steps of the flow, and how a large scan is worked on. `progress` is called with a
-        sentence and the share done.
+        How the scan is worked on; what is called with a sentence and the share done.
     reading
         Options of reading a file, or the place of an array: spacing, unit, crop and the others of `curvafit.load`; and
         of probabilities `like`, the path of an image of the same voxels that says where they are (by default one that
         lies beside an NPZ file and has its name, as nnU-Net's segmentations do).
 
-    Raises
-    ------
-    ValueError, FileNotFoundError
-        If an argument is out of range or does not fit the scan, or the prior's unit cannot be converted; if there is no
-        such `fit.json`; if probabilities are not in [0, 1], or have neither a weight nor an example, or both.
+    Raises ValueError or FileNotFoundError if an argument is out of range or does not fit the scan, or the prior's unit
+    cannot be converted; if there is no such `fit.json`; if probabilities are not in [0, 1], or have neither a weight
+    nor an example, or both.
     """
     check_given(probabilities, weight, example, threshold, dark, reading.get("label"))
     if probabilities:
