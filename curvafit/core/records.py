@@ -33,7 +33,8 @@ MARK = "curvafit"
 _HEAD = 4096
 #: Suffixes of two parts; any other suffix is what follows the last dot.
 _DOUBLE = (".nii.gz", ".ome.tif", ".ome.tiff", ".ome.zarr")
-#: Seconds after its record within which a file is the one that was written with it.
+#: Seconds after its record within which a file is the one that was written with it. All are moved into place one after
+#: the other, which takes far less; a file that is newer was changed by somebody, and is not ours to replace.
 LATER = 10.0
 #: Files of a Zarr group of images that `curvafit.volumes` wrote.
 _WRITTEN = re.compile(r"(\d+/)?(zarr\.json|\.zgroup|\.zattrs|\.zarray)|\d+/(c/)?(\d+/)*\d+|\d+/c")

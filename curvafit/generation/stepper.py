@@ -252,6 +252,8 @@ class LbfgsStepper(TorchStepper):
 
     def _first_rate(self) -> float:
         """Return the rate that moves no parameter beyond `FIRST_MOVE`; torch scales it by min(1, 1 / Σ|slope|)."""
+        # L-BFGS knows no curvature before its first step, which torch makes along the slope itself: where the energy is
+        # steep that would be across all of the interface, from where the line search finds another minimum.
         size = self._slope.abs()
         return FIRST_MOVE / max(float(size.max()), 1e-30) * max(1.0, float(size.sum(dtype=torch.float64)))
 

@@ -21,6 +21,12 @@ NEAR = 8
 
 
 # ---- distances -------------------------------------------------------------------------------------------------------
+#
+# The least of hz²(z - z')² + hy²(y - y')² + hx²(x - x')² over the voxels of the other side is a minimum over x' within
+# each row, then over y' of what the rows have, then over z': three passes along one axis each. A pass searches outwards
+# from each voxel, and ends where the way alone, (k h)², costs more than the best so far. That is after as many voxels
+# as the distance itself is long: few in structures, where the lower envelope of parabolas, whose cost does not depend
+# on the distance, would be slower. Signs of the squares hold both sides in one array.
 
 
 def square_distances(

@@ -111,6 +111,8 @@ def best_candidate(candidates: Sequence[Candidate]) -> Candidate | None:
     grown = [(each.distance, each) for each in candidates if each.distance is not None]
     if not grown:
         return None
+    # Twins of one law differ by the noise of their starts, so that a smaller distance within that noise says nothing;
+    # then the law that follows from the field's own equation is the one to believe.
     least, nearest = min(grown, key=itemgetter(0))
     reach = least + (nearest.seed_noise or 0.0)
     return next((each for away, each in grown if each.name == "stationarity" and away <= reach), nearest)

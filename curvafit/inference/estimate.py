@@ -133,6 +133,8 @@ def refine_matches(described: Described, posterior: Posterior, matches: Sequence
 
 def middle_of(parameters: np.ndarray) -> np.ndarray:
     """Return the row of parameters `(n, 6)` nearest to the medians, in units of each column's range."""
+    # Medians taken one by one need not be a law that the posterior holds likely: its parameters are correlated. A draw
+    # is one.
     away = (parameters - np.median(parameters, 0)) / np.ptp(parameters, axis=0)
     return parameters[np.square(away).sum(1).argmin()]
 

@@ -179,7 +179,7 @@ def _infer_prepared(
             misfit = _test_law(estimate, prepared, described, known, growth, seed, progress)
             estimate = estimate if misfit is None else replace(estimate, misfit=misfit)
         judgement = _judge(estimate, prepared, numbers, checked=growth is not None)
-    progress("done", 1.0)
+        progress("done", 1.0)
     provenance = _describe_provenance(volume, shape, known, seed)
     fit = _build_fit(prepared, diagram, numbers, estimate, judgement, provenance)
     return Inference(volume, prepared, diagram, twins, fit, estimate.simulated)

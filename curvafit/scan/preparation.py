@@ -39,7 +39,8 @@ HALF = 0.5
 MOSTLY = "The structure fills {:.0%} of the volume: if the other phase was meant, turn the two round (--dark)."
 #: The note on specks and pinholes.
 DROPPED = "Dropped what is smaller than a ball of half the median thickness (specks: {}, pinholes: {})."
-#: Coarsening stops where a side would have fewer working voxels than this.
+#: Coarsening stops where a side would have fewer working voxels than this: three thicknesses, as curvature needs some
+#: surface that the faces do not cut.
 FEWEST = 24
 #: Least mean of √(κ1² + κ2²) times the window's edge at which a surface is not flat; a ball that fits has 2.8.
 FLATTEST = 2.0

@@ -75,6 +75,7 @@ class Block(nn.Module):
 
 def _normalise(x: Tensor) -> Tensor:
     """Divide features by their root mean square over channels."""
+    # Over channels of one pixel alone: means over a slice would depend on how much background there is around.
     return x * torch.rsqrt(x.square().mean(1, keepdim=True) + 1e-3)
 
 
@@ -100,6 +101,8 @@ class Gaps:
         """What tells a height, (B * n, CONDITIONS)."""
         t, (count, n) = self.heights, self.marks.shape[:2]
         gap = self.step * (n + 1) / _GAP
+        # A gap is the same read from either end, but for the order of its slices: the distance to the nearer end lets
+        # the network learn so, and the place which end is which. A step of known length tells thin from thick gaps.
         place = torch.stack([t, torch.minimum(t, 1 - t)], dim=1).repeat(count, 1)
         size = torch.stack([gap, self.step / 4], dim=1).repeat_interleave(n, 0)
         return torch.cat([place, size], dim=1)

@@ -83,6 +83,8 @@ class Trial:
 def search(trials: Sequence[Trial], strengths: Sequence[float], worth: Callable[[Trial], float]) -> Trial:
     """Return the best of some trials, then climb from it to stronger and weaker strengths as long as they are better.
     `strengths` ascend; a trial whose own strength is not among them stays as it is."""
+    # A trial takes minutes, and Dice over the strength has one hump: too weak changes nothing, too strong destroys. So a
+    # climb may stop at the first fall, and what lies beyond is not tried.
     first = max(trials, key=worth)
     best = first
     for step in (1, -1):
@@ -191,6 +193,8 @@ def choose_by_masks(
     def worth(trial: Trial) -> float:
         return float(dice_of(counts(trial).sum(0)))
 
+    # The best of several trials is better than it deserves, by about a standard error of the difference for a handful
+    # of trials that are alike; so a law must beat the start by more than that (`BEYOND`).
     start, best = Trial(), search(trials, strengths, worth)
     best = max((best, *(replace(trial, strength=best.strength) for trial in trials)), key=worth)
     gain, noise = gain_of(counts(best), counts(start))
@@ -221,6 +225,8 @@ def dice_of(counts: np.ndarray) -> np.ndarray:
 def gain_of(after: np.ndarray, before: np.ndarray) -> tuple[float, float]:
     """Return the difference of the Dice coefficients of two counts (T, 2), and its error by a jackknife over the cubes.
     The errors of neighbouring voxels are correlated, those of cubes hardly."""
+    # Dice is a ratio of sums, so its error follows from leaving out one cube at a time: (T - 1) / T times the sum of
+    # squares of what that changes, which is (T - 1) times their variance.
     whole = dice_of(after.sum(0)) - dice_of(before.sum(0))
     without = dice_of(after.sum(0) - after) - dice_of(before.sum(0) - before)
     return float(whole), float(np.sqrt((len(without) - 1) * without.var()))

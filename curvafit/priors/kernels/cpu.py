@@ -2,6 +2,12 @@
 
 A step is four passes, each parallel over z: blur of div A along z; energy and gradient; blur of that along z; along y
 and x, with -∇, Adam, and the next step's blur of div A along y and x.
+
+Why these four: a step moves bytes more than it computes. A and Adam's two moments are nine volumes, which are read and
+written once at least; each pass beyond that reads and writes another. A pass must end where the next needs planes that
+other threads have yet to write, which is so along z only: both blurs along z, and the stencils of the energy, which
+reach two planes. What stays within a plane, the blurs along y and x, the divergence's and Adam's work, is done while
+the plane is in the cache.
 """
 
 from __future__ import annotations
