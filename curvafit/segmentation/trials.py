@@ -83,7 +83,7 @@ class Trial:
 def search(trials: Sequence[Trial], strengths: Sequence[float], worth: Callable[[Trial], float]) -> Trial:
     """Return the best of some trials, then climb from it to stronger and weaker strengths as long as they are better.
     `strengths` ascend; a trial whose own strength is not among them stays as it is."""
-    # A trial takes minutes, and Dice over the strength has one hump: too weak changes nothing, too strong destroys. So a
+    # A trial takes long, and Dice over the strength has one hump: too weak changes nothing, too strong destroys. So a
     # climb may stop at the first fall, and what lies beyond is not tried.
     first = max(trials, key=worth)
     best = first
