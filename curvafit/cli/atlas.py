@@ -199,8 +199,8 @@ def teach_filler(
         if (count := sum(map(len, sources))) < FEW:
             say_notes([f"{count} shapes teach little: {FEW} or more are better"])
         card["command"] = command_line()
-        how = {"plain": plain, "volumes": images or VOLUMES, "steps": steps, "seed": seed}
-        taught = teach(sources, card, **how, checkpoint=checkpoint, progress=progress)
+        settings = {"plain": plain, "volumes": images or VOLUMES, "steps": steps, "seed": seed}
+        taught = teach(sources, card, **settings, checkpoint=checkpoint, progress=progress)
     taught.save(out)
     remove(checkpoint)
     learnt, cubic = (taught.card[f"held_out_{each}"] for each in ("loss", "cubic"))
@@ -222,8 +222,8 @@ def map_atlas(
     with show_stages() as progress:
         from curvafit.report.atlas import write_map
 
-        how = {"fits": fit or (), "command": command_line(), "overwrite": overwrite, "progress": progress}
-        page = write_map(stores, out, **how)
+        settings = {"fits": fit or (), "command": command_line(), "overwrite": overwrite, "progress": progress}
+        page = write_map(stores, out, **settings)
     say(str(page))
 
 

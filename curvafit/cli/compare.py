@@ -46,11 +46,11 @@ def compare(
         from curvafit.studies.comparison import compare as compare_scans
 
         check_comparison(out, [*scans, *([] if subjects is None else [subjects])], overwrite, command_line())
-        how = {"primary": primary, "permutations": permutations, "seed": seed, "subjects": subjects}
-        how |= {"workers": workers, "progress": progress, "paired": paired}
+        settings = {"primary": primary, "permutations": permutations, "seed": seed, "subjects": subjects}
+        settings |= {"workers": workers, "progress": progress, "paired": paired}
         labels = by.split(",") if by is not None and "," in by else by
         groups = scans if labels is by else [scans]
-        comparison = compare_scans(*groups, by=labels, **structure, **how, **reading)
+        comparison = compare_scans(*groups, by=labels, **structure, **settings, **reading)
         progress("drawing the page", 1.0)
         page = write_comparison(comparison, out, command=command_line(), overwrite=overwrite)
     say_notes(comparison.notes)

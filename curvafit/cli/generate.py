@@ -225,11 +225,11 @@ def _remove(checkpoint: Path | None) -> None:
         checkpoint.unlink(missing_ok=True)
 
 
-def _write(flow: Flow, out: Path, record: dict[str, Any], **how: Any) -> None:
+def _write(flow: Flow, out: Path, record: dict[str, Any], **settings: Any) -> None:
     """Write the files, and print the flow's status and the paths."""
     from curvafit.drawing.shapes import write_shape
 
-    files = write_shape(flow, out, record=record, **how)
+    files = write_shape(flow, out, record=record, **settings)
     say_notes([] if flow.viability.viable else [flow.status])
     say(f"{flow.status}; {100 * record['volume_fraction']:.2f} % of the volume")
     for path in files:

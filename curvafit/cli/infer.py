@@ -55,8 +55,8 @@ def infer(
         law["growth"] = None if law.pop("fast") else grown
         what = {**structure, **law, "roi": roi, "seed": seed, **reading}
         if len(scans) > 1:
-            how = {"workers": workers, "command": command_line(), "overwrite": overwrite, "progress": progress}
-            page = infer_scans(scans, out, **how, **what)
+            settings = {"workers": workers, "command": command_line(), "overwrite": overwrite, "progress": progress}
+            page = infer_scans(scans, out, **settings, **what)
             say(str(page))
             return
         check_report(out, [*scans, *files], overwrite, command_line())

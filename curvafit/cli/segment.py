@@ -180,8 +180,8 @@ def _list_maps(job: _Job, given: dict[str, str | None]) -> tuple[list[_Job], Cal
     ]
     for each in jobs:
         each.check()
-    how = {name: value for name, value in reading.items() if name != "label"}
-    read = partial(load_probabilities, **how, like=like, logits=kind == "logits")
+    place = {name: value for name, value in reading.items() if name != "label"}
+    read = partial(load_probabilities, **place, like=like, logits=kind == "logits")
     example = None if (path := given["example_probabilities"]) is None else read(path, like=None, crop=None)
     for each in jobs:
         field = read(each.source)
@@ -309,9 +309,9 @@ def _run(
             # The header is kept where it says where the voxels are; one of a file of channels is of all of them.
             stated = ("spacing", "crop") if job.image else ("spacing", "crop", "channel", "time")
             like = (job.image or job.source) if all(reading[name] is None for name in stated) else None
-            how = {"sure": labels, "like": like, "unit": reading["unit"], "overwrite": job.overwrite}
-            how["record"] = job.content | ({"not_held": lost} if lost else {})
-            paths = write_mask(result, volume, job.out, **how)
+            settings = {"sure": labels, "like": like, "unit": reading["unit"], "overwrite": job.overwrite}
+            settings["record"] = job.content | ({"not_held": lost} if lost else {})
+            paths = write_mask(result, volume, job.out, **settings)
         remove(store)
     for note in result.notes:
         say(note)

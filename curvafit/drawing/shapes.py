@@ -54,9 +54,9 @@ class Output:
         object.__setattr__(self, "unit", unit)
         edge = check_float(self.voxel, "a positive voxel edge", SHORTEST, LONGEST)
         object.__setattr__(self, "voxel", edge * factor)
-        said = "3 whole repeats of at least 1 (z, y, x)"
+        form = "3 whole repeats of at least 1 (z, y, x)"
         tile = as_tuple(self.tile, "3 whole repeats (z, y, x)")
-        tile = tuple(check_int(n, said, 1, MOST, of=tile) for n in (tile if len(tile) == 3 else (None,)))
+        tile = tuple(check_int(n, form, 1, MOST, of=tile) for n in (tile if len(tile) == 3 else (None,)))
         object.__setattr__(self, "tile", tile)
 
     def shape(self, grid: Grid) -> tuple[int, ...]:
@@ -137,11 +137,11 @@ def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | No
     Another file of that name is replaced, another folder is not. A VTP surface has its level set's principal curvatures
     `kappa1` and `kappa2` at the vertices, 0 on caps.
     """
-    target, how = Path(path), output or Output()
-    how.shape(grid)
-    values, edges = np.tile(field.numpy(), how.tile), (how.voxel, how.voxel, how.voxel)
+    target, layout = Path(path), output or Output()
+    layout.shape(grid)
+    values, edges = np.tile(field.numpy(), layout.tile), (layout.voxel, layout.voxel, layout.voxel)
     if not target.name.lower().endswith(SUFFIXES):
-        return save(Volume(values, edges, how.unit), target, kind=FORMAT.name)
+        return save(Volume(values, edges, layout.unit), target, kind=FORMAT.name)
     box = Grid(values.shape, edges, grid.boundary)
     mesh = solid_surface(values, box)
     data = None
@@ -151,7 +151,7 @@ def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | No
         reach = np.abs(mesh.vertices / np.array(box.spacing) - middle)
         capped = np.any(reach > middle + 0.5 - 1e-6, axis=1)  # faces are half a voxel beyond the outermost centres
         data = {name: np.where(capped, 0, κ) for name, κ in data.items()}
-    return write_surface(mesh, target, unit=how.unit, data=data)
+    return write_surface(mesh, target, unit=layout.unit, data=data)
 
 
 def shape_record(

@@ -168,9 +168,9 @@ def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simul
     return simulate
 
 
-def tail_probability(usual: np.ndarray, own: float) -> float:
-    """Return the probability that a number is as great as `own` where it, too, is one of such as `usual` `(n,)`."""
-    return float((1 + (usual >= own).sum()) / (1 + len(usual)))
+def tail_probability(values: np.ndarray, own: float) -> float:
+    """Return the probability that a number is as great as `own` where it, too, is one of such as `values` `(n,)`."""
+    return float((1 + (values >= own).sum()) / (1 + len(values)))
 
 
 def check_law(

@@ -172,8 +172,8 @@ def _infer_prepared(
     if diagram is not None and not reason:
         progress("measuring descriptors", 0.1)
         described = measure_descriptors(prepared)
-        how = {"refined": refined, "growth": growth, "seed": seed, "progress": progress}
-        estimate = _estimate(prepared, diagram, described, known, **how)
+        settings = {"refined": refined, "growth": growth, "seed": seed, "progress": progress}
+        estimate = _estimate(prepared, diagram, described, known, **settings)
         if growth is not None:
             estimate, twins = _grow(estimate, diagram, prepared, growth, seed, progress)
             misfit = _test_law(estimate, prepared, described, known, growth, seed, progress)

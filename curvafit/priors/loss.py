@@ -128,9 +128,9 @@ class CurvaturePrior(nn.Module):
 
     def extra_repr(self) -> str:
         """Return the settings that `repr` shows: the laws, what is not the default, spacing, ε, weights, border."""
-        usual = {"sigmoid": False, "softmax": False, "include_background": True, "to_onehot_y": False}
-        usual |= {"reduction": "mean", "ignore_index": None, "shape": None}
-        own = [f"{name}={getattr(self, name)!r}" for name, value in usual.items() if getattr(self, name) != value]
+        defaults = {"sigmoid": False, "softmax": False, "include_background": True, "to_onehot_y": False}
+        defaults |= {"reduction": "mean", "ignore_index": None, "shape": None}
+        own = [f"{name}={getattr(self, name)!r}" for name, value in defaults.items() if getattr(self, name) != value]
         numbers = (", ".join(f"{float(a):.6g}" for a in law) for law in self.coefficients)
         laws = [f"{origin} ({six})" for origin, six in zip(self._origins, numbers, strict=True)]
         scale = f"spacing={self.spacing}, epsilon={self.epsilon:g}, weight={self.weight}, border={self.border}"

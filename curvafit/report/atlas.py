@@ -136,13 +136,13 @@ def write_map(
     np.fill_diagonal(away, np.inf)
     near = np.argsort(away, axis=1, kind="stable")[:, :NEIGHBOURS]
     distances = np.take_along_axis(away, near, axis=1)
-    usual = float(np.quantile(distances[:n, 0], 0.95))
+    typical = float(np.quantile(distances[:n, 0], 0.95))
     ends = np.array([shared_limits([each]) for each in diagrams])
     limits = float(np.quantile(ends[:, 0], 0.05)), float(np.quantile(ends[:, 1], 0.95))
     kinds, columns = families_of(atlas), _columns(atlas)
     turned = set(farthest_points(places[:n], SOLIDS).tolist())
     shapes = _draw_shapes(sources, atlas, kinds, columns, turned, sub_progress(progress, 0.6, 1.0))
-    shapes += [{"rows": _describe_fit(fit, distances[n + k, 0] > usual)} for k, fit in enumerate(scans)]
+    shapes += [{"rows": _describe_fit(fit, distances[n + k, 0] > typical)} for k, fit in enumerate(scans)]
     for k, shape in enumerate(shapes):
         shape |= {"name": [*atlas.ids, *names][k], "place": places[k].round(4).tolist(), "near": near[k].tolist()}
         shape |= {"distances": distances[k].round(3).tolist(), "diagram": _pack(_shades(diagrams[k], limits))}

@@ -451,9 +451,9 @@ def _fill_gap(
     rest is filled tile by tile."""
     distances = torch.from_numpy(np.ascontiguousarray(known))
     near = _trim(~((distances == FAR).all(0) | (distances == -FAR).all(0)), REACH)
-    told = torch.zeros(1, count, *known.shape[1:])
+    marked = torch.zeros(1, count, *known.shape[1:])
     if marks is not None:
-        told, near = torch.from_numpy(marks)[None], torch.ones_like(near)
+        marked, near = torch.from_numpy(marks)[None], torch.ones_like(near)
     read = None
     if evidence is not None:
         read, near = torch.from_numpy(np.ascontiguousarray(evidence))[None], torch.ones_like(near)
@@ -462,7 +462,7 @@ def _fill_gap(
         core = (slice(y, y + TILE), slice(x, x + TILE))
         if near[core].any():
             seen = (..., slice(y, y + TILE + 2 * REACH), slice(x, x + TILE + 2 * REACH))
-            gaps = Gaps(distances[seen][None], torch.tensor([step]), told[seen], None if read is None else read[seen])
+            gaps = Gaps(distances[seen][None], torch.tensor([step]), marked[seen], None if read is None else read[seen])
             logits[:, *core] = torch.where(near[core], filler(gaps, REACH)[0], logits[:, *core])
     return logits.numpy()
 

@@ -43,7 +43,7 @@ def read_image(values: np.ndarray, slices: Slices, progress: Progress = silent) 
 
     Raises ImportError where scikit-learn is not installed.
     """
-    known, slope, shift, told = slices.inside, 1.0, 0.0, math.nan
+    known, slope, shift, gain = slices.inside, 1.0, 0.0, math.nan
     progress("learning from the image", 0.0)
     levels = ((values - values.mean()) / max(float(values.std()), 1e-12)).astype(np.float32)
     describe = partial(_features, levels, slices.spacing)
@@ -56,7 +56,7 @@ def read_image(values: np.ndarray, slices: Slices, progress: Progress = silent) 
         truth = known[1::2].ravel()
         slope, shift = fit_weights(logits[:, None], truth)
         loss = float(np.logaddexp(0, np.where(truth, -1, 1) * (slope * logits + shift)).mean())
-        told = 1 - loss / float(entropy(truth.mean()))
+        gain = 1 - loss / float(entropy(truth.mean()))
     progress("learning from the image", 0.35)
     trees = _learn(features, known)
     evidence = np.empty(values.shape, dtype=np.float32)
@@ -66,7 +66,7 @@ def read_image(values: np.ndarray, slices: Slices, progress: Progress = silent) 
             logits = trees.decision_function(plane.reshape(-1, plane.shape[-1]))
             evidence[row] = (slope * logits + shift).reshape(plane.shape[:2])
     progress("reading the image", 1.0)
-    return evidence, told
+    return evidence, gain
 
 
 def find_shift(values: np.ndarray, slices: Slices) -> tuple[int, int]:

@@ -250,8 +250,8 @@ def doubt_places(there: np.ndarray, places: Sequence[int]) -> tuple[str, ...]:
 def doubt_labels(values: np.ndarray, ignore: int | None = None) -> tuple[str, ...]:
     """Return a sentence where known slices have several labels, given their values, each once."""
     count = np.count_nonzero((values > 0) & (values != ignore))
-    how = "reconstruct_labels, or --labels all, fills each by itself"
-    return (f"The known slices have {count} labels, which are filled as one structure: {how}.",) if count > 1 else ()
+    advice = "reconstruct_labels, or --labels all, fills each by itself"
+    return (f"The known slices have {count} labels, which are filled as one structure: {advice}.",) if count > 1 else ()
 
 
 def list_numbers(numbers: Sequence[int], most: int = 4) -> str:

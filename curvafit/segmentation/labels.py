@@ -316,8 +316,8 @@ def _describe_labels(
         return "; ".join(f"label {number}: {part.status}" for number, (_, part) in each) + end
     worst = ", ".join(f"label {number} {dice[number]:.2f}" for number in sorted(dice, key=lambda n: dice[n])[:FEW])
     median = f"expect a Dice of {np.median(list(dice.values())):.2f} between known slices in the median; least: {worst}"
-    how = "filled:" if whole is None else f"filled as instances of one structure, {whole.status}; of labels,"
-    return f"{len(parts)} labels {how} {median}{end}"
+    way = "filled:" if whole is None else f"filled as instances of one structure, {whole.status}; of labels,"
+    return f"{len(parts)} labels {way} {median}{end}"
 
 
 def _odds(part: Segmentation) -> np.ndarray:

@@ -85,7 +85,7 @@ GREY, SAMPLED = 8, 1_000_000
 #: Bytes that each voxel takes at least while a volume is filled at once.
 LEAST_BYTES = 30
 #: Least share of the entropy of slices held out that an image takes away: that of the structure takes half or more.
-TOLD = 0.1
+LEAST_GAIN = 0.1
 SHIFTED = "The image seems to lie off the annotated slices by {} voxels along {}: it fits them better when it is moved."
 UNTOLD = "The image does not tell the structure in annotated slices held out: it is left out."
 #: Least probability whose odds or log-odds are taken.
@@ -222,7 +222,7 @@ def _fill_between(given: _Given, suggest: int, run: Run, working: Working, progr
     taught, evidence, learned = _learn(given.taught, known, target, given.image, part, step)
     engine = _Engine(taught, evidence, working.epsilon, progress)
     place, tiles = engine.cut(target, working.tile) if given.laws else (None, [])
-    chosen, task, said = _choose_law(engine, target, given.laws, part, (working.stiffness, working.steps), len(tiles))
+    chosen, task, head = _choose_law(engine, target, given.laws, part, (working.stiffness, working.steps), len(tiles))
     notes = (*notes, *learned)
     if place is None or chosen.law is None:
         filled, phase = _fill_volume(known, target, engine, run, working.tile, given.in_blocks)
@@ -236,7 +236,7 @@ def _fill_between(given: _Given, suggest: int, run: Run, working: Working, progr
     uncertain = filled.judge(known, target, engine, suggest)
     tested = "the example" if part else "slices left out" if chosen.law else "generated shapes"
     ways = {"tested": tested, "image": evidence is not None, "periodic": periodic}
-    status, doubts = describe_filled(said, inside, filled.share, uncertain, known.places, target.length, **ways)
+    status, doubts = describe_filled(head, inside, filled.share, uncertain, known.places, target.length, **ways)
     return Segmentation.of(
         volume, filled.mask, phase, chosen.law, choose_epsilon(volume, working.epsilon), (*notes, *doubts),
         weight=None, status=status, uncertainty=uncertain, image=given.image,
@@ -287,7 +287,7 @@ class _Engine:
         """Return the network's log-odds of the inside (Z, Y, X), computed once."""
         return self._fill(slices)[1]
 
-    def told(self, slices: Slices) -> np.ndarray:
+    def thresholded(self, slices: Slices) -> np.ndarray:
         """Return which slices have a threshold of their own: those between known ones, and by an image all."""
         return slices.between | (self.evidence is not None)
 
@@ -299,7 +299,7 @@ class _Engine:
         level = logits.copy()
         level[list(slices.places)] = (SLOPE / raster.pixel) * depth.astype(np.float32)
         least = best_log_odds(logits[slices.between]) if slices.between.any() else 0.0
-        level = level - np.where(self.told(slices), least, 0)[:, None, None]
+        level = level - np.where(self.thresholded(slices), least, 0)[:, None, None]
         return (min(slices.spacing[1:]) * level).astype(np.float32)
 
     def run(self, slices: Slices, trial: Trial) -> np.ndarray:
@@ -353,7 +353,7 @@ class _Filled:
     def judge(self, given: Known, slices: Slices, engine: _Engine, suggest: int) -> Uncertainty:
         """Return how sure the volume is, and which slices to annotate next."""
         sums, ends = self.sums, {"periodic": slices.periodic, "whole": engine.evidence is not None}
-        dice = float(2 * sums["both"] / max(sums["told"] + sums["sum"], 1e-9)) if slices.between.any() else 1.0
+        dice = float(2 * sums["both"] / max(sums["count"] + sums["sum"], 1e-9)) if slices.between.any() else 1.0
         order = turn_axes((0, 1, 2), given.axis)
         return Uncertainty(
             replace(given.volume, array=self.likely, notes=()),
@@ -390,7 +390,7 @@ def _fill_volume(
     sums = add_records(_widen(record, core, slices.shape) for core, record in zip(cores, found, strict=True))
     compared: list[Record] = []
     least = max(best_threshold(sums["counts"]), LEAST) if slices.between.any() else 0.5
-    least = np.where(engine.told(slices), least, 0.5).astype(np.float32)[:, None, None]
+    least = np.where(engine.thresholded(slices), least, 0.5).astype(np.float32)[:, None, None]
     for core in cores:
         box = given.turn_box(core)
         part = np.moveaxis(likely[box], given.axis, 0)
@@ -433,18 +433,18 @@ def look_at(likely: np.ndarray, slices: Slices, core: Box, *, whole: bool = Fals
     rows = core[0]
     counts = count_probabilities(likely[slices.between[rows]])  # marked voxels too, as those of the phase field
     likely = slices.keep_known(likely.astype(np.float32), core)
-    unsure, told = doubt(likely), likely[slices.between[rows]]
+    unsure, filled = doubt(likely), likely[slices.between[rows]]
     along = {f"along {k}": unsure.sum(tuple({0, 1, 2} - {k})) for k in range(3)}
     total = likely if whole else likely[~slices.outside[rows]]
-    sums = {"sum": told.sum(dtype=np.float64), "total": total.sum(dtype=np.float64)}
+    sums = {"sum": filled.sum(dtype=np.float64), "total": total.sum(dtype=np.float64)}
     return {"likely": likely, "counts": counts, **sums, **along}
 
 
 def _compare(likely: np.ndarray, mask: np.ndarray, between: np.ndarray) -> dict[str, Any]:
     """Return how many voxels of a mask there are, and between known slices their number and probabilities."""
-    told = mask[between]
-    both = likely[between][told].sum(dtype=np.float64)
-    return {"inside": np.count_nonzero(mask), "told": np.count_nonzero(told), "both": both}
+    inside = mask[between]
+    both = likely[between][inside].sum(dtype=np.float64)
+    return {"inside": np.count_nonzero(mask), "count": np.count_nonzero(inside), "both": both}
 
 
 def _widen(record: Record, core: Box, shape: Sequence[int]) -> Record:
@@ -549,10 +549,10 @@ def _weigh_evidence(
         return _Filled.of(given, target, expit(engine.logits(target)), mask), engine
     rows, tried = list(task.places), engine.run(task.given, trial)
     weights = fit_weights(known := evidence(task.given, tried, rows), task.truth.ravel())
-    told, near = probability(known, weights).reshape(task.truth.shape), near_surface(tried > 0)[rows]
+    tested, near = probability(known, weights).reshape(task.truth.shape), near_surface(tried > 0)[rows]
     likely = probability(evidence(target, found.phase, list(range(target.length))), weights).reshape(target.shape)
     likely[target.outside] = np.minimum(likely[target.outside], 0.5)
-    error = calibration_error(told[near], task.truth[near])
+    error = calibration_error(tested[near], task.truth[near])
     return _Filled.of(given, target, likely, mask), replace(engine, taught=replace(engine.taught, error=error))
 
 
@@ -579,8 +579,8 @@ def _read_evidence(
     """Return what an image says of a volume, None where it does not tell known slices, and sentences on its doubts."""
     off = zip(find_shift(levels, slices), "zyx".replace("zyx"[axis], ""), strict=True)
     doubts = tuple(SHIFTED.format(f"{voxels:+d}", name) for voxels, name in off if voxels)
-    evidence, told = read_image(levels, slices, progress=progress)
-    return (None, (*doubts, UNTOLD)) if told < TOLD else (evidence, doubts)
+    evidence, gain = read_image(levels, slices, progress=progress)
+    return (None, (*doubts, UNTOLD)) if gain < LEAST_GAIN else (evidence, doubts)
 
 
 def load_example(example: Source, volume: Volume, reading: dict[str, Any]) -> Volume:

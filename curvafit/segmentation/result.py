@@ -372,10 +372,10 @@ def describe_run(found: Segmentation, options: Mapping[str, Any], scan: Volume) 
 
 
 def describe_filled(
-    said: str, inside: str, share: float, uncertain: Uncertainty, places: Sequence[int], length: int, *, tested: str,
+    head: str, inside: str, share: float, uncertain: Uncertainty, places: Sequence[int], length: int, *, tested: str,
     image: bool = False, periodic: bool = False,
 ) -> tuple[str, tuple[str, ...]]:  # fmt: skip
-    """Return the status of a volume between the known slices at `places`, and sentences on what is doubtful. `said` is
+    """Return the status of a volume between the known slices at `places`, and sentences on what is doubtful. `head` is
     how it was filled, `inside` a sentence on the mask, `share` its share of the volume, and `tested` what probabilities
     were held to. With an image or in a periodic volume all slices are filled."""
     reach = slice(0, length) if image or periodic else reach_of(places, length)
@@ -383,7 +383,7 @@ def describe_filled(
     known = uncertain.known_share
     span = f" ({100 * known[1]:.2f} to {100 * known[2]:.2f})" if known[1:] else ""
     status = (
-        f"{said}: {len(places)} of {length} slices known{f', {left} beyond them not filled' * (left > 0)}, {inside}, "
+        f"{head}: {len(places)} of {length} slices known{f', {left} beyond them not filled' * (left > 0)}, {inside}, "
         f"{100 * known[0]:.2f} %{span} by known slices alone, {100 * uncertain.mean_probability:.2f} % by "
         f"probabilities; expect a Dice of {uncertain.expected_dice:.2f} between known slices; "
         f"probabilities err by {uncertain.calibration_error:.3f} near the surface of {tested}"

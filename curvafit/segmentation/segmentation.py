@@ -101,7 +101,7 @@ def segment(
     volume = load(scan, **reading, lazy=True)
     volume.check_fits()
     place = WorkingGrid.of(volume, working.epsilon, halo=HALO)
-    tiles, said = cut_tiles(place, volume.shape, working.tile), ""
+    tiles, head = cut_tiles(place, volume.shape, working.tile), ""
     trial, notes = _weigh_law(prior, weight, volume, working)
     _check_finite(volume)
     evidence = GreyEvidence.of(volume, threshold, dark, apart=weight is None)
@@ -111,9 +111,9 @@ def segment(
         raise ScanError(f"the scan shows no {missing}: every voxel is on one side")
     found = lower(evidence, trial, place, tiles, store=working.store, workers=working.workers, progress=progress)
     if weight is None and not _explains(evidence, found.mask, tiles):
-        trial, said = replace(trial, law=None), "no prior helps here, the first guess explains the scan better: "
+        trial, head = replace(trial, law=None), "no prior helps here, the first guess explains the scan better: "
         found = lower(evidence, trial, place, tiles)
-    return _describe(volume, found, trial, place, notes, said)
+    return _describe(volume, found, trial, place, notes, head)
 
 
 def _segment_probabilities(
@@ -125,7 +125,7 @@ def _segment_probabilities(
     volume = load(load_probabilities(scan, **given), lazy=True)
     volume.check_fits()
     place = WorkingGrid.of(volume, working.epsilon, halo=HALO)
-    tiles, said = cut_tiles(place, volume.shape, working.tile), ""
+    tiles, head = cut_tiles(place, volume.shape, working.tile), ""
     if example is None:
         trial, notes = _weigh_law(prior, weight, volume, working)
     else:
@@ -134,13 +134,13 @@ def _segment_probabilities(
             trials, progress = sub_progress(progress, 0.0, TRIALS), sub_progress(progress, TRIALS, 1.0)
             example = calibrate(*example, prior, working=working, progress=trials, **same)
         check_spacing(example.example, volume, "the probabilities")
-        trial, notes, said = example.trial, example.notes, f"{example}; "
+        trial, notes, head = example.trial, example.notes, f"{example}; "
     evidence = probability_evidence(likely := volume.load())
     notes = (*notes, f"Probabilities from {likely.values.min():.3g} to {likely.values.max():.3g}.")
     flat = trial.law is not None and _missing_phase(evidence, tiles)  # without a surface there is nothing to lower
     stays = replace(trial, law=None) if flat else trial
     found = lower(evidence, stays, place, tiles, store=working.store, workers=working.workers, progress=progress)
-    return _describe(volume, found, trial, place, notes, said)
+    return _describe(volume, found, trial, place, notes, head)
 
 
 def _weigh_law(
@@ -153,13 +153,13 @@ def _weigh_law(
 
 
 def _describe(
-    volume: Volume, found: LoweredVolume, trial: Trial, place: WorkingGrid, notes: tuple[str, ...], said: str
+    volume: Volume, found: LoweredVolume, trial: Trial, place: WorkingGrid, notes: tuple[str, ...], head: str
 ) -> Segmentation:
-    """Return the result with its status, which begins with what is `said`."""
+    """Return the result with its status, which begins with `head`."""
     return Segmentation.of(
         volume, found.mask, found.phase, trial.law, place.epsilon, (*notes, *place.notes),
         weight=None if trial.law is None else trial.strength * BENDING / bending(trial.law),
-        status=f"{said}{flow_summary(float(found.mask.mean()), found.energies, found.steps)}",
+        status=f"{head}{flow_summary(float(found.mask.mean()), found.energies, found.steps)}",
     )  # fmt: skip
 
 

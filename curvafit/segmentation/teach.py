@@ -351,9 +351,9 @@ def image_shape(textures: Sequence[Sequence[Texture]], mix: ImageMix, seed: Sequ
         source = textures[int(rng.integers(len(textures)))]
         texture = source[int(rng.integers(len(source)))]
         names = list(MODALITIES)
-        how = MODALITIES[names[int(rng.integers(len(names)))]].draw(int(rng.integers(2**31)))
+        modality = MODALITIES[names[int(rng.integers(len(names)))]].draw(int(rng.integers(2**31)))
         turn = rng.permutation(3)
-        edges = np.array(how.spacing)[turn]
+        edges = np.array(modality.spacing)[turn]
         finest = float(edges[1:].min())
         gap = int(rng.integers(mix.gap[0], max(mix.gap[0], min(mix.gap[1], int(mix.longest * finest / edges[0]))) + 1))
         sides = np.ceil(mix.edge * finest / edges[1:]).astype(int)
@@ -362,12 +362,12 @@ def image_shape(textures: Sequence[Sequence[Texture]], mix: ImageMix, seed: Sequ
         low, high = mix.thickness
         low = min(max(low, mix.edge * texture.thickness / FINEST), high)
         edge = math.exp(rng.uniform(math.log(low), math.log(high))) * finest / texture.thickness
-        size = field_shape(shape.tolist(), edge, how)
+        size = field_shape(shape.tolist(), edge, modality)
         start = rng.integers(0, texture.values.shape)
         rows = [(a + np.arange(n)) % m for a, n, m in zip(start, size, texture.values.shape, strict=True)]
         phase = torch.from_numpy(np.ascontiguousarray(texture.values[np.ix_(*rows)], dtype=np.float32))
-        seen = image(phase, edge, how, int(rng.integers(2**31))).numpy()
-        inside = regrid(phase, edge, how).numpy() > 0
+        seen = image(phase, edge, modality, int(rng.integers(2**31))).numpy()
+        inside = regrid(phase, edge, modality).numpy() > 0
         box = tuple(slice(n) for n in shape)
         seen, inside = (np.ascontiguousarray(each[box].transpose(turn)) for each in (seen, inside))
         known = inside[::gap]
@@ -461,21 +461,21 @@ def teach(
 
     Raises ValueError if a source is empty, or an argument is out of range.
     """
-    usual = STEPS if plain is None else IMAGE_STEPS
-    steps = check_int(usual if steps is None else steps, "a number of steps from 1", 1, 10**7)
+    default = STEPS if plain is None else IMAGE_STEPS
+    steps = check_int(default if steps is None else steps, "a number of steps from 1", 1, 10**7)
     seed, volumes = check_seed(seed), check_int(volumes, "a number of volumes from 1", 1, 10**5)
     if not sources or not all(sources):
         raise ValueError("expected sources with one shape or more to teach with")
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         filler = Filler() if plain is None else Filler.with_image(plain.filler)
-    said = {"steps": steps, "seed": seed}
+    settings = {"steps": steps, "seed": seed}
     if plain is None:
         held = [texture for source in sources for texture in source[HELD_OUT - 1 :: HELD_OUT]] or [sources[-1][-1]]
         taught = [[texture for texture in source if texture not in held] or list(source) for source in sources]
         mix = mix or Mix()
         lessons, exam = Lessons(taught, mix, seed, steps), Lessons([held], replace(mix, partial=0.0), seed + 1, JUDGED)
-        said |= {"shapes": sum(map(len, taught)), "held_out": len(held), "mix": asdict(mix)}
+        settings |= {"shapes": sum(map(len, taught)), "held_out": len(held), "mix": asdict(mix)}
     else:
         judging = [source[HELD_OUT - 1 :: HELD_OUT] or source for source in sources]
         taught = [[each for k, each in enumerate(source) if (k + 1) % HELD_OUT] for source in sources]
@@ -484,13 +484,13 @@ def teach(
             progress(f"imaging shape {number + 1} of {count}", 0.3 * number / count)
             wholes.append(image_shape(taught if number < volumes else judging, ImageMix(), (seed, number)))
         lessons, exam = WholeLessons(wholes[:volumes], steps, seed), WholeLessons(wholes[volumes:], JUDGED, seed + 1)
-        said |= {"plain": plain.card, "volumes": volumes, "mix": asdict(ImageMix())}
+        settings |= {"plain": plain.card, "volumes": volumes, "mix": asdict(ImageMix())}
         progress = sub_progress(progress, 0.3, 1.0)
-    told = sub_progress(progress, 0.0, 0.97)
-    losses = learn(filler, lessons, RATE, checkpoint=checkpoint, workers=workers, progress=told)
+    step = sub_progress(progress, 0.0, 0.97)
+    losses = learn(filler, lessons, RATE, checkpoint=checkpoint, workers=workers, progress=step)
     temperatures, figures, error = judge(filler, exam)
     progress("judging on shapes held out", 1.0)
-    return Taught(filler, temperatures, {**card, **said, "losses": losses, **figures}, error)
+    return Taught(filler, temperatures, {**card, **settings, "losses": losses, **figures}, error)
 
 
 @torch.inference_mode()

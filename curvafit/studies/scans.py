@@ -297,10 +297,10 @@ def measure_scans(
     some scans have a physical unit.
     """
     unit, notes = _check_scans(cases, reading, sub_progress(progress, 0.0, 0.05))
-    how = options | reading
+    given = options | reading
     found: dict[int, Any] = {k: (case.source,) for k, case in enumerate(cases) if isinstance(case.source, Measures)}
     tasks: dict[int, Task] = {
-        k: partial(_measure_one, case.source, case.name, False, how) for k, case in enumerate(cases) if k not in found
+        k: partial(_measure_one, case.source, case.name, False, given) for k, case in enumerate(cases) if k not in found
     }
     found |= share_out(tasks, [case.name for case in cases], workers, sub_progress(progress, 0.05, 1.0))
     measures: list[Measures] = [found[k][0] for k in range(len(cases))]

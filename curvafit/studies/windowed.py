@@ -164,11 +164,11 @@ def windows(
     edges = tuple(h * n for h, n in zip(field.spacing, thin, strict=True))
     structure = replace(field, array=shown, spacing=edges, affine=None)
     left = f"The last {', '.join(map(str, rest))} voxels along z, y, x are in no window."
-    how = {"size": sizes, "stride": strides, "clusters": clusters, "seed": seed, "kind": kind}
+    settings = {"size": sizes, "stride": strides, "clusters": clusters, "seed": seed, "kind": kind}
     notes = (f"{sampling}.", *maps.notes, *([left] if any(rest) else []))
     return Windows(
         kind=maps.kind, size=sizes, stride=strides, values=values, clusters=grid, explained=explained,
-        structure=structure, options=how | options | reading, notes=notes,
+        structure=structure, options=settings | options | reading, notes=notes,
     )  # fmt: skip
 
 

@@ -176,8 +176,8 @@ def _lock(folder: Path, mine: Mapping[str, str]) -> Iterator[Path]:
     try:
         other = json.loads((folder / _RUN).read_bytes()) if (folder / _RUN).exists() else mine
         if changed := [name for name in sorted({**other, **mine}) if other.get(name) != mine.get(name)]:
-            values = "; ".join(f"{name} {other.get(name)} instead of {mine.get(name)}" for name in changed)
-            raise ValueError(f"the tiles in {folder} are another run's, with {values[:500]}: delete them")
+            what = ", ".join(changed)
+            raise ValueError(f"the tiles in {folder} are another run's, which differs in {what}: delete them")
         write_content(folder / _RUN, json.dumps(mine, indent=2))
         yield folder
     except ScanError:
