@@ -21,7 +21,7 @@ from matplotlib.figure import Figure, FigureBase
 
 from curvafit.drawing.plot import INK, diagram_on, shared_limits, surface_on, write_picture
 from curvafit.drawing.rendering import view
-from curvafit.generation.flow import Flow, generate
+from curvafit.generation.flow import Execution, Flow, generate
 from curvafit.geometry.diagrams import Diagram, diagram
 from curvafit.geometry.distances import wasserstein
 from curvafit.geometry.mesh import NoSurface
@@ -62,8 +62,8 @@ def made(options: Namespace) -> Flow:
     grid = Grid((options.edge, options.edge, len(ORDER) * options.edge))
     a, mass = maps(options.edge)
     file = options.output / "spatialised.checkpoint"
-    told = {"schedule": plan_of(options), "seed": options.seed, "device": options.device, "checkpoint": file}
-    return generate(a, mass, grid, **told)
+    execution = Execution(device=options.device, checkpoint=file)
+    return generate(a, mass, grid, schedule=plan_of(options), seed=options.seed, execution=execution)
 
 
 def maps(edge: int) -> tuple[Coefficients, torch.Tensor]:

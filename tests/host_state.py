@@ -33,6 +33,8 @@ import curvafit
 from curvafit import priors
 from curvafit.generation.flow import Optimiser
 from curvafit.generation.schedule import schedule
+from curvafit.inference import Growth
+from curvafit.segmentation import Working
 
 #: Numbers of threads that are nobody's default.
 TORCH_THREADS, NUMBA_THREADS = 2, 3
@@ -128,8 +130,8 @@ def calls(folder: Path) -> dict[str, Callable[[], object]]:
         plot.png(plot.surface_figure(kept["flow"].field.numpy(), width=32))
 
     def infer() -> None:
-        few = {"simulations": 1, "rounds": 1, "twins": 1, "test": False, "schedule": brief}
-        found = curvafit.infer(curvafit.Volume(kept["flow"].field.numpy()), kind="field", periodic=True, **few)
+        few = Growth(simulations=1, rounds=1, twins=1, test=False, schedule=brief)
+        found = curvafit.infer(curvafit.Volume(kept["flow"].field.numpy()), kind="field", periodic=True, growth=few)
         (folder / "fit.json").write_text(found.fit.to_json())
 
     scan, slices, files = curvafit.Volume(200.0 * ball + 1), curvafit.Volume(ball), ("a.nii.gz", "a.tif", "a.ome.tif")
@@ -160,8 +162,8 @@ def calls(folder: Path) -> dict[str, Callable[[], object]]:
         "Volume": lambda: curvafit.Volume(ball),
         "save": lambda: [curvafit.save(sized, folder / name) for name in (*files, "a.npy", "a.mrc", "a.zarr")],
         "load": lambda: [curvafit.load(path) for path in sorted(folder.glob("a.*"))],
-        "segment": lambda: curvafit.segment(scan, "tubes", threshold=100.0, steps=2),
-        "reconstruct": lambda: curvafit.reconstruct(slices, "tubes", every=4, steps=2), "infer": infer,
+        "segment": lambda: curvafit.segment(scan, "tubes", threshold=100.0, working=Working(steps=2)),
+        "reconstruct": lambda: curvafit.reconstruct(slices, "tubes", every=4, working=Working(steps=2)), "infer": infer,
         "measure": lambda: curvafit.measure(ball), "measure_instances": lambda: curvafit.measure_instances(ball),
         "windows": lambda: curvafit.windows((np.indices((24, 24, 36))[2] % 12 < 6).astype(np.uint8), 24, 12),
         "compare": lambda: curvafit.compare(*[[np.roll(ball, k, 0) for k in (0, 1)]] * 2),

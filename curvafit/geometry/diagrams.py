@@ -243,7 +243,8 @@ def _voxel_curvatures(values: Tensor, grid: Grid, epsilon: float, curvature: str
 def _interpolate(
     fields: tuple[np.ndarray, ...], resolved: np.ndarray, centres: np.ndarray, periodic: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return values `(N, 2)` at `centres` `(N, 3)` (in voxels) from the resolved voxels around, and where any are."""
+    """Return values `(N, 2)` at `centres` `(N, 3)` (in voxels) from the resolved voxels around, and where any are. The
+    fields are 0 elsewhere: their sums over the sum of resolved voxels are means."""
     *sums, total = (
         map_coordinates(values, centres.T, np.float64, order=1, mode="grid-wrap" if periodic else "nearest")
         for values in (*fields, resolved)

@@ -176,9 +176,11 @@ class Search:
     def _propose(
         self, draws: np.ndarray, simulated: Simulations, barren: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return candidate parameters `(n, 6)` and twice the negative log likelihood of each, `(n,)`."""
+        """Return parameters to try `(n, 6)`, draws and others around the best simulations, and -2 log likelihood of
+        each `(n,)`; near `barren` parameters, from which nothing grew, they cost more."""
         emulator = self.emulator
-        centres = np.repeat(simulated.parameters[self.nearest(simulated)[:NEAREST]], AROUND * len(WIDTHS), 0)
+        best = simulated.parameters[self.nearest(simulated)[:NEAREST]]
+        centres = np.repeat(best, AROUND * len(WIDTHS), 0)
         widths = np.resize(np.repeat(WIDTHS, AROUND), len(centres))[:, None]
         near = centres + widths * emulator.deviation * rng.standard_normal(centres.shape)
         candidates = np.concatenate([draws, np.clip(near, *emulator.box.T)])

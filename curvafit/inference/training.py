@@ -96,7 +96,7 @@ def train_posterior(
     """
     members, seed = check_int(members, "a number of flows", 1, MOST), check_seed(seed)
     sizes, table = architecture or Architecture(), table.visible.pooled
-    number, laws = table.laws, len(np.unique(table.laws))
+    law_of_row, laws = table.laws, len(np.unique(table.laws))
     if laws < 2 * sizes.components:
         raise ValueError(f"expected shapes of {2 * sizes.components} laws or more to train on, got {laws}")
     views = tuple(sorted(set(table.views.tolist())))
@@ -118,23 +118,23 @@ def train_posterior(
     posterior = dataclasses.replace(posterior, centre=logits.mean(0), spread=logits.std(0))
     target = torch.from_numpy(posterior.standardise(table.targets)).float()
     context = posterior.context(table.descriptors, table.views, table.amount)
-    flows, apart, missed = [], [], []
+    flows, held_out, errors = [], [], []
     for k in range(members):
         rng = np.random.default_rng([seed, k])
         holdout = rng.permutation(laws)[: max(1, round(VALIDATION * laws))]
-        validation = torch.from_numpy(np.isin(number, holdout))
+        validation = torch.from_numpy(np.isin(law_of_row, holdout))
         part = sub_progress(progress, *(EMULATOR_PART + (1 - EMULATOR_PART) * end / members for end in (k, k + 1)))
         with torch.random.fork_rng():
             torch.manual_seed(int(rng.integers(2**31)))
             flow = Member(sizes, len(views))
             flows.append(_fit(flow, context, target, validation, flow_plan, f"member {k + 1} of {members}", part))
         # What the flow misses of the rows that it has not learnt.
-        apart.append(np.flatnonzero(validation.numpy()))
-        alone, asked = dataclasses.replace(posterior, members=(flow,)), table.rows(apart[-1])
-        draws = alone.sample(asked.descriptors, asked.views, asked.amount, DRAWS)
-        missed.append(draws[..., : len(PARAMETERS)].mean(1) - asked.parameters)
-    asked = table.rows(np.concatenate(apart))
-    sums = find_combinations(np.concatenate(missed), asked.parameters, asked.descriptors)
+        held_out.append(np.flatnonzero(validation.numpy()))
+        single, rows = dataclasses.replace(posterior, members=(flow,)), table.rows(held_out[-1])
+        draws = single.sample(rows.descriptors, rows.views, rows.amount, DRAWS)
+        errors.append(draws[..., : len(PARAMETERS)].mean(1) - rows.parameters)
+    rows = table.rows(np.concatenate(held_out))
+    sums = find_combinations(np.concatenate(errors), rows.parameters, rows.descriptors)
     return dataclasses.replace(posterior, members=tuple(flows), combinations=sums)
 
 

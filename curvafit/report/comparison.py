@@ -113,7 +113,11 @@ def _count_scans(comparison: Comparison) -> list[str]:
 
 
 def _format_row(number: Number, comparison: Comparison) -> list[str]:
-    """Return a row of the page's table, of which some cells stand out where the number differs among all."""
+    """Return a row of the page's table, of which some cells stand out where the number differs, all numbers tested.
+
+    Its p values are the number's own, those corrected for all numbers (of the family, by Holm, by false discoveries);
+    then comes the share of the error that is known.
+    """
     means = [
         f"{format_number(mean)} ± {format_number(sd, 2)}"
         for mean, sd in zip(number.means, number.deviations, strict=True)
@@ -138,20 +142,24 @@ def name_quantity(name: str, symbol: str, power: int, unit: str) -> tuple[str, s
 
 def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
     """Yield a row for each test: the diagrams', then each number's; None where there is no value."""
-    c, letters = comparison, [*ascii_lowercase, *range(27, 1 + len(comparison.groups))][: len(comparison.groups)]
-    columns = ["quantity", "symbol", "unit", *(f"mean_{each}" for each in letters), *(f"sd_{each}" for each in letters)]
+    c, count = comparison, len(comparison.groups)
+    groups = [*ascii_lowercase, *range(27, 1 + count)][:count]  # a, b, … z, 27, 28, …
+    columns = ["quantity", "symbol", "unit", *(f"mean_{each}" for each in groups), *(f"sd_{each}" for each in groups)]
     effect = {"g": "g", "η": "eta", "r": "r"}[c.effect]
     columns += ["slope" if c.effect == "r" else "difference", effect, f"{effect}_low", f"{effect}_high"]
     columns += ["p", "p_family", "p_holm", "p_bh", "known_error"]
-    whole = {"quantity": "curvature diagram", "symbol": "E", "unit": plain_unit(c.unit, -1)}
-    statistic = {"difference": c.statistic} if c.groups else {"symbol": "R", "unit": "", "r": c.statistic}
-    yield dict.fromkeys(columns) | whole | statistic | {"p": c.p}
+    diagrams: dict[str, Any] = {"quantity": "curvature diagram", "p": c.p}
+    if c.groups:
+        diagrams |= {"symbol": "E", "unit": plain_unit(c.unit, -1), "difference": c.statistic}
+    else:
+        diagrams |= {"symbol": "R", "unit": "", "r": c.statistic}
+    yield dict.fromkeys(columns) | diagrams
     for each in c.numbers:
         cells = (each.name, each.symbol, plain_unit(c.unit, each.power), *each.means, *each.deviations)
         cells += (each.difference, each.effect, each.low, each.high)
         cells += (each.p, each.family, each.holm, each.discovery, each.known)
-        known = (None if isinstance(cell, float) and not math.isfinite(cell) else cell for cell in cells)
-        yield dict(zip(columns, known, strict=True))
+        finite = (None if isinstance(cell, float) and not math.isfinite(cell) else cell for cell in cells)
+        yield dict(zip(columns, finite, strict=True))
 
 
 # ---- figures ---------------------------------------------------------------------------------------------------------

@@ -287,9 +287,9 @@ def _slice(inference: Inference, axis: int, limits: tuple[float, float]) -> page
     """Return a picture of the slice across the main window's middle, by the edges of voxels, in the scan's unit."""
     scan, prepared = inference.scan, inference.prepared
     down, across = (k for k in range(3) if k != axis)
-    index = (prepared.windows[0][axis].start + prepared.windows[0][axis].stop) // 2
-    place = prepared.origin[axis] + (index + 0.5) * prepared.scale[axis]
-    row = int(np.clip(place, 0, scan.values.shape[axis] - 1))
+    index = (prepared.windows[0][axis].start + prepared.windows[0][axis].stop) // 2  # on the working grid
+    voxels = prepared.origin[axis] + (index + 0.5) * prepared.scale[axis]
+    row = int(np.clip(voxels, 0, scan.values.shape[axis] - 1))  # on the scan's
     start, step = np.array(prepared.origin) * scan.spacing, np.array(prepared.scale) * scan.spacing
     stop = start + step * prepared.phase.shape
     first = start + step * [edge.start for edge in prepared.windows[0]]
@@ -303,9 +303,9 @@ def _slice(inference: Inference, axis: int, limits: tuple[float, float]) -> page
         axes_names=("zyx"[down], "zyx"[across]), window=framed,
     )  # fmt: skip
     depth = format_length((row + 0.5) * scan.spacing[axis], scan.unit)
-    part = list(scan.values.shape) != inference.fit.provenance.get("scan_shape", list(scan.values.shape))
-    of = " of the part that was read" if part else ""
-    title, text = f"Across {'zyx'[axis]}", f"Slice {row} of {scan.values.shape[axis]}{of}, at {depth}"
+    is_part = list(scan.values.shape) != inference.fit.provenance.get("scan_shape", list(scan.values.shape))
+    where = " of the part that was read" if is_part else ""
+    title, text = f"Across {'zyx'[axis]}", f"Slice {row} of {scan.values.shape[axis]}{where}, at {depth}"
     return page.picture_of(figure, f"Slice across {'zyx'[axis]} with the surface's outline", title=title, text=text)
 
 

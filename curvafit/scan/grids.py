@@ -245,19 +245,20 @@ class CutOut(NamedTuple):
 def _small_pieces(
     mask: np.ndarray, smallest: float, part: CutOut, structure: np.ndarray | None
 ) -> tuple[np.ndarray, int]:
+    """Return the voxels of pieces of fewer than `smallest` voxels, and how many such pieces belong to the core."""
     labels: np.ndarray = ndimage.label(mask, structure)[0]  # type: ignore[index]
     small: np.ndarray = np.bincount(labels.ravel()) < smallest
     small[0] = False
-    for axis, ends in enumerate(part.cut):
-        for end, cut in zip((0, -1), ends, strict=True):
+    for axis, cut_ends in enumerate(part.cut):  # a piece that is cut may go on beyond, and be larger
+        for end, cut in zip((0, -1), cut_ends, strict=True):
             if cut:
                 small[np.unique(np.take(labels, end, axis=axis))] = False
     pieces = small[labels]
     where = np.flatnonzero(pieces)
-    first = where[np.unique(labels.ravel()[where], return_index=True)[1]]
-    inside = np.zeros(mask.shape, dtype=bool)
-    inside[part.core] = True
-    return pieces, int(np.count_nonzero(inside.ravel()[first]))
+    first_voxels = where[np.unique(labels.ravel()[where], return_index=True)[1]]
+    in_core = np.zeros(mask.shape, dtype=bool)
+    in_core[part.core] = True  # of the tiles that see a piece, the one with its first voxel counts it
+    return pieces, int(np.count_nonzero(in_core.ravel()[first_voxels]))
 
 
 def _middle(whole: slice, length: int) -> slice:

@@ -120,15 +120,18 @@ def _measure_body(volume: Volume, boxes: Sequence[tuple[int, Box]], number: int)
     except ValueError as reason:  # too thin, or without a surface away from the image's borders
         curved, drawn, notes = whole.no_curvature(volume.unit, reason)
     surface = whole.measure_surface(mask, volume.spacing, False)
-    empty = np.zeros_like(thickness)
-    maps = whole.Maps(volume.spacing, mask, thickness, empty, empty, surface, curved, drawn, "mask", notes)
+    gap = euler = np.zeros_like(thickness)  # of the body alone neither is measured
+    maps = whole.Maps(volume.spacing, mask, thickness, gap, euler, surface, curved, drawn, "mask", notes)
     total = dict(zip(whole.SUMS, maps.sum(whole.Blocks(mask.shape, ((0,),) * 3))[0], strict=True))  # type: ignore[arg-type]
     total |= {"χ": euler_number(mask), **_measure_extent(read(0), box, volume)}
     with np.errstate(divide="ignore", invalid="ignore"):  # without curvature
         values = [(name, symbol, float(figure(total)), math.nan, power) for name, symbol, power, figure in OF_BODIES]
     quantities, direction = tuple(whole.Quantity(*each) for each in values), whole.find_direction(total)
-    place = (quantities, direction, drawn, (1, 1, 1), notes, ("instance", label))
-    return {"measures": whole.Measures(volume.source, volume.unit, "mask", *place)}
+    one_block, part = (1, 1, 1), ("instance", label)
+    measured = whole.Measures(
+        volume.source, volume.unit, "mask", quantities, direction, drawn, one_block, notes, part
+    )  # fmt: skip
+    return {"measures": measured}
 
 
 def _measure_extent(body: np.ndarray, box: Box, field: Volume) -> dict[str, float]:

@@ -221,14 +221,17 @@ def summarise_sums(
         values[[names.index("Euler number"), names.index("connectivity density")]] = connectivity
         count, weights = blocks.count, None
     else:
+        # Blocks that a region fills in part count for less: (Σv)² / Σv² is their effective number.
         count, weights = round(volumes.sum() ** 2 / np.square(volumes).sum()), volumes / volumes.mean()
-    halves = errors(table, blocks, combine, weights) if count >= LEAST else np.full(len(values), np.nan)
+    half_widths = errors(table, blocks, combine, weights) if count >= LEAST else np.full(len(values), np.nan)
     if count < LEAST:
         where = "scan" if connectivity is not None else " ".join(map(str, part or ("region",)))
         why = f"they need {LEAST} blocks of a period (thickness and spacing), and the {where} has {count}"
         notes = (*notes, f"No intervals: {why}.")
-    rows = zip(QUANTITIES, values, halves, strict=True)
-    numbers = tuple(Quantity(name, symbol, float(v), float(h), power) for (name, symbol, power, _), v, h in rows)
+    rows = zip(QUANTITIES, values, half_widths, strict=True)
+    numbers = tuple(
+        Quantity(name, symbol, float(value), float(half), power) for (name, symbol, power, _), value, half in rows
+    )
     direction = find_direction(dict(zip(SUMS, total, strict=True)))
     return Measures(frame.source, frame.unit, kind, numbers, direction, drawn, blocks.counts, notes, part)
 

@@ -188,11 +188,13 @@ def coarser_level(
     if prepared.noise or prepared.kind == "field" or reading.get("spacing") is not None or None in levels.values():
         return None
     edges = [(name, np.array(spacing)[-3:]) for name, spacing in levels.items()]
-    best, size = None, np.array(shape, dtype=float)
+    finest, best, size = edges[0][1], None, np.array(shape, dtype=float)
     for name, edge in edges[1:]:
-        finest, fits = edges[0][1], size.max() <= LARGEST_SCAN
-        thickness, size = prepared.thickness * prepared.scale[0] * finest[0] / edge.max(), shape * finest / edge
-        if fits or thickness < SUITED or size.min() < FEWEST:
+        if size.max() <= LARGEST_SCAN:  # the level before shows all of the scan
+            break
+        size = shape * finest / edge
+        thickness = prepared.thickness * prepared.scale[0] * finest[0] / edge.max()
+        if thickness < SUITED or size.min() < FEWEST:
             break
         best = name
     return best
@@ -398,16 +400,17 @@ def count_voxels(shape: Sequence[int], scale: Sequence[float]) -> tuple[int, int
 
 def _choose_box(scan: _Scan, scale: tuple[float, float, float]) -> _Extent:
     """Return all of a scan, or the part of a large one that holds most of its surface."""
-    full = count_voxels(scan.field.shape, scale)
-    if max(full) <= LARGEST_BOX:
-        return (0, 0, 0), full, ()
-    sides = [min(n, LARGEST_BOX) for n in full]
-    size = [math.ceil(n * s) for n, s in zip(sides, scale, strict=True)]
-    boxes = grids.boxes_by_surface(grids.surface_voxels(scan.counted), size)
-    corner = boxes[0] if boxes else tuple(slice(0, n) for n in size)
-    start = [min(int(c.start / s), n - m) for c, s, n, m in zip(corner, scale, full, sides, strict=True)]
-    note = f"Of {_join_sides(full)} working voxels, {_join_sides(sides)} from {tuple(start)} on are used."
-    return (start[0], start[1], start[2]), (sides[0], sides[1], sides[2]), (note,)
+    all_voxels = count_voxels(scan.field.shape, scale)
+    if max(all_voxels) <= LARGEST_BOX:
+        return (0, 0, 0), all_voxels, ()
+    sides = [min(n, LARGEST_BOX) for n in all_voxels]
+    scan_sides = [math.ceil(n * step) for n, step in zip(sides, scale, strict=True)]
+    boxes = grids.boxes_by_surface(grids.surface_voxels(scan.counted), scan_sides)
+    box = boxes[0] if boxes else tuple(slice(0, n) for n in scan_sides)
+    last = [n - side for n, side in zip(all_voxels, sides, strict=True)]
+    z, y, x = (min(int(edge.start / step), end) for edge, step, end in zip(box, scale, last, strict=True))
+    note = f"Of {_join_sides(all_voxels)} working voxels, {_join_sides(sides)} from {(z, y, x)} on are used."
+    return (z, y, x), (sides[0], sides[1], sides[2]), (note,)
 
 
 def _move(

@@ -72,16 +72,16 @@ def survey(structure: Structure, run: Run) -> Plan:
     splitting.check_phases(filled, size)
     noise = structure.kind != "field" and splitting.pairs_of_noise(volume.shape, filled / size, total["pairs"])
     plan = Plan(structure, noise, (*volume.notes, note))
-    thinner = filled <= preparation.HALF * size
+    structure_is_thinner = filled <= preparation.HALF * size
     candidates = candidate_boxes(volume.shape, MEASURED)
     median, thick, plan = _measure_thickness(plan, order_boxes(candidates, total["surface"].tolist()), True)
     if structure.kind == "image":
         plan = replace(plan, smallest=preparation.smallest_piece(median) / math.prod(volume.spacing))
-    if not thinner:
+    if not structure_is_thinner:
         order = order_boxes(candidates, total["other surface"].tolist())
         median, thick, plan = _measure_thickness(plan, order, False)
     # the working grid, as `preparation.prepare` chooses it
-    keeps_grid, name = structure.kind == "field" or noise, "structure" if thinner else "background"
+    keeps_grid, name = structure.kind == "field" or noise, "structure" if structure_is_thinner else "background"
     note = preparation.judge_thickness(name, median, thick, volume.spacing, keeps_grid)
     scale, why = preparation.choose_scale(volume.shape, volume.spacing, median, keeps_grid)
     return replace(

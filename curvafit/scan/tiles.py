@@ -426,18 +426,20 @@ def _prepare_part(plan: Plan, phase: np.ndarray, mask: np.ndarray, part: Box) ->
 
 
 def _bin(plan: Plan, drawn: Diagram, kept: np.ndarray, part: str) -> Record:
-    """Return the bins of a diagram's points that are kept: their place, and area times 1, κ1, κ2 and κ1² + κ2²."""
+    """Return the bins of a diagram's points that are kept: their indices, and area times 1, κ1, κ2 and κ1² + κ2²; and
+    the area without curvature, as one that is `lost`."""
     points, weights = drawn.points[kept], drawn.weights[kept]
-    bins = np.floor(points / (_BIN * BIN_WIDTH * WORKING_SPACING / plan.edge)).astype(np.int64)
+    width = _BIN * BIN_WIDTH * WORKING_SPACING / plan.edge
+    bins = np.floor(points / width).astype(np.int64)
     first = bins.min(0, initial=0)
-    across = int(bins[:, 1].max(initial=0) - first[1]) + 1
-    numbers = (bins - first) @ np.array([across, 1])
-    columns = np.column_stack([np.ones(len(points)), points, (points**2).sum(1)]) * weights[:, None]
-    areas = np.stack([np.bincount(numbers, column) for column in columns.T], axis=1)
-    held = np.flatnonzero(areas[:, 0])
-    bins = np.stack(np.divmod(held, across), axis=1) + first
+    columns = int(bins[:, 1].max(initial=0) - first[1]) + 1
+    flat = (bins - first) @ np.array([columns, 1])
+    moments = np.column_stack([np.ones(len(points)), points, (points**2).sum(1)]) * weights[:, None]
+    areas = np.stack([np.bincount(flat, moment) for moment in moments.T], axis=1)
+    occupied = np.flatnonzero(areas[:, 0])
+    bins = np.stack(np.divmod(occupied, columns), axis=1) + first
     lost = np.float64(drawn.excluded * weights.sum())
-    return {f"bins{part}": bins, f"areas{part}": areas[held], f"lost{part}": lost}
+    return {f"bins{part}": bins, f"areas{part}": areas[occupied], f"lost{part}": lost}
 
 
 # ---- all tiles -------------------------------------------------------------------------------------------------------
@@ -540,18 +542,19 @@ def _draw(plan: Plan, records: Sequence[Record], part: str) -> Diagram:
 def _notes(plan: Plan, records: Sequence[Record]) -> tuple[str, ...]:
     """Return notes on how a volume was measured, as `_measure_whole` gives them."""
     notes = [*plan.notes]
-    specks, holes = (int(n) for n in np.sum([each["pieces"] for each in records], axis=0))
-    if specks or holes:
-        notes.append(DROPPED.format(specks, holes))
+    specks, pinholes = (int(n) for n in np.sum([record["pieces"] for record in records], axis=0))
+    if specks or pinholes:
+        notes.append(DROPPED.format(specks, pinholes))
     wide = np.sum([each["wide"] for each in records], axis=0)
     for name, count in zip(("structure", "background"), wide, strict=True):
         if count:
             share = f"around {count / math.prod(plan.volume.shape):.2g} of the voxels, in the {name}"
             notes.append(f"Balls wider than {2 * WIDEST} voxels count as that wide: {share}.")
-    working, count = [*plan.working_notes], max(1, math.prod(plan.working))
-    specks, holes = (int(n) for n in np.sum([each["specks"] for each in records], axis=0))
-    if specks or holes:
-        changed = sum(int(each["changed"]) for each in records) / count
-        working.append(DROPPED.format(specks, f"{holes}, {changed:.2g} of the volume"))
-    working.extend(note_on_filling(sum(int(each["filled"]) for each in records) / count))
-    return (*notes, *(f"Of curvature: {note}" for note in working))
+    # The same on the working grid, where curvature is measured.
+    more, voxels = [*plan.working_notes], max(1, math.prod(plan.working))
+    specks, pinholes = (int(n) for n in np.sum([record["specks"] for record in records], axis=0))
+    if specks or pinholes:
+        changed = sum(int(record["changed"]) for record in records) / voxels
+        more.append(DROPPED.format(specks, f"{pinholes}, {changed:.2g} of the volume"))
+    more.extend(note_on_filling(sum(int(record["filled"]) for record in records) / voxels))
+    return (*notes, *(f"Of curvature: {note}" for note in more))

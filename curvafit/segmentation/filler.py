@@ -370,10 +370,11 @@ class Raster:
     def to_slices(self, values: np.ndarray) -> np.ndarray:
         """Return values (n, *size) on the voxels of the core, (n, Y, X)."""
         shape = [edge.stop - edge.start for edge in self.core]
-        pairs = zip(self.core, self.scale, self._pixels, strict=True)
-        first = [core.start * h - edge.start for core, h, edge in pairs]
+        axes = zip(self.core, self.scale, self._pixels, strict=True)
+        # Where the core's first voxel lies, in pixels of the window that was filled.
+        first = [core.start * pixels_per_voxel - window.start for core, pixels_per_voxel, window in axes]
         if self.scale == (1.0, 1.0):
-            y, x = (int(start) for start in first)
+            y, x = (int(pixel) for pixel in first)
             return values[:, y : y + shape[0], x : x + shape[1]]
         return np.stack([_sample(plane, shape, self.scale, first) for plane in values])
 

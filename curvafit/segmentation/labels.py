@@ -123,15 +123,15 @@ class _Labels:
         check_which(volume.shape, **which, suggest=suggest)
         volume = replace(volume, array=round_labels(volume.values))
         given, ignore = Known.find(volume, Run(), **which), which["ignore"]
-        places, turned = list(given.places), given.turn(volume.values)
-        doubts = () if which["every"] is None else doubt_places(np.asarray((turned > 0).any((1, 2))), places)
-        suggest = check_int(suggest, "a number of slices from 0", 0, len(turned) - len(places))
-        numbers = find_labels(turned[places], chosen)
+        places, slices_first = list(given.places), given.turn(volume.values)
+        doubts = () if which["every"] is None else doubt_places(np.asarray((slices_first > 0).any((1, 2))), places)
+        suggest = check_int(suggest, "a number of slices from 0", 0, len(slices_first) - len(places))
+        numbers = find_labels(slices_first[places], chosen)
         if which["every"] is None and which["known"] is None and ignore is None:
-            check_shared(turned, places, numbers)
+            check_shared(slices_first, places, numbers)
         given = replace(given, notes=(*given.notes, *doubts))
         values = index_labels(volume.values, numbers, ignore)
-        known = given.turn_back(mark_known(turned.shape, places, given.marks))
+        known = given.turn_back(mark_known(slices_first.shape, places, given.marks))
         other = None if example is None else load_example(example, volume, reading)
         levels = None if image is None else load_image(image, volume, reading)
         return cls(

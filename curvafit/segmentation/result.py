@@ -277,23 +277,24 @@ def write_mask(
 
 
 def _finish(work: Path, target: Path, maps: Sequence[str], figure: Figure, content: dict[str, Any]) -> tuple[Path, ...]:
-    """Write picture and record into a folder beside a target where the mask and its `maps` are, move all together to
-    where they belong, remove former maps, and return the paths."""
+    """Write picture and record into the folder `work` beside a target, where the mask and its `maps` are; move all
+    together to where they belong, a mask of labels into its image, remove maps of an earlier run, return the paths."""
     from curvafit.drawing.plot import DPI
 
-    image, note = image_of(target), beside(target, ".json")
-    listed = FORMAT.companions(target if image is None else note)
-    former = [place for name in MAPS if name not in maps and (place := map_path(target, name)).name in listed]
+    enclosing_image, note = image_of(target), beside(target, ".json")
+    listed = FORMAT.companions(target if enclosing_image is None else note)
+    others = [map_path(target, name) for name in MAPS if name not in maps]
+    old_maps = [path for path in others if path.name in listed]
     parts = [work / beside(target, ending).name for ending in (".png", ".json")]
     parts += [work / map_path(target, name).name for name in maps]
-    parts = parts if image else [work / target.name, *parts]
+    parts = parts if enclosing_image else [work / target.name, *parts]
     figure.savefig(work / beside(target, ".png").name, dpi=DPI)
     FORMAT.write(work / note.name, {**content, "files": [part.name for part in parts]})
     with hold_signals():
-        added = () if image is None else (add_labels(work / target.name, image, target.name),)
+        added = () if enclosing_image is None else (add_labels(work / target.name, enclosing_image, target.name),)
         files = move_together(parts, note.parent)
-        for place in former:
-            remove(place)
+        for path in old_maps:
+            remove(path)
     return (*added, *files)
 
 

@@ -68,9 +68,8 @@ def segment(
         Grey levels of two phases with noise, or probabilities of the inside, in [0, 1]: the path of a file, a `Volume`,
         or an array or tensor (Z, Y, X).
     prior
-        `Coefficients` with lengths in the scan's unit; or a preset's name, in working units of which the smallest voxel
-        edge is 0.01; or the path of a `fit.json`, whose unit is converted. By default the Willmore energy, or with an
-        example the law that `infer` finds of its mask.
+        `Coefficients` with lengths in the scan's unit; a preset's name, in working units of which the smallest voxel
+        edge is 0.01; a `fit.json`, whose unit is converted. By default the Willmore energy, or the example's law.
     weight
         λ, in nats per unit of F_ε. For grey levels it is by default 0.6 / (a20 + a02); classes that overlap are then
         measured off the surface, and the first guess is the result where it explains the scan clearly better. Small
@@ -120,7 +119,7 @@ def _segment_probabilities(
     scan: Source, prior: LawLike | None, weight: float | None, example: tuple[Source, Source] | Calibration | None, *,
     working: Working, progress: Progress, reading: dict[str, Any],
 ) -> Segmentation:  # fmt: skip
-    """Return the mask of a network's probabilities; the law's weight is given, or an example chooses both."""
+    """Return the mask of a network's probabilities; the law's weight is given, or an example chooses law and weight."""
     given = {name: value for name, value in reading.items() if name != "label"}  # that is of the example
     volume = load(load_probabilities(scan, **given), lazy=True)
     volume.check_fits()
@@ -137,9 +136,9 @@ def _segment_probabilities(
         trial, notes, head = example.trial, example.notes, f"{example}; "
     evidence = probability_evidence(likely := volume.load())
     notes = (*notes, f"Probabilities from {likely.values.min():.3g} to {likely.values.max():.3g}.")
-    flat = trial.law is not None and _missing_phase(evidence, tiles)  # without a surface there is nothing to lower
-    stays = replace(trial, law=None) if flat else trial
-    found = lower(evidence, stays, place, tiles, store=working.store, workers=working.workers, progress=progress)
+    without_surface = trial.law is not None and _missing_phase(evidence, tiles)  # there is nothing to lower then
+    run = replace(trial, law=None) if without_surface else trial
+    found = lower(evidence, run, place, tiles, store=working.store, workers=working.workers, progress=progress)
     return _describe(volume, found, trial, place, notes, head)
 
 

@@ -167,13 +167,15 @@ def crop_to_surface(slices: Slices, edge: int) -> tuple[Slices, Box]:
 def leave_out_slices(slices: Slices) -> Task[Slices] | None:
     """Return the task to predict every second known slice from the others; None where there are too few. The first and
     the last slice are not left out, unless the volume is periodic."""
-    number = len(slices.places)
-    out = range(1, number - (0 if slices.periodic and number % 2 == 0 else 1), 2)
-    rest = [k for k in range(number) if k not in out]
-    given = replace(slices, inside=slices.inside[rest], places=tuple(slices.places[k] for k in rest))
-    if not out or len(rest) < 2 or given.inside.all() or not given.inside.any():
+    count = len(slices.places)
+    # In a periodic volume the first slice follows the last, which may go if its neighbours then stay.
+    last_may_go = slices.periodic and count % 2 == 0
+    left_out = range(1, count if last_may_go else count - 1, 2)
+    kept = [k for k in range(count) if k not in left_out]
+    given = replace(slices, inside=slices.inside[kept], places=tuple(slices.places[k] for k in kept))
+    if not left_out or len(kept) < 2 or given.inside.all() or not given.inside.any():
         return None
-    return Task(given, slices.inside[list(out)], [slices.places[k] for k in out])
+    return Task(given, slices.inside[list(left_out)], [slices.places[k] for k in left_out])
 
 
 def choose_by_masks(

@@ -360,8 +360,8 @@ def _find_step(field: Volume, on: Volume) -> tuple[np.ndarray, np.ndarray] | Non
             factor = METRES[on.unit] / METRES[field.unit]
         elif not np.allclose(sorted(field.spacing), sorted(on.spacing), rtol=1e-3):
             return None
-    step = np.linalg.inv(field.affine) @ np.diag([factor] * 3 + [1.0]) @ on.affine
-    return step[2::-1, 2::-1], step[2::-1, 3]
+    between = np.linalg.inv(field.affine) @ np.diag([factor] * 3 + [1.0]) @ on.affine
+    return between[2::-1, 2::-1], between[2::-1, 3]  # affines are of x, y, z, arrays of z, y, x
 
 
 def _take_nearest(

@@ -16,7 +16,7 @@ from curvafit.generation.schedule import LEARNED, SCHEDULES, schedule
 from curvafit.geometry.description import BLOCKS, descriptors
 from curvafit.geometry.diagrams import diagram
 from curvafit.geometry.distances import wasserstein
-from curvafit.inference import estimate
+from curvafit.inference import Growth, estimate
 from curvafit.inference.atlas import load_atlas
 from curvafit.inference.candidates import EDGES, TITLES
 from curvafit.inference.fit import Fit
@@ -44,10 +44,10 @@ def tubes() -> np.ndarray:
 def inference(tubes: np.ndarray) -> Inference:
     """With fewer shapes, of fewer steps, than a user's: every stage is passed, none polished."""
     scan = Volume((tubes > 0).astype(np.uint8), (2.0, 2.0, 2.0), "um", source="tubes")
-    few = {"simulations": 8, "rounds": 1, "twins": 2, "schedule": schedule(LEARNED, steps=400)}
+    few = Growth(simulations=8, rounds=1, twins=2, schedule=schedule(LEARNED, steps=400))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(estimate, "TESTED", 8)
-        return infer(scan, kind="mask", periodic=True, seed=3, **few)
+        return infer(scan, kind="mask", periodic=True, seed=3, growth=few)
 
 
 @pytest.mark.slow

@@ -186,12 +186,13 @@ class Background(NamedTuple):
 
 
 def _measure_background(values: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> Background:
-    """Return the background's level and correlations, measured some voxels away from the structure."""
-    finest = steps.min() / steps
+    """Return the background's level, its noise and texture by their correlations, and how far its level drifts,
+    measured some voxels away from the structure."""
+    finest_edges = steps.min() / steps
     away = ndimage.distance_transform_edt(~inside, sampling=steps) > 4 * steps.min()
     where = away if away.mean() > 0.02 else ~inside
-    smooth = ndimage.gaussian_filter(values, 2 * finest)
-    where = where & (smooth <= np.quantile(smooth[where], 0.98))
+    smooth = ndimage.gaussian_filter(values, 2 * finest_edges)
+    where = where & (smooth <= np.quantile(smooth[where], 0.98))  # without other bright things than the structure
     level = float(values[where].mean())
     weight = where.astype(np.float32)
     rest = (values - level) * weight
@@ -201,8 +202,8 @@ def _measure_background(values: np.ndarray, inside: np.ndarray, steps: np.ndarra
     noise, lateral, texture, length = _split_covariance(plane)
     _, axial, _, _ = _split_covariance(covariances[0])
     widths = [n / 8 for n in values.shape]
-    slow = ndimage.gaussian_filter(rest, widths) / np.maximum(ndimage.gaussian_filter(weight, widths), 1e-3)
-    low, high = np.quantile(slow, (0.01, 0.99))
+    drift = ndimage.gaussian_filter(rest, widths) / np.maximum(ndimage.gaussian_filter(weight, widths), 1e-3)
+    low, high = np.quantile(drift, (0.01, 0.99))
     bias, width = float(high - low) / 2 / max(abs(level), 1e-9), (axial, lateral, lateral)
     return Background(where, level, noise, width, math.sqrt(texture), length * float(steps[2]), bias)
 

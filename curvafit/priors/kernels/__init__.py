@@ -1,6 +1,6 @@
 """Fused kernels for float32 fields on processors: `cpu` is for callers, `loops` has the loops.
 
-`energy.energy_gradient`, and `gaussian_blur` here, choose between a kernel and plain torch by type and device.
+`energies.energy_gradient`, and `gaussian_blur` here, choose between a kernel and plain torch by type and device.
 """
 
 from __future__ import annotations

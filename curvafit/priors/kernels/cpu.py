@@ -38,7 +38,7 @@ _LINE = 16
 def fused_energy_gradient(
     u: np.ndarray, a, grid: Grid, epsilon, orientation=None, mask=None
 ) -> tuple[float, np.ndarray]:
-    """Return F_ε(u) and its gradient in float32, as `energy.energy_gradient` does, from arrays `(Z, Y, X)`.
+    """Return F_ε(u) and its gradient in float32, as `energies.energy_gradient` does, from arrays `(Z, Y, X)`.
 
     The coefficients (a20 first) and ε are numbers, or arrays where they vary.
     """

@@ -32,6 +32,8 @@ _HALVED = 2
 _UNITS = {"nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter"}
 #: Version of OME-Zarr -> Zarr's format, for writing.
 _FORMATS = {"0.4": 2, "0.5": 3}
+#: In the index of a shard: bytes of a chunk's offset and length, of the checksum at the end, and what stands for none.
+_ENTRY, _CHECKSUM, _ABSENT = 16, 4, 2**64 - 1
 #: The letters of the axes of a level of an image, and the steps, units and origin along them, as `Stated` has them.
 _Place = dict[str, Any]
 
@@ -457,12 +459,12 @@ def _missing_within(array: Any, shard: Path, inside: Sequence[int]) -> int:
     if [type(each).__name__ for each in getattr(codec, "index_codecs", ())] != ["BytesCodec", "Crc32cCodec"]:
         return 0
     counts = _counts(array.shards, array.chunks)
-    size = 16 * math.prod(counts)
+    size = _ENTRY * math.prod(counts)
     with shard.open("rb") as stream:
         if str(getattr(codec.index_location, "value", codec.index_location)) == "end":
-            stream.seek(max(0, shard.stat().st_size - size - 4))
+            stream.seek(max(0, shard.stat().st_size - size - _CHECKSUM))
         index = stream.read(size)
     if len(index) < size:
         return 0  # reading it says what is wrong
-    absent = (np.frombuffer(index, "<u8").reshape(*counts, 2) == 2**64 - 1).all(-1)
+    absent = (np.frombuffer(index, "<u8").reshape(*counts, 2) == _ABSENT).all(-1)
     return int(absent[tuple(slice(n) for n in inside)].sum())
