@@ -185,7 +185,8 @@ def coarser_level(
     which `shape` and `prepared` are."""
     levels = levels_of(scan, key)
     # A phase field has its ε at the finest level alone, and a spacing of the caller's is that of one level.
-    if prepared.noise or prepared.kind == "field" or reading.get("spacing") is not None or None in levels.values():
+    only_one = len(levels) < 2 or None in levels.values()
+    if only_one or prepared.noise or prepared.kind == "field" or reading.get("spacing") is not None:
         return None
     edges = [(name, np.array(spacing)[-3:]) for name, spacing in levels.items()]
     finest, best, size = edges[0][1], None, np.array(shape, dtype=float)
