@@ -259,8 +259,8 @@ def prepare(
 
 
 def prepare_whole(kind: Kind, signed: Volume, periodic: bool, most: int) -> Prepared:
-    """Put all of a scan on the working grid, without blur and noise, given its kind and what is above 0 in its
-    structure (`structure.find_structure`); raise TooLarge where that is more than `most` working voxels."""
+    """Put all of a scan on the working grid, without blur and noise. The sign of `signed` tells structure from
+    background (`structure.find_structure`). Raises TooLarge where that is more than `most` working voxels."""
 
     def take_all(scan: _Scan, scale: tuple[float, float, float]) -> _Extent:
         full = count_voxels(scan.field.shape, scale)

@@ -376,7 +376,8 @@ def _look_at_values(structure: Structure, bars: Sequence[Box], value: Any, numbe
 
 def _count_padding(structure: Structure, bars: Sequence[Box], value: Any, number: int) -> Record:
     """Return sums that tell padding with a value in a bar of whole rows: how many voxels have it, and how many in runs
-    from the ends of rows; then sums of powers 0 to 4 of the levels next to those runs, and of all others."""
+    from the ends of rows; then sums of powers 0 to 4 of the levels next to those runs, and of all levels that are not
+    the value. From these follow means, variances, and the skewness and kurtosis of Sarle's test (`_judge_padding`)."""
     values = structure.read(bars[number])
     constant = values == value
     ahead = np.logical_and.accumulate(constant, axis=2)

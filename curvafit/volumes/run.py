@@ -152,8 +152,9 @@ def open_run(
 ) -> Iterator[Run]:
     """Start workers, or a number of processes, open the folder `store`, if there is one, and return the run.
 
-    `same` is what runs must have in common to share records. Raises ValueError where the folder holds other things, or
-    another run's, or is in use. It is removed where a ScanError is raised: of such a scan nothing is of use.
+    `same` is what runs must have in common to share records; `ends` are the shares of the work, as `Run` has them.
+    Raises ValueError where the folder holds other things, or another run's, or is in use. The folder is removed where a
+    ScanError is raised: of such a scan nothing is of use.
     """
     mine = {name: str(each) for name, each in {**same, "curvafit": version("curvafit")}.items()}
     with join_workers(workers) as joined, nullcontext() if store is None else _lock(Path(store), mine) as folder:

@@ -744,7 +744,8 @@ def _adam_rows(A, m, v, o, keep, free, slopes, n, adam):
 def _adam_plane(A, m, v, keep, ring, slopes, below, here, above, half, adam, z, shape):
     """Make Adam's step along -∇ of a plane, some rows at a time; return sum and maximum of the slopes' moduli.
 
-    `below`, `here`, `above` are the first samples' offsets in the ring.
+    `below`, `here`, `above` are the first samples' offsets in the ring, which has planes with continued borders; A and
+    the moments have none. `half` is 1 / 2h along each axis, `keep` 0 where A is frozen.
     """
     Z, Y, X = shape
     stride, whole = X + 2 * EDGE, (X + LANES - 1) & -LANES
