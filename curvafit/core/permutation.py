@@ -33,18 +33,18 @@ def relabel(labels: np.ndarray, most: int, seed: int = 0, blocks: np.ndarray | N
     are no more than `most`; else `most` random ones after the given one, from `seed`.
     """
     blocks = np.zeros(len(labels), dtype=int) if blocks is None else blocks
-    parts = [np.flatnonzero(blocks == block) for block in np.unique(blocks)]
-    if math.prod(_count_arrangements(labels[part]) for part in parts) <= most:
-        orders = [_arrange(labels[part]) for part in parts]
-        picked = np.indices([len(each) for each in orders]).reshape(len(orders), -1)
-        arranged = np.empty((picked.shape[1], len(labels)), dtype=labels.dtype)
-        for part, each, rows in zip(parts, orders, picked, strict=True):
-            arranged[:, part] = each[rows]
+    members = [np.flatnonzero(blocks == block) for block in np.unique(blocks)]
+    if math.prod(_count_arrangements(labels[member]) for member in members) <= most:
+        orders = [_arrange(labels[member]) for member in members]
+        picks = np.indices([len(order) for order in orders]).reshape(len(orders), -1)
+        arranged = np.empty((picks.shape[1], len(labels)), dtype=labels.dtype)
+        for member, order, rows in zip(members, orders, picks, strict=True):
+            arranged[:, member] = order[rows]
         return arranged[np.argsort((arranged != labels).any(1), kind="stable")], True
     random = np.random.default_rng(seed)
     arranged = np.repeat(labels[None], most + 1, axis=0)
-    for row, part in itertools.product(arranged[1:], parts):
-        row[random.permutation(part)] = np.sort(labels[part])[::-1]
+    for row, member in itertools.product(arranged[1:], members):
+        row[random.permutation(member)] = np.sort(labels[member])[::-1]
     return arranged, False
 
 

@@ -93,13 +93,13 @@ class Candidate:
         distance = float(one_to_many(scan, diagrams).mean())
         pairs = [one_to_many(each, diagrams[k + 1 :]) for k, each in enumerate(diagrams[:-1])]
         noise = float(np.concatenate(pairs).mean()) if pairs else None
-        numbers = tuple(each.morphometry for each in twins if each.morphometry is not None)
+        morphometries = tuple(each.morphometry for each in twins if each.morphometry is not None)
         mass = self.mass
         if self.name == "match":
             mass = float(np.clip(np.mean([each.mass for each in twins if each.phase is not None]), -RARE, RARE))
         thickness = float(np.mean([thinner_thickness(each.phase > 0) for each in twins if each.phase is not None]))
-        found = {"distance": distance, "seed_noise": noise, "twins": numbers}
-        return replace(self, mass=mass, thickness=thickness, **found)
+        compared = {"distance": distance, "seed_noise": noise, "twins": morphometries}
+        return replace(self, mass=mass, thickness=thickness, **compared)
 
 
 def best_candidate(candidates: Sequence[Candidate]) -> Candidate | None:

@@ -106,16 +106,16 @@ class Table:
     def pooled(self) -> Table:
         """Return the rows, and those of 2, 4, 8, … shapes of one law in one view, as if one scan had shown them all:
         the means of their descriptors, and the sum of what was seen."""
-        parts, laws = [[k] for k in range(len(self))], self.laws
+        groups, laws = [[k] for k in range(len(self))], self.laws
         for law, view in product(np.unique(laws), np.unique(self.views)):
             group = np.flatnonzero((laws == law) & (self.views == view)).tolist()
             for size in (2**k for k in range(1, len(group).bit_length())):
-                parts += [group[start : start + size] for start in range(0, len(group) - size + 1, size)]
-        found = self.rows(np.array([part[0] for part in parts]))
-        means = np.array([self.descriptors[part].mean(0) for part in parts])
-        thickness = np.array([self.thickness[part].mean() for part in parts])
-        amount = np.array([self.amount[part].sum() for part in parts])
-        return replace(found, descriptors=means, thickness=thickness, amount=amount)
+                groups += [group[start : start + size] for start in range(0, len(group) - size + 1, size)]
+        firsts = self.rows(np.array([rows[0] for rows in groups]))
+        means = np.array([self.descriptors[rows].mean(0) for rows in groups])
+        thickness = np.array([self.thickness[rows].mean() for rows in groups])
+        amount = np.array([self.amount[rows].sum() for rows in groups])
+        return replace(firsts, descriptors=means, thickness=thickness, amount=amount)
 
 
 def parameters_of(law: Coefficients, mass: float) -> np.ndarray:

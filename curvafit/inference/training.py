@@ -181,37 +181,39 @@ def train_emulator(
     """
     views = tuple(sorted(set(table.views.tolist())))
     target = compression(table.descriptors)
-    number = table.laws
-    part = np.random.default_rng(seed).permutation(number.max() + 1)[number] % FOLDS
+    law_of_row = table.laws
+    fold = np.random.default_rng(seed).permutation(law_of_row.max() + 1)[law_of_row] % FOLDS
     none = (Layer(np.zeros((1, 1, 1)), np.zeros((1, 1))),)
     blank = Emulator(compression, views, box, none, none, np.eye(target.shape[1]), 1.0)
     inputs = blank.inputs(table.parameters, table.views, table.amount)
     x, y = torch.from_numpy(inputs).float(), torch.from_numpy(target).float()
 
-    means = _train_ensemble(x, y, part, _mean_square, plan, seed, sub_progress(progress, 0.0, 0.5))
-    missed = y - _predict_held_out(means, x, part)
-    values, vectors = np.linalg.eigh(np.cov(missed.double().numpy().T))
+    means = _train_ensemble(x, y, fold, _mean_square, plan, seed, sub_progress(progress, 0.0, 0.5))
+    errors = y - _predict_held_out(means, x, fold)
+    values, vectors = np.linalg.eigh(np.cov(errors.double().numpy().T))
     basis = (vectors / np.sqrt(np.maximum(values, 1e-9 * values.max()))).T[::-1].astype(np.float32)
-    whitened = missed @ torch.from_numpy(basis).T
-    spreads = _train_ensemble(x, whitened, part, _normal_nats, plan, seed, sub_progress(progress, 0.5, 1.0))
-    deviation = torch.exp(_predict_held_out(spreads, x, part)).clamp(min=FAINTEST)
+    whitened = errors @ torch.from_numpy(basis).T
+    spreads = _train_ensemble(x, whitened, fold, _normal_nats, plan, seed, sub_progress(progress, 0.5, 1.0))
+    deviation = torch.exp(_predict_held_out(spreads, x, fold)).clamp(min=FAINTEST)
     emulator = Emulator(compression, views, box, _layers(means), _layers(spreads), basis, 1.0)
-    left = (whitened / deviation).double().numpy()
-    emulator = dataclasses.replace(emulator, inflation=_inflation(emulator, table, left))
-    rows = [[np.flatnonzero((table.views == view) & (part == k)) for k in range(FOLDS)] for view in views]
-    least = min(REFERENCE // FOLDS, *(len(each) for parts in rows for each in parts))
-    if not least:
+    residuals = (whitened / deviation).double().numpy()
+    emulator = dataclasses.replace(emulator, inflation=_inflation(emulator, table, residuals))
+    rows = [[np.flatnonzero((table.views == view) & (fold == k)) for k in range(FOLDS)] for view in views]
+    rows_of_fold = min(REFERENCE // FOLDS, *(len(each) for parts in rows for each in parts))
+    if not rows_of_fold:
         raise ValueError(f"expected many shapes in each of the views {', '.join(views)}, got few in one")
-    found: dict[str, list[np.ndarray]] = {view: [] for view in views}
+    references: dict[str, list[np.ndarray]] = {view: [] for view in views}
     for k in range(FOLDS):  # the network that did not learn from these rows
         mean, spread = (
             [Layer(w[k : k + 1], b[k : k + 1]) for w, b in each] for each in (emulator.mean, emulator.spread)
         )
         single = dataclasses.replace(emulator, mean=tuple(mean), spread=tuple(spread))
         for view, parts in zip(views, rows, strict=True):
-            own = table.rows(parts[k][:least])
-            found[view].append(misfits(single, own.descriptors, own.views, own.amount, own.parameters[:, None]))
-    return emulator, {view: np.sort(np.concatenate(each)) for view, each in found.items()}
+            held_out = table.rows(parts[k][:rows_of_fold])
+            references[view].append(
+                misfits(single, held_out.descriptors, held_out.views, held_out.amount, held_out.parameters[:, None])
+            )
+    return emulator, {view: np.sort(np.concatenate(each)) for view, each in references.items()}
 
 
 def _inflation(emulator: Emulator, table: Table, left: np.ndarray) -> float:

@@ -302,27 +302,31 @@ def find_split(structure: Structure, run: Run, extremes: tuple[Any, Any] | None 
     bars = cut_boxes(volume.shape, (side, side, volume.shape[2]))
     value = structure.read((slice(0, 1), slice(0, 1), slice(0, 1)))[0, 0, 0]
     records = run("reading", partial(_look_at_values, structure, bars, value), len(bars))
-    total = add_records({name: each[name] for name in each if name not in ("two", "values")} for each in records)
+    total = add_records({name: record[name] for name in record if name not in ("two", "values")} for record in records)
     if faults := int(total["faults"]):
         raise ScanError(f"a volume must be finite, got {faults} values that are not in {volume.source}")
     lowest, highest = total["lowest"], total["highest"]
-    first, last = (lowest, highest) if extremes is None else extremes
-    if first == last and volume.in_file and (label := volume.array.label) is not None:
+    low, high = (lowest, highest) if extremes is None else extremes
+    if low == high and volume.in_file and (label := volume.array.label) is not None:
         raise ScanError(f"label {label} is no label of the scan, or the only one")
-    if first == last and volume.source:
+    if low == high and volume.source:
         raise ScanError(f"every voxel of {volume.source} is {lowest}: a volume must vary")
-    ends = {float(first), float(last)}
-    two = all(bool(each["two"]) and {float(each["lowest"]), float(each["highest"])} <= ends for each in records)
+    ends = {float(low), float(high)}
+    two_values = all(
+        bool(record["two"]) and {float(record["lowest"]), float(record["highest"])} <= ends for record in records
+    )
     kind = structure.kind
     if kind == "auto":
-        kind = _guess_kind(structure, total, np.unique(np.concatenate([each["values"] for each in records])), two)
-    ends = {"lowest": float(first), "highest": float(last)}
-    structure = replace(structure, kind=kind, **ends, two=two and bool(first < last))
+        kind = _guess_kind(
+            structure, total, np.unique(np.concatenate([record["values"] for record in records])), two_values
+        )
+    ends = {"lowest": float(low), "highest": float(high)}
+    structure = replace(structure, kind=kind, **ends, two=two_values and bool(low < high))
     if kind == "field":
         return structure, f"Taken for a phase field: values {float(lowest):.3g} to {float(highest):.3g}."
     if kind == "mask":
         note = f"Taken for a mask of the values {structure.lowest:g} and {structure.highest:g}."
-        return structure, note if two else SEVERAL
+        return structure, note if two_values else SEVERAL
     return _split_image(structure, bars, total, value, run), ""
 
 

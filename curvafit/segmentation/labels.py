@@ -275,16 +275,16 @@ def _split_instances(
     the structure times the label's share in the odds of all), and the Dice to expect of each."""
     assert whole.probability is not None
     values = split_structure(whole.mask.values, values, labels.known, labels.given.volume.spacing)
-    inside, given = whole.probability.values, labels.given
+    inside, known = whole.probability.values, labels.given
     likely, dice = np.where(values, inside, 1 - inside), []
-    between = np.zeros(values.shape[given.axis], dtype=bool)
-    between[given.places[0] : given.places[-1]] = True
-    between[list(given.places)] = False
-    for place, (box, part) in enumerate(parts, 1):
-        own, mine = inside[box] * _odds(part) / np.maximum(odds[box], SURE), values[box] == place
-        likely[box] = np.where(mine, own, likely[box])
-        own, mine = (given.turn(each)[between[box[given.axis]]] for each in (own, mine))
-        dice.append(expected_dice(own, mine) if own.size else 1.0)
+    between = np.zeros(values.shape[known.axis], dtype=bool)
+    between[known.places[0] : known.places[-1]] = True
+    between[list(known.places)] = False
+    for number, (box, part) in enumerate(parts, 1):
+        chances, voxels = inside[box] * _odds(part) / np.maximum(odds[box], SURE), values[box] == number
+        likely[box] = np.where(voxels, chances, likely[box])
+        chances, voxels = (known.turn(each)[between[box[known.axis]]] for each in (chances, voxels))
+        dice.append(expected_dice(chances, voxels) if chances.size else 1.0)
     return values, likely, dice
 
 

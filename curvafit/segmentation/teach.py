@@ -498,11 +498,11 @@ def judge(filler: Filler, lessons: Batches) -> tuple[np.ndarray, dict[str, float
     """Return temperatures (2, k) by gap; the cross entropy of held-out lessons and that of the cubic alone; and the
     calibration error near surfaces, where a temperature is of another half of the lessons."""
     gaps, logits, plain, truths = [], [], [], []
-    for *given, truth in DataLoader(lessons, batch_size=None):
-        batch = Gaps(*given)
-        found, cubic = filler(batch), SLOPE * interpolate(batch.distances, batch.heights)[1]
+    for *inputs, truth in DataLoader(lessons, batch_size=None):
+        batch = Gaps(*inputs)
+        filled, cubic = filler(batch), SLOPE * interpolate(batch.distances, batch.heights)[1]
         gaps += (batch.step * (truth.shape[1] + 1)).tolist()
-        for each, values in ((logits, found), (plain, cubic), (truths, truth)):
+        for each, values in ((logits, filled), (plain, cubic), (truths, truth)):
             each += [window[lessons.inner].flatten() for window in values]
     table, errors = [], []
     for rows in np.array_split(np.argsort(gaps), TEMPERATURES):
@@ -513,8 +513,8 @@ def judge(filler: Filler, lessons: Batches) -> tuple[np.ndarray, dict[str, float
         table.append((float(np.mean([gaps[k] for k in rows])), float(np.sqrt(np.prod(cooled)))))
     cross_entropy = F.binary_cross_entropy_with_logits
     pairs = (("held_out_loss", logits), ("held_out_cubic", plain))
-    whole = {name: float(cross_entropy(torch.cat(each), torch.cat(truths))) for name, each in pairs}
-    return np.array(table).T, whole, float(np.mean(errors))
+    losses = {name: float(cross_entropy(torch.cat(each), torch.cat(truths))) for name, each in pairs}
+    return np.array(table).T, losses, float(np.mean(errors))
 
 
 def near_error(logits: Tensor, truth: Tensor) -> float:

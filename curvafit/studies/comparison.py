@@ -311,30 +311,32 @@ def _compare_measures(
     labels = np.array([groups.index(label) if isinstance(label, str) else label for label, _ in subjects])
     blocks = np.unique([name for _, name in subjects], return_inverse=True)[1] if options["paired"] else None
     # What goes with a number may go straight or level off: its rank loses little of the first and sees the second.
-    tested = labels if groups else rankdata(labels)
-    arranged, exact = permutation.relabel(tested, options["permutations"], options["seed"], blocks)
+    scores = labels if groups else rankdata(labels)
+    arrangements, exact = permutation.relabel(scores, options["permutations"], options["seed"], blocks)
     test = permutation.measure_energy if groups else permutation.measure_dependence
     pooled = [_pool([measures[k].diagram for k in own]) for own in scans]
     rows = np.stack([sliced_embedding(each) for each in pooled])
-    away = cdist(rows, rows)
-    statistics = test(away, arranged, blocks)
+    distances = cdist(rows, rows)
+    statistics = test(distances, arrangements, blocks)
     sides = labels if groups else _halve(labels)
     means = tuple(
         _pool([each for each, own in zip(pooled, sides, strict=True) if own == side]) for side in np.unique(sides)
     )
-    alike = (sides[:, None] == sides) & ~np.eye(len(sides), dtype=bool)
-    edges, differences, p = _compare_bins(pooled, labels, arranged, blocks)
+    same_side = (sides[:, None] == sides) & ~np.eye(len(sides), dtype=bool)
+    edges, differences, p = _compare_bins(pooled, labels, arrangements, blocks)
     values, errors, halves = _average(measures, scans)
     # Of a number that is the label.
-    least = permutation.share_beyond(permutation.correlate(tested[:, None], arranged, blocks))[0]
+    least_p = permutation.share_beyond(permutation.correlate(scores[:, None], arrangements, blocks))[0]
     return Comparison(
         by=options["by"], groups=groups, unit=measures[0].unit, cases=tuple(cases), measures=tuple(measures),
         subjects=tuple(subjects), labels=labels, blocks=blocks, values=values, errors=errors, halves=halves,
-        numbers=_compare_numbers(measures[0], values, errors, labels, arranged, blocks),
-        statistic=float(statistics[0]), p=float(permutation.share_beyond(statistics)), least=float(least), sides=sides,
-        diagrams=means, apart=float(pdist(np.stack([sliced_embedding(each) for each in means])).max()),
-        within=float(away[alike].mean()), edges=edges, differences=differences, bins_p=p, permutations=len(arranged),
-        exact=exact, options=options, notes=(*notes, *gather_notes(measures, cases)),
+        numbers=_compare_numbers(measures[0], values, errors, labels, arrangements, blocks),
+        statistic=float(statistics[0]), p=float(permutation.share_beyond(statistics)), least=float(least_p),
+        sides=sides, diagrams=means,
+        apart=float(pdist(np.stack([sliced_embedding(each) for each in means])).max()),
+        within=float(distances[same_side].mean()), edges=edges, differences=differences, bins_p=p,
+        permutations=len(arrangements), exact=exact, options=options,
+        notes=(*notes, *gather_notes(measures, cases)),
     )  # fmt: skip
 
 
@@ -411,20 +413,24 @@ def _measure_change(
 ) -> tuple[tuple[float, ...], tuple[float, ...], float, tuple[float, float, float], float]:
     """Return means, deviations, difference and effect with its interval of a `Number`, and the variance left over."""
     if np.issubdtype(labels.dtype, np.floating):
-        parts, freed = [], 1
+        samples, spent = [], 1
         difference, _ = permutation.measure_slope(values, labels, blocks)
         _, effect = permutation.measure_slope(values, ranks, blocks)
-        share = effect[0]
+        correlation = effect[0]
     else:
         order = np.arange(len(labels)) if blocks is None else np.argsort(blocks, kind="stable")
-        parts = [values[order][labels[order] == group] for group in np.unique(labels)]
-        freed, two = len(parts) - 1, len(parts) == 2
-        share = float(permutation.correlate(values[:, None], labels[None], blocks)[0, 0])
-        difference = float(parts[1].mean() - parts[0].mean()) if two else math.nan
-        effect = permutation.measure_effect(*parts, paired=blocks is not None) if two else (share, math.nan, math.nan)
+        samples = [values[order][labels[order] == group] for group in np.unique(labels)]
+        spent, two_groups = len(samples) - 1, len(samples) == 2
+        correlation = float(permutation.correlate(values[:, None], labels[None], blocks)[0, 0])
+        difference = float(samples[1].mean() - samples[0].mean()) if two_groups else math.nan
+        effect = (
+            permutation.measure_effect(*samples, paired=blocks is not None)
+            if two_groups
+            else (correlation, math.nan, math.nan)
+        )
     squares = float((permutation.center(values, blocks) ** 2).sum())
-    freedom = len(labels) - (1 if blocks is None else len(np.unique(blocks))) - freed
+    freedom = len(labels) - (1 if blocks is None else len(np.unique(blocks))) - spent
     effect = effect if squares > 0 else (math.nan, math.nan, math.nan)
-    left = squares * (1 - share**2) / freedom if freedom > 0 and math.isfinite(effect[0]) else math.nan
-    means = tuple(float(part.mean()) for part in parts)
-    return means, tuple(float(part.std(ddof=1)) for part in parts), difference, effect, left
+    variance_left = squares * (1 - correlation**2) / freedom if freedom > 0 and math.isfinite(effect[0]) else math.nan
+    means = tuple(float(sample.mean()) for sample in samples)
+    return means, tuple(float(sample.std(ddof=1)) for sample in samples), difference, effect, variance_left
