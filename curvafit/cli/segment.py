@@ -298,19 +298,19 @@ def _run(
         if record.get("labels"):
             volume = volume.load()
             check_labels(job.out, volume)
-        lost = note_lost(job.out, volume)
-        say_notes(lost)
+        not_held = note_lost(job.out, volume)
+        say_notes(not_held)
         store = hidden_store(job.out)
         with resumable(lambda: "the same command" if store.exists() else ""):
             result = compute(volume, progress=progress, working=Working(**working, store=store))
             progress("writing", 1.0)
-            labels = None if sure is None else result.keep_sure(sure)
-            result = result if labels is None else replace(result, notes=(*result.notes, *labels.notes))
+            sure_labels = None if sure is None else result.keep_sure(sure)
+            result = result if sure_labels is None else replace(result, notes=(*result.notes, *sure_labels.notes))
             # The header is kept where it says where the voxels are; one of a file of channels is of all of them.
-            stated = ("spacing", "crop") if job.image else ("spacing", "crop", "channel", "time")
-            like = (job.image or job.source) if all(reading[name] is None for name in stated) else None
-            settings = {"sure": labels, "like": like, "unit": reading["unit"], "overwrite": job.overwrite}
-            settings["record"] = job.content | ({"not_held": lost} if lost else {})
+            place_options = ("spacing", "crop") if job.image else ("spacing", "crop", "channel", "time")
+            like = (job.image or job.source) if all(reading[name] is None for name in place_options) else None
+            settings = {"sure": sure_labels, "like": like, "unit": reading["unit"], "overwrite": job.overwrite}
+            settings["record"] = job.content | ({"not_held": not_held} if not_held else {})
             paths = write_mask(result, volume, job.out, **settings)
         remove(store)
     for note in result.notes:

@@ -92,31 +92,35 @@ def estimate_law(
 
     The parameters are as in `infer`; where nothing grows the scan is compared with what training left unexplained.
     """
-    reading, turn = described.reading, described.turn
+    reading, of_structure = described.reading, described.turn
     progress("reading the posterior", 0.0)
     draws = posterior.draw(reading, DRAWS, seed)
     parameters = draws[:, :-1]
     combinations = posterior.combinations.read(parameters, background=described.background)
-    estimate = Estimate(np.column_stack([turn(parameters), draws[:, -1]]), reading.view, combinations)
+    estimate = Estimate(np.column_stack([of_structure(parameters), draws[:, -1]]), reading.view, combinations)
     thickness = float(np.exp(np.median(draws[:, -1])))
-    likely = Candidate("posterior", *law_of(turn(middle_of(parameters))), _deviations(turn(parameters)), thickness)
+    likely = Candidate(
+        "posterior", *law_of(of_structure(middle_of(parameters))), _deviations(of_structure(parameters)), thickness
+    )
     grown = None
     if growth is not None and growth.simulations:
-        simulate, part = _simulator(described.seen, reading.view, growth.schedule), sub_progress(progress, 0.15, 0.45)
-        grown = simulate_draws(parameters, simulate, growth.simulations, seed=seed, progress=part)
+        simulate, step = _simulator(described.seen, reading.view, growth.schedule), sub_progress(progress, 0.15, 0.45)
+        grown = simulate_draws(parameters, simulate, growth.simulations, seed=seed, progress=step)
     if growth is None or grown is None or len(grown.parameters) < FEWEST:
-        left = misfits(posterior.emulator, *reading.columns, parameters[None, :STARTS])[0]
-        p, level_cut = _join_level_cut(tail_probability(posterior.misfits[reading.view], left), posterior, reading)
+        own_misfit = misfits(posterior.emulator, *reading.columns, parameters[None, :STARTS])[0]
+        p, level_cut = _join_level_cut(
+            tail_probability(posterior.misfits[reading.view], own_misfit), posterior, reading
+        )
         misfit = Misfit(p, {}, "by the best fit, nothing grown", level_cut=level_cut)
         candidates = (likely, _best_fit(posterior, described, parameters[:STARTS], thickness))
         return replace(estimate, candidates=candidates, misfit=misfit)
     pool = posterior.draw(reading, POOL, seed)[:, :-1]
     search = Search(posterior.emulator, reading)
-    part = sub_progress(progress, 0.45, 1.0)
-    likeliest, every = search.run(pool, grown, simulate, rounds=growth.rounds, seed=seed, progress=part)
-    nearest = every.parameters[search.nearest(every)[0]]
+    step = sub_progress(progress, 0.45, 1.0)
+    likeliest, simulations = search.run(pool, grown, simulate, rounds=growth.rounds, seed=seed, progress=step)
+    nearest = simulations.parameters[search.nearest(simulations)[0]]
     laws = {"refined": likeliest} | ({} if np.array_equal(nearest, likeliest) else {"simulation": nearest})
-    refined, *others = (Candidate(name, *law_of(turn(each)), {}, thickness) for name, each in laws.items())
+    refined, *others = (Candidate(name, *law_of(of_structure(each)), {}, thickness) for name, each in laws.items())
     names, row, rows = np.array(column_names()), reading.descriptors, grown.columns[0]
     blocks = {name: (row[names == name], rows[:, names == name]) for name in BLOCKS}
     return replace(estimate, candidates=(refined, likely, *others), simulated=blocks)

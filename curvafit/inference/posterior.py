@@ -320,10 +320,12 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
     if len(ends) != len(PARAMETERS):
         raise ValueError(f"words for {len(ends)} combinations, not {len(PARAMETERS)}")
     sums = Combinations(arrays["combinations.weights"], arrays["combinations.centre"], ends)
-    places, tests = (box, arrays["centre"], arrays["spread"]), (arrays["departures"], arrays["discriminant"])
+    ranges, tests = (box, arrays["centre"], arrays["spread"]), (arrays["departures"], arrays["discriminant"])
     tests += (discriminants if len(taught) > 1 else {},)
-    made = header["provenance"]
-    return Posterior(architecture, tuple(members), compression, views, *places, emulator, misfits, sums, made, *tests)
+    provenance = header["provenance"]
+    return Posterior(
+        architecture, tuple(members), compression, views, *ranges, emulator, misfits, sums, provenance, *tests
+    )
 
 
 def _read_layers(arrays: dict[str, np.ndarray], name: str, views: int, outputs: int) -> tuple[Layer, ...]:

@@ -74,17 +74,17 @@ def find_shift(values: np.ndarray, slices: Slices) -> tuple[int, int]:
 
     The correlation of slices with grey levels, whichever of the two is brighter, is greatest at the shift.
     """
-    whole = np.zeros(slices.inside.shape[1:])
+    correlation = np.zeros(slices.inside.shape[1:])
     for place, inside in zip(slices.places, slices.inside, strict=True):
         plane = values[place].astype(np.float64)
         plane -= ndimage.uniform_filter(plane, LOCAL, mode="nearest")
         mask, grey = np.fft.rfft2(inside - inside.mean()), np.fft.rfft2(plane / max(plane.std(), 1e-12))
-        whole += np.fft.irfft2(mask.conj() * grey, whole.shape)
-    reach = [min(FURTHEST, n // 4) for n in whole.shape]
-    near = np.abs(np.roll(whole, reach, (0, 1))[: 2 * reach[0] + 1, : 2 * reach[1] + 1])
-    y, x = (int(k) - r for k, r in zip(np.unravel_index(near.argmax(), near.shape), reach, strict=True))
-    least = max((1 + BETTER) * near[reach[0], reach[1]], CLEAR * float(np.sqrt(np.square(whole).mean())))
-    return (y, x) if max(abs(y), abs(x)) >= NEAREST and near.max() > least else (0, 0)
+        correlation += np.fft.irfft2(mask.conj() * grey, correlation.shape)
+    reach = [min(FURTHEST, n // 4) for n in correlation.shape]
+    around = np.abs(np.roll(correlation, reach, (0, 1))[: 2 * reach[0] + 1, : 2 * reach[1] + 1])
+    y, x = (int(k) - r for k, r in zip(np.unravel_index(around.argmax(), around.shape), reach, strict=True))
+    threshold = max((1 + BETTER) * around[reach[0], reach[1]], CLEAR * float(np.sqrt(np.square(correlation).mean())))
+    return (y, x) if max(abs(y), abs(x)) >= NEAREST and around.max() > threshold else (0, 0)
 
 
 def _learn(features: np.ndarray, inside: np.ndarray) -> Any:

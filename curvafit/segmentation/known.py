@@ -64,19 +64,19 @@ class Known:
             which = record["which"]
             if len(which):
                 inside[which[0] : which[-1] + 1] = record["inside"]
-            found = {"there": record["there"], "values": record["values"]}
-            return {**found, "count": np.count_nonzero(record["inside"])}
+            records = {"there": record["there"], "values": record["values"]}
+            return {**records, "count": np.count_nonzero(record["inside"])}
 
-        found = run("reading known slices", partial(_read_slab, self, name), len(self._slabs), keep=keep)
-        values = np.unique(np.concatenate([each["values"] for each in found]))
+        records = run("reading known slices", partial(_read_slab, self, name), len(self._slabs), keep=keep)
+        values = np.unique(np.concatenate([block["values"] for block in records]))
         if len(values) > LABELS:
             raise ScanError(f"{name} must be a mask or have at most {LABELS} labels, got {len(values)} values")
-        count = sum(int(each["count"]) for each in found)
+        count = sum(int(block["count"]) for block in records)
         self._check_label(count > 0)
         require_outline(count, len(self.places) * plane[0] * plane[1], name)
         edges = turn_axes(self.volume.spacing, self.axis)
         slices = Slices(inside.stored, self.places, length, edges, self.volume.unit, periodic, self.marks)
-        return slices, values, np.concatenate([each["there"] for each in found])
+        return slices, values, np.concatenate([block["there"] for block in records])
 
     def turn(self, values: np.ndarray) -> np.ndarray:
         """Move the axis across the slices to the front."""

@@ -187,12 +187,12 @@ def _join_labels(
     labels: _Labels, parts: _Parts, whole: Segmentation | None, notes: Sequence[str], reasons: Sequence[str]
 ) -> Segmentation:
     """Return the result of labels that are filled one by one, or as parts of a whole."""
-    given, image, numbers = labels.given, labels.image, labels.numbers
-    volume, places = given.volume, list(given.places)
-    length = volume.shape[given.axis]
-    far = np.ones(given.turn(labels.values).shape, dtype=bool)
+    known, image, numbers = labels.given, labels.image, labels.numbers
+    volume, places = known.volume, list(known.places)
+    length = volume.shape[known.axis]
+    far = np.ones(known.turn(labels.values).shape, dtype=bool)
     far[slice(None) if labels.periodic or image is not None else reach_of(places, length)] = False
-    values, likely, phase, odds = _join_parts(labels, parts, labels.full, given.turn_back(far))
+    values, likely, phase, odds = _join_parts(labels, parts, labels.full, known.turn_back(far))
     doubts = {number: part.uncertainty for number, (_, part) in zip(numbers, parts, strict=True)}
     dice = {number: doubt.expected_dice for number, doubt in doubts.items() if doubt is not None}
     if whole is not None:
@@ -202,7 +202,7 @@ def _join_labels(
     error = max(doubt.calibration_error for doubt in (whole and whole.uncertainty, *doubts.values()) if doubt)
     unsure = doubt(likely)
     entropies = tuple(unsure.sum(tuple({0, 1, 2} - {axis})) for axis in range(3))
-    following = suggest_slices(entropies[given.axis], places, labels.suggest, labels.periodic)
+    following = suggest_slices(entropies[known.axis], places, labels.suggest, labels.periodic)
     table = np.array([0, *numbers], volume.values.dtype if volume.values.dtype.kind in "iu" else np.int64)
     if (kind := smallest_type(table)).itemsize < 8:  # of 64 bits the given one
         table = table.astype(kind)
@@ -211,7 +211,7 @@ def _join_labels(
     )
     return Segmentation.of(
         volume, values != 0, np.maximum(phase, -1), None, max(part.epsilon for _, part in parts),
-        (*given.notes, *notes, *reasons), weight=None, status=_describe_labels(parts, dice, whole, following),
+        (*known.notes, *notes, *reasons), weight=None, status=_describe_labels(parts, dice, whole, following),
         image=image, labels=replace(volume, array=table[values], notes=()), uncertainty=uncertain,
     )  # fmt: skip
 
@@ -331,14 +331,14 @@ def find_labels(values: np.ndarray, chosen: Sequence[int] | None) -> list[int]:
     `ScanError` if the values are grey levels, a chosen label is missing, or there is none but 0."""
     if chosen is not None:
         chosen = sorted({check_int(n, "labels that are whole numbers", -SEEDS, IDS) for n in chosen})
-        others = require_labels(values, "the known slices", math.inf)  # of those that are not chosen any number
-        values = np.where(index_labels(others, chosen), others, 0)
-    found = [int(value) for value in np.unique(require_labels(values, "the known slices"))]
-    numbers = [number for number in found if number] if chosen is None else chosen
-    listed = ", ".join(map(str, found[:12])) + (", …" if len(found) > 12 else "")
+        kept = require_labels(values, "the known slices", math.inf)  # of those that are not chosen any number
+        values = np.where(index_labels(kept, chosen), kept, 0)
+    present = [int(value) for value in np.unique(require_labels(values, "the known slices"))]
+    numbers = [number for number in present if number] if chosen is None else chosen
+    listed = ", ".join(map(str, present[:12])) + (", …" if len(present) > 12 else "")
     if not numbers or 0 in numbers:
         raise ScanError(f"labels must be other than 0, got {'0' if numbers else f'{listed} in the known slices'}")
-    if missing := [number for number in numbers if number not in found]:
+    if missing := [number for number in numbers if number not in present]:
         raise ScanError(f"the known slices have the labels {listed}, but not {', '.join(map(str, missing))}")
     return numbers
 
@@ -366,16 +366,16 @@ def split_structure(mask: np.ndarray, labels: np.ndarray, known: np.ndarray, spa
     where there is none, and those of `known` voxels stay. Each label is kept in one piece: of the pieces that it has,
     those without a known voxel go to the label that they touch most, or to the background."""
     near = ndimage.distance_transform_edt(labels == 0, spacing, return_distances=False, return_indices=True)
-    found = np.where(known, labels, np.where(mask, labels[tuple(near)], 0))  # type: ignore[arg-type]
-    pieces = np.asarray(measure.label(found, connectivity=3))
-    owner, stays = np.zeros(pieces.max() + 1, dtype=found.dtype), np.zeros(pieces.max() + 1, dtype=bool)
-    owner[pieces], stays[pieces[known]], stays[0] = found, True, True
+    labelled = np.where(known, labels, np.where(mask, labels[tuple(near)], 0))  # type: ignore[arg-type]
+    pieces = np.asarray(measure.label(labelled, connectivity=3))
+    owner, stays = np.zeros(pieces.max() + 1, dtype=labelled.dtype), np.zeros(pieces.max() + 1, dtype=bool)
+    owner[pieces], stays[pieces[known]], stays[0] = labelled, True, True
     row = np.cumsum(~stays) - 1
     touched = np.zeros((np.count_nonzero(~stays), int(labels.max()) + 1), dtype=np.intp)
     for axis in range(3):
-        turned = np.moveaxis(pieces, axis, 0)
-        for one, other in ((turned[1:], turned[:-1]), (turned[:-1], turned[1:])):
-            meet = ~stays[one] & stays[other] & (other > 0)
-            np.add.at(touched, (row[one[meet]], owner[other[meet]]), 1)
+        moved = np.moveaxis(pieces, axis, 0)
+        for here, there in ((moved[1:], moved[:-1]), (moved[:-1], moved[1:])):
+            meet = ~stays[here] & stays[there] & (there > 0)
+            np.add.at(touched, (row[here[meet]], owner[there[meet]]), 1)
     owner[~stays] = touched.argmax(1)  # that is 0 where nothing is touched
     return owner[pieces]

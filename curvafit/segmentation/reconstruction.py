@@ -383,25 +383,25 @@ def _fill_volume(
         return look_at(expit(engine.logits(slices)), slices, cores[0], whole=engine.evidence is not None)
 
     if raster is None:
-        found = run(_FILL, fill_all, 1, keep=keep)
+        records = run(_FILL, fill_all, 1, keep=keep)
     else:
         stated = _describe_blocks(slices, raster, cores, run.processes)
-        found = run(_FILL, partial(fill_block, slices, engine.taught, raster, cores), len(cores), stated, keep)
-    sums = add_records(_widen(record, core, slices.shape) for core, record in zip(cores, found, strict=True))
+        records = run(_FILL, partial(fill_block, slices, engine.taught, raster, cores), len(cores), stated, keep)
+    sums = add_records(_widen(record, core, slices.shape) for core, record in zip(cores, records, strict=True))
     compared: list[Record] = []
-    least = max(best_threshold(sums["counts"]), LEAST) if slices.between.any() else 0.5
-    least = np.where(engine.thresholded(slices), least, 0.5).astype(np.float32)[:, None, None]
+    thresholds = max(best_threshold(sums["counts"]), LEAST) if slices.between.any() else 0.5
+    thresholds = np.where(engine.thresholded(slices), thresholds, 0.5).astype(np.float32)[:, None, None]
     for core in cores:
         box = given.turn_box(core)
         part = np.moveaxis(likely[box], given.axis, 0)
-        inside = part > least[core[0]]
+        inside = part > thresholds[core[0]]
         mask[box] = np.moveaxis(inside, 0, given.axis)
         compared.append(_compare(part, inside, slices.between[core[0]]))
     filled = _Filled(_voxels(likely.stored), _voxels(mask.stored, label=1), sums | add_records(compared))
     if raster is None:
         return filled, given.turn_back(engine.run(slices, Trial()))
     epsilon = choose_epsilon(slices.frame, engine.epsilon)
-    profile = _Profile(likely.stored, np.moveaxis(least, 0, given.axis), min(slices.spacing[1:]), epsilon)
+    profile = _Profile(likely.stored, np.moveaxis(thresholds, 0, given.axis), min(slices.spacing[1:]), epsilon)
     return filled, _voxels(profile)
 
 

@@ -95,12 +95,12 @@ class Texture:
     def cut(self, rng: np.random.Generator, axes: Sequence[np.ndarray], thickness: float, mix: Mix) -> np.ndarray:
         """Return a window, bool (Z, Y, X), at places along three axes, anywhere, turned and stretched at random, of
         structures of a thickness in the unit of the places."""
-        voxels = self.thickness / thickness
+        voxels_per_unit = self.thickness / thickness
         if rng.random() < mix.upright or not self.periodic:
-            turn = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)[:, None]
+            rotation = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)[:, None]
         else:
-            turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
-        matrix = turn * (voxels * np.exp(mix.stretch * rng.standard_normal(3)))
+            rotation, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+        matrix = rotation * (voxels_per_unit * np.exp(mix.stretch * rng.standard_normal(3)))
         grid = np.stack(np.meshgrid(*axes, indexing="ij")).reshape(3, -1)
         corner = rng.uniform(0, self.values.shape)[:, None]
         return self.read(matrix @ grid + corner).reshape([len(axis) for axis in axes]) > 0
@@ -247,18 +247,18 @@ def load_textures(
     for number, source in enumerate(map(Path, sources)):
         if (source / "draws").is_dir():
             draws = find_well_formed((source,))
-            found = [Texture(store.field(index)) for store, index in draws]
+            shapes = [Texture(store.field(index)) for store, index in draws]
             settings = draws[0][0].settings
-            kept = {"design": settings.design, "seed": settings.seed, "shape": list(settings.shape)}
+            origin = {"design": settings.design, "seed": settings.seed, "shape": list(settings.shape)}
         else:
             mask = load(source)
-            found = [Texture(2 * (mask.values > 0).astype(np.float32) - 1, periodic=False)]
-            kept = {"shape": list(mask.shape)}
-        found = [each for each in found if FILLED[0] < (each.values > 0).mean() < FILLED[1]]
-        if not found:
+            shapes = [Texture(2 * (mask.values > 0).astype(np.float32) - 1, periodic=False)]
+            origin = {"shape": list(mask.shape)}
+        shapes = [texture for texture in shapes if FILLED[0] < (texture.values > 0).mean() < FILLED[1]]
+        if not shapes:
             raise ValueError(f"{source} has no shape that can teach")
-        textures.append(found)
-        names.append({"source": source.name, "shapes": len(found), **kept})
+        textures.append(shapes)
+        names.append({"source": source.name, "shapes": len(shapes), **origin})
         progress(f"reading {source.name}", (number + 1) / len(sources))
     return textures, {"sources": names, "curvafit": version("curvafit"), "torch": version("torch")}
 
@@ -352,13 +352,13 @@ def image_shape(textures: Sequence[Sequence[Texture]], mix: ImageMix, seed: Sequ
         texture = source[int(rng.integers(len(source)))]
         names = list(MODALITIES)
         modality = MODALITIES[names[int(rng.integers(len(names)))]].draw(int(rng.integers(2**31)))
-        turn = rng.permutation(3)
-        edges = np.array(modality.spacing)[turn]
+        order = rng.permutation(3)
+        edges = np.array(modality.spacing)[order]
         finest = float(edges[1:].min())
         gap = int(rng.integers(mix.gap[0], max(mix.gap[0], min(mix.gap[1], int(mix.longest * finest / edges[0]))) + 1))
         sides = np.ceil(mix.edge * finest / edges[1:]).astype(int)
         shape = np.empty(3, dtype=int)
-        shape[turn] = [mix.gaps * gap + 1, *sides]
+        shape[order] = [mix.gaps * gap + 1, *sides]
         low, high = mix.thickness
         low = min(max(low, mix.edge * texture.thickness / FINEST), high)
         edge = math.exp(rng.uniform(math.log(low), math.log(high))) * finest / texture.thickness
@@ -366,21 +366,21 @@ def image_shape(textures: Sequence[Sequence[Texture]], mix: ImageMix, seed: Sequ
         start = rng.integers(0, texture.values.shape)
         rows = [(a + np.arange(n)) % m for a, n, m in zip(start, size, texture.values.shape, strict=True)]
         phase = torch.from_numpy(np.ascontiguousarray(texture.values[np.ix_(*rows)], dtype=np.float32))
-        seen = image(phase, edge, modality, int(rng.integers(2**31))).numpy()
+        grey = image(phase, edge, modality, int(rng.integers(2**31))).numpy()
         inside = regrid(phase, edge, modality).numpy() > 0
         box = tuple(slice(n) for n in shape)
-        seen, inside = (np.ascontiguousarray(each[box].transpose(turn)) for each in (seen, inside))
+        grey, inside = (np.ascontiguousarray(each[box].transpose(order)) for each in (grey, inside))
         known = inside[::gap]
         if IMAGED[0] < inside.mean() < IMAGED[1] and not known.all() and known.any():
             break
     if rng.random() < mix.noisy:
-        contrast = abs(float(seen[inside].mean()) - float(seen[~inside].mean()))
+        contrast = abs(float(grey[inside].mean()) - float(grey[~inside].mean()))
         deviation = math.exp(rng.uniform(*np.log(mix.noise))) * contrast
-        seen = seen + deviation * rng.standard_normal(seen.shape, dtype=np.float32)
+        grey = grey + deviation * rng.standard_normal(grey.shape, dtype=np.float32)
     slices = Slices(known, tuple(range(0, len(inside), gap)), len(inside), tuple(edges.tolist()))
     raster, margin = Raster.of(slices), slice(REACH - HALO, HALO - REACH)
     distances = np.stack([raster.distances(mask)[margin, margin] for mask in inside])
-    evidence = np.stack([raster.spread(plane)[margin, margin] for plane in read_image(seen, slices)[0]])
+    evidence = np.stack([raster.spread(plane)[margin, margin] for plane in read_image(grey, slices)[0]])
     return Whole(distances, gap, slices.spacing[0] / raster.pixel, evidence)
 
 

@@ -297,13 +297,15 @@ def measure_scans(
     some scans have a physical unit.
     """
     unit, notes = _check_scans(cases, reading, sub_progress(progress, 0.0, 0.05))
-    given = options | reading
-    found: dict[int, Any] = {k: (case.source,) for k, case in enumerate(cases) if isinstance(case.source, Measures)}
+    settings = options | reading
+    measured: dict[int, Any] = {k: (case.source,) for k, case in enumerate(cases) if isinstance(case.source, Measures)}
     tasks: dict[int, Task] = {
-        k: partial(_measure_one, case.source, case.name, False, given) for k, case in enumerate(cases) if k not in found
+        k: partial(_measure_one, case.source, case.name, False, settings)
+        for k, case in enumerate(cases)
+        if k not in measured
     }
-    found |= share_out(tasks, [case.name for case in cases], workers, sub_progress(progress, 0.05, 1.0))
-    measures: list[Measures] = [found[k][0] for k in range(len(cases))]
+    measured |= share_out(tasks, [case.name for case in cases], workers, sub_progress(progress, 0.05, 1.0))
+    measures: list[Measures] = [measured[k][0] for k in range(len(cases))]
     if flat := [case.name for case, each in zip(cases, measures, strict=True) if not each.diagram.area > 0]:
         raise ValueError(
             f"{flat[0]}: expected a scan with curvature, got a stack too thin for it: measure has its numbers"

@@ -356,18 +356,18 @@ def _find_axes(
         what = "times" if letter == "t" else "channels"
         taken = (f"The file calls an axis of {shape[named['z']]} {what}: it is taken for slices.",)
     space = [named[letter] for letter in "zyx" if letter in named]
-    others = {"channel": named.get("s", named.get("c")), "time": named.get("t")}
-    if others["channel"] is None and channel is not None and time is None:
-        others = {"channel": others["time"], "time": None}
-    numbers = _pick_numbers(shape, others, {"channel": channel, "time": time}, source, len(long))
+    further = {"channel": named.get("s", named.get("c")), "time": named.get("t")}
+    if further["channel"] is None and channel is not None and time is None:
+        further = {"channel": further["time"], "time": None}
+    numbers = _pick_numbers(shape, further, {"channel": channel, "time": time}, source, len(long))
     if len(space) != 3 or len(long) != 3 + len(numbers) or 0 in shape:
         got = "no values" if 0 in shape else f"{len(long) - len(numbers)}D of shape {tuple(shape)}"
         hint = "; a channel, counted from 0, picks one volume of several" if (len(long), len(numbers)) == (4, 0) else ""
         raise ScanError(f"a volume must be 3D, got {got} in {source}{hint}")
-    if missing := {name: shape[axis] for name, axis in others.items() if axis is not None and numbers[axis] is None}:
-        held = " of ".join(f"{count} {name}s" for name, count in missing.items())
-        asked = " and ".join(f"a {name} from 0 to {count - 1}" for name, count in missing.items())
-        raise ScanError(f"{source} holds {held}: choose {asked}")
+    if missing := {name: shape[axis] for name, axis in further.items() if axis is not None and numbers[axis] is None}:
+        content = " of ".join(f"{count} {name}s" for name, count in missing.items())
+        choices = " and ".join(f"a {name} from 0 to {count - 1}" for name, count in missing.items())
+        raise ScanError(f"{source} holds {content}: choose {choices}")
     used = {"Channel": channel, "Time": time}
     notes = (f"{name} {number} is used." for name, number in used.items() if number is not None)
     single = {axis: 0 for axis, n in enumerate(shape) if n == 1}
