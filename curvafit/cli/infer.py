@@ -83,6 +83,9 @@ def _print_result(inference: Inference) -> None:
         heads = ("", "working units", "±", "90 % of the posterior", f"with lengths in {fit.length_unit}")
         print_table(heads, rows, right=range(1, 5))
     if inference.twins:
-        distances = [f"{TITLES.get(each.name, each.name)} {format_number(each.distance, 2)}" for each in fit.candidates]
+        distances = [
+            f"{TITLES.get(candidate.name, candidate.name)} {format_number(candidate.distance, 2)}"
+            for candidate in fit.candidates
+        ]
         unit = format_length(fit.length, fit.length_unit, 3)
         say(f"Distances in 1/working unit ({unit}): {', '.join(distances)}.")

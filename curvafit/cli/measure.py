@@ -227,20 +227,20 @@ def _print_instances(instances: Sequence[Measures]) -> None:
     from curvafit.core.units import format_number, power_name
 
     rows = []
-    for same in zip(*(each.quantities for each in instances), strict=True):
+    for same in zip(*(instance.quantities for instance in instances), strict=True):
         values = sorted(each.value for each in same if math.isfinite(each.value)) or [math.nan]
         shown = (format_number(each, 4) for each in (values[0], median(values), values[-1]))
         rows.append((same[0].name, same[0].symbol, *shown, power_name(instances[0].unit, same[0].power)))
     print_table(("", "", "least", "median", "greatest", "unit"), rows, right=(2, 3, 4))
-    cut = sum(each["S.cut"].value > 0 for each in instances)
-    thin = sum(math.isnan(each["H"].value) for each in instances)
+    cut = sum(instance["S.cut"].value > 0 for instance in instances)
+    thin = sum(math.isnan(instance["H"].value) for instance in instances)
     say(f"{len(instances)} instances; {cut} are cut by the border, {thin} too thin for curvature.")
 
 
 def _print_measures(measures: Measures) -> None:
     if measures.part is not None:
         say(" ".join(map(str, measures.part)), style="bold")
-    rows = [(each.name, each.symbol, *each.format(measures.unit)) for each in measures.quantities]
+    rows = [(quantity.name, quantity.symbol, *quantity.format(measures.unit)) for quantity in measures.quantities]
     print_table(("", "", "value", "95 %", "unit"), rows, right=(2, 3))
     z, y, x = measures.direction
     if math.isfinite(z):

@@ -56,10 +56,10 @@ def command(*examples: str) -> Callable[[Callable[..., None]], Callable[..., Non
                 function(**arguments)
 
         parameters = [each for name in own for each in groups.get(name, {name: own[name]}).values()]
-        keywords = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
+        keywords = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
         # typer reads the options of a command from these two.
         run.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
-        run.__annotations__ = {each.name: each.annotation for each in parameters}
+        run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
         run.examples = "\n\n".join(["[bold]Examples[/bold]", *examples]) if examples else None  # type: ignore[attr-defined]
         return run
 

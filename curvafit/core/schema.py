@@ -46,7 +46,7 @@ def decode(hint: Any, value: Any, name: str = "") -> Any:
     hint, rule = get_args(hint)[:2] if get_origin(hint) is Annotated else (hint, Rule())
     kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     # Without tensors, which JSON cannot hold.
-    kind: Any = next(each for each in kinds if each is not NoneType and getattr(each, "__name__", "") != "Tensor")
+    kind: Any = next(kind for kind in kinds if kind is not NoneType and getattr(kind, "__name__", "") != "Tensor")
     nullable = NoneType in kinds or rule.unknown
     if value is None and nullable:
         return math.nan if rule.unknown else None

@@ -87,17 +87,17 @@ class Candidate:
 
     def compare(self, scan: Diagram, twins: Sequence[Twin]) -> Candidate:
         """Return the candidate with what its twins measure against the scan's curvature diagram."""
-        diagrams = [each.diagram for each in twins if each.diagram is not None]
+        diagrams = [twin.diagram for twin in twins if twin.diagram is not None]
         if not diagrams:
             return replace(self, status=f"{self.status} No shape grew: {twins[0].reason}.".strip())
         distance = float(one_to_many(scan, diagrams).mean())
         pairs = [one_to_many(each, diagrams[k + 1 :]) for k, each in enumerate(diagrams[:-1])]
         noise = float(np.concatenate(pairs).mean()) if pairs else None
-        morphometries = tuple(each.morphometry for each in twins if each.morphometry is not None)
+        morphometries = tuple(twin.morphometry for twin in twins if twin.morphometry is not None)
         mass = self.mass
         if self.name == "match":
-            mass = float(np.clip(np.mean([each.mass for each in twins if each.phase is not None]), -RARE, RARE))
-        thickness = float(np.mean([thinner_thickness(each.phase > 0) for each in twins if each.phase is not None]))
+            mass = float(np.clip(np.mean([twin.mass for twin in twins if twin.phase is not None]), -RARE, RARE))
+        thickness = float(np.mean([thinner_thickness(twin.phase > 0) for twin in twins if twin.phase is not None]))
         compared = {"distance": distance, "seed_noise": noise, "twins": morphometries}
         return replace(self, mass=mass, thickness=thickness, **compared)
 
@@ -108,7 +108,7 @@ def best_candidate(candidates: Sequence[Candidate]) -> Candidate | None:
     Stationarity reads a phase field's law off its equation. It is the best one where its twins are farther by no more
     than the distance between two twins of the nearest.
     """
-    grown = [(each.distance, each) for each in candidates if each.distance is not None]
+    grown = [(candidate.distance, candidate) for candidate in candidates if candidate.distance is not None]
     if not grown:
         return None
     # Twins of one law differ by the noise of their starts, so that a smaller distance within that noise says nothing;
@@ -121,7 +121,7 @@ def best_candidate(candidates: Sequence[Candidate]) -> Candidate | None:
 def seed_noise_of(candidates: Sequence[Candidate]) -> float | None:
     """Return the distance between two twins of the best candidate; of another one where it has fewer than two."""
     best = best_candidate(candidates)
-    known = [each.seed_noise for each in candidates if each.seed_noise is not None]
+    known = [candidate.seed_noise for candidate in candidates if candidate.seed_noise is not None]
     return best.seed_noise if best is not None and best.seed_noise is not None else next(iter(known), None)
 
 
@@ -257,7 +257,7 @@ def find_differences(scan: Morphometry, twins: Sequence[Morphometry]) -> list[st
     words = []
     for word, name in FAMILIAR.items():
         own = getattr(scan, name)
-        ratios = np.array([getattr(each, name) / own for each in twins] if own else [])
+        ratios = np.array([getattr(twin, name) / own for twin in twins] if own else [])
         count = abs(1 - scan.euler) if name == "connectivity_density" else math.inf
         reach = np.maximum(NEAR, 2 * np.sqrt((1 + np.abs(ratios)) / max(count, 1)))
         if len(ratios) and ((ratios > 1 + reach).all() or (ratios < 1 - reach).all()):

@@ -131,7 +131,7 @@ def refine_matches(described: Described, posterior: Posterior, matches: Sequence
 
     Levenberg and Marquardt's method, by optimistix, starts from each match, with the exact derivatives of the emulator.
     """
-    starts = described.turn(np.stack([parameters_of(each.coefficients, each.mass) for each in matches]))
+    starts = described.turn(np.stack([parameters_of(match.coefficients, match.mass) for match in matches]))
     return _best_fit(posterior, described, starts, matches[0].thickness)
 
 

@@ -100,7 +100,7 @@ class Fit(Pictured):
     @property
     def best(self) -> Candidate | None:
         """Return the candidate that was chosen."""
-        return next((each for each in self.candidates if each.name == self.chosen), None)
+        return next((candidate for candidate in self.candidates if candidate.name == self.chosen), None)
 
     @property
     def coefficients(self) -> Coefficients | None:

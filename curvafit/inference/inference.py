@@ -80,7 +80,7 @@ class Inference(Pictured):
     def __repr__(self) -> str:
         fit = self.fit
         voxels = " x ".join(map(str, self.scan.values.shape))
-        near = ", ".join(f"{each.name} {format_number(each.distance, 2)}" for each in fit.candidates)
+        near = ", ".join(f"{candidate.name} {format_number(candidate.distance, 2)}" for candidate in fit.candidates)
         return f"Inference({fit.family} from {KINDS[fit.kind]} of {voxels} voxels, distances: {near}. {fit.status})"
 
     @property

@@ -284,7 +284,7 @@ def load_posterior(path: str | Path | None = None) -> Posterior:
 
 
 def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posterior:
-    if not all(np.isfinite(each).all() for each in arrays.values() if each.dtype.kind == "f"):
+    if not all(np.isfinite(array).all() for array in arrays.values() if array.dtype.kind == "f"):
         raise ValueError("numbers that are not finite")
     sizes = header["architecture"]
     architecture = Architecture(**sizes | {name: tuple(sizes[name]) for name in ("hidden", "blocks")})

@@ -199,7 +199,7 @@ def train_emulator(
     residuals = (whitened / deviation).double().numpy()
     emulator = dataclasses.replace(emulator, inflation=_inflation(emulator, table, residuals))
     rows = [[np.flatnonzero((table.views == view) & (fold == k)) for k in range(FOLDS)] for view in views]
-    rows_of_fold = min(REFERENCE // FOLDS, *(len(each) for parts in rows for each in parts))
+    rows_of_fold = min(REFERENCE // FOLDS, *(len(part) for parts in rows for part in parts))
     if not rows_of_fold:
         raise ValueError(f"expected many shapes in each of the views {', '.join(views)}, got few in one")
     references: dict[str, list[np.ndarray]] = {view: [] for view in views}

@@ -101,8 +101,10 @@ def place_of_field(field: Volume) -> dict[str, Any]:
 
 def list_layers(viewer: Any, *kinds: str) -> list[tuple[str, Any]]:
     """Return the layers of kinds such as `"Image"`, by name, without the images that the plugin added."""
-    layers = [each for each in viewer.layers if type(each).__name__ in kinds]
-    return [(each.name, each) for each in layers if type(each).__name__ != "Image" or "curvafit" not in each.metadata]
+    layers = [layer for layer in viewer.layers if type(layer).__name__ in kinds]
+    return [
+        (layer.name, layer) for layer in layers if type(layer).__name__ != "Image" or "curvafit" not in layer.metadata
+    ]
 
 
 def put_layer(viewer: Any, kind: str, data: Any, name: str, **options: Any) -> Any:
@@ -255,7 +257,7 @@ class Measure(Dock):
         """Fill the table, draw the diagram, write the file, and let napari show a label's numbers beneath the mouse."""
         self.measures, first, layer = result, result[0], self.layer.value
         several = first.part is not None
-        powers = [power_name(first.unit, each.power) for each in first.quantities]
+        powers = [power_name(first.unit, quantity.power) for quantity in first.quantities]
         pairs = zip(first.quantities, powers, strict=True)
         names = [f"{each.symbol} ({power})" if power else each.symbol for each, power in pairs]
         if several:

@@ -119,7 +119,7 @@ def write_map(
     """
     script = require("plotly.offline", "atlas", "the map of an atlas").get_plotlyjs()
     sources = open_all(stores)
-    read = [each for each in fits if not isinstance(each, Fit)]
+    read = [fit for fit in fits if not isinstance(fit, Fit)]
     if (target := Path(path)).suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"the name of a map must end in .html, got {target.name!r}")
     inputs = [*(store.path for store in sources), *map(Path, read)]
@@ -129,15 +129,16 @@ def write_map(
     if (n := len(atlas)) < LEAST_SHAPES:
         raise ValueError(f"a map needs at least {LEAST_SHAPES} shapes, got {n}")
     λ = WORKING_THICKNESS * WORKING_SPACING
-    diagrams = [replace(each, points=each.points * λ) for each in atlas.mask_diagrams] + list(map(scale_fit, scans))
-    embeddings = np.stack([sliced_embedding(each) for each in diagrams])
+    diagrams = [replace(diagram, points=diagram.points * λ) for diagram in atlas.mask_diagrams]
+    diagrams += map(scale_fit, scans)
+    embeddings = np.stack([sliced_embedding(diagram) for diagram in diagrams])
     places, shares = place_on_plane(embeddings[:n], embeddings)
     away = cdist(embeddings, embeddings[:n])
     np.fill_diagonal(away, np.inf)
     near = np.argsort(away, axis=1, kind="stable")[:, :NEIGHBOURS]
     distances = np.take_along_axis(away, near, axis=1)
     typical = float(np.quantile(distances[:n, 0], 0.95))
-    ends = np.array([shared_limits([each]) for each in diagrams])
+    ends = np.array([shared_limits([diagram]) for diagram in diagrams])
     limits = float(np.quantile(ends[:, 0], 0.05)), float(np.quantile(ends[:, 1], 0.95))
     kinds, columns = families_of(atlas), _columns(atlas)
     turned = set(farthest_points(places[:n], SOLIDS).tolist())

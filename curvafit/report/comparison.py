@@ -87,7 +87,7 @@ def describe_methods(comparison: Comparison) -> str:
     return describe_measures(
         c.measures, c=c, scans=join_names(_count_scans(c)), unit=per_unit(c.unit, 1), level=f"{LEVEL:.2g}",
         directions=DIRECTIONS, quantiles=QUANTILES, bins=BINS, smooth=f"{SMOOTH:g}",
-        differ=[each for each in c.numbers if each.family <= LEVEL], tested=int(np.isfinite(c.bins_p).sum()),
+        differ=[number for number in c.numbers if number.family <= LEVEL], tested=int(np.isfinite(c.bins_p).sum()),
     )  # fmt: skip
 
 
@@ -96,7 +96,7 @@ def describe_measures(measures: Sequence[Measures], **values: Any) -> str:
 
     It is `templates/methods.txt`, filled with `values`.
     """
-    counts = Counter(each.kind for each in measures).items()
+    counts = Counter(scan.kind for scan in measures).items()
     kinds = " and ".join(f"{n} were taken for {kind}s" for kind, n in counts)
     text = render("methods.txt", measures=measures, kinds=kinds, notes=list(count_notes(measures)), **values)
     return re.sub("[ \n]+", " ", text).strip()
@@ -144,7 +144,7 @@ def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
     """Yield a row for each test: the diagrams', then each number's; None where there is no value."""
     c, count = comparison, len(comparison.groups)
     groups = [*ascii_lowercase, *range(27, 1 + count)][:count]  # a, b, … z, 27, 28, …
-    columns = ["quantity", "symbol", "unit", *(f"mean_{each}" for each in groups), *(f"sd_{each}" for each in groups)]
+    columns = ["quantity", "symbol", "unit", *(f"mean_{g}" for g in groups), *(f"sd_{g}" for g in groups)]
     effect = {"g": "g", "η": "eta", "r": "r"}[c.effect]
     columns += ["slope" if c.effect == "r" else "difference", effect, f"{effect}_low", f"{effect}_high"]
     columns += ["p", "p_family", "p_holm", "p_bh", "known_error"]

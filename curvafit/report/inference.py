@@ -99,8 +99,13 @@ def report_html(inference: Inference) -> str:
     fit, limits = inference.fit, plot.grey_limits(inference.scan.values)
     made = {str(name).replace("_", " "): _to_words(value) for name, value in fit.provenance.items()}
     matches = [
-        (each.id, format_number(each.distance, 2), *map(format_number, (*each.coefficients, each.mass)), str(each.seed))
-        for each in fit.matches
+        (
+            match.id,
+            format_number(match.distance, 2),
+            *map(format_number, (*match.coefficients, match.mass)),
+            str(match.seed),
+        )
+        for match in fit.matches
     ]
     return page.render(
         "report.html", title=f"{describe(inference)}.", made=made, version=fit.provenance.get("curvafit", ""), fit=fit,
@@ -184,7 +189,7 @@ def _number_rows(inference: Inference) -> list[list[str]]:
     )
     rows = []
     for name, short, key, text in kinds:
-        own, values = float(getattr(scan, key)), [float(getattr(each, key)) for each in twins]
+        own, values = float(getattr(scan, key)), [float(getattr(twin, key)) for twin in twins]
         cells = [text(own)]
         if values:
             mean = sum(values) / len(values)
@@ -369,7 +374,7 @@ def _corner(inference: Inference) -> page.Picture | None:
     if fit.draws is None or fit.best is None:
         return None
     draws = fit.draws[:, : len(SYMBOLS)]
-    shown = [each for each in fit.candidates if each.name in (fit.chosen, "match")]
+    shown = [candidate for candidate in fit.candidates if candidate.name in (fit.chosen, "match")]
     marks = {_title(each): parameters_of(each.coefficients, each.mass) for each in shown}
     rows = [np.percentile(draws, (0.5, 99.5), axis=0), *(mark[None] for mark in marks.values())]
     low, high = np.concatenate(rows).min(0), np.concatenate(rows).max(0)
@@ -461,8 +466,11 @@ def _is_done(folder: Path, command: str) -> bool:
 def _rows(name: str, fit: Fit) -> Iterator[dict[str, Any]]:
     """Yield a row for each number of a fit; None where it is not known."""
     columns = ("scan", "quantity", "value", "low", "high", "known", "version")
-    numbers = [(f"from {each.low} to {each.high}", each.median, *each.interval, each.known)
-            for each in fit.combinations if each.low]  # fmt: skip
+    numbers = [
+        (f"from {each.low} to {each.high}", each.median, *each.interval, each.known)
+        for each in fit.combinations
+        if each.low
+    ]
     numbers += [(key, each["median"], *each["90"], None) for key, each in (fit.intervals() or {}).items()]
     numbers.append(("p of the law", None if fit.misfit is None else fit.misfit.probability, None, None, None))
     for row in numbers:

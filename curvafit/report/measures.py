@@ -62,7 +62,7 @@ def write_measures(
     if not measures:
         raise ValueError("expected at least one scan, got none")
     target = check_measures(directory, overwrite=overwrite, command=command)
-    measures = [each.convert(measures[0].unit) for each in measures]
+    measures = [scan.convert(measures[0].unit) for scan in measures]
     columns = columns or [{}] * len(measures)
     rows = [
         (part, more)
@@ -71,7 +71,7 @@ def write_measures(
     ]
     parts, unit = [part for part, _ in rows], measures[0].unit
     names, further = name_parts(parts), list(dict.fromkeys(name for _, more in rows for name in more))
-    scans = [{"scan": each.source, "kind": each.kind, "notes": each.notes} for each in measures]
+    scans = [{"scan": scan.source, "kind": scan.kind, "notes": scan.notes} for scan in measures]
     more = {"status": describe_range(parts), "scans": scans, "notes": list(count_notes(parts))}
     record = start_record(command, unit=unit, options=dict(options or {}), **more)
     page = {
@@ -139,7 +139,7 @@ def measures_figure(measures: Measures) -> Figure:
 
 def diagrams_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figure:
     """Return a figure of the curvature diagrams of scans of one unit, on axes that all share; of some none is known."""
-    known = [each.diagram for each in measures if each.diagram.area > 0]
+    known = [scan.diagram for scan in measures if scan.diagram.area > 0]
     across, up = plot.shown_window(known) if known else ((0.0, 1.0), (0.0, 1.0))
     columns, rows = min(DIAGRAMS, len(names)), -(-len(names) // DIAGRAMS)
     ratio = min(1.6, (up[1] - up[0]) / (across[1] - across[0]))
@@ -169,7 +169,7 @@ def intervals_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figu
     panels = figure.subplots(rows, PANELS, sharey=True)
     places = range(len(names), 0, -1)
     for axes, symbol in zip(panels.ravel(), plot.FIRST_SHOWN, strict=True):
-        found = [each[symbol] for each in measures]
+        found = [scan[symbol] for scan in measures]
         values = np.array([each.value for each in found])
         halves = np.nan_to_num([each.half for each in found])
         low, high = values - halves, values + halves

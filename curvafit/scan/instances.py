@@ -126,7 +126,7 @@ def _measure_body(volume: Volume, boxes: Sequence[tuple[int, Box]], number: int)
     total |= {"χ": euler_number(mask), **_measure_extent(read(0), box, volume)}
     with np.errstate(divide="ignore", invalid="ignore"):  # without curvature
         values = [(name, symbol, float(figure(total)), math.nan, power) for name, symbol, power, figure in OF_BODIES]
-    quantities, direction = tuple(whole.Quantity(*each) for each in values), whole.find_direction(total)
+    quantities, direction = tuple(whole.Quantity(*value) for value in values), whole.find_direction(total)
     one_block, part = (1, 1, 1), ("instance", label)
     measured = whole.Measures(
         volume.source, volume.unit, "mask", quantities, direction, drawn, one_block, notes, part

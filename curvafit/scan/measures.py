@@ -184,7 +184,7 @@ class Measures(Pictured):
 
     def scale(self, factor: float, unit: str) -> Measures:
         """Return the measures of the same scan whose lengths are longer by a factor, in a unit."""
-        scaled = ((each, factor**each.power) for each in self.quantities)
+        scaled = ((quantity, factor**quantity.power) for quantity in self.quantities)
         quantities = (replace(each, value=each.value * by, half=each.half * by) for each, by in scaled)
         old = self.diagram
         places = None if old.places is None else old.places * factor
@@ -199,7 +199,7 @@ def find_quantity(rows: Sequence[Row], name: str) -> Row:
     for each in rows:
         if name in (each.name, each.symbol):
             return each
-    raise KeyError(f"expected one of {', '.join(each.name for each in rows)}, got {name!r}")
+    raise KeyError(f"expected one of {', '.join(row.name for row in rows)}, got {name!r}")
 
 
 def summarise_sums(
@@ -259,7 +259,7 @@ class Maps(NamedTuple):
         """Return sums (N, C): a row for each block, a column for each of `SUMS`."""
         ones = np.ones(self.mask.shape, dtype=bool)
         volumes = (ones, self.mask, self.thickness, np.square(self.thickness), self.gap)
-        sums = (math.prod(self.spacing) * blocks.sums(each) for each in volumes)
+        sums = (math.prod(self.spacing) * blocks.sums(volume) for volume in volumes)
         surfaces = (blocks.gather(*each) for each in (self.surface, self.curved))
         return np.column_stack([*sums, blocks.sums(self.euler), *surfaces])
 

@@ -463,7 +463,7 @@ def _measure_tiles(
         stated = _describe_tiles(plan, run.processes)
         records = run(_FIRST, partial(measure_tile, plan), len(plan.cores), stated)
         # the factors that `morphology.local_thickness` chooses
-        widest, finest = np.max([each["widest"] for each in records], axis=0), min(plan.volume.spacing)
+        widest, finest = np.max([record["widest"] for record in records], axis=0), min(plan.volume.spacing)
         wide = replace(plan, factors=tuple(max(1, math.ceil(each / finest / COARSE)) for each in widest))
         again: list[Record] = []
         if max(wide.factors) > 1:
@@ -474,7 +474,7 @@ def _measure_tiles(
 def _summarise(plan: Plan, records: Sequence[Record], again: Sequence[Record], stated: str) -> Measures:
     """Return the measures of a volume, and of the parts of its region, from what was found in its tiles."""
     finest, shape = plan.finest, plan.volume.shape
-    parts = {name.removeprefix("rows") for each in records for name in each if name.startswith("rows")}
+    parts = {name.removeprefix("rows") for record in records for name in record if name.startswith("rows")}
     tables = {part: _sum_tiles(plan, records, again, part) for part in parts}
     total = dict(zip(whole.SUMS, tables[_WHOLE].sum(0), strict=True))
     if not 0 < total["inside"] < total["volume"]:
@@ -484,7 +484,7 @@ def _summarise(plan: Plan, records: Sequence[Record], again: Sequence[Record], s
         raise ScanError("expected a surface between structure and background, got none on the working grid")
     period = total["thickness"] / total["inside"] + total["gap"] / (total["volume"] - total["inside"])
     blocks = Blocks.divide(shape, plan.volume.spacing, period)
-    χ = float(sum(each["euler"] for each in records))
+    χ = float(sum(record["euler"] for record in records))
     density = connectivity_density(χ, shape, plan.volume.spacing, periodic=False)
     none = whole.no_curvature(plan.volume.unit, whole.TOO_THIN)
     notes = (*_notes(plan, records), *(() if curved else none[2]), *([stated] if len(plan.cores) > 1 else []))
@@ -528,7 +528,7 @@ def _merge(table: np.ndarray, finest: Blocks, blocks: Blocks) -> np.ndarray:
 
 def _draw(plan: Plan, records: Sequence[Record], part: str) -> Diagram:
     """Return the diagram of a part over all tiles: the barycentres of its bins."""
-    parts = [each for each in records if f"bins{part}" in each]
+    parts = [record for record in records if f"bins{part}" in record]
     bins, areas = (np.concatenate([each[f"{name}{part}"] for each in parts]) for name in ("bins", "areas"))
     bins, index = np.unique(bins, axis=0, return_inverse=True)
     index = index.reshape(-1)
@@ -545,7 +545,7 @@ def _notes(plan: Plan, records: Sequence[Record]) -> tuple[str, ...]:
     specks, pinholes = (int(n) for n in np.sum([record["pieces"] for record in records], axis=0))
     if specks or pinholes:
         notes.append(DROPPED.format(specks, pinholes))
-    wide = np.sum([each["wide"] for each in records], axis=0)
+    wide = np.sum([record["wide"] for record in records], axis=0)
     for name, count in zip(("structure", "background"), wide, strict=True):
         if count:
             share = f"around {count / math.prod(plan.volume.shape):.2g} of the voxels, in the {name}"

@@ -319,7 +319,7 @@ class WholeLessons(Batches):
                 parts.append(whole.evidence[between][:, *window])
             for axis in range(3):
                 if rng.random() < 0.5:
-                    parts = [np.flip(each, axis) for each in parts]
+                    parts = [np.flip(part, axis) for part in parts]
             found.append(parts)
         distances, truths, *evidence = (np.ascontiguousarray(np.stack(each)) for each in zip(*found, strict=True))
         steps, truths = np.full(self.size, whole.step, np.float32), truths.astype(np.float32)

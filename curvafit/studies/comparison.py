@@ -333,7 +333,7 @@ def _compare_measures(
         numbers=_compare_numbers(measures[0], values, errors, labels, arrangements, blocks),
         statistic=float(statistics[0]), p=float(permutation.share_beyond(statistics)), least=float(least_p),
         sides=sides, diagrams=means,
-        apart=float(pdist(np.stack([sliced_embedding(each) for each in means])).max()),
+        apart=float(pdist(np.stack([sliced_embedding(mean) for mean in means])).max()),
         within=float(distances[same_side].mean()), edges=edges, differences=differences, bins_p=p,
         permutations=len(arrangements), exact=exact, options=options,
         notes=(*notes, *gather_notes(measures, cases)),
@@ -348,8 +348,8 @@ def _halve(numbers: np.ndarray) -> np.ndarray:
 
 def _pool(diagrams: Sequence[Diagram]) -> Diagram:
     """Return the mean of diagrams, each of total area 1."""
-    points = np.concatenate([each.points for each in diagrams])
-    weights = np.concatenate([each.normalised.weights / len(diagrams) for each in diagrams])
+    points = np.concatenate([diagram.points for diagram in diagrams])
+    weights = np.concatenate([diagram.normalised.weights / len(diagrams) for diagram in diagrams])
     return Diagram(points, weights, unit=diagrams[0].unit)
 
 
@@ -378,7 +378,8 @@ def _compare_bins(
 def _average(measures: Sequence[Measures], scans: Sequence[Sequence[int]]) -> tuple[np.ndarray, ...]:
     """Return `values`, `errors` and `halves` of a `Comparison`; `scans` are the numbers of each subject's."""
     values, halves = (
-        np.array([[getattr(each, name) for each in scan.quantities] for scan in measures]) for name in ("value", "half")
+        np.array([[getattr(quantity, name) for quantity in scan.quantities] for scan in measures])
+        for name in ("value", "half")
     )
     errors = halves / np.array([[interval_reach(scan.blocks)] for scan in measures])
     spread = (np.sqrt([(each[own] ** 2).mean(0) / len(own) for own in scans]) for each in (errors, halves))

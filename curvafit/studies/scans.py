@@ -310,9 +310,9 @@ def measure_scans(
         raise ValueError(
             f"{flat[0]}: expected a scan with curvature, got a stack too thin for it: measure has its numbers"
         )
-    units = {each.unit for each in measures}
+    units = {scan.unit for scan in measures}
     notes += [] if len(units) == 1 else [f"Lengths in {', '.join(sorted(units))} were converted to {unit}."]
-    return [each.convert(unit) for each in measures], notes
+    return [scan.convert(unit) for scan in measures], notes
 
 
 def measure_each(
@@ -426,7 +426,7 @@ def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progr
             f"{units[other]}: say it with --spacing and --unit"
         )
     notes = ["Lengths are counted in voxels: compare only scans of one voxel size."] if "voxel" in units else []
-    medians = [float(np.median(each)) for each in edges.values()]
+    medians = [float(np.median(edge)) for edge in edges.values()]
     if medians and len(units) == 1 and min(medians) < (1 - ALIKE_EDGES) * max(medians):
         ends = " and ".join(format_number(end) for end in (min(medians), max(medians)))
         notes.append(f"Voxels differ, {ends} {next(iter(units))}: so does what they resolve.")
@@ -480,9 +480,9 @@ def write_table(
         return write_atomically(target, lambda temporary: frame.to_parquet(temporary, index=False))
     if target.suffix.lower() == ".json":
         scans = [
-            {"scan": each.source, "kind": each.kind, "blocks": each.blocks, "notes": each.notes}
-            | dict([each.part] if each.part else [])
-            for each in measures
+            {"scan": scan.source, "kind": scan.kind, "blocks": scan.blocks, "notes": scan.notes}
+            | dict([scan.part] if scan.part else [])
+            for scan in measures
         ]
         return FORMAT.write(target, {"scans": scans, "rows": rows})
     return write_content(target, format_csv(rows))

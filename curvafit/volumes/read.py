@@ -410,7 +410,7 @@ def _find_lengths(
     A caller's unit alone converts lengths in a unit that the file names, and names that of others.
     """
     units = _take_three(stated.units, order, stated.axes)
-    own, factors = common_unit([each or stated.custom for each in units])
+    own, factors = common_unit([unit or stated.custom for unit in units])
     if not is_unit(own) and (spacing is None or unit is None):
         raise ScanError(f"{source} states lengths in {quoted(own)}, which is not known: give --spacing and --unit")
     try:

@@ -140,7 +140,7 @@ def _entries(value: Any) -> tuple[Any, ...]:
     """Return the first entries of an attribute as a tuple, bytes as text."""
     array = np.asarray(value, dtype=object) if isinstance(value, list | tuple) else np.asarray(value)
     entries = array.ravel()[:99].tolist()
-    return tuple(each.decode(errors="replace") if isinstance(each, bytes) else each for each in entries)
+    return tuple(entry.decode(errors="replace") if isinstance(entry, bytes) else entry for entry in entries)
 
 
 # ---- numbers of a file -----------------------------------------------------------------------------------------------

@@ -62,7 +62,7 @@ def read_nrrd(path: Path, **_: object) -> Stated:
     if {"old min", "old max"} & header.keys():
         notes = (f"The values stand for {header.get('old min')} to {header.get('old max')}: they are as stored.",)
     axes, units = _name_axes(header), list(header.get("space units", header.get("units", ())))
-    units = [each or next(filter(None, units), None) for each in units]
+    units = [unit or next(filter(None, units), None) for unit in units]
     if "space directions" in header:
         directions = np.asarray(header["space directions"], dtype=np.float64)
         directions = directions[~np.isnan(directions).any(axis=1)]
@@ -157,7 +157,7 @@ def _name_axes(header: dict[str, Any]) -> str:
     count, kinds = int(header["dimension"]), [str(kind).lower() for kind in header.get("kinds", ())]
     if "space directions" in header:
         directions = np.asarray(header["space directions"], dtype=np.float64)
-        other = [bool(np.isnan(each).any()) for each in directions]
+        other = [bool(np.isnan(direction).any()) for direction in directions]
     else:
         other = [kind not in ("domain", "space", "none", "???") for kind in kinds]
     if len(other) != count or len(kinds) not in (0, count):

@@ -110,7 +110,7 @@ def _pick_array(node: Any, key: str | None, path: Path) -> tuple[dict[str, Any],
     elif key.strip("/") in firsts:
         key = firsts[key.strip("/")]
     name = base.pick_key(sorted(arrays), key, path)
-    return arrays, next((each for each in levels.values() if name in each), {}), name
+    return arrays, next((level for level in levels.values() if name in level), {}), name
 
 
 def _state_array(array: Any, folder: Path | None, place: _Place | None = None, group: Any = None) -> Stated:
@@ -455,7 +455,7 @@ def _counts(shape: Sequence[int], edges: Sequence[int]) -> list[int]:
 
 def _missing_within(array: Any, shard: Path, inside: Sequence[int]) -> int:
     """Return how many chunks a shard's index, if of the usual kind, lacks of those `inside` the array."""
-    codec: Any = next((each for each in array.metadata.codecs if hasattr(each, "index_codecs")), None)
+    codec: Any = next((codec for codec in array.metadata.codecs if hasattr(codec, "index_codecs")), None)
     if [type(each).__name__ for each in getattr(codec, "index_codecs", ())] != ["BytesCodec", "Crc32cCodec"]:
         return 0
     counts = _counts(array.shards, array.chunks)
