@@ -59,9 +59,9 @@ def compare(
 
     middle = comparison.groups or ("slope",)
     rows = []
-    for each in comparison.numbers:
-        values = (*(each.means or (each.difference,)), each.effect, each.p, each.family)
-        rows.append((each.name, each.symbol, *map(format_number, values)))
+    for number in comparison.numbers:
+        values = (*(number.means or (number.difference,)), number.effect, number.p, number.family)
+        rows.append((number.name, number.symbol, *map(format_number, values)))
     head = ("", "", *middle, comparison.effect, "p", "family-wise p")
     print_table(head, rows, right=range(2, len(head)))
     say(str(page))

@@ -77,8 +77,8 @@ def _print_result(inference: Inference) -> None:
     fit = inference.fit
     say(f"{describe(inference)}.", style="bold")
     say(fit.status)
-    for each in fit.combinations:
-        say(str(each))
+    for combination in fit.combinations:
+        say(str(combination))
     if rows := parameter_table(inference):
         heads = ("", "working units", "±", "90 % of the posterior", f"with lengths in {fit.length_unit}")
         print_table(heads, rows, right=range(1, 5))

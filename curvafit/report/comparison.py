@@ -154,10 +154,10 @@ def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
     else:
         diagrams |= {"symbol": "R", "unit": "", "r": c.statistic}
     yield dict.fromkeys(columns) | diagrams
-    for each in c.numbers:
-        cells = (each.name, each.symbol, plain_unit(c.unit, each.power), *each.means, *each.deviations)
-        cells += (each.difference, each.effect, each.low, each.high)
-        cells += (each.p, each.family, each.holm, each.discovery, each.known)
+    for number in c.numbers:
+        cells = (number.name, number.symbol, plain_unit(c.unit, number.power), *number.means, *number.deviations)
+        cells += (number.difference, number.effect, number.low, number.high)
+        cells += (number.p, number.family, number.holm, number.discovery, number.known)
         finite = (None if isinstance(cell, float) and not math.isfinite(cell) else cell for cell in cells)
         yield dict(zip(columns, finite, strict=True))
 

@@ -232,11 +232,13 @@ def _parameters(inference: Inference) -> list[tuple[str, tuple[str, ...], str]]:
 def list_strips(fit: Fit) -> list[dict[str, Any]]:
     """Return the bars of what a fit tells of each combination of parameters, in percent of a strip."""
     strips = []
-    for each in fit.combinations:
-        start, end = (100 * float(np.clip(0.5 + x / (2 * STRIP), 0, 1)) for x in each.interval)
-        low, high = (format_number(x, 2) for x in each.interval)
-        strips.append({"low": each.low, "high": each.high, "start": f"{start:.1f}", "width": f"{end - start:.1f}",
-                       "known": each.known >= KNOWN, "text": f"{low} to {high}"})  # fmt: skip
+    for combination in fit.combinations:
+        start, end = (100 * float(np.clip(0.5 + x / (2 * STRIP), 0, 1)) for x in combination.interval)
+        low, high = (format_number(x, 2) for x in combination.interval)
+        strips.append({
+            "low": combination.low, "high": combination.high, "start": f"{start:.1f}", "width": f"{end - start:.1f}",
+            "known": combination.known >= KNOWN, "text": f"{low} to {high}",
+        })  # fmt: skip
     return strips
 
 

@@ -161,12 +161,12 @@ class Measures(Pictured):
         release, (z, y, x) = version("curvafit"), self.direction
         more = dict([self.part] if self.part else []) | more
         rows = []
-        for each in self.quantities:
-            ends = (each.value, each.value - each.half, each.value + each.half)
+        for quantity in self.quantities:
+            ends = (quantity.value, quantity.value - quantity.half, quantity.value + quantity.half)
             value, low, high = (end if math.isfinite(end) else None for end in ends)
-            axis = f"{z:.4f} {y:.4f} {x:.4f}" if each.symbol == "DA" and math.isfinite(z) else ""
-            unit = plain_unit(self.unit, each.power)
-            cells = (self.source, each.name, each.symbol, value, low, high, unit, axis, release)
+            axis = f"{z:.4f} {y:.4f} {x:.4f}" if quantity.symbol == "DA" and math.isfinite(z) else ""
+            unit = plain_unit(self.unit, quantity.power)
+            cells = (self.source, quantity.name, quantity.symbol, value, low, high, unit, axis, release)
             rows.append(dict(zip(COLUMNS, cells, strict=True)) | more)
         return rows
 

@@ -392,9 +392,9 @@ def _count_padding(structure: Structure, bars: Sequence[Box], value: Any, number
     levels = [values[part].astype(np.float64) for part in (rim & ~constant, ~constant)]
     sums = [np.count_nonzero(constant), np.count_nonzero(ahead | behind)]
     with np.errstate(all="ignore"):  # huge numbers tell nothing
-        for each in levels:
-            squares = np.square(each)
-            sums += [each.size, each.sum(), squares.sum(), np.dot(squares, each), np.dot(squares, squares)]
+        for level in levels:
+            squares = np.square(level)
+            sums += [level.size, level.sum(), squares.sum(), np.dot(squares, level), np.dot(squares, squares)]
     return {"padding": np.array(sums, dtype=np.float64)}
 
 
@@ -471,8 +471,8 @@ def _sum_sides(levels: Levels, bars: Sequence[Box], level: float, number: int) -
 def add_records(records: Iterable[Record]) -> dict[str, np.ndarray]:
     """Return the sums over pieces; of what is called lowest and highest the extremes."""
     total: dict[str, np.ndarray] = {}
-    for each in records:
-        for name, value in each.items():
+    for record in records:
+        for name, value in record.items():
             join = {"lowest": np.minimum, "highest": np.maximum}.get(name, np.add)
             total[name] = join(total[name], value) if name in total else value
     return total
