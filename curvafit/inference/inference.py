@@ -16,7 +16,7 @@ import torch
 from curvafit.core.checks import SEEDS, check_choice, check_int, check_type
 from curvafit.core.runtime import Pictured, Progress, log_stages, sub_progress
 from curvafit.core.units import format_number
-from curvafit.generation.schedule import LEARNED, SCHEDULES
+from curvafit.generation.schedule import LEARNED, schedule
 from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE, Diagram, family_of
 from curvafit.geometry.morphology import Morphometry, morphometry
 from curvafit.inference.atlas import VERSION, Atlas, Match, load_atlas, mirror_match, nearest
@@ -180,7 +180,7 @@ def _infer_prepared(
             estimate = estimate if misfit is None else replace(estimate, misfit=misfit)
         judgement = _judge(estimate, prepared, numbers, checked=growth is not None)
         progress("done", 1.0)
-    provenance = _describe_provenance(volume, shape, known, seed)
+    provenance = _describe_provenance(volume, shape, known, growth, seed)
     fit = _build_fit(prepared, diagram, numbers, estimate, judgement, provenance)
     return Inference(volume, prepared, diagram, twins, fit, estimate.simulated)
 
@@ -355,14 +355,16 @@ def _build_fit(
     )
 
 
-def _describe_provenance(volume: Volume, shape: tuple[int, ...], known: _Known, seed: int) -> dict[str, Any]:
+def _describe_provenance(
+    volume: Volume, shape: tuple[int, ...], known: _Known, growth: Growth | None, seed: int
+) -> dict[str, Any]:
     return {
         "curvafit": version("curvafit"),
         "scan": str(volume.source),
         "scan_shape": list(shape),
         "scan_spacing": list(volume.spacing),
         "seed": seed,
-        "schedule": SCHEDULES[LEARNED].as_dict(),
+        "schedule": schedule(LEARNED if growth is None else growth.schedule).as_dict(),
         "epsilon": WORKING_EPSILON,
         "atlas": {"format": VERSION, "shapes": len(known.atlas.ids)},
         "posterior": {name: value for name, value in known.posterior.provenance.items() if name != "table"},

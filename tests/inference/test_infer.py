@@ -12,7 +12,7 @@ from found import lattice
 from scipy import ndimage
 from shapes import grown
 
-from curvafit.generation.schedule import LEARNED, SCHEDULES, schedule
+from curvafit.generation.schedule import LEARNED, schedule
 from curvafit.geometry.description import BLOCKS, descriptors
 from curvafit.geometry.diagrams import diagram
 from curvafit.geometry.distances import wasserstein
@@ -106,7 +106,7 @@ def test_fit_json_holds_what_the_generator_needs(inference: Inference, tmp_path)
     content = json.loads(path.read_text())
     assert content["format"] == FORMAT
     assert content["provenance"]["seed"] == 3 and content["length_unit"] == "um"
-    assert content["provenance"]["schedule"] == SCHEDULES[LEARNED].as_dict()
+    assert content["provenance"]["schedule"] == schedule(LEARNED, steps=400).as_dict()
     kept = content["diagram"]
     assert kept["seen_as"] == "mask" and sum(kept["share"]) == pytest.approx(1, abs=1e-4)
     assert len(kept["kappa1"]) == len(kept["share"]) and path.read_text().count("\n") < 1000
