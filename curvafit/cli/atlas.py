@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from curvafit.cli.console import command_line, error_console, resumable, say, say_notes, show_stages
-from curvafit.cli.options import Crew, Group, OverwriteOption, add_commands, command, parse_whole_triple
+from curvafit.cli.options import OverwriteOption, Workers, add_commands, command, parse_whole_triple
 
 if TYPE_CHECKING:
     from curvafit.core.records import Format
@@ -35,7 +35,7 @@ def build_atlas(
     schedule: Annotated[str, typer.Option(help="Schedule of the flow: fast, paper, deep or cosine.")] = "fast",
     steps: Annotated[int | None, typer.Option(help="Number of steps, instead of the schedule's.")] = None,
     *,
-    crew: Annotated[Crew, Group(Crew)],
+    crew: Workers,
 ) -> None:
     """Generate shapes into a store until enough are viable. The same command resumes a build that was stopped."""
     box = parse_whole_triple(shape, "--shape")
@@ -61,7 +61,7 @@ def extend_atlas(
     store: _Store,
     count: Annotated[int, typer.Option(help="Number of viable shapes to add; 0 resumes what was stopped.")] = 100,
     *,
-    crew: Annotated[Crew, Group(Crew)],
+    crew: Workers,
 ) -> None:
     """Add shapes to a store, with the design and the settings of the store."""
     from curvafit.data_synth.atlas import extend
@@ -130,7 +130,7 @@ def describe_atlas(
     out: Annotated[Path, typer.Option("-o", "--output", help="The table (.npz) to write; one that exists goes on.")],
     views: Annotated[str | None, typer.Option(help="Views of each shape, between commas; by default all.")] = None,
     *,
-    crew: Annotated[Crew, Group(Crew)],
+    crew: Workers,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure each shape of stores as field, mask and scan: the table that `atlas train` reads."""

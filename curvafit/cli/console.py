@@ -188,7 +188,6 @@ def show_stages() -> Iterator[Callable[[str, float], None]]:
             if without_numbers != stage or share >= last_share + 0.05:
                 stage, last_share = without_numbers, share
                 waiting.append(f"[{100 * share:3.0f} %] {text}")
-                # The first line waits for a second: a command that ends at once, or fails, shows no progress.
                 while len(waiting) > (1 if share == 0 else 0):
                     say(waiting.pop(0), to=console)
 

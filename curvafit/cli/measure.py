@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from inspect import signature
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,7 +19,6 @@ from curvafit.cli.options import (
     Reading,
     Structure,
     command,
-    parse_reading,
     parse_structure,
     parse_whole_triple,
 )
@@ -102,41 +100,41 @@ def measure(
         return
     store = None if out is None else out.with_name(f".{out.name}.curvafit-tiles")
     options = {} if labels else {"roi": roi, "tile": tile, "store": store, **structure}
-    options |= {"labels": labels, "workers": workers, **reading}
+    options |= {"labels": labels, "workers": workers}
     with _keep_tiles(store):
         if folder is None:
-            _write_table(scans, out, subjects, overwrite, options)
+            _write_table(scans, out, subjects, overwrite, options, reading)
         else:
-            shown = {"roi": roi, "tile": tile, **structure, **reading}
-            _write_page(scans, folder, subjects, overwrite, options, shown)
+            _write_page(scans, folder, subjects, overwrite, options, reading)
 
 
 def _write_page(
     scans: list[str], folder: Path, subjects: Path | None, overwrite: bool, options: dict[str, Any],
-    shown: dict[str, Any],
+    reading: dict[str, Any],
 ) -> None:  # fmt: skip
-    """Measure scans, and write a page of them, which tells the options that are `shown`."""
+    """Measure scans, and write a page of them."""
     with show_stages() as progress:
         from curvafit.core.runtime import sub_progress
         from curvafit.report.measures import check_measures, write_measures
         from curvafit.studies.scans import check_units, count_notes, measure_each
 
         check_measures(folder, [*scans, *_files(options.get("roi"), subjects)], overwrite, command_line())
-        reading = {name: value for name, value in options.items() if name in signature(parse_reading).parameters}
         check_units(scans, sub_progress(progress, 0.0, 0.05), **reading)
         columns = _read_subjects(subjects, scans)
         part = sub_progress(progress, 0.05, 1.0)
-        whole = [measures for (measures,) in measure_each(scans, progress=part, **options)]
+        whole = [measures for (measures,) in measure_each(scans, progress=part, **options, **reading)]
         progress("drawing the page", 1.0)
-        more = {"columns": columns, "options": shown, "command": command_line(), "overwrite": overwrite}
+        shown = {name: value for name, value in options.items() if name not in ("store", "labels", "workers")}
+        more = {"columns": columns, "options": shown | reading, "command": command_line(), "overwrite": overwrite}
         page = write_measures(whole, folder, **more)
     say_notes(tuple(count_notes(whole)))
     say(str(page))
 
 
 def _write_table(
-    scans: list[str], out: Path | None, subjects: Path | None, overwrite: bool, options: dict[str, Any]
-) -> None:
+    scans: list[str], out: Path | None, subjects: Path | None, overwrite: bool, options: dict[str, Any],
+    reading: dict[str, Any],
+) -> None:  # fmt: skip
     """Measure scans, print the numbers, and write them into a table, if there is an output."""
     with show_stages() as progress:
         from curvafit.studies.scans import check_table, measure_each, write_table
@@ -144,7 +142,7 @@ def _write_table(
         if out is not None:
             check_table(out, [*scans, *_files(options.get("roi"), subjects)], overwrite)
         columns = _read_subjects(subjects, scans)
-        measured = measure_each(scans, progress=progress, **options)
+        measured = measure_each(scans, progress=progress, **options, **reading)
     _print_measured(measured, options["labels"])
     if out is not None:
         rows = None if columns is None else [row for row, parts in zip(columns, measured, strict=True) for _ in parts]

@@ -216,6 +216,9 @@ class Crew:
                 yield workers, progress
 
 
+Workers = Annotated[Crew, Group(Crew)]
+
+
 # ---- parsing ---------------------------------------------------------------------------------------------------------
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli.console import command_line, error_console, say, say_notes
-from curvafit.cli.options import Crew, Group, Reading, command, parse_numbers, parse_whole_triple
+from curvafit.cli.options import Group, Reading, Workers, command, parse_numbers, parse_whole_triple
 
 if TYPE_CHECKING:
     from curvafit.data_synth.imaging.modality import Modality
@@ -93,7 +93,7 @@ def synth(
     layout: Annotated[str, _out(help="nnunet (v2, raw), monai (decathlon's list) or zarr.")] = "nnunet",
     labels: Parts = None,
     seed: Annotated[int, _out(help="Seed of shapes and images; the same seed gives the same voxels.")] = 0,
-    crew: Annotated[Crew, Group(Crew)],
+    crew: Workers,
 ) -> None:
     """Make a training set: images of generated shapes with exact labels."""
     unit, wall, voxel = reading["unit"], composition["wall"], sampling["voxel"]

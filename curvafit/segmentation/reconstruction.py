@@ -228,8 +228,8 @@ def _fill_between(given: _Given, suggest: int, run: Run, working: Working, progr
         filled, phase = _fill_volume(known, target, engine, run, working.tile, given.in_blocks)
         inside = flow_summary(filled.share)
     else:
-        problem, tools = SlicesProblem(chosen, target, engine.level(target)), (working.store, working.workers)
-        found = lower_volume(problem, place, tiles, store=tools[0], workers=tools[1], progress=progress)
+        problem, store, workers = SlicesProblem(chosen, target, engine.level(target)), working.store, working.workers
+        found = lower_volume(problem, place, tiles, store=store, workers=workers, progress=progress)
         filled, engine = _weigh_evidence(engine, chosen, task, known, target, found)
         phase, notes = known.turn_back(found.phase), (*notes, *place.notes)
         inside = flow_summary(float(found.mask.mean()), found.energies, found.steps)
