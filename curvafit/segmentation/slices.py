@@ -59,11 +59,6 @@ class Slices:
         return kept
 
     @property
-    def known_voxels(self) -> np.ndarray:
-        """Which voxels of the volume are known, bool (length, Y, X)."""
-        return mark_known(self.shape, self.places, self.marks)
-
-    @property
     def shape(self) -> tuple[int, int, int]:
         """The shape of the volume."""
         return (self.length, *self.inside.shape[1:])  # type: ignore[return-value]
