@@ -24,15 +24,15 @@ def has_kernel(device: torch.device | str) -> bool:
 def to_numpy_cost(
     coefficients: Iterable[float | Tensor], grid: Grid, epsilon: float | Tensor, orientation: Tensor | None
 ) -> tuple[list[float | np.ndarray], float | np.ndarray, np.ndarray | None]:
-    """Return a cost as `cpu` takes it: numbers, or arrays `(Z, Y, X)` where they vary in space."""
+    """Return coefficients, ε and orientation as `cpu` takes them: numbers, or arrays `(Z, Y, X)` if they vary."""
 
-    def number(value: float | Tensor) -> float | np.ndarray:
+    def to_numpy(value: float | Tensor) -> float | np.ndarray:
         if not isinstance(value, Tensor) or value.dim() == 0:
             return float(value)
         return value.detach().double().expand(grid.shape).numpy()
 
     Q = None if orientation is None else orientation.double().numpy()
-    return [number(value) for value in coefficients], number(epsilon), Q
+    return [to_numpy(value) for value in coefficients], to_numpy(epsilon), Q
 
 
 def gaussian_blur(u: Tensor, grid: Grid, width: float) -> Tensor:

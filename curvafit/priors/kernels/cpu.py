@@ -22,12 +22,12 @@ from numpy.lib.stride_tricks import as_strided
 from curvafit.priors.curvature import ROOT_FLOOR, ROOT_ROUNDING, XI
 from curvafit.priors.grid import Grid
 from curvafit.priors.kernels import loops
-from curvafit.priors.kernels.loops import ALL, EDGE, ENDS, MOVE, SLACK, TAPS, TOGETHER, WIDE
+from curvafit.priors.kernels.loops import ALL, BLUR_ROWS, EDGE, ENDS, MOVE, SLACK, TAPS, WIDE
 from curvafit.priors.kernels.threads import count_threads
 from curvafit.priors.stencils import gaussian_taps
 
-#: The least voxels for which another thread saves more than its start costs.
-_WORTH = 32768
+#: Fewest voxels for which another thread saves more than its start costs.
+_VOXELS_PER_THREAD = 32768
 #: Cells of a block of rows whose partial derivatives fit into the first-level cache, and of a tile, of which three
 #: planes of u and three of sums fit into the second-level cache.
 _BLOCK, _TILE = 432, 43_000
@@ -51,15 +51,16 @@ def fused_energy_gradient(
 def gaussian_blur(u: np.ndarray, grid: Grid, width: float) -> np.ndarray:
     """Return k ∗ u in float32, as `stencils.gaussian_blur` does; ValueError where its shape is not the grid's."""
     blur = _Blur(grid, width, _choose_threads(grid))
-    volume, along_z = _pad_field(u, grid), _make_volume(grid)
-    blur.along_z(volume, along_z, 0.0, _NO_FIELD)
-    blur.in_planes(along_z, volume)
+    volume, blurred_along_z = _pad_field(u, grid), _make_volume(grid)
+    blur.along_z(volume, blurred_along_z, 0.0, _NO_FIELD)
+    blur.in_planes(blurred_along_z, volume)
     return _view_field(volume, grid).copy()
 
 
 def halo(grid: Grid, width: float) -> int:
-    """Return how many planes beyond its own a step of a slab needs: the blur's reach, and the stencils' two."""
-    return _pad_taps(width / grid.spacing[0])[1] + EDGE
+    """Return how many planes beyond its own a slab needs for a step: the blur's radius, and the stencils' two."""
+    _, radius = _pad_taps(width / grid.spacing[0])
+    return radius + EDGE
 
 
 class FusedFlow:
@@ -69,8 +70,8 @@ class FusedFlow:
     `vector`. `base` is k ∗ base: the mass m₀, or a blurred field. `width` is the blur's standard deviation in spacing's
     unit; A is constant in `frozen` voxels; `betas` and `adam_eps` are `torch.optim.Adam`'s.
 
-    Of a slab of a larger box, `own` are the planes that count, and `exchange` fills the others, `halo` of them on
-    either side, in a volume `(Z, …)` whose own planes are known.
+    Where the grid is a slab of a larger box, `own` are the planes whose energy and gradient count. `exchange` then
+    fills the others, `halo` of them on either side, of a volume `(Z, …)` in which the own planes are filled.
     """
 
     def __init__(
@@ -83,25 +84,26 @@ class FusedFlow:
         #: Adam's decay rates, which may change between steps.
         self.betas = betas
         self._threads = threads = _choose_threads(grid)
-        size = 3 * Z * Y * X
+        voxels = Z * Y * X
         self._own, self._exchange = own, exchange
-        self._vector, self._first, self._second = (_make_zeros(size + 2 * SLACK) for _ in range(3))
-        #: Whether the last step has left the next one's blurred div A in place of its gradient.
-        self._ahead = False
+        self._vector, self._first, self._second = (_make_zeros(3 * voxels + 2 * SLACK) for _ in range(3))
+        #: Whether `_gradient` holds div A, blurred along y and x, which the last step computed for the next one.
+        self._divergence_ready = False
         if start is not None:
             self.vector[...] = start
         self._half = np.array([0.5 / h for h in grid.spacing], np.float32)
         self._blur, self._density = _Blur(grid, width, threads), _Density(a, grid, epsilon, threads, orientation)
         self._mass, self._base = (base, _NO_FIELD) if np.ndim(base) == 0 else (0.0, _pad_field(base, grid))
-        self._keep, self._free = np.empty(0, np.float32), 3 * len(range(Z)[own]) * Y * X
+        self._keep, self._free_count = np.empty(0, np.float32), 3 * len(range(Z)[own]) * Y * X
         if frozen is not None:
-            self._keep = _make_zeros(size // 3 + 2 * SLACK)
+            self._keep = _make_zeros(voxels + 2 * SLACK)
             self._keep[SLACK:-SLACK] = 1 - np.asarray(frozen, np.float32).ravel()
-            self._free = 3 * int(np.count_nonzero(self._keep))
-        self._between, self._field, self._gradient = _make_volume(grid), _make_volume(grid), _make_volume(grid)
+            self._free_count = 3 * int(np.count_nonzero(self._keep))
+        self._field, self._gradient, self._gradient_along_z = (_make_volume(grid) for _ in range(3))
+        #: Of each plane, the sum of |∂F_ε/∂A|, and the bits of its maximum (see `loops._measure_sizes`).
         self._sums, self._highest = np.empty(Z), np.empty(Z, np.int32)
         self._index_z = _continue_index(Z, EDGE, EDGE, grid.periodic)
-        sizes = 3 * loops.pitch(Y, X) + 2 * SLACK, loops.ROWS * X + SLACK, Y * X + SLACK
+        sizes = 3 * loops.pitch(Y, X) + 2 * SLACK, loops.ADAM_ROWS * X + SLACK, Y * X + SLACK
         self._rings, self._slopes, self._fluxes = (_make_scratch(threads, size) for size in sizes)
 
     @property
@@ -112,7 +114,7 @@ class FusedFlow:
     @property
     def vector(self) -> np.ndarray:
         """A, `(3, Z, Y, X)`: a view that the next step overwrites, and that may be written to between steps."""
-        self._ahead = False
+        self._divergence_ready = False
         return self._vector[SLACK:-SLACK].reshape(3, *self.grid.shape)
 
     def state(self) -> dict[str, Any]:
@@ -125,94 +127,80 @@ class FusedFlow:
         """Continue from a state of a flow with the same parameters."""
         for name, values in (("vector", self._vector), ("first", self._first), ("second", self._second)):
             values[SLACK:-SLACK] = np.asarray(state[name], np.float32).ravel()
-        self._mass, self.taken, self._ahead = state["mass"], state["taken"], False
+        self._mass, self.taken, self._divergence_ready = state["mass"], state["taken"], False
 
     def shift(self, amount: float) -> None:
         """Add a constant to u from the next step on."""
         self._mass += amount
 
     def evaluate(self) -> float:
-        """Compute u and the gradient of F_ε with respect to u; return F_ε."""
-        if not self._ahead:  # a step leaves div A blurred along y and x for the next one
+        """Compute u and the gradient of F_ε with respect to u, the first two passes of a step; return F_ε."""
+        if not self._divergence_ready:
             self._adam_step(ALL, np.zeros(6, np.float32))
-        self._ahead = False
+        self._divergence_ready = False
         self._fill_halos()
-        self.blur_along_z()
-        return self.fill_gradient()
-
-    def update(self, rate: float) -> tuple[float, float]:
-        """Make an Adam step of length `rate` along the last gradient; return maximum and mean of |∂F_ε/∂A|."""
-        self._fill_halos()
-        self.blur_gradient_along_z()
-        return self.blur_adam(rate)
-
-    def _fill_halos(self) -> None:
-        """Fill the planes of the gradient, or of what takes its place, that others own."""
-        if self._exchange is not None:
-            Z, Y, X = self.grid.shape
-            size = loops.pitch(Y, X)
-            self._exchange(self._gradient[SLACK : SLACK + Z * size].reshape(Z, size))
-
-    def blur_along_z(self) -> None:
-        """Blur along z and add the base, the first part of a step."""
         self._blur.along_z(self._gradient, self._field, self._mass, self._base)
-
-    def fill_gradient(self) -> float:
-        """Compute F_ε and its gradient with respect to u, the second part of a step."""
         return self._density(self._field, self._gradient, self._own)
 
-    def blur_gradient_along_z(self) -> None:
-        """Blur the gradient along z, the third part of a step."""
-        self._blur.along_z(self._gradient, self._between, 0.0, _NO_FIELD)
+    def update(self, rate: float) -> tuple[float, float]:
+        """Make an Adam step of length `rate` along the last gradient; return maximum and mean of |∂F_ε/∂A|.
 
-    def blur_adam(self, rate: float) -> tuple[float, float]:
-        """Blur the gradient along y and x, apply -∇ and Adam, the last part of a step.
-
-        The next step's div A, blurred along y and x, takes the gradient's place.
+        These are the last two passes. The next step's div A, blurred along y and x, is then in `_gradient`.
         """
-        self.taken, self._ahead = self.taken + 1, True
+        self._fill_halos()
+        self._blur.along_z(self._gradient, self._gradient_along_z, 0.0, _NO_FIELD)
+        self.taken, self._divergence_ready = self.taken + 1, True
         β1, β2 = self.betas
-        length, spread = rate / (1 - β1**self.taken), 1 / math.sqrt(1 - β2**self.taken)
-        adam = np.array([1 - β1, β2, 1 - β2, length, spread, self._adam_eps], np.float32)
+        # With Adam's corrections of the bias of its moments, which begin at 0.
+        corrected_rate, root_factor = rate / (1 - β1**self.taken), 1 / math.sqrt(1 - β2**self.taken)
+        adam = np.array([1 - β1, β2, 1 - β2, corrected_rate, root_factor, self._adam_eps], np.float32)
         self._adam_step(MOVE, adam)
         self._adam_step(ENDS, adam)
-        most, total = self._highest[self._own].max(), self._sums[self._own].sum()
-        return float(most.view(np.float32)), float(total) / max(1, self._free)
+        highest, total = self._highest[self._own].max().view(np.float32), self._sums[self._own].sum()
+        return float(highest), float(total) / max(1, self._free_count)
+
+    def _fill_halos(self) -> None:
+        """Fill the planes of `_gradient` that other processes own, whether it holds the gradient or div A."""
+        if self._exchange is not None:
+            Z, Y, X = self.grid.shape
+            pitch = loops.pitch(Y, X)
+            self._exchange(self._gradient[SLACK : SLACK + Z * pitch].reshape(Z, pitch))
 
     def _adam_step(self, phase: int, adam: np.ndarray) -> None:
-        """Run the last pass, or a part of it."""
+        """Run a phase of `loops.adam_step`, the last pass of a step."""
         loops.adam_step(
-            self._threads, phase, self._between, self._vector, self._first, self._second, self._keep, self._gradient,
-            self._blur.rows, self._rings, self._slopes, self._fluxes, self._sums, self._highest,
+            self._threads, phase, self._gradient_along_z, self._vector, self._first, self._second, self._keep,
+            self._gradient, self._blur.rows, self._rings, self._slopes, self._fluxes, self._sums, self._highest,
             self._half, adam, self.grid.shape, self.grid.periodic, self._index_z, self._blur.planes,
         )  # fmt: skip
 
 
 class _Blur:
-    """The blur k on a grid: for each axis the index of its continuation, and the weights, with zeros after them."""
+    """The blur k on a grid: along each axis the weights, and the samples that they meet, also beyond the box."""
 
     def __init__(self, grid: Grid, width: float, threads: int) -> None:
         (z, rz), (y, ry), (x, rx) = (_pad_taps(width / h) for h in grid.spacing)
         Z, Y, X = grid.shape
         periodic = grid.periodic
         self._grid, self._threads = grid, threads
-        self._index, self._taps = _continue_index(Z, rz, len(z) + TOGETHER, periodic), z
+        # Loops run over all weights, whose number is rounded up, and over `BLUR_ROWS` rows: so beyond the radius.
+        self._index, self._taps = _continue_index(Z, rz, len(z) + BLUR_ROWS, periodic), z
         #: Index and weights along y and along x, the samples that continue a row at its ends, and the radius along x.
         self.planes = (
-            _continue_index(Y, ry + EDGE, len(y) + EDGE + TOGETHER, periodic),
+            _continue_index(Y, ry + EDGE, len(y) + EDGE + BLUR_ROWS, periodic),
             y,
             _continue_index(X, rx, rx, periodic),
             x,
             _continue_index(X, EDGE, EDGE, periodic)[[0, 1, X + EDGE, X + EDGE + 1]],
             rx,
         )
-        self.rows = _make_scratch(threads, 2 * TOGETHER * loops.row_length(X, len(x)) + SLACK)
+        self.rows = _make_scratch(threads, 2 * BLUR_ROWS * loops.row_length(X, len(x)) + SLACK)
 
     def along_z(self, source: np.ndarray, out: np.ndarray, shift: float, base: np.ndarray) -> None:
-        """Blur along z, and add a number and, where it is not empty, a field."""
+        """Blur along z, and add the number `shift` and, where it is not empty, the field `base`."""
         Z, *plane = self._grid.shape
-        size, number = loops.pitch(*plane), np.float32(shift)
-        loops.blur_z(self._threads, source, out, base, self._threads, Z, size, self._index, self._taps, number)
+        pitch, number = loops.pitch(*plane), np.float32(shift)
+        loops.blur_z(self._threads, source, out, base, self._threads, Z, pitch, self._index, self._taps, number)
 
     def in_planes(self, source: np.ndarray, out: np.ndarray) -> None:
         """Blur along y and x."""
@@ -228,32 +216,34 @@ class _Density:
         self._grid, self._threads = grid, threads
         self._block, self._tile = max(1, min(8, _BLOCK // stride)), min(Y, max(8, _TILE // stride))
         weights, ratios = _compute_weights(a, grid, epsilon), _compute_ratios(grid)
-        self._constants, self._general = _make_constants(weights, grid), (ratios, None, None, None)
-        ratios = _RATIOS if ratios is None else ratios
+        self._constants = _make_constants(weights, grid)
+        #: `ratios`, `orient`, `local` and `table` of `loops._differentiate`: None where the loop can do without.
+        self._optional = (ratios, None, None, None)
+        ratios = _RATIOS if ratios is None else ratios  # the cases below have one compiled form each
         if orientation is not None or any(np.ndim(value) > 0 for value in weights):
             weights.append(_check_voxelwise(epsilon, grid) * grid.voxel_volume / (2 * grid.spacing[2]) ** 2)
             if mask is not None:
                 weights[1:] = [value * _check_voxelwise(mask, grid) for value in weights[1:]]
-            self._general = (ratios, _mirror_orientation(orientation, grid), *_join_weights(weights, self._block, grid))
+            self._optional = ratios, _mirror_orientation(orientation, grid), *_join_weights(weights, self._block, grid)
         elif mask is not None:
-            self._general = (ratios, None, _pad_field(np.asarray(mask), grid), None)
+            self._optional = (ratios, None, _pad_field(np.asarray(mask), grid), None)
         self._index = _continue_index(Z, EDGE, EDGE, grid.periodic)
         row = np.zeros(stride, np.float32)
         row[EDGE:-EDGE] = 1
-        nothing = np.zeros(self._block * stride + SLACK, np.float32)
-        self._inside = np.concatenate([np.tile(row, self._block), nothing])
-        self._energies = np.empty((-(-Y // self._tile), Z))
-        part = -(-(self._block + 2) * stride // _LINE) * _LINE + SLACK
-        self._rings = _make_scratch(threads, loops.PARTIALS * part + 2 * SLACK)
+        outside = np.zeros(self._block * stride + SLACK, np.float32)
+        self._inside = np.concatenate([np.tile(row, self._block), outside])
+        self._energies = np.empty((math.ceil(Y / self._tile), Z))
+        partial_size = _round_up((self._block + 2) * stride) + SLACK
+        self._rings = _make_scratch(threads, loops.PARTIALS * partial_size + 2 * SLACK)
         # Three planes of sums, and a block to discard into.
-        part = -(-max(self._tile, self._block + 1) * stride // _LINE) * _LINE + SLACK
-        self._sums = _make_scratch(threads, 4 * part + 2 * SLACK)
+        plane_size = _round_up(max(self._tile, self._block + 1) * stride) + SLACK
+        self._sums = _make_scratch(threads, 4 * plane_size + 2 * SLACK)
 
     def __call__(self, u: np.ndarray, gradient: np.ndarray, planes: slice = slice(None)) -> float:
-        """Fill the gradient; return the energy of some planes."""
+        """Fill `gradient` with ∂F_ε/∂u of the volume `u`; return the energy of `planes`."""
         loops.fill_gradient(
             self._threads, u, gradient, self._energies, self._rings, self._sums, self._inside, self._constants,
-            *self._general, self._index, self._block, self._tile, *self._grid.shape,
+            *self._optional, self._index, self._block, self._tile, *self._grid.shape,
         )  # fmt: skip
         return float(self._energies[:, planes].sum())
 
@@ -262,63 +252,68 @@ _NO_FIELD = np.empty(0, np.float32)
 
 
 def _choose_threads(grid: Grid) -> int:
-    """Return how many threads a grid is worth, of those that numba may use."""
-    worth = min(math.prod(grid.shape) // _WORTH, grid.shape[0] // TOGETHER)
-    return min(count_threads(), worth) if worth > 1 else 1
+    """Return the number of threads that a grid makes use of, at most as many as numba may take."""
+    useful = min(math.prod(grid.shape) // _VOXELS_PER_THREAD, grid.shape[0] // BLUR_ROWS)
+    return min(count_threads(), useful) if useful > 1 else 1
+
+
+def _round_up(size: int) -> int:
+    """Round a number of floats up to whole cache lines."""
+    return -(-size // _LINE) * _LINE
 
 
 def _make_scratch(threads: int, size: int) -> np.ndarray:
-    """Make room of a size for each thread, on cache lines of its own."""
-    size = -(-size // _LINE) * _LINE
+    """Make a scratch array `(threads, ≥ size)` whose rows share no cache line."""
+    size = _round_up(size)
     return _make_zeros(threads * size).reshape(threads, size)
 
 
 def _make_zeros(size: int) -> np.ndarray:
     """Make zeros that begin at a cache line."""
-    room = np.zeros(size + _LINE, np.float32)
-    first = -room.ctypes.data // 4 % _LINE
-    return room[first : first + size]
+    array = np.zeros(size + _LINE, np.float32)
+    first = -array.ctypes.data // 4 % _LINE
+    return array[first : first + size]
 
 
 def _make_volume(grid: Grid) -> np.ndarray:
-    """Make room for the grid's planes, or for as many as a blur along z makes at once."""
-    return _make_zeros(max(grid.shape[0], TOGETHER) * loops.pitch(*grid.shape[1:]) + 2 * SLACK)
+    """Make a flat volume (see `loops`) for the grid's planes, at least as many as a blur along z writes at once."""
+    return _make_zeros(max(grid.shape[0], BLUR_ROWS) * loops.pitch(*grid.shape[1:]) + 2 * SLACK)
 
 
-def _view_whole(volume: np.ndarray, grid: Grid) -> np.ndarray:
-    """View the field and its continuation in planes."""
+def _view_padded(volume: np.ndarray, grid: Grid) -> np.ndarray:
+    """View a flat volume as a field with its continuation in planes, `(Z, Y + 2·EDGE, X + 2·EDGE)`."""
     Z, Y, X = grid.shape
-    rows = (X + 2 * EDGE) * 4
-    return as_strided(volume[SLACK:], (Z, Y + 2 * EDGE, X + 2 * EDGE), (loops.pitch(Y, X) * 4, rows, 4))
+    row_bytes = (X + 2 * EDGE) * 4
+    return as_strided(volume[SLACK:], (Z, Y + 2 * EDGE, X + 2 * EDGE), (loops.pitch(Y, X) * 4, row_bytes, 4))
 
 
 def _view_field(volume: np.ndarray, grid: Grid) -> np.ndarray:
-    """View the field without its continuation."""
-    return _view_whole(volume, grid)[:, EDGE:-EDGE, EDGE:-EDGE]
+    """View a flat volume as a field `(Z, Y, X)`, without its continuation."""
+    return _view_padded(volume, grid)[:, EDGE:-EDGE, EDGE:-EDGE]
 
 
 def _pad_field(u: np.ndarray, grid: Grid) -> np.ndarray:
-    """Copy a field into planes and continue it."""
+    """Copy a field `(Z, Y, X)` into a flat volume and continue it in planes."""
     if u.shape != grid.shape:
         raise ValueError(f"expected a field of shape {grid.shape}, got {u.shape}")
     volume = _make_volume(grid)
-    whole = _view_whole(volume, grid)
+    padded = _view_padded(volume, grid)
     y, x = (EDGE + _continue_index(n, EDGE, EDGE, grid.periodic) for n in grid.shape[1:])
-    whole[:, EDGE:-EDGE, EDGE:-EDGE] = u
+    padded[:, EDGE:-EDGE, EDGE:-EDGE] = u
     sides = [0, 1, -2, -1]
-    whole[:, :, sides] = whole[:, :, x[sides]]
-    whole[:, sides] = whole[:, y[sides]]
+    padded[:, :, sides] = padded[:, :, x[sides]]
+    padded[:, sides] = padded[:, y[sides]]
     return volume
 
 
 def _pad_taps(deviation: float) -> tuple[np.ndarray, int]:
-    """Return the weights with zeros after them, and the radius; a deviation of zero is the identity."""
+    """Return a blur's weights, with zeros up to a multiple of `TAPS`, and its radius; deviation 0 is the identity."""
     taps = gaussian_taps(deviation) if deviation > 0 else (1.0,)
     return np.array(taps + (0.0,) * (-len(taps) % TAPS), np.float32), len(taps) // 2
 
 
 def _continue_index(n: int, before: int, after: int, periodic: bool) -> np.ndarray:
-    """Return which of n samples stands at places -before to n + after - 1."""
+    """Return the index of the sample at each position from -before to n + after - 1, periodic or mirrored."""
     return np.pad(np.arange(n), (before, after), mode="wrap" if periodic else "symmetric")
 
 
@@ -338,6 +333,8 @@ def _compute_weights(a, grid: Grid, epsilon) -> list:
     """
     a20, a11, a02, a10, a01, a00 = (_check_voxelwise(value, grid) for value in a)
     ε, h = _check_voxelwise(epsilon, grid), grid.spacing[2]
+    # In eq. 20, |M|²/2ε has (ε/h²)² and the ½ of |M|² = (X + T²)/2, |∇u|/2 has G/2h, and |∇u|² has s/4h²: with the
+    # factors 0.75 and 0.5 below, all three are ε V / 4h^power.
     second, first, zeroth = (ε * (grid.voxel_volume / (power * h**power)) for power in (4, 3, 2))
     X = (a20 + a02 - a11) * second
     return [
@@ -352,37 +349,41 @@ def _compute_weights(a, grid: Grid, epsilon) -> list:
 
 
 def _make_constants(weights: list, grid: Grid) -> np.ndarray:
-    """Return the constants `k` of `loops._differentiate`: ξ², small numbers, weights that do not vary, and the share
-    of the squares that rounding leaves undecided."""
+    """Return the constants `k` of `loops._differentiate`: ξ², literals, weights that do not vary, `ROOT_ROUNDING`."""
     h = grid.spacing[2]
-    well, *rest = (float(value) if np.ndim(value) == 0 else math.nan for value in weights)
-    low = ROOT_FLOOR * h**2
-    varies = any(np.ndim(value) > 0 for value in weights)
-    X, T2, *_, s = rest
-    small = ((2 * h * XI) ** 2, 0, 0.5, 0.25, 1, 2, 3)
-    numbers = [*small, well, low if varies else low * well, *rest, 2 * X, 2 * T2, 2 * s, ROOT_ROUNDING]
-    return np.array(numbers, np.float32)
+    well, *terms = (float(value) if np.ndim(value) == 0 else math.nan for value in weights)
+    # The floor of X in units of (ε/h²)², without the factor (h/ε)² where that may vary.
+    floor = ROOT_FLOOR * h**2
+    if all(np.ndim(value) == 0 for value in weights):
+        floor *= well
+    X, T2, *_, s = terms
+    literals = (0, 0.5, 0.25, 1, 2, 3)
+    constants = [(2 * h * XI) ** 2, *literals, well, floor, *terms, 2 * X, 2 * T2, 2 * s, ROOT_ROUNDING]
+    return np.array(constants, np.float32)
 
 
 def _join_weights(weights: list, block: int, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Return `local` and `places` of `loops._differentiate`: the weights, volumes where they vary and else one vector,
-    and the signs of mirrored x in a block of rows, one after the other; and their offsets and whether they vary."""
-    parts = []
-    for value in weights:
-        part = np.full(WIDE, value, np.float32) if np.ndim(value) == 0 else _pad_field(value, grid)
-        if np.ndim(value):
-            part[:SLACK] = part[-SLACK:] = 1
-        parts.append(part)
+    """Return `local` and `table` of `loops._differentiate`: all weights in one array; their offsets and if they vary.
+
+    A weight is a flat volume where it varies, else one vector. After them come the signs of x in a block of rows, -1
+    where x is mirrored.
+    """
+    arrays, varies = [], [np.ndim(value) > 0 for value in weights]
+    for value, varying in zip(weights, varies, strict=True):
+        array = _pad_field(value, grid) if varying else np.full(WIDE, value, np.float32)
+        if varying:
+            array[:SLACK] = array[-SLACK:] = 1  # so that no root of 0 makes a NaN in cells that count 0 times
+        arrays.append(array)
     signs = np.ones(grid.shape[2] + 2 * EDGE, np.float32)
     if not grid.periodic:
         signs[:EDGE] = signs[-EDGE:] = -1
-    parts.append(np.pad(np.tile(signs, block), (0, SLACK)))
-    offsets = np.cumsum([0, *(part.size for part in parts[:-1])])
-    return np.concatenate(parts), np.array([offsets, [*(np.ndim(value) > 0 for value in weights), True]]).T.copy()
+    arrays.append(np.pad(np.tile(signs, block), (0, SLACK)))
+    offsets = np.cumsum([0, *(array.size for array in arrays[:-1])])
+    return np.concatenate(arrays), np.array([offsets, [*varies, True]]).T.copy()
 
 
 def _mirror_orientation(orientation, grid: Grid) -> np.ndarray:
-    """Return Q's zz, yy, xx, zy, zx, yx (4, 6): as it is, and mirrored in y, in z and in both."""
+    """Return the components zz, yy, xx, zy, zx, yx of Q, `(4, 6)`: as it is, and mirrored in y, in z and in both."""
     Q = np.zeros((3, 3)) if orientation is None else np.asarray(orientation, np.float64)
     if Q.shape != (3, 3) or not np.array_equal(Q, Q.T):
         raise ValueError(f"expected a symmetric 3×3 orientation (z, y, x), got {Q.tolist()}")

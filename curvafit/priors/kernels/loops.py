@@ -80,26 +80,26 @@ _PARALLEL: dict[str, Any] = {**_PLAIN, **_SUMS, "cache": True}
 
 
 #: The processor's features that numba compiles for: the host's, unless numba's settings give others.
-_GIVEN = getattr(config, "CPU_FEATURES", None)
-_FEATURES = llvm.get_host_cpu_features().flatten() if _GIVEN is None else _GIVEN
+_CONFIGURED = getattr(config, "CPU_FEATURES", None)
+_FEATURES = llvm.get_host_cpu_features().flatten() if _CONFIGURED is None else _CONFIGURED
 #: Floats of a vector of the density: two of the processor's where it has the registers.
 WIDE = 32 if "+avx512f" in _FEATURES.split(",") else 8
 #: Floats before and after a flat volume.
 SLACK = 64
 #: Samples of the continuation on every side of a plane.
 EDGE = 2
-#: Rows that a blur computes at once, and taps that are unrolled (weights are padded with zeros to a multiple).
-TOGETHER, TAPS = 4, 17
+#: Rows that a blur computes at once, and weights that are unrolled (they are padded with zeros to a multiple of it).
+BLUR_ROWS, TAPS = 4, 17
 #: Rows that Adam takes at a time: whole vectors whatever X.
-ROWS = 16
+ADAM_ROWS = 16
 #: Partial derivatives kept for a row: what goes to the six neighbours, to the centre, and along the diagonals.
 PARTIALS = 10
 _YM, _C, _ZM, _ZP, _XM, _XP, _ZX, _YP, _ZY, _YX = range(PARTIALS)
 #: Floats of a strip in the blur along z: the twenty rows that four outputs need stay in the second-level cache.
 _STRIP = 2048
 
-_ZERO, _ONE, _LEAST = (np.float32(value) for value in (0, 1, 1e-37))
-#: Floats that a row is rounded up to.
+_ZERO, _ONE, _TINY = (np.float32(value) for value in (0, 1, 1e-37))
+#: Row lengths are rounded up to a multiple of so many floats.
 LANES = 16
 #: The phases of `adam_step`.
 MOVE, ENDS, ALL = range(3)
@@ -109,13 +109,13 @@ _at = np.uint64
 
 @njit(**_COUNTING)
 def pitch(Y, X):
-    """Count the floats from a plane to the next: the last row may be rounded up."""
+    """Return the number of floats from one plane to the next, with room for rounding up the last row."""
     return ((Y + 2 * EDGE) * (X + 2 * EDGE) + 2 * LANES - 1) & -LANES
 
 
 @njit(**_COUNTING)
 def row_length(X, taps):
-    """Count the floats of a row, its continuation and what it is rounded up to."""
+    """Return the number of floats of a row with its continuation, rounded up."""
     return (X + taps + 2 * LANES) & -LANES
 
 
@@ -149,42 +149,42 @@ def _shuffle(builder, first, second, indices):
 
 def _splat(builder, number, width: int):
     """Fill a vector with one number."""
-    nothing = ir.Constant(_ir(width), ir.Undefined)
-    return _shuffle(builder, builder.insert_element(nothing, number, ir.IntType(32)(0)), nothing, [0] * width)
+    undef = ir.Constant(_ir(width), ir.Undefined)
+    return _shuffle(builder, builder.insert_element(undef, number, ir.IntType(32)(0)), undef, [0] * width)
 
 
 def _declare(builder, name: str, result, arguments):
     """Declare an LLVM function once in a module."""
-    known = builder.module.globals.get(name)
-    return known or ir.Function(builder.module, ir.FunctionType(result, arguments), name)
+    declared = builder.module.globals.get(name)
+    return declared or ir.Function(builder.module, ir.FunctionType(result, arguments), name)
 
 
 def _define_operators(vector: _Vector) -> None:
     """Define v + v, v - v, v · v and v / v, also with a number on either side."""
-    kinds = ((vector, vector), (vector, types.float32), (types.float32, vector))
-    cases = [signature(vector, *kind) for kind in kinds]
+    operand_types = ((vector, vector), (vector, types.float32), (types.float32, vector))
+    cases = [signature(vector, *pair) for pair in operand_types]
     names = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
     for symbol, name in names.items():
         _infer(symbol)(type(f"{name}_{vector}", (ConcreteTemplate,), {"cases": cases}))
 
         def lower(context, builder, sig, values, name=name):
             first, second = (
-                value if kind == vector else _splat(builder, value, vector.width)
-                for value, kind in zip(values, sig.args, strict=True)
+                value if numba_type == vector else _splat(builder, value, vector.width)
+                for value, numba_type in zip(values, sig.args, strict=True)
             )
             return getattr(builder, name)(first, second)
 
-        for kind in kinds:
-            lower_builtin(symbol, *kind)(lower)
+        for pair in operand_types:
+            lower_builtin(symbol, *pair)(lower)
 
 
 _VECTOR = _Vector(WIDE)
 _define_operators(_VECTOR)
 
 
-def _address(context, builder, kind, values, width: int):
+def _address(context, builder, array_type, values, width: int):
     """Return a vector's address in an array; the first two values are the array and an index from 0."""
-    data = context.make_array(kind)(context, builder, values[0]).data
+    data = context.make_array(array_type)(context, builder, values[0]).data
     return builder.bitcast(builder.gep(data, [values[1]]), _ir(width).as_pointer())
 
 
@@ -225,14 +225,14 @@ def _store_first(typingctx, array, index, value, count):
 
     def generate(context, builder, sig, values):
         width = value.width
-        numbers = ir.VectorType(ir.IntType(64), width)
-        nothing = ir.Constant(numbers, ir.Undefined)
-        limit = _shuffle(builder, builder.insert_element(nothing, values[3], ir.IntType(32)(0)), nothing, [0] * width)
-        within = builder.icmp_signed("<", ir.Constant(numbers, list(range(width))), limit)
+        integers = ir.VectorType(ir.IntType(64), width)
+        undef = ir.Constant(integers, ir.Undefined)
+        limits = _shuffle(builder, builder.insert_element(undef, values[3], ir.IntType(32)(0)), undef, [0] * width)
+        mask = builder.icmp_signed("<", ir.Constant(integers, list(range(width))), limits)
         address = _address(context, builder, sig.args[0], values, width)
-        kinds = [_ir(width), address.type, ir.IntType(32), within.type]
-        masked = _declare(builder, f"llvm.masked.store.v{width}f32.p0", ir.VoidType(), kinds)
-        builder.call(masked, [values[2], address, ir.IntType(32)(4), within])
+        argument_types = [_ir(width), address.type, ir.IntType(32), mask.type]
+        store = _declare(builder, f"llvm.masked.store.v{width}f32.p0", ir.VoidType(), argument_types)
+        builder.call(store, [values[2], address, ir.IntType(32)(4), mask])
         return context.get_dummy_value()
 
     return types.void(array, types.intp, value, types.intp), generate
@@ -269,8 +269,8 @@ def _sum(typingctx, value):
     """Add a vector's floats."""
 
     def generate(context, builder, sig, values):
-        whole = f"llvm.vector.reduce.fadd.v{value.width}f32"
-        function = _declare(builder, whole, ir.FloatType(), [ir.FloatType(), _ir(value.width)])
+        name = f"llvm.vector.reduce.fadd.v{value.width}f32"
+        function = _declare(builder, name, ir.FloatType(), [ir.FloatType(), _ir(value.width)])
         return builder.call(function, [ir.FloatType()(0.0), *values], fastmath=("reassoc",))
 
     return types.float32(value), generate
@@ -285,35 +285,31 @@ def _scale(value, ratios, which):
 
 
 @njit(**_SERIAL)
-def _read(local, places, which, cell):
-    """Read one of the density's weights where they vary."""
-    return _load(local, places[which, 0] + places[which, 1] * cell)
+def _read(local, table, which, cell):
+    """Read the vector of the density's weight number `which` at a cell."""
+    return _load(local, table[which, 0] + table[which, 1] * cell)
 
 
 @njit(**_SERIAL)
-def _read_cost(k, local, places, cell):
+def _read_cost(k, local, table, cell):
     """Read (h/ε)², the floor of X, the weights of X, T², TS, GT, GS and s, and twice those of X, T² and s.
 
-    They are numbers where `local` is None, numbers times the mask `local` where `places` is, else arrays.
+    They are constants of `k` where `local` is None; these times the mask `local` where `table` is None; else arrays.
     """
     if local is None:
         return (
             _fill(k[7]), _fill(k[8]), _fill(k[9]), _fill(k[10]), _fill(k[11]), _fill(k[12]), _fill(k[13]), _fill(k[14]),
             _fill(k[15]), _fill(k[16]), _fill(k[17]),
         )  # fmt: skip
-    if places is None:
+    if table is None:
         mask = _load(local, cell)
         return (
             _fill(k[7]), _fill(k[8]), mask * k[9], mask * k[10], mask * k[11], mask * k[12], mask * k[13], mask * k[14],
             mask * k[15], mask * k[16], mask * k[17],
         )  # fmt: skip
-    well, X, T2 = (
-        _read(local, places, 0, cell),
-        _read(local, places, 1, cell),
-        _read(local, places, 2, cell),
-    )
-    TS, GT = _read(local, places, 3, cell), _read(local, places, 4, cell)
-    GS, s = _read(local, places, 5, cell), _read(local, places, 6, cell)
+    well, X, T2 = _read(local, table, 0, cell), _read(local, table, 1, cell), _read(local, table, 2, cell)
+    TS, GT = _read(local, table, 3, cell), _read(local, table, 4, cell)
+    GS, s = _read(local, table, 5, cell), _read(local, table, 6, cell)
     return well, well * k[8], X, T2, TS, GT, GS, s, X + X, T2 + T2, s + s
 
 
@@ -326,9 +322,9 @@ def _mirror(orient, across_z, across_y):
 
 
 @njit(**_SERIAL)
-def _tilt(gz, gy, gx, orient, local, places, cell, i):
-    """Compute Q∇u times the weight of ∇uᵀQ∇u; a row of signs in `local` is negative where x is mirrored."""
-    weight, sign = _read(local, places, 7, cell), _load(local, places[8, 0] + i)
+def _tilt(gz, gy, gx, orient, local, table, cell, i):
+    """Compute Q∇u times the weight of ∇uᵀQ∇u; the signs in `local` are negative where x is mirrored."""
+    weight, sign = _read(local, table, 7, cell), _load(local, table[8, 0] + i)
     gz, gy, gx = weight * gz, weight * gy, weight * gx
     across = sign * gx
     tz = gz * orient[0] + gy * orient[3] + across * orient[4]
@@ -337,22 +333,20 @@ def _tilt(gz, gy, gx, orient, local, places, cell, i):
 
 
 @njit(**_SERIAL)
-def _differentiate(u, m, c, p, stride, n, ring, size, at, inside, from_, k, ratios, orient, local, places):
+def _differentiate(u, m, c, p, stride, n, ring, size, at, inside, inside_at, k, ratios, orient, local, table):
     """Compute the energy of n cells; store the partial derivatives from `at` on in the ring's ten arrays, `size` apart.
 
-    `m`, `c`, `p` are the cells' offsets in the planes z-1, z, z+1 of u; `inside` is one in the box from `from_` on.
-    Differences are in units of the spacing, and the constants `k` are scaled so; these are read where they are used,
-    since in registers they would push the variables out. Where weights vary, `local` holds them one after the other and
-    a row of `places` is a weight's offset in it, with 1, or 0 for one vector that holds everywhere; `orient` then holds
-    Q's zz, yy, xx, zy, zx, yx. `local` without `places` is a mask that multiplies all weights.
+    `m`, `c`, `p` are the cells' offsets in the planes z-1, z, z+1 of u; `inside`, from `inside_at` on, is 1 in cells of
+    the box, else 0. Differences are in units of the spacing, and the constants `k` are scaled so; these are read where
+    they are used, since in registers they would push the variables out. Where weights vary, `local` holds them one
+    after the other, and a row of `table` is a weight's offset in it, and 1 or, for one vector that all cells share, 0;
+    `orient` then holds Q's zz, yy, xx, zy, zx, yx. `local` without `table` is a mask that multiplies all weights.
     """
     energy = _fill(k[1])
     for i in range(0, n, WIDE):
         ξ2, zero, quarter = _fill(k[0]), _fill(k[1]), _fill(k[3])
         one, two, three = _fill(k[4]), _fill(k[5]), _fill(k[6])
-        well, low, of_X, of_T2, of_TS, of_GT, of_GS, of_s, twice_X, twice_T2, twice_s = _read_cost(
-            k, local, places, c + i
-        )
+        well, low, of_X, of_T2, of_TS, of_GT, of_GS, of_s, two_X, two_T2, two_s = _read_cost(k, local, table, c + i)
         u_ = _load(u, c + i)
         zm, zp = _load(u, m + i), _load(u, p + i)
         ym, yp = _load(u, c + i - stride), _load(u, c + i + stride)
@@ -370,14 +364,14 @@ def _differentiate(u, m, c, p, stride, n, ring, size, at, inside, from_, k, rati
         )
         zy, zx = _scale(quarter * zy, ratios, 6), _scale(quarter * zx, ratios, 7)
         yx = _scale(quarter * yx, ratios, 8)
-        # The density. Shared terms are computed once, as late as possible, since registers run out.
+        # The density; `i_…` are inverses. Shared terms are computed once, and late, since registers run out.
         gzz, gyy, gxx = gz * gz, gy * gy, gx * gx
         s = gzz + gyy + gxx
         d = s + ξ2
         i_G = _inverse_root(d, one)
         i_d, G = i_G * i_G, d * i_G
-        beyond = ξ2 * i_d
-        r = one - beyond
+        damping = ξ2 * i_d  # 1 - r, by which ξ dampens the normal
+        r = one - damping
         u2 = u_ * u_
         w = u_ * (well * u2 - well)
         N = (zz * zz + yy * yy + xx * xx) + two * (zy * zy + zx * zx + yx * yx)
@@ -390,30 +384,30 @@ def _differentiate(u, m, c, p, stride, n, ring, size, at, inside, from_, k, rati
         T2 = T * T
         squares = N + wr * wr
         X = two * (squares - (w + w) * q) - T2
-        inner = _where_above(X, low, X, low)
-        i_S = _inverse_root(inner, one)
-        S = inner * i_S
+        floored = _where_above(X, low, X, low)
+        i_S = _inverse_root(floored, one)
+        S = floored * i_S
         TS = of_TS * T
         e_S = TS + of_GS * G
         e_G = of_GT * T + of_GS * S
         e = of_X * X + of_T2 * T2 + TS * S + G * e_G + of_s * s
         tz = ty = tx = zero
         if orient is not None:
-            tz, ty, tx = _tilt(gz, gy, gx, orient, local, places, c + i, i)
+            tz, ty, tx = _tilt(gz, gy, gx, orient, local, table, c + i, i)
             e = e + (gz * tz + gy * ty + gx * tx)
-        energy = energy + e * _load(inside, from_ + i)
+        energy = energy + e * _load(inside, inside_at + i)
         # Its derivatives, from the outside in, as at the file's head. The root's is zero where X is not resolved
         # (`curvature.positive_root`); `e_q` and `e_s` are the factors of D g and g in ∂e/∂g.
         slope = _where_above(X, low, i_S, zero)
-        e_P = twice_X + e_S * _where_above(X, squares * k[18], slope, zero)
-        e_T = T * (twice_T2 - e_P) + (of_TS * S + of_GT * G)
+        e_P = two_X + e_S * _where_above(X, squares * k[18], slope, zero)
+        e_T = T * (two_T2 - e_P) + (of_TS * S + of_GT * G)
         P2 = e_P + e_P
         e_wr = e_T + P2 * wr
         half_Q = w * e_P * i_d
         Q = half_Q + half_Q
         e_q = Q + Q
         e_w = r * e_wr - P2 * q
-        e_s = twice_s + e_G * i_G + e_q * q + two * beyond * i_d * (w * e_wr)
+        e_s = two_s + e_G * i_G + e_q * q + two * damping * i_d * (w * e_wr)
         dz, dy, dx = e_s * gz - e_q * hz, e_s * gy - e_q * hy, e_s * gx - e_q * hx
         if orient is not None:
             dz, dy, dx = dz + (tz + tz), dy + (ty + ty), dx + (tx + tx)
@@ -439,76 +433,79 @@ def _differentiate(u, m, c, p, stride, n, ring, size, at, inside, from_, k, rati
 
 @njit(**_SERIAL)
 def _gather(ring, size, at, stride, n, sums, below, centre, above, out, target):
-    """Apply the transposed stencils to n cells from `at` of the ring on: finish the plane below, add to this one and
-    begin the one above, whose offsets in `sums` are `below`, `centre` and `above`."""
+    """Apply the transposed stencils to the partials of n cells, from `at` of the ring on: finish the plane below in
+    `out`, and in `sums` add to this plane and begin the one above; `below`, `centre` and `above` are their offsets."""
     c, zm, zp = at + _C * size, at + _ZM * size, at + _ZP * size
     xm, xp, zx = at + _XM * size, at + _XP * size, at + _ZX * size
     yp, ym = at + _YP * size - stride, at + _YM * size + stride
     zy_m, zy_p = at + _ZY * size - stride, at + _ZY * size + stride
     yx_m, yx_p = at + _YX * size - stride, at + _YX * size + stride
     for i in range(0, n, WIDE):
-        within = _load(ring, c + i) + _load(ring, yp + i) + (_load(ring, ym + i) + _load(ring, xp + i - 1))
-        within = within + _load(ring, xm + i + 1) + (_load(ring, yx_p + i + 1) - _load(ring, yx_p + i - 1))
-        within = within + (_load(ring, yx_m + i - 1) - _load(ring, yx_m + i + 1))
+        in_plane = _load(ring, c + i) + _load(ring, yp + i) + (_load(ring, ym + i) + _load(ring, xp + i - 1))
+        in_plane = in_plane + _load(ring, xm + i + 1) + (_load(ring, yx_p + i + 1) - _load(ring, yx_p + i - 1))
+        in_plane = in_plane + (_load(ring, yx_m + i - 1) - _load(ring, yx_m + i + 1))
         across = (_load(ring, zy_p + i) - _load(ring, zy_m + i)) + (_load(ring, zx + i + 1) - _load(ring, zx + i - 1))
         _store(out, target + i, _load(sums, below + i) + _load(ring, zm + i) + across)
         _store(sums, above + i, _load(ring, zp + i) - across)
+        # This plane's sums are added to: a vector that overshoots would add to rows that have some already.
         if i + WIDE <= n:
-            _store(sums, centre + i, _load(sums, centre + i) + within)
+            _store(sums, centre + i, _load(sums, centre + i) + in_plane)
         else:
-            _store_first(sums, centre + i, _load(sums, centre + i) + within, n - i)
+            _store_first(sums, centre + i, _load(sums, centre + i) + in_plane, n - i)
 
 
 @njit(**_SERIAL)
 def _carry(ring, size, stride, count):
-    """Move the rows that the next block still reads from the end of the ring to its beginning.
+    """Move the rows that the next block still reads from the end of the ring's arrays to their beginning.
 
-    Of `count` new rows, which start at row 2, these are the last one of each array, or the last two of the partials.
+    Of `count` new rows, which start at row 2, these are the last one, or the last two in the arrays from `_YP` on.
     """
-    far = count * stride
+    distance = count * stride
     for array in range(_C, _YP):
         first = SLACK + array * size + stride
         for i in range(first, first + stride, WIDE):
-            _store(ring, i, _load(ring, i + far))
+            _store(ring, i, _load(ring, i + distance))
     for array in range(_YP, PARTIALS):
         first = SLACK + array * size
         for i in range(first, first + 2 * stride, WIDE):
-            _store(ring, i, _load(ring, i + far))
+            _store(ring, i, _load(ring, i + distance))
 
 
 @njit(**_SERIAL)
 def _fill_gradient_chunk(
-    u, out, energies, ring, sums, inside, k, ratios, orient, local, places, index,
+    u, out, energies, ring, sums, inside, k, ratios, orient, local, table, index,
     first, last, y0, y1, block, Z, Y, stride,
 ):  # fmt: skip
-    """Compute the gradient in planes first to last - 1 and rows y0 to y1 - 1, which needs partials one cell around."""
+    """Compute the gradient in planes first to last - 1, rows y0 to y1 - 1, from partials of one cell more around."""
     plane, size = pitch(Y, stride - 2 * EDGE), (ring.size - 2 * SLACK) // PARTIALS
-    share = (sums.size - 2 * SLACK) // 4
+    slot = (sums.size - 2 * SLACK) // 4
     for z in range(first - 1, last + 1):
         m, c, p = SLACK + index[z + 1] * plane, SLACK + index[z + 2] * plane, SLACK + index[z + 3] * plane
-        below, centre, above = SLACK + (z + 2) % 3 * share, SLACK + (z + 3) % 3 * share, SLACK + (z + 4) % 3 * share
+        below, centre, above = SLACK + (z + 2) % 3 * slot, SLACK + (z + 3) % 3 * slot, SLACK + (z + 4) % 3 * slot
         energy = 0.0
         y = y0 - 1
         while y <= y1:
-            within = y0 <= y < y1
-            count = min(block, y1 - y) if within else 1
+            in_tile = y0 <= y < y1
+            count = min(block, y1 - y) if in_tile else 1
             o = (y + EDGE) * stride
-            from_ = (block - count if within else block) * stride
-            place = SLACK + 2 * stride
+            # `inside` is `block` rows of ones, then of zeros: the energy of rows beyond the tile counts elsewhere.
+            inside_at = (block - count if in_tile else block) * stride
+            at = SLACK + 2 * stride
             energy += _differentiate(
-                u, m + o, c + o, p + o, stride, count * stride, ring, size, place, inside, from_, k, ratios,
-                _mirror(orient, z < 0 or z >= Z, y < 0 or y >= Y), local, places,
+                u, m + o, c + o, p + o, stride, count * stride, ring, size, at, inside, inside_at, k, ratios,
+                _mirror(orient, z < 0 or z >= Z, y < 0 or y >= Y), local, table,
             )  # fmt: skip
+            # A row is gathered after the next one has its partials, so that the rows gathered are one behind.
             begin = max(y - 1, y0)
             n = (y + count - 1 - begin) * stride
-            place += (begin - y) * stride
+            at += (begin - y) * stride
             row = (begin - y0) * stride
             if z > first:
                 target = SLACK + (z - 1) * plane + (begin + EDGE) * stride
-                _gather(ring, size, place, stride, n, sums, below + row, centre + row, above + row, out, target)
-            else:
-                discard = SLACK + 3 * share
-                _gather(ring, size, place, stride, n, sums, below + row, centre + row, above + row, sums, discard)
+                _gather(ring, size, at, stride, n, sums, below + row, centre + row, above + row, out, target)
+            else:  # the plane below is another chunk's
+                discard = SLACK + 3 * slot
+                _gather(ring, size, at, stride, n, sums, below + row, centre + row, above + row, sums, discard)
             _carry(ring, size, stride, count)
             y += count
         if first <= z < last:
@@ -516,7 +513,7 @@ def _fill_gradient_chunk(
 
 
 @partial(Kernel, **_PARALLEL)
-def fill_gradient(u, out, energies, rings, sums, inside, k, ratios, orient, local, places, index, block, tile, Z, Y, X):
+def fill_gradient(u, out, energies, rings, sums, inside, k, ratios, orient, local, table, index, block, tile, Z, Y, X):
     """Compute the energies of tiles of rows in planes, and the gradient."""
     chunks = rings.shape[0]
     for chunk in prange(chunks):
@@ -525,7 +522,7 @@ def fill_gradient(u, out, energies, rings, sums, inside, k, ratios, orient, loca
             for y0 in range(0, Y, tile):
                 _fill_gradient_chunk(
                     u, out, energies[y0 // tile], rings[chunk], sums[chunk], inside, k, ratios, orient,
-                    local, places, index, first, last, y0, min(Y, y0 + tile), block, Z, Y, X + 2 * EDGE,
+                    local, table, index, first, last, y0, min(Y, y0 + tile), block, Z, Y, X + 2 * EDGE,
                 )  # fmt: skip
 
 
@@ -533,16 +530,16 @@ def _blur_across(begins: bool):
     """Return the loop over the first `TAPS` weights of a blur across rows, or over the next ones."""
 
     @njit(**_INLINE)
-    def blur(source, origin, size, index, first, out, target, apart, n, taps, j0, shift):
-        """Add the rows under `TAPS` weights from j0 on to four output rows, which begin as a number."""
+    def blur(source, source_at, stride, index, first, out, target, out_stride, n, taps, j0, shift):
+        """Add source rows times `TAPS` weights, from j0 on, to four output rows, which begin as the number `shift`."""
         for i in range(n):
             if begins:
                 a = b = c = d = shift
             else:
-                a, b = out[_at(target + i)], out[_at(target + apart + i)]
-                c, d = out[_at(target + 2 * apart + i)], out[_at(target + 3 * apart + i)]
-            for j in range(TAPS + TOGETHER - 1):
-                row = source[_at(origin + index[_at(first + j0 + j)] * size + i)]
+                a, b = out[_at(target + i)], out[_at(target + out_stride + i)]
+                c, d = out[_at(target + 2 * out_stride + i)], out[_at(target + 3 * out_stride + i)]
+            for j in range(TAPS + BLUR_ROWS - 1):
+                row = source[_at(source_at + index[_at(first + j0 + j)] * stride + i)]
                 if j < TAPS:
                     a += row * taps[_at(j0 + j)]
                 if 1 <= j <= TAPS:
@@ -551,8 +548,8 @@ def _blur_across(begins: bool):
                     c += row * taps[_at(j0 + j - 2)]
                 if j >= 3:
                     d += row * taps[_at(j0 + j - 3)]
-            out[_at(target + i)], out[_at(target + apart + i)] = a, b
-            out[_at(target + 2 * apart + i)], out[_at(target + 3 * apart + i)] = c, d
+            out[_at(target + i)], out[_at(target + out_stride + i)] = a, b
+            out[_at(target + 2 * out_stride + i)], out[_at(target + 3 * out_stride + i)] = c, d
 
     return blur
 
@@ -561,14 +558,14 @@ _begin_across, _add_across = _blur_across(True), _blur_across(False)
 
 
 @njit(**_INLINE)
-def _blur_rows(source, origin, size, index, first, out, target, apart, n, taps, shift):
-    """Blur across rows: compute four rows of n floats, `apart` in `out`.
+def _blur_rows(source, source_at, stride, index, first, out, target, out_stride, n, taps, shift):
+    """Blur across rows: compute four rows of n floats, `out_stride` apart in `out` from `target` on.
 
-    `index[first + t]` is the source row, of those `size` apart, under tap t of the first output row.
+    Weight t of the first output row multiplies the source row `index[first + t]`, of rows `stride` apart.
     """
-    _begin_across(source, origin, size, index, first, out, target, apart, n, taps, 0, shift)
+    _begin_across(source, source_at, stride, index, first, out, target, out_stride, n, taps, 0, shift)
     for j0 in range(TAPS, taps.size, TAPS):
-        _add_across(source, origin, size, index, first, out, target, apart, n, taps, j0, shift)
+        _add_across(source, source_at, stride, index, first, out, target, out_stride, n, taps, j0, shift)
 
 
 @njit(**_INLINE)
@@ -576,20 +573,20 @@ def _blur_z(chunk, chunks, source, out, base, Z, plane, index, taps, shift):
     """Blur a chunk of planes along z."""
     first, last = chunk * Z // chunks, (chunk + 1) * Z // chunks
     for strip in range(0, plane, _STRIP):
-        n = min(_STRIP, plane - strip) & -LANES
-        for next_z in range(first, last, TOGETHER):
-            z = max(0, min(next_z, last - TOGETHER))
+        n = min(_STRIP, plane - strip) & -LANES  # no other number: so LLVM sees that it is whole vectors
+        for next_z in range(first, last, BLUR_ROWS):
+            z = max(0, min(next_z, last - BLUR_ROWS))  # the last four overlap those before
             target = SLACK + strip + z * plane
             _blur_rows(source, SLACK + strip, plane, index, z, out, target, plane, n, taps, shift)
             if base.size > 0:
-                for row in range(target, target + TOGETHER * plane, plane):
+                for row in range(target, target + BLUR_ROWS * plane, plane):
                     for i in range(n):
                         out[_at(row + i)] += base[_at(row + i)]
 
 
 @partial(Kernel, **_PARALLEL)
 def blur_z(source, out, base, chunks, Z, plane, index, taps, shift):
-    """Blur along z, and add a number and, where it is not empty, a field; four planes of a strip at a time.
+    """Blur along z, and add the number `shift` and, where it is not empty, the field `base`; four planes at a time.
 
     Every chunk has four planes or is the whole volume, which has room for four.
     """
@@ -602,7 +599,7 @@ def _continue_rows(rows, start, length, X, r, index):
     """Continue four rows, `length` apart, by r samples on both sides; their samples are from start + r on."""
     for j in range(r):
         left, right = r + index[_at(j)], r + index[_at(r + X + j)]
-        for k in range(TOGETHER):
+        for k in range(BLUR_ROWS):
             row = start + k * length
             rows[_at(row + j)] = rows[_at(row + left)]
             rows[_at(row + r + X + j)] = rows[_at(row + right)]
@@ -613,7 +610,7 @@ def _blur_along(begins: bool):
 
     @njit(**_INLINE)
     def blur(rows, first, out, target, n, taps, j0):
-        """Add the samples, from `first` on, under `TAPS` weights from j0 on to the outputs of a row."""
+        """Add samples, from `first` on, times `TAPS` weights, from j0 on, to the n outputs of a row."""
         for i in range(n):
             total = _ZERO if begins else out[_at(target + i)]
             for j in range(TAPS):
@@ -628,7 +625,7 @@ _begin_along, _add_along = _blur_along(True), _blur_along(False)
 
 @njit(**_INLINE)
 def _blur_x(rows, start, length, count, out, target, X, taps, ends):
-    """Blur along `count` continued rows, `length` apart from `start` on, into rows X + 2·EDGE apart, and continue those
+    """Blur along `count` continued rows, `length` apart from `start` on, into rows X + 2·EDGE apart, and continue these
     by two samples at both ends."""
     n = (X + LANES - 1) & -LANES
     for k in range(count):
@@ -644,21 +641,21 @@ def _blur_x(rows, start, length, count, out, target, X, taps, ends):
 def _blur_plane(source, origin, size, rows, out, target, edge, Y, X, blur):
     """Blur a plane along y and x: from rows `size` apart, to rows -edge … Y + edge - 1 of `out`, row 0 at `target`.
 
-    Four rows are blurred along y before the previous four are along x, whose values have arrived in memory by then.
+    Four rows are blurred along y, then the previous four along x, whose values have arrived in memory by then.
     """
     index_y, taps_y, index_x, taps_x, ends, r = blur
     length = row_length(X, taps_x.size)
     n = (X + LANES - 1) & -LANES
-    now, before = 0, TOGETHER * length
-    for y in range(-edge, Y + edge + TOGETHER, TOGETHER):
+    current, previous = 0, BLUR_ROWS * length
+    for y in range(-edge, Y + edge + BLUR_ROWS, BLUR_ROWS):
         if y < Y + edge:
-            _blur_rows(source, origin, size, index_y, y + EDGE, rows, now + r, length, n, taps_y, _ZERO)
-            _continue_rows(rows, now, length, X, r, index_x)
+            _blur_rows(source, origin, size, index_y, y + EDGE, rows, current + r, length, n, taps_y, _ZERO)
+            _continue_rows(rows, current, length, X, r, index_x)
         if y > -edge:
-            done = y - TOGETHER
-            count = min(TOGETHER, Y + edge - done)
-            _blur_x(rows, before, length, count, out, target + done * (X + 2 * EDGE), X, taps_x, ends)
-        now, before = before, now
+            done = y - BLUR_ROWS
+            count = min(BLUR_ROWS, Y + edge - done)
+            _blur_x(rows, previous, length, count, out, target + done * (X + 2 * EDGE), X, taps_x, ends)
+        current, previous = previous, current
 
 
 @njit(**_INLINE)
@@ -681,7 +678,7 @@ def blur_in_planes(source, out, rows, shape, blur):
 
 @njit(**_INLINE)
 def _wrap_index(i, n, periodic):
-    """Return an index that is at most one beyond either end as one inside: at the other end, or at the nearest."""
+    """Return the index inside for one that is at most 1 outside: at the other end if periodic, else at the nearest."""
     if i < 0:
         return n - 1 if periodic else 0
     if i >= n:
@@ -691,68 +688,76 @@ def _wrap_index(i, n, periodic):
 
 @njit(**_INLINE)
 def _divergence_plane(A, flux, half, z, shape, periodic):
-    """Compute div A on a plane: central differences of an odd continuation (no flux through mirrors)."""
+    """Compute div A on a plane: central differences; beyond a mirror A changes sign, so that no flux crosses it."""
     Z, Y, X = shape
     size, n = Y * X, (X + LANES - 1) & -LANES
     Az, Ay, Ax = SLACK, SLACK + (Z + z) * size, SLACK + (2 * Z + z) * size
     odd = _ONE if periodic else -_ONE
     zm, zp = Az + _wrap_index(z - 1, Z, periodic) * size, Az + _wrap_index(z + 1, Z, periodic) * size
-    fz_m, fz_p = half[0] * (odd if z == 0 else _ONE), half[0] * (odd if z == Z - 1 else _ONE)
-    fx, left, right = half[2], _wrap_index(-1, X, periodic), _wrap_index(X, X, periodic)
+    half_zm, half_zp = half[0] * (odd if z == 0 else _ONE), half[0] * (odd if z == Z - 1 else _ONE)
+    half_x, left, right = half[2], _wrap_index(-1, X, periodic), _wrap_index(X, X, periodic)
     for y in range(Y):
-        fy_m, fy_p = half[1] * (odd if y == 0 else _ONE), half[1] * (odd if y == Y - 1 else _ONE)
+        half_ym, half_yp = half[1] * (odd if y == 0 else _ONE), half[1] * (odd if y == Y - 1 else _ONE)
         row, ym, yp = y * X, Ay + _wrap_index(y - 1, Y, periodic) * X, Ay + _wrap_index(y + 1, Y, periodic) * X
         o = Ax + row
         for i in range(n):
-            total = A[_at(zp + row + i)] * fz_p - A[_at(zm + row + i)] * fz_m
-            total += A[_at(yp + i)] * fy_p - A[_at(ym + i)] * fy_m
-            flux[_at(row + i)] = total + (A[_at(o + i + 1)] - A[_at(o + i - 1)]) * fx
-        flux[_at(row)] += fx * (A[_at(o - 1)] - odd * A[_at(o + left)])
-        flux[_at(row + X - 1)] += fx * (odd * A[_at(o + right)] - A[_at(o + X)])
+            total = A[_at(zp + row + i)] * half_zp - A[_at(zm + row + i)] * half_zm
+            total += A[_at(yp + i)] * half_yp - A[_at(ym + i)] * half_ym
+            flux[_at(row + i)] = total + (A[_at(o + i + 1)] - A[_at(o + i - 1)]) * half_x
+        # The loop read the neighbouring rows' samples beyond both ends: put the continuation in their place.
+        flux[_at(row)] += half_x * (A[_at(o - 1)] - odd * A[_at(o + left)])
+        flux[_at(row + X - 1)] += half_x * (odd * A[_at(o + right)] - A[_at(o + X)])
 
 
 @njit(**_SUMMING)
 def _measure_sizes(slopes, n):
-    """Return the sum of the moduli of n slopes, and the bits of the greatest: bits are in order and keep a NaN."""
+    """Return the sum of the moduli of n slopes, and the greatest modulus as the bits of its float32.
+
+    As integers, the bits of positive floats have the order of the floats, and a NaN's are above all: it is not lost.
+    """
     bits = slopes.view(np.int32)
-    total, most = _ZERO, np.int32(0)
+    total, highest = _ZERO, np.int32(0)
     for i in range(n):
         total += abs(slopes[_at(i)])
     for i in range(n):
-        most = max(most, bits[_at(i)] & np.int32(0x7FFFFFFF))
-    return total, most
+        highest = max(highest, bits[_at(i)] & np.int32(0x7FFFFFFF))
+    return total, highest
 
 
 @njit(**_INLINE)
-def _adam_rows(A, m, v, o, keep, free, slopes, n, adam):
-    """Make Adam's step on n samples of a component, from `o` on."""
+def _adam_rows(A, m, v, o, keep, keep_at, slopes, n, adam):
+    """Make Adam's step on n samples of a component, from `o` on, by n slopes; `m` and `v` are Adam's moments.
+
+    `adam` is 1 - β1, β2, 1 - β2, the corrected rate, the corrected factor of √v, and eps. Slopes are multiplied by
+    `keep`, from `keep_at` on, where it is not empty.
+    """
     if keep.size > 0:
         for i in range(n):
-            slopes[_at(i)] *= keep[_at(free + i)]
+            slopes[_at(i)] *= keep[_at(keep_at + i)]
     for i in range(n):
         slope = slopes[_at(i)]
         first = m[_at(o + i)]
         first += (slope - first) * adam[0]
         second = v[_at(o + i)] * adam[1] + slope * slope * adam[2]
-        # Roots of numbers below the least that the processor estimates are negligible beside eps.
-        root = second * (_ONE / math.sqrt(max(second, _LEAST)))
+        # A product with 1/√v, which processors estimate fast. Roots of less than `_TINY` are negligible beside eps.
+        root = second * (_ONE / math.sqrt(max(second, _TINY)))
         m[_at(o + i)], v[_at(o + i)] = first, second
         A[_at(o + i)] -= first * adam[3] / (root * adam[4] + adam[5])
 
 
 @njit(**_INLINE)
 def _adam_plane(A, m, v, keep, ring, slopes, below, here, above, half, adam, z, shape):
-    """Make Adam's step along -∇ of a plane, some rows at a time; return sum and maximum of the slopes' moduli.
+    """Make Adam's step of plane z of A along -∇, some rows at a time; return `_measure_sizes` of the plane's slopes.
 
     `below`, `here`, `above` are the first samples' offsets in the ring, which has planes with continued borders; A and
     the moments have none. `half` is 1 / 2h along each axis, `keep` 0 where A is frozen.
     """
     Z, Y, X = shape
     stride, whole = X + 2 * EDGE, (X + LANES - 1) & -LANES
-    total, most = 0.0, np.int32(0)
-    for y in range(0, Y, ROWS):
-        count = min(ROWS, Y - y)
-        free = SLACK + (z * Y + y) * X
+    total, highest = 0.0, np.int32(0)
+    for y in range(0, Y, ADAM_ROWS):
+        count = min(ADAM_ROWS, Y - y)
+        at = SLACK + (z * Y + y) * X
         for component in range(3):
             before, after = here - 1, here + 1
             if component == 0:
@@ -764,11 +769,11 @@ def _adam_plane(A, m, v, keep, ring, slopes, below, here, above, half, adam, z, 
                 for i in range(whole):
                     difference = ring[_at(before + row + i)] - ring[_at(after + row + i)]
                     slopes[_at(k * X + i)] = difference * half[_at(component)]
-            _adam_rows(A, m, v, component * Z * Y * X + free, keep, free, slopes, count * X, adam)
-            part, top = _measure_sizes(slopes, count * X)
-            total += part
-            most = max(most, top)
-    return total, most
+            _adam_rows(A, m, v, component * Z * Y * X + at, keep, at, slopes, count * X, adam)
+            rows_total, rows_highest = _measure_sizes(slopes, count * X)
+            total += rows_total
+            highest = max(highest, rows_highest)
+    return total, highest
 
 
 @njit(**_INLINE)
@@ -782,16 +787,16 @@ def _adam_chunk(
     corner = EDGE * stride + EDGE
     first, last = chunk * Z // chunks, (chunk + 1) * Z // chunks
     for z in range(first - 1, last + 2):
-        for of_A in (False, True):
-            if of_A:
-                # A plane whose neighbours in this chunk have moved.
-                moved = z - 2
-                inner = first < moved < last - 1
-                if not first <= moved < last or (phase != ALL and inner != (phase == MOVE)):
+        for for_divergence in (False, True):
+            if for_divergence:
+                # The newest plane of A whose neighbours in this chunk have made Adam's step.
+                z_moved = z - 2
+                inner = first < z_moved < last - 1
+                if not first <= z_moved < last or (phase != ALL and inner != (phase == MOVE)):
                     continue
                 source, origin, size, out, edge = fluxes[chunk], 0, X, next_g, EDGE
-                target = SLACK + moved * plane + corner
-                _divergence_plane(A, source, half, moved, shape, periodic)
+                target = SLACK + z_moved * plane + corner
+                _divergence_plane(A, source, half, z_moved, shape, periodic)
             else:
                 if phase != MOVE or z > last:
                     continue
@@ -799,7 +804,7 @@ def _adam_chunk(
                 origin = SLACK + index_z[_at(z + 2)] * plane + corner
                 target = SLACK + (z + 3) % 3 * plane + corner
             _blur_plane(source, origin, size, rows[chunk], out, target, edge, Y, X, blur)
-            if not of_A and z > first:
+            if not for_divergence and z > first:
                 below, here = SLACK + (z + 1) % 3 * plane + corner, SLACK + (z + 2) % 3 * plane + corner
                 sums[z - 1], highest[z - 1] = _adam_plane(
                     A, m, v, keep, rings[chunk], slopes[chunk], below, here, target, half, adam, z - 1, shape

@@ -29,55 +29,55 @@ _ONE_CALLER = threading.Lock()
 
 
 class Kernel:
-    """Run a loop over chunks on numba's threads, or on none of them: two forms of one function, compiled on demand.
+    """A loop over chunks, compiled on demand in two forms: parallel on numba's threads, and serial without them.
 
     A call for one thread takes the serial form, and so does every call in a forked process, as numba's threads do not
     survive a fork. Arrays among the arguments must not overlap.
     """
 
     def __init__(self, function: Callable[..., None], **options: Any) -> None:
-        alone = FunctionType(function.__code__, function.__globals__, function.__name__, function.__defaults__)
-        alone.__qualname__ = f"{function.__qualname__}_alone"  # numba's cache tells functions apart by this name
-        self._together = _njit(parallel=True, **options)(function)
-        self._alone = _njit(noalias=True, **options)(alone)
+        copy = FunctionType(function.__code__, function.__globals__, function.__name__, function.__defaults__)
+        copy.__qualname__ = f"{function.__qualname__}_alone"  # numba's cache distinguishes functions by this name
+        self._parallel = _njit(parallel=True, **options)(function)
+        self._serial = _njit(noalias=True, **options)(copy)
 
     def __call__(self, threads: int, *arguments: Any) -> None:
         """Run the loop on at most `threads` threads."""
         threads = min(threads, count_threads()) if threads > 1 else 1
         if threads == 1:
-            self._alone(*arguments)
+            self._serial(*arguments)
             return
         with _ONE_CALLER if threading_layer() == "workqueue" else nullcontext(), limit_threads(threads):
-            self._together(*arguments)
+            self._parallel(*arguments)
 
     def is_compiled(self) -> bool:
-        """Return whether a form of the loop was compiled, in this process or, as far as file names say, before it."""
-        made = self._together.signatures or self._alone.signatures
-        folder, name = Path(self._together.stats.cache_path), self._together.py_func.__qualname__
-        return bool(made) or any(folder.glob(f"*.{name}*.nbi"))
+        """Return whether either form is compiled: in this process, or in numba's cache as far as file names say."""
+        compiled = self._parallel.signatures or self._serial.signatures
+        folder, name = Path(self._parallel.stats.cache_path), self._parallel.py_func.__qualname__
+        return bool(compiled) or any(folder.glob(f"*.{name}*.nbi"))
 
 
 @cache
 def start() -> None:
-    """Start numba's threads, which its first parallel loop would do too, once in a process.
+    """Start numba's threads, once in a process, as its first parallel loop would do too.
 
-    With OpenMP the start changes settings of the thread that makes it, which torch's loops follow: the number of
-    threads, and whether parallel loops nest. So a thread that ends at once makes it. The start also fixes the start
-    method of `multiprocessing`, which a program may want to choose later; it is reset here.
+    With OpenMP the start changes settings of the calling thread that torch's loops follow too: the number of threads,
+    and whether parallel loops nest. So a short-lived thread makes the call. The start also fixes the start method of
+    `multiprocessing`, which a program may want to choose later; it is reset here.
     """
-    chosen = multiprocessing.get_start_method(allow_none=True)
-    with ThreadPoolExecutor(1, "curvafit-start") as elsewhere:
-        elsewhere.submit(get_num_threads).result()
-    multiprocessing.set_start_method(chosen, force=True)
+    start_method = multiprocessing.get_start_method(allow_none=True)
+    with ThreadPoolExecutor(1, "curvafit-start") as short_lived:
+        short_lived.submit(get_num_threads).result()
+    multiprocessing.set_start_method(start_method, force=True)
 
 
 def count_threads() -> int:
     """Return how many threads our loops may take: no more than torch or numba may, and one in a forked process."""
-    most = torch.get_num_threads()
-    if most == 1 or is_forked():
+    torch_threads = torch.get_num_threads()
+    if torch_threads == 1 or is_forked():
         return 1
     start()
-    return min(most, get_num_threads())
+    return min(torch_threads, get_num_threads())
 
 
 @contextmanager
@@ -97,7 +97,7 @@ def limit_threads(threads: int) -> Iterator[None]:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Give torch and our loops one thread: sums, and so voxels, do not depend on the number of threads."""
+    """Limit torch and our loops to one thread, so that sums, and with them fields, do not depend on the machine."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
