@@ -63,10 +63,10 @@ def energy_gradient(
     orientation: Tensor | None = None,
     mask: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Return F_ε(u) of a field `(Z, Y, X)` (paper, eq. 20) and its gradient ∂F_ε/∂u, a number for every voxel.
+    """Return F_ε(u) of a field `(Z, Y, X)` (paper, eq. 20) and its gradient ∂F_ε/∂u in every voxel, `(Z, Y, X)`.
 
     Float32 on a processor takes the fused kernel, where numba is installed; all else takes autograd. The parameters are
-    those of `energy`; the voxel's volume is a factor of the gradient.
+    those of `energy`. The gradient is that of the sum over voxels, so it is proportional to the voxel's volume.
     """
     if u.dtype != torch.float32 or not kernels.has_kernel(u.device):
         return energy_gradient_by_autograd(u, coefficients, grid, epsilon, orientation, mask)
@@ -74,8 +74,8 @@ def energy_gradient(
 
     a, ε, Q = kernels.to_numpy_cost(coefficients, grid, epsilon, orientation)
     weights = None if mask is None else mask.detach().numpy()
-    value, slope = cpu.fused_energy_gradient(u.detach().numpy(), a, grid, ε, Q, weights)
-    return torch.tensor(value, dtype=torch.float64), torch.from_numpy(slope)
+    value, du = cpu.fused_energy_gradient(u.detach().numpy(), a, grid, ε, Q, weights)
+    return torch.tensor(value, dtype=torch.float64), torch.from_numpy(du)
 
 
 def energy_gradient_by_autograd(u: Tensor, *cost: Any) -> tuple[Tensor, Tensor]:
@@ -84,17 +84,17 @@ def energy_gradient_by_autograd(u: Tensor, *cost: Any) -> tuple[Tensor, Tensor]:
     `cost` are the other arguments of `energy`.
     """
 
-    def total(u: Tensor) -> tuple[Tensor, Tensor]:
+    def sum_energies(u: Tensor) -> tuple[Tensor, Tensor]:
         values = energy(u, *cost)
         return values.sum(), values
 
-    if torch.compiler.is_compiling():  # compilers read this form alone, which takes more memory uncompiled
-        gradients, values = torch.func.grad(total, has_aux=True)(u)
+    if torch.compiler.is_compiling():  # compilers read only `torch.func.grad`, which takes more memory uncompiled
+        gradients, values = torch.func.grad(sum_energies, has_aux=True)(u)
         return values, gradients
-    free = u.detach().requires_grad_()
+    leaf = u.detach().requires_grad_()
     with torch.enable_grad():
-        whole, values = total(free)
-        (gradients,) = torch.autograd.grad(whole, free)
+        total, values = sum_energies(leaf)
+        (gradients,) = torch.autograd.grad(total, leaf)
     return values.detach(), gradients
 
 
@@ -105,12 +105,13 @@ def orientation(direction: Sequence[int | float] | Tensor, strength: int | float
     symmetric `(3, 3)`, float64; a sum of orientations is an orientation too.
     """
     expected = "a direction of 3 finite numbers (z, y, x), not all 0"
-    parts = [check_float(part, expected, of=direction) for part in as_tuple(direction, "3 numbers")]
-    θ = torch.tensor(parts, dtype=torch.float64)
+    components = [check_float(component, expected, of=direction) for component in as_tuple(direction, "3 numbers")]
+    θ = torch.tensor(components, dtype=torch.float64)
     if tuple(θ.shape) != (3,) or not bool(θ.any()):
         raise ValueError(f"expected {expected}, got {quoted(direction)}")
     strength = check_float(strength, "a finite strength")
-    θ = θ * 2.0 ** -math.frexp(float(θ.abs().max()))[1]  # exact, and its square is finite
+    _, exponent = math.frexp(float(θ.abs().max()))
+    θ = θ * 2.0**-exponent  # a power of two: exact, and the squares in the norm are finite
     θ = θ / θ.norm()
     return strength * torch.outer(θ, θ)
 
@@ -124,7 +125,7 @@ def orientation_form(slope: Float[Tensor, "*batch 3 z y x"], orientation: Float[
 
 
 def energy_terms(field: Jet, epsilon: float | Tensor) -> Float[Tensor, "*batch 6 z y x"]:
-    """Return the densities that a20, a11, a02, a10, a01 and a00 multiply in F_ε (paper, eq. 20).
+    """Return the six densities, stacked on axis -4, that a20, a11, a02, a10, a01 and a00 multiply in F_ε (eq. 20).
 
     With R = √(2|M|² - (Tr M)²)⁺, the density of κ1² is (|M|² + R Tr M)/2ε and that of κ2² (|M|² - R Tr M)/2ε, since
     κ1, κ2 = (Tr M ± R)/2ε|∇u| (eqs. 17 and 18).
@@ -132,7 +133,7 @@ def energy_terms(field: Jet, epsilon: float | Tensor) -> Float[Tensor, "*batch 6
     ε = epsilon
     trace, norm2, root, slope = second_form(field, ε)
     slope2 = field.gradient.square().sum(-4)
-    even, odd = norm2 / (2 * ε), trace * root / (2 * ε)
+    even, odd = norm2 / (2 * ε), trace * root / (2 * ε)  # symmetric and antisymmetric in κ1, κ2
     terms = (
         even + odd,
         (trace**2 - norm2) / (2 * ε),

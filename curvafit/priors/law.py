@@ -64,7 +64,7 @@ class Law:
 
     @classmethod
     def of(cls, law: LawLike) -> Law:
-        """Return a law, however it is stated; every argument and option that takes a law is read here.
+        """Convert any statement of a law to a `Law`; every argument and option that takes a law is converted here.
 
         Parameters
         ----------
@@ -86,8 +86,8 @@ class Law:
             return cls.load(law)
         if isinstance(law, HasLaw):
             return law.to_law()
-        if (numbers := _read_numbers(law)) is not None:
-            return cls(numbers, working=False)
+        if (coefficients := _read_numbers(law)) is not None:
+            return cls(coefficients, working=False)
         kinds = "Coefficients, their six numbers, a preset or its name, a fit.json or a fit"
         raise ValueError(f"expected a law ({kinds}), got {quoted(law)}")
 
@@ -100,15 +100,16 @@ class Law:
         file = read_fit(path, _LawFile)
         if file.coefficients is None or file.mass is None or file.coefficients_physical is None:
             raise ValueError(f"expected a fit with a law, got one without in {path}: {file.status}")
-        share = (file.morphometry or {}).get("volume_fraction")
-        width = file.epsilon_physical * WORKING_SPACING / file.working_voxel
-        own: dict[str, Any] = {"working_voxel": file.working_voxel, "length_unit": file.length_unit}
-        own |= {"volume_fraction": share, "status": file.status}
-        return cls(file.coefficients, file.mass, f"prior {os.fspath(path)}", epsilon=width, **own)
+        epsilon = file.epsilon_physical * WORKING_SPACING / file.working_voxel
+        volume_fraction = (file.morphometry or {}).get("volume_fraction")
+        return cls(
+            file.coefficients, file.mass, f"prior {os.fspath(path)}", epsilon=epsilon, working_voxel=file.working_voxel,
+            length_unit=file.length_unit, volume_fraction=volume_fraction, status=file.status,
+        )  # fmt: skip
 
     @property
     def doubt(self) -> str:
-        """A sentence where it was fitted to a scan that it may not be the law of; else empty."""
+        """A sentence of warning where the fit's status is not `Supported`; else empty."""
         if not self.status or self.status.startswith("Supported"):
             return ""
         return f"The law ({self.origin}) is of a fit that is not `Supported`: it may not be that of its scan."
@@ -149,15 +150,15 @@ class Law:
 
         Raises ValueError where the coefficients vary in space, or the two units cannot be compared.
         """
-        numbers = self._require_numbers()
+        coefficients = self._require_numbers()
         if not self.fitted:
-            return numbers.in_unit(WORKING_SPACING / edge) if self.working and edge is not None else numbers
+            return coefficients.in_unit(WORKING_SPACING / edge) if self.working and edge is not None else coefficients
         if unit is None or unit == self.length_unit:
             return self.physical
         if unit not in METRES or self.length_unit not in METRES:
-            mend = ": run `curvafit infer` again with --spacing and --unit" if self.length_unit not in METRES else ""
+            remedy = ": run `curvafit infer` again with --spacing and --unit" if self.length_unit not in METRES else ""
             units = f"{unit} and the fit's {self.length_unit}"
-            raise ValueError(f"expected two units among {', '.join(METRES)}, got {units}{mend}")
+            raise ValueError(f"expected two units among {', '.join(METRES)}, got {units}{remedy}")
         return self.physical.in_unit(METRES[unit] / METRES[self.length_unit])
 
     @property
@@ -212,7 +213,7 @@ Mass = Annotated[float | None, Rule(above=-1, below=1)]
 
 @dataclass(frozen=True)
 class _LawFile:
-    """What a law needs of a `fit.json`; `inference.fit` knows the rest."""
+    """The fields of a `fit.json` that a law needs; `inference.fit` reads the others."""
 
     coefficients: Coefficients | None
     mass: Mass
@@ -227,16 +228,16 @@ class _LawFile:
 
 
 def read_fit(path: str | PathLike[str], kind: type[Content]) -> Content:
-    """Return the file of a fit as a dataclass; raise FileNotFoundError if there is none, ValueError as `parse_fit`."""
+    """Read a `fit.json` as a dataclass; raise FileNotFoundError if there is none, ValueError as `parse_fit` does."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"expected a fit.json, found no file {path}")
     return parse_fit(Path(path).read_bytes(), path, kind)
 
 
 def parse_fit(text: str | bytes, place: object, kind: type[Content]) -> Content:
-    """Return a `fit.json`'s text as a dataclass; raise ValueError if it is of another format or lacks what that needs.
+    """Parse a `fit.json`'s text as the dataclass `kind`, whose fields are the keys that are read.
 
-    Messages call the file `place`.
+    Raises ValueError, which calls the file `place`, if the text is of another format or lacks a key.
     """
     expected = "a fit.json written by `curvafit infer`"
     content = parse_json(text, expected, place)
@@ -246,8 +247,8 @@ def parse_fit(text: str | bytes, place: object, kind: type[Content]) -> Content:
         raise ValueError(f"expected a fit.json of format {FORMAT}, {got}")
     try:
         return decode(kind, content)
-    except ValueError as fault:
-        raise ValueError(f"expected {expected} with {fault} in {place}") from None
+    except ValueError as error:
+        raise ValueError(f"expected {expected} with {error} in {place}") from None
 
 
 # ---- presets ---------------------------------------------------------------------------------------------------------
