@@ -47,10 +47,10 @@ class Coefficients:
             elif value.is_complex() or not bool(torch.isfinite(value).all()):
                 got = "values that are not finite" if value.dim() > 0 else quoted(value.item())
                 raise ValueError(f"expected a finite coefficient {name}, got {got}")
-        least = [float(torch.as_tensor(a, dtype=torch.float64).detach().min()) for a in (self.a20, self.a02)]
-        if min(least) <= 0:
+        a20, a02 = (float(torch.as_tensor(a, dtype=torch.float64).detach().min()) for a in (self.a20, self.a02))
+        if min(a20, a02) <= 0:
             warnings.warn(
-                f"a20 > 0 and a02 > 0 keep the energy bounded below, got least a20 = {least[0]:g}, a02 = {least[1]:g}",
+                f"a20 > 0 and a02 > 0 keep the energy bounded below, got least a20 = {a20:g}, a02 = {a02:g}",
                 stacklevel=3,
             )
 
@@ -59,8 +59,8 @@ class Coefficients:
 
     def tensor(self, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None) -> Tensor:
         """Return the six values stacked along a first axis, `(6,)` or `(6, *shape)`; differentiable."""
-        parts = [torch.as_tensor(value, dtype=dtype, device=device) for value in self]
-        return torch.stack(torch.broadcast_tensors(*parts))
+        values = [torch.as_tensor(value, dtype=dtype, device=device) for value in self]
+        return torch.stack(torch.broadcast_tensors(*values))
 
     def polynomial(self, kappa1, kappa2):
         """Return p(κ1, κ2), elementwise."""
@@ -118,14 +118,14 @@ def check_strengths(
     coefficients: Iterable[float | Tensor], epsilon: float | Tensor, orientation: Tensor | None = None
 ) -> None:
     """Raise ValueError where a coefficient, or the orientation, exceeds `STRONGEST` with lengths in units of ε."""
-    parts = [(name, value, POWERS[name]) for name, value in zip(NAMES, coefficients, strict=True)]
+    terms = [(name, value, POWERS[name]) for name, value in zip(NAMES, coefficients, strict=True)]
     if orientation is not None:
-        parts.append(("the orientation", orientation, POWERS["a00"]))
-    for name, value, power in parts:
-        size = _largest(value) * _largest(epsilon) ** power
-        if not size <= STRONGEST:
-            of = {0: "", 1: " epsilon", 2: " epsilon²"}[power]
-            raise ValueError(f"expected |{name}|{of} of at most {STRONGEST:g}, got {size:.3g}")
+        terms.append(("the orientation", orientation, POWERS["a00"]))
+    for name, value, power in terms:
+        strength = _largest(value) * _largest(epsilon) ** power
+        if not strength <= STRONGEST:
+            unit = {0: "", 1: " epsilon", 2: " epsilon²"}[power]
+            raise ValueError(f"expected |{name}|{unit} of at most {STRONGEST:g}, got {strength:.3g}")
 
 
 def _largest(value: float | Tensor) -> float:

@@ -57,29 +57,29 @@ def jet(u: Tensor, grid: Grid) -> Jet:
 def second_form(field: Jet, epsilon: float | Tensor) -> SecondForm:
     """Return the invariants of M_ε = -ε Hess u + W'(u)/ε n⊗n (paper, eq. 7), where n⊗n = ∇u⊗∇u / (|∇u|² + ξ²).
 
-    ε is a number or a tensor that broadcasts with the field. `positive_root` says what the root's derivative is.
+    ε is a number or a tensor that broadcasts with the field. For the derivative of the root see `positive_root`.
     """
     ε = epsilon
     slope2, laplacian, hess2, normal = _invariants(field)
     W_ = double_well_derivative(field.value)
     length2 = slope2 + XI**2
-    unit = slope2 / length2
-    trace = -ε * laplacian + W_ / ε * unit
-    bend2, well2 = ε**2 * hess2, (W_ / ε * unit) ** 2
+    n2 = slope2 / length2  # |n|², below 1 where ∇u is small
+    trace = -ε * laplacian + W_ / ε * n2
+    bend2, well2 = ε**2 * hess2, (W_ / ε * n2) ** 2
     norm2 = bend2 - 2 * W_ * normal / length2 + well2
     root = positive_root(2 * norm2 - trace**2, bend2 + well2)
     return SecondForm(trace, norm2, root, length2.sqrt())
 
 
 def positive_root(square: Tensor, squares: Tensor) -> Tensor:
-    """Return √(x⁺) of a difference x of squares; its derivative is taken as 0 where it is unbounded.
+    """Return √(x⁺) of a difference x of squares, with the derivative 0 where that of the root is unbounded.
 
-    x = 0 at umbilics, κ1 = κ2, where √(x⁺) = ε|∇u| |κ1 - κ2| has the tip of a cone in the directions that part the two
-    curvatures. Its subdifferential there holds slopes of either sign, and the element of least norm is 0: a step along
-    it prefers no direction. The derivative is 0 wherever x cannot be distinguished from 0: up to `ROOT_FLOOR`, below
-    which the root is constant, and up to the share `ROOT_ROUNDING` of the squares that float32 rounds. That share
-    holds for float64 too, so that both types have one gradient; the root itself is exact there. (The paper's smooth
-    positive part, 1e-6 wide, ends about the floor; its slope was that of neither side.)
+    x = 0 at umbilics, κ1 = κ2, where √(x⁺) = ε|∇u| |κ1 - κ2| has the tip of a cone in the directions in which the two
+    curvatures separate. Its subdifferential there holds slopes of either sign, and the element of least norm is 0: a
+    step along it prefers no direction. The derivative is 0 wherever x cannot be distinguished from 0: up to
+    `ROOT_FLOOR`, below which the root is constant, and up to the fraction `ROOT_ROUNDING` of the squares, which float32
+    rounds away. That fraction holds for float64 too, so that both types have one gradient; the root itself is exact
+    there. (The paper's smooth positive part, 1e-6 wide, ends about the floor; its slope was that of neither side.)
 
     `square` is x = 2|M|² - (Tr M)²; `squares` is the sum of the terms of |M|² before any of them cancels.
     """
@@ -90,9 +90,9 @@ def positive_root(square: Tensor, squares: Tensor) -> Tensor:
 def diffuse_curvatures(field: Jet, epsilon: float | Tensor) -> Curvatures:
     """Return κ1, κ2 = (Tr M ± √(2|M|² - (Tr M)²)⁺) / 2ε|∇u|, H and K (paper, eqs. 15 to 18)."""
     trace, norm2, root, slope = second_form(field, epsilon)
-    width = 2 * epsilon * slope
+    denominator = 2 * epsilon * slope
     gauss = (trace**2 - norm2) / (2 * (epsilon * slope) ** 2)
-    return Curvatures((trace + root) / width, (trace - root) / width, 2 * trace / width, gauss)
+    return Curvatures((trace + root) / denominator, (trace - root) / denominator, 2 * trace / denominator, gauss)
 
 
 def geometric_curvatures(field: Jet) -> Curvatures:

@@ -62,7 +62,7 @@ class Grid:
 
     @classmethod
     def trusted(cls, shape: tuple[int, ...], spacing: tuple[float, ...], boundary: Boundary) -> Grid:
-        """Make a grid of numbers that were checked, or of a compiler's symbols for them, which no check can read."""
+        """Make a grid without checks: of numbers that were checked, or of a compiler's symbols, which cannot be."""
         grid = object.__new__(cls)
         for name, value in (("shape", shape), ("spacing", spacing), ("boundary", boundary)):
             object.__setattr__(grid, name, value)
@@ -90,10 +90,10 @@ class Grid:
 
 
 def _triple(value: Any) -> tuple:
-    """Return three values, or a single one three times; three None, which the next check refuses, for others."""
+    """Return three values, or a single one three times; else three None, which the checks of numbers then refuse."""
     single = isinstance(value, str) or not hasattr(value, "__iter__") or getattr(value, "shape", None) == ()
     try:
-        parts = (value,) * 3 if single else tuple(value)
+        values = (value,) * 3 if single else tuple(value)
     except TypeError:
-        parts = ()
-    return parts if len(parts) == 3 else (None,) * 3
+        values = ()
+    return values if len(values) == 3 else (None,) * 3

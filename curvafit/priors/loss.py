@@ -107,57 +107,58 @@ class CurvaturePrior(nn.Module):
         patch = Grid((4, 4, 4) if shape is None else shape, spacing)  # type: ignore[arg-type]
         self.spacing, self.shape = patch.spacing, None if shape is None else patch.shape
         edge = min(self.spacing)
-        width = RESOLVED * edge if epsilon is None else epsilon
-        self.epsilon = check_float(width, "epsilon > 0 in spacing's unit", math.ulp(0), COARSEST * edge)
+        epsilon = RESOLVED * edge if epsilon is None else epsilon
+        self.epsilon = check_float(epsilon, "epsilon > 0 in spacing's unit", math.ulp(0), COARSEST * edge)
         self.border = check_int(border, "a border of whole voxels from 0", 0, 2**31)
         self._warned: set[str] = set()
         self.weight = _read_weights(weight)
         laws = read_laws(law)
-        self.coefficients = tuple(_read_coefficients(known, edge, unit, self.epsilon) for known in laws)
-        self._origins = tuple(known.origin for known in laws)
-        presets = [known.origin for known in laws if known.working]
-        if unit is not None and presets and not any(known.fitted for known in laws):
+        self.coefficients = tuple(_read_coefficients(law, edge, unit, self.epsilon) for law in laws)
+        self._origins = tuple(law.origin for law in laws)
+        presets = [law.origin for law in laws if law.working]
+        if unit is not None and presets and not any(law.fitted for law in laws):
             warnings.warn(f"a unit changes nothing for {presets[0]}: its lengths follow the voxel edge", stacklevel=2)
-        times = choose_refinement(self.spacing, self.epsilon)
-        if max(times) > 1:
-            axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", times, strict=True) if n > 1)
-            words, longest = f"ε = {self.epsilon:g} spans fewer than 2 voxels: interpolating {axes}", max(self.spacing)
+        refinement, longest = choose_refinement(self.spacing, self.epsilon), max(self.spacing)
+        if max(refinement) > 1:
+            axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", refinement, strict=True) if n > 1)
+            message = f"ε = {self.epsilon:g} spans fewer than 2 voxels: interpolating {axes}"
             if longest > LONGEST * self.epsilon:
-                words += f"; voxels longer than ε inflate F_ε, 1.7-fold at 1.5 ε: state an ε of {longest:g} or more"
-            warnings.warn(words, stacklevel=2)
+                message += f"; voxels longer than ε inflate F_ε, 1.7-fold at 1.5 ε: state an ε of {longest:g} or more"
+            warnings.warn(message, stacklevel=2)
 
     def extra_repr(self) -> str:
         """Return the settings that `repr` shows: the laws, what is not the default, spacing, ε, weights, border."""
         defaults = {"sigmoid": False, "softmax": False, "include_background": True, "to_onehot_y": False}
         defaults |= {"reduction": "mean", "ignore_index": None, "shape": None}
-        own = [f"{name}={getattr(self, name)!r}" for name, value in defaults.items() if getattr(self, name) != value]
+        shown = [f"{name}={getattr(self, name)!r}" for name, value in defaults.items() if getattr(self, name) != value]
         numbers = (", ".join(f"{float(a):.6g}" for a in law) for law in self.coefficients)
-        laws = [f"{origin} ({six})" for origin, six in zip(self._origins, numbers, strict=True)]
+        laws = [f"{origin} ({six_numbers})" for origin, six_numbers in zip(self._origins, numbers, strict=True)]
         scale = f"spacing={self.spacing}, epsilon={self.epsilon:g}, weight={self.weight}, border={self.border}"
-        return ", ".join((*laws, *own, scale))
+        return ", ".join((*laws, *shown, scale))
 
     def forward(self, input: Tensor, target: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
         """Return the loss of a batch; see the class."""
         input, target, mask = _strip_subclass(input), _strip_subclass(target), _strip_subclass(mask)
         with torch.autocast(input.device.type, enabled=False):
-            voxels, ignored = self._voxel_weights(input, target, mask)
-            if ignored is not None:  # before the activation, whose derivative of a NaN is one
+            mask, ignored = self._mask_voxels(input, target, mask)
+            if ignored is not None:  # before the activation, as its derivative at a NaN is NaN
                 input = torch.where(ignored, 0.0 if self.sigmoid or self.softmax else 0.5, input)
             probability = self._probability(input)
             classes, spacing, skipped = probability.shape[1], self._spacing_of(input), self._is_skipped(input)
-            times = (1, 1, 1) if skipped else choose_refinement(spacing, self.epsilon)
+            refinement = (1, 1, 1) if skipped else choose_refinement(spacing, self.epsilon)
             options = {"normalize": self.reduction != "sum", "border": self.border}
             laws = _repeat_per_class(self.coefficients, classes, "one law")
             weights = _repeat_per_class(self.weight, classes, "one weight")
-            columns = []
+            losses = []
             for channel, (law, weight) in enumerate(zip(laws, weights, strict=True)):
                 field = probability[:, channel]
                 if weight == 0 or skipped:
-                    columns.append(field.sum((-3, -2, -1)) * 0)
+                    losses.append(field.sum((-3, -2, -1)) * 0)  # a zero that has a gradient
                     continue
-                seen = None if voxels is None else voxels[:, min(channel, voxels.shape[1] - 1)]
-                columns.append(weight * _measure_window(field, law, spacing, self.epsilon, times, seen, **options))
-            values = torch.stack(columns, 1)
+                own_mask = None if mask is None else mask[:, min(channel, mask.shape[1] - 1)]
+                energy = _measure_window(field, law, spacing, self.epsilon, refinement, own_mask, **options)
+                losses.append(weight * energy)
+            values = torch.stack(losses, 1)
             if self.reduction == "none":
                 return values[..., None, None, None]
             return values.sum() if self.reduction == "sum" else values.mean()
@@ -165,24 +166,24 @@ class CurvaturePrior(nn.Module):
     def suggest_weight(
         self, loss_fn: Callable[[Tensor, Tensor], Tensor], batch: tuple[Tensor, Tensor], share: float = 1.0
     ) -> float:
-        """Return the factor by which this loss has `share` times the gradient's norm, over the input, of another loss.
+        """Return the weight with which this loss's gradient has `share` times the norm of that of another loss.
 
-        The batch is a network's output and its target, as in training, of which `loss_fn` is a function; its values are
-        summed. At the default ε, tubes two voxels thick survive a share of 0.1 with `trabec` and `tubes`, but not with
-        `pearls`; a share of 1 removes them.
+        Both gradients are with respect to the input. The batch is a network's output and its target, as in training;
+        `loss_fn` is the other loss, a function of the two whose values are summed. At the default ε, tubes two voxels
+        thick survive a share of 0.1 with `trabec` and `tubes`, but not with `pearls`; a share of 1 removes them.
 
         Raises ValueError where either gradient is zero or not finite, as on a prediction without a surface.
         """
         output, target = batch
         leaf = output.detach().float().requires_grad_()
-        sizes = []
+        norms = []
         for loss in (loss_fn, self):
             with torch.enable_grad():
-                (slope,) = torch.autograd.grad(loss(leaf, target).sum(), leaf)
-            sizes.append(float(slope.double().norm()))
-        if not all(0 < size < math.inf for size in sizes):
-            raise ValueError(f"expected a batch on which both losses have a gradient, got norms {sizes[0]}, {sizes[1]}")
-        return share * sizes[0] / sizes[1]
+                (gradient,) = torch.autograd.grad(loss(leaf, target).sum(), leaf)
+            norms.append(float(gradient.double().norm()))
+        if not all(0 < norm < math.inf for norm in norms):
+            raise ValueError(f"expected a batch on which both losses have a gradient, got norms {norms[0]}, {norms[1]}")
+        return share * norms[0] / norms[1]
 
     def _probability(self, input: Tensor) -> Tensor:
         """Return probabilities (B, classes that count, D, H, W) in float32 or float64."""
@@ -195,41 +196,45 @@ class CurvaturePrior(nn.Module):
             self._check_range(values)
         if input.shape[1] == 1:
             options = {"softmax=True": self.softmax, "include_background=False": not self.include_background}
-            for name in (name for name, active in options.items() if active):
-                warnings.warn(f"single channel prediction, `{name}` ignored.", stacklevel=3)
+            for name, active in options.items():
+                if active:
+                    warnings.warn(f"single channel prediction, `{name}` ignored.", stacklevel=3)
             return values
         if self.softmax:
             values = values.softmax(1)
         return values if self.include_background else values[:, 1:]
 
-    def _voxel_weights(
+    def _mask_voxels(
         self, input: Tensor, target: Tensor | None, mask: Tensor | None
     ) -> tuple[Tensor | None, Tensor | None]:
-        """Return the mask (B or 1, classes that count or 1, D, H, W) with zeros on ignored voxels and on those that
-        have them for neighbours, and the ignored voxels (B, 1, D, H, W); None where all count, or none is ignored."""
+        """Check the mask and the target; return the mask with zeros on and around ignored voxels, and these voxels.
+
+        The mask is (B or 1, classes that count or 1, D, H, W), or None if all voxels count; the ignored voxels are
+        (B, 1, D, H, W), or None without an `ignore_index`.
+        """
         batch, classes = input.shape[:2]
         space = tuple(input.shape[2:])
         if mask is not None:
-            fits = mask.dim() == 5 and mask.shape[0] in (1, batch) and mask.shape[1] in (1, classes)
-            if not fits or tuple(mask.shape[2:]) != space:
+            valid = mask.dim() == 5 and mask.shape[0] in (1, batch) and mask.shape[1] in (1, classes)
+            if not valid or tuple(mask.shape[2:]) != space:
                 expected = f"({batch} or 1, {classes} or 1, {', '.join(map(str, space))})"
                 raise ValueError(f"expected a mask of shape {expected}, got {tuple(mask.shape)}")
             if _read_number(((mask >= 0) & (mask <= HEAVIEST)).all()) == 0:
                 raise ValueError(f"expected a mask of finite numbers from 0, at most {HEAVIEST:g}, got others")
             if mask.shape[1] > 1 and not self.include_background:
                 mask = mask[:, 1:]
-        numbers = self.to_onehot_y or self.ignore_index is not None
+        labels = self.to_onehot_y or self.ignore_index is not None  # else the target may have a channel for each class
         if target is not None:
-            fits = target.dim() == 5 and target.shape[0] == batch and tuple(target.shape[2:]) == space
-            if not fits or (numbers and target.shape[1] != 1):
+            valid = target.dim() == 5 and target.shape[0] == batch and tuple(target.shape[2:]) == space
+            if not valid or (labels and target.shape[1] != 1):
                 raise ValueError(f"expected a target of shape {(batch, 1, *space)}, got {tuple(target.shape)}")
         if self.ignore_index is None:
             return mask, None
         if target is None:
             raise ValueError(f"ignore_index needs a target with label {self.ignore_index} on ignored voxels, got none")
-        ignored, reach = target == self.ignore_index, max(1, self.border)
-        valid = nn.functional.max_pool3d(ignored.float(), 2 * reach + 1, 1, reach) == 0
-        return (valid if mask is None else mask * valid), ignored
+        ignored, radius = target == self.ignore_index, max(1, self.border)
+        counted = nn.functional.max_pool3d(ignored.float(), 2 * radius + 1, 1, radius) == 0
+        return (counted if mask is None else mask * counted), ignored
 
     def _spacing_of(self, input: Tensor) -> tuple[float, float, float]:
         """Return the voxel edges of an input, which are larger than the patch's where the input has fewer voxels."""
@@ -243,8 +248,8 @@ class CurvaturePrior(nn.Module):
         space = tuple(input.shape[2:])
         if self.shape is None or space == self.shape:
             return False
-        times = RESOLVED * max(self._spacing_of(input)) / self.epsilon
-        if times <= FINEST + 1e-3 and min(space) >= max(4, 2 * self.border + 1):
+        refinement = RESOLVED * max(self._spacing_of(input)) / self.epsilon
+        if refinement <= FINEST + 1e-3 and min(space) >= max(4, 2 * self.border + 1):
             return False
         self._warn(str(space), f"a level of {space} voxels is too coarse for ε = {self.epsilon:g}, so its loss is 0")
         return True
@@ -310,7 +315,7 @@ class CombinedLoss(nn.Module):
         self.weight, self.warmup = float(state[0]), int(state[1])
 
     def _load_from_state_dict(self, state_dict, prefix, *options) -> None:
-        """Load a state, also one of before these two were part of it."""
+        """Load a state, also an older one without weight and warm-up."""
         state_dict.setdefault(f"{prefix}_extra_state", self.get_extra_state())
         super()._load_from_state_dict(state_dict, prefix, *options)
 
@@ -357,14 +362,14 @@ def curvature_prior(
     Raises ValueError where the window is too small for its border or ε, a coefficient is too large for float32, or an
     axis would be refined more than 16-fold.
     """
-    times = choose_refinement(spacing, epsilon)
-    coefficients = Law.of(law).in_unit(None, min(spacing))
-    check_strengths(coefficients, epsilon)
-    return _measure_window(probability, coefficients, spacing, epsilon, times, mask, normalize=normalize, border=border)
+    refinement = choose_refinement(spacing, epsilon)
+    a = Law.of(law).in_unit(None, min(spacing))
+    check_strengths(a, epsilon)
+    return _measure_window(probability, a, spacing, epsilon, refinement, mask, normalize=normalize, border=border)
 
 
 def choose_refinement(spacing: Sequence[float], epsilon: float) -> tuple[int, int, int]:
-    """Return by how many times each axis is to be refined for ε to span two voxels; 1 where it lacks at most a tenth.
+    """Return by how many times to refine each axis (z, y, x) for ε to span two voxels; 1 if it lacks at most a tenth.
 
     Raises ValueError where an axis would be refined more than 16-fold, or ε spans more than `COARSEST` voxels.
     """
@@ -372,7 +377,7 @@ def choose_refinement(spacing: Sequence[float], epsilon: float) -> tuple[int, in
         most = COARSEST * min(spacing)
         raise ValueError(f"ε must be above 0 and at most {most:g} for voxels of {tuple(spacing)}, got {epsilon:g}")
     ratios = [RESOLVED * h / epsilon for h in spacing]
-    if max(ratios) > FINEST + 1e-3:
+    if max(ratios) > FINEST + 1e-3:  # here and below 1e-3 is for rounding: a ratio of 2.0001 is a refinement by 2
         least = RESOLVED * max(spacing) / FINEST
         raise ValueError(
             f"expected an ε of at least {least:g} for voxels of {tuple(spacing)}, got {epsilon:g}, for which an axis "
@@ -395,20 +400,20 @@ def _read_weights(weight: float | Sequence[float]) -> tuple[float, ...]:
 
 def _read_coefficients(law: Law, edge: float, unit: str | None, epsilon: float) -> Coefficients:
     """Return a law's coefficients with lengths in spacing's unit; warn where its fit is in doubt or had another ε."""
-    numbers = law.in_unit(unit, edge)
-    check_strengths(numbers, epsilon)
+    coefficients = law.in_unit(unit, edge)
+    check_strengths(coefficients, epsilon)
     if law.length_unit is None:
         if unit is not None and unit not in METRES:
             raise ValueError(f"expected a unit among {', '.join(METRES)}, got {quoted(unit)}")
-        return numbers
+        return coefficients
     if law.doubt:
         warnings.warn(law.doubt, stacklevel=4)
     unit = unit or law.length_unit
-    width = convert_length(law.epsilon_physical, law.length_unit, unit)
-    if not 1 / 4 <= epsilon / width <= 4:
-        widths = f"ε is {epsilon:g} {unit} here and was {width:g} {unit} in the fit"
-        warnings.warn(f"{widths}: state spacing and its unit if the two should be alike", stacklevel=4)
-    return numbers
+    fit_epsilon = convert_length(law.epsilon_physical, law.length_unit, unit)
+    if not 1 / 4 <= epsilon / fit_epsilon <= 4:
+        difference = f"ε is {epsilon:g} {unit} here and was {fit_epsilon:g} {unit} in the fit"
+        warnings.warn(f"{difference}: state spacing and its unit if the two should be alike", stacklevel=4)
+    return coefficients
 
 
 def _repeat_per_class(values: tuple, classes: int, name: str) -> tuple:
@@ -420,7 +425,7 @@ def _repeat_per_class(values: tuple, classes: int, name: str) -> tuple:
 
 def _measure_window(
     probability: Tensor, coefficients: Coefficients, spacing: tuple[float, float, float], epsilon: float,
-    times: tuple[int, int, int], mask: Tensor | None, *, normalize: bool, border: int,
+    refinement: tuple[int, int, int], mask: Tensor | None, *, normalize: bool, border: int,
 ) -> Tensor:  # fmt: skip
     """Compute `curvature_prior` of checked numbers, which may be a compiler's symbols."""
     shape, least = tuple(probability.shape[1:]), max(4, 2 * border + 1)
@@ -432,11 +437,12 @@ def _measure_window(
     u, inside = 2 * probability - 1, probability.new_zeros(shape)
     inside[tuple(slice(border, n - border) for n in shape)].fill_(1)
     weights = inside[None] if mask is None else inside * mask.to(inside)
-    for axis, n in enumerate(times):
+    for axis, n in enumerate(refinement):
         if n > 1:
             u, weights = refine_axis(u, axis, n), weights.repeat_interleave(n, axis - 3)
+    # In working units, where ξ and the floor under the root are small, whatever the unit of length.
     unit = epsilon / WORKING_EPSILON
-    edges = tuple(h / n / unit for h, n in zip(spacing, times, strict=True))
+    edges = tuple(h / n / unit for h, n in zip(spacing, refinement, strict=True))
     grid = Grid.trusted(tuple(u.shape[1:]), edges, "replicate")
     scaled = (a * unit**power for a, power in zip(coefficients, POWERS.values(), strict=True))
     total = energies(u, scaled, grid, WORKING_EPSILON, weights)
@@ -447,7 +453,7 @@ def _measure_window(
 
 
 def _strip_subclass(values: _Values) -> _Values:
-    """Return a tensor without its subclass (MONAI's `MetaTensor`), but not without that by which `export` traces it."""
+    """Return a subclass's values (MONAI's `MetaTensor`) as a plain tensor; the subclass of `export`'s traces stays."""
     if not (values is None or isinstance(values, Tensor)):
         raise TypeError(f"expected a torch tensor, got {type(values).__name__}: torch.from_numpy makes one of an array")
     exporting = torch.compiler.is_compiling() and not torch.compiler.is_dynamo_compiling()
@@ -457,7 +463,7 @@ def _strip_subclass(values: _Values) -> _Values:
 
 
 def _read_number(value: Tensor) -> float | None:
-    """Return a tensor's single number, or None where it has none yet: in compiled code and under `torch.func.vmap`."""
+    """Return a tensor's single number, or None where it has no value: in compiled code and under `torch.func.vmap`."""
     if torch.compiler.is_compiling():
         return None
     try:

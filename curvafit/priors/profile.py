@@ -52,8 +52,8 @@ def signed_distance(
     inside = mask.bool()
     if not inside.flatten(-3).any(-1).all() or inside.flatten(-3).all(-1).any():
         raise ValueError("expected a mask with voxels inside and outside, got an empty or a full one")
-    reach = math.inf if limit is None else float(limit)
-    return _measure_distance(~inside, grid, reach) - _measure_distance(inside, grid, reach)
+    cutoff = math.inf if limit is None else float(limit)
+    return _measure_distance(~inside, grid, cutoff) - _measure_distance(inside, grid, cutoff)
 
 
 def phase_field(mask: Bool[Tensor, "*batch z y x"], grid: Grid, epsilon: float) -> Float[Tensor, "*batch z y x"]:
@@ -65,37 +65,40 @@ def phase_field(mask: Bool[Tensor, "*batch z y x"], grid: Grid, epsilon: float) 
     accurate: across tilted faces, whose voxels overhang, distances are up to a fifth short, about as much as the
     profiles of generated shapes are wider than tanh. Raises ValueError where the mask is empty or full.
     """
-    reach = 6 * epsilon + math.ceil(4 * STAIRS) * max(grid.spacing)
-    voxels = Grid(grid.shape, (1.0, 1.0, 1.0), grid.boundary)
-    once = gaussian_blur(signed_distance(mask, grid, limit=reach), voxels, STAIRS)
-    distance = 2 * once - gaussian_blur(once, voxels, STAIRS)
-    return optimal_profile(_restore_signs(distance, mask.bool(), voxels), epsilon)
+    limit = 6 * epsilon + math.ceil(4 * STAIRS) * max(grid.spacing)  # tanh is ±1 to 4e-4, and a blur's radius
+    voxel_grid = Grid(grid.shape, (1.0, 1.0, 1.0), grid.boundary)
+    smoothed = gaussian_blur(signed_distance(mask, grid, limit), voxel_grid, STAIRS)
+    distance = 2 * smoothed - gaussian_blur(smoothed, voxel_grid, STAIRS)
+    return optimal_profile(_restore_signs(distance, mask.bool(), voxel_grid), epsilon)
 
 
-def _restore_signs(distance: Tensor, mask: Tensor, voxels: Grid) -> Tensor:
+def _restore_signs(distance: Tensor, mask: Tensor, voxel_grid: Grid) -> Tensor:
     """Add Gaussians where the sign differs from the mask's; a sweep lowers a single voxel's error by a seventh."""
     for _ in range(SWEEPS):
         error = torch.where(mask, distance.clamp_max(0), distance.clamp_min(0))
         if not bool(error.any()):
             break
-        distance = distance - PULL * gaussian_blur(error, voxels, PULL_WIDTH)
+        distance = distance - PULL * gaussian_blur(error, voxel_grid, PULL_WIDTH)
     return distance
 
 
-def _measure_distance(target: Tensor, grid: Grid, reach: float) -> Tensor:
-    """Return the distance to the voxels of `target`, by a min-plus transform with (|k| - ½)₊ Δx along each axis."""
+def _measure_distance(target: Tensor, grid: Grid, cutoff: float) -> Tensor:
+    """Return the distance from every voxel's centre to the faces of the voxels in `target`, cut at `cutoff`.
+
+    The squared distance is a minimum over one axis after the other; k steps away along it, a face is (k - ½) Δx away.
+    """
     dtype = torch.float64 if torch.get_default_dtype() == torch.float64 else torch.float32
     squared = torch.where(target, 0.0, math.inf).to(dtype)
     for axis, h in enumerate(grid.spacing):
         n = grid.shape[axis]
         longest = n // 2 if grid.periodic else n - 1
-        steps = min(longest, math.ceil(reach / h + 0.5)) if math.isfinite(reach) else longest
+        steps = min(longest, math.ceil(cutoff / h + 0.5)) if math.isfinite(cutoff) else longest
         source, squared = squared, squared.clone()
         for k in range(1, steps + 1):
             cost = ((k - 0.5) * h) ** 2
             for offset in (k, -k):
                 _lower(squared, source, cost, offset, axis - 3, grid.periodic)
-    return squared.sqrt().clamp(max=reach)
+    return squared.sqrt().clamp(max=cutoff)
 
 
 def _lower(squared: Tensor, source: Tensor, cost: float, offset: int, dim: int, periodic: bool) -> None:
@@ -104,5 +107,5 @@ def _lower(squared: Tensor, source: Tensor, cost: float, offset: int, dim: int, 
         torch.minimum(squared, source.roll(-offset, dim) + cost, out=squared)
         return
     n = squared.shape[dim] - abs(offset)
-    here = squared.narrow(dim, max(0, -offset), n)
-    torch.minimum(here, source.narrow(dim, max(0, offset), n) + cost, out=here)
+    target = squared.narrow(dim, max(0, -offset), n)
+    torch.minimum(target, source.narrow(dim, max(0, offset), n) + cost, out=target)

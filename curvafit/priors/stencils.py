@@ -59,13 +59,13 @@ def divergence(vector: Float[Tensor, "*batch 3 z y x"], grid: Grid) -> Float[Ten
 def hessian(u: Float[Tensor, "*batch z y x"], grid: Grid) -> Float[Tensor, "*batch 6 z y x"]:
     """Return second differences: [1, -2, 1] on the diagonal, the 4-point cross off the diagonal (19 points in all)."""
     v = pad(_check_shape(u, grid), grid)
-    return torch.stack([_second(v, i, j) / _area(grid, i, j) for i, j in HESSIAN_AXES], -4)
+    return torch.stack([_second(v, i, j) / (grid.spacing[i] * grid.spacing[j]) for i, j in HESSIAN_AXES], -4)
 
 
 def gaussian_blur(u: Float[Tensor, "*batch z y x"], grid: Grid, width: float) -> Float[Tensor, "*batch z y x"]:
     """Return k ∗ u, k a separable Gaussian of standard deviation `width` (in spacing's unit), cut at four deviations.
 
-    The continuation beyond the box is a reflection group's, so the blur is its own adjoint under both boundaries.
+    The blur is its own adjoint under both boundaries, since the continuation beyond the box is a reflection group's.
     """
     _check_shape(u, grid)
     check_blur(grid, width)
@@ -128,20 +128,15 @@ def _second(v: Tensor, i: int, j: int) -> Tensor:
     """Return the second difference along axes i and j."""
     if i == j:
         return _shift(v, {i: 1}) - 2 * _shift(v, {}) + _shift(v, {i: -1})
-    same = _shift(v, {i: 1, j: 1}) + _shift(v, {i: -1, j: -1})
-    return (same - _shift(v, {i: 1, j: -1}) - _shift(v, {i: -1, j: 1})) / 4
+    diagonal = _shift(v, {i: 1, j: 1}) + _shift(v, {i: -1, j: -1})
+    return (diagonal - _shift(v, {i: 1, j: -1}) - _shift(v, {i: -1, j: 1})) / 4
 
 
 def _shift(v: Tensor, offset: dict[int, int]) -> Tensor:
-    """Return the box within a field padded by one voxel, shifted by offsets along axes."""
+    """Return the box within a field padded by one voxel, shifted by the offset (-1, 0 or 1) along each axis."""
     for axis in range(3):
         v = v.narrow(axis - 3, 1 + offset.get(axis, 0), v.shape[axis - 3] - 2)
     return v
-
-
-def _area(grid: Grid, i: int, j: int) -> float:
-    """Return the product of a voxel's edges along axes i and j."""
-    return grid.spacing[i] * grid.spacing[j]
 
 
 def _check_shape(u: Tensor, grid: Grid) -> Tensor:
@@ -153,17 +148,20 @@ def _check_shape(u: Tensor, grid: Grid) -> Tensor:
 
 @lru_cache(maxsize=32)
 def _compute_spline_weights(n: int, times: int) -> np.ndarray:
-    """Return interpolation weights `(n, n · times)`, a column for each new sample: V⁻¹ S, with V and S the quintic
-    B-spline around each old sample, and around its mirror images, at the old places and at the new ones."""
-    bases = []
-    for place in (np.arange(n, dtype=float), (np.arange(n * times) + 0.5) / times - 0.5):
-        basis, first = np.zeros((n, len(place))), np.floor(place).astype(int) - 2
-        for centre in (first + k for k in range(6)):
-            image = centre % (2 * n)
-            image = np.where(image < n, image, 2 * n - 1 - image)
-            basis[image, np.arange(len(place))] += _quintic_spline(place - centre)
-        bases.append(basis)
-    return np.ascontiguousarray(np.linalg.solve(*bases))  # no tensor, which would be of the transform that is going on
+    """Return interpolation weights `(n, n · times)`, a column for each new sample: V⁻¹ S.
+
+    Row i of V (n columns) holds the quintic B-spline around sample i and its mirror images at the positions of all
+    samples; row i of S (n · times columns), the same at the positions of the new ones.
+    """
+    matrices = []
+    for positions in (np.arange(n, dtype=float), (np.arange(n * times) + 0.5) / times - 0.5):
+        matrix, first = np.zeros((n, len(positions))), np.floor(positions).astype(int) - 2
+        for centres in (first + k for k in range(6)):  # the splines that are not 0 at a position
+            samples = centres % (2 * n)
+            samples = np.where(samples < n, samples, 2 * n - 1 - samples)
+            matrix[samples, np.arange(len(positions))] += _quintic_spline(positions - centres)
+        matrices.append(matrix)
+    return np.ascontiguousarray(np.linalg.solve(*matrices))  # a cached tensor would belong to `torch.func`'s transform
 
 
 def _quintic_spline(x: np.ndarray) -> np.ndarray:
