@@ -61,8 +61,8 @@ class Execution:
         except (RuntimeError, TypeError, ValueError, AssertionError):
             usable = False
         if not usable:
-            text = f"torch cannot compute on the device {quoted(self.device)} here"
-            raise ValueError(f"{text}: take 'cpu', or a GPU that is there")
+            device = quoted(self.device)
+            raise ValueError(f"torch cannot compute on the device {device} here: take 'cpu', or a GPU that is there")
         check_type(self.checkpoint, (str, Path, type(None)), "a path for the checkpoint")
         check_float(self.checkpoint_every, "a finite number of seconds between checkpoints, at least 0", 0)
 
@@ -152,11 +152,11 @@ def generate(
     the device has no fused step.
     """
     check_type(execution, Execution, "an Execution")
-    known = Law.of(law)
-    mass = known.mass if mass is None and volume_fraction is None else mass
+    law = Law.of(law)
+    mass = law.mass if mass is None and volume_fraction is None else mass
     grid, seed = grid if isinstance(grid, Grid) else Grid(grid), check_seed(seed)  # type: ignore[arg-type]
-    cost = Cost(known.coefficients, grid, epsilon, orientation, blur)
-    options = FlowOptions(cost, choose_schedule([known], schedule), watch, reject_early, volume_fraction)
+    cost = Cost(law.coefficients, grid, epsilon, orientation, blur)
+    options = FlowOptions(cost, choose_schedule([law], schedule), watch, reject_early, volume_fraction)
     options.check_memory(execution.device)
     base = choose_base(mass, volume_fraction, grid)
     form = DivergenceForm.of(grid, cost.blur, base, _choose_blur(execution))
@@ -204,10 +204,10 @@ def descend(
     Raises ValueError as `generate` does, and if the field or the mask is not of the grid's shape or not finite.
     """
     check_choice(flow, FORMS, f"a flow among {', '.join(FORMS)}")
-    for value, kind in ((optimiser, Optimiser), (execution, Execution)):
-        check_type(value, kind, f"an {kind.__name__}")
-    width = min(grid.spacing) if blur is None and isinstance(grid, Grid) else blur
-    cost = Cost(Law.of(law).coefficients, grid, epsilon, orientation, width, data)  # type: ignore[arg-type]
+    check_type(optimiser, Optimiser, "an Optimiser")
+    check_type(execution, Execution, "an Execution")
+    blur = min(grid.spacing) if blur is None and isinstance(grid, Grid) else blur
+    cost = Cost(Law.of(law).coefficients, grid, epsilon, orientation, blur, data)  # type: ignore[arg-type]
     options = FlowOptions(cost, optimiser.plan, watch)
     _check_voxels("field", field, grid)
     if frozen is not None:
@@ -236,7 +236,7 @@ def _make_stepper(
     execution: Execution, start: Tensor, form: Form, options: FlowOptions, method: str = "adam",
     frozen: Tensor | None = None,
 ) -> Stepper:  # fmt: skip
-    """Return the stepper of one shape: fused where there is a kernel, unless the backend is plain torch."""
+    """Return the stepper of a flow from `start`: fused where there is a kernel, unless the backend is plain torch."""
     cost, betas, device = options.cost, options.plan.betas_at(0), execution.device
     has_kernel, plain = kernels.has_kernel(device), execution.backend == "torch"
     if execution.backend == "fused" and not has_kernel:
@@ -247,26 +247,26 @@ def _make_stepper(
         return SlabStepper(start, form, cost, betas)
     if method == "adam" and cost.data is None and not plain and has_kernel and isinstance(form, DivergenceForm):
         return FusedStepper(start, form, cost, betas, frozen)
-    kind = LbfgsStepper if method == "lbfgs" else TorchStepper
-    return kind(start, form, cost, betas, frozen, device, fused=not plain)
+    stepper = LbfgsStepper if method == "lbfgs" else TorchStepper
+    return stepper(start, form, cost, betas, frozen, device, fused=not plain)
 
 
 def _open_checkpoint(
     execution: Execution, stepper: Stepper, options: FlowOptions, **start: object
 ) -> Checkpoint | None:
-    """Return the checkpoint of a run from a start, or None where the run has none."""
+    """Return the checkpoint of a run from `start`, its initial values by name; None where no file is asked for."""
     if execution.checkpoint is None:
         return None
-    job = {**vars(options.cost), "schedule": options.plan, "volume_fraction": options.volume_fraction, **start}
-    job |= {"snapshots": [*options.watch.snapshots], "device": execution.device}
-    # Slabs go on from what one process saved, and the other way round.
+    settings = {**vars(options.cost), "schedule": options.plan, "volume_fraction": options.volume_fraction, **start}
+    settings |= {"snapshots": [*options.watch.snapshots], "device": execution.device}
+    # Slabs have the names of one process's flow, as either resumes what the other saved.
     name = FusedStepper.__name__ if isinstance(stepper, SlabStepper) else type(stepper).__name__
-    job |= {"stepper": name, "backend": execution.backend.replace("slabs", "auto")}
-    return Checkpoint(execution.checkpoint, execution.checkpoint_every, identity(**job), execution.keep_checkpoint)
+    settings |= {"stepper": name, "backend": execution.backend.replace("slabs", "auto")}
+    return Checkpoint(execution.checkpoint, execution.checkpoint_every, identity(**settings), execution.keep_checkpoint)
 
 
 def choose_base(mass: float | Tensor | None, share: float | None, grid: Grid) -> float | Tensor:
-    """Return the base of div A: the mass, a field of masses `(Z, Y, X)`, or the first mass for a share of volume."""
+    """Return what is added to div A: the mass, a field of masses `(Z, Y, X)`, or the first mass for a volume share."""
     if share is not None:
         return first_mass(share, None if mass is None else check_open_interval(mass, "a mass in (-1, 1)", -1, 1))
     if mass is None:

@@ -35,8 +35,8 @@ FRACTION_BEGIN = 0.2
 #: Share of the shortfall that one correction adds, in a flow of at most `FRACTION_GAIN_STEPS` steps: in a longer
 #: flow the shape responds more slowly, and there are more corrections.
 FRACTION_GAIN, FRACTION_GAIN_STEPS = 0.1, 1000
-#: The greatest distance of the mass from that of a sharp shape: thin shapes differ by some 0.15; beyond
-#: `FRACTION_REACH`, a phase is lost.
+#: The greatest distance of the mass from that of a sharp shape: it is some 0.15 in thin shapes; where it is more than
+#: this, a phase is lost.
 FRACTION_REACH = 0.2
 #: The greatest modulus of a mass.
 FRACTION_BOUND = 0.95
@@ -103,11 +103,12 @@ class _Run:
         stepper, plan = self._stepper, self._options.plan
         steps = self._resume(checkpoint)
         while True:
+            # One step whose statistics are read, then those up to the next mark, without statistics.
             stepper.betas = plan.betas_at(steps)
             last = steps == plan.steps or stepper.stalled
             stepper.step(None if last else plan.rate(steps))
             if last and self._set_fraction():
-                stepper.step(None)
+                stepper.step(None)  # evaluates u with the constant that was added
             self._observe(steps, last)
             if last or self._stop:
                 break
@@ -117,7 +118,7 @@ class _Run:
                 checkpoint.save(self._pack_state(steps))
         if checkpoint is not None:
             if self._stopped_by_callback and not last:
-                checkpoint.save(self._pack_state(steps + 1))
+                checkpoint.save(self._pack_state(steps + 1))  # the next step was made before the callbacks
             else:
                 checkpoint.close()
 
@@ -134,7 +135,7 @@ class _Run:
         return {"made": steps, "lanes": [(self._rows, self._snapshots)], "stepper": self._stepper.state()}
 
     def _set_fraction(self) -> bool:
-        """Add the constant that makes the share of volume exact, if it is small; return whether it was added."""
+        """Add the constant to u that makes the volume fraction exact, if it is small; return whether it was added."""
         share = self._options.volume_fraction
         if share is None:
             return False
@@ -147,7 +148,7 @@ class _Run:
         return False
 
     def _observe(self, steps: int, last: bool) -> None:
-        """Take the snapshot, record and check that are due after `steps` steps."""
+        """Take the snapshot, the record and the viability check that are due after `steps` steps."""
         watch, plan = self._options.watch, self._options.plan
         if steps in watch.snapshots:
             self._snapshots[steps] = self._stepper.field()
@@ -182,8 +183,8 @@ class _Run:
             return
         if options.watch.callbacks:
             state = State(stepper.field(), *statistics, mass)
-            answers = [bool(callback(steps, total, state)) for callback in options.watch.callbacks]
-            if any(answers):
+            stops = [bool(callback(steps, total, state)) for callback in options.watch.callbacks]  # each one is called
+            if any(stops):
                 self._stop, self._stopped_by_callback = f"stopped by a callback after {steps} of {total} steps", True
         share = options.volume_fraction
         if share is not None and not last and steps >= FRACTION_BEGIN * total:
@@ -201,29 +202,29 @@ class _Run:
             return f"no shape after {steps} steps: {end.reason}{self._shortfall}"
         if self._stepper.stalled:
             return f"stopped after {steps} steps: the line search finds no lower energy{self._shortfall}"
-        before = history.energy[np.searchsorted(history.step, 0.9 * steps, side="right") - 1]
-        fall = (before - history.energy[-1]) / max(abs(before), 1e-30)
-        word, way = "converged" if abs(fall) < SETTLED else "still moving", "rose" if fall < 0 else "fell"
-        change = f"the energy {way} by {100 * abs(fall):.2f} % over the last tenth"
-        return f"{word} after {steps} steps: {change}{self._shortfall}"
+        earlier = history.energy[np.searchsorted(history.step, 0.9 * steps, side="right") - 1]
+        fall = (earlier - history.energy[-1]) / max(abs(earlier), 1e-30)
+        verdict = "converged" if abs(fall) < SETTLED else "still moving"
+        change = f"the energy {'rose' if fall < 0 else 'fell'} by {100 * abs(fall):.2f} % over the last tenth"
+        return f"{verdict} after {steps} steps: {change}{self._shortfall}"
 
 
 # ---- a share of volume in place of a mass ----------------------------------------------------------------------------
 
 
 def first_mass(share: float, mass: float | None = None) -> float:
-    """Return the first mass of a flow towards a share of volume: that of a sharp shape, with values ±1.
+    """Return the mass at which a flow towards a volume fraction begins: that of a sharp shape, with values ±1.
 
-    A given mass is taken instead, as far as `FRACTION_REACH` from it. Raises ValueError if the share is not in (0, 1).
+    A `mass` is taken instead, limited to `FRACTION_REACH` around it. Raises ValueError if the share is not in (0, 1).
     """
     share = check_open_interval(share, "a volume fraction in (0, 1)", 0, 1)
     sharp = min(max(2 * share - 1, -FRACTION_BOUND), FRACTION_BOUND)
-    begin = sharp if mass is None else min(max(mass, sharp - FRACTION_REACH), sharp + FRACTION_REACH)
-    return min(max(begin, -FRACTION_BOUND), FRACTION_BOUND)
+    first = sharp if mass is None else min(max(mass, sharp - FRACTION_REACH), sharp + FRACTION_REACH)
+    return min(max(first, -FRACTION_BOUND), FRACTION_BOUND)
 
 
 def correct_mass(u: Tensor, share: float, mass: float, steps: int) -> float:
-    """Return the number to add to the mass during a flow of `steps` steps, so that the share of volume comes nearer."""
+    """Return what to add to the mass, in a flow of `steps` steps, so that u's volume fraction approaches `share`."""
     shortfall = share - float(np.count_nonzero(u.numpy() > 0)) / u.numel()
     gain, sharp = min(FRACTION_GAIN, FRACTION_GAIN * FRACTION_GAIN_STEPS / steps), first_mass(share)
     # Twice, as the share of a sharp shape of mass m is (1 + m) / 2.
@@ -233,9 +234,10 @@ def correct_mass(u: Tensor, share: float, mass: float, steps: int) -> float:
 
 def last_shift(u: Tensor, share: float) -> float:
     """Return the constant c such that u + c is positive in round(share × voxels) voxels, at least 1 and not all."""
-    values, inside = u.numpy().ravel(), round(share * u.numel())
-    rank = min(max(u.numel() - inside, 1), u.numel() - 1)
-    below, above = np.partition(values, (rank - 1, rank))[rank - 1 : rank + 1]
+    outside = u.numel() - round(share * u.numel())
+    rank = min(max(outside, 1), u.numel() - 1)
+    # The highest value that is to be negative, and the lowest that is to be positive: zero goes to their middle.
+    below, above = np.partition(u.numpy().ravel(), (rank - 1, rank))[rank - 1 : rank + 1]
     return -(float(below) + float(above)) / 2
 
 
@@ -263,9 +265,8 @@ class Checkpoint:
         try:
             lock.acquire(timeout=0)
         except Timeout:
-            raise ValueError(
-                f"the checkpoint {self.path} is in use by another run: wait for it to end, or name another file"
-            ) from None
+            message = f"the checkpoint {self.path} is in use by another run"
+            raise ValueError(f"{message}: wait for it to end, or name another file") from None
         try:
             remove_leftovers(self.path)
             yield
@@ -282,16 +283,14 @@ class Checkpoint:
             return None
         head, _, payload = self.path.read_bytes().partition(b"\n")
         if head != _HEAD + hashlib.sha256(payload).hexdigest().encode():
-            fault = "a damaged one" if head.startswith(_HEAD) else "another kind of file"
-            raise ValueError(f"{self.path} is no checkpoint of a flow, but {fault}: delete it to start again")
+            kind = "a damaged one" if head.startswith(_HEAD) else "another kind of file"
+            raise ValueError(f"{self.path} is no checkpoint of a flow, but {kind}: delete it to start again")
         record = torch.load(io.BytesIO(payload), weights_only=True)
-        other = record["run"]
-        names = [name for name in {**other, **self._run} if other.get(name) != self._run.get(name)]
+        saved, current = record["run"], self._run
+        names = [name for name in {**saved, **current} if saved.get(name) != current.get(name)]
         if names:
-            parts = (f"{name} {other.get(name)} instead of {self._run.get(name)}" for name in names)
-            raise ValueError(
-                f"{self.path} is the checkpoint of another run, with {'; '.join(parts)}: delete or rename it"
-            )
+            changes = "; ".join(f"{name} {saved.get(name)} instead of {current.get(name)}" for name in names)
+            raise ValueError(f"{self.path} is the checkpoint of another run, with {changes}: delete or rename it")
         return record["content"]
 
     def is_due(self) -> bool:
@@ -326,7 +325,7 @@ def resolve_place(path: str | Path) -> Path:
 
 
 def identity(**parts: object) -> dict[str, str]:
-    """Return what must be equal for a run to resume another: its parts as texts, tensors as digests, and versions."""
+    """Return what must be equal for a run to resume another: its parameters as texts, tensors as digests, versions."""
     texts = {name: _to_text(value) for name, value in parts.items()}
     return {**texts, "curvafit": version("curvafit"), "torch": version("torch")}
 

@@ -16,7 +16,7 @@ from curvafit.priors.coefficients import NAMES, Coefficients, check_strengths
 from curvafit.priors.grid import Float, Grid
 from curvafit.priors.stencils import divergence, gaussian_blur, gradient
 
-#: The least that ε is, in voxels: two are published; below a tenth no voxel lies on the interface.
+#: The smallest ε, in voxels: two are published; below a tenth no voxel lies on the interface.
 FINEST = 0.1
 #: Bounds of a voxel's edge: float32 holds the squares of second differences, and ξ = 1e-6 (`curvature.XI`) is small
 #: beside the inverse of an edge.
@@ -58,8 +58,8 @@ class Cost:
         if not isinstance(self.epsilon, Tensor):
             object.__setattr__(self, "epsilon", check_float(self.epsilon, expected, math.ulp(0)))
         object.__setattr__(self, "blur", check_float(self.blur, expected, 0))
-        lengths = torch.as_tensor(self.epsilon, dtype=torch.float64)
-        low, high = float(lengths.min()), float(lengths.max())
+        epsilons = torch.as_tensor(self.epsilon, dtype=torch.float64)
+        low, high = float(epsilons.min()), float(epsilons.max())
         if not (low > 0 and math.isfinite(high)):
             raise ValueError(f"expected {expected}, got {low} to {high} and {self.blur}")
         if not FINEST * min(edges) <= low <= high <= box:
@@ -88,10 +88,10 @@ class Cost:
 def check_shape(name: str, value: Tensor, grid: Grid) -> None:
     """Raise ValueError where a tensor does not broadcast with the voxels."""
     try:
-        fits = torch.broadcast_shapes(value.shape, grid.shape) == grid.shape
+        broadcasts = torch.broadcast_shapes(value.shape, grid.shape) == grid.shape
     except RuntimeError:
-        fits = False
-    if not fits:
+        broadcasts = False
+    if not broadcasts:
         raise ValueError(f"{name} must broadcast with the voxels {grid.shape}, got the shape {tuple(value.shape)}")
 
 
@@ -163,10 +163,10 @@ class Hinge(_VoxelTerm):
     def slope(self, u: Float[Tensor, "z y x"], grid: Grid, /) -> tuple[float, Float[Tensor, "z y x"]]:
         """Return D(u) and the gradient of D."""
         r = self.ratio.to(u.dtype)
-        short = (self.margin - r.sign() * u).clamp_min(0)
-        pull = r * short
-        value = float((pull.abs() * short).sum(dtype=torch.float64)) * grid.voxel_volume / 4
-        return value, pull * (-0.5 * grid.voxel_volume)
+        shortfall = (self.margin - r.sign() * u).clamp_min(0)
+        force = r * shortfall
+        value = float((force.abs() * shortfall).sum(dtype=torch.float64)) * grid.voxel_volume / 4
+        return value, force * (-0.5 * grid.voxel_volume)
 
 
 # ---- forms and their starts ------------------------------------------------------------------------------------------
@@ -189,7 +189,7 @@ class DivergenceForm:
     def of(
         cls, grid: Grid, width: float, base: float | Float[Tensor, "z y x"], blur: Blur = gaussian_blur
     ) -> DivergenceForm:
-        """Return the form of a base that is not blurred yet."""
+        """Return the form u = k ∗ (div A + base) for a base that is not blurred yet."""
         return cls(grid, width, blur(base, grid, width) if isinstance(base, Tensor) else float(base), blur)
 
     @classmethod

@@ -41,7 +41,7 @@ class Viability:
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """Figures every `RECORD_EVERY` steps and at the end, in arrays `(N,)`.
+    """Figures of a flow at every `RECORD_EVERY`th step and at the end, in arrays `(N,)`.
 
     They are the number of steps, F_ε, maximum and mean of |∂F_ε/∂A| over free voxels (∂F_ε/∂v in L² flows), and the
     mean of u.
@@ -84,8 +84,8 @@ class Watch:
     def __post_init__(self) -> None:
         for name in ("snapshots", "callbacks"):
             object.__setattr__(self, name, as_tuple(getattr(self, name), name))
-        if faults := [callback for callback in self.callbacks if not callable(callback)]:
-            raise ValueError(f"expected callbacks that can be called, got {quoted(faults[0])}")
+        if invalid := [callback for callback in self.callbacks if not callable(callback)]:
+            raise ValueError(f"expected callbacks that can be called, got {quoted(invalid[0])}")
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -137,18 +137,19 @@ def viability(u: Float[Tensor, "z y x"], grid: Grid, epsilon: float | Tensor) ->
 
 
 def _discrepancy(u: Tensor, grid: Grid, epsilon: float | Tensor) -> float:
-    """Return `discrepancy_ratio` by sums in float64 over a few planes at a time, which take little memory."""
+    """Return `discrepancy_ratio`, summed in float64 over a few planes at a time to save memory."""
     Z, Y, X = grid.shape
-    widths = epsilon.expand(grid.shape) if isinstance(epsilon, Tensor) else None
-    above = below = 0.0
+    ε = epsilon.expand(grid.shape) if isinstance(epsilon, Tensor) else epsilon
+    difference = total = 0.0
     for planes in torch.arange(Z).tensor_split(max(1, Z // 16)):  # some 16 planes at a time
-        reach = torch.arange(int(planes[0]) - 1, int(planes[-1]) + 2)
-        reach = reach % Z if grid.periodic else reach.clamp(0, Z - 1)
-        slab = Grid((len(reach), Y, X), grid.spacing, grid.boundary)
-        parts = cahn_hilliard_parts(u[reach], slab, epsilon if widths is None else widths[reach])
-        slope, well = (part[1:-1].double() for part in parts)
-        above, below = above + float((slope - well).abs().sum()), below + float((slope + well).sum())
-    return above / below if below else math.nan
+        padded = torch.arange(int(planes[0]) - 1, int(planes[-1]) + 2)  # with the neighbours that differences need
+        padded = padded % Z if grid.periodic else padded.clamp(0, Z - 1)
+        slab = Grid((len(padded), Y, X), grid.spacing, grid.boundary)
+        densities = cahn_hilliard_parts(u[padded], slab, ε[padded] if isinstance(ε, Tensor) else ε)
+        slope, well = (density[1:-1].double() for density in densities)
+        difference += float((slope - well).abs().sum())
+        total += float((slope + well).sum())
+    return difference / total if total else math.nan
 
 
 def _reason(ratio: float, highest: float, lowest: float) -> str:

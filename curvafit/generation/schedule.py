@@ -19,7 +19,7 @@ MOST_STEPS, LONGEST_STEP = 10**7, 1e6
 
 @dataclass(frozen=True)
 class Phase:
-    """Lengths and decay rates, as in `Schedule`, of a share in (0, 1) of the steps at a schedule's beginning."""
+    """A phase at the beginning of a schedule: its share in (0, 1) of all steps, and fields as those of `Schedule`."""
 
     share: float
     start: float
@@ -71,8 +71,8 @@ class Schedule:
         steps = check_int(self.steps, "a whole number of steps, at least 1", 1, MOST_STEPS)
         object.__setattr__(self, "steps", steps)
         _normalise_steps(self)
-        parts = as_tuple(self.opening, "phases")
-        phases = tuple(Phase(**part) if isinstance(part, dict) else part for part in parts)
+        opening = as_tuple(self.opening, "phases")
+        phases = tuple(Phase(**phase) if isinstance(phase, dict) else phase for phase in opening)
         for phase in phases:
             check_type(phase, Phase, "an opening of phases as Phase")
         check_open_interval(sum(phase.share for phase in phases), "phases with shares below 1 in all", -1, 1)
@@ -103,8 +103,8 @@ class Schedule:
     def _find_phase(self, step: int) -> tuple[Phase | Schedule, int, int]:
         """Return the phase of a step, the first step of that phase, and its number of steps."""
         k = bisect_right(self.bounds, step)
-        first, end = (0, *self.bounds)[k], (*self.bounds, self.steps)[k]
-        return (*self.opening, self)[k], first, end - first
+        starts, ends = (0, *self.bounds), (*self.bounds, self.steps)
+        return (*self.opening, self)[k], starts[k], ends[k] - starts[k]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields in JSON's types, for records: `Schedule(**fields)` is the schedule again."""
@@ -127,23 +127,23 @@ def _normalise_steps(phase: Phase | Schedule) -> None:
         object.__setattr__(phase, name, length)
     check_choice(phase.shape, ("constant", "cosine"), "a schedule's shape 'constant' or 'cosine'")
     for name in ("momentum", "memory"):
-        # The interval is open: with the greatest float below 0 as its end, 0 is in it.
+        # The check is of an open interval: with the greatest float below 0 as its end, 0 is in it.
         object.__setattr__(phase, name, check_open_interval(getattr(phase, name), f"{name} in [0, 1)", -math.ulp(0), 1))
 
 
 def _make_phased(name: str, longest: float) -> Schedule:
-    """Return 1500 steps: as published while the topology forms, then longer, with more momentum and less memory.
+    """Return a schedule of 1500 steps: as published while the topology forms, then longer, up to `longest`.
 
-    The longer steps follow the same descent.
+    With more momentum and less memory the longer steps follow the same descent.
     """
     late = {"shape": "cosine", "momentum": 0.97, "memory": 0.99}
     opening = Phase(0.2, 1e-3, 1e-3, "constant"), Phase(0.2, 1e-3, longest, **late)
     return Schedule(name, 1500, longest, 1e-3, **late, opening=opening)
 
 
-#: `paper` is the published schedule. `fast` ends near its end, in under a fifth of its steps. `deep`, with steps twice
-#: as long, descends further where the energy still falls: `weird` ends elsewhere. `cosine` takes long steps at once and
-#: cools: sooner, and often to other ends of less energy. `benchmarks.texture` compares them for each preset.
+#: `paper` is the published schedule. `fast` ends in a shape near that of `paper`, in a fifth of the steps. `deep`,
+#: with steps twice as long, descends further where the energy still falls: the preset `weird` ends in another shape.
+#: `cosine` begins with long steps: it is done sooner, often in other shapes of less energy. See `benchmarks.texture`.
 SCHEDULES: dict[str, Schedule] = {
     "paper": Schedule("paper", 8000, 1e-3, 1e-3, "constant"),
     "fast": _make_phased("fast", 7.5e-3),
@@ -156,7 +156,7 @@ LEARNED = "deep"
 
 
 def schedule(name: str | Schedule, steps: int | None = None) -> Schedule:
-    """Return the schedule of a name (else ValueError), or a `Schedule` itself, with `steps` steps if that is given."""
+    """Return the schedule of that name (else ValueError), or a `Schedule` itself, with `steps` steps if stated."""
     if not isinstance(name, Schedule):
         check_choice(name, SCHEDULES, f"a schedule among {', '.join(SCHEDULES)}")
         name = SCHEDULES[name]
@@ -165,8 +165,8 @@ def schedule(name: str | Schedule, steps: int | None = None) -> Schedule:
 
 def choose_schedule(laws: Sequence[Law], stated: str | Schedule | None = None) -> Schedule:
     """Return the stated schedule; where none is, that of the laws, and `fast` where these differ."""
-    own = {law.schedule for law in laws}
-    return schedule((own.pop() if len(own) == 1 else "fast") if stated is None else stated)
+    names = {law.schedule for law in laws}
+    return schedule((names.pop() if len(names) == 1 else "fast") if stated is None else stated)
 
 
 def present_name(fields: dict[str, Any]) -> str:
@@ -174,6 +174,8 @@ def present_name(fields: dict[str, Any]) -> str:
 
     The name and the number of steps of a record do not count: schedules were renamed, and users choose the steps.
     """
-    plan = Schedule(**fields)
-    matches = (dataclasses.replace(known, name=plan.name, steps=plan.steps) == plan for known in SCHEDULES.values())
-    return next((name for name, same in zip(SCHEDULES, matches, strict=True) if same), plan.name)
+    recorded = Schedule(**fields)
+    for name, today in SCHEDULES.items():
+        if dataclasses.replace(today, name=recorded.name, steps=recorded.steps) == recorded:
+            return name
+    return recorded.name

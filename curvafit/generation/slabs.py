@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -30,16 +31,17 @@ from curvafit.priors.grid import Grid
 
 #: How long a process waits for another one: the first may write a large checkpoint meanwhile.
 PATIENCE = timedelta(hours=1)
-#: Which way planes go.
+#: The directions in which planes are sent, as tags of the messages.
 _UP, _DOWN = 0, 1
 
 
 @dataclass(frozen=True)
 class Slab:
-    """The planes that a process holds: its own, `first` to `last` of the box, and its neighbours' next ones.
+    """The planes that a process holds: its own, `first` to `last` - 1 of the box, and its neighbours' next ones.
 
-    `own`, `below` and `above` are where they lie. The box's first and last plane lie at the ends, as they do in the
-    box, whether it repeats or not: so that they are computed alike, to the last bit.
+    `places` are the planes' indices in the box, and `own`, `below` and `above` slices of them. The box's first and last
+    planes are first and last here too, even if the box repeats, so that they are computed as in one process, to the
+    last bit.
     """
 
     first: int
@@ -61,14 +63,13 @@ def divide(grid: Grid, count: int, halo: int) -> list[Slab]:
         raise ValueError(f"expected at least {halo} planes along z for each of {count} processes, got {Z} in all")
     for k in range(count):
         first, last = Z * k // count, Z * (k + 1) // count
-        below, above = np.arange(first - halo, first) % Z, np.arange(last, last + halo) % Z
+        planes = {"below": np.arange(first - halo, first) % Z}
+        planes |= {"own": np.arange(first, last), "above": np.arange(last, last + halo) % Z}
         order = ("own", "above", "below") if k == 0 else ("below", "own", "above")
         order = ("above", "below", "own") if 0 < k == count - 1 else order
-        held = {"below": below, "own": np.arange(first, last), "above": above}
-        parts = {name: held[name] for name in order}
-        ends = np.cumsum([0, *map(len, parts.values())]).tolist()
-        where = {name: slice(a, b) for name, a, b in zip(parts, ends, ends[1:], strict=False)}
-        slabs.append(Slab(first, last, **where, places=np.concatenate(list(parts.values()))))
+        bounds = np.cumsum([0, *(len(planes[name]) for name in order)]).tolist()
+        slices = {name: slice(*pair) for name, pair in zip(order, pairwise(bounds), strict=True)}
+        slabs.append(Slab(first, last, **slices, places=np.concatenate([planes[name] for name in order])))
     return slabs
 
 
@@ -80,7 +81,7 @@ def lead() -> Iterator[None]:
     """
     with _join():
         yield
-        _tell("end")
+        _broadcast("end")
 
 
 def serve() -> None:
@@ -89,15 +90,15 @@ def serve() -> None:
     Raises OSError where one of them is gone.
     """
     with _join():
-        part: _Part | None = None
-        while (message := _hear())[0] != "end":
+        local: _LocalStepper | None = None
+        while (message := _receive())[0] != "end":
             name, arguments = message
-            with _together():
+            with _report_lost_process():
                 if name == "begin":
-                    part = None  # of an earlier shape
-                    part = _Part(*arguments)
+                    local = None  # frees an earlier shape's memory first
+                    local = _LocalStepper(*arguments)
                 else:
-                    getattr(part, name)(*arguments)
+                    getattr(local, name)(*arguments)
 
 
 def count_processes() -> tuple[int, int]:
@@ -118,22 +119,23 @@ def _join() -> Iterator[None]:
 
 
 @contextmanager
-def _together() -> Iterator[None]:
-    """Say in a sentence that another process is gone."""
+def _report_lost_process() -> Iterator[None]:
+    """Raise OSError, with a sentence, where an exchange fails because another process is gone."""
     try:
         yield
     except RuntimeError as error:
         raise OSError(f"a process of the flow is gone ({one_line(str(error))})") from error
 
 
-def _tell(name: str, *arguments: Any) -> None:
-    with _together():
+def _broadcast(name: str, *arguments: Any) -> None:
+    """Send all other processes the name of a method of their `_LocalStepper`, or "begin" or "end", and arguments."""
+    with _report_lost_process():
         dist.broadcast_object_list([(name, arguments)], src=0)
 
 
-def _hear() -> tuple[str, tuple[Any, ...]]:
+def _receive() -> tuple[str, tuple[Any, ...]]:
     message: list[Any] = [None]
-    with _together():
+    with _report_lost_process():
         dist.broadcast_object_list(message, src=0)
     return message[0]
 
@@ -148,82 +150,82 @@ class SlabStepper(Stepper):
 
         slabs = divide(cost.grid, dist.get_world_size(), cpu.halo(cost.grid, cost.blur))
         self.betas, options = betas, {"width": cost.blur, "betas": betas, "adam_eps": ADAM_EPS, "orientation": Q}
-        _tell("begin", slabs, cost.grid, options)
-        with _together():
-            self._part = _Part(slabs, cost.grid, options, [*a, epsilon, base], start.numpy())
+        _broadcast("begin", slabs, cost.grid, options)
+        with _report_lost_process():
+            self._local = _LocalStepper(slabs, cost.grid, options, [*a, epsilon, base], start.numpy())
 
-    def _all(self, name: str, *arguments: Any) -> Any:
-        _tell(name, *arguments)
-        with _together():
-            return getattr(self._part, name)(*arguments)
+    def _call_all(self, name: str, *arguments: Any) -> Any:
+        """Call a method of the `_LocalStepper` of every process; return this process's result."""
+        _broadcast(name, *arguments)
+        with _report_lost_process():
+            return getattr(self._local, name)(*arguments)
 
     def step(self, rate: float | None) -> None:
         self.run([rate or 0.0])
 
     def run(self, rates: Sequence[float]) -> int:
-        self._all("advance", list(rates), self.betas)
+        self._call_all("advance", list(rates), self.betas)
         return len(rates)
 
     def statistics(self) -> Statistics:
-        return self._all("statistics")
+        return self._call_all("statistics")
 
     def field(self) -> Tensor:
-        return self._all("field")
+        return self._call_all("field")
 
     def mass(self) -> float:
-        return self._all("mass")
+        return self._call_all("mass")
 
     def shift(self, amount: float) -> None:
-        self._all("shift", amount)
+        self._call_all("shift", amount)
 
     def state(self) -> dict[str, Any]:
-        return self._all("state")
+        return self._call_all("state")
 
     def restore(self, state: dict[str, Any]) -> None:
         numbers = {name: value for name, value in state.items() if not isinstance(value, Tensor)}
-        _tell("restore", numbers)
-        with _together():
-            self._part.restore(numbers, {name: np.asarray(state[name]) for name in _ARRAYS})
+        _broadcast("restore", numbers)
+        with _report_lost_process():
+            self._local.restore(numbers, {name: np.asarray(state[name]) for name in _ARRAYS})
 
 
 #: The arrays of a state.
 _ARRAYS = ("vector", "first", "second")
 
 
-class _Part(FusedStepper):
-    """The slab of a process. All processes call the same method at once; the first one's gives the whole's results."""
+class _LocalStepper(FusedStepper):
+    """The stepper of this process's slab; all processes call the same method at once, and the first gets the results.
+
+    Only the first process has `numbers`, the coefficients, ε and the base, and `start`, A of the whole box.
+    """
 
     def __init__(
-        self,
-        slabs: Sequence[Slab],
-        grid: Grid,
-        options: dict[str, Any],
-        numbers: list[Any] | None = None,
+        self, slabs: Sequence[Slab], grid: Grid, options: dict[str, Any], numbers: list[Any] | None = None,
         start: np.ndarray | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         from curvafit.priors.kernels.cpu import FusedFlow
         from curvafit.priors.kernels.threads import count_threads, limit_threads
 
         self._slabs, self._rank = slabs, dist.get_rank()
         self._slab = slab = slabs[self._rank]
         self._shape = grid.shape
-        mine: list[Any] = [None]
-        dist.scatter_object_list(mine, None if numbers is None else [[*map(part.cut, numbers)] for part in slabs])
-        *a, epsilon, base = mine[0]
-        local = Grid((len(slab.places), *self._shape[1:]), grid.spacing, grid.boundary)
-        begin, exchange = self._scatter(start), partial(_exchange, slab, self._rank, len(slabs))
+        received: list[Any] = [None]
+        dist.scatter_object_list(received, None if numbers is None else [[*map(s.cut, numbers)] for s in slabs])
+        *a, epsilon, base = received[0]
+        local_grid = Grid((len(slab.places), *self._shape[1:]), grid.spacing, grid.boundary)
+        start, exchange = self._scatter(start), partial(_exchange, slab, self._rank, len(slabs))
         # Processes of one machine share its cores.
         with limit_threads(max(1, count_threads() // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))):
-            self._flow = FusedFlow(begin, base, a, local, epsilon, own=slab.own, exchange=exchange, **options)
+            self._flow = FusedFlow(start, base, a, local_grid, epsilon, own=slab.own, exchange=exchange, **options)
 
     def advance(self, rates: Sequence[float], betas: tuple[float, float]) -> None:
         self.betas = betas
         self.run(rates)
 
     def statistics(self) -> Statistics:
-        energy, most, mean = self._statistics
-        share = (self._slab.last - self._slab.first) / self._shape[0]
-        sums, highest = torch.tensor([energy, mean * share], dtype=torch.float64), torch.tensor(most)
+        energy, local_highest, mean = self._statistics
+        fraction = (self._slab.last - self._slab.first) / self._shape[0]
+        sums, highest = torch.tensor([energy, mean * fraction], dtype=torch.float64), torch.tensor(local_highest)
         dist.all_reduce(sums)
         dist.all_reduce(highest, dist.ReduceOp.MAX)
         return Statistics(float(sums[0]), float(highest), float(sums[1]))
@@ -240,23 +242,23 @@ class _Part(FusedStepper):
         return {name: self._gather(v) if isinstance(v, Tensor) else v for name, v in super().state().items()}
 
     def restore(self, numbers: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> None:
-        parts = {name: self._scatter(None if arrays is None else arrays[name]) for name in _ARRAYS}
-        self._flow.restore(numbers | parts)
+        local_arrays = {name: self._scatter(None if arrays is None else arrays[name]) for name in _ARRAYS}
+        self._flow.restore(numbers | local_arrays)
 
     def _scatter(self, whole: np.ndarray | None) -> np.ndarray:
-        """Send to each process its part of an array `(3, Z, Y, X)` of the first one, a component at a time."""
-        part = np.empty((3, len(self._slab.places), *self._shape[1:]), np.float32)
-        for k, component in enumerate(part):
+        """Return this process's planes of the first one's array `(3, Z, Y, X)`, sent one component at a time."""
+        local = np.empty((3, len(self._slab.places), *self._shape[1:]), np.float32)
+        for k, component in enumerate(local):
             if whole is None:
                 dist.recv(torch.from_numpy(component), 0)
                 continue
             for rank, slab in enumerate(self._slabs[1:], 1):
                 dist.send(torch.from_numpy(slab.cut(whole[k])), rank)
             component[...] = self._slab.cut(whole[k])
-        return part
+        return local
 
     def _gather(self, values: Tensor) -> Tensor | None:
-        """Bring the own planes of a tensor `(…, Z, Y, X)` of all processes together in the first one."""
+        """Collect all processes' own planes in the first one, as a tensor `(…, Z, Y, X)`; return None in the others."""
         own = values[..., self._slab.own, :, :]
         if self._rank:
             dist.send(own.contiguous(), 0)
@@ -264,19 +266,20 @@ class _Part(FusedStepper):
         whole = torch.empty((*values.shape[:-3], *self._shape))
         whole[..., : self._slab.last, :, :] = own
         for rank, slab in enumerate(self._slabs[1:], 1):
-            part = torch.empty((*values.shape[:-3], slab.last - slab.first, *values.shape[-2:]))
-            dist.recv(part, rank)
-            whole[..., slab.first : slab.last, :, :] = part
+            planes = torch.empty((*values.shape[:-3], slab.last - slab.first, *values.shape[-2:]))
+            dist.recv(planes, rank)
+            whole[..., slab.first : slab.last, :, :] = planes
         return whole
 
 
 def _exchange(slab: Slab, rank: int, count: int, volume: np.ndarray) -> None:
-    """Fill the planes of a volume `(Z, n)` beyond a process's own with the neighbours' own."""
+    """Fill the planes of a volume `(Z, n)` that neighbouring processes own, and send them the planes next to theirs."""
     planes = torch.from_numpy(volume)
-    own, waiting = planes[slab.own], []
-    for beyond, step, way in ((planes[slab.below], -1, _DOWN), (planes[slab.above], 1, _UP)):
-        other, halo = (rank + step) % count, len(beyond)
-        mine = own[:halo] if way == _DOWN else own[-halo:]
-        waiting += [dist.irecv(beyond, other, tag=1 - way), dist.isend(mine, other, tag=way)]
-    for transfer in waiting:
+    own, transfers = planes[slab.own], []
+    for halo, step, direction in ((planes[slab.below], -1, _DOWN), (planes[slab.above], 1, _UP)):
+        neighbour, width = (rank + step) % count, len(halo)
+        edge = own[:width] if direction == _DOWN else own[-width:]
+        # What comes from there goes the other way; of two processes, each is the other's neighbour in both directions.
+        transfers += [dist.irecv(halo, neighbour, tag=1 - direction), dist.isend(edge, neighbour, tag=direction)]
+    for transfer in transfers:
         transfer.wait()

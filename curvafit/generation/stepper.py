@@ -16,7 +16,7 @@ from curvafit.priors.energies import energy_gradient, energy_gradient_by_autogra
 
 #: The number that Adam adds to the root, as published instead of the usual 1e-8; shapes depend on it.
 ADAM_EPS = 1e-2
-#: Number of steps and slopes that L-BFGS stores, as published.
+#: Number of earlier steps, and of changes of the gradient, that L-BFGS stores, as published.
 LBFGS_HISTORY = 10
 #: The most evaluations in a line search, as published.
 LINE_SEARCH = 20
@@ -41,11 +41,11 @@ class Stepper(Protocol):
     betas: tuple[float, float]
 
     def step(self, rate: float | None) -> None:
-        """Compute u and the gradient, then step by `rate`, or not if it is None, after which no rate may come."""
+        """Compute u and the gradient, then step by `rate`; with None only compute, after which no rate may follow."""
         ...
 
     def run(self, rates: Sequence[float]) -> int:
-        """Make a step for each rate, without statistics, until a stall; return the number of steps made."""
+        """Make a step at each rate, without statistics, until the stepper stalls; return the number of steps made."""
         for count, rate in enumerate(rates):
             if self.stalled:
                 return count
@@ -78,7 +78,7 @@ class Stepper(Protocol):
 
 
 class FusedStepper(Stepper):
-    """One shape on a processor, by fused kernels; a step of None advances Adam's moments all the same."""
+    """The flow of Algorithm 1 on a processor, by fused kernels; `step(None)` advances Adam's moments all the same."""
 
     def __init__(
         self, start: Tensor, form: DivergenceForm, cost: Cost, betas: tuple[float, float], frozen: Tensor | None
@@ -87,9 +87,9 @@ class FusedStepper(Stepper):
 
         base = form.base.numpy() if isinstance(form.base, Tensor) else form.base
         a, epsilon, Q = kernels.to_numpy_cost(cost.coefficients, cost.grid, cost.epsilon, cost.orientation)
-        fixed = None if frozen is None else torch.as_tensor(frozen).numpy()
+        frozen_voxels = None if frozen is None else torch.as_tensor(frozen).numpy()
         self._flow = FusedFlow(
-            start.numpy(), base, a, cost.grid, epsilon, cost.blur, fixed,
+            start.numpy(), base, a, cost.grid, epsilon, cost.blur, frozen_voxels,
             betas=betas, adam_eps=ADAM_EPS, orientation=Q,
         )  # fmt: skip
         self.betas, self._statistics = betas, Statistics(0.0, 0.0, 0.0)
@@ -140,7 +140,7 @@ class TorchStepper(Stepper):
         self._free = None if frozen is None else ~torch.as_tensor(frozen, dtype=torch.bool, device=device)
         self._parameters = start.to(device).clone()
         self._value: Tensor | float = 0.0
-        self._u = self._slope = self._parameters
+        self._u = self._gradient = self._parameters
         self._offset = torch.zeros((), device=device)
         self._statistics: Statistics | None = None
         self._start_optimiser()
@@ -151,21 +151,21 @@ class TorchStepper(Stepper):
         self._taken = 0
 
     def _evaluate(self, parameters: Tensor, offset: Tensor) -> tuple[Tensor | float, Tensor, Tensor]:
-        """Return the energies, u, and the gradient with respect to the parameters."""
+        """Return the energy, u, and the energy's gradient with respect to the parameters."""
         u = self._form.field(parameters) + offset
-        value, slope = self._energy_gradient(u, *self._cost)
+        value, gradient_u = self._energy_gradient(u, *self._cost)
         if self._data is not None:
-            data_value, data_slope = self._data.slope(u, self._form.grid)
-            value, slope = value + data_value, slope + data_slope
-        slope = self._form.pullback(slope)
-        return value, u, slope if self._free is None else slope * self._free
+            data_value, data_gradient = self._data.slope(u, self._form.grid)
+            value, gradient_u = value + data_value, gradient_u + data_gradient
+        gradient = self._form.pullback(gradient_u)
+        return value, u, gradient if self._free is None else gradient * self._free
 
     def step(self, rate: float | None) -> None:
         self._statistics = None
         if rate is not None:
             self.run([rate])
         else:
-            self._value, self._u, self._slope = self._evaluate(self._parameters, self._offset)
+            self._value, self._u, self._gradient = self._evaluate(self._parameters, self._offset)
 
     def run(self, rates: Sequence[float]) -> int:
         """Make steps of `torch.optim.Adam`, without statistics, and return their number."""
@@ -173,21 +173,21 @@ class TorchStepper(Stepper):
         taken = range(self._taken + 1, self._taken + len(rates) + 1)
         # Minus a step's length over the first moment's bias correction, and the root of the second's: on the device, so
         # that no step waits for the host.
-        lengths = [(-rate / (1 - momentum**k), (1 - memory**k) ** 0.5) for rate, k in zip(rates, taken, strict=True)]
-        for numbers in torch.tensor(lengths, dtype=torch.float32).to(self._parameters.device):
-            self._value, self._u, self._slope = self._evaluate(self._parameters, self._offset)
-            first.lerp_(self._slope, 1 - momentum)
-            second.mul_(memory).addcmul_(self._slope, self._slope, value=1 - memory)
-            self._parameters.addcdiv_(first * numbers[0], second.sqrt().div_(numbers[1]).add_(ADAM_EPS))
+        factors = [(-rate / (1 - momentum**k), (1 - memory**k) ** 0.5) for rate, k in zip(rates, taken, strict=True)]
+        for length, root in torch.tensor(factors, dtype=torch.float32).to(self._parameters.device):
+            self._value, self._u, self._gradient = self._evaluate(self._parameters, self._offset)
+            first.lerp_(self._gradient, 1 - momentum)
+            second.mul_(memory).addcmul_(self._gradient, self._gradient, value=1 - memory)
+            self._parameters.addcdiv_(first * length, second.sqrt().div_(root).add_(ADAM_EPS))
         self._taken += len(rates)
         return len(rates)
 
     def statistics(self) -> Statistics:
         if self._statistics is None:
-            size = self._slope.abs()
-            count = size.numel() if self._free is None else int(self._free.expand_as(size).sum())
-            mean = float(size.sum(dtype=torch.float64)) / max(1, count)
-            self._statistics = Statistics(float(self._value), float(size.amax()), mean)
+            moduli = self._gradient.abs()
+            count = moduli.numel() if self._free is None else int(self._free.expand_as(moduli).sum())
+            mean = float(moduli.sum(dtype=torch.float64)) / max(1, count)
+            self._statistics = Statistics(float(self._value), float(moduli.amax()), mean)
         return self._statistics
 
     def field(self) -> Tensor:
@@ -221,14 +221,9 @@ class LbfgsStepper(TorchStepper):
     def _start_optimiser(self) -> None:
         self._cached: tuple[Tensor, tuple[Tensor | float, Tensor, Tensor]] | None = None
         self._optimiser = torch.optim.LBFGS(
-            [self._parameters],
-            max_iter=1,
-            max_eval=1 + LINE_SEARCH,
-            history_size=LBFGS_HISTORY,
-            tolerance_grad=0,
-            tolerance_change=0,
-            line_search_fn="strong_wolfe",
-        )
+            [self._parameters], max_iter=1, max_eval=1 + LINE_SEARCH, history_size=LBFGS_HISTORY,
+            tolerance_grad=0, tolerance_change=0, line_search_fn="strong_wolfe",
+        )  # fmt: skip
 
     def _evaluate_once(self) -> tuple[Tensor | float, Tensor, Tensor]:
         """Return the evaluation at the parameters, from the cache if they have not moved."""
@@ -238,24 +233,24 @@ class LbfgsStepper(TorchStepper):
 
     def step(self, rate: float | None) -> None:
         self._statistics = None
-        self._value, self._u, self._slope = self._evaluate_once()
+        self._value, self._u, self._gradient = self._evaluate_once()
         if rate is None:
             return
         first = not self._optimiser.state
         self._optimiser.param_groups[0]["lr"] = rate * self._first_rate() if first else rate
-        before = self._parameters.clone()
+        previous = self._parameters.clone()
         self._optimiser.step(self._closure)
-        self.stalled = torch.equal(before, self._parameters)
+        self.stalled = torch.equal(previous, self._parameters)
 
     def run(self, rates: Sequence[float]) -> int:
         return Stepper.run(self, rates)
 
     def _first_rate(self) -> float:
-        """Return the rate that moves no parameter beyond `FIRST_MOVE`; torch scales it by min(1, 1 / Σ|slope|)."""
-        # L-BFGS knows no curvature before its first step, which torch makes along the slope itself: where the energy is
-        # steep that would be across all of the interface, from where the line search finds another minimum.
-        size = self._slope.abs()
-        return FIRST_MOVE / max(float(size.max()), 1e-30) * max(1.0, float(size.sum(dtype=torch.float64)))
+        """Return the rate at which the first step moves no parameter by more than `FIRST_MOVE`."""
+        # L-BFGS knows no curvature before its first step, which torch makes along the gradient g, times the rate and
+        # min(1, 1 / Σ|g|). Where the energy is steep that would cross the interface, and end in another minimum.
+        moduli = self._gradient.abs()
+        return FIRST_MOVE / max(float(moduli.max()), 1e-30) * max(1.0, float(moduli.sum(dtype=torch.float64)))
 
     def _closure(self) -> float:
         """Return the energy and set the parameters' gradient, as torch's line search asks."""
