@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -74,9 +73,8 @@ class Coefficients:
     def in_unit(self, unit: float) -> Coefficients:
         """Return the coefficients of the same energy with lengths in multiples of `unit`, a length in the old unit.
 
-        The linear part is multiplied by `unit`, the constant one by its square.
-
-        Working units become physical ones by `in_unit(0.01 / working voxel)`.
+        The linear part is multiplied by `unit`, the constant one by its square. Working units become physical ones by
+        `in_unit(0.01 / working voxel)`.
         """
         unit = check_float(unit, "a positive length unit", SHORTEST, LONGEST)
         a20, a11, a02, a10, a01, a00 = self
@@ -111,7 +109,7 @@ class Coefficients:
 
     def as_dict(self) -> dict[str, float]:
         """Return numbers by name, of coefficients that do not vary in space."""
-        return {name: float(value) for name, value in dataclasses.asdict(self).items()}
+        return {name: float(value) for name, value in zip(NAMES, self, strict=True)}
 
 
 def check_strengths(

@@ -209,6 +209,7 @@ def _read_numbers(law: object) -> Coefficients | None:
 
 Positive = Annotated[float, Rule(above=0)]
 Mass = Annotated[float | None, Rule(above=-1, below=1)]
+Fraction = Annotated[float, Rule(least=0, most=1, unknown=True)]
 
 
 @dataclass(frozen=True)
@@ -222,9 +223,7 @@ class _LawFile:
     working_voxel: Positive
     length_unit: Literal["voxel", *METRES]  # type: ignore[valid-type]
     status: str = ""
-    morphometry: Annotated[
-        dict[str, Any] | None, Rule(keys=(("volume_fraction", Annotated[float, Rule(least=0, most=1, unknown=True)]),))
-    ] = None
+    morphometry: Annotated[dict[str, Any] | None, Rule(keys=(("volume_fraction", Fraction),))] = None
 
 
 def read_fit(path: str | PathLike[str], kind: type[Content]) -> Content:

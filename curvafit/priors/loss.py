@@ -207,11 +207,8 @@ class CurvaturePrior(nn.Module):
     def _mask_voxels(
         self, input: Tensor, target: Tensor | None, mask: Tensor | None
     ) -> tuple[Tensor | None, Tensor | None]:
-        """Check the mask and the target; return the mask with zeros on and around ignored voxels, and these voxels.
-
-        The mask is (B or 1, classes that count or 1, D, H, W), or None if all voxels count; the ignored voxels are
-        (B, 1, D, H, W), or None without an `ignore_index`.
-        """
+        """Check mask and target; return the mask (B or 1, classes that count or 1, D, H, W), with zeros on and around
+        ignored voxels, and these voxels (B, 1, D, H, W); None where all voxels count, or none can be ignored."""
         batch, classes = input.shape[:2]
         space = tuple(input.shape[2:])
         if mask is not None:
@@ -378,11 +375,9 @@ def choose_refinement(spacing: Sequence[float], epsilon: float) -> tuple[int, in
         raise ValueError(f"ε must be above 0 and at most {most:g} for voxels of {tuple(spacing)}, got {epsilon:g}")
     ratios = [RESOLVED * h / epsilon for h in spacing]
     if max(ratios) > FINEST + 1e-3:  # here and below 1e-3 is for rounding: a ratio of 2.0001 is a refinement by 2
-        least = RESOLVED * max(spacing) / FINEST
-        raise ValueError(
-            f"expected an ε of at least {least:g} for voxels of {tuple(spacing)}, got {epsilon:g}, for which an axis "
-            f"is refined more than {FINEST}-fold: state ε in spacing's unit, or a larger ε"
-        )
+        least, remedy = RESOLVED * max(spacing) / FINEST, "state ε in spacing's unit, or a larger ε"
+        expected = f"expected an ε of at least {least:g} for voxels of {tuple(spacing)}, got {epsilon:g}"
+        raise ValueError(f"{expected}, for which an axis is refined more than {FINEST}-fold: {remedy}")
     z, y, x = (1 if ratio <= 1.1 else math.ceil(ratio - 1e-3) for ratio in ratios)
     return z, y, x
 

@@ -33,6 +33,8 @@ _VOXELS_PER_THREAD = 32768
 _BLOCK, _TILE = 432, 43_000
 #: Floats of a cache line.
 _LINE = 16
+#: These stand for a field that is not there, and for the ratios of `_compute_ratios` where all are one.
+_NO_FIELD, _RATIOS = np.empty(0, np.float32), np.ones(9, np.float32)
 
 
 def fused_energy_gradient(
@@ -248,9 +250,6 @@ class _Density:
         return float(self._energies[:, planes].sum())
 
 
-_NO_FIELD = np.empty(0, np.float32)
-
-
 def _choose_threads(grid: Grid) -> int:
     """Return the number of threads that a grid makes use of, at most as many as numba may take."""
     useful = min(math.prod(grid.shape) // _VOXELS_PER_THREAD, grid.shape[0] // BLUR_ROWS)
@@ -264,8 +263,7 @@ def _round_up(size: int) -> int:
 
 def _make_scratch(threads: int, size: int) -> np.ndarray:
     """Make a scratch array `(threads, ≥ size)` whose rows share no cache line."""
-    size = _round_up(size)
-    return _make_zeros(threads * size).reshape(threads, size)
+    return _make_zeros(threads * _round_up(size)).reshape(threads, -1)
 
 
 def _make_zeros(size: int) -> np.ndarray:
@@ -396,6 +394,3 @@ def _compute_ratios(grid: Grid) -> np.ndarray | None:
     """Return the ratios of the spacing along x to that along z, y, x, and their products; None if all are one."""
     z, y, x = (grid.spacing[2] / h for h in grid.spacing)
     return None if z == y == 1 else np.array([z, y, x, z * z, y * y, x * x, z * y, z * x, y * x], np.float32)
-
-
-_RATIOS = np.ones(9, np.float32)

@@ -78,7 +78,6 @@ _SUMMING: dict[str, Any] = {**_INLINE, **_SUMS}
 _COUNTING: dict[str, Any] = {**_PLAIN, "forceinline": True, "cache": True}
 _PARALLEL: dict[str, Any] = {**_PLAIN, **_SUMS, "cache": True}
 
-
 #: The processor's features that numba compiles for: the host's, unless numba's settings give others.
 _CONFIGURED = getattr(config, "CPU_FEATURES", None)
 _FEATURES = llvm.get_host_cpu_features().flatten() if _CONFIGURED is None else _CONFIGURED
@@ -143,7 +142,6 @@ def _ir(width: int) -> ir.VectorType:
 
 
 def _shuffle(builder, first, second, indices):
-    """Shuffle the elements of two vectors."""
     return builder.shuffle_vector(first, second, ir.Constant(ir.VectorType(ir.IntType(32), len(indices)), indices))
 
 
@@ -711,10 +709,8 @@ def _divergence_plane(A, flux, half, z, shape, periodic):
 
 @njit(**_SUMMING)
 def _measure_sizes(slopes, n):
-    """Return the sum of the moduli of n slopes, and the greatest modulus as the bits of its float32.
-
-    As integers, the bits of positive floats have the order of the floats, and a NaN's are above all: it is not lost.
-    """
+    """Return the sum of the moduli of n slopes, and the greatest modulus as the bits of its float32."""
+    # As integers, the bits of positive floats have the order of the floats, and a NaN's are above all: it is not lost.
     bits = slopes.view(np.int32)
     total, highest = _ZERO, np.int32(0)
     for i in range(n):
@@ -787,8 +783,9 @@ def _adam_chunk(
     corner = EDGE * stride + EDGE
     first, last = chunk * Z // chunks, (chunk + 1) * Z // chunks
     for z in range(first - 1, last + 2):
-        for for_divergence in (False, True):
-            if for_divergence:
+        # Plane z of the gradient, then div A two planes behind: one call, which is inlined, blurs them in turn.
+        for is_divergence in (False, True):
+            if is_divergence:
                 # The newest plane of A whose neighbours in this chunk have made Adam's step.
                 z_moved = z - 2
                 inner = first < z_moved < last - 1
@@ -804,7 +801,7 @@ def _adam_chunk(
                 origin = SLACK + index_z[_at(z + 2)] * plane + corner
                 target = SLACK + (z + 3) % 3 * plane + corner
             _blur_plane(source, origin, size, rows[chunk], out, target, edge, Y, X, blur)
-            if not for_divergence and z > first:
+            if not is_divergence and z > first:
                 below, here = SLACK + (z + 1) % 3 * plane + corner, SLACK + (z + 2) % 3 * plane + corner
                 sums[z - 1], highest[z - 1] = _adam_plane(
                     A, m, v, keep, rings[chunk], slopes[chunk], below, here, target, half, adam, z - 1, shape
