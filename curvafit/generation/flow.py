@@ -139,7 +139,7 @@ def generate(
     seed
         Seed of the start. The same seed, grid and number of threads make the same field, bit for bit.
     orientation
-        Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x; see `priors.energy.orientation`.
+        Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x; see `priors.orientation`.
     watch
         What is taken from the flow while it runs: snapshots, and calls of functions.
     reject_early
