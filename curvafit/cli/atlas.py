@@ -38,21 +38,21 @@ def build_atlas(
     crew: Workers,
 ) -> None:
     """Generate shapes into a store until enough are viable. The same command resumes a build that was stopped."""
-    box = parse_whole_triple(shape, "--shape")
-    law = _choose_design(design, around, spread)
+    size = parse_whole_triple(shape, "--shape")
+    law_design = _choose_design(design, around, spread)
     from curvafit.core.files import check_folder
     from curvafit.data_synth.atlas import build, make_settings
     from curvafit.data_synth.store import open_store
-    from curvafit.generation.schedule import schedule as named
+    from curvafit.generation.schedule import schedule as make_schedule
 
-    crew.check_memory(box)
-    plan = named(schedule, steps)
-    settings = make_settings(box, seed, plan, law)
+    crew.check_memory(size)
+    plan = make_schedule(schedule, steps)
+    settings = make_settings(size, seed, plan, law_design)
     if store.exists():
-        open_store(store, settings)
+        open_store(store, settings)  # refuses a store of other settings, before workers start
     check_folder(store.parent)
     with crew.start() as (workers, progress):
-        build(store, count, box, seed, plan, progress, design=law, workers=workers)
+        build(store, count, size, seed, plan, progress, design=law_design, workers=workers)
     say(str(store))
 
 
@@ -69,10 +69,11 @@ def extend_atlas(
 
     target = open_store(store).wanted + count
 
-    def again() -> str:
+    def resume_command() -> str:
+        # Once the store states the new target, the same command would add `count` shapes a second time.
         return "`--count 0`" if open_store(store).wanted == target else "the same command"
 
-    with crew.start(again) as (workers, progress):
+    with crew.start(resume_command) as (workers, progress):
         extend(store, count, progress, workers=workers)
     say(str(store))
 
@@ -160,11 +161,11 @@ def train_atlas(
     from curvafit.inference.training import train_posterior
 
     _check_archive(out, POSTERIOR_FILE, [table], overwrite)
-    content = load_table(table)
+    descriptors = load_table(table)
     if views is not None:
-        content = content.select_views(views.split(","))
+        descriptors = descriptors.select_views(views.split(","))
     with show_stages() as progress:
-        posterior = train_posterior(content, members=members, seed=seed, progress=progress)
+        posterior = train_posterior(descriptors, members=members, seed=seed, progress=progress)
     save_posterior(posterior, out)
     say(f"{posterior.provenance['shapes']} shapes", to=error_console())
     say(str(out))
@@ -191,20 +192,21 @@ def teach_filler(
 
     if filler is not None and not images:
         raise ValueError("--filler goes with --images")
-    _check_archive(out, FILLER_FILE, [*stores, *([filler] if filler else [])], overwrite)
+    _check_archive(out, FILLER_FILE, stores if filler is None else [*stores, filler], overwrite)
     checkpoint = out.with_name(f".{out.name}.curvafit-steps")
     with resumable(), show_stages() as progress:
+        # With images, a filler that was taught on masks alone learns to use them.
         plain = Taught.load(filler) if images else None
         sources, card = load_textures(stores, progress)
         if (count := sum(map(len, sources))) < FEW:
             say_notes([f"{count} shapes teach little: {FEW} or more are better"])
-        card["command"] = command_line()
         settings = {"plain": plain, "volumes": images or VOLUMES, "steps": steps, "seed": seed}
+        card["command"] = command_line()
         taught = teach(sources, card, **settings, checkpoint=checkpoint, progress=progress)
     taught.save(out)
     remove(checkpoint)
-    learnt, cubic = (taught.card[f"held_out_{each}"] for each in ("loss", "cubic"))
-    say(f"cross entropy of shapes held out {learnt:.4f}, of the cubic interpolation {cubic:.4f}", to=error_console())
+    loss, cubic = taught.card["held_out_loss"], taught.card["held_out_cubic"]
+    say(f"cross entropy of shapes held out {loss:.4f}, of the cubic interpolation {cubic:.4f}", to=error_console())
     say(str(out))
 
 
@@ -232,7 +234,7 @@ add_commands(atlas_app, extract_atlas, describe_atlas, train_atlas, teach_filler
 
 
 def _check_archive(out: Path, kind: Format, inputs: list[Path], overwrite: bool) -> None:
-    """Refuse a target that is no `.npz`, cannot be written, is an input, or is a file of another kind."""
+    """Raise an error if the output is not a `.npz`, cannot be written, is an input, or is a file of another kind."""
     from curvafit.core.records import can_write
 
     if out.suffix.lower() != ".npz":
@@ -247,8 +249,8 @@ def _choose_design(name: str, around: str | None, spread: float | None) -> Desig
     if around is not None:
         if name not in ("random", "sobol"):
             raise ValueError(f"give either --around or the file of a design, got {around} and {name}")
-        share = design.SPREAD if spread is None else spread
-        return design.design_around(design.read_point(around), share, name)  # type: ignore[arg-type]
+        width = design.SPREAD if spread is None else spread
+        return design.design_around(design.read_point(around), width, name)  # type: ignore[arg-type]
     if spread is not None:
         raise ValueError("--spread needs --around")
     if name in ("random", "sobol"):

@@ -48,8 +48,9 @@ def compare(
         check_comparison(out, [*scans, *([] if subjects is None else [subjects])], overwrite, command_line())
         settings = {"primary": primary, "permutations": permutations, "seed": seed, "subjects": subjects}
         settings |= {"workers": workers, "progress": progress, "paired": paired}
-        labels = by.split(",") if by is not None and "," in by else by
-        groups = scans if labels is by else [scans]
+        # `--by 0,7,14` has a number for each scan of one list; otherwise each argument is a group or a CSV.
+        labels = by.split(",") if by and "," in by else by
+        groups = [scans] if isinstance(labels, list) else scans
         comparison = compare_scans(*groups, by=labels, **structure, **settings, **reading)
         progress("drawing the page", 1.0)
         page = write_comparison(comparison, out, command=command_line(), overwrite=overwrite)
@@ -57,11 +58,11 @@ def compare(
     say(comparison.status, style="bold")
     from curvafit.core.units import format_number
 
-    middle = comparison.groups or ("slope",)
     rows = []
     for number in comparison.numbers:
-        values = (*(number.means or (number.difference,)), number.effect, number.p, number.family)
+        estimates = number.means or (number.difference,)  # the mean of each group, or the slope
+        values = (*estimates, number.effect, number.p, number.family)
         rows.append((number.name, number.symbol, *map(format_number, values)))
-    head = ("", "", *middle, comparison.effect, "p", "family-wise p")
+    head = ("", "", *(comparison.groups or ("slope",)), comparison.effect, "p", "family-wise p")
     print_table(head, rows, right=range(2, len(head)))
     say(str(page))

@@ -27,7 +27,7 @@ LONGEST = 700
 #: Characters that look better on a page, but are copied from a terminal, and that some encodings lack.
 _PLAIN = str.maketrans({"\u2212": "-", "\u2013": "-", "\u202f": " ", "\u00a0": " "})
 #: The exception of an option that typer cannot parse; its name and module change with typer's versions.
-_Refusal: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+_UsageError: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 
 
 # ---- errors ----------------------------------------------------------------------------------------------------------
@@ -40,8 +40,8 @@ class Commands(TyperGroup):
         """Run a command and exit, as `click.Group.main` does."""
         try:
             code = super().main(*args, **more | {"standalone_mode": False})
-        except _Refusal as error:
-            if type(error).__name__ == "NoArgsIsHelpError":
+        except _UsageError as error:
+            if type(error).__name__ == "NoArgsIsHelpError":  # a group without a command: show its help
                 error.show()  # type: ignore[attr-defined]
             else:
                 say(_explain_usage(error), to=error_console())
@@ -53,11 +53,11 @@ class Commands(TyperGroup):
 
 
 def _explain_usage(error: Any) -> str:
-    """Return the sentence of typer's usage error, with the command whose help tells more."""
+    """Return typer's usage error as a sentence that names the help to read."""
     text = error.format_message().rstrip(".")
     context = getattr(error, "ctx", None)
-    more = "" if context is None else f" (see {' '.join(['curvafit', *context.command_path.split()[1:], '--help'])})"
-    return sentence(f"{text[:1].lower()}{text[1:]}{more}")
+    hint = "" if context is None else f" (see {' '.join(['curvafit', *context.command_path.split()[1:], '--help'])})"
+    return sentence(f"{text[:1].lower()}{text[1:]}{hint}")
 
 
 @contextmanager
@@ -86,13 +86,13 @@ def plain_errors() -> Iterator[None]:
 
 @contextmanager
 def resumable(again: Callable[[], str] = lambda: "the same command") -> Iterator[None]:
-    """On a signal, print that finished parts are saved, and the command that resumes the work, if `again` names one."""
+    """On a signal, print how to resume: `again` returns the command, or an empty text where nothing is saved."""
     try:
         yield
     except KeyboardInterrupt as signal:
-        if not (line := again()):
+        if not (command := again()):
             raise
-        say(f"{_name_signal(signal)}: finished parts are saved. Run {line} to resume", to=error_console())
+        say(f"{_name_signal(signal)}: finished parts are saved. Run {command} to resume", to=error_console())
         raise typer.Exit(exit_code(signal)) from None
 
 
@@ -118,11 +118,11 @@ def _explain(error: Exception) -> str:
 
 def _say_warnings(caught: list[warnings.WarningMessage]) -> None:
     """Print the warnings that are for users, each once."""
-    say_notes(dict.fromkeys(str(each.message) for each in caught if issubclass(each.category, UserWarning)))
+    say_notes(dict.fromkeys(str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)))
 
 
 def command_line() -> str:
-    """Return the command as typed, but for leave to replace files."""
+    """Return the command as typed, without `--overwrite`: with it or not, a command's results are the same."""
     return shlex.join(["curvafit", *(word for word in sys.argv[1:] if word != "--overwrite")])
 
 
@@ -180,7 +180,7 @@ def show_stages() -> Iterator[Callable[[str, float], None]]:
     console = error_console()
     if not console.is_terminal:
         stage, last_share = "", 0.0
-        waiting: list[str] = []
+        waiting: list[str] = []  # lines that are not printed yet
 
         def write(text: str, share: float) -> None:
             nonlocal stage, last_share

@@ -16,7 +16,7 @@ from curvafit.cli.options import Group, OverwriteOption, command, parse_numbers,
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from curvafit.generation.result import Flow, State
+    from curvafit.generation.result import Flow
     from curvafit.priors.law import Law
 
     #: Parameters that vary in space, by name; see `volumes.read_maps`.
@@ -40,9 +40,9 @@ def parse_law(
     maps: Annotated[Path | None, _what(help="Volumes a20 … a00, mass, epsilon that vary: an .npz or a folder.")] = None,
     epsilon: Annotated[float | None, _what(help="Interface width in working units; by default 0.02.")] = None,
 ) -> dict[str, Any]:
-    """Return what says which shape is grown."""
-    given = {"preset": preset, "coefficients": coefficients, "prior": prior, "mass": mass, "epsilon": epsilon}
-    return given | {"volume_fraction": volume_fraction, "orientation": orientation, "maps": maps}
+    """Return the options that determine which shape is grown, by name."""
+    law = {"preset": preset, "coefficients": coefficients, "prior": prior, "mass": mass, "epsilon": epsilon}
+    return law | {"volume_fraction": volume_fraction, "orientation": orientation, "maps": maps}
 
 
 def parse_run(
@@ -55,11 +55,11 @@ def parse_run(
     checkpoint: Annotated[Path | None, _how(help="File to save the run in, and to resume it from.")] = None,
     checkpoint_every: Annotated[float | None, _how(help="Seconds between two checkpoints; 60 by default.")] = None,
 ) -> dict[str, Any]:
-    """Return how a shape is grown; raise ValueError where options do not go together."""
+    """Return the options of the run that grows a shape; raise ValueError where options do not go together."""
     if checkpoint is None and checkpoint_every is not None:
         raise ValueError(f"--checkpoint-every {checkpoint_every:g} needs --checkpoint")
-    every = {} if checkpoint_every is None else {"checkpoint_every": checkpoint_every}
-    return {"schedule": schedule, "steps": steps, "device": device, "checkpoint": checkpoint, **every}
+    run = {"schedule": schedule, "steps": steps, "device": device, "checkpoint": checkpoint}
+    return run if checkpoint_every is None else {**run, "checkpoint_every": checkpoint_every}
 
 
 def parse_output(
@@ -67,7 +67,7 @@ def parse_output(
     unit: Annotated[str | None, _out(help="nm, um, mm or m; needs --spacing.")] = None,
     tile: Annotated[str | None, _out(help="Repeat a periodic box N or Z,Y,X times.")] = None,
 ) -> dict[str, Any]:
-    """Return the size of what is written; raise ValueError where options do not go together."""
+    """Return voxel edge, unit and repeats of the file to write; raise ValueError where options do not go together."""
     if unit is not None and spacing is None:
         raise ValueError("--unit needs --spacing")
     edge = None if spacing is None else parse_numbers(spacing, "--spacing", 1)[0]
@@ -99,36 +99,37 @@ def generate(
     """Make a shape from parameters, with a record (.json) and a picture (.png) beside it."""
     from curvafit.generation.slabs import count_processes, serve
 
-    if count_processes()[0]:
+    rank, _ = count_processes()
+    if rank != 0:  # torchrun started several processes: the first runs the command, the others help it
         serve()
         return
     from curvafit.drawing.shapes import Output, check_target, shape_record
     from curvafit.generation.flow import Execution
     from curvafit.generation.schedule import choose_schedule
-    from curvafit.generation.schedule import schedule as named
+    from curvafit.generation.schedule import schedule as make_schedule
     from curvafit.priors.grid import Grid
     from curvafit.volumes.read import map_shape, read_maps
 
-    box, maps = None if shape is None else parse_whole_triple(shape, "--shape"), wanted["maps"]
-    volumes = {} if maps is None else read_maps(maps, box)
-    law = _read_law(wanted["preset"], wanted["coefficients"], wanted["prior"], volumes)
-    options = _choose_parameters(law, volumes, wanted)
-    options["grid"] = grid = Grid(box or map_shape(volumes) or EDGE, boundary=boundary)  # type: ignore[arg-type]
-    options["schedule"] = named(choose_schedule([law], running.pop("schedule")), running.pop("steps"))
-    running["checkpoint"] = place = _place_checkpoint(running["checkpoint"], out)
+    size = None if shape is None else parse_whole_triple(shape, "--shape")
+    maps = {} if wanted["maps"] is None else read_maps(wanted["maps"], size)
+    law = _read_law(wanted["preset"], wanted["coefficients"], wanted["prior"], maps)
+    options = _choose_parameters(law, maps, wanted)
+    options["grid"] = grid = Grid(size or map_shape(maps) or EDGE, boundary=boundary)  # type: ignore[arg-type]
+    options["schedule"] = make_schedule(choose_schedule([law], running.pop("schedule")), running.pop("steps"))
+    running["checkpoint"] = checkpoint = _locate_checkpoint(running["checkpoint"], out)
     options |= {"seed": seed, "execution": Execution(keep_checkpoint=True, **running)}
     edge, unit = writing["edge"] or law.working_voxel or 1.0, writing["unit"] or law.length_unit or "voxel"
     output = Output(edge, unit, writing["repeats"])
-    output.shape(grid)
+    output.shape(grid)  # raises ValueError where the volume cannot be repeated or does not fit into memory
     law_file = None if not law.fitted else wanted["prior"] or wanted["preset"]
-    inputs = [str(path) for path in (law_file, maps) if path is not None]
+    inputs = [str(path) for path in (law_file, wanted["maps"]) if path is not None]
     check_target(out, output, inputs=inputs, picture=picture, overwrite=overwrite)
     flow, Q = _grow(options), options["orientation"]
-    more = {"orientation": None if Q is None else Q.tolist(), "maps": None if maps is None else str(maps)}
-    more |= {"origin": law.origin, "wanted_volume_fraction": wanted["volume_fraction"], "command": command_line()}
-    record = shape_record(flow, mass=options["mass"], output=output, **more)
+    facts = {"orientation": None if Q is None else Q.tolist(), "maps": wanted["maps"] and str(wanted["maps"])}
+    facts |= {"origin": law.origin, "wanted_volume_fraction": wanted["volume_fraction"], "command": command_line()}
+    record = shape_record(flow, mass=options["mass"], output=output, **facts)
     _write(flow, out, record, output=output, picture=picture, overwrite=overwrite)
-    _remove(place)
+    _remove(checkpoint)
 
 
 @command()
@@ -138,58 +139,61 @@ def presets() -> None:
     from curvafit.priors.law import PRESETS
 
     rows = [
-        (name, *(f"{value:g}" for value in entry.coefficients.as_dict().values()), f"{entry.mass:g}", entry.source)
-        for name, entry in PRESETS.items()
+        (name, *(f"{value:g}" for value in preset.coefficients.as_dict().values()), f"{preset.mass:g}", preset.source)
+        for name, preset in PRESETS.items()
     ]
     print_table(("name", *NAMES, "mass", "source"), rows, right=range(1, 8))
 
 
-def _read_law(preset: str | None, six: str | None, prior: str | None, maps: Maps3D) -> Law:
-    """Return the one law among the options, or that of six maps of coefficients."""
+def _read_law(preset: str | None, coefficients: str | None, prior: str | None, maps: Maps3D) -> Law:
+    """Return the law that one of the options gives, or a placeholder where maps give all six coefficients."""
     from curvafit.priors.coefficients import NAMES, Coefficients
     from curvafit.priors.law import Law
 
-    laws = [value for value in (preset, six, prior) if value is not None]
+    laws = [value for value in (preset, coefficients, prior) if value is not None]
     if len(laws) > 1 or (not laws and not set(NAMES) <= maps.keys()):
         raise ValueError(f"give one of --preset, --coefficients and --prior, got {len(laws)} of them")
     if not laws:
         return Law(Coefficients(1, 0, 1), None, "maps")
-    return Law.of(laws[0] if six is None else Coefficients(*parse_numbers(six, "--coefficients", 6)))
+    if coefficients is not None:
+        return Law.of(Coefficients(*parse_numbers(coefficients, "--coefficients", 6)))
+    return Law.of(laws[0])
 
 
 def _choose_parameters(law: Law, maps: Maps3D, wanted: dict[str, Any]) -> dict[str, Any]:
-    """Return the law, the mass or the share, ε and Q as `generate` takes them, with maps in place of numbers."""
+    """Return law, mass or volume fraction, ε and Q as arguments of `generate`; maps take the place of numbers."""
     from curvafit.priors.coefficients import NAMES
     from curvafit.priors.energies import orientation
     from curvafit.priors.grid import WORKING_EPSILON
 
-    mass, share, epsilon = wanted["mass"], wanted["volume_fraction"], wanted["epsilon"]
-    for name, value in (("mass", mass), ("epsilon", epsilon)):
-        if value is not None and name in maps:
+    for name in ("mass", "epsilon"):
+        if wanted[name] is not None and name in maps:
             raise ValueError(f"give either --{name} or a map of it, got both")
-    mean, Q = maps.get("mass", mass), None
-    if mean is not None and share is not None:
+    mass, fraction = maps.get("mass", wanted["mass"]), wanted["volume_fraction"]
+    if mass is not None and fraction is not None:
         raise ValueError("give either a mass or --volume-fraction, got both")
+    if mass is None and fraction is None:
+        mass = law.mass
+    Q = None
     if wanted["orientation"] is not None:
         *direction, strength = parse_numbers(wanted["orientation"], "--orientation", 4)
         Q = orientation(direction, strength)
     coefficients = replace(law.coefficients, **{name: maps[name] for name in NAMES if name in maps})
-    width = maps.get("epsilon", WORKING_EPSILON if epsilon is None else epsilon)
-    mean = law.mass if mean is None and share is None else mean
-    return {"law": coefficients, "mass": mean, "volume_fraction": share, "epsilon": width, "orientation": Q}
+    ε = maps.get("epsilon", WORKING_EPSILON if wanted["epsilon"] is None else wanted["epsilon"])
+    return {"law": coefficients, "mass": mass, "volume_fraction": fraction, "epsilon": ε, "orientation": Q}
 
 
-def _place_checkpoint(file: Path | None, out: Path) -> Path | None:
-    """Return the place of the checkpoint, if there is one; refuse that of an output."""
+def _locate_checkpoint(file: Path | None, out: Path) -> Path | None:
+    """Return the path of the checkpoint, None without one; raise ValueError if it is that of an output."""
     from curvafit.core.records import sibling
     from curvafit.generation.loop import resolve_place
 
     if file is None:
         return None
-    place = resolve_place(file)
-    if place in [path.resolve() for path in (out, sibling(out, ".json"), sibling(out, ".png"))]:
-        raise ValueError(f"the checkpoint {place} would be written over by an output: choose another name")
-    return place
+    checkpoint = resolve_place(file)
+    if checkpoint in [path.resolve() for path in (out, sibling(out, ".json"), sibling(out, ".png"))]:
+        raise ValueError(f"the checkpoint {checkpoint} would be written over by an output: choose another name")
+    return checkpoint
 
 
 def _grow(options: dict[str, Any]) -> Flow:
@@ -198,22 +202,21 @@ def _grow(options: dict[str, Any]) -> Flow:
     from curvafit.generation.result import Watch
     from curvafit.generation.slabs import count_processes, lead
 
-    saved, several = options["execution"].checkpoint, count_processes()[1] > 1
-    if several:
+    checkpoint = options["execution"].checkpoint
+    _, processes = count_processes()
+    if processes > 1:
         options["execution"] = replace(options["execution"], backend="slabs")
 
-    def again() -> str:
-        return "the same command" if saved is not None and saved.exists() else ""
+    def resume_command() -> str:
+        return "the same command" if checkpoint is not None and checkpoint.exists() else ""
 
-    with resumable(again), show_stages() as progress, lead() if several else nullcontext():
+    with resumable(resume_command), show_stages() as progress, lead() if processes > 1 else nullcontext():
         progress("starting (a first run compiles the kernels for this processor)", 0.0)
-
-        def watch(step: int, total: int, state: State) -> None:
-            progress("growing", step / total)
-
-        flow = make(**options, watch=Watch(callbacks=[watch]))
+        watch = Watch(callbacks=[lambda step, total, _: progress("growing", step / total)])
+        flow = make(**options, watch=watch)
+    # The surface is the level 0 of the field: without values on both sides there is none.
     if not (flow.finite and flow.viability.lowest < 0 < flow.viability.highest):
-        _remove(saved)
+        _remove(checkpoint)
         say(f"{flow.status}; nothing was written", to=error_console())
         raise typer.Exit(1)
     return flow

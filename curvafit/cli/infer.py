@@ -21,7 +21,7 @@ def parse_inference(
     fast: Annotated[bool, typer.Option("--fast", help="Seconds, not minutes: nothing is grown or checked.")] = False,
     test: Annotated[bool, typer.Option(help="Grow shapes to test whether the law can have made the scan.")] = True,
 ) -> dict[str, Any]:
-    """Return by what a law is read of a scan, and which shapes are grown for it."""
+    """Return the options by which a law is inferred and tested, by name."""
     return {"atlas": atlas, "posterior": posterior, "method": method, "fast": fast, "test": test}
 
 
@@ -51,16 +51,16 @@ def infer(
         from curvafit.inference.simulate import Growth
         from curvafit.report.inference import check_report, infer_scans, with_command, write_inference
 
-        grown = Growth(test=law.pop("test"))
-        law["growth"] = None if law.pop("fast") else grown
-        what = {**structure, **law, "roi": roi, "seed": seed, **reading}
+        growth = Growth(test=law.pop("test"))
+        law["growth"] = None if law.pop("fast") else growth
+        options = {**structure, **law, "roi": roi, "seed": seed, **reading}
         if len(scans) > 1:
             settings = {"workers": workers, "command": command_line(), "overwrite": overwrite, "progress": progress}
-            page = infer_scans(scans, out, **settings, **what)
+            page = infer_scans(scans, out, **settings, **options)
             say(str(page))
             return
         check_report(out, [*scans, *files], overwrite, command_line())
-        inference = infer_scan(scans[0], progress=progress, **what)
+        inference = infer_scan(scans[0], progress=progress, **options)
         progress("drawing the report", 1.0)
         say_notes(inference.scan.notes)
         report = write_inference(with_command(inference, command_line()), out, overwrite=overwrite)
@@ -69,7 +69,7 @@ def infer(
 
 
 def _print_result(inference: Inference) -> None:
-    """Print the description, the verdict and a small table."""
+    """Print the description, the verdict, the table of parameters, and the distances of the regrown shapes."""
     from curvafit.core.units import format_length, format_number
     from curvafit.inference.candidates import TITLES
     from curvafit.report.inference import describe, parameter_table

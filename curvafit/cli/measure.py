@@ -38,13 +38,13 @@ def parse_windows(
     ] = None,
     clusters: Annotated[int | None, typer.Option(help="Clusters of windows, by default 2.")] = None,
 ) -> dict[str, Any] | None:
-    """Return the windows over which numbers are mapped, as `curvafit.windows` takes them; None for none."""
+    """Return size, stride and clusters of windows, as `curvafit.windows` takes them; None without `--windows`."""
     if windows is None:
         if (stride, clusters) != (None, None):
             raise ValueError("--stride and --clusters go with --windows")
         return None
     size = parse_whole_triple(windows, "--windows")
-    halves = tuple(n if n % 2 else n // 2 for n in size)
+    halves = tuple(n if n % 2 else n // 2 for n in size)  # a stride divides the size: an odd one has no half
     steps = halves if stride is None else parse_whole_triple(stride, "--stride")
     return {"size": size, "stride": steps, "clusters": 2 if clusters is None else clusters}
 
@@ -118,16 +118,17 @@ def _write_page(
         from curvafit.report.measures import check_measures, write_measures
         from curvafit.studies.scans import check_units, count_notes, measure_each
 
-        check_measures(folder, [*scans, *_files(options.get("roi"), subjects)], overwrite, command_line())
+        check_measures(folder, _inputs(scans, options.get("roi"), subjects), overwrite, command_line())
         check_units(scans, sub_progress(progress, 0.0, 0.05), **reading)
         columns = _read_subjects(subjects, scans)
-        part = sub_progress(progress, 0.05, 1.0)
-        whole = [measures for (measures,) in measure_each(scans, progress=part, **options, **reading)]
+        measuring = sub_progress(progress, 0.05, 1.0)
+        # A page is for scans, of which each has one result; instances have a table only.
+        results = [measures for (measures,) in measure_each(scans, progress=measuring, **options, **reading)]
         progress("drawing the page", 1.0)
-        shown = {name: value for name, value in options.items() if name not in ("store", "labels", "workers")}
-        more = {"columns": columns, "options": shown | reading, "command": command_line(), "overwrite": overwrite}
-        page = write_measures(whole, folder, **more)
-    say_notes(tuple(count_notes(whole)))
+        recorded = {name: value for name, value in options.items() if name not in ("store", "labels", "workers")}
+        settings: dict[str, Any] = {"options": recorded | reading, "command": command_line(), "overwrite": overwrite}
+        page = write_measures(results, folder, columns=columns, **settings)
+    say_notes(tuple(count_notes(results)))
     say(str(page))
 
 
@@ -140,21 +141,23 @@ def _write_table(
         from curvafit.studies.scans import check_table, measure_each, write_table
 
         if out is not None:
-            check_table(out, [*scans, *_files(options.get("roi"), subjects)], overwrite)
+            check_table(out, _inputs(scans, options.get("roi"), subjects), overwrite)
         columns = _read_subjects(subjects, scans)
-        measured = measure_each(scans, progress=progress, **options, **reading)
-    _print_measured(measured, options["labels"])
+        results = measure_each(scans, progress=progress, **options, **reading)
+    _print_results(results, options["labels"])
     if out is not None:
-        rows = None if columns is None else [row for row, parts in zip(columns, measured, strict=True) for _ in parts]
-        say(str(write_table([part for parts in measured for part in parts], out, columns=rows, overwrite=overwrite)))
+        if columns is not None:  # a label image has several rows, one for each instance
+            columns = [row for row, measures in zip(columns, results, strict=True) for _ in measures]
+        flat = [measures for of_scan in results for measures in of_scan]
+        say(str(write_table(flat, out, columns=columns, overwrite=overwrite)))
 
 
-def _files(*paths: Path | None) -> list[Path]:
-    return [path for path in paths if path is not None]
+def _inputs(scans: list[str], *paths: Path | None) -> list[str | Path]:
+    return [*scans, *(path for path in paths if path is not None)]
 
 
 def _read_subjects(subjects: Path | None, scans: list[str]) -> Any:
-    """Return the columns that a table of subjects has for each scan, None without a table."""
+    """Return each scan's row of a CSV of subjects as a dict, None without a CSV."""
     from curvafit.scan.measures import COLUMNS
     from curvafit.studies.scans import OF_PARTS, read_columns
 
@@ -168,16 +171,16 @@ def _map_windows(scan: str, folder: Path, overwrite: bool, options: dict[str, An
         from curvafit.studies.windowed import windows as measure_windows
 
         check_windows(folder, scan, overwrite, command_line())
-        found = measure_windows(scan, progress=progress, **options)
+        windows = measure_windows(scan, progress=progress, **options)
         progress("drawing the page", 1.0)
-        page = write_windows(found, folder, command=command_line(), overwrite=overwrite)
-    say_notes(found.notes)
-    say(found.status, style="bold")
+        page = write_windows(windows, folder, command=command_line(), overwrite=overwrite)
+    say_notes(windows.notes)
+    say(windows.status, style="bold")
     say(str(page))
 
 
 def _choose_folder(out: Path | None, labels: bool, subjects: Path | None) -> Path | None:
-    """Return the folder that an output names, None where it is a table; refuse what does not go with it."""
+    """Return the output if it is a folder, None if it is a table; raise ValueError where an option contradicts it."""
     if subjects is not None and out is None:
         raise ValueError("--subjects is for the table: give its name with -o")
     if out is None or (out.suffix and not out.is_dir()):
@@ -191,14 +194,13 @@ def _choose_folder(out: Path | None, labels: bool, subjects: Path | None) -> Pat
 
 @contextmanager
 def _keep_tiles(store: Path | None) -> Iterator[None]:
-    """Keep a folder of finished tiles while the command is at work, and where a signal or an error ends it."""
+    """Delete the folder of finished tiles once the block succeeds; after a signal or an error it stays, to resume."""
     from curvafit.core.files import is_empty, remove
 
-    saved = store is not None and store.exists
-    with resumable(lambda: "the same command" if saved and saved() else ""):
+    with resumable(lambda: "the same command" if store is not None and store.exists() else ""):
         try:
             yield
-        except ValueError:
+        except ValueError:  # raised before the first tile: there is nothing to resume
             if store is not None and store.is_dir() and is_empty(store):
                 remove(store)
             raise
@@ -206,29 +208,30 @@ def _keep_tiles(store: Path | None) -> Iterator[None]:
         remove(store)
 
 
-def _print_measured(found: Sequence[tuple[Measures, ...]], labels: bool) -> None:
-    """Print the notes and the numbers of scans and compartments, or of the bodies of label images."""
-    for measures in found:
-        if len(found) > 1:
-            say(measures[0].source, style="bold")
+def _print_results(results: Sequence[tuple[Measures, ...]], labels: bool) -> None:
+    """Print notes and measures of each scan and its compartments; with `labels` a summary of each image's instances."""
+    for of_scan in results:
+        if len(results) > 1:
+            say(of_scan[0].source, style="bold")
         if labels:
-            _print_instances(measures)
+            _print_instances(of_scan)
             continue
-        parts = list(measures[0].compartments.values()) or measures
-        say_notes(dict.fromkeys(note for part in parts for note in part.notes))
-        for part in parts:
-            _print_measures(part)
+        compartments = list(of_scan[0].compartments.values()) or of_scan
+        say_notes(dict.fromkeys(note for measures in compartments for note in measures.notes))
+        for measures in compartments:
+            _print_measures(measures)
 
 
 def _print_instances(instances: Sequence[Measures]) -> None:
-    """Print the least, the median and the greatest of each number of instances."""
+    """Print the least, the median and the greatest value of each quantity of instances."""
     from curvafit.core.units import format_number, power_name
 
     rows = []
-    for same in zip(*(instance.quantities for instance in instances), strict=True):
-        values = sorted(each.value for each in same if math.isfinite(each.value)) or [math.nan]
-        shown = (format_number(each, 4) for each in (values[0], median(values), values[-1]))
-        rows.append((same[0].name, same[0].symbol, *shown, power_name(instances[0].unit, same[0].power)))
+    for k, quantity in enumerate(instances[0].quantities):
+        values = [instance.quantities[k].value for instance in instances]
+        known = sorted(filter(math.isfinite, values)) or [math.nan]
+        figures = (format_number(value, 4) for value in (known[0], median(known), known[-1]))
+        rows.append((quantity.name, quantity.symbol, *figures, power_name(instances[0].unit, quantity.power)))
     print_table(("", "", "least", "median", "greatest", "unit"), rows, right=(2, 3, 4))
     cut = sum(instance["S.cut"].value > 0 for instance in instances)
     thin = sum(math.isnan(instance["H"].value) for instance in instances)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace files that another command wrote.")]
 
 
-#: Parameters of commands that are volumes to read, and those that are laws.
+#: Parameters of commands that are volumes to read; those that are laws, each with the name of its option.
 _VOLUMES = ("scan", "scans", "slices", "roi", "image", "example", "example_probabilities", "like",
             "like_mask")  # fmt: skip
 _LAWS = {"preset": "preset", "prior": "prior", "laws": "preset"}
@@ -41,25 +41,24 @@ def command(*examples: str) -> Callable[[Callable[..., None]], Callable[..., Non
     """
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
-        own = inspect.signature(function, eval_str=True).parameters
-        makers = {name: maker for name, each in own.items() if (maker := _maker_of(each.annotation)) is not None}
-        groups = {name: inspect.signature(maker, eval_str=True).parameters for name, maker in makers.items()}
+        parameters = inspect.signature(function, eval_str=True).parameters
+        makers = {name: make for name, value in parameters.items() if (make := _maker_of(value.annotation)) is not None}
+        groups = {name: inspect.signature(make, eval_str=True).parameters for name, make in makers.items()}
 
         @functools.wraps(function)
         def run(**arguments: Any) -> None:
             with plain_errors():
-                inputs = dict(arguments)
-                for name, options in groups.items():
-                    given = {option: arguments.pop(option) for option in options}
-                    inputs, arguments[name] = inputs | given, makers[name](**given)
-                _check_inputs(inputs)
+                values = dict(arguments)
+                for name, make in makers.items():
+                    arguments[name] = make(**{option: arguments.pop(option) for option in groups[name]})
+                _check_inputs(values)
                 function(**arguments)
 
-        parameters = [each for name in own for each in groups.get(name, {name: own[name]}).values()]
-        keywords = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
-        # typer reads the options of a command from these two.
+        # typer reads a command's options from signature and annotations: these list a group's options in its place.
+        options = [option for name in parameters for option in groups.get(name, {name: parameters[name]}).values()]
+        keywords = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
         run.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
-        run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+        run.__annotations__ = {option.name: option.annotation for option in options}
         run.examples = "\n\n".join(["[bold]Examples[/bold]", *examples]) if examples else None  # type: ignore[attr-defined]
         return run
 
@@ -74,27 +73,27 @@ class Group(NamedTuple):
 
 def _maker_of(annotation: Any) -> Callable[..., Any] | None:
     """Return the function that makes the value of a group of options; None for a single option."""
-    return next((part.make for part in get_args(annotation)[1:] if isinstance(part, Group)), None)
+    return next((extra.make for extra in get_args(annotation)[1:] if isinstance(extra, Group)), None)
 
 
-def _check_inputs(arguments: Mapping[str, Any]) -> None:
-    """Raise an error where a volume is missing or a law is none, before libraries are imported that need it."""
+def _check_inputs(values: Mapping[str, Any]) -> None:
+    """Raise an error if an option names a missing volume or an unknown law, before slow libraries are imported."""
     from curvafit.core.files import is_url
 
-    for given in filter(None, map(arguments.get, _VOLUMES)):
-        for path in map(str, given if isinstance(given, list) else [given]):
-            file = path.rpartition("::")[0] or path
+    for volumes in filter(None, map(values.get, _VOLUMES)):
+        for path in map(str, volumes if isinstance(volumes, list) else [volumes]):
+            file = path.rpartition("::")[0] or path  # without the key of an array, as in file.h5::key
             if not (os.path.exists(path) or os.path.exists(file) or is_url(path)):
                 raise FileNotFoundError(f"no such file: {file}")
     from curvafit.core.checks import quoted, simplify_name
     from curvafit.priors.published import PUBLISHED
 
-    for argument, name in _LAWS.items():
-        given = arguments.get(argument)
-        for law in [] if given is None or given.endswith(".json") else given.split(","):
-            if simplify_name(law) not in PUBLISHED and not law.endswith(".json") and not os.path.isfile(str(given)):
-                names = ", ".join(PUBLISHED)
-                raise ValueError(f"--{name} takes a preset among {names}, or a fit.json, got {quoted(law)}")
+    for parameter, option in _LAWS.items():
+        text = values.get(parameter)
+        for law in [] if text is None or text.endswith(".json") else text.split(","):
+            if simplify_name(law) not in PUBLISHED and not law.endswith(".json") and not os.path.isfile(text):
+                presets = ", ".join(PUBLISHED)
+                raise ValueError(f"--{option} takes a preset among {presets}, or a fit.json, got {quoted(law)}")
 
 
 def add_commands(app: typer.Typer, *functions: Callable[..., None]) -> None:
@@ -104,7 +103,7 @@ def add_commands(app: typer.Typer, *functions: Callable[..., None]) -> None:
 
 
 def add_gone(app: typer.Typer, name: str, instead: str) -> None:
-    """Add a hidden command that refuses whatever is typed, and says what to type instead."""
+    """Add a hidden command that accepts any arguments, and fails with the advice what to type instead."""
 
     @app.command(name, hidden=True, context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
     @command()
@@ -176,7 +175,7 @@ def parse_working(
     tile: Annotated[int | None, _work(help="Side of a tile or block in voxels: large files have some.", min=8)] = None,
     workers: Annotated[int | None, _work(help="Processes for tiles; by default this one.", min=0)] = None,
 ) -> dict[str, Any]:
-    """Return how a volume is worked on, as `curvafit.segmentation.Working` takes it."""
+    """Return the options of a flow and its tiles, as `curvafit.segmentation.Working` takes them."""
     return {"epsilon": epsilon, "steps": steps, "tile": tile, "workers": workers}
 
 
@@ -248,14 +247,15 @@ def parse_whole_triple(text: str, option: str) -> tuple[int, int, int]:
 
 
 def parse_whole_numbers(text: str, option: str) -> tuple[int, ...]:
-    """Return a text as whole numbers from 0, of 64 bits too."""
+    """Return a text as whole numbers from 0."""
+    # Digits alone are read as integers, as a float does not hold the labels of 64 bits.
     if all(part.strip().isdecimal() for part in text.split(",")):
         return tuple(map(int, text.split(",")))
     return _round(parse_numbers(text, option, text.count(",") + 1), option)
 
 
 def _round(values: tuple[float, ...], option: str) -> tuple[int, ...]:
-    """Return numbers as whole ones, or raise ValueError where they are not whole or negative."""
+    """Return numbers as integers; raise ValueError where one is negative or not whole."""
     if min(values) < 0 or any(value != int(value) for value in values):
         raise ValueError(f"{option} must be whole numbers from 0, got {', '.join(f'{value:g}' for value in values)}")
     return tuple(int(value) for value in values)

@@ -25,7 +25,7 @@ def list_samples(context: typer.Context) -> None:
     if context.invoked_subcommand is None:
         from curvafit.data_synth.samples import list_samples
 
-        print_table(("name", "what", "licence", "source"), [(name, *about) for name, about in list_samples().items()])
+        print_table(("name", "what", "licence", "source"), [(name, *facts) for name, facts in list_samples().items()])
 
 
 @command("curvafit infer $(curvafit samples get bone) -o bone")
@@ -37,9 +37,9 @@ def get_sample(
     """Download a sample once, check it, and print its path."""
     from curvafit.data_synth.samples import fetch, list_samples
 
-    if name in (about := list_samples()):
-        what, licence, source = about[name]
-        say(f"{name}: {what}; licence {licence}; {source}", to=error_console())
+    if name in (samples := list_samples()):
+        description, licence, source = samples[name]
+        say(f"{name}: {description}; licence {licence}; {source}", to=error_console())
     path = fetch(name)
     say(str(path if out is None else _copy_to(path, out, overwrite)))
 
@@ -69,15 +69,16 @@ def demo(
                 raise
             say(f"{error}; taking the synthetic scan", to=error_console())
             path = fetch(SYNTHETIC)
-        page, found = write_demo(load(path), out, seed=seed, overwrite=overwrite, progress=progress)
-    plain = max(value for way, value in found.dice.items() if way != "curvafit")
-    own = found.dice["curvafit"]
-    say(f"Filled from every {EVERY}th slice: Dice {own:.3f}; by the best plain interpolation {plain:.3f}.")
+        page, completion = write_demo(load(path), out, seed=seed, overwrite=overwrite, progress=progress)
+    dice = dict(completion.dice)
+    network = dice.pop("curvafit")
+    plain = max(dice.values())
+    say(f"Filled from every {EVERY}th slice: Dice {network:.3f}; by the best plain interpolation {plain:.3f}.")
     say(str(page))
 
 
 def _copy_to(path: Path, target: Path, overwrite: bool) -> Path:
-    """Copy a sample to a target, whose suffix must be the sample's."""
+    """Copy a sample to a file or into a folder; raise ValueError where a file's suffix is not the sample's."""
     from curvafit.core.files import write_atomically
     from curvafit.core.records import can_write
 
@@ -85,9 +86,8 @@ def _copy_to(path: Path, target: Path, overwrite: bool) -> Path:
     suffix = path.name[path.name.index(".") :]
     if not target.name.lower().endswith(suffix):
         raise ValueError(f"the name of this sample must end in {suffix}, got {target.name!r}")
-
-    def is_same(there: Path) -> bool:
-        return there.is_file() and filecmp.cmp(path, there, shallow=False)
-
-    can_write(target, is_same, inputs=[path], overwrite=overwrite)
+    # An earlier copy of the sample may be replaced without `overwrite`.
+    can_write(
+        target, lambda old: old.is_file() and filecmp.cmp(path, old, shallow=False), inputs=[path], overwrite=overwrite
+    )
     return write_atomically(target, lambda temporary: shutil.copyfile(path, temporary))

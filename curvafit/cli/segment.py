@@ -41,7 +41,7 @@ def parse_network(
     example_probabilities: Annotated[Path | None, _what(help="The network's probabilities for the example.")] = None,
     like: Annotated[Path | None, _what(help="Image of the same voxels; by default one of the NPZ's name.")] = None,
 ) -> dict[str, Any]:
-    """Return what `segment` is to know of a network's output; raise ValueError where options do not go together."""
+    """Return the options on a network's output, by name; raise ValueError where they do not go together."""
     if (example is None) != (example_probabilities is None):
         raise ValueError("--example and --example-probabilities go together, got one of them")
     kind: bool | str = "logits" if logits else probabilities
@@ -65,22 +65,16 @@ def parse_known(
         raise ValueError("give either --every and --known, which slices are known, or --ignore, what is not")
     if every is None and first is not None:
         raise ValueError(f"--first {first} goes with --every")
-    numbers = None if known is None else list(parse_whole_numbers(known, "--known"))
+    slices = None if known is None else list(parse_whole_numbers(known, "--known"))
     rhythm = every if first is None else slice(first, None, every)
-    return {
-        "every": rhythm,
-        "known": numbers,
-        "ignore": ignore,
-        "axis": "zyx".index(axis.lower()),
-        "periodic": periodic,
-    }
+    return {"every": rhythm, "known": slices, "ignore": ignore, "axis": "zyx".index(axis.lower()), "periodic": periodic}
 
 
 def parse_labels(
     labels: Annotated[str | None, _what(help="Several structures: all, or their labels, 1,2,5; writes labels.")] = None,
     instances: Annotated[bool | None, _what(help="Labels are of one kind, such as cells; by default as drawn.")] = None,
 ) -> dict[str, Any] | None:
-    """Return which structures are filled, as `reconstruct_labels` takes it; None for one."""
+    """Return the options of `reconstruct_labels` on labels, and their text; None where one structure is filled."""
     if labels is None:
         if instances is not None:
             raise ValueError("--instances goes with --labels and --image")
@@ -94,7 +88,7 @@ def parse_learning(
     example: Annotated[Path | None, _what(help="Mask of another such volume: it tunes the network.")] = None,
     filler: Annotated[Path | None, _what(help="Weights of `curvafit atlas teach`, not the packaged ones.")] = None,
 ) -> dict[str, str | None]:
-    """Return the files from which is learned what lies between slices."""
+    """Return the paths of the files that improve the filling, by name."""
     paths = {"image": image, "example": example, "filler": filler}
     return {name: None if path is None else str(path) for name, path in paths.items()}
 
@@ -128,30 +122,26 @@ def segment(
     from curvafit.volumes.read import load
 
     kind, example = network["kind"], network["example"]
-    split: dict[str, Any] = {"threshold": parse_threshold(threshold), "dark": dark}
-    check_given(kind, weight, example, **split, label=reading["label"])
+    phases: dict[str, Any] = {"threshold": parse_threshold(threshold), "dark": dark}
+    check_given(kind, weight, example, **phases, label=reading["label"])
     options: dict[str, Any] = {"weight": weight}
     record = {"job": "segment", **options, **_without(working, "workers")}
     if not kind:
-        job = _Job(scan, out, prior, reading, {**record, **split}, overwrite)
-        _run(
-            job,
-            partial(segment_scan, prior=prior, **options, **split),
-            partial(load, scan, **reading, lazy=True),
-            working,
-        )
+        job = _Job(scan, out, prior, reading, {**record, **phases}, overwrite)
+        compute = partial(segment_scan, prior=prior, **options, **phases)
+        _run(job, compute, partial(load, scan, **reading, lazy=True), working)
         return
-    texts = {name: None if path is None else str(path) for name, path in _without(network, "kind").items()}
-    record |= {"probabilities": kind, **texts}
-    jobs, read = _list_maps(_Job(scan, out, prior, reading, record, overwrite), texts)
+    files = {name: None if path is None else str(path) for name, path in _without(network, "kind").items()}
+    record |= {"probabilities": kind, **files}
+    jobs, read = _list_jobs(_Job(scan, out, prior, reading, record, overwrite), files)
     if example is not None:
-        chances = read(network["example_probabilities"], like=None, crop=None)
+        probabilities = read(network["example_probabilities"], like=None, crop=None)
         mask = load(example, **{name: reading[name] for name in ("spacing", "unit", "label", "strict")})
-        say_notes((*chances.notes, *mask.notes))
+        say_notes((*probabilities.notes, *mask.notes))
         with show_stages() as progress:
-            learned = calibrate(chances, mask, prior, working=Settings(**working), progress=progress)
-        options["example"] = learned
-        jobs = [replace(job, record={**job.record, "calibration": learned.as_dict()}) for job in jobs]
+            calibration = calibrate(probabilities, mask, prior, working=Settings(**working), progress=progress)
+        options["example"] = calibration
+        jobs = [replace(job, record={**job.record, "calibration": calibration.as_dict()}) for job in jobs]
     for job in jobs:
         compute = partial(segment_scan, prior=prior, probabilities=True, **options)
         _run(job, compute, partial(read, job.source), working)
@@ -161,33 +151,34 @@ def _without(options: Mapping[str, Any], name: str) -> dict[str, Any]:
     return {key: value for key, value in options.items() if key != name}
 
 
-def _list_maps(job: _Job, given: dict[str, str | None]) -> tuple[list[_Job], Callable[..., Volume]]:
-    """Return a job for a map of probabilities, or for each of a folder of NPZ files, and what reads a map. All are read
-    before the first work, which may take minutes, so that what is none is refused."""
+def _list_jobs(job: _Job, files: dict[str, str | None]) -> tuple[list[_Job], Callable[..., Volume]]:
+    """Return a job for each probability map, of which a folder of NPZ files has several, and a function to read one.
+
+    Every map is read once here, so that a bad one is refused before the first job, which may take minutes.
+    """
     from curvafit.segmentation.evidence import find_image, load_probabilities, probability_evidence
     from curvafit.segmentation.slices import check_spacing
 
-    like, reading, kind = given["like"], job.reading, job.record["probabilities"]
+    like, reading = files["like"], job.reading
     maps = sorted(Path(job.source).glob("*.npz")) if Path(job.source).is_dir() else []
-    files = {str(path): job.out / f"{path.stem}.nii.gz" for path in maps} or {job.source: job.out}
-    if like is not None and len(files) > 1:
+    targets = {str(path): job.out / f"{path.stem}.nii.gz" for path in maps} or {job.source: job.out}
+    if like is not None and len(targets) > 1:
         raise ValueError("--like is for one file; images of a folder lie beside its NPZ files")
-    has_place = reading["spacing"] is not None or reading["unit"] is not None
-    images = {source: like or (None if has_place else find_image(source)) for source in files}
-    inputs = [path for path in (*files, *images.values(), *given.values()) if path is not None]
-    jobs = [
-        replace(job, source=source, out=target, inputs=inputs, image=images[source]) for source, target in files.items()
-    ]
-    for each in jobs:
-        each.check()
-    place = {name: value for name, value in reading.items() if name != "label"}
-    read = partial(load_probabilities, **place, like=like, logits=kind == "logits")
-    example = None if (path := given["example_probabilities"]) is None else read(path, like=None, crop=None)
-    for each in jobs:
-        field = read(each.source)
-        probability_evidence(field)
+    has_spacing = reading["spacing"] is not None or reading["unit"] is not None
+    images = {path: like or (None if has_spacing else find_image(path)) for path in targets}
+    inputs = [path for path in (*targets, *images.values(), *files.values()) if path is not None]
+    jobs = [replace(job, source=path, out=out, inputs=inputs, image=images[path]) for path, out in targets.items()]
+    for map_job in jobs:
+        map_job.check()
+    logits = job.record["probabilities"] == "logits"
+    read = partial(load_probabilities, **_without(reading, "label"), like=like, logits=logits)
+    example_file = files["example_probabilities"]
+    example = None if example_file is None else read(example_file, like=None, crop=None)
+    for map_job in jobs:
+        probabilities = read(map_job.source)
+        probability_evidence(probabilities)  # raises an error where values are not probabilities
         if example is not None:
-            check_spacing(example, field, "the probabilities")
+            check_spacing(example, probabilities, "the probabilities")
     return jobs, read
 
 
@@ -221,28 +212,29 @@ def reconstruct(
     if several is not None and several["instances"] is not None and learning["image"] is None:
         raise ValueError("--instances goes with --labels and --image")
     filler, every = learning["filler"], which["every"]
-    shown = _without(learning, "filler")
-    record: dict[str, Any] = {"job": "reconstruct", "sure": sure, "suggest": suggest, **which, **shown}
+    volume_files = _without(learning, "filler")
+    record: dict[str, Any] = {"job": "reconstruct", "sure": sure, "suggest": suggest, **which, **volume_files}
     record |= {"filler": filler, "stiffness": stiffness, **_without(working, "workers")}
+    # JSON has no slices: their step and start are recorded.
     record |= {"every": every.step, "first": every.start} if isinstance(every, slice) else {"first": 0}
     record |= {} if several is None else _without(several, "chosen")
     inputs = [path for path in learning.values() if path is not None]
     maps = ("probability",) if sure is None else ("probability", "sure")
 
-    def compute(volume: Volume, **tools: Any) -> Segmentation:
+    def compute(volume: Volume, **options: Any) -> Segmentation:
         from curvafit.segmentation.labels import reconstruct_labels
         from curvafit.segmentation.reconstruction import reconstruct as fill
 
-        alike = {"example": ("spacing", "unit", "label", "strict"), "image": ("spacing", "unit", "crop")}
-        for name, path in shown.items():
+        # The options of reading that hold for each file as they do for the slices.
+        shared = {"example": ("spacing", "unit", "label", "strict"), "image": ("spacing", "unit", "crop")}
+        for name, path in volume_files.items():
             if path is not None:
-                tools[name] = load(path, **{option: reading[option] for option in alike[name]})
-                say_notes(tools[name].notes)
-        volume = volume if sure is None else volume.load()
-        tools |= {**which, "suggest": suggest}
-        if several is None:
-            return fill(volume, prior, **tools)
-        return reconstruct_labels(volume.load(), prior, **_without(several, "labels"), **tools)
+                options[name] = load(path, **{option: reading[option] for option in shared[name]})
+                say_notes(options[name].notes)
+        options |= {**which, "suggest": suggest}
+        if several is not None:
+            return reconstruct_labels(volume.load(), prior, **_without(several, "labels"), **options)
+        return fill(volume if sure is None else volume.load(), prior, **options)
 
     job = _Job(slices, out, prior, reading, record, overwrite, inputs, maps)
     working |= {"filler": filler, "stiffness": stiffness}
@@ -275,7 +267,7 @@ class _Job:
 
     @property
     def content(self) -> dict[str, Any]:
-        """What the mask's record says of the command."""
+        """What the mask's record states on the command."""
         return {"command": command_line(), "prior": self.prior, **self.record}
 
 
@@ -283,7 +275,7 @@ def _run(
     job: _Job, compute: Callable[..., Segmentation], read: Callable[[], Volume], working: dict[str, Any],
     sure: float | None = None,
 ) -> None:  # fmt: skip
-    """Check, read, compute, write and print. Finished tiles are kept beside the output until it is written."""
+    """Compute a volume's mask and write it; finished tiles are kept until then. `sure` adds labels to train with."""
     from curvafit.core.files import remove
     from curvafit.segmentation.flow import Working
     from curvafit.segmentation.result import hidden_store, write_mask
@@ -294,23 +286,23 @@ def _run(
     with show_stages() as progress:
         progress("reading", 0.0)
         volume = read()
-        job.check(volume)  # again, as a format may not hold the unit
+        job.check(volume)  # again: only now is the unit known, which the output's format may not hold
         if record.get("labels"):
             volume = volume.load()
             check_labels(job.out, volume)
-        not_held = note_lost(job.out, volume)
-        say_notes(not_held)
+        lost = note_lost(job.out, volume)  # what the output's format does not hold
+        say_notes(lost)
         store = hidden_store(job.out)
         with resumable(lambda: "the same command" if store.exists() else ""):
             result = compute(volume, progress=progress, working=Working(**working, store=store))
             progress("writing", 1.0)
             sure_labels = None if sure is None else result.keep_sure(sure)
             result = result if sure_labels is None else replace(result, notes=(*result.notes, *sure_labels.notes))
-            # The header is kept where it says where the voxels are; one of a file of channels is of all of them.
-            place_options = ("spacing", "crop") if job.image else ("spacing", "crop", "channel", "time")
-            like = (job.image or job.source) if all(reading[name] is None for name in place_options) else None
+            # The mask gets the source's header unless an option of reading makes that wrong for its voxels.
+            changing = ("spacing", "crop") if job.image else ("spacing", "crop", "channel", "time")
+            like = (job.image or job.source) if all(reading[name] is None for name in changing) else None
             settings = {"sure": sure_labels, "like": like, "unit": reading["unit"], "overwrite": job.overwrite}
-            settings["record"] = job.content | ({"not_held": not_held} if not_held else {})
+            settings["record"] = job.content | ({"not_held": lost} if lost else {})
             paths = write_mask(result, volume, job.out, **settings)
         remove(store)
     for note in result.notes:

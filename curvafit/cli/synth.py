@@ -40,9 +40,9 @@ def parse_shapes(
     volume_fraction: Annotated[float | None, _what(help="Share of the volume inside; by default the fit's.")] = None,
     draws: Annotated[int | None, _what(help="Laws drawn from each fit's posterior, in place of its best.")] = None,
 ) -> dict[str, Any]:
-    """Return which shapes are shown."""
+    """Return the options on the source of shapes, by name."""
     names = [] if laws is None else laws.split(",")
-    return {"laws": names, "atlas": atlas, "filled": volume_fraction, "draws": draws}
+    return {"laws": names, "atlas": atlas, "volume_fraction": volume_fraction, "draws": draws}
 
 
 def parse_composition(
@@ -50,9 +50,9 @@ def parse_composition(
     wall: Annotated[float | None, _show(help="Shells: thickness of a wall around a lumen, in --unit.")] = None,
     levels: Annotated[str | None, _show(help="Light of each class: 0 as background, 1 as structure.")] = None,
 ) -> dict[str, Any]:
-    """Return what an image shows of its shapes."""
-    lights = None if levels is None else tuple(parse_numbers(levels, "--levels", levels.count(",") + 1))
-    return {"classes": classes, "wall": wall, "levels": lights}
+    """Return the options on classes, walls and light levels in an image, by name."""
+    light_levels = None if levels is None else tuple(parse_numbers(levels, "--levels", levels.count(",") + 1))
+    return {"classes": classes, "wall": wall, "levels": light_levels}
 
 
 def parse_imaging(
@@ -61,7 +61,7 @@ def parse_imaging(
     like_mask: Annotated[str | None, _image(help="Mask of the structure in --like, for better estimates.")] = None,
     visible: Annotated[str | None, _image(help="Masks as seen: where this share of light arrives, or auto.")] = None,
 ) -> dict[str, Any]:
-    """Return how shapes are imaged."""
+    """Return the options on imaging, by name."""
     return {"name": modality, "like": like, "mask": like_mask, "visible": visible}
 
 
@@ -101,24 +101,24 @@ def synth(
         if voxel is None and wall is None:
             raise ValueError("--unit needs --spacing, --voxel or --wall")
         reading["unit"] = None  # it is that of --voxel and --wall, not of --like
-    source, sized = _choose_source(**shapes)
+    source, laws = _choose_source(**shapes)
     if composition["classes"] and shapes["draws"] is not None:
         raise ValueError("--classes takes one law for each class: leave out --draws")
-    kind = _choose_modality(**imaging, reading=reading)
+    modality = _choose_modality(**imaging, reading=reading)
     from curvafit.core.files import check_folder
     from curvafit.core.units import convert_length
     from curvafit.data_synth import sets
     from curvafit.data_synth.dataset import Composition, Recipe
     from curvafit.data_synth.sources import choose_voxel
 
-    edge = choose_voxel(sized, kind) if voxel is None else convert_length(voxel, unit, kind.base.unit)
-    thickness = None if wall is None else convert_length(wall, unit, kind.base.unit)
-    shown = Composition(composition["classes"], thickness, composition["levels"])
-    recipe = Recipe(source, kind, sampling["shape"], edge, seed, sampling["calibres"], shown)
+    edge = choose_voxel(laws, modality) if voxel is None else convert_length(voxel, unit, modality.base.unit)
+    thickness = None if wall is None else convert_length(wall, unit, modality.base.unit)
+    content = Composition(composition["classes"], thickness, composition["levels"])
+    recipe = Recipe(source, modality, sampling["shape"], edge, seed, sampling["calibres"], content)
     spec = sets.SetSpec(recipe, layout, tuple(labels.split(",")) if labels else ())
     check_folder(out)
     sets.check_set(out, spec)
-    if source.edge == math.inf:
+    if source.edge == math.inf:  # shapes are grown at any size, not cropped from a store
         crew.check_memory(recipe.largest)
     with crew.start() as (workers, progress):
         sets.build_set(out, spec, count, progress, workers=workers)
@@ -129,34 +129,33 @@ def synth(
 
 
 def _choose_source(
-    laws: list[str], atlas: Path | None, filled: float | None, draws: int | None
+    laws: list[str], atlas: Path | None, volume_fraction: float | None, draws: int | None
 ) -> tuple[ShapeSource, list[Any]]:
-    """Return the source of shapes that the options name, and the laws whose fits tell how large a voxel is."""
+    """Return the source of shapes that the options name, and the laws whose fits state the size of a voxel."""
     if bool(laws) == (atlas is not None):
         raise ValueError(f"give either --prior (or --preset) or --atlas, got {'both' if laws else 'neither'}")
     from curvafit.data_synth.sources import Generated, Stored
 
     if atlas is None and draws is None:
-        return Generated.of(laws, filled), laws
+        return Generated.of(laws, volume_fraction), laws
     if atlas is None:
-        return _draw_source(laws, filled, int(draws or 0))
+        return _draw_source(laws, volume_fraction, int(draws or 0))
     if draws is not None:
         raise ValueError("--draws is for fits, not for an atlas")
     if atlas.suffix.lower() != ".npz":
-        if filled is not None:
+        if volume_fraction is not None:
             raise ValueError("--volume-fraction is for shapes that are grown, not for those of a store")
         return Stored((atlas.resolve(),)), []
     from curvafit.inference.atlas import load_atlas
 
     shapes = load_atlas(atlas)
-    points = tuple(
-        (*map(float, row), float(mass)) for row, mass in zip(shapes.coefficients, shapes.masses, strict=True)
-    )
-    return Generated(points, shapes.ids, fraction=filled), []
+    parameters = zip(shapes.coefficients, shapes.masses, strict=True)
+    points = tuple((*map(float, coefficients), float(mass)) for coefficients, mass in parameters)
+    return Generated(points, shapes.ids, fraction=volume_fraction), []
 
 
-def _draw_source(laws: list[str], filled: float | None, count: int) -> tuple[ShapeSource, list[Any]]:
-    """Return the source of shapes of laws from a fit's posterior, and the law with a voxel of their median edge."""
+def _draw_source(laws: list[str], volume_fraction: float | None, count: int) -> tuple[ShapeSource, list[Any]]:
+    """Draw `count` laws from a fit's posterior; return the source of their shapes, and a law of median voxel edge."""
     from statistics import median
 
     from curvafit.data_synth.sources import Generated
@@ -164,10 +163,11 @@ def _draw_source(laws: list[str], filled: float | None, count: int) -> tuple[Sha
 
     if len(laws) > 1:
         raise ValueError(f"--draws takes one fit, got {len(laws)}")
-    drawn = draw_laws(laws[0], count)
-    edges = [float(law.working_voxel or 1.0) for law in drawn]
-    scales = tuple(edge / median(edges) for edge in edges)
-    return replace(Generated.of(drawn, filled), scales=scales), [replace(drawn[0], working_voxel=median(edges))]
+    draws = draw_laws(laws[0], count)
+    edges = [float(law.working_voxel or 1.0) for law in draws]
+    scales = tuple(edge / median(edges) for edge in edges)  # so that each law's shapes keep their own size
+    source = replace(Generated.of(draws, volume_fraction), scales=scales)
+    return source, [replace(draws[0], working_voxel=median(edges))]
 
 
 def _choose_modality(
@@ -180,21 +180,20 @@ def _choose_modality(
     if (name is None) == (like is None):
         raise ValueError(f"give either --modality or --like, got {'neither' if name is None else 'both'}")
     if like is None:
-        given = {**reading, "like_mask": mask}
-        extras = [name for name, value in given.items() if value is not None and value is not False]
-        if extras:
-            raise ValueError(f"--{extras[0].replace('_', '-')} needs --like")
-        from curvafit.data_synth.imaging.modality import modality
+        for option, value in {**reading, "like_mask": mask}.items():
+            if value is not None and value is not False:
+                raise ValueError(f"--{option.replace('_', '-')} needs --like")
+        from curvafit.data_synth.imaging.modality import modality as named_modality
 
-        kind = modality(str(name))
+        modality = named_modality(str(name))
     else:
-        kind = _fit_to_scan(like, mask, reading)
+        modality = _fit_to_scan(like, mask, reading)
     if visible is None:
-        return kind
+        return modality
     from curvafit.data_synth.imaging.modality import annotator_threshold
 
-    share = annotator_threshold(kind.base) if visible == "auto" else parse_numbers(visible, "--visible", 1)[0]
-    return replace(kind, base=replace(kind.base, visible=share))
+    share = annotator_threshold(modality.base) if visible == "auto" else parse_numbers(visible, "--visible", 1)[0]
+    return replace(modality, base=replace(modality.base, visible=share))
 
 
 def _fit_to_scan(like: str, mask: str | None, reading: dict[str, Any]) -> Modality:
@@ -206,11 +205,11 @@ def _fit_to_scan(like: str, mask: str | None, reading: dict[str, Any]) -> Modali
 
     if reading["label"] is not None and mask is None:
         raise ValueError("--label needs --like-mask: it is a value of that mask")
-    scan, inside = load(like, **{**reading, "label": None}), None
+    scan = load(like, **{**reading, "label": None})
     say_notes(scan.notes)
-    if mask is not None:
-        values = load(mask, **{name: reading[name] for name in ("spacing", "unit", "label", "crop", "strict")}).values
-        if (kinds := len(np.unique(values))) != 2:
-            raise ValueError(f"--like-mask must have two values, got {kinds}: choose one with --label")
-        inside = values > values.min()
-    return fit_modality(scan, inside)
+    if mask is None:
+        return fit_modality(scan, None)
+    values = load(mask, **{name: reading[name] for name in ("spacing", "unit", "label", "crop", "strict")}).values
+    if (count := len(np.unique(values))) != 2:
+        raise ValueError(f"--like-mask must have two values, got {count}: choose one with --label")
+    return fit_modality(scan, values > values.min())
