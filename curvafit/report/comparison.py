@@ -55,13 +55,14 @@ def write_comparison(
     others are a ValueError without `overwrite`. `command` is what the record calls the command line.
     """
     target = check_comparison(directory, overwrite=overwrite, command=command)
-    c, label, tests = comparison, "group" if comparison.groups else "number", list(_test_rows(comparison))
-    tried = {"seed": c.options["seed"], "permutations": c.permutations}
-    record = start_record(command, unit=c.unit, options=c.options, status=c.status, notes=c.notes, **tried)
+    c, tests = comparison, list(_test_rows(comparison))
+    label = "group" if c.groups else "number"
+    permutation = {"seed": c.options["seed"], "permutations": c.permutations}
+    record = start_record(command, unit=c.unit, options=c.options, status=c.status, notes=c.notes, **permutation)
     record |= {"exact": c.exact, "p": c.p, "least_p": c.least, "by": c.by, "groups": list(c.groups)}
     record["scans"] = [
-        {"scan": each.source, "subject": case.subject, label: case.label, "kind": each.kind, "notes": list(each.notes)}
-        for each, case in zip(c.measures, c.cases, strict=True)
+        {"scan": scan.source, "subject": case.subject, label: case.label, "kind": scan.kind, "notes": list(scan.notes)}
+        for scan, case in zip(c.measures, c.cases, strict=True)
     ]
     record |= {"energy" if c.groups else "distance_correlation": c.statistic, "apart": c.apart, "within": c.within}
     record |= {"tests": tests, "methods": describe_methods(c)}
@@ -71,14 +72,14 @@ def write_comparison(
         "rows": [_format_row(number, c) for number in c.numbers], "level": f"{LEVEL:.2g}",
         "differs": bool(c.significant.any()),
     }  # fmt: skip
-    drawn = {
+    figures = {
         "difference": (comparison_figure(c), "Mean curvature diagrams and their difference"),
         "numbers": (numbers_figure(c), f"Each number by {c.by}"),
     }
-    whose = [{"subject": case.subject, label: case.label} for case in c.cases]
-    rows = (row for each, more in zip(c.measures, whose, strict=True) for row in each.rows(**more))
-    tables = {"measures.csv": rows, "numbers.csv": tests}
-    return write_study(target, FORMAT, FILES, record, page, tables, figures=drawn, shown=("command", "date", *tried))
+    columns = [{"subject": case.subject, label: case.label} for case in c.cases]
+    rows = (row for scan, more in zip(c.measures, columns, strict=True) for row in scan.rows(**more))
+    tables, shown = {"measures.csv": rows, "numbers.csv": tests}, ("command", "date", *permutation)
+    return write_study(target, FORMAT, FILES, record, page, tables, figures=figures, shown=shown)
 
 
 def describe_methods(comparison: Comparison) -> str:
@@ -103,32 +104,32 @@ def describe_measures(measures: Sequence[Measures], **values: Any) -> str:
 
 
 def _count_scans(comparison: Comparison) -> list[str]:
-    """Return each part's name with the numbers of its scans and subjects."""
-    side = dict(zip(comparison.subjects, comparison.sides.tolist(), strict=True))
-    scans = Counter(side[case.label, case.subject] for case in comparison.cases)
+    """Return the name of each group, or half of the numbers, with the counts of its scans and subjects."""
+    side_of = dict(zip(comparison.subjects, comparison.sides.tolist(), strict=True))
+    scans = Counter(side_of[case.label, case.subject] for case in comparison.cases)
     return [
-        f"{name} ({scans[k]} scans of {count} subjects)"
-        for k, (name, count) in enumerate(zip(comparison.parts, comparison.counts, strict=True))
+        f"{name} ({scans[side]} scans of {subjects} subjects)"
+        for side, (name, subjects) in enumerate(zip(comparison.parts, comparison.counts, strict=True))
     ]
 
 
 def _format_row(number: Number, comparison: Comparison) -> list[str]:
-    """Return a row of the page's table, of which some cells stand out where the number differs, all numbers tested.
+    """Return a number's row of the page's table; it stands out where its family-wise p is significant.
 
-    Its p values are the number's own, those corrected for all numbers (of the family, by Holm, by false discoveries);
-    then comes the share of the error that is known.
+    The p values are uncorrected, family-wise, of Holm, and of Benjamini and Hochberg; the known error comes last.
     """
     means = [
         f"{format_number(mean)} ± {format_number(sd, 2)}"
         for mean, sd in zip(number.means, number.deviations, strict=True)
     ]
     interval = "–" if math.isnan(number.low) else f"{format_number(number.low, 2)} to {format_number(number.high, 2)}"
-    holm, discovery = (format_number(each, 2) for each in (number.holm, number.discovery))
+    p, family, holm, discovery = (format_number(x, 2) for x in (number.p, number.family, number.holm, number.discovery))
+    difference, effect = format_number(number.difference), format_number(number.effect, 2)
+    if number.family <= LEVEL:
+        difference, effect, family = map(Chosen, (difference, effect, family))
     known = "–" if math.isnan(number.known) else "all" if number.known >= 1 else format_percent(number.known)
-    named = name_quantity(number.name, number.symbol, number.power, comparison.unit)
-    main = format_number(number.difference), format_number(number.effect, 2), format_number(number.family, 2)
-    difference, effect, family = map(Chosen, main) if number.family <= LEVEL else main
-    return [*named, *means, difference, effect, interval, format_number(number.p, 2), family, holm, discovery, known]
+    titles = name_quantity(number.name, number.symbol, number.power, comparison.unit)
+    return [*titles, *means, difference, effect, interval, p, family, holm, discovery, known]
 
 
 def name_quantity(name: str, symbol: str, power: int, unit: str) -> tuple[str, str]:
@@ -141,10 +142,10 @@ def name_quantity(name: str, symbol: str, power: int, unit: str) -> tuple[str, s
 
 
 def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
-    """Yield a row for each test: the diagrams', then each number's; None where there is no value."""
+    """Yield the row of the diagrams' test, then one for each number's; None where there is no value."""
     c, count = comparison, len(comparison.groups)
-    groups = [*ascii_lowercase, *range(27, 1 + count)][:count]  # a, b, … z, 27, 28, …
-    columns = ["quantity", "symbol", "unit", *(f"mean_{g}" for g in groups), *(f"sd_{g}" for g in groups)]
+    suffixes = [*ascii_lowercase, *range(27, 1 + count)][:count]  # of groups: a, b, … z, 27, 28, …
+    columns = ["quantity", "symbol", "unit", *(f"mean_{k}" for k in suffixes), *(f"sd_{k}" for k in suffixes)]
     effect = {"g": "g", "η": "eta", "r": "r"}[c.effect]
     columns += ["slope" if c.effect == "r" else "difference", effect, f"{effect}_low", f"{effect}_high"]
     columns += ["p", "p_family", "p_holm", "p_bh", "known_error"]
@@ -168,33 +169,31 @@ def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
 def comparison_figure(comparison: Comparison) -> Figure:
     """Return a figure of the mean curvature diagrams of groups, or halves of numbers, and their differences.
 
-    Of two the second less the first, of more each less the mean of all, by a number from the least to the greatest. The
-    outline holds the bins that differ significantly among all.
+    A difference is the second of two groups less the first; each of more groups less the mean of all; or the change
+    from the least number to the greatest. Outlines surround the bins that differ significantly, all tested.
     """
     c, names, edges = comparison, [plot.plain(name) for name in comparison.parts], comparison.edges
     limits, unit, window = (edges[0], edges[-1]), c.unit, plot.shown_window(c.diagrams)
-    one = len(c.differences) == 1
-    columns = 3 if one else min(len(names), ROW)
-    rows = 1 if one else 2 * math.ceil(len(names) / columns)
+    single = len(c.differences) == 1  # in one row with the two diagrams; else differences lie in rows of their own
+    columns = 3 if single else min(len(names), ROW)
+    rows = 1 if single else 2 * math.ceil(len(names) / columns)
     figure = plot.make_figure(13.2, 3.6 * rows * 3 / max(columns, 3), layout="constrained")
     for k, (name, diagram) in enumerate(zip(names, c.diagrams, strict=True)):
         axes = figure.add_subplot(rows, columns, k + 1)
         picture = plot.diagram_on(axes, diagram, limits=limits, unit=unit, window=window)
         axes.set_title(f"{name}, {c.counts[k]} subjects", fontsize=11, color=plot.GROUPS[k % len(plot.GROUPS)])
         _bar_on(axes, picture, format=FuncFormatter(lambda share, _: f"{100 * share:g}"))
-    p = f"p = {format_number(c.p, 2)}"
-    titles = [f"{names[1]} less {names[0]}, {p}"] if c.groups else [f"from the least to the most, {p}"]
-    titles = [f"{name} less all, {p}" for name in names] if len(names) > 2 else titles
-    shown = 100 * c.differences
-    most = max(float(np.abs(shown).max()), 1e-9)
-    for k, (title, difference) in enumerate(zip(titles, shown, strict=True)):
-        axes = figure.add_subplot(rows, columns, k + (3 if one else rows // 2 * columns + 1))
-        picture = axes.pcolormesh(
-            edges, edges, difference, cmap=MORE, norm=Normalize(-most, most), rasterized=True, zorder=0.5
-        )
+    titles = [f"{names[1]} less {names[0]}"] if c.groups else ["from the least to the most"]
+    titles = [f"{name} less all" for name in names] if len(names) > 2 else titles
+    percents = 100 * c.differences
+    greatest = max(float(np.abs(percents).max()), 1e-9)
+    colours: dict[str, Any] = {"cmap": MORE, "norm": Normalize(-greatest, greatest)}
+    for k, (title, difference) in enumerate(zip(titles, percents, strict=True)):
+        axes = figure.add_subplot(rows, columns, k + (3 if single else rows // 2 * columns + 1))
+        picture = axes.pcolormesh(edges, edges, difference, rasterized=True, zorder=0.5, **colours)
         plot.frame_diagram(axes, limits, unit, window)
         _outline_on(axes, edges, c.significant)
-        axes.set_title(title, fontsize=11)
+        axes.set_title(f"{title}, p = {format_number(c.p, 2)}", fontsize=11)
         _bar_on(axes, picture, ticks=MaxNLocator(4, symmetric=True))
     return figure
 
@@ -209,36 +208,37 @@ def _bar_on(axes: Axes, picture: QuadMesh, **options: Any) -> None:
 def _outline_on(axes: Axes, edges: np.ndarray, inside: np.ndarray) -> None:
     """Draw the border of a set of bins, bool (rows, columns), along the bins' edges."""
     lines = []
-    for turned, where in ((False, inside), (True, inside.T)):
-        rows, columns = np.nonzero(np.diff(np.pad(where, ((1, 1), (0, 0))).astype(int), axis=0))
+    for transposed, mask in ((False, inside), (True, inside.T)):  # first horizontal lines, then vertical ones
+        rows, columns = np.nonzero(np.diff(np.pad(mask, ((1, 1), (0, 0))).astype(int), axis=0))
         ends = np.stack([edges[columns], edges[columns + 1]], axis=1)
         level = np.repeat(edges[rows][:, None], 2, axis=1)
-        lines.append(np.stack([level, ends] if turned else [ends, level], axis=-1))
+        lines.append(np.stack([level, ends] if transposed else [ends, level], axis=-1))
     axes.add_collection(LineCollection(list(np.concatenate(lines)), colors=plot.INK, linewidths=1.2, zorder=3.5))
 
 
 def numbers_figure(comparison: Comparison) -> Figure:
     """Return a figure of each quantity: subjects by group or over the number, with the 95 % intervals of their scans.
 
-    A long line is a group's mean, or the fitted one; a thin line joins a subject's own where they are paired. The names
-    of quantities that differ significantly among all are bold.
+    A long line is a group's mean, or the regression line; a thin line joins the values of one subject in paired groups.
+    The names of quantities that differ significantly, all tested, are bold.
     """
     c = comparison
     figure, panels = _panels(c)
-    joined = [] if c.blocks is None else [np.flatnonzero(c.blocks == block) for block in np.unique(c.blocks)]
-    places = np.array(c.labels, dtype=float)
-    for group, count in enumerate(c.counts if c.groups and not joined else ()):
-        places[c.sides == group] += np.linspace(-0.18, 0.18, count)
+    pairs = [] if c.blocks is None else [np.flatnonzero(c.blocks == block) for block in np.unique(c.blocks)]
+    x = np.array(c.labels, dtype=float)
+    for group, count in enumerate(c.counts if c.groups and not pairs else ()):
+        x[c.sides == group] += np.linspace(-0.18, 0.18, count)  # side by side, so that intervals do not overlap
+    members = [c.sides == group for group in range(len(c.counts))] if c.groups else [np.ones(len(x), dtype=bool)]
     for k, (axes, number) in enumerate(zip(panels, c.numbers, strict=True)):
         values, halves = c.values[:, k], c.halves[:, k]
-        low = values - halves if number.symbol in plot.SIGNED else np.maximum(values - halves, 0)
-        for own in joined:
-            own = own[np.argsort(places[own])]
-            axes.plot(places[own], values[own], color=plot.QUIET, linewidth=0.8, zorder=1)
-        for group, colour in zip(range(len(c.counts)) if c.groups else (None,), itertools.cycle(plot.GROUPS)):
-            own = slice(None) if group is None else c.sides == group
-            axes.vlines(places[own], low[own], (values + halves)[own], color=colour, alpha=0.35, linewidth=1.4)
-            axes.plot(places[own], values[own], "o", color=colour, markersize=4, markeredgewidth=0)
+        low, high = values - halves, values + halves
+        low = low if number.symbol in plot.SIGNED else np.maximum(low, 0)
+        for pair in pairs:
+            pair = pair[np.argsort(x[pair])]
+            axes.plot(x[pair], values[pair], color=plot.QUIET, linewidth=0.8, zorder=1)
+        for inside, colour in zip(members, itertools.cycle(plot.GROUPS)):
+            axes.vlines(x[inside], low[inside], high[inside], color=colour, alpha=0.35, linewidth=1.4)
+            axes.plot(x[inside], values[inside], "o", color=colour, markersize=4, markeredgewidth=0)
         for group, mean in enumerate(number.means):
             axes.hlines(mean, group - 0.32, group + 0.32, color=plot.INK, linewidth=1.4)
         if c.groups:
@@ -247,42 +247,42 @@ def numbers_figure(comparison: Comparison) -> Figure:
             axes.set_xticks(range(len(names)), names, fontsize=8)
             axes.set_xlim(-0.6, len(names) - 0.4)
         else:
-            ends = np.array([places.min(), places.max()])
-            axes.plot(ends, values.mean() + number.difference * (ends - places.mean()), color=plot.INK, linewidth=1.4)
+            ends = np.array([x.min(), x.max()])
+            axes.plot(ends, values.mean() + number.difference * (ends - x.mean()), color=plot.INK, linewidth=1.4)
             axes.set_xlabel(plot.plain(c.by), fontsize=8)
         if number.symbol not in plot.SIGNED and axes.get_ylim()[0] < 0:
             axes.set_ylim(bottom=0)
-    marks = [
+    handles = [
         Line2D([], [], color=plot.QUIET, marker="o", linestyle="", markersize=4, label="a subject"),
         Line2D([], [], color=plot.QUIET, linewidth=1.4, label="95 % interval of the subject's own scans"),
         Line2D([], [], color=plot.INK, linewidth=1.4, label="mean of the group" if c.groups else "slope"),
-        *[Line2D([], [], color=plot.QUIET, linewidth=0.8, label="of one subject")] * bool(joined),
     ]
-    figure.legend(handles=marks, loc="outside lower center", ncols=len(marks), frameon=False, fontsize=9)
+    if pairs:
+        handles.append(Line2D([], [], color=plot.QUIET, linewidth=0.8, label="of one subject"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=9)
     return figure
 
 
 def _panels(comparison: Comparison) -> tuple[Figure, list[Axes]]:
-    """Return a figure and a panel for each quantity, its symbol and tests above it; the familiar first and larger."""
+    """Return a figure and its panel for each number, with the tests above it; familiar numbers are first and larger."""
     numbers, ranks = comparison.numbers, {symbol: k for k, symbol in enumerate(plot.FIRST_SHOWN)}
     order = sorted(range(len(numbers)), key=lambda k: ranks.get(numbers[k].symbol, len(ranks)))
-    first = sum(number.symbol in ranks for number in numbers)
-    large, small = -(-first // LARGE), -(-(len(numbers) - first) // SMALL)
-    figure = plot.make_figure(13.2, 3.1 * large + 2.5 * small, layout="constrained")
-    parts = figure.add_gridspec(2, 1, height_ratios=(max(3.1 * large, 0.01), max(2.5 * small, 0.01)))
-    grids = parts[0].subgridspec(max(large, 1), LARGE), parts[1].subgridspec(max(small, 1), SMALL)
+    familiar = sum(number.symbol in ranks for number in numbers)
+    large_rows, small_rows = math.ceil(familiar / LARGE), math.ceil((len(numbers) - familiar) / SMALL)
+    figure = plot.make_figure(13.2, 3.1 * large_rows + 2.5 * small_rows, layout="constrained")
+    heights = max(3.1 * large_rows, 0.01), max(2.5 * small_rows, 0.01)
+    halves = figure.add_gridspec(2, 1, height_ratios=heights)
+    large, small = halves[0].subgridspec(max(large_rows, 1), LARGE), halves[1].subgridspec(max(small_rows, 1), SMALL)
     panels: dict[int, Axes] = {}
-    for place, k in enumerate(order):
-        grid, columns, here = (grids[0], LARGE, place) if place < first else (grids[1], SMALL, place - first)
-        axes, number = figure.add_subplot(grid[divmod(here, columns)]), numbers[k]
-        name = power_name(comparison.unit, number.power)
+    for rank, k in enumerate(order):
+        number, is_large = numbers[k], rank < familiar
+        cell = large[divmod(rank, LARGE)] if is_large else small[divmod(rank - familiar, SMALL)]
+        axes = figure.add_subplot(cell)
+        unit = power_name(comparison.unit, number.power)
+        weight = "bold" if number.family <= comparison.level else "normal"
+        title = number.symbol + (f" ({unit})" if unit else "")
+        axes.set_title(title, fontsize=11 if is_large else 9.5, fontweight=weight, pad=26)
         label = f"{comparison.effect} = {format_number(number.effect, 2)}, p = {format_number(number.p, 2)}"
-        axes.set_title(
-            number.symbol + (f" ({name})" if name else ""),
-            fontsize=11 if place < first else 9.5,
-            fontweight="bold" if number.family <= comparison.level else "normal",
-            pad=26,
-        )
         label += f"\nfamily-wise p = {format_number(number.family, 2)}"
         axes.annotate(label, (0.5, 1), (0, 3), "axes fraction", "offset points", ha="center", va="bottom", fontsize=7.5)
         axes.yaxis.set_major_locator(MaxNLocator(4))

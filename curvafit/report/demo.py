@@ -54,8 +54,8 @@ class Completion(NamedTuple):
     def known(self) -> np.ndarray:
         """The known slices alone, bool (Z, Y, X)."""
         mask = np.zeros_like(self.truth)
-        known, truth = (np.moveaxis(each, self.axis, 0) for each in (mask, self.truth))
-        known[::EVERY] = truth[::EVERY]
+        known = (slice(None),) * self.axis + (slice(None, None, EVERY),)
+        mask[known] = self.truth[known]
         return mask
 
 
@@ -79,8 +79,9 @@ def write_demo(
     inference = infer(scan, growth=None, seed=seed, atlas=atlas, progress=reading)
     if inference.diagram is None:
         raise ScanError(f"expected a scan with a structure: {inference.fit.status}")
-    _, signed = find_structure(scan)
-    mask, axis = signed.values > 0, int(np.argmin(np.array(scan.shape) * scan.spacing))
+    _, field = find_structure(scan)
+    mask = field.values > 0
+    axis = int(np.argmin(np.array(scan.shape) * scan.spacing))
     volume = Volume(mask.view(np.uint8), scan.spacing, scan.unit)
     filled = reconstruct(volume, every=EVERY, axis=axis, progress=sub_progress(progress, 0.3, 0.6))
     completion = score_completion(mask, filled.mask.values, axis)
@@ -89,7 +90,8 @@ def write_demo(
         if len(textures) < len(PLACES):
             progress("growing the nearest textures", 0.6 + 0.35 * len(textures) / len(PLACES))
             flow = generate(match.coefficients, match.mass, EDGE, seed=match.seed, schedule=LEARNED)
-            textures += [flow.field.numpy()] * flow.viability.viable
+            if flow.viability.viable:
+                textures.append(flow.field.numpy())
     progress("drawing the page", 0.95)
     text = demo_page(inference, measures, completion, textures, atlas)
     write_inference(inference, folder, overwrite=overwrite)
@@ -97,16 +99,14 @@ def write_demo(
 
 
 def score_completion(truth: np.ndarray, filled: np.ndarray, axis: int = 0) -> Completion:
-    """Compare a volume filled from one in `EVERY` slices of a mask, and plain interpolations, with what was left out.
+    """Score a volume filled from one in `EVERY` slices of a mask, and plain interpolations, on the slices left out.
 
     Only slices between the first and the last known one count.
     """
-    known, found = (np.moveaxis(each, axis, 0) for each in (truth, filled))
-    places = tuple(range(0, len(known), EVERY))
-    slices = Slices(known[::EVERY], places, len(known), (1.0, 1.0, 1.0))
-    left_out = slices.between
-    volumes = {"curvafit": found, **{way: slices.level(way) > 0 for way in WAYS}}
-    scores = {name: dice(volume[left_out], known[left_out]) for name, volume in volumes.items()}
+    mask, network = np.moveaxis(truth, axis, 0), np.moveaxis(filled, axis, 0)
+    known = Slices(mask[::EVERY], tuple(range(0, len(mask), EVERY)), len(mask), (1.0, 1.0, 1.0))
+    volumes = {"curvafit": network, **{way: known.level(way) > 0 for way in WAYS}}
+    scores = {name: dice(volume[known.between], mask[known.between]) for name, volume in volumes.items()}
     return Completion(truth, filled, axis, scores)
 
 
@@ -118,23 +118,22 @@ def demo_page(
     The scan is placed on the map of `atlas`; `textures` are the phase fields of the nearest of its shapes.
     """
     fit = inference.fit
-    grown = {f"{place} texture": u for place, u in zip(PLACES, textures, strict=False)}
-    placed = _map_figure(inference, atlas)
-    shown = ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D", "BS/BV", "DA", "H", "K")
+    gallery = {f"{rank} texture": u for rank, u in zip(PLACES, textures, strict=False)}
     shapes, slices = _shape_figure(completion, inference.scan.spacing), _slice_figure(inference.scan, completion)
     blocks = int(np.prod(measures.blocks)) if np.isfinite(measures["BV/TV"].half) else 0
-    rows = [(each.name, each.symbol, *each.format(measures.unit)) for each in map(measures.__getitem__, shown)]
-    (_, own), *plain = ((name, f"{score:.3f}") for name, score in completion.dice.items())
+    quantities = [measures[symbol] for symbol in ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D", "BS/BV", "DA", "H", "K")]
+    rows = [(quantity.name, quantity.symbol, *quantity.format(measures.unit)) for quantity in quantities]
+    (_, network), *plain = ((name, f"{score:.3f}") for name, score in completion.dice.items())
     return render(
         "demo.html", title=f"{describe(inference)}.", made={}, scan=describe_scan(inference), every=EVERY,
         axis="zyx"[completion.axis],
         shapes=picture_of(shapes, "Known slices, the filled volume, and the scan"),
         slices=picture_of(slices, "A left-out slice, as it is and as filled"),
-        scores=[("the network", Chosen(own)), *((f"plain interpolation, {name}", score) for name, score in plain)],
+        scores=[("the network", Chosen(network)), *((f"plain interpolation, {name}", score) for name, score in plain)],
         measures=[(name, symbol, value, half if blocks else "", unit) for name, symbol, value, half, unit in rows],
         blocks=blocks, count=len(atlas),
-        map=picture_of(placed, "The scan's curvature diagram, and its place on the atlas's map"),
-        near=picture_of(gallery_figure(grown, columns=3, width=1500), "The nearest textures") if grown else None,
+        map=picture_of(_map_figure(inference, atlas), "The scan's curvature diagram, and its place on the atlas's map"),
+        near=picture_of(gallery_figure(gallery, columns=3, width=1500), "The nearest textures") if gallery else None,
         misfit=fit.misfit, reading=fit.status,
         believed=fit.misfit is not None and fit.misfit.probability >= UNBELIEVABLE,
         strips=list_strips(fit), notes=dict.fromkeys((*inference.scan.notes, *fit.notes)),
@@ -142,61 +141,62 @@ def demo_page(
 
 
 def _shape_figure(completion: Completion, spacing: tuple[float, float, float]) -> Figure:
-    """Return a figure of the known slices, the filled volume and the scan, cut open, the slices lying."""
+    """Return a figure of the known slices, the filled volume and the scan, cut in half to show what is inside."""
     shape, axis = completion.truth.shape, completion.axis
-    order = (axis, *sorted({0, 1, 2} - {axis}, key=lambda each: shape[each] * spacing[each]))
+    # The slices lie horizontally: the axis across them becomes z, and their longer side x.
+    order = (axis, *sorted({0, 1, 2} - {axis}, key=lambda k: shape[k] * spacing[k]))
     known, filled, scan = (mask.transpose(order) for mask in (completion.known, completion.filled, completion.truth))
-    (box,) = ndimage.find_objects(scan.view(np.uint8))
-    shapes = {f"every {EVERY}th slice": known, "filled between them": filled, "the scan": scan}
-    halves = {name: mask[box][:, (box[1].stop - box[1].start) // 2 :] for name, mask in shapes.items()}
+    (box,) = ndimage.find_objects(scan.view(np.uint8))  # without empty margins
+    masks = {f"every {EVERY}th slice": known, "filled between them": filled, "the scan": scan}
+    halves = {name: mask[box][:, (box[1].stop - box[1].start) // 2 :] for name, mask in masks.items()}
     return gallery_figure(halves, columns=3, width=1500, spacing=tuple(spacing[k] for k in order))
 
 
 def _slice_figure(scan: Volume, completion: Completion) -> Figure:
-    """Return the slice midway between two known ones: its grey values, and where the filled slice differs."""
-    axis = completion.axis
-    place = (scan.shape[axis] // 2 // EVERY) * EVERY + EVERY // 2
-    place -= EVERY if place > (scan.shape[axis] - 1) // EVERY * EVERY else 0
-    plane, truth, filled = (
-        each.take(place, axis) for each in (np.asarray(scan.values), completion.truth, completion.filled)
-    )
+    """Return a figure of a slice midway between two known ones: its grey values, and where the filled slice differs."""
+    axis, count = completion.axis, scan.shape[completion.axis]
+    index = (count // 2 // EVERY) * EVERY + EVERY // 2
+    index -= EVERY if index > (count - 1) // EVERY * EVERY else 0  # after the last known slice: take the gap before it
+    volumes = (np.asarray(scan.values), completion.truth, completion.filled)
+    grey, truth, filled = (volume.take(index, axis) for volume in volumes)
     down, across = (h for k, h in enumerate(scan.spacing) if k != axis)
-    if down * truth.shape[0] > across * truth.shape[1]:  # lying, it takes less of the page
-        plane, truth, filled, down, across = plane.T, truth.T, filled.T, across, down
-    plane, aspect = plane.astype(np.float32), down / across
+    if down * truth.shape[0] > across * truth.shape[1]:  # put the longer side across: it takes less of the page
+        grey, truth, filled, down, across = grey.T, truth.T, filled.T, across, down
+    grey, aspect = grey.astype(np.float32), down / across
     figure = make_figure(10.2, 0.7 + 3.4 * aspect * truth.shape[0] / truth.shape[1], layout="constrained")
-    axes = figure.subplots(1, 3)
-    low, high = np.percentile(plane, (0.5, 99.5))
-    names = ("a slice that was left out", "filled, on the same slice", "missing (blue), too much (orange)")
-    for each, mask in zip(axes, (truth, filled), strict=False):
-        section_on(each, plane, mask, (low, high), aspect)
+    panels = figure.subplots(1, 3)
+    low, high = np.percentile(grey, (0.5, 99.5))
+    titles = ("a slice that was left out", "filled, on the same slice", "missing (blue), too much (orange)")
+    for axes, mask in zip(panels, (truth, filled), strict=False):
+        section_on(axes, grey, mask, (low, high), aspect)
     difference = np.ones((*truth.shape, 3), np.float32)
     difference[truth & filled] = (0.72, 0.74, 0.78)
     difference[truth & ~filled] = (0.0, 0.45, 0.70)
     difference[~truth & filled] = (0.84, 0.37, 0.0)
-    axes[2].imshow(difference, aspect=aspect, interpolation="nearest")
-    for each, name in zip(axes, names, strict=True):
-        each.set_title(name, fontsize=11)
-        each.set(xticks=[], yticks=[])
-    words = f"{'zyx'[axis]} = {place}, {EVERY // 2} slices from the nearest known one"
-    figure.suptitle(words, fontsize=9, color="#5b616b")
+    panels[2].imshow(difference, aspect=aspect, interpolation="nearest")
+    for axes, title in zip(panels, titles, strict=True):
+        axes.set_title(title, fontsize=11)
+        axes.set(xticks=[], yticks=[])
+    position = f"{'zyx'[axis]} = {index}, {EVERY // 2} slices from the nearest known one"
+    figure.suptitle(position, fontsize=9, color="#5b616b")
     return figure
 
 
 def _map_figure(inference: Inference, atlas: Atlas) -> Figure:
-    """Return a figure of the scan's diagram and its place among the atlas's, on the main axes of sliced quantiles."""
-    assert inference.diagram is not None
+    """Return a figure of the scan's curvature diagram, and of its position on the map of the atlas."""
+    diagram = inference.diagram
+    assert diagram is not None
     figure = make_figure(10.2, 4.6)
     λ, unit = inference.prepared.length, inference.fit.length_unit
-    left = figure.add_axes((0.07, 0.13, 0.36, 0.78))
-    diagram_on(left, inference.diagram, limits=shared_limits([inference.diagram], length=λ), unit=unit, length=λ)
-    left.set_title("how much surface has which curvatures", fontsize=11)
-    right = figure.add_axes((0.5, 0.13, 0.48, 0.78))
+    diagram_axes = figure.add_axes((0.07, 0.13, 0.36, 0.78))
+    diagram_on(diagram_axes, diagram, limits=shared_limits([diagram], length=λ), unit=unit, length=λ)
+    diagram_axes.set_title("how much surface has which curvatures", fontsize=11)
+    map_axes = figure.add_axes((0.5, 0.13, 0.48, 0.78))
     seen_as = "field" if inference.fit.kind == "field" else "mask"
-    own = map_on(right, atlas, seen_as, sliced_embedding(inference.diagram)[None])[0]
-    right.scatter(*own, s=150, marker="*", c=INK, edgecolors="white", linewidths=1.2, zorder=5)
-    right.annotate(
-        "this scan", own, (7, 7), textcoords="offset points", fontsize=11, fontweight="bold", color=INK, zorder=6,
+    position = map_on(map_axes, atlas, seen_as, sliced_embedding(diagram)[None])[0]
+    map_axes.scatter(*position, s=150, marker="*", c=INK, edgecolors="white", linewidths=1.2, zorder=5)
+    map_axes.annotate(
+        "this scan", position, (7, 7), textcoords="offset points", fontsize=11, fontweight="bold", color=INK, zorder=6,
         path_effects=[withStroke(linewidth=3, foreground="white")],
     )  # fmt: skip
     return figure

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib.metadata import version
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +51,11 @@ _TERMS = {
 }  # fmt: skip
 #: The parameters as a corner plot names them.
 SYMBOLS = ("a₁₁", "log a₀₂", "a₁₀", "a₀₁", "a₀₀", "m₀")
-#: Deviations among laws from the middle of a strip to its end.
+#: Half the width of a strip, in standard deviations among laws.
 STRIP = 2.5
-#: tan 22.5°: how far in direction a point may lie from a family's ideal one.
+#: tan 22.5°: a family's points (κ1, κ2) lie within this angle of its ideal direction, as κ2 = 0 of tubes.
 _NARROW = math.tan(math.pi / 8)
-#: For each round family: which points (κ1, κ2) are its own, and the curvature that its radius is one over.
+#: For each round family: which points (κ1, κ2) belong to it, and the curvature that is 1/radius.
 _ROUND: dict[str, Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
     "spheres": lambda k1, k2: (k2 > _NARROW * k1, (k1 + k2) / 2),
     "tubes": lambda k1, k2: ((k1 > 0) & (np.abs(k2) < _NARROW * k1), k1),
@@ -98,15 +98,10 @@ def report_html(inference: Inference) -> str:
     """Return the report of an inference as the text of its page."""
     fit, limits = inference.fit, plot.grey_limits(inference.scan.values)
     made = {str(name).replace("_", " "): _to_words(value) for name, value in fit.provenance.items()}
-    matches = [
-        (
-            match.id,
-            format_number(match.distance, 2),
-            *map(format_number, (*match.coefficients, match.mass)),
-            str(match.seed),
-        )
-        for match in fit.matches
-    ]
+    matches = []
+    for match in fit.matches:
+        parameters = map(format_number, (*match.coefficients, match.mass))
+        matches.append((match.id, format_number(match.distance, 2), *parameters, str(match.seed)))
     return page.render(
         "report.html", title=f"{describe(inference)}.", made=made, version=fit.provenance.get("curvafit", ""), fit=fit,
         status=fit.status, voxel=format_length(inference.prepared.working_voxel, fit.length_unit, 3),
@@ -134,20 +129,20 @@ def describe(inference: Inference) -> str:
     else:
         struts = "struts " if fit.family == "sponge" else ""
         size = f"{struts}{format_length(numbers.thickness_mean, fit.length_unit)} thick"
-    whose = "in a phase that is " if fit.family in ("tubular cavities", "bubbles") else ""
-    return f"{fit.family.capitalize()}, {size}, {whose}{format_percent(numbers.volume_fraction)} of the volume"
+    phase = "in a phase that is " if fit.family in ("tubular cavities", "bubbles") else ""
+    return f"{fit.family.capitalize()}, {size}, {phase}{format_percent(numbers.volume_fraction)} of the volume"
 
 
 def family_radius(diagram: Diagram, family: str) -> float | None:
-    """Return the median radius over the area of a round family, in the diagram's unit; None for another family."""
+    """Return the area-weighted median radius of a round family, in the diagram's unit; None for another family."""
     if family not in _ROUND:
         return None
-    own, kappa = _ROUND[family](*np.asarray(diagram.points).T)
-    own = own & (kappa > 0)
-    if not own.any():
+    inside, kappa = _ROUND[family](*np.asarray(diagram.points).T)
+    inside = inside & (kappa > 0)
+    if not inside.any():
         return None
-    weights = np.asarray(diagram.weights)[own]
-    return float(1 / np.quantile(kappa[own], 0.5, weights=weights, method="inverted_cdf"))
+    weights = np.asarray(diagram.weights)[inside]
+    return float(1 / np.quantile(kappa[inside], 0.5, weights=weights, method="inverted_cdf"))
 
 
 def describe_scan(inference: Inference) -> str:
@@ -155,8 +150,8 @@ def describe_scan(inference: Inference) -> str:
     scan, fit = inference.scan, inference.fit
     shape = " × ".join(str(n) for n in scan.values.shape)
     kind = "phase field" if fit.kind == "field" else fit.kind
-    same = len({round(h / scan.spacing[0], 6) for h in scan.spacing}) == 1
-    spacing = (scan.spacing[0],) if same else scan.spacing
+    isotropic = len({round(h / scan.spacing[0], 6) for h in scan.spacing}) == 1
+    spacing = (scan.spacing[0],) if isotropic else scan.spacing
     voxel = " × ".join(f"{h:.4g}" for h in spacing) + f" {unit_name(scan.unit, spacing[0])}"
     return f"{name_source(scan.source) or 'a volume'}: {kind} of {shape} voxels (z, y, x), voxel edge {voxel}."
 
@@ -168,19 +163,19 @@ def name_source(source: str | None) -> str:
 
 
 def _distances(inference: Inference) -> list[tuple[str, float | None, str]]:
-    """Return the name, the distance from the scan and the kind of each candidate's shape, and of two seeds'."""
+    """Return (name, distance, CSS class) of each candidate's shape from the scan, and last of two seeds' shapes."""
     if not inference.twins:
         return []
-    chosen, noise = inference.fit.chosen, seed_noise_of(inference.fit.candidates)
-    laws = ((_title(each), each.distance, "best" * (each.name == chosen)) for each in _chosen_first(inference))
-    return [*laws, ("Two seeds", noise, "noise")]
+    chosen = inference.fit.chosen
+    laws = [(_title(law), law.distance, "best" if law.name == chosen else "") for law in _chosen_first(inference)]
+    return [*laws, ("Two seeds", seed_noise_of(inference.fit.candidates), "noise")]
 
 
 def _number_rows(inference: Inference) -> list[list[str]]:
-    """Return rows of the scan's familiar numbers, the twins' mean with its extremes, and the mean over the scan's."""
+    """Return rows of familiar numbers: the scan's, the twins' mean with its range, and the ratio of mean and scan."""
     scan, best = inference.fit.morphometry, inference.fit.best
     twins, unit = () if best is None else best.twins, scan.unit
-    kinds: tuple[tuple[str, str, str, Callable[[float], str]], ...] = (
+    quantities: tuple[tuple[str, str, str, Callable[[float], str]], ...] = (
         ("Volume fraction", "BV/TV", "volume_fraction", format_percent),
         ("Mean thickness", "Tb.Th", "thickness_mean", lambda x: format_length(x, unit)),
         ("Mean spacing", "Tb.Sp", "spacing_mean", lambda x: format_length(x, unit)),
@@ -188,19 +183,19 @@ def _number_rows(inference: Inference) -> list[list[str]]:
         ("Surface to volume", "BS/BV", "surface_to_volume", lambda x: format_density(x, unit, 1)),
     )
     rows = []
-    for name, short, key, text in kinds:
-        own, values = float(getattr(scan, key)), [float(getattr(twin, key)) for twin in twins]
-        cells = [text(own)]
-        if values:
-            mean = sum(values) / len(values)
-            extremes = f" ({text(min(values))} to {text(max(values))})" if len(values) > 1 else ""
-            cells += [text(mean) + extremes, format_number(mean / own, 2) if own else "–"]
-        rows.append([name, short, *cells])
+    for name, symbol, key, text in quantities:
+        value, twin_values = float(getattr(scan, key)), [float(getattr(twin, key)) for twin in twins]
+        row = [name, symbol, text(value)]
+        if twin_values:
+            mean = sum(twin_values) / len(twin_values)
+            extremes = f" ({text(min(twin_values))} to {text(max(twin_values))})" if len(twin_values) > 1 else ""
+            row += [text(mean) + extremes, format_number(mean / value, 2) if value else "–"]
+        rows.append(row)
     return rows
 
 
 def parameter_table(inference: Inference) -> list[tuple[str, str, str, str, str]]:
-    """Return rows of name, chosen value, its own deviation, the posterior's 90 % interval, and the physical value.
+    """Return a row for each parameter: name, chosen value, deviation, the posterior's 90 % interval, physical value.
 
     Without a law there are no rows.
     """
@@ -211,26 +206,28 @@ def parameter_table(inference: Inference) -> list[tuple[str, str, str, str, str]
 
 
 def _parameters(inference: Inference) -> list[tuple[str, tuple[str, ...], str]]:
-    """Return the name, the cells and the unit of each parameter of the chosen law."""
+    """Return (name, (value, deviation, median, 50 % and 90 % interval, physical value), unit) of each parameter."""
     fit, best, physical = inference.fit, inference.fit.best, inference.fit.coefficients_physical
     if best is None or physical is None:
         return []
     intervals = fit.intervals() or {}
     rows = []
     for name, value in {**best.coefficients.as_dict(), "mass": best.mass}.items():
-        known, power = intervals.get(name), _TERMS[name][2]
-        median = format_number(known["median"]) if known else ""
+        posterior = ("", "", "")
+        if interval := intervals.get(name):
+            ranges = (" to ".join(map(format_number, interval[level])) for level in ("50", "90"))
+            posterior = (format_number(interval["median"]), *ranges)
+        σ = best.uncertainty.get(name)
+        deviation = "" if σ is None else "fixed" if σ == 0 else format_number(σ, 2)
         scaled = "" if name == "mass" else format_number(physical.as_dict()[name])
-        ranges = ("" if known is None else " to ".join(map(format_number, known[level])) for level in ("50", "90"))
-        own = best.uncertainty.get(name)
-        deviation = "" if own is None else "fixed" if own == 0 else format_number(own, 2)
-        cells = (format_number(value), deviation, median, *ranges, scaled)
-        rows.append((name, cells, per_unit(fit.length_unit, power) if power else ""))
+        power = _TERMS[name][2]
+        unit = per_unit(fit.length_unit, power) if power else ""
+        rows.append((name, (format_number(value), deviation, *posterior, scaled), unit))
     return rows
 
 
 def list_strips(fit: Fit) -> list[dict[str, Any]]:
-    """Return the bars of what a fit tells of each combination of parameters, in percent of a strip."""
+    """Return for each combination of parameters its 90 % interval, as text and as a bar in percent of a strip."""
     strips = []
     for combination in fit.combinations:
         start, end = (100 * float(np.clip(0.5 + x / (2 * STRIP), 0, 1)) for x in combination.interval)
@@ -243,7 +240,7 @@ def list_strips(fit: Fit) -> list[dict[str, Any]]:
 
 
 def _law(inference: Inference) -> dict[str, Any] | None:
-    """Return what the page says of the chosen law; None without one."""
+    """Return the chosen law's table and what explains it on the page; None without a law."""
     fit, best = inference.fit, inference.fit.best
     if best is None:
         return None
@@ -252,7 +249,8 @@ def _law(inference: Inference) -> dict[str, Any] | None:
         for name, (value, *cells, physical), unit in _parameters(inference)
     ]
     width = ("0.02", "", "", "", "", format_number(fit.epsilon_physical), unit_name(fit.length_unit, 2))
-    fixed = [name for name in ("a20", "a02") if abs(best.coefficients.as_dict()[name] - 1) < 1e-9]
+    coefficients = best.coefficients.as_dict()  # only their ratios matter: a law fixes one of them, its gauge
+    fixed = [name for name in ("a20", "a02") if abs(coefficients[name] - 1) < 1e-9]
     return {
         "rows": [*rows, ("ε", "interface", *width)],
         "gauge": f"here {_TERMS[fixed[0]][0]} = 1" if fixed else "all six may be multiplied by one factor",
@@ -263,12 +261,12 @@ def _law(inference: Inference) -> dict[str, Any] | None:
 
 def _to_words(value: object) -> str:
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_to_words(part)}" for name, part in value.items())
+        return ", ".join(f"{name} {_to_words(entry)}" for name, entry in value.items())
     return ", ".join(map(_to_words, value)) if isinstance(value, (list, tuple)) else str(value)
 
 
 def _chosen_first(inference: Inference) -> list[Candidate]:
-    return sorted(inference.fit.candidates, key=lambda each: each.name != inference.fit.chosen)
+    return sorted(inference.fit.candidates, key=lambda candidate: candidate.name != inference.fit.chosen)
 
 
 def _title(candidate: Candidate) -> str:
@@ -291,82 +289,82 @@ def inference_figure(inference: Inference, **options: Any) -> Figure:
 
 
 def _slice(inference: Inference, axis: int, limits: tuple[float, float]) -> page.Picture:
-    """Return a picture of the slice across the main window's middle, by the edges of voxels, in the scan's unit."""
-    scan, prepared = inference.scan, inference.prepared
-    down, across = (k for k in range(3) if k != axis)
-    index = (prepared.windows[0][axis].start + prepared.windows[0][axis].stop) // 2  # on the working grid
-    voxels = prepared.origin[axis] + (index + 0.5) * prepared.scale[axis]
-    row = int(np.clip(voxels, 0, scan.values.shape[axis] - 1))  # on the scan's
+    """Return a picture of the slice through the middle of the main window: the scan, and the outline of the surface."""
+    scan, prepared, window = inference.scan, inference.prepared, inference.prepared.windows[0]
+    shape, name = scan.values.shape, "zyx"[axis]
+    working_index = (window[axis].start + window[axis].stop) // 2
+    index = int(np.clip(prepared.origin[axis] + (working_index + 0.5) * prepared.scale[axis], 0, shape[axis] - 1))
+    # Positions of voxel faces in the scan's unit: the working grid lies somewhere within the scan.
     start, step = np.array(prepared.origin) * scan.spacing, np.array(prepared.scale) * scan.spacing
-    stop = start + step * prepared.phase.shape
-    first = start + step * [edge.start for edge in prepared.windows[0]]
-    last = start + step * [edge.stop for edge in prepared.windows[0]]
-    size = np.array(scan.values.shape) * scan.spacing
-    framed = (first[across], last[across], last[down], first[down]) if _is_framed(inference) else None
+    down, across = (k for k in range(3) if k != axis)
+
+    def extent(low: np.ndarray, high: np.ndarray) -> tuple[float, float, float, float]:
+        return low[across], high[across], high[down], low[down]
+
+    low, high = start + step * [side.start for side in window], start + step * [side.stop for side in window]
     figure = plot.slice_figure(
-        np.asarray(scan.values.take(row, axis), dtype=np.float32), prepared.phase.take(index, axis),
-        image_extent=(0.0, size[across], size[down], 0.0),
-        extent=(start[across], stop[across], stop[down], start[down]), limits=limits, unit=scan.unit,
-        axes_names=("zyx"[down], "zyx"[across]), window=framed,
+        np.asarray(scan.values.take(index, axis), dtype=np.float32), prepared.phase.take(working_index, axis),
+        image_extent=extent(np.zeros(3), np.array(shape) * scan.spacing),
+        extent=extent(start, start + step * prepared.phase.shape), limits=limits, unit=scan.unit,
+        axes_names=("zyx"[down], "zyx"[across]), window=extent(low, high) if _is_framed(inference) else None,
     )  # fmt: skip
-    depth = format_length((row + 0.5) * scan.spacing[axis], scan.unit)
-    is_part = list(scan.values.shape) != inference.fit.provenance.get("scan_shape", list(scan.values.shape))
-    where = " of the part that was read" if is_part else ""
-    title, text = f"Across {'zyx'[axis]}", f"Slice {row} of {scan.values.shape[axis]}{where}, at {depth}"
-    return page.picture_of(figure, f"Slice across {'zyx'[axis]} with the surface's outline", title=title, text=text)
+    depth = format_length((index + 0.5) * scan.spacing[axis], scan.unit)
+    is_crop = list(shape) != inference.fit.provenance.get("scan_shape", list(shape))
+    text = f"Slice {index} of {shape[axis]}{' of the part that was read' if is_crop else ''}, at {depth}"
+    return page.picture_of(figure, f"Slice across {name} with the surface's outline", title=f"Across {name}", text=text)
 
 
 def _is_framed(inference: Inference) -> bool:
-    """Return whether the main window is smaller than what the slices show."""
+    """Return whether the main window is smaller than the whole working grid."""
     shape = inference.prepared.phase.shape
-    return any(edge.stop - edge.start < n for edge, n in zip(inference.prepared.windows[0], shape, strict=True))
+    return any(side.stop - side.start < n for side, n in zip(inference.prepared.windows[0], shape, strict=True))
 
 
 def _shapes(inference: Inference) -> list[page.Picture]:
     """Return pictures of the surfaces of the scan and of each candidate's shape, in boxes of one size."""
     fit = inference.fit
-    word = "the nearest" if fit.status.startswith((UNBELIEVED, UNDECIDED)) else "best supported"
+    verdict = "the nearest" if fit.status.startswith((UNBELIEVED, UNDECIDED)) else "best supported"
     pictures = [_shape(inference, "The scan", scan_box(inference))]
-    for each in _chosen_first(inference):
-        distance = "" if each.distance is None else f"; distance {each.distance:.1f}"
-        badge = word if each.name == fit.chosen else ""
-        u = inference.shape_of(each.name)
-        pictures.append(_shape(inference, f"{_title(each)}, regrown", u, distance, badge))
+    for candidate in _chosen_first(inference):
+        distance = "" if candidate.distance is None else f"; distance {candidate.distance:.1f}"
+        badge = verdict if candidate.name == fit.chosen else ""
+        u = inference.shape_of(candidate.name)
+        pictures.append(_shape(inference, f"{_title(candidate)}, regrown", u, distance, badge))
     return pictures
 
 
-def _shape(inference: Inference, title: str, u: np.ndarray | None, more: str = "", badge: str = "") -> page.Picture:
-    """Return a picture of one surface, without data if there is no shape; `more` follows the size of its box."""
+def _shape(inference: Inference, title: str, u: np.ndarray | None, note: str = "", badge: str = "") -> page.Picture:
+    """Return a picture of one surface, without data if there is no shape; `note` follows the size of its box."""
     if u is None:
         return page.picture_of(None, "", title=title, badge=badge)
     edges = [format_length(n * inference.fit.working_voxel, inference.fit.length_unit, 3) for n in u.shape]
     box = f"edge {edges[0]}" if len(set(edges)) == 1 else " × ".join(edges)
-    return page.picture_of(plot.surface_figure(u), f"Surface: {title}", title=title, text=box + more, badge=badge)
+    return page.picture_of(plot.surface_figure(u), f"Surface: {title}", title=title, text=box + note, badge=badge)
 
 
 def scan_box(inference: Inference) -> np.ndarray:
     """Return the main window's phase field, cut to the size of the regenerated shape so that both have one scale."""
     phase = inference.prepared.phase[inference.prepared.windows[0]]
-    other = inference.best
-    if other is None:
+    if inference.best is None:
         return phase
-    starts = [(n - min(n, m)) // 2 for n, m in zip(phase.shape, other.shape, strict=True)]
-    return phase[tuple(slice(s, s + m) for s, m in zip(starts, other.shape, strict=True))]
+    shape = inference.best.shape
+    starts = [(n - min(n, m)) // 2 for n, m in zip(phase.shape, shape, strict=True)]
+    return phase[tuple(slice(start, start + m) for start, m in zip(starts, shape, strict=True))]
 
 
 def _diagrams(inference: Inference) -> list[page.Picture]:
     """Return curvature diagrams of the scan, the chosen law and the match, with shared axes, in the scan's unit."""
     diagrams: list[tuple[str, Diagram | None]] = [("The scan", inference.diagram)]
-    for each in _chosen_first(inference) if inference.twins else ():
-        if each.name in (inference.fit.chosen, "match"):
-            grown = (twin.diagram for twin in inference.twins.get(each.name, ()) if twin.diagram)
-            diagrams.append((f"{_title(each)}, regrown", next(grown, None)))
+    for candidate in _chosen_first(inference) if inference.twins else ():
+        if candidate.name in (inference.fit.chosen, "match"):
+            regrown = (twin.diagram for twin in inference.twins.get(candidate.name, ()) if twin.diagram)
+            diagrams.append((f"{_title(candidate)}, regrown", next(regrown, None)))
     λ, unit = inference.prepared.length, inference.fit.length_unit
     limits = plot.shared_limits([diagram for _, diagram in diagrams if diagram is not None], length=λ)
     pictures = []
     for title, diagram in diagrams:
-        drawn = None if diagram is None else plot.diagram_figure(diagram, limits=limits, unit=unit, length=λ)
-        pictures.append(page.picture_of(drawn, f"Curvature diagram: {title}", title=title))
+        figure = None if diagram is None else plot.diagram_figure(diagram, limits=limits, unit=unit, length=λ)
+        pictures.append(page.picture_of(figure, f"Curvature diagram: {title}", title=title))
     return pictures
 
 
@@ -376,12 +374,13 @@ def _corner(inference: Inference) -> page.Picture | None:
     if fit.draws is None or fit.best is None:
         return None
     draws = fit.draws[:, : len(SYMBOLS)]
-    shown = [candidate for candidate in fit.candidates if candidate.name in (fit.chosen, "match")]
-    marks = {_title(each): parameters_of(each.coefficients, each.mass) for each in shown}
-    rows = [np.percentile(draws, (0.5, 99.5), axis=0), *(mark[None] for mark in marks.values())]
-    low, high = np.concatenate(rows).min(0), np.concatenate(rows).max(0)
-    rim = 0.06 * np.maximum(high - low, 1e-6)
-    limits = list(zip((low - rim).tolist(), (high + rim).tolist(), strict=True))
+    laws = [candidate for candidate in fit.candidates if candidate.name in (fit.chosen, "match")]
+    marks = {_title(law): parameters_of(law.coefficients, law.mass) for law in laws}
+    # The axes show 99 % of the draws, and all marks.
+    extremes = np.concatenate([np.percentile(draws, (0.5, 99.5), axis=0), *(mark[None] for mark in marks.values())])
+    low, high = extremes.min(0), extremes.max(0)
+    margin = 0.06 * np.maximum(high - low, 1e-6)
+    limits = list(zip((low - margin).tolist(), (high + margin).tolist(), strict=True))
     return page.picture_of(plot.corner_figure(draws, SYMBOLS, limits, marks), "Draws of the parameters, two by two")
 
 
@@ -412,7 +411,7 @@ def infer_scans(
     progress: Progress = silent,
     **options: Any,
 ) -> Path:
-    """Infer the parameters of many scans into a folder: for each its own, and a page and a table. Return that page.
+    """Infer the parameters of many scans into a folder for each, with a page and a table of all; return the page.
 
     A scan whose folder has a fit of the same command and version is not inferred again. `options` are those of `infer`.
     Raises ValueError as `infer`, with the scan's name, and where a folder has others' files.
@@ -440,12 +439,12 @@ def infer_scans(
 
 
 def name_folders(scans: Sequence[str]) -> list[str]:
-    """Return a folder's name for each scan: its file's, without suffixes unless two would be alike."""
+    """Return a folder's name for each scan: that of its file, without suffixes unless two would have one name."""
     names = [Path(scan.partition("::")[0]).name for scan in scans]
     stems = [name.partition(".")[0] or name for name in names]
     folders = [stem if stems.count(stem) == 1 else name for stem, name in zip(stems, names, strict=True)]
-    if twice := sorted({name for name in folders if folders.count(name) > 1}):
-        raise ValueError(f"expected scans with names of their own, got several named {twice[0]}")
+    if duplicates := sorted({name for name in folders if folders.count(name) > 1}):
+        raise ValueError(f"expected scans with names of their own, got several named {duplicates[0]}")
     return folders
 
 
@@ -466,14 +465,13 @@ def _is_done(folder: Path, command: str) -> bool:
 
 
 def _rows(name: str, fit: Fit) -> Iterator[dict[str, Any]]:
-    """Yield a row for each number of a fit; None where it is not known."""
+    """Yield a table row for each combination and parameter of a fit, and for its p; None where a value is missing."""
     columns = ("scan", "quantity", "value", "low", "high", "known", "version")
-    numbers = [
-        (f"from {each.low} to {each.high}", each.median, *each.interval, each.known)
-        for each in fit.combinations
-        if each.low
-    ]
-    numbers += [(key, each["median"], *each["90"], None) for key, each in (fit.intervals() or {}).items()]
-    numbers.append(("p of the law", None if fit.misfit is None else fit.misfit.probability, None, None, None))
-    for row in numbers:
+    rows: list[tuple[Any, ...]] = []
+    for combination in filter(attrgetter("low"), fit.combinations):
+        quantity = f"from {combination.low} to {combination.high}"
+        rows.append((quantity, combination.median, *combination.interval, combination.known))
+    rows += [(key, interval["median"], *interval["90"], None) for key, interval in (fit.intervals() or {}).items()]
+    rows.append(("p of the law", None if fit.misfit is None else fit.misfit.probability, None, None, None))
+    for row in rows:
         yield dict(zip(columns, (name, *row, version("curvafit")), strict=True))

@@ -64,34 +64,33 @@ def write_measures(
     target = check_measures(directory, overwrite=overwrite, command=command)
     measures = [scan.convert(measures[0].unit) for scan in measures]
     columns = columns or [{}] * len(measures)
-    rows = [
-        (part, more)
-        for each, more in zip(measures, columns, strict=True)
-        for part in each.compartments.values() or (each,)
-    ]
-    parts, unit = [part for part, _ in rows], measures[0].unit
-    names, further = name_parts(parts), list(dict.fromkeys(name for _, more in rows for name in more))
+    unit, symbols = measures[0].unit, plot.FIRST_SHOWN
+    titles = list(dict.fromkeys(title for row in columns for title in row))
+    # A scan without compartments has itself as the only one.
+    compartments = [list(scan.compartments.values()) or [scan] for scan in measures]
+    parts = [part for scan_parts in compartments for part in scan_parts]
+    names, rows = name_parts(parts), []
+    for scan_parts, row in zip(compartments, columns, strict=True):
+        for part in scan_parts:
+            cells = (_format_cell(part[symbol]) for symbol in symbols)
+            rows.append([names[len(rows)], *(row.get(title, "") for title in titles), *cells])
     scans = [{"scan": scan.source, "kind": scan.kind, "notes": scan.notes} for scan in measures]
-    more = {"status": describe_range(parts), "scans": scans, "notes": list(count_notes(parts))}
-    record = start_record(command, unit=unit, options=dict(options or {}), **more)
+    facts = {"status": describe_range(parts), "scans": scans, "notes": list(count_notes(parts))}
+    record = start_record(command, unit=unit, options=dict(options or {}), **facts)
     page = {
         "title": f"{len(measures)} scans measured" if len(measures) > 1 else "One scan measured",
-        "head": ["scan", *further, *((each, power_name(unit, measures[0][each].power)) for each in plot.FIRST_SHOWN)],
-        "kinds": [""] * (1 + len(further)), "methods": describe_measures(measures),
-        "rows": [
-            [name, *(more.get(head, "") for head in further), *(_format_cell(part[each]) for each in plot.FIRST_SHOWN)]
-            for name, (part, more) in zip(names, rows, strict=True)
-        ],
+        "head": ["scan", *titles, *((symbol, power_name(unit, measures[0][symbol].power)) for symbol in symbols)],
+        "kinds": [""] * (1 + len(titles)), "methods": describe_measures(measures), "rows": rows,
         "omitted": {"diagrams": max(0, len(rows) - MOST_DIAGRAMS), "numbers": max(0, len(rows) - MOST_ROWS)},
     }  # fmt: skip
     diagrams = diagrams_figure(names[:MOST_DIAGRAMS], parts[:MOST_DIAGRAMS])
-    numbers = intervals_figure(names[:MOST_ROWS], parts[:MOST_ROWS])
-    drawn = {
+    intervals = intervals_figure(names[:MOST_ROWS], parts[:MOST_ROWS])
+    figures = {
         "diagrams": (diagrams, "The curvature diagram of each scan"),
-        "numbers": (numbers, "Numbers of each scan with their intervals"),
+        "numbers": (intervals, "Numbers of each scan with their intervals"),
     }
     tables = {"measures.csv": list_rows(measures, columns)}
-    return write_study(target, FORMAT, FILES, record, page, tables, figures=drawn)
+    return write_study(target, FORMAT, FILES, record, page, tables, figures=figures)
 
 
 def _format_cell(quantity: Quantity) -> tuple[str, str]:
@@ -100,32 +99,32 @@ def _format_cell(quantity: Quantity) -> tuple[str, str]:
 
 
 def describe_range(parts: Sequence[Measures]) -> str:
-    """Return what the numbers of scans of one unit span, in some sentences."""
+    """Return sentences on the least and greatest volume fraction, thickness and spacing of scans of one unit."""
     sentences, names = [], name_parts(parts)
     for symbol in ("BV/TV", "Tb.Th", "Tb.Sp"):
-        known = [(part[symbol], name) for name, part in zip(names, parts, strict=True)]
-        known = [each for each in known if math.isfinite(each[0].value)]
+        quantities = [part[symbol] for part in parts]
+        known = [k for k, quantity in enumerate(quantities) if math.isfinite(quantity.value)]
         if not known:
             continue
-        (least, first), (most, last) = (end(known, key=lambda each: each[0].value) for end in (min, max))
-        unit = power_name(parts[0].unit, least.power)
-        values = [f"{format_number(each.value)} {unit}".strip() for each in (least, most)]
-        span = f"from {values[0]} ({first}) to {values[1]} ({last})" if len(known) > 1 else values[0]
-        sentences.append(f"{least.name[0].upper()}{least.name[1:]} {span}.")
+        extremes = [extreme(known, key=lambda k: quantities[k].value) for extreme in (min, max)]
+        title, unit = quantities[0].name, power_name(parts[0].unit, quantities[0].power)
+        low, high = (f"{format_number(quantities[k].value)} {unit}".strip() for k in extremes)
+        span = f"from {low} ({names[extremes[0]]}) to {high} ({names[extremes[1]]})" if len(known) > 1 else low
+        sentences.append(f"{title[0].upper()}{title[1:]} {span}.")
     return " ".join(sentences)
 
 
 def name_parts(parts: Sequence[Measures]) -> list[str]:
-    """Return the names of scans' files, or their paths where two have one name, with the part each is."""
+    """Return a name for each scan or part of one: its file, or the path where two files have one name, and its part."""
     sources: dict[str, set[str]] = {}
-    for each in parts:
-        sources.setdefault(Path(each.source).name, set()).add(each.source)
-    names = (
-        file if len(sources[file := Path(each.source).name]) == 1 and file else each.source or f"array {k}"
-        for k, each in enumerate(parts, 1)
-    )
-    return [f"{name}, {' '.join(map(str, each.part))}" if each.part else name
-            for name, each in zip(names, parts, strict=True)]  # fmt: skip
+    for part in parts:
+        sources.setdefault(Path(part.source).name, set()).add(part.source)
+    names = []
+    for k, part in enumerate(parts, 1):
+        file = Path(part.source).name
+        name = file if file and len(sources[file]) == 1 else part.source or f"array {k}"
+        names.append(f"{name}, {' '.join(map(str, part.part))}" if part.part else name)
+    return names
 
 
 # ---- figures ---------------------------------------------------------------------------------------------------------
@@ -138,24 +137,23 @@ def measures_figure(measures: Measures) -> Figure:
 
 
 def diagrams_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figure:
-    """Return a figure of the curvature diagrams of scans of one unit, on axes that all share; of some none is known."""
-    known = [scan.diagram for scan in measures if scan.diagram.area > 0]
-    across, up = plot.shown_window(known) if known else ((0.0, 1.0), (0.0, 1.0))
-    columns, rows = min(DIAGRAMS, len(names)), -(-len(names) // DIAGRAMS)
-    ratio = min(1.6, (up[1] - up[0]) / (across[1] - across[0]))
+    """Return a figure of the curvature diagrams of scans of one unit, all on the same axes."""
+    diagrams = [scan.diagram for scan in measures if scan.diagram.area > 0]
+    x, y = plot.shown_window(diagrams) if diagrams else ((0.0, 1.0), (0.0, 1.0))
+    limits = min(x[0], y[0]), max(x[1], y[1])
+    columns, rows = min(DIAGRAMS, len(names)), math.ceil(len(names) / DIAGRAMS)
+    ratio = min(1.6, (y[1] - y[0]) / (x[1] - x[0]))
     figure = plot.make_figure(2.6 * columns, (2.1 * ratio + 0.6) * rows, layout="constrained")
-    panels, words = figure.subplots(rows, columns, squeeze=False).ravel(), shorten(names)
-    for k, axes in enumerate(panels):
-        if k >= len(names):
-            axes.set_axis_off()
-            continue
-        axes.set_title(plot.plain(words[k]), fontsize=9)
-        if not measures[k].diagram.area > 0:
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in panels[len(names) :]:
+        axes.set_axis_off()
+    for axes, name, scan in zip(panels, shorten(names), measures, strict=False):
+        axes.set_title(plot.plain(name), fontsize=9)
+        if not scan.diagram.area > 0:
             axes.text(0.5, 0.5, "no surface", ha="center", transform=axes.transAxes, color=plot.QUIET)
             axes.set(xticks=[], yticks=[])
             continue
-        limits = min(across[0], up[0]), max(across[1], up[1])
-        plot.diagram_on(axes, measures[k].diagram, limits=limits, unit=measures[k].unit, window=(across, up))
+        plot.diagram_on(axes, scan.diagram, limits=limits, unit=scan.unit, window=(x, y))
         axes.tick_params(labelsize=7)
         for label in (axes.xaxis.label, axes.yaxis.label):
             label.set_fontsize(8)
@@ -164,32 +162,32 @@ def diagrams_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figur
 
 def intervals_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figure:
     """Return a figure of eight numbers of scans of one unit, a row for each scan, with 95 % intervals."""
-    rows = -(-len(plot.FIRST_SHOWN) // PANELS)
+    rows = math.ceil(len(plot.FIRST_SHOWN) / PANELS)
     figure = plot.make_figure(12.0, rows * (0.9 + 0.19 * max(len(names), 4)), layout="constrained")
     panels = figure.subplots(rows, PANELS, sharey=True)
-    places = range(len(names), 0, -1)
+    heights = range(len(names), 0, -1)  # the first scan on top
     for axes, symbol in zip(panels.ravel(), plot.FIRST_SHOWN, strict=True):
-        found = [scan[symbol] for scan in measures]
-        values = np.array([each.value for each in found])
-        halves = np.nan_to_num([each.half for each in found])
+        quantities = [scan[symbol] for scan in measures]
+        values = np.array([quantity.value for quantity in quantities])
+        halves = np.nan_to_num([quantity.half for quantity in quantities])
         low, high = values - halves, values + halves
         low = low if symbol in plot.SIGNED else np.maximum(0.0, low)
-        axes.hlines(places, low, high, color=plot.FIRST, alpha=0.4, linewidth=1.6)
-        axes.plot(values, places, "o", color=plot.FIRST, markersize=4, markeredgewidth=0)
-        unit = power_name(measures[0].unit, found[0].power)
+        axes.hlines(heights, low, high, color=plot.FIRST, alpha=0.4, linewidth=1.6)
+        axes.plot(values, heights, "o", color=plot.FIRST, markersize=4, markeredgewidth=0)
+        unit = power_name(measures[0].unit, quantities[0].power)
         axes.set_title(symbol + (f" ({unit})" if unit else ""), fontsize=10)
         axes.xaxis.set_major_locator(MaxNLocator(4))
         axes.grid(axis="y", color="#E5E7EB", linewidth=0.6)
         axes.set_axisbelow(True)
         axes.tick_params(length=2, labelsize=8)
         axes.spines[:].set_color(plot.QUIET)
-    panels[0, 0].set_yticks(places, [plot.plain(name) for name in shorten(names)])
+    panels[0, 0].set_yticks(heights, [plot.plain(name) for name in shorten(names)])
     panels[0, 0].set_ylim(0.4, len(names) + 0.6)
     return figure
 
 
 def shorten(names: Sequence[str]) -> list[str]:
-    """Return names that a panel has room for: of a long one its end, with a number where two would be alike."""
+    """Return names that a panel has room for: the end of a long name, with a number where two would be the same."""
     short = [name if len(name) <= WORD else f"…{name[1 - WORD :]}" for name in names]
     return [name if short.count(name) == 1 else f"{k} {name}" for k, name in enumerate(short, 1)]
 
@@ -198,7 +196,7 @@ def shorten(names: Sequence[str]) -> list[str]:
 
 
 def list_files(source: str | Path) -> tuple[str, ...]:
-    """Return the names of all files: the maps of a Zarr store are Zarr stores, of any other scan NIfTI."""
+    """Return the names of all files; maps are Zarr stores if the scan is one, else NIfTI files."""
     suffix = ".ome.zarr" if ".zarr" in str(source).lower() else ".nii.gz"
     return (*WINDOWS_FILES, *(f"{name.replace(' ', '_')}{suffix}" for name in ("clusters", *NAMES)))
 
@@ -225,70 +223,73 @@ def write_windows(windows: Windows, directory: str | Path, *, command: str = "",
     clusters = (f"cluster {k}" for k in range(1, 1 + int(windows.clusters.values.max())))
     head = ["", "", "least", "median", "most", *clusters, "between"]
     page = {"title": "A scan in windows", "head": head, "rows": rows}
-    drawn = {"windows": (windows_figure(windows), "The structure, coloured by clusters and by six numbers")}
-    fields = (windows.clusters, *map(windows.__getitem__, NAMES))
-    maps = dict(zip(files[len(WINDOWS_FILES) :], fields, strict=True))
+    figures = {"windows": (windows_figure(windows), "The structure, coloured by clusters and by six numbers")}
+    volumes = (windows.clusters, *map(windows.__getitem__, NAMES))
+    maps = dict(zip(files[len(WINDOWS_FILES) :], volumes, strict=True))
     shown = ("scan", "command", "date", "options")
     tables = {"windows.csv": _rows(windows)}
-    return write_study(target, WINDOWS_FORMAT, files, record, page, tables, figures=drawn, maps=maps, shown=shown)
+    return write_study(target, WINDOWS_FORMAT, files, record, page, tables, figures=figures, maps=maps, shown=shown)
 
 
 def _rows(windows: Windows) -> Iterator[dict[str, Any]]:
-    """Yield a row for each window: its centre, cluster and numbers; None where a number is not known."""
-    for place in np.ndindex(windows.clusters.shape):
-        values, centre = windows.values[place], zip("zyx", windows.centres[place].tolist(), strict=True)
-        numbers = zip(NAMES, (each if np.isfinite(each) else None for each in values.tolist()), strict=True)
-        yield {**dict(centre), "unit": windows.unit, "cluster": int(windows.clusters.values[place]), **dict(numbers)}
+    """Yield a row for each window: its centre, cluster and quantities; None where a value is not known."""
+    for index in np.ndindex(windows.clusters.shape):
+        centre = dict(zip("zyx", windows.centres[index].tolist(), strict=True))
+        values = (value if np.isfinite(value) else None for value in windows.values[index].tolist())
+        row = {**centre, "unit": windows.unit, "cluster": int(windows.clusters.values[index])}
+        yield row | dict(zip(NAMES, values, strict=True))
 
 
 def _format_row(windows: Windows, k: int) -> list[str]:
-    """Return a row of the page's table: a number's name, range, cluster means, and share of variance between these."""
+    """Return the page's table row of quantity k: name, least, median, greatest, the clusters' means, and the fraction
+    of the variance that lies between clusters."""
     values = windows.values[..., k]
     labels = np.where(np.isfinite(values), windows.clusters.values, 0)
-    parts = [values[labels == label] for label in range(1, 1 + int(windows.clusters.values.max()))]
-    means = [float(part.mean()) if len(part) else np.nan for part in parts]
+    clusters = [values[labels == label] for label in range(1, 1 + int(windows.clusters.values.max()))]
+    means = [float(cluster.mean()) if len(cluster) else np.nan for cluster in clusters]
     total = float(np.var(values[labels > 0]) * np.count_nonzero(labels)) if labels.any() else 0.0
-    ends = np.nanpercentile(values, (0, 50, 100)) if np.isfinite(values).any() else [np.nan] * 3
-    between = format_percent(1 - sum(part.var() * len(part) for part in parts if len(part)) / total) if total else "–"
-    numbers = (format_number(float(each)) for each in (*ends, *means))
-    return [*name_quantity(*QUANTITIES[k][:3], windows.unit), *numbers, between]
+    within = sum(cluster.var() * len(cluster) for cluster in clusters if len(cluster))
+    between = format_percent(1 - within / total) if total else "–"
+    percentiles = np.nanpercentile(values, (0, 50, 100)) if np.isfinite(values).any() else [np.nan] * 3
+    figures = (format_number(float(value)) for value in (*percentiles, *means))
+    return [*name_quantity(*QUANTITIES[k][:3], windows.unit), *figures, between]
 
 
 def windows_figure(windows: Windows) -> Figure:
     """Return a figure of the clusters on the middle slices, and of familiar numbers where they are least and greatest.
 
-    Each voxel of the structure has the colour of the nearest window, grey where this is not known. A number's two
-    slices are across z, through the windows of its extremes, which are framed; its colours go from one to the other.
+    Each voxel of the structure has the colour of the nearest window, grey where its value is not known. Each number has
+    two slices across z, through the windows of its extremes, which are framed; its colours go from one to the other.
     """
     figure = plot.make_figure(13.2, 13.2, layout="constrained")
     panels = figure.subplots(4, 4)
     structure = windows.structure
     for axis, axes in enumerate(panels[0, :3]):
-        place = structure.shape[axis] // 2
-        plane = _colour_structure(windows, windows.clusters.values, axis, place)
-        shown = COLOURS[np.where(np.isfinite(plane), plane, 0).astype(int)]
-        shown[~np.isfinite(plane) | (plane == 0)] = 0
-        _section_on(axes, windows, shown, axis, place)
-        axes.set_title(f"clusters, {_position(windows, axis, place)}", fontsize=9.5)
+        index = structure.shape[axis] // 2
+        labels = _colour_structure(windows, windows.clusters.values, axis, index)
+        colours = COLOURS[np.where(np.isfinite(labels), labels, 0).astype(int)]
+        colours[~np.isfinite(labels) | (labels == 0)] = 0
+        _section_on(axes, windows, colours, axis, index)
+        axes.set_title(f"clusters, {_position(windows, axis, index)}", fontsize=9.5)
     _legend_on(panels[0, 3], windows)
     pairs = panels[1:].reshape(len(plot.FAMILIAR), 2)
-    familiar = [each for each in QUANTITIES if each[1] in plot.FAMILIAR]
+    familiar = [quantity for quantity in QUANTITIES if quantity[1] in plot.FAMILIAR]
     for pair, (name, symbol, power, _) in zip(pairs, familiar, strict=True):
         values = windows[name].values
         label = f"{symbol} ({power_name(windows.unit, power)})" if power else symbol
-        ends = windows.extremes(name)
-        for axes, word, window in zip(pair, ("least", "greatest"), ends, strict=False):
-            low, high = (values[end] for end in ends)
-            place = _fullest_slice(windows, window)
-            plane = _colour_structure(windows, values, 0, place)
-            picture = _section_on(axes, windows, plane, 0, place, vmin=low, vmax=max(high, low + 1e-12), cmap="viridis")
-            extreme = format_number(values[window] + 0.0)  # of -0 as well
-            axes.set_title(f"{word} {symbol}: {extreme}, {_position(windows, 0, place)}", fontsize=9.5)
+        extremes = windows.extremes(name)
+        for axes, title, window in zip(pair, ("least", "greatest"), extremes, strict=False):
+            low, high = (values[extreme] for extreme in extremes)
+            index = _fullest_slice(windows, window)
+            plane = _colour_structure(windows, values, 0, index)
+            picture = _section_on(axes, windows, plane, 0, index, vmin=low, vmax=max(high, low + 1e-12), cmap="viridis")
+            value = format_number(values[window] + 0.0)  # -0 becomes 0
+            axes.set_title(f"{title} {symbol}: {value}, {_position(windows, 0, index)}", fontsize=9.5)
             axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
             edges = (np.array(windows.size) * windows.clusters.spacing / windows.stride)[1:]
             corner = windows.centres[window][1:] - edges / 2
             axes.add_patch(Rectangle(corner[::-1], *edges[::-1], fill=False, edgecolor=plot.INK, linestyle=(0, (4, 3))))
-        if not ends:
+        if not extremes:
             pair[0].set_title(f"{label} is not known", fontsize=9.5)
             continue
         plot.scale_on(pair[0], 1.0, windows.unit)
@@ -298,57 +299,57 @@ def windows_figure(windows: Windows) -> Figure:
     return figure
 
 
-def _position(windows: Windows, axis: int, place: int) -> str:
-    """Return where a slice lies, in the scan's unit."""
-    where = place * windows.structure.spacing[axis]
-    return f"{'zyx'[axis]} = {format_number(where)} {unit_name(windows.unit, 2)}"
+def _position(windows: Windows, axis: int, index: int) -> str:
+    """Return the position of a slice as text, in the scan's unit."""
+    position = index * windows.structure.spacing[axis]
+    return f"{'zyx'[axis]} = {format_number(position)} {unit_name(windows.unit, 2)}"
 
 
 def _legend_on(axes: Axes, windows: Windows) -> None:
     """Write which colour is which cluster, with its number of windows and its thickness."""
     labels, thickness = windows.clusters.values, windows["thickness"].values
-    marks = [Patch(color=str(UNKNOWN), label=f"not known: {(labels == 0).sum()} of {labels.size}")] * bool(
-        (labels == 0).any()
-    )
+    handles = []
+    if unknown := (labels == 0).sum():
+        handles.append(Patch(color=str(UNKNOWN), label=f"not known: {unknown} of {labels.size}"))
     for k in range(1, 1 + int(labels.max())):
         mean = format_length(float(thickness[labels == k].mean()), windows.unit)
-        marks.append(Patch(color=COLOURS[k], label=f"{k}: {(labels == k).sum()} windows, {mean} thick"))
+        handles.append(Patch(color=COLOURS[k], label=f"{k}: {(labels == k).sum()} windows, {mean} thick"))
     axes.set_axis_off()
-    axes.legend(handles=marks, title="cluster", loc="center left", frameon=False, fontsize=9.5, alignment="left")
+    axes.legend(handles=handles, title="cluster", loc="center left", frameon=False, fontsize=9.5, alignment="left")
 
 
-def _section_on(axes: Axes, windows: Windows, plane: np.ndarray, axis: int, place: int, **colours: Any) -> Any:
-    """Draw a slice over the structure in grey, with positions in the scan's unit, and return its picture."""
-    mask, (down, across) = windows.structure.values.take(place, axis), np.delete(windows.structure.spacing, axis)
+def _section_on(axes: Axes, windows: Windows, plane: np.ndarray, axis: int, index: int, **colours: Any) -> Any:
+    """Draw values (rows, columns) of a slice over the grey structure, on axes in the scan's unit; return the image."""
+    mask = windows.structure.values.take(index, axis)
+    down, across = np.delete(windows.structure.spacing, axis)
     rows, columns = mask.shape
     extent = (-across / 2, (columns - 0.5) * across, (rows - 0.5) * down, -down / 2)
     axes.imshow(np.where(mask, UNKNOWN, 1.0), cmap="gray", vmin=0, vmax=1, extent=extent)
     axes.locator_params(nbins=4)
     axes.tick_params(length=2, labelsize=8)
     axes.spines[:].set_color(plot.QUIET)
-    named = [f"{name} ({unit_name(windows.unit, 2)})" for k, name in enumerate("zyx") if k != axis]
-    axes.set_ylabel(named[0], fontsize=8)
-    axes.set_xlabel(named[1], fontsize=8)
+    vertical, horizontal = (f"{name} ({unit_name(windows.unit, 2)})" for k, name in enumerate("zyx") if k != axis)
+    axes.set_ylabel(vertical, fontsize=8)
+    axes.set_xlabel(horizontal, fontsize=8)
     return axes.imshow(plane, extent=extent, interpolation="nearest", **colours)
 
 
 def _nearest(windows: Windows, axis: int) -> np.ndarray:
-    """Return for each plane of voxels across an axis the number of the nearest windows along it."""
+    """Return, for each index of voxels along an axis, the index of the nearest windows along it."""
     count, step = windows.clusters.shape[axis], windows.clusters.spacing[axis]
-    places = np.arange(windows.structure.shape[axis]) * windows.structure.spacing[axis]
-    return np.clip(np.rint((places - windows.centres[0, 0, 0, axis]) / step).astype(int), 0, count - 1)
+    positions = np.arange(windows.structure.shape[axis]) * windows.structure.spacing[axis]
+    return np.clip(np.rint((positions - windows.centres[0, 0, 0, axis]) / step).astype(int), 0, count - 1)
 
 
 def _fullest_slice(windows: Windows, window: tuple[int, ...]) -> int:
-    """Return the number of the slice across z that has most structure in a window's colour."""
-    near = [_nearest(windows, axis) == k for axis, k in enumerate(window)]
-    inside = windows.structure.values[np.ix_(*near)].sum((1, 2))
-    return int(np.flatnonzero(near[0])[inside.argmax()])
+    """Return the index of the slice across z that has most of the structure nearest to a window."""
+    near = [np.flatnonzero(_nearest(windows, axis) == k) for axis, k in enumerate(window)]
+    counts = windows.structure.values[np.ix_(*near)].sum((1, 2))
+    return int(near[0][counts.argmax()])
 
 
-def _colour_structure(windows: Windows, values: np.ndarray, axis: int, place: int) -> np.ndarray:
-    """Return each voxel's value on a slice across an axis, the nearest window's; NaN off the structure."""
-    nearest = [_nearest(windows, k) for k in range(3)]
-    rows, columns = (places for k, places in enumerate(nearest) if k != axis)
-    plane = values.take(nearest[axis][place], axis)[np.ix_(rows, columns)]
-    return np.where(windows.structure.values.take(place, axis), plane, np.nan)
+def _colour_structure(windows: Windows, values: np.ndarray, axis: int, index: int) -> np.ndarray:
+    """Return a slice of voxels across an axis, each with its nearest window's value; NaN outside the structure."""
+    rows, columns = (_nearest(windows, k) for k in range(3) if k != axis)
+    plane = values.take(_nearest(windows, axis)[index], axis)[np.ix_(rows, columns)]
+    return np.where(windows.structure.values.take(index, axis), plane, np.nan)

@@ -21,13 +21,8 @@ from matplotlib.figure import Figure
 from curvafit.core.files import move_together, remove, temporary_folder
 from curvafit.core.records import Format, can_write, has_mark
 from curvafit.core.runtime import hold_signals
-from curvafit.core.units import (
-    format_number,
-)
-from curvafit.drawing.plot import (
-    png,
-    svg,
-)
+from curvafit.core.units import format_number
+from curvafit.drawing.plot import png, svg
 from curvafit.studies.scans import format_csv
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
@@ -58,10 +53,10 @@ def picture_of(figure: Figure | None, alt: str, **words: str) -> Picture:
 
 
 def render(name: str, **values: Any) -> str:
-    """Return a text of `templates`, filled with values, which are escaped in a page.
+    """Return the template of a name, filled with values, which are escaped in a page.
 
-    Of a page's values, `made` is a table of how it was made, `status` stands below the `title`, and `methods` and
-    `notes` after the sections.
+    All pages take `title`, and `made`, which says how the page was made; and, if there are any, `status` for below the
+    title, `methods` and `notes` for below the sections.
     """
     environment = Environment(
         loader=PackageLoader("curvafit.report"), autoescape=select_autoescape(), undefined=StrictUndefined,
@@ -81,27 +76,28 @@ def check_result_folder(
     overwrite: bool = False,
     command: str = "",
 ) -> Path:
-    """Return the folder if a result's files, the record and the page first, can be written there; else ValueError.
+    """Return the folder if a result can be written into it; else raise ValueError.
 
-    `inputs` are files or folders that are read, and so never written over. A result of the same `command` is replaced;
-    `overwrite` allows to replace others, and files that are no result.
+    `files` are the names of the record, the page and the result's other files, in this order. `inputs` are files or
+    folders that are read, and so never written over. An earlier result of the same `command` may be replaced; other
+    results, and files that are no result, only with `overwrite`.
     """
     folder = Path(directory)
-    first, page, *more = (folder / name for name in files)
-    ours = kind.owns(first) and has_mark(page, MARK) and _command_of(first) == command
-    can_write(first, lambda _: ours, more=(page, *more), inputs=inputs, overwrite=overwrite)
+    record, page, *others = (folder / name for name in files)
+    ours = kind.owns(record) and has_mark(page, MARK) and _command_of(record) == command
+    can_write(record, lambda _: ours, more=(page, *others), inputs=inputs, overwrite=overwrite)
     return folder
 
 
 def _command_of(record: Path) -> str:
-    """Return the command line that a result's record states; an empty one where Python made it."""
+    """Return the command line in a result's record; an empty text where the result was made from Python."""
     content = json.loads(record.read_text(encoding="utf-8"))
     return str(content.get("command") or content.get("provenance", {}).get("command") or "")
 
 
 @contextmanager
 def fill_folder(target: Path, files: Sequence[str]) -> Iterator[Path]:
-    """Give a temporary folder, and move its files into `target` together once all are whole.
+    """Yield a temporary folder to write into, and move its files into `target` together at the end of the block.
 
     Those of `files` that an earlier result had and this one lacks are deleted.
     """
@@ -116,10 +112,10 @@ def fill_folder(target: Path, files: Sequence[str]) -> Iterator[Path]:
 
 
 def start_record(command: str, **more: Any) -> dict[str, Any]:
-    """Return a record: version, date and command line, and more, of which is text what JSON has not."""
+    """Return a record of version, date, command line and `more`, whose values become JSON types or else text."""
     date = datetime.now(UTC).isoformat(timespec="seconds")
-    made = {"curvafit": version("curvafit"), "date": date, "command": command}
-    return made | json.loads(json.dumps(more, default=str))
+    origin = {"curvafit": version("curvafit"), "date": date, "command": command}
+    return origin | json.loads(json.dumps(more, default=str))
 
 
 def write_study(
@@ -136,16 +132,18 @@ def write_study(
 ) -> Path:
     """Write a study's record, page, tables, maps, and figures as PNG and SVG, into a folder together.
 
-    Return the page's path. The record and `values` fill the template of the page's name, besides the figures, each with
-    what it shows in words; entries of the record that are `shown` stand at the page's end.
+    `files` are their names, the record's and the page's first. The page is the template of its name, filled with the
+    record, `values` and the figures, each of which comes with a description; it ends with the entries of the record
+    that `shown` names. Return the page's path.
     """
-    pictures = {name: picture_of(*each) for name, each in (figures or {}).items()}
+    pictures = {name: picture_of(figure, alt) for name, (figure, alt) in (figures or {}).items()}
     made = {name: record[name] for name in shown if record[name] not in ("", {})}
-    page = render(files[1], made=made, **record | pictures | dict(values))
+    texts = {files[1]: render(files[1], made=made, **record | pictures | dict(values))}
+    texts |= {name: format_csv(list(rows)) for name, rows in tables.items()}
     with fill_folder(target, files) as work:
-        for name, field in (maps or {}).items():
-            save(field, work / name, kind=form.name)
-        for name, text in {files[1]: page, **{name: format_csv(list(rows)) for name, rows in tables.items()}}.items():
+        for name, volume in (maps or {}).items():
+            save(volume, work / name, kind=form.name)
+        for name, text in texts.items():
             (work / name).write_text(text, encoding="utf-8", newline="")
         for name, (figure, _) in (figures or {}).items():
             (work / f"{name}.png").write_bytes(base64.b64decode(pictures[name].data or ""))
