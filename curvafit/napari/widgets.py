@@ -51,10 +51,10 @@ _PAUSE = 100
 
 
 def field_of_layer(layer: Any, kind: str = "a layer") -> Volume:
-    """Return the values of a layer, of its finest level, with its scale and unit; else ScanError, which names the kind.
+    """Return a layer as a volume: its values (of the finest level), voxel edges and unit.
 
-    The layer has three axes, besides any of length one before them, and no colours. A turned or sheared layer is read
-    on its own axes.
+    The layer must have three axes, besides any of length one before them, and no colours; else ScanError is raised. A
+    rotated or sheared layer is read along its own axes. `kind` is what the message asks for where there is no layer.
     """
     if layer is None:
         raise ScanError(f"expected {kind}, got none: add one")
@@ -72,52 +72,50 @@ def field_of_layer(layer: Any, kind: str = "a layer") -> Volume:
 
 def _lengths(layer: Any) -> tuple[tuple[float, float, float], str]:
     """Return voxel edges (z, y, x) and their unit, that of the last axis."""
-    names = [str(each) for each in layer.units[-3:]]
-    if wrong := next((name for name in names if not is_unit(name)), None):
-        raise ScanError(f"expected lengths along the axes of {layer.name}, got the unit {wrong}")
+    names = [str(unit) for unit in layer.units[-3:]]
+    if other := next((name for name in names if not is_unit(name)), None):
+        raise ScanError(f"expected lengths along the axes of {layer.name}, got the unit {other}")
     units = [parse_unit(name)[0] for name in names]
     if 0 < units.count("voxel") < 3:
         raise ScanError(f"expected one kind of unit along the axes of {layer.name}, got pixels and lengths")
-    pairs = zip(layer.scale[-3:], names, strict=True)
-    z, y, x = (convert_length(abs(float(length)), own, units[-1]) for length, own in pairs)
+    edges = zip(layer.scale[-3:], names, strict=True)
+    z, y, x = (convert_length(abs(float(edge)), unit, units[-1]) for edge, unit in edges)
     return (z, y, x), units[-1]
 
 
 def place_of_layer(layer: Any) -> dict[str, Any]:
-    """Return options of a new layer that lies, with its three last axes, where a layer does."""
+    """Return options by which a new layer of three axes gets the position of a layer's last three axes."""
     return {
-        "scale": layer.scale[-3:],
-        "translate": layer.translate[-3:],
-        "rotate": layer.rotate[-3:, -3:],
-        "shear": layer.shear if len(layer.scale) == 3 else None,
-        "units": layer.units[-3:],
-    }
+        "scale": layer.scale[-3:], "translate": layer.translate[-3:], "rotate": layer.rotate[-3:, -3:],
+        "shear": layer.shear if len(layer.scale) == 3 else None, "units": layer.units[-3:],
+    }  # fmt: skip
 
 
 def place_of_field(field: Volume) -> dict[str, Any]:
-    """Return options of a layer for a field."""
+    """Return options by which a new layer gets the spacing and the unit of a volume."""
     return {"scale": field.spacing, "units": (_UNITS[field.unit],) * 3}
 
 
 def list_layers(viewer: Any, *kinds: str) -> list[tuple[str, Any]]:
-    """Return the layers of kinds such as `"Image"`, by name, without the images that the plugin added."""
-    layers = [layer for layer in viewer.layers if type(layer).__name__ in kinds]
-    return [
-        (layer.name, layer) for layer in layers if type(layer).__name__ != "Image" or "curvafit" not in layer.metadata
+    """Return (name, layer) of the layers of kinds such as `"Image"`, without the images that the plugin added."""
+    layers = [(type(layer).__name__, layer) for layer in viewer.layers]
+    layers = [
+        layer for kind, layer in layers if kind in kinds and (kind != "Image" or "curvafit" not in layer.metadata)
     ]
+    return [(layer.name, layer) for layer in layers]
 
 
 def put_layer(viewer: Any, kind: str, data: Any, name: str, **options: Any) -> Any:
-    """Add a layer of a kind, such as `"labels"`, in the place of one of its name that the plugin added."""
+    """Add a layer of a kind, such as `"labels"`; it replaces one of the same name that the plugin added."""
     drop_layer(viewer, name)
     return getattr(viewer, f"add_{kind}")(data, name=name, metadata={"curvafit": name}, **options)
 
 
 def drop_layer(viewer: Any, name: str) -> None:
     """Remove the layer of a name that the plugin added, if it is there."""
-    for old in list(viewer.layers):
-        if old.metadata.get("curvafit") == name:
-            viewer.layers.remove(old)
+    for layer in list(viewer.layers):
+        if layer.metadata.get("curvafit") == name:
+            viewer.layers.remove(layer)
 
 
 # ---- work in a thread, with progress, a button that stops it, and a sentence at the end ------------------------------
@@ -128,10 +126,8 @@ class Stopped(Exception):
 
 
 class Dock(Container):
-    """A widget that works: `prepare` reads the choices, its result runs in a thread, `show_result` takes what it gives.
-
-    The widgets of the choices come first, then the buttons, the progress and a sentence.
-    """
+    """A widget with a job: `prepare` reads the choices and returns a function, which runs in a thread; `show_result`
+    gets what that returns. Below the choices are the buttons, the progress and a sentence."""
 
     def __init__(self, viewer: Any, choices: list[Any], verb: str) -> None:
         self.viewer = viewer
@@ -143,7 +139,8 @@ class Dock(Container):
         self.status.native.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.MinimumExpanding)
         self.run_button.changed.connect(self.run)
         self.stop_button.changed.connect(self.stop)
-        self._stopping, self._told, self.worker = threading.Event(), ("", 0.0), None
+        self._stopping, self.worker = threading.Event(), None
+        self._latest = ("", 0.0)  # sentence and share done, which the thread writes and the timer shows
         self._timer = QTimer(self.native)
         self._timer.setInterval(_PAUSE)
         self._timer.timeout.connect(self._show_progress)
@@ -151,7 +148,7 @@ class Dock(Container):
 
     @abstractmethod
     def prepare(self) -> Callable[[Progress], Any]:
-        """Return the work, by the choices; raise ValueError where they are none."""
+        """Return the function that does the chosen work; raise ValueError where a choice is invalid."""
 
     @abstractmethod
     def show_result(self, result: Any) -> str:
@@ -165,13 +162,13 @@ class Dock(Container):
             self.say(f"{reason}.")
             return
         self._stopping.clear()
-        self._told = ("beginning", 0.0)
+        self._latest = ("beginning", 0.0)
         self.run_button.enabled, self.stop_button.enabled = False, True
         self.progress.visible = True
         self._show_progress()
         self._timer.start()
         connect = {"returned": self._end, "errored": self._fail, "finished": self._finish}
-        self.worker = create_worker(work, self._hear, _connect=connect, _ignore_errors=True)
+        self.worker = create_worker(work, self._note_progress, _connect=connect, _ignore_errors=True)
 
     def stop(self) -> None:
         """Stop the work at its next step."""
@@ -182,14 +179,14 @@ class Dock(Container):
         """Show a sentence."""
         self.status.value = text[:1].upper() + text[1:]
 
-    def _hear(self, text: str, share: float) -> None:
-        """Note how far the work is, in its thread."""
+    def _note_progress(self, text: str, share: float) -> None:
+        """Note how far the work is; called in its thread, which it ends where the user stopped it."""
         if self._stopping.is_set():
             raise Stopped
-        self._told = (text, share)
+        self._latest = (text, share)
 
     def _show_progress(self) -> None:
-        text, share = self._told
+        text, share = self._latest
         self.progress.value = round(100 * share)
         if not self._stopping.is_set():
             self.say(f"{text} …")
@@ -234,7 +231,7 @@ class Measure(Dock):
         self.measures: tuple[Measures, ...] = ()
 
     def prepare(self) -> Callable[[Progress], tuple[Measures, ...]]:
-        """Read the layer, and check the file."""
+        """Read the layer, check the file, and return the function that measures."""
         layer, path = self.layer.value, self._path
         self.table.value = {"data": [], "columns": []}
         self._draw(None)
@@ -244,39 +241,38 @@ class Measure(Dock):
         if type(layer).__name__ == "Image":
             options = {"dark": self.dark.value}
             return lambda progress: (measure_scan(field, progress=progress, **options),)
-        numbers = np.unique(field.values[field.values != 0])
-        places = np.flatnonzero((field.values != 0).any((1, 2)))
-        if len(numbers) == 0 or (len(places) > 1 and np.diff(places).min() > 1):
-            what = "labels" if len(numbers) == 0 else "labels on neighbouring slices: complete the layer first"
-            raise ValueError(f"expected {what}, got none in {layer.name}")
-        if len(numbers) > 1:
+        labels = np.unique(field.values[field.values != 0])
+        slices = np.flatnonzero((field.values != 0).any((1, 2)))
+        if len(labels) == 0 or (len(slices) > 1 and np.diff(slices).min() > 1):
+            expected = "labels" if len(labels) == 0 else "labels on neighbouring slices: complete the layer first"
+            raise ValueError(f"expected {expected}, got none in {layer.name}")
+        if len(labels) > 1:
             return lambda progress: measure_instances(field, progress=progress)
         return lambda progress: (measure_scan(field, progress=progress, kind="mask"),)
 
     def show_result(self, result: tuple[Measures, ...]) -> str:
         """Fill the table, draw the diagram, write the file, and let napari show a label's numbers beneath the mouse."""
-        self.measures, first, layer = result, result[0], self.layer.value
-        several = first.part is not None
-        powers = [power_name(first.unit, quantity.power) for quantity in first.quantities]
-        pairs = zip(first.quantities, powers, strict=True)
-        names = [f"{each.symbol} ({power})" if power else each.symbol for each, power in pairs]
-        if several:
-            labels = [each.part[1] for each in result if each.part]
-            cells = [[format_number(q.value, 4) for q in each.quantities] for each in result]
+        self.measures, layer = result, self.layer.value
+        first = result[0]
+        units = [(quantity.symbol, power_name(first.unit, quantity.power)) for quantity in first.quantities]
+        names = [f"{symbol} ({unit})" if unit else symbol for symbol, unit in units]
+        values = [[quantity.value for quantity in measures.quantities] for measures in result]
+        labels = [measures.part[1] for measures in result if measures.part]
+        if labels:
+            cells = [[format_number(value, 4) for value in row] for row in values]
             self.table.value = {"data": cells, "columns": names, "index": list(map(str, labels))}
         else:
             cells = [[format_number(q.value, 4), f"± {format_number(q.half, 2)}"] for q in first.quantities]
             self.table.value = {"data": cells, "columns": ["value", "95 %"], "index": names}
         self.table.native.resizeColumnsToContents()
-        self._draw(join_diagrams([each.diagram for each in result]))
-        if several and type(layer).__name__ == "Labels":
+        self._draw(join_diagrams([measures.diagram for measures in result]))
+        if labels and type(layer).__name__ == "Labels":
             import pandas
 
-            values = [[q.value for q in each.quantities] for each in result]
             layer.features = pandas.DataFrame(values, columns=names).assign(index=labels)
         if self._path is None:
-            why = [note for each in result for note in each.notes if note.startswith("No intervals")]
-            return f"{len(result)} labels measured." if several else " ".join(["Measured.", *why[:1]])
+            reasons = [note for note in first.notes if note.startswith("No intervals")]
+            return f"{len(result)} labels measured." if labels else " ".join(["Measured.", *reasons[:1]])
         return f"{write_table(result, self._path)} written."
 
     @property
@@ -341,11 +337,11 @@ def annotated_tubes() -> list[tuple[Any, dict[str, Any], str]]:
     tubes = generate("tubes", grid=(65, 80, 80), seed=0, schedule=schedule("fast", 400)).field.numpy() > 0
     noise = np.random.default_rng(0).standard_normal(tubes.shape)
     image = (100 + 60 * ndimage.gaussian_filter(tubes.astype(np.float32), 1.0) + 12 * noise).clip(0, 255)
-    some = np.zeros(tubes.shape, np.uint8)
-    some[::8] = tubes[::8]
-    place = {"scale": (0.5, 0.5, 0.5), "units": ("micrometer",) * 3}
+    annotated = np.zeros(tubes.shape, np.uint8)
+    annotated[::8] = tubes[::8]
+    scale = {"scale": (0.5, 0.5, 0.5), "units": ("micrometer",) * 3}
     return [
-        (image.astype(np.uint8), {"name": "tubes", **place}, "image"),
-        (some, {"name": "every 8th slice", **place}, "labels"),
-        (tubes.astype(np.uint8), {"name": "all of them", "visible": False, **place}, "labels"),
+        (image.astype(np.uint8), {"name": "tubes", **scale}, "image"),
+        (annotated, {"name": "every 8th slice", **scale}, "labels"),
+        (tubes.astype(np.uint8), {"name": "all of them", "visible": False, **scale}, "labels"),
     ]
