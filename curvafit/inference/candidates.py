@@ -24,7 +24,7 @@ from curvafit.priors.law import LawLike, read_fit
 from curvafit.scan.measures import scan_diagram
 from curvafit.scan.preparation import Prepared, thinner_thickness
 
-#: Greatest mass of either sign: a rare structure's field lies a little beyond ±1 in the mean.
+#: Greatest absolute mass: the mean of the field of a rare structure may lie a little beyond ±1.
 RARE = 1 - 1e-6
 #: Where a law comes from, as people read it.
 TITLES = {
@@ -41,7 +41,7 @@ EDGES = (32, 100)
 UNBELIEVABLE = 0.05
 #: What a verdict begins with where no law is the scan's, and where it is not known.
 UNBELIEVED, UNDECIDED = "No believable twin", "Undecided"
-#: Familiar numbers in which twins may differ from the scan, and the part by which all of them must to be named.
+#: Familiar numbers in which twins may differ from the scan, and the relative difference of all twins that is named.
 FAMILIAR = {"thickness": "thickness_mean", "spacing": "spacing_mean", "connectivity": "connectivity_density"}
 NEAR = 0.15
 
@@ -63,8 +63,8 @@ class Candidate:
     uncertainty
         Standard deviations by coefficient, and of the mass where it has one; empty where they are not known.
     thickness
-        How many of their own voxels the law's shapes are thick: its twins once they are grown. None where that is not
-        known, or the law is of a phase field's own voxels.
+        Thickness, in their own voxels, of the law's shapes: of its twins once they are grown. None where it is not
+        known, or the law is in a phase field's own voxels.
     distance
         Mean distance of its twins' curvature diagrams from the scan's, 1 / working unit; None where none grew.
     seed_noise
@@ -86,13 +86,13 @@ class Candidate:
     status: str = ""
 
     def compare(self, scan: Diagram, twins: Sequence[Twin]) -> Candidate:
-        """Return the candidate with what its twins measure against the scan's curvature diagram."""
+        """Return the candidate with its twins' figures, and their distances from the scan's diagram and each other."""
         diagrams = [twin.diagram for twin in twins if twin.diagram is not None]
         if not diagrams:
             return replace(self, status=f"{self.status} No shape grew: {twins[0].reason}.".strip())
         distance = float(one_to_many(scan, diagrams).mean())
-        pairs = [one_to_many(each, diagrams[k + 1 :]) for k, each in enumerate(diagrams[:-1])]
-        noise = float(np.concatenate(pairs).mean()) if pairs else None
+        between = [one_to_many(diagram, diagrams[k + 1 :]) for k, diagram in enumerate(diagrams[:-1])]
+        noise = float(np.concatenate(between).mean()) if between else None
         morphometries = tuple(twin.morphometry for twin in twins if twin.morphometry is not None)
         mass = self.mass
         if self.name == "match":
@@ -114,20 +114,21 @@ def best_candidate(candidates: Sequence[Candidate]) -> Candidate | None:
     # Twins of one law differ by the noise of their starts, so that a smaller distance within that noise says nothing;
     # then the law that follows from the field's own equation is the one to believe.
     least, nearest = min(grown, key=itemgetter(0))
-    reach = least + (nearest.seed_noise or 0.0)
-    return next((each for away, each in grown if each.name == "stationarity" and away <= reach), nearest)
+    limit = least + (nearest.seed_noise or 0.0)
+    return next((law for distance, law in grown if law.name == "stationarity" and distance <= limit), nearest)
 
 
 def seed_noise_of(candidates: Sequence[Candidate]) -> float | None:
     """Return the distance between two twins of the best candidate; of another one where it has fewer than two."""
     best = best_candidate(candidates)
-    known = [candidate.seed_noise for candidate in candidates if candidate.seed_noise is not None]
-    return best.seed_noise if best is not None and best.seed_noise is not None else next(iter(known), None)
+    if best is not None and best.seed_noise is not None:
+        return best.seed_noise
+    return next((candidate.seed_noise for candidate in candidates if candidate.seed_noise is not None), None)
 
 
 @dataclass(frozen=True)
 class _File:
-    """The candidates of a `fit.json`, whatever else the file holds."""
+    """The entries of a `fit.json` that are read; it may hold any others."""
 
     format: str
     candidates: tuple[Candidate, ...] = ()
@@ -136,7 +137,7 @@ class _File:
 def load_candidates(law: LawLike) -> tuple[Candidate, ...]:
     """Return the candidates of a fit, an inference or a `fit.json`; none of any other law.
 
-    Of a file no other entries are read: it may lack them. Raises FileNotFoundError or ValueError as `Fit.load`.
+    A file may lack all other entries. Raises FileNotFoundError or ValueError as `Fit.load`.
     """
     if not isinstance(law, (str, PathLike)):
         return getattr(getattr(law, "fit", law), "candidates", ())
@@ -164,23 +165,23 @@ def twin(
 ) -> Twin:
     """Grow a shape of a law in a box as many thicknesses long as the scan's main window, of `longest` voxels at most.
 
-    The mass of the atlas's match to a mask or an image is not the scan's: its shape fills as much of its box as the
-    structure does (`Prepared.true_volume_fraction`), or has the law's own mass where nothing grows so.
+    A match to a mask or an image has another mass than the scan: its shape is grown at the structure's volume fraction
+    (`Prepared.true_volume_fraction`), or at the law's own mass where nothing grows at that.
     """
     ratio = 1.0 if law.thickness is None else law.thickness / prepared.thickness
     z, y, x = (int(np.clip(ratio * (edge.stop - edge.start), EDGES[0], longest)) for edge in prepared.windows[0])
     grid = Grid((z, y, x), prepared.grid.spacing, "periodic")
     options = {"schedule": schedule, "seed": seed, "reject_early": True}
     if law.name == "match" and prepared.kind != "field":
-        share = prepared.true_volume_fraction
-        flow = generate(law.coefficients, law.mass, grid, volume_fraction=share, **options)
+        fraction = prepared.true_volume_fraction
+        flow = generate(law.coefficients, law.mass, grid, volume_fraction=fraction, **options)
         if (grown := _measure_twin(flow, prepared, seed)).phase is not None:
             return grown
     return _measure_twin(generate(law.coefficients, law.mass, grid, **options), prepared, seed)
 
 
 def _measure_twin(flow: Flow, prepared: Prepared, seed: int) -> Twin:
-    """Return a flow's shape with its diagram and numbers, as the scan would show it."""
+    """Measure the shape that a flow ended with as the scan would show it; without a shape, return the reason."""
     if not flow.viability.viable:
         return Twin(None, flow.mass, None, None, flow.viability.reason)
     field = flow.field.numpy()
@@ -189,18 +190,18 @@ def _measure_twin(flow: Flow, prepared: Prepared, seed: int) -> Twin:
         curvature = scan_diagram(seen)
     except ValueError as error:
         return Twin(None, flow.mass, None, None, str(error))
-    numbers = morphometry(seen.mask, seen.working_voxel, seen.unit, periodic=seen.grid.periodic)
-    return Twin(field, flow.mass, curvature, numbers, seen=seen)
+    figures = morphometry(seen.mask, seen.working_voxel, seen.unit, periodic=seen.grid.periodic)
+    return Twin(field, flow.mass, curvature, figures, seen=seen)
 
 
 @dataclass(frozen=True)
 class Misfit:
-    """The share of the model's shapes whose descriptors are as unusual as the scan's.
+    """The fraction of the model's shapes whose descriptors are as unusual as the scan's.
 
     `probability` is of all descriptors together, `blocks` of each block alone; `method` says what was compared with.
-    `departure` is how much farther the scan lies from shapes of the law than these from each other, in the mean, in the
-    emulator's uncorrelated directions; None where nothing grew. `level_cut` is the part of the model's shapes that look
-    as much like a level cut of a random field as the scan does; None where the posterior does not tell.
+    `departure` is the mean distance of the scan from shapes of the law, less the mean distance between these, in the
+    emulator's uncorrelated directions; None where nothing grew. `level_cut` is the fraction of the model's shapes that
+    look as much like a level cut of a random field as the scan does; None where the posterior cannot say.
     """
 
     probability: Annotated[float, Rule(least=0, most=1)]
@@ -223,26 +224,25 @@ def verdict(
 ) -> tuple[str | None, str]:
     """Return the name of the best supported law of a scan, and the verdict on it; no name where nothing grew.
 
-    The test alone decides (`Fit.misfit`). A law that is not believable is still named: it is the nearest that there is.
-    `fast` says that nothing was grown.
+    The test of the misfit alone decides whether a law is believable; one that is not is still named, as the nearest
+    there is. `fast` says that nothing was grown.
     """
     if fast:
         return candidates[0].name, _join(_describe_misfit(misfit), "Nothing was grown to check the law (--fast).")
     best = best_candidate(candidates)
     if best is None or best.distance is None:
         return None, _join("No law: nothing grew from any candidate.", candidates[0].status)
-    noise, title = seed_noise_of(candidates), TITLES[best.name]
+    noise = seed_noise_of(candidates)
     distances = f"its twins lie {best.distance:.1f} from the scan's curvature diagram"
     distances += f", {noise:.1f} from each other." if noise else "."
     if misfit is None:
-        word, reason = UNDECIDED, "The law was not tested."
-    elif misfit.probability < UNBELIEVABLE:
-        word, reason = UNBELIEVED, _describe_misfit(misfit)
+        rating, reason = UNDECIDED, "The law was not tested."
     else:
-        word, reason = "Supported", _describe_misfit(misfit)
-    other = find_differences(scan, best.twins)
-    familiar = f"Twins over scan: {', '.join(other)}." if other else ""
-    return best.name, _join(f"{word} ({title}): {distances}", reason, familiar, best.status)
+        rating = UNBELIEVED if misfit.probability < UNBELIEVABLE else "Supported"
+        reason = _describe_misfit(misfit)
+    differences = ", ".join(find_differences(scan, best.twins))
+    ratios = f"Twins over scan: {differences}." if differences else ""
+    return best.name, _join(f"{rating} ({TITLES[best.name]}): {distances}", reason, ratios, best.status)
 
 
 def _join(*sentences: str) -> str:
@@ -250,24 +250,24 @@ def _join(*sentences: str) -> str:
 
 
 def find_differences(scan: Morphometry, twins: Sequence[Morphometry]) -> list[str]:
-    """Return words on the familiar numbers that are greater, or smaller, in all twins than in the scan, by over `NEAR`.
+    """Describe the familiar numbers that are greater, or smaller, in all twins than in the scan, by over `NEAR`.
 
     Connectivities are counts of bodies and tunnels: by chance two counts differ by up to twice the root of their sum.
     """
-    words = []
-    for word, name in FAMILIAR.items():
-        own = getattr(scan, name)
-        ratios = np.array([getattr(twin, name) / own for twin in twins] if own else [])
+    differences = []
+    for label, name in FAMILIAR.items():
+        scan_value = getattr(scan, name)
+        ratios = np.array([getattr(twin, name) / scan_value for twin in twins] if scan_value else [])
         count = abs(1 - scan.euler) if name == "connectivity_density" else math.inf
-        reach = np.maximum(NEAR, 2 * np.sqrt((1 + np.abs(ratios)) / max(count, 1)))
-        if len(ratios) and ((ratios > 1 + reach).all() or (ratios < 1 - reach).all()):
+        tolerance = np.maximum(NEAR, 2 * np.sqrt((1 + np.abs(ratios)) / max(count, 1)))
+        if len(ratios) and ((ratios > 1 + tolerance).all() or (ratios < 1 - tolerance).all()):
             ratio = float(ratios.mean())
-            words.append(f"{word} of the other sign" if ratio < 0 else f"{word} {format_number(ratio, 2)}")
-    return words
+            differences.append(f"{label} of the other sign" if ratio < 0 else f"{label} {format_number(ratio, 2)}")
+    return differences
 
 
 def _describe_misfit(misfit: Misfit | None) -> str:
-    """Return how usual the scan is for the law, as a sentence."""
+    """Say in a sentence whether shapes of the law look like the scan, and what differs; "" where that is not known."""
     if misfit is None:
         return ""
     p = format_number(misfit.probability, 2)
@@ -275,11 +275,13 @@ def _describe_misfit(misfit: Misfit | None) -> str:
         if misfit.departure is None:
             return f"A quick reading does not rule this law out (p = {p})."
         return f"Shapes of this law look like the scan (p = {p})."
-    random = misfit.level_cut is not None and join_tests(1.0, misfit.level_cut) < UNBELIEVABLE
-    cut = "It looks more like a level cut of a random field, which no law made." if random else ""
+    # The level cut is one of two joined tests, so that its probability is doubled here as it is there.
+    like_level_cut = misfit.level_cut is not None and join_tests(1.0, misfit.level_cut) < UNBELIEVABLE
+    note = "It looks more like a level cut of a random field, which no law made." if like_level_cut else ""
     if misfit.departure is None:
-        return _join(f"A quick reading rules this law out (p = {p}).", cut)
-    strangest = [name for name, own in sorted(misfit.blocks.items(), key=itemgetter(1)) if own < UNBELIEVABLE]
-    what = f"what differs most: {', '.join(strangest)}" if strangest else "no descriptor tells it alone"
-    direction = "The scan has a direction (fabric), and the model has none." if "fabric" in strangest else ""
-    return _join(f"Shapes of this law do not look like the scan (p = {p}); {what}.", direction, cut)
+        return _join(f"A quick reading rules this law out (p = {p}).", note)
+    blocks = sorted(misfit.blocks.items(), key=itemgetter(1))
+    unlikely = [name for name, probability in blocks if probability < UNBELIEVABLE]
+    difference = f"what differs most: {', '.join(unlikely)}" if unlikely else "no descriptor tells it alone"
+    direction = "The scan has a direction (fabric), and the model has none." if "fabric" in unlikely else ""
+    return _join(f"Shapes of this law do not look like the scan (p = {p}); {difference}.", direction, note)

@@ -43,11 +43,11 @@ from curvafit.scan.structure import check_options, is_rounded, read_region
 from curvafit.volumes.read import Source
 from curvafit.volumes.volume import Volume
 
-#: Number of nearest shapes, and of those from which stationarity starts.
+#: Number of nearest shapes, and how many of them stationarity starts from.
 MATCHES, STARTS = 5, 3
 #: Whether a method refines the nearest match, in place of draws from the posterior.
 REFINED = {"posterior": False, "match": True}
-#: The seeds of the shapes that test a law come so much later than those of its twins.
+#: Distance of the seeds of the shapes that test a law from the seeds of its twins.
 TWINS = 1000
 
 
@@ -79,9 +79,9 @@ class Inference(Pictured):
 
     def __repr__(self) -> str:
         fit = self.fit
-        voxels = " x ".join(map(str, self.scan.values.shape))
-        near = ", ".join(f"{candidate.name} {format_number(candidate.distance, 2)}" for candidate in fit.candidates)
-        return f"Inference({fit.family} from {KINDS[fit.kind]} of {voxels} voxels, distances: {near}. {fit.status})"
+        size = " x ".join(map(str, self.scan.values.shape))
+        distances = ", ".join(f"{law.name} {format_number(law.distance, 2)}" for law in fit.candidates)
+        return f"Inference({fit.family} from {KINDS[fit.kind]} of {size} voxels, distances: {distances}. {fit.status})"
 
     @property
     def best(self) -> np.ndarray | None:
@@ -90,7 +90,7 @@ class Inference(Pictured):
 
     def shape_of(self, name: str | None) -> np.ndarray | None:
         """Return the first shape grown from a candidate's law; None where none grew."""
-        return next((each.phase for each in self.twins.get(name or "", ()) if each.phase is not None), None)
+        return next((twin.phase for twin in self.twins.get(name or "", ()) if twin.phase is not None), None)
 
     def to_law(self) -> Law:
         """Return the fit as a law, so that an inference is taken wherever a law is."""
@@ -139,61 +139,63 @@ def infer(
     method
         `"posterior"`, or `"match"`: nearest match, then gradient refinement. A match alone has no intervals.
     growth
-        Which shapes are grown to refine, compare and test laws. None grows nothing: seconds instead of minutes, but
-        nothing is checked by a twin.
+        Which shapes are grown to refine, compare and test laws. None grows nothing: the result takes seconds instead
+        of minutes, but no law is checked by a twin.
     seed, progress
         Seed of draws and shapes. `progress` is called with a sentence and the share done; by default the logger
         `curvafit` gets each stage once, at level INFO.
     reading
-        Options of reading a file, or the place of an array: spacing, unit, label, crop and the others of
-        `curvafit.load`. A `crop` is of the scan and of `roi`.
+        Options of reading a file or an array: spacing, unit, label, crop and the others of `curvafit.load`. A `crop`
+        applies to the scan and to `roi`.
     """
     check_options(kind, threshold, reading.get("label"))
     check_choice(method, REFINED, "method posterior or match")
     seed = check_int(seed, "a seed that is a whole number from 0", 0, SEEDS - 2)  # and the next one
     progress = progress or log_stages()
     progress("reading the scan", 0.0)
-    known = _Known.load(atlas, posterior)
+    references = _References.load(atlas, posterior)
     structure = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark, "roi": roi}
-    scanned = _read_and_prepare(scan, structure, reading)
-    return _infer_prepared(*scanned, known, refined=REFINED[method], growth=growth, seed=seed, progress=progress)
+    volume, shape, prepared = _read_and_prepare(scan, structure, reading)
+    settings = {"refined": REFINED[method], "growth": growth, "seed": seed, "progress": progress}
+    return _infer_prepared(volume, shape, prepared, references, **settings)
 
 
 def _infer_prepared(
-    volume: Volume, shape: tuple[int, int, int], prepared: Prepared, known: _Known, *, refined: bool,
+    volume: Volume, shape: tuple[int, int, int], prepared: Prepared, references: _References, *, refined: bool,
     growth: Growth | None, seed: int, progress: Progress,
 ) -> Inference:  # fmt: skip
-    """Measure a prepared scan, read its law, grow shapes, judge, and join all in one result."""
+    """Measure a prepared scan, estimate its law, grow and compare shapes, judge, and return all in one result."""
     progress("measuring curvature", 0.05)
     diagram = None if prepared.noise else scan_diagram(prepared)
-    numbers = morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=prepared.grid.periodic)
-    reason = NOISE if diagram is None else why_no_texture(prepared, diagram)
-    estimate, twins, judgement = Estimate(), dict[str, tuple[Twin, ...]](), Judgement(reason)
-    if diagram is not None and not reason:
+    figures = morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=prepared.grid.periodic)
+    no_law = NOISE if diagram is None else why_no_texture(prepared, diagram)
+    estimate, judgement = Estimate(), Judgement(no_law)
+    twins: dict[str, tuple[Twin, ...]] = {}
+    if diagram is not None and not no_law:
         progress("measuring descriptors", 0.1)
         described = measure_descriptors(prepared)
         settings = {"refined": refined, "growth": growth, "seed": seed, "progress": progress}
-        estimate = _estimate(prepared, diagram, described, known, **settings)
+        estimate = _estimate(prepared, diagram, described, references, **settings)
         if growth is not None:
             estimate, twins = _grow(estimate, diagram, prepared, growth, seed, progress)
-            misfit = _test_law(estimate, prepared, described, known, growth, seed, progress)
+            misfit = _test_law(estimate, prepared, described, references, growth, seed, progress)
             estimate = estimate if misfit is None else replace(estimate, misfit=misfit)
-        judgement = _judge(estimate, prepared, numbers, checked=growth is not None)
+        judgement = _judge(estimate, prepared, figures, checked=growth is not None)
         progress("done", 1.0)
-    provenance = _describe_provenance(volume, shape, known, growth, seed)
-    fit = _build_fit(prepared, diagram, numbers, estimate, judgement, provenance)
+    provenance = _describe_provenance(volume, shape, references, growth, seed)
+    fit = _build_fit(prepared, diagram, figures, estimate, judgement, provenance)
     return Inference(volume, prepared, diagram, twins, fit, estimate.simulated)
 
 
-class _Known(NamedTuple):
+class _References(NamedTuple):
     """What a scan is compared with."""
 
     atlas: Atlas
     posterior: Posterior
 
     @classmethod
-    def load(cls, atlas: str | Path | Atlas | None, posterior: str | Path | Posterior | None) -> _Known:
-        """Return both, by their paths or as they are given; by default the packaged ones."""
+    def load(cls, atlas: str | Path | Atlas | None, posterior: str | Path | Posterior | None) -> _References:
+        """Load those given by a path, keep those given as objects, and take the packaged ones for None."""
         if atlas is not None:
             check_type(atlas, (str, Path, Atlas), "an atlas, as the path of a file or as Atlas")
         if posterior is not None:
@@ -203,32 +205,33 @@ class _Known(NamedTuple):
 
 
 def _estimate(
-    prepared: Prepared, diagram: Diagram, described: Described | None, known: _Known, *, refined: bool,
+    prepared: Prepared, diagram: Diagram, described: Described | None, references: _References, *, refined: bool,
     growth: Growth | None, seed: int, progress: Progress,
 ) -> Estimate:  # fmt: skip
-    """Return what descriptors say of the law, and the laws to grow: of a phase field its stationarity, those read from
-    descriptors, the nearest match."""
+    """Estimate the law of a scan; the candidates to grow are, in this order, the law by which a phase field is
+    stationary, those read from the descriptors, and the nearest match of the atlas."""
     estimate = Estimate()
     if described is not None and not refined:
-        part = sub_progress(progress, 0.15, 0.5)
-        estimate = estimate_law(described, known.posterior, growth=growth, seed=seed, progress=part)
+        stage = sub_progress(progress, 0.15, 0.5)
+        estimate = estimate_law(described, references.posterior, growth=growth, seed=seed, progress=stage)
     progress("searching the atlas", 0.5)
-    matches = _find_matches(prepared, diagram, known.atlas, exact=refined)
-    read = estimate.candidates
+    matches = _find_matches(prepared, diagram, references.atlas, exact=refined)
     if described is not None and refined:
-        read = (refine_matches(described, known.posterior, matches),)
-    laws = (*read, Candidate("match", matches[0].coefficients, matches[0].mass, {}, matches[0].thickness))
+        estimate = Estimate(candidates=(refine_matches(described, references.posterior, matches),))
+    match = Candidate("match", matches[0].coefficients, matches[0].mass, {}, matches[0].thickness)
+    laws = (*estimate.candidates, match)
     if prepared.kind == "field" and not is_rounded(prepared.phase):
-        starts = [law.coefficients for law in (*read[:1], *matches[:STARTS])]
-        field, part = _main_window(prepared), sub_progress(progress, 0.5, 0.6)
-        laws = (stationarity(*field, WORKING_EPSILON, starts=starts, seed=seed, progress=part), *laws)
+        starts = [law.coefficients for law in (*estimate.candidates[:1], *matches[:STARTS])]
+        options = {"starts": starts, "seed": seed, "progress": sub_progress(progress, 0.5, 0.6)}
+        laws = (stationarity(*_main_window(prepared), WORKING_EPSILON, **options), *laws)
     return replace(estimate, candidates=laws, matches=matches)
 
 
 def _find_matches(prepared: Prepared, diagram: Diagram, atlas: Atlas, *, exact: bool) -> tuple[Match, ...]:
     """Return the shapes of the atlas that are nearest to a scan."""
-    # An atlas holds shapes that fill less than half: of one that fills more the background is looked up.
-    seen_as, inverted = "field" if prepared.kind == "field" else "mask", prepared.volume_fraction > HALF
+    seen_as = "field" if prepared.kind == "field" else "mask"
+    # The shapes of an atlas fill less than half of their box: of a structure that fills more, the background is sought.
+    inverted = prepared.volume_fraction > HALF
     query = diagram.mirrored if inverted else diagram
     matches = nearest(query, atlas, seen_as=seen_as, count=MATCHES, exact=exact)
     return tuple(map(mirror_match, matches)) if inverted else tuple(matches)
@@ -236,53 +239,55 @@ def _find_matches(prepared: Prepared, diagram: Diagram, atlas: Atlas, *, exact: 
 
 def _main_window(prepared: Prepared, step: float = 1.0) -> tuple[torch.Tensor, Grid]:
     """Return the phase field of the main window and its grid, on voxels of `step` working voxels."""
-    where = prepared.windows[0]
+    window = prepared.windows[0]
     if step == 1:
-        return torch.from_numpy(np.ascontiguousarray(prepared.phase[where])), prepared.part(where)
-    mask, boundary = sample_mask(prepared.mask[where], [step] * 3, prepared.grid.periodic), prepared.grid.boundary
-    grid = Grid(mask.shape, prepared.grid.spacing, boundary)
+        return torch.from_numpy(np.ascontiguousarray(prepared.phase[window])), prepared.part(window)
+    mask = sample_mask(prepared.mask[window], [step] * 3, prepared.grid.periodic)
+    grid = Grid(mask.shape, prepared.grid.spacing, prepared.grid.boundary)
     return phase_field(torch.from_numpy(mask), grid, WORKING_EPSILON), grid
 
 
 def _grow(
     estimate: Estimate, diagram: Diagram, prepared: Prepared, growth: Growth, seed: int, progress: Progress
 ) -> tuple[Estimate, dict[str, tuple[Twin, ...]]]:
-    """Grow a twin of each law, and `growth.twins` of the best (`best_candidate`)."""
-    twins, laws = dict[str, tuple[Twin, ...]](), estimate.candidates
-    part = sub_progress(progress, 0.6, 0.8 if growth.test else 1.0)
+    """Grow a twin of each law, and `growth.twins` of the best; return the compared laws, and the twins by law."""
+    twins: dict[str, tuple[Twin, ...]] = {}
+    stage = sub_progress(progress, 0.6, 0.8 if growth.test else 1.0)
 
-    def grow(law: Candidate, share: float) -> Candidate:
-        start = seed + len(twins.get(law.name, ()))
-        part(f"growing: {TITLES[law.name]}, seed {start}", share)
-        twins[law.name] = (*twins.get(law.name, ()), twin(law, prepared, start, growth.schedule))
+    def grow(law: Candidate, fraction_done: float) -> Candidate:
+        earlier = twins.get(law.name, ())
+        twin_seed = seed + len(earlier)
+        stage(f"growing: {TITLES[law.name]}, seed {twin_seed}", fraction_done)
+        twins[law.name] = (*earlier, twin(law, prepared, twin_seed, growth.schedule))
         return law.compare(diagram, twins[law.name])
 
+    laws = estimate.candidates
     laws = tuple(grow(law, 0.7 * k / len(laws)) for k, law in enumerate(laws))
-    most = 2 * growth.twins  # another twin may make another law the best
-    for k in range(most):
+    tries = 2 * growth.twins  # more than one law needs, as another twin may make another law the best
+    for k in range(tries):
         best = best_candidate(laws)
         if best is not None and len(twins[best.name]) < growth.twins:
-            laws = tuple(grow(law, 0.7 + 0.3 * k / most) if law is best else law for law in laws)
+            laws = tuple(grow(law, 0.7 + 0.3 * k / tries) if law is best else law for law in laws)
     return replace(estimate, candidates=laws), twins
 
 
 def _test_law(
-    estimate: Estimate, prepared: Prepared, described: Described | None, known: _Known, growth: Growth, seed: int,
-    progress: Progress,
+    estimate: Estimate, prepared: Prepared, described: Described | None, references: _References, growth: Growth,
+    seed: int, progress: Progress,
 ) -> Misfit | None:  # fmt: skip
-    """Return the test of the best law, if it is asked for, and both the law and the scan can be described."""
+    """Test the best law by further shapes; None where nothing grew, none is asked for, or there are no descriptors."""
     best = best_candidate(estimate.candidates)
     if best is None or described is None or not growth.test:
         return None
     options = {"seed": seed + TWINS, "schedule": growth.schedule, "progress": sub_progress(progress, 0.8, 1.0)}
-    return check_law(best, prepared, described, known.posterior, **options)
+    return check_law(best, prepared, described, references.posterior, **options)
 
 
 class Judgement(NamedTuple):
     """The verdict on a scan, and the name of the law that was chosen, if any.
 
-    `ratio` is the edge of a voxel of the law's shapes, in working voxels of the scan: with it they are as thick as the
-    scan's structure. `drift` is how far a flow of the law moves the scan's surface.
+    `ratio` is the edge, in working voxels of the scan, of the voxel with which the law's shapes are as thick as
+    the scan's structure. `drift` is how far, in working voxels, a short flow of the law moves that structure's surface.
     """
 
     status: str
@@ -291,56 +296,59 @@ class Judgement(NamedTuple):
     drift: float | None = None
 
 
-def _judge(estimate: Estimate, prepared: Prepared, numbers: Morphometry, *, checked: bool) -> Judgement:
+def _judge(estimate: Estimate, prepared: Prepared, figures: Morphometry, *, checked: bool) -> Judgement:
     """Choose a law and say what supports it; `checked` says whether shapes were grown."""
-    chosen, status = verdict(estimate.candidates, estimate.misfit, numbers, fast=not checked)
+    chosen, status = verdict(estimate.candidates, estimate.misfit, figures, fast=not checked)
     law = next((law for law in estimate.candidates if law.name == chosen), None)
     if law is None:
         return Judgement(status, chosen)
+    # The voxel of a phase field follows from its interface width; a mask shows none, so its thickness decides.
     scaled = prepared.kind != "field" and law.thickness is not None
     ratio = prepared.thickness / law.thickness if scaled else 1.0  # type: ignore[operator]
-    moved = drift(*_main_window(prepared, ratio), WORKING_EPSILON, law.coefficients)
-    return Judgement(status, chosen, ratio, moved)
+    distance = drift(*_main_window(prepared, ratio), WORKING_EPSILON, law.coefficients)
+    return Judgement(status, chosen, ratio, distance)
 
 
 def _read_and_prepare(
     scan: Source, options: Mapping[str, Any], reading: Mapping[str, Any]
 ) -> tuple[Volume, tuple[int, int, int], Prepared]:
-    """Return a scan, or a large one's middle at the level that suits its structure, the level's shape, and prepared."""
+    """Read and prepare a scan; of a large one its middle, at the level of its pyramid that suits its structure.
+
+    Returns the scan as read, the shape of that level, and the prepared scan.
+    """
     roi, crop = options["roi"], reading.get("crop")
     volume, shape = read_scan(scan, whole=roi is not None or options["periodic"], **reading)
     if roi is not None:
-        place = {name: value for name, value in reading.items() if name not in ("label", "crop")}
-        region, laid = read_region(roi, volume, scan, crop, **place)
-        volume, options = replace(volume, notes=volume.notes + laid), {**options, "roi": region}
+        position = {name: value for name, value in reading.items() if name not in ("label", "crop")}
+        region, region_notes = read_region(roi, volume, scan, crop, **position)
+        volume, options = replace(volume, notes=volume.notes + region_notes), {**options, "roi": region}
     prepared = prepare(volume, one_scale=True, **options)
     if crop is None and reading.get("label") is None and volume.shape != shape:
         level = coarser_level(scan, shape, prepared, **reading)
         if level is not None:
-            other, size = read_scan(scan, **{**reading, "key": level})
+            coarser, coarser_shape = read_scan(scan, **{**reading, "key": level})
             note = f"Read at the level {level} of its pyramid, which shows more of this large scan than the finest."
-            other = replace(other, notes=(*other.notes, note))
-            coarser = prepare(other, one_scale=True, **options)
-            if coarser.kind == prepared.kind:  # the means of a mask are an image
-                return other, size, coarser
+            coarser = replace(coarser, notes=(*coarser.notes, note))
+            coarser_prepared = prepare(coarser, one_scale=True, **options)
+            if coarser_prepared.kind == prepared.kind:  # a coarser level may average a mask to an image
+                return coarser, coarser_shape, coarser_prepared
     return volume, shape, prepared
 
 
 def _build_fit(
-    prepared: Prepared, diagram: Diagram | None, numbers: Morphometry, estimate: Estimate, judgement: Judgement,
+    prepared: Prepared, diagram: Diagram | None, figures: Morphometry, estimate: Estimate, judgement: Judgement,
     provenance: dict[str, Any],
 ) -> Fit:  # fmt: skip
-    """Return the fit of a scan: what was measured, read of it, grown and judged."""
     grid, ratio = prepared.grid, judgement.ratio
     return Fit(
         kind=prepared.kind,
         family="noise" if diagram is None else family_of(diagram, prepared.thickness / 2 * grid.spacing[0]),
-        scale=tuple(ratio * step for step in prepared.scale),  # type: ignore[arg-type]
+        scale=tuple(ratio * scale for scale in prepared.scale),  # type: ignore[arg-type]
         working_voxel=ratio * prepared.working_voxel,
         length_unit=prepared.unit,
         thickness=prepared.thickness * prepared.working_voxel,
         status=judgement.status,
-        morphometry=numbers,
+        morphometry=figures,
         notes=prepared.notes,
         provenance=provenance,
         diagram=None if diagram is None else diagram.thin(BIN_WIDTH, TAIL_SHARE),
@@ -356,7 +364,7 @@ def _build_fit(
 
 
 def _describe_provenance(
-    volume: Volume, shape: tuple[int, ...], known: _Known, growth: Growth | None, seed: int
+    volume: Volume, shape: tuple[int, ...], references: _References, growth: Growth | None, seed: int
 ) -> dict[str, Any]:
     return {
         "curvafit": version("curvafit"),
@@ -366,8 +374,8 @@ def _describe_provenance(
         "seed": seed,
         "schedule": schedule(LEARNED if growth is None else growth.schedule).as_dict(),
         "epsilon": WORKING_EPSILON,
-        "atlas": {"format": VERSION, "shapes": len(known.atlas.ids)},
-        "posterior": {name: value for name, value in known.posterior.provenance.items() if name != "table"},
+        "atlas": {"format": VERSION, "shapes": len(references.atlas.ids)},
+        "posterior": {name: value for name, value in references.posterior.provenance.items() if name != "table"},
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "python": platform.python_version(),
         "torch": version("torch"),
