@@ -32,7 +32,7 @@ class Atlas:
 
     `ids` name the shapes; `coefficients` is float64 (N, 6) in the order of `curvafit.priors.coefficients.NAMES`,
     `masses` m₀, `volume_fractions` of {u > 0} and `thicknesses` in voxels float64 (N,), `seeds` int64 (N,) those of the
-    noise each shape grew from. Masks are measured as scans are, on voxels of which they are eight thick. `provenance`
+    noise each shape grew from. Masks are measured as scans are, on voxels with which they are eight thick. `provenance`
     says how they were made: grid, schedule, law, versions, command, date.
     """
 
@@ -76,15 +76,16 @@ class Atlas:
     def embeddings(self, seen_as: str) -> np.ndarray:
         """Return the sliced-quantile embeddings (N, 288) of those diagrams; computed once."""
         if seen_as not in self._embedded:
-            self._embedded[seen_as] = np.stack([np.asarray(sliced_embedding(each)) for each in self.diagrams(seen_as)])
+            rows = [np.asarray(sliced_embedding(diagram)) for diagram in self.diagrams(seen_as)]
+            self._embedded[seen_as] = np.stack(rows)
         return self._embedded[seen_as]
 
 
 def save_atlas(atlas: Atlas, path: str | Path) -> None:
     """Write an atlas as one compressed `.npz`: arrays, and a JSON header with format, version and provenance.
 
-    Points are stored in float16: κ is rounded by at most 2⁻¹¹ of itself (0.03 at 100), far below the bins' width of 2.
-    Weights, as parts of a diagram's area, are stored in float32.
+    Points are stored in float16: κ has a relative error of at most 2⁻¹¹ (0.03 at 100), far below the bins' width of 2.
+    Weights are stored in float32, divided by the diagram's area.
     """
     arrays = {name: getattr(atlas, name) for name in ARRAYS}
     for view in SEEN_AS:
@@ -93,7 +94,7 @@ def save_atlas(atlas: Atlas, path: str | Path) -> None:
         packed = {
             "points": np.concatenate([d.points for d in diagrams]).astype(np.float16),
             "weights": np.concatenate([d.weights / a for d, a in zip(diagrams, areas, strict=True)]).astype(np.float32),
-            "offsets": np.cumsum([0] + [len(d.weights) for d in diagrams]),  # number i's rows end before the (i + 1)th
+            "offsets": np.cumsum([0] + [len(d.weights) for d in diagrams]),  # diagram i has rows offsets[i:i + 2]
             "areas": areas,
             "spreads": np.array([d.spread for d in diagrams]),
             "excluded": np.array([d.excluded for d in diagrams]),
@@ -103,7 +104,7 @@ def save_atlas(atlas: Atlas, path: str | Path) -> None:
 
 
 def load_atlas(path: str | Path | None = None) -> Atlas:
-    """Read an atlas file; without a path, the one that comes with the package.
+    """Read an atlas file; by default the packaged one.
 
     Raises FileNotFoundError if there is no such file, and ValueError if it is not an atlas, is truncated, or has
     another format version.
@@ -116,22 +117,23 @@ def load_atlas(path: str | Path | None = None) -> Atlas:
 
 
 def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Atlas:
-    sound = all(x.dtype.kind in "iuf" and np.isfinite(x).all() for x in arrays.values())
-    if not (sound and (np.abs(arrays["masses"]) < 1).all() and all(isinstance(one, str) for one in header["ids"])):
+    finite = all(array.dtype.kind in "iuf" and np.isfinite(array).all() for array in arrays.values())
+    if not (finite and (np.abs(arrays["masses"]) < 1).all() and all(isinstance(name, str) for name in header["ids"])):
         raise ValueError("expected finite numbers, masses in (-1, 1) and ids that are texts, got others")
     diagrams = (_unpack_diagrams(arrays, view) for view in SEEN_AS)
     return Atlas(tuple(header["ids"]), *(arrays[name] for name in ARRAYS), *diagrams, header["provenance"])  # type: ignore[call-arg]
 
 
 def _unpack_diagrams(arrays: dict[str, np.ndarray], view: str) -> tuple[Diagram, ...]:
+    """Return the diagrams whose points and weights `save_atlas` wrote one after the other."""
     points, weights = (arrays[f"{view}_{name}"].astype(np.float64) for name in ("points", "weights"))
-    bounds = arrays[f"{view}_offsets"].astype(np.int64)
-    if list(bounds[[0, -1]]) != [0, len(points)] or (np.diff(bounds) < 0).any():
+    offsets = arrays[f"{view}_offsets"].astype(np.int64)
+    if list(offsets[[0, -1]]) != [0, len(points)] or (np.diff(offsets) < 0).any():
         raise ValueError(f"expected offsets from 0 to {len(points)}, got others")
-    figures = (arrays[f"{view}_{name}"] for name in ("areas", "spreads", "excluded"))
+    columns = (arrays[f"{view}_{name}"] for name in ("areas", "spreads", "excluded"))
     return tuple(
-        Diagram(points[first:last], weights[first:last] * area, spread=float(spread), excluded=float(excluded))
-        for first, last, area, spread, excluded in zip(bounds[:-1], bounds[1:], *figures, strict=True)
+        Diagram(points[start:end], weights[start:end] * area, spread=float(spread), excluded=float(excluded))
+        for start, end, area, spread, excluded in zip(offsets[:-1], offsets[1:], *columns, strict=True)
     )
 
 
@@ -139,7 +141,7 @@ def _unpack_diagrams(arrays: dict[str, np.ndarray], view: str) -> tuple[Diagram,
 class Match:
     """A shape of an atlas, and the Wasserstein distance of its diagram to the query's (1 / working unit).
 
-    `coefficients` (working units), `mass` m₀ and the noise `seed` made the shape, `thickness` of its voxels thick.
+    `coefficients` (working units), `mass` m₀ and the noise `seed` made the shape; `thickness` is in its own voxels.
     """
 
     id: str
@@ -152,8 +154,8 @@ class Match:
 
 def mirror_match(match: Match) -> Match:
     """Return a match's shape with inside and outside exchanged, in the gauge a20 = 1."""
-    six = match.coefficients.mirror()
-    return replace(match, coefficients=six.scale(1 / float(six.a20)), mass=-match.mass)
+    mirrored = match.coefficients.mirror()
+    return replace(match, coefficients=mirrored.scale(1 / float(mirrored.a20)), mass=-match.mass)
 
 
 def nearest(
@@ -170,23 +172,21 @@ def nearest(
     seen_as
         What the query was measured on, `"field"` or `"mask"`: it is compared with diagrams of the same kind.
     exact
-        Compute the distances of the matches by geomloss in float64 (`wasserstein`), and not in float32.
+        Compute the distances of the matches by geomloss in float64 (`wasserstein`), in place of float32.
     """
     if count < 1:
         raise ValueError(f"expected a count of at least 1, got {count}")
     candidates = atlas.diagrams(seen_as)
     if not float(diagram.weights.sum()) > 0:
         raise ValueError("expected a diagram with area, got an empty one")
-    away = np.linalg.norm(atlas.embeddings(seen_as) - np.asarray(sliced_embedding(diagram)), axis=1)
-    near = np.argsort(away, kind="stable")[: max(count, SHORT)].tolist()
-    distances = one_to_many(diagram, [candidates[i] for i in near])
-    matches = [
-        Match(
-            atlas.ids[near[k]],
-            wasserstein(diagram, candidates[near[k]]) if exact else float(distances[k]),
-            atlas.shape_coefficients(near[k]),
-            *(each[near[k]].item() for each in (atlas.masses, atlas.seeds, atlas.thicknesses)),
-        )
-        for k in np.argsort(distances, kind="stable")[:count]
-    ]
+    sliced = np.linalg.norm(atlas.embeddings(seen_as) - np.asarray(sliced_embedding(diagram)), axis=1)
+    shortlist = np.argsort(sliced, kind="stable")[: max(count, SHORT)].tolist()
+    distances = one_to_many(diagram, [candidates[position] for position in shortlist])
+    matches = []
+    for k in np.argsort(distances, kind="stable")[:count]:
+        position = shortlist[k]
+        distance = wasserstein(diagram, candidates[position]) if exact else float(distances[k])
+        others = (column[position].item() for column in (atlas.masses, atlas.seeds, atlas.thicknesses))
+        matches.append(Match(atlas.ids[position], distance, atlas.shape_coefficients(position), *others))
+    # Exact distances may give another order than those in float32.
     return tuple(sorted(matches, key=lambda match: match.distance))

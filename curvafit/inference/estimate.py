@@ -33,29 +33,29 @@ from curvafit.priors.grid import Grid
 from curvafit.scan.measures import Reading, read_texture, windows_along
 from curvafit.scan.preparation import HALF, Prepared
 
-#: Draws from the posterior, and those among which more are chosen to be grown.
+#: Draws from the posterior, and draws among which the search chooses parameters to grow.
 DRAWS, POOL = 400, 2000
 #: Edge, in voxels, of the boxes in which draws are grown.
 EDGE = 64
-#: Draws from which the best parameters are looked for.
+#: Draws from which the search for the best parameters starts.
 STARTS = 8
-#: Least simulations to go on from, and least windows of shapes to test a law with.
+#: Least number of simulations to refine from, and of windows of shapes to test a law with.
 FEWEST = 6
-#: Windows of shapes that a law is tested with, and the least deviation of a column, of the mean of its block's.
+#: Windows of shapes that a law is tested with, and the least deviation of a column, as a fraction of its block's mean.
 TESTED, FAINTEST = 24, 0.05
-#: Most relabellings of windows that are tried; where there are fewer, all of them are.
+#: Most relabellings of windows that are tried; all are, where there are no more.
 RELABELLED = 1999
 
 
 class Described(NamedTuple):
-    """The phase of a scan that is described, what is read of it, and whether it is the background."""
+    """A scan whose rarer phase is taken as the structure, the reading of that, and whether it is the background."""
 
-    seen: Prepared
+    prepared: Prepared
     reading: Reading
     background: bool
 
-    def turn(self, parameters: np.ndarray) -> np.ndarray:
-        """Return the parameters of the structure from those of the phase that is described, or the other way round."""
+    def mirror_if_background(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the parameters of the scan's structure from those of the described phase, or the reverse."""
         return mirror_parameters(parameters) if self.background else parameters
 
 
@@ -63,8 +63,8 @@ class Described(NamedTuple):
 class Estimate:
     """What is read of a scan's law: draws, view, combinations, candidates, misfit and matches, as a `Fit` has them.
 
-    `simulated` has, by block of descriptors, the scan's numbers `(k,)` and those of shapes grown from draws `(n, k)`;
-    None where none grew.
+    `simulated` has, by block, the descriptors of the scan `(k,)` and of shapes grown from draws `(n, k)`; None where
+    none grew.
     """
 
     draws: np.ndarray | None = None
@@ -78,52 +78,51 @@ class Estimate:
 
 def measure_descriptors(prepared: Prepared) -> Described | None:
     """Measure the descriptors of a scan; None where they cannot be measured."""
-    # Of a structure that fills most of the volume the background is described, as the training's shapes were thin.
-    turned = prepared.volume_fraction > HALF
-    seen = prepared.inverted if turned else prepared
-    reading = read_texture(seen)
-    return None if reading is None else Described(seen, reading, turned)
+    # The training's shapes fill less than half of their box, so of a structure that fills more the background is taken.
+    background = prepared.volume_fraction > HALF
+    described = prepared.inverted if background else prepared
+    reading = read_texture(described)
+    return None if reading is None else Described(described, reading, background)
 
 
 def estimate_law(
     described: Described, posterior: Posterior, *, growth: Growth | None, seed: int, progress: Progress
 ) -> Estimate:
-    """Read the law of a scan from its descriptors: draw from the posterior, grow some draws, and compare.
+    """Read the law of a scan from its descriptors: draw from the posterior, grow some of the draws, and refine by them.
 
-    The parameters are as in `infer`; where nothing grows the scan is compared with what training left unexplained.
+    `growth` and `seed` are as in `infer`; where too little grows, the best fit is compared with those of training.
     """
-    reading, of_structure = described.reading, described.turn
+    reading, mirror = described.reading, described.mirror_if_background
     progress("reading the posterior", 0.0)
     draws = posterior.draw(reading, DRAWS, seed)
-    parameters = draws[:, :-1]
+    parameters, log_thickness = draws[:, :-1], draws[:, -1]
     combinations = posterior.combinations.read(parameters, background=described.background)
-    estimate = Estimate(np.column_stack([of_structure(parameters), draws[:, -1]]), reading.view, combinations)
-    thickness = float(np.exp(np.median(draws[:, -1])))
-    likely = Candidate(
-        "posterior", *law_of(of_structure(middle_of(parameters))), _deviations(of_structure(parameters)), thickness
-    )
+    estimate = Estimate(np.column_stack([mirror(parameters), log_thickness]), reading.view, combinations)
+    thickness = float(np.exp(np.median(log_thickness)))
+    middle = Candidate("posterior", *law_of(mirror(middle_of(parameters))), _deviations(mirror(parameters)), thickness)
     grown = None
     if growth is not None and growth.simulations:
-        simulate, step = _simulator(described.seen, reading.view, growth.schedule), sub_progress(progress, 0.15, 0.45)
-        grown = simulate_draws(parameters, simulate, growth.simulations, seed=seed, progress=step)
+        simulate = _simulator(described.prepared, reading.view, growth.schedule)
+        stage = sub_progress(progress, 0.15, 0.45)
+        grown = simulate_draws(parameters, simulate, growth.simulations, seed=seed, progress=stage)
     if growth is None or grown is None or len(grown.parameters) < FEWEST:
-        own_misfit = misfits(posterior.emulator, *reading.columns, parameters[None, :STARTS])[0]
-        p, level_cut = _join_level_cut(
-            tail_probability(posterior.misfits[reading.view], own_misfit), posterior, reading
-        )
+        unexplained = misfits(posterior.emulator, *reading.columns, parameters[None, :STARTS])[0]
+        p = tail_probability(posterior.misfits[reading.view], unexplained)
+        p, level_cut = _join_level_cut(p, posterior, reading)
         misfit = Misfit(p, {}, "by the best fit, nothing grown", level_cut=level_cut)
-        candidates = (likely, _best_fit(posterior, described, parameters[:STARTS], thickness))
+        candidates = (middle, _best_fit(posterior, described, parameters[:STARTS], thickness))
         return replace(estimate, candidates=candidates, misfit=misfit)
     pool = posterior.draw(reading, POOL, seed)[:, :-1]
     search = Search(posterior.emulator, reading)
-    step = sub_progress(progress, 0.45, 1.0)
-    likeliest, simulations = search.run(pool, grown, simulate, rounds=growth.rounds, seed=seed, progress=step)
+    stage = sub_progress(progress, 0.45, 1.0)
+    likeliest, simulations = search.run(pool, grown, simulate, rounds=growth.rounds, seed=seed, progress=stage)
     nearest = simulations.parameters[search.nearest(simulations)[0]]
-    laws = {"refined": likeliest} | ({} if np.array_equal(nearest, likeliest) else {"simulation": nearest})
-    refined, *others = (Candidate(name, *law_of(of_structure(each)), {}, thickness) for name, each in laws.items())
-    names, row, rows = np.array(column_names()), reading.descriptors, grown.columns[0]
-    blocks = {name: (row[names == name], rows[:, names == name]) for name in BLOCKS}
-    return replace(estimate, candidates=(refined, likely, *others), simulated=blocks)
+    candidates = (Candidate("refined", *law_of(mirror(likeliest)), {}, thickness), middle)
+    if not np.array_equal(nearest, likeliest):
+        candidates += (Candidate("simulation", *law_of(mirror(nearest)), {}, thickness),)
+    blocks, scan_row, grown_rows = np.array(column_names()), reading.descriptors, grown.columns[0]
+    simulated = {block: (scan_row[blocks == block], grown_rows[:, blocks == block]) for block in BLOCKS}
+    return replace(estimate, candidates=candidates, simulated=simulated)
 
 
 def refine_matches(described: Described, posterior: Posterior, matches: Sequence[Match]) -> Candidate:
@@ -131,33 +130,32 @@ def refine_matches(described: Described, posterior: Posterior, matches: Sequence
 
     Levenberg and Marquardt's method, by optimistix, starts from each match, with the exact derivatives of the emulator.
     """
-    starts = described.turn(np.stack([parameters_of(match.coefficients, match.mass) for match in matches]))
-    return _best_fit(posterior, described, starts, matches[0].thickness)
+    parameters = np.stack([parameters_of(match.coefficients, match.mass) for match in matches])
+    return _best_fit(posterior, described, described.mirror_if_background(parameters), matches[0].thickness)
 
 
 def middle_of(parameters: np.ndarray) -> np.ndarray:
     """Return the row of parameters `(n, 6)` nearest to the medians, in units of each column's range."""
-    # Medians taken one by one need not be a law that the posterior holds likely: its parameters are correlated. A draw
-    # is one.
-    away = (parameters - np.median(parameters, 0)) / np.ptp(parameters, axis=0)
-    return parameters[np.square(away).sum(1).argmin()]
+    # As parameters are correlated, the medians of all six together may be a law that the posterior holds unlikely.
+    offsets = (parameters - np.median(parameters, 0)) / np.ptp(parameters, axis=0)
+    return parameters[np.square(offsets).sum(1).argmin()]
 
 
 def _best_fit(posterior: Posterior, described: Described, starts: np.ndarray, thickness: float) -> Candidate:
     """Return the best fit of the descriptors, with deviations by draws from the normal distribution around it."""
     best, covariance = best_parameters(posterior.emulator, described.reading, starts)
-    near = np.random.default_rng(0).multivariate_normal(best, covariance, DRAWS, check_valid="ignore")
-    deviations = _deviations(described.turn(np.clip(near, *posterior.emulator.box.T)))
-    return Candidate("optimum", *law_of(described.turn(best)), deviations, thickness)
+    samples = np.random.default_rng(0).multivariate_normal(best, covariance, DRAWS, check_valid="ignore")
+    deviations = _deviations(described.mirror_if_background(np.clip(samples, *posterior.emulator.box.T)))
+    return Candidate("optimum", *law_of(described.mirror_if_background(best)), deviations, thickness)
 
 
 def _deviations(parameters: np.ndarray) -> dict[str, float]:
-    """Return the standard deviations by name, 0 for a20, of parameters `(n, 6)`."""
+    """Return the standard deviations of parameters `(n, 6)` by name; that of a20, which is 1, is 0."""
     return {"a20": 0.0} | dict(zip(COLUMNS, to_columns(parameters).std(1).tolist(), strict=False))
 
 
 def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simulate:
-    """Return a function that grows a shape in a box of the training, and reads its descriptors as the scan's were."""
+    """Return a function that grows a shape in a box of training's size, and reads its descriptors as the scan's."""
     grid = Grid((EDGE, EDGE, EDGE))
 
     def simulate(parameters: np.ndarray, seed: int) -> Reading | None:
@@ -173,63 +171,58 @@ def _simulator(prepared: Prepared, view: str, schedule: Schedule | str) -> Simul
 
 
 def tail_probability(values: np.ndarray, own: float) -> float:
-    """Return the probability that a number is as great as `own` where it, too, is one of such as `values` `(n,)`."""
+    """Return the probability that a value drawn as `values` `(n,)` were is at least `own`, which counts among them."""
     return float((1 + (values >= own).sum()) / (1 + len(values)))
 
 
 def check_law(
-    law: Candidate,
-    prepared: Prepared,
-    described: Described,
-    posterior: Posterior,
-    *,
-    seed: int = 0,
-    schedule: Schedule | str = LEARNED,
-    progress: Progress = silent,
-) -> Misfit | None:
-    """Compare a scan's windows with those of shapes of a law, seen as the scan is (`compare_windows`).
+    law: Candidate, prepared: Prepared, described: Described, posterior: Posterior, *, seed: int = 0,
+    schedule: Schedule | str = LEARNED, progress: Progress = silent,
+) -> Misfit | None:  # fmt: skip
+    """Grow shapes of a law, and compare the scan's windows with theirs, scanned alike (`compare_windows`).
 
-    A shape shows as many windows as the scan's main window does: parts of a large shape differ more than small shapes,
-    each of which has the mass of the law. As many shapes are grown as show `TESTED` windows; where some are not well
-    formed, up to as many again are tried.
-
-    Returns None where fewer than two shapes, or `FEWEST` windows, grow.
+    A shape is read in as many windows as the scan's main window: windows of one large shape differ more than small
+    shapes, each of which has the mass of the law. So many shapes are grown that they have `TESTED` windows; where some
+    are not well formed, up to as many again are tried. Returns None where fewer than two shapes, or `FEWEST` windows,
+    grow.
     """
-    reading, background = described.reading, described.background
+    reading = described.reading
     across = windows_along(prepared, [edge.stop - edge.start for edge in prepared.windows[0]])
-    count, rows = -(-TESTED // math.prod(across)), []
+    count = math.ceil(TESTED / math.prod(across))
+    windows = []
     for k in range(2 * count):
         grown = twin(law, prepared, seed + k, schedule, longest=EDGE * max(across))
         if grown.seen is not None:
-            own = read_texture(grown.seen.inverted if background else grown.seen, reading.view, across)
-            rows += [] if own is None else [own.windows]
-        progress(f"testing the law: {len(rows)} of {count} shapes", len(rows) / count)
-        if len(rows) == count:
+            scanned = grown.seen.inverted if described.background else grown.seen
+            if (twin_reading := read_texture(scanned, reading.view, across)) is not None:
+                windows.append(twin_reading.windows)
+        progress(f"testing the law: {len(windows)} of {count} shapes", len(windows) / count)
+        if len(windows) == count:
             break
-    if len(rows) < 2 or sum(map(len, rows)) < FEWEST:
+    if len(windows) < 2 or sum(map(len, windows)) < FEWEST:
         return None
-    return compare_windows(posterior, reading, np.concatenate(rows))
+    return compare_windows(posterior, reading, np.concatenate(windows))
 
 
 def probability_alike(scan: np.ndarray, twins: np.ndarray, seed: int = 0) -> float:
     """Return the probability that windows of one texture differ as much as a scan's `(k, d)` and its twins' `(n, d)`.
 
-    The statistic is the energy distance of both sets. If all windows are of one law, each choice of some of them for
-    the scan's was as likely, so that values up to p come up with probability p: of a single window this is the scan's
-    rank among the twins. Where not all choices are tried, some are drawn, by a seed.
+    It is the permutation test of the energy distance between both sets: if all windows are of one texture, any k of
+    them were as likely the scan's. For a single window it ranks the scan among the twins. At most `RELABELLED` choices,
+    drawn by `seed`, are tried.
     """
-    rows = np.concatenate([scan, twins])
-    choices, _ = relabel(np.arange(len(rows)) < len(scan), RELABELLED, seed)
-    return float(share_beyond(measure_energy(cdist(rows, rows), choices)))
+    windows = np.concatenate([scan, twins])
+    choices, _ = relabel(np.arange(len(windows)) < len(scan), RELABELLED, seed)
+    return float(share_beyond(measure_energy(cdist(windows, windows), choices)))
 
 
 def rank_level_cut(posterior: Posterior, view: str, windows: np.ndarray) -> float:
-    """Return the part of the model's shapes that look as much like a level cut as windows `(k, 351)` of a scan do."""
+    """Return the fraction of the model's shapes that look as much like a level cut as windows `(k, 351)` of a scan."""
     return tail_probability(-posterior.discriminants[view], -float(posterior.discriminate(windows).mean()))
 
 
 def _join_level_cut(p: float, posterior: Posterior, reading: Reading) -> tuple[float, float | None]:
-    """Return the probability of a test with that of `rank_level_cut`, and the latter, if the posterior tells it."""
+    """Join the probability of a test with that of `rank_level_cut`; return both, or `p` and None without the latter."""
     if not len(posterior.discriminant):
         return p, None
     level_cut = rank_level_cut(posterior, reading.view, reading.windows)
@@ -237,24 +230,25 @@ def _join_level_cut(p: float, posterior: Posterior, reading: Reading) -> tuple[f
 
 
 def compare_windows(posterior: Posterior, reading: Reading, twins: np.ndarray) -> Misfit:
-    """Return how probable it is that windows of a scan `(k, 351)` differ so from those of twins `(n, 351)`.
+    """Test whether windows of a scan `(k, 351)` differ from those of twins `(n, 351)` more than the model's shapes do.
 
-    The law of the twins was found for the scan, and is not quite its own even if there is one. So the scan's departure
-    from them, in the emulator's uncorrelated directions, is ranked among those of shapes of the model whose laws were
-    found in the same way (`Posterior.departures`); and its discriminant among those of shapes in the same view. The
-    two tests are joined (`join_tests`). Where departures are not known, and for each block, which is compared in
-    deviations of the twins, the probability is that of a law named beforehand.
+    The law of the twins was fitted to the scan, and differs a little from the true one even if there is one. So the
+    scan's departure from them, in the emulator's uncorrelated directions, is ranked among those of shapes of the model
+    whose laws were fitted in the same way (`Posterior.departures`), and its discriminant among those of shapes in the
+    same view. The two tests are joined (`join_tests`). Without known departures, and for each block, which is compared
+    in deviations of the twins, the probability is that for a law chosen before the scan was seen.
     """
-    scan, known = reading.windows, posterior.departures
-    seen, grown = map(posterior.emulator.decorrelate, (scan, twins))
-    departure = float(cdist(seen, grown).mean() - pdist(grown).mean())
-    p = tail_probability(known, departure) if len(known) else probability_alike(seen, grown)
+    scan, references = reading.windows, posterior.departures
+    scan_scores, twin_scores = map(posterior.emulator.decorrelate, (scan, twins))
+    departure = float(cdist(scan_scores, twin_scores).mean() - pdist(twin_scores).mean())
+    ranked = len(references) > 0
+    p = tail_probability(references, departure) if ranked else probability_alike(scan_scores, twin_scores)
     p, level_cut = _join_level_cut(p, posterior, reading)
     blocks = {}
     for name in BLOCKS:
-        own, others = (columns_of(rows, [name]) for rows in (scan, twins))
-        spread = others.std(0) + FAINTEST * others.std(0).mean() + 1e-12
-        blocks[name] = probability_alike(own / spread, others / spread)
-    ranked = f", ranked among {len(known)} shapes" if len(known) else ""
-    method = f"{len(twins)} windows of shapes of the law, {len(scan)} of the scan{ranked}"
+        scan_block, twin_block = (columns_of(windows, [name]) for windows in (scan, twins))
+        spread = twin_block.std(0) + FAINTEST * twin_block.std(0).mean() + 1e-12
+        blocks[name] = probability_alike(scan_block / spread, twin_block / spread)
+    ranking = f", ranked among {len(references)} shapes" if ranked else ""
+    method = f"{len(twins)} windows of shapes of the law, {len(scan)} of the scan{ranking}"
     return Misfit(p, blocks, method, departure, level_cut)

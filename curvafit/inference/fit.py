@@ -49,17 +49,17 @@ class Fit(Pictured):
     view
         What the scan was taken for: a kind of view that the posterior was trained on.
     combinations
-        What the scan tells of sums of the parameters, the best known first; of the background's where the structure
-        fills over half.
+        What the scan says of sums of the parameters, the best known first; of the background's parameters where the
+        structure fills over half.
     misfit
-        How the scan's descriptors lie among those that the model makes; None where that is not known.
+        Test of whether the chosen law can have made the scan's descriptors; None where it was not tested.
     drift
         Root mean square distance, in working voxels, by which a short flow of the chosen law moves the scan's surface.
     scale
         Working voxel in scan voxels, (z, y, x).
     working_voxel, length_unit
-        Edge of a working voxel, which is one of the chosen law's shapes where their thickness is the scan's; and the
-        unit that it and every physical number here is in.
+        Edge of a working voxel, with which the chosen law's shapes are as thick as the scan's structure; and its unit,
+        which is that of every physical number here.
     thickness
         Median thickness of the scan's structure beneath its surface.
     matches
@@ -67,8 +67,8 @@ class Fit(Pictured):
     status
         The verdict, in a sentence or two.
     diagram
-        The scan's curvature diagram, binned as an atlas's are, in 1 / working unit: with it the scan finds its place on
-        an atlas's map. Of masks and images a working unit is 100 voxels of which the structure is eight thick.
+        The scan's curvature diagram, binned as an atlas's are, in 1 / working unit: it locates the scan on an atlas's
+        map. Of masks and images a working unit is 100 voxels of which the structure is eight thick.
     """
 
     kind: Literal[*KINDS]  # type: ignore[valid-type]
@@ -92,10 +92,10 @@ class Fit(Pictured):
     matches: tuple[Match, ...] = ()
 
     def __repr__(self) -> str:
-        six = "none" if self.best is None else f"({', '.join(f'{x:.4g}' for x in self.best.coefficients)})"
+        values = "none" if self.best is None else f"({', '.join(f'{a:.4g}' for a in self.best.coefficients)})"
         mass = "" if self.best is None else f", mass {self.best.mass:.3g}"
         voxel = f"working voxel {self.working_voxel:.4g} {self.length_unit}"
-        return f"Fit({self.family} from {KINDS[self.kind]}, a = {six}{mass}, {voxel}: {self.status})"
+        return f"Fit({self.family} from {KINDS[self.kind]}, a = {values}{mass}, {voxel}: {self.status})"
 
     @property
     def best(self) -> Candidate | None:
@@ -139,13 +139,13 @@ class Fit(Pictured):
         """
         if self.draws is None:
             return None
-        parts, columns = {}, to_columns(self.draws)
-        lengths = self.thickness / columns[-1] / WORKING_SPACING if physical else 1.0
+        intervals, columns = {}, to_columns(self.draws)
+        working_length = self.thickness / columns[-1] / WORKING_SPACING if physical else 1.0
         for name, column in zip(COLUMNS[:-1], columns[:-1], strict=True):
-            values = column * lengths ** -(POWERS | {"mass": 0})[name]
-            parts[name] = {"median": float(np.median(values))}
-            parts[name] |= {str(n): np.percentile(values, (50 - n / 2, 50 + n / 2)).tolist() for n in LEVELS}
-        return parts
+            values = column * working_length ** -(POWERS | {"mass": 0})[name]
+            intervals[name] = {"median": float(np.median(values))}
+            intervals[name] |= {str(n): np.percentile(values, (50 - n / 2, 50 + n / 2)).tolist() for n in LEVELS}
+        return intervals
 
     def to_law(self) -> Law:
         """Return the chosen law; raise ValueError if the fit has none."""
@@ -154,24 +154,24 @@ class Fit(Pictured):
         width = self.epsilon_physical * WORKING_SPACING / self.working_voxel
         return replace(self._law(self.best.coefficients, self.best.mass, "prior", self.working_voxel), epsilon=width)
 
-    def _law(self, six: Coefficients, mass: float, origin: str, edge: float) -> Law:
-        """Return a law whose working voxel is `edge` long, with what is known of the scan."""
-        filled = self.morphometry.volume_fraction
-        own = {"length_unit": self.length_unit, "volume_fraction": filled, "status": self.status}
-        return Law(six, mass, origin, working_voxel=edge, **own)
+    def _law(self, coefficients: Coefficients, mass: float, origin: str, edge: float) -> Law:
+        """Return a law whose working voxel is `edge` long, with the scan's unit, volume fraction and status."""
+        scan = {"volume_fraction": self.morphometry.volume_fraction, "status": self.status}
+        return Law(coefficients, mass, origin, working_voxel=edge, length_unit=self.length_unit, **scan)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers, strings, lists and dicts, as `fit.json` holds them."""
-        own: dict[str, Any] = {"format": FORMAT, "posterior": None, "diagram": None}
-        own |= {"intervals": self.intervals(), "intervals_physical": self.intervals(physical=True)}
+        derived: dict[str, Any] = {"format": FORMAT, "posterior": None, "diagram": None}
+        derived |= {"intervals": self.intervals(), "intervals_physical": self.intervals(physical=True)}
         if self.draws is not None:
             draws = _Draws(*([float(f"{x:.6g}") for x in column] for column in to_columns(self.draws)))
-            own["posterior"] = _Posterior(self.view, "amortised: conditional flows given the descriptors", draws)
-        if (seen := self.diagram) is not None:
-            (κ1, κ2), shares = seen.points.round(2).T.tolist(), seen.normalised.weights.round(7).tolist()
-            columns = {"kappa1": κ1, "kappa2": κ2, "share": shares, "spread": seen.spread, "excluded": seen.excluded}
-            own["diagram"] = _Columns(seen_as="field" if self.kind == "field" else "mask", unit=seen.unit, **columns)
-        return {name: encode(own[name] if name in own else getattr(self, name)) for name in ENTRIES}
+            derived["posterior"] = _Posterior(self.view, "amortised: conditional flows given the descriptors", draws)
+        if (diagram := self.diagram) is not None:
+            κ1, κ2 = diagram.points.round(2).T.tolist()
+            columns = {"kappa1": κ1, "kappa2": κ2, "share": diagram.normalised.weights.round(7).tolist()}
+            columns |= {"unit": diagram.unit, "spread": diagram.spread, "excluded": diagram.excluded}
+            derived["diagram"] = _Columns(seen_as="field" if self.kind == "field" else "mask", **columns)
+        return {name: encode(derived[name] if name in derived else getattr(self, name)) for name in ENTRIES}
 
     def to_json(self) -> str:
         """Return the text of a `fit.json`, indented; raise ValueError where `from_json` would not take it."""
@@ -181,7 +181,8 @@ class Fit(Pictured):
         except ValueError as fault:
             raise ValueError(f"expected {fault} in a fit") from None
         text = json.dumps(content, indent=2, allow_nan=False)
-        return re.sub(r"\[\n\s+([-+.\de,\s]+?)\n\s+\]", lambda numbers: f"[{' '.join(numbers[1].split())}]", text)
+        # Lists of numbers go on one line each, for people to read.
+        return re.sub(r"\[\n\s+([-+.\de,\s]+?)\n\s+\]", lambda match: f"[{' '.join(match[1].split())}]", text)
 
     @classmethod
     def from_json(cls, text: str | bytes) -> Fit:
@@ -199,21 +200,21 @@ class Fit(Pictured):
 
 
 def draw_laws(law: LawLike, count: int) -> list[Law]:
-    """Return `count` laws of the posterior of a fit, an inference or a `fit.json`, evenly from among its draws.
+    """Return `count` laws of the posterior of a fit, an inference or a `fit.json`, evenly spaced among its draws.
 
     Each has the voxel in which its shapes are as thick as the scan's structure, and the scan's volume fraction. Raises
     ValueError where there are no draws, or fewer.
     """
-    named = preset_name(law) is None and isinstance(law, (str, PathLike))
-    fit = Fit.load(law) if named else getattr(law, "fit", law)  # type: ignore[arg-type]
+    is_path = preset_name(law) is None and isinstance(law, (str, PathLike))
+    fit = Fit.load(law) if is_path else getattr(law, "fit", law)  # type: ignore[arg-type]
     if not isinstance(fit, Fit) or fit.draws is None:
         raise ValueError(f"expected a fit with draws of a posterior, got {quoted(law)}")
     check_int(count, f"from 1 to {len(fit.draws)} draws", 1, len(fit.draws))
     rows = np.linspace(0, len(fit.draws) - 1, count).round().astype(int).tolist()
-    source = f" of {os.fspath(law)}" if named else ""  # type: ignore[arg-type]
+    source = f" of {os.fspath(law)}" if is_path else ""  # type: ignore[arg-type]
     return [
-        fit._law(Coefficients(1.0, *five), mass, f"draw {row}{source}", fit.thickness / thickness)
-        for row, (*five, mass, thickness) in zip(rows, to_columns(fit.draws[rows]).T.tolist(), strict=True)
+        fit._law(Coefficients(1.0, *others), mass, f"draw {row}{source}", fit.thickness / thickness)
+        for row, (*others, mass, thickness) in zip(rows, to_columns(fit.draws[rows]).T.tolist(), strict=True)
     ]
 
 
@@ -229,14 +230,14 @@ ENTRIES = (
 
 Column = Annotated[tuple[float, ...], Rule(filled=True)]
 
-# Draws by parameter; and with what was read, a kind of view, and how.
+# The entry `posterior`: the kind of view, how draws were made, and the draws by parameter.
 _Draws: Any = make_dataclass("_Draws", [(name, Column) for name in COLUMNS])
 _Posterior: Any = make_dataclass("_Posterior", [("view", str), ("method", str), ("draws", _Draws)])
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Columns:
-    """A diagram: curvatures to 2 decimals (bins are 2 wide), shares of area, and its kind in an atlas."""
+    """The entry `diagram`: curvatures to 2 decimals (bins are 2 wide), shares of area, and its kind in an atlas."""
 
     seen_as: Literal["field", "mask"] = "mask"
     unit: str = "1/working unit"
@@ -247,7 +248,7 @@ class _Columns:
     excluded: NotNegative = 0.0
 
 
-# Entries that are no fields of a `Fit` follow from its fields, for other programs, or hold its arrays.
+# Types of the entries: those that are no fields of a `Fit` follow from its fields, for other programs, or hold arrays.
 _HINTS = get_type_hints(Fit, include_extras=True) | {
     "format": str, "coefficients": Coefficients | None, "mass": Mass, "uncertainty": Deviations,
     "coefficients_physical": Coefficients | None, "epsilon_physical": Positive, "intervals": dict[str, Any] | None,
@@ -257,22 +258,22 @@ _File: Any = make_dataclass("_File", [(name, _HINTS[name]) for name in ENTRIES])
 
 
 def _fit_of(file: Any) -> Fit:
-    read = {field.name: getattr(file, field.name) for field in fields(Fit) if field.name in ENTRIES}
+    entries = {field.name: getattr(file, field.name) for field in fields(Fit) if field.name in ENTRIES}
     if file.posterior is not None:
         draws = _stack([getattr(file.posterior.draws, name) for name in COLUMNS], "draws", "posterior")
-        draws[:, [1, 6]] = np.log(draws[:, [1, 6]])
-        read |= {"draws": draws, "view": file.posterior.view}
-    if (seen := file.diagram) is not None:
-        rows = _stack([seen.kappa1, seen.kappa2, seen.share], "kappa1, kappa2 and share", "diagram")
-        read["diagram"] = Diagram(rows[:, :2], rows[:, 2], seen.unit, seen.spread, seen.excluded)
-    fit = Fit(**read)
+        draws[:, [1, 6]] = np.log(draws[:, [1, 6]])  # a02 and thickness, which a `Fit` keeps as logarithms
+        entries |= {"draws": draws, "view": file.posterior.view}
+    if (columns := file.diagram) is not None:
+        rows = _stack([columns.kappa1, columns.kappa2, columns.share], "kappa1, kappa2 and share", "diagram")
+        entries["diagram"] = Diagram(rows[:, :2], rows[:, 2], columns.unit, columns.spread, columns.excluded)
+    fit = Fit(**entries)
     if (fit.chosen is None) != (fit.best is None):
         raise ValueError(f"expected a chosen law among the fit's candidates, got {fit.chosen!r}")
     return fit
 
 
-def _stack(columns: list[tuple[float, ...]], names: str, place: str) -> np.ndarray:
+def _stack(columns: list[tuple[float, ...]], names: str, entry: str) -> np.ndarray:
     if len({len(column) for column in columns}) > 1:
         lengths = ", ".join(str(len(column)) for column in columns)
-        raise ValueError(f"expected {names} of one length in a fit's {place}, got {lengths}")
+        raise ValueError(f"expected {names} of one length in a fit's {entry}, got {lengths}")
     return np.stack(columns, 1, dtype=np.float64)

@@ -3,7 +3,7 @@
 Each Gaussian test function gives one equation. The columns carry the error of the field itself, amplified by second
 differences, so ordinary least squares is biased; here the misfit is measured in units of the misfit that such an error
 causes (total least squares with the noise propagated through the columns), and the error's size is the one at which
-the two agree.
+both are equal.
 
 Stationarity reads how a profile deviates from tanh, so it says nothing of a mask, whose profile is made up. There a
 short flow (`drift`) first mends the profile, and then moves the interface: the better the law, the less.
@@ -33,9 +33,9 @@ from curvafit.priors.stencils import gaussian_blur, gradient, pad
 from curvafit.scan.grids import boxes_by_surface, surface_voxels
 from curvafit.scan.structure import is_rounded
 
-#: Standard deviation of the test functions, in voxels; in a crop less, for what their support takes from each side.
+#: Standard deviation of the test functions, in voxels; less in a crop, whose borders their support must not reach.
 TEST_WIDTH, CROP_WIDTH = 4.0, 3.0
-#: Least edge of a crop: in a smaller one test functions would be narrower than the blur, and no blurred ones.
+#: Least edge of a crop: in a smaller one the test functions, which include the blur k, would be narrower than k.
 SMALLEST_CROP = 28
 #: Reach in voxels of a density's gradient: one of the stencil, one of its adjoint.
 _REACH = 2
@@ -67,11 +67,11 @@ def energy_gradients(u: Float[Tensor, "z y x"], grid: Grid, epsilon: float) -> F
     slabs = []
     for start in range(0, grid.shape[0], _SLAB):
         slab = padded[start : start + _SLAB + 2 * _REACH].clone().requires_grad_()
-        part = Grid(tuple(slab.shape), grid.spacing, "replicate")  # type: ignore[arg-type]
-        terms = energy_terms(jet(slab, part), epsilon).sum((-3, -2, -1))
-        each = [torch.autograd.grad(term, slab, retain_graph=True)[0] for term in terms]
+        slab_grid = Grid(tuple(slab.shape), grid.spacing, "replicate")  # type: ignore[arg-type]
+        terms = energy_terms(jet(slab, slab_grid), epsilon).sum((-3, -2, -1))
+        gradients = [torch.autograd.grad(term, slab, retain_graph=True)[0] for term in terms]
         inside = slice(_REACH, -_REACH)
-        slabs.append(torch.stack(each)[:, inside, inside, inside])
+        slabs.append(torch.stack(gradients)[:, inside, inside, inside])
     return torch.cat(slabs, 1)
 
 
@@ -108,21 +108,22 @@ def stationarity(
         raise ValueError(f"expected a field of shape {grid.shape}, got {tuple(values.shape)}")
     if not bool(torch.isfinite(values).all()):
         raise ValueError("expected a finite field, got NaN or infinity in it")
-    octants, problem, size = weak_form(values, grid, epsilon, seed, progress)
+    octants, problem, error_size = weak_form(values, grid, epsilon, seed, progress)
     progress("solving", 0.8)
     factors = unit_factors(epsilon)
-    matches = [np.array([float(value) for value in start]) / factors for start in starts]
-    origins = np.stack([clip_to_domain(start) for start in (total_least_squares(problem)[0], *matches)])
+    dimensionless = [np.array([float(value) for value in start]) / factors for start in starts]
+    origins = np.stack([clip_to_domain(start) for start in (total_least_squares(problem)[0], *dimensionless)])
     solutions, residuals = solve([problem] * len(origins), origins)
     best = solutions[residuals.argmin()]
     coefficients, fixed = fix_gauge(best * factors)
-    parts = [Problem(_join_triangles(np.delete(octants, k, 0)), problem.error) for k in range(len(octants))]
-    replicas = solve(parts, np.stack([best] * len(parts)))[0] * factors
+    leave_one_out = [Problem(_join_triangles(np.delete(octants, k, 0)), problem.error) for k in range(len(octants))]
+    replicas = solve(leave_one_out, np.stack([best] * len(octants)))[0] * factors
     replicas /= replicas[:, fixed : fixed + 1]
-    # The jackknife's deviation: replicas that leave one of n out vary by less than independent ones, by n - 1.
+    # Replicas that leave one of n out share most of their data: their variance is too small by a factor of n - 1.
     n = len(replicas)
     deviations = np.sqrt((n - 1) / n * ((replicas - replicas.mean(0)) ** 2).sum(0))
-    status = _status(coefficients, deviations, fixed, float(size * residuals.min()), is_rounded(values.numpy()))
+    field_error = float(error_size * residuals.min())
+    status = _status(coefficients, deviations, fixed, field_error, is_rounded(values.numpy()))
     progress("solved", 1.0)
     uncertainty = {str(name): float(d) for name, d in zip(NAMES, deviations, strict=True)}
     return Candidate("stationarity", coefficients, float(values.mean()), uncertainty, status=status)
@@ -131,36 +132,35 @@ def stationarity(
 def weak_form(
     values: Tensor, grid: Grid, epsilon: float, seed: int = 0, progress: Progress = silent
 ) -> tuple[np.ndarray, Problem, float]:
-    """Return the weak form of a field's stationarity: octants' triangles `(8, 7, 7)`, the problem of them all, and the
-    root mean square of the field error that explains the misfit."""
+    """Set up the weak form of a field's stationarity. Returns the triangles of the box's octants `(8, 7, 7)`, the
+    problem of the whole box, and the root mean square of the field error that explains the misfit."""
     if not grid.periodic and min(grid.shape) < SMALLEST_CROP:
         raise ValueError(f"expected a crop of at least {SMALLEST_CROP} voxels along each axis, got {grid.shape}")
-    # In a small crop test functions leave a core of eight voxels.
+    # In a crop a margin of 4 widths and the stencil's reach is lost on each side; a core of eight voxels must remain.
     width = TEST_WIDTH if grid.periodic else min(CROP_WIDTH, (min(grid.shape) - 8 - 2 * _REACH) // 2 / 4)
     progress("differentiating the energy", 0.0)
     gradients = energy_gradients(values, grid, epsilon)
-    tested = integrate_columns(gradients, grid, epsilon, width)
-    parts = [tested]
+    integrals = integrate_columns(gradients, grid, epsilon, width)
+    boxes = [integrals]
     for axis in (1, 2, 3):
-        parts = [half for part in parts for half in np.array_split(part, 2, axis)]
-    octants = np.stack([_compress(part.reshape(6, -1)) for part in parts]) / math.sqrt(tested[0].size)
+        boxes = [half for box in boxes for half in np.array_split(box, 2, axis)]
+    octants = np.stack([_compress(box.reshape(6, -1)) for box in boxes]) / math.sqrt(integrals[0].size)
     progress("propagating the field's error", 0.2)
-    problem, size = _propagate_error(values, gradients, _join_triangles(octants), grid, epsilon, width, seed)
-    return octants, problem, size
+    return octants, *_propagate_error(values, gradients, _join_triangles(octants), grid, epsilon, width, seed)
 
 
 def integrate_columns(columns: Tensor, grid: Grid, epsilon: float, width: float) -> np.ndarray:
-    """Integrate columns `(6, …)` against Gaussians `width` voxels wide whose support stays in the box or goes round it.
+    """Integrate columns `(6, Z, Y, X)` against Gaussians `width` voxels wide, whose support is periodic or in the box.
 
-    Returns dimensionless numbers `(6, …)`, one for every second voxel along each axis.
+    Returns dimensionless integrals `(6, …)`, for Gaussians centred on every second voxel along each axis.
     """
     deviation = width * max(grid.spacing)
     core = []
     for n, h in zip(grid.shape, grid.spacing, strict=True):
         margin = 0 if grid.periodic else math.ceil(4 * deviation / h) + _REACH
         core.append(slice(margin, n - margin, 2))
-    smooth = [gaussian_blur(column, grid, deviation)[tuple(core)].numpy() for column in columns]
-    return np.stack(smooth) * unit_factors(epsilon).reshape(6, 1, 1, 1)
+    integrals = [gaussian_blur(column, grid, deviation)[tuple(core)].numpy() for column in columns]
+    return np.stack(integrals) * unit_factors(epsilon).reshape(6, 1, 1, 1)
 
 
 def _compress(columns: np.ndarray) -> np.ndarray:
@@ -170,14 +170,14 @@ def _compress(columns: np.ndarray) -> np.ndarray:
 
 
 def _join_triangles(stack: np.ndarray) -> np.ndarray:
-    """Return triangles `(n, 7, 7)` as one, `(6, 6)`, without the first column, which is the multiplier's."""
+    """Reduce triangles `(n, 7, 7)` to one `(6, 6)`, from which the first column, the multiplier's, is eliminated."""
     return np.asarray(np.linalg.qr(stack.reshape(-1, 7), mode="r"))[1:, 1:]
 
 
 def _propagate_error(
     u: Tensor, clean: Tensor, columns: np.ndarray, grid: Grid, epsilon: float, width: float, seed: int
 ) -> tuple[Problem, float]:
-    """Return the problem whitened by a field error, and the size of that error that alone causes the misfit."""
+    """Search for the size of a field error that alone causes the misfit; return the problem with it, and the size."""
     # A finite error, not its linearisation: the columns are singular where ∇u = 0 and at umbilics.
     error = torch.randn(u.shape, generator=torch.Generator().manual_seed(seed), dtype=u.dtype)
     error = gaussian_blur(error, grid, _ERROR_WIDTH * max(grid.spacing))
@@ -187,6 +187,7 @@ def _propagate_error(
         change = integrate_columns(energy_gradients(u + size * error, grid, epsilon) - clean, grid, epsilon, width)
         triangle = _compress(change.reshape(6, -1))[1:, 1:] / math.sqrt(change[0].size)
         problem = Problem(columns, triangle)
+        # The least misfit in units of what an error of this size causes, so that at the size sought it is 1.
         target = float(np.clip(size * total_least_squares(problem)[1][-1], *_ERROR_LIMITS))
         if trial == _ERROR_STEPS or abs(math.log(target / size)) < 0.1:
             break
@@ -205,7 +206,7 @@ def total_least_squares(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
 
 def solve(problems: Sequence[Problem], origins: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the minimisers `(n, 6)` of |R a| / |N a| with a20 + a02 = 2, both positive, and their values `(n,)`."""
-    columns, errors = (np.stack(part) for part in zip(*problems, strict=True))
+    columns, errors = (np.stack(triangles) for triangles in zip(*problems, strict=True))
     return call_in_double(_minimiser, columns, errors, origins)
 
 
@@ -217,8 +218,8 @@ def _minimiser() -> Callable[..., Any]:
     import optimistix
 
     def coefficients(free):
-        share = jax.nn.sigmoid(free[0])
-        return jnp.stack([2 * share, free[1], 2 - 2 * share, free[2], free[3], free[4]])
+        fraction = jax.nn.sigmoid(free[0])  # keeps a20 and a02 positive, with a sum of 2
+        return jnp.stack([2 * fraction, free[1], 2 - 2 * fraction, free[2], free[3], free[4]])
 
     def residual(free, args):
         columns, error = args
@@ -226,24 +227,25 @@ def _minimiser() -> Callable[..., Any]:
         return columns @ a / jnp.linalg.norm(error @ a)
 
     def minimise(columns, error, start):
-        begin = jnp.concatenate([jnp.log(start[:1] / start[2:3]), start[1:2], start[3:]])
+        free = jnp.concatenate([jnp.log(start[:1] / start[2:3]), start[1:2], start[3:]])
         solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-10)
-        end = optimistix.least_squares(residual, solver, begin, args=(columns, error), max_steps=500, throw=False).value
-        return coefficients(end), jnp.linalg.norm(residual(end, (columns, error)))
+        args = (columns, error)
+        free = optimistix.least_squares(residual, solver, free, args=args, max_steps=500, throw=False).value
+        return coefficients(free), jnp.linalg.norm(residual(free, args))
 
     return jax.jit(jax.vmap(minimise))
 
 
-def _status(coefficients: Coefficients, deviations: np.ndarray, fixed: int, residual: float, rounded: bool) -> str:
+def _status(coefficients: Coefficients, deviations: np.ndarray, fixed: int, field_error: float, rounded: bool) -> str:
     """Say in a sentence how well stationarity supports the coefficients."""
     if rounded:
-        why = "the field was rounded to few values, which its second differences amplify"
-        return f"Stationarity is not supported: {why}."
+        reason = "the field was rounded to few values, which its second differences amplify"
+        return f"Stationarity is not supported: {reason}."
     weak = [name for name, value, d in zip(NAMES, coefficients, deviations, strict=True) if d > abs(value) / 2]
     gauge = "" if fixed == 0 else " a20 is at the edge of the domain, so a02 = 1 fixes the scale."
-    verdict = "Stationarity is weakly supported" if residual > 0.005 else "Stationarity is supported"
+    verdict = "Stationarity is weakly supported" if field_error > 0.005 else "Stationarity is supported"
     weakness = f"; weakly held: {', '.join(weak)}" if weak else ""
-    return f"{verdict}: a field error of {residual:.1e} would explain the misfit{weakness}.{gauge}"
+    return f"{verdict}: a field error of {field_error:.1e} would explain the misfit{weakness}.{gauge}"
 
 
 def unit_factors(epsilon: float) -> np.ndarray:
@@ -252,7 +254,7 @@ def unit_factors(epsilon: float) -> np.ndarray:
 
 
 def fix_gauge(values: np.ndarray) -> tuple[Coefficients, int]:
-    """Return the coefficients over a20, or over a02 where a20 is far smaller; and which of the six that is."""
+    """Divide coefficients `(6,)` by a20, or by a02 where a20 is far smaller; return them, and the divisor's index."""
     fixed = 0 if values[0] > 1e-3 * values[2] else 2
     return Coefficients(*(float(value) for value in values / values[fixed])), fixed
 
@@ -260,27 +262,27 @@ def fix_gauge(values: np.ndarray) -> tuple[Coefficients, int]:
 def clip_to_domain(values: np.ndarray) -> np.ndarray:
     """Return the nearest coefficients `(6,)` with a20 + a02 = 2 and both positive, away from the edge."""
     scaled = 2 * values / max(values[0] + values[2], 1e-12)
-    share = np.clip(scaled[0] / 2, 0.01, 0.99)
-    return np.concatenate(([2 * share, scaled[1], 2 - 2 * share], scaled[3:]))
+    fraction = np.clip(scaled[0] / 2, 0.01, 0.99)
+    return np.concatenate(([2 * fraction, scaled[1], 2 - 2 * fraction], scaled[3:]))
 
 
 # ---- drift -----------------------------------------------------------------------------------------------------------
 
 
 def drift(phase: Float[Tensor, "z y x"], grid: Grid, epsilon: float, coefficients: Coefficients) -> float | None:
-    """Return how far, in voxels, a short flow of a law moves the surface of `phase`: root mean square, low-passed.
+    """Return the root mean square distance, in voxels, by which a short flow of a law moves the surface of `phase`.
 
-    Only the direction of the coefficients counts: the flow takes them in their gauge. None where the box is too small
-    to have an inside apart from its borders.
+    The displacement is low-passed. Coefficients count up to scale: the flow takes them in their gauge. None where the
+    box is too small to have an inside between its halos.
     """
     if not grid.periodic and min(grid.shape) <= 2 * HALO + STRIDE:
         return None
     values = phase.detach().to("cpu", torch.float32)
-    if max(grid.shape) > LARGEST_BOX:  # the part with the most surface
+    if max(grid.shape) > LARGEST_BOX:  # flow the box with the most surface
         windows = boxes_by_surface(surface_voxels((values > 0).numpy()), LARGEST_BOX)
         values = values[windows[0]].contiguous()
         grid = Grid(tuple(values.shape), grid.spacing, "replicate")  # type: ignore[arg-type]
-    start, voxel = deblur(values, grid, epsilon), grid.spacing[0]
+    start = deblur(values, grid, epsilon)
     law, _ = fix_gauge(np.array([float(value) for value in coefficients]))
     options = {"optimiser": Optimiser("adam", SHORT_FLOW.steps, SHORT_FLOW), "epsilon": epsilon, "blur": WORKING_BLUR}
     flow = descend(start, law, grid, flow="h-1", frozen=halo_of(grid), **options)
@@ -289,12 +291,13 @@ def drift(phase: Float[Tensor, "z y x"], grid: Grid, epsilon: float, coefficient
     if not bool(torch.isfinite(moved).all()):
         return 10.0  # the flow diverged
     margin = 0 if grid.periodic else HALO
-    read = tuple(slice(margin, n - margin, STRIDE) for n in grid.shape)
-    # The displacement is the low-passed change of u over `share`, the low-passed |∇u|, and weighs by `share`.
-    slope = gradient(before.double(), grid).square().sum(-4).sqrt()
-    share, change = (gaussian_blur(each, grid, LOW_PASS * voxel)[read] for each in (slope, moved))
-    kept = share > 0.02 * share.max()  # the others hold little interface
-    return float((change[kept].square() / share[kept]).sum() / share[kept].sum()) ** 0.5 / voxel
+    sampled = tuple(slice(margin, n - margin, STRIDE) for n in grid.shape)
+    # The displacement is the low-passed change of u over the low-passed |∇u|, by which it is weighted in the mean.
+    steepness = gradient(before.double(), grid).square().sum(-4).sqrt()
+    voxel = grid.spacing[0]
+    slope, change = (gaussian_blur(field, grid, LOW_PASS * voxel)[sampled] for field in (steepness, moved))
+    interface = slope > 0.02 * slope.max()
+    return float((change[interface].square() / slope[interface]).sum() / slope[interface].sum()) ** 0.5 / voxel
 
 
 def halo_of(grid: Grid) -> Tensor | None:
@@ -341,5 +344,5 @@ def call_in_double(make: Callable[[], Callable[..., Any]], *arguments: Any) -> A
     else:  # an earlier JAX
         from jax.experimental import enable_x64 as double_precision  # pyright: ignore[reportAttributeAccessIssue]
     with double_precision(True), jax.default_device(jax.devices("cpu")[0]):
-        ready = jax.tree.map(lambda part: jax.numpy.asarray(part, float), arguments)
-        return jax.tree.map(np.asarray, make()(*ready))
+        converted = jax.tree.map(lambda value: jax.numpy.asarray(value, float), arguments)
+        return jax.tree.map(np.asarray, make()(*converted))
