@@ -312,10 +312,8 @@ def _judge(estimate: Estimate, prepared: Prepared, figures: Morphometry, *, chec
 def _read_and_prepare(
     scan: Source, options: Mapping[str, Any], reading: Mapping[str, Any]
 ) -> tuple[Volume, tuple[int, int, int], Prepared]:
-    """Read and prepare a scan; of a large one its middle, at the level of its pyramid that suits its structure.
-
-    Returns the scan as read, the shape of that level, and the prepared scan.
-    """
+    """Read and prepare a scan; of a large one its middle, at the level of its pyramid that suits its structure. Returns
+    the scan as read, the shape of that level, and the prepared scan."""
     roi, crop = options["roi"], reading.get("crop")
     volume, shape = read_scan(scan, whole=roi is not None or options["periodic"], **reading)
     if roi is not None:

@@ -1,7 +1,7 @@
 """What the descriptors of a texture say about its parameters: an ensemble of conditional normalising flows.
 
-Sums of parameters that a texture tells well are its combinations: the best known come first, in words for what they do
-to shapes.
+Combinations are sums of parameters: those that a texture determines best come first, with words for what they do to
+shapes.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ POSTERIOR_FILE = Format("curvafit posterior", 4, "a posterior", "train it again"
 WIDEST, MOST = 2048, 64
 #: Which of the parameters is the mass.
 MASS = PARAMETERS.index("m0")
-#: Part by which the box of the parameters is wider, on each side, than what was drawn.
+#: Margin on each side of the box of the parameters, as a fraction of the range that was drawn.
 RIM = 0.02
-#: A combination is known where its draws have at most the other part of its variance among laws.
+#: A combination is known where a scan takes away at least this fraction of its variance among laws.
 KNOWN = 0.5
 
 
 @dataclass(frozen=True)
 class Architecture:
     """Sizes of a flow of splines: principal components of the descriptors that it sees, widths of its hidden layers,
-    transforms, bins of a spline, part of the components that training leaves out at random, and blocks of descriptors.
-    Raises ValueError if a size is not a whole number from 1 to `WIDEST`, or a block has another name.
+    transforms, bins of a spline, dropout of the components in training, and blocks of descriptors. Raises ValueError if
+    a size is not a whole number from 1 to `WIDEST`, or a block has another name.
     """
 
     components: int = 32
@@ -61,7 +61,7 @@ class Member(nn.Module):
     """One flow of an ensemble: a conditional distribution of `TARGETS`, in coordinates without bounds.
 
     The mass is modelled as a straight line of the context, one for each view, plus a remainder of deviation `width`
-    `(views,)`: dropout would hide the volume fraction, which tells the mass.
+    `(views,)`: dropout would hide the volume fraction, which determines the mass.
     """
 
     slope: Tensor
@@ -70,10 +70,9 @@ class Member(nn.Module):
     def __init__(self, architecture: Architecture, views: int) -> None:
         super().__init__()
         context = architecture.components + 1 + views
-        sizes, splines = architecture.hidden, architecture.transforms
         zuko = require("zuko", "infer", "reading a posterior")
-        options = {"bins": architecture.bins, "transforms": splines, "hidden_features": sizes}
-        self.flow = zuko.flows.NSF(len(TARGETS), context, **options)
+        sizes = {"transforms": architecture.transforms, "hidden_features": architecture.hidden}
+        self.flow = zuko.flows.NSF(len(TARGETS), context, bins=architecture.bins, **sizes)
         self.dropout = nn.Dropout(architecture.dropout)
         self.register_buffer("slope", torch.zeros(views, context))
         self.register_buffer("width", torch.ones(views))
@@ -90,33 +89,33 @@ class Member(nn.Module):
 @dataclass(frozen=True, eq=False)
 class Posterior:
     """The posterior of (a11, log a02, a10, a01, a00, m₀), with a20 = 1, and of the thickness of their shapes, given
-    descriptors in voxels of which the structure is eight thick.
+    descriptors in voxels with which the structure is eight thick.
 
     Attributes
     ----------
     members
         Flows whose equal mixture it is.
     compression
-        What the flows see of descriptors.
+        From descriptors to what the flows see of them.
     views
         Kinds of views that it was trained on.
     box
         `(7, 2)`: least and greatest values of `TARGETS`.
     centre, spread
-        `(7,)`: mean and deviation of these without bounds.
+        `(7,)`: mean and deviation of their logits (`to_logits`) in training.
     emulator
-        What parameters make of the descriptors.
+        From parameters to the descriptors of their shapes.
     misfits
         By view, what the emulator's best parameters leave unexplained of shapes that it did not learn from, increasing.
     combinations
-        The sums of parameters that textures tell.
+        Sums of parameters, ordered by how well textures determine them.
     departures
-        Those (`Misfit.departure`) of shapes of the model, as masks that went through all of `infer`, from shapes of the
-        law that it found; empty where that was not measured.
+        Departures (`Misfit.departure`) of shapes of the model, run as masks through all of `infer`, from shapes of the
+        law that it inferred; empty where that was not measured.
     discriminant, discriminants
-        Weights of the descriptors by which shapes of the model are told from level cuts of Gaussian random fields with
-        the same two-point function (`discriminate`), and what it is of shapes of the model, by view, increasing; empty
-        where that was not taught.
+        Weights of the descriptors that separate shapes of the model from level cuts of Gaussian random fields with the
+        same two-point function (`discriminate`), and the discriminants of shapes of the model, by view, increasing;
+        empty where that was not trained.
     """
 
     architecture: Architecture
@@ -139,10 +138,10 @@ class Posterior:
     ) -> np.ndarray:
         """Draw `TARGETS` `(N, count, 7)` given what `context` takes."""
         context = self.context(descriptors, views, amount)
-        parts = [len(part) for part in np.array_split(np.arange(count), len(self.members))]
+        counts = [len(chunk) for chunk in np.array_split(np.arange(count), len(self.members))]
         with torch.random.fork_rng(), torch.no_grad():
             torch.manual_seed(seed)
-            draws = [member(context).sample(torch.Size((n,))) for member, n in zip(self.members, parts, strict=True)]
+            draws = [member(context).sample(torch.Size((n,))) for member, n in zip(self.members, counts, strict=True)]
         standard = torch.cat(draws).movedim(0, 1).double().numpy()
         return self.from_logits(standard * self.spread + self.centre)
 
@@ -151,7 +150,7 @@ class Posterior:
         return self.sample(*reading.columns, count, seed)[0]
 
     def context(self, descriptors: np.ndarray, views: np.ndarray, amount: np.ndarray) -> Tensor:
-        """Return what the flows see of descriptors `(N, 351)`, kinds of views and how much was seen `(N,)`.
+        """Return the flows' inputs `(N, …)` for descriptors `(N, 351)`, views and amounts `(N,)`.
 
         Raises ValueError if it was not trained on a view, or descriptors are not finite.
         """
@@ -161,19 +160,19 @@ class Posterior:
         return torch.from_numpy(np.concatenate([self.compression(descriptors), seen], axis=1)).float()
 
     def discriminate(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return Fisher's discriminant `(N,)` of descriptors `(N, 351)`: least of those of level cuts."""
+        """Return Fisher's discriminant `(N,)` of descriptors `(N, 351)`: level cuts have the least."""
         return replace(self.compression, basis=self.discriminant[None])(descriptors)[:, 0]
 
     def to_logits(self, parameters: np.ndarray) -> np.ndarray:
-        """Return the logits of the parameters' places in the box: numbers without bounds."""
-        low, wide = self._edges
-        share = np.clip((parameters - low) / wide, 1e-6, 1 - 1e-6)
-        return np.log(share / (1 - share))
+        """Return the logits of the parameters' positions in the box, from 0 to 1: numbers without bounds."""
+        low, lengths = self._edges
+        position = np.clip((parameters - low) / lengths, 1e-6, 1 - 1e-6)
+        return np.log(position / (1 - position))
 
     def from_logits(self, logits: np.ndarray) -> np.ndarray:
         """Return the parameters of logits."""
-        low, wide = self._edges
-        return low + wide / (1 + np.exp(-logits))
+        low, lengths = self._edges
+        return low + lengths / (1 + np.exp(-logits))
 
     def standardise(self, parameters: np.ndarray) -> np.ndarray:
         """Return the parameters' logits, in deviations of the shapes that the posterior was trained on."""
@@ -181,25 +180,25 @@ class Posterior:
 
     @property
     def _edges(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the least parameters of the box, widened by its rim, and its lengths."""
+        """Return the least parameters, and the lengths, of the box with its margin."""
         low, high = self.box.T
         return low - RIM * (high - low), (1 + 2 * RIM) * (high - low)
 
 
 @dataclass(frozen=True)
 class Combination:
-    """A sum of parameters, in deviations among laws, and what a scan tells of it.
+    """A weighted sum of parameters, in deviations among laws, and what a scan says of it.
 
     Attributes
     ----------
     low, high
-        What shapes look like at its ends, in words; empty where it hardly changes how they look.
+        Words for how shapes look at its ends; empty where it hardly changes how they look.
     weights
-        What is added for each parameter's distance from the laws' mean, by name (`table.PARAMETERS`).
+        By name (`table.PARAMETERS`), the weight of each parameter's difference from the laws' mean.
     median, interval
         Median, and central 90 % interval, of the posterior's draws.
     known
-        Part of its variance among laws that the scan takes away.
+        Fraction of its variance among laws that the scan takes away.
     """
 
     low: str
@@ -219,10 +218,10 @@ class Combination:
 
 @dataclass(frozen=True, eq=False)
 class Combinations:
-    """Six sums of the parameters, uncorrelated among laws.
+    """Six weighted sums of the parameters, uncorrelated among laws, each of deviation 1.
 
-    `weights` `(6, 6)` has a row for each, `centre` `(6,)` the laws' mean; a sum's deviation among laws is 1. `ends` has
-    the words for its low and its high end, empty where it hardly changes how shapes look.
+    `weights` `(6, 6)` has a row for each sum, `centre` `(6,)` is the laws' mean. `ends` has words for the low and the
+    high end of each, empty where it hardly changes how shapes look.
     """
 
     weights: np.ndarray
@@ -234,28 +233,27 @@ class Combinations:
         return (parameters - self.centre) @ self.weights.T
 
     def read(self, draws: np.ndarray, *, background: bool = False) -> tuple[Combination, ...]:
-        """Return what draws `(n, 6)` tell of each, the best known first; of the background's shapes where that is what
-        was described."""
-        sums, of = self(draws), " (the background)" if background else ""
-        ranges = np.quantile(sums, (0.05, 0.5, 0.95), axis=0).T
-        read = [
-            Combination(low and low + of, high and high + of, dict(zip(PARAMETERS, map(float, weights), strict=True)),
-                        float(middle), (float(least), float(most)), float(np.clip(1 - column.var(), 0, 1)))
-            for (low, high), weights, (least, middle, most), column in zip(
-                self.ends, self.weights, ranges, sums.T, strict=True)
-        ]  # fmt: skip
-        return tuple(sorted(read, key=lambda combination: -combination.known))
+        """Return what draws `(n, 6)` say of each sum, the best known first; `background`: they are the background's."""
+        suffix = " (the background)" if background else ""
+        combinations = []
+        for ends, weights, sums in zip(self.ends, self.weights, self(draws).T, strict=True):
+            low, high = (words and words + suffix for words in ends)
+            by_name = dict(zip(PARAMETERS, weights.tolist(), strict=True))
+            least, median, most = np.quantile(sums, (0.05, 0.5, 0.95)).tolist()
+            known = float(np.clip(1 - sums.var(), 0, 1))  # a sum's variance among laws is 1
+            combinations.append(Combination(low, high, by_name, median, (least, most), known))
+        return tuple(sorted(combinations, key=lambda combination: -combination.known))
 
 
 def save_posterior(posterior: Posterior, path: str | Path) -> None:
     """Write a posterior as one compressed `.npz`: arrays and a JSON header, nothing that runs when it is read."""
     arrays = {name: getattr(posterior, name) for name in ("box", "centre", "spread", "departures", "discriminant")}
     arrays |= {name: getattr(posterior.compression, name) for name in ("mean", "scale", "basis")}
-    for number, member in enumerate(posterior.members):
-        arrays |= {f"{number}.{name}": value.numpy() for name, value in member.state_dict().items()}
+    for k, member in enumerate(posterior.members):
+        arrays |= {f"{k}.{name}": value.numpy() for name, value in member.state_dict().items()}
     for name, layers in (("mean", posterior.emulator.mean), ("spread", posterior.emulator.spread)):
-        for level, layer in enumerate(layers):
-            arrays |= {f"emulator.{name}.{level}.{part}": value for part, value in layer._asdict().items()}
+        for k, layer in enumerate(layers):
+            arrays |= {f"emulator.{name}.{k}.{field}": value for field, value in layer._asdict().items()}
     arrays["emulator.basis"] = posterior.emulator.basis.astype(np.float32)
     for name in ("misfits", "discriminants"):
         arrays |= {f"{name}.{view}": values.astype(np.float32) for view, values in getattr(posterior, name).items()}
@@ -284,6 +282,7 @@ def load_posterior(path: str | Path | None = None) -> Posterior:
 
 
 def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Posterior:
+    """Return the posterior of a file's header and arrays; raise ValueError where they do not fit together."""
     if not all(np.isfinite(array).all() for array in arrays.values() if array.dtype.kind == "f"):
         raise ValueError("numbers that are not finite")
     sizes = header["architecture"]
@@ -291,41 +290,40 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
     views = tuple(str(view) for view in header["views"])
     columns, components = int(np.isin(column_names(), architecture.blocks).sum()), architecture.components
     arrays = {"departures": np.zeros(0), "discriminant": np.zeros(0)} | arrays  # which earlier files lack
-    taught = ("misfits", "discriminants") if len(arrays["discriminant"]) else ("misfits",)
+    by_view = ("misfits", "discriminants") if len(arrays["discriminant"]) else ("misfits",)
     expected: dict[str, tuple[int | None, ...]] = {"mean": (columns,), "scale": (columns,)}
     expected |= {"basis": (components, columns), "emulator.basis": (components, components), "departures": (None,)}
     expected |= {"box": (len(TARGETS), 2), "centre": (len(TARGETS),), "spread": (len(TARGETS),)}
     expected |= {"combinations.weights": (len(PARAMETERS), len(PARAMETERS)), "combinations.centre": (len(PARAMETERS),)}
-    expected |= {"discriminant": (columns if len(taught) > 1 else 0,)}
-    expected |= {f"{name}.{view}": (None,) for name in taught for view in views}
+    expected |= {"discriminant": (columns if "discriminants" in by_view else 0,)}
+    expected |= {f"{name}.{view}": (None,) for name in by_view for view in views}
     for name, shape in expected.items():
-        own = arrays[name].shape
-        if len(own) != len(shape) or any(n not in (None, m) for n, m in zip(shape, own, strict=True)):
-            raise ValueError(f"{name} of shape {own}, not {shape}")
+        actual = arrays[name].shape
+        if len(actual) != len(shape) or any(n not in (None, m) for n, m in zip(shape, actual, strict=True)):
+            raise ValueError(f"{name} of shape {actual}, not {shape}")
     members = []
-    for number in range(check_int(header["members"], "a number of flows", 1, MOST)):
+    for k in range(check_int(header["members"], "a number of flows", 1, MOST)):
         with torch.random.fork_rng():  # its first weights are drawn, and then replaced
             member = Member(architecture, len(views)).eval()
-        own = ((k.partition("."), v) for k, v in arrays.items())
-        member.load_state_dict({name: torch.from_numpy(v) for (n, _, name), v in own if n == str(number)})
+        split = ((key.partition("."), value) for key, value in arrays.items())
+        member.load_state_dict({name: torch.from_numpy(value) for (n, _, name), value in split if n == str(k)})
         members.append(member)
     compression = Compression(architecture.blocks, arrays["mean"], arrays["scale"], arrays["basis"])
     mean, spread = (_read_layers(arrays, f"emulator.{name}", len(views), components) for name in ("mean", "spread"))
     inflation, box = check_float(header["inflation"], "an emulator's inflation", 1e-3, 1e3), arrays["box"]
     emulator = Emulator(compression, views, box[: len(PARAMETERS)], mean, spread, arrays["emulator.basis"], inflation)
-    misfits, discriminants = ({view: arrays[f"{name}.{view}"] for view in views} for name in (*taught, *taught)[:2])
-    if not all(map(len, misfits.values())):
+    references = {name: {view: arrays[f"{name}.{view}"] for view in views} for name in by_view}
+    if not all(map(len, references["misfits"].values())):
         raise ValueError("misfits without numbers")
     ends = tuple((str(low), str(high)) for low, high in header["ends"])
     if len(ends) != len(PARAMETERS):
         raise ValueError(f"words for {len(ends)} combinations, not {len(PARAMETERS)}")
-    sums = Combinations(arrays["combinations.weights"], arrays["combinations.centre"], ends)
-    ranges, tests = (box, arrays["centre"], arrays["spread"]), (arrays["departures"], arrays["discriminant"])
-    tests += (discriminants if len(taught) > 1 else {},)
-    provenance = header["provenance"]
+    combinations = Combinations(arrays["combinations.weights"], arrays["combinations.centre"], ends)
     return Posterior(
-        architecture, tuple(members), compression, views, *ranges, emulator, misfits, sums, provenance, *tests
-    )
+        architecture, tuple(members), compression, views, box, arrays["centre"], arrays["spread"], emulator,
+        references["misfits"], combinations, header["provenance"], arrays["departures"], arrays["discriminant"],
+        references.get("discriminants", {}),
+    )  # fmt: skip
 
 
 def _read_layers(arrays: dict[str, np.ndarray], name: str, views: int, outputs: int) -> tuple[Layer, ...]:

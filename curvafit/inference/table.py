@@ -23,26 +23,26 @@ from curvafit.volumes.volume import Volume
 
 _REMEDY = "describe the stores into another file, or with --overwrite"
 TABLE_FILE = Format("curvafit descriptors", 2, "a table of descriptors", _REMEDY, {"blocks": BLOCKS})
-#: What is inferred, with a20 = 1 as the gauge, in working units; and with it how thick the law's shapes are, in their
-#: own voxels, which says how long those are on a scan.
+#: Parameters that are inferred, in working units with a20 = 1 as the gauge; and with them the thickness of the law's
+#: shapes in their own voxels, from which the length of such a voxel on a scan follows.
 PARAMETERS = ("a11", "log a02", "a10", "a01", "a00", "m0")
 TARGETS = (*PARAMETERS, "log thickness")
 #: The same without logarithms, as columns of draws.
 COLUMNS = ("a11", "a02", "a10", "a01", "a00", "mass", "thickness")
-#: Voxels that a mask's scanner puts into a thickness, and its least and greatest voxel, in voxels of the field.
+#: Range of a shape's thickness in the voxels of a mask's scanner, and range of these in voxels of the field.
 SAMPLED, SCALES = (4.0, 16.0), (0.5, 2.0)
-#: A degraded scan: deviation of the blur in voxels, contrast over the noise's deviation, and voxels a slice is thick.
+#: A degraded scan: deviation of the blur in voxels, contrast over the noise's deviation, and thickness of slices.
 BLUR, SNR, SLICE = 1.0, 5.0, 2
 #: Blocks whose logarithm is taken, and the least value that goes into it.
 LOGARITHMIC = ("fraction", "chords", "gaps", "depths", "clearances")
 LEAST = 1e-3
 #: Of the densities of ∫H and χ, in these units, the inverse sinh is taken.
 BENDS, EULERS = 50.0, 100.0
-#: Furthest that a column may lie from its mean, in its deviations.
+#: Most deviations from its mean to which a column is clipped.
 FURTHEST = 6.0
-#: How much is usually seen of a texture, and the most that training shows, in cubes of a thickness.
+#: Typical amount seen of a texture, and the most that training shows, in cubes of a thickness.
 USUAL, MOST_SEEN = 500.0, 8000.0
-#: Deviations that blocks have before compression, 1 where none is named.
+#: Weights of blocks in the compression, 1 where none is named.
 WEIGHTS = {"curvature": 3.0}
 
 
@@ -50,9 +50,9 @@ WEIGHTS = {"curvature": 3.0}
 class Table:
     """Readings of N views of shapes, and what made the shapes.
 
-    `shapes` and `views` name them (str, `(N,)`); `parameters` is `(N, 6)` (`PARAMETERS`), `thickness` `(N,)` how many
-    of its own voxels a shape is thick; `descriptors` `(N, 351)` has the blocks of `Descriptors` in their order, NaN
-    where a view shows no surface, and `amount` `(N,)` says how much was seen (`Reading`).
+    `shapes` and `views` name them (str, `(N,)`); `parameters` is `(N, 6)` (`PARAMETERS`), `thickness` `(N,)` that of a
+    shape in its own voxels; `descriptors` `(N, 351)` has the blocks of `Descriptors` in their order, NaN where a view
+    shows no surface, and `amount` `(N,)` says how much was seen (`Reading`).
     """
 
     shapes: np.ndarray
@@ -75,13 +75,12 @@ class Table:
         return len(self.shapes)
 
     def rows(self, chosen: np.ndarray) -> Table:
-        """Return some rows, by their numbers or a mask."""
-        i = np.asarray(chosen)
-        columns = {field.name: getattr(self, field.name)[i] for field in fields(self)[:-1]}
-        return replace(self, **columns)
+        """Return some rows, by their indices or a mask."""
+        columns = fields(self)[:-1]  # all but the provenance
+        return replace(self, **{column.name: getattr(self, column.name)[np.asarray(chosen)] for column in columns})
 
     def select_views(self, views: Sequence[str]) -> Table:
-        """Return the rows of some kinds of views; raise ValueError if there is none of a kind."""
+        """Return the rows of some views, by name; raise ValueError if a view has no row."""
         kinds = set(self.views.tolist())
         if missing := [view for view in views if view not in kinds]:
             raise ValueError(f"expected views among {', '.join(sorted(kinds))}, got {', '.join(missing)}")
@@ -89,7 +88,7 @@ class Table:
 
     @property
     def targets(self) -> np.ndarray:
-        """Return what is inferred `(N, 7)` (`TARGETS`)."""
+        """Return the numbers to infer `(N, 7)` (`TARGETS`)."""
         return np.column_stack([self.parameters, np.log(self.thickness)])
 
     @property
@@ -99,23 +98,23 @@ class Table:
 
     @property
     def laws(self) -> np.ndarray:
-        """Return the number of each row's law, from 0 `(N,)`."""
+        """Return the index of each row's law, from 0 `(N,)`."""
         return np.unique(np.round(self.parameters, 9), axis=0, return_inverse=True)[1].ravel()
 
     @property
     def pooled(self) -> Table:
-        """Return the rows, and those of 2, 4, 8, … shapes of one law in one view, as if one scan had shown them all:
-        the means of their descriptors, and the sum of what was seen."""
+        """Return the rows, and with them a row for each 2, 4, 8, … shapes of one law in one view, as if one scan had
+        shown them all: the means of their descriptors, and the sum of their amounts."""
         groups, laws = [[k] for k in range(len(self))], self.laws
         for law, view in product(np.unique(laws), np.unique(self.views)):
             group = np.flatnonzero((laws == law) & (self.views == view)).tolist()
             for size in (2**k for k in range(1, len(group).bit_length())):
                 groups += [group[start : start + size] for start in range(0, len(group) - size + 1, size)]
-        firsts = self.rows(np.array([rows[0] for rows in groups]))
-        means = np.array([self.descriptors[rows].mean(0) for rows in groups])
+        pooled = self.rows(np.array([rows[0] for rows in groups]))
+        descriptors = np.array([self.descriptors[rows].mean(0) for rows in groups])
         thickness = np.array([self.thickness[rows].mean() for rows in groups])
         amount = np.array([self.amount[rows].sum() for rows in groups])
-        return replace(firsts, descriptors=means, thickness=thickness, amount=amount)
+        return replace(pooled, descriptors=descriptors, thickness=thickness, amount=amount)
 
 
 def parameters_of(law: Coefficients, mass: float) -> np.ndarray:
@@ -136,9 +135,9 @@ def law_of(parameters: Sequence[float] | np.ndarray) -> tuple[Coefficients, floa
 
 
 def to_columns(draws: np.ndarray) -> np.ndarray:
-    """Return draws of `TARGETS` `(n, 7)`, or of the parameters alone, as `COLUMNS`: without logarithms."""
+    """Return draws `(n, 7)` of `TARGETS`, or `(n, 6)` of `PARAMETERS`, as columns `COLUMNS`, without logarithms."""
     columns = draws.T.copy()
-    for k in {1, 6} & set(range(len(columns))):
+    for k in {1, 6} & set(range(len(columns))):  # a02, and thickness where there is one
         columns[k] = np.exp(columns[k])
     return columns
 
@@ -151,15 +150,14 @@ def mirror_parameters(parameters: np.ndarray) -> np.ndarray:
 
 
 def encode_seen(kinds: Sequence[str], views: np.ndarray, amount: np.ndarray) -> np.ndarray:
-    """Return how textures were seen as numbers `(N, 1 + kinds)`: how much, and a 1 for the kind of view.
+    """Encode how textures were seen as numbers `(N, 1 + kinds)`: the amount's logarithm, and the view one-hot.
 
-    More than `MOST_SEEN` counts as so much: training says nothing of more. Raises ValueError if a view is of another
-    kind.
+    Amounts are clipped to `MOST_SEEN`, as training shows no more. Raises ValueError if a view is not among `kinds`.
     """
     if unknown := sorted(set(views.tolist()) - set(kinds)):
         raise ValueError(f"expected views among {', '.join(kinds)}, got {', '.join(unknown)}")
-    much = np.log10(np.minimum(amount, MOST_SEEN) / USUAL)
-    return np.concatenate([much[:, None], views[:, None] == np.array(kinds)], axis=1)
+    log_amount = np.log10(np.minimum(amount, MOST_SEEN) / USUAL)
+    return np.concatenate([log_amount[:, None], views[:, None] == np.array(kinds)], axis=1)
 
 
 def column_names() -> list[str]:
@@ -192,22 +190,23 @@ def load_table(path: str | Path) -> Table:
 
 
 def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Table:
-    """Return the table of a file's header and arrays; each column may be float16 between its ends (`scaled`)."""
-    shapes, views = (np.array(each, dtype=str) for each in json.loads(arrays["names"].tobytes()))
+    """Return the table of a file's header and arrays; descriptors may be stored `scaled` to each column's range."""
+    shapes, views = (np.array(names, dtype=str) for names in json.loads(arrays["names"].tobytes()))
     if not np.isfinite(arrays["parameters"]).all():
         raise ValueError("parameters that are not finite")
-    found = arrays["scaled"] * arrays["span"] + arrays["least"] if "scaled" in arrays else arrays["descriptors"]
-    if found.dtype.kind != "f" or not isinstance(header["provenance"], dict):
+    scaled = "scaled" in arrays
+    descriptors = arrays["scaled"] * arrays["span"] + arrays["least"] if scaled else arrays["descriptors"]
+    if descriptors.dtype.kind != "f" or not isinstance(header["provenance"], dict):
         raise ValueError("descriptors that are no numbers, or no provenance")
     parameters, thickness, amount = (arrays[name] for name in ("parameters", "thickness", "amount"))
-    return Table(shapes, views, parameters, thickness, found, amount, header["provenance"])
+    return Table(shapes, views, parameters, thickness, descriptors, amount, header["provenance"])
 
 
 # ---- views -----------------------------------------------------------------------------------------------------------
 
 
 class Scanned(NamedTuple):
-    """What a scanner makes of a shape, and what `prepare` is told of it: its kind, and whether it repeats."""
+    """A simulated scan of a shape, and the options with which it is prepared: its kind, and whether it is periodic."""
 
     scan: Volume
     kind: Literal["field", "mask", "image"]
@@ -220,7 +219,7 @@ def see_field(u: np.ndarray, rng: np.random.Generator) -> Scanned:
 
 
 def see_mask(u: np.ndarray, rng: np.random.Generator) -> Scanned:
-    """Return {u > 0}, opened anywhere, on voxels of a scanner on which it is 4 to 16 thick."""
+    """Return {u > 0}, cut open at random, on coarser or finer voxels with which it is 4 to 16 thick."""
     inside = _open(u, rng)
     voxel = float(np.clip(thinner_thickness(inside) / math.exp(rng.uniform(*np.log(SAMPLED))), *SCALES))
     coarse = sample_mask(inside, [voxel] * 3, periodic=False)
@@ -228,10 +227,10 @@ def see_mask(u: np.ndarray, rng: np.random.Generator) -> Scanned:
 
 
 def see_scan(u: np.ndarray, rng: np.random.Generator) -> Scanned:
-    """Return {u > 0}, opened anywhere, scanned badly: blurred, slices two voxels thick, noise at SNR 5."""
+    """Return {u > 0}, cut open at random, scanned badly: blurred, slices two voxels thick, noise at SNR 5."""
     grey = ndimage.gaussian_filter(_open(u, rng).astype(np.float32), BLUR, mode="nearest")
-    whole = np.pad(grey, ((0, -len(grey) % SLICE), (0, 0), (0, 0)), mode="edge")
-    grey = whole.reshape(-1, SLICE, *grey.shape[1:]).mean(1)
+    padded = np.pad(grey, ((0, -len(grey) % SLICE), (0, 0), (0, 0)), mode="edge")
+    grey = padded.reshape(-1, SLICE, *grey.shape[1:]).mean(1)
     grey += rng.standard_normal(grey.shape, dtype=np.float32) / SNR
     return Scanned(Volume(grey, (float(SLICE), 1.0, 1.0), "voxel"), "image")
 
@@ -242,7 +241,7 @@ VIEWS = {"field": see_field, "mask": see_mask, "scan": see_scan}
 
 
 def _open(u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return {u > 0} of a box that repeats, cut open anywhere."""
+    """Return {u > 0} of a periodic box, rolled by a random shift, so that its sides cut the structure anywhere."""
     return np.roll(u > 0, [int(rng.integers(n)) for n in u.shape], (0, 1, 2))
 
 
@@ -265,10 +264,10 @@ class Compression:
 
 
 def compression_of(descriptors: np.ndarray, components: int, blocks: tuple[str, ...] = tuple(BLOCKS)) -> Compression:
-    """Return the compression to the principal components of some descriptors.
+    """Return the compression to the principal components of descriptors `(N, 351)`.
 
-    Columns are scaled to deviation 1 (those of the curvature block by one factor, so that distances stay), and blocks
-    weighed by `WEIGHTS`. Components are half whitened: one of deviation σ is divided by √σ, so that the first do not
+    Columns are scaled to deviation 1 (those of the curvature block by one factor, which keeps distances), and blocks
+    weighted by `WEIGHTS`. Components are half whitened: one of deviation σ is divided by √σ, so that the first do not
     drown the others. The components' mean square is 1.
     """
     names = np.array(column_names())
@@ -282,8 +281,8 @@ def compression_of(descriptors: np.ndarray, components: int, blocks: tuple[str, 
         if block == "curvature":
             scale[in_block] = np.sqrt((scale[in_block] ** 2).mean())
     uncompressed = Compression(blocks, mean, scale, np.diag(weight))
-    weighed = uncompressed(descriptors)
-    values, vectors = np.linalg.eigh(weighed.T @ weighed / len(weighed))
+    weighted = uncompressed(descriptors)
+    values, vectors = np.linalg.eigh(weighted.T @ weighted / len(weighted))
     order = np.argsort(-values)[:components]
     # An eigenvalue is σ², so its fourth root is √σ.
     basis = (vectors[:, order] / (values[order] + 1e-12) ** (1 / 4)).T * weight
@@ -295,8 +294,8 @@ def columns_of(descriptors: np.ndarray, blocks: Sequence[str]) -> np.ndarray:
     """Return the columns of some blocks, lengths and densities as logarithms."""
     names = np.array(column_names())
     columns = np.array(descriptors, dtype=np.float64)
-    chosen = np.isin(names, LOGARITHMIC)
-    columns[:, chosen] = np.log(np.maximum(columns[:, chosen], LEAST))
+    logarithmic = np.isin(names, LOGARITHMIC)
+    columns[:, logarithmic] = np.log(np.maximum(columns[:, logarithmic], LEAST))
     area, bend, euler = np.flatnonzero(names == "densities")
     columns[:, area] = np.log(np.maximum(columns[:, area], LEAST))
     columns[:, bend] = np.arcsinh(columns[:, bend] / BENDS)

@@ -15,19 +15,20 @@ from torch import Tensor, nn
 
 from curvafit.core.checks import check_int, check_seed
 from curvafit.core.runtime import Progress, silent, sub_progress
+from curvafit.geometry.description import LEVELS
 from curvafit.inference.emulator import FAINTEST, Emulator, Layer, misfits
 from curvafit.inference.posterior import MASS, MOST, Architecture, Combinations, Member, Posterior
 from curvafit.inference.table import LEAST, PARAMETERS, TARGETS, Compression, Table, column_names, compression_of
 
-#: Part of the shapes, of all of whose views a member learns nothing: they tell when it has learnt enough.
+#: Fraction of the laws that a member does not learn from: their likelihood says when to stop.
 VALIDATION = 0.1
-#: How much steep lines of the mass are shunned, in rows.
+#: Ridge penalty of the straight lines that fit the mass, in rows.
 RIDGE = 3.0
 #: Most steps of a flow, which bound the time that a large table takes.
 STEPS = 12_000
-#: Part of the time that the emulator takes.
+#: Fraction of the progress that the emulator takes.
 EMULATOR_PART = 0.2
-#: Networks of the mean, of which each leaves out another part of the shapes, and of the deviations.
+#: Folds of the laws; the emulator has as many networks of the mean, and of the deviations: each leaves out one fold.
 FOLDS = 5
 #: Widths of the hidden layers.
 HIDDEN = (96, 96)
@@ -37,7 +38,7 @@ REFERENCE = 400
 BATCH, PACE = (64, 512), 100
 #: Draws of a flow whose mean is compared with the truth.
 DRAWS = 200
-#: What tells shapes apart, with the words for little and for much of it, and how many of them describe an end.
+#: Features by which shapes differ, with words for low and high values; and how many features describe an end.
 LOOKS = {
     "filled": ("sparse", "full"),
     "roundness": ("flat", "round"),
@@ -47,14 +48,15 @@ LOOKS = {
     "gaps": ("even in spacing", "uneven in spacing"),
 }
 NAMED = 2
-#: An end is described by no look whose correlation with the combination is less.
+#: Least correlation with a combination of a feature that describes its ends.
 FAINT = 0.18
 
 Network = TypeVar("Network", bound=nn.Module)
+Cost = Callable[[nn.Module, Tensor, Tensor], Tensor]
 
 
 class Plan(NamedTuple):
-    """First step length, weight decay, most epochs, and epochs without a better validation."""
+    """First learning rate, weight decay, most epochs, and most epochs in a row without a better validation."""
 
     rate: float
     decay: float
@@ -77,9 +79,9 @@ def train_posterior(
 ) -> Posterior:
     """Fit an ensemble of flows to the parameters of a table's rows, and an emulator to the descriptors.
 
-    Each member starts from other weights, and stops where the likelihood of its own tenth of the shapes, which it does
-    not learn from, is highest: all views of a shape are on one side. Raises ValueError if the table has too few shapes,
-    or a parameter that does not vary, or an argument is out of range.
+    Each member starts from other weights, and stops where the likelihood of a tenth of the laws, from none of whose
+    shapes it learns, is highest. Raises ValueError if the table has too few shapes, or a parameter that does not vary,
+    or an argument is out of range.
 
     Parameters
     ----------
@@ -95,25 +97,25 @@ def train_posterior(
         Called after each epoch with a sentence and the share of the epochs that are done at most.
     """
     members, seed = check_int(members, "a number of flows", 1, MOST), check_seed(seed)
-    sizes, table = architecture or Architecture(), table.visible.pooled
+    architecture, table = architecture or Architecture(), table.visible.pooled
     law_of_row, laws = table.laws, len(np.unique(table.laws))
-    if laws < 2 * sizes.components:
-        raise ValueError(f"expected shapes of {2 * sizes.components} laws or more to train on, got {laws}")
+    if laws < 2 * architecture.components:
+        raise ValueError(f"expected shapes of {2 * architecture.components} laws or more to train on, got {laws}")
     views = tuple(sorted(set(table.views.tolist())))
     box = np.stack([table.targets.min(0), table.targets.max(0)], axis=1)
     if fixed := [name for name, (low, high) in zip(TARGETS, box, strict=True) if low == high]:
         raise ValueError(f"expected shapes whose parameters all vary, got {', '.join(fixed)} the same in all")
-    compression = compression_of(table.descriptors, sizes.components, sizes.blocks)
+    compression = compression_of(table.descriptors, architecture.components, architecture.blocks)
     flow_plan, emulator_plan = plans or PLANS
-    part = sub_progress(progress, 0.0, EMULATOR_PART)
-    prior = box[: len(PARAMETERS)]
-    emulator, left = train_emulator(table, compression, prior, seed=seed, plan=emulator_plan, progress=part)
+    options = {"seed": seed, "plan": emulator_plan, "progress": sub_progress(progress, 0.0, EMULATOR_PART)}
+    emulator, misfits_by_view = train_emulator(table, compression, box[: len(PARAMETERS)], **options)
     counts = {"shapes": len(np.unique(table.shapes)), "laws": laws, "rows": len(table), "members": members}
     provenance = {"table": table.provenance, **counts, "seed": seed}
-    zero, one = np.zeros(len(TARGETS)), np.ones(len(TARGETS))
-    none = Combinations(np.eye(len(PARAMETERS)), zero[: len(PARAMETERS)], ())
-    untested = (np.zeros(0), np.zeros(0), {})
-    posterior = Posterior(sizes, (), compression, views, box, zero, one, emulator, left, none, provenance, *untested)
+    # Members, the scaling of the parameters and combinations are replaced below.
+    posterior = Posterior(
+        architecture, (), compression, views, box, np.zeros(len(TARGETS)), np.ones(len(TARGETS)), emulator,
+        misfits_by_view, Combinations(np.eye(6), np.zeros(6), ()), provenance, np.zeros(0), np.zeros(0), {},
+    )  # fmt: skip
     logits = posterior.to_logits(table.targets)
     posterior = dataclasses.replace(posterior, centre=logits.mean(0), spread=logits.std(0))
     target = torch.from_numpy(posterior.standardise(table.targets)).float()
@@ -123,26 +125,26 @@ def train_posterior(
         rng = np.random.default_rng([seed, k])
         holdout = rng.permutation(laws)[: max(1, round(VALIDATION * laws))]
         validation = torch.from_numpy(np.isin(law_of_row, holdout))
-        part = sub_progress(progress, *(EMULATOR_PART + (1 - EMULATOR_PART) * end / members for end in (k, k + 1)))
+        stage = sub_progress(progress, *(EMULATOR_PART + (1 - EMULATOR_PART) * end / members for end in (k, k + 1)))
         with torch.random.fork_rng():
             torch.manual_seed(int(rng.integers(2**31)))
-            flow = Member(sizes, len(views))
-            flows.append(_fit(flow, context, target, validation, flow_plan, f"member {k + 1} of {members}", part))
-        # What the flow misses of the rows that it has not learnt.
+            flow = Member(architecture, len(views))
+            flows.append(_fit(flow, context, target, validation, flow_plan, f"member {k + 1} of {members}", stage))
+        # Combinations are found from the flow's errors on rows that it has not learnt from.
         held_out.append(np.flatnonzero(validation.numpy()))
         single, rows = dataclasses.replace(posterior, members=(flow,)), table.rows(held_out[-1])
         draws = single.sample(rows.descriptors, rows.views, rows.amount, DRAWS)
         errors.append(draws[..., : len(PARAMETERS)].mean(1) - rows.parameters)
     rows = table.rows(np.concatenate(held_out))
-    sums = find_combinations(np.concatenate(errors), rows.parameters, rows.descriptors)
-    return dataclasses.replace(posterior, members=tuple(flows), combinations=sums)
+    combinations = find_combinations(np.concatenate(errors), rows.parameters, rows.descriptors)
+    return dataclasses.replace(posterior, members=tuple(flows), combinations=combinations)
 
 
 def _fit(
     member: Member, context: Tensor, target: Tensor, validation: Tensor, plan: Plan, name: str, progress: Progress
 ) -> Member:
-    """Fit a flow to all rows but those of a mask, and return it as it was where the likelihood of those was highest."""
-    _draw_lines(member, context[~validation], target[~validation, MASS])
+    """Fit a flow to the rows outside `validation`, and return it as it was when those within were likeliest."""
+    _fit_lines(member, context[~validation], target[~validation, MASS])
     rows = int((~validation).sum())
     epochs = min(plan.epochs, STEPS * batch_size(rows) // rows + 1)
 
@@ -155,11 +157,11 @@ def _fit(
     return learn(member, (context, target), validation, nats, plan._replace(epochs=epochs), report)
 
 
-def _draw_lines(member: Member, context: Tensor, mass: Tensor) -> None:
-    """Give a flow the straight lines, one for each view, that fit the mass by the context, and their deviations."""
+def _fit_lines(member: Member, context: Tensor, mass: Tensor) -> None:
+    """Fit the mass as a straight line of the context by ridge regression, for each view, and store it in a flow."""
     for view in range(len(member.width)):
-        mine = context[:, view - len(member.width)] == 1
-        x, y = context[mine].double(), mass[mine].double()
+        in_view = context[:, view - len(member.width)] == 1  # the last columns are 1 for the row's view
+        x, y = context[in_view].double(), mass[in_view].double()
         slope = torch.linalg.solve(x.T @ x + RIDGE * torch.eye(x.shape[1]), x.T @ y)
         member.slope[view], member.width[view] = slope, (y - x @ slope).std()
 
@@ -176,21 +178,21 @@ def train_emulator(
     """Fit networks to the compressed descriptors of a table's rows, given their parameters.
 
     One ensemble of networks learns the mean. A second one learns the deviations of the first one's errors on shapes
-    held out. Returned beside the emulator, by view: the misfits (`emulator.misfits`) of shapes held out, of
-    `REFERENCE` rows at most, to which the misfit of a scan is compared.
+    held out. Returns the emulator and, by view, the misfits (`emulator.misfits`) of shapes held out, of `REFERENCE`
+    rows at most, with which the misfit of a scan is compared.
     """
     views = tuple(sorted(set(table.views.tolist())))
     target = compression(table.descriptors)
     law_of_row = table.laws
     fold = np.random.default_rng(seed).permutation(law_of_row.max() + 1)[law_of_row] % FOLDS
-    none = (Layer(np.zeros((1, 1, 1)), np.zeros((1, 1))),)
-    blank = Emulator(compression, views, box, none, none, np.eye(target.shape[1]), 1.0)
-    inputs = blank.inputs(table.parameters, table.views, table.amount)
+    untrained = Emulator(compression, views, box, (), (), np.eye(target.shape[1]), 1.0)
+    inputs = untrained.inputs(table.parameters, table.views, table.amount)
     x, y = torch.from_numpy(inputs).float(), torch.from_numpy(target).float()
 
     means = _train_ensemble(x, y, fold, _mean_square, plan, seed, sub_progress(progress, 0.0, 0.5))
     errors = y - _predict_held_out(means, x, fold)
     values, vectors = np.linalg.eigh(np.cov(errors.double().numpy().T))
+    # Rows are the principal directions of the errors, greatest variance first, scaled so that theirs along each is 1.
     basis = (vectors / np.sqrt(np.maximum(values, 1e-9 * values.max()))).T[::-1].astype(np.float32)
     whitened = errors @ torch.from_numpy(basis).T
     spreads = _train_ensemble(x, whitened, fold, _normal_nats, plan, seed, sub_progress(progress, 0.5, 1.0))
@@ -199,35 +201,36 @@ def train_emulator(
     residuals = (whitened / deviation).double().numpy()
     emulator = dataclasses.replace(emulator, inflation=_inflation(emulator, table, residuals))
     rows = [[np.flatnonzero((table.views == view) & (fold == k)) for k in range(FOLDS)] for view in views]
-    rows_of_fold = min(REFERENCE // FOLDS, *(len(part) for parts in rows for part in parts))
+    rows_of_fold = min(REFERENCE // FOLDS, *(len(chosen) for by_fold in rows for chosen in by_fold))
     if not rows_of_fold:
         raise ValueError(f"expected many shapes in each of the views {', '.join(views)}, got few in one")
     references: dict[str, list[np.ndarray]] = {view: [] for view in views}
-    for k in range(FOLDS):  # the network that did not learn from these rows
+    for k in range(FOLDS):
+        # The k-th networks did not learn from the rows of fold k.
         mean, spread = (
-            [Layer(w[k : k + 1], b[k : k + 1]) for w, b in each] for each in (emulator.mean, emulator.spread)
+            tuple(Layer(w[k : k + 1], b[k : k + 1]) for w, b in layers) for layers in (emulator.mean, emulator.spread)
         )
-        single = dataclasses.replace(emulator, mean=tuple(mean), spread=tuple(spread))
-        for view, parts in zip(views, rows, strict=True):
-            held_out = table.rows(parts[k][:rows_of_fold])
-            references[view].append(
-                misfits(single, held_out.descriptors, held_out.views, held_out.amount, held_out.parameters[:, None])
-            )
-    return emulator, {view: np.sort(np.concatenate(each)) for view, each in references.items()}
+        single = dataclasses.replace(emulator, mean=mean, spread=spread)
+        for view, by_fold in zip(views, rows, strict=True):
+            held_out = table.rows(by_fold[k][:rows_of_fold])
+            columns = (held_out.descriptors, held_out.views, held_out.amount)
+            references[view].append(misfits(single, *columns, held_out.parameters[:, None]))
+    return emulator, {view: np.sort(np.concatenate(values)) for view, values in references.items()}
 
 
-def _inflation(emulator: Emulator, table: Table, left: np.ndarray) -> float:
-    """Return how much more than uncorrelated residuals `left` move the best parameters: the ratio of mean squares."""
-    # Parameters move along the derivatives of the mean, and are held by a prior of deviation 1.
+def _inflation(emulator: Emulator, table: Table, residuals: np.ndarray) -> float:
+    """Return the mean square by which whitened residuals `(N, k)` move the best parameters, over its expectation if
+    they were independent of variance 1."""
+    # A Gauss-Newton step moves parameters by covariance · slopesᵀ residuals; their prior has deviation 1.
     squared, expected = 0.0, 0.0
     for view in emulator.views:
-        mine = table.views == view
-        slopes = emulator.slopes(table.parameters[mine], table.views[mine], table.amount[mine])
-        pulls = np.einsum("nkd,nk->nd", slopes, left[mine])
-        firmness = np.einsum("nkd,nke->nde", slopes, slopes)
-        covariance = np.linalg.inv(firmness + np.eye(len(PARAMETERS)))
-        squared += np.einsum("nd,nde,ne->", pulls, covariance, pulls)
-        expected += np.einsum("nde,ned->", covariance, firmness)
+        in_view = table.views == view
+        slopes = emulator.slopes(table.parameters[in_view], table.views[in_view], table.amount[in_view])
+        gradients = np.einsum("nkd,nk->nd", slopes, residuals[in_view])
+        information = np.einsum("nkd,nke->nde", slopes, slopes)
+        covariance = np.linalg.inv(information + np.eye(len(PARAMETERS)))
+        squared += np.einsum("nd,nde,ne->", gradients, covariance, gradients)
+        expected += np.einsum("nde,ned->", covariance, information)
     return float(squared / expected)
 
 
@@ -242,15 +245,9 @@ def _normal_nats(network: nn.Module, x: Tensor, target: Tensor) -> Tensor:
 
 
 def _train_ensemble(
-    x: Tensor,
-    y: Tensor,
-    part: np.ndarray,
-    cost: Callable[[nn.Module, Tensor, Tensor], Tensor],
-    plan: Plan,
-    seed: int,
-    progress: Progress,
+    x: Tensor, y: Tensor, fold: np.ndarray, cost: Cost, plan: Plan, seed: int, progress: Progress
 ) -> list[nn.Sequential]:
-    """Return `FOLDS` networks; each learns from all parts of the rows but one, and stops where that one is fit best."""
+    """Return `FOLDS` networks; each learns from all folds of the rows but one, and stops where that one is fit best."""
     sizes, networks = (x.shape[1], *HIDDEN), []
     with torch.random.fork_rng():
         torch.manual_seed(seed)
@@ -259,21 +256,21 @@ def _train_ensemble(
             def report(epoch: int, _: float, k: int = k) -> None:
                 progress(f"emulator, epoch {epoch}", (k + epoch / plan.epochs) / FOLDS)
 
-            layers = [each for n, m in itertools.pairwise(sizes) for each in (nn.Linear(n, m), nn.SiLU())]
+            layers = [layer for n, m in itertools.pairwise(sizes) for layer in (nn.Linear(n, m), nn.SiLU())]
             network = nn.Sequential(*layers, nn.Linear(HIDDEN[-1], y.shape[1]))
-            networks.append(learn(network, (x, y), torch.from_numpy(part == k), cost, plan, report))
+            networks.append(learn(network, (x, y), torch.from_numpy(fold == k), cost, plan, report))
     return networks
 
 
-def _predict_held_out(networks: list[nn.Sequential], x: Tensor, part: np.ndarray) -> Tensor:
+def _predict_held_out(networks: list[nn.Sequential], x: Tensor, fold: np.ndarray) -> Tensor:
     """Return each row's outputs by the network that did not learn from it."""
     with torch.no_grad():
         outputs = torch.stack([network(x) for network in networks])
-    return outputs[torch.from_numpy(part), torch.arange(len(x))]
+    return outputs[torch.from_numpy(fold), torch.arange(len(x))]
 
 
 def _layers(networks: list[nn.Sequential]) -> tuple[Layer, ...]:
-    """Return the weights of networks, stacked."""
+    """Return the linear layers of networks of one shape, each stacked over the networks."""
     linear = [[layer for layer in network if isinstance(layer, nn.Linear)] for network in networks]
     return tuple(
         Layer(*(np.stack([getattr(layer, name).detach().numpy() for layer in level]) for name in ("weight", "bias")))
@@ -282,39 +279,36 @@ def _layers(networks: list[nn.Sequential]) -> tuple[Layer, ...]:
 
 
 def batch_size(rows: int) -> int:
-    """Return how many rows of a table a step sees."""
+    """Return the number of rows of a step: `PACE` steps to an epoch, within `BATCH`."""
     return min(max(rows // PACE, BATCH[0]), BATCH[1])
 
 
 def learn(
-    network: Network,
-    rows: tuple[Tensor, Tensor],
-    validation: Tensor,
-    cost: Callable[[Network, Tensor, Tensor], Tensor],
-    plan: Plan,
-    report: Callable[[int, float], object],
-) -> Network:
-    """Fit a network to all rows (inputs and targets) but those of a mask, and return it as it was where those cost
-    least; `report` is called with the number of each epoch, from 1, and the least cost so far."""
+    network: Network, rows: tuple[Tensor, Tensor], validation: Tensor,
+    cost: Callable[[Network, Tensor, Tensor], Tensor], plan: Plan, report: Callable[[int, float], object],
+) -> Network:  # fmt: skip
+    """Fit a network by AdamW to the rows (inputs, targets) outside `validation`, and return it as it was where those
+    within cost least; `report` is called with the number of each epoch, from 1, and the least cost so far."""
     optimiser = torch.optim.AdamW(network.parameters(), lr=plan.rate, weight_decay=plan.decay)
-    slower = torch.optim.lr_scheduler.ReduceLROnPlateau(optimiser, factor=0.5, patience=plan.patience // 3)
-    (x, y), held_out = [part[~validation] for part in rows], [part[validation] for part in rows]
+    scheduler = torch.optim.lr_scheduler.ReduceLROnPlateau(optimiser, factor=0.5, patience=plan.patience // 3)
+    x, y = (column[~validation] for column in rows)
+    held_out = [column[validation] for column in rows]
     best, state, waited = np.inf, copy.deepcopy(network.state_dict()), 0
-    for epoch in range(plan.epochs):
+    for epoch in range(1, plan.epochs + 1):
         network.train()
-        for chosen in torch.randperm(len(x)).split(batch_size(len(x))):
+        for batch in torch.randperm(len(x)).split(batch_size(len(x))):
             optimiser.zero_grad()
-            cost(network, x[chosen], y[chosen]).backward()
+            cost(network, x[batch], y[batch]).backward()
             nn.utils.clip_grad_norm_(network.parameters(), 5.0)
             optimiser.step()
         network.eval()
         with torch.no_grad():
             value = float(cost(network, *held_out))
-        slower.step(value)
-        waited = 0 if value < best else waited + 1
+        scheduler.step(value)
+        waited += 1
         if value < best:
-            best, state = value, copy.deepcopy(network.state_dict())
-        report(epoch + 1, best)
+            best, state, waited = value, copy.deepcopy(network.state_dict()), 0
+        report(epoch, best)
         if waited > plan.patience:
             break
     network.load_state_dict(state)
@@ -325,35 +319,36 @@ def learn(
 
 
 def find_combinations(errors: np.ndarray, parameters: np.ndarray, descriptors: np.ndarray) -> Combinations:
-    """Return the combinations whose mean square error, against their variance among laws, is least, then next.
+    """Find uncorrelated sums of parameters, by increasing mean square error over variance among laws.
 
-    `errors` `(N, 6)` are what a posterior's means miss of laws that it has not learnt, `parameters` `(N, 6)` theirs,
-    and `descriptors` `(N, 351)` those of their shapes.
+    `errors` `(N, 6)` are those of a posterior's means for laws that it has not learnt from, `parameters` `(N, 6)` and
+    `descriptors` `(N, 351)` are the laws' and their shapes'.
     """
     centre = parameters.mean(0)
     deviations = parameters - centre
+    # The generalised eigenvectors of both covariances, by increasing eigenvalue.
     weights = linalg.eigh(errors.T @ errors / len(errors), deviations.T @ deviations / len(deviations))[1].T
-    scores, looks = deviations @ weights.T, np.array(list(LOOKS.values()), dtype=object)
-    shown = _look(descriptors)
-    correlations = scores.T @ ((shown - shown.mean(0)) / np.maximum(shown.std(0), 1e-9)) / len(scores)
+    sums, features = deviations @ weights.T, _measure_looks(descriptors)
+    correlations = sums.T @ ((features - features.mean(0)) / np.maximum(features.std(0), 1e-9)) / len(sums)
+    # A sum's sign is free: it is chosen so that the feature that goes with it most increases.
     signs = np.sign(np.take_along_axis(correlations, np.abs(correlations).argmax(1)[:, None], 1))
-    ends = []
+    words, ends = list(LOOKS.values()), []
     for row in signs * correlations:
         chosen = [k for k in np.argsort(-np.abs(row))[:NAMED] if np.abs(row[k]) >= FAINT]
-        ends.append(tuple(", ".join(looks[k, int((row[k] > 0) == high)] for k in chosen) for high in (False, True)))
+        ends.append(tuple(", ".join(words[k][int((row[k] > 0) == high)] for k in chosen) for high in (False, True)))
     return Combinations(signs * weights, centre, tuple(ends))
 
 
-def _look(descriptors: np.ndarray) -> np.ndarray:
-    """Return the numbers `(N, 6)` of `LOOKS` of descriptors `(N, 351)`."""
+def _measure_looks(descriptors: np.ndarray) -> np.ndarray:
+    """Return the features `(N, 6)` of `LOOKS` of descriptors `(N, 351)`."""
     names = np.array(column_names())
     fraction, (area, bend, euler), depths, gaps = (
         np.maximum(descriptors[:, names == name].T, LEAST if name != "densities" else -np.inf)
         for name in ("fraction", "densities", "depths", "clearances")
     )
 
-    def spread(lengths: np.ndarray) -> np.ndarray:
-        return np.log(lengths[8] / lengths[5])
+    def spread(quantiles: np.ndarray) -> np.ndarray:
+        return np.log(quantiles[LEVELS.index(0.9)] / quantiles[LEVELS.index(0.5)])
 
     area = np.maximum(area, LEAST)
     return np.column_stack([
