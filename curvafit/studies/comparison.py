@@ -1,4 +1,4 @@
-"""Do groups of scans differ, or does a number such as time or dose matter: in which curvature, and by how much?"""
+"""Do groups of scans differ, or change with a number such as time or dose: in which curvature, and by how much?"""
 
 from __future__ import annotations
 
@@ -24,39 +24,39 @@ from curvafit.scan.measures import QUANTITIES, SURE, Measures, find_quantity, in
 from curvafit.scan.structure import check_options
 from curvafit.studies.scans import Case, Group, gather_notes, list_cases, measure_scans
 
-#: Arrangements of the labels that are tried: all where there are no more.
+#: Most arrangements of the labels that are tried; all are, where there are no more.
 PERMUTATIONS = 9999
-#: What p must not exceed for a difference that is shown.
+#: Greatest p of a difference that is significant.
 LEVEL = 1 - SURE
 #: The familiar numbers, without those of curvature.
 FAMILIAR = ("BV/TV", "Tb.Th", "Tb.Th.SD", "Tb.Sp", "Tb.N", "Conn.D", "χ", "BS/BV", "BS/TV", "DA")
 #: Bins along each axis of the difference of diagrams, and the width in bins of the Gaussian that smooths it.
 BINS, SMOOTH = 48, 2.0
-#: Bins with less than this part of the fullest one's area are not tested.
+#: Bins with less than this fraction of the fullest one's area are not tested.
 LEAST_SHARE = 0.02
 
 
 @dataclass(frozen=True)
 class Number:
-    """How one quantity goes with the labels, in the scans' unit to `power`; NaN, and no means, where there is none.
+    """How one quantity depends on the labels, in the scans' unit to `power`; NaN, and no means, where there is none.
 
     Attributes
     ----------
     means, deviations
         Of the subjects of each group.
     difference
-        Of two groups the second mean less the first; by a number the slope over it, of pairs within subjects.
+        Of two groups, the second mean less the first; by a number, the slope over it, within subjects if paired.
     effect, low, high
-        Of two groups Hedges' g, of pairs that of the differences; by a number the correlation r with its rank; with a
-        95 % interval. Of more groups the correlation ratio η.
+        Effect size with a 95 % interval: of two groups Hedges' g, of the differences if paired; by a number, the
+        correlation r with its rank. Of more groups the correlation ratio η, without an interval.
     p
         Share of arrangements of the labels with at least that effect.
     family, holm, discovery
-        p corrected for all quantities. The first two hold the chance of any false finding: by the most of the effects
-        of all quantities in each arrangement, and by Holm, whose p cannot be small with few subjects. The third, by
-        Benjamini and Hochberg, holds the share of false findings.
+        p corrected for all quantities. The first two control the chance of any false finding: by the greatest effect of
+        all quantities in each arrangement, and by Holm, whose p cannot be small with few subjects. The third, by
+        Benjamini and Hochberg, controls the share of false findings.
     known
-        The part of the variance that the labels leave which the scans' own intervals explain.
+        The fraction of the variance left by the labels that the scans' own intervals explain.
     """
 
     name: str
@@ -77,7 +77,7 @@ class Number:
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Comparison(Pictured):
-    """How groups of scans differ, or what goes with a number.
+    """How groups of scans differ, or what changes with a number.
 
     A *subject* here is a subject in one group, or at one number.
 
@@ -86,23 +86,23 @@ class Comparison(Pictured):
     by, groups
         What subjects are compared by, and the names of the groups; none where it is a number.
     measures, cases
-        Of each scan, its measures in `unit`, and its name, subject and label.
+        The scans' measures in `unit`; and their names, subjects and labels.
     subjects, labels, blocks
-        Label and name of each subject; the number of its group, or its number, (S,); and where subjects are paired the
-        number of its name, (S,), else None.
+        Label and name of each subject; the index of its group, or its number, (S,); and the index of its name, (S,),
+        where subjects are paired, else None.
     values, errors, halves
-        Each subject's quantities (S, K), means over its scans; the standard errors that the scans' own intervals give
-        them, and half the widths of their 95 % intervals, NaN where a scan has none.
+        Each subject's quantities (S, K), means over its scans; their standard errors and the halves of their 95 %
+        intervals, which follow from the scans' own intervals, NaN where a scan has none.
     numbers
         A test of each quantity.
     statistic, p, least
         Energy distance of the groups' curvature diagrams, in 1 / `unit`, or the diagrams' distance correlation with the
-        number's rank; the share of arrangements with at least as much, and the least that it could be.
+        number's rank; the share of arrangements with at least as much, and the least possible share.
     sides, diagrams
-        The part of the subjects, (S,), that each is in: its group, or the lower and the upper half of the numbers; and
-        the mean diagram of each part, of total area 1.
+        The index (S,) of each subject's part: its group, or the lower or upper half of the numbers; and the mean
+        diagram of each part, of total area 1.
     apart, within
-        Sliced Wasserstein distance of the parts' mean diagrams, the greatest, and the mean one of two subjects of one.
+        Sliced Wasserstein distances: the greatest of two parts' mean diagrams, and the mean of two subjects of a part.
     edges, differences, bins_p
         Edges (B + 1,) of bins in κ1 and κ2; over them (κ2, κ1) the second group's mean diagram less the first's, or
         each group's less that of all, or the slope from the least number to the greatest, `(M, B, B)`; and the
@@ -139,8 +139,8 @@ class Comparison(Pictured):
     notes: tuple[str, ...]
 
     def __repr__(self) -> str:
-        what = ", ".join(map(repr, self.groups)) or f"by {self.by!r}"
-        return f"Comparison({what}, p {self.p:.3g}, {len(self.cases)} scans)"
+        groups = ", ".join(map(repr, self.groups)) or f"by {self.by!r}"
+        return f"Comparison({groups}, p {self.p:.3g}, {len(self.cases)} scans)"
 
     def __getitem__(self, name: str) -> Number:
         """Return the test of a quantity by its name or symbol; raise KeyError where there is none."""
@@ -176,27 +176,27 @@ class Comparison(Pictured):
     def status(self) -> str:
         """Return the answer in a sentence or a few: whether, by how much, in which direction."""
         unit = per_unit(self.unit, 1)
-        most = max((self[name] for name in FAMILIAR), key=lambda each: abs(np.nan_to_num(each.effect)))
+        strongest = max((self[name] for name in FAMILIAR), key=lambda number: abs(np.nan_to_num(number.effect)))
         few = f"So few subjects cannot give a p below {format_number(self.least, 2)}: nothing can be shown to differ."
         lines = [few] if self.least > LEVEL else []
         if self.primary:
-            lines.append(f"{self.verdict}, named beforehand: {self._say(self.primary)}.")
+            lines.append(f"{self.verdict}, named beforehand: {self._describe(self.primary)}.")
         lines += [
             f"{self._judge(self.p, 'curvature diagrams')}: p = {format_number(self.p, 2)}.",
-            f"Of the familiar numbers the one that differs most: {self._say(most)}, "
-            f"{format_number(most.family, 2)} among all {len(self.numbers)} numbers.",
+            f"Of the familiar numbers the one that differs most: {self._describe(strongest)}, "
+            f"{format_number(strongest.family, 2)} among all {len(self.numbers)} numbers.",
             f"In curvature the mean diagrams of {join_names(self.parts)} lie "
             f"{'up to ' * (len(self.parts) > 2)}{format_number(self.apart, 2)} {unit} apart, those of two subjects of "
             f"one of them {format_number(self.within, 2)} {unit} on average (sliced Wasserstein distance).",
         ]
         if self.p <= LEVEL and len(self.groups) <= 2:
-            low, high = (f"{self.by} {end:g}" for end in (self.labels.min(), self.labels.max()))
-            a, b, span = (*self.groups, 1.0) if self.groups else (low, high, float(np.ptp(self.labels)))
-            shifts = sorted((span * self[f"share of {name}"].difference, name) for name in FAMILIES)
-            (fall, loser), (rise, winner) = shifts[0], shifts[-1]
+            low, high = self.groups or (f"{self.by} {label:g}" for label in (self.labels.min(), self.labels.max()))
+            span = 1.0 if self.groups else float(np.ptp(self.labels))  # a difference by a number is a slope
+            changes = sorted((span * self[f"share of {name}"].difference, name) for name in FAMILIES)
+            (fall, falling), (rise, rising) = changes[0], changes[-1]
             lines.append(
-                f"From {a} to {b} the share of {loser} falls by {format_percent(-fall)} "
-                f"of the surface, and that of {winner} rises by {format_percent(rise)}."
+                f"From {low} to {high} the share of {falling} falls by {format_percent(-fall)} "
+                f"of the surface, and that of {rising} rises by {format_percent(rise)}."
             )
         return " ".join(lines)
 
@@ -213,12 +213,12 @@ class Comparison(Pictured):
             return self._judge(self.primary.p, self.primary.name)
         return self._judge(self.p, "curvature diagrams")
 
-    def _judge(self, p: float, what: str) -> str:
+    def _judge(self, p: float, quantity: str) -> str:
         if not self.groups:
-            return f"With {self.by} subjects {'differ' if p <= LEVEL else 'are not seen to differ'} by their {what}"
-        return f"{join_names(self.groups)} {'differ' if p <= LEVEL else 'are not told apart'} by their {what}"
+            return f"With {self.by} subjects {'differ' if p <= LEVEL else 'are not seen to differ'} by their {quantity}"
+        return f"{join_names(self.groups)} {'differ' if p <= LEVEL else 'are not told apart'} by their {quantity}"
 
-    def _say(self, number: Number) -> str:
+    def _describe(self, number: Number) -> str:
         """Return a number with its means or its slope, and its p, as text."""
         unit = power_name(self.unit, number.power)
         if self.groups:
@@ -255,8 +255,8 @@ def compare(
     groups are compared by the energy distance of the subjects' diagrams, by a number by their distance correlation with
     its rank; each quantity, and each bin of the diagram, by its correlation with the labels: all over the same
     arrangements of the labels. Raises ValueError where labels cannot be exchanged (fewer than two groups of two
-    subjects, fewer than three numbers, a subject with several labels that is not `paired`, or with one that is), scans
-    are there twice, or only some have a physical unit; and as `measure`, with the scan's name.
+    subjects, fewer than three numbers, a subject with several labels that is not `paired`, or with one that is), a scan
+    is listed twice, or only some have a physical unit; and as `measure`, with the scan's name.
 
     Parameters
     ----------
@@ -268,8 +268,8 @@ def compare(
         The table's column to compare by; or a label for each scan of one sequence. Where all are numbers, such as times
         or doses, what goes with the number is tested; else they name groups.
     paired
-        Compare within subjects, each of which is in every group, or at several numbers: in a table, of one name in the
-        column subject; in folders, of one name of a file; in sequences, at one place.
+        Compare within subjects, each of which is in every group, or at several numbers. A subject has one name in the
+        column subject of a table, one file name in folders, and one position in sequences.
     subjects
         A CSV table of the columns scan and subject, for groups. Without it each scan is a subject.
     kind, periodic, threshold, dark
@@ -289,43 +289,42 @@ def compare(
     check_int(permutations, "a number of permutations from 99", 99, 10**6)
     check_seed(seed)
     if primary is not None:
-        names = {each for name, symbol, *_ in QUANTITIES for each in (name, symbol)}
+        names = {word for name, symbol, *_ in QUANTITIES for word in (name, symbol)}
         check_choice(primary, names, f"a primary number of {', '.join(symbol for _, symbol, *_ in QUANTITIES)}")
     cases, notes = list_cases(groups, by, subjects, paired)
     options = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark}
-    measures, more = measure_scans(cases, options, reading, workers, sub_progress(progress, 0.0, 0.97))
+    measures, measure_notes = measure_scans(cases, options, reading, workers, sub_progress(progress, 0.0, 0.97))
     progress("comparing", 0.97)
     name = by if isinstance(by, str) else "group" if isinstance(cases[0].label, str) else "the number"
     parameters = {**options, **reading, "by": name, "paired": paired, "primary": primary}
     parameters |= {"permutations": permutations, "seed": seed}
-    return _compare_measures(measures, cases, parameters, [*notes, *more])
+    return _compare_measures(measures, cases, parameters, [*notes, *measure_notes])
 
 
 def _compare_measures(
     measures: Sequence[Measures], cases: Sequence[Case], options: dict[str, Any], notes: Sequence[str]
 ) -> Comparison:
-    keys = [(case.label, case.subject) for case in cases]
-    subjects = list(dict.fromkeys(keys))
-    scans = [[k for k, key in enumerate(keys) if key == subject] for subject in subjects]
+    """Test measures of scans by the labels of their subjects, and describe how far apart the groups or halves are."""
+    subject_of_scan = [(case.label, case.subject) for case in cases]
+    subjects = list(dict.fromkeys(subject_of_scan))
+    scans = [[k for k, key in enumerate(subject_of_scan) if key == subject] for subject in subjects]
     groups = tuple(dict.fromkeys(label for label, _ in subjects if isinstance(label, str)))
     labels = np.array([groups.index(label) if isinstance(label, str) else label for label, _ in subjects])
     blocks = np.unique([name for _, name in subjects], return_inverse=True)[1] if options["paired"] else None
-    # What goes with a number may go straight or level off: its rank loses little of the first and sees the second.
+    # A quantity may depend on a number in a straight line or level off: ranks detect both.
     scores = labels if groups else rankdata(labels)
     arrangements, exact = permutation.relabel(scores, options["permutations"], options["seed"], blocks)
     test = permutation.measure_energy if groups else permutation.measure_dependence
-    pooled = [_pool([measures[k].diagram for k in own]) for own in scans]
-    rows = np.stack([sliced_embedding(each) for each in pooled])
-    distances = cdist(rows, rows)
+    diagrams = [_pool([measures[k].diagram for k in own_scans]) for own_scans in scans]
+    embeddings = np.stack([sliced_embedding(diagram) for diagram in diagrams])
+    distances = cdist(embeddings, embeddings)
     statistics = test(distances, arrangements, blocks)
     sides = labels if groups else _halve(labels)
-    means = tuple(
-        _pool([each for each, own in zip(pooled, sides, strict=True) if own == side]) for side in np.unique(sides)
-    )
+    means = tuple(_pool([diagrams[k] for k in np.flatnonzero(sides == side)]) for side in np.unique(sides))
     same_side = (sides[:, None] == sides) & ~np.eye(len(sides), dtype=bool)
-    edges, differences, p = _compare_bins(pooled, labels, arrangements, blocks)
+    edges, differences, bins_p = _compare_bins(diagrams, labels, arrangements, blocks)
     values, errors, halves = _average(measures, scans)
-    # Of a number that is the label.
+    # The least possible p is that of a quantity equal to the labels.
     least_p = permutation.share_beyond(permutation.correlate(scores[:, None], arrangements, blocks))[0]
     return Comparison(
         by=options["by"], groups=groups, unit=measures[0].unit, cases=tuple(cases), measures=tuple(measures),
@@ -334,7 +333,7 @@ def _compare_measures(
         statistic=float(statistics[0]), p=float(permutation.share_beyond(statistics)), least=float(least_p),
         sides=sides, diagrams=means,
         apart=float(pdist(np.stack([sliced_embedding(mean) for mean in means])).max()),
-        within=float(distances[same_side].mean()), edges=edges, differences=differences, bins_p=p,
+        within=float(distances[same_side].mean()), edges=edges, differences=differences, bins_p=bins_p,
         permutations=len(arrangements), exact=exact, options=options,
         notes=(*notes, *gather_notes(measures, cases)),
     )  # fmt: skip
@@ -342,32 +341,32 @@ def _compare_measures(
 
 def _halve(numbers: np.ndarray) -> np.ndarray:
     """Return which numbers are in the upper half, 0 or 1; neither half is empty."""
-    middle = np.median(numbers)
-    return (numbers > middle if middle < numbers.max() else numbers >= middle).astype(int)
+    median = np.median(numbers)
+    return (numbers > median if median < numbers.max() else numbers >= median).astype(int)
 
 
 def _pool(diagrams: Sequence[Diagram]) -> Diagram:
-    """Return the mean of diagrams, each of total area 1."""
+    """Return the mean of diagrams, each scaled to total area 1."""
     points = np.concatenate([diagram.points for diagram in diagrams])
     weights = np.concatenate([diagram.normalised.weights / len(diagrams) for diagram in diagrams])
     return Diagram(points, weights, unit=diagrams[0].unit)
 
 
 def _compare_bins(
-    pooled: Sequence[Diagram], labels: np.ndarray, arranged: np.ndarray, blocks: np.ndarray | None
+    diagrams: Sequence[Diagram], labels: np.ndarray, arrangements: np.ndarray, blocks: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return `edges`, `differences` and `bins_p` of a `Comparison`."""
-    edges = np.linspace(*shared_limits(pooled), BINS + 1)
-    shares = np.stack(
-        [
-            gaussian_filter(np.histogram2d(*each.points.T[::-1], bins=(edges, edges), weights=each.weights)[0], SMOOTH)
-            for each in pooled
-        ]
-    )
+    edges = np.linspace(*shared_limits(diagrams), BINS + 1)
+    histograms = []
+    for diagram in diagrams:
+        κ1, κ2 = diagram.points.T
+        histogram, _, _ = np.histogram2d(κ2, κ1, bins=(edges, edges), weights=diagram.weights)
+        histograms.append(gaussian_filter(histogram, SMOOTH))
+    shares = np.stack(histograms)
     mean = shares.mean(0)
-    tested = (mean >= LEAST_SHARE * mean.max()) & (edges[1:, None] <= edges[None, 1:])
+    tested = (mean >= LEAST_SHARE * mean.max()) & (edges[1:, None] <= edges[None, 1:])  # κ2 ≤ κ1
     p = np.full(mean.shape, np.nan)
-    p[tested] = permutation.correct_by_most(shares[:, tested], arranged, blocks)
+    p[tested] = permutation.correct_by_most(shares[:, tested], arrangements, blocks)
     if np.issubdtype(labels.dtype, np.floating):
         x = permutation.center(labels, blocks)
         return edges, np.ptp(labels) * np.tensordot(x, shares, 1)[None] / (x @ x), p
@@ -376,52 +375,50 @@ def _compare_bins(
 
 
 def _average(measures: Sequence[Measures], scans: Sequence[Sequence[int]]) -> tuple[np.ndarray, ...]:
-    """Return `values`, `errors` and `halves` of a `Comparison`; `scans` are the numbers of each subject's."""
-    values, halves = (
-        np.array([[getattr(quantity, name) for quantity in scan.quantities] for scan in measures])
-        for name in ("value", "half")
-    )
+    """Return `values`, `errors` and `halves` of a `Comparison`; `scans` are the indices of each subject's scans."""
+    values = np.array([[quantity.value for quantity in scan.quantities] for scan in measures])
+    halves = np.array([[quantity.half for quantity in scan.quantities] for scan in measures])
     errors = halves / np.array([[interval_reach(scan.blocks)] for scan in measures])
-    spread = (np.sqrt([(each[own] ** 2).mean(0) / len(own) for own in scans]) for each in (errors, halves))
-    return np.stack([values[own].mean(0) for own in scans]), *spread
+    # Errors of a mean of n independent scans add up in squares, over n².
+    of_means = (np.sqrt([(widths[own] ** 2).mean(0) / len(own) for own in scans]) for widths in (errors, halves))
+    return np.stack([values[own].mean(0) for own in scans]), *of_means
 
 
 def _compare_numbers(
-    scan: Measures,
-    values: np.ndarray,
-    errors: np.ndarray,
-    labels: np.ndarray,
-    arranged: np.ndarray,
+    scan: Measures, values: np.ndarray, errors: np.ndarray, labels: np.ndarray, arrangements: np.ndarray,
     blocks: np.ndarray | None,
-) -> tuple[Number, ...]:
+) -> tuple[Number, ...]:  # fmt: skip
     """Test each quantity of subjects' values (S, K); `scan` has the quantities' names."""
-    known = np.asarray(np.isfinite(values).all(0))
-    p, family, holm, discovery = np.full((4, len(known)), np.nan)
-    p[known] = permutation.share_beyond(permutation.correlate(values[:, known], arranged, blocks))
-    holm[known], discovery[known] = permutation.correct_holm(p[known]), false_discovery_control(p[known])
-    family[known] = permutation.correct_by_most(values[:, known], arranged, blocks)
-    rows, corrected = [], np.stack([p, family, holm, discovery], axis=1).tolist()
-    for quantity, own, error, tested in zip(scan.quantities, values.T, errors.T, corrected, strict=True):
-        means, deviations, difference, effect, left = _measure_change(own, labels, arranged[0], blocks)
-        share = float((error**2).mean() / left) if left > 0 else math.nan
-        named = quantity.name, quantity.symbol, quantity.power
-        rows.append(Number(*named, means, deviations, difference, *effect, *tested, share))  # type: ignore[call-arg]
-    return tuple(rows)
+    finite = np.asarray(np.isfinite(values).all(0))
+    p, family, holm, discovery = np.full((4, len(finite)), np.nan)
+    p[finite] = permutation.share_beyond(permutation.correlate(values[:, finite], arrangements, blocks))
+    holm[finite], discovery[finite] = permutation.correct_holm(p[finite]), false_discovery_control(p[finite])
+    family[finite] = permutation.correct_by_most(values[:, finite], arrangements, blocks)
+    numbers, p_values = [], np.stack([p, family, holm, discovery], axis=1).tolist()
+    for quantity, column, error, tests in zip(scan.quantities, values.T, errors.T, p_values, strict=True):
+        means, deviations, difference, effect, variance = _measure_change(column, labels, arrangements[0], blocks)
+        known = (
+            float((error**2).mean() / variance) if variance > 0 else math.nan
+        )  # of the variance that the labels leave
+        names = quantity.name, quantity.symbol, quantity.power
+        numbers.append(Number(*names, means, deviations, difference, *effect, *tests, known))  # type: ignore[call-arg]
+    return tuple(numbers)
 
 
 def _measure_change(
     values: np.ndarray, labels: np.ndarray, ranks: np.ndarray, blocks: np.ndarray | None
 ) -> tuple[tuple[float, ...], tuple[float, ...], float, tuple[float, float, float], float]:
-    """Return means, deviations, difference and effect with its interval of a `Number`, and the variance left over."""
+    """Return the means, deviations, difference and effect of a `Number`, and the variance that the labels leave."""
     if np.issubdtype(labels.dtype, np.floating):
-        samples, spent = [], 1
+        samples = []
         difference, _ = permutation.measure_slope(values, labels, blocks)
         _, effect = permutation.measure_slope(values, ranks, blocks)
         correlation = effect[0]
     else:
+        # Pairs have the same position in both samples.
         order = np.arange(len(labels)) if blocks is None else np.argsort(blocks, kind="stable")
         samples = [values[order][labels[order] == group] for group in np.unique(labels)]
-        spent, two_groups = len(samples) - 1, len(samples) == 2
+        two_groups = len(samples) == 2
         correlation = float(permutation.correlate(values[:, None], labels[None], blocks)[0, 0])
         difference = float(samples[1].mean() - samples[0].mean()) if two_groups else math.nan
         effect = (
@@ -430,7 +427,8 @@ def _measure_change(
             else (correlation, math.nan, math.nan)
         )
     squares = float((permutation.center(values, blocks) ** 2).sum())
-    freedom = len(labels) - (1 if blocks is None else len(np.unique(blocks))) - spent
+    # Degrees of freedom: subjects, less the mean of each block, less the slope or the differences between groups.
+    freedom = len(labels) - (1 if blocks is None else len(np.unique(blocks))) - max(len(samples) - 1, 1)
     effect = effect if squares > 0 else (math.nan, math.nan, math.nan)
     variance_left = squares * (1 - correlation**2) / freedom if freedom > 0 and math.isfinite(effect[0]) else math.nan
     means = tuple(float(sample.mean()) for sample in samples)

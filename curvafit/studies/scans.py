@@ -1,4 +1,4 @@
-"""Many scans: of which subject and in which group each is, measured in one unit, and their numbers in tables.
+"""Many scans: their subjects and groups, their measures in one unit, and tables of their numbers.
 
 Scans come from folders, sequences or a table. All are read once before long work. Numbers are written as CSV, JSON or
 Parquet, a row for each scan and quantity.
@@ -34,29 +34,29 @@ from curvafit.scan.tiles import measure
 from curvafit.volumes.read import Source, load, pick_reader
 from curvafit.volumes.volume import ScanError
 
-#: A group as a caller gives it: a folder of scans, scans, or scans by subject. What is measured already is taken so.
+#: A group as a caller gives it: a folder of scans, scans, or scans by subject; `Measures` are not measured again.
 Group = str | PathLike[str] | Sequence[Source | Measures] | Mapping[str, Sequence[Source | Measures]]
-#: The fewest subjects of a group whose spread can be told.
+#: The fewest subjects of a group whose spread can be measured.
 FEWEST = 2
-#: Edge of the bins of a scan's diagram as it is kept, over the inverse of the structure's thickness.
+#: Edge of the bins to which a scan's diagram is reduced, over the inverse of the structure's thickness.
 FINE = 0.1
-#: Voxel edges of groups that differ by more than this part deserve a note.
+#: Relative difference of the groups' voxel edges above which there is a note.
 ALIKE_EDGES = 0.1
-#: What is done with one scan, given its progress; a function that has a module's name.
+#: What is done with one scan, given its progress; workers need a function that can be pickled.
 Task = Callable[[Progress], Any]
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 #: Suffixes of the files that are written.
 SUFFIXES = (".csv", ".json", ".parquet")
-#: Columns that rows of a part of a scan have besides.
+#: Further columns in rows of a part of a scan.
 OF_PARTS = ("compartment", "instance")
-#: The start of a formula: a sign but for that of numbers.
+#: The start of a formula in a spreadsheet: a plus or minus counts unless it is a number's.
 _FORMULA = re.compile(r"[=@\t\r]|[-+](?![\d.eE\s-]*$)")
 #: `format` of a JSON table.
 FORMAT = Format("curvafit measures 1", title="a table of measures")
 
 
 class Case(NamedTuple):
-    """A scan, its name, the subject it is of, and its label: the name of its group, or a number."""
+    """A scan, its name, its subject, and its label: the name of its group, or a number."""
 
     source: Source | Measures
     name: str
@@ -81,39 +81,39 @@ def list_cases(
     else:
         cases = _list_labelled(groups[0], by) if len(groups) == 1 else _list_groups(groups, by, paired, notes)
         if table is not None:
-            listed = _read_table(Path(table), ("scan", "subject"))
-            if "group" in listed[0]:
+            rows = _read_table(Path(table), ("scan", "subject"))
+            if "group" in rows[0]:
                 raise ValueError(
                     f"expected the groups once, got two folders and a column group in {table}: leave one out"
                 )
-            rows = {row["scan"]: row["subject"] for row in listed}
-            cases = [case._replace(subject=_find_row(case.source, case.name, rows, Path(table))) for case in cases]
+            subjects = {row["scan"]: row["subject"] for row in rows}
+            cases = [case._replace(subject=_find_row(case.source, case.name, subjects, Path(table))) for case in cases]
         elif not paired and not any(isinstance(group, Mapping) for group in groups):
             notes.append("Each scan counts as a subject; a table (--subjects) tells if several are of one.")
-            names = Counter(subject for subject, _ in {(case.subject, case.label) for case in cases})
-            if both := sum(count > 1 for count in names.values()):
-                notes.append(f"The groups have {both} names in common: they count as different subjects.")
+            groups_of = Counter(subject for subject, _ in {(case.subject, case.label) for case in cases})
+            if common := sum(count > 1 for count in groups_of.values()):
+                notes.append(f"The groups have {common} names in common: they count as different subjects.")
                 cases = [case._replace(subject=f"{case.label}/{case.subject}") for case in cases]
     cases = _name_labels(cases, by)
-    _check(cases, paired)
+    _check_labels(cases, paired)
     return cases, notes
 
 
 def _name_labels(cases: Sequence[Case], by: Any) -> list[Case]:
-    """Return cases with numbers where all labels that `by` gives are; else with names, each group together."""
-    found = [None if by is None else _parse(case.label) for case in cases]
-    if None not in found:
-        return [case._replace(label=number) for case, number in zip(cases, found, strict=True)]  # type: ignore[arg-type]
+    """Return cases with numbers as labels where `by` gives only numbers; else with names, sorted by group."""
+    numbers = [None if by is None else _parse_number(case.label) for case in cases]
+    if None not in numbers:
+        return [case._replace(label=number) for case, number in zip(cases, numbers, strict=True)]  # type: ignore[arg-type]
     names = [str(case.label) for case in cases]
-    if any(number is not None for number in found):
-        odd = quoted(names[found.index(None)])
-        raise ValueError(f"expected finite numbers, or names of groups, to compare by, got {odd} beside numbers")
+    if any(number is not None for number in numbers):
+        name = quoted(names[numbers.index(None)])
+        raise ValueError(f"expected finite numbers, or names of groups, to compare by, got {name} beside numbers")
     order = sorted(range(len(cases)), key=lambda k: names.index(names[k]))
     return [cases[k]._replace(label=names[k]) for k in order]
 
 
-def _parse(label: Any) -> float | None:
-    """Return a label as a finite number; None of others."""
+def _parse_number(label: Any) -> float | None:
+    """Return a label as a finite number; None where it is none."""
     try:
         number = float(label)
     except (TypeError, ValueError):
@@ -121,11 +121,11 @@ def _parse(label: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _check(cases: Sequence[Case], paired: bool) -> None:
-    """Raise ValueError if a scan is there twice, or labels cannot be exchanged."""
-    places = Counter(Path(str(case.source)).resolve() for case in cases if isinstance(case.source, str | PathLike))
-    if places and (most := places.most_common(1)[0])[1] > 1:
-        raise ValueError(f"expected each scan once, got {most[0]} {most[1]} times")
+def _check_labels(cases: Sequence[Case], paired: bool) -> None:
+    """Raise ValueError if a scan is listed twice, or labels cannot be exchanged between enough subjects."""
+    paths = Counter(Path(str(case.source)).resolve() for case in cases if isinstance(case.source, str | PathLike))
+    if repeated := [path for path, count in paths.most_common(1) if count > 1]:
+        raise ValueError(f"expected each scan once, got {repeated[0]} {paths[repeated[0]]} times")
     pairs = list(dict.fromkeys((case.subject, case.label) for case in cases))
     counts = Counter(label for _, label in pairs)
     groups = isinstance(pairs[0][1], str)
@@ -141,8 +141,8 @@ def _check(cases: Sequence[Case], paired: bool) -> None:
             where = "in each group" if groups else f"at {FEWEST} numbers or more"
             raise ValueError(f"expected {subject} {where}, to be paired with itself")
         if not paired and count > 1:
-            both = ", ".join(str(label) for name, label in pairs if name == subject)
-            raise ValueError(f"expected one group or number of {subject}, got {both}: --paired compares within it")
+            labels = ", ".join(str(label) for name, label in pairs if name == subject)
+            raise ValueError(f"expected one group or number of {subject}, got {labels}: --paired compares within it")
 
 
 # ---- folders and sequences -------------------------------------------------------------------------------------------
@@ -151,22 +151,22 @@ def _check(cases: Sequence[Case], paired: bool) -> None:
 def _list_labelled(scans: Any, by: Any) -> list[Case]:
     if by is None or isinstance(by, str) or isinstance(scans, Mapping):
         raise ValueError("expected two groups or more, a table, or scans with a label for each")
-    labels, cases = as_tuple(by, "labels"), _gather(as_tuple(scans, "scans"), "scan ", [])
+    labels, cases = as_tuple(by, "labels"), _list_group(as_tuple(scans, "scans"), "scan ", [])
     if len(labels) != len(cases):
         raise ValueError(f"expected a label for each of {len(cases)} scans (--by), got {len(labels)}")
     return [case._replace(label=label) for case, label in zip(cases, labels, strict=True)]
 
 
 def _list_groups(groups: Sequence[Group], by: Any, paired: bool, notes: list[str]) -> list[Case]:
-    """Return the scans of groups; where they are paired, a scan's subject is its file's name or its place."""
+    """Return the scans of groups; of paired ones, the subject is the file's name, or the position in a sequence."""
     if by is not None or len(groups) < 2:
         raise ValueError("expected two groups or more, and by only with a table or with one sequence of scans")
     cases = []
     for group, name in zip(groups, _name_groups(groups), strict=True):
-        listed = _gather(group, name, notes)
+        group_cases = _list_group(group, name, notes)
         if paired and not isinstance(group, str | PathLike | Mapping):
-            listed = [case._replace(subject=str(k)) for k, case in enumerate(listed, 1)]
-        cases += listed
+            group_cases = [case._replace(subject=str(k)) for k, case in enumerate(group_cases, 1)]
+        cases += group_cases
     return cases
 
 
@@ -180,15 +180,15 @@ def _name_groups(groups: Sequence[Group]) -> list[str]:
             raise FileNotFoundError(f"no such folder: {folder}")
         if not folder.is_dir():
             raise ValueError(f"expected a folder of scans, got the file {folder}; single scans need --by")
-    for one, other in permutations((folder.resolve() for folder in folders), 2):
-        if one.is_relative_to(other):
-            raise ValueError(f"expected folders apart from each other, got {one} and {other}")
+    for folder, other in permutations((folder.resolve() for folder in folders), 2):
+        if folder.is_relative_to(other):
+            raise ValueError(f"expected folders apart from each other, got {folder} and {other}")
     names = [folder.resolve().name for folder in folders]
     return names if len(set(names)) == len(names) else list(map(str, folders))
 
 
-def _gather(group: Group, name: str, notes: list[str]) -> list[Case]:
-    """Return the scans of a group, each a subject unless the group says whose it is."""
+def _list_group(group: Group, name: str, notes: list[str]) -> list[Case]:
+    """Return the scans of a group; each is a subject of its own unless the group is a mapping by subject."""
     if isinstance(group, str | PathLike):
         return _list_folder(Path(group), name, notes)
     if isinstance(group, Mapping):
@@ -204,20 +204,21 @@ def _gather(group: Group, name: str, notes: list[str]) -> list[Case]:
 
 def _list_folder(folder: Path, group: str, notes: list[str]) -> list[Case]:
     """Return the scans in a folder: files, and folders of slices or Zarr stores, that `curvafit.load` reads."""
-    cases, aside = [], []
+    cases, skipped = [], []
     for path in sorted(folder.iterdir()):
         if path.name.startswith("."):
             continue
         try:
             pick_reader(path)
         except ScanError:
-            aside.append(path.name)
+            skipped.append(path.name)
         else:
             cases.append(Case(str(path), path.name, path.name.partition(".")[0], group))
     if not cases:
         raise ValueError(f"expected scans in the folder {folder}, got none that can be read")
-    if aside:
-        notes.append(f"{len(aside)} other files in {folder.name} were left aside: {', '.join(aside[:3])}.")
+    if skipped:
+        notes.append(f"{len(skipped)} other files in {folder.name} were left aside: {', '.join(skipped[:3])}.")
+    # A scan is named by its stem, such as that of a subject, unless another file shares it.
     stems = Counter(case.subject for case in cases)
     return [case if stems[case.subject] == 1 else case._replace(subject=case.name) for case in cases]
 
@@ -226,49 +227,49 @@ def _list_folder(folder: Path, group: str, notes: list[str]) -> list[Case]:
 
 
 def _read_cases(table: Path, by: str, paired: bool) -> list[Case]:
-    """Return the scans that a table names, with their labels, each group together."""
+    """Return the scans that a table names, with their labels from its column `by`."""
     if table.is_dir():
         raise ValueError(f"expected two folders or more, or a table, got the folder {table} alone")
     if not table.exists():
         raise FileNotFoundError(f"no such file: {table}")
     by = by.strip().casefold()
-    rows = _read_table(table, ("scan", by, *["subject"] * paired))
     cases = []
-    for row in rows:
-        place = table.parent / row["scan"]
-        place = place if Path(str(place).partition("::")[0]).exists() else Path(row["scan"])
-        if not Path(str(place).partition("::")[0]).exists():
+    for row in _read_table(table, ("scan", by, *["subject"] * paired)):
+        # Relative to the table, or else to the working folder; what follows :: names a part of the file.
+        paths = (table.parent / row["scan"], Path(row["scan"]))
+        path = next((path for path in paths if Path(str(path).partition("::")[0]).exists()), None)
+        if path is None:
             raise FileNotFoundError(f"no such file: {row['scan']}, which {table} names")
-        cases.append(Case(str(place), place.name, row.get("subject") or row["scan"], row[by]))
+        cases.append(Case(str(path), path.name, row.get("subject") or row["scan"], row[by]))
     return cases
 
 
 def read_columns(table: str | PathLike[str], scans: Sequence[str], taken: Sequence[str] = ()) -> list[dict[str, str]]:
-    """Return what a table says of each scan: its columns but `scan`, such as subject, group and time.
+    """Return, for each scan, its row of a table without the column `scan`: such as its subject, group and time.
 
     Raises ValueError where a scan has no row, or a column's name is `taken`; FileNotFoundError where there is no table.
     """
-    place = Path(table)
-    if not place.exists():
-        raise FileNotFoundError(f"no such file: {place}")
-    rows = {row["scan"]: row for row in _read_table(place, ("scan",))}
-    if both := sorted({name for row in rows.values() for name in row} & set(taken) - {"scan"}):
-        raise ValueError(f"expected columns in {place} that a table of measures has not, got {', '.join(both)}")
-    found = (_find_row(scan, Path(scan.partition("::")[0]).name, rows, place) for scan in scans)
-    return [{name: value for name, value in row.items() if name != "scan"} for row in found]
+    path = Path(table)
+    if not path.exists():
+        raise FileNotFoundError(f"no such file: {path}")
+    rows = {row["scan"]: row for row in _read_table(path, ("scan",))}
+    if clashes := sorted({name for row in rows.values() for name in row} & set(taken) - {"scan"}):
+        raise ValueError(f"expected columns in {path} that a table of measures has not, got {', '.join(clashes)}")
+    scan_rows = [_find_row(scan, Path(scan.partition("::")[0]).name, rows, path) for scan in scans]
+    return [{name: value for name, value in row.items() if name != "scan"} for row in scan_rows]
 
 
 def _find_row(source: object, name: str, rows: Mapping[str, Any], table: Path) -> Any:
-    """Return the row of a scan, which the table names by its path or by the name of its file."""
-    place = Path(str(source))
-    for path, row in rows.items():
-        if path == name or place.resolve() in (Path(path).resolve(), (table.parent / path).resolve()):
+    """Return the row of a scan, which the table names by its file's name, or by a path from here or from the table."""
+    path = Path(str(source)).resolve()
+    for listed, row in rows.items():
+        if listed == name or path in (Path(listed).resolve(), (table.parent / listed).resolve()):
             return row
     raise ValueError(f"expected a row for each scan in {table}, got none for {name}")
 
 
 def _read_table(table: Path, needed: Sequence[str]) -> list[dict[str, str]]:
-    """Return the rows of a CSV file between commas, semicolons or tabs, with the columns' names in small letters."""
+    """Return the rows of a CSV file, split at commas, semicolons or tabs, with the columns' names in small letters."""
     try:
         lines = table.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
@@ -285,7 +286,7 @@ def _read_table(table: Path, needed: Sequence[str]) -> list[dict[str, str]]:
     return rows
 
 
-# ---- measured --------------------------------------------------------------------------------------------------------
+# ---- measurement -----------------------------------------------------------------------------------------------------
 
 
 def measure_scans(
@@ -306,7 +307,7 @@ def measure_scans(
     }
     measured |= share_out(tasks, [case.name for case in cases], workers, sub_progress(progress, 0.05, 1.0))
     measures: list[Measures] = [measured[k][0] for k in range(len(cases))]
-    if flat := [case.name for case, each in zip(cases, measures, strict=True) if not each.diagram.area > 0]:
+    if flat := [case.name for case, scan in zip(cases, measures, strict=True) if not scan.diagram.area > 0]:
         raise ValueError(
             f"{flat[0]}: expected a scan with curvature, got a stack too thin for it: measure has its numbers"
         )
@@ -324,11 +325,11 @@ def measure_each(
     progress: Progress = silent,
     **options: Any,
 ) -> list[tuple[Measures, ...]]:
-    """Measure scans, each by itself, in this process or by several; with `labels` the instances of label images.
+    """Measure scans in this process or by several; with `labels` the instances of label images.
 
-    `options` are those of `measure`, or of `measure_instances`. Workers share the scans, or the tiles of a single one;
-    finished tiles lie in the folder `store`. Diagrams of several scans are binned finely, so that many take little
-    memory. Raises ValueError as those do.
+    `options` are those of `measure`, or of `measure_instances`, and so are errors. Workers share the scans, or the
+    tiles of a single one; finished tiles are kept in the folder `store`. Diagrams of several scans are binned finely,
+    so that many take little memory.
     """
     several = len(scans) > 1
     options |= {"workers": 0 if several else workers}
@@ -336,14 +337,14 @@ def measure_each(
     for k, scan in enumerate(scans):
         tiles = {} if labels or store is None else {"store": store / f"{k:04d}"}
         tasks[k] = partial(_measure_one, scan, scan if several else "", labels, options | tiles)
-    found = share_out(tasks, scans, workers if several else 0, progress)
-    return [found[k] for k in tasks]
+    measured = share_out(tasks, scans, workers if several else 0, progress)
+    return [measured[k] for k in tasks]
 
 
 def _measure_one(
     scan: Any, name: str, labels: bool, options: dict[str, Any], progress: Progress
 ) -> tuple[Measures, ...]:
-    """Measure a scan, or its instances; one that is named is among several, and its diagram is binned finely."""
+    """Measure a scan, or its instances; a scan with a `name` is one of several, so its diagram is binned finely."""
     with name_errors(name):
         if labels:
             return measure_instances(scan, progress=progress, **options)
@@ -352,62 +353,63 @@ def _measure_one(
 
 
 def share_out(tasks: Mapping[int, Task], names: Sequence[str], workers: int, progress: Progress) -> dict[int, Any]:
-    """Do the tasks of scans, by their numbers among `names`, in this process or by several; return what they return."""
-    count, found = len(names), {}
-    with cluster(workers) as crew:
-        parts = {k: sub_progress(progress, k / count, (k + 1) / count) for k in tasks}
-        tell = {
-            k: silent if workers else lambda text, share, k=k: parts[k](f"{names[k]}: {text}", share) for k in tasks
+    """Run the tasks of scans, by index in `names`, in this process or by several; return the results by index."""
+    count, results = len(names), {}
+    with cluster(workers) as pool:
+        stages = {k: sub_progress(progress, k / count, (k + 1) / count) for k in tasks}
+        reports = {
+            k: silent if workers else lambda text, share, k=k: stages[k](f"{names[k]}: {text}", share) for k in tasks
         }
-        for k, result in run_jobs(_do, ((k, tasks[k], tell[k]) for k in tasks), crew):
-            found[k] = result
-            progress(f"{len(found)} of {count} scans done", len(found) / count)
-    return found
+        for k, result in run_jobs(_run_task, ((k, tasks[k], reports[k]) for k in tasks), pool):
+            results[k] = result
+            progress(f"{len(results)} of {count} scans done", len(results) / count)
+    return results
 
 
-def _do(job: tuple[int, Task, Progress]) -> tuple[int, Any]:
-    number, task, progress = job
-    return number, task(progress)
+def _run_task(job: tuple[int, Task, Progress]) -> tuple[int, Any]:
+    k, task, progress = job
+    return k, task(progress)
 
 
 def _bin_diagrams(measures: Measures) -> Measures:
     width = FINE / measures["thickness"].value
-    fine = {label: replace(each, diagram=each.diagram.bin(width)) for label, each in measures.compartments.items()}
-    return replace(measures, diagram=measures.diagram.bin(width), compartments=fine)
+    binned = {label: replace(part, diagram=part.diagram.bin(width)) for label, part in measures.compartments.items()}
+    return replace(measures, diagram=measures.diagram.bin(width), compartments=binned)
 
 
 def gather_notes(measures: Sequence[Measures], cases: Sequence[Case]) -> Iterator[str]:
-    """Yield the scans' notes, with whose they are; those that differ in numbers only are one."""
+    """Yield the scans' notes, each after the scans that have it; notes that differ in numbers only are one."""
     for scans, note in merge_notes(measures):
-        first, more = cases[scans[0]].name, len(scans) - 1
-        who = f"{first} and {more} more" if more else first
-        yield f"{who if len(scans) < len(cases) else f'All {len(cases)} scans'}: {note}"
+        first, others = cases[scans[0]].name, len(scans) - 1
+        some = f"{first} and {others} more" if others else first
+        yield f"{some if len(scans) < len(cases) else f'All {len(cases)} scans'}: {note}"
 
 
 def merge_notes(measures: Sequence[Measures]) -> Iterator[tuple[list[int], str]]:
-    """Yield the scans' notes, each after the numbers of the scans that have it: `([0, 1], "Split at 78–84.")`.
+    """Yield the scans' notes, each after the indices of the scans that have it: `([0, 1], "Split at 78–84.")`.
 
     Notes that differ in numbers only are one, with the range of each number.
     """
-    alike: dict[str, list[tuple[int, str]]] = {}
+    by_wording: dict[str, list[tuple[int, str]]] = {}
     for k, scan in enumerate(measures):
         for note in scan.notes:
-            alike.setdefault(_NUMBER.sub("#", note), []).append((k, note))
-    for found in alike.values():
-        columns = zip(*(_NUMBER.findall(note) for _, note in found), strict=True)
+            by_wording.setdefault(_NUMBER.sub("#", note), []).append((k, note))
+    for notes in by_wording.values():
+        columns = zip(*(_NUMBER.findall(note) for _, note in notes), strict=True)
         ends = ((min(column, key=float), max(column, key=float)) for column in columns)
         ranges = iter([low if float(low) == float(high) else f"{low}–{high}" for low, high in ends])
-        yield sorted({k for k, _ in found}), _NUMBER.sub(lambda _, ranges=ranges: next(ranges), found[0][1])
+        # The first note, with each of its numbers replaced by that number's range.
+        yield sorted({k for k, _ in notes}), _NUMBER.sub(lambda _, ranges=ranges: next(ranges), notes[0][1])
 
 
 def count_notes(measures: Sequence[Measures]) -> Iterator[str]:
-    """Yield the notes of scans, or of parts of scans (`merge_notes`), each with how many have it, unless all have."""
+    """Yield the notes of scans, or of parts of scans (`merge_notes`), with the number that has it if not all."""
     for scans, note in merge_notes(measures):
         yield note if len(scans) == len(measures) else f"Of {len(scans)} of {len(measures)} scans: {note}"
 
 
 def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progress) -> tuple[str, list[str]]:
-    """Read all scans once, so that what is wrong is said before long work; return their unit, and notes."""
+    """Read all scans once, so that errors come before long work; return the first scan's unit, and notes."""
     units: dict[str, str] = {}
     edges: dict[str | float, list[float]] = {}
     for k, case in enumerate(cases):
@@ -434,13 +436,13 @@ def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progr
 
 
 def check_units(scans: Sequence[str], progress: Progress = silent, **reading: Any) -> None:
-    """Raise ValueError where only some scans have a physical unit; of files that can be read in boxes no voxel is."""
+    """Raise ValueError where only some scans have a physical unit; where a format allows, no voxels are read."""
     _check_scans([Case(scan, scan, "", "") for scan in scans], {**reading, "lazy": True}, progress)
 
 
 @contextmanager
 def name_errors(name: str) -> Iterator[None]:
-    """Add a scan's name to what is wrong with it."""
+    """Add a scan's name to the message of a ValueError."""
     try:
         yield
     except ValueError as error:
@@ -459,7 +461,7 @@ def check_table(path: str | PathLike[str], inputs: Sequence[str | Path] = (), ov
         )
     if target.suffix.lower() == ".parquet":
         _pandas()
-    return can_write(target, _ours, inputs=inputs, overwrite=overwrite)
+    return can_write(target, _is_measures_table, inputs=inputs, overwrite=overwrite)
 
 
 def write_table(
@@ -491,8 +493,8 @@ def write_table(
 def list_rows(measures: Sequence[Measures], columns: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
     """Return the rows of scans, or of their compartments, all with the same columns; `columns` has further ones."""
     rows = []
-    for each, more in zip(measures, columns, strict=True):
-        rows += [row for part in (each.compartments.values() or (each,)) for row in part.rows(**more)]
+    for scan, more in zip(measures, columns, strict=True):
+        rows += [row for part in (scan.compartments.values() or (scan,)) for row in part.rows(**more)]
     names = dict.fromkeys(name for row in rows for name in row)
     return [{name: row.get(name) for name in names} for row in rows]
 
@@ -510,8 +512,8 @@ def format_csv(rows: Sequence[dict[str, Any]]) -> str:
     return text.getvalue()
 
 
-def _ours(target: Path) -> bool:
-    """Return whether a file is a table of this program."""
+def _is_measures_table(target: Path) -> bool:
+    """Return whether a file is a table that this program wrote, which may be replaced."""
     if target.suffix.lower() == ".csv":
         return has_mark(target, ",".join(COLUMNS))
     return target.suffix.lower() == ".json" and FORMAT.owns(target)
