@@ -168,9 +168,10 @@ class Fit(Pictured):
             derived["posterior"] = _Posterior(self.view, "amortised: conditional flows given the descriptors", draws)
         if (diagram := self.diagram) is not None:
             κ1, κ2 = diagram.points.round(2).T.tolist()
-            columns = {"kappa1": κ1, "kappa2": κ2, "share": diagram.normalised.weights.round(7).tolist()}
-            columns |= {"unit": diagram.unit, "spread": diagram.spread, "excluded": diagram.excluded}
-            derived["diagram"] = _Columns(seen_as="field" if self.kind == "field" else "mask", **columns)
+            derived["diagram"] = _Columns(
+                seen_as="field" if self.kind == "field" else "mask", unit=diagram.unit, kappa1=κ1, kappa2=κ2,
+                share=diagram.normalised.weights.round(7).tolist(), spread=diagram.spread, excluded=diagram.excluded,
+            )  # fmt: skip
         return {name: encode(derived[name] if name in derived else getattr(self, name)) for name in ENTRIES}
 
     def to_json(self) -> str:

@@ -397,9 +397,7 @@ def _compare_numbers(
     numbers, p_values = [], np.stack([p, family, holm, discovery], axis=1).tolist()
     for quantity, column, error, tests in zip(scan.quantities, values.T, errors.T, p_values, strict=True):
         means, deviations, difference, effect, variance = _measure_change(column, labels, arrangements[0], blocks)
-        known = (
-            float((error**2).mean() / variance) if variance > 0 else math.nan
-        )  # of the variance that the labels leave
+        known = float((error**2).mean() / variance) if variance > 0 else math.nan
         names = quantity.name, quantity.symbol, quantity.power
         numbers.append(Number(*names, means, deviations, difference, *effect, *tests, known))  # type: ignore[call-arg]
     return tuple(numbers)
