@@ -32,16 +32,16 @@ def quoted(value: Any) -> str:
 def check_int(value: Any, expected: str, least: int, most: int, *, of: Any = None) -> int:
     """Return a whole number from `least` to `most` as an int, or raise ValueError; True, text and 64.0 are refused.
 
-    The message says what was `expected` (the kind of number and the least one), adds `most` where the number is above
-    it, and quotes the value, or the argument `of` that the value is a part of.
+    The message says what was `expected` (which should name the least number), adds `most` where the number is above it,
+    and quotes the value, or the whole argument `of` that contains the value.
     """
     try:
         number = None if isinstance(value, bool) else operator.index(value)
     except TypeError:
         number = None
     if number is None or not least <= number <= most:
-        words = f"{expected}{_bound_words(number, 0, most)}"
-        raise ValueError(f"expected {words}, got {quoted(value if of is None else of)}")
+        bound = _broken_bound(number, 0, most)  # `expected` has the least number
+        raise ValueError(f"expected {expected}{bound}, got {quoted(value if of is None else of)}")
     return number
 
 
@@ -54,8 +54,8 @@ def check_float(
         with contextlib.suppress(TypeError, ValueError, OverflowError, RuntimeError):
             number = float(value)
     if not (math.isfinite(number) and least <= number <= most):
-        words = f"{expected}{_bound_words(number, least, most)}"
-        raise ValueError(f"expected {words}, got {quoted(value if of is None else of)}")
+        bound = _broken_bound(number, least, most)
+        raise ValueError(f"expected {expected}{bound}, got {quoted(value if of is None else of)}")
     return number
 
 
@@ -70,12 +70,12 @@ def check_open_interval(value: Any, expected: str, low: float, high: float) -> f
 def as_tuple(values: Any, name: str) -> tuple[Any, ...]:
     """Return the values of a sequence of any type but text, or raise ValueError."""
     try:
-        parts = None if isinstance(values, (str, bytes)) else tuple(values)
+        items = None if isinstance(values, (str, bytes)) else tuple(values)
     except TypeError:
-        parts = None
-    if parts is None:
+        items = None
+    if items is None:
         raise ValueError(f"expected a sequence of {name}, got {quoted(values)}")
-    return parts
+    return items
 
 
 def check_type(value: Any, kinds: type | tuple[type, ...], expected: str) -> None:
@@ -100,11 +100,13 @@ def check_seed(value: Any) -> int:
     return check_int(value, "a seed that is a whole number from 0", 0, SEEDS - 1)
 
 
-def _bound_words(number: float | None, least: float, most: float) -> str:
-    """Return the words for the bound that a number breaks; none where its kind or its sign is what is wrong."""
-    if number is None or not -math.inf < number < math.inf or (number <= most and not 0 < number < least):
+def _broken_bound(number: float | None, least: float, most: float) -> str:
+    """Return words on the bound that a number breaks; none if it is no number, not finite, or not positive."""
+    if number is None or not -math.inf < number < math.inf:
         return ""
-    return f", at most {most:g}" if number > most else f", at least {least:g}"
+    if number > most:
+        return f", at most {most:g}"
+    return f", at least {least:g}" if 0 < number < least else ""
 
 
 # ---- packages that only some uses need, and links that are no packages -----------------------------------------------
@@ -113,14 +115,14 @@ def _bound_words(number: float | None, least: float, most: float) -> str:
 def require(module: str, extra: str, purpose: str) -> ModuleType:
     """Import an optional module, or raise ImportError with the command that installs the `extra` that has it.
 
-    `purpose` is what needs the module, for the message: `"reading NRRD files"`. A module that no extra has, `""`, is
-    installed by its own name.
+    `purpose` says for the message what needs the module: `"reading NRRD files"`. With `extra=""`, where no extra has
+    it, the command installs the module by its own name.
     """
     try:
         return import_module(module)
     except ImportError as error:
         if error.name is None or not module.startswith(error.name.partition(".")[0]):
-            raise  # the module is there, and what it imports itself is not
+            raise  # the module is installed, but not one that it imports
         install = f'pip install "curvafit[{extra}]"' if extra else f"pip install {module}"
         raise ImportError(f"{purpose} needs {error.name}, which is not installed: {install}", name=error.name) from None
 

@@ -70,30 +70,30 @@ def move_together(parts: Iterable[Path], folder: Path) -> tuple[Path, ...]:
 
 def move_into_place(temporary: Path, target: Path) -> Path:
     """Rename a finished file or folder to `target`, on the same disk, and delete the old one after that."""
-    aside = target.with_name(f".{_random_digits()}.old.{target.name}")
+    backup = target.with_name(f".{_random_digits()}.old.{target.name}")
     with hold_signals():
-        if target.is_dir():
-            os.replace(target, aside)
+        if target.is_dir():  # os.replace replaces a file, but no folder
+            os.replace(target, backup)
         try:
             os.replace(temporary, target)
         except OSError:
-            if aside.exists():
-                os.replace(aside, target)
+            if backup.exists():
+                os.replace(backup, target)
             raise
-        remove(aside)
+        remove(backup)
     return target
 
 
 def remove(path: Path) -> None:
     """Delete a file, a link, or a folder with its content, if there is one; a signal waits until all is gone."""
     if path.is_dir() and not path.is_symlink():
-        aside = path.with_name(f".{_random_digits()}.old.{path.name[:200]}")
-        with hold_signals():  # half a folder of tiles is nobody's: under its name there is all of it or nothing
-            try:
-                os.replace(path, aside)
-            except OSError:  # a file of it is open on Windows, or the folder around it is not ours
-                aside = path
-            shutil.rmtree(aside)
+        doomed = path.with_name(f".{_random_digits()}.old.{path.name[:200]}")
+        with hold_signals():
+            try:  # a program that is killed meanwhile leaves no half-deleted folder under the name
+                os.replace(path, doomed)
+            except OSError:  # a file in it is open on Windows, or the folder around it is not ours
+                doomed = path
+            shutil.rmtree(doomed)
     else:
         path.unlink(missing_ok=True)
 
@@ -114,14 +114,14 @@ def is_url(path: str) -> bool:
 def check_folder(path: str | Path) -> Path:
     """Return the path of a folder that can be written to, or made; raise ValueError where it cannot."""
     folder = Path(path)
-    nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists())
-    if not nearest.is_dir():
-        raise ValueError(f"cannot write to the folder {folder}: {nearest} is a file")
+    existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+    if not existing.is_dir():
+        raise ValueError(f"cannot write to the folder {folder}: {existing} is a file")
     try:  # permissions do not say that a disk is read-only
-        with tempfile.TemporaryFile(dir=nearest):
+        with tempfile.TemporaryFile(dir=existing):
             return folder
     except OSError as error:
-        raise ValueError(f"the folder {nearest} cannot be written to: {error.strerror or error}") from None
+        raise ValueError(f"the folder {existing} cannot be written to: {error.strerror or error}") from None
 
 
 def is_empty(folder: Path) -> bool:

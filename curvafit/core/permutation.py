@@ -27,24 +27,25 @@ BATCH, ROOM = 500, 2**24
 
 
 def relabel(labels: np.ndarray, most: int, seed: int = 0, blocks: np.ndarray | None = None) -> tuple[np.ndarray, bool]:
-    """Return arrangements (m, n) of labels (n,), the given one first, and whether they are all there are.
+    """Return arrangements (m, n) of labels (n,), the given one first, and whether they are all that exist.
 
     With `blocks` (n,), labels are exchanged within a block only. All distinct arrangements are returned where there
     are no more than `most`; else `most` random ones after the given one, from `seed`.
     """
     blocks = np.zeros(len(labels), dtype=int) if blocks is None else blocks
     members = [np.flatnonzero(blocks == block) for block in np.unique(blocks)]
-    if math.prod(_count_arrangements(labels[member]) for member in members) <= most:
-        orders = [_arrange(labels[member]) for member in members]
-        picks = np.indices([len(order) for order in orders]).reshape(len(orders), -1)
-        arranged = np.empty((picks.shape[1], len(labels)), dtype=labels.dtype)
-        for member, order, rows in zip(members, orders, picks, strict=True):
-            arranged[:, member] = order[rows]
-        return arranged[np.argsort((arranged != labels).any(1), kind="stable")], True
+    if math.prod(_count_arrangements(labels[indices]) for indices in members) <= most:
+        orders = [_list_orders(labels[indices]) for indices in members]
+        # All combinations of one order of each block: a column has the number of the order for every block.
+        combinations = np.indices([len(order) for order in orders]).reshape(len(orders), -1)
+        arranged = np.empty((combinations.shape[1], len(labels)), dtype=labels.dtype)
+        for indices, order, numbers in zip(members, orders, combinations, strict=True):
+            arranged[:, indices] = order[numbers]
+        return arranged[np.argsort((arranged != labels).any(1), kind="stable")], True  # the given one first
     random = np.random.default_rng(seed)
     arranged = np.repeat(labels[None], most + 1, axis=0)
-    for row, member in itertools.product(arranged[1:], members):
-        row[random.permutation(member)] = np.sort(labels[member])[::-1]
+    for row, indices in itertools.product(arranged[1:], members):
+        row[random.permutation(indices)] = np.sort(labels[indices])[::-1]  # sorted: their given order must not matter
     return arranged, False
 
 
@@ -54,33 +55,33 @@ def _count_arrangements(labels: np.ndarray) -> int:
     return math.factorial(len(labels)) // repeated
 
 
-def _arrange(labels: np.ndarray) -> np.ndarray:
-    """Return the distinct orders (m, n) of labels (n,)."""
-    first, places = labels.min(), np.arange(len(labels))
-    if (labels == first).all():
+def _list_orders(labels: np.ndarray) -> np.ndarray:
+    """Return the distinct orders (m, n) of labels (n,): the positions of the lowest, times the orders of the others."""
+    lowest, positions = labels.min(), np.arange(len(labels))
+    if (labels == lowest).all():
         return labels[None]
-    others = _arrange(labels[labels != first])
-    chosen = list(itertools.combinations(places, len(labels) - others.shape[1]))
-    arranged = np.full((len(chosen), len(others), len(labels)), first)
-    for rows, taken in zip(arranged, chosen, strict=True):
-        rows[:, np.delete(places, taken)] = others
+    others = _list_orders(labels[labels != lowest])
+    choices = list(itertools.combinations(positions, len(labels) - others.shape[1]))
+    arranged = np.full((len(choices), len(others), len(labels)), lowest)
+    for rows, choice in zip(arranged, choices, strict=True):
+        rows[:, np.delete(positions, choice)] = others
     return arranged.reshape(-1, len(labels))
 
 
 def share_beyond(statistics: np.ndarray) -> np.ndarray:
-    """Return the share (…) of arrangements whose statistic (m, …) is at least that of the first: the p-value."""
+    """Return the p-value (…) of statistics (m, …): the share of arrangements whose statistic is at least the first."""
     return (statistics >= statistics[0] * (1 - TIE)).mean(0)
 
 
 def center(values: np.ndarray, blocks: np.ndarray | None = None) -> np.ndarray:
-    """Return values (n, …) less the mean of each block, or of all; 0 where they are the same for all of them."""
+    """Return values (n, …) minus the mean of their block, or of all; exactly 0 where they vary by rounding only."""
     if blocks is None:
         centred = values - values.mean(0)
     else:
-        within = (blocks[:, None] == blocks).astype(np.float64)
-        centred = values - np.tensordot(within / within.sum(1, keepdims=True), values, 1)
-    alike = np.linalg.norm(centred, axis=0) <= TIE * np.abs(values).max(0) * math.sqrt(len(values))
-    return np.where(alike, 0.0, centred)
+        is_same_block = (blocks[:, None] == blocks).astype(np.float64)
+        centred = values - np.tensordot(is_same_block / is_same_block.sum(1, keepdims=True), values, 1)
+    constant = np.linalg.norm(centred, axis=0) <= TIE * np.abs(values).max(0) * math.sqrt(len(values))
+    return np.where(constant, 0.0, centred)
 
 
 # ---- statistics ------------------------------------------------------------------------------------------------------
@@ -94,30 +95,30 @@ def measure_energy(away: np.ndarray, arranged: np.ndarray, blocks: np.ndarray | 
     For Euclidean distances it is at least 0, and 0 only for equal laws.
     """
     centred = _center_both(away, blocks)
-    within = np.zeros(len(arranged))
+    within = np.zeros(len(arranged))  # centred distances sum to 0: what lies between groups is minus what lies within
     groups, sizes = np.unique(arranged[0], return_counts=True)
     for group, size in zip(groups, sizes, strict=True):
-        inside = (arranged == group).astype(np.float64)
-        within += ((inside @ centred) * inside).sum(1) / size
+        is_member = (arranged == group).astype(np.float64)
+        within += ((is_member @ centred) * is_member).sum(1) / size
     return np.maximum(-within * 2 * len(away) / (len(away) ** 2 - (sizes**2).sum()), 0)
 
 
 def measure_dependence(away: np.ndarray, arranged: np.ndarray, blocks: np.ndarray | None = None) -> np.ndarray:
-    """Return the distance correlation (m,) of subjects with the numbers of each arrangement (m, n).
+    """Return the distance correlation (m,), 0 to 1, of distances (n, n) with the labels of each arrangement (m, n).
 
-    From the subjects' distances (n, n) and the differences of their numbers (Székely, Rizzo & Bakirov 2007): 0 where
-    they are independent, at most 1.
+    Labels are numbers, whose distances are their differences (Székely, Rizzo & Bakirov 2007). It is 0 where they are
+    independent of the subjects' distances.
     """
     centred = _center_both(away, blocks)
-    own = _center_both(np.abs(np.subtract.outer(arranged[0], arranged[0])), blocks)
-    size = np.linalg.norm(centred) * np.linalg.norm(own)
-    if size == 0:
+    label_distances = _center_both(np.abs(np.subtract.outer(arranged[0], arranged[0])), blocks)
+    norm = np.linalg.norm(centred) * np.linalg.norm(label_distances)  # the same for all arrangements
+    if norm == 0:
         return np.zeros(len(arranged))
-    products = [
-        np.abs(part[:, :, None] - part[:, None]).reshape(len(part), -1) @ centred.ravel()
-        for part in np.array_split(arranged, math.ceil(len(arranged) * len(away) ** 2 / ROOM))
+    products = [  # it is enough that one factor is centred
+        np.abs(batch[:, :, None] - batch[:, None]).reshape(len(batch), -1) @ centred.ravel()
+        for batch in np.array_split(arranged, math.ceil(len(arranged) * len(away) ** 2 / ROOM))
     ]
-    return np.sqrt(np.maximum(np.concatenate(products) / size, 0))
+    return np.sqrt(np.maximum(np.concatenate(products) / norm, 0))
 
 
 def _center_both(away: np.ndarray, blocks: np.ndarray | None) -> np.ndarray:
@@ -126,37 +127,38 @@ def _center_both(away: np.ndarray, blocks: np.ndarray | None) -> np.ndarray:
 
 
 def correlate(values: np.ndarray, arranged: np.ndarray, blocks: np.ndarray | None = None) -> np.ndarray:
-    """Return the correlation (m, d) of each number (n, d) with the labels of each arrangement (m, n), at least 0.
+    """Return the correlation (m, d), 0 to 1, of each column of values (n, d) with each arrangement (m, n) of labels.
 
-    |r| with the labels where they are numbers or name two groups; of more groups the root of the part of the variance
-    that lies between them (the correlation ratio η). For one number they order arrangements as Student's t and Fisher's
-    F do; over many they are free of their scales. 0 where a number is the same for all, NaN where one is not known.
+    This is |r| where labels are numbers or name two groups; with more groups it is the correlation ratio η, the root of
+    the share of the variance that lies between groups. In one column both order arrangements as Student's t and
+    Fisher's F do; they do not depend on a column's scale. 0 where a column is constant, NaN where it has a NaN.
     """
     centred = center(values, blocks)
-    length = np.linalg.norm(centred, axis=0)
-    length = np.where(length == 0, np.inf, length)
+    norm = np.linalg.norm(centred, axis=0)
+    norm = np.where(norm == 0, np.inf, norm)
     groups, sizes = np.unique(arranged[0], return_counts=True)
     if np.issubdtype(arranged.dtype, np.floating) or len(groups) <= 2:
         labels = center(arranged.T.astype(np.float64), blocks).T
-        return np.abs(labels @ centred) / (np.linalg.norm(labels, axis=1)[:, None] * length)
+        return np.abs(labels @ centred) / (np.linalg.norm(labels, axis=1)[:, None] * norm)
     sums = [np.square((arranged == g).astype(np.float64) @ centred) / n for g, n in zip(groups, sizes, strict=True)]
-    return np.sqrt(np.sum(sums, axis=0)) / length
+    return np.sqrt(np.sum(sums, axis=0)) / norm
 
 
 def correct_by_most(values: np.ndarray, arranged: np.ndarray, blocks: np.ndarray | None = None) -> np.ndarray:
-    """Return the family-wise p (d,) of numbers (n, d): the share of arrangements whose most is at least its own.
+    """Return family-wise p-values (d,) of columns of values (n, d), whose labels the first arrangement (m, n) has.
 
-    What is compared is their correlation with the labels. As Holm's correction it holds the chance of one or more false
-    findings (Westfall & Young 1993), and loses nothing where numbers go together.
+    A p-value is the share of arrangements in which the largest correlation of any column with the labels reaches the
+    column's own. As Holm's correction this bounds the chance of any false finding (Westfall & Young 1993), but loses
+    no power where columns are correlated.
     """
-    parts = np.array_split(arranged, math.ceil(len(arranged) / BATCH))
-    most = np.sort(np.concatenate([correlate(values, part, blocks).max(1, initial=0) for part in parts]))
-    own = correlate(values, arranged[:1], blocks)[0]
-    return 1 - np.searchsorted(most, own * (1 - TIE)) / len(most)
+    batches = np.array_split(arranged, math.ceil(len(arranged) / BATCH))
+    largest = np.sort(np.concatenate([correlate(values, batch, blocks).max(1, initial=0) for batch in batches]))
+    observed = correlate(values, arranged[:1], blocks)[0]
+    return 1 - np.searchsorted(largest, observed * (1 - TIE)) / len(largest)
 
 
 def correct_holm(p: np.ndarray) -> np.ndarray:
-    """Return Holm's p-values (K,): the chance of one or more false findings among all K is held."""
+    """Return p-values (K,) by Holm's correction, which bounds the chance of any false finding among all K."""
     order = np.argsort(p)
     raised = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
     corrected = np.empty_like(p)
@@ -168,21 +170,22 @@ def correct_holm(p: np.ndarray) -> np.ndarray:
 
 
 def measure_effect(first: np.ndarray, second: np.ndarray, paired: bool = False) -> tuple[float, float, float]:
-    """Return Hedges' g of second over first, (n,) and (m,), and its interval; NaN where no number varies.
+    """Return Hedges' g of samples (n,) and (m,), positive where the second is larger, and its interval's ends.
 
-    The difference of means over the pooled deviation, or of `paired` numbers over the deviation of their differences,
-    without the bias of few (Hedges 1981); NaN of two pairs. The interval is that of the noncentrality of Student's t.
+    The difference of means over the pooled deviation, or of `paired` values over the deviation of their differences,
+    corrected for the bias of small samples (Hedges 1981). The interval is that of the noncentrality of Student's t. All
+    are NaN where values do not vary, or of two pairs.
     """
-    parts = [second - first] if paired else [first, second]
-    freedom = sum(map(len, parts)) - len(parts)
-    squares = sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
+    samples = [second - first] if paired else [first, second]
+    freedom = sum(map(len, samples)) - len(samples)
+    squares = sum(float(((sample - sample.mean()) ** 2).sum()) for sample in samples)
     deviation = math.sqrt(squares / freedom)
     if freedom < 2 or not deviation > TIE * max(np.abs(first).max(), np.abs(second).max()):
         return math.nan, math.nan, math.nan
-    scale = math.sqrt(sum(1 / len(part) for part in parts))
+    scale = math.sqrt(sum(1 / len(sample) for sample in samples))
     t = (second.mean() - first.mean()) / (deviation * scale)
-    halves = special.gammaln(freedom / 2) - special.gammaln((freedom - 1) / 2)
-    unbiased = scale * math.exp(halves) / math.sqrt(freedom / 2)
+    log_ratio = special.gammaln(freedom / 2) - special.gammaln((freedom - 1) / 2)
+    unbiased = scale * math.exp(log_ratio) / math.sqrt(freedom / 2)  # of t to g, with Hedges' correction J
     ends = (t, special.nctdtrinc(freedom, 0.975, t), special.nctdtrinc(freedom, 0.025, t))
     g, low, high = (unbiased * float(end) for end in ends)
     return g, low, high
@@ -191,12 +194,12 @@ def measure_effect(first: np.ndarray, second: np.ndarray, paired: bool = False) 
 def measure_slope(
     values: np.ndarray, numbers: np.ndarray, blocks: np.ndarray | None = None
 ) -> tuple[float, tuple[float, float, float]]:
-    """Return the slope of values (n,) over numbers (n,), within blocks, and r with its interval by Fisher's z."""
+    """Return the slope of values (n,) over numbers (n,), within blocks, and (r, low, high) by Fisher's z."""
     y, x = center(values, blocks), center(numbers, blocks)
     slope = float(x @ y / (x @ x))
-    freedom = len(y) - (1 if blocks is None else len(np.unique(blocks))) - 2
+    freedom = len(y) - (1 if blocks is None else len(np.unique(blocks))) - 2  # n - 3 for a single block
     if not y.any() or np.isnan(y).any():
         return slope, (math.nan, math.nan, math.nan)
     r = float(np.clip(x @ y / (np.linalg.norm(x) * np.linalg.norm(y)), -1 + 1e-15, 1 - 1e-15))
-    reach = float(special.ndtri(0.975)) / math.sqrt(freedom) if freedom > 0 else math.nan
-    return slope, (r, math.tanh(math.atanh(r) - reach), math.tanh(math.atanh(r) + reach))
+    half_width = float(special.ndtri(0.975)) / math.sqrt(freedom) if freedom > 0 else math.nan
+    return slope, (r, math.tanh(math.atanh(r) - half_width), math.tanh(math.atanh(r) + half_width))

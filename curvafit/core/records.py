@@ -33,12 +33,12 @@ MARK = "curvafit"
 _HEAD = 4096
 #: Suffixes of two parts; any other suffix is what follows the last dot.
 _DOUBLE = (".nii.gz", ".ome.tif", ".ome.tiff", ".ome.zarr")
-#: Seconds after its record within which a file is the one that was written with it. All are moved into place one after
-#: the other, which takes far less; a file that is newer was changed by somebody, and is not ours to replace.
+#: Seconds by which a file may be newer than its record and still count as written with it. Moving all files to their
+#: names takes far less; a file that is newer was changed by somebody, and is not ours to replace.
 LATER = 10.0
 #: Files of a Zarr group of images that `curvafit.volumes` wrote.
 _WRITTEN = re.compile(r"(\d+/)?(zarr\.json|\.zgroup|\.zattrs|\.zarray)|\d+/(c/)?(\d+/)*\d+|\d+/c")
-#: What the making of a result from a damaged file may raise.
+#: What may be raised where a result is built from a damaged file.
 _FAULTS = (KeyError, ValueError, IndexError, TypeError, AttributeError, RuntimeError)
 #: The most digits of a whole number in JSON.
 _DIGITS = 40
@@ -129,10 +129,10 @@ class Format:
             raise ValueError(f"{place} is not {self.title}: it is truncated, damaged or something else") from error
         if header.get("format") != self.name:
             raise ValueError(f"{place} is not {self.title}: it is something else")
-        if others := [name for name, value in self._marks.items() if header.get(name) != value]:
-            theirs = ", ".join(f"{name} {quoted(header.get(name))}" for name in others)
-            mine = ", ".join(f"{name} {quoted(self._marks[name])}" for name in others)
-            raise ValueError(f"{place} is {self.title} with {theirs} instead of {mine}: {self.remedy}")
+        if differing := [name for name, value in self._marks.items() if header.get(name) != value]:
+            actual = ", ".join(f"{name} {quoted(header.get(name))}" for name in differing)
+            expected = ", ".join(f"{name} {quoted(self._marks[name])}" for name in differing)
+            raise ValueError(f"{place} is {self.title} with {actual} instead of {expected}: {self.remedy}")
         try:
             return build(header, arrays)
         except _FAULTS as error:
@@ -140,28 +140,25 @@ class Format:
             raise ValueError(f"{place} is not {self.title} that can be read: {reason}") from error
 
     def owns(self, path: Path) -> bool:
-        """Return whether a file says that it is of this format, or a Zarr store of images that it is of this kind.
-
-        The version, and all else in the file, may be another.
-        """
+        """Return whether a file, or a Zarr store of images, names this format in its header, whatever its version."""
         if path.is_dir():
             return path.name.lower().endswith(".zarr") and is_own_zarr(path, self.name)
         return _read_header(path).get("format") == self.name
 
     def companions(self, target: Path) -> list[str]:
-        """Return the names of the files written together with `target`, by its record `sibling(target, ".json")`.
+        """Return the names of the files written together with `target`, from its record `sibling(target, ".json")`.
 
-        There are none if the record is not there, is of another format, or does not list `target`. A file that somebody
-        changed since is left out.
+        Returns none if the record is missing, is of another format, or does not list `target`. Files that were changed
+        after they were written are left out.
         """
         record = sibling(target, ".json")
         header = _read_header(record)
         names = header.get("files") if header.get("format") == self.name else None
         if not isinstance(names, list) or target.name not in names:
             return []
-        latest = record.stat().st_mtime + LATER
+        newest = record.stat().st_mtime + LATER
         files = {name: target.with_name(str(name)) for name in names}
-        return [name for name, file in files.items() if not file.is_file() or file.stat().st_mtime < latest]
+        return [name for name, file in files.items() if not file.is_file() or file.stat().st_mtime < newest]
 
 
 def can_write(
@@ -172,7 +169,7 @@ def can_write(
     inputs: Iterable[str | Path] = (),
     overwrite: bool = False,
 ) -> Path:
-    """Return the path of a file if it can be written, and `more` files with it, without a loss; else raise ValueError.
+    """Return `path` as a Path if writing it, and the files `more`, loses nothing of others; else raise ValueError.
 
     Call it before long work, and again before writing.
 
@@ -192,35 +189,35 @@ def can_write(
     check_folder(target.parent)
     if target.is_dir() and not (target.name.lower().endswith(".zarr") or is_zarr(target)):
         raise ValueError(f"{target} is a folder: give the name of a file")
-    listed = ours.companions(target) if isinstance(ours, Format) else []
+    companions = ours.companions(target) if isinstance(ours, Format) else []
 
-    def replaceable(there: Path) -> bool:
+    def is_ours(existing: Path) -> bool:
         if not isinstance(ours, Format):
-            return ours(there)
-        listed_too = there.name in listed and (there.is_file() or is_own_zarr(there, ours.name))
-        return listed_too or (there == target and ours.owns(there))
+            return ours(existing)
+        is_companion = existing.name in companions and (existing.is_file() or is_own_zarr(existing, ours.name))
+        return is_companion or (existing == target and ours.owns(existing))
 
     sources = [source for name in inputs if (source := Path(str(name).partition("::")[0])).exists()]
-    for place in (target, *more):
+    for output in (target, *more):
         for source in sources:
-            _check_apart(place, source)
-        if place.exists() and not (place.is_file() or place.is_dir()):
-            raise ValueError(f"{place} is a device or a pipe: give the name of a file")
-        if (place.exists() or place.is_symlink()) and not (overwrite or replaceable(place)):
-            what = "folder" if place.is_dir() else "file"
+            _check_distinct(output, source)
+        if output.exists() and not (output.is_file() or output.is_dir()):
+            raise ValueError(f"{output} is a device or a pipe: give the name of a file")
+        if (output.exists() or output.is_symlink()) and not (overwrite or is_ours(output)):
+            kind = "folder" if output.is_dir() else "file"
             raise ValueError(
-                f"the name {place} is not free, a {what} is there that would be lost: choose another "
+                f"the name {output} is not free, a {kind} is there that would be lost: choose another "
                 "name, or replace it with --overwrite (in Python, overwrite=True)"
             )
     return target
 
 
-def _check_apart(target: Path, source: Path) -> None:
-    """Raise ValueError if writing `target` would change `source`: if they are the same, or one is within the other."""
-    read, place = source.resolve(), target.resolve()
-    same = target.exists() and target.samefile(source)
-    if same or place.is_relative_to(read) or read.is_relative_to(place):
-        raise ValueError(f"the output {target} would write over the input {source}")
+def _check_distinct(output: Path, source: Path) -> None:
+    """Raise ValueError if writing `output` would change `source`: if they are the same, or one is within the other."""
+    written, read = output.resolve(), source.resolve()
+    is_same = output.exists() and output.samefile(source)
+    if is_same or written.is_relative_to(read) or read.is_relative_to(written):
+        raise ValueError(f"the output {output} would write over the input {source}")
 
 
 def has_mark(path: Path, mark: str) -> bool:
@@ -237,7 +234,7 @@ def has_mark(path: Path, mark: str) -> bool:
 def sibling(path: str | Path, ending: str) -> Path:
     """Return the path with another ending than its suffix; `.nii.gz`, `.ome.tif` and `.ome.zarr` count as one."""
     target = Path(path)
-    suffix = next((double for double in _DOUBLE if target.name.lower().endswith(double)), target.suffix)
+    suffix = next((suffix for suffix in _DOUBLE if target.name.lower().endswith(suffix)), target.suffix)
     return target.with_name(target.name[: len(target.name) - len(suffix)] + ending)
 
 
@@ -247,20 +244,21 @@ def is_zarr(folder: Path) -> bool:
 
 
 def is_own_zarr(folder: Path, kind: str) -> bool:
-    """Return whether a folder is empty, or a Zarr group of images with the mark of this kind and nothing else in it."""
+    """Return whether a folder is empty, or is a Zarr group of images of this kind, written by us, with nothing else."""
     if folder.is_symlink():
         return False
     if is_empty(folder):
         return True
     try:
-        old = folder / ".zattrs"
-        content = parse_json((old if old.exists() else folder / "zarr.json").read_bytes(), "a Zarr group", folder)
-        if (content if old.exists() else content["attributes"])[MARK]["kind"] != kind:
+        is_format_2 = (folder / ".zattrs").exists()  # Zarr's format 3 has the attributes in zarr.json
+        metadata = folder / (".zattrs" if is_format_2 else "zarr.json")
+        content = parse_json(metadata.read_bytes(), "a Zarr group", folder)
+        if (content if is_format_2 else content["attributes"])[MARK]["kind"] != kind:
             return False
     except (OSError, *_FAULTS):
         return False
-    inside = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
-    return all(_WRITTEN.fullmatch(name) for name in inside)
+    names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
+    return all(_WRITTEN.fullmatch(name) for name in names)
 
 
 def encode_json(value: Any) -> np.ndarray:
@@ -283,9 +281,9 @@ def _read(source: Path | IO[bytes]) -> Record:
             raise ValueError(f"{source} is not a file")
         with source.open("rb") as file:
             return _read(file)
-    start = source.read(2)
+    signature = source.read(2)
     source.seek(0)
-    if start != b"PK":
+    if signature != b"PK":  # not a ZIP archive, as NPZ files are
         return Record(dict(parse_json(source.read(), "a header", "it")), {})
     arrays = read_archive(source)
     return Record(dict(parse_json(arrays.pop("header").tobytes(), "a header", "it")), arrays)
@@ -304,7 +302,7 @@ def read_archive(source: Path | IO[bytes]) -> dict[str, np.ndarray]:
             return {name.removesuffix(".npy"): read_member(archive, name) for name in members}
     except (OSError, ValueError):
         raise
-    except Exception as reason:  # zipfile, zlib and numpy have a dozen ways to say so
+    except Exception as reason:  # zipfile, zlib and numpy raise a dozen types of error
         raise ValueError(f"the NPZ file cannot be read ({quoted(str(reason))})") from reason
 
 

@@ -35,11 +35,11 @@ def silent(text: str, share: float) -> None:
 
 
 def log_stages() -> Progress:
-    """Return a progress that logs each stage once, at level INFO of the logger `curvafit`; numbers make no stage."""
+    """Return a progress that logs each stage once, at level INFO of the logger `curvafit`."""
     stages: set[str] = set()
 
     def log(text: str, share: float) -> None:
-        if (stage := re.sub(r"\d+", "", text)) not in stages:
+        if (stage := re.sub(r"\d+", "", text)) not in stages:  # texts that differ in numbers are one stage
             stages.add(stage)
             logging.getLogger("curvafit").info("%s (%.0f %% done)", text, 100 * share)
 
@@ -84,8 +84,8 @@ class Pictured:
         Raises ValueError if there is nothing to draw: no surface, or a field that is not finite.
         """
         figures = sys.modules[__name__.partition(".")[0]]._FIGURES
-        place = next(figures[each.__name__] for each in type(self).__mro__ if each.__name__ in figures)
-        module, _, function = place.partition(":")
+        target = next(figures[ancestor.__name__] for ancestor in type(self).__mro__ if ancestor.__name__ in figures)
+        module, _, function = target.partition(":")
         return getattr(import_module(module), function)(self, **options)
 
     def _repr_html_(self) -> str:
@@ -106,7 +106,7 @@ class Pictured:
 
 # ---- forks -----------------------------------------------------------------------------------------------------------
 
-#: This process, where it was forked from one that had imported this module: the memory is that one's, its threads gone.
+#: The id of this process if it was forked after this module was imported: it has its parent's memory, not its threads.
 _FORKS: list[int] = []
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=lambda: _FORKS.append(os.getpid()))
@@ -130,7 +130,7 @@ def memory() -> int:
     return min(sizes)
 
 
-#: Bytes that a voxel of a field takes, and one of a field that is written, with its copy in the file's layout.
+#: Bytes that a voxel of a field takes in memory, and while the field is written, with its copy in the file's layout.
 FIELD, FILE = 4, 8
 #: The least bytes that a voxel of a flow takes. Compiled: A, Adam's two moments and the start, three float32 numbers
 #: each; u, the gradient, and the field between two passes of the blur. In plain torch autograd stores more.
@@ -173,7 +173,7 @@ class Terminated(KeyboardInterrupt):
 
 
 class _Pending:
-    """How many blocks of the main thread hold signals back, and the signal that waits for their end."""
+    """The nesting depth of `hold_signals` blocks in the main thread, and the signal that is raised when they end."""
 
     depth = 0
     waiting: int | None = None
@@ -233,9 +233,9 @@ def _resend_lost_signal(unraisable: sys.UnraisableHookArgs) -> None:
     if not isinstance(error, KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)
         return
-    later = threading.Timer(_PAUSE, signal.raise_signal, (exit_code(error) - 128,))
-    later.daemon = True
-    later.start()
+    timer = threading.Timer(_PAUSE, signal.raise_signal, (exit_code(error) - 128,))  # the signal's number
+    timer.daemon = True
+    timer.start()
 
 
 def _exception(number: int) -> KeyboardInterrupt:

@@ -39,7 +39,7 @@ _PLAIN: dict[Any, str] = {str: "a text", bool: "true or false"}
 
 
 def decode(hint: Any, value: Any, name: str = "") -> Any:
-    """Return a value from JSON as a dataclass, text, number, `Literal`, tuple or dictionary, or one of these or None.
+    """Return a value from JSON as the type of `hint`: a dataclass, text, number, `Literal`, tuple, dictionary or None.
 
     Raises ValueError with the first fault, such as `"mass as a positive number, got 0"`, in which the value is `name`.
     """
@@ -50,29 +50,24 @@ def decode(hint: Any, value: Any, name: str = "") -> Any:
     nullable = NoneType in kinds or rule.unknown
     if value is None and nullable:
         return math.nan if rule.unknown else None
-    return _decode(kind, value, name, rule, ", or null" * nullable)
-
-
-def _decode(kind: Any, value: Any, name: str, rule: Rule, more: str) -> Any:
-    """Return a value of a type that is no union."""
-    words, fits = _check(kind, rule, value)
-    if not fits:
-        raise ValueError(f"{name or 'the content'} as {words}{more}, got {quoted(value)}")
+    expected, is_valid = _check_value(kind, rule, value)
+    if not is_valid:
+        raise ValueError(f"{name or 'the content'} as {expected}{', or null' * nullable}, got {quoted(value)}")
     if dataclasses.is_dataclass(kind):
         return _decode_fields(kind, value, name)
     if get_origin(kind) is tuple:
         return tuple(decode(get_args(kind)[0], item, f"{name}[{k}]") for k, item in enumerate(value))
     if get_origin(kind) is dict:
-        for key, inner in rule.keys:
+        for key, entry_hint in rule.keys:  # checked only: what is returned is decoded by the dictionary's own type
             if key in value:
-                decode(inner, value[key], f"{name}.{key}")
+                decode(entry_hint, value[key], f"{name}.{key}")
         inner = get_args(kind)[1]
         return {k: v if v is None or inner is Any else decode(inner, v, f"{name}.{k}") for k, v in value.items()}
     return kind(value) if kind in (int, float) else value
 
 
 def _decode_fields(kind: Any, value: Mapping[str, Any], name: str) -> Any:
-    """Return a dataclass, whose entries without a default must be there; further entries are left out."""
+    """Return a dataclass from a JSON object. Fields without a default must be there, unknown entries are ignored."""
     prefix, hints = f"{name}." if name else "", get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
         if field.default is dataclasses.MISSING and field.name not in value:
@@ -80,27 +75,27 @@ def _decode_fields(kind: Any, value: Mapping[str, Any], name: str) -> Any:
     return kind(**{key: decode(hints[key], value[key], prefix + key) for key in hints if key in value})
 
 
-def _check(kind: Any, rule: Rule, value: Any) -> tuple[str, bool]:
-    """Return what a value must be, in words, and whether it is; items and entries are not looked at."""
+def _check_value(kind: Any, rule: Rule, value: Any) -> tuple[str, bool]:
+    """Return a description of the values of a type and rule, and whether `value`, but for its items, is one of them."""
     if kind in _PLAIN:
         return _PLAIN[kind], isinstance(value, kind)
     if kind in (int, float):
-        fits = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-        fits = fits and rule.least <= value <= rule.most and rule.above < value < rule.below
-        return _number_words(rule), fits
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        is_within = is_number and rule.least <= value <= rule.most and rule.above < value < rule.below
+        return _describe_number(rule), is_within
     if get_origin(kind) is Literal:
-        *some, last = get_args(kind)
-        return f"{', '.join(some)} or {last}" if some else last, isinstance(value, str) and value in (*some, last)
+        *others, last = choices = get_args(kind)
+        return f"{', '.join(others)} or {last}" if others else last, isinstance(value, str) and value in choices
     if get_origin(kind) is tuple:
         items = get_args(kind)
-        count = 0 if items[-1] is Ellipsis else len(items)
-        fits = isinstance(value, (list, tuple)) and len(value) >= (count or int(rule.filled))
-        return f"a list of {count} numbers" if count else "a list", fits
+        count = 0 if items[-1] is Ellipsis else len(items)  # 0: any number of items
+        is_long_enough = isinstance(value, (list, tuple)) and len(value) >= (count or int(rule.filled))
+        return f"a list of {count} numbers" if count else "a list", is_long_enough
     return "an object", isinstance(value, Mapping)
 
 
-def _number_words(rule: Rule) -> str:
-    """Return what a number must be, in words."""
+def _describe_number(rule: Rule) -> str:
+    """Return a description of the numbers that a rule admits."""
     if rule.above > -math.inf:
         return "a positive number" if rule.below == math.inf else f"a number between {rule.above:g} and {rule.below:g}"
     if rule.least > -math.inf:
@@ -109,7 +104,7 @@ def _number_words(rule: Rule) -> str:
 
 
 def encode(value: Any) -> Any:
-    """Return a dataclass, and all in it, in JSON's types; NaN becomes None."""
+    """Return a dataclass and its content as JSON's types; NaN becomes None."""
     if dataclasses.is_dataclass(value):
         return {field.name: encode(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):

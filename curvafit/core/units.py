@@ -34,7 +34,7 @@ _GLUE = "\u00a0"
 
 
 def parse_unit(unit: str | None) -> tuple[str, float]:
-    """Return this package's name of a length unit and the factor to it, or raise ValueError; `"cm"`: `("mm", 10.0)`."""
+    """Return our name of a length unit and the factor to it, `("mm", 10.0)` for `"cm"`; raise ValueError if unknown."""
     if not is_unit(unit):
         raise ValueError(f"expected a unit of voxel, nm, um, mm or m, got {quoted(unit)}")
     return _UNITS[_plain_name(unit)]
@@ -46,18 +46,19 @@ def is_unit(unit: str | None) -> bool:
 
 
 def common_unit(units: Sequence[str | None]) -> tuple[str | None, tuple[float, ...]]:
-    """Return the last of several units of length, and the factor of each to it.
+    """Return the last of several units of length, and the factor from each unit to it.
 
-    Where they have none in common, since one is not known or just some are voxels, all are named, with factors of 1.
+    Units that cannot be converted, as one is unknown or only some are voxels, are joined by "and", with factors of 1.
     """
     if all(map(is_unit, units)) and len({parse_unit(unit)[0] == "voxel" for unit in units}) == 1:
+        # In 15 digits 1 um is 1000 nm, not 999.9999999999999.
         return units[-1], tuple(float(f"{convert_length(1.0, unit, units[-1]):.15g}") for unit in units)
     return " and ".join(dict.fromkeys(map(str, units))), (1.0,) * len(units)
 
 
 def _plain_name(unit: str | None) -> str:
-    """Return a unit's name in small letters, each with one code: that of micro has two, and Java's `\\u00B5`."""
-    text = re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), unit or "")
+    """Return a unit's name in small letters, with one form of µ for its two Unicode codes and Java's `\\u00B5`."""
+    text = re.sub(r"\\u([0-9a-fA-F]{4})", lambda escape: chr(int(escape[1], 16)), unit or "")
     return unicodedata.normalize("NFKC", text.strip().casefold())
 
 
@@ -87,7 +88,8 @@ def format_number(value: float | None, digits: int = 3) -> str:
 
 def format_sampling(shape: Sequence[int], spacing: Sequence[float], unit: str = "") -> str:
     """Return the number and the size of voxels (z, y, x) as text; three equal edges are written once."""
-    edges = " x ".join(f"{h:.4g}" for h in spacing[: 1 if len(set(spacing)) == 1 else 3])
+    is_isotropic = len(set(spacing)) == 1
+    edges = " x ".join(f"{h:.4g}" for h in spacing[: 1 if is_isotropic else 3])
     size = "" if (edges, unit) == ("1", "voxel") else f" of {edges} {unit}".rstrip()
     return f"{' x '.join(map(str, shape))} voxels{size}"
 
@@ -102,17 +104,17 @@ def format_length(value: float, unit: str, digits: int = 2) -> str:
     if unit not in METRES or not math.isfinite(value) or value <= 0:
         return f"{format_number(value, digits)}{_GLUE}{unit_name(unit, value)}"
     metres = value * METRES[unit]
-    fitting = [name for name, size in METRES.items() if metres / size >= 0.9995]
-    best = fitting[-1] if fitting else "nm"
+    not_longer = [name for name, size in METRES.items() if metres / size >= 0.9995]  # 999.5 um is shown as 1 mm
+    best = not_longer[-1] if not_longer else "nm"
     return f"{format_number(metres / METRES[best], digits)}{_GLUE}{unit_name(best)}"
 
 
 def format_density(value: float, unit: str, power: int) -> str:
     """Return a number per length to a power as text, in another unit of length if it would be tiny or huge."""
-    names = [unit, *(name for name in ("mm", "um", "nm", "m") if unit in METRES and name != unit)]
-    scaled = {name: value * (METRES[name] / METRES[unit]) ** power if name != unit else value for name in names}
-    best = next((name for name in names if 0.1 <= abs(scaled[name]) < 1e4), unit)
-    return f"{format_number(scaled[best])}{_GLUE}{per_unit(best, power)[1:]}"
+    units = [unit, *(other for other in ("mm", "um", "nm", "m") if unit in METRES and other != unit)]
+    scaled = {other: value * (METRES[other] / METRES[unit]) ** power if other != unit else value for other in units}
+    best = next((other for other in units if 0.1 <= abs(scaled[other]) < 1e4), unit)
+    return f"{format_number(scaled[best])}{_GLUE}{per_unit(best, power)[1:]}"  # without the 1 of 1/mm
 
 
 def per_unit(unit: str, power: int) -> str:

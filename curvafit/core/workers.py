@@ -1,4 +1,4 @@
-"""Who does jobs: this process, or the workers of a dask cluster."""
+"""Jobs run by this process, or by the workers of a dask cluster."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ _IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN
 class Cluster:
     """The workers of a dask cluster, which must see folders under the same names.
 
-    `submit` hands a job out, `collect` waits for one of them and returns its result. `places` is the number of jobs
-    that may wait at once. A job whose worker dies goes to another.
+    `submit` hands out a job, `collect` waits for any job and returns its result. `places` is the number of jobs that
+    may be handed out at once. A job whose worker dies goes to another.
     """
 
     def __init__(self, client: Client) -> None:
@@ -54,34 +54,34 @@ class Cluster:
     def collect(self) -> Any:
         from distributed import KilledWorker
 
-        first = next(self._futures)
+        finished = next(self._futures)
         try:
-            return first.result()
+            return finished.result()
         except KilledWorker as error:
             raise OSError(f"a part of the work killed several workers: {error}") from error
 
 
 def run_jobs(function: Callable[[Any], Any], jobs: Iterable[Any], workers: Cluster | None = None) -> Iterator[Any]:
-    """Yield the results of a function of each job in the order they come; by default this process does them.
+    """Yield `function(job)` for each job, in the order in which they finish; by default this process runs them in turn.
 
-    As many jobs wait at once as the workers have places. The function has a module's name, or is a partial of one.
+    At most `workers.places` jobs are handed out at once. Workers must be able to import the function by its name.
     """
     if workers is None:
         yield from map(function, jobs)
         return
-    queue, waiting = iter(jobs), 0
+    remaining, running = iter(jobs), 0
     while True:
-        while waiting < workers.places and (job := next(queue, None)) is not None:
+        while running < workers.places and (job := next(remaining, None)) is not None:
             workers.submit(function, job)
-            waiting += 1
-        if not waiting:
+            running += 1
+        if not running:
             return
         yield workers.collect()
-        waiting -= 1
+        running -= 1
 
 
 def check_workers(count: int | None, scheduler: str | None) -> None:
-    """Raise ValueError if the number of workers is out of range, or a scheduler, which has its own, is given too."""
+    """Raise ValueError if the number of workers is out of range, or is given with a scheduler, which has its own."""
     if count is not None:
         check_int(count, "a number of workers from 0", 0, 1024)
         if scheduler is not None:
@@ -94,14 +94,14 @@ def cluster(
 ) -> Iterator[Cluster | None]:
     """Start `count` workers on this machine, or take those of a dask scheduler; end them with the block.
 
-    Raises ImportError if dask.distributed is not installed and more than this process is wanted, and OSError if there
-    is no scheduler at the address, it has no workers, or it goes.
+    Raises ImportError if dask.distributed is needed and not installed, and OSError if there is no scheduler at the
+    address, it has no workers, or it ends.
 
     Parameters
     ----------
     count
-        Processes on this machine, which talk over the loopback alone; by default one for each core that a container or
-        the scheduler leaves to this process. 0 is this process, and None in place of workers.
+        Processes on this machine, which talk over the loopback alone; by default one for each core that this process
+        may use. With 0 the block gets None: this process does the work.
     scheduler
         Address of a scheduler, whose workers are used.
     dashboard
@@ -117,7 +117,7 @@ def cluster(
 
 
 def join_workers(workers: Cluster | int | None) -> AbstractContextManager[Cluster | None]:
-    """Take the workers that are given, or start a number of processes on this machine; None where there are none."""
+    """Return a context with the given workers, or with that many new processes on this machine; None stays None."""
     return cluster(workers) if isinstance(workers, int) else nullcontext(workers)
 
 
@@ -141,8 +141,8 @@ def _start(count: int | None, dashboard: int | None) -> Iterator[Client]:
             memory_limit=0,
             silence_logs=logging.ERROR,
             preload=_IGNORE_INTERRUPTS,
-        ) as here,
-        distributed.Client(here) as client,
+        ) as local_cluster,
+        distributed.Client(local_cluster) as client,
     ):
         yield client
 
