@@ -17,9 +17,9 @@ from collections import Counter
 import numpy as np
 from scipy import special
 
-#: Statistics that differ by less than this part of themselves are equal: sums taken in another order.
+#: Relative difference up to which statistics count as equal: the same sum in another order is rounded otherwise.
 TIE = 1e-9
-#: Arrangements whose statistics are taken at once, and the most numbers that they may have.
+#: The most arrangements, and the most numbers, that are in memory at once.
 BATCH, ROOM = 500, 2**24
 
 

@@ -1,4 +1,4 @@
-"""The runner: passes over the blocks of a volume, by workers; records may stay in a folder that outlives a kill."""
+"""Passes over the blocks of a volume, by workers. Records may stay in a folder, so that a killed run goes on."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from curvafit.volumes.read import FileArray
 
 #: Arrays and numbers of a block of a volume, by name.
 Record = Mapping[str, Any]
-#: The file in a run's folder that says whose it is.
+#: The file in a run's folder with the settings of the run that it belongs to.
 _RUN = "run.json"
 
 
@@ -64,18 +64,18 @@ class Run:
         shown: str = "",
         keep: Callable[[int, Record], Record] = lambda _, record: record,
     ) -> list[Record]:
-        """Return the records of blocks 0 to `count` - 1, in their order.
+        """Return the records `function(number)` of blocks 0 to `count` - 1, in this order.
 
-        The progress says the pass's name, or what is `shown`. `keep` is called here with each new record, to store its
-        voxels, and returns what is kept.
+        The progress shows the pass's name, or `shown`. In this process `keep` is called with each new record, to store
+        its voxels, and returns the record that is kept.
         """
         records = {} if self._folder is None else _read_records(self._folder, name, count)
-        rest = [number for number in range(count) if number not in records]
+        missing = [number for number in range(count) if number not in records]
         start = self._share
         self._share = stop = max(start, min(self._ends.get(name, start + 0.02), 1.0))
         self._progress(shown or name, start)
-        do = partial(_do, function, not self.alone)
-        for done, (number, record) in enumerate(run_jobs(do, rest, self._crew), count - len(rest) + 1):
+        compute = partial(_compute_record, function, not self.alone)
+        for done, (number, record) in enumerate(run_jobs(compute, missing, self._crew), count - len(missing) + 1):
             records[number] = keep(number, record)
             if self._folder is not None:
                 buffer = io.BytesIO()
@@ -97,9 +97,9 @@ class RunArray:
         if path is None:
             self._array = np.empty(shape, dtype)
         elif not path.exists():
-            new = path.with_name(f"{path.name}.new")
-            np.lib.format.open_memmap(new, mode="w+", dtype=dtype, shape=shape).flush()
-            os.replace(new, path)
+            temporary = path.with_name(f"{path.name}.new")
+            np.lib.format.open_memmap(temporary, mode="w+", dtype=dtype, shape=shape).flush()
+            os.replace(temporary, path)
 
     def __setitem__(self, box: Any, values: np.ndarray) -> None:
         array = self._array if self._path is None else np.load(self._path, mmap_mode="r+")
@@ -121,9 +121,9 @@ class RunArray:
         return self._array if self._path is None else FileArray(self._path, {}, self.values)
 
 
-def _do(function: Callable[[int], Record], shared: bool, number: int) -> tuple[int, Record]:
-    """Return the record of a block, made on one thread where workers share the cores."""
-    with one_thread() if shared else nullcontext():
+def _compute_record(function: Callable[[int], Record], one_threaded: bool, number: int) -> tuple[int, Record]:
+    """Return the number of a block and its record."""
+    with one_thread() if one_threaded else nullcontext():
         return number, function(number)
 
 
@@ -132,7 +132,7 @@ def _file_of(folder: Path, name: str, number: int) -> Path:
 
 
 def _read_records(folder: Path, name: str, count: int) -> dict[int, Record]:
-    """Return the records of earlier runs, by number of the block."""
+    """Return the records of a pass that earlier runs stored, by number of the block."""
     records = {}
     for number in range(count):
         path = _file_of(folder, name, number)
@@ -150,20 +150,21 @@ def open_run(
     progress: Progress = silent,
     ends: Mapping[str, float] | None = None,
 ) -> Iterator[Run]:
-    """Start workers, or a number of processes, open the folder `store`, if there is one, and return the run.
+    """Return a context with a run on workers, or on a number of new processes, whose records stay in a folder `store`.
 
-    `same` is what runs must have in common to share records; `ends` are the shares of the work, as `Run` has them.
-    Raises ValueError where the folder holds other things, or another run's, or is in use. The folder is removed where a
-    ScanError is raised: of such a scan nothing is of use.
+    `same` are settings that runs must have in common to share records; `ends` are the shares of the work, as in `Run`.
+    Raises ValueError where the folder holds something else or another run's records, or is in use. If a ScanError is
+    raised within, the folder is removed: a scan that cannot be used has no use for its records.
     """
-    mine = {name: str(each) for name, each in {**same, "curvafit": version("curvafit")}.items()}
-    with join_workers(workers) as joined, nullcontext() if store is None else _lock(Path(store), mine) as folder:
-        yield Run(joined, folder, progress, ends)
+    settings = {name: str(value) for name, value in {**same, "curvafit": version("curvafit")}.items()}
+    locked = nullcontext() if store is None else _lock_folder(Path(store), settings)
+    with join_workers(workers) as crew, locked as folder:
+        yield Run(crew, folder, progress, ends)
 
 
 @contextmanager
-def _lock(folder: Path, mine: Mapping[str, str]) -> Iterator[Path]:
-    """Make the folder of a run, if there is none, and lock it."""
+def _lock_folder(folder: Path, settings: Mapping[str, str]) -> Iterator[Path]:
+    """Lock the folder of a run, made if it is missing; raise ValueError if it is not one of a run with `settings`."""
     # What begins with a dot is a file that a killed run was writing.
     names = {path.name for path in folder.iterdir() if path.name[0] != "."} if folder.is_dir() else set()
     if (_RUN not in names and names - {"lock"}) or (folder.exists() and not folder.is_dir()):
@@ -175,11 +176,11 @@ def _lock(folder: Path, mine: Mapping[str, str]) -> Iterator[Path]:
     except Timeout:
         raise ValueError(f"the tiles in {folder} are in use by another run") from None
     try:
-        other = json.loads((folder / _RUN).read_bytes()) if (folder / _RUN).exists() else mine
-        if changed := [name for name in sorted({**other, **mine}) if other.get(name) != mine.get(name)]:
-            what = ", ".join(changed)
-            raise ValueError(f"the tiles in {folder} are another run's, which differs in {what}: delete them")
-        write_content(folder / _RUN, json.dumps(mine, indent=2))
+        stored = json.loads((folder / _RUN).read_bytes()) if (folder / _RUN).exists() else settings
+        if changed := [name for name in sorted({**stored, **settings}) if stored.get(name) != settings.get(name)]:
+            listed = ", ".join(changed)
+            raise ValueError(f"the tiles in {folder} are another run's, which differs in {listed}: delete them")
+        write_content(folder / _RUN, json.dumps(settings, indent=2))
         yield folder
     except ScanError:
         remove(folder)

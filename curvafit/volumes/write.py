@@ -47,10 +47,10 @@ def save(
     store that `save` wrote with the same `kind`, or with `overwrite`.
 
     NIfTI keeps the affine (qform and sform) and the unit. TIFF (ImageJ's or OME's metadata), MRC (in Å) and Zarr
-    (OME-Zarr 0.5, with halved copies of a large volume) keep spacing and unit, Zarr and MRC the first voxel's place of
-    axes that are not turned, too. NPY keeps the values only. What is lost so `note_lost` says. TIFF has 64-bit whole
-    numbers in the least type that holds them, float16 as float32. A path `IMAGE/labels/NAME` in an image of OME-Zarr
-    0.4 or 0.5 gets labels on that image's voxels.
+    (OME-Zarr 0.5, with halved copies of a large volume) keep spacing and unit; Zarr and MRC also keep the position of
+    the first voxel, unless axes are rotated. NPY keeps the values only. `note_lost` says what is lost. TIFF stores
+    64-bit integers in the smallest type that holds them, and float16 as float32. A path `IMAGE/labels/NAME` in an image
+    of OME-Zarr 0.4 or 0.5 gets labels on that image's voxels.
 
     Raises ValueError if the suffix is unknown, the format cannot hold the values' type or needs a unit and the volume
     has none, the source is not a volume, or another folder has that name.
@@ -67,10 +67,10 @@ def save(
         Whether any other folder of that name may be replaced.
     """
     target = Path(path)
-    lazy = is_streamed(target) and isinstance(source, Volume)  # what a file has is checked
+    lazy = is_streamed(target) and isinstance(source, Volume)  # of a path the values are read, and checked, first
     field = load(source, spacing=spacing, unit=unit, lazy=lazy)
     writer = pick_writer(target, field.unit, np.empty(0, field.dtype) if field.in_file else field.values)
-    can_write(target, lambda there: not there.is_dir() or is_own_zarr(there, kind), overwrite=overwrite)
+    can_write(target, lambda existing: not existing.is_dir() or is_own_zarr(existing, kind), overwrite=overwrite)
 
     def write(temporary: Path) -> None:
         writer(field, temporary)
@@ -86,13 +86,13 @@ def save(
 
 
 def pick_writer(path: Path, unit: str, values: np.ndarray | None = None) -> Callable[[Any, Path], None]:
-    """Return the writer of a file by its suffix, or of labels, if the format can hold lengths in `unit` and `values`.
+    """Return the writer for a path; raise ScanError if its format cannot hold lengths in `unit`, or `values`.
 
-    For a check before the work, `values` may be an array of their type with the least and the greatest of them.
+    To check before the work, pass an array of the values' type with only the smallest and the largest of them.
     """
     if (image := image_of(path)) is not None:
         return partial(write_labels, image=image)
-    suffix = next((known for known in WRITERS if path.name.lower().endswith(known)), None)
+    suffix = next((suffix for suffix in WRITERS if path.name.lower().endswith(suffix)), None)
     if suffix is None:
         raise ScanError(f"a volume's name must end in one of {', '.join(WRITERS)}, got {path.name!r}")
     if suffix == ".mrc":
@@ -110,15 +110,17 @@ def is_streamed(path: Path) -> bool:
 
 
 def note_lost(path: Path, volume: Volume) -> tuple[str, ...]:
-    """Return a sentence on what a format does not hold of a volume's place, for the time before the work."""
-    name, at, straight = path.name.lower(), any(first_voxel(volume)), np.diag([*volume.spacing[::-1], 1.0])
-    turned = volume.affine is not None and not at and not np.allclose(volume.affine, straight, rtol=1e-5)
+    """Return a note on the parts of a volume's position and axes that the format of `path` does not hold, if any."""
+    name, shifted = path.name.lower(), any(first_voxel(volume))
+    unrotated = np.diag([*volume.spacing[::-1], 1.0])
+    # `first_voxel` is 0 where axes are rotated: an affine that is not shifted and not this one is rotated.
+    rotated = volume.affine is not None and not shifted and not np.allclose(volume.affine, unrotated, rtol=1e-5)
     if name.endswith(".npy"):
         lost = "voxel size and place" if volume.affine is not None or volume.unit != "voxel" else ""
     elif name.endswith((".tif", ".tiff")):
-        lost = "the place" if turned or at else ""
+        lost = "the place" if rotated or shifted else ""
     else:
-        lost = "turned axes and the place" if turned and not name.endswith((".nii", ".nii.gz")) else ""
+        lost = "turned axes and the place" if rotated and not name.endswith((".nii", ".nii.gz")) else ""
     return (f"{path.name} does not hold {lost}: NIfTI does.",) if lost and image_of(path) is None else ()
 
 

@@ -19,7 +19,7 @@ from curvafit.core.runtime import memory, one_line
 
 #: From DICOM's and ITK's patient frame (left, posterior, superior) to NIfTI's (right, anterior, superior).
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
-#: A name like that of a spacing.
+#: Names of attributes that look like a spacing.
 _SPACING = re.compile("spacing|resolution|(voxel|pixel|element)_?size", re.IGNORECASE)
 #: What is assumed of slices whose distance a file does not state.
 NO_DISTANCE = "The file states no distance of slices: it is taken as the pixel's."
@@ -44,7 +44,7 @@ class Stated(NamedTuple):
     Attributes
     ----------
     array
-        The values as the file means them: an array, or what has `shape`, `dtype` and `array[index]` and reads then.
+        The values as the file means them: an array, or an object with `shape`, `dtype` and `array[index]`, which reads.
     axes
         A letter for each axis of the array: z, y, x; t (times), c (channels), s (samples of a colour); or `?` where the
         file names none.
@@ -56,7 +56,7 @@ class Stated(NamedTuple):
     affine
         4x4 map from index (x, y, z, 1) to the world, right, anterior, superior, in the unit of x.
     custom
-        The unit of steps that name none, by the custom of the format.
+        The unit that the format implies for steps without one.
     notes, guesses, gaps
         Sentences: on what was done; on a spacing or unit that the file does not state, which do not hold where the
         caller states them; on values that the file lacks and that were filled in.
@@ -78,8 +78,8 @@ class Stated(NamedTuple):
 def collect_complaints(logger: str | None = None) -> Iterator[list[str]]:
     """Collect what a library logs in this thread, so that nothing is printed, and silence warnings."""
     messages: list[str] = []
-    thread, source = threading.get_ident(), logging.getLogger(logger or __name__)
-    level = source.level
+    thread, library = threading.get_ident(), logging.getLogger(logger or __name__)
+    level = library.level
 
     def collect(record: logging.LogRecord) -> bool:
         if record.thread == thread:
@@ -88,18 +88,18 @@ def collect_complaints(logger: str | None = None) -> Iterator[list[str]]:
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        source.addFilter(collect)
-        if not source.isEnabledFor(logging.WARNING):
-            source.setLevel(logging.WARNING)
+        library.addFilter(collect)
+        if not library.isEnabledFor(logging.WARNING):  # a disabled logger calls no filter
+            library.setLevel(logging.WARNING)
         try:
             yield messages
         finally:
-            source.setLevel(level)
-            source.removeFilter(collect)
+            library.setLevel(level)
+            library.removeFilter(collect)
 
 
 def pick_key(keys: list[str], key: str | None, path: object) -> str:
-    """Return the key, by default the only one, or raise ScanError with a list of the keys."""
+    """Return the one of `keys` that `key` names, by default the only one, or raise ScanError with a list of them."""
     listed = ", ".join(name[:80] for name in keys[:20]) + (", …" if len(keys) > 20 else "")
     if key is None:
         if len(keys) == 1:
@@ -112,27 +112,27 @@ def pick_key(keys: list[str], key: str | None, path: object) -> str:
 
 
 def read_spacing(attributes: Mapping[str, Any], ndim: int) -> dict[str, Any]:
-    """Return steps, units and origin from an array's attributes, unchecked; one number counts for all axes.
+    """Return steps, units and origin from an array's attributes, as fields of `Stated`, unchecked.
 
-    `resolution` and `offset` are CREMI's. A note names what looks like a spacing and is not used.
+    One number counts for all axes. `resolution` and `offset` are CREMI's. A note names what looks like a spacing and is
+    not used.
     """
-    given = next(
-        (name for name in ("element_size_um", "spacing", "voxel_size", "resolution") if name in attributes), ""
-    )
-    like = [name for name in attributes if _SPACING.search(name) and name != given]
-    notes = (f"It has {', '.join(like)[:200]}, which is not used.",) if like else ()
-    if not given:
+    names = ("element_size_um", "spacing", "voxel_size", "resolution")
+    used = next((name for name in names if name in attributes), "")
+    unused = [name for name in attributes if _SPACING.search(name) and name != used]
+    notes = (f"It has {', '.join(unused)[:200]}, which is not used.",) if unused else ()
+    if not used:
         return {"notes": notes}
-    sizes = _entries(attributes[given])
-    unit = "um" if given == "element_size_um" else None
+    sizes = _entries(attributes[used])
+    unit = "um" if used == "element_size_um" else None
     unit = unit or next(iter(_entries(attributes.get("unit", attributes.get("units")))), None)
     sizes = sizes * ndim if len(sizes) == 1 else sizes
-    place: dict[str, Any] = {"steps": sizes, "units": (unit,) * len(sizes), "notes": notes}
-    return place | ({"origin": _entries(attributes["offset"])} if "offset" in attributes else {})
+    geometry: dict[str, Any] = {"steps": sizes, "units": (unit,) * len(sizes), "notes": notes}
+    return geometry | ({"origin": _entries(attributes["offset"])} if "offset" in attributes else {})
 
 
 def is_place_name(name: str) -> bool:
-    """Return whether `read_spacing` uses an attribute as lengths, or says that it is not used."""
+    """Return whether `read_spacing` uses an attribute as lengths, or notes that it does not."""
     return name == "offset" or _SPACING.search(name) is not None
 
 
@@ -147,27 +147,28 @@ def _entries(value: Any) -> tuple[Any, ...]:
 
 
 def read_numbers(stream: Any, shape: Sequence[int], dtype: np.dtype, place: object) -> np.ndarray:
-    """Return the array of a stream, last axis fastest. The stream must end with it: its checksum is compared there."""
+    """Read an array, last axis fastest, that fills the rest of a stream; raise Damaged where the lengths differ."""
     check_array(shape, dtype, place)
     values = np.empty(math.prod(shape), dtype)
-    buffer, size = values.view(np.uint8).data, 0
-    while size < values.nbytes and (count := stream.readinto(buffer[size : size + _PIECE])):
-        size += count
-    if size < values.nbytes or stream.read(1):
-        held = size if size < values.nbytes else "more"
-        raise Damaged(f"{values.nbytes} bytes of values by its header, {held} in the file")
+    buffer, filled = values.view(np.uint8).data, 0
+    while filled < values.nbytes and (count := stream.readinto(buffer[filled : filled + _PIECE])):
+        filled += count
+    if filled < values.nbytes or stream.read(1):  # at its end a compressed stream compares its checksum
+        actual = filled if filled < values.nbytes else "more"
+        raise Damaged(f"{values.nbytes} bytes of values by its header, {actual} in the file")
     return values.reshape(shape)
 
 
 def smallest_type(values: np.ndarray) -> np.dtype:
-    """Return the smallest type of whole numbers that holds those of an array."""
+    """Return the smallest integer type that holds the whole numbers of an array."""
     low, high = int(values.min(initial=0)), int(values.max(initial=0))
-    kinds = map(np.dtype, ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64"))
-    return next((kind for kind in kinds if np.iinfo(kind).min <= low and high <= np.iinfo(kind).max), np.dtype("int64"))
+    dtypes = map(np.dtype, ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64"))
+    fitting = (dtype for dtype in dtypes if np.iinfo(dtype).min <= low and high <= np.iinfo(dtype).max)
+    return next(fitting, np.dtype("int64"))
 
 
 def map_numbers(path: Path, start: int, shape: Sequence[int], dtype: np.dtype, tail: bool = False) -> np.ndarray:
-    """Map the array, last axis fastest, that fills a file from the byte `start` to the end, or to a `tail`."""
+    """Map an array in a file, last axis fastest, from the byte `start` to the end; other bytes may follow if `tail`."""
     nbytes, size = math.prod(shape) * dtype.itemsize, path.stat().st_size - start
     if nbytes > size or (nbytes < size and not tail):
         raise Damaged(f"{nbytes} bytes of values by its header, {size} in the file")
@@ -175,7 +176,7 @@ def map_numbers(path: Path, start: int, shape: Sequence[int], dtype: np.dtype, t
 
 
 def check_array(shape: Sequence[int], dtype: np.dtype, place: object) -> None:
-    """Raise ScanError if an array does not hold numbers or fit into memory; call it before memory is allocated."""
+    """Raise ScanError if an array would not hold numbers, or not fit into memory; call it before allocating it."""
     if dtype.kind in "OV":
         raise ScanError(f"a volume must hold numbers, got values of type {str(dtype)[:80]} in {place}")
     size = math.prod(int(n) for n in shape) * dtype.itemsize
@@ -186,7 +187,7 @@ def check_array(shape: Sequence[int], dtype: np.dtype, place: object) -> None:
 
 
 def affine_of(matrix: np.ndarray, first: Any) -> np.ndarray:
-    """Return the affine of axes (3, 3), x first, and the place of the first voxel."""
+    """Return the affine (4, 4) of a matrix (3, 3) with the axes as columns, x first, and the first voxel's position."""
     return np.vstack([np.column_stack([matrix, first]), [0.0, 0.0, 0.0, 1.0]])
 
 
@@ -198,14 +199,14 @@ def check_regular(path: Path) -> Path:
 
 
 def name_axes(names: Sequence[str]) -> str:
-    """Return the letter of each axis, `?` of a name that is none."""
+    """Return a string with the letter of each axis, `?` for an unknown name."""
     letters = {"channel": "c", "time": "t"}
-    known = (letters.get(name.casefold(), name.casefold()) for name in names)
-    return "".join(name if name in tuple("tcszyx") else "?" for name in known)
+    lowered = (letters.get(name.casefold(), name.casefold()) for name in names)
+    return "".join(name if name in tuple("tcszyx") else "?" for name in lowered)
 
 
 def first_voxel(volume: Any) -> tuple[float, ...]:
-    """Return where a volume's first voxel lies (z, y, x); at 0 if its axes are turned, which few formats can say."""
+    """Return the position of a volume's first voxel (z, y, x); 0 if axes are rotated, which few formats can express."""
     affine = volume.affine
     if affine is None or not np.allclose(affine[:3, :3], np.diag(volume.spacing[::-1]), rtol=1e-5, atol=0):
         return (0.0, 0.0, 0.0)
