@@ -1,8 +1,7 @@
 """Reading of volumes: `load` takes any source of one, `read_maps` files of parameters that vary in space.
 
-The suffix of a file chooses its reader. What a file states is used, or refused in a sentence, or said in a note: axes
-come in the order z, y, x, one channel and time, lengths in one unit. Any fault of a file becomes one sentence, and
-libraries print nothing.
+The suffix of a file chooses its reader. What a file states is used, or refused with a ScanError, or mentioned in a
+note. Volumes have axes in the order z, y, x, one channel and time, and lengths in one unit. Libraries print nothing.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from torch import Tensor
 
 from curvafit.core.checks import SEEDS, check_int, quoted
 from curvafit.core.files import is_url
-from curvafit.core.records import read_archive
+from curvafit.core.records import is_zarr, read_archive
 from curvafit.core.runtime import one_line
 from curvafit.core.units import common_unit, convert_length, is_unit, parse_unit
 from curvafit.priors.coefficients import NAMES
@@ -49,7 +48,7 @@ READERS: dict[str, Callable[..., Stated]] = {
     ".isq": headers.read_isq,
     ".aim": headers.read_aim,
 }
-#: Cosine of the angle of two axes up to which they count as at right angles: a shear of 2 % turns normals by a degree.
+#: Largest cosine of the angle between axes that count as orthogonal: a shear of 2 % turns normals by a degree.
 RIGHT = 0.02
 #: What may vary in space: the six coefficients, the mass and ε, all in working units.
 PARAMETERS = (*NAMES, "mass", "epsilon")
@@ -77,8 +76,7 @@ def load(
 
     Raises FileNotFoundError if there is no such file, and ScanError, which is a ValueError, if the suffix is unknown,
     the file is damaged or truncated, the key is missing, the volume is not 3D, not finite, constant or larger than
-    memory, the spacing is not positive, or the file has no such channel, label or crop; or if the source is none, or an
-    option does not apply to it.
+    memory, the spacing is not positive, the file has no such channel, label or crop, or an option does not apply.
 
     Parameters
     ----------
@@ -103,18 +101,18 @@ def load(
     raw_shape, dtype
         Voxels (z, y, x) and numpy type of a RAW file, which does not state them.
     strict
-        Refuse a volume with parts that are not stored: chunks of Zarr or HDF5, which otherwise get the fill value, or
-        slices that a folder's numbers skip. Without `strict` a note tells of such parts.
+        Refuse a volume with values that are not stored: chunks of Zarr or HDF5, which otherwise get the fill value, or
+        slices that a folder's numbers skip. Without `strict` a note names them.
     lazy
-        Read voxels where they are asked for, from the files of which only a box is read; values are not checked then.
+        Read voxels only when they are used, from formats of which a box can be read; values are not checked then.
     """
-    placed: dict[str, Any] = {"spacing": spacing, "unit": unit}
+    sampling: dict[str, Any] = {"spacing": spacing, "unit": unit}
     reading = {"key": key, "channel": channel, "time": time, "raw_shape": raw_shape, "dtype": dtype, "strict": strict}
     box = None if crop is None else parse_box(crop)
     if isinstance(source, str | os.PathLike):
-        volume = _open(source, **placed, **reading)
+        volume = _open(source, **sampling, **reading)
     elif isinstance(source, Volume):
-        _refuse(placed, "a file or an array", "a Volume, which has its own")
+        _refuse(sampling, "a file or an array", "a Volume, which has its own")
         _refuse(reading, "the path of a file", "a Volume, which is read already")
         volume = source
     elif isinstance(source, np.ndarray | torch.Tensor):
@@ -137,7 +135,7 @@ def _open(
     strict: bool,
     **options: Any,
 ) -> Volume:
-    """Return the volume of a file, whose values are read where they are asked for where the format has them so."""
+    """Return the volume of a file, whose values are read only when they are used, if the format allows it."""
     location, key = split_key(path, key)
     reading = {"key": key, "raw_shape": raw_shape, "dtype": dtype}
     stated = read_file(location, **reading)  # type: ignore[arg-type]
@@ -159,7 +157,7 @@ class FileArray:
         return {**vars(self), "_array": None}
 
     def __getitem__(self, index: Any) -> np.ndarray:
-        # A mapped file that became shorter would end the process: what is mapped is opened, and checked, each time.
+        # A mapped file that is truncated meanwhile would crash the process: it is opened, and checked, each time.
         if self._array is None or isinstance(getattr(self._array, "array", self._array), np.memmap):
             self._array = read_file(self.path, **self.reading).array
         with _name_damage(self.path):
@@ -167,19 +165,19 @@ class FileArray:
 
     @property
     def digest(self) -> str:
-        """A text that changes with the content, without reading it: of a folder the total size and latest time."""
-        if isinstance(self.path, str):
+        """A text that changes with the content, from the total size of the files and the latest time of change."""
+        if isinstance(self.path, str):  # a URL
             return f"{self.path} {self.reading}"
         files = [path for path in self.path.rglob("*") if path.is_file()] if self.path.is_dir() else [self.path]
-        states = [path.stat() for path in files]
-        size, time = sum(state.st_size for state in states), max(state.st_mtime_ns for state in states)
+        stats = [path.stat() for path in files]
+        size, time = sum(stat.st_size for stat in stats), max(stat.st_mtime_ns for stat in stats)
         return f"{self.path.resolve()} {self.reading}: {size} bytes at {time}"
 
 
 def read_values(path: str | os.PathLike[str]) -> np.ndarray:
-    """Return the array in a volume file, z first, without axes of length one before the last three.
+    """Return the array in a volume file, z first, without leading axes of length one beyond three axes.
 
-    Values are not checked; a warning tells of parts that are not stored.
+    Values are not checked; a warning tells if some are not stored.
     """
     stated = read_file(Path(path))
     for gap in stated.gaps:
@@ -195,7 +193,7 @@ def read_values(path: str | os.PathLike[str]) -> np.ndarray:
 def read_file(
     path: Path | str, key: str | None = None, raw_shape: Sequence[int] | None = None, dtype: str | None = None
 ) -> Stated:
-    """Return what a file, a folder, or a store of an address states; what a library raises at damage is a ScanError."""
+    """Return what a file, a folder, or a store at a URL states; errors of the reading library become a ScanError."""
     if isinstance(path, str):
         with _name_damage(path):
             return zarr.read_remote(path, key)
@@ -212,7 +210,7 @@ def read_file(
 
 @contextmanager
 def _name_damage(path: Path | str) -> Iterator[None]:
-    """Turn what a library raises at damage into a ScanError that names the file, and keep what it prints."""
+    """Turn a library's error into a ScanError that names the file, and silence its warnings."""
     try:
         with base.collect_complaints():
             yield
@@ -220,9 +218,9 @@ def _name_damage(path: Path | str) -> Iterator[None]:
         raise
     except MemoryError as reason:
         raise ScanError(f"{path} does not fit into memory") from reason
-    except Exception as reason:  # every library has its own way to say that a file is damaged
-        kind = "" if isinstance(reason, base.Damaged | ValueError) else f"{type(reason).__name__}: "
-        text = " ".join(f"{kind}{reason}"[:2000].split())[:200]
+    except Exception as reason:  # every library has its own errors for a damaged file
+        prefix = "" if isinstance(reason, base.Damaged | ValueError) else f"{type(reason).__name__}: "
+        text = " ".join(f"{prefix}{reason}"[:2000].split())[:200]
         raise ScanError(f"{path} cannot be read, it is damaged or something else ({text})") from reason
 
 
@@ -259,17 +257,16 @@ def _to_numpy(source: np.ndarray | torch.Tensor) -> np.ndarray:
 
 
 def split_key(path: str | os.PathLike[str], key: str | None) -> tuple[Path | str, str | None]:
-    """Return the file of a path, and the name of the array in the file, which the path may state after `::`; of a store
-    that is not on this machine its address."""
+    """Return the file, or the URL, of a path such as `file.h5::key`, and the key, which `key` overrides."""
     path = os.fspath(path)
-    name, separator, inner = path.rpartition("::")
+    name, separator, stated_key = path.rpartition("::")
     if not separator or Path(path).exists():
-        name, inner = path, None
-    return (name if is_url(name) else Path(name)), key or inner or None
+        name, stated_key = path, None
+    return (name if is_url(name) else Path(name)), key or stated_key or None
 
 
 def levels_of(source: object, key: str | None = None) -> dict[str, tuple[float, ...] | None]:
-    """Return the spacing of each level of an OME-Zarr image by its key, the finest first; nothing of a named level."""
+    """Return the spacing of each level of an OME-Zarr image by key, finest first; {} if the key names one level."""
     if not isinstance(source, str | os.PathLike):
         return {}
     path, key = split_key(source, key)
@@ -280,12 +277,12 @@ def levels_of(source: object, key: str | None = None) -> dict[str, tuple[float, 
 
 def _pick_folder(path: Path) -> Callable[..., Stated]:
     """Return the reader of a folder: of a Zarr store, or of slices, as images or DICOM."""
-    inside = [p for p in path.iterdir() if not p.name.startswith(".")]
-    if any(p.name in ("zarr.json", ".zarray", ".zgroup") for p in path.iterdir()) or path.suffix == ".zarr":
+    if is_zarr(path) or path.suffix == ".zarr":
         return zarr.read_zarr
-    if any(p.suffix.lower() in tiff.SLICES for p in inside):
+    visible = [p for p in path.iterdir() if not p.name.startswith(".")]
+    if any(p.suffix.lower() in tiff.SLICES for p in visible):
         return tiff.read_slices
-    if any(p.is_file() and dicom.is_dicom(p) for p in inside):
+    if any(p.is_file() and dicom.is_dicom(p) for p in visible):
         return dicom.read_dicom
     raise ScanError(f"the folder {path} holds neither slices (TIFF, BMP, PNG, JPEG, DICOM) nor a Zarr store")
 
@@ -310,25 +307,26 @@ def to_volume(
     array = stated.array
     if array.dtype.kind not in "biuf":
         raise ScanError(f"a volume must hold real numbers, got values of type {array.dtype} in {source}")
-    order, numbers, notes = _find_axes(array.shape, stated.axes, channel, time, source)
+    order, numbers, axis_notes = _find_axes(array.shape, stated.axes, channel, time, source)
     index = tuple(numbers.get(axis, slice(0, n)) for axis, n in enumerate(array.shape))
     if isinstance(array, np.ndarray):
-        turned = array[index].transpose([sorted(order).index(axis) for axis in order])
-        array = np.ascontiguousarray(turned, dtype=array.dtype.newbyteorder("="))
+        # The axes with a number in `index` are gone: those of `order` are counted without them.
+        zyx = array[index].transpose([sorted(order).index(axis) for axis in order])
+        array = np.ascontiguousarray(zyx, dtype=array.dtype.newbyteorder("="))
     else:
         array = StoredArray(array, index, order)
-    edges, name, scale, more = _find_lengths(stated, order, spacing, unit, source)
-    affine, origin = stated.affine, _take_three(stated.origin, order, stated.axes)
+    edges, edge_unit, scale, length_notes = _find_lengths(stated, order, spacing, unit, source)
+    affine, origin = stated.affine, _take_zyx(stated.origin, order, stated.axes)
     if affine is not None:
-        affine = np.diag([scale[2]] * 3 + [1.0]) @ affine
+        affine = np.diag([scale[2]] * 3 + [1.0]) @ affine  # an affine is in the unit of x
         if spacing is not None or stated.steps is None:
             lengths = np.linalg.norm(affine[:3, :3], axis=0)
-            affine[:3, :3] *= edges[::-1] / np.where(lengths > 0, lengths, 1)
+            affine[:3, :3] *= edges[::-1] / np.where(lengths > 0, lengths, 1)  # its columns get the edges' lengths
     elif origin is not None and any(origin):
         affine = base.affine_of(np.diag(edges[::-1]), (scale * origin)[::-1])
-    notes = (*stated.gaps, *stated.notes, *notes, *more)
+    notes = (*stated.gaps, *stated.notes, *axis_notes, *length_notes)
     notes += stated.guesses if spacing is None and unit is None else ()
-    volume = Volume(array, tuple(edges.tolist()), name, affine, source, notes)
+    volume = Volume(array, tuple(edges.tolist()), edge_unit, affine, source, notes)
     if affine is not None and spacing is None:
         _check_angles(affine[:3, :3], source)
     return volume
@@ -337,55 +335,55 @@ def to_volume(
 def _find_axes(
     shape: Sequence[int], axes: str, channel: int | None, time: int | None, source: str
 ) -> tuple[tuple[int, int, int], dict[int, int], tuple[str, ...]]:
-    """Return the axes z, y and x of an array, the number to take of each other axis, and notes.
+    """Return the axes z, y and x of an array, the index to take along every other axis, and notes.
 
-    Axes without a name are z, y and x in turn; of four, that of channels is the shorter one of the first and the last.
-    An axis of times or channels of slices without a z is taken for z, and one of times by `channel` where there are no
-    channels.
+    Unnamed axes are z, y and x in this order. If there is one more, and a channel is chosen, the shorter of the first
+    and the last one holds channels. Without an axis z, that of times, or else of channels, is taken for z. `channel`
+    chooses a time if the file has times but no channels.
     """
     long = [axis for axis, n in enumerate(shape) if n != 1]
     named = {axes[axis]: axis for axis in long if axes[axis] != "?"}
-    free = [axis for axis in long if axes[axis] == "?"]
-    lacking, taken = [letter for letter in "zyx" if letter not in named], ()
-    if len(free) == len(lacking) + 1 and channel is not None and not {"c", "s"} & named.keys():
-        named["c"] = free.pop(0 if shape[free[0]] <= shape[free[-1]] else -1)
-    if len(free) == len(lacking):
-        named |= dict(zip(lacking, free, strict=True))
-    elif lacking == ["z"] and not free and (letter := "t" if "t" in named else "c") in named:
+    unnamed = [axis for axis in long if axes[axis] == "?"]
+    lacking, notes = [letter for letter in "zyx" if letter not in named], ()
+    if len(unnamed) == len(lacking) + 1 and channel is not None and not {"c", "s"} & named.keys():
+        named["c"] = unnamed.pop(0 if shape[unnamed[0]] <= shape[unnamed[-1]] else -1)
+    if len(unnamed) == len(lacking):
+        named |= dict(zip(lacking, unnamed, strict=True))
+    elif lacking == ["z"] and not unnamed and (letter := "t" if "t" in named else "c") in named:
         named["z"] = named.pop(letter)
-        what = "times" if letter == "t" else "channels"
-        taken = (f"The file calls an axis of {shape[named['z']]} {what}: it is taken for slices.",)
+        content = "times" if letter == "t" else "channels"
+        notes = (f"The file calls an axis of {shape[named['z']]} {content}: it is taken for slices.",)
     space = [named[letter] for letter in "zyx" if letter in named]
-    further = {"channel": named.get("s", named.get("c")), "time": named.get("t")}
-    if further["channel"] is None and channel is not None and time is None:
-        further = {"channel": further["time"], "time": None}
-    numbers = _pick_numbers(shape, further, {"channel": channel, "time": time}, source, len(long))
+    others = {"channel": named.get("s", named.get("c")), "time": named.get("t")}
+    if others["channel"] is None and channel is not None and time is None:
+        others = {"channel": others["time"], "time": None}
+    chosen = {"channel": channel, "time": time}
+    numbers = _pick_numbers(shape, others, chosen, source, len(long))
     if len(space) != 3 or len(long) != 3 + len(numbers) or 0 in shape:
         got = "no values" if 0 in shape else f"{len(long) - len(numbers)}D of shape {tuple(shape)}"
         hint = "; a channel, counted from 0, picks one volume of several" if (len(long), len(numbers)) == (4, 0) else ""
         raise ScanError(f"a volume must be 3D, got {got} in {source}{hint}")
-    if missing := {name: shape[axis] for name, axis in further.items() if axis is not None and numbers[axis] is None}:
-        content = " of ".join(f"{count} {name}s" for name, count in missing.items())
-        choices = " and ".join(f"a {name} from 0 to {count - 1}" for name, count in missing.items())
+    if undecided := {name: shape[axis] for name, axis in others.items() if axis is not None and numbers[axis] is None}:
+        content = " of ".join(f"{count} {name}s" for name, count in undecided.items())
+        choices = " and ".join(f"a {name} from 0 to {count - 1}" for name, count in undecided.items())
         raise ScanError(f"{source} holds {content}: choose {choices}")
-    used = {"Channel": channel, "Time": time}
-    notes = (f"{name} {number} is used." for name, number in used.items() if number is not None)
+    notes += tuple(f"{name.title()} {number} is used." for name, number in chosen.items() if number is not None)
     single = {axis: 0 for axis, n in enumerate(shape) if n == 1}
-    return (space[0], space[1], space[2]), {**single, **numbers}, (*taken, *notes)  # type: ignore[dict-item]
+    return (space[0], space[1], space[2]), {**single, **numbers}, notes  # type: ignore[dict-item]
 
 
 def _pick_numbers(
-    shape: Sequence[int], axes: Mapping[str, int | None], asked: Mapping[str, int | None], source: str, count: int
+    shape: Sequence[int], axes: Mapping[str, int | None], chosen: Mapping[str, int | None], source: str, count: int
 ) -> dict[int, int | None]:
-    """Return the number to take of the axis of channels and that of times, None where none is asked for."""
+    """Map the axes of channels and times, if there are any, to the chosen index or None; ScanError if out of range."""
     numbers: dict[int, int | None] = {}
     for name, axis in axes.items():
-        number = asked[name]
+        number = chosen[name]
         if number is not None:
             check_int(number, f"a {name} that is a whole number from 0", -SEEDS, SEEDS)
             if axis is None:
-                other = " (a channel picks one of several without names)" if name == "time" and count == 4 else ""
-                raise ScanError(f"{source} names no axis of {name}s, got {name} {number}{other}")
+                hint = " (a channel picks one of several without names)" if name == "time" and count == 4 else ""
+                raise ScanError(f"{source} names no axis of {name}s, got {name} {number}{hint}")
             if not 0 <= number < shape[axis]:
                 raise ScanError(f"{name} must be from 0 to {shape[axis] - 1} for {source}, got {number}")
         if axis is not None:
@@ -393,9 +391,9 @@ def _pick_numbers(
     return numbers
 
 
-def _take_three(values: Sequence[Any] | None, order: Sequence[int], axes: str) -> Any:
-    """Return what is stated along z, y and x, of what is stated along all axes or these three; an axis that is taken
-    for z has what is stated of z."""
+def _take_zyx(values: Sequence[Any] | None, order: Sequence[int], axes: str) -> Any:
+    """Return the values along z, y and x, from values along these three or along all axes, of which z may have length 1
+    where another axis is taken for it."""
     if values is None or len(values) != len(axes):
         return values
     z = axes.index("z") if "z" in axes else order[0]
@@ -405,41 +403,42 @@ def _take_three(values: Sequence[Any] | None, order: Sequence[int], axes: str) -
 def _find_lengths(
     stated: Stated, order: Sequence[int], spacing: Sequence[float] | float | None, unit: str | None, source: str
 ) -> tuple[np.ndarray, str, np.ndarray, tuple[str, ...]]:
-    """Return voxel edges (z, y, x), their unit, factors from the file's units to it, and a note.
+    """Return voxel edges (z, y, x), their unit, factors (3,) from the file's units to it, and a note.
 
-    A caller's unit alone converts lengths in a unit that the file names, and names that of others.
+    If the caller states a unit but no spacing, lengths are converted to it where the file names a unit, and else taken
+    to be in it.
     """
-    units = _take_three(stated.units, order, stated.axes)
-    own, factors = common_unit([unit or stated.custom for unit in units])
-    if not is_unit(own) and (spacing is None or unit is None):
-        raise ScanError(f"{source} states lengths in {quoted(own)}, which is not known: give --spacing and --unit")
+    axis_units = _take_zyx(stated.units, order, stated.axes)
+    common, factors = common_unit([axis_unit or stated.custom for axis_unit in axis_units])
+    if not is_unit(common) and (spacing is None or unit is None):
+        raise ScanError(f"{source} states lengths in {quoted(common)}, which is not known: give --spacing and --unit")
     try:
-        given, times = parse_unit(own if unit is None else unit)
+        name, factor = parse_unit(common if unit is None else unit)
         edges = None if spacing is None else np.array(positive_triple(spacing))
-        steps = None if stated.steps is None or spacing is not None else _take_three(stated.steps, order, stated.axes)
+        steps = None if stated.steps is None or spacing is not None else _take_zyx(stated.steps, order, stated.axes)
         steps = None if steps is None else positive_triple(steps)
     except ValueError as reason:
         raise ScanError(f"{reason} for {source}") from None
-    measured = is_unit(own) and parse_unit(own)[0] != "voxel" and any(units)
-    if unit is not None and measured and given == "voxel" and spacing is None:
-        raise ScanError(f"lengths of {source} are in {own}, which no --unit voxel converts: give --spacing too")
-    by = convert_length(1.0, own, given) if unit is not None and measured else times
-    scale, note = np.array(factors) * float(f"{by:.15g}"), ()
+    names_length = is_unit(common) and parse_unit(common)[0] != "voxel" and any(axis_units)
+    if unit is not None and names_length and name == "voxel" and spacing is None:
+        raise ScanError(f"lengths of {source} are in {common}, which no --unit voxel converts: give --spacing too")
+    conversion = convert_length(1.0, common, name) if unit is not None and names_length else factor
+    scale, note = np.array(factors) * float(f"{conversion:.15g}"), ()
     if edges is not None:
-        if unit is None and given == "voxel" and edges.min() != 1:  # edges of which the finest is 1 are ratios
+        if unit is None and name == "voxel" and edges.min() != 1:  # edges of which the smallest is 1 are ratios
             raise ScanError(f"expected the unit of the spacing {quoted(spacing)} of {source}, such as mm, got none")
-        edges = edges if unit is None else times * edges
+        edges = edges if unit is None else factor * edges
     elif steps is not None:
         edges = scale * steps
     else:
-        edges = np.full(3, 1.0 if unit is None else times)
-        counted = "counted in voxels" if given == "voxel" else f"those of voxels of 1 {given}"
-        note = (f"The file states no spacing: lengths are {counted}.",)
-    return edges, given, scale, note
+        edges = np.full(3, 1.0 if unit is None else factor)
+        meaning = "counted in voxels" if name == "voxel" else f"those of voxels of 1 {name}"
+        note = (f"The file states no spacing: lengths are {meaning}.",)
+    return edges, name, scale, note
 
 
 def _check_angles(matrix: np.ndarray, source: str) -> None:
-    """Raise ScanError where the axes of voxels, columns of a matrix, are not at right angles."""
+    """Raise ScanError where the axes of voxels, the columns of a matrix (3, 3), are not at right angles."""
     directions = matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
     cosine = np.abs(directions.T @ directions - np.eye(3)).max()
     if not np.isfinite(cosine):
@@ -455,7 +454,7 @@ def _check_angles(matrix: np.ndarray, source: str) -> None:
 
 
 def read_maps(path: str | Path, shape: tuple[int, int, int] | None = None) -> dict[str, float | Tensor]:
-    """Return the map `(Z, Y, X)`, float32, or the number of each parameter.
+    """Return a map `(Z, Y, X)`, float32, or a number for each parameter in a file or folder.
 
     Raises FileNotFoundError if there is no such file or folder, and ValueError if it is empty or holds another name, or
     a map has another shape or values that are not finite.
@@ -468,26 +467,26 @@ def read_maps(path: str | Path, shape: tuple[int, int, int] | None = None) -> di
     shape
         Voxels of every map (z, y, x); by default the shape of the first map.
     """
-    place = Path(path)
-    if not place.exists():
-        raise FileNotFoundError(f"no such file or folder of maps: {place}")
+    source = Path(path)
+    if not source.exists():
+        raise FileNotFoundError(f"no such file or folder of maps: {source}")
     try:
-        content = None if place.is_dir() else read_archive(place)
+        content = None if source.is_dir() else read_archive(source)
     except (ValueError, OSError) as reason:
-        raise ValueError(f"{place} is neither an NPZ file nor a folder of maps") from reason
-    content = _read_folder(place) if content is None else content
+        raise ValueError(f"{source} is neither an NPZ file nor a folder of maps") from reason
+    content = _read_folder(source) if content is None else content
     unknown = sorted(content.keys() - set(PARAMETERS))
     if unknown or not content:
         listed = ", ".join(unknown) or "none"
-        raise ValueError(f"maps must be named {', '.join(PARAMETERS)}, got {listed} in {place}")
+        raise ValueError(f"maps must be named {', '.join(PARAMETERS)}, got {listed} in {source}")
     for name, values in content.items():
-        numbers = values.dtype.kind in "iuf"
-        if not numbers or not np.isfinite(values).all() or np.abs(values).max(initial=0) > np.finfo(np.float32).max:
-            raise ValueError(f"the map {name} must hold finite numbers, got others in {place}")
+        is_numeric = values.dtype.kind in "iuf"
+        if not is_numeric or not np.isfinite(values).all() or np.abs(values).max(initial=0) > np.finfo(np.float32).max:
+            raise ValueError(f"the map {name} must hold finite numbers, got others in {source}")
         if values.size > 1:
             shape = shape or values.shape  # type: ignore[assignment]
             if values.shape != shape or len(values.shape) != 3:
-                raise ValueError(f"the map {name} must have the shape {shape}, got {values.shape} in {place}")
+                raise ValueError(f"the map {name} must have the shape {shape}, got {values.shape} in {source}")
     return {
         name: float(values.reshape(())) if values.size == 1 else torch.from_numpy(values.astype(np.float32))
         for name, values in content.items()
@@ -501,7 +500,7 @@ def map_shape(maps: Mapping[str, float | Tensor]) -> tuple[int, int, int] | None
 
 
 def _read_folder(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a folder's volume files by name; files of other names are not read, and get empty arrays."""
+    """Return the arrays of a folder's volume files by name; files of unknown names get an empty array, unread."""
     suffixes = tuple(READERS)
     files = [p for p in sorted(path.iterdir()) if p.name.lower().endswith(suffixes) and not p.name.startswith(".")]
     content: dict[str, np.ndarray] = {}
