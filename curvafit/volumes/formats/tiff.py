@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,15 +12,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from curvafit.core.units import is_unit, parse_unit
+from curvafit.core.units import convert_length, is_unit, parse_unit
 from curvafit.volumes.formats import base
 from curvafit.volumes.formats.base import ScanError, Stated
 
 if TYPE_CHECKING:
     import tifffile
-from collections import Counter
-
-from curvafit.core.units import convert_length
 
 #: Bytes beyond which ImageJ's TIFF cannot point.
 _IMAGEJ_LIMIT = 2**32 - 2**25
@@ -36,9 +34,9 @@ _UNKNOWN: _Spacing = (None, (None,) * 3, ())
 _SCREEN = (1, 25.4, 72, 96, 100, 150, 200, 300, 600)
 #: Suffixes of slices.
 SLICES = (".tif", ".tiff", ".bmp", ".png", ".jpg", ".jpeg")
-#: The share by which pixel sizes may differ that are one.
+#: Relative difference up to which pixel sizes count as equal.
 _SAME = 0.01
-#: Annotated slices are at most this share of a volume of so many slices, and have so many labels.
+#: Bounds of a volume of which only some slices are annotated: the share of these, its slices, and its labels.
 _MOST, _LONGEST, _LABELS = 0.5, 10_000, 32
 
 
@@ -53,29 +51,30 @@ def read_tiff(path: Path, **_: object) -> Stated:
         values = np.asarray(series.asarray())
         steps, units, guesses = _read_spacing(file)
         axes = base.name_axes(series.axes)
-        values, calibration = _calibrate(values, file.imagej_metadata or {})
+        values, calibration_notes = _calibrate(values, file.imagej_metadata or {})
         count, nodata = len(file.series), series.pages[0].tags.get(42113)  # type: ignore[union-attr]
-    tags = [text for text in messages if text.startswith("<TiffTag")]
+    tag_errors = [text for text in messages if text.startswith("<TiffTag")]
     # GDAL's value for what was not measured, tag 42113, may not fit the values' type.
-    if losses := [text for text in messages if text not in tags and _LOST.search(text) and "GDAL" not in text]:
+    if losses := [text for text in messages if text not in tag_errors and _LOST.search(text) and "GDAL" not in text]:
         raise base.Damaged(losses[0])
     notes = (f"The file holds {count} images: the first is used.",) if count > 1 else ()
     if nodata is not None:
         notes += (f"By the file, {nodata.value} stands where nothing was measured.",)
-    notes += (f"{len(tags)} of the file's tags cannot be read: what they state is not known.",) if tags else ()
-    return Stated(values, axes, steps, units, notes=(*notes, *calibration), guesses=guesses)
+    if tag_errors:
+        notes += (f"{len(tag_errors)} of the file's tags cannot be read: what they state is not known.",)
+    return Stated(values, axes, steps, units, notes=(*notes, *calibration_notes), guesses=guesses)
 
 
 def _calibrate(values: np.ndarray, metadata: Mapping[str, Any]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Apply ImageJ's straight calibration of grey values, c0 + c1 v, as it does; a note tells of a curved one."""
+    """Return values with ImageJ's linear calibration, c0 + c1 v, applied, or with a note on one that is not linear."""
     function, c0, c1 = metadata.get("cf", 0), metadata.get("c0"), metadata.get("c1")
     if function not in (0, 20):  # 20 is none
         return values, (f"ImageJ's calibration of grey values, its function {function}, is not applied.",)
     if values.dtype.kind not in "iu" or c0 is None or not c1 or (c0, c1) == (0, 1) or function == 20:
         return values, ()
     grey = np.maximum(values * np.float64(c1) + float(c0), 0 if metadata.get("zeroclip") else -np.inf)
-    whole = float(c0).is_integer() and float(c1).is_integer()  # labels stay whole numbers
-    return grey.astype(base.smallest_type(grey) if whole else np.float32), ()
+    is_whole = float(c0).is_integer() and float(c1).is_integer()  # labels stay whole numbers
+    return grey.astype(base.smallest_type(grey) if is_whole else np.float32), ()
 
 
 def _check_pages(file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> None:
@@ -85,7 +84,7 @@ def _check_pages(file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> No
         raise base.Damaged(
             f"{metadata['images']} images by its description, {math.prod(series.shape[:-2])} in the file"
         )
-    if series.dataoffset is not None:  # all values in one piece, whatever its pages are
+    if series.dataoffset is not None:  # all values are contiguous, whatever the pages say
         nbytes = math.prod(series.shape) * np.dtype(series.dtype).itemsize
         if series.dataoffset + nbytes > file.filehandle.size:
             raise base.Damaged(f"{nbytes} bytes of values by its header, fewer in the file")
@@ -94,21 +93,20 @@ def _check_pages(file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> No
         if page is None:
             raise base.Damaged(f"page {number} is not there")
         size = page.parent.filehandle.size  # a series may have its pages in several files
-        places = list(zip(page.dataoffsets, page.databytecounts, strict=False))
-        whole = all(start > 0 and count > 0 and start + count <= size for start, count in places)
-        if not whole or len(places) < (1 if page.is_contiguous else math.prod(page.chunked)):
+        segments = list(zip(page.dataoffsets, page.databytecounts, strict=False))
+        in_file = all(start > 0 and count > 0 and start + count <= size for start, count in segments)
+        if not in_file or len(segments) < (1 if page.is_contiguous else math.prod(page.chunked)):
             raise base.Damaged(f"strips or tiles of page {number} are not there")
 
 
 def write_tiff(field: Any, path: Path) -> None:
-    """Write a TIFF with ImageJ's metadata, with OME's where ImageJ lacks the type or cannot hold the size, or plainly
-    where OME lacks the type, too."""
+    """Write a TIFF with the first metadata that hold its type and size: ImageJ's, OME's, or tifffile's own."""
     import tifffile
 
     values, (z, y, x) = _to_tiff(field.values), field.spacing
-    fits = values.nbytes < _IMAGEJ_LIMIT and max(1 / x, 1 / y) < _RESOLUTION_LIMIT
-    if values.dtype in (np.uint8, np.uint16, np.float32) and fits:
-        exact = {"curvafit_spacing": f"{z!r},{y!r},{x!r}", "curvafit_unit": field.unit}
+    within_limits = values.nbytes < _IMAGEJ_LIMIT and max(1 / x, 1 / y) < _RESOLUTION_LIMIT
+    if values.dtype in (np.uint8, np.uint16, np.float32) and within_limits:
+        exact = {"curvafit_spacing": f"{z!r},{y!r},{x!r}", "curvafit_unit": field.unit}  # resolutions are rounded
         unit = {"um": "micron", "voxel": "pixel"}.get(field.unit, field.unit)
         metadata = {"axes": "ZYX", "spacing": z, "unit": unit, **exact}
         options = {"imagej": True, "resolution": (1 / x, 1 / y), "metadata": metadata}
@@ -131,8 +129,8 @@ def write_ome_tiff(field: Any, path: Path) -> None:
 
 def check_ome_tiff(values: np.ndarray) -> None:
     """Raise ScanError if values are whole numbers that need 64 bits, before `write_ome_tiff`."""
-    if (kind := _to_tiff(values).dtype).kind in "iu" and kind.itemsize > 4:
-        raise ScanError(f"an OME-TIFF holds whole numbers of at most 32 bits, got {kind}: name it .tif")
+    if (dtype := _to_tiff(values).dtype).kind in "iu" and dtype.itemsize > 4:
+        raise ScanError(f"an OME-TIFF holds whole numbers of at most 32 bits, got {dtype}: name it .tif")
 
 
 def _to_tiff(values: np.ndarray) -> np.ndarray:
@@ -145,7 +143,7 @@ def _to_tiff(values: np.ndarray) -> np.ndarray:
 
 
 def _read_spacing(file: tifffile.TiffFile) -> _Spacing:
-    """Return spacing, unit and notes on what is assumed, from the description or, without one, the tags."""
+    """Return steps, units and notes on what is assumed, from the description or, without one, the resolution tags."""
     if file.is_ome and file.ome_metadata:
         nodes = ElementTree.fromstring(file.ome_metadata).iter()
         return _from_sizes(next((node.attrib for node in nodes if node.tag.endswith("Pixels")), {}))
@@ -168,7 +166,7 @@ def _read_spacing(file: tifffile.TiffFile) -> _Spacing:
 
 
 def _from_sizes(pixels: Mapping[str, Any]) -> _Spacing:
-    """Return steps, units and a note from OME's sizes, where 0 is not known; an axis without a size has that of x."""
+    """Return steps, units and notes from OME's sizes, where 0 is unknown; an axis without a size gets that of x."""
     sizes = {axis: float(pixels.get(f"PhysicalSize{axis}", 0)) for axis in "ZYX"}
     if not sizes["X"]:
         return _UNKNOWN
@@ -181,14 +179,13 @@ def _from_sizes(pixels: Mapping[str, Any]) -> _Spacing:
 
 
 def _from_imagej(file: tifffile.TiffFile, description: dict[str, Any]) -> _Spacing:
-    """Return steps, units and a note from ImageJ's description: the distance of slices in `zunit`, and by the tags
-    pixels per `unit` or `yunit`. Without a unit only proportions have a meaning: lengths are in pixels along x."""
+    """Return steps, units and a note from ImageJ's description (the distance of slices) and the resolution tags."""
     y, x = _pixels_per_unit(file)
     z = abs(float(description.get("spacing") or 0))
     units = [description.get(f"{axis}unit", description.get("unit")) for axis in "zyx"]
-    units = units if z else [units[2], *units[1:]]
+    units = units if z else [units[2], *units[1:]]  # the distance of slices is then taken as the pixel's
     if all(is_unit(unit) and parse_unit(unit)[0] == "voxel" for unit in units):
-        steps = (z * x if z else 1.0, x / y, 1.0)
+        steps = (z * x if z else 1.0, x / y, 1.0)  # without a unit only ratios have a meaning: in pixels along x
         return (None if np.allclose(steps, 1) else steps), _UNKNOWN[1], ()
     return (z or 1 / x, 1 / y, 1 / x), units, () if z else (base.NO_DISTANCE,)
 
@@ -200,20 +197,20 @@ def _from_tags(file: tifffile.TiffFile) -> _Spacing:
     unit = _TAG_UNITS.get(int(tag.value)) if tag is not None else None
     if unit is None or min(x, y) <= 0:
         return _UNKNOWN
-    dots = x * (2.54 if unit == "cm" else 1.0)
-    if any(abs(dots - screen) < 0.51 for screen in _SCREEN):
+    dots_per_inch = x * (2.54 if unit == "cm" else 1.0)
+    if any(abs(dots_per_inch - screen) < 0.51 for screen in _SCREEN):
         return _UNKNOWN
     return (1 / x, 1 / y, 1 / x), (unit,) * 3, (base.NO_DISTANCE,)
 
 
 def _pixels_per_unit(file: tifffile.TiffFile) -> tuple[float, float]:
     """Return the resolution tags along (y, x), 1 where there are none."""
-    values = []
+    resolutions = []
     for name in ("YResolution", "XResolution"):
         tag = file.pages[0].tags.get(name)  # type: ignore[union-attr]
-        top, bottom = tag.value if tag is not None else (1, 1)
-        values.append(top / bottom if top and bottom else 1.0)
-    return values[0], values[1]
+        numerator, denominator = tag.value if tag is not None else (1, 1)
+        resolutions.append(numerator / denominator if numerator and denominator else 1.0)
+    return resolutions[0], resolutions[1]
 
 
 # ---- folders of slices: TIFF, BMP, PNG or JPEG; those of NRecon with the voxel size of its log -----------------------
@@ -222,52 +219,54 @@ def _pixels_per_unit(file: tifffile.TiffFile) -> tuple[float, float]:
 def read_slices(path: Path, **_: object) -> Stated:
     """Read a folder of 2D slices in the natural order of their names, with the pixel size that they or a log state.
 
-    Labels in fewer than half of the slices, at uneven distances, lie where their numbers say, among empty ones.
+    Slices with labels of fewer than half of a volume, at uneven distances, are put at their numbers among empty ones.
     """
-    names, notes = _list_slices(path)
+    files, notes = _list_slices(path)
     first, planes = None, []
-    for name in names:
-        stated = (read_tiff if name.suffix.lower() in SLICES[:2] else _read_picture)(base.check_regular(name))
-        first, plane = first or stated, _squeeze_plane(stated)
+    for file in files:
+        stated = (read_tiff if file.suffix.lower() in SLICES[:2] else _read_picture)(base.check_regular(file))
+        first = first or stated
+        plane = _squeeze_plane(stated)
         planes.append(plane)
         if plane.ndim != 2 + ("s" in first.axes) or plane.shape != planes[0].shape:
-            got = f"{plane.shape} in {name.name} of {path}"
+            got = f"{plane.shape} in {file.name} of {path}"
             raise ScanError(f"slices must be 2D and of one shape {planes[0].shape}, got {got}")
         if plane.dtype != planes[0].dtype:
-            both = f"{planes[0].dtype} in {names[0].name} and {plane.dtype} in {name.name}"
-            raise ScanError(f"slices must be of one type, got {both} of {path}")
-        if not _are_same(stated, first):
-            raise ScanError(f"slices must have one pixel size, got another in {name.name} of {path}")
+            got = f"{planes[0].dtype} in {files[0].name} and {plane.dtype} in {file.name} of {path}"
+            raise ScanError(f"slices must be of one type, got {got}")
+        if not _have_same_size(stated, first):
+            raise ScanError(f"slices must have one pixel size, got another in {file.name} of {path}")
     assert first is not None
     logged = _read_logs(path)
     if logged is not None:
         size, step, log = logged
-        own = first._replace(units=[unit or first.custom for unit in first.units])
-        if first.steps is not None and not _are_same(own, Stated(None, "zyx", [size] * 3, ["um"] * 3)):
-            raise ScanError(f"{names[0].name} states another pixel size than the {size:g} um of {log} in {path}")
+        with_units = first._replace(units=[unit or first.custom for unit in first.units])
+        if first.steps is not None and not _have_same_size(with_units, Stated(None, "zyx", [size] * 3, ["um"] * 3)):
+            raise ScanError(f"{files[0].name} states another pixel size than the {size:g} um of {log} in {path}")
         first = first._replace(steps=[step * size, size, size], units=["um"] * 3, guesses=())
         notes += (f"The voxel size is that of {log}.",)
-    values, axes = np.stack(planes), "zyxs"[: planes[0].ndim + 1]
-    values, gaps = _place_slices(values, [name.stem for name in names])
+    axes = "zyxs"[: planes[0].ndim + 1]
+    values, gaps = _place_slices(np.stack(planes), [file.stem for file in files])
     return first._replace(array=values, axes=axes, gaps=gaps, notes=(*first.notes, *notes))
 
 
 def _list_slices(path: Path) -> tuple[list[Path], tuple[str, ...]]:
-    """Return the slices of a folder in order, and a note on images that are none."""
+    """Return the images of a folder that are slices, in order, and notes on other images and on JPEG."""
     files = [p for p in path.iterdir() if p.suffix.lower() in SLICES and not p.name.startswith(".")]
-    kind = Counter(p.suffix.lower()[:4] for p in files).most_common(1)[0][0]
-    names = [p for p in files if p.suffix.lower()[:4] == kind and not p.stem.lower().endswith("_spr")]
-    aside = sorted(p.name for p in set(files) - set(names))
-    if not names:
-        raise ScanError(f"the folder {path} holds no slices but a preview, {aside[0]}")
-    listed = ", ".join(aside[:3]) + (", …" if len(aside) > 3 else "")
-    notes = (f"Not taken for slices: {listed}.",) if aside else ()
-    notes += ("JPEG keeps grey values only roughly.",) if kind in (".jpg", ".jpe") else ()
-    return sorted(names, key=lambda p: natural_key(p.name)), notes
+    # The most common format counts, by four characters: .tif and .tiff are one. NRecon's preview is named _spr.
+    suffix = Counter(p.suffix.lower()[:4] for p in files).most_common(1)[0][0]
+    slices = [p for p in files if p.suffix.lower()[:4] == suffix and not p.stem.lower().endswith("_spr")]
+    ignored = sorted(p.name for p in set(files) - set(slices))
+    if not slices:
+        raise ScanError(f"the folder {path} holds no slices but a preview, {ignored[0]}")
+    listed = ", ".join(ignored[:3]) + (", …" if len(ignored) > 3 else "")
+    notes = (f"Not taken for slices: {listed}.",) if ignored else ()
+    notes += ("JPEG keeps grey values only roughly.",) if suffix in (".jpg", ".jpe") else ()
+    return sorted(slices, key=lambda p: natural_key(p.name)), notes
 
 
 def _read_picture(path: Path) -> Stated:
-    """Read a BMP, PNG or JPEG; equal colours are grey, and transparency is left out."""
+    """Read a BMP, PNG or JPEG, without transparency; colours become grey values if all channels are equal."""
     import imagecodecs
     from PIL import Image
 
@@ -279,24 +278,25 @@ def _read_picture(path: Path) -> Stated:
     if values.ndim == 2:
         return Stated(values, "yx")
     values = values[..., : 3 if values.shape[2] > 2 else 1]
-    grey = bool((values == values[..., :1]).all())
-    return Stated(values[..., 0], "yx") if grey else Stated(values, "yxs")
+    is_grey = bool((values == values[..., :1]).all())
+    return Stated(values[..., 0], "yx") if is_grey else Stated(values, "yxs")
 
 
-def _are_same(one: Stated, other: Stated) -> bool:
-    """Return whether two slices state the same pixel size, in any unit, or none."""
-    if one.steps is None or other.steps is None:
-        return one.steps is other.steps
-    lengths = [
-        [h if not is_unit(unit) or unit in (None, "voxel") else convert_length(h, unit, "um") for h, unit in each]
-        for each in (list(zip(stated.steps or (), stated.units, strict=True))[-2:] for stated in (one, other))
-    ]
-    return np.allclose(*lengths, rtol=_SAME)
+def _have_same_size(first: Stated, second: Stated) -> bool:
+    """Return whether two slices state the same pixel size, in any units, or both state none."""
+    if first.steps is None or second.steps is None:
+        return first.steps is second.steps
+    return np.allclose(_pixel_size(first), _pixel_size(second), rtol=_SAME)
+
+
+def _pixel_size(stated: Stated) -> list[float]:
+    """Return a slice's pixel edges (y, x), in um if their units are known."""
+    edges = list(zip(stated.steps or (), stated.units, strict=True))[-2:]
+    return [h if not is_unit(unit) or unit in (None, "voxel") else convert_length(h, unit, "um") for h, unit in edges]
 
 
 def _read_logs(path: Path) -> tuple[float, float, str] | None:
-    """Return the pixel size in um of NRecon's logs in a folder, pixels from slice to slice, and the name of one; None
-    where there is none."""
+    """Return pixel size in um, distance of slices in pixels, and name of NRecon's log in a folder; None without one."""
     sizes: dict[float, tuple[float, str]] = {}
     for log in sorted(p for p in path.iterdir() if p.suffix.lower() == ".log" and p.is_file()):
         text = log.read_text(encoding="latin-1")
@@ -320,19 +320,21 @@ def _squeeze_plane(stated: Stated) -> np.ndarray:
 
 
 def _place_slices(values: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return slices as a volume, and a sentence on numbers that are skipped, if the names differ in their last one."""
-    parts = [re.fullmatch(r"(.*?)(\d{1,15})(\D*)", name) for name in names]
-    if len(names) < 2 or None in parts or len({(part[1], part[3]) for part in parts if part}) > 1:
+    """Return slices (n, Y, X) as a volume, with empty ones at skipped numbers if they hold labels, and a note."""
+    # A slice's number is the last one of its name; names that differ in more state none.
+    matches = [re.fullmatch(r"(.*?)(\d{1,15})(\D*)", name) for name in names]
+    if len(names) < 2 or None in matches or len({(match[1], match[3]) for match in matches if match}) > 1:
         return values, ()
-    numbers = np.array([int(part[2]) for part in parts if part])
+    numbers = np.array([int(match[2]) for match in matches if match])
     steps, count = np.diff(numbers), int(np.ptp(numbers)) + 1
-    at = int(steps.argmax())
-    if steps.min() < 1 or steps[at] == 1:
+    widest = int(steps.argmax())
+    if steps.min() < 1 or steps[widest] == 1:
         return values, ()
-    if steps[at] == steps.min() and len(names) > 2:
-        return values, (f"The numbers of the slices step by {steps[at]}: what is there is stacked.",)
-    if len(names) >= _MOST * count or count > _LONGEST or len(np.unique(values)) > _LABELS:
-        return values, (f"The numbers of the slices skip some, after {names[at]} for one: what is there is stacked.",)
+    if steps[widest] == steps.min() and len(names) > 2:
+        return values, (f"The numbers of the slices step by {steps[widest]}: what is there is stacked.",)
+    if len(names) >= _MOST * count or count > _LONGEST or len(np.unique(values)) > _LABELS:  # not sparse annotations
+        example = names[widest]
+        return values, (f"The numbers of the slices skip some, after {example} for one: what is there is stacked.",)
     base.check_array((count, *values.shape[1:]), values.dtype, "a folder of slices")
     placed = np.zeros((count, *values.shape[1:]), values.dtype)
     placed[numbers - numbers[0]] = values
