@@ -37,28 +37,30 @@ def write_npy(field: Any, path: Path) -> None:
 
 
 def read_npz(path: Path, *, key: str | None = None, **_: object) -> Stated:
-    """Read the array of an NPZ file that a key names, and what arrays named like `spacing` say of its voxels."""
+    """Read the array of an NPZ file that a key names, with the voxel size that arrays named like `spacing` state."""
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
-        described = [name for name in names if name != key and _states_place(archive, name)]
-        values = read_member(archive, f"{base.pick_key([n for n in names if n not in described], key, path)}.npy")
-        place = {name: read_member(archive, f"{name}.npy") for name in described}
-    return Stated(values, "?" * values.ndim, **base.read_spacing(place, values.ndim))
+        attribute_names = [name for name in names if name != key and _is_attribute(archive, name)]
+        keys = [name for name in names if name not in attribute_names]
+        values = read_member(archive, f"{base.pick_key(keys, key, path)}.npy")
+        attributes = {name: read_member(archive, f"{name}.npy") for name in attribute_names}
+    return Stated(values, "?" * values.ndim, **base.read_spacing(attributes, values.ndim))
 
 
-def _states_place(archive: zipfile.ZipFile, name: str) -> bool:
-    """Return whether an array is named like a spacing or a unit, and is a few numbers, or text."""
-    if not (unit := name in ("unit", "units")) and not base.is_place_name(name):
+def _is_attribute(archive: zipfile.ZipFile, name: str) -> bool:
+    """Return whether an array is named like a spacing and is a few numbers, or is named like a unit and is text."""
+    is_unit_name = name in ("unit", "units")
+    if not is_unit_name and not base.is_place_name(name):
         return False
     with archive.open(f"{name}.npy") as stream:
         version = np.lib.format.read_magic(stream)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = read(stream)
-    return dtype.kind in ("US" if unit else "iuf") and len(shape) <= 1 and math.prod(shape) <= 99
+    return dtype.kind in ("US" if is_unit_name else "iuf") and len(shape) <= 1 and math.prod(shape) <= 99
 
 
 def read_hdf5(path: Path, *, key: str | None = None, **_: object) -> Stated:
-    """Read a dataset, with the axes of `axistags` or of its dimensions' labels, and what `read_spacing` finds."""
+    """Read a dataset, its axes from `axistags` or dimension labels, and its spacing from attributes or `axistags`."""
     import h5py
 
     file = h5py.File(path, "r")
@@ -68,20 +70,19 @@ def read_hdf5(path: Path, *, key: str | None = None, **_: object) -> Stated:
     tags = tags if len(tags) == dataset.ndim else []
     labels = [dimension.label for dimension in dataset.dims]
     names = [str(tag["key"]) for tag in tags] or labels
-    axes, place = base.name_axes(names), base.read_spacing(dataset.attrs, dataset.ndim)
+    axes, geometry = base.name_axes(names), base.read_spacing(dataset.attrs, dataset.ndim)
     if tags and any(labels) and base.name_axes(labels) != axes:
-        raise ScanError(
-            f"{path} calls its axes {', '.join(names)} in axistags, and {', '.join(labels)} in their labels"
-        )
+        listed = f"{', '.join(names)} in axistags, and {', '.join(labels)} in their labels"
+        raise ScanError(f"{path} calls its axes {listed}")
     steps = [float(tag.get("resolution") or 0) for tag in tags]
-    if "steps" not in place and tags and all(h > 0 for h, axis in zip(steps, axes, strict=True) if axis in "zyx"):
+    if "steps" not in geometry and tags and all(h > 0 for h, axis in zip(steps, axes, strict=True) if axis in "zyx"):
         units = [text if is_unit(text := str(tag.get("description") or "")) else None for tag in tags]
-        place |= {"steps": [h or 1.0 for h in steps], "units": units}
-    return Stated(dataset, axes, **place, gaps=tuple(_gaps(dataset, path)))
+        geometry |= {"steps": [h or 1.0 for h in steps], "units": units}
+    return Stated(dataset, axes, **geometry, gaps=tuple(_describe_gaps(dataset, path)))
 
 
 def read_imaris(path: Path, *, key: str | None = None, **_: object) -> Stated:
-    """Read a channel (key `TimePoint 0/Channel 1`) of an Imaris file, without voxels that fill up its last chunks."""
+    """Read a channel (key `TimePoint 0/Channel 1`) of an Imaris file, without the padding of its last chunks."""
     import h5py
 
     level = "DataSet/ResolutionLevel 0/"
@@ -92,12 +93,12 @@ def read_imaris(path: Path, *, key: str | None = None, **_: object) -> Stated:
     dataset, image = channel["Data"], file["DataSetInfo/Image"]
     _check_dataset(dataset, path)
     shape = tuple(int(_read_text(channel, f"ImageSize{axis}")) for axis in "ZYX")
-    ends = [[float(_read_text(image, f"Ext{end}{k}")) for k in (2, 1, 0)] for end in ("Min", "Max")]
+    lower, upper = ([float(_read_text(image, f"Ext{end}{k}")) for k in (2, 1, 0)] for end in ("Min", "Max"))
     if len(dataset.shape) != 3 or not all(0 < n <= stored for n, stored in zip(shape, dataset.shape, strict=True)):
         raise base.Damaged(f"{list(shape)} voxels by its header, {list(dataset.shape)} in the file")
-    steps = [(last - first) / n for first, last, n in zip(*ends, shape, strict=True)]
+    steps = [(high - low) / n for low, high, n in zip(lower, upper, shape, strict=True)]
     unit = _read_text(image, "Unit") if "Unit" in image.attrs else "um"
-    return Stated(Corner(dataset, shape), "zyx", steps, (unit,) * 3, gaps=tuple(_gaps(dataset, path)))
+    return Stated(Corner(dataset, shape), "zyx", steps, (unit,) * 3, gaps=tuple(_describe_gaps(dataset, path)))
 
 
 class Corner:
@@ -132,25 +133,25 @@ def _read_text(item: Any, name: str) -> str:
     return np.asarray(item.attrs[name]).astype("S").tobytes().decode("latin-1").strip("\0 ")
 
 
-def _gaps(dataset: Any, path: Path) -> Iterator[str]:
-    """Yield sentences on the parts of a dataset that are not in the file: HDF5 fills them in and says nothing."""
+def _describe_gaps(dataset: Any, path: Path) -> Iterator[str]:
+    """Yield a sentence if values of a dataset are not stored: HDF5 fills them in silently."""
     fill = f"their voxels have the fill value {dataset.fillvalue}."
     if dataset.is_virtual:
-        files = {source.file_name for source in dataset.virtual_sources()} - {"."}
-        missing = sorted(name for name in files if not base.check_regular(path.parent / name).exists())
-        if missing:
-            yield f"{len(missing)} of its {len(files)} source files are not there, {missing[0][:80]} among them; {fill}"
+        files = {source.file_name for source in dataset.virtual_sources()} - {"."}  # "." is the file itself
+        absent = sorted(name for name in files if not base.check_regular(path.parent / name).exists())
+        if absent:
+            yield f"{len(absent)} of its {len(files)} source files are not there, {absent[0][:80]} among them; {fill}"
     elif dataset.chunks:
         count = math.prod(-(-n // chunk) for n, chunk in zip(dataset.shape, dataset.chunks, strict=True))
-        missing = count - dataset.id.get_num_chunks()
-        if missing > 0:
-            yield f"{missing} of {count} chunks are not stored: {fill}"
+        unstored = count - dataset.id.get_num_chunks()
+        if unstored > 0:
+            yield f"{unstored} of {count} chunks are not stored: {fill}"
     elif dataset.size and not dataset.id.get_storage_size():
         yield f"No values are stored: {fill}"
 
 
 def read_raw(path: Path, *, raw_shape: Sequence[int] | None = None, dtype: str | None = None, **_: object) -> Stated:
-    """Read bare numbers, x fastest; shape and type come from the caller (one byte per voxel needs no type)."""
+    """Read numbers without a header, x fastest, of the given shape and type, by default one byte per voxel."""
     if raw_shape is None:
         raise ScanError(f"{path} holds bare numbers: give raw_shape (--raw-shape Z,Y,X)")
     shape = tuple(int(n) for n in raw_shape)
@@ -160,17 +161,17 @@ def read_raw(path: Path, *, raw_shape: Sequence[int] | None = None, dtype: str |
     if dtype is None and size != math.prod(shape):
         raise ScanError(f"{path} has {size / math.prod(shape):.4g} bytes a voxel: give dtype (--dtype)")
     try:
-        kind = np.dtype(dtype or "uint8")
+        number_type = np.dtype(dtype or "uint8")
     except TypeError:
         raise ScanError(f"dtype must be one of {_RAW_TYPES}, got {quoted(dtype)}") from None
-    if size != (nbytes := math.prod(shape) * kind.itemsize):
-        raise ScanError(f"shape {shape} of {kind} takes {nbytes} bytes, got {size} in {path}")
-    return Stated(base.map_numbers(path, 0, shape, kind), "zyx")
+    if size != (nbytes := math.prod(shape) * number_type.itemsize):
+        raise ScanError(f"shape {shape} of {number_type} takes {nbytes} bytes, got {size} in {path}")
+    return Stated(base.map_numbers(path, 0, shape, number_type), "zyx")
 
 
 def read_microscope(path: Path, *, key: str | None = None, **_: object) -> Stated:
     """Read a scene (`key`), by default the only one, with the voxel size in um that its file states."""
-    for module in (MICROSCOPES[path.suffix.lower()], "bioio"):
+    for module in (MICROSCOPES[path.suffix.lower()], "bioio"):  # the format's reader is only a plugin of bioio
         bioio = require(module, "microscopes", f"reading {path.suffix}")
     image = bioio.BioImage(path)
     image.set_scene(base.pick_key(list(image.scenes), key, path))

@@ -14,7 +14,7 @@ import numpy as np
 from curvafit.core.units import parse_unit
 from curvafit.volumes.formats.base import ScanError, Stated, collect_complaints, map_numbers, read_numbers
 
-#: Bytes of one member of a compressed file.
+#: Uncompressed bytes in each member of a gzip file.
 MEMBER = 2**28
 #: Our unit -> (NIfTI's, factor to it).
 _TO_FILE = {"voxel": ("unknown", 1.0), "nm": ("micron", 1e-3), "um": ("micron", 1.0)}
@@ -22,7 +22,7 @@ _TO_FILE |= {"mm": ("mm", 1.0), "m": ("meter", 1.0)}
 
 
 def read_nifti(path: Path, **_: object) -> Stated:
-    """Read values, zooms, unit and affine; without a unit, lengths that are stated are taken for mm, as is usual."""
+    """Read values, voxel sizes, unit and affine; lengths without a unit are taken to be in mm, as is usual."""
     import nibabel
 
     with collect_complaints("nibabel.global") as repairs:
@@ -32,39 +32,41 @@ def read_nifti(path: Path, **_: object) -> Stated:
     if len(zooms) < 3:
         raise ScanError(f"a volume must be 3D, got {len(image.shape)}D of shape {image.shape[::-1]} in {path}")
     forms = [image.get_sform(coded=True)[0], image.get_qform(coded=True)[0]]  # None where the code is 0
-    placed = any(form is not None for form in forms)
-    steps, unit, custom = zooms[::-1], header.get_xyzt_units()[0], "voxel"
+    has_affine = any(form is not None for form in forms)
+    steps = zooms[::-1]
+    unit, implied_unit = header.get_xyzt_units()[0], "voxel"
     guesses = [f"The file's header is mended: {text}." for text in dict.fromkeys(repairs)]
-    if own := _own_unit(header):
-        unit, factor = own
+    if described := _described_unit(header):
+        unit, factor = described
         affine[:3] *= factor
         steps = tuple(h * factor for h in zooms[::-1])
     elif unit == "unknown":
         unit = None
-        if any(h != 1 for h in zooms) or (placed and not np.allclose(affine, np.eye(4))):
-            custom = "mm"
+        if any(h != 1 for h in zooms) or (has_affine and not np.allclose(affine, np.eye(4))):
+            implied_unit = "mm"
             guesses.append("The file names no unit of length: mm is assumed.")
         else:
             steps = None
-    if placed and steps is not None and not np.allclose(np.linalg.norm(affine[:3, :3], axis=0)[::-1], steps, rtol=0.01):
+    lengths = np.linalg.norm(affine[:3, :3], axis=0)[::-1]
+    if has_affine and steps is not None and not np.allclose(lengths, steps, rtol=0.01):
         guesses.append("The file's affine and voxel sizes disagree: the voxel sizes are used.")
     notes: tuple[str, ...] = ()
     if all(form is not None for form in forms) and not np.allclose(*forms, rtol=1e-3, atol=0.01 * min(zooms)):
         notes = ("The file states two places that differ, an sform and a qform: the sform is used.",)
     array, axes = _open_values(image, path)
-    affine = affine if placed else None  # nibabel would make one up, with x from right to left
-    return Stated(array, axes, steps, (unit,) * 3, None, affine, custom, notes, tuple(guesses))
+    affine = affine if has_affine else None  # nibabel would make one up, with x from right to left
+    return Stated(array, axes, steps, (unit,) * 3, None, affine, implied_unit, notes, tuple(guesses))
 
 
 def _open_values(image: Any, path: Path) -> tuple[Any, str]:
-    """Return the scaled values, z first, and the letters of their axes; of a file that is not compressed, unread."""
+    """Return the scaled values, z first, and the letters of their axes; an uncompressed file is mapped, not read."""
     proxy, compressed = image.dataobj, path.name.lower().endswith(".gz")
     shape = proxy.shape[::-1]
-    # Of axes beyond space NIfTI's fourth is time, but programs use it for channels: it is that of channels where no
-    # other has more than one entry, unless the header has a unit of time.
+    # NIfTI's fourth axis is time, but programs use it for channels: it is taken for channels where no other axis beyond
+    # space has more than one entry, unless the header has a unit of time.
     long = [axis for axis, n in enumerate(shape[:-3]) if n != 1]
-    timed = len(long) > 1 or image.header.get_xyzt_units()[1] in ("sec", "msec", "usec")
-    time = long[-1] if long and long[-1] == len(shape) - 4 and timed else None
+    has_times = len(long) > 1 or image.header.get_xyzt_units()[1] in ("sec", "msec", "usec")
+    time = long[-1] if long and long[-1] == len(shape) - 4 and has_times else None
     channel = next((axis for axis in long if axis != time), None)
     letters = ("t" if axis == time else "c" if axis == channel else "?" for axis in range(len(shape) - 3))
     if compressed:
@@ -122,10 +124,10 @@ def affine_in_file(field: Any) -> np.ndarray:
 
 
 def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | None = None) -> None:
-    """Write values (Z, Y, X) with the header of another NIfTI file of that shape: affines, codes and zooms to the bit.
+    """Write values (Z, Y, X) with the header of another NIfTI file of that shape: same affines, codes and voxel sizes.
 
-    Only the values' type, scale, range and intent are new, and the unit if one is given and the header has none: it
-    names the lengths in the header. NIfTI has neither nm nor cm: lengths in these are converted.
+    Only the values' type, scale, range and intent are new. A given unit becomes that of the header's lengths if it has
+    none; NIfTI has neither nm nor cm: lengths in these are converted.
     """
     import nibabel
 
@@ -138,9 +140,9 @@ def write_nifti_like(values: np.ndarray, like: Path, path: Path, unit: str | Non
     header.set_slope_inter(1, 0)
     header.set_intent("none")
     header["cal_min"] = header["cal_max"] = 0
-    stated = (_own_unit(header) or header.get_xyzt_units())[0]
-    if unit is not None and stated in ("voxel", "unknown"):
-        _name_unit(header, unit)
+    header_unit = (_described_unit(header) or header.get_xyzt_units())[0]
+    if unit is not None and header_unit in ("voxel", "unknown"):
+        _set_unit(header, unit)
     _save(type(image)(values.T.reshape(image.shape), None, header), path)
 
 
@@ -150,15 +152,15 @@ def _save(image: Any, path: Path) -> None:
 
     buffer = io.BytesIO()
     image.to_stream(buffer)
-    content, compression = buffer.getbuffer(), path.name.lower().endswith(".gz")
+    content, compressed = buffer.getbuffer(), path.name.lower().endswith(".gz")
     with path.open("wb") as stream:
-        for first in range(0, len(content), MEMBER):
-            part = content[first : first + MEMBER]
-            stream.write(gzip_encode(bytes(part), level=1) if compression else part)
+        for start in range(0, len(content), MEMBER):
+            member = content[start : start + MEMBER]
+            stream.write(gzip_encode(bytes(member), level=1) if compressed else member)
 
 
-def _own_unit(header: Any) -> tuple[str, float] | None:
-    """Return a unit that NIfTI has no code for, as `write_nifti` noted it in the description, and the factor to it."""
+def _described_unit(header: Any) -> tuple[str, float] | None:
+    """Return the unit without a NIfTI code that `write_nifti` wrote into the description, and the factor to it."""
     match = re.match(r"curvafit unit=(\w+)", bytes(header["descrip"]).decode("latin-1"))
     if match is None:
         return None
@@ -166,15 +168,15 @@ def _own_unit(header: Any) -> tuple[str, float] | None:
     return unit, 1 / _TO_FILE[unit][1]
 
 
-def _name_unit(header: Any, unit: str) -> None:
-    """Name the unit of the lengths in a header; the numbers stay where NIfTI has the unit."""
+def _set_unit(header: Any, unit: str) -> None:
+    """Set the unit of the lengths in a header, which are scaled only if NIfTI lacks the unit."""
     name, factor = parse_unit(unit)
-    code, into = _TO_FILE[name]
-    scale, own = factor * into, _own_unit(header)
+    code, code_factor = _TO_FILE[name]
+    scale, described = factor * code_factor, _described_unit(header)
     header.set_xyzt_units(code, header.get_xyzt_units()[1])
     if scale != 1:
         header["pixdim"][1:4] *= scale
         for key in ("srow_x", "srow_y", "srow_z", "qoffset_x", "qoffset_y", "qoffset_z"):
             header[key] = header[key] * scale
-    if own or name in ("voxel", "nm"):
+    if described or name in ("voxel", "nm"):  # an older description must not contradict the code
         header["descrip"] = f"curvafit unit={name}".encode() if name in ("voxel", "nm") else b""
