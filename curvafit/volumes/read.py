@@ -392,11 +392,10 @@ def _pick_numbers(
 
 
 def _take_zyx(values: Sequence[Any] | None, order: Sequence[int], axes: str) -> Any:
-    """Return the values along z, y and x, from values along these three or along all axes, of which z may have length 1
-    where another axis is taken for it."""
+    """Return the values along z, y and x, from values along these three or along all axes of an array."""
     if values is None or len(values) != len(axes):
         return values
-    z = axes.index("z") if "z" in axes else order[0]
+    z = axes.index("z") if "z" in axes else order[0]  # a stated z counts, even if another axis is taken for it
     return values[z], values[order[1]], values[order[2]]
 
 
@@ -405,8 +404,7 @@ def _find_lengths(
 ) -> tuple[np.ndarray, str, np.ndarray, tuple[str, ...]]:
     """Return voxel edges (z, y, x), their unit, factors (3,) from the file's units to it, and a note.
 
-    If the caller states a unit but no spacing, lengths are converted to it where the file names a unit, and else taken
-    to be in it.
+    A caller's unit without a spacing converts the lengths of a file that names their unit, and is taken for others.
     """
     axis_units = _take_zyx(stated.units, order, stated.axes)
     common, factors = common_unit([axis_unit or stated.custom for axis_unit in axis_units])
@@ -444,10 +442,8 @@ def _check_angles(matrix: np.ndarray, source: str) -> None:
     if not np.isfinite(cosine):
         raise ScanError(f"the axes of {source} are no numbers: give --spacing")
     if cosine > RIGHT:
-        angle = np.degrees(np.arccos(min(cosine, 1.0)))
-        raise ScanError(
-            f"the axes of {source} meet at {angle:.3g}°, not at right angles: resample it, or give --spacing"
-        )
+        angle = f"{np.degrees(np.arccos(min(cosine, 1.0))):.3g}°"
+        raise ScanError(f"the axes of {source} meet at {angle}, not at right angles: resample it, or give --spacing")
 
 
 # ---- parameters that vary in space -----------------------------------------------------------------------------------

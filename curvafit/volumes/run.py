@@ -122,7 +122,6 @@ class RunArray:
 
 
 def _compute_record(function: Callable[[int], Record], one_threaded: bool, number: int) -> tuple[int, Record]:
-    """Return the number of a block and its record."""
     with one_thread() if one_threaded else nullcontext():
         return number, function(number)
 

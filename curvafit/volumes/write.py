@@ -111,9 +111,8 @@ def is_streamed(path: Path) -> bool:
 
 def note_lost(path: Path, volume: Volume) -> tuple[str, ...]:
     """Return a note on the parts of a volume's position and axes that the format of `path` does not hold, if any."""
-    name, shifted = path.name.lower(), any(first_voxel(volume))
+    name, shifted = path.name.lower(), any(first_voxel(volume))  # which is 0 where axes are rotated
     unrotated = np.diag([*volume.spacing[::-1], 1.0])
-    # `first_voxel` is 0 where axes are rotated: an affine that is not shifted and not this one is rotated.
     rotated = volume.affine is not None and not shifted and not np.allclose(volume.affine, unrotated, rtol=1e-5)
     if name.endswith(".npy"):
         lost = "voxel size and place" if volume.affine is not None or volume.unit != "voxel" else ""

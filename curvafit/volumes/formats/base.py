@@ -112,10 +112,9 @@ def pick_key(keys: list[str], key: str | None, path: object) -> str:
 
 
 def read_spacing(attributes: Mapping[str, Any], ndim: int) -> dict[str, Any]:
-    """Return steps, units and origin from an array's attributes, as fields of `Stated`, unchecked.
+    """Return steps, units and origin from an array's attributes, unchecked; one number counts for all axes.
 
-    One number counts for all axes. `resolution` and `offset` are CREMI's. A note names what looks like a spacing and is
-    not used.
+    `resolution` and `offset` are CREMI's. A note names what looks like a spacing and is not used.
     """
     names = ("element_size_um", "spacing", "voxel_size", "resolution")
     used = next((name for name in names if name in attributes), "")

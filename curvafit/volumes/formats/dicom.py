@@ -76,15 +76,14 @@ def _stack(planes: list[_Plane], path: Path) -> Stated:
     """Stack slices in the order of their positions, or of their numbers where none has a position."""
     if len(planes) < 2:
         raise ScanError(f"a DICOM series must have several slices, got {len(planes)} in {path}")
-    has_position = [plane.position is not None and plane.directions is not None for plane in planes]
-    if any(has_position) and not all(has_position):
-        count = has_position.count(False)
-        raise ScanError(f"DICOM slices must all state a position, got {count} without one in {path}")
+    positioned = [plane.position is not None and plane.directions is not None for plane in planes]
+    if any(positioned) and not all(positioned):
+        raise ScanError(f"DICOM slices must all state a position, got {positioned.count(False)} without one in {path}")
     for name, attribute in (("directions", "ImageOrientationPatient"), ("spacing", "PixelSpacing")):
         arrays = [array for plane in planes if (array := getattr(plane, name)) is not None]
         if arrays and np.ptp(np.array(arrays), axis=0).max() > 1e-3 * np.abs(arrays).max():
             raise ScanError(f"DICOM slices must have one {attribute}, got several in {path}")
-    if not any(has_position):
+    if not any(positioned):
         planes = sorted(planes, key=lambda plane: plane.number)
         notes = ["The slices state no position: they are stacked in the order of their numbers."]
         if (spacing := planes[0].spacing) is not None:

@@ -27,11 +27,8 @@ from curvafit.volumes.formats import base
 from curvafit.volumes.formats.base import LPS_TO_RAS, ScanError, Stated
 
 #: NRRD's encodings that are read -> the function that makes a stream of a file.
-_NRRD_ENCODINGS: dict[str, Callable[[Any], Any]] = {
-    "raw": lambda file: file,
-    **dict.fromkeys(("gzip", "gz"), gzip.open),
-    **dict.fromkeys(("bzip2", "bz2"), bz2.open),
-}
+_NRRD_ENCODINGS: dict[str, Callable[[Any], Any]] = {"raw": lambda file: file}
+_NRRD_ENCODINGS |= {"gzip": gzip.open, "gz": gzip.open, "bzip2": bz2.open, "bz2": bz2.open}
 #: NRRD's fields that files spell with or without the space.
 _SPACED = ("data file", "line skip", "byte skip", "axis mins", "axis maxs", "old min", "old max")
 #: MetaImage's types -> numpy's.
@@ -372,7 +369,6 @@ def read_aim(path: Path, **_: object) -> Stated:
 
 
 def _read_head(path: Path, size: int) -> bytes:
-    """Return the first bytes of a file."""
     with path.open("rb") as file:
         head = file.read(size)
     if len(head) < size:

@@ -79,11 +79,9 @@ def _calibrate(values: np.ndarray, metadata: Mapping[str, Any]) -> tuple[np.ndar
 
 def _check_pages(file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> None:
     """Raise Damaged where pages, strips or tiles are missing or beyond the end: tifffile fills them with zeros."""
-    metadata = file.imagej_metadata or {}
-    if file.is_imagej and int(metadata.get("images", 1)) > math.prod(series.shape[:-2]):
-        raise base.Damaged(
-            f"{metadata['images']} images by its description, {math.prod(series.shape[:-2])} in the file"
-        )
+    metadata, count = file.imagej_metadata or {}, math.prod(series.shape[:-2])
+    if file.is_imagej and int(metadata.get("images", 1)) > count:
+        raise base.Damaged(f"{metadata['images']} images by its description, {count} in the file")
     if series.dataoffset is not None:  # all values are contiguous, whatever the pages say
         nbytes = math.prod(series.shape) * np.dtype(series.dtype).itemsize
         if series.dataoffset + nbytes > file.filehandle.size:
@@ -94,7 +92,7 @@ def _check_pages(file: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> No
             raise base.Damaged(f"page {number} is not there")
         size = page.parent.filehandle.size  # a series may have its pages in several files
         segments = list(zip(page.dataoffsets, page.databytecounts, strict=False))
-        in_file = all(start > 0 and count > 0 and start + count <= size for start, count in segments)
+        in_file = all(start > 0 and length > 0 and start + length <= size for start, length in segments)
         if not in_file or len(segments) < (1 if page.is_contiguous else math.prod(page.chunked)):
             raise base.Damaged(f"strips or tiles of page {number} are not there")
 
@@ -327,14 +325,13 @@ def _place_slices(values: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray,
         return values, ()
     numbers = np.array([int(match[2]) for match in matches if match])
     steps, count = np.diff(numbers), int(np.ptp(numbers)) + 1
-    widest = int(steps.argmax())
-    if steps.min() < 1 or steps[widest] == 1:
+    gap = int(steps.argmax())
+    if steps.min() < 1 or steps[gap] == 1:
         return values, ()
-    if steps[widest] == steps.min() and len(names) > 2:
-        return values, (f"The numbers of the slices step by {steps[widest]}: what is there is stacked.",)
-    if len(names) >= _MOST * count or count > _LONGEST or len(np.unique(values)) > _LABELS:  # not sparse annotations
-        example = names[widest]
-        return values, (f"The numbers of the slices skip some, after {example} for one: what is there is stacked.",)
+    if steps[gap] == steps.min() and len(names) > 2:
+        return values, (f"The numbers of the slices step by {steps[gap]}: what is there is stacked.",)
+    if len(names) >= _MOST * count or count > _LONGEST or len(np.unique(values)) > _LABELS:
+        return values, (f"The numbers of the slices skip some, after {names[gap]} for one: what is there is stacked.",)
     base.check_array((count, *values.shape[1:]), values.dtype, "a folder of slices")
     placed = np.zeros((count, *values.shape[1:]), values.dtype)
     placed[numbers - numbers[0]] = values
