@@ -133,41 +133,42 @@ class Measures(Pictured):
     compartments: Mapping[int, Measures] = default(default_factory=dict)
 
     def __repr__(self) -> str:
-        some = ", ".join(f"{each.symbol} {each.value:.4g}" for each in self.quantities[:4])
-        return f"Measures({some}, in {self.unit}, of {self.source or 'an array'})"
+        values = ", ".join(f"{quantity.symbol} {quantity.value:.4g}" for quantity in self.quantities[:4])
+        return f"Measures({values}, in {self.unit}, of {self.source or 'an array'})"
 
     def _repr_html_(self) -> str:
         """Return a table, with a column of values for each compartment where there are some."""
-        parts = [*self.compartments.values()] or [self]
-        heads = [" ".join(map(str, part.part or ("value",))) for part in parts]
-        rows = [("", "", *heads, "")]
-        for same in zip(*(part.quantities for part in parts), strict=True):
-            texts = [each.format(self.unit) for each in same]
-            rows.append((same[0].name, same[0].symbol, *(f"{value} {half}" for value, half, _ in texts), texts[0][2]))
+        columns = [*self.compartments.values()] or [self]
+        titles = [" ".join(map(str, column.part or ("value",))) for column in columns]
+        rows = [("", "", *titles, "")]
+        for quantities in zip(*(column.quantities for column in columns), strict=True):
+            texts = [quantity.format(self.unit) for quantity in quantities]
+            values = [f"{value} {interval}" for value, interval, _ in texts]
+            rows.append((quantities[0].name, quantities[0].symbol, *values, texts[0][2]))
         lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
         return f"<code>{escape(repr(self))}</code><table><tr>{'</tr><tr>'.join(lines)}</tr></table>"
 
     def to_frame(self) -> Any:
         """Return the numbers as a pandas data frame, as tables have them; ImportError where pandas is missing."""
-        rows = [row for part in self.compartments.values() or (self,) for row in part.rows()]
+        rows = [row for measures in self.compartments.values() or (self,) for row in measures.rows()]
         return require("pandas", "tables", "a data frame").DataFrame(rows)
 
     def rows(self, **more: str | float) -> list[dict[str, Any]]:
-        """Return a row for each quantity, as values by column; None where a number is not known.
+        """Return a row for each quantity, as values by column name; a value that is not known is None.
 
-        A compartment or an instance has its label in a column of that name. `more` are further columns with the same
-        value in each row.
+        A compartment or an instance adds a column of that name with its label. `more` adds columns whose value is the
+        same in every row.
         """
         release, (z, y, x) = version("curvafit"), self.direction
-        more = dict([self.part] if self.part else []) | more
+        shared = dict([self.part] if self.part else []) | more
         rows = []
         for quantity in self.quantities:
-            ends = (quantity.value, quantity.value - quantity.half, quantity.value + quantity.half)
-            value, low, high = (end if math.isfinite(end) else None for end in ends)
+            bounds = (quantity.value, quantity.value - quantity.half, quantity.value + quantity.half)
+            value, low, high = (bound if math.isfinite(bound) else None for bound in bounds)
             axis = f"{z:.4f} {y:.4f} {x:.4f}" if quantity.symbol == "DA" and math.isfinite(z) else ""
             unit = plain_unit(self.unit, quantity.power)
             cells = (self.source, quantity.name, quantity.symbol, value, low, high, unit, axis, release)
-            rows.append(dict(zip(COLUMNS, cells, strict=True)) | more)
+            rows.append(dict(zip(COLUMNS, cells, strict=True)) | shared)
         return rows
 
     def __getitem__(self, name: str) -> Quantity:
@@ -183,22 +184,23 @@ class Measures(Pictured):
         return self.scale(convert_length(1.0, self.unit, unit), unit)
 
     def scale(self, factor: float, unit: str) -> Measures:
-        """Return the measures of the same scan whose lengths are longer by a factor, in a unit."""
-        scaled = ((quantity, factor**quantity.power) for quantity in self.quantities)
-        quantities = (replace(each, value=each.value * by, half=each.half * by) for each, by in scaled)
+        """Return the same measures with every length multiplied by `factor`, in `unit`."""
+        powers = [factor**quantity.power for quantity in self.quantities]
+        pairs = zip(self.quantities, powers, strict=True)
+        quantities = tuple(replace(q, value=q.value * power, half=q.half * power) for q, power in pairs)
         old = self.diagram
         places = None if old.places is None else old.places * factor
         diagram = replace(old, points=old.points / factor, weights=old.weights * factor**2, places=places)
         diagram = replace(diagram, unit=f"1/{unit}", spread=old.spread / factor)
-        parts = {label: each.scale(factor, unit) for label, each in self.compartments.items()}
-        return replace(self, unit=unit, quantities=tuple(quantities), diagram=diagram, compartments=parts)
+        compartments = {label: measures.scale(factor, unit) for label, measures in self.compartments.items()}
+        return replace(self, unit=unit, quantities=quantities, diagram=diagram, compartments=compartments)
 
 
 def find_quantity(rows: Sequence[Row], name: str) -> Row:
     """Return the row of a quantity by its name or symbol; raise KeyError where there is none."""
-    for each in rows:
-        if name in (each.name, each.symbol):
-            return each
+    for row in rows:
+        if name in (row.name, row.symbol):
+            return row
     raise KeyError(f"expected one of {', '.join(row.name for row in rows)}, got {name!r}")
 
 
@@ -208,40 +210,43 @@ def summarise_sums(
     blocks: Blocks,
     table: np.ndarray,
     connectivity: tuple[float, float] | None,
-    drawn: Diagram,
+    diagram: Diagram,
     notes: tuple[str, ...],
     *,
     part: tuple[str, int] | None = None,
 ) -> Measures:
-    """Return the measures that follow from a row of `SUMS` for each block, χ and connectivity density of the whole scan
-    (None of a region), and areas over (κ1, κ2); of `frame` the source and the unit count."""
-    total, volumes = table.sum(0), table[:, SUMS.index("volume")]
-    values, names = combine(total), [name for name, *_ in QUANTITIES]
+    """Return the measures of a scan, or of a region of it, from a table (N, C): a row for each block, a column for each
+    of `SUMS`. `connectivity` is χ and connectivity density of the whole scan, None for a region; `frame` gives source
+    and unit."""
+    total = table.sum(0)
+    values = combine(total)
     if connectivity is not None:
+        names = [name for name, *_ in QUANTITIES]
         values[[names.index("Euler number"), names.index("connectivity density")]] = connectivity
         count, weights = blocks.count, None
     else:
-        # Blocks that a region fills in part count for less: (Σv)² / Σv² is their effective number.
+        # Blocks that a region fills only partly count for less: (Σv)² / Σv² is their effective number.
+        volumes = table[:, SUMS.index("volume")]
         count, weights = round(volumes.sum() ** 2 / np.square(volumes).sum()), volumes / volumes.mean()
     half_widths = errors(table, blocks, combine, weights) if count >= LEAST else np.full(len(values), np.nan)
     if count < LEAST:
-        where = "scan" if connectivity is not None else " ".join(map(str, part or ("region",)))
-        why = f"they need {LEAST} blocks of a period (thickness and spacing), and the {where} has {count}"
+        scope = "scan" if connectivity is not None else " ".join(map(str, part or ("region",)))
+        why = f"they need {LEAST} blocks of a period (thickness and spacing), and the {scope} has {count}"
         notes = (*notes, f"No intervals: {why}.")
-    rows = zip(QUANTITIES, values, half_widths, strict=True)
-    numbers = tuple(
-        Quantity(name, symbol, float(value), float(half), power) for (name, symbol, power, _), value, half in rows
+    quantities = tuple(
+        Quantity(name, symbol, float(value), float(half), power)
+        for (name, symbol, power, _), value, half in zip(QUANTITIES, values, half_widths, strict=True)
     )
     direction = find_direction(dict(zip(SUMS, total, strict=True)))
-    return Measures(frame.source, frame.unit, kind, numbers, direction, drawn, blocks.counts, notes, part)
+    return Measures(frame.source, frame.unit, kind, quantities, direction, diagram, blocks.counts, notes, part)
 
 
 class Maps(NamedTuple):
-    """What is measured at each voxel and triangle of a scan, from which `combine` makes its numbers once it is summed.
+    """What is measured at each voxel and triangle of a scan; `combine` turns its sums into the scan's quantities.
 
     `mask` is the structure on the scan's voxels; `thickness`, `gap` and `euler` (shares of χ) are on them too.
-    `surface` and `curved` are places (M, 3) in voxels from the first centre, and columns (M, C) of area and of
-    curvatures times area, as in `SUMS`. `diagram` has the whole scan's areas in its unit, at the places of `curved`.
+    `surface` and `curved` are positions (M, 3) in voxels from the first centre, and columns (M, C) of area and of
+    curvatures times area, as in `SUMS`. `diagram` has the areas of all triangles of `curved`, in the scan's unit.
     """
 
     spacing: tuple[float, float, float]
@@ -258,17 +263,18 @@ class Maps(NamedTuple):
     def sum(self, blocks: Blocks) -> np.ndarray:
         """Return sums (N, C): a row for each block, a column for each of `SUMS`."""
         ones = np.ones(self.mask.shape, dtype=bool)
-        volumes = (ones, self.mask, self.thickness, np.square(self.thickness), self.gap)
-        sums = (math.prod(self.spacing) * blocks.sums(volume) for volume in volumes)
-        surfaces = (blocks.gather(*each) for each in (self.surface, self.curved))
+        integrands = (ones, self.mask, self.thickness, np.square(self.thickness), self.gap)
+        sums = (math.prod(self.spacing) * blocks.sums(values) for values in integrands)
+        surfaces = (blocks.gather(*triangles) for triangles in (self.surface, self.curved))
         return np.column_stack([*sums, blocks.sums(self.euler), *surfaces])
 
 
 def measure_maps(
     field: Volume, kind: Kind, options: dict[str, Any], progress: Progress = silent, most: int | None = None
 ) -> Maps:
-    """Measure what is summed of a scan; `options` are the threshold, dark and periodic of `measure`. Curvature is that
-    of a part of a large scan (`preparation.prepare`), or of all of it, of up to `most` working voxels."""
+    """Measure what is summed over a scan's blocks; `options` are `threshold`, `dark` and `periodic` of `measure`.
+    Curvature is that of the part of a large scan that `preparation.prepare` chooses, or given `most`, of the whole scan
+    on at most so many working voxels."""
     periodic: bool = options["periodic"]
     progress("finding the structure", 0.0)
     detected, signed = find_structure(field, kind=kind, **options)  # type: ignore[arg-type]
@@ -280,34 +286,35 @@ def measure_maps(
         else:
             prepared = preparation.prepare_whole(detected, signed, periodic, most)
         curved, diagram = measure_curvatures(prepared)
-        working = tuple(f"Of curvature: {note}" for note in prepared.notes if note not in notes)
+        curvature_notes = tuple(f"Of curvature: {note}" for note in prepared.notes if note not in notes)
     except ValueError as reason:
         if isinstance(reason, preparation.TooLarge) or min(field.shape) >= FEWEST_SLICES:
             raise
-        curved, diagram, working = no_curvature(field.unit, TOO_THIN)
+        curved, diagram, curvature_notes = no_curvature(field.unit, TOO_THIN)
     progress("measuring thickness", 0.5)
-    thickness, gap = (local_thickness(each, field.spacing, periodic=periodic) for each in (mask, ~mask))
-    euler, surface = euler_shares(mask, periodic=periodic), measure_surface(mask, field.spacing, periodic)
-    voxels, notes = (mask, thickness, gap, euler), (*notes, *working)
-    return Maps(field.spacing, *voxels, surface, curved, diagram, detected, notes)
+    thickness, gap = (local_thickness(phase, field.spacing, periodic=periodic) for phase in (mask, ~mask))
+    euler = euler_shares(mask, periodic=periodic)
+    surface = measure_surface(mask, field.spacing, periodic)
+    notes = (*notes, *curvature_notes)
+    return Maps(field.spacing, mask, thickness, gap, euler, surface, curved, diagram, detected, notes)
 
 
 def no_curvature(unit: str, reason: object) -> tuple[tuple[np.ndarray, np.ndarray], Diagram, tuple[str, ...]]:
-    """Return what stands for curvatures that are not known, as `Maps.curved` and a diagram, and a note on why."""
+    """Return an empty `Maps.curved`, an empty diagram and a note on why curvature is not known."""
     columns = np.zeros((0, len(SUMS) - SUMS.index("curved")))
-    drawn = Diagram(np.zeros((0, 2)), np.zeros(0), f"1/{unit}", places=np.zeros((0, 3)))
-    return (np.zeros((0, 3)), columns), drawn, (f"No curvature: {reason}.",)
+    empty = Diagram(np.zeros((0, 2)), np.zeros(0), f"1/{unit}", places=np.zeros((0, 3)))
+    return (np.zeros((0, 3)), columns), empty, (f"No curvature: {reason}.",)
 
 
 def _drop_specks(kind: Kind, signed: Volume, periodic: bool) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the structure on the scan's voxels, of an image without specks, and notes."""
+    """Return the structure as a mask on the scan's voxels (of an image, without specks and pinholes), and notes."""
     mask, notes = signed.values > 0, signed.notes
     if kind == "image":
         thickness = median_thickness(mask, signed.spacing, periodic)[0]
         smallest = preparation.smallest_piece(thickness) / math.prod(signed.spacing)
-        mask, specks, holes = remove_specks(mask, smallest, periodic)
-        if specks or holes:
-            notes = (*notes, preparation.DROPPED.format(specks, holes))
+        mask, specks, pinholes = remove_specks(mask, smallest, periodic)
+        if specks or pinholes:
+            notes = (*notes, preparation.DROPPED.format(specks, pinholes))
     if mask.all() or not mask.any():
         raise ScanError("expected a structure and background in the scan, got one of them only")
     return mask, notes
@@ -316,39 +323,40 @@ def _drop_specks(kind: Kind, signed: Volume, periodic: bool) -> tuple[np.ndarray
 def measure_surface(
     mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangles' places in voxels, their areas, and n⊗n dA in the upper triangle's order (z, y, x); those at
-    a window's faces count for what lies beyond the outer voxels' centres, too (`border_weights`)."""
-    places, columns = tabulate_surface(smooth_surface(mask, spacing, periodic=periodic), spacing)
-    return places, columns if periodic else columns * border_weights(places, mask.shape)[:, None]
+    """Return the triangles' positions (M, 3) in voxels, and columns (M, 7): area, and the upper triangle of n⊗n dA.
+    Those at a window's faces also count for what lies beyond the outer voxels' centres (`border_weights`)."""
+    positions, columns = tabulate_surface(smooth_surface(mask, spacing, periodic=periodic), spacing)
+    return positions, columns if periodic else columns * border_weights(positions, mask.shape)[:, None]
 
 
 def tabulate_surface(mesh: Surface, spacing: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return what `measure_surface` does of a mesh, unweighted."""
-    normals = area_vectors(mesh)[:, ::-1]
-    area = np.linalg.norm(normals, axis=1)
-    parts = normals[:, _UPPER[0]] * normals[:, _UPPER[1]] / np.where(area > 0, area, 1)[:, None]
-    return mesh.barycentres / np.array(spacing), np.column_stack([area, parts])
+    """Return the positions and the columns of `measure_surface` of a mesh, without its weights."""
+    vectors = area_vectors(mesh)[:, ::-1]  # n dA in the order (z, y, x)
+    area = np.linalg.norm(vectors, axis=1)
+    tensors = vectors[:, _UPPER[0]] * vectors[:, _UPPER[1]] / np.where(area > 0, area, 1)[:, None]
+    return mesh.barycentres / np.array(spacing), np.column_stack([area, tensors])
 
 
 def measure_curvatures(prepared: Prepared) -> tuple[tuple[np.ndarray, np.ndarray], Diagram]:
-    """Return triangles' places in the scan's voxels, curvatures times area, and the diagram, in the scan's unit."""
+    """Return the triangles' positions (M, 3) in the scan's voxels and the columns (M, C) of `SUMS` from "curved" on,
+    which are curvatures times area; and the diagram in the scan's unit."""
     working = scan_diagram(prepared)
     length = prepared.length
     points, weights = working.points / length, working.weights * length**2
     physical = replace(working, points=points, weights=weights, unit=f"1/{prepared.unit}")
-    corners = (np.asarray(working.places) / WORKING_SPACING + 0.5) * np.array(prepared.scale)
-    voxels = corners - 0.5 + np.array(prepared.origin)
+    from_corner = (np.asarray(working.places) / WORKING_SPACING + 0.5) * np.array(prepared.scale)
+    positions = from_corner - 0.5 + np.array(prepared.origin)
     κ1, κ2 = physical.points.T
     H = (κ1 + κ2) / 2
-    kinds = np.eye(len(FAMILIES))[families(working.points, prepared.thickness / 2 * WORKING_SPACING)]
-    columns = np.column_stack([np.ones_like(H), H, H**2, κ1 * κ2, κ1, κ2, np.hypot(κ1, κ2) / math.sqrt(2), kinds])
-    return (voxels, columns * physical.weights[:, None]), physical
+    one_hot = np.eye(len(FAMILIES))[families(working.points, prepared.thickness / 2 * WORKING_SPACING)]
+    columns = np.column_stack([np.ones_like(H), H, H**2, κ1 * κ2, κ1, κ2, np.hypot(κ1, κ2) / math.sqrt(2), one_hot])
+    return (positions, columns * physical.weights[:, None]), physical
 
 
 def combine(sums: np.ndarray) -> np.ndarray:
     """Return the quantities (…, K) that follow from sums (…, C)."""
     named = dict(zip(SUMS, np.moveaxis(sums, -1, 0), strict=True))
-    with np.errstate(divide="ignore", invalid="ignore"):  # draws of blocks without surface
+    with np.errstate(divide="ignore", invalid="ignore"):  # blocks without surface
         return np.stack([figure(named) for *_, figure in QUANTITIES], axis=-1)
 
 
@@ -367,36 +375,36 @@ def _tensor(sums: Sums) -> np.ndarray:
 def _anisotropy(sums: Sums) -> np.ndarray:
     """Return 1 - smallest / largest eigenvalue of the fabric; NaN without surface."""
     tensor = _tensor(sums)
-    known = np.asarray(np.isfinite(tensor).all(axis=(-1, -2)))[..., None]
-    spectrum = np.where(known, np.linalg.eigvalsh(np.where(known[..., None], tensor, 0)), np.nan)
-    return 1 - spectrum[..., 0] / spectrum[..., 2]
+    finite = np.asarray(np.isfinite(tensor).all(axis=(-1, -2)))[..., None]
+    eigenvalues = np.where(finite, np.linalg.eigvalsh(np.where(finite[..., None], tensor, 0)), np.nan)
+    return 1 - eigenvalues[..., 0] / eigenvalues[..., 2]
 
 
 def find_direction(sums: Sums) -> tuple[float, float, float]:
     """Return the unit vector (z, y, x) to which the surface is most nearly parallel; NaN without surface."""
     if not sums["area"] > 0:
         return math.nan, math.nan, math.nan
-    _, axes = np.linalg.eigh(_tensor(sums))
-    z, y, x = (axes[:, 0] * np.sign(axes[np.abs(axes[:, 0]).argmax(), 0])).tolist()
+    axis = np.linalg.eigh(_tensor(sums))[1][:, 0]
+    z, y, x = (axis * np.sign(axis[np.abs(axis).argmax()])).tolist()  # the sign makes the largest component positive
     return z, y, x
 
 
 def scan_diagram(prepared: Prepared) -> Diagram:
-    """Measure the geometric curvature diagram of a prepared scan, of a large one tile by tile, each cell in one tile;
+    """Measure the geometric curvature diagram of a prepared scan. A large one is measured in tiles, each cell in one;
     places are in working units from the centre of the grid's first voxel."""
     grid = prepared.grid
     cuts = [[slice(None)] if grid.periodic else _cut_axis(n) for n in grid.shape]
-    parts: list[Diagram] = []
+    diagrams: list[Diagram] = []
     for tile in itertools.product(*cuts):
         with contextlib.suppress(NoSurface):
-            parts.append(_measure_tile(prepared, tile))
-    if not parts:
+            diagrams.append(_measure_tile(prepared, tile))
+    if not diagrams:
         raise NoSurface("expected a surface inside the scan, got none away from its borders")
-    return join_diagrams(parts)
+    return join_diagrams(diagrams)
 
 
 def _cut_axis(n: int) -> list[slice]:
-    """Cut an axis of n voxels into overlapping stretches whose interiors, `MARGIN` voxels in, meet in a plane."""
+    """Cut an axis of n voxels into intervals that overlap by their margins, of `MARGIN` voxels at each end."""
     count = math.ceil((n - 2 * MARGIN) / (LARGEST_WINDOW - 2 * MARGIN))
     ends = np.linspace(MARGIN, n - 1 - MARGIN, count + 1).astype(int)
     return [slice(a - MARGIN, b + MARGIN + 1) for a, b in itertools.pairwise(ends)]
@@ -407,9 +415,9 @@ def _measure_tile(prepared: Prepared, tile: tuple[slice, ...]) -> Diagram:
     z, y, x = phase.shape
     grid = Grid((z, y, x), prepared.grid.spacing, prepared.grid.boundary)
     where = None if prepared.roi is None else ndimage.binary_erosion(prepared.roi, iterations=MARGIN)[tile]
-    part = diagram(phase, grid, WORKING_EPSILON, where=where)
+    measured = diagram(phase, grid, WORKING_EPSILON, where=where)
     corner = np.array([edge.start or 0 for edge in tile]) * np.array(grid.spacing)
-    return replace(part, places=part.places + corner)
+    return replace(measured, places=measured.places + corner)
 
 
 class Reading(NamedTuple):
@@ -433,33 +441,35 @@ class Reading(NamedTuple):
 
 def read_texture(prepared: Prepared, view: str | None = None, across: Sequence[int] | None = None) -> Reading | None:
     """Measure a scan's descriptors in windows of one size that fill its grid, or in the largest cube within its region
-    of interest. None where that cube is smaller than `SMALLEST_CUBE` voxels, or no window shows a surface.
+    of interest. Return None where that cube is smaller than `SMALLEST_CUBE` voxels, or no window has a surface.
 
-    It is read as a kind of view, by default its own; with so many windows `across` the grid along each axis, by default
-    as `windows_along` says.
+    `view` is the kind of view, by default the scan's own; `across` is the number of windows along each axis, by default
+    that of `windows_along`.
     """
-    rows, view = [], _kind_of_view(prepared) if view is None else view
+    view = _kind_of_view(prepared) if view is None else view
     across = windows_along(prepared, prepared.grid.shape) if across is None else across
     edges = [n // count for n, count in zip(prepared.grid.shape, across, strict=True)]
-    windows = cut_boxes([n * count for n, count in zip(edges, across, strict=True)], edges)
-    windows = windows if prepared.roi is None else filter(None, [_largest_cube(prepared.roi)])
-    for where in windows:
-        values = prepared.phase if view == "field" else prepared.mask
+    windows = cut_boxes([edge * count for edge, count in zip(edges, across, strict=True)], edges)
+    if prepared.roi is not None:
+        cube = _largest_cube(prepared.roi)
+        windows = [] if cube is None else [cube]
+    values, rows = prepared.phase if view == "field" else prepared.mask, []
+    for window in windows:
         with contextlib.suppress(NoSurface):
-            rows.append(descriptors(np.ascontiguousarray(values[where]), prepared.part(where)).vector())
-            size = prepared.mask[where].size
+            rows.append(descriptors(np.ascontiguousarray(values[window]), prepared.part(window)).vector())
+            size = values[window].size
     return Reading(np.array(rows), view, len(rows) * size / prepared.thickness**3) if rows else None
 
 
 def windows_along(prepared: Prepared, shape: Sequence[int]) -> list[int]:
-    """Return in how many windows, of `READ` voxels or more, each axis of a part of a scan's working grid is read; what
-    repeats, or has a region of interest, is read in one."""
-    whole = prepared.grid.periodic or prepared.roi is not None
-    return [1 if whole else max(n // READ, 1) for n in shape]
+    """Return the number of windows, of `READ` voxels or more, along each axis of a part of a scan's working grid; it is
+    1 where the scan repeats or has a region of interest."""
+    single = prepared.grid.periodic or prepared.roi is not None
+    return [1 if single else max(n // READ, 1) for n in shape]
 
 
 def _kind_of_view(prepared: Prepared) -> str:
-    """Return the kind of view for a posterior: a part of a field is read as its mask, a clean image as a mask."""
+    """Return the kind of view for a posterior: scan of a degraded image, field of a whole periodic one, else mask."""
     if prepared.quality is not None and prepared.quality.degraded:
         return "scan"
     whole = prepared.kind == "field" and prepared.grid.periodic and not is_rounded(prepared.phase)
@@ -468,12 +478,13 @@ def _kind_of_view(prepared: Prepared) -> str:
 
 def _largest_cube(region: np.ndarray) -> tuple[slice, slice, slice] | None:
     """Return the largest cube within a region, of at most a window's edge; None where it is too small."""
-    inside = np.asarray(ndimage.distance_transform_cdt(np.pad(region, 1), metric="chessboard"))[1:-1, 1:-1, 1:-1]
-    reach = min(int(inside.max()), LARGEST_WINDOW // 2) - 1
-    if 2 * reach + 1 < SMALLEST_CUBE:
+    # A voxel's chessboard distance to the outside is half the edge of the largest cube centred there.
+    distance = np.asarray(ndimage.distance_transform_cdt(np.pad(region, 1), metric="chessboard"))[1:-1, 1:-1, 1:-1]
+    half = min(int(distance.max()), LARGEST_WINDOW // 2) - 1
+    if 2 * half + 1 < SMALLEST_CUBE:
         return None
-    z, y, x = (int(i) for i in np.unravel_index(int(inside.argmax()), inside.shape))
-    return slice(z - reach, z + reach + 1), slice(y - reach, y + reach + 1), slice(x - reach, x + reach + 1)
+    z, y, x = (int(i) for i in np.unravel_index(int(distance.argmax()), distance.shape))
+    return slice(z - half, z + half + 1), slice(y - half, y + half + 1), slice(x - half, x + half + 1)
 
 
 @dataclass(frozen=True)
@@ -503,19 +514,19 @@ class Blocks:
 
     def sums(self, values: np.ndarray) -> np.ndarray:
         """Return the sum of a volume (Z, Y, X) over each block, float64 (N,)."""
-        kind = np.float64 if values.dtype.kind == "f" else np.int64
+        dtype = np.float64 if values.dtype.kind == "f" else np.int64
         for axis, starts in enumerate(self.starts):
-            values = np.add.reduceat(values, starts, axis=axis, dtype=kind)
+            values = np.add.reduceat(values, starts, axis=axis, dtype=dtype)
         return values.ravel().astype(np.float64)
 
-    def gather(self, places: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Return sums over each block, (N, …), of weights (M, …) at places (M, 3) in voxels from the first centre."""
-        voxels = np.clip(np.rint(places), 0, np.array(self.shape) - 1).astype(np.int64).T
-        numbers = np.zeros(len(places), dtype=np.int64)
+    def gather(self, positions: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return sums over blocks, (N, …), of weights (M, …) at positions (M, 3) in voxels from the first centre."""
+        voxels = np.clip(np.rint(positions), 0, np.array(self.shape) - 1).astype(np.int64).T
+        index = np.zeros(len(positions), dtype=np.int64)  # of the block that each position is in
         for axis, starts in enumerate(self.starts):
-            numbers = numbers * len(starts) + np.searchsorted(starts, voxels[axis], side="right") - 1
+            index = index * len(starts) + np.searchsorted(starts, voxels[axis], side="right") - 1
         columns = weights.reshape(len(weights), math.prod(weights.shape[1:]))
-        sums = [np.bincount(numbers, column, minlength=self.count) for column in columns.T]
+        sums = [np.bincount(index, column, minlength=self.count) for column in columns.T]
         return np.stack(sums, axis=1).reshape(self.count, *weights.shape[1:])
 
 
@@ -524,35 +535,35 @@ def errors(
 ) -> np.ndarray:
     """Return half the width of the `SURE` interval of each figure, (K,), by a jackknife over neighbours that correlate.
 
-    `figures` gives figures (…, K) from sums (…, C); `sums` has those of each block, (N, C). With ψ the change of a
+    `figures` computes figures (…, K) from sums (…, C); `sums` has those of each block, (N, C). With ψ the change of a
     figure when a block is left out, the variance is ψᵀ W ψ: W has 1 on its diagonal, and ½ for each axis along which
-    two blocks are neighbours (Bartlett's kernel, as Newey & West 1987 for series). Were blocks independent, ψᵀ W ψ
-    would be σ² tr(P W P) / n², P taking the mean off: that sets its scale, and with tr² / tr(·²) the degrees of freedom
-    of Student's t. A bootstrap over single blocks would take neighbours for independent.
+    two blocks are neighbours (Bartlett's kernel, as Newey & West 1987 for series). If blocks were independent, ψᵀ W ψ
+    would be σ² tr(P W P) / n², where P subtracts the mean: this sets the scale, and tr² / tr(·²) is the number of
+    degrees of freedom of Student's t. A bootstrap over single blocks would take neighbours for independent.
 
-    `weights`, of mean 1, are the parts of blocks that count, and a block's mean varies by one over its weight.
+    `weights`, of mean 1, say how much of each block counts; the variance of a block's mean is one over its weight.
     """
     count, total = len(sums), sums.sum(0)
     weights = np.ones(count) if weights is None else weights
     form, kernel = _neighbour_forms(blocks.counts, weights)
     change = (figures(total) - figures(total - sums)) * (1 - weights / count)[:, None]
     variance = (change * (kernel @ change)).sum(0) * count / np.trace(form)
-    return _reach(form) * np.sqrt(np.maximum(variance, 0))
+    return _student_quantile(form) * np.sqrt(np.maximum(variance, 0))
 
 
 def interval_reach(counts: Sequence[int]) -> float:
-    """Return how many standard errors an interval of `errors` reaches to either side, from the blocks along axes; NaN
-    of one."""
+    """Return half the width of an interval of `errors` in standard errors, given the number of blocks along each axis;
+    NaN for a single block."""
     count = math.prod(counts)
-    return math.nan if count == 1 else _reach(_neighbour_forms(counts, np.ones(count))[0])
+    return math.nan if count == 1 else _student_quantile(_neighbour_forms(counts, np.ones(count))[0])
 
 
-def _reach(form: np.ndarray) -> float:
+def _student_quantile(form: np.ndarray) -> float:
     return float(stats.t.ppf((1 + SURE) / 2, np.trace(form) ** 2 / (form**2).sum()))
 
 
 def _neighbour_forms(counts: Sequence[int], weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return P W P and W of `errors`, each (N, N); with weights w, P is √w - w √wᵀ / n (rows by columns)."""
+    """Return the matrices P W P and W of `errors`, (N, N) both; with weights w, P is diag(√w) - w √wᵀ / n."""
     kernel = np.ones((1, 1))
     for n in counts:
         kernel = np.kron(kernel, np.eye(n) + (np.eye(n, k=1) + np.eye(n, k=-1)) / 2)

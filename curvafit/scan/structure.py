@@ -37,11 +37,11 @@ PLATEAUS, PLATEAU = 0.6, 0.35
 LAGS, UNCORRELATED = (4, 5, 6, 7, 8), 0.06
 #: Voxels that smoothing grey levels reaches.
 SMOOTHED = 3
-#: The least share of neighbours with labels that have the same one.
-_ALIKE = 0.25
+#: The least fraction of labelled neighbours with one label; noise and grey levels have fewer.
+_LEAST_SHARED = 0.25
 #: The most values of labels: grey levels of four bits have more.
-_FEW = 12
-#: About so many voxels tell, first, whether a volume has more values.
+_MOST_LABELS = 12
+#: About so many voxels are looked at first to see whether a volume has more values.
 _SAMPLED = 4096
 #: What structure is in a mask of several values.
 SEVERAL = (
@@ -59,10 +59,10 @@ Levels = Callable[[Box], np.ndarray]
 
 @dataclass(frozen=True)
 class Structure:
-    """What in a volume is structure: as the caller says it, and as it is once `find_split` has looked.
+    """What in a volume is structure: the caller's options, completed by `find_split`.
 
-    A `region` is not 0 where the threshold of a padded scan is taken; if that `alone` counts, it is that of any scan.
-    Found are the kind, the extremes, whether they are the only two values, and the threshold and padding of an image.
+    The threshold of a padded scan is taken where `region` is not 0; with `alone`, that of any scan. `find_split` sets
+    the kind, the extremes, whether they are the only `two` values, and the threshold (`level`) and padding of an image.
     """
 
     volume: Volume
@@ -84,8 +84,8 @@ class Structure:
 
 
 class Padding(NamedTuple):
-    """A constant around what was imaged, its share of the scan, the deviation of the other levels, and whether it is
-    `sure` that it is no background."""
+    """A constant value around what was imaged, the share of the scan that has it, the standard deviation of the other
+    levels, and whether it is `sure` that the constant is no background."""
 
     value: float
     share: float
@@ -103,11 +103,11 @@ def find_structure(
     periodic: bool = False,
     extremes: tuple[float, float] | None = None,
 ) -> tuple[Kind, Volume]:
-    """Return the kind of a scan in memory, and it as float32 values that are above 0 in its structure, with notes.
+    """Return the kind of a scan in memory, and the scan as float32 values above 0 in its structure, with notes.
 
-    The parameters are as in `preparation.prepare`; `extremes` are the lowest and the highest value of the whole that
-    `field` is a part of: they tell a mask's two values. Raises ScanError if the threshold splits nothing or a phase is
-    empty.
+    The parameters are as in `preparation.prepare`; `extremes` are the lowest and the highest value of the whole scan
+    that `field` is a part of, which are the two values of a mask. Raises ScanError if the threshold splits nothing or
+    a phase is empty.
     """
     inside = None if region is None else replace(field, array=region)
     structure, note = find_split(Structure(field, kind, threshold, dark, inside, alone=True), Run(), extremes)
@@ -128,11 +128,11 @@ def check_phases(inside: int, count: int) -> None:
 
 
 def find_levels(structure: Structure, box: Box, periodic: bool = False) -> np.ndarray:
-    """Return a box of a volume, all of a `periodic` one, as float32 values that are above 0 in its structure.
+    """Return the values of a box (the whole volume if `periodic`) as float32, above 0 in the structure.
 
-    Grey levels are smoothed by one voxel of the finest axis, less the raw levels' threshold.
+    Those of an image are its grey levels, smoothed by one voxel of the finest axis, minus the raw levels' threshold.
     """
-    # Smoothing lowers thin structures' grey: a threshold of the smoothed levels would sink and make them fat.
+    # Smoothing lowers the grey of thin structures: a threshold of smoothed levels would be too low, and they too fat.
     if structure.kind == "image":
         around, padding = grow(box, SMOOTHED, structure.volume.shape), structure.padding
         smooth = _smooth_levels(structure.read(around), structure.volume.spacing, periodic, padding)
@@ -156,13 +156,13 @@ def _smooth_levels(
     smooth = partial(ndimage.gaussian_filter, sigma=width, mode="wrap" if periodic else "nearest", truncate=3.0)
     if padding is None or not padding.sure:
         return smooth(values.astype(np.float32))
-    known = values != padding.value
-    weights = smooth(known.astype(np.float32))
-    return smooth(np.where(known, values, 0).astype(np.float32)) / np.where(known, weights, np.nan)
+    imaged = values != padding.value
+    weights = smooth(imaged.astype(np.float32))  # dividing by them makes a mean over imaged voxels alone
+    return smooth(np.where(imaged, values, 0).astype(np.float32)) / np.where(imaged, weights, np.nan)
 
 
 def check_options(kind: str, threshold: float | str, label: int | None = None) -> None:
-    """Raise ValueError where a kind, threshold or label is none, or contradicts another."""
+    """Raise ValueError where a kind, threshold or label is not valid, or contradicts another."""
     check_choice(kind, ("auto", "field", "mask", "image"), "kind auto, field, mask or image")
     otsu = isinstance(threshold, str) and threshold == "otsu"
     level = "otsu" if otsu else check_float(threshold, "a threshold that is a number or 'otsu'")
@@ -180,15 +180,15 @@ def check_options(kind: str, threshold: float | str, label: int | None = None) -
 def read_region(
     roi: Source, field: Volume, scan: Source | None = None, crop: Crop | None = None, **reading: Any
 ) -> tuple[Volume, tuple[str, ...]]:
-    """Return a region of interest on the voxels of a field, and a note on how it was laid.
+    """Return a region of interest on the voxels of a field, and notes on how it was laid.
 
-    A field that is a crop of a scan names that, and its reading: without a place, the region is cropped alike. Raises
-    ScanError where the region is empty, and as `lay`.
+    If the field is a `crop` of a scan, `scan` and `reading` name the scan: a region without an affine lies on all of
+    it, and is cropped in the same way. Raises ScanError where the region is empty, and as `lay`.
     """
-    region, on = load(roi), field if crop is None or scan is None else load(scan, **reading, lazy=True)
-    if region.affine is not None and on.affine is not None:
-        on, crop = field, None
-    region, notes = lay(region, on, "the region of interest", "the scan")
+    region, target = load(roi), field if crop is None or scan is None else load(scan, **reading, lazy=True)
+    if region.affine is not None and target.affine is not None:
+        target, crop = field, None
+    region, notes = lay(region, target, "the region of interest", "the scan")
     values = region.values if crop is None else region.crop(crop).values
     if not values.any():
         raise ScanError("expected a region of interest with voxels in it, got an empty one")
@@ -203,7 +203,7 @@ def read_labels(labels: Volume, what: str) -> np.ndarray:
 
 
 def whole_labels(values: np.ndarray, what: str) -> np.ndarray:
-    """Return nearly whole numbers as whole ones; raise ScanError if some are not."""
+    """Return labels that are nearly whole numbers as integers; raise ScanError if some are not."""
     rounded = round_labels(values)
     whole = rounded.astype(np.int64) if rounded.dtype.kind == "f" else rounded
     if (whole != rounded).any():
@@ -212,43 +212,45 @@ def whole_labels(values: np.ndarray, what: str) -> np.ndarray:
 
 
 def count_alike(labels: np.ndarray) -> np.ndarray:
-    """Return how many voxels have a label, how many pairs along x have two, and how many the same one twice."""
+    """Return three counts: labelled voxels, pairs of labelled neighbours along x, and those pairs with one label."""
     pairs = (labels[..., :-1] != 0) & (labels[..., 1:] != 0)
-    same = pairs & (labels[..., :-1] == labels[..., 1:])
-    return np.array([np.count_nonzero(each) for each in (labels, pairs, same)])
+    equal = pairs & (labels[..., :-1] == labels[..., 1:])
+    return np.array([np.count_nonzero(voxels) for voxels in (labels, pairs, equal)])
 
 
 def judge_labels(counts: np.ndarray, what: str) -> None:
-    """Raise ScanError where there are no labels, by `count_alike`, or neighbours do not share them."""
-    labelled, pairs, same = counts.tolist()
+    """Raise ScanError where by `count_alike` there are no labels, or too few neighbours share theirs."""
+    labelled, pairs, equal = counts.tolist()
     if not labelled:
         raise ScanError(f"expected {what}, got none: every voxel is 0")
-    if same < _ALIKE * pairs:
+    if equal < _LEAST_SHARED * pairs:
         raise ScanError(f"expected {what}, whole numbers that neighbours share, got grey levels")
 
 
 def is_noise(mask: np.ndarray) -> bool:
-    """Return whether voxels a few apart have nothing to do with each other, along each axis."""
+    """Return whether voxels a few apart along an axis are uncorrelated, for all axes."""
     z, y, x = (slice(0, n) for n in mask.shape)
     return pairs_of_noise(mask.shape, float(mask.mean()), count_pairs(mask, (z, y, x), (z, y, x), mask.shape))
 
 
 def count_pairs(mask: np.ndarray, inner: Box, core: Box, shape: Sequence[int]) -> np.ndarray:
-    """Return, for each axis and each of `LAGS`, how many pairs a lag apart, that begin in a core of a volume, are
-    inside, how many first and last ones; the core lies at `inner` in the mask."""
+    """Count voxel pairs that begin in a core of a volume of a shape; the core lies at `inner` in the mask.
+
+    Return (3, `LAGS`, 3): for each axis and lag, the pairs that lie in the mask with both voxels, the first, the last.
+    """
     counts = np.zeros((3, len(LAGS), 3), dtype=np.int64)
     for axis, (edge, n) in enumerate(zip(inner, shape, strict=True)):
-        start = core[axis].start
         for k, lag in enumerate(LAGS):
-            stop = edge.start + max(0, min(core[axis].stop, n - lag) - start)
-            moved = (slice(edge.start + shift, stop + shift) for shift in (0, lag))
-            first, last = (mask[(*inner[:axis], part, *inner[axis + 1 :])] for part in moved)
+            stop = edge.start + max(0, min(core[axis].stop, n - lag) - core[axis].start)  # pairs end in the volume
+            ranges = (slice(edge.start + shift, stop + shift) for shift in (0, lag))
+            first, last = (mask[(*inner[:axis], voxels, *inner[axis + 1 :])] for voxels in ranges)
             counts[axis, k] = [np.count_nonzero(first & last), np.count_nonzero(first), np.count_nonzero(last)]
     return counts
 
 
 def pairs_of_noise(shape: Sequence[int], share: float, pairs: np.ndarray) -> bool:
-    """Return whether `count_pairs` of a volume of a shape, of which a share is inside, are those of noise."""
+    """Return whether a mask is noise: the `pairs` of `count_pairs` are as uncorrelated as those of independent voxels
+    of which a `share` is inside."""
     for axis, n in enumerate(shape):
         for k, lag in enumerate(LAGS):
             if n <= 2 * lag:
@@ -260,30 +262,30 @@ def pairs_of_noise(shape: Sequence[int], share: float, pairs: np.ndarray) -> boo
 
 
 def is_rounded(u: np.ndarray) -> bool:
-    """Return whether a field holds so few values that it was quantised: second differences of it are then noise."""
+    """Return whether a field holds so few values that it was rounded: its second differences are then noise."""
     return len(np.unique(np.asarray(u))) <= min(_ROUNDED_VALUES, math.prod(u.shape) // 16)
 
 
 def describe_image(structure: Structure, lowest: float, highest: float) -> str:
     """Return the note on padding and threshold, given the extremes of `find_levels`; raise ScanError where the
-    threshold is not between those of the smoothed levels."""
+    threshold is not within the range of the smoothed levels."""
     otsu, level = structure.threshold == "otsu", structure.level
     low, high = (level - highest, level - lowest) if structure.dark else (level + lowest, level + highest)
     if not low < level < high:
         raise ScanError(f"expected a threshold within the smoothed scan's {low:.4g} to {high:.4g}, got {level:.4g}")
     source, side = "Otsu's" if otsu else "the given", "dark" if structure.dark else "bright"
-    padding, inside = structure.padding, structure.region is not None
-    note = "" if padding is None else _describe_padding(padding, otsu, inside)
+    padding = structure.padding
+    note = "" if padding is None else _describe_padding(padding, otsu, structure.region is not None)
     note += f"Smoothed by one voxel, split at {source} threshold of {level:.4g}: the {side} phase is the structure."
     return note
 
 
-def _describe_padding(padding: Padding, otsu: bool, inside: bool) -> str:
-    """Return a note on padding; `inside` says whether Otsu's threshold is taken inside of a region."""
+def _describe_padding(padding: Padding, otsu: bool, has_region: bool) -> str:
+    """Return a note on padding, and on the levels of which Otsu's threshold is taken."""
     text = f"{padding.share:.0%} of the voxels, reached from the borders, are exactly {padding.value:g}"
     text += ", and count as background" * padding.sure
-    text += "" if inside else ": if nothing was imaged there, a region of interest leaves them out"
-    levels = " without them" * padding.sure + " inside the region" * inside
+    text += "" if has_region else ": if nothing was imaged there, a region of interest leaves them out"
+    levels = " without them" * padding.sure + " inside the region" * has_region
     return f"{text}; the threshold is taken{levels}. " if levels and otsu else f"{text}. "
 
 
@@ -291,16 +293,15 @@ def _describe_padding(padding: Padding, otsu: bool, inside: bool) -> str:
 
 
 def find_split(structure: Structure, run: Run, extremes: tuple[Any, Any] | None = None) -> tuple[Structure, str]:
-    """Find how structure and background are split; return it, and a note for fields and masks. `extremes` are those of
-    `find_structure`.
+    """Find how structure and background are split; return the completed structure, and a note for fields and masks.
 
     Two values are a mask, as are labels; floats from about -1 to about 1, without noise and mostly far from 0, are a
-    phase field; anything else is an image.
+    phase field; anything else is an image. `extremes` are those of `find_structure`.
     """
     volume = structure.volume
     side = max(1, math.isqrt(PIECE // volume.shape[2]))
     bars = cut_boxes(volume.shape, (side, side, volume.shape[2]))
-    value = structure.read((slice(0, 1), slice(0, 1), slice(0, 1)))[0, 0, 0]
+    value = structure.read((slice(0, 1), slice(0, 1), slice(0, 1)))[0, 0, 0]  # padding would have it
     records = run("reading", partial(_look_at_values, structure, bars, value), len(bars))
     total = add_records({name: record[name] for name in record if name not in ("two", "values")} for record in records)
     if faults := int(total["faults"]):
@@ -317,11 +318,10 @@ def find_split(structure: Structure, run: Run, extremes: tuple[Any, Any] | None 
     )
     kind = structure.kind
     if kind == "auto":
-        kind = _guess_kind(
-            structure, total, np.unique(np.concatenate([record["values"] for record in records])), two_values
-        )
-    ends = {"lowest": float(low), "highest": float(high)}
-    structure = replace(structure, kind=kind, **ends, two=two_values and bool(low < high))
+        values = np.unique(np.concatenate([record["values"] for record in records]))
+        kind = _guess_kind(structure, total, values, two_values)
+    two = two_values and bool(low < high)
+    structure = replace(structure, kind=kind, lowest=float(low), highest=float(high), two=two)
     if kind == "field":
         return structure, f"Taken for a phase field: values {float(lowest):.3g} to {float(highest):.3g}."
     if kind == "mask":
@@ -331,95 +331,102 @@ def find_split(structure: Structure, run: Run, extremes: tuple[Any, Any] | None 
 
 
 def _guess_kind(structure: Structure, total: Record, values: np.ndarray, two: bool) -> Kind:
-    """Return what a scan is, by the sums of `_look_at_values` and its values, or as many as labels never have."""
+    """Return the kind of a scan from the sums of `_look_at_values` and its distinct values, `_MOST_LABELS` + 1 or more
+    where it has too many for labels."""
     lowest, highest, otsu = float(total["lowest"]), float(total["highest"]), structure.threshold == "otsu"
-    if two or (otsu and 2 < len(values) <= _FEW and values[0] >= 0 and (values == np.rint(values)).all()):
+    if two or (otsu and 2 < len(values) <= _MOST_LABELS and values[0] >= 0 and (values == np.rint(values)).all()):
         return "mask"
     if not (structure.volume.dtype.kind == "f" and otsu and -2 <= lowest <= -0.7 and 0.3 <= highest <= 2):
         return "image"
-    steady = 2 * total["steady"] > total["steps"] or not total["steps"]
-    return "field" if steady and total["plateau"] > PLATEAUS * math.prod(structure.volume.shape) else "image"
+    smooth = 2 * total["steady"] > total["steps"] or not total["steps"]
+    return "field" if smooth and total["plateau"] > PLATEAUS * math.prod(structure.volume.shape) else "image"
 
 
 def _split_image(structure: Structure, bars: Sequence[Box], total: Record, value: Any, run: Run) -> Structure:
-    """Return the structure with the padding and the threshold of an image, of which `total` is known."""
-    levels, ends = partial(_read_levels, structure, None, False), (total["lowest"], total["highest"])
+    """Return the structure with the padding and the threshold of an image; `total` are sums of `_look_at_values`."""
+    levels, extremes = partial(_read_levels, structure, None, False), (total["lowest"], total["highest"])
     if total["constant"] > PADDED * math.prod(structure.volume.shape):
         counted = add_records(run("looking for padding", partial(_count_padding, structure, bars, value), len(bars)))
         structure = replace(structure, padding=_judge_padding(value, counted["padding"]))
     padding = structure.padding
     if structure.threshold != "otsu":
         return replace(structure, level=float(structure.threshold))
-    sure, inside = padding is not None and padding.sure, padding is not None or structure.alone
-    if sure or (inside and structure.region is not None):
-        levels = partial(_read_levels, structure, value if sure else None, True)
+    skips_padding = padding is not None and padding.sure
+    in_region = structure.region is not None and (padding is not None or structure.alone)
+    if skips_padding or in_region:
+        levels = partial(_read_levels, structure, value if skips_padding else None, in_region)
         counted = add_records(run("looking at levels", partial(_look_at_levels, levels, bars), len(bars)))
         if not counted or counted["lowest"] == counted["highest"]:
             raise ScanError("expected grey levels that differ where they count, got one of them only")
-        ends = (counted["lowest"], counted["highest"])
-    return replace(structure, level=_find_threshold(levels, bars, *ends, run))
+        extremes = (counted["lowest"], counted["highest"])
+    return replace(structure, level=_find_threshold(levels, bars, *extremes, run))
 
 
 def _look_at_values(structure: Structure, bars: Sequence[Box], value: Any, number: int) -> Record:
-    """Return the extremes of a bar, how many voxels have a value, whether there are two at most, and sums by kind."""
+    """Return the extremes of a bar, its distinct values (or some), whether there are two at most, how many voxels are
+    `value` and how many not finite; of values that may be a phase field's, also how many are smooth and in plateaus."""
     values = structure.read(bars[number])
     lowest, highest = values.min(), values.max()
-    record = {"lowest": lowest, "highest": highest, "two": np.all((values == lowest) | (values == highest))}
-    some = np.array([lowest, highest]) if record["two"] else np.unique(values.ravel()[:: 1 + values.size // _SAMPLED])
-    record["values"] = (some if record["two"] or len(some) > _FEW else np.unique(values))[: _FEW + 1]
+    two = np.all((values == lowest) | (values == highest))
+    # A sample shows at once where there are too many values for labels: only few are worth sorting all voxels.
+    distinct = np.array([lowest, highest]) if two else np.unique(values.ravel()[:: 1 + values.size // _SAMPLED])
+    if not two and len(distinct) <= _MOST_LABELS:
+        distinct = np.unique(values)
+    record = {"lowest": lowest, "highest": highest, "two": two, "values": distinct[: _MOST_LABELS + 1]}
     record["constant"] = np.int64(np.count_nonzero(values == value))
     if values.dtype.kind != "f":
         return {**record, "faults": np.int64(0)}
     record["faults"] = np.int64(values.size - np.count_nonzero(np.isfinite(values)))
     if structure.kind == "auto" and not record["faults"] and lowest >= -2 and highest <= 2:
-        steps = np.abs(np.diff(values, 3, axis=2)) if values.shape[2] > 3 else np.empty(0)
-        record |= {"steady": np.count_nonzero(steps < JITTER), "steps": np.int64(steps.size)}
+        third = np.abs(np.diff(values, 3, axis=2)) if values.shape[2] > 3 else np.empty(0)
+        record |= {"steady": np.count_nonzero(third < JITTER), "steps": np.int64(third.size)}
         record["plateau"] = np.count_nonzero(np.abs(values) > PLATEAU)
-    return {name: np.asarray(value) for name, value in record.items()}
+    return {name: np.asarray(figure) for name, figure in record.items()}
 
 
 def _count_padding(structure: Structure, bars: Sequence[Box], value: Any, number: int) -> Record:
-    """Return sums that tell padding with a value in a bar of whole rows: how many voxels have it, and how many in runs
-    from the ends of rows; then sums of powers 0 to 4 of the levels next to those runs, and of all levels that are not
-    the value. From these follow means, variances, and the skewness and kurtosis of Sarle's test (`_judge_padding`)."""
+    """Return what `_judge_padding` needs of a bar of whole rows, (12,): how many voxels are `value`, how many are in
+    runs of it from the ends of rows; then sums of powers 0 to 4 of the levels next to those runs, and of all levels but
+    `value`. From these follow means, variances, and the skewness and kurtosis of Sarle's test."""
     values = structure.read(bars[number])
     constant = values == value
-    ahead = np.logical_and.accumulate(constant, axis=2)
-    behind = np.logical_and.accumulate(constant[..., ::-1], axis=2)[..., ::-1]
+    from_start = np.logical_and.accumulate(constant, axis=2)
+    from_end = np.logical_and.accumulate(constant[..., ::-1], axis=2)[..., ::-1]
     rim = np.zeros_like(constant)
-    rim[..., 1:] = ahead[..., :-1]
-    rim[..., :-1] |= behind[..., 1:]
-    levels = [values[part].astype(np.float64) for part in (rim & ~constant, ~constant)]
-    sums = [np.count_nonzero(constant), np.count_nonzero(ahead | behind)]
-    with np.errstate(all="ignore"):  # huge numbers tell nothing
-        for level in levels:
-            squares = np.square(level)
-            sums += [level.size, level.sum(), squares.sum(), np.dot(squares, level), np.dot(squares, squares)]
+    rim[..., 1:] = from_start[..., :-1]
+    rim[..., :-1] |= from_end[..., 1:]
+    sums = [np.count_nonzero(constant), np.count_nonzero(from_start | from_end)]
+    with np.errstate(all="ignore"):  # where powers of huge levels overflow, padding is not sure
+        for voxels in (rim & ~constant, ~constant):
+            levels = values[voxels].astype(np.float64)
+            squares = np.square(levels)
+            sums += [levels.size, levels.sum(), squares.sum(), np.dot(squares, levels), np.dot(squares, squares)]
     return {"padding": np.array(sums, dtype=np.float64)}
 
 
 def _judge_padding(value: Any, counts: np.ndarray) -> Padding | None:
     """Return the padding of a scan by its `_count_padding`; None where there is none.
 
-    It is sure where the other levels have two phases (Sarle's coefficient; of a normal distribution it is 1/3), and
-    what lies next to it is like them; or is far from it, and it is below 0, to which no background is cut. A background
-    ends in the low levels of blurred edges.
+    It is sure where the other levels have two phases (Sarle's coefficient; of a normal distribution it is 1/3), and the
+    rim, the levels next to the constant, is similar to them: next to a background it has the low levels of blurred
+    edges. It is also sure where the rim is far from a constant below 0: no background is cut off at such a value.
     """
-    total, reached, size = counts[0], counts[1], counts[0] + counts[7]
-    if total <= PADDED * size or reached < REACHED * total or total == size:
+    constant, reached, size = counts[0], counts[1], counts[0] + counts[7]
+    if constant <= PADDED * size or reached < REACHED * constant or constant == size:
         return None
-    near, m, (p2, p3, p4) = counts[3] / max(counts[2], 1), counts[8] / counts[7], counts[9:] / counts[7]
+    rim_mean, rim_square = counts[3:5] / max(counts[2], 1)
+    m, p2, p3, p4 = counts[8:] / counts[7]  # means of powers
     with np.errstate(all="ignore"):
-        spread, variance = counts[4] / max(counts[2], 1) - near**2, max(p2 - m**2, 0.0)
+        rim_variance, variance = rim_square - rim_mean**2, max(p2 - m**2, 0.0)
         third, fourth = p3 - 3 * m * p2 + 2 * m**3, p4 - 4 * m * p3 + 6 * m**2 * p2 - 3 * m**4
-        similar = 4 * (near - m) ** 2 < variance < 4 * spread
-        far = value < 0 and (near - float(value)) ** 2 > variance
-        phases = third**2 + variance**3 > TWO_PHASES * fourth * variance
-    return Padding(float(value), total / size, math.sqrt(variance), bool(phases and (similar or far)))
+        similar = 4 * (rim_mean - m) ** 2 < variance < 4 * rim_variance
+        far = value < 0 and (rim_mean - float(value)) ** 2 > variance
+        two_phases = third**2 + variance**3 > TWO_PHASES * fourth * variance
+    return Padding(float(value), constant / size, math.sqrt(variance), bool(two_phases and (similar or far)))
 
 
 def _read_levels(structure: Structure, skipped: float | None, inside: bool, box: Box) -> np.ndarray:
-    """Return the values of a box but one that is left out, `inside` of the region, if there is one."""
+    """Return the values of a box (flat) other than `skipped`; those `inside` the region alone, if there is one."""
     values = structure.read(box)
     counted = np.ones(values.shape, dtype=bool) if skipped is None else values != skipped
     if inside and structure.region is not None:
@@ -434,14 +441,14 @@ def _look_at_levels(levels: Levels, bars: Sequence[Box], number: int) -> Record:
 
 
 def _find_threshold(levels: Levels, bars: Sequence[Box], lowest: Any, highest: Any, run: Run) -> float:
-    """Return the threshold of the levels that count, as `find_structure` finds it."""
-    lowest, highest = lowest[()], highest[()]
-    whole = lowest.dtype.kind in "iu"
-    if whole and int(highest) - int(lowest) >= _MOST_LEVELS:
+    """Return the middle between the means of the levels on the two sides of Otsu's threshold."""
+    lowest, highest = lowest[()], highest[()]  # scalars of arrays without axes
+    integers = lowest.dtype.kind in "iu"
+    if integers and int(highest) - int(lowest) >= _MOST_LEVELS:
         raise ScanError(f"expected at most {_MOST_LEVELS} grey levels, got {lowest} to {highest}: give a threshold")
     name = "finding the threshold"
     counts = add_records(run(name, partial(_count_levels, levels, bars, lowest, highest), len(bars)))["counts"]
-    if whole:
+    if integers:
         centres = np.arange(int(lowest), int(highest) + 1)
         high = centres > threshold_otsu(hist=(counts, centres))
         means = [np.dot(counts[side], centres[side].astype(np.float64)) / counts[side].sum() for side in (high, ~high)]
@@ -453,7 +460,7 @@ def _find_threshold(levels: Levels, bars: Sequence[Box], lowest: Any, highest: A
 
 
 def _count_levels(levels: Levels, bars: Sequence[Box], lowest: Any, highest: Any, number: int) -> Record:
-    """Return a histogram of a bar: of each whole number, or of 256 bins."""
+    """Return the histogram of a bar: a bin for each whole number, or 256 bins for floats."""
     values = levels(bars[number])
     if values.dtype.kind not in "iu":
         return {"counts": np.histogram(values, 256, (lowest, highest))[0]}
@@ -461,7 +468,7 @@ def _count_levels(levels: Levels, bars: Sequence[Box], lowest: Any, highest: Any
 
 
 def _sum_sides(levels: Levels, bars: Sequence[Box], level: float, number: int) -> Record:
-    """Return the numbers and sums of the values above a level, and of the others."""
+    """Return how many values of a bar are above a level and their sum, and the same of the others, (2, 2)."""
     values = levels(bars[number])
     high = values > level
     sides = [(values[side].size, values[side].sum(dtype=np.float64)) for side in (high, ~high)]
@@ -469,7 +476,7 @@ def _sum_sides(levels: Levels, bars: Sequence[Box], level: float, number: int) -
 
 
 def add_records(records: Iterable[Record]) -> dict[str, np.ndarray]:
-    """Return the sums over pieces; of what is called lowest and highest the extremes."""
+    """Return records summed by name; of those named lowest and highest, the minimum and the maximum."""
     total: dict[str, np.ndarray] = {}
     for record in records:
         for name, value in record.items():
