@@ -22,7 +22,8 @@ MEASURED = 160
 
 
 def bounding_box(shape: tuple[int, int, int], region: np.ndarray | None, longest: int) -> tuple[Box, tuple[str, ...]]:
-    """Return the box around a region (else all), or its middle where a side is over `longest` voxels; and notes."""
+    """Return the box around a region (all of `shape` without one), its middle where a side is longer than `longest`
+    voxels, and notes on both."""
     box, notes = [slice(0, n) for n in shape], []
     if region is not None:
         box = list(ndimage.find_objects(region.astype(np.uint8))[0])
@@ -35,14 +36,13 @@ def bounding_box(shape: tuple[int, int, int], region: np.ndarray | None, longest
 
 
 def median_thickness(mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool) -> tuple[float, float]:
-    """Return the median and 95th percentile, over the structure's surface, of the local thickness beneath it, in the
-    box of at most `MEASURED` voxels a side that `boxes_by_surface` puts first."""
+    """Return the median and 95th percentile of the local thickness over the structure's surface, measured in the box of
+    at most `MEASURED` voxels a side that `boxes_by_surface` puts first."""
     # Weighed by surface, not by volume, as a curvature diagram is: else a rind around thin struts would set the scale.
     surface = surface_voxels(mask)
     boxes = boxes_by_surface(surface, MEASURED)
-    part = mask[boxes[0]] if boxes else mask
-    below = surface[boxes[0]] if boxes else part
-    return thickness_beneath(part, below, spacing, periodic and part.shape == mask.shape)
+    cropped, surface = (mask[boxes[0]], surface[boxes[0]]) if boxes else (mask, mask)
+    return thickness_beneath(cropped, surface, spacing, periodic and cropped.shape == mask.shape)
 
 
 def thickness_beneath(
@@ -59,8 +59,8 @@ def surface_voxels(mask: np.ndarray) -> np.ndarray:
 
 
 def boxes_by_surface(content: np.ndarray, size: int | Sequence[int]) -> list[Box]:
-    """Return the boxes, of at most `size` voxels a side, that cover the volume and hold content, the fullest first; but
-    the middle one before them, unless it holds less than half of what the others hold on average."""
+    """Return the boxes of `candidate_boxes` in which `content` has voxels, that with most first; but the middle box
+    before all others, unless it has less than half of the average."""
     candidates = candidate_boxes(content.shape, size)
     return order_boxes(candidates, [int(np.count_nonzero(content[box])) for box in candidates])
 
@@ -74,27 +74,28 @@ def candidate_boxes(shape: Sequence[int], size: int | Sequence[int]) -> list[Box
 
 
 def order_boxes(candidates: Sequence[Box], counts: Sequence[int]) -> list[Box]:
-    """Return the boxes of `candidate_boxes` that hold anything, in the order of `boxes_by_surface`."""
+    """Return the boxes of `candidate_boxes` whose count of voxels is above 0, in the order of `boxes_by_surface`."""
     filled = [(count, box) for count, box in zip(counts, candidates, strict=True) if count]
     ordered = [box for _, box in sorted(filled, key=lambda pair: -pair[0])]
+    middle = candidates[0]
     if ordered and counts[0] >= 0.5 * sum(counts) / len(counts):
-        ordered.remove(candidates[0])
-        ordered.insert(0, candidates[0])
+        ordered.remove(middle)
+        ordered.insert(0, middle)
     return ordered
 
 
 def box_with_most_surface(mask: np.ndarray, edge: int | Sequence[int]) -> Box:
-    """Return the box, of at most `edge` voxels a side, that holds most of a mask's surface: it slides by voxels."""
+    """Return the box, of at most `edge` voxels a side, that holds most of a mask's surface, of all positions."""
     edges = [edge] * 3 if isinstance(edge, int) else edge
-    box = [min(n, side) for n, side in zip(mask.shape, edges, strict=True)]
-    sides = mask.astype(np.int8)  # of each voxel, its next neighbours beyond the border count
-    z, y, x = (np.abs(np.diff(sides, axis=axis, append=0)) for axis in range(3))
-    held = (z + y + x).astype(np.float32)
-    for axis, side in enumerate(box):
-        held = ndimage.uniform_filter1d(held, side, axis, mode="constant")
-    inner = tuple(slice(b // 2, n - (b - 1) // 2) for n, b in zip(mask.shape, box, strict=True))
-    first = (int(k) for k in np.unravel_index(int(held[inner].argmax()), held[inner].shape))
-    z, y, x = (slice(k, k + side) for k, side in zip(first, box, strict=True))
+    sides = [min(n, side) for n, side in zip(mask.shape, edges, strict=True)]
+    values = mask.astype(np.int8)  # each face between structure and background counts at the voxel before it
+    z, y, x = (np.abs(np.diff(values, axis=axis, append=0)) for axis in range(3))
+    density = (z + y + x).astype(np.float32)
+    for axis, side in enumerate(sides):
+        density = ndimage.uniform_filter1d(density, side, axis, mode="constant")
+    centres = tuple(slice(side // 2, n - (side - 1) // 2) for n, side in zip(mask.shape, sides, strict=True))
+    start = (int(k) for k in np.unravel_index(int(density[centres].argmax()), density[centres].shape))
+    z, y, x = (slice(k, k + side) for k, side in zip(start, sides, strict=True))
     return z, y, x
 
 
@@ -107,7 +108,7 @@ def centre_distance(
 ) -> np.ndarray:
     """Return the signed distance of each voxel to the border of a mask of any dimension, positive inside.
 
-    It is measured from centre to centre across the border, less half the finest edge, and cut at ±`limit`; a mask
+    It is measured from centre to centre across the border, minus half the finest edge, and clipped to ±`limit`; a mask
     without a border has ±`limit` everywhere. It estimates the distance to the smooth surface behind the mask better
     than `priors.signed_distance`, the exact distance to the voxels' faces. Periodic boxes need a limit.
     """
@@ -134,12 +135,13 @@ def profile_mask(mask: np.ndarray) -> np.ndarray:
     squares = square_distances(mask, (1.0, 1.0, 1.0), reach, offset=0.5, both=True)
     distance = np.copysign(np.sqrt(np.abs(squares)), squares)
     del squares
-    once = gaussian_blur(distance, voxels, STAIRS)
-    np.multiply(once, 2, out=distance)
-    distance -= gaussian_blur(once, voxels, STAIRS)
-    error = once
+    # With the blur G, 2 G - G² smooths the voxels' stairs, and shrinks curved surfaces less than G does.
+    blurred = gaussian_blur(distance, voxels, STAIRS)
+    np.multiply(blurred, 2, out=distance)
+    distance -= gaussian_blur(blurred, voxels, STAIRS)
+    error = blurred  # its memory is used again
     for _ in range(SWEEPS):
-        if not _find_errors(distance, mask, error):
+        if not _fill_errors(distance, mask, error):
             break
         distance -= np.float32(PULL) * gaussian_blur(error, voxels, PULL_WIDTH)
     distance *= np.float32(WORKING_SPACING / (math.sqrt(2) * WORKING_EPSILON))
@@ -147,16 +149,15 @@ def profile_mask(mask: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def _find_errors(distance, mask, error):  # pragma: no cover
-    """Fill the distances whose sign is not the mask's, 0 elsewhere; return whether there are any."""
-    wrong_signs = False
-    values, inside, wrong = distance.ravel(), mask.ravel(), error.ravel()
-    for i in range(len(values)):
-        value = min(values[i], np.float32(0)) if inside[i] else max(values[i], np.float32(0))
-        wrong[i] = value
-        if value != 0:
-            wrong_signs = True
-    return wrong_signs
+def _fill_errors(distance, mask, error):  # pragma: no cover
+    """Fill `error` with the distances whose sign is not the mask's, 0 elsewhere; return whether there are any."""
+    any_wrong = False
+    distances, inside, errors = distance.ravel(), mask.ravel(), error.ravel()
+    for i in range(len(distances)):
+        errors[i] = min(distances[i], np.float32(0)) if inside[i] else max(distances[i], np.float32(0))
+        if errors[i] != 0:
+            any_wrong = True
+    return any_wrong
 
 
 def resample(
@@ -171,22 +172,23 @@ def resample(
 ) -> np.ndarray:
     """Resample values (Z, Y, X) to a grid whose voxels are `scale` old voxels long; the first voxels' corners coincide.
 
-    New voxel i covers the old voxels from i·scale to (i + 1)·scale. Linear, after a Gaussian of (scale - 1)/2 old
-    voxels along axes that become coarser; or the value that is `nearest`, of labels. `start` and `shape` say which new
-    voxels are wanted; `corner` is the old voxel that `values` begin with, where they are a part of a volume.
+    New voxel i covers the old voxels from i·scale to (i + 1)·scale. Interpolation is linear, after a Gaussian of
+    (scale - 1)/2 old voxels along axes that become coarser; or takes the `nearest` value, for labels. `start` and
+    `shape` are the new voxels that are returned; `corner` is the first old voxel of `values` cut from a volume.
     """
     width = [0.0 if nearest else max(0.0, (s - 1) / 2) for s in scale]
-    cut, first = values, [0, 0, 0]
-    if not periodic:
+    smooth, first = values, [0, 0, 0]
+    if not periodic:  # no more is smoothed than the new voxels depend on
         margin = [math.ceil(4 * w) + 2 for w in width]
         first = [max(c, math.floor(a * s) - m) for a, s, m, c in zip(start, scale, margin, corner, strict=True)]
-        last = [math.ceil((a + n) * s) + m for a, n, s, m in zip(start, shape, scale, margin, strict=True)]
-        cut = values[tuple(slice(a - c, b - c) for a, b, c in zip(first, last, corner, strict=True))]
-    smooth = ndimage.gaussian_filter(cut, width, mode="wrap" if periodic else "nearest") if any(width) else cut
+        stop = [math.ceil((a + n) * s) + m for a, n, s, m in zip(start, shape, scale, margin, strict=True)]
+        smooth = values[tuple(slice(a - c, b - c) for a, b, c in zip(first, stop, corner, strict=True))]
+    if any(width):
+        smooth = ndimage.gaussian_filter(smooth, width, mode="wrap" if periodic else "nearest")
     for axis, (a, n, s, f) in enumerate(zip(start, shape, scale, first, strict=True)):
-        # places in the whole volume, whatever part of it this is: a part has the whole's values to the bit
-        places = (np.arange(a, a + n) + 0.5) * s - 0.5
-        smooth = _interpolate(smooth, axis, np.floor(places + 0.5) if nearest else places, f, periodic)
+        # Positions count from the volume's first voxel, not the cut's, so that rounding is the same in every cut.
+        positions = (np.arange(a, a + n) + 0.5) * s - 0.5
+        smooth = _interpolate(smooth, axis, np.floor(positions + 0.5) if nearest else positions, f, periodic)
     return smooth
 
 
@@ -200,23 +202,22 @@ def resample_mask(
     periodic: bool = False,
     corner: Sequence[int] = (0, 0, 0),
 ) -> np.ndarray:
-    """Return the signed distances to a mask's border, on voxels of `spacing`, on another grid: see `resample`."""
+    """Resample the signed distances to the border of a mask, whose voxels have edges `spacing`: see `resample`."""
     distance = centre_distance(mask, spacing, distance_reach(spacing, scale), periodic)
     return resample(distance, scale, start, shape, periodic=periodic, corner=corner)
 
 
 def distance_reach(spacing: Sequence[float], scale: Sequence[float]) -> float:
-    """Return how far signed distances are taken to resample a mask: four of the longest voxel, old or new."""
+    """Return the limit of the signed distances that resample a mask: four edges of the longest voxel, old or new."""
     return 4 * max(max(s * h, h) for s, h in zip(scale, spacing, strict=True))
 
 
-def _interpolate(values: np.ndarray, axis: int, places: np.ndarray, first: int, periodic: bool) -> np.ndarray:
-    """Return values at places along an axis, whose first value is at `first`, linearly."""
-    n, low = values.shape[axis], np.floor(places).astype(np.int64)
-    weights = (places - low).reshape([-1 if k == axis else 1 for k in range(3)])
-    lower, upper = (
-        values.take((at % n) if periodic else np.clip(at, 0, n - 1), axis) for at in (low - first, low + 1 - first)
-    )
+def _interpolate(values: np.ndarray, axis: int, positions: np.ndarray, first: int, periodic: bool) -> np.ndarray:
+    """Interpolate values linearly at positions along an axis; the first value is at position `first`."""
+    n, below = values.shape[axis], np.floor(positions).astype(np.int64)
+    weights = (positions - below).reshape([-1 if k == axis else 1 for k in range(3)])
+    indices = (below - first, below + 1 - first)
+    lower, upper = (values.take(index % n if periodic else np.clip(index, 0, n - 1), axis) for index in indices)
     return lower + (upper - lower) * weights.astype(values.dtype) if weights.any() else lower
 
 
@@ -225,14 +226,14 @@ def remove_specks(
 ) -> tuple[np.ndarray, int, int]:
     """Drop specks (26-connected) and pinholes (6-connected) under `smallest` voxels; return the mask and both counts.
 
-    Pieces that touch the faces of a periodic box, or those by which a part was cut from a volume, may go on beyond, and
-    stay. Of a part, pieces are counted whose first voxel lies in its core.
+    Pieces that touch a face of a periodic box, or a face where `part` was cut from a volume, may continue beyond it and
+    are kept. In such a part, a piece is counted if its first voxel lies in the core.
     """
     part = part or CutOut(tuple(slice(0, n) for n in mask.shape), ((periodic, periodic),) * 3)  # type: ignore[arg-type]
-    specks, count = _small_pieces(mask, smallest, part, np.ones((3, 3, 3), dtype=bool))
+    specks, speck_count = _small_pieces(mask, smallest, part, np.ones((3, 3, 3), dtype=bool))
     cleaned = mask & ~specks
-    pinholes, holes = _small_pieces(~cleaned, smallest, part, None)
-    return cleaned | pinholes, count, holes
+    pinholes, pinhole_count = _small_pieces(~cleaned, smallest, part, None)
+    return cleaned | pinholes, speck_count, pinhole_count
 
 
 class CutOut(NamedTuple):
@@ -249,23 +250,23 @@ def _small_pieces(
     labels: np.ndarray = ndimage.label(mask, structure)[0]  # type: ignore[index]
     small: np.ndarray = np.bincount(labels.ravel()) < smallest
     small[0] = False
-    for axis, cut_ends in enumerate(part.cut):  # a piece that is cut may go on beyond, and be larger
+    for axis, cut_ends in enumerate(part.cut):  # a piece at a cut may be larger than what is visible of it
         for end, cut in zip((0, -1), cut_ends, strict=True):
             if cut:
                 small[np.unique(np.take(labels, end, axis=axis))] = False
     pieces = small[labels]
-    where = np.flatnonzero(pieces)
-    first_voxels = where[np.unique(labels.ravel()[where], return_index=True)[1]]
+    voxels = np.flatnonzero(pieces)
+    first_voxels = voxels[np.unique(labels.ravel()[voxels], return_index=True)[1]]
     in_core = np.zeros(mask.shape, dtype=bool)
-    in_core[part.core] = True  # of the tiles that see a piece, the one with its first voxel counts it
+    in_core[part.core] = True  # several tiles may read a piece: the one whose core has its first voxel counts it
     return pieces, int(np.count_nonzero(in_core.ravel()[first_voxels]))
 
 
-def _middle(whole: slice, length: int) -> slice:
-    extent = whole.stop - whole.start
-    length = min(length, extent)
-    first = whole.start + (extent - length) // 2
-    return slice(first, first + length)
+def _middle(interval: slice, longest: int) -> slice:
+    """Return the middle of an interval, at most `longest` voxels of it."""
+    length = min(longest, interval.stop - interval.start)
+    start = interval.start + (interval.stop - interval.start - length) // 2
+    return slice(start, start + length)
 
 
 def _tiles(n: int, size: int) -> list[slice]:

@@ -107,22 +107,23 @@ class Prepared:
 
     @property
     def length(self) -> float:
-        """Return a working length of 1 in `unit`."""
+        """Return the length, in `unit`, of 1 working unit."""
         return self.working_voxel / WORKING_SPACING
 
     @property
     def volume_fraction(self) -> float:
-        """Return the part of the scan, or of its region of interest, that is structure."""
+        """Return the fraction of the scan, or of its region of interest, that is structure."""
         return float((self.mask if self.roi is None else self.mask[self.roi]).mean())
 
     def scan_alike(self, grown: np.ndarray, seed: int) -> Prepared:
-        """Scan a period of a grown shape as this scan was made, and prepare it alike: its phase field if this is one,
-        else its mask `(Z, Y, X)` at this scan's thickness in voxels; an image as blurred and noisy as this one."""
+        """Scan a simulated periodic shape `(Z, Y, X)`, positive inside, as this scan was made, and prepare the result:
+        a field as it is; a mask or an image on voxels of which the structure is as many thick as here, and an image as
+        blurred and noisy as this one."""
         if self.kind == "field":
             return prepare(Volume(grown), kind="field", periodic=True, one_scale=self.one_scale)
         mask, quality = grown > 0, self.quality
         thickness = thinner_thickness(mask)
-        step = [thickness / (scale * self.thickness) for scale in self.scale]
+        step = [thickness / (scale * self.thickness) for scale in self.scale]  # of a scan voxel, in the shape's voxels
         z, y, x = (self.working_voxel / scale for scale in self.scale)
         if quality is None:
             values = sample_mask(mask, step, keep_volume=True).astype(np.uint8)
@@ -145,11 +146,11 @@ class Prepared:
             rescanned = self.scan_alike(inside, 0).volume_fraction
         except ScanError:
             return self.volume_fraction
-        share = self.volume_fraction * inside.mean() / rescanned
-        return share if 0 < share < 1 else self.volume_fraction
+        corrected = self.volume_fraction * inside.mean() / rescanned
+        return corrected if 0 < corrected < 1 else self.volume_fraction
 
     def part(self, where: Box) -> Grid:
-        """Return the grid of a part: it is periodic only where it is all of a periodic grid."""
+        """Return the grid of a box: it is periodic only where the box is all of a periodic grid."""
         z, y, x = self.mask[where].shape
         whole = (z, y, x) == self.grid.shape
         return Grid((z, y, x), self.grid.spacing, self.grid.boundary if whole else "replicate")
@@ -164,8 +165,8 @@ class Prepared:
 def read_scan(
     scan: Source, *, label: int | None = None, crop: Crop | None = None, whole: bool = False, **reading: Any
 ) -> tuple[Volume, tuple[int, int, int]]:
-    """Return a scan as `load`, and its shape; of a large file no more is read than `prepare` uses, which a note
-    says, unless `whole`."""
+    """Return a scan as `load` does, and the shape of all of it; unless `whole`, only the middle of a large file is
+    read, as much as `prepare` uses, and a note says so."""
     volume = load(scan, crop=crop, label=label, **reading, lazy=True)
     shape = volume.shape
     if whole or not volume.in_file or max(shape) <= LARGEST_SCAN:
@@ -181,20 +182,20 @@ def read_scan(
 def coarser_level(
     scan: Source, shape: tuple[int, int, int], prepared: Prepared, *, key: str | None = None, **reading: Any
 ) -> str | None:
-    """Return the key of the level of a pyramid that shows more of a large scan, None where its finest level does, of
-    which `shape` and `prepared` are."""
+    """Return the key of the level of a pyramid that shows most of a large scan and still resolves its structure; None
+    if that is the finest level, whose `shape` and `prepared` scan are given."""
     levels = levels_of(scan, key)
     # A phase field has its ε at the finest level alone, and a spacing of the caller's is that of one level.
     only_one = len(levels) < 2 or None in levels.values()
     if only_one or prepared.noise or prepared.kind == "field" or reading.get("spacing") is not None:
         return None
-    edges = [(name, np.array(spacing)[-3:]) for name, spacing in levels.items()]
-    finest, best, size = edges[0][1], None, np.array(shape, dtype=float)
-    for name, edge in edges[1:]:
+    (_, finest), *coarser = [(name, np.array(spacing)[-3:]) for name, spacing in levels.items()]
+    best, size = None, np.array(shape, dtype=float)
+    for name, edges in coarser:
         if size.max() <= LARGEST_SCAN:  # the level before shows all of the scan
             break
-        size = shape * finest / edge
-        thickness = prepared.thickness * prepared.scale[0] * finest[0] / edge.max()
+        size = shape * finest / edges
+        thickness = prepared.thickness * prepared.scale[0] * finest[0] / edges.max()
         if thickness < SUITED or size.min() < FEWEST:
             break
         best = name
@@ -212,15 +213,15 @@ def prepare(
     one_scale: bool = False,
     quality: Quality | None = None,
 ) -> Prepared:
-    """Find the structure and put it on the working grid, where its median thickness is a known number of voxels.
+    """Find the structure of a scan and put it on the working grid, where its median thickness is known in voxels.
 
     A mask is a volume of two values, a phase field a float volume with plateaus near ±1, anything else an image: it is
     smoothed (Gaussian, one voxel of the finest axis) and thresholded. The grid is kept where it is a phase field's, or
     isotropic with a median thickness of 5 to 16 voxels; else it is resampled to a thickness of 8: images as smoothed
-    grey levels, masks as signed distances. Thickness is the local thickness (`morphology.local_thickness`), its median
-    over the structure's surface. Specks and pinholes smaller than a ball of half that diameter are dropped. Raises
-    ValueError if a kind or threshold is none, and ScanError if there is no structure, nothing else, no surface, or
-    nothing at least 3 voxels thick; or if `roi` or `threshold` do not fit the scan.
+    grey levels, masks as signed distances. Thickness is the median of the local thickness
+    (`morphology.local_thickness`) over the structure's surface. Specks and pinholes smaller than a ball of half that
+    diameter are dropped. Raises ValueError if a kind or threshold is not valid, and ScanError if there is no structure,
+    no background, no surface, or nothing at least 3 voxels thick; or if `roi` or `threshold` do not fit the scan.
 
     Parameters
     ----------
@@ -242,31 +243,31 @@ def prepare(
         Blur and noise of an image, where they are known; else they are measured.
     """
     structure.check_options(kind, threshold)
-    region, laid = (None, ()) if roi is None else structure.read_region(roi, field)
-    region = None if region is None else region.values != 0
-    where, notes = grids.bounding_box(field.shape, region, LARGEST_SCAN)
-    region = None if region is None else region[where]
-    part = replace(field, array=field.values[where], affine=None, notes=field.notes + laid + notes)
-    periodic = periodic and part.shape == field.shape
-    options = {"kind": kind, "threshold": threshold, "dark": dark}
+    laid, region_notes = (None, ()) if roi is None else structure.read_region(roi, field)
+    region = None if laid is None else laid.values != 0
+    box, box_notes = grids.bounding_box(field.shape, region, LARGEST_SCAN)
+    region = None if region is None else region[box]
+    cropped = replace(field, array=field.values[box], affine=None, notes=field.notes + region_notes + box_notes)
+    periodic = periodic and cropped.shape == field.shape
+    options = {"kind": kind, "threshold": threshold, "dark": dark, "region": region, "periodic": periodic}
     extremes = (field.values.min(), field.values.max())
-    detected, signed = structure.find_structure(part, region=region, periodic=periodic, extremes=extremes, **options)  # type: ignore[arg-type]
+    detected, signed = structure.find_structure(cropped, extremes=extremes, **options)  # type: ignore[arg-type]
     prepared = _put_on_grid(_Scan(detected, signed, periodic, region, one_scale), _choose_box, _profile)
     if detected == "image" and quality is None:
-        quality = measure_quality(-part.values if dark else part.values, signed.values > 0, part.spacing)
-    corner = tuple(s.start + o for s, o in zip(where, prepared.origin, strict=True))
-    return replace(prepared, quality=quality, origin=corner)  # type: ignore[arg-type]
+        quality = measure_quality(-cropped.values if dark else cropped.values, signed.values > 0, cropped.spacing)
+    origin = tuple(edge.start + start for edge, start in zip(box, prepared.origin, strict=True))
+    return replace(prepared, quality=quality, origin=origin)  # type: ignore[arg-type]
 
 
 def prepare_whole(kind: Kind, signed: Volume, periodic: bool, most: int) -> Prepared:
-    """Put all of a scan on the working grid, without blur and noise. The sign of `signed` tells structure from
-    background (`structure.find_structure`). Raises TooLarge where that is more than `most` working voxels."""
+    """Put all of a scan on the working grid, without measuring blur and noise; `signed` is above 0 in the structure
+    (`structure.find_structure`). Raises TooLarge where that takes more than `most` working voxels."""
 
     def take_all(scan: _Scan, scale: tuple[float, float, float]) -> _Extent:
-        full = count_voxels(scan.field.shape, scale)
-        if math.prod(full) > most:
-            raise TooLarge(f"expected at most {most} working voxels in one piece, got {_join_sides(full)}")
-        return (0, 0, 0), full, ()
+        shape = count_voxels(scan.field.shape, scale)
+        if math.prod(shape) > most:
+            raise TooLarge(f"expected at most {most} working voxels in one piece, got {_join_sides(shape)}")
+        return (0, 0, 0), shape, ()
 
     # These scans may be large: compiled loops, which know no periodic box, need less memory. They differ by some 1e-7.
     profile = _profile if periodic else lambda mask, _: grids.profile_mask(mask)
@@ -275,7 +276,7 @@ def prepare_whole(kind: Kind, signed: Volume, periodic: bool, most: int) -> Prep
 
 @dataclass(frozen=True)
 class _Scan:
-    """A scan once its structure, where the field is above 0, is known."""
+    """A scan whose structure is known: `field` is above 0 there."""
 
     kind: Kind
     field: Volume
@@ -304,18 +305,19 @@ def _put_on_grid(
     choose_box: Callable[[_Scan, tuple[float, float, float]], _Extent],
     profile: Callable[[np.ndarray, Grid], np.ndarray],
 ) -> Prepared:
-    """Choose the working voxel, move a scan to it, as far as `choose_box` says, drop specks, `profile` the mask, choose
-    windows."""
-    spacing, noise = scan.field.spacing, scan.kind != "field" and structure.is_noise(scan.field.values > 0)
+    """Put a scan on the working grid: choose the working voxel, resample the box that `choose_box` returns, drop
+    specks, make the phase field of the mask with `profile`, and choose windows."""
+    spacing = scan.field.spacing
+    noise = scan.kind != "field" and structure.is_noise(scan.field.values > 0)
     keeps_grid = scan.kind == "field" or noise  # a phase field has its ε, and noise no thickness
-    phase, name = scan.thinner
-    thickness, thick = grids.median_thickness(phase, spacing, scan.periodic)
-    note = judge_thickness(name, thickness, thick, spacing, keeps_grid)
+    thinner, name = scan.thinner
+    thickness, thick = grids.median_thickness(thinner, spacing, scan.periodic)
+    thickness_note = judge_thickness(name, thickness, thick, spacing, keeps_grid)
     kept = KEPT_FOR_LAWS if scan.one_scale else KEPT
     scale, why = choose_scale(scan.field.shape, spacing, thickness, keeps_grid, kept=kept, periodic=scan.periodic)
     start, shape, cut = choose_box(scan, scale)
     edge = working_edge(scale, spacing)
-    values, region = _move(scan, scale, start, shape)
+    values, region = _resample(scan, scale, start, shape)
     grid = Grid(shape, boundary="periodic" if scan.periodic and not cut else "replicate")
     mask, dropped = _clean_mask(scan.kind, values, region, thickness / edge, grid.periodic)
     windows = grids.boxes_by_surface(grids.surface_voxels(mask), LARGEST_WINDOW)
@@ -326,11 +328,11 @@ def _put_on_grid(
         phase = profile(mask, grid)
     else:
         phase = values if region is None or region.all() else np.minimum(values, profile(region, grid))
-    values, size = np.ascontiguousarray(phase, dtype=np.float32), (scale, edge, scan.field.unit, thickness / edge)
-    notes = (*scan.field.notes, note, *why, *cut, *dropped, *inverted)
-    origin = tuple(a * s for a, s in zip(start, scale, strict=True))
+    phase, size = np.ascontiguousarray(phase, dtype=np.float32), (scale, edge, scan.field.unit, thickness / edge)
+    notes = (*scan.field.notes, thickness_note, *why, *cut, *dropped, *inverted)
+    origin = tuple(first * step for first, step in zip(start, scale, strict=True))
     known = {"roi": region, "noise": noise, "one_scale": scan.one_scale}
-    return Prepared(scan.kind, values, mask, grid, *size, tuple(windows), notes, origin, **known)  # type: ignore[arg-type]
+    return Prepared(scan.kind, phase, mask, grid, *size, tuple(windows), notes, origin, **known)  # type: ignore[arg-type]
 
 
 def _profile(mask: np.ndarray, grid: Grid) -> np.ndarray:
@@ -338,14 +340,14 @@ def _profile(mask: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def note_on_filling(share: float) -> tuple[str, ...]:
-    """Return a note where the structure fills more than the background."""
+    """Return a note where the structure fills more than the background, none elsewhere."""
     return (MOSTLY.format(share),) if share > HALF else ()
 
 
 def judge_thickness(
     name: str, median: float, thick: float, spacing: tuple[float, float, float], keeps_grid: bool
 ) -> str:
-    """Return a note on the thickness of a phase; raise ScanError where its 95th percentile is too thin for a shape."""
+    """Return a note on a phase's median thickness; raise ScanError where its 95th percentile, `thick`, is too thin."""
     voxel = math.prod(spacing) ** (1 / 3)
     thin = thick < (THINNEST - 0.5) * voxel  # balls on the grid understate thin tubes
     if thin and not keeps_grid:
@@ -364,10 +366,10 @@ def choose_scale(
     kept: tuple[float, float] = KEPT,
     periodic: bool = False,
 ) -> tuple[tuple[float, float, float], tuple[str, ...]]:
-    """Return the working voxel of a scan in its own voxels (z, y, x), and notes; all ones where its grid is kept.
+    """Return the edges of a working voxel in scan voxels (z, y, x), and notes; all ones where the scan's grid is kept.
 
-    The grid of isotropic voxels is kept where it `keeps_grid`, whatever the thickness, or where the median thickness is
-    between the two numbers of voxels that are `kept`.
+    A grid of isotropic voxels is kept if `keeps_grid`, whatever the thickness, or if the median thickness in voxels is
+    between the two numbers `kept`.
     """
     finest = min(spacing)
     if max(spacing) <= 1.01 * finest and (keeps_grid or kept[0] <= thickness / finest <= kept[1]):
@@ -379,20 +381,20 @@ def choose_scale(
         edge = max(extent / FEWEST, finest)
         note = f"Resampled as far as leaves {FEWEST} voxels a side"
     scale = [edge / h for h in spacing]
-    if periodic:
+    if periodic:  # a period is a whole number of working voxels
         scale = [n / max(4, round(n / s)) for n, s in zip(shape, scale, strict=True)]
     edges = " x ".join(f"{s:.3g}" for s in scale)
     return (scale[0], scale[1], scale[2]), (f"{note}: a working voxel is {edges} scan voxels (z, y, x).",)
 
 
 def working_edge(scale: Sequence[float], spacing: Sequence[float]) -> float:
-    """Return the edge of a working voxel in the scan's unit; the mean of edges that are not quite alike."""
+    """Return the edge of a working voxel in the scan's unit: the geometric mean of edges that differ."""
     edges = [s * h for s, h in zip(scale, spacing, strict=True)]
     return edges[0] if max(edges) <= (1 + 1e-9) * min(edges) else math.prod(edges) ** (1 / 3)
 
 
 def count_voxels(shape: Sequence[int], scale: Sequence[float]) -> tuple[int, int, int]:
-    """Return the working voxels of a scan of a shape along each axis; raise ScanError where they are too few."""
+    """Return the number of working voxels along each axis of a scan; raise ScanError where there are too few."""
     z, y, x = (math.floor(n / s + 1e-6) for n, s in zip(shape, scale, strict=True))
     if min(z, y, x) < 4:
         raise ScanError(f"expected at least 4 working voxels along each axis, got {_join_sides((z, y, x))}")
@@ -400,42 +402,42 @@ def count_voxels(shape: Sequence[int], scale: Sequence[float]) -> tuple[int, int
 
 
 def _choose_box(scan: _Scan, scale: tuple[float, float, float]) -> _Extent:
-    """Return all of a scan, or the part of a large one that holds most of its surface."""
-    all_voxels = count_voxels(scan.field.shape, scale)
-    if max(all_voxels) <= LARGEST_BOX:
-        return (0, 0, 0), all_voxels, ()
-    sides = [min(n, LARGEST_BOX) for n in all_voxels]
-    scan_sides = [math.ceil(n * step) for n, step in zip(sides, scale, strict=True)]
+    """Return the extent of all of a scan, or the box of a large one that holds most of its surface."""
+    shape = count_voxels(scan.field.shape, scale)
+    if max(shape) <= LARGEST_BOX:
+        return (0, 0, 0), shape, ()
+    sides = [min(n, LARGEST_BOX) for n in shape]
+    scan_sides = [math.ceil(side * step) for side, step in zip(sides, scale, strict=True)]
     boxes = grids.boxes_by_surface(grids.surface_voxels(scan.counted), scan_sides)
-    box = boxes[0] if boxes else tuple(slice(0, n) for n in scan_sides)
-    last = [n - side for n, side in zip(all_voxels, sides, strict=True)]
-    z, y, x = (min(int(edge.start / step), end) for edge, step, end in zip(box, scale, last, strict=True))
-    note = f"Of {_join_sides(all_voxels)} working voxels, {_join_sides(sides)} from {(z, y, x)} on are used."
+    box = boxes[0] if boxes else tuple(slice(0, side) for side in scan_sides)
+    latest = [n - side for n, side in zip(shape, sides, strict=True)]  # starts at which the box ends with the scan
+    z, y, x = (min(int(edge.start / step), end) for edge, step, end in zip(box, scale, latest, strict=True))
+    note = f"Of {_join_sides(shape)} working voxels, {_join_sides(sides)} from {(z, y, x)} on are used."
     return (z, y, x), (sides[0], sides[1], sides[2]), (note,)
 
 
-def _move(
+def _resample(
     scan: _Scan, scale: tuple[float, float, float], start: tuple[int, int, int], shape: tuple[int, int, int]
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the level values and region of interest on the working grid."""
-    values, region, spacing = scan.field.values, scan.region, scan.field.spacing
+    """Return the scan's values (above 0 in the structure) and its region of interest on the working grid."""
+    values, region = scan.field.values, scan.region
     if scale == (1.0, 1.0, 1.0):
-        box = tuple(slice(a, a + n) for a, n in zip(start, shape, strict=True))
+        box = tuple(slice(first, first + n) for first, n in zip(start, shape, strict=True))
         return values[box], None if region is None else region[box]
     target: Any = (scale, start, shape)
     if scan.kind == "mask":
-        values = grids.resample_mask(values > 0, spacing, *target, periodic=scan.periodic)
+        values = grids.resample_mask(values > 0, scan.field.spacing, *target, periodic=scan.periodic)
     else:
         values = grids.resample(values, *target, periodic=scan.periodic)
-    if region is None:
-        return values, None
-    return values, grids.resample(region.astype(np.uint8), *target, periodic=scan.periodic, nearest=True) > 0
+    if region is not None:
+        region = grids.resample(region.astype(np.uint8), *target, periodic=scan.periodic, nearest=True) > 0
+    return values, region
 
 
 def _clean_mask(
     kind: Kind, values: np.ndarray, region: np.ndarray | None, thickness: float, periodic: bool
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the mask on the working grid, without specks and pinholes unless of a phase field, and notes."""
+    """Return the mask of values on the working grid, and notes; except of a phase field, drop specks and pinholes."""
     mask = values > 0 if region is None else (values > 0) & region
     if kind == "field":
         return mask, ()
@@ -447,12 +449,12 @@ def _clean_mask(
 
 
 def thinner_thickness(mask: np.ndarray) -> float:
-    """Return the median thickness, in voxels, of the phase of a period `(Z, Y, X)` that fills less."""
+    """Return the median thickness, in voxels, of the phase of a periodic mask `(Z, Y, X)` that fills less."""
     return grids.median_thickness(mask if mask.mean() <= HALF else ~mask, (1.0, 1.0, 1.0), periodic=True)[0]
 
 
 def smallest_piece(thickness: float) -> float:
-    """Return the volume of a ball of half a thickness: what is smaller is no structure."""
+    """Return the volume of a ball whose diameter is half a thickness: pieces that are smaller are no structure."""
     return math.pi / 6 * (thickness / 2) ** 3
 
 
@@ -461,10 +463,10 @@ def _join_sides(shape: Iterable[int]) -> str:
 
 
 def why_no_texture(prepared: Prepared, diagram: Diagram) -> str:
-    """Return why a scan shows no texture whose law could be read, as a sentence; empty where it may."""
+    """Return a sentence on why no law can be read from a scan's texture; empty where one can."""
     edge = max(s.stop - s.start for s in prepared.windows[0]) * prepared.grid.spacing[0]
-    bend = np.average(np.hypot(*np.asarray(diagram.points).T), weights=np.asarray(diagram.weights)) * edge
-    if bend < FLATTEST:
+    curvature = np.average(np.hypot(*np.asarray(diagram.points).T), weights=np.asarray(diagram.weights))
+    if curvature * edge < FLATTEST:
         return "No law: the surface is flat, and a flat surface says nothing of how it would bend."
     if is_ball(prepared.mask) or is_ball(~prepared.mask):
         return "No law: the scan shows a single ball-like body, and a texture is many alike."

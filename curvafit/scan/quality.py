@@ -1,4 +1,4 @@
-"""How blurred a scan is and how noisy, measured from its grey levels; and images of grown shapes that are as it is."""
+"""How blurred and how noisy a scan is, measured from its grey levels; and images of simulated shapes made like it."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Quality:
 
     @property
     def smoothed(self) -> float:
-        """Return the noise, over the contrast, that is left after smoothing by a voxel of the finest axis."""
+        """Return the noise over the contrast after smoothing by one voxel of the finest axis."""
         return self.noise * _smoothing_factor(self.grain, self.spacing)
 
     @property
@@ -63,8 +63,8 @@ class Quality:
         return self.smoothed > NOISY or max(self.spacing) > SLICED * min(self.spacing)
 
     def image(self, mask: np.ndarray, step: Sequence[float], seed: int) -> np.ndarray:
-        """Return grey levels of a periodic mask `(Z, Y, X)` as this scan would show it: blurred, sampled on voxels of
-        `step` of the mask's (z, y, x), and made noisy with noise of a seed."""
+        """Return grey levels of a periodic mask `(Z, Y, X)` as this scan would show it: sampled on voxels with edges
+        `step` in the mask's voxels, blurred, and with noise from `seed`; structure is about 1, background 0."""
         filled = np.clip(centre_distance(mask, (1.0, 1.0, 1.0), 2.0, periodic=True) + 0.5, 0, 1)
         grey = resample(filled, step, (0, 0, 0), sampled_shape(mask.shape, step), periodic=True)
         widths = [min(self.spacing) / h for h in self.spacing]
@@ -77,27 +77,27 @@ class Quality:
 def sample_mask(
     mask: np.ndarray, step: Sequence[float], periodic: bool = True, *, keep_volume: bool = False
 ) -> np.ndarray:
-    """Return a mask `(Z, Y, X)` on voxels of `step` of its own (z, y, x), by signed distances: a thin structure loses
-    some per cent of its volume, unless `keep_volume` moves its surface outwards by as much."""
+    """Resample a mask `(Z, Y, X)` by signed distances to voxels with edges `step` in its own voxels (z, y, x). A thin
+    structure loses some per cent of its volume, unless `keep_volume` moves its surface outwards to restore it."""
     shape = sampled_shape(mask.shape, step)
     sampled = resample_mask(mask, (1.0, 1.0, 1.0), step, (0, 0, 0), shape, periodic=periodic)
     return sampled > (np.quantile(sampled, 1 - mask.mean()) if keep_volume else 0)
 
 
 def sampled_shape(shape: Sequence[int], step: Sequence[float]) -> tuple[int, ...]:
-    """Return how many voxels of `step` lie along the axes of a box of voxels of 1."""
+    """Return how many voxels with edges `step` fit along each axis of a box of `shape` unit voxels, 4 or more."""
     return tuple(max(4, int(n / h)) for n, h in zip(shape, step, strict=True))
 
 
 def measure_quality(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, float, float]) -> Quality:
     """Measure blur and noise of a scan from its structure.
 
-    Blur, contrast and shift of the boundary are those with which the structure, blurred, explains the grey levels best
-    (least squares over `_BLURS` and `_SHIFTS`); thin structures come out too fat where noise shifts the threshold. The
-    noise is the deviation of grey levels deep within the phases, less uneven lighting. Where nothing lies deep, the
-    noise is taken for white and read from second differences along three axes, which neither structure nor lighting
-    passes (Immerkær 1996). The mask of the structure is bool, of the image's shape `(Z, Y, X)`. Raises ScanError if the
-    grey levels have no contrast between structure and background.
+    Blur, contrast and shift of the boundary are those with which the blurred structure fits the grey levels best (least
+    squares over `_BLURS` and `_SHIFTS`); thin structures come out too fat where noise shifts the threshold. The noise
+    is the deviation of grey levels deep within the phases, after uneven lighting is subtracted. Without deep voxels,
+    the noise is assumed to be white and estimated from second differences along three axes, which remove structure and
+    lighting (Immerkær 1996). The mask of the structure is bool, of the image's shape `(Z, Y, X)`. Raises ScanError if
+    the grey levels have no contrast between structure and background.
     """
     box = next(iter(boxes_by_surface(surface_voxels(mask), _MEASURED)), (slice(None),) * 3)
     image, mask = image[box].astype(np.float32), mask[box]
@@ -107,35 +107,36 @@ def measure_quality(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, f
     blur, contrast, shift = _fit_blur(levels, distance.astype(np.float32), edges)
     if not contrast > 0:
         raise ScanError("expected grey levels that tell structure from background, got none that do")
-    noise, rest = _measure_deep_noise(levels, distance, edges) or (_measure_white_noise(levels), 0.0)
-    grain = min(_GRAINS, key=lambda width: abs(_smoothing_factor(width, spacing) - rest))
+    noise, ratio = _measure_deep_noise(levels, distance, edges) or (_measure_white_noise(levels), 0.0)
+    grain = min(_GRAINS, key=lambda width: abs(_smoothing_factor(width, spacing) - ratio))
     return Quality(blur, noise / contrast, grain, shift, spacing)
 
 
 def _fit_blur(levels: np.ndarray, distance: np.ndarray, edges: Sequence[float]) -> tuple[float, float, float]:
-    """Return blur, contrast and boundary shift of levels of mean 0 on voxels with edges in units of the finest."""
-    explained = []
+    """Return the blur, contrast and boundary shift that fit levels of mean 0 best; lengths are in the finest edge."""
+    fits = []
     for shift in _SHIFTS:
         filled = np.clip(distance - shift + 0.5, 0, 1)
         for blur in _BLURS:
             model = ndimage.gaussian_filter(filled, [blur / h for h in edges])
             model -= model.mean()
             product, square = float((model * levels).mean()), float(np.square(model).mean())
-            if square > 0:
-                explained.append((product * abs(product) / square, blur, product / square, shift))
-    return max(explained)[1:]
+            if square > 0:  # the variance that the model explains has the sign of the contrast: inverted ones come last
+                fits.append((product * abs(product) / square, blur, product / square, shift))
+    return max(fits)[1:]
 
 
 def _measure_deep_noise(levels: np.ndarray, distance: np.ndarray, edges: Sequence[float]) -> tuple[float, float] | None:
-    """Return the deviation of levels deep within the phases and the share of it that smoothing leaves, or None."""
+    """Return the deviation of levels deep within the phases, and the fraction of it that is left after smoothing by one
+    voxel of the finest axis; None where too few voxels lie deep."""
     smoothing, uneven = ([width / h for h in edges] for width in (1.0, _UNEVEN))
-    both = (levels, ndimage.gaussian_filter(levels, smoothing))
+    images = (levels, ndimage.gaussian_filter(levels, smoothing))
     squares, count = np.zeros(2), 0
     for deep in (distance >= _DEEP, distance <= -_DEEP):
-        around = np.maximum(ndimage.gaussian_filter(deep.astype(np.float32), uneven), 1e-6)
-        for k, each in enumerate(both):
-            mean = ndimage.gaussian_filter(np.where(deep, each, 0), uneven) / around
-            squares[k] += float(np.square((each - mean)[deep], dtype=np.float64).sum())
+        weights = np.maximum(ndimage.gaussian_filter(deep.astype(np.float32), uneven), 1e-6)
+        for k, image in enumerate(images):
+            lighting = ndimage.gaussian_filter(np.where(deep, image, 0), uneven) / weights  # mean over deep voxels
+            squares[k] += float(np.square((image - lighting)[deep], dtype=np.float64).sum())
         count += int(np.count_nonzero(deep))
     if count < _FEWEST:
         return None
@@ -147,14 +148,15 @@ def _measure_white_noise(levels: np.ndarray) -> float:
     """Return the deviation of white noise in levels."""
     for axis in range(3):
         levels = np.diff(levels, 2, axis)
-    return float(np.median(np.abs(levels))) / _NORMAL_MEDIAN / 6**1.5
+    return float(np.median(np.abs(levels))) / _NORMAL_MEDIAN / 6**1.5  # (1, -2, 1) multiplies the deviation by √6
 
 
 def _smoothing_factor(grain: float, spacing: Sequence[float]) -> float:
     """Return the factor by which smoothing by a voxel of the finest axis lowers the deviation of noise of a grain."""
-    spike, factor = np.eye(1, 65, 32)[0], 1.0
+    # White noise that is filtered has a deviation proportional to the norm of the filter's response to an impulse.
+    impulse, factor = np.eye(1, 65, 32)[0], 1.0
     for edge in spacing:
         width = min(spacing) / edge
-        noise = ndimage.gaussian_filter(spike, grain * width)
-        factor *= float(np.linalg.norm(ndimage.gaussian_filter(noise, width)) / np.linalg.norm(noise))
+        response = ndimage.gaussian_filter(impulse, grain * width)
+        factor *= float(np.linalg.norm(ndimage.gaussian_filter(response, width)) / np.linalg.norm(response))
     return factor

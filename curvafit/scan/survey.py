@@ -1,8 +1,8 @@
 """What all tiles of a volume must have in common: its kind, threshold, noise and thickness, found box by box.
 
-Three passes read the volume. The first finds its extremes and kind; the second, of images alone, Otsu's threshold, and
-before it padding where one value fills much of them; the third counts the structure, and where it has most surface.
-There the thickness is measured that sets the working grid.
+Three passes read the volume. The first finds its extremes and kind; the second, for images alone, Otsu's threshold (and
+before it the padding, where one value fills much of the image); the third counts the structure and finds the box with
+most surface. There the thickness is measured that sets the working grid.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from curvafit.volumes.volume import Box, Volume, cut_boxes, grow, within
 class Plan:
     """What the tiles of a volume have in common.
 
-    `smallest` is the fewest voxels of a piece of an image's structure that is no speck, 0 where all pieces count; a
-    working voxel has `scale` of the volume's voxels and the edge `edge`, and there are `working` along (z, y, x);
-    `reach` is the radius of the largest ball where the thickness was measured. Lengths are in the volume's unit. Tiles
-    have `cores`, and balls of both phases are painted on grids coarser by `factors`.
+    `smallest` is the fewest voxels of a piece of an image's structure that is no speck, 0 where all pieces count;
+    `scale` is the edges of a working voxel in the volume's voxels, `edge` its edge in the volume's unit, and `working`
+    the number of working voxels along (z, y, x); `reach` is the radius of the largest ball where the thickness was
+    measured. Tiles have `cores`; balls of structure and background are painted on grids coarser by `factors`.
     """
 
     structure: Structure
@@ -54,7 +54,7 @@ class Plan:
 
     @property
     def finest(self) -> Blocks:
-        """The division whose parts make up the blocks of any number along an axis up to `MOST`."""
+        """The finest division into blocks: any division into up to `MOST` blocks along an axis joins some of them."""
         shape = self.volume.shape
         starts = (sorted({n * k // count for count in range(1, MOST + 1) for k in range(count)}) for n in shape)
         return Blocks(shape, tuple(map(tuple, starts)))  # type: ignore[arg-type]
@@ -95,32 +95,34 @@ def survey(structure: Structure, run: Run) -> Plan:
 
 
 def _measure_thickness(plan: Plan, order: Sequence[Box], inside: bool) -> tuple[float, float, Plan]:
-    """Return median and 95th percentile of a phase's thickness, as `grids.median_thickness`, and the plan's reach."""
+    """Return median and 95th percentile of the thickness of the structure (`inside`) or the background, as
+    `grids.median_thickness`, from the first box; and the plan with its reach."""
     spacing, box = plan.volume.spacing, order[0]
-    around = grow(box, 1, plan.volume.shape)
-    mask = (find_levels(plan.structure, around) > 0) == inside
-    part, surface = (each[within(box, around)] for each in (mask, surface_voxels(mask)))
-    median, thick = thickness_beneath(part, surface, spacing)
-    half = max(n * h for n, h in zip(part.shape, spacing, strict=True)) / 2
-    finite = [float(ball_radii(each, spacing, half).max()) for each in (part, ~part) if each.any()]
-    return median, thick, replace(plan, reach=max(plan.reach, *finite))
+    around = grow(box, 1, plan.volume.shape)  # a voxel is on the surface by its neighbours
+    phase = (find_levels(plan.structure, around) > 0) == inside
+    mask, surface = (voxels[within(box, around)] for voxels in (phase, surface_voxels(phase)))
+    median, thick = thickness_beneath(mask, surface, spacing)
+    half = max(n * h for n, h in zip(mask.shape, spacing, strict=True)) / 2
+    radii = [float(ball_radii(voxels, spacing, half).max()) for voxels in (mask, ~mask) if voxels.any()]
+    return median, thick, replace(plan, reach=max(plan.reach, *radii))
 
 
 def _count_structure(structure: Structure, pieces: Sequence[Box], number: int) -> Record:
-    """Return the structure's voxels in a piece, its surface in boxes that may be measured, and `count_pairs`."""
+    """Return counts of a piece: voxels in the structure, `count_pairs`, and surface voxels of structure and background
+    in each box of `candidate_boxes`; and the extremes of its levels."""
     core, shape = pieces[number], structure.volume.shape
     box = grow(core, max(LAGS), shape)
-    levels = find_levels(structure, box)
     inner = within(core, box)
-    record = {"lowest": levels[inner].min(), "highest": levels[inner].max()}
+    levels = find_levels(structure, box)
     mask = levels > 0
-    record["filled"] = np.int64(np.count_nonzero(mask[inner]))
-    boxes = [
-        tuple(slice(max(a.start - b.start, 0), max(a.stop - b.start, 0)) for a, b in zip(measured, core, strict=True))
-        for measured in candidate_boxes(shape, MEASURED)
+    overlaps = [
+        tuple(slice(max(a.start - b.start, 0), max(a.stop - b.start, 0)) for a, b in zip(candidate, core, strict=True))
+        for candidate in candidate_boxes(shape, MEASURED)
     ]
+    record = {"lowest": levels[inner].min(), "highest": levels[inner].max()}
+    record["filled"] = np.int64(np.count_nonzero(mask[inner]))
     for name, phase in (("surface", mask), ("other surface", ~mask)):
         surface = surface_voxels(phase)[inner]
-        record[name] = np.array([np.count_nonzero(surface[shared]) for shared in boxes], dtype=np.int64)
+        record[name] = np.array([np.count_nonzero(surface[overlap]) for overlap in overlaps], dtype=np.int64)
     record["pairs"] = splitting.count_pairs(mask, inner, core, shape)
     return {name: np.asarray(value) for name, value in record.items()}
