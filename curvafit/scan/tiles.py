@@ -1,7 +1,7 @@
-"""The numbers of a scan that need not fit into memory: sums over tiles, each read with what lies around it.
+"""The numbers of a scan that need not fit into memory: sums over tiles, each read with its surroundings.
 
-Every number of `measure` follows from sums over blocks. A tile sums what lies in its core, on the finest division that
-blocks may need; what surrounds the core is read because balls, distances and pieces of structure reach across its
+Every number of `measure` follows from sums over blocks. A tile sums over the voxels of its core, in the finest blocks
+that may be needed; its surroundings are read because balls, distances and pieces of structure reach across the core's
 faces. So a scan in tiles has the numbers of the scan in one piece.
 """
 
@@ -45,7 +45,7 @@ HALO = 32
 #: Voxels of a tile with its surroundings, by default; the shortest edge of a core.
 LARGEST_TILE, SHORTEST = 224**3, 32
 #: Bytes that a voxel of a tile with its surroundings takes, and those of the program itself.
-_EACH, _PROGRAM = 100, 300 * 2**20
+_VOXEL_BYTES, _PROGRAM_BYTES = 100, 300 * 2**20
 #: Bins of the stored curvature diagram, in `diagrams.BIN_WIDTH`.
 _BIN = 0.25
 #: Parts of a volume: all of it, and its region of interest; the region's labels are others.
@@ -108,11 +108,11 @@ def measure(
     label, region = reading.pop("label", None), None
     volume = load(scan, label=label, **reading, lazy=True)
     if roi is not None:
-        region, laid = read_region(roi, volume, scan, **reading)
+        region, region_notes = read_region(roi, volume, scan, **reading)
         region = replace(region, array=read_labels(region, "a region of interest with labels"))
         if (count := len(np.unique(region.values))) > MOST_COMPARTMENTS:
             raise ScanError(f"expected at most {MOST_COMPARTMENTS} labels in a region of interest, got {count}")
-        volume = replace(volume, notes=(*volume.notes, *laid))
+        volume = replace(volume, notes=(*volume.notes, *region_notes))
     sampling, unit, edge = format_sampling(volume.shape, volume.spacing, volume.unit), volume.unit, min(volume.spacing)
     # Lengths are counted in the finest edge: which of two lengths is greater must not depend on a unit.
     spacing = tuple(round(h / edge, 12) for h in volume.spacing)
@@ -139,31 +139,32 @@ def _measure_whole(field: Volume, periodic: bool, progress: Progress, kind: Kind
 
 
 def _describe_tiles(plan: Plan, processes: int) -> str:
-    """Return how many tiles there are, and how much memory they take at most, as a sentence."""
+    """Return a sentence on the number of tiles and the memory that they take at most."""
     sides = " x ".join(str(max(core[axis].stop - core[axis].start for core in plan.cores)) for axis in range(3))
-    spacing, most = plan.volume.spacing, 0
-    reach = _reach(plan.reach, min(spacing))
+    spacing, largest = plan.volume.spacing, 0
+    margin = [math.ceil(_read_distance(plan.reach, min(spacing)) / h) + 1 for h in spacing]
     for core in plan.cores:
-        around = grow(core, [math.ceil(reach / h) + 1 for h in spacing], plan.volume.shape)
-        boxes = (around, _around(plan, core)[0])
-        most = max(most, *(math.prod(edge.stop - edge.start for edge in box) for box in boxes))
-    each, base = processes * _EACH * most, (processes + (processes > 1)) * _PROGRAM
-    return f"Measured in {len(plan.cores)} tiles of {sides} voxels, in about {(each + base) / 1e9:.2g} GB of memory."
+        boxes = (grow(core, margin, plan.volume.shape), _working_boxes(plan, core)[0])
+        largest = max(largest, *(math.prod(edge.stop - edge.start for edge in box) for box in boxes))
+    programs = processes + (processes > 1)  # workers, and the process that waits for them
+    size = (processes * _VOXEL_BYTES * largest + programs * _PROGRAM_BYTES) / 1e9
+    return f"Measured in {len(plan.cores)} tiles of {sides} voxels, in about {size:.2g} GB of memory."
 
 
 def _choose_edges(plan: Plan) -> tuple[int, ...]:
-    """Return the edges of tiles that are `LARGEST_TILE` voxels with their surroundings, on both grids."""
-    side, finest = round(LARGEST_TILE ** (1 / 3)), min(plan.volume.spacing)
+    """Return the edges of tiles, in voxels, of at most `LARGEST_TILE` voxels with their surroundings, on both grids."""
+    side = round(LARGEST_TILE ** (1 / 3))
+    distance = _read_distance(plan.reach, min(plan.volume.spacing))
     edges = []
     for n, h, scale in zip(plan.volume.shape, plan.volume.spacing, plan.scale, strict=True):
-        most = side - 2 * math.ceil(_reach(plan.reach, finest) / h)
-        most = max(SHORTEST, min(most, int((side - 2 * HALO) * scale)))
-        edges.append(math.ceil(n / math.ceil(n / most)))
+        longest = min(side - 2 * math.ceil(distance / h), int((side - 2 * HALO) * scale))
+        count = math.ceil(n / max(SHORTEST, longest))
+        edges.append(math.ceil(n / count))
     return tuple(edges)
 
 
-def _reach(radius: float, edge: float) -> float:
-    """Return how far around a core voxels are read for balls of a radius: as far as those reach that reach into it."""
+def _read_distance(radius: float, edge: float) -> float:
+    """Return how far around a core voxels are read, so that all balls of a radius that overlap the core are whole."""
     return 2 * radius + (NEAR + 1) * edge
 
 
@@ -171,7 +172,7 @@ def _reach(radius: float, edge: float) -> float:
 
 
 def measure_tile(plan: Plan, number: int) -> Record:
-    """Return the sums over a tile's core, on the rows of the finest division that it touches, and what else adds up."""
+    """Return the sums over a tile's core, for the finest blocks that it overlaps, and counts that add up over tiles."""
     core = plan.cores[number]
     sums = _Sums(plan, core)
     balls = _measure_balls(plan, core, plan.factors)
@@ -179,97 +180,101 @@ def measure_tile(plan: Plan, number: int) -> Record:
     voxel = math.prod(plan.volume.spacing)
     sums.add("volume", np.ones(mask[inner].shape, dtype=bool), voxel)
     sums.add("inside", mask[inner], voxel)
-    sums.add_thickness(balls.thickness, voxel)
-    lower = tuple(slice(edge.start - (edge.start > 0), edge.stop) for edge in inner)
-    first = tuple(slice(edge.start - part.start, None) for edge, part in zip(inner, lower, strict=True))
-    sums.add("χ", euler_shares(mask[lower])[first], 1.0)
+    sums.add_thickness(balls, voxel)
+    # A voxel's share of χ depends on the voxels before it: a layer before the core is taken along, where there is one.
+    extended = tuple(slice(edge.start - (edge.start > 0), edge.stop) for edge in inner)
+    in_core = tuple(slice(edge.start - outer.start, None) for edge, outer in zip(inner, extended, strict=True))
+    sums.add("χ", euler_shares(mask[extended])[in_core], 1.0)
     ends = tuple((edge.start == 0, edge.stop == n) for edge, n in zip(core, plan.volume.shape, strict=True))
-    record = {"euler": np.float64(euler_of_window(mask[lower], ends)), "pieces": np.array(balls.pieces)}
+    record = {"euler": np.float64(euler_of_window(mask[extended], ends)), "pieces": np.array(balls.pieces)}
     record |= {"widest": np.array(balls.widest), "wide": np.array(balls.wide)}
-    with_surface = _measure_surface(plan, mask, balls.box, core)
-    if with_surface is not None:
-        sums.gather("area", *with_surface)
+    surface = _measure_surface(plan, mask, balls.box, core)
+    if surface is not None:
+        sums.gather("area", *surface)
     del mask, balls
     record |= _measure_curvature(plan, core, sums)
     return {**record, **sums.rows}
 
 
 def _measure_wide(plan: Plan, number: int) -> Record:
-    """Return the sums over a tile's core that balls on a coarser grid change."""
+    """Return the sums over a tile's core of thickness whose balls are painted on a coarser grid."""
     core = plan.cores[number]
     sums, balls = _Sums(plan, core), _measure_balls(plan, core, plan.factors)
-    sums.add_thickness(balls.thickness, math.prod(plan.volume.spacing), *(factor > 1 for factor in plan.factors))
+    sums.add_thickness(balls, math.prod(plan.volume.spacing), *(factor > 1 for factor in plan.factors))
     return sums.rows
 
 
 class _Sums:
-    """Sums of a core on the finest division of a volume: of all of it, and of the parts that a region labels, by name.
+    """Sums over a core, in a table for each part of the volume: a row for each of the finest blocks, columns `SUMS`.
 
-    The part of no name is all, `INSIDE` the region, and a number one of its labels.
+    The part named "" is all of the volume, `INSIDE` its region of interest, and a number one of the region's labels.
     """
 
     def __init__(self, plan: Plan, core: Box) -> None:
-        finest, names = plan.finest, [_WHOLE]
-        self._finest, self._core, self._near, self._labels = finest, core, core, None
-        self._where, starts = [], []
-        for edge, all_starts in zip(core, finest.starts, strict=True):
-            first, last = (int(np.searchsorted(all_starts, at, side="right")) - 1 for at in (edge.start, edge.stop - 1))
-            self._where.append(slice(first, last + 1))
-            starts.append(tuple(max(all_starts[k] - edge.start, 0) for k in range(first, last + 1)))
+        finest, parts = plan.finest, [_WHOLE]
+        self._finest, self._core, self._labels_box, self._labels = finest, core, core, None
+        overlapped, starts = [], []
+        for edge, block_starts in zip(core, finest.starts, strict=True):
+            first = int(np.searchsorted(block_starts, edge.start, side="right")) - 1
+            stop = int(np.searchsorted(block_starts, edge.stop - 1, side="right"))
+            overlapped.append(slice(first, stop))
+            starts.append(tuple(max(start - edge.start, 0) for start in block_starts[first:stop]))
         z, y, x = (edge.stop - edge.start for edge in core)
-        self._local = Blocks((z, y, x), tuple(starts))  # type: ignore[arg-type]
+        # The finest blocks that the core overlaps, as slices of all blocks and as a division of the core.
+        self._overlapped, self._core_blocks = tuple(overlapped), Blocks((z, y, x), tuple(starts))  # type: ignore[arg-type]
         if plan.structure.region is not None:  # surface lies up to a working voxel beyond the core
-            self._near = grow(core, [math.ceil(s) + 2 for s in plan.scale], plan.volume.shape)
-            self._labels = plan.structure.region.read(self._near)
-            names += [INSIDE, *(str(label) for label in np.unique(self._labels).tolist() if label)]
-        self.tables = {name: np.zeros((finest.count, len(whole.SUMS))) for name in names}
+            self._labels_box = grow(core, [math.ceil(s) + 2 for s in plan.scale], plan.volume.shape)
+            self._labels = plan.structure.region.read(self._labels_box)
+            parts += [INSIDE, *(str(label) for label in np.unique(self._labels).tolist() if label)]
+        self.tables = {part: np.zeros((finest.count, len(whole.SUMS))) for part in parts}
 
-    def add(self, name: str, values: np.ndarray, each: float) -> None:
-        """Add a volume's values on the core."""
+    def add(self, name: str, values: np.ndarray, factor: float) -> None:
+        """Add values on the core's voxels, times a factor, to the column `name` of each part."""
         for part, table in self.tables.items():
             column = table[:, whole.SUMS.index(name)].reshape(self._finest.counts)
-            own = values if part == _WHOLE else values * self._lie_in(part, within(self._core, self._near))
-            column[tuple(self._where)] += each * self._local.sums(own).reshape(self._local.counts)
+            inside = values if part == _WHOLE else values * self._is_in(part, within(self._core, self._labels_box))
+            column[self._overlapped] += factor * self._core_blocks.sums(inside).reshape(self._core_blocks.counts)
 
-    def add_thickness(self, of: Sequence[np.ndarray], each: float, structure: bool = True, gaps: bool = True) -> None:
+    def add_thickness(self, balls: _Balls, factor: float, structure: bool = True, gaps: bool = True) -> None:
         """Add the thickness of structure and background on the core, or of one of them."""
+        thickness, gap = balls.thickness
         if structure:
-            self.add("thickness", of[0], each)
-            self.add("thickness²", np.square(of[0]), each)
+            self.add("thickness", thickness, factor)
+            self.add("thickness²", np.square(thickness), factor)
         if gaps:
-            self.add("gap", of[1], each)
+            self.add("gap", gap, factor)
 
-    def gather(self, name: str, places: np.ndarray, columns: np.ndarray) -> None:
-        """Add columns, of which the first is `name`, at places in voxels from the volume's first centre."""
+    def gather(self, name: str, positions: np.ndarray, columns: np.ndarray) -> None:
+        """Add columns (M, C), the first of which is `name`, at positions (M, 3) in voxels from the first centre."""
         first = whole.SUMS.index(name)
         for part, table in self.tables.items():
-            own = self.select(part, places)
-            table[:, first : first + columns.shape[1]] += self._finest.gather(places[own], columns[own])
+            inside = self.select(part, positions)
+            table[:, first : first + columns.shape[1]] += self._finest.gather(positions[inside], columns[inside])
 
-    def select(self, part: str, places: np.ndarray) -> np.ndarray:
-        """Return which places, in voxels from the volume's first centre, lie in a part."""
+    def select(self, part: str, positions: np.ndarray) -> np.ndarray:
+        """Return which positions (M, 3), in voxels from the volume's first centre, lie in a part, bool (M,)."""
         if part == _WHOLE:
-            return np.ones(len(places), dtype=bool)
-        corner, shape = np.array([[edge.start, edge.stop - edge.start] for edge in self._near]).T
-        voxels = np.clip(np.rint(places) - corner, 0, shape - 1).astype(np.int64)
-        return self._lie_in(part, tuple(voxels.T))
+            return np.ones(len(positions), dtype=bool)
+        corner, shape = np.array([[edge.start, edge.stop - edge.start] for edge in self._labels_box]).T
+        voxels = np.clip(np.rint(positions) - corner, 0, shape - 1).astype(np.int64)
+        return self._is_in(part, tuple(voxels.T))
 
-    def _lie_in(self, part: str, where: Any) -> np.ndarray:
+    def _is_in(self, part: str, index: Any) -> np.ndarray:
         assert self._labels is not None
-        labels = self._labels[where]
+        labels = self._labels[index]
         return labels != 0 if part == INSIDE else labels == int(part)
 
     @property
     def rows(self) -> Record:
-        """Return the numbers of the rows that hold anything, and the rows, of each part."""
+        """Return, for each part, the indices of the blocks whose sums are not all 0, and those blocks' sums."""
         rows = {part: np.flatnonzero(table.any(axis=1)) for part, table in self.tables.items()}
-        sums = {f"sums{part}": self.tables[part][numbers] for part, numbers in rows.items()}
-        return {**{f"rows{part}": numbers for part, numbers in rows.items()}, **sums}
+        sums = {f"sums{part}": self.tables[part][index] for part, index in rows.items()}
+        return {**{f"rows{part}": index for part, index in rows.items()}, **sums}
 
 
 class _Balls(NamedTuple):
-    """The structure in what was read around a core, specks and pinholes that were dropped, and of both phases the
-    thickness on the core, the largest ball's radius, and the voxels around which it is larger than `WIDEST`."""
+    """The structure in a box around a core, and how many specks and pinholes were dropped; then of structure and
+    background the thickness on the core, the largest radius, and the voxels whose radius is about `WIDEST`."""
 
     box: Box
     mask: np.ndarray
@@ -280,26 +285,27 @@ class _Balls(NamedTuple):
 
 
 def _measure_balls(plan: Plan, core: Box, factors: tuple[int, int]) -> _Balls:
-    """Measure the thickness of both phases on a core, from as much around it as its balls reach; it is left out (0)
-    where balls are wider than `COARSE` and yet to be painted on the finer grid."""
+    """Measure the thickness of both phases on a core. It stays 0 where balls are wider than `COARSE` but the factor is
+    1: such a phase is measured again, with the factor that the widest ball of all tiles asks for."""
     spacing, finest = plan.volume.spacing, min(plan.volume.spacing)
-    reach = _reach(min(plan.reach, WIDEST * finest), finest)
-    while True:
-        box, mask, pieces = _find_structure(plan, core, reach)
+    distance = _read_distance(min(plan.reach, WIDEST * finest), finest)
+    while True:  # until all balls that overlap the core are whole
+        box, mask, pieces = _find_structure(plan, core, distance)
         inner = within(core, box)
         radii = [ball_radii(phase, spacing, WIDEST * finest) for phase in (mask, ~mask)]
         largest = [reaching_radius(radius, spacing, inner) for radius in radii]
-        if _reach(max(largest), finest) <= reach * (1 + 1e-6):
+        needed = _read_distance(max(largest), finest)
+        if needed <= distance * (1 + 1e-6):
             break
-        reach = _reach(max(largest), finest)
+        distance = needed
     thickness, widest, wide = [], [], []
-    for most, factor in zip(largest, factors, strict=True):
-        radius = radii.pop(0)
+    for largest_radius, factor in zip(largest, factors, strict=True):
+        radius = radii.pop(0)  # so that its memory is freed before the next phase is painted
         widest.append(float(radius[inner].max()))
         wide.append(int(np.count_nonzero(radius[inner] > (WIDEST - 1e-3) * finest)))
         if factor > 1:
             painted = paint_coarse_balls(radius, spacing, factor)[inner]
-        elif most <= COARSE * finest:
+        elif largest_radius <= COARSE * finest:
             painted = paint_balls(radius, spacing, core=inner)[inner]
         else:
             painted = np.zeros_like(radius[inner])
@@ -307,18 +313,16 @@ def _measure_balls(plan: Plan, core: Box, factors: tuple[int, int]) -> _Balls:
     return _Balls(box, mask, pieces, tuple(thickness), tuple(widest), tuple(wide))  # type: ignore[arg-type]
 
 
-def _find_structure(plan: Plan, core: Box, reach: float) -> tuple[Box, np.ndarray, tuple[int, int]]:
-    """Return a box around a core, the structure there, and how many specks and pinholes were dropped."""
-    least = 2 * SOFTENED + 2
-    around = grow(core, [max(math.ceil(reach / h), least) for h in plan.volume.spacing], plan.volume.shape)
-    # a coarser grid begins with the volume: boxes begin and end where two voxels of it meet
-    z, y, x = (
-        slice(e.start // 2 * 2, min(-(-e.stop // 2) * 2, n)) for e, n in zip(around, plan.volume.shape, strict=True)
-    )
+def _find_structure(plan: Plan, core: Box, distance: float) -> tuple[Box, np.ndarray, tuple[int, int]]:
+    """Return the box up to a distance around a core, its mask, and how many specks and pinholes were dropped."""
+    least, shape = 2 * SOFTENED + 2, plan.volume.shape  # the surface needs some voxels around the core, too
+    around = grow(core, [max(math.ceil(distance / h), least) for h in plan.volume.spacing], shape)
+    # A coarser grid begins with the volume, and its factor is 2: boxes begin and end at even voxels.
+    z, y, x = (slice(e.start // 2 * 2, min(-(-e.stop // 2) * 2, n)) for e, n in zip(around, shape, strict=True))
     box, pieces = (z, y, x), (0, 0)
     mask = find_levels(plan.structure, box) > 0
     if plan.smallest:
-        mask, *pieces = remove_specks(mask, plan.smallest, False, _cut_out(core, box, plan.volume.shape))
+        mask, *pieces = remove_specks(mask, plan.smallest, False, _cut_out(core, box, shape))
     return box, mask, tuple(pieces)  # type: ignore[return-value]
 
 
@@ -330,115 +334,120 @@ def _cut_out(core: Box, box: Box, shape: Sequence[int]) -> CutOut:
 
 
 def _measure_surface(plan: Plan, mask: np.ndarray, box: Box, core: Box) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return what `measures.measure_surface` does, of the cells that begin in a core; None if there are none."""
+    """Return the surface of the cells that begin in a core, as `measures.measure_surface` does; None without any."""
     shape, spacing = plan.volume.shape, plan.volume.spacing
-    own = [(edge.start, min(edge.stop, n - 1)) for edge, n in zip(core, shape, strict=True)]
-    if any(start >= stop for start, stop in own):
+    # A cell lies between voxels and their next neighbours: the last voxels of the volume begin none.
+    cells = [slice(edge.start, min(edge.stop, n - 1)) for edge, n in zip(core, shape, strict=True)]
+    if any(edge.start >= edge.stop for edge in cells):
         return None
-    part: Box = tuple(slice(start, stop + 1) for start, stop in own)  # type: ignore[assignment]
-    around = grow(part, SOFTENED, shape)
-    soft = soften(mask[within(around, box)])[within(part, around)]
+    corners: Box = tuple(slice(edge.start, edge.stop + 1) for edge in cells)  # type: ignore[assignment]
+    around = grow(corners, SOFTENED, shape)
+    soft = soften(mask[within(around, box)])[within(corners, around)]
     try:
         mesh = march(soft, spacing, 0.5)
     except NoSurface:
         return None
-    places, columns = whole.tabulate_surface(mesh, spacing)
-    places = places + [edge.start for edge in part]
-    return places, columns * border_weights(places, shape)[:, None]
+    positions, columns = whole.tabulate_surface(mesh, spacing)
+    positions = positions + [edge.start for edge in corners]
+    return positions, columns * border_weights(positions, shape)[:, None]
 
 
-def _around(plan: Plan, core: Box) -> tuple[Box, Box]:
-    """Return the working voxels that a core's curvature depends on, and those of the core."""
-    owned = []
+def _working_boxes(plan: Plan, core: Box) -> tuple[Box, Box]:
+    """Return two boxes of the working grid: the voxels that a core's curvature depends on, and those of the core."""
+    edges = []
     for edge, n, scale, count in zip(core, plan.volume.shape, plan.scale, plan.working, strict=True):
-        start, stop = (count if at == n else min(count, round(at / scale)) for at in (edge.start, edge.stop))
-        owned.append(slice(start, stop))
-    z, y, x = owned
+        # Cores meet at the same working voxel; the last one ends with the grid.
+        start, stop = (count if end == n else min(count, round(end / scale)) for end in (edge.start, edge.stop))
+        edges.append(slice(start, stop))
+    z, y, x = edges
     return grow((z, y, x), HALO, plan.working), (z, y, x)
 
 
 def _measure_curvature(plan: Plan, core: Box, sums: _Sums) -> Record:
     """Sum the curvatures in the working cells that begin in a core; return the bins of the diagram and other counts."""
-    box, owned = _around(plan, core)
+    box, working_core = _working_boxes(plan, core)
     record: dict[str, Any] = {"specks": np.zeros(2, np.int64), "changed": np.int64(0), "filled": np.int64(0)}
-    if min(plan.working) < whole.FEWEST_SLICES or any(edge.start >= edge.stop for edge in owned):
+    if min(plan.working) < whole.FEWEST_SLICES or any(edge.start >= edge.stop for edge in working_core):
         return record
     values = _find_working_levels(plan, box)
-    mask, inner = values > 0, within(owned, box)
+    mask, inner = values > 0, within(working_core, box)
     if plan.structure.kind != "field":
-        smallest, cut = smallest_piece(plan.thickness / plan.edge), _cut_out(owned, box, plan.working)
+        smallest, cut = smallest_piece(plan.thickness / plan.edge), _cut_out(working_core, box, plan.working)
         cleaned, *specks = remove_specks(mask, smallest, False, cut)
         record |= {"specks": np.array(specks), "changed": np.count_nonzero((cleaned != mask)[inner])}
-        mask, values = cleaned, values[:0]
+        mask, values = cleaned, values[:0]  # frees the levels: the profile of the mask takes over
         del cleaned
     record["filled"] = np.count_nonzero(mask[inner])
-    own = [(max(e.start, MARGIN), min(e.stop, n - 1 - MARGIN)) for e, n in zip(owned, plan.working, strict=True)]
-    if any(start >= stop for start, stop in own) or mask.all() or not mask.any():
+    bounds = [(MARGIN, n - 1 - MARGIN) for n in plan.working]  # of the cells that are measured at all
+    cells = [(max(e.start, low), min(e.stop, high)) for e, (low, high) in zip(working_core, bounds, strict=True)]
+    if any(start >= stop for start, stop in cells) or mask.all() or not mask.any():
         return record
-    # three cells along an axis at least: fewer make no grid
-    stops = [min(max(stop, start + 3), n - 1 - MARGIN) for (start, stop), n in zip(own, plan.working, strict=True)]
-    wide = [(max(min(start, stop - 3), MARGIN), stop) for (start, _), stop in zip(own, stops, strict=True)]
-    part: Box = tuple(slice(start - MARGIN, stop + MARGIN + 1) for start, stop in wide)  # type: ignore[assignment]
-    piece = mask[within(part, box)]
-    if piece.all() or not piece.any():
+    # A grid has at least three cells along an axis: a thin core takes neighbours along, whose triangles are not kept.
+    stops = [min(max(stop, start + 3), high) for (start, stop), (_, high) in zip(cells, bounds, strict=True)]
+    wide = [(max(min(start, stop - 3), MARGIN), stop) for (start, _), stop in zip(cells, stops, strict=True)]
+    window: Box = tuple(slice(start - MARGIN, stop + MARGIN + 1) for start, stop in wide)  # type: ignore[assignment]
+    cropped = mask[within(window, box)]
+    if cropped.all() or not cropped.any():
         return record
     if plan.structure.kind != "field":
         values = profile_mask(mask)
+    prepared = _prepare_window(plan, values[within(window, box)], cropped, window)
     try:
-        (places, columns), drawn = whole.measure_curvatures(_prepare_part(plan, values[within(part, box)], piece, part))
+        (positions, columns), diagram = whole.measure_curvatures(prepared)
     except NoSurface:
         return record
-    corner = np.asarray(drawn.places) / WORKING_SPACING + [edge.start for edge in part]
-    kept = np.ones(len(places), dtype=bool)
-    for at, cells, more in zip(corner.T, own, wide, strict=True):
-        kept &= (cells == more) | ((at >= cells[0]) & (at < cells[1]))
-    sums.gather("curved", places[kept], columns[kept])
-    for name in sums.tables:
-        record |= _bin(plan, drawn, kept & sums.select(name, places), name)
+    working_positions = np.asarray(diagram.places) / WORKING_SPACING + [edge.start for edge in window]
+    kept = np.ones(len(positions), dtype=bool)
+    for position, (start, stop), widened in zip(working_positions.T, cells, wide, strict=True):
+        kept &= ((start, stop) == widened) | ((position >= start) & (position < stop))
+    sums.gather("curved", positions[kept], columns[kept])
+    for part in sums.tables:
+        record |= _bin(plan, diagram, kept & sums.select(part, positions), part)
     return record
 
 
 def _find_working_levels(plan: Plan, box: Box) -> np.ndarray:
-    """Return a box of the working grid above 0 in the structure, as `preparation.prepare` makes it."""
+    """Return the values of a box of the working grid, above 0 in the structure, as `preparation.prepare` has them."""
     if plan.scale == (1.0, 1.0, 1.0):
         return find_levels(plan.structure, box)
-    volume = plan.volume
+    volume, is_mask = plan.volume, plan.structure.kind == "mask"
     ends = [(math.floor(e.start * s), math.ceil(e.stop * s)) for e, s in zip(box, plan.scale, strict=True)]
-    z, y, x = (slice(min(a, n), min(b, n)) for (a, b), n in zip(ends, volume.shape, strict=True))
-    blurred = [math.ceil(4 * max(0.0, (s - 1) / 2)) + 2 for s in plan.scale]
-    reach = distance_reach(volume.spacing, plan.scale) if plan.structure.kind == "mask" else None
-    far = [0 if reach is None else math.ceil(reach / h) + 1 for h in volume.spacing]
-    around = grow((z, y, x), [a + b for a, b in zip(blurred, far, strict=True)], volume.shape)
+    z, y, x = (slice(min(start, n), min(stop, n)) for (start, stop), n in zip(ends, volume.shape, strict=True))
+    margins = [math.ceil(4 * max(0.0, (s - 1) / 2)) + 2 for s in plan.scale]  # of the blur in `resample`
+    if is_mask:
+        reach = distance_reach(volume.spacing, plan.scale)
+        margins = [margin + math.ceil(reach / h) + 1 for margin, h in zip(margins, volume.spacing, strict=True)]
+    around = grow((z, y, x), margins, volume.shape)
     values, corner = find_levels(plan.structure, around), [edge.start for edge in around]
     start, shape = [edge.start for edge in box], [edge.stop - edge.start for edge in box]
-    if plan.structure.kind == "mask":
+    if is_mask:
         return resample_mask(values > 0, volume.spacing, plan.scale, start, shape, corner=corner)
     return resample(values, plan.scale, start, shape, corner=corner)
 
 
-def _prepare_part(plan: Plan, phase: np.ndarray, mask: np.ndarray, part: Box) -> Prepared:
-    """Return a part of the working grid as if it were a scan of its own, at its place in the volume."""
+def _prepare_window(plan: Plan, phase: np.ndarray, mask: np.ndarray, window: Box) -> Prepared:
+    """Return a window of the working grid as a scan of its own, with its origin in the volume."""
     phase, grid = np.ascontiguousarray(phase, dtype=np.float32), Grid(phase.shape, boundary="replicate")  # type: ignore[arg-type]
     z, y, x = (slice(0, n) for n in phase.shape)
     size = (plan.scale, plan.edge, plan.volume.unit, plan.thickness / plan.edge)
-    origin = tuple(edge.start * s for edge, s in zip(part, plan.scale, strict=True))
+    origin = tuple(edge.start * s for edge, s in zip(window, plan.scale, strict=True))
     return Prepared(plan.structure.kind, phase, mask, grid, *size, ((z, y, x),), (), origin)  # type: ignore[arg-type]
 
 
-def _bin(plan: Plan, drawn: Diagram, kept: np.ndarray, part: str) -> Record:
-    """Return the bins of a diagram's points that are kept: their indices, and area times 1, κ1, κ2 and κ1² + κ2²; and
-    the area without curvature, as one that is `lost`."""
-    points, weights = drawn.points[kept], drawn.weights[kept]
+def _bin(plan: Plan, diagram: Diagram, kept: np.ndarray, part: str) -> Record:
+    """Return the bins of a part's points: for each its two indices ("bins"), and the area times 1, κ1, κ2 and κ1² + κ2²
+    ("areas"); and an estimate of the part's area whose curvature is not resolved ("lost")."""
+    points, weights = diagram.points[kept], diagram.weights[kept]
     width = _BIN * BIN_WIDTH * WORKING_SPACING / plan.edge
     bins = np.floor(points / width).astype(np.int64)
     first = bins.min(0, initial=0)
     columns = int(bins[:, 1].max(initial=0) - first[1]) + 1
-    flat = (bins - first) @ np.array([columns, 1])
+    flat = (bins - first) @ np.array([columns, 1])  # one number for each bin, for bincount
     moments = np.column_stack([np.ones(len(points)), points, (points**2).sum(1)]) * weights[:, None]
     areas = np.stack([np.bincount(flat, moment) for moment in moments.T], axis=1)
     occupied = np.flatnonzero(areas[:, 0])
     bins = np.stack(np.divmod(occupied, columns), axis=1) + first
-    lost = np.float64(drawn.excluded * weights.sum())
+    lost = np.float64(diagram.excluded * weights.sum())
     return {f"bins{part}": bins, f"areas{part}": areas[occupied], f"lost{part}": lost}
 
 
@@ -452,49 +461,51 @@ def _measure_tiles(
     store: str | PathLike[str] | None,
     progress: Progress,
 ) -> Measures:
-    same: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     workers = workers if structure.volume.in_file and structure.region is None else None
     if store is not None:  # digests take a while
-        same = {"scan": structure.volume.digest, "region": structure.region and structure.region.digest, "tile": edge}
-        same |= {name: getattr(structure, name) for name in ("kind", "threshold", "dark")}
-    with open_run(workers, store, same, progress, {_FIRST: 0.95, _AGAIN: 1.0}) as run, one_thread():
+        regions = structure.region and structure.region.digest
+        options = {"scan": structure.volume.digest, "region": regions, "tile": edge}
+        options |= {name: getattr(structure, name) for name in ("kind", "threshold", "dark")}
+    with open_run(workers, store, options, progress, {_FIRST: 0.95, _AGAIN: 1.0}) as run, one_thread():
         plan = survey(structure, run)
         plan = replace(plan, cores=tuple(cut_boxes(plan.volume.shape, edge or _choose_edges(plan))))
-        stated = _describe_tiles(plan, run.processes)
-        records = run(_FIRST, partial(measure_tile, plan), len(plan.cores), stated)
-        # the factors that `morphology.local_thickness` chooses
+        tiles_note = _describe_tiles(plan, run.processes)
+        records = run(_FIRST, partial(measure_tile, plan), len(plan.cores), tiles_note)
+        # The factors that `morphology.local_thickness` would choose for the whole volume.
         widest, finest = np.max([record["widest"] for record in records], axis=0), min(plan.volume.spacing)
-        wide = replace(plan, factors=tuple(max(1, math.ceil(each / finest / COARSE)) for each in widest))
-        again: list[Record] = []
-        if max(wide.factors) > 1:
-            again = run(_AGAIN, partial(_measure_wide, wide), len(plan.cores))
-    return _summarise(wide, records, again, stated)
+        plan = replace(plan, factors=tuple(max(1, math.ceil(radius / finest / COARSE)) for radius in widest))
+        wide_records: list[Record] = []
+        if max(plan.factors) > 1:
+            wide_records = run(_AGAIN, partial(_measure_wide, plan), len(plan.cores))
+    return _summarise(plan, records, wide_records, tiles_note)
 
 
-def _summarise(plan: Plan, records: Sequence[Record], again: Sequence[Record], stated: str) -> Measures:
-    """Return the measures of a volume, and of the parts of its region, from what was found in its tiles."""
+def _summarise(plan: Plan, records: Sequence[Record], wide_records: Sequence[Record], tiles_note: str) -> Measures:
+    """Return the measures of a volume, and of the compartments of its region, from the records of its tiles."""
     finest, shape = plan.finest, plan.volume.shape
     parts = {name.removeprefix("rows") for record in records for name in record if name.startswith("rows")}
-    tables = {part: _sum_tiles(plan, records, again, part) for part in parts}
+    tables = {part: _sum_tiles(plan, records, wide_records, part) for part in parts}
     total = dict(zip(whole.SUMS, tables[_WHOLE].sum(0), strict=True))
     if not 0 < total["inside"] < total["volume"]:
         raise ScanError("expected a structure and background in the scan, got one of them only")
-    curved = total["curved"] > 0
-    if not curved and min(shape) >= whole.FEWEST_SLICES:
+    has_curvature = total["curved"] > 0
+    if not has_curvature and min(shape) >= whole.FEWEST_SLICES:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
     period = total["thickness"] / total["inside"] + total["gap"] / (total["volume"] - total["inside"])
     blocks = Blocks.divide(shape, plan.volume.spacing, period)
     χ = float(sum(record["euler"] for record in records))
     density = connectivity_density(χ, shape, plan.volume.spacing, periodic=False)
-    none = whole.no_curvature(plan.volume.unit, whole.TOO_THIN)
-    notes = (*_notes(plan, records), *(() if curved else none[2]), *([stated] if len(plan.cores) > 1 else []))
+    _, empty, why = whole.no_curvature(plan.volume.unit, whole.TOO_THIN)
+    notes = (*_notes(plan, records), *(() if has_curvature else why), *([tiles_note] if len(plan.cores) > 1 else []))
 
     def summarise(part: str, label: int | None = None) -> Measures:
-        drawn = _draw(plan, records, part) if tables[part][:, whole.SUMS.index("curved")].any() else none[1]
+        curved = tables[part][:, whole.SUMS.index("curved")].any()
+        diagram = _join_bins(plan, records, part) if curved else empty
         connectivity = (χ, density) if part == _WHOLE else None
-        table, named = _merge(tables[part], finest, blocks), None if label is None else ("compartment", label)
+        table, name = _merge(tables[part], finest, blocks), None if label is None else ("compartment", label)
         return whole.summarise_sums(
-            plan.volume, plan.structure.kind, blocks, table, connectivity, drawn, notes, part=named
+            plan.volume, plan.structure.kind, blocks, table, connectivity, diagram, notes, part=name
         )
 
     if plan.structure.region is None:
@@ -503,39 +514,41 @@ def _summarise(plan: Plan, records: Sequence[Record], again: Sequence[Record], s
     return replace(summarise(INSIDE), compartments={label: summarise(str(label), label) for label in labels})
 
 
-def _sum_tiles(plan: Plan, records: Sequence[Record], again: Sequence[Record], part: str) -> np.ndarray:
-    """Return the sums of all tiles over a part on the finest division."""
-    table, rows, sums = np.zeros((plan.finest.count, len(whole.SUMS))), f"rows{part}", f"sums{part}"
-    for each in records:
-        if rows in each:
-            table[each[rows]] += each[sums]
+def _sum_tiles(plan: Plan, records: Sequence[Record], wide_records: Sequence[Record], part: str) -> np.ndarray:
+    """Return the sums of all tiles over a part, for each of the finest blocks."""
+    table = np.zeros((plan.finest.count, len(whole.SUMS)))
+
+    def add(tiles: Sequence[Record]) -> None:
+        for record in tiles:
+            if f"rows{part}" in record:
+                table[record[f"rows{part}"]] += record[f"sums{part}"]
+
+    add(records)
     for factor, names in zip(plan.factors, (("thickness", "thickness²"), ("gap",)), strict=True):
-        if factor > 1:
+        if factor > 1:  # measured again
             table[:, [whole.SUMS.index(name) for name in names]] = 0
-    for each in again:
-        if rows in each:
-            table[each[rows]] += each[sums]
+    add(wide_records)
     return table
 
 
 def _merge(table: np.ndarray, finest: Blocks, blocks: Blocks) -> np.ndarray:
-    """Return the sums over blocks from those over the finest division."""
+    """Return the sums over blocks from those over the finest blocks."""
     sums = table.reshape(*finest.counts, -1)
-    for axis, (fine, starts) in enumerate(zip(finest.starts, blocks.starts, strict=True)):
-        sums = np.add.reduceat(sums, np.searchsorted(fine, starts), axis=axis)
+    for axis, (fine_starts, starts) in enumerate(zip(finest.starts, blocks.starts, strict=True)):
+        sums = np.add.reduceat(sums, np.searchsorted(fine_starts, starts), axis=axis)
     return sums.reshape(blocks.count, -1)
 
 
-def _draw(plan: Plan, records: Sequence[Record], part: str) -> Diagram:
+def _join_bins(plan: Plan, records: Sequence[Record], part: str) -> Diagram:
     """Return the diagram of a part over all tiles: the barycentres of its bins."""
-    parts = [record for record in records if f"bins{part}" in record]
-    bins, areas = (np.concatenate([each[f"{name}{part}"] for each in parts]) for name in ("bins", "areas"))
+    binned = [record for record in records if f"bins{part}" in record]
+    bins, areas = (np.concatenate([record[f"{name}{part}"] for record in binned]) for name in ("bins", "areas"))
     bins, index = np.unique(bins, axis=0, return_inverse=True)
     index = index.reshape(-1)
     area, κ1, κ2, square = (np.bincount(index, column, minlength=len(bins)) for column in areas.T)
     points = np.stack([κ1, κ2], axis=1) / area[:, None]
     spread = max(float((square - area * (points**2).sum(1)).sum() / area.sum()), 0.0)
-    lost = float(sum(each[f"lost{part}"] for each in parts)) / float(area.sum())
+    lost = float(sum(record[f"lost{part}"] for record in binned)) / float(area.sum())
     return Diagram(points, area, f"1/{plan.volume.unit}", math.sqrt(spread), lost)
 
 
@@ -551,10 +564,10 @@ def _notes(plan: Plan, records: Sequence[Record]) -> tuple[str, ...]:
             share = f"around {count / math.prod(plan.volume.shape):.2g} of the voxels, in the {name}"
             notes.append(f"Balls wider than {2 * WIDEST} voxels count as that wide: {share}.")
     # The same on the working grid, where curvature is measured.
-    more, voxels = [*plan.working_notes], max(1, math.prod(plan.working))
+    working_notes, voxels = [*plan.working_notes], max(1, math.prod(plan.working))
     specks, pinholes = (int(n) for n in np.sum([record["specks"] for record in records], axis=0))
     if specks or pinholes:
         changed = sum(int(record["changed"]) for record in records) / voxels
-        more.append(DROPPED.format(specks, f"{pinholes}, {changed:.2g} of the volume"))
-    more.extend(note_on_filling(sum(int(record["filled"]) for record in records) / voxels))
-    return (*notes, *(f"Of curvature: {note}" for note in more))
+        working_notes.append(DROPPED.format(specks, f"{pinholes}, {changed:.2g} of the volume"))
+    working_notes.extend(note_on_filling(sum(int(record["filled"]) for record in records) / voxels))
+    return (*notes, *(f"Of curvature: {note}" for note in working_notes))
