@@ -55,10 +55,11 @@ class Diagram(Pictured):
     """A measure on the (κ1, κ2) plane: areas (`weights`, `(N,)`) in the grid's unit squared, at points `(N, 2)` in
     `unit`.
 
-    `spread` is the root mean square distance of the measured points to the ones that stand for them, 0 unless binned:
-    the transport distance (cost ½|x - y|²) between a diagram and its binned self is at most √½ · spread. `excluded` is
-    the part of the surface's area left out because curvature is not resolved there. `places` `(N, 3)` are (z, y, x) on
-    the surface of each point, in the grid's unit from the first voxel's centre; None once points were merged or read.
+    `spread` is the root mean square distance of the measured points to the bins that replace them, 0 unless binned: the
+    transport distance (cost ½|x - y|²) between a diagram and its binned self is at most √½ · spread. `excluded` is the
+    fraction of the surface's area left out because curvature is not resolved there. `places` `(N, 3)` are the points'
+    positions (z, y, x) on the surface, in the grid's unit from the first voxel's centre; None once points were merged
+    or read.
     """
 
     points: np.ndarray
@@ -80,10 +81,8 @@ class Diagram(Pictured):
     def __repr__(self) -> str:
         if not len(self.points):
             return f"Diagram(no points, in {self.unit})"
-        low, high = self.points.min(), self.points.max()
-        return (
-            f"Diagram({len(self.points)} points, area {self.area:.4g}, κ from {low:.4g} to {high:.4g} in {self.unit})"
-        )
+        curvatures = f"κ from {self.points.min():.4g} to {self.points.max():.4g} in {self.unit}"
+        return f"Diagram({len(self.points)} points, area {self.area:.4g}, {curvatures})"
 
     @property
     def area(self) -> float:
@@ -107,54 +106,56 @@ class Diagram(Pictured):
         return self.normalised.weights @ self.points
 
     def bin(self, width: float) -> Diagram:
-        """Return bins of edge `width`, each replaced by its barycentre: means and total weight are kept exactly."""
+        """Merge the points in each bin of edge `width` into their barycentre; the mean and the total weight stay."""
         if not width > 0:
             raise ValueError(f"expected a bin width above 0, got {width}")
         return self._merge(self._cells(width))
 
     def thin(self, width: float, share: float) -> Diagram:
-        """Return bins of edge `width` where the area is, and wider ones, by powers of two, in the tails.
+        """Merge points in bins of edge `width`, widened by powers of two in the tails, where there is little area.
 
-        A bin is the widest whose part of the area times (edge / width)² is at most `share`.
+        Of all bins, a point takes the widest whose share of the area times (edge / width)² is at most `share`.
         """
         if not share > 0:
             raise ValueError(f"expected a share above 0, got {share}")
         fine = self.bin(width)
-        parts = fine.normalised.weights
+        shares = fine.normalised.weights
         index = fine._cells(width)
-        merged = np.zeros(len(parts), dtype=bool)
+        merged = np.zeros(len(shares), dtype=bool)
         for level in range(WIDENINGS, 0, -1):
             cells = fine._cells(width * 2**level)
-            light = (np.bincount(cells, parts * ~merged) * 4.0**level <= share)[cells] & ~merged
-            index[light] = level * len(parts) + cells[light]
+            light = (np.bincount(cells, shares * ~merged) * 4.0**level <= share)[cells] & ~merged
+            index[light] = level * len(shares) + cells[light]  # no other level has these indices
             merged |= light
         return fine._merge(np.unique(index, return_inverse=True)[1])
 
     def _cells(self, width: float) -> np.ndarray:
-        """Return the number of the square of edge `width` that each point is in: 0, 1, … over the occupied ones."""
+        """Return the index of each point's bin of edge `width`: 0, 1, … over the occupied bins."""
         cells = np.floor(self.points / width).astype(np.int64)
         cells -= cells.min(0, initial=0)
-        return np.unique(cells @ np.array([cells[:, 1].max(initial=0) + 1, 1]), return_inverse=True)[1]
+        flat = cells @ np.array([cells[:, 1].max(initial=0) + 1, 1])
+        return np.unique(flat, return_inverse=True)[1]
 
     def _merge(self, index: np.ndarray) -> Diagram:
-        """Return the points with the same index (0, 1, …) replaced by their barycentre."""
+        """Merge the points with the same index (0, 1, …) into their barycentre."""
         weights = np.bincount(index, self.weights)
-        heavy = weights > 0
-        safe = np.where(heavy, weights, 1)
-        means = np.stack([np.bincount(index, self.weights * self.points[:, k]) / safe for k in range(2)], axis=1)
+        occupied = weights > 0
+        divisor = np.where(occupied, weights, 1)
+        means = np.stack([np.bincount(index, self.weights * self.points[:, k]) / divisor for k in range(2)], axis=1)
         square = ((self.points - means[index]) ** 2).sum(1)
-        added = float(self.weights @ square) / self.area if self.area > 0 else 0.0
-        spread = math.sqrt(self.spread**2 + added)
-        return replace(self, points=means[heavy], weights=weights[heavy], spread=spread, places=None)
+        variance = float(self.weights @ square) / self.area if self.area > 0 else 0.0
+        spread = math.sqrt(self.spread**2 + variance)
+        return replace(self, points=means[occupied], weights=weights[occupied], spread=spread, places=None)
 
 
-def join_diagrams(parts: Sequence[Diagram]) -> Diagram:
+def join_diagrams(diagrams: Sequence[Diagram]) -> Diagram:
     """Return the diagram of several surfaces together, in the unit of the first."""
-    points, weights = (np.concatenate([getattr(part, name) for part in parts]) for name in ("points", "weights"))
-    lost = sum(part.excluded * part.area for part in parts) / weights.sum() if weights.any() else 0.0
-    known = [part.places for part in parts if part.places is not None]
-    places = np.concatenate(known) if len(known) == len(parts) else None
-    return Diagram(points, weights, parts[0].unit, excluded=float(lost), places=places)
+    points = np.concatenate([diagram.points for diagram in diagrams])
+    weights = np.concatenate([diagram.weights for diagram in diagrams])
+    excluded = sum(diagram.excluded * diagram.area for diagram in diagrams) / weights.sum() if weights.any() else 0.0
+    places = [diagram.places for diagram in diagrams if diagram.places is not None]
+    joined = np.concatenate(places) if len(places) == len(diagrams) else None
+    return Diagram(points, weights, diagrams[0].unit, excluded=float(excluded), places=joined)
 
 
 def diagram(
@@ -168,10 +169,11 @@ def diagram(
 ) -> Diagram:
     """Measure the curvature diagram of {u = 0}, Σ area[c] δ_(κ1, κ2)[c] over the cells c of its mesh (paper, eq. 25).
 
-    Curvatures of the voxels around a triangle are interpolated linearly at its barycentre. The geometric ones are those
-    of the level sets of √2 ε artanh(u), which are u's own: differences of that near-distance err far less than
-    differences of tanh. The diffuse ones, to reproduce the paper, are of u itself. The field `(Z, Y, X)` is finite and
-    positive inside. Where there is no surface, in the box or in `where`, NoSurface is raised, a ValueError.
+    Curvatures of the voxels around a triangle are interpolated linearly at its barycentre. Geometric curvatures are
+    those of the level sets of √2 ε artanh(u), which are the level sets of u: finite differences of this approximate
+    distance are far more accurate than those of u. Diffuse curvatures, to reproduce the paper, are those of u itself.
+    The field `(Z, Y, X)` is finite and positive inside. Raises NoSurface, a ValueError, if there is no surface in the
+    box or in `where`.
 
     Parameters
     ----------
@@ -198,25 +200,25 @@ def diagram(
     if not counted.any():
         raise NoSurface("expected a surface in the part that counts, got none")
     weights, centres = weights[counted], centres[counted]
-    points, known = _interpolate((kappa1, kappa2), resolved, centres, grid.periodic)
-    if not known.any():
+    points, kept = _interpolate((kappa1, kappa2), resolved, centres, grid.periodic)
+    if not kept.any():
         raise NoSurface("expected a surface whose curvature the grid resolves, got none")
-    excluded = 1 - float(weights[known].sum() / weights.sum())
-    places = centres[known] * np.array(grid.spacing)
-    return Diagram(points[known], weights[known], excluded=excluded, places=places)
+    excluded = 1 - float(weights[kept].sum() / weights.sum())
+    places = centres[kept] * np.array(grid.spacing)
+    return Diagram(points[kept], weights[kept], excluded=excluded, places=places)
 
 
 def find_resolved(slope: Tensor, kappa1: Tensor, kappa2: Tensor, grid: Grid) -> Tensor:
-    """Return where the grid resolves curvatures, as bool: the level set is defined, and no radius is under a voxel.
+    """Return, as bool, the voxels where the level set is defined and no radius of curvature is below a voxel.
 
-    `slope` is that of the distance that the profile gives (`profile_distance`), 1 for a perfect profile.
+    `slope` is the norm of the gradient of `profile_distance`, 1 for a perfect profile.
     """
     sharpest = 1 / (LEAST_RADIUS * max(grid.spacing))
     return (slope > LEAST_SLOPE) & (kappa1.abs() < sharpest) & (kappa2.abs() < sharpest)
 
 
 def _inner_surface(values: Tensor, grid: Grid, margin: int | None) -> Surface:
-    """Return the surface in the whole box's coordinates, without a margin along the sides that are not periodic."""
+    """Return the surface without `margin` voxels along the faces of a box that is not periodic, in its coordinates."""
     m = 0 if grid.periodic else MARGIN if margin is None else margin
     if m == 0:
         return surface(values, grid)
@@ -235,16 +237,17 @@ def _voxel_curvatures(values: Tensor, grid: Grid, epsilon: float, curvature: str
     else:
         κ1, κ2, _, _ = diffuse_curvatures(jet(values, grid), epsilon)
     slope = distance.gradient.square().sum(-4).sqrt()
-    known = find_resolved(slope, κ1, κ2, grid)
-    parts = (torch.where(known, κ1, 0.0), torch.where(known, κ2, 0.0), known.to(values.dtype))
-    return tuple(part.detach().cpu().numpy() for part in parts)
+    resolved = find_resolved(slope, κ1, κ2, grid)
+    fields = (torch.where(resolved, κ1, 0.0), torch.where(resolved, κ2, 0.0), resolved.to(values.dtype))
+    return tuple(field.detach().cpu().numpy() for field in fields)
 
 
 def _interpolate(
     fields: tuple[np.ndarray, ...], resolved: np.ndarray, centres: np.ndarray, periodic: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return values `(N, 2)` at `centres` `(N, 3)` (in voxels) from the resolved voxels around, and where any are. The
-    fields are 0 elsewhere: their sums over the sum of resolved voxels are means."""
+    """Interpolate two fields at `centres` `(N, 3)`, in voxels, from the resolved voxels around each; return values
+    `(N, 2)`, and whether any of those voxels are resolved, bool `(N,)`."""
+    # Fields are 0 where they are not resolved: dividing by the weight of the resolved voxels makes a mean over those.
     *sums, total = (
         map_coordinates(values, centres.T, np.float64, order=1, mode="grid-wrap" if periodic else "nearest")
         for values in (*fields, resolved)
@@ -253,9 +256,10 @@ def _interpolate(
 
 
 def family_shares(diagram: Diagram, radius: float) -> dict[str, float]:
-    """Return the share of area nearest in direction to each family's ideal point, and the flat share (`layers`).
+    """Return the share of area of each family by name, layers first: the flat area is layers, other area belongs to the
+    family whose ideal point is nearest in direction on the (κ1, κ2) plane, after Koenderink's shape index.
 
-    Directions after Koenderink's shape index; `radius` is the structure's half-thickness in the diagram's unit.
+    `radius` is the structure's half-thickness in the diagram's unit.
     """
     areas = np.bincount(families(diagram.points, radius), diagram.weights, minlength=len(FAMILIES))
     shares = dict(zip(FAMILIES, map(float, areas / areas.sum()), strict=True))
@@ -263,14 +267,14 @@ def family_shares(diagram: Diagram, radius: float) -> dict[str, float]:
 
 
 def families(points: np.ndarray, radius: float) -> np.ndarray:
-    """Return the family, as its number in `FAMILIES`, of each point (κ1, κ2), (N, 2); see `family_shares`."""
+    """Return the index in `FAMILIES` of the family of each point (κ1, κ2), `(N, 2)`; see `family_shares`."""
     kappa1, kappa2 = points.T
     flat = np.hypot(kappa1, kappa2) * radius * _FLAT_RADII < 1
     angle = np.degrees(np.arctan2(kappa2, kappa1))
-    angle = np.where(angle > 45 + 1e-9, angle - 360, angle)
+    angle = np.where(angle > 45 + 1e-9, angle - 360, angle)  # κ1 ≥ κ2: angles go from -135 to 45
     nearest = np.abs(angle[:, None] - np.array(list(_ANGLES.values()))).argmin(1)
-    numbers = np.array([FAMILIES.index(name) for name in _ANGLES])
-    return np.where(flat, FAMILIES.index("layers"), numbers[nearest])
+    indices = np.array([FAMILIES.index(name) for name in _ANGLES])
+    return np.where(flat, FAMILIES.index("layers"), indices[nearest])
 
 
 def family_of(diagram: Diagram, radius: float) -> str:
@@ -293,10 +297,10 @@ def half_thickness(diagram: Diagram, volume: float) -> float:
     plates, cylinders and balls; at most `_DEEPEST` times volume / area, where a ball's is 3.
     """
     depths = np.linspace(0, _DEEPEST * volume / diagram.area, 601)
-    left = np.zeros_like(depths)  # of the area, by depth
+    inner_areas = np.zeros_like(depths)
     for start in range(0, len(diagram.points), _TOGETHER):
-        part = slice(start, start + _TOGETHER)
-        shrunk = np.clip(1 - diagram.points[part, :, None] * depths, 0, None)
-        left += diagram.weights[part] @ shrunk.prod(axis=1)
-    swept = cumulative_trapezoid(left, depths, initial=0)
+        block = slice(start, start + _TOGETHER)
+        factors = np.clip(1 - diagram.points[block, :, None] * depths, 0, None)
+        inner_areas += diagram.weights[block] @ factors.prod(axis=1)
+    swept = cumulative_trapezoid(inner_areas, depths, initial=0)
     return float(depths[np.searchsorted(swept, min(volume, swept[-1]) * (1 - 1e-9))])
