@@ -20,11 +20,11 @@ from curvafit.core.checks import check_type
 from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE, Diagram
 from curvafit.priors.kernels.threads import Kernel, count_threads
 
-#: Pairs that are taken at once: a few seconds on a processor.
+#: Pairs that are computed at once: a few seconds on a processor.
 BLOCK = 8192
 #: Lines on which a sliced embedding projects a diagram, and quantiles of each.
 DIRECTIONS, QUANTILES = 12, 24
-#: All of fast-math but the leave to assume that no value is NaN or infinite.
+#: All fast-math flags but those that assume that no value is NaN or infinite.
 _FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
 _SERIAL = {"cache": True, "fastmath": _FAST, "error_model": "numpy", "nogil": True}
 #: A sum over the plan is trusted between these; outside, what it adds may have left float32's range.
@@ -32,7 +32,7 @@ _LEAST, _MOST = np.float32(1e-25), np.float32(1e30)
 _LN2 = math.log(2.0)
 _LOW, _HIGH = np.float32(-126), np.float32(127)
 _ZERO, _ONE = np.float32(0), np.float32(1)
-#: 2^r on [-½, ½] to 3e-7 of itself: Taylor's coefficients from the fifth to the first.
+#: Taylor's coefficients of 2^r, from the fifth to the first: on [-½, ½] the relative error is below 3e-7.
 _C5, _C4, _C3, _C2, _C1 = (np.float32(_LN2**k / math.factorial(k)) for k in (5, 4, 3, 2, 1))
 
 
@@ -41,15 +41,14 @@ def pairwise(
 ) -> np.ndarray:
     """Return `wasserstein` of every pair of N diagrams: `(N, N)` float64, symmetric, with a zero diagonal.
 
-    `wasserstein` is met to 1e-4 of itself, or 1e-5 where that is less than 0.1: the steps are the same, in float32. A
-    pair takes half a millisecond, on numba's threads. Options and errors are those of `wasserstein`.
+    Values agree with `wasserstein` to a relative 1e-4, or to 1e-5 below 0.1: the steps are the same, in float32. A pair
+    takes half a millisecond, on numba's threads. Options and errors are those of `wasserstein`.
     """
     distances = np.zeros((len(diagrams),) * 2)
     first, second = np.triu_indices(len(diagrams), 1)
-    order = np.random.default_rng(0).permutation(len(first))  # so that threads get pairs of like sizes
-    first, second = first[order], second[order]
-    found = _measure_pairs(diagrams, first, second, blur, reach, bin_width)
-    distances[first, second] = distances[second, first] = found
+    order = np.random.default_rng(0).permutation(len(first))  # so that no thread gets most of the large diagrams
+    i, j = first[order], second[order]
+    distances[i, j] = distances[j, i] = _measure_pairs(diagrams, i, j, blur, reach, bin_width)
     return distances
 
 
@@ -69,19 +68,19 @@ def one_to_many(
 def _measure_pairs(
     diagrams: Sequence[Diagram], first: np.ndarray, second: np.ndarray, blur: float, reach: float | None, width: float
 ) -> np.ndarray:
-    """Return the debiased Sinkhorn distances √(cost(a, b) - cost(a, a) / 2 - cost(b, b) / 2) of pairs."""
-    reduced = _normalise(diagrams, blur, reach, width)
-    clouds = pack([d.points for d in reduced], [d.weights for d in reduced])
-    # A cloud's cost with itself depends on how often the pair's blur is halved: it is computed once for each cloud and
-    # number of halvings, of which a cloud meets two or three.
-    halved = pair_halvings(clouds, first, second, blur)
-    keys = np.concatenate([np.stack([ends, halved], axis=1) for ends in (first, second)])
-    distinct, places = np.unique(keys, axis=0, return_inverse=True)
+    """Return the debiased Sinkhorn distances √(cost(a, b) - cost(a, a) / 2 - cost(b, b) / 2) of K pairs, `(K,)`."""
+    binned = _normalise(diagrams, blur, reach, width)
+    clouds = pack([d.points for d in binned], [d.weights for d in binned])
+    # A cloud's cost with itself depends on the pair's number of halvings: it is computed once for each cloud and number
+    # that occur, two or three numbers for a cloud.
+    counts = pair_halvings(clouds, first, second, blur)
+    keys = np.concatenate([np.stack([indices, counts], axis=1) for indices in (first, second)])
+    distinct, inverse = np.unique(keys, axis=0, return_inverse=True)
     self_costs = costs(clouds, distinct[:, 0], distinct[:, 0], distinct[:, 1], blur=blur, reach=reach)
-    bias = self_costs[places.reshape(2, -1)].sum(0) / 2
+    bias = self_costs[inverse.reshape(2, -1)].sum(0) / 2
     blocks = (slice(start, start + BLOCK) for start in range(0, len(first), BLOCK))  # Ctrl-C ends work between two
-    pairs = [costs(clouds, first[b], second[b], halved[b], blur=blur, reach=reach) for b in blocks]
-    return np.sqrt(np.maximum(np.concatenate([np.empty(0), *pairs]) - bias, 0))
+    pair_costs = [costs(clouds, first[b], second[b], counts[b], blur=blur, reach=reach) for b in blocks]
+    return np.sqrt(np.maximum(np.concatenate([np.empty(0), *pair_costs]) - bias, 0))
 
 
 def wasserstein(
@@ -93,9 +92,8 @@ def wasserstein(
     blur 1 and reach 20 (in 1 / grid's unit), on binned diagrams instead of random triangles. Two diagrams that differ
     by a small shift s are |s| / √2 apart; far apart, the distance levels off.
 
-    geomloss computes it in float64; where geomloss is not installed, `one_to_many` does in float32, which is the same
-    to 1e-4 of it, or 1e-5. Matches, the atlas's map and reports take `one_to_many` and `pairwise` always. Raises
-    ValueError if a diagram is none or empty, the units differ, or a parameter is out of range.
+    geomloss computes it in float64; where geomloss is not installed, `one_to_many` does in float32, with the accuracy
+    of `pairwise`. Raises ValueError if a diagram is none or empty, the units differ, or a parameter is out of range.
 
     Parameters
     ----------
@@ -112,24 +110,24 @@ def wasserstein(
     from geomloss import SamplesLoss
 
     clouds = pack([first.points, second.points], [first.weights, second.weights])
-    falls = pair_halvings(clouds, np.array([0]), np.array([1]), blur)[0]
-    options = {"blur": blur, "reach": reach, "diameter": blur * 2.0 ** (float(falls) - 0.5)}
+    count = pair_halvings(clouds, np.array([0]), np.array([1]), blur)[0]
+    options = {"blur": blur, "reach": reach, "diameter": blur * 2.0 ** (float(count) - 0.5)}
     loss = SamplesLoss("sinkhorn", p=2, debias=True, backend="tensorized", **options)
     with torch.no_grad():
-        parts = (torch.from_numpy(part) for d in (first, second) for part in (d.weights, d.points))
-        return math.sqrt(max(0.0, float(loss(*parts))))
+        tensors = (torch.from_numpy(values) for d in (first, second) for values in (d.weights, d.points))
+        return math.sqrt(max(0.0, float(loss(*tensors))))
 
 
 def _normalise(diagrams: Sequence[Diagram], blur: float, reach: float | None, bin_width: float) -> list[Diagram]:
-    """Return the diagrams binned and with total weight 1, as distances compare them, or raise ValueError."""
+    """Return the diagrams binned and with total weight 1; raise ValueError where they or an option are not valid."""
     if not blur > 0 or not (reach is None or reach > 0) or bin_width < 0:
         raise ValueError(f"expected positive blur and reach, got blur {blur}, reach {reach}, bin width {bin_width}")
     for other in diagrams:
         check_type(other, Diagram, "curvature diagrams, which `curvafit.diagram` and `Measures.diagram` give")
         if other.unit != diagrams[0].unit:
             raise ValueError(f"expected diagrams in one unit, got {diagrams[0].unit} and {other.unit}")
-    whole = (diagram.normalised for diagram in diagrams)
-    return [each.thin(bin_width, TAIL_SHARE) if bin_width else each for each in whole]
+    normalised = (diagram.normalised for diagram in diagrams)
+    return [diagram.thin(bin_width, TAIL_SHARE) if bin_width else diagram for diagram in normalised]
 
 
 def sliced_embedding(diagram: Diagram) -> np.ndarray:
@@ -138,16 +136,16 @@ def sliced_embedding(diagram: Diagram) -> np.ndarray:
     They are scaled so that the Euclidean distance of two embeddings is their sliced W₂, the mean over directions of the
     squared one-dimensional distances: |s| / √2 for a shift by s, as in `wasserstein`.
     """
-    whole = diagram.normalised
+    normalised = diagram.normalised
     angles = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     levels = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    lines = whole.points @ np.stack([np.cos(angles), np.sin(angles)])
-    rows = []
-    for values in lines.T:
+    projections = normalised.points @ np.stack([np.cos(angles), np.sin(angles)])
+    quantiles = []
+    for values in projections.T:
         order = np.argsort(values, kind="stable")
-        reached = np.cumsum(whole.weights[order]) - whole.weights[order] / 2
-        rows.append(np.interp(levels, reached, values[order]))
-    return np.concatenate(rows) / math.sqrt(DIRECTIONS * QUANTILES)
+        weights = normalised.weights[order]
+        quantiles.append(np.interp(levels, np.cumsum(weights) - weights / 2, values[order]))
+    return np.concatenate(quantiles) / math.sqrt(DIRECTIONS * QUANTILES)
 
 
 class Clouds(NamedTuple):
@@ -167,10 +165,10 @@ class Clouds(NamedTuple):
 
 def pack(points: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> Clouds:
     """Pack point sets `(n, 2)` with weights `(n,)`, some of each above 0; points without weight are left out."""
-    heavy = [w > 0 for w in weights]
-    points = [p[k].astype(np.float32) for p, k in zip(points, heavy, strict=True)]
+    points = [p[w > 0].astype(np.float32) for p, w in zip(points, weights, strict=True)]
+    # An empty array in front: there may be no sets at all.
     flat = np.concatenate([np.empty((0, 2), np.float32), *points])
-    log2 = np.concatenate([np.empty(0), *(np.log2(w[k]) for w, k in zip(weights, heavy, strict=True))])
+    log2 = np.concatenate([np.empty(0), *(np.log2(w[w > 0]) for w in weights)])
     low, high = (np.array([end(p, axis=0) for p in points], np.float64).reshape(-1, 2) for end in (np.min, np.max))
     bounds = np.cumsum([0, *map(len, points)])
     x, y = np.ascontiguousarray(flat.T)
@@ -208,14 +206,15 @@ def costs(
 
 def _schedule(falls: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
     """Return ε of every step of every pair, and the share of its potentials that a step keeps, both `(K, T)`."""
-    # The share is 1 before a pair begins, 0 at its first step and its last, ½ between.
+    # All pairs end together: one with fewer steps begins later, at its step 0. The share is 1 before a pair begins, 0
+    # at its first step and its last, ½ between.
     falls = np.asarray(falls, dtype=np.int64)[:, None]
-    steps = falls + 4
-    longest = int(steps.max(initial=0))
-    place = np.arange(longest) - (longest - steps)
-    ε = np.where(place >= falls + 2, blur**2, (blur * 2.0 ** (falls - 0.5 - np.maximum(place - 2, 0))) ** 2)
-    ends = (place == 0) | (place == steps - 1)
-    return ε, np.where(ends, 0.0, np.where(place < 0, 1.0, 0.5))
+    counts = falls + 4
+    longest = int(counts.max(initial=0))
+    step = np.arange(longest) - (longest - counts)
+    ε = np.where(step >= falls + 2, blur**2, (blur * 2.0 ** (falls - 0.5 - np.maximum(step - 2, 0))) ** 2)
+    first_or_last = (step == 0) | (step == counts - 1)
+    return ε, np.where(first_or_last, 0.0, np.where(step < 0, 1.0, 0.5))
 
 
 @partial(Kernel, **_SERIAL)
@@ -235,10 +234,11 @@ def _slice_cloud(clouds, number):
 
 @njit(**_SERIAL)
 def _cost(a, b, ε, shares, ρ):
-    """Return the cost of one pair."""
+    """Return the cost of one pair: Sinkhorn's steps on the potentials f and g, of both at once."""
     (x, y, log_a), (X, Y, log_b) = a, b
     n, m = len(x), len(X)
     f, g = np.zeros(n), np.zeros(m)
+    # F, G: potentials over ε and weights, in powers of 2; to_f, to_g: log2 of the sums that give new potentials.
     F, G = np.empty(n, np.float32), np.empty(m, np.float32)
     to_f, to_g = np.empty(n, np.float32), np.empty(m, np.float32)
     for t in range(len(ε)):
@@ -250,49 +250,49 @@ def _cost(a, b, ε, shares, ρ):
             F[i] = f[i] / unit + log_a[i]
         for j in range(m):
             G[j] = g[j] / unit + log_b[j]
-        here, there = (x, y, F), (X, Y, G)
-        _plan_sums(here, there, h, to_f, to_g)
-        _take_logarithms(here, there, h, to_f)
-        _take_logarithms(there, here, h, to_g)
-        moved = (1 - shares[t]) * unit / (1 + ε[t] / ρ)
+        source, target = (x, y, F), (X, Y, G)
+        _plan_sums(source, target, h, to_f, to_g)
+        _take_logarithms(source, target, h, to_f)
+        _take_logarithms(target, source, h, to_g)
+        factor = (1 - shares[t]) * unit / (1 + ε[t] / ρ)
         for i in range(n):
-            f[i] = shares[t] * f[i] - moved * to_f[i]
+            f[i] = shares[t] * f[i] - factor * to_f[i]
         for j in range(m):
-            g[j] = shares[t] * g[j] - moved * to_g[j]
-    return _part(log_a, f, ε[-1], ρ) + _part(log_b, g, ε[-1], ρ)
+            g[j] = shares[t] * g[j] - factor * to_g[j]
+    return _dual_cost(log_a, f, ε[-1], ρ) + _dual_cost(log_b, g, ε[-1], ρ)
 
 
 @njit(**_SERIAL)
-def _plan_sums(here, there, h, rows, columns):
-    """Write the sums of the plan 2^(F + G - h d²) over its second and over its first index."""
-    (x, y, F), (X, Y, G) = here, there
+def _plan_sums(source, target, h, rows, columns):
+    """Write the sums of the plan 2^(F + G - h d²) over its second index into `rows`, over its first into `columns`."""
+    (x, y, F), (X, Y, G) = source, target
     columns[:] = _ZERO
     for i in range(len(x)):
         xi, yi, Fi = x[i], y[i], F[i]
         total = _ZERO
         for j in range(len(X)):
             dx, dy = xi - X[j], yi - Y[j]
-            part = _exp2(Fi + G[j] - h * (dx * dx + dy * dy))
-            total += part
-            columns[j] += part
+            mass = _exp2(Fi + G[j] - h * (dx * dx + dy * dy))
+            total += mass
+            columns[j] += mass
         rows[i] = total
 
 
 @njit(**_SERIAL)
-def _take_logarithms(here, there, h, sums):
-    """Write log2 ∑ 2^(G - h d²) of every row in place of the sums over the plan's rows."""
-    x, y, F = here
+def _take_logarithms(source, target, h, sums):
+    """Replace the sums over the plan's rows by log2 ∑ 2^(G - h d²) of every row; G and d are those of the target."""
+    x, y, F = source
     for i in range(len(x)):
         if _LEAST < sums[i] < _MOST:
             sums[i] = np.log2(sums[i]) - F[i]
         else:
-            sums[i] = _log_sum(x[i], y[i], there, h)
+            sums[i] = _log_sum(x[i], y[i], target, h)
 
 
 @njit(**_SERIAL)
-def _log_sum(x, y, there, h):
-    """Return log2 ∑ 2^(G - h d²) of one row, with its largest term taken out."""
-    X, Y, G = there
+def _log_sum(x, y, target, h):
+    """Return log2 ∑ 2^(G - h d²) of one row; its largest term is factored out, so that nothing overflows."""
+    X, Y, G = target
     top = np.float32(-np.inf)
     for j in range(len(X)):
         dx, dy = x - X[j], y - Y[j]
@@ -306,7 +306,7 @@ def _log_sum(x, y, there, h):
 
 @njit(inline="always")
 def _exp2(t):
-    """Return 2^t in float32 to 3e-7 of itself: a polynomial, and the whole part put into the exponent's bits."""
+    """Return 2^t in float32, to a relative 3e-7: a polynomial of the fraction, times a float made of exponent bits."""
     t = min(max(t, _LOW), _HIGH)
     whole = np.rint(t)
     r = t - whole
@@ -315,8 +315,8 @@ def _exp2(t):
 
 
 @njit(**_SERIAL)
-def _part(log_weights, f, ε, ρ):
-    """Return the potential's part of the cost: ∑ a (ρ + ε/2) (1 - exp(-f/ρ)), or ∑ a f where all is moved."""
+def _dual_cost(log_weights, f, ε, ρ):
+    """Return what a potential adds to the cost: ∑ a (ρ + ε/2) (1 - exp(-f/ρ)), or ∑ a f where all is moved."""
     total = 0.0
     for i in range(len(f)):
         value = f[i] if np.isinf(ρ) else -(ρ + ε / 2) * math.expm1(-f[i] / ρ)

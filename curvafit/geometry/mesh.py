@@ -15,9 +15,9 @@ from torch import Tensor
 from curvafit.core.files import write_content
 from curvafit.priors.grid import Grid
 
-#: Part of the greatest value by which a capped surface's voxels are moved away from the level.
+#: Fraction of the greatest value by which a capped surface's voxels are moved away from the level.
 LEAST_PART = 5e-4
-#: Greatest relative change that makes voxels of equal values differ: marching cubes leaves holes where a face ties.
+#: Greatest random relative change that makes equal values differ: marching cubes leaves holes where a face has ties.
 TIE = np.float32(1e-4)
 #: Suffixes that `write_surface` knows.
 SUFFIXES = (".stl", ".ply", ".vtp")
@@ -49,16 +49,16 @@ class Surface:
 def surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Surface:
     """Return the level set of `u` `(Z, Y, X)` by Lewiner's marching cubes.
 
-    The cells between the last and the first voxels of a periodic box belong to it, each once; a box with other borders
-    ends at its outermost voxels' centres. Raises ValueError if `u` is not a finite volume of the grid's shape, or
-    nowhere crosses the level.
+    In a periodic box, the cells between the last and the first voxels are included; any other box ends at the centres
+    of its outermost voxels. Raises ValueError if `u` is not a finite volume of the grid's shape, or does not cross the
+    level.
     """
     values = _as_volume(u, grid)
     return march(np.pad(values, (0, 1), mode="wrap") if grid.periodic else values, grid.spacing, level)
 
 
 def march(values: np.ndarray, spacing: Sequence[float], level: float = 0.0) -> Surface:
-    """Return the level set of finite values (Z, Y, X), two or more along each axis, as `surface` does of a window."""
+    """Return the level set of finite values (Z, Y, X), two or more along each axis, of a box that is not periodic."""
     low, high = float(values.min()), float(values.max())
     if not low < level < high:
         raise NoSurface(f"expected a field that crosses {level:g}, got values from {low:g} to {high:g}")
@@ -80,15 +80,16 @@ def capped_surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Su
         values = _add_walls(values, axis, grid.periodic)
     values += np.copysign(LEAST_PART * np.abs(values).max(), values)
     vertices, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")
-    places = [_unpad(vertices[:, k], n) * h for k, (n, h) in enumerate(zip(grid.shape, grid.spacing, strict=True))]
-    return _weld(Surface(np.stack(places, axis=1), faces.astype(np.int64)))
+    sides = enumerate(zip(grid.shape, grid.spacing, strict=True))
+    positions = np.stack([_unpad(vertices[:, axis], n) * h for axis, (n, h) in sides], axis=1)
+    return _weld(Surface(positions, faces.astype(np.int64)))
 
 
 def solid_surface(u: np.ndarray | Tensor, grid: Grid) -> Surface:
     """Return the capped boundary of {u > 0} (`capped_surface`) that encloses the volume of the voxels in {u > 0}.
 
-    Flat triangles cut a curved surface short, by 1 % of the volume of tubes 10 voxels thick. A small shift of the
-    level, some hundredths of a voxel, makes up for it. Raises ValueError as `surface` does.
+    Flat triangles enclose less than a curved surface, by 1 % of the volume for tubes 10 voxels thick. A small shift of
+    the level, some hundredths of a voxel, corrects this. Raises ValueError as `surface` does.
     """
     values = _as_volume(u, grid)
     target = np.count_nonzero(values > 0) * grid.voxel_volume
@@ -97,14 +98,15 @@ def solid_surface(u: np.ndarray | Tensor, grid: Grid) -> Surface:
         mesh = capped_surface(values, grid, level)
         return volume(mesh) - target, mesh
 
-    attempts = [attempt(0.0)]
-    error, highest = attempts[0][0], float(values.max())
+    highest = float(values.max())
+    error, mesh = attempt(0.0)
     step = math.copysign(0.01 * highest, error)
-    attempts.append(attempt(step))
-    if attempts[1][0] != error:
-        level = step * error / (error - attempts[1][0])  # where the line through both has its zero
+    next_error, next_mesh = attempt(step)
+    attempts = [(error, mesh), (next_error, next_mesh)]
+    if next_error != error:  # a step of the secant method
+        level = step * error / (error - next_error)
         attempts.append(attempt(min(max(level, -0.1 * highest), 0.1 * highest)))
-    return min(attempts, key=lambda each: abs(each[0]))[1]
+    return min(attempts, key=lambda result: abs(result[0]))[1]
 
 
 def areas(mesh: Surface) -> np.ndarray:
@@ -133,23 +135,23 @@ def _as_volume(u: np.ndarray | Tensor, grid: Grid) -> np.ndarray:
 
 
 def _add_walls(values: np.ndarray, axis: int, periodic: bool) -> np.ndarray:
-    """Add two layers at both ends of an axis: the field on the box's face, and the outside right beyond it."""
+    """Add two layers at both ends of an axis: the field on the box's face, and negative values right beyond it."""
     first, last = np.take(values, [0], axis), np.take(values, [-1], axis)
-    if periodic:
+    if periodic:  # opposite faces have the same cap
         first = last = (first + last) / 2
     outside = np.full_like(first, -np.abs(values).max())
     return np.concatenate([outside, first, values, last, outside], axis)
 
 
 def _unpad(index: np.ndarray, count: int) -> np.ndarray:
-    """Return positions in an axis with walls as voxels of the axis without; both layers of a wall lie on the face."""
+    """Convert positions along an axis with walls to voxels of the axis without; both layers of a wall lie on a face."""
     inner = np.arange(count, dtype=np.float64)
     knots = np.concatenate([[-0.5, -0.5], inner, [count - 0.5, count - 0.5]])
     return np.interp(index, np.arange(count + 4), knots)
 
 
 def _weld(mesh: Surface) -> Surface:
-    """Merge the vertices that lie in one place, and drop the triangles that this closes."""
+    """Merge vertices with the same position, and drop the triangles that lose an edge."""
     vertices, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[mesh.faces]
     a, b, c = faces.T
@@ -169,12 +171,11 @@ def write_surface(mesh: Surface, path: str | Path, *, unit: str = "voxel", data:
     for name, values in (data or {}).items():
         if np.shape(values) != (len(mesh.vertices),):
             raise ValueError(f"expected {name} of shape ({len(mesh.vertices)},), got {np.shape(values)}")
-    remark = f"curvafit surface, lengths in {unit}"
-    content = _stl(mesh, remark) if suffix == ".stl" else (_ply if suffix == ".ply" else _vtp)(mesh, remark, data or {})
-    return write_content(path, content)
+    encode = {".stl": _stl, ".ply": _ply, ".vtp": _vtp}[suffix]
+    return write_content(path, encode(mesh, f"curvafit surface, lengths in {unit}", data or {}))
 
 
-def _stl(mesh: Surface, remark: str) -> bytes:
+def _stl(mesh: Surface, remark: str, _: Data) -> bytes:
     vectors = area_vectors(mesh)
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -199,14 +200,14 @@ def _ply(mesh: Surface, remark: str, data: Data) -> bytes:
 
 
 def _vtp(mesh: Surface, remark: str, data: Data) -> bytes:
-    """Return XML PolyData; every array inline, base64 of its length in bytes and its numbers."""
-    count, ends = len(mesh.vertices), np.arange(3, 3 * len(mesh.faces) + 1, 3)
+    """Return XML PolyData; every array is inline, as base64 of its length in bytes and its numbers."""
+    ends = np.arange(3, 3 * len(mesh.faces) + 1, 3)  # of the faces in "connectivity"
     lines = (
         '<?xml version="1.0"?>',
         f"<!-- {remark} -->",
         '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">',
         "<PolyData>",
-        f'<Piece NumberOfPoints="{count}" NumberOfVerts="0" NumberOfLines="0" NumberOfStrips="0" '
+        f'<Piece NumberOfPoints="{len(mesh.vertices)}" NumberOfVerts="0" NumberOfLines="0" NumberOfStrips="0" '
         f'NumberOfPolys="{len(mesh.faces)}">',
         *("<PointData>", *(_vtk_array(name, values, "f4") for name, values in data.items()), "</PointData>"),
         *("<Points>", _vtk_array("Points", mesh.vertices[:, ::-1], "f4", 3), "</Points>"),

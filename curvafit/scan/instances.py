@@ -131,10 +131,8 @@ def _measure_body(volume: Volume, boxes: Sequence[tuple[int, Box]], number: int)
             whole.Quantity(name, symbol, float(figure(total)), math.nan, power)
             for name, symbol, power, figure in OF_BODIES
         )
-    direction, part = whole.find_direction(total), ("instance", label)
-    measures = whole.Measures(
-        volume.source, volume.unit, "mask", quantities, direction, diagram, (1, 1, 1), notes, part
-    )  # fmt: skip
+    axis, part = whole.find_direction(total), ("instance", label)
+    measures = whole.Measures(volume.source, volume.unit, "mask", quantities, axis, diagram, (1, 1, 1), notes, part)
     return {"measures": measures}
 
 

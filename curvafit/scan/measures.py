@@ -23,7 +23,7 @@ from curvafit.geometry.diagrams import FAMILIES, MARGIN, Diagram, diagram, famil
 from curvafit.geometry.mesh import NoSurface, Surface, area_vectors
 from curvafit.geometry.morphology import border_weights, local_thickness, smooth_surface
 from curvafit.geometry.topology import euler_shares
-from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
+from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
 from curvafit.scan import preparation
 from curvafit.scan.grids import median_thickness, remove_specks
 from curvafit.scan.preparation import LARGEST_WINDOW, Prepared
@@ -38,10 +38,9 @@ SUMS += ("curved", "H", "H²", "K", "κ1", "κ2", "C", *FAMILIES)
 _UPPER = np.triu_indices(3)
 Sums = Mapping[str, np.ndarray]
 Row = TypeVar("Row", bound=Any)
-#: Least edge, in working voxels, of a cube whose descriptors are measured.
-SMALLEST_CUBE = 24
-#: Least edge, in working voxels, of the windows of a larger scan: those that training sees are about as large.
-READ = 56
+#: Least edges, in working voxels: of a cube whose descriptors are measured; of the windows of a larger scan, which are
+#: about as large as those of training.
+SMALLEST_CUBE, READ = 24, 56
 #: The fewest blocks, and the most along an axis; the length of a block in periods of the structure.
 LEAST, MOST, PERIODS = 8, 6, 1.0
 #: Slices from which on a scan without curvature is refused, and why one of fewer has the other numbers alone.
@@ -411,9 +410,7 @@ def _cut_axis(n: int) -> list[slice]:
 
 
 def _measure_tile(prepared: Prepared, tile: tuple[slice, ...]) -> Diagram:
-    phase = np.ascontiguousarray(prepared.phase[tile])
-    z, y, x = phase.shape
-    grid = Grid((z, y, x), prepared.grid.spacing, prepared.grid.boundary)
+    phase, grid = np.ascontiguousarray(prepared.phase[tile]), prepared.part(tile)  # type: ignore[arg-type]
     where = None if prepared.roi is None else ndimage.binary_erosion(prepared.roi, iterations=MARGIN)[tile]
     measured = diagram(phase, grid, WORKING_EPSILON, where=where)
     corner = np.array([edge.start or 0 for edge in tile]) * np.array(grid.spacing)

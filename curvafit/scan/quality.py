@@ -11,11 +11,9 @@ from scipy import ndimage
 from curvafit.scan.grids import boxes_by_surface, centre_distance, resample, resample_mask, surface_voxels
 from curvafit.volumes.volume import ScanError
 
-#: Blurs that are tried, in voxels of the finest axis.
+#: Blurs, shifts of the boundary and grains that are tried, in voxels of the finest axis.
 _BLURS = (0.0, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
-#: Shifts of the boundary that are tried, in voxels of the finest axis.
 _SHIFTS = (-0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5)
-#: Grains that are tried, in voxels of the finest axis.
 _GRAINS = (0.0, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0)
 #: Edge of the box in which a scan's noise and blur are measured.
 _MEASURED = 64

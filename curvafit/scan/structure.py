@@ -313,9 +313,7 @@ def find_split(structure: Structure, run: Run, extremes: tuple[Any, Any] | None 
     if low == high and volume.source:
         raise ScanError(f"every voxel of {volume.source} is {lowest}: a volume must vary")
     ends = {float(low), float(high)}
-    two_values = all(
-        bool(record["two"]) and {float(record["lowest"]), float(record["highest"])} <= ends for record in records
-    )
+    two_values = all(bar["two"] and {float(bar["lowest"]), float(bar["highest"])} <= ends for bar in records)
     kind = structure.kind
     if kind == "auto":
         values = np.unique(np.concatenate([record["values"] for record in records]))

@@ -84,14 +84,9 @@ def survey(structure: Structure, run: Run) -> Plan:
     keeps_grid, name = structure.kind == "field" or noise, "structure" if structure_is_thinner else "background"
     note = preparation.judge_thickness(name, median, thick, volume.spacing, keeps_grid)
     scale, why = preparation.choose_scale(volume.shape, volume.spacing, median, keeps_grid)
-    return replace(
-        plan,
-        thickness=median,
-        scale=scale,
-        working=preparation.count_voxels(volume.shape, scale) if min(volume.shape) > 3 else (0, 0, 0),  # no curvature
-        edge=preparation.working_edge(scale, volume.spacing),
-        working_notes=(note, *why),
-    )
+    working = preparation.count_voxels(volume.shape, scale) if min(volume.shape) > 3 else (0, 0, 0)  # no curvature
+    edge = preparation.working_edge(scale, volume.spacing)
+    return replace(plan, thickness=median, scale=scale, working=working, edge=edge, working_notes=(note, *why))
 
 
 def _measure_thickness(plan: Plan, order: Sequence[Box], inside: bool) -> tuple[float, float, Plan]:

@@ -483,20 +483,20 @@ def _measure_tiles(
 
 def _summarise(plan: Plan, records: Sequence[Record], wide_records: Sequence[Record], tiles_note: str) -> Measures:
     """Return the measures of a volume, and of the compartments of its region, from the records of its tiles."""
-    finest, shape = plan.finest, plan.volume.shape
+    volume, finest = plan.volume, plan.finest
     parts = {name.removeprefix("rows") for record in records for name in record if name.startswith("rows")}
     tables = {part: _sum_tiles(plan, records, wide_records, part) for part in parts}
     total = dict(zip(whole.SUMS, tables[_WHOLE].sum(0), strict=True))
     if not 0 < total["inside"] < total["volume"]:
         raise ScanError("expected a structure and background in the scan, got one of them only")
     has_curvature = total["curved"] > 0
-    if not has_curvature and min(shape) >= whole.FEWEST_SLICES:
+    if not has_curvature and min(volume.shape) >= whole.FEWEST_SLICES:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
     period = total["thickness"] / total["inside"] + total["gap"] / (total["volume"] - total["inside"])
-    blocks = Blocks.divide(shape, plan.volume.spacing, period)
+    blocks = Blocks.divide(volume.shape, volume.spacing, period)
     χ = float(sum(record["euler"] for record in records))
-    density = connectivity_density(χ, shape, plan.volume.spacing, periodic=False)
-    _, empty, why = whole.no_curvature(plan.volume.unit, whole.TOO_THIN)
+    density = connectivity_density(χ, volume.shape, volume.spacing, periodic=False)
+    _, empty, why = whole.no_curvature(volume.unit, whole.TOO_THIN)
     notes = (*_notes(plan, records), *(() if has_curvature else why), *([tiles_note] if len(plan.cores) > 1 else []))
 
     def summarise(part: str, label: int | None = None) -> Measures:
@@ -504,9 +504,7 @@ def _summarise(plan: Plan, records: Sequence[Record], wide_records: Sequence[Rec
         diagram = _join_bins(plan, records, part) if curved else empty
         connectivity = (χ, density) if part == _WHOLE else None
         table, name = _merge(tables[part], finest, blocks), None if label is None else ("compartment", label)
-        return whole.summarise_sums(
-            plan.volume, plan.structure.kind, blocks, table, connectivity, diagram, notes, part=name
-        )
+        return whole.summarise_sums(volume, plan.structure.kind, blocks, table, connectivity, diagram, notes, part=name)
 
     if plan.structure.region is None:
         return summarise(_WHOLE)
