@@ -57,9 +57,8 @@ class Diagram(Pictured):
 
     `spread` is the root mean square distance of the measured points to the bins that replace them, 0 unless binned: the
     transport distance (cost ½|x - y|²) between a diagram and its binned self is at most √½ · spread. `excluded` is the
-    fraction of the surface's area left out because curvature is not resolved there. `places` `(N, 3)` are the points'
-    positions (z, y, x) on the surface, in the grid's unit from the first voxel's centre; None once points were merged
-    or read.
+    fraction of the surface's area left out because curvature is not resolved there. `places` `(N, 3)` are positions
+    (z, y, x) on the surface, in the grid's unit from the first voxel's centre; None once points were merged or read.
     """
 
     points: np.ndarray
@@ -133,8 +132,7 @@ class Diagram(Pictured):
         """Return the index of each point's bin of edge `width`: 0, 1, … over the occupied bins."""
         cells = np.floor(self.points / width).astype(np.int64)
         cells -= cells.min(0, initial=0)
-        flat = cells @ np.array([cells[:, 1].max(initial=0) + 1, 1])
-        return np.unique(flat, return_inverse=True)[1]
+        return np.unique(cells @ np.array([cells[:, 1].max(initial=0) + 1, 1]), return_inverse=True)[1]
 
     def _merge(self, index: np.ndarray) -> Diagram:
         """Merge the points with the same index (0, 1, …) into their barycentre."""
@@ -172,8 +170,7 @@ def diagram(
     Curvatures of the voxels around a triangle are interpolated linearly at its barycentre. Geometric curvatures are
     those of the level sets of √2 ε artanh(u), which are the level sets of u: finite differences of this approximate
     distance are far more accurate than those of u. Diffuse curvatures, to reproduce the paper, are those of u itself.
-    The field `(Z, Y, X)` is finite and positive inside. Raises NoSurface, a ValueError, if there is no surface in the
-    box or in `where`.
+    The field `(Z, Y, X)` is finite and positive inside. Raises NoSurface, a ValueError, where there is no surface.
 
     Parameters
     ----------
@@ -245,9 +242,8 @@ def _voxel_curvatures(values: Tensor, grid: Grid, epsilon: float, curvature: str
 def _interpolate(
     fields: tuple[np.ndarray, ...], resolved: np.ndarray, centres: np.ndarray, periodic: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate two fields at `centres` `(N, 3)`, in voxels, from the resolved voxels around each; return values
-    `(N, 2)`, and whether any of those voxels are resolved, bool `(N,)`."""
-    # Fields are 0 where they are not resolved: dividing by the weight of the resolved voxels makes a mean over those.
+    """Interpolate two fields at `centres` `(N, 3)`, in voxels, from the resolved voxels around each, if there are any;
+    return values `(N, 2)` and whether there are. Fields are 0 elsewhere: sums over the resolved weight are means."""
     *sums, total = (
         map_coordinates(values, centres.T, np.float64, order=1, mode="grid-wrap" if periodic else "nearest")
         for values in (*fields, resolved)
@@ -256,10 +252,9 @@ def _interpolate(
 
 
 def family_shares(diagram: Diagram, radius: float) -> dict[str, float]:
-    """Return the share of area of each family by name, layers first: the flat area is layers, other area belongs to the
-    family whose ideal point is nearest in direction on the (κ1, κ2) plane, after Koenderink's shape index.
+    """Return the share of area of each family by name: flat area is layers, other area has the nearest ideal point.
 
-    `radius` is the structure's half-thickness in the diagram's unit.
+    Points are compared by direction (Koenderink's shape index); `radius` is the half-thickness in the diagram's unit.
     """
     areas = np.bincount(families(diagram.points, radius), diagram.weights, minlength=len(FAMILIES))
     shares = dict(zip(FAMILIES, map(float, areas / areas.sum()), strict=True))

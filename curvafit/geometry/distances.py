@@ -166,8 +166,7 @@ class Clouds(NamedTuple):
 def pack(points: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> Clouds:
     """Pack point sets `(n, 2)` with weights `(n,)`, some of each above 0; points without weight are left out."""
     points = [p[w > 0].astype(np.float32) for p, w in zip(points, weights, strict=True)]
-    # An empty array in front: there may be no sets at all.
-    flat = np.concatenate([np.empty((0, 2), np.float32), *points])
+    flat = np.concatenate([np.empty((0, 2), np.float32), *points])  # there may be no sets
     log2 = np.concatenate([np.empty(0), *(np.log2(w[w > 0]) for w in weights)])
     low, high = (np.array([end(p, axis=0) for p in points], np.float64).reshape(-1, 2) for end in (np.min, np.max))
     bounds = np.cumsum([0, *map(len, points)])

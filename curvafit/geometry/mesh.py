@@ -80,9 +80,8 @@ def capped_surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Su
         values = _add_walls(values, axis, grid.periodic)
     values += np.copysign(LEAST_PART * np.abs(values).max(), values)
     vertices, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")
-    sides = enumerate(zip(grid.shape, grid.spacing, strict=True))
-    positions = np.stack([_unpad(vertices[:, axis], n) * h for axis, (n, h) in sides], axis=1)
-    return _weld(Surface(positions, faces.astype(np.int64)))
+    positions = [_unpad(vertices[:, k], n) * h for k, (n, h) in enumerate(zip(grid.shape, grid.spacing, strict=True))]
+    return _weld(Surface(np.stack(positions, axis=1), faces.astype(np.int64)))
 
 
 def solid_surface(u: np.ndarray | Tensor, grid: Grid) -> Surface:

@@ -23,8 +23,8 @@ from curvafit.geometry.topology import euler_number, euler_of_window
 
 #: Voxels that the Gaussian reaches which smooths a mask's stairs.
 SOFTENED = 3
-#: The part of a mask's slope with which it goes on beyond a window's faces. Windows of 16³ voxels of Gaussian level
-#: sets then have the whole's area to 0.5 %; with none 1.5 % less.
+#: The fraction of a mask's slope with which it continues beyond a window's faces. Windows of 16³ voxels of Gaussian
+#: level sets then have the area of the whole to 0.5 %; without a slope 1.5 % less.
 SLOPE = 0.6
 #: How far a periodic box is continued before distances are taken, in voxels: at first, and where balls are wider.
 _WRAPPED = (16, 32)
@@ -87,7 +87,7 @@ def morphometry(
 def measure_connectivity(
     mask: np.ndarray, spacing: tuple[float, float, float], *, periodic: bool = False
 ) -> tuple[float, float]:
-    """Return χ, and the connectivity density."""
+    """Return χ and the connectivity density of a mask (see `morphometry`)."""
     euler = float(euler_number(mask, periodic=True)) if periodic else euler_of_window(mask)
     return euler, connectivity_density(euler, mask.shape, spacing, periodic=periodic)
 
@@ -110,15 +110,15 @@ def local_thickness(
     The result is float32 (Z, Y, X), in spacing's unit. Diameters are 2·EDT, EDT being the distance to the nearest outer
     voxel's centre: half a voxel too much on plates (on average over their positions), up to a voxel too little on tubes
     and balls, whose axes miss the grid; for the same reason a ball covers voxels up to half a voxel beyond its rim.
-    Where balls are wider than `largest` voxels in radius they are painted on a grid coarser by a whole factor, at a
-    cost of under 1/`largest` of their size. Balls of a periodic box go round it, up to 32 voxels in radius; of
-    another they may reach out.
+    Where balls are wider than `largest` voxels in radius, all are painted on a grid coarser by a whole factor, with an
+    error below 1/`largest` of their size. In a periodic box balls continue across its faces, up to 32 voxels in radius;
+    in any other they may reach out of it.
     """
     mask = np.asarray(mask, dtype=bool)
     if not mask.any() or mask.all():
         return np.where(mask, np.float32(np.inf), np.float32(0))
     edge = float(min(spacing))
-    for width in _WRAPPED if periodic else (0,):
+    for width in _WRAPPED if periodic else (0,):  # the second margin is tried where balls are wider than the first
         margin = [min(n // 2, width) for n in mask.shape]
         inner = tuple(slice(m, m + n) for m, n in zip(margin, mask.shape, strict=True))
         radius = ball_radii(np.pad(mask, [(m, m) for m in margin], mode="wrap"), spacing)
@@ -143,26 +143,26 @@ def smooth_surface(mask: np.ndarray, spacing: tuple[float, float, float], *, per
 
 
 def soften(mask: np.ndarray, periodic: bool = False) -> np.ndarray:
-    """Return a mask after the Gaussian of `smooth_surface`, float32; it reaches `SOFTENED` voxels.
+    """Smooth a mask by the Gaussian of `smooth_surface`, which reaches `SOFTENED` voxels; return float32.
 
-    Beyond a window's faces the mask goes on with a part of its slope there (`SLOPE`): without, the surface would meet
-    the faces upright.
+    Beyond a window's faces the mask continues with a fraction of its slope there (`SLOPE`): else the surface would meet
+    the faces at right angles.
     """
     mask = mask.astype(np.float32)
     if periodic:
         return ndimage.gaussian_filter(mask, 0.7, mode="wrap")
-    flat, steep = np.pad(mask, SOFTENED, "edge"), np.pad(mask, SOFTENED, "reflect", reflect_type="odd")
+    flat, sloped = np.pad(mask, SOFTENED, "edge"), np.pad(mask, SOFTENED, "reflect", reflect_type="odd")
     inner = tuple(slice(SOFTENED, SOFTENED + n) for n in mask.shape)
-    return np.ascontiguousarray(ndimage.gaussian_filter(flat + SLOPE * (steep - flat), 0.7)[inner])
+    return np.ascontiguousarray(ndimage.gaussian_filter(flat + SLOPE * (sloped - flat), 0.7)[inner])
 
 
-def border_weights(places: np.ndarray, shape: Sequence[int]) -> np.ndarray:
-    """Return how much triangles at places (M, 3), in voxels from the first centre, count in a window of a shape.
+def border_weights(positions: np.ndarray, shape: Sequence[int]) -> np.ndarray:
+    """Return the weights `(M,)` of triangles at positions `(M, 3)`, in voxels from the first centre of a window.
 
-    A mesh ends at the centres of the outer voxels. What lies between those and the next ones stands for the half voxel
-    beyond, too: so the area is that of all voxels, on average over windows.
+    A mesh ends at the centres of the outer voxels. Triangles between those and the next ones also stand for the half
+    voxel beyond: so the area is that of all voxels, on average over windows.
     """
-    weights = np.ones(len(places))
-    for at, n in zip(places.T, shape, strict=True):
-        weights *= 1 + 0.5 * (at < 1) + 0.5 * (at > n - 2)
+    weights = np.ones(len(positions))
+    for position, n in zip(positions.T, shape, strict=True):
+        weights *= 1 + 0.5 * (position < 1) + 0.5 * (position > n - 2)
     return weights

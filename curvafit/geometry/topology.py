@@ -1,4 +1,4 @@
-"""Pieces, tunnels and cavities of a mask, in a box that ends or one that repeats."""
+"""Pieces, tunnels and cavities of a mask, in a box that is a window or periodic."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Ends = tuple[tuple[bool, bool], ...]
 
 
 def components(mask: np.ndarray, *, periodic: bool = False, connectivity: int = 26) -> tuple[np.ndarray, int]:
-    """Find the connected pieces: int32 (Z, Y, X) of 0 outside and 1, 2, … in the pieces, and how many there are.
+    """Return the connected pieces as labels, int32 (Z, Y, X), 0 outside and 1, 2, … in the pieces, and their count.
 
     Voxels touch by corners (`connectivity` 26) or by faces (6); in a periodic box also across its faces.
     """
@@ -29,11 +29,11 @@ def components(mask: np.ndarray, *, periodic: bool = False, connectivity: int = 
 
 
 def number_pieces(labels: np.ndarray) -> np.ndarray:
-    """Return pieces numbered 1, 2, … in the order of their first voxels, int32; 0 stays."""
-    first = np.full(labels.max() + 1, labels.size)
-    np.minimum.at(first, labels.ravel(), np.arange(labels.size))
-    first[0] = -1
-    return np.argsort(np.argsort(first)).astype(np.int32)[labels]
+    """Renumber pieces 1, 2, … in the order of their first voxels, int32; 0 stays."""
+    first_voxels = np.full(labels.max() + 1, labels.size)
+    np.minimum.at(first_voxels, labels.ravel(), np.arange(labels.size))
+    first_voxels[0] = -1
+    return np.argsort(np.argsort(first_voxels)).astype(np.int32)[labels]
 
 
 def euler_number(mask: np.ndarray, *, periodic: bool = False) -> int:
@@ -47,12 +47,12 @@ def euler_shares(mask: np.ndarray, *, periodic: bool = False) -> np.ndarray:
     """Return what each voxel adds to χ of the union of the closed voxels (26-connected), int8 of the mask's shape.
 
     In three dimensions a voxel counts itself (-1) and those of its low faces (1 each), low edges (-1 each) and low
-    corner (1) that belong to the union. In a window the first layers count nothing: their neighbours are not seen. Sums
-    over parts are shares of χ.
+    corner (1) that belong to the union. In a window the first layers count nothing: their neighbours are unknown. Sums
+    over boxes are shares of χ.
     """
     total = np.zeros(mask.shape, dtype=np.int8)
     for axes in chain.from_iterable(combinations(range(mask.ndim), k) for k in range(mask.ndim + 1)):
-        cells = mask
+        cells = mask  # voxels, or their low faces, edges or corners across `axes`
         for axis in axes:
             cells = cells | np.roll(cells, 1, axis)
         total += ((-1) ** (mask.ndim - len(axes)) * cells.astype(np.int8)).astype(np.int8)
@@ -65,27 +65,28 @@ def euler_shares(mask: np.ndarray, *, periodic: bool = False) -> np.ndarray:
 def euler_of_window(mask: np.ndarray, ends: Ends = ((True, True),) * 3) -> float:
     """Return what a window of a larger structure adds to χ, on average over windows.
 
-    From χ of the part inside, half of χ of each outer layer is subtracted, a quarter of that of each outer row added,
-    and an eighth of each corner subtracted (Odgaard & Gundersen 1993; BoneJ's Δχ). On average a window of n voxels a
-    side then has the share of (n - 1)³ voxels, and a structure that touches no face has its own χ.
+    From χ of the structure in the window, half of χ of each outer layer is subtracted, a quarter of that of each outer
+    row added, and an eighth of each corner subtracted (Odgaard & Gundersen 1993; BoneJ's Δχ). On average a window of n
+    voxels a side then has the share of (n - 1)³ voxels, and a structure that touches no face has its own χ.
 
-    The `ends` of a part of a window say along which axes it begins, and ends, with the window; where it does not begin
-    with it, its first layer is the one before. Sums over parts are the window's.
+    For a box of a window, `ends` say along which axes it begins, and ends, with the window; where it does not begin
+    with it, its first layer belongs to the box before. The sum over boxes is the window's.
     """
     padded, total = np.pad(mask, [(int(first), int(last)) for first, last in ends]), 0.0
     for layers in product((None, 0, 1), repeat=3):
         if all(layer is None or end[layer] for layer, end in zip(layers, ends, strict=True)):
-            part = padded[tuple({None: slice(None), 0: 1, 1: -2}[layer] for layer in layers)]
-            total += (-0.5) ** (3 - part.ndim) * int(euler_shares(part).sum(dtype=np.int64))
+            # All of an axis, or its first or last layer, which are at 1 and -2 after padding.
+            outer = padded[tuple({None: slice(None), 0: 1, 1: -2}[layer] for layer in layers)]
+            total += (-0.5) ** (3 - outer.ndim) * int(euler_shares(outer).sum(dtype=np.int64))
     return total
 
 
 def betti_numbers(mask: np.ndarray, *, periodic: bool = False) -> tuple[int, int, int]:
     """Return b0 pieces (26-connected), b1 tunnels, b2 cavities (6-connected).
 
-    A box that is not periodic is all there is: what opens to its faces is no cavity. A periodic one is a torus: a tube
-    that goes around it is a tunnel, and b2 = (pieces of the outside) - 1 + 3 - (directions in which the outside goes
-    around), by Alexander duality. b1 = b0 + b2 - χ.
+    Beyond a box that is not periodic all is outside: a hollow that opens to a face is no cavity. A periodic box is a
+    torus: a tube that goes around it is a tunnel, and b2 = (pieces of the outside) - 1 + 3 - (directions in which the
+    outside goes around), by Alexander duality. b1 = b0 + b2 - χ.
     """
     inside = np.asarray(mask, dtype=bool)
     if not inside.any():
@@ -125,21 +126,21 @@ def _graph(pairs: np.ndarray, count: int) -> coo_array:
 
 
 def _count_directions(mask: np.ndarray) -> int:
-    """Return in how many independent directions a 6-connected phase goes around the torus."""
-    # Pieces within the box are laid out along spanning trees; contacts that then do not fit are loops around it.
+    """Return the number of independent directions in which a 6-connected phase goes around the torus."""
+    # Seams of a spanning tree put each piece within the box into a period (z, y, x); a seam that disagrees is a loop.
     labels, count = _label_pieces(mask, corners=False)
     seams = _find_seams(labels, False)
-    one, other, steps = seams[:, 0] - 1, seams[:, 1] - 1, np.eye(3, dtype=np.int64)[seams[:, 2]]
+    low, high, steps = seams[:, 0] - 1, seams[:, 1] - 1, np.eye(3, dtype=np.int64)[seams[:, 2]]
     graph = _graph(seams[:, :2] - 1, count).tocsr()
-    step = {}
-    for i, j, by in zip(one, other, steps, strict=True):
-        step[i, j], step[j, i] = by, -by
-    place, seen = np.zeros((count, 3), dtype=np.int64), np.zeros(count, dtype=bool)
+    step_between = {}
+    for i, j, step in zip(low, high, steps, strict=True):
+        step_between[i, j], step_between[j, i] = step, -step
+    periods, visited = np.zeros((count, 3), dtype=np.int64), np.zeros(count, dtype=bool)
     for root in range(count):
-        if not seen[root]:
-            order, before = breadth_first_order(graph, root, directed=False)
-            seen[order] = True
+        if not visited[root]:
+            order, parents = breadth_first_order(graph, root, directed=False)
+            visited[order] = True
             for node in order[1:]:
-                place[node] = place[before[node]] + step[before[node], node]
-    around = place[one] + steps - place[other]
-    return int(np.linalg.matrix_rank(around)) if len(around) else 0
+                periods[node] = periods[parents[node]] + step_between[parents[node], node]
+    loops = periods[low] + steps - periods[high]
+    return int(np.linalg.matrix_rank(loops)) if len(loops) else 0

@@ -22,8 +22,7 @@ MEASURED = 160
 
 
 def bounding_box(shape: tuple[int, int, int], region: np.ndarray | None, longest: int) -> tuple[Box, tuple[str, ...]]:
-    """Return the box around a region (all of `shape` without one), its middle where a side is longer than `longest`
-    voxels, and notes on both."""
+    """Return the box around a region (else all), cut to the middle `longest` voxels of longer sides, and notes."""
     box, notes = [slice(0, n) for n in shape], []
     if region is not None:
         box = list(ndimage.find_objects(region.astype(np.uint8))[0])
@@ -77,10 +76,9 @@ def order_boxes(candidates: Sequence[Box], counts: Sequence[int]) -> list[Box]:
     """Return the boxes of `candidate_boxes` whose count of voxels is above 0, in the order of `boxes_by_surface`."""
     filled = [(count, box) for count, box in zip(counts, candidates, strict=True) if count]
     ordered = [box for _, box in sorted(filled, key=lambda pair: -pair[0])]
-    middle = candidates[0]
-    if ordered and counts[0] >= 0.5 * sum(counts) / len(counts):
-        ordered.remove(middle)
-        ordered.insert(0, middle)
+    if ordered and counts[0] >= 0.5 * sum(counts) / len(counts):  # of the middle box
+        ordered.remove(candidates[0])
+        ordered.insert(0, candidates[0])
     return ordered
 
 

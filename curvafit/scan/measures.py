@@ -142,8 +142,8 @@ class Measures(Pictured):
         rows = [("", "", *titles, "")]
         for quantities in zip(*(column.quantities for column in columns), strict=True):
             texts = [quantity.format(self.unit) for quantity in quantities]
-            values = [f"{value} {interval}" for value, interval, _ in texts]
-            rows.append((quantities[0].name, quantities[0].symbol, *values, texts[0][2]))
+            name, symbol, unit = quantities[0].name, quantities[0].symbol, texts[0][2]
+            rows.append((name, symbol, *(f"{value} {interval}" for value, interval, _ in texts), unit))
         lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
         return f"<code>{escape(repr(self))}</code><table><tr>{'</tr><tr>'.join(lines)}</tr></table>"
 
@@ -214,9 +214,8 @@ def summarise_sums(
     *,
     part: tuple[str, int] | None = None,
 ) -> Measures:
-    """Return the measures of a scan, or of a region of it, from a table (N, C): a row for each block, a column for each
-    of `SUMS`. `connectivity` is χ and connectivity density of the whole scan, None for a region; `frame` gives source
-    and unit."""
+    """Return the measures of a scan from a table (N, C) of `SUMS` over its blocks; `connectivity` is χ and connectivity
+    density of the whole scan, None for a region of it, and `frame` gives source and unit."""
     total = table.sum(0)
     values = combine(total)
     if connectivity is not None:
@@ -271,9 +270,8 @@ class Maps(NamedTuple):
 def measure_maps(
     field: Volume, kind: Kind, options: dict[str, Any], progress: Progress = silent, most: int | None = None
 ) -> Maps:
-    """Measure what is summed over a scan's blocks; `options` are `threshold`, `dark` and `periodic` of `measure`.
-    Curvature is that of the part of a large scan that `preparation.prepare` chooses, or given `most`, of the whole scan
-    on at most so many working voxels."""
+    """Measure what is summed over a scan's blocks; `options` are `threshold`, `dark` and `periodic` of `measure`. The
+    curvature is that of the box that `preparation.prepare` chooses, or of all, on at most `most` working voxels."""
     periodic: bool = options["periodic"]
     progress("finding the structure", 0.0)
     detected, signed = find_structure(field, kind=kind, **options)  # type: ignore[arg-type]

@@ -117,8 +117,7 @@ class Prepared:
 
     def scan_alike(self, grown: np.ndarray, seed: int) -> Prepared:
         """Scan a simulated periodic shape `(Z, Y, X)`, positive inside, as this scan was made, and prepare the result:
-        a field as it is; a mask or an image on voxels of which the structure is as many thick as here, and an image as
-        blurred and noisy as this one."""
+        a field as it is, else with a structure as many voxels thick as here; an image as blurred and noisy as here."""
         if self.kind == "field":
             return prepare(Volume(grown), kind="field", periodic=True, one_scale=self.one_scale)
         mask, quality = grown > 0, self.quality

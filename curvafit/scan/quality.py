@@ -125,8 +125,7 @@ def _fit_blur(levels: np.ndarray, distance: np.ndarray, edges: Sequence[float]) 
 
 
 def _measure_deep_noise(levels: np.ndarray, distance: np.ndarray, edges: Sequence[float]) -> tuple[float, float] | None:
-    """Return the deviation of levels deep within the phases, and the fraction of it that is left after smoothing by one
-    voxel of the finest axis; None where too few voxels lie deep."""
+    """Return the deviation of levels deep within the phases and the fraction of it left after smoothing, or None."""
     smoothing, uneven = ([width / h for h in edges] for width in (1.0, _UNEVEN))
     images = (levels, ndimage.gaussian_filter(levels, smoothing))
     squares, count = np.zeros(2), 0

@@ -39,10 +39,8 @@ LAGS, UNCORRELATED = (4, 5, 6, 7, 8), 0.06
 SMOOTHED = 3
 #: The least fraction of labelled neighbours with one label; noise and grey levels have fewer.
 _LEAST_SHARED = 0.25
-#: The most values of labels: grey levels of four bits have more.
-_MOST_LABELS = 12
-#: About so many voxels are looked at first to see whether a volume has more values.
-_SAMPLED = 4096
+#: The most values of labels (grey levels of four bits have more), and the voxels of a first sample for more values.
+_MOST_LABELS, _SAMPLED = 12, 4096
 #: What structure is in a mask of several values.
 SEVERAL = (
     "Taken for a mask or labels: the structure is where they are positive. Naming a label (label) measures it alone, "
@@ -105,9 +103,8 @@ def find_structure(
 ) -> tuple[Kind, Volume]:
     """Return the kind of a scan in memory, and the scan as float32 values above 0 in its structure, with notes.
 
-    The parameters are as in `preparation.prepare`; `extremes` are the lowest and the highest value of the whole scan
-    that `field` is a part of, which are the two values of a mask. Raises ScanError if the threshold splits nothing or
-    a phase is empty.
+    The parameters are as in `preparation.prepare`; `extremes` are the lowest and highest value of the whole scan that
+    `field` is cropped from: a mask's values. Raises ScanError if the threshold splits nothing or a phase is empty.
     """
     inside = None if region is None else replace(field, array=region)
     structure, note = find_split(Structure(field, kind, threshold, dark, inside, alone=True), Run(), extremes)
@@ -234,10 +231,8 @@ def is_noise(mask: np.ndarray) -> bool:
 
 
 def count_pairs(mask: np.ndarray, inner: Box, core: Box, shape: Sequence[int]) -> np.ndarray:
-    """Count voxel pairs that begin in a core of a volume of a shape; the core lies at `inner` in the mask.
-
-    Return (3, `LAGS`, 3): for each axis and lag, the pairs that lie in the mask with both voxels, the first, the last.
-    """
+    """Count the voxel pairs a lag apart that begin in a core (`inner` in the mask) of a volume: for each axis and each
+    of `LAGS`, those with both voxels, with the first, and with the last in the mask, (3, `LAGS`, 3)."""
     counts = np.zeros((3, len(LAGS), 3), dtype=np.int64)
     for axis, (edge, n) in enumerate(zip(inner, shape, strict=True)):
         for k, lag in enumerate(LAGS):
@@ -249,8 +244,7 @@ def count_pairs(mask: np.ndarray, inner: Box, core: Box, shape: Sequence[int]) -
 
 
 def pairs_of_noise(shape: Sequence[int], share: float, pairs: np.ndarray) -> bool:
-    """Return whether a mask is noise: the `pairs` of `count_pairs` are as uncorrelated as those of independent voxels
-    of which a `share` is inside."""
+    """Return whether a mask is noise: its pairs (`count_pairs`) are uncorrelated, given the share that is inside."""
     for axis, n in enumerate(shape):
         for k, lag in enumerate(LAGS):
             if n <= 2 * lag:
@@ -329,8 +323,7 @@ def find_split(structure: Structure, run: Run, extremes: tuple[Any, Any] | None 
 
 
 def _guess_kind(structure: Structure, total: Record, values: np.ndarray, two: bool) -> Kind:
-    """Return the kind of a scan from the sums of `_look_at_values` and its distinct values, `_MOST_LABELS` + 1 or more
-    where it has too many for labels."""
+    """Return the kind of a scan from the sums and the distinct values of `_look_at_values`."""
     lowest, highest, otsu = float(total["lowest"]), float(total["highest"]), structure.threshold == "otsu"
     if two or (otsu and 2 < len(values) <= _MOST_LABELS and values[0] >= 0 and (values == np.rint(values)).all()):
         return "mask"
@@ -366,9 +359,8 @@ def _look_at_values(structure: Structure, bars: Sequence[Box], value: Any, numbe
     values = structure.read(bars[number])
     lowest, highest = values.min(), values.max()
     two = np.all((values == lowest) | (values == highest))
-    # A sample shows at once where there are too many values for labels: only few are worth sorting all voxels.
     distinct = np.array([lowest, highest]) if two else np.unique(values.ravel()[:: 1 + values.size // _SAMPLED])
-    if not two and len(distinct) <= _MOST_LABELS:
+    if not two and len(distinct) <= _MOST_LABELS:  # the sample has so few values that all voxels must be sorted
         distinct = np.unique(values)
     record = {"lowest": lowest, "highest": highest, "two": two, "values": distinct[: _MOST_LABELS + 1]}
     record["constant"] = np.int64(np.count_nonzero(values == value))
@@ -405,9 +397,9 @@ def _count_padding(structure: Structure, bars: Sequence[Box], value: Any, number
 def _judge_padding(value: Any, counts: np.ndarray) -> Padding | None:
     """Return the padding of a scan by its `_count_padding`; None where there is none.
 
-    It is sure where the other levels have two phases (Sarle's coefficient; of a normal distribution it is 1/3), and the
-    rim, the levels next to the constant, is similar to them: next to a background it has the low levels of blurred
-    edges. It is also sure where the rim is far from a constant below 0: no background is cut off at such a value.
+    It is sure where the other levels have two phases (Sarle's coefficient; 1/3 of a normal distribution), and the rim,
+    the levels next to the constant, is similar to them (the rim of a background has low levels, of blurred edges) or
+    far from a constant below 0 (no background is clipped at such a value).
     """
     constant, reached, size = counts[0], counts[1], counts[0] + counts[7]
     if constant <= PADDED * size or reached < REACHED * constant or constant == size:

@@ -90,8 +90,7 @@ def survey(structure: Structure, run: Run) -> Plan:
 
 
 def _measure_thickness(plan: Plan, order: Sequence[Box], inside: bool) -> tuple[float, float, Plan]:
-    """Return median and 95th percentile of the thickness of the structure (`inside`) or the background, as
-    `grids.median_thickness`, from the first box; and the plan with its reach."""
+    """Return the median and 95th percentile of a phase's thickness in the first box, and the plan with its reach."""
     spacing, box = plan.volume.spacing, order[0]
     around = grow(box, 1, plan.volume.shape)  # a voxel is on the surface by its neighbours
     phase = (find_levels(plan.structure, around) > 0) == inside
@@ -103,8 +102,7 @@ def _measure_thickness(plan: Plan, order: Sequence[Box], inside: bool) -> tuple[
 
 
 def _count_structure(structure: Structure, pieces: Sequence[Box], number: int) -> Record:
-    """Return counts of a piece: voxels in the structure, `count_pairs`, and surface voxels of structure and background
-    in each box of `candidate_boxes`; and the extremes of its levels."""
+    """Return a piece's count of structure voxels, surface voxels in `candidate_boxes`, `count_pairs` and extremes."""
     core, shape = pieces[number], structure.volume.shape
     box = grow(core, max(LAGS), shape)
     inner = within(core, box)

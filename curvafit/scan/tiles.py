@@ -356,7 +356,6 @@ def _working_boxes(plan: Plan, core: Box) -> tuple[Box, Box]:
     """Return two boxes of the working grid: the voxels that a core's curvature depends on, and those of the core."""
     edges = []
     for edge, n, scale, count in zip(core, plan.volume.shape, plan.scale, plan.working, strict=True):
-        # Cores meet at the same working voxel; the last one ends with the grid.
         start, stop = (count if end == n else min(count, round(end / scale)) for end in (edge.start, edge.stop))
         edges.append(slice(start, stop))
     z, y, x = edges
@@ -391,8 +390,8 @@ def _measure_curvature(plan: Plan, core: Box, sums: _Sums) -> Record:
         return record
     if plan.structure.kind != "field":
         values = profile_mask(mask)
-    prepared = _prepare_window(plan, values[within(window, box)], cropped, window)
     try:
+        prepared = _prepare_window(plan, values[within(window, box)], cropped, window)
         (positions, columns), diagram = whole.measure_curvatures(prepared)
     except NoSurface:
         return record
@@ -464,8 +463,8 @@ def _measure_tiles(
     options: dict[str, Any] = {}
     workers = workers if structure.volume.in_file and structure.region is None else None
     if store is not None:  # digests take a while
-        regions = structure.region and structure.region.digest
-        options = {"scan": structure.volume.digest, "region": regions, "tile": edge}
+        region = structure.region and structure.region.digest
+        options = {"scan": structure.volume.digest, "region": region, "tile": edge}
         options |= {name: getattr(structure, name) for name in ("kind", "threshold", "dark")}
     with open_run(workers, store, options, progress, {_FIRST: 0.95, _AGAIN: 1.0}) as run, one_thread():
         plan = survey(structure, run)
@@ -514,18 +513,16 @@ def _summarise(plan: Plan, records: Sequence[Record], wide_records: Sequence[Rec
 
 def _sum_tiles(plan: Plan, records: Sequence[Record], wide_records: Sequence[Record], part: str) -> np.ndarray:
     """Return the sums of all tiles over a part, for each of the finest blocks."""
-    table = np.zeros((plan.finest.count, len(whole.SUMS)))
-
-    def add(tiles: Sequence[Record]) -> None:
-        for record in tiles:
-            if f"rows{part}" in record:
-                table[record[f"rows{part}"]] += record[f"sums{part}"]
-
-    add(records)
+    table, rows, sums = np.zeros((plan.finest.count, len(whole.SUMS))), f"rows{part}", f"sums{part}"
+    for record in records:
+        if rows in record:
+            table[record[rows]] += record[sums]
     for factor, names in zip(plan.factors, (("thickness", "thickness²"), ("gap",)), strict=True):
-        if factor > 1:  # measured again
+        if factor > 1:  # measured again, in `wide_records`
             table[:, [whole.SUMS.index(name) for name in names]] = 0
-    add(wide_records)
+    for record in wide_records:
+        if rows in record:
+            table[record[rows]] += record[sums]
     return table
 
 
