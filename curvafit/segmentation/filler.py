@@ -1,7 +1,7 @@
 """A small network that fills the gap between two known slices, taught by the generator's shapes.
 
-For each gap it reads the signed distances of the four nearest known slices, in square pixels, and for each height in
-the gap it returns the log-odds of the inside. Convolutions see `REACH` pixels at most and nothing is normalised over a
+For each gap it reads the signed distances of the four nearest known slices, in square pixels, and for each slice in the
+gap it returns the log-odds of the inside. Convolutions see `REACH` pixels at most and nothing is normalised over a
 slice, so that the background around a structure, or a cut into tiles, changes nothing.
 """
 
@@ -32,11 +32,11 @@ from curvafit.volumes.volume import Box
 FILLER_FILE = Format("curvafit filler", 1, "weights of a filler", "teach them again with `curvafit atlas teach`")
 #: Signed distances are cut here, in pixels: what is further away does not matter for a gap of 24 pixels at most.
 FAR = 16.0
-#: Pixels beyond which nothing is seen: that of the convolutions, of the distances, and a multiple of 4.
+#: Radius, in pixels, of what the network sees around a pixel, by convolutions and distances; a multiple of 4.
 REACH = 40
 #: Pixels beyond the border that the last convolutions at half and at full size need.
 RIM = 8
-#: Pixels by which numbers are scaled: distances, and gaps.
+#: Lengths in pixels by which distances and gaps are divided before the network reads them.
 _DISTANCE, _GAP = 8.0, 16.0
 #: Log-odds of the inside for a pixel of the cubic interpolation, before anything is learnt.
 SLOPE = 0.6
@@ -44,14 +44,14 @@ SLOPE = 0.6
 CERTAIN = 100.0
 #: The weight of an image's log-odds before anything is learnt, and where they are cut.
 TRUST, SUREST = 0.7, 8.0
-#: Numbers that tell a height: place in the gap, distance to the nearer end, the gap and a step from slice to slice.
+#: Numbers that describe a slice to fill: height in the gap, distance to the nearer end, the gap, and the step in it.
 CONDITIONS = 4
 
 
 class Block(nn.Module):
-    """Two convolutions with a shortcut; features are normalised over channels, pixel by pixel. A condition,
-    `conditions` long, scales and shifts each channel; `skips` channels of features that are the same for all slices of
-    a gap are convolved once, and added."""
+    """Two convolutions with a shortcut; features are normalised over channels, pixel by pixel. A vector of `conditions`
+    numbers scales and shifts each channel. A skip connection of `skips` channels, the same for all slices of a gap, is
+    convolved once and added."""
 
     def __init__(self, inputs: int, outputs: int, conditions: int = 0, skips: int = 0) -> None:
         super().__init__()
@@ -93,23 +93,23 @@ class Gaps:
 
     @property
     def heights(self) -> Tensor:
-        """The heights of the slices to fill, (n,), from 0 to 1 without the ends."""
+        """The heights of the slices to fill, (n,), strictly between 0 and 1."""
         return heights_between(self.marks.shape[1]).to(self.marks.device)
 
     @property
     def conditions(self) -> Tensor:
-        """What tells a height, (B * n, CONDITIONS)."""
-        t, (count, n) = self.heights, self.marks.shape[:2]
+        """The numbers that describe each slice to fill to the network, (B * n, CONDITIONS)."""
+        t, (batch, n) = self.heights, self.marks.shape[:2]
         gap = self.step * (n + 1) / _GAP
-        # A gap is the same read from either end, but for the order of its slices: the distance to the nearer end lets
-        # the network learn so, and the place which end is which. A step of known length tells thin from thick gaps.
-        place = torch.stack([t, torch.minimum(t, 1 - t)], dim=1).repeat(count, 1)
+        # A gap read from its other end is as likely: the distance to the nearer end, which is then the same, makes this
+        # easy to learn. The height tells the ends apart, and the step a gap of few thick slices from one of many.
+        height = torch.stack([t, torch.minimum(t, 1 - t)], dim=1).repeat(batch, 1)
         size = torch.stack([gap, self.step / 4], dim=1).repeat_interleave(n, 0)
-        return torch.cat([place, size], dim=1)
+        return torch.cat([height, size], dim=1)
 
 
 def heights_between(count: int) -> Tensor:
-    """Return the heights of `count` slices in a gap, from 0 to 1 without the ends."""
+    """Return the heights of `count` slices in a gap, evenly spaced and strictly between 0 and 1."""
     return torch.arange(1, count + 1) / (count + 1)
 
 
@@ -131,16 +131,17 @@ def interpolate(distances: Tensor, heights: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Filler(nn.Module):
-    """The network: an encoder of the four slices, once a gap; a decoder, once a height; and a pass through the gap.
+    """The network: an encoder of the four slices, run once a gap; a decoder, run for each slice to fill; and a
+    convolution in 3D through the gap.
 
-    The cubic interpolation, times `SLOPE`, is added at the end, and the evidence of an image, times `TRUST`: what is
-    learnt is how log-odds differ from that.
+    The cubic interpolation, times `SLOPE`, is added at the end, and the evidence of an image, times `TRUST`: the
+    network learns only how the log-odds differ from that.
     """
 
     def __init__(self, width: int = 16, *, image: bool = False) -> None:
         super().__init__()
-        c = check_int(width, "a width of the filler", 1, 256)
-        self.width, self.image, hidden = c, image, 32
+        self.width = c = check_int(width, "a width of the filler", 1, 256)
+        self.image, hidden = image, 32
         self.fine, self.middle, self.coarse = Block(4, c), Block(c, 2 * c), Block(2 * c, 4 * c)
         self.condition = nn.Sequential(nn.Linear(CONDITIONS, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU())
         self.deep = Block(4 * c, 4 * c, hidden)
@@ -156,28 +157,30 @@ class Filler(nn.Module):
             nn.SiLU(),
             nn.Conv3d(8, 1, 1),
         )
-        for last in (self.out, self.through[-1]):
+        for last in (self.out, self.through[-1]):  # a new network is the interpolation itself
             nn.init.zeros_(last.weight)  # type: ignore[arg-type]
             nn.init.zeros_(last.bias)  # type: ignore[arg-type]
-        for part in self.modules():
-            if isinstance(part, nn.Conv2d):
-                part.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     @classmethod
     def with_image(cls, plain: Filler) -> Filler:
-        """Return a filler that takes the evidence of an image, and without it knows what a plain one knows."""
-        filler, known = cls(plain.width, image=True), plain.state_dict()
+        """Return a filler that also takes the evidence of an image, with the weights of a plain one, and weights of 0
+        for the channels that a plain one lacks."""
+        filler, plain_state = cls(plain.width, image=True), plain.state_dict()
         state = filler.state_dict()
-        for name, values in state.items():
-            if name in known:
-                wider = [(0, n - m) for n, m in zip(values.shape, known[name].shape, strict=True)]
-                state[name] = F.pad(known[name], [n for pair in reversed(wider) for n in pair])
+        for name, values in plain_state.items():
+            added = [n - m for n, m in zip(state[name].shape, values.shape, strict=True)]
+            # torch pads the last axis first, before and after each
+            state[name] = F.pad(values, [width for n in reversed(added) for width in (0, n)])
         filler.load_state_dict(state)
         return filler
 
     def forward(self, gaps: Gaps, drop: int = 0) -> Tensor:
         """Return the log-odds of the inside (B, n, Y - 2 drop, X - 2 drop) in the slices to fill. `drop` pixels at each
-        border, a multiple of 4, are only seen: 0, or 16 and more."""
+        border are read but not filled: 0, or a multiple of 4 from 16 on."""
+        # Each stage drops the border pixels that no later one needs; the last convolutions need `rim`.
         n, rim = gaps.marks.shape[1], min(drop, RIM)
         fine = self.fine(gaps.distances / _DISTANCE)
         middle = self.middle(F.avg_pool2d(fine, 2))
@@ -188,25 +191,26 @@ class Filler(nn.Module):
         x = _trim(x, rim // 2)
         distances, marks = _trim(gaps.distances, drop - rim), _trim(gaps.marks, drop - rim)
         linear, cubic = interpolate(distances, gaps.heights)
-        hints = [linear / _DISTANCE, cubic / _DISTANCE, marks, marks.abs()]
-        seen = None if gaps.evidence is None else _trim(gaps.evidence, drop - rim).clamp(-SUREST, SUREST)
-        if seen is not None:
-            hints.append(seen / _DISTANCE)
-        x = torch.cat([_double(self.to_fine(x)), torch.stack(hints, dim=2).flatten(0, 1)], dim=1)
+        inputs = [linear / _DISTANCE, cubic / _DISTANCE, marks, marks.abs()]
+        evidence = None if gaps.evidence is None else _trim(gaps.evidence, drop - rim).clamp(-SUREST, SUREST)
+        if evidence is not None:
+            inputs.append(evidence / _DISTANCE)
+        x = torch.cat([_double(self.to_fine(x)), torch.stack(inputs, dim=2).flatten(0, 1)], dim=1)
         x = self.up_fine(x, condition, _trim(fine, drop - rim))
         logits = self.out(x).unflatten(0, (-1, n))[:, :, 0] + self.slope * cubic
-        if seen is not None and self.trust is not None:
-            logits = logits + self.trust * seen
+        if evidence is not None and self.trust is not None:
+            logits = logits + self.trust * evidence
+        # Each slice was decoded on its own: this pass sees all slices of a gap, between the two known ones.
         ends = self.slope * distances[:, 1:3]
         stack = torch.cat([ends[:, :1], logits, ends[:, 1:]], dim=1) / _DISTANCE
         known = torch.ones_like(stack)
         known[:, 1:-1] = marks.abs()
-        volumes = [stack, known]
-        if seen is not None:
-            volumes.append(F.pad(seen / _DISTANCE, (0, 0, 0, 0, 1, 1)))
-        x = torch.stack(volumes, dim=1)
-        for part in self.through:
-            x = _convolve(part, x) if isinstance(part, nn.Conv3d) else part(x)
+        channels = [stack, known]
+        if evidence is not None:
+            channels.append(F.pad(evidence / _DISTANCE, (0, 0, 0, 0, 1, 1)))
+        x = torch.stack(channels, dim=1)
+        for layer in self.through:
+            x = _convolve(layer, x) if isinstance(layer, nn.Conv3d) else layer(x)
         return _trim(logits + x[:, 0, 1:-1], rim)
 
 
@@ -215,16 +219,16 @@ def _trim(x: Tensor, pixels: int) -> Tensor:
     return x[..., pixels : x.shape[-2] - pixels, pixels : x.shape[-1] - pixels]
 
 
-def _convolve(part: nn.Conv3d, x: Tensor) -> Tensor:
-    """Return a convolution in 3D, (B, c, Z, Y, X), as one in 2D of slices with their neighbours as channels. With few
-    channels and slices that is five times as fast on a processor."""
-    size, count = part.kernel_size[0], x.shape[2]
+def _convolve(layer: nn.Conv3d, x: Tensor) -> Tensor:
+    """Convolve x (B, c, Z, Y, X) in 3D by a convolution in 2D, to which each slice's neighbours are more channels: five
+    times as fast on a processor with few channels and slices."""
+    size, count = layer.kernel_size[0], x.shape[2]
     margin = size // 2
     padded = F.pad(x, (0, 0, 0, 0, margin, margin))
-    near = torch.cat([padded[:, :, k : k + count] for k in range(size)], dim=1)
-    planes = near.transpose(1, 2).flatten(0, 1).contiguous(memory_format=torch.channels_last)
-    weight = part.weight.transpose(1, 2).flatten(1, 2).contiguous(memory_format=torch.channels_last)
-    return F.conv2d(planes, weight, part.bias, padding=margin).unflatten(0, (-1, count)).transpose(1, 2)
+    neighbours = torch.cat([padded[:, :, k : k + count] for k in range(size)], dim=1)
+    planes = neighbours.transpose(1, 2).flatten(0, 1).contiguous(memory_format=torch.channels_last)
+    weight = layer.weight.transpose(1, 2).flatten(1, 2).contiguous(memory_format=torch.channels_last)
+    return F.conv2d(planes, weight, layer.bias, padding=margin).unflatten(0, (-1, count)).transpose(1, 2)
 
 
 def _double(x: Tensor) -> Tensor:
@@ -252,28 +256,30 @@ def fill(
 
     In known slices they are `CERTAIN` or minus that. Before the first and beyond the last they are `SLOPE` times the
     signed distance in pixels from the outline in the nearest known slice, but at most 0 in slices that are not filled
-    (`Slices.outside`). `evidence` is what an image says, as log-odds (length, Y, X); slices before the first and beyond
-    the last then have that. `raster` has the network's pixels, by default those of the slices.
+    (`Slices.unfilled`). `evidence` holds an image's log-odds (length, Y, X), which are then those of the slices before
+    the first and beyond the last. `raster` has the network's pixels, by default those of the slices.
     """
     rows, *core = (slice(*edge.indices(n)[:2]) for edge, n in zip(box, slices.shape, strict=True))
     raster = replace(raster or Raster.of(slices), core=tuple(core))  # type: ignore[arg-type]
     logits = np.empty([edge.stop - edge.start for edge in (rows, *core)], dtype=np.float32)
-    for k, outer in ((0, slice(0, slices.places[0])), (-1, slice(slices.places[-1] + 1, slices.length))):
+    before, beyond = slice(0, slices.places[0]), slice(slices.places[-1] + 1, slices.length)
+    for known_row, outer in ((0, before), (-1, beyond)):
         start, stop = max(outer.start, rows.start), min(outer.stop, rows.stop)
         if start < stop and not slices.periodic:
-            here = slice(start - rows.start, stop - rows.start)
+            part = logits[start - rows.start : stop - rows.start]  # a view
             if evidence is not None:
-                logits[here] = evidence[(slice(start, stop), *core)]
+                part[:] = evidence[(slice(start, stop), *core)]
                 continue
-            depth = plane_distances(slices.inside[[k]], slices.spacing[1:], slices.gap * slices.spacing[0])[0]
-            logits[here] = (SLOPE / raster.pixel) * depth[tuple(core)].astype(np.float32)
-            far = slices.outside[start:stop]
-            logits[here][far] = np.minimum(logits[here][far], 0)
-    for numbers, inside in fill_gaps(slices, taught, raster, rows, evidence=evidence, progress=progress):
-        here = (numbers >= rows.start) & (numbers < rows.stop)
-        logits[numbers[here] - rows.start] = inside[here]
-    places, inside = slices.known((rows, *core))  # type: ignore[arg-type]
-    logits[places] = np.where(inside, CERTAIN, -CERTAIN)
+            mask, gap = slices.inside[[known_row]], slices.gap * slices.spacing[0]
+            distances = plane_distances(mask, slices.spacing[1:], gap)[0]
+            part[:] = (SLOPE / raster.pixel) * distances[tuple(core)].astype(np.float32)
+            unfilled = slices.unfilled[start:stop]
+            part[unfilled] = np.minimum(part[unfilled], 0)
+    for indices, values in fill_gaps(slices, taught, raster, rows, evidence=evidence, progress=progress):
+        in_box = (indices >= rows.start) & (indices < rows.stop)
+        logits[indices[in_box] - rows.start] = values[in_box]
+    positions, inside = slices.known((rows, *core))  # type: ignore[arg-type]
+    logits[positions] = np.where(inside, CERTAIN, -CERTAIN)
     return logits
 
 
@@ -286,34 +292,35 @@ def fill_gaps(
     evidence: np.ndarray | None = None,
     progress: Progress = silent,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the numbers of slices in gaps, and their log-odds as `fill` returns them, float32 (n, Y, X), on the core of
-    a raster; of gaps that reach into some `rows` of the volume."""
+    """Fill each gap that overlaps `rows` of the volume: yield the indices of the slices in it, and their log-odds as
+    `fill` returns them, float32 (n, Y, X), on the core of a raster."""
     places, count = list(slices.places), len(slices.places)
     start, stop, _ = rows.indices(slices.length)
-    steps = [(k, (places[(k + 1) % count] - places[k]) % slices.length) for k in range(count - (not slices.periodic))]
-    gaps = [(k, gap) for k, gap in steps if gap > 1 and places[k] + 1 < stop and places[k] + gap > start]
-    seen, known = raster.seen, dict[int, np.ndarray]()
-    for number, (k, gap) in enumerate(gaps):
-        progress("filling the gaps", number / len(gaps))
+    pairs = count if slices.periodic else count - 1  # the first known slice follows the last in a periodic volume
+    lengths = [(k, (places[(k + 1) % count] - places[k]) % slices.length) for k in range(pairs)]
+    gaps = [(k, gap) for k, gap in lengths if gap > 1 and places[k] + 1 < stop and places[k] + gap > start]
+    window, step, distances = raster.support, slices.spacing[0] / raster.pixel, dict[int, np.ndarray]()
+    for done, (k, gap) in enumerate(gaps):
+        progress("filling the gaps", done / len(gaps))
         four = [k - 1, k, k + 1, k + 2]
         four = [row % count for row in four] if slices.periodic else [min(max(row, 0), count - 1) for row in four]
         for row in four:
-            if row not in known:
-                known[row] = raster.distances(slices.inside[(row, *seen)])
-        step = slices.spacing[0] / raster.pixel
-        numbers = np.arange(places[k] + 1, places[k] + gap) % slices.length
-        marks = None if slices.marks is None else raster.marks(slices.marks[(numbers, *seen)])
-        read = None if evidence is None else np.stack([raster.spread(plane) for plane in evidence[(numbers, *seen)]])
-        stack = np.stack([known[row] for row in four])
-        inside = _fill_gap(taught.filler, stack, marks, read, gap - 1, step) / taught.temperature(gap * step)
-        yield numbers, raster.to_slices(inside)
+            if row not in distances:
+                distances[row] = raster.distances(slices.inside[(row, *window)])
+        indices = np.arange(places[k] + 1, places[k] + gap) % slices.length
+        known = np.stack([distances[row] for row in four])
+        marks = None if slices.marks is None else raster.marks(slices.marks[(indices, *window)])
+        planes = None if evidence is None else evidence[(indices, *window)]
+        planes = None if planes is None else np.stack([raster.spread(plane) for plane in planes])
+        logits = _fill_gap(taught.filler, known, marks, planes, gap - 1, step) / taught.temperature(gap * step)
+        yield indices, raster.to_slices(logits)
     progress("filling the gaps", 1.0)
 
 
 @dataclass(frozen=True)
 class Raster:
-    """Square pixels for slices, `pixel` wide in the unit of their spacing, so that structures are some pixels thick.
-    The pixels cover the core (y, x) of slices of a shape; those of a core lie where those of the whole do."""
+    """Square pixels for slices of a `shape` with voxel `edges` (y, x): `pixel` wide, in the unit of the edges, so that
+    structures are some pixels thick. They cover the part `core` (y, x) of the slices, on the grid of the whole."""
 
     shape: tuple[int, int]
     edges: tuple[float, float]
@@ -322,9 +329,9 @@ class Raster:
 
     @classmethod
     def of(cls, slices: Slices) -> Raster:
-        """Return the pixels of whole slices."""
-        edges, shape, known = slices.spacing[1:], slices.shape[1:], range(len(slices.places))
-        thickness = plane_thickness((slices.inside[k] for k in known), edges)
+        """Return pixels for whole slices."""
+        edges, shape = slices.spacing[1:], slices.shape[1:]
+        thickness = plane_thickness((slices.inside[k] for k in range(len(slices.places))), edges)
         pixel = choose_pixel(thickness, edges, slices.gap * slices.spacing[0])
         return cls(shape, edges, pixel, (slice(0, shape[0]), slice(0, shape[1])))
 
@@ -339,66 +346,68 @@ class Raster:
         return tuple(edge.stop - edge.start for edge in self._pixels)  # type: ignore[return-value]
 
     @property
-    def seen(self) -> tuple[slice, slice]:
+    def support(self) -> tuple[slice, slice]:
         """The voxels that the core's pixels depend on, (y, x)."""
         ends = zip(self._window, self.shape, strict=True)
         return tuple(slice(max(edge.start, 0), min(edge.stop, n)) for edge, n in ends)  # type: ignore[return-value]
 
     def distances(self, mask: np.ndarray) -> np.ndarray:
-        """Return the signed distances of the part of a slice that is seen, in pixels, cut at `FAR`, float32. The
-        outlines are continued by `REACH` pixels on each side: the shape is `size` + 2 `REACH`."""
+        """Return the signed distances in a mask of `support`, in pixels, cut at `FAR`, float32. They reach `REACH`
+        pixels beyond the core on each side, where the slice's border is repeated: the shape is `size` + 2 `REACH`."""
         padded = np.pad(mask, self._padding, mode="edge")
         return self._resample(centre_distance(padded, self.edges, FAR * self.pixel) / self.pixel)
 
     def spread(self, plane: np.ndarray) -> np.ndarray:
-        """Return the seen part of a plane in pixels, float32; its border is continued as that of `distances`."""
+        """Return values on `support` in pixels, float32, of the same shape as `distances`."""
         return self._resample(np.pad(plane, self._padding, mode="edge"))
 
     def marks(self, marks: np.ndarray) -> np.ndarray:
-        """Return marks (n, Y, X) of the part that is seen in pixels, float32, 0 beyond the slices."""
-        kept = np.zeros((len(marks), *(m + 2 * REACH for m in self.size)), dtype=np.float32)
-        inner, taken = [], []
-        for edge, n, h, seen in zip(self._pixels, self.shape, self.scale, self.seen, strict=True):
-            numbers = np.arange(edge.start - REACH, edge.stop + REACH)
-            voxels = np.floor((numbers + 0.5) / h).astype(int)
-            there = np.flatnonzero((voxels >= 0) & (voxels < n))
-            inner.append(there)
-            taken.append(voxels[there] - seen.start)
-        kept[np.ix_(np.arange(len(marks)), *inner)] = marks[np.ix_(np.arange(len(marks)), *taken)]
-        return kept
+        """Return marks (n, Y, X) of `support` in pixels, of the shape of `distances`, float32, 0 beyond the slices. Each
+        pixel has the mark of the voxel at its centre, since marks cannot be interpolated."""
+        resampled = np.zeros((len(marks), *(m + 2 * REACH for m in self.size)), dtype=np.float32)
+        targets, sources = [np.arange(len(marks))], [np.arange(len(marks))]
+        for edge, n, pixels_per_voxel, window in zip(self._pixels, self.shape, self.scale, self.support, strict=True):
+            centres = np.arange(edge.start - REACH, edge.stop + REACH) + 0.5
+            voxels = np.floor(centres / pixels_per_voxel).astype(int)
+            pixels = np.flatnonzero((voxels >= 0) & (voxels < n))
+            targets.append(pixels)
+            sources.append(voxels[pixels] - window.start)
+        resampled[np.ix_(*targets)] = marks[np.ix_(*sources)]
+        return resampled
 
     def to_slices(self, values: np.ndarray) -> np.ndarray:
-        """Return values (n, *size) on the voxels of the core, (n, Y, X)."""
+        """Interpolate values in pixels (n, *size) on the voxels of the core, (n, Y, X)."""
         shape = [edge.stop - edge.start for edge in self.core]
         axes = zip(self.core, self.scale, self._pixels, strict=True)
-        # Where the core's first voxel lies, in pixels of the window that was filled.
+        # The position of the core's first voxel, in pixels from the first one of `values`.
         first = [core.start * pixels_per_voxel - window.start for core, pixels_per_voxel, window in axes]
         if self.scale == (1.0, 1.0):
-            y, x = (int(pixel) for pixel in first)
+            y, x = map(int, first)
             return values[:, y : y + shape[0], x : x + shape[1]]
         return np.stack([_sample(plane, shape, self.scale, first) for plane in values])
 
     @property
     def _pixels(self) -> list[slice]:
-        """The pixels that the core's voxels are interpolated from, in those of the whole slice, along both axes."""
-        found = []
+        """The pixels from which the core's voxels are interpolated, counted in the whole slice, along both axes."""
+        edges = []
         for core, n, h in zip(self.core, self.shape, self.scale, strict=True):
             most = 4 * math.ceil(n * h / 4)
             first = 0 if core.start == 0 else max(math.floor((core.start + 0.5) * h - 0.5), 0)
             stop = most if core.stop == n else min(math.ceil((core.stop - 0.5) * h - 0.5) + 1, most)
-            found.append(slice(first // 4 * 4, 4 * math.ceil(stop / 4)))
-        return found
+            # The network halves pixels twice: edges at multiples of 4 pool the same pixels in any core.
+            edges.append(slice(first // 4 * 4, 4 * math.ceil(stop / 4)))
+        return edges
 
     @property
     def _window(self) -> list[slice]:
-        """The voxels, also those beyond the slices, that cover all that the core's pixels depend on."""
-        found = []
+        """The voxels that the core's pixels depend on, along both axes, with those beyond the slices' borders."""
+        edges = []
         for edge, n, h in zip(self._pixels, self.shape, self.scale, strict=True):
             most = math.ceil((4 * math.ceil(n * h / 4) + REACH) / h)
             first = math.floor((edge.start - REACH - FAR) / h) - 2
             stop = math.ceil((edge.stop + REACH + FAR) / h) + 2
-            found.append(slice(max(first, -math.ceil(REACH / h)), min(stop, most)))
-        return found
+            edges.append(slice(max(first, -math.ceil(REACH / h)), min(stop, most)))
+        return edges
 
     @property
     def _padding(self) -> list[tuple[int, int]]:
@@ -406,10 +415,10 @@ class Raster:
         return [(max(-edge.start, 0), max(edge.stop - n, 0)) for edge, n in zip(self._window, self.shape, strict=True)]
 
     def _resample(self, plane: np.ndarray) -> np.ndarray:
-        """Return a plane of the window in pixels, `size` + 2 `REACH`."""
+        """Interpolate values on the voxels of `_window` in pixels, `size` + 2 `REACH` of them."""
         shape = [m + 2 * REACH for m in self.size]
-        pairs = zip(self._pixels, self.scale, self._window, strict=True)
-        start = [(edge.start - REACH) / h - window.start for edge, h, window in pairs]
+        axes = zip(self._pixels, self.scale, self._window, strict=True)
+        start = [(edge.start - REACH) / h - window.start for edge, h, window in axes]
         if self.scale == (1.0, 1.0):
             y, x = map(int, start)
             return plane[y : y + shape[0], x : x + shape[1]]
@@ -417,28 +426,29 @@ class Raster:
 
 
 def _sample(plane: np.ndarray, shape: Sequence[int], step: Sequence[float], start: Sequence[float]) -> np.ndarray:
-    """Interpolate a plane linearly, from a corner on, at the centres of pixels `step` wide."""
+    """Interpolate a plane linearly at the centres of pixels `step` wide, the first of which has its corner at `start`,
+    both in the plane's own pixels."""
     offset = [a + 0.5 * h - 0.5 for a, h in zip(start, step, strict=True)]
-    matrix = np.diag(step)
-    return ndimage.affine_transform(plane, matrix, offset, shape, np.float32, order=1, mode="nearest")  # type: ignore[arg-type]
+    return ndimage.affine_transform(plane, np.diag(step), offset, shape, np.float32, order=1, mode="nearest")  # type: ignore[arg-type]
 
 
 def plane_thickness(masks: Iterable[np.ndarray], edges: Sequence[float]) -> float:
-    """Return the mean thickness of a structure in planes (Y, X) with voxel edges (y, x), in their unit: four times the
-    mean distance to the outline inside, which is the width of a strip; infinite where there is no outline."""
+    """Return the mean thickness of a structure in masks (Y, X) with voxel edges (y, x), in their unit: four times the
+    mean distance of inside voxels from the outline, as in a strip of this width; infinite without an outline."""
     total, count = 0.0, 0
     for mask in masks:
         if mask.any() and not mask.all():
-            inside = centre_distance(mask, edges)[mask]
-            total, count = total + float(inside.sum(dtype=np.float64)), count + len(inside)
+            distances = centre_distance(mask, edges)[mask]
+            total += float(distances.sum(dtype=np.float64))
+            count += len(distances)
     return 4 * total / count if count else math.inf
 
 
 def choose_pixel(thickness: float, edges: Sequence[float], gap: float) -> float:
-    """Return the edge of a pixel for structures of a thickness in slices with voxel edges (y, x), at most a gap
-    apart."""
+    """Return the edge of a pixel for a structure's mean thickness, voxel edges (y, x) and the largest gap, in the unit
+    of them all: the finest voxel edge, but smaller for thin structures, and larger for thick ones with long gaps."""
     finest = min(edges)
-    thick, long = thickness / finest, gap / finest
+    thick, long = thickness / finest, gap / finest  # in voxels
     coarser = float(np.clip(long / LONG, 1.0, max(thick / THICKNESS[1], 1.0)))
     return finest * min(thick / THICKNESS[0], coarser)
 
@@ -447,24 +457,23 @@ def choose_pixel(thickness: float, edges: Sequence[float], gap: float) -> float:
 def _fill_gap(
     filler: Filler, known: np.ndarray, marks: np.ndarray | None, evidence: np.ndarray | None, count: int, step: float
 ) -> np.ndarray:
-    """Return the log-odds (count, Y, X) in the slices of a gap whose four known slices have distances (4, Y', X').
-    Those are longer by `REACH` on all sides. Where all four are far inside or far outside, nothing is computed; the
-    rest is filled tile by tile."""
+    """Return the log-odds (count, Y, X) in the slices of a gap, given the distances (4, Y', X') of four known slices;
+    the inputs extend `REACH` pixels beyond Y and X on all sides. The network runs tile by tile, and only where pixels
+    are not far inside or far outside in all four slices, unless marks or evidence may change those too."""
     distances = torch.from_numpy(np.ascontiguousarray(known))
-    near = _trim(~((distances == FAR).all(0) | (distances == -FAR).all(0)), REACH)
-    marked = torch.zeros(1, count, *known.shape[1:])
-    if marks is not None:
-        marked, near = torch.from_numpy(marks)[None], torch.ones_like(near)
-    read = None
-    if evidence is not None:
-        read, near = torch.from_numpy(np.ascontiguousarray(evidence))[None], torch.ones_like(near)
+    uncertain = _trim(~((distances == FAR).all(0) | (distances == -FAR).all(0)), REACH)
+    if marks is not None or evidence is not None:
+        uncertain = torch.ones_like(uncertain)
+    all_marks = torch.zeros(1, count, *known.shape[1:]) if marks is None else torch.from_numpy(marks)[None]
+    planes = None if evidence is None else torch.from_numpy(np.ascontiguousarray(evidence))[None]
     logits = SLOPE * interpolate(_trim(distances, REACH)[None], heights_between(count))[0][0]
-    for y, x in product(*(range(0, n, TILE) for n in near.shape)):
+    for y, x in product(*(range(0, n, TILE) for n in uncertain.shape)):
         core = (slice(y, y + TILE), slice(x, x + TILE))
-        if near[core].any():
-            seen = (..., slice(y, y + TILE + 2 * REACH), slice(x, x + TILE + 2 * REACH))
-            gaps = Gaps(distances[seen][None], torch.tensor([step]), marked[seen], None if read is None else read[seen])
-            logits[:, *core] = torch.where(near[core], filler(gaps, REACH)[0], logits[:, *core])
+        if uncertain[core].any():
+            window = (..., slice(y, y + TILE + 2 * REACH), slice(x, x + TILE + 2 * REACH))
+            seen = None if planes is None else planes[window]
+            gaps = Gaps(distances[window][None], torch.tensor([step]), all_marks[window], seen)
+            logits[:, *core] = torch.where(uncertain[core], filler(gaps, REACH)[0], logits[:, *core])
     return logits.numpy()
 
 
@@ -473,9 +482,10 @@ def _fill_gap(
 
 @dataclass(frozen=True, eq=False)
 class Taught:
-    """A filler with its `card` of JSON's types, on what taught it and how well it does on shapes held out.
-    `temperatures` (2, k) are gaps in pixels, ascending, and by what log-odds are divided there to be true; `error` is
-    the calibration error near surfaces on shapes held out, or an example; `status` begins a sentence on what fills."""
+    """A trained filler with its calibration. `temperatures` (2, k) are gaps in pixels, ascending, and the numbers by
+    which log-odds are divided there so that they are calibrated; `error` is the calibration error near surfaces on
+    held-out shapes, or an example. The `card`, of JSON's types, says what taught it and how well it does on held-out
+    shapes; `status` begins a sentence on what fills."""
 
     filler: Filler
     temperatures: np.ndarray
@@ -484,7 +494,7 @@ class Taught:
     status: str = "filled by the network"
 
     def temperature(self, gap: float) -> float:
-        """Return by what log-odds are divided in a gap of so many pixels."""
+        """Return the number by which log-odds are divided in a gap of so many pixels."""
         return float(np.interp(gap, *self.temperatures))
 
     @property
@@ -520,7 +530,7 @@ class Taught:
     @classmethod
     def _of(cls, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Taught:
         temperatures = arrays.pop("temperatures")
-        if not all(np.isfinite(each).all() for each in (temperatures, *arrays.values())):
+        if not all(np.isfinite(array).all() for array in (temperatures, *arrays.values())):
             raise ValueError("numbers that are not finite")
         if temperatures.ndim != 2 or len(temperatures) != 2 or not (temperatures > 0).all():
             raise ValueError("temperatures that are not positive")

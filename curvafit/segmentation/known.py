@@ -11,7 +11,7 @@ import numpy as np
 
 from curvafit.core.checks import SEEDS, check_int
 from curvafit.priors.grid import MOST
-from curvafit.segmentation.slices import IDS, LABELS, Slices, require_labels, require_outline, turn_axes
+from curvafit.segmentation.slices import IDS, LABELS, Slices, axis_first, require_labels, require_outline
 from curvafit.volumes.formats.zarr import CHUNK
 from curvafit.volumes.run import Record, Run
 from curvafit.volumes.volume import Box, ScanError, Volume, check_finite, round_labels
@@ -57,7 +57,7 @@ class Known:
 
         Raises `ScanError` if they hold grey levels, or are all empty or all full; the message calls them `name`.
         """
-        length, *plane = turn_axes(self.volume.shape, self.axis)
+        length, *plane = axis_first(self.volume.shape, self.axis)
         inside = run.open("known", np.bool_, (len(self.places), *plane))
 
         def keep(number: int, record: Record) -> Record:
@@ -74,7 +74,7 @@ class Known:
         count = sum(int(block["count"]) for block in records)
         self._check_label(count > 0)
         require_outline(count, len(self.places) * plane[0] * plane[1], name)
-        edges = turn_axes(self.volume.spacing, self.axis)
+        edges = axis_first(self.volume.spacing, self.axis)
         slices = Slices(inside.stored, self.places, length, edges, self.volume.unit, periodic, self.marks)
         return slices, values, np.concatenate([block["there"] for block in records])
 
@@ -95,7 +95,7 @@ class Known:
     @property
     def _slabs(self) -> list[slice]:
         """The slices that are read at once: of a volume in memory all."""
-        length, *plane = turn_axes(self.volume.shape, self.axis)
+        length, *plane = axis_first(self.volume.shape, self.axis)
         thick = length
         if self.volume.in_file:
             thick = min(THICK, max(1, SLAB // (plane[0] * plane[1] * self.volume.array.file.dtype.itemsize)))
@@ -103,7 +103,7 @@ class Known:
 
     def _slab(self, rows: slice) -> np.ndarray:
         """Return the values (n, Y, X) of some slices."""
-        _, *plane = turn_axes(self.volume.shape, self.axis)
+        _, *plane = axis_first(self.volume.shape, self.axis)
         values = self.volume.read(self.turn_box((rows, slice(0, plane[0]), slice(0, plane[1]))))
         if self.volume.in_file:
             check_finite(values, self.volume.source)

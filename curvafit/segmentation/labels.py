@@ -19,7 +19,7 @@ from curvafit.segmentation.flow import Working
 from curvafit.segmentation.known import Known, check_shared, check_which, doubt_places
 from curvafit.segmentation.reconstruction import SHIFTED, SURE, UNTOLD, load_example, load_image, reconstruct
 from curvafit.segmentation.result import Segmentation, Uncertainty
-from curvafit.segmentation.slices import IDS, WHOLE, index_labels, mark_known, reach_of, require_labels
+from curvafit.segmentation.slices import IDS, WHOLE, filled_range, index_labels, mark_known, require_labels
 from curvafit.segmentation.uncertainty import doubt, expected_dice, suggest_slices
 from curvafit.volumes.formats.base import smallest_type
 from curvafit.volumes.read import Source, load
@@ -191,7 +191,7 @@ def _join_labels(
     volume, places = known.volume, list(known.places)
     length = volume.shape[known.axis]
     far = np.ones(known.turn(labels.values).shape, dtype=bool)
-    far[slice(None) if labels.periodic or image is not None else reach_of(places, length)] = False
+    far[slice(None) if labels.periodic or image is not None else filled_range(places, length)] = False
     values, likely, phase, odds = _join_parts(labels, parts, labels.full, known.turn_back(far))
     doubts = {number: part.uncertainty for number, (_, part) in zip(numbers, parts, strict=True)}
     dice = {number: doubt.expected_dice for number, doubt in doubts.items() if doubt is not None}

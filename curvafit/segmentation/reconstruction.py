@@ -38,11 +38,11 @@ from curvafit.segmentation.result import Segmentation, Uncertainty, describe_fil
 from curvafit.segmentation.slices import (
     WHOLE,
     Slices,
+    axis_first,
     check_spacing,
     load_with,
     plane_distances,
     require_labels,
-    turn_axes,
 )
 from curvafit.segmentation.teach import tune
 from curvafit.segmentation.tiles import LoweredVolume, Problem, cut_tiles, lower_volume
@@ -354,7 +354,7 @@ class _Filled:
         """Return how sure the volume is, and which slices to annotate next."""
         sums, ends = self.sums, {"periodic": slices.periodic, "whole": engine.evidence is not None}
         dice = float(2 * sums["both"] / max(sums["count"] + sums["sum"], 1e-9)) if slices.between.any() else 1.0
-        order = turn_axes((0, 1, 2), given.axis)
+        order = axis_first((0, 1, 2), given.axis)
         return Uncertainty(
             replace(given.volume, array=self.likely, notes=()),
             engine.taught.error,
@@ -435,7 +435,7 @@ def look_at(likely: np.ndarray, slices: Slices, core: Box, *, whole: bool = Fals
     likely = slices.keep_known(likely.astype(np.float32), core)
     unsure, filled = doubt(likely), likely[slices.between[rows]]
     along = {f"along {k}": unsure.sum(tuple({0, 1, 2} - {k})) for k in range(3)}
-    total = likely if whole else likely[~slices.outside[rows]]
+    total = likely if whole else likely[~slices.unfilled[rows]]
     sums = {"sum": filled.sum(dtype=np.float64), "total": total.sum(dtype=np.float64)}
     return {"likely": likely, "counts": counts, **sums, **along}
 
@@ -500,7 +500,7 @@ class SlicesProblem(Problem):
     def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Data]:
         """Return the level on a box, and the hinge term that holds known voxels, and by the pull those between."""
         slices, trial, (rows, inside) = self.slices, self.trial, self.slices.known(box)
-        numbers = slices.numbers(box)
+        numbers = slices.indices(box)
         level = self.level[np.ix_(*numbers)]
         held = slices.between[numbers[0], None, None]
         pull = np.where(held, trial.pull / min(slices.spacing[1:]) * level, 0).astype(np.float32)
@@ -544,14 +544,14 @@ def _weigh_evidence(
         depth = profile_distance(torch.from_numpy(phase[rows]), float(RESOLVED)).numpy()
         return np.stack([engine.logits(slices)[rows].ravel(), depth.ravel()], axis=-1)
 
-    mask = target.keep_known(found.mask & ~target.outside[:, None, None])
+    mask = target.keep_known(found.mask & ~target.unfilled[:, None, None])
     if task is None:
         return _Filled.of(given, target, expit(engine.logits(target)), mask), engine
     rows, tried = list(task.places), engine.run(task.given, trial)
     weights = fit_weights(known := evidence(task.given, tried, rows), task.truth.ravel())
     tested, near = probability(known, weights).reshape(task.truth.shape), near_surface(tried > 0)[rows]
     likely = probability(evidence(target, found.phase, list(range(target.length))), weights).reshape(target.shape)
-    likely[target.outside] = np.minimum(likely[target.outside], 0.5)
+    likely[target.unfilled] = np.minimum(likely[target.unfilled], 0.5)
     error = calibration_error(tested[near], task.truth[near])
     return _Filled.of(given, target, likely, mask), replace(engine, taught=replace(engine.taught, error=error))
 

@@ -18,7 +18,7 @@ from curvafit.core.records import Format, can_write, is_own_zarr, sibling
 from curvafit.core.runtime import Pictured, check_memory, hold_signals
 from curvafit.core.units import format_sampling
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.slices import IDS, reach_of
+from curvafit.segmentation.slices import IDS, filled_range
 from curvafit.segmentation.uncertainty import doubt
 from curvafit.volumes.formats.nifti import write_nifti_like
 from curvafit.volumes.formats.zarr import CHUNK, add_labels, check_place, image_of, mark, store_of, write_labels
@@ -379,7 +379,7 @@ def describe_filled(
     """Return the status of a volume between the known slices at `places`, and sentences on what is doubtful. `head` is
     how it was filled, `inside` a sentence on the mask, `share` its share of the volume, and `tested` what probabilities
     were held to. With an image or in a periodic volume all slices are filled."""
-    reach = slice(0, length) if image or periodic else reach_of(places, length)
+    reach = slice(0, length) if image or periodic else filled_range(places, length)
     left = length - (reach.stop - reach.start)
     known = uncertain.known_share
     span = f" ({100 * known[1]:.2f} to {100 * known[2]:.2f})" if known[1:] else ""

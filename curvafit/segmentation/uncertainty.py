@@ -10,7 +10,7 @@ from scipy.special import entr, expit, logit
 from scipy.stats import t as student
 
 from curvafit.scan.grids import centre_distance
-from curvafit.segmentation.slices import harmonic_distance, reach_of
+from curvafit.segmentation.slices import filled_range, harmonic_distance
 
 #: Distance from a surface, in voxels, within which probabilities are judged.
 NEAR = 3
@@ -123,7 +123,7 @@ def share_by_slices(
     of both. A step of the walk adds n (n² - 1) / 12 in a gap of n slices and e (e + 1) (2e + 1) / 6 in e slices beyond
     an end; a jump adds the square of how many slices a known one counts for.
     """
-    reach, at = slice(0, length) if whole else reach_of(places, length), np.array(places, dtype=np.int64)
+    reach, at = slice(0, length) if whole else filled_range(places, length), np.array(places, dtype=np.int64)
     if periodic:
         at, shares = np.append(at, at[0] + length), np.append(shares, shares[0])
         reach = slice(int(at[0]), int(at[-1]))
