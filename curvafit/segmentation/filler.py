@@ -362,7 +362,7 @@ class Raster:
         return self._resample(np.pad(plane, self._padding, mode="edge"))
 
     def marks(self, marks: np.ndarray) -> np.ndarray:
-        """Return marks (n, Y, X) of `support` in pixels, of the shape of `distances`, float32, 0 beyond the slices. Each
+        """Return marks (n, Y, X) of `support` in pixels, of the shape of `distances`, float32, 0 beyond slices. Each
         pixel has the mark of the voxel at its centre, since marks cannot be interpolated."""
         resampled = np.zeros((len(marks), *(m + 2 * REACH for m in self.size)), dtype=np.float32)
         targets, sources = [np.arange(len(marks))], [np.arange(len(marks))]
@@ -389,25 +389,25 @@ class Raster:
     @property
     def _pixels(self) -> list[slice]:
         """The pixels from which the core's voxels are interpolated, counted in the whole slice, along both axes."""
-        edges = []
+        ranges = []
         for core, n, h in zip(self.core, self.shape, self.scale, strict=True):
             most = 4 * math.ceil(n * h / 4)
             first = 0 if core.start == 0 else max(math.floor((core.start + 0.5) * h - 0.5), 0)
             stop = most if core.stop == n else min(math.ceil((core.stop - 0.5) * h - 0.5) + 1, most)
             # The network halves pixels twice: edges at multiples of 4 pool the same pixels in any core.
-            edges.append(slice(first // 4 * 4, 4 * math.ceil(stop / 4)))
-        return edges
+            ranges.append(slice(first // 4 * 4, 4 * math.ceil(stop / 4)))
+        return ranges
 
     @property
     def _window(self) -> list[slice]:
         """The voxels that the core's pixels depend on, along both axes, with those beyond the slices' borders."""
-        edges = []
+        ranges = []
         for edge, n, h in zip(self._pixels, self.shape, self.scale, strict=True):
             most = math.ceil((4 * math.ceil(n * h / 4) + REACH) / h)
             first = math.floor((edge.start - REACH - FAR) / h) - 2
             stop = math.ceil((edge.stop + REACH + FAR) / h) + 2
-            edges.append(slice(max(first, -math.ceil(REACH / h)), min(stop, most)))
-        return edges
+            ranges.append(slice(max(first, -math.ceil(REACH / h)), min(stop, most)))
+        return ranges
 
     @property
     def _padding(self) -> list[tuple[int, int]]:
@@ -471,8 +471,8 @@ def _fill_gap(
         core = (slice(y, y + TILE), slice(x, x + TILE))
         if uncertain[core].any():
             window = (..., slice(y, y + TILE + 2 * REACH), slice(x, x + TILE + 2 * REACH))
-            seen = None if planes is None else planes[window]
-            gaps = Gaps(distances[window][None], torch.tensor([step]), all_marks[window], seen)
+            tile_planes = None if planes is None else planes[window]
+            gaps = Gaps(distances[window][None], torch.tensor([step]), all_marks[window], tile_planes)
             logits[:, *core] = torch.where(uncertain[core], filler(gaps, REACH)[0], logits[:, *core])
     return logits.numpy()
 

@@ -1,4 +1,4 @@
-"""What an image says of a volume: boosted trees on its grey levels, learnt from the volume's own known slices."""
+"""The evidence of an image: log-odds of the inside by boosted trees, which learn from the volume's own known slices."""
 
 from __future__ import annotations
 
@@ -18,51 +18,53 @@ from curvafit.core.runtime import Progress, silent
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.uncertainty import entropy, fit_weights
 
-#: Widths of the Gaussians in voxels of the shortest edge, and the least one along an axis in its own voxels. Along a
-#: longer edge they shrink by its root: optics ask for its ratio, and outlines that are drawn voxel by voxel for none.
+#: Deviations of the Gaussians in voxels of the shortest edge, and the least one along an axis in its own voxels. Along
+#: a longer edge they shrink by the root of the ratio: optics ask for the ratio, outlines drawn by voxels for none.
 WIDTHS, LEAST = (0.7, 1.2, 2.0, 3.4, 5.6), 0.5
-#: Width of a second Gaussian before derivatives are taken.
+#: Deviation of a second Gaussian before derivatives are taken.
 SMOOTH = 0.7
-#: Most voxels that trees learn from, trees, their rate and leaves.
+#: Most voxels that trees learn from; the number of trees, their learning rate and most leaves.
 LEARNT, TREES, RATE, LEAVES = 200_000, 120, 0.1, 31
-#: Furthest shift of an image that is looked for, in voxels, and the width of the mean that its levels are taken from;
-#: the least shift that is told, by what part the image must fit the slices better there, and how many times better than
-#: anywhere (root mean square).
+#: Furthest shift of an image that is looked for, in voxels; width of the local mean that is subtracted from its levels;
+#: least shift that is reported; the fraction by which the correlation there must exceed that without a shift, and how
+#: many times the root mean square over all shifts it must be.
 FURTHEST, LOCAL, NEAREST, BETTER, CLEAR = 12, 61, 2, 0.1, 5.0
-#: Voxels whose features are computed at once, and most of which they are kept for the second reading.
+#: Voxels whose features are computed at once, and the most voxels of an image whose features are kept, since they are
+#: read twice.
 HELD, KEPT = 4_000_000, 20_000_000
 
 
 def read_image(values: np.ndarray, slices: Slices, progress: Progress = silent) -> tuple[np.ndarray, float]:
-    """Return what an image (Z, Y, X) says of a volume of which some slices are known: log-odds, float32 (Z, Y, X), and
-    the share of the entropy of slices held out that it takes away.
+    """Return the log-odds of the inside by an image (Z, Y, X) whose known slices are given, float32 (Z, Y, X), and the
+    fraction of the entropy of held-out known slices that they explain.
 
-    Trees learn, from the known slices, which levels are inside, by the slopes and Hessians about them at several
-    widths. First they learn from every second slice, and the others say how sure they may be, if both have an inside;
-    else the share is NaN.
+    Trees learn from the known slices which voxels are inside, by grey levels, slopes and Hessians at several widths.
+    They first learn from every second known slice: the others calibrate the log-odds, and give the fraction. Where one
+    half has no inside or no outside, log-odds stay as they are, and the fraction is NaN.
 
     Raises ImportError where scikit-learn is not installed.
     """
     known, slope, shift, gain = slices.inside, 1.0, 0.0, math.nan
     progress("learning from the image", 0.0)
     levels = ((values - values.mean()) / max(float(values.std()), 1e-12)).astype(np.float32)
-    describe = partial(_features, levels, slices.spacing)
-    kept = list(describe()) if values.size <= KEPT else None
-    features = np.concatenate([part[np.isin(rows, slices.places)] for rows, part in kept or describe()])
+    compute_features = partial(_features, levels, slices.spacing)
+    cached = list(compute_features()) if values.size <= KEPT else None
+    blocks = cached or compute_features()
+    features = np.concatenate([block[np.isin(rows, slices.places)] for rows, block in blocks])
     progress("learning from the image", 0.2)
     if all(half.any() and not half.all() for half in (known[::2], known[1::2])):
-        trees = _learn(features[::2], known[::2])
+        trees = _train_trees(features[::2], known[::2])
         logits = trees.decision_function(features[1::2].reshape(-1, features.shape[-1]))
         truth = known[1::2].ravel()
         slope, shift = fit_weights(logits[:, None], truth)
         loss = float(np.logaddexp(0, np.where(truth, -1, 1) * (slope * logits + shift)).mean())
         gain = 1 - loss / float(entropy(truth.mean()))
     progress("learning from the image", 0.35)
-    trees = _learn(features, known)
+    trees = _train_trees(features, known)
     evidence = np.empty(values.shape, dtype=np.float32)
-    for rows, part in kept or describe():
+    for rows, block in cached or compute_features():
         progress("reading the image", 0.6 + 0.4 * rows[0] / len(values))
-        for row, plane in zip(rows, part, strict=True):
+        for row, plane in zip(rows, block, strict=True):
             logits = trees.decision_function(plane.reshape(-1, plane.shape[-1]))
             evidence[row] = (slope * logits + shift).reshape(plane.shape[:2])
     progress("reading the image", 1.0)
@@ -70,9 +72,10 @@ def read_image(values: np.ndarray, slices: Slices, progress: Progress = silent) 
 
 
 def find_shift(values: np.ndarray, slices: Slices) -> tuple[int, int]:
-    """Return by how many voxels (y, x) an image (Z, Y, X) lies off the known slices; (0, 0) where it lies on them.
+    """Return the shift (y, x), in voxels, of an image (Z, Y, X) off the known slices; (0, 0) where none is clear.
 
-    The correlation of slices with grey levels, whichever of the two is brighter, is greatest at the shift.
+    It is where the cross-correlation of masks and grey levels is greatest; its sign, by which phase is the brighter
+    one, does not matter.
     """
     correlation = np.zeros(slices.inside.shape[1:])
     for place, inside in zip(slices.places, slices.inside, strict=True):
@@ -80,19 +83,21 @@ def find_shift(values: np.ndarray, slices: Slices) -> tuple[int, int]:
         plane -= ndimage.uniform_filter(plane, LOCAL, mode="nearest")
         mask, grey = np.fft.rfft2(inside - inside.mean()), np.fft.rfft2(plane / max(plane.std(), 1e-12))
         correlation += np.fft.irfft2(mask.conj() * grey, correlation.shape)
-    reach = [min(FURTHEST, n // 4) for n in correlation.shape]
-    around = np.abs(np.roll(correlation, reach, (0, 1))[: 2 * reach[0] + 1, : 2 * reach[1] + 1])
-    y, x = (int(k) - r for k, r in zip(np.unravel_index(around.argmax(), around.shape), reach, strict=True))
-    threshold = max((1 + BETTER) * around[reach[0], reach[1]], CLEAR * float(np.sqrt(np.square(correlation).mean())))
-    return (y, x) if max(abs(y), abs(x)) >= NEAREST and around.max() > threshold else (0, 0)
+    furthest = [min(FURTHEST, n // 4) for n in correlation.shape]
+    centred = np.roll(correlation, furthest, (0, 1))[: 2 * furthest[0] + 1, : 2 * furthest[1] + 1]
+    strength = np.abs(centred)  # no shift is its middle
+    y, x = (int(k) - n for k, n in zip(np.unravel_index(strength.argmax(), strength.shape), furthest, strict=True))
+    background = float(np.sqrt(np.square(correlation).mean()))
+    threshold = max((1 + BETTER) * strength[furthest[0], furthest[1]], CLEAR * background)
+    return (y, x) if max(abs(y), abs(x)) >= NEAREST and strength.max() > threshold else (0, 0)
 
 
-def _learn(features: np.ndarray, inside: np.ndarray) -> Any:
-    """Return trees that tell the inside by features (N, Y, X, F)."""
+def _train_trees(features: np.ndarray, inside: np.ndarray) -> Any:
+    """Train a classifier of the inside (N, Y, X) by features (N, Y, X, F), on a sample of the voxels."""
     ensemble = require("sklearn.ensemble", "image", "reading an image")
     table, truth = features.reshape(-1, features.shape[-1]), inside.ravel()
     rows = np.random.default_rng(0).permutation(len(table))[:LEARNT]
-    if len(np.unique(truth[rows])) == 1:
+    if len(np.unique(truth[rows])) == 1:  # a rare class is missing in the sample: take all of it
         rows = np.append(rows, np.flatnonzero(truth != truth[rows[0]]))
     options = {"max_iter": TREES, "learning_rate": RATE, "max_leaf_nodes": LEAVES, "l2_regularization": 1.0}
     return ensemble.HistGradientBoostingClassifier(**options, early_stopping=False, random_state=0).fit(
@@ -101,39 +106,40 @@ def _learn(features: np.ndarray, inside: np.ndarray) -> Any:
 
 
 def _features(levels: np.ndarray, spacing: Sequence[float]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield numbers of slices and their features (n, Y, X, F), float16: smoothed levels, their slopes, and the
-    eigenvalues of their Hessians; as many slices at once as may be held, by as many threads as torch has."""
+    """Yield the indices (n,) of some slices at a time with their features (n, Y, X, F), float16: at each width the
+    smoothed level, its slope, and the eigenvalues of its Hessian. Blocks of slices are computed in parallel threads."""
     edges = [math.sqrt(edge / min(spacing)) for edge in spacing]
+    # Gaussians are cut at 4 deviations, and each of two derivatives reads one more slice.
     halo, depth = int(4 * (max(WIDTHS) + SMOOTH) / edges[0]) + 3, len(levels)
-    most = max(1, HELD // levels[0].size)
+    thickness = max(1, HELD // levels[0].size)
     pairs = list(combinations_with_replacement(range(3), 2))
 
     def blur(values: np.ndarray, width: float) -> np.ndarray:
-        deviations = [max(width / edge, LEAST) for edge in edges]
-        return ndimage.gaussian_filter(values, deviations, mode="nearest")
+        return ndimage.gaussian_filter(values, [max(width / edge, LEAST) for edge in edges], mode="nearest")
 
-    def describe(start: int) -> tuple[np.ndarray, np.ndarray]:
-        rows, low = np.arange(start, min(start + most, depth)), max(start - halo, 0)
-        slab, found = levels[low : rows[-1] + halo + 1], []
+    def compute_block(start: int) -> tuple[np.ndarray, np.ndarray]:
+        rows, low = np.arange(start, min(start + thickness, depth)), max(start - halo, 0)
+        slab, features = levels[low : rows[-1] + halo + 1], []
         for width in WIDTHS:
             smooth = blur(slab, width)
-            slopes = np.gradient(blur(smooth, SMOOTH), *edges)
-            curved = [np.gradient(slopes[i], edges[j], axis=j) for i, j in pairs]
-            each = [smooth, np.sqrt(sum(slope**2 for slope in slopes)), *_eigenvalues(*curved)]
-            found += [values[rows - low].astype(np.float16) for values in each]
-        return rows, np.stack(found, axis=-1)
+            gradient = np.gradient(blur(smooth, SMOOTH), *edges)
+            hessian = [np.gradient(gradient[i], edges[j], axis=j) for i, j in pairs]
+            slope = np.sqrt(sum(component**2 for component in gradient))
+            for values in (smooth, slope, *_eigenvalues(*hessian)):
+                features.append(values[rows - low].astype(np.float16))
+        return rows, np.stack(features, axis=-1)
 
-    starts, crew = range(0, depth, most), torch.get_num_threads()
-    with ThreadPoolExecutor(crew) as threads:
-        for k in range(0, len(starts), crew):
-            yield from threads.map(describe, starts[k : k + crew])
+    starts, count = range(0, depth, thickness), torch.get_num_threads()
+    with ThreadPoolExecutor(count) as threads:
+        for k in range(0, len(starts), count):  # `map` alone would compute all blocks ahead, and hold them
+            yield from threads.map(compute_block, starts[k : k + count])
 
 
 def _eigenvalues(
     zz: np.ndarray, zy: np.ndarray, zx: np.ndarray, yy: np.ndarray, yx: np.ndarray, xx: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the eigenvalues of symmetric 3 × 3 matrices, the greatest first, by the cosines that solve their cubic.
-    Ten times as fast as LAPACK, and as exact as features of 16 bits need."""
+    """Return the eigenvalues of symmetric 3 × 3 matrices, the greatest first, by the trigonometric solution of the
+    cubic: ten times as fast as LAPACK, and as exact as features of 16 bits need."""
     mean = (zz + yy + xx) / 3
     a, b, c = zz - mean, yy - mean, xx - mean
     scale = np.sqrt((a * a + b * b + c * c + 2 * (zy * zy + zx * zx + yx * yx)) / 6)

@@ -1,9 +1,9 @@
 """A volume between known slices: filled by a network, block by block, and by F_ε where a law is better.
 
-The network reads four known slices for each gap, and no more than `REACH` pixels around each pixel: a block with what
-lies around it is filled as the whole is, and a volume that fits into memory is one block. Three numbers are those of
-the whole: the thickness of the structure in known slices, which says how large a pixel is; the probability from which
-voxels are inside; and the expected Dice. All follow from sums over slices or blocks.
+The network reads four known slices for each gap, and no more than `REACH` pixels around each pixel: a block with this
+margin is filled as the whole would be, and a volume that fits into memory is one block. Three numbers are those of the
+whole: the thickness of the structure in known slices, which sets the size of a pixel; the threshold of the probability;
+and the expected Dice. All follow from sums over slices or blocks.
 """
 
 from __future__ import annotations
@@ -88,13 +88,13 @@ LEAST_BYTES = 30
 LEAST_GAIN = 0.1
 SHIFTED = "The image seems to lie off the annotated slices by {} voxels along {}: it fits them better when it is moved."
 UNTOLD = "The image does not tell the structure in annotated slices held out: it is left out."
-#: Least probability whose odds or log-odds are taken.
+#: Probabilities are clipped by this much from 0 and 1 before odds or log-odds are taken.
 SURE = 1e-6
 #: Slices of a block by default, and voxels a side across them at most.
 DEEP, WIDE = 2 * CHUNK, 4 * CHUNK
-#: Bytes that a pixel of a slice takes in the network, those of a voxel of a block, and of the program itself.
-_EACH, _VOXEL, _PROGRAM = 800, 24, 600 * 2**20
-#: The pass that fills, and the share of the work that is done after each pass.
+#: Bytes of memory for each pixel of a slice in the network, for each voxel of a block, and for the program itself.
+_PIXEL, _VOXEL, _PROGRAM = 800, 24, 600 * 2**20
+#: The pass that fills, and the fraction of the work that is done after each pass.
 _FILL, _READ = "filling blocks", 0.07
 _ENDS = {"looking for labels": 0.02, "reading known slices": _READ, _FILL: 0.98}
 
@@ -157,15 +157,15 @@ def reconstruct(
     volume = load(slices, **reading, lazy=True)
     which = {"every": every, "known": known, "ignore": ignore, "axis": axis}
     check_which(volume.shape, **which, suggest=suggest)  # type: ignore[arg-type]
-    given = _Given.load(volume, which, prior, image, example, periodic, working=working, reading=reading)
-    with given.open_run(working, progress) as run:
-        return _fill_between(given, suggest, run, working, progress)
+    inputs = _Inputs.load(volume, which, prior, image, example, periodic, working=working, reading=reading)
+    with inputs.open_run(working, progress) as run:
+        return _fill_between(inputs, suggest, run, working, progress)
 
 
 @dataclass(frozen=True, eq=False)
-class _Given:
-    """What a volume is filled from: labels and which of them are known, laws with notes on them, the network, an image
-    and an example; and whether it is filled in blocks."""
+class _Inputs:
+    """What a volume is filled from: its labels, the options `which` of its known slices, laws with notes on them, the
+    network, an image and an example; and whether it is filled in blocks."""
 
     volume: Volume
     which: dict[str, Any]
@@ -181,9 +181,9 @@ class _Given:
     def load(
         cls, volume: Volume, which: dict[str, Any], prior: LawLike | None, image: Source | None,
         example: Source | None, periodic: bool, *, working: Working, reading: dict[str, Any],
-    ) -> _Given:  # fmt: skip
-        """Read what is not read yet; raise ScanError where parts do not go together."""
-        choose_epsilon(volume, working.epsilon)
+    ) -> _Inputs:  # fmt: skip
+        """Load the inputs, and the volume if it is filled at once; raise ScanError where inputs exclude each other."""
+        choose_epsilon(volume, working.epsilon)  # refuses an ε before the work
         large = working.tile is not None or (volume.in_file and max(volume.shape) > LARGEST_BOX)
         in_blocks = large and prior is None and image is None and which["ignore"] is None and not periodic
         if not in_blocks:
@@ -193,60 +193,59 @@ class _Given:
         if image is not None and (example is not None or laws):
             raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
         taught = Taught.load(working.filler, image=image is not None)
-        levels = None if image is None else load_image(image, volume, reading)
-        other = None if example is None else load_example(example, volume, reading)
-        return cls(volume, which, laws, notes, taught, levels, other, periodic, in_blocks)
+        grey = None if image is None else load_image(image, volume, reading)
+        annotated = None if example is None else load_example(example, volume, reading)
+        return cls(volume, which, laws, notes, taught, grey, annotated, periodic, in_blocks)
 
     def open_run(self, working: Working, progress: Progress) -> AbstractContextManager[Run]:
         """Open the run of the blocks; a volume that is filled at once is one block in memory."""
-        if not self.in_blocks:
-            return open_run(None, None, {}, silent, _ENDS)
-        same: dict[str, Any] = {}
-        if working.store is not None:  # digests take a while
-            same = {"labels": self.volume.digest, **self.which, "filler": self.taught.digest, "tile": working.tile}
-            same |= {"example": self.example and self.example.digest}
-        crew = working.workers if self.volume.in_file and working.store is not None else None
-        return open_run(crew, working.store, same, progress, _ENDS)
+        if not self.in_blocks or working.store is None:
+            return open_run(None, None, {}, progress if self.in_blocks else silent, _ENDS)
+        identity = {"labels": self.volume.digest, **self.which, "filler": self.taught.digest, "tile": working.tile}
+        identity |= {"example": self.example and self.example.digest}
+        crew = working.workers if self.volume.in_file else None
+        return open_run(crew, working.store, identity, progress, _ENDS)
 
 
-def _fill_between(given: _Given, suggest: int, run: Run, working: Working, progress: Progress) -> Segmentation:
-    """Read the known slices, learn from what is given, choose a law, fill the volume, and say how sure it is."""
-    volume, periodic = given.volume, given.periodic
-    known = Known.find(volume, run, **given.which)
+def _fill_between(inputs: _Inputs, suggest: int, run: Run, working: Working, progress: Progress) -> Segmentation:
+    """Read the known slices, adapt the network, choose a law, fill the volume, and say how sure each voxel is."""
+    volume, periodic = inputs.volume, inputs.periodic
+    known = Known.find(volume, run, **inputs.which)
     suggest = check_int(suggest, "a number of slices from 0", 0, volume.shape[known.axis] - len(known.places))
-    target, labels, there = known.read(run, periodic)
-    doubts = () if given.which["every"] is None else doubt_places(there, known.places)
-    notes = (*known.notes, *doubts, *doubt_labels(labels, given.which["ignore"]), *given.notes)
-    part = None if given.example is None else Example.of(given.example, known.places, known.axis)
-    step = sub_progress(progress, *((_READ, _READ) if given.in_blocks else (0.0, 0.5)))
-    taught, evidence, learned = _learn(given.taught, known, target, given.image, part, step)
+    slices, labels, labelled = known.read(run, periodic)
+    doubts = () if inputs.which["every"] is None else doubt_places(labelled, known.places)
+    notes = (*known.notes, *doubts, *doubt_labels(labels, inputs.which["ignore"]), *inputs.notes)
+    example = None if inputs.example is None else Example.of(inputs.example, known.places, known.axis)
+    step = sub_progress(progress, *((_READ, _READ) if inputs.in_blocks else (0.0, 0.5)))
+    taught, evidence, input_notes = _adapt(inputs.taught, known, slices, inputs.image, example, step)
+    notes = (*notes, *input_notes)
     engine = _Engine(taught, evidence, working.epsilon, progress)
-    place, tiles = engine.cut(target, working.tile) if given.laws else (None, [])
-    chosen, task, head = _choose_law(engine, target, given.laws, part, (working.stiffness, working.steps), len(tiles))
-    notes = (*notes, *learned)
-    if place is None or chosen.law is None:
-        filled, phase = _fill_volume(known, target, engine, run, working.tile, given.in_blocks)
+    grid, tiles = engine.cut(slices, working.tile) if inputs.laws else (None, [])
+    strength = (working.stiffness, working.steps)
+    trial, task, head = _choose_law(engine, slices, inputs.laws, example, strength, len(tiles))
+    if grid is None or trial.law is None:
+        filled, phase = _fill_volume(known, slices, engine, run, working.tile, inputs.in_blocks)
         inside = flow_summary(filled.share)
     else:
-        problem, store, workers = SlicesProblem(chosen, target, engine.level(target)), working.store, working.workers
-        found = lower_volume(problem, place, tiles, store=store, workers=workers, progress=progress)
-        filled, engine = _weigh_evidence(engine, chosen, task, known, target, found)
-        phase, notes = known.turn_back(found.phase), (*notes, *place.notes)
-        inside = flow_summary(float(found.mask.mean()), found.energies, found.steps)
-    uncertain = filled.judge(known, target, engine, suggest)
-    tested = "the example" if part else "slices left out" if chosen.law else "generated shapes"
-    ways = {"tested": tested, "image": evidence is not None, "periodic": periodic}
-    status, doubts = describe_filled(head, inside, filled.share, uncertain, known.places, target.length, **ways)
+        problem, store, workers = SlicesProblem(trial, slices, engine.level(slices)), working.store, working.workers
+        lowered = lower_volume(problem, grid, tiles, store=store, workers=workers, progress=progress)
+        filled, engine = _weigh_evidence(engine, trial, task, known, slices, lowered)
+        phase, notes = known.turn_back(lowered.phase), (*notes, *grid.notes)
+        inside = flow_summary(float(lowered.mask.mean()), lowered.energies, lowered.steps)
+    uncertain = filled.judge(known, slices, engine, suggest)
+    tested = "the example" if example else "slices left out" if trial.law else "generated shapes"
+    options = {"tested": tested, "image": evidence is not None, "periodic": periodic}
+    status, doubts = describe_filled(head, inside, filled.share, uncertain, known.places, slices.length, **options)
     return Segmentation.of(
-        volume, filled.mask, phase, chosen.law, choose_epsilon(volume, working.epsilon), (*notes, *doubts),
-        weight=None, status=status, uncertainty=uncertain, image=given.image,
+        volume, filled.mask, phase, trial.law, choose_epsilon(volume, working.epsilon), (*notes, *doubts),
+        weight=None, status=status, uncertainty=uncertain, image=inputs.image,
     )  # fmt: skip
 
 
-def _learn(
+def _adapt(
     taught: Taught, known: Known, slices: Slices, image: Volume | None, example: Example | None, progress: Progress
 ) -> tuple[Taught, np.ndarray | None, tuple[str, ...]]:
-    """Return the network, which an example tunes; what an image says; and notes on either."""
+    """Return the network, tuned on the example if there is one; an image's log-odds (length, Y, X); and notes."""
     if image is not None:
         evidence, doubts = _read_evidence(known.turn(image.values), slices, known.axis, progress)
         return Taught.load() if evidence is None else taught, evidence, (*image.notes, *doubts)
@@ -259,22 +258,24 @@ def _choose_law(
     engine: _Engine, slices: Slices, laws: Sequence[Coefficients], example: Example | None,
     strength: tuple[float | None, int], tiles: int,
 ) -> tuple[Trial, Task[Slices] | None, str]:  # fmt: skip
-    """Return the law to lower, if one is better than the network alone, what it was tried out on, and a sentence's
-    beginning; with a stiffness and steps as `strength` the first is not tried out. There are so many `tiles`."""
-    (stiffness, steps), task = strength, None if example is None else example.task
+    """Return the trial to run, with a law if one is better than the network alone; the task that decided; and the
+    beginning of the status. `strength` is the stiffness and the steps: a given stiffness takes the first law untried.
+    Of a volume of several `tiles`, laws are tried in a box."""
+    stiffness, steps = strength
+    task = None if example is None else example.task
     if not laws:
         return Trial(), task, engine.taught.status
     if stiffness is not None:
         return Trial(laws[0], stiffness, steps), task, "the law is lowered from the network's volume"
     task = _pose_task(slices if tiles == 1 else crop_to_surface(slices, PART)[0], example)
     trials = [Trial(law, STIFFNESS, steps, pull) for law, pull in product(laws, PULLS)]
-    chosen = choose_by_masks(task, trials, lambda slices, trial: engine.run(slices, trial) > 0)
-    return chosen, task, _describe_gain(chosen, "left out" if example is None else "of the example")
+    best = choose_by_masks(task, trials, lambda slices, trial: engine.run(slices, trial) > 0)
+    return best, task, _describe_gain(best, "left out" if example is None else "of the example")
 
 
 @dataclass(frozen=True, eq=False)
 class _Engine:
-    """What fills any slices: the network, and laws that start from its volume."""
+    """Fills slices by the network, and by laws that start from its result; each result is computed once."""
 
     taught: Taught
     evidence: np.ndarray | None
@@ -284,42 +285,42 @@ class _Engine:
     lowered: dict[tuple[Any, ...], np.ndarray] = field(default_factory=dict)
 
     def logits(self, slices: Slices) -> np.ndarray:
-        """Return the network's log-odds of the inside (Z, Y, X), computed once."""
+        """Return the network's log-odds of the inside (Z, Y, X)."""
         return self._fill(slices)[1]
 
     def thresholded(self, slices: Slices) -> np.ndarray:
-        """Return which slices have a threshold of their own: those between known ones, and by an image all."""
+        """Return which slices are cut at the best threshold, not at 1/2: those between known ones; all by an image."""
         return slices.between | (self.evidence is not None)
 
     def level(self, slices: Slices) -> np.ndarray:
-        """Return log-odds over those of the best threshold (Z, Y, X), times the edge of a voxel; in known slices the
-        signed distance from the outline tells them."""
+        """Return log-odds less those of the threshold (Z, Y, X), times the edge of a voxel: about a signed distance. In
+        known slices, whose log-odds are constant, they follow from the distance from the outline."""
         raster, logits = self._fill(slices)
-        depth = plane_distances(slices.inside, slices.spacing[1:], slices.gap * slices.spacing[0])
+        distances = plane_distances(slices.inside, slices.spacing[1:], slices.gap * slices.spacing[0])
         level = logits.copy()
-        level[list(slices.places)] = (SLOPE / raster.pixel) * depth.astype(np.float32)
-        least = best_log_odds(logits[slices.between]) if slices.between.any() else 0.0
-        level = level - np.where(self.thresholded(slices), least, 0)[:, None, None]
+        level[list(slices.places)] = (SLOPE / raster.pixel) * distances.astype(np.float32)
+        threshold = best_log_odds(logits[slices.between]) if slices.between.any() else 0.0
+        level = level - np.where(self.thresholded(slices), threshold, 0)[:, None, None]
         return (min(slices.spacing[1:]) * level).astype(np.float32)
 
     def run(self, slices: Slices, trial: Trial) -> np.ndarray:
-        """Return the phase field (Z, Y, X) of a trial; a law is lowered once, whatever the trial's scores."""
+        """Return the phase field (Z, Y, X) of a trial; its scores, which are set later, do not matter."""
         if trial.law is None:
             return _profile(self.level(slices), choose_epsilon(slices.frame, self.epsilon))
         key = (slices, trial.law, trial.strength, trial.steps, trial.pull)
         if key not in self.lowered:
-            step: Progress = lambda _, share: self.progress("trying the law out", share)  # noqa: E731
+            step: Progress = lambda _, fraction: self.progress("trying the law out", fraction)  # noqa: E731
             problem = SlicesProblem(trial, slices, self.level(slices))
             self.lowered[key] = lower_volume(problem, *self.cut(slices), progress=step).phase
         return self.lowered[key]
 
     def cut(self, slices: Slices, edge: int | None = None) -> tuple[WorkingGrid, list[Box]]:
         """Return the working grid on which a law is lowered, and the tiles."""
-        place = WorkingGrid.of(slices.frame, self.epsilon, halo=HALO, periodic=slices.periodic)
-        return place, cut_tiles(place, slices.shape, edge)
+        grid = WorkingGrid.of(slices.frame, self.epsilon, halo=HALO, periodic=slices.periodic)
+        return grid, cut_tiles(grid, slices.shape, edge)
 
     def _fill(self, slices: Slices) -> tuple[Raster, np.ndarray]:
-        """Return the network's pixels, and log-odds."""
+        """Return the network's pixels and its log-odds (Z, Y, X), computed once."""
         if slices not in self.filled:
             raster, step = Raster.of(slices), sub_progress(self.progress, 0.5, 1.0)
             logits = fill(slices, self.taught, raster=raster, evidence=self.evidence, progress=step)
@@ -332,31 +333,31 @@ class _Engine:
 
 @dataclass(frozen=True, eq=False)
 class _Filled:
-    """A volume's probabilities and mask, in its own axes, and the sums over its blocks that say how sure they are."""
+    """A volume's probabilities (`likely`) and mask in its own axes, and sums over its blocks by name (`look_at`)."""
 
     likely: Any
     mask: Any
     sums: dict[str, Any]
 
     @classmethod
-    def of(cls, given: Known, slices: Slices, likely: np.ndarray, mask: np.ndarray) -> _Filled:
-        """Return what is known of probabilities and a mask (length, Y, X) in memory."""
+    def of(cls, known: Known, slices: Slices, likely: np.ndarray, mask: np.ndarray) -> _Filled:
+        """Return the result that consists of probabilities and a mask (length, Y, X) in memory."""
         sums = dict(look_at(likely, slices, WHOLE))
         likely = sums.pop("likely")
-        return cls(given.turn_back(likely), given.turn_back(mask), sums | _compare(likely, mask, slices.between))
+        return cls(known.turn_back(likely), known.turn_back(mask), sums | _compare(likely, mask, slices.between))
 
     @property
     def share(self) -> float:
-        """The mask's share of the volume."""
+        """The mask's fraction of the volume."""
         return float(self.sums["inside"] / math.prod(self.mask.shape))
 
-    def judge(self, given: Known, slices: Slices, engine: _Engine, suggest: int) -> Uncertainty:
+    def judge(self, known: Known, slices: Slices, engine: _Engine, suggest: int) -> Uncertainty:
         """Return how sure the volume is, and which slices to annotate next."""
         sums, ends = self.sums, {"periodic": slices.periodic, "whole": engine.evidence is not None}
         dice = float(2 * sums["both"] / max(sums["count"] + sums["sum"], 1e-9)) if slices.between.any() else 1.0
-        order = axis_first((0, 1, 2), given.axis)
+        order = axis_first((0, 1, 2), known.axis)  # the volume's axes in the order of the sums
         return Uncertainty(
-            replace(given.volume, array=self.likely, notes=()),
+            replace(known.volume, array=self.likely, notes=()),
             engine.taught.error,
             suggest_slices(sums["along 0"], slices.places, suggest, slices.periodic),
             dice,
@@ -367,16 +368,16 @@ class _Filled:
 
 
 def _fill_volume(
-    given: Known, slices: Slices, engine: _Engine, run: Run, tile: int | None, blocks: bool
+    known: Known, slices: Slices, engine: _Engine, run: Run, tile: int | None, in_blocks: bool
 ) -> tuple[_Filled, Any]:
-    """Fill a volume by the network alone, at once or in blocks; no mask is cut before all of it is filled. Return the
-    phase field too."""
-    shape, raster = given.volume.shape, Raster.of(slices) if blocks else None
+    """Fill a volume by the network alone, at once or in blocks; return it and its phase field (Z, Y, X). The threshold
+    of the mask follows from the probabilities of all blocks, so that a second pass makes the mask."""
+    shape, raster = known.volume.shape, Raster.of(slices) if in_blocks else None
     cores = cut_boxes(slices.shape, slices.shape if raster is None else _choose_edges(raster, tile))
     likely, mask = run.open("probability", np.float32, shape), run.open("mask", np.uint8, shape)
 
     def keep(number: int, record: Record) -> Record:
-        likely[given.turn_box(cores[number])] = np.moveaxis(record["likely"], 0, given.axis)
+        likely[known.turn_box(cores[number])] = np.moveaxis(record["likely"], 0, known.axis)
         return {name: value for name, value in record.items() if name != "likely"}
 
     def fill_all(_: int) -> Record:
@@ -385,94 +386,99 @@ def _fill_volume(
     if raster is None:
         records = run(_FILL, fill_all, 1, keep=keep)
     else:
-        stated = _describe_blocks(slices, raster, cores, run.processes)
-        records = run(_FILL, partial(fill_block, slices, engine.taught, raster, cores), len(cores), stated, keep)
-    sums = add_records(_widen(record, core, slices.shape) for core, record in zip(cores, records, strict=True))
+        message = _describe_blocks(slices, raster, cores, run.processes)
+        records = run(_FILL, partial(fill_block, slices, engine.taught, raster, cores), len(cores), message, keep)
+    sums = add_records(_pad_entropies(record, core, slices.shape) for core, record in zip(cores, records, strict=True))
     compared: list[Record] = []
-    thresholds = max(best_threshold(sums["counts"]), LEAST) if slices.between.any() else 0.5
-    thresholds = np.where(engine.thresholded(slices), thresholds, 0.5).astype(np.float32)[:, None, None]
+    threshold = max(best_threshold(sums["counts"]), LEAST) if slices.between.any() else 0.5
+    thresholds = np.where(engine.thresholded(slices), threshold, 0.5).astype(np.float32)[:, None, None]
     for core in cores:
-        box = given.turn_box(core)
-        part = np.moveaxis(likely[box], given.axis, 0)
-        inside = part > thresholds[core[0]]
-        mask[box] = np.moveaxis(inside, 0, given.axis)
-        compared.append(_compare(part, inside, slices.between[core[0]]))
+        box = known.turn_box(core)
+        block = np.moveaxis(likely[box], known.axis, 0)
+        inside = block > thresholds[core[0]]
+        mask[box] = np.moveaxis(inside, 0, known.axis)
+        compared.append(_compare(block, inside, slices.between[core[0]]))
     filled = _Filled(_voxels(likely.stored), _voxels(mask.stored, label=1), sums | add_records(compared))
     if raster is None:
-        return filled, given.turn_back(engine.run(slices, Trial()))
+        return filled, known.turn_back(engine.run(slices, Trial()))
     epsilon = choose_epsilon(slices.frame, engine.epsilon)
-    profile = _Profile(likely.stored, np.moveaxis(thresholds, 0, given.axis), min(slices.spacing[1:]), epsilon)
+    profile = _Profile(likely.stored, np.moveaxis(thresholds, 0, known.axis), min(slices.spacing[1:]), epsilon)
     return filled, _voxels(profile)
 
 
 class _Profile:
-    """The phase field of probabilities, computed where it is asked for: the profile of their log-odds over those of
-    `least`, times the edge of a voxel."""
+    """An array that computes its boxes on demand: the phase field of probabilities (Z, Y, X), whose level is their
+    log-odds less those of the `thresholds`, which broadcast to them, times the edge of a voxel."""
 
     dtype, digest = np.dtype(np.float32), ""
 
-    def __init__(self, likely: Any, least: np.ndarray, edge: float, epsilon: float) -> None:
-        self.likely, self.least, self.edge, self.epsilon, self.shape = likely, least, edge, epsilon, likely.shape
+    def __init__(self, likely: Any, thresholds: np.ndarray, edge: float, epsilon: float) -> None:
+        self.likely, self.shape, self.thresholds = likely, likely.shape, thresholds
+        self.edge, self.epsilon = edge, epsilon
 
     def __getitem__(self, index: tuple[slice, ...]) -> np.ndarray:
         likely = np.clip(self.likely[index], SURE, 1 - SURE)
-        own = (edge if n > 1 else slice(None) for edge, n in zip(index, self.least.shape, strict=True))
-        level = self.edge * (logit(likely) - logit(self.least[tuple(own)]))
+        rows = tuple(edge if n > 1 else slice(None) for edge, n in zip(index, self.thresholds.shape, strict=True))
+        level = self.edge * (logit(likely) - logit(self.thresholds[rows]))
         return _profile(level, self.epsilon).astype(np.float32)
 
 
 def fill_block(slices: Slices, taught: Taught, raster: Raster, cores: Sequence[Box], number: int) -> Record:
-    """Return what `look_at` says of a block that the network fills."""
+    """Fill a block by the network, and return its record (`look_at`)."""
     return look_at(expit(fill(slices, taught, cores[number], raster=raster)), slices, cores[number])
 
 
 def look_at(likely: np.ndarray, slices: Slices, core: Box, *, whole: bool = False) -> Record:
-    """Return the probabilities of a block, float32, those of known voxels 0 or 1; of the voxels between known slices
-    the counts and the sum; the sum of all that are filled, or of the `whole`; and the entropy of slices along each
-    axis."""
+    """Return the record of a block's probabilities (Z, Y, X): themselves, `likely`, float32, 0 or 1 in known voxels;
+    their histogram, `counts`, and `sum` between known slices; their `total` over filled slices, or over the `whole`;
+    and the entropies of the slices across axis k, `along k`."""
     rows = core[0]
-    counts = count_probabilities(likely[slices.between[rows]])  # marked voxels too, as those of the phase field
+    counts = count_probabilities(likely[slices.between[rows]])  # of marked voxels too, as for `_Engine.level`
     likely = slices.keep_known(likely.astype(np.float32), core)
-    unsure, filled = doubt(likely), likely[slices.between[rows]]
-    along = {f"along {k}": unsure.sum(tuple({0, 1, 2} - {k})) for k in range(3)}
-    total = likely if whole else likely[~slices.unfilled[rows]]
-    sums = {"sum": filled.sum(dtype=np.float64), "total": total.sum(dtype=np.float64)}
+    entropies, between = doubt(likely), likely[slices.between[rows]]
+    along = {f"along {k}": entropies.sum(tuple({0, 1, 2} - {k})) for k in range(3)}
+    filled = likely if whole else likely[~slices.unfilled[rows]]
+    sums = {"sum": between.sum(dtype=np.float64), "total": filled.sum(dtype=np.float64)}
     return {"likely": likely, "counts": counts, **sums, **along}
 
 
 def _compare(likely: np.ndarray, mask: np.ndarray, between: np.ndarray) -> dict[str, Any]:
-    """Return how many voxels of a mask there are, and between known slices their number and probabilities."""
+    """Return the voxels `inside` a mask; and in slices between known ones, their `count` and the sum of their
+    probabilities, which is the overlap with the truth to expect, `both`."""
     inside = mask[between]
     both = likely[between][inside].sum(dtype=np.float64)
     return {"inside": np.count_nonzero(mask), "count": np.count_nonzero(inside), "both": both}
 
 
-def _widen(record: Record, core: Box, shape: Sequence[int]) -> Record:
-    """Return a block's record with what is along an axis on all slices of the volume, 0 beyond the block."""
-    wide = dict(record)
+def _pad_entropies(record: Record, core: Box, shape: Sequence[int]) -> Record:
+    """Return a block's record with entropies for all slices of the volume, 0 beyond the block, so that they add up."""
+    padded = dict(record)
     for axis, n in enumerate(shape):
-        wide[f"along {axis}"] = np.zeros(n)
-        wide[f"along {axis}"][core[axis]] = record[f"along {axis}"]
-    return wide
+        padded[f"along {axis}"] = np.zeros(n)
+        padded[f"along {axis}"][core[axis]] = record[f"along {axis}"]
+    return padded
 
 
 def _choose_edges(raster: Raster, tile: int | None) -> tuple[int, ...]:
     """Return the edges of blocks: `tile`, or as many voxels as the network fills at once."""
-    wide = (min(max(int(TILE / scale) // CHUNK, 1) * CHUNK, WIDE) for scale in raster.scale)
-    return (tile,) * 3 if tile is not None else (DEEP, *wide)
+    if tile is not None:
+        return (tile,) * 3
+    # Whole chunks of a store: no two blocks write to the same one.
+    return (DEEP, *(min(max(int(TILE / scale) // CHUNK, 1) * CHUNK, WIDE) for scale in raster.scale))
 
 
 def _describe_blocks(slices: Slices, raster: Raster, cores: Sequence[Box], processes: int) -> str:
     """Return how many blocks there are, and how much memory they take at most, as a sentence."""
     sides = [edge.stop - edge.start for edge in cores[0]]
     pixels = [min(TILE, n * scale) + 2 * REACH for n, scale in zip(sides[1:], raster.scale, strict=True)]
-    network, known = _EACH * math.prod(pixels) * (slices.gap - 1), math.prod(slices.inside.shape)
-    total = processes * (network + _VOXEL * math.prod(sides) + SLAB) + (processes + (processes > 1)) * _PROGRAM + known
+    network, known = _PIXEL * math.prod(pixels) * (slices.gap - 1), math.prod(slices.inside.shape)
+    programs = processes + (processes > 1)  # workers, and the process that waits for them
+    total = processes * (network + _VOXEL * math.prod(sides) + SLAB) + programs * _PROGRAM + known
     return f"{len(cores)} blocks of {' x '.join(map(str, sides))} voxels, in about {total / 1e9:.2g} GB of memory."
 
 
 def _voxels(stored: Any, label: int | None = None) -> Any:
-    """Return what a volume reads an array from, in memory or stored, or the mask of a label."""
+    """Return an array that a `Volume` can read: one in memory as it is, a stored one lazily; or the mask of a label."""
     z, y, x = (slice(0, n) for n in stored.shape)
     if isinstance(stored, np.ndarray):
         return stored if label is None else stored == label
@@ -484,8 +490,8 @@ def _voxels(stored: Any, label: int | None = None) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class SlicesProblem(Problem):
-    """The volume between slices, and a trial whose strength is the stiffness of springs on the known voxels. `level`
-    (length, Y, X), positive inside, is the start: log-odds over a threshold's, times the edge of a voxel."""
+    """A law lowered between known slices, with a trial whose strength is the stiffness of springs on known voxels. The
+    start is `level` (length, Y, X), positive inside: log-odds less a threshold's, times the edge of a voxel."""
 
     slices: Slices
     level: np.ndarray
@@ -493,22 +499,23 @@ class SlicesProblem(Problem):
     @property
     def inputs(self) -> dict[str, object]:
         slices, trial = self.slices, self.trial
-        numbers = {"places": slices.places, "spacing": slices.spacing, "periodic": slices.periodic}
+        geometry = {"places": slices.places, "spacing": slices.spacing, "periodic": slices.periodic}
         springs = {"strength": trial.strength, "pull": trial.pull}
-        return {"slices": digest_of(slices.inside), **numbers, "start": digest_of(self.level), **springs}
+        return {"slices": digest_of(slices.inside), **geometry, "start": digest_of(self.level), **springs}
 
     def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Data]:
-        """Return the level on a box, and the hinge term that holds known voxels, and by the pull those between."""
-        slices, trial, (rows, inside) = self.slices, self.trial, self.slices.known(box)
-        numbers = slices.indices(box)
-        level = self.level[np.ix_(*numbers)]
-        held = slices.between[numbers[0], None, None]
-        pull = np.where(held, trial.pull / min(slices.spacing[1:]) * level, 0).astype(np.float32)
-        pull[rows] = np.where(inside, trial.strength, -trial.strength)
+        """Return the level on a box, and the springs of its voxels: on known ones the trial's strength; on others
+        between known slices its pull times their log-odds, which are the level over the edge of a voxel."""
+        slices, trial, indices = self.slices, self.trial, self.slices.indices(box)
+        positions, inside = slices.known(box)
+        level = self.level[np.ix_(*indices)]
+        between = slices.between[indices[0], None, None]
+        stiffness = np.where(between, trial.pull / min(slices.spacing[1:]) * level, 0).astype(np.float32)
+        stiffness[positions] = np.where(inside, trial.strength, -trial.strength)
         if slices.marks is not None:
-            marks = slices.marks[np.ix_(*numbers)]
-            pull = np.where(marks == 0, pull, trial.strength * marks).astype(np.float32)
-        return level, Hinge(place.spread(pull, centre=0), MARGIN)
+            marks = slices.marks[np.ix_(*indices)]
+            stiffness = np.where(marks == 0, stiffness, trial.strength * marks).astype(np.float32)
+        return level, Hinge(place.spread(stiffness, centre=0), MARGIN)
 
     def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
         """Return the optimal profile of the level."""
@@ -524,7 +531,7 @@ def _profile(level: np.ndarray, epsilon: float) -> np.ndarray:
 
 
 def _pose_task(slices: Slices, example: Example | None) -> Task[Slices]:
-    """Return what a law is tried out on: a part of the example, or else every second known slice."""
+    """Return the task on which laws are tried out: a part of the example, or else every second known slice."""
     task = leave_out_slices(slices) if example is None else example.part
     if task is None:
         raise ScanError(
@@ -535,57 +542,61 @@ def _pose_task(slices: Slices, example: Example | None) -> Task[Slices]:
 
 
 def _weigh_evidence(
-    engine: _Engine, trial: Trial, task: Task[Slices] | None, given: Known, target: Slices, found: LoweredVolume
+    engine: _Engine, trial: Trial, task: Task[Slices] | None, known: Known, slices: Slices, lowered: LoweredVolume
 ) -> tuple[_Filled, _Engine]:
-    """Return the volume where a law was lowered: its probabilities are by the network's log-odds and the depth below
-    the law's surface, with weights fitted to the task if there is one; and the engine with their calibration error."""
+    """Return the volume that a law filled, and the engine with the calibration error of its probabilities. These are
+    logistic in the network's log-odds and the depth below the law's surface, with weights fitted to the task; without a
+    task they are the network's."""
 
     def evidence(slices: Slices, phase: np.ndarray, rows: list[int]) -> np.ndarray:
         depth = profile_distance(torch.from_numpy(phase[rows]), float(RESOLVED)).numpy()
         return np.stack([engine.logits(slices)[rows].ravel(), depth.ravel()], axis=-1)
 
-    mask = target.keep_known(found.mask & ~target.unfilled[:, None, None])
+    mask = slices.keep_known(lowered.mask & ~slices.unfilled[:, None, None])
     if task is None:
-        return _Filled.of(given, target, expit(engine.logits(target)), mask), engine
-    rows, tried = list(task.places), engine.run(task.given, trial)
-    weights = fit_weights(known := evidence(task.given, tried, rows), task.truth.ravel())
-    tested, near = probability(known, weights).reshape(task.truth.shape), near_surface(tried > 0)[rows]
-    likely = probability(evidence(target, found.phase, list(range(target.length))), weights).reshape(target.shape)
-    likely[target.unfilled] = np.minimum(likely[target.unfilled], 0.5)
-    error = calibration_error(tested[near], task.truth[near])
-    return _Filled.of(given, target, likely, mask), replace(engine, taught=replace(engine.taught, error=error))
+        return _Filled.of(known, slices, expit(engine.logits(slices)), mask), engine
+    rows, phase = list(task.places), engine.run(task.given, trial)
+    task_evidence = evidence(task.given, phase, rows)
+    weights = fit_weights(task_evidence, task.truth.ravel())
+    predicted, near = probability(task_evidence, weights).reshape(task.truth.shape), near_surface(phase > 0)[rows]
+    error = calibration_error(predicted[near], task.truth[near])
+    likely = probability(evidence(slices, lowered.phase, list(range(slices.length))), weights).reshape(slices.shape)
+    likely[slices.unfilled] = np.minimum(likely[slices.unfilled], 0.5)
+    return _Filled.of(known, slices, likely, mask), replace(engine, taught=replace(engine.taught, error=error))
 
 
 def _describe_gain(best: Trial, where: str) -> str:
-    """Say what was chosen and what it gains, as the beginning of a sentence."""
-    score, plain = f"Dice {best.score:.3f}", f"{best.plain:.3f}"
+    """Return the beginning of a status: whether a law was chosen, and the Dice with it and without."""
+    score, plain = f"{best.score:.3f}", f"{best.plain:.3f}"
     if best.law is None:
-        return f"no law helps here: Dice {plain} on slices {where} by the network alone, {best.score:.3f} with a law"
-    return f"a law helps: {score} on slices {where}, {plain} by the network alone"
+        return f"no law helps here: Dice {plain} on slices {where} by the network alone, {score} with a law"
+    return f"a law helps: Dice {score} on slices {where}, {plain} by the network alone"
 
 
 def load_image(image: Source, volume: Volume, reading: dict[str, Any]) -> Volume:
-    """Load the grey levels of the volume that the slices are of."""
+    """Load the image of a volume of slices, on the same voxels; raise ScanError where it has no grey levels."""
     require("sklearn.ensemble", "image", "reading an image")
-    field, laid = lay(load_with(image, reading, "crop"), volume, "the image", "the slices", exact=True)
-    if (count := len(np.unique(field.values.ravel()[:: -(-field.values.size // SAMPLED)]))) < GREY:
+    grey, notes = lay(load_with(image, reading, "crop"), volume, "the image", "the slices", exact=True)
+    stride = -(-grey.values.size // SAMPLED)  # rounded up
+    if (count := len(np.unique(grey.values.ravel()[::stride]))) < GREY:
         raise ScanError(f"the image must have grey levels, but has {count} values: is it a mask?")
-    return replace(field, notes=laid)
+    return replace(grey, notes=notes)
 
 
 def _read_evidence(
     levels: np.ndarray, slices: Slices, axis: int, progress: Progress
 ) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """Return what an image says of a volume, None where it does not tell known slices, and sentences on its doubts."""
-    off = zip(find_shift(levels, slices), "zyx".replace("zyx"[axis], ""), strict=True)
-    doubts = tuple(SHIFTED.format(f"{voxels:+d}", name) for voxels, name in off if voxels)
+    """Return an image's log-odds (length, Y, X), None where they do not predict known slices, and notes on doubts."""
+    names = "zyx".replace("zyx"[axis], "")  # the axes within a slice
+    shifts = zip(find_shift(levels, slices), names, strict=True)
+    doubts = tuple(SHIFTED.format(f"{voxels:+d}", name) for voxels, name in shifts if voxels)
     evidence, gain = read_image(levels, slices, progress=progress)
     return (None, (*doubts, UNTOLD)) if gain < LEAST_GAIN else (evidence, doubts)
 
 
 def load_example(example: Source, volume: Volume, reading: dict[str, Any]) -> Volume:
-    """Load an example with the spacing and unit of the slices, which are of `volume`."""
-    field = load_with(example, reading)
-    check_spacing(field, volume, "the slices")
-    require_labels(field.values, "the example")
-    return field
+    """Load an example, read with the spacing and unit of the slices' `volume`; raise ScanError where it differs."""
+    mask = load_with(example, reading)
+    check_spacing(mask, volume, "the slices")
+    require_labels(mask.values, "the example")
+    return mask

@@ -1,4 +1,4 @@
-"""A mask of a scan, or of a network's probabilities: what voxels say and the energy F_ε of the surface, lowered."""
+"""The mask of a scan, or of a network's probabilities: the voxels' -log p and the surface's energy F_ε, lowered."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from curvafit.segmentation.trials import Task, Trial, choose_by_masks, law_of, l
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.volume import Box, ScanError, Volume, cut_boxes, lay
 
-#: The law where none is given; it is also tried beside those of a prior.
+#: The law where none is given; `calibrate` also tries it beside those of a prior.
 WILLMORE = Coefficients.willmore()
 #: What a unit of F_ε of a law with a20 + a02 = 2 costs in a scan whose weight is not given, in nats. They measure grey
 #: levels by their own noise, so that one number holds for all: it did best on generated textures of noise 3.
@@ -33,9 +33,9 @@ USUAL = 0.3
 NATS, FIRST = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0), 10.0
 #: Least and greatest weight.
 WEIGHTS = (1e-9, 1e9)
-#: Longest edge in voxels of the part of an example on which laws and weights are tried, and the share of the time.
+#: Longest edge in voxels of the part of an example on which laws are tried, and the fraction of the time for that.
 EDGE, TRIALS = 96, 0.7
-#: Share of the evidence for the first guess's inside that a mask must keep, where no weight is given.
+#: Fraction of the evidence for the first guess that a mask must keep, where no weight is given.
 KEPT = 0.95
 #: Voxels that are checked at once.
 _SLAB = 2**24
@@ -99,20 +99,23 @@ def segment(
         return _segment_probabilities(scan, prior, weight, example, working=working, progress=progress, reading=reading)
     volume = load(scan, **reading, lazy=True)
     volume.check_fits()
-    place = WorkingGrid.of(volume, working.epsilon, halo=HALO)
-    tiles, head = cut_tiles(place, volume.shape, working.tile), ""
+    grid = WorkingGrid.of(volume, working.epsilon, halo=HALO)
+    tiles, head = cut_tiles(grid, volume.shape, working.tile), ""
     trial, notes = _weigh_law(prior, weight, volume, working)
+    if weight is None:
+        trial = replace(trial, strength=USUAL)
     _check_finite(volume)
     evidence = GreyEvidence.of(volume, threshold, dark, apart=weight is None)
-    classes, trial = evidence.classes, trial if weight else replace(trial, strength=USUAL)
-    notes = (*notes, *(FAINT,) * (classes.faint and threshold == "otsu"), f"{str(classes).capitalize()}.")
+    if evidence.classes.faint and threshold == "otsu":
+        notes = (*notes, FAINT)
+    notes = (*notes, f"{str(evidence.classes).capitalize()}.")
     if missing := _missing_phase(evidence, tiles):
         raise ScanError(f"the scan shows no {missing}: every voxel is on one side")
-    found = lower(evidence, trial, place, tiles, store=working.store, workers=working.workers, progress=progress)
-    if weight is None and not _explains(evidence, found.mask, tiles):
+    lowered = lower(evidence, trial, grid, tiles, store=working.store, workers=working.workers, progress=progress)
+    if weight is None and not _explains(evidence, lowered.mask, tiles):
         trial, head = replace(trial, law=None), "no prior helps here, the first guess explains the scan better: "
-        found = lower(evidence, trial, place, tiles)
-    return _describe(volume, found, trial, place, notes, head)
+        lowered = lower(evidence, trial, grid, tiles)
+    return _describe(volume, lowered, trial, grid, notes, head)
 
 
 def _segment_probabilities(
@@ -120,26 +123,28 @@ def _segment_probabilities(
     working: Working, progress: Progress, reading: dict[str, Any],
 ) -> Segmentation:  # fmt: skip
     """Return the mask of a network's probabilities; the law's weight is given, or an example chooses law and weight."""
-    given = {name: value for name, value in reading.items() if name != "label"}  # that is of the example
-    volume = load(load_probabilities(scan, **given), lazy=True)
+    # `label` is the example's alone, `like` and `crop` are the scan's.
+    scan_reading = {name: value for name, value in reading.items() if name != "label"}
+    volume = load(load_probabilities(scan, **scan_reading), lazy=True)
     volume.check_fits()
-    place = WorkingGrid.of(volume, working.epsilon, halo=HALO)
-    tiles, head = cut_tiles(place, volume.shape, working.tile), ""
+    grid = WorkingGrid.of(volume, working.epsilon, halo=HALO)
+    tiles, head = cut_tiles(grid, volume.shape, working.tile), ""
     if example is None:
         trial, notes = _weigh_law(prior, weight, volume, working)
     else:
         if not isinstance(example, Calibration):
-            same = {name: value for name, value in reading.items() if name not in ("like", "crop")}
+            example_reading = {name: value for name, value in reading.items() if name not in ("like", "crop")}
             trials, progress = sub_progress(progress, 0.0, TRIALS), sub_progress(progress, TRIALS, 1.0)
-            example = calibrate(*example, prior, working=working, progress=trials, **same)
+            example = calibrate(*example, prior, working=working, progress=trials, **example_reading)
         check_spacing(example.example, volume, "the probabilities")
         trial, notes, head = example.trial, example.notes, f"{example}; "
-    evidence = probability_evidence(likely := volume.load())
+    likely = volume.load()
+    evidence = probability_evidence(likely)
     notes = (*notes, f"Probabilities from {likely.values.min():.3g} to {likely.values.max():.3g}.")
     without_surface = trial.law is not None and _missing_phase(evidence, tiles)  # there is nothing to lower then
     run = replace(trial, law=None) if without_surface else trial
-    found = lower(evidence, run, place, tiles, store=working.store, workers=working.workers, progress=progress)
-    return _describe(volume, found, trial, place, notes, head)
+    lowered = lower(evidence, run, grid, tiles, store=working.store, workers=working.workers, progress=progress)
+    return _describe(volume, lowered, trial, grid, notes, head)
 
 
 def _weigh_law(
@@ -147,18 +152,19 @@ def _weigh_law(
 ) -> tuple[Trial, tuple[str, ...]]:
     """Return the law to lower with its weight, 0 where none is given, and notes on its origin."""
     law, notes = law_of(WILLMORE if prior is None else prior, volume)
-    notes = notes if prior is not None else ("No prior is given: the Willmore energy is lowered.",)
+    if prior is None:
+        notes = ("No prior is given: the Willmore energy is lowered.",)
     return Trial(law, (weight or 0.0) * bending(law) / BENDING, working.steps), notes
 
 
 def _describe(
-    volume: Volume, found: LoweredVolume, trial: Trial, place: WorkingGrid, notes: tuple[str, ...], head: str
+    volume: Volume, lowered: LoweredVolume, trial: Trial, grid: WorkingGrid, notes: tuple[str, ...], head: str
 ) -> Segmentation:
     """Return the result with its status, which begins with `head`."""
     return Segmentation.of(
-        volume, found.mask, found.phase, trial.law, place.epsilon, (*notes, *place.notes),
+        volume, lowered.mask, lowered.phase, trial.law, grid.epsilon, (*notes, *grid.notes),
         weight=None if trial.law is None else trial.strength * BENDING / bending(trial.law),
-        status=f"{head}{flow_summary(float(found.mask.mean()), found.energies, found.steps)}",
+        status=f"{head}{flow_summary(float(lowered.mask.mean()), lowered.energies, lowered.steps)}",
     )  # fmt: skip
 
 
@@ -190,11 +196,11 @@ def check_given(
 
 
 def lower(
-    evidence: VolumeEvidence, trial: Trial, place: WorkingGrid, tiles: Sequence[Box], **tools: Any
+    evidence: VolumeEvidence, trial: Trial, grid: WorkingGrid, tiles: Sequence[Box], **options: Any
 ) -> LoweredVolume:
-    """Lower -log p(data | mask) + λ F_ε from the evidence's first guess, which is the result without a law; `trial` has
-    λ, in nats of a unit of F_ε if a20 + a02 = 2."""
-    return lower_volume(EvidenceProblem(trial, evidence), place, tiles, **tools)
+    """Lower -log p(data | mask) + λ F_ε from the evidence's first guess, which is the result without a law. The trial's
+    strength is λ, in nats per unit of F_ε if a20 + a02 = 2; `options` are those of `lower_volume`."""
+    return lower_volume(EvidenceProblem(trial, evidence), grid, tiles, **options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,28 +214,28 @@ class EvidenceProblem(Problem):
         return {"evidence": self.evidence.digest, "nats": self.trial.strength}
 
     def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Evidence]:
-        found, nats = self.evidence.of_box(box), self.trial.strength or 1.0  # no law has no strength
-        return found.level, Evidence(place.spread(found.ratio) / (nats * place.grid.voxel_volume))
+        evidence, nats = self.evidence.of_box(box), self.trial.strength or 1.0  # 0 where there is no law
+        return evidence.level, Evidence(place.spread(evidence.ratio) / (nats * place.grid.voxel_volume))
 
     def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
-        return np.clip(2 * level, -1, 1)  # the level of probabilities is p - 1/2, of grey levels in contrasts
+        return np.clip(2 * level, -1, 1)  # levels are p - 1/2, or grey levels off the middle, over the contrast
 
 
 def _explains(evidence: VolumeEvidence, mask: np.ndarray, tiles: Sequence[Box]) -> bool:
-    """Return whether a mask keeps nearly all the evidence for the rarer phase of the first guess: so it does, unless
-    thin structures, or pores, got lost, since the energy is lowered together with -log p."""
-    kept, guessed, voxels = np.zeros((3, 2))
+    """Return whether a mask keeps nearly all the evidence that the first guess has for its rarer phase. A mask that
+    lost thin structures, or pores, does not."""
+    kept, guessed, voxels = np.zeros((3, 2))  # of the structure and the background
     for tile in tiles:
-        found = evidence.of_box(tile)
-        for sums, inside in ((kept, mask[tile] > 0), (guessed, found.level > 0)):
-            sums += [found.ratio[inside].sum(dtype=np.float64), -found.ratio[~inside].sum(dtype=np.float64)]
-        voxels += [np.count_nonzero(found.level > 0), np.count_nonzero(found.level <= 0)]
+        part = evidence.of_box(tile)
+        for sums, inside in ((kept, mask[tile] > 0), (guessed, part.level > 0)):
+            sums += [part.ratio[inside].sum(dtype=np.float64), -part.ratio[~inside].sum(dtype=np.float64)]
+        voxels += [np.count_nonzero(part.level > 0), np.count_nonzero(part.level <= 0)]
     rarer = int(voxels.argmin())
     return bool(kept[rarer] >= KEPT * guessed[rarer] and 0 < mask.mean() < 1)
 
 
 def _check_finite(volume: Volume) -> None:
-    """Read all of a volume, some slices at once, and raise ScanError where values are not finite."""
+    """Read a volume slab by slab, and raise ScanError where values are not finite."""
     shape = volume.shape
     slabs = cut_boxes(shape, (max(1, _SLAB // max(1, shape[1] * shape[2])), *shape[1:]))
     if faults := sum(np.count_nonzero(~np.isfinite(volume.read(slab))) for slab in slabs):
@@ -237,23 +243,23 @@ def _check_finite(volume: Volume) -> None:
 
 
 def _missing_phase(evidence: VolumeEvidence, tiles: Sequence[Box]) -> str:
-    """Return which phase the first guess lacks, or nothing; the first tiles that have both end the search."""
-    seen: set[bool] = set()
+    """Return the name of the phase that the first guess lacks, or "" where it has both."""
+    structure, background = False, False
     for tile in tiles:
         inside = evidence.of_box(tile).level > 0
-        seen |= {bool(inside.any()), bool(inside.all())}
-        if len(seen) == 2:
+        structure, background = structure or bool(inside.any()), background or not inside.all()
+        if structure and background:  # the remaining tiles need not be read
             return ""
-    return "background" if True in seen else "structure"
+    return "background" if structure else "structure"
 
 
 @dataclass(frozen=True)
 class Calibration:
     """The law and weight that an example chose for a network's probabilities.
 
-    `trial` has the law, its strength in nats of a unit of F_ε (or p > 1/2), and the Dice of both; `fitted` says whether
-    the law is one of the prior's, rather than the Willmore energy. Others than the `example`'s probabilities must have
-    its voxel size; `notes` are on the origin of the prior.
+    `trial` has the law, or none where p > 1/2 is better; its strength, in nats per unit of F_ε; and the Dice with it
+    and without. `fitted` says whether the law is one of the prior's, rather than the Willmore energy. `example` holds
+    the example's probabilities, whose voxel size later ones must have; `notes` are on the origin of the prior.
     """
 
     trial: Trial
@@ -300,7 +306,7 @@ def calibrate(
     """
     field = load_probabilities(probabilities, **reading)
     truth = load_with(mask, reading, label=label)
-    truth, laid = lay(truth, field, "the mask", "the probabilities", exact=True)
+    truth, place_notes = lay(truth, field, "the mask", "the probabilities", exact=True)
     inside = require_labels(truth.values, "the example") > 0
     if inside.all() or not inside.any():
         state = "full" if inside.all() else "empty"
@@ -314,21 +320,21 @@ def calibrate(
     for law in tried:
         bending(law)  # refuses a law before the work
     probability_evidence(field)  # refuses values outside [0, 1] beyond the part, too
-    where = box_with_most_surface(inside, EDGE)
-    part = replace(field, array=field.values[where])
-    place = WorkingGrid.of(part, working.epsilon, halo=HALO)
-    tiles = cut_tiles(place, part.shape)
-    count, expected = 0, 2 * len(tried) + 3
+    box = box_with_most_surface(inside, EDGE)
+    part = replace(field, array=field.values[box])
+    grid = WorkingGrid.of(part, working.epsilon, halo=HALO)
+    tiles = cut_tiles(grid, part.shape)
+    count, expected = 0, 2 * len(tried) + 3  # an estimate: each law at two strengths, and a few more
 
     def fill(evidence: VolumeEvidence, trial: Trial) -> np.ndarray:
         nonlocal count
         count += 1
         progress("trying the prior out", min(count / expected, 1.0))
         try:
-            return lower(evidence, trial, place, tiles).mask
+            return lower(evidence, trial, grid, tiles).mask
         except ScanError:  # the energy does not stay finite
             return np.zeros(part.shape, dtype=bool)
 
-    task = Task(probability_evidence(part), inside[where], range(part.shape[0]))
+    task = Task(probability_evidence(part), inside[box], range(part.shape[0]))
     best = choose_by_masks(task, [Trial(law, FIRST, working.steps) for law in tried], fill, NATS)
-    return Calibration(best, best.law in laws, field, (*notes, *truth.notes, *laid))
+    return Calibration(best, best.law in laws, field, (*notes, *truth.notes, *place_notes))
