@@ -1,6 +1,6 @@
-"""What each voxel of a scan or a probability map says of being inside, and a first guess of the surface.
+"""The log-likelihood ratio of inside to outside in each voxel of a scan or probability map, and a first guess.
 
-The noise of single voxels decides how far grey levels are smoothed before they are split. `scan.structure` splits them
+The noise of single voxels sets how far grey levels are smoothed before they are split. `scan.structure` splits them
 otherwise, on purpose: see there.
 """
 
@@ -25,9 +25,9 @@ from curvafit.volumes.volume import Box, Crop, ScanError, Volume, cut_boxes, dig
 
 #: Percentiles to which grey levels are clipped for Otsu's threshold.
 TAILS = (0.1, 99.9)
-#: Most noise of a smoothed scan, as a share of the contrast; least and greatest deviation of the smoothing, in voxels.
+#: Most noise of a smoothed scan, as a fraction of the contrast; least and greatest width of the smoothing, in voxels.
 QUIET, WIDTHS = 1 / 16, (0.7, 3.0)
-#: Least noise, as a share of the contrast; least distance of a probability from 0 and 1.
+#: Least noise, as a fraction of the contrast; least distance of a probability from 0 and 1.
 LEAST_NOISE, CERTAIN = 0.05, 1e-4
 #: Probabilities may lie so far beyond 0 and 1.
 _STRAY = 1e-3
@@ -86,8 +86,8 @@ class Classes:
 
 @dataclass(frozen=True, eq=False)
 class GreyEvidence:
-    """The evidence of a scan of grey levels, computed box by box: levels are clipped to `bounds`; the first guess is by
-    the classes `first`, and what a level says by the `classes`."""
+    """The evidence of a scan of grey levels, computed box by box: levels are clipped to `bounds`, split by the classes
+    `first` for the first guess, and weighed by the `classes`."""
 
     volume: Volume
     bounds: tuple[float, float]
@@ -98,28 +98,28 @@ class GreyEvidence:
     def of(
         cls, volume: Volume, threshold: float | str = "otsu", dark: bool = False, apart: bool = False
     ) -> GreyEvidence:
-        """Return a scan's evidence by the classes of a sample of it; `apart` measures those that overlap again.
+        """Measure a scan's classes on a sample of it; with `apart`, those that overlap once more.
 
         A threshold of noisy levels leaves some of each phase on either side, which brings the two means together. They
         are measured again `DEEP` voxels off the first guess of the surface, where few voxels are on the wrong side.
         """
         sample, _ = subsample(volume)
-        levels, bounds = grey_levels(sample, threshold), grey_bounds(sample.values.astype(np.float32), threshold)
+        levels = grey_levels(sample, threshold)
+        bounds = grey_bounds(sample.values.astype(np.float32), threshold)
         first = classes = estimate_classes(levels, sample, threshold, dark)
         if apart and threshold == "otsu" and abs(classes.contrast) < OVERLAP * classes.noise:
             inside = grey_evidence(levels, sample, classes).level > 0
             erode = partial(ndimage.binary_erosion, iterations=DEEP, border_value=1)
-            deep = [levels[np.asarray(erode(side), dtype=bool)] for side in (~inside, inside)]
-            if min(map(len, deep)) >= FEWEST:
-                outer, inner = (float(side.mean(dtype=np.float64)) for side in deep)
+            cores = [levels[np.asarray(erode(phase), dtype=bool)] for phase in (~inside, inside)]
+            if min(map(len, cores)) >= FEWEST:
+                outer, inner = (float(core.mean(dtype=np.float64)) for core in cores)
                 classes = replace(classes, outside=outer, inside=inner, middle=(outer + inner) / 2)
         return cls(volume, bounds, first, classes)
 
     def of_box(self, box: Box) -> VoxelEvidence:
         """Return the evidence of a box of voxels."""
         values = self.volume.read(box).astype(np.float32).clip(*self.bounds)
-        found = grey_evidence(values, self.volume, self.first)
-        level = found.level / np.float32(abs(self.first.contrast))
+        level = grey_evidence(values, self.volume, self.first).level / np.float32(abs(self.first.contrast))
         return VoxelEvidence(grey_ratio(values, self.classes), level)
 
     @property
@@ -128,7 +128,7 @@ class GreyEvidence:
         return f"{self.volume.digest}, {self.first}, {self.classes}"
 
 
-#: What says of each box of a volume where the inside is.
+#: The evidence of a volume, in memory or computed box by box.
 VolumeEvidence = VoxelEvidence | GreyEvidence
 
 
@@ -139,8 +139,7 @@ def grey_levels(scan: Volume, threshold: float | str = "otsu") -> np.ndarray:
 
 
 def grey_bounds(values: np.ndarray, threshold: float | str = "otsu") -> tuple[float, float]:
-    """Return the levels to which grey levels are clipped before Otsu's threshold splits them; infinite for a given
-    threshold."""
+    """Return the bounds to which grey levels are clipped before Otsu's threshold; infinite for a given threshold."""
     if threshold == "otsu" and not np.all((values == values.min()) | (values == values.max())):
         low, high = np.percentile(values, TAILS)  # a mask's rarer value is no tail
         return float(low), float(high)
@@ -149,9 +148,9 @@ def grey_bounds(values: np.ndarray, threshold: float | str = "otsu") -> tuple[fl
 
 def estimate_classes(values: np.ndarray, scan: Volume, threshold: float | str = "otsu", dark: bool = False) -> Classes:
     """Split the smoothed scan at a threshold, and measure the raw levels on either side: means and pooled deviation.
-    This is done twice: the noise found first sets the width of the smoothing then. With `"otsu"` the classes are split
-    half way between their means. A structure of less than 0.1 % of the volume needs a given threshold, since Otsu's
-    takes it for a tail of the noise."""
+    The second time, the noise of the first sets the width of the smoothing. With `"otsu"` the classes are split half
+    way between their means. A structure of less than 0.1 % of the volume needs a given threshold, since Otsu's takes it
+    for a tail of the noise."""
     means, noise = _split(values, _smooth(values, scan, WIDTHS[0] + 0.3), threshold)
     width = _smoothing_width(noise / (means[1] - means[0]))
     means, noise = _split(values, _smooth(values, scan, width), threshold)
@@ -161,7 +160,7 @@ def estimate_classes(values: np.ndarray, scan: Volume, threshold: float | str = 
 
 
 def grey_evidence(values: np.ndarray, scan: Volume, classes: Classes) -> VoxelEvidence:
-    """Return what grey levels (Z, Y, X) say (`grey_ratio`), and smoothed levels to start from."""
+    """Return the evidence of grey levels (Z, Y, X): `grey_ratio`, and smoothed levels to start from."""
     level = _smooth(values, scan, _smoothing_width(classes.noise / abs(classes.contrast))) - np.float32(classes.middle)
     return VoxelEvidence(grey_ratio(values, classes), -level if classes.contrast < 0 else level)
 
@@ -200,16 +199,16 @@ def _split(values: np.ndarray, smooth: np.ndarray, threshold: float | str) -> tu
     """Return the means of the levels below and above a threshold of the smoothed ones, and their pooled deviation."""
     level = float(threshold_otsu(smooth)) if threshold == "otsu" else float(threshold)
     bright = smooth > level
-    share = float(bright.mean())
-    if share in (0.0, 1.0):
+    fraction = float(bright.mean())
+    if fraction in (0.0, 1.0):
         lowest, highest = smooth.min(), smooth.max()
         raise ScanError(
             f"the threshold must lie within the smoothed scan's {lowest:.4g} to {highest:.4g}, got {level:.4g}"
         )
-    inside, outside = values[bright], values[~bright]
-    pooled = share * inside.var(dtype=np.float64) + (1 - share) * outside.var(dtype=np.float64)
-    means = float(outside.mean(dtype=np.float64)), float(inside.mean(dtype=np.float64))
-    return means, math.sqrt(pooled)
+    above, below = values[bright], values[~bright]
+    variance = fraction * above.var(dtype=np.float64) + (1 - fraction) * below.var(dtype=np.float64)
+    means = float(below.mean(dtype=np.float64)), float(above.mean(dtype=np.float64))
+    return means, math.sqrt(variance)
 
 
 def subsample(volume: Volume) -> tuple[Volume, list[Box]]:
@@ -222,10 +221,10 @@ def subsample(volume: Volume) -> tuple[Volume, list[Box]]:
     # The runs, which are of one length along an axis, lie end to end in the sample.
     shape = [sum(run.stop - run.start for run in axis) for axis in runs]
     sample = np.empty(shape, volume.dtype)
-    places = cut_boxes(shape, [axis[0].stop - axis[0].start for axis in runs])
-    for place, (z, y, x) in zip(places, product(*runs), strict=True):
-        sample[place] = volume.read((z, y, x))
-    return replace(volume, array=sample, affine=None), places
+    boxes = cut_boxes(shape, [axis[0].stop - axis[0].start for axis in runs])
+    for box, (z, y, x) in zip(boxes, product(*runs), strict=True):
+        sample[box] = volume.read((z, y, x))
+    return replace(volume, array=sample, affine=None), boxes
 
 
 def _sample_runs(n: int) -> list[slice]:
@@ -246,7 +245,7 @@ def load_probabilities(
     logits: bool = False,
     **reading: Any,
 ) -> Volume:
-    """Load a network's probabilities at the place of `like`, an image of the same voxels, where there is one.
+    """Load a network's probabilities, with spacing and affine of `like`, an image of the same voxels, if there is one.
 
     See `segment` for the parameters. Raises `ScanError` if the image has another shape, or both an image and a spacing
     or unit are given.
@@ -258,18 +257,19 @@ def load_probabilities(
     if image is None:
         field = load(source, spacing=spacing, unit=unit, crop=crop, **reading)
     else:
-        place = load(image, lazy=True)
-        field = load(source, spacing=place.spacing, unit=place.unit, **reading)
-        if field.shape != place.shape:
-            raise ScanError(f"the probabilities must have the shape {place.shape} of {image}, got {field.shape}")
-        field = replace(field, affine=place.affine, notes=(*field.notes, f"The voxels are those of {image}."))
+        grid = load(image, lazy=True)
+        field = load(source, spacing=grid.spacing, unit=grid.unit, **reading)
+        if field.shape != grid.shape:
+            raise ScanError(f"the probabilities must have the shape {grid.shape} of {image}, got {field.shape}")
+        field = replace(field, affine=grid.affine, notes=(*field.notes, f"The voxels are those of {image}."))
         field = field if crop is None else field.crop(crop)
     return replace(field, array=expit(field.values.astype(np.float32))) if logits else field
 
 
 def find_image(source: Source) -> Path | None:
-    """Return the image beside an NPZ file that has its name; None where there is none, or for another source."""
+    """Return the image of the same name beside an NPZ file; None where there is none, or for another source."""
     if not isinstance(source, str | os.PathLike) or not os.fspath(source).lower().endswith(".npz"):
         return None
     stem = os.fspath(source)[: -len(".npz")]
-    return next((Path(stem + suffix) for suffix in IMAGES if Path(stem + suffix).is_file()), None)
+    paths = (Path(stem + suffix) for suffix in IMAGES)
+    return next((path for path in paths if path.is_file()), None)

@@ -1,8 +1,8 @@
 """Teach a filler from generated shapes: cut slices of them, and let the network fill the gaps, or weigh their images.
 
-Windows of a shape are read at any rotation, scale and stretch: a shape that repeats has no border. What a person's
-slices have and a shape has not is added: outlines that tremble, slices that are shifted, specks, structures of two
-calibres, slices that are known in part. The losses are cross entropies, so that the log-odds are those of the inside.
+Windows of a shape are cut at any rotation, scale and stretch: a shape that repeats has no border. Faults of slices that
+a person draws are added: outlines that tremble, slices that are shifted, specks, structures of two calibres, slices
+that are known in part. The losses are cross entropies, so that outputs are log-odds of the inside.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ FILLED, FEW = (0.02, 0.75), 200
 FINEST, IMAGED = 160, (0.01, 0.9)
 #: The largest gap, in thicknesses of a structure, that can be learnt.
 SLIMMEST = 4.0
-#: Pixels around a window that are only seen.
+#: Pixels at a window's border that the network reads, but whose loss does not count.
 HALO = 8
 #: One of so many shapes is held out.
 HELD_OUT = 10
@@ -83,18 +83,18 @@ class Texture:
     thickness: float = field(init=False)
 
     def __post_init__(self) -> None:
-        planes = [np.moveaxis(self.values, axis, 0)[::4] > 0 for axis in range(3)]
-        found = [plane_thickness(masks, (1.0, 1.0)) for masks in planes]
-        object.__setattr__(self, "thickness", float(np.mean(found)))
+        stacks = [np.moveaxis(self.values, axis, 0)[::4] > 0 for axis in range(3)]  # some planes are enough
+        thicknesses = [plane_thickness(masks, (1.0, 1.0)) for masks in stacks]
+        object.__setattr__(self, "thickness", float(np.mean(thicknesses)))
 
     def read(self, points: np.ndarray) -> np.ndarray:
-        """Return the field at points (3, ...), in voxels."""
+        """Interpolate the field at points (3, ...), in voxels."""
         mode = "grid-wrap" if self.periodic else "mirror"
         return ndimage.map_coordinates(self.values, points, np.float32, order=1, mode=mode, prefilter=False)
 
     def cut(self, rng: np.random.Generator, axes: Sequence[np.ndarray], thickness: float, mix: Mix) -> np.ndarray:
-        """Return a window, bool (Z, Y, X), at places along three axes, anywhere, turned and stretched at random, of
-        structures of a thickness in the unit of the places."""
+        """Cut a window, bool (Z, Y, X), anywhere in the shape, turned and stretched at random. `axes` are the positions
+        of its voxels along three axes, and `thickness` that of its structures in the same unit."""
         voxels_per_unit = self.thickness / thickness
         if rng.random() < mix.upright or not self.periodic:
             rotation = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)[:, None]
@@ -108,11 +108,12 @@ class Texture:
 
 @dataclass(frozen=True)
 class Mix:
-    """How windows are drawn; lengths in pixels, shares from 0 to 1. Intervals of the structures' `thickness` (uniform
-    in the logarithm) and of the `gap`, the `most` slices to fill, and the deviation of the logarithm by which each axis
-    is stretched. Shares of windows that lie along the axes of the shape, whose slices are not one pixel apart, that end
-    at a known slice, have structures of two shapes, are turned inside out, have slices as a person draws them, and have
-    slices to fill that are known in part."""
+    """How windows are drawn at random; lengths in pixels. Intervals of the structures' `thickness` (uniform in the
+    logarithm) and of the `gap`, the `most` slices to fill, and the deviation of the logarithm of each axis' `stretch`.
+    The others are probabilities of a window: to lie along the axes of the shape (`upright`), to have slices that are
+    not one pixel apart (`coarse`), to lack the known slice beyond an end of the gap (`ends`), to have structures of two
+    shapes (`pairs`) or inside and outside swapped (`holes`), to have known slices as a person draws them
+    (`trembling`), and to have slices to fill that are known in part (`partial`)."""
 
     thickness: tuple[float, float] = (3.0, 14.0)
     gap: tuple[float, float] = (2.0, 20.0)
@@ -128,7 +129,7 @@ class Mix:
 
 
 class Batches(Dataset, ABC):
-    """Batches of gaps to fill, `length` of them; of a window only what is `halo` pixels from its border counts."""
+    """Batches of gaps to fill, `length` of them. The outer `halo` pixels of a window do not count for the loss."""
 
     length: int
     halo: int
@@ -138,19 +139,19 @@ class Batches(Dataset, ABC):
 
     def loss(self, network: nn.Module, lesson: Lesson) -> Tensor:
         """Return the loss of a network on a batch."""
-        *given, truth = lesson
-        return F.binary_cross_entropy_with_logits(network(Gaps(*given))[self.inner], truth[self.inner])  # type: ignore[arg-type,index]
+        *inputs, truth = lesson
+        return F.binary_cross_entropy_with_logits(network(Gaps(*inputs))[self.inner], truth[self.inner])  # type: ignore[arg-type,index]
 
     @property
     def inner(self) -> tuple[Any, ...]:
-        """The part of a window, on its last two axes, that counts."""
+        """The index of the pixels that count, on the last two axes."""
         return (..., slice(self.halo, -self.halo), slice(self.halo, -self.halo))
 
 
 @dataclass(frozen=True, eq=False)
 class Lessons(Batches):
-    """Batches of `size` gaps to fill, the same for ever for a seed: batch k depends on (seed, k) alone. Each of the
-    `sources` of shapes teaches as often as the others; `edge` pixels of a window's side count."""
+    """Batches of `size` gaps in windows of shapes; batch k depends on (seed, k) alone. Each of the `sources` of shapes
+    is drawn as often as the others; `edge` pixels of a window's side count for the loss."""
 
     sources: Sequence[Sequence[Texture]]
     mix: Mix
@@ -163,31 +164,33 @@ class Lessons(Batches):
     def __getitem__(self, number: int) -> Lesson:
         rng = np.random.default_rng([self.seed, number])
         count = int(rng.integers(1, self.mix.most + 1))
-        found: list[tuple[np.ndarray, float, np.ndarray, np.ndarray]] = []
-        while len(found) < self.size:
+        gaps: list[tuple[np.ndarray, float, np.ndarray, np.ndarray]] = []
+        while len(gaps) < self.size:
             step = 1.0
             if rng.random() < self.mix.coarse:
                 step = float(np.exp(rng.uniform(math.log(0.5), math.log(6))))
             low, high = self.mix.gap
             if not low <= step * (count + 1) <= high:
                 step = float(rng.uniform(low, high)) / (count + 1)
-            window = self._draw(rng, count, step)
-            if window[2:-2][self.inner].any() and not window[2:-2][self.inner].all():
-                found.append(self._pose(rng, window, step))
-        distances, steps, marks, truth = zip(*found, strict=True)
+            window = self._draw_window(rng, count, step)
+            answer = window[2:-2][self.inner]
+            if answer.any() and not answer.all():  # else there is nothing to learn
+                gaps.append(self._pose(rng, window, step))
+        distances, steps, marks, truth = zip(*gaps, strict=True)
         return np.stack(distances), np.array(steps, np.float32), np.stack(marks), None, np.stack(truth)
 
-    def _draw(self, rng: np.random.Generator, count: int, step: float) -> np.ndarray:
-        """Return slices of a structure, bool (count + 4, Y, X): two known, those to fill, two known."""
+    def _draw_window(self, rng: np.random.Generator, count: int, step: float) -> np.ndarray:
+        """Draw slices of a structure, bool (count + 4, Y, X): two known ones, those to fill, two known ones. Three gaps
+        of the same length lie between the known ones."""
         plane = np.arange(self.edge + 2 * self.halo, dtype=np.float64)
         heights = step * np.array([-count - 1, *range(count + 2), 2 * count + 2], dtype=np.float64)
-        thinnest, mix = step * (count + 1) / SLIMMEST, self.mix
+        mix, (low, high) = self.mix, self.mix.thickness
+        low = min(max(low, step * (count + 1) / SLIMMEST), high)  # thinner structures cannot be predicted in this gap
 
         def cut() -> np.ndarray:
             textures = self.sources[int(rng.integers(len(self.sources)))]
             texture = textures[int(rng.integers(len(textures)))]
-            low, high = mix.thickness
-            thickness = float(np.exp(rng.uniform(math.log(min(max(low, thinnest), high)), math.log(high))))
+            thickness = float(np.exp(rng.uniform(math.log(low), math.log(high))))
             return texture.cut(rng, (heights, plane, plane), thickness, mix)
 
         inside = cut()
@@ -198,7 +201,7 @@ class Lessons(Batches):
     def _pose(
         self, rng: np.random.Generator, window: np.ndarray, step: float
     ) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
-        """Return what of a window is shown, and what is to be found."""
+        """Return a window as a gap: distances in known slices (4, Y, X), the step, marks and truth (n, Y, X)."""
         known, truth = window[[0, 1, -2, -1]], window[2:-2]
         if rng.random() < self.mix.trembling:
             known = np.stack([tremble(mask, rng) for mask in known])
@@ -209,12 +212,12 @@ class Lessons(Batches):
             distances[3] = distances[2]
         marks = np.zeros(truth.shape, np.float32)
         if rng.random() < self.mix.partial:
-            marks = np.where(_mark(truth.shape, rng), 2 * truth.astype(np.float32) - 1, 0).astype(np.float32)
+            marks = np.where(_draw_known(truth.shape, rng), 2 * truth.astype(np.float32) - 1, 0).astype(np.float32)
         return distances, step, marks, truth.astype(np.float32)
 
 
 def tremble(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return a mask as a person draws it: shifted by a pixel or so, its outline moved to and fro, with a few specks."""
+    """Return a mask as a person draws it: shifted by about a pixel, with a wavy outline and a few specks."""
     wave = ndimage.gaussian_filter(rng.standard_normal(mask.shape, dtype=np.float32), 2.0)
     level = centre_distance(mask, (1.0, 1.0), FAR) + rng.uniform(0, 1.0) * wave / wave.std()
     level = ndimage.shift(level, rng.normal(0, 0.7, 2), order=1, mode="nearest")
@@ -222,28 +225,28 @@ def tremble(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return (level > 0) ^ specks
 
 
-def _mark(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Return the voxels, bool (n, Y, X), of slices to fill that are known: a slice across, or a rectangle of one."""
-    marked = np.zeros(shape, bool)
+def _draw_known(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """Draw which voxels of the slices to fill are known, bool (n, Y, X): planes across y or x, or part of one slice."""
+    known = np.zeros(shape, bool)
     count, ys, xs = shape
-    kind = rng.random()
-    if kind < 0.35:
-        marked[:, int(rng.integers(ys)) :: max(ys // 2, 8)] = True
-    elif kind < 0.7:
-        marked[:, :, int(rng.integers(xs)) :: max(xs // 2, 8)] = True
+    choice = rng.random()
+    if choice < 0.35:
+        known[:, int(rng.integers(ys)) :: max(ys // 2, 8)] = True
+    elif choice < 0.7:
+        known[:, :, int(rng.integers(xs)) :: max(xs // 2, 8)] = True
     else:
         y, x = int(rng.integers(ys // 2)), int(rng.integers(xs // 2))
-        marked[int(rng.integers(count)), y : y + ys // 2, x : x + xs // 2] = True
-    return marked
+        known[int(rng.integers(count)), y : y + ys // 2, x : x + xs // 2] = True
+    return known
 
 
 def load_textures(
     sources: Sequence[str | Path], progress: Progress = silent
 ) -> tuple[list[list[Texture]], dict[str, Any]]:
-    """Return the shapes of stores and of mask files that can teach, by source, and a card that says what they are. Of a
-    store all well-formed shapes between `FILLED` of the volume are taken: they repeat. A mask ends at its borders.
+    """Load the shapes of stores and mask files that can teach, one list for each source, and a card that describes
+    them. All well-formed shapes of a store are periodic, a mask is not; those that fill between `FILLED` are taken.
     Raises ValueError and FileNotFoundError as `open_store` and `load`."""
-    textures, names = [], []
+    textures, origins = [], []
     for number, source in enumerate(map(Path, sources)):
         if (source / "draws").is_dir():
             draws = find_well_formed((source,))
@@ -258,9 +261,9 @@ def load_textures(
         if not shapes:
             raise ValueError(f"{source} has no shape that can teach")
         textures.append(shapes)
-        names.append({"source": source.name, "shapes": len(shapes), **origin})
+        origins.append({"source": source.name, "shapes": len(shapes), **origin})
         progress(f"reading {source.name}", (number + 1) / len(sources))
-    return textures, {"sources": names, "curvafit": version("curvafit"), "torch": version("torch")}
+    return textures, {"sources": origins, "curvafit": version("curvafit"), "torch": version("torch")}
 
 
 # ---- learning --------------------------------------------------------------------------------------------------------
@@ -268,8 +271,8 @@ def load_textures(
 
 @dataclass(frozen=True, eq=False)
 class Whole:
-    """A volume that is known whole: signed distances in each slice (Z, Y, X), in pixels, `step` pixels apart, and what
-    an image of it says, log-odds (Z, Y, X), where slices 0, `gap`, 2 `gap`, … are known."""
+    """A volume whose every slice is known: signed `distances` in each slice (Z, Y, X), in pixels, with slices `step`
+    pixels apart. `evidence` holds an image's log-odds (Z, Y, X) where slices 0, `gap`, 2 `gap`, … are known."""
 
     distances: np.ndarray
     gap: int
@@ -278,7 +281,7 @@ class Whole:
 
     @classmethod
     def of(cls, example: Example) -> Whole:
-        """Return the part of an example that teaches, in the pixels and with the gap of its task."""
+        """Return the lesson of an example, in the pixels and with the gap of its task."""
         given, raster = example.task.given, Raster.of(example.task.given)
         distances = np.stack([raster.distances(mask) for mask in example.lesson.inside])
         return cls(distances, given.gap, given.spacing[0] / raster.pixel)
@@ -286,8 +289,8 @@ class Whole:
 
 @dataclass(frozen=True, eq=False)
 class WholeLessons(Batches):
-    """Batches of gaps in volumes that are known whole, a batch of one volume; batch k depends on (seed, k) alone.
-    Without evidence gaps are shorter or longer by one slice, and begin anywhere."""
+    """Batches of `size` gaps in one of the `volumes` each; batch k depends on (seed, k) alone. With evidence, gaps lie
+    between the slices it was learnt from; without, they begin anywhere, and may be a slice shorter or longer."""
 
     volumes: Sequence[Whole]
     length: int
@@ -299,39 +302,40 @@ class WholeLessons(Batches):
     def __getitem__(self, number: int) -> Lesson:
         rng = np.random.default_rng([self.seed, number])
         whole = self.volumes[int(rng.integers(len(self.volumes)))]
-        depth, most = len(whole.distances), self.edge + 2 * self.halo
+        depth, edge = len(whole.distances), self.edge + 2 * self.halo
         gap, starts = whole.gap, np.arange(0, depth - whole.gap, whole.gap)
         if whole.evidence is None:
             gap = max(min(whole.gap + int(rng.integers(-1, 2)), depth - 1), 2)
             starts = np.arange(depth - gap)
-        found: list[list[np.ndarray]] = []
-        while len(found) < self.size:
+        gaps: list[list[np.ndarray]] = []
+        while len(gaps) < self.size:
             start = int(rng.choice(starts))
-            corner = [int(rng.integers(max(n - most, 0) + 1)) for n in whole.distances.shape[1:]]
-            window = tuple(slice(a, a + most) for a in corner)
-            part = whole.distances[:, *window]
+            corner = [int(rng.integers(max(n - edge, 0) + 1)) for n in whole.distances.shape[1:]]
+            window = tuple(slice(a, a + edge) for a in corner)
+            planes = whole.distances[:, *window]
             rows = [start - gap, start, start + gap, start + 2 * gap]
+            # The nearest known slice takes the place of one beyond the volume, and now and then of any outer one.
             rows[0] = start if rows[0] < 0 or rng.random() < 0.1 else rows[0]
             rows[3] = start + gap if rows[3] >= depth or rng.random() < 0.1 else rows[3]
             between = slice(start + 1, start + gap)
-            parts = [part[rows], part[between] > 0]
+            arrays = [planes[rows], planes[between] > 0]
             if whole.evidence is not None:
-                parts.append(whole.evidence[between][:, *window])
+                arrays.append(whole.evidence[between][:, *window])
             for axis in range(3):
                 if rng.random() < 0.5:
-                    parts = [np.flip(part, axis) for part in parts]
-            found.append(parts)
-        distances, truths, *evidence = (np.ascontiguousarray(np.stack(each)) for each in zip(*found, strict=True))
+                    arrays = [np.flip(array, axis) for array in arrays]
+            gaps.append(arrays)
+        distances, truths, *evidence = (np.ascontiguousarray(np.stack(arrays)) for arrays in zip(*gaps, strict=True))
         steps, truths = np.full(self.size, whole.step, np.float32), truths.astype(np.float32)
         return distances, steps, np.zeros_like(truths), evidence[0] if evidence else None, truths
 
 
 @dataclass(frozen=True)
 class ImageMix:
-    """How imaged shapes are drawn; lengths in pixels, shares from 0 to 1. Intervals of the structures' `thickness`
-    (uniform in the logarithm; thick where a slice would be too many voxels) and of the slices from a known one to the
-    next, `gap`, at most `longest` pixels; a slice's side and gaps of a volume; the share of images with noise besides
-    the modality's, and the interval of its deviation, in contrasts."""
+    """How imaged shapes are drawn at random; lengths in pixels. Intervals of the structures' `thickness` (uniform in
+    the logarithm; thick where a slice would have too many voxels) and of the `gap`, the slices from a known one to the
+    next, which are at most `longest` pixels apart; the `edge` of a slice, and the number of `gaps` of a volume. The
+    probability that an image is `noisy` beyond its modality, and the interval of the `noise`, in contrasts."""
 
     thickness: tuple[float, float] = (3.0, 14.0)
     gap: tuple[int, int] = (2, 15)
@@ -343,7 +347,8 @@ class ImageMix:
 
 
 def image_shape(textures: Sequence[Sequence[Texture]], mix: ImageMix, seed: Sequence[int]) -> Whole:
-    """Return a shape and what an image of it says where every `gap`-th slice is known, in pixels; any axis is first."""
+    """Draw a shape, a modality that images it, an axis across its slices and a gap; return the shape with the evidence
+    of the image where every `gap`-th slice is known, in pixels."""
     from curvafit.data_synth.imaging.modality import MODALITIES, field_shape, image, regrid
 
     rng = np.random.default_rng(seed)
@@ -352,24 +357,24 @@ def image_shape(textures: Sequence[Sequence[Texture]], mix: ImageMix, seed: Sequ
         texture = source[int(rng.integers(len(source)))]
         names = list(MODALITIES)
         modality = MODALITIES[names[int(rng.integers(len(names)))]].draw(int(rng.integers(2**31)))
-        order = rng.permutation(3)
+        order = rng.permutation(3)  # the modality's axes in the order of the result
         edges = np.array(modality.spacing)[order]
-        finest = float(edges[1:].min())
+        finest = float(edges[1:].min())  # the edge of a pixel
         gap = int(rng.integers(mix.gap[0], max(mix.gap[0], min(mix.gap[1], int(mix.longest * finest / edges[0]))) + 1))
         sides = np.ceil(mix.edge * finest / edges[1:]).astype(int)
         shape = np.empty(3, dtype=int)
         shape[order] = [mix.gaps * gap + 1, *sides]
         low, high = mix.thickness
         low = min(max(low, mix.edge * texture.thickness / FINEST), high)
-        edge = math.exp(rng.uniform(math.log(low), math.log(high))) * finest / texture.thickness
-        size = field_shape(shape.tolist(), edge, modality)
-        start = rng.integers(0, texture.values.shape)
-        rows = [(a + np.arange(n)) % m for a, n, m in zip(start, size, texture.values.shape, strict=True)]
-        phase = torch.from_numpy(np.ascontiguousarray(texture.values[np.ix_(*rows)], dtype=np.float32))
-        grey = image(phase, edge, modality, int(rng.integers(2**31))).numpy()
-        inside = regrid(phase, edge, modality).numpy() > 0
+        voxel = math.exp(rng.uniform(math.log(low), math.log(high))) * finest / texture.thickness
+        size = field_shape(shape.tolist(), voxel, modality)
+        corner = rng.integers(0, texture.values.shape)
+        indices = [(a + np.arange(n)) % m for a, n, m in zip(corner, size, texture.values.shape, strict=True)]
+        phase = torch.from_numpy(np.ascontiguousarray(texture.values[np.ix_(*indices)], dtype=np.float32))
+        grey = image(phase, voxel, modality, int(rng.integers(2**31))).numpy()
+        inside = regrid(phase, voxel, modality).numpy() > 0
         box = tuple(slice(n) for n in shape)
-        grey, inside = (np.ascontiguousarray(each[box].transpose(order)) for each in (grey, inside))
+        grey, inside = (np.ascontiguousarray(values[box].transpose(order)) for values in (grey, inside))
         known = inside[::gap]
         if IMAGED[0] < inside.mean() < IMAGED[1] and not known.all() and known.any():
             break
@@ -398,22 +403,21 @@ def learn(
     total = len(lessons)
     optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=1e-4)
     cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=total, pct_start=0.1)
-    parts = {"network": network, "optimiser": optimiser, "cycle": cycle}
-    begun, losses = 0, []
+    stateful = {"network": network, "optimiser": optimiser, "cycle": cycle}
+    done, losses = 0, []
     if checkpoint is not None and checkpoint.exists():
         state = torch.load(checkpoint, weights_only=True)
         try:
-            for name, part in parts.items():
+            for name, part in stateful.items():
                 part.load_state_dict(state[name])
         except (KeyError, RuntimeError) as error:
             raise ValueError(f"{checkpoint} is of another teaching: delete it, or choose another output") from error
-        begun, losses = state["step"], state["losses"]
-    rest = Subset(lessons, range(begun, total))
+        done, losses = state["step"], state["losses"]
     network.train()
-    loader = DataLoader(
-        rest, batch_size=None, num_workers=workers, multiprocessing_context="spawn" if workers else None
-    )
-    for step, lesson in enumerate(loader, begun + 1):
+    remaining = Subset(lessons, range(done, total))
+    context = "spawn" if workers else None
+    loader = DataLoader(remaining, batch_size=None, num_workers=workers, multiprocessing_context=context)
+    for step, lesson in enumerate(loader, done + 1):
         loss = lessons.loss(network, lesson)
         optimiser.zero_grad()
         loss.backward()
@@ -423,7 +427,7 @@ def learn(
         losses.append(float(loss.detach()))
         progress(f"step {step} of {total}, loss {np.mean(losses[-100:]):.4f}", step / total)
         if checkpoint is not None and (step % SAVED == 0 or step == total):
-            state = {name: part.state_dict() for name, part in parts.items()} | {"step": step, "losses": losses}
+            state = {name: part.state_dict() for name, part in stateful.items()} | {"step": step, "losses": losses}
             write_atomically(checkpoint, partial(torch.save, state))
     network.eval()
     return [float(np.mean(losses[k : k + 100])) for k in range(0, total, 100)]
@@ -471,49 +475,52 @@ def teach(
         filler = Filler() if plain is None else Filler.with_image(plain.filler)
     settings = {"steps": steps, "seed": seed}
     if plain is None:
-        held = [texture for source in sources for texture in source[HELD_OUT - 1 :: HELD_OUT]] or [sources[-1][-1]]
-        taught = [[texture for texture in source if texture not in held] or list(source) for source in sources]
+        held_out = [texture for source in sources for texture in source[HELD_OUT - 1 :: HELD_OUT]] or [sources[-1][-1]]
+        training = [[texture for texture in source if texture not in held_out] or list(source) for source in sources]
         mix = mix or Mix()
-        lessons, exam = Lessons(taught, mix, seed, steps), Lessons([held], replace(mix, partial=0.0), seed + 1, JUDGED)
-        settings |= {"shapes": sum(map(len, taught)), "held_out": len(held), "mix": asdict(mix)}
+        lessons = Lessons(training, mix, seed, steps)
+        tests = Lessons([held_out], replace(mix, partial=0.0), seed + 1, JUDGED)
+        settings |= {"shapes": sum(map(len, training)), "held_out": len(held_out), "mix": asdict(mix)}
     else:
-        judging = [source[HELD_OUT - 1 :: HELD_OUT] or source for source in sources]
-        taught = [[each for k, each in enumerate(source) if (k + 1) % HELD_OUT] for source in sources]
+        held_out_sources = [source[HELD_OUT - 1 :: HELD_OUT] or source for source in sources]
+        training = [[texture for k, texture in enumerate(source) if (k + 1) % HELD_OUT] for source in sources]
         count, wholes = volumes + max(volumes // 10, 1), []
         for number in range(count):
             progress(f"imaging shape {number + 1} of {count}", 0.3 * number / count)
-            wholes.append(image_shape(taught if number < volumes else judging, ImageMix(), (seed, number)))
-        lessons, exam = WholeLessons(wholes[:volumes], steps, seed), WholeLessons(wholes[volumes:], JUDGED, seed + 1)
+            textures = training if number < volumes else held_out_sources
+            wholes.append(image_shape(textures, ImageMix(), (seed, number)))
+        lessons, tests = WholeLessons(wholes[:volumes], steps, seed), WholeLessons(wholes[volumes:], JUDGED, seed + 1)
         settings |= {"plain": plain.card, "volumes": volumes, "mix": asdict(ImageMix())}
         progress = sub_progress(progress, 0.3, 1.0)
     step = sub_progress(progress, 0.0, 0.97)
     losses = learn(filler, lessons, RATE, checkpoint=checkpoint, workers=workers, progress=step)
-    temperatures, figures, error = judge(filler, exam)
+    temperatures, figures, error = judge(filler, tests)
     progress("judging on shapes held out", 1.0)
     return Taught(filler, temperatures, {**card, **settings, "losses": losses, **figures}, error)
 
 
 @torch.inference_mode()
 def judge(filler: Filler, lessons: Batches) -> tuple[np.ndarray, dict[str, float], float]:
-    """Return temperatures (2, k) by gap; the cross entropy of held-out lessons and that of the cubic alone; and the
-    calibration error near surfaces, where a temperature is of another half of the lessons."""
-    gaps, logits, plain, truths = [], [], [], []
+    """Return temperatures (2, k) by gap; the cross entropy of held-out lessons, by the filler and by the cubic alone;
+    and the calibration error near surfaces."""
+    gaps, logits, cubics, truths = [], [], [], []  # one entry a gap
     for *inputs, truth in DataLoader(lessons, batch_size=None):
         batch = Gaps(*inputs)
         filled, cubic = filler(batch), SLOPE * interpolate(batch.distances, batch.heights)[1]
         gaps += (batch.step * (truth.shape[1] + 1)).tolist()
-        for each, values in ((logits, filled), (plain, cubic), (truths, truth)):
-            each += [window[lessons.inner].flatten() for window in values]
+        for windows, values in ((logits, filled), (cubics, cubic), (truths, truth)):
+            windows += [window[lessons.inner].flatten() for window in values]
     table, errors = [], []
-    for rows in np.array_split(np.argsort(gaps), TEMPERATURES):
-        halves = [rows[::2], rows[1::2]]
-        parts = [(torch.cat([logits[k] for k in half]), torch.cat([truths[k] for k in half])) for half in halves]
-        cooled = [fit_temperature(z.numpy(), y.numpy()) for z, y in parts]
-        errors += [near_error(z / t, y) for (z, y), t in zip(parts, cooled[::-1], strict=True)]
-        table.append((float(np.mean([gaps[k] for k in rows])), float(np.sqrt(np.prod(cooled)))))
+    for group in np.array_split(np.argsort(gaps), TEMPERATURES):
+        # Cross-validation: each half of a group of similar gaps is judged at the temperature of the other.
+        halves = (group[::2], group[1::2])
+        pairs = [[torch.cat([windows[k] for k in half]) for windows in (logits, truths)] for half in halves]
+        temperatures = [fit_temperature(z.numpy(), y.numpy()) for z, y in pairs]
+        errors += [near_error(z / t, y) for (z, y), t in zip(pairs, temperatures[::-1], strict=True)]
+        table.append((float(np.mean([gaps[k] for k in group])), float(np.sqrt(np.prod(temperatures)))))
     cross_entropy = F.binary_cross_entropy_with_logits
-    pairs = (("held_out_loss", logits), ("held_out_cubic", plain))
-    losses = {name: float(cross_entropy(torch.cat(each), torch.cat(truths))) for name, each in pairs}
+    predictions = {"held_out_loss": torch.cat(logits), "held_out_cubic": torch.cat(cubics)}
+    losses = {name: float(cross_entropy(values, torch.cat(truths))) for name, values in predictions.items()}
     return np.array(table).T, losses, float(np.mean(errors))
 
 
@@ -527,25 +534,25 @@ def near_error(logits: Tensor, truth: Tensor) -> float:
 
 
 def tune(taught: Taught, example: Example, progress: Progress = silent) -> Taught:
-    """Teach a filler the texture of an example for a minute, and keep what it learnt if it is better than the noise. It
-    learns from the example's lesson; on the task it is judged, and its probabilities are calibrated."""
-    given, truth, places = example.task.given, example.task.truth, list(example.task.places)
+    """Train a filler further on an example's lesson, for a minute, and return it if it gains more than the noise on the
+    task, else the filler as it was; either is calibrated on the task."""
+    task, places = example.task, list(example.task.places)
     filler = copy.deepcopy(taught.filler)
     lessons = WholeLessons([Whole.of(example)], TUNING)
-    learn(filler, lessons, TUNING_RATE, workers=0, progress=lambda _, share: progress("tuning on the example", share))
+    learn(filler, lessons, TUNING_RATE, workers=0, progress=lambda _, done: progress("tuning on the example", done))
     tuned = replace(taught, filler=filler)
-    volumes = [fill(given, each)[places] for each in (taught, tuned)]
-    before, after = (tally(volume > best_log_odds(volume), truth, places) for volume in volumes)
+    predictions = [fill(task.given, candidate)[places] for candidate in (taught, tuned)]
+    before, after = (tally(logits > best_log_odds(logits), task.truth, places) for logits in predictions)
     gain, noise = gain_of(after, before)
     better = gain > BEYOND * noise
-    logits = torch.from_numpy(volumes[better]).flatten()
-    answer = torch.from_numpy(truth).float().flatten()
-    temperature = fit_temperature(logits.numpy(), answer.numpy())
-    plain, better_dice = (float(dice_of(each.sum(0))) for each in (before, after))
-    scores = f"Dice {plain:.3f} on a part of the example, {better_dice:.3f} tuned on the rest"
+    logits = torch.from_numpy(predictions[1 if better else 0]).flatten()
+    truth = torch.from_numpy(task.truth).float().flatten()
+    temperature = fit_temperature(logits.numpy(), truth.numpy())
+    dice_before, dice_after = (float(dice_of(counts.sum(0))) for counts in (before, after))
+    scores = f"Dice {dice_before:.3f} on a part of the example, {dice_after:.3f} tuned on the rest"
     return replace(
         tuned if better else taught,
         temperatures=taught.temperatures * [[1.0], [temperature]],
-        error=near_error(logits / temperature, answer),
+        error=near_error(logits / temperature, truth),
         status=f"filled by the network{', tuned on the example' if better else ''} ({scores})",
     )

@@ -1,7 +1,7 @@
-"""The laws that a prior offers, and the choice among them and their strengths by masks that are known.
+"""The laws that a prior offers, and the choice among them and their strengths by true masks.
 
 Each law is tried at one strength, then the best law at stronger and weaker ones as long as it gets better. A law is
-chosen only where it beats the plain way by more than the noise.
+chosen only where it beats the result without a law by more than the noise.
 """
 
 from __future__ import annotations
@@ -59,17 +59,19 @@ def laws_of(prior: LawLike, scan: Volume) -> tuple[tuple[Coefficients, ...], tup
     that of `law_of`; of a fit the candidates in `TRUSTED` follow."""
     first, notes = law_of(prior, scan)
     law = Law.of(prior)
-    others = [each.coefficients for each in load_candidates(prior) if each.name in TRUSTED] if law.fitted else []
-    tried = (replace(law, coefficients=other) for other in others if other != law.coefficients)
-    return (first, *(law_of(other, scan)[0] for other in tried)), notes
+    if not law.fitted:
+        return (first,), notes
+    candidates = [candidate.coefficients for candidate in load_candidates(prior) if candidate.name in TRUSTED]
+    others = [replace(law, coefficients=other) for other in candidates if other != law.coefficients]
+    return (first, *(law_of(other, scan)[0] for other in others)), notes
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A way to find or fill a structure: the start as it is, or a law lowered from it, with lengths in the scan's unit.
-    `strength` is the stiffness of the springs on known voxels, or the nats of a unit of F_ε; `pull` that of the springs
-    on the others for each nat of their log-odds. Once chosen it has the Dice of the best law, `plain`, that of the
-    start, and the standard error of their difference, `noise`."""
+    """One way to find or fill a structure: the start as it is, or a law lowered from it, with lengths in the scan's
+    unit. `strength` is the stiffness of springs on known voxels, or the nats per unit of F_ε; `pull` the stiffness of
+    springs on other voxels per nat of their log-odds. A chosen trial has scores: `score`, the Dice of the best law;
+    `plain`, that of the start; and `noise`, the standard error of their difference."""
 
     law: Coefficients | None = None
     strength: float = 0.0
@@ -81,28 +83,28 @@ class Trial:
 
 
 def search(trials: Sequence[Trial], strengths: Sequence[float], worth: Callable[[Trial], float]) -> Trial:
-    """Return the best of some trials, then climb from it to stronger and weaker strengths as long as they are better.
-    `strengths` ascend; a trial whose own strength is not among them stays as it is."""
+    """Climb from the best trial to stronger and weaker `strengths`, which ascend, as long as `worth` grows; return the
+    best. A trial whose own strength is not among them stays as it is."""
     # A trial takes long, and Dice over the strength has one hump: too weak changes nothing, too strong destroys. So a
     # climb may stop at the first fall, and what lies beyond is not tried.
     first = max(trials, key=worth)
     best = first
     for step in (1, -1):
-        last = first
-        while last.strength in strengths:
-            number = [*strengths].index(last.strength) + step
-            further = replace(last, strength=strengths[number]) if 0 <= number < len(strengths) else last
-            if further == last or worth(further) <= worth(last):
+        current = first
+        while current.strength in strengths:
+            index = [*strengths].index(current.strength) + step
+            following = replace(current, strength=strengths[index]) if 0 <= index < len(strengths) else current
+            if following == current or worth(following) <= worth(current):
                 break
-            last = further
-        best = max(best, last, key=worth)
+            current = following
+        best = max(best, current, key=worth)
     return best
 
 
 @dataclass(frozen=True, eq=False)
 class Task(Generic[Given]):
-    """The given part of a volume, slices or evidence, and the slices that a filled volume is compared with. `truth`
-    holds the true masks of these slices, bool (N, Y, X), and `places` their numbers in the volume, ascending."""
+    """A volume to fill whose answer is known in part: `given` is the input, slices or evidence; `truth` holds the true
+    masks of some slices of the volume, bool (N, Y, X), and `places` their indices, ascending."""
 
     given: Given
     truth: np.ndarray
@@ -111,9 +113,8 @@ class Task(Generic[Given]):
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """An example, cut in two along the longer axis of its slices. Of `lesson`, two thirds, every slice is known; of
-    `task`, the rest, slices as far apart as those of the volume to fill. A note says where only a box of the example is
-    read."""
+    """An example, cut in two along the longer axis of its slices. In `lesson`, two thirds, every slice is known; in
+    `task`, the rest, slices with the gap of the volume to fill. A note says if only a box of the example is read."""
 
     lesson: Slices
     task: Task[Slices]
@@ -121,7 +122,7 @@ class Example:
 
     @classmethod
     def of(cls, volume: Volume, places: Sequence[int], axis: int) -> Example:
-        """Cut an example for a volume whose known slices have these places.
+        """Cut an example's mask, `volume`, for another volume with known slices at `places` across `axis`.
 
         Raises `ScanError` if it is not longer than a gap, is no mask, or has a part without a surface.
         """
@@ -133,30 +134,31 @@ class Example:
             )
         whole, *_ = Known(volume, axis, tuple(range(length))).read(Run(), name="the example's slices")
         inside = whole.inside[box_with_most_surface(whole.inside, LARGEST)]
-        notes = (f"Of the example {' x '.join(map(str, inside.shape))} voxels are read, where most of its surface is.",)
-        cut = inside.size < whole.inside.size
-        side = 1 + int(np.argmax(inside.shape[1:]))
-        lesson, rest = np.array_split(inside, [2 * inside.shape[side] // 3], axis=side)
+        size, notes = " x ".join(map(str, inside.shape)), ()
+        if inside.size < whole.inside.size:
+            notes = (f"Of the example {size} voxels are read, where most of its surface is.",)
+        longer = 1 + int(np.argmax(inside.shape[1:]))
+        first, rest = np.array_split(inside, [2 * inside.shape[longer] // 3], axis=longer)
         known = range(0, len(inside), gap)
         between = [n for n in range(known[-1]) if n % gap]
+        lesson = replace(whole, inside=first, places=tuple(range(len(inside))), length=len(inside))
         given = replace(whole, inside=rest[known], places=tuple(known), length=len(inside))
-        every = replace(whole, inside=lesson, places=tuple(range(len(inside))), length=len(inside))
-        if not between or any(not part.any() or part.all() for part in (given.inside, lesson)):
+        if not between or any(not masks.any() or masks.all() for masks in (given.inside, first)):
             raise ScanError(f"expected an example with a surface in both its parts, longer than {gap} slices")
-        return cls(every, Task(given, rest[between], between), notes if cut else ())
+        return cls(lesson, Task(given, rest[between], between), notes)
 
     @property
     def part(self) -> Task[Slices]:
-        """A box of the task, on which laws are lowered."""
-        given, box = crop_to_surface(self.task.given, PART)
-        kept = [k for k, place in enumerate(self.task.places) if box[0].start < place < box[0].stop]
-        places = [self.task.places[k] - box[0].start for k in kept]
-        return Task(given, self.task.truth[kept][:, box[1], box[2]], places)
+        """The task in a box, on which laws are lowered."""
+        given, (rows, ys, xs) = crop_to_surface(self.task.given, PART)
+        kept = [k for k, place in enumerate(self.task.places) if rows.start < place < rows.stop]
+        places = [self.task.places[k] - rows.start for k in kept]
+        return Task(given, self.task.truth[kept][:, ys, xs], places)
 
 
 def crop_to_surface(slices: Slices, edge: int) -> tuple[Slices, Box]:
-    """Return the known slices in a box that holds most of their surface, at most so many voxels a side but for
-    `FEWEST_SLICES` slices, and its place in the volume."""
+    """Return the known slices in a box that holds most of their surface, and the box in the volume. Its sides have at
+    most `edge` voxels, or more across the slices, where it has `FEWEST_SLICES` known ones."""
     count = max(FEWEST_SLICES, edge // slices.gap + 1)
     rows, ys, xs = box_with_most_surface(slices.inside, (count, edge, edge))
     first, *_, last = slices.places[rows]
@@ -165,10 +167,11 @@ def crop_to_surface(slices: Slices, edge: int) -> tuple[Slices, Box]:
 
 
 def leave_out_slices(slices: Slices) -> Task[Slices] | None:
-    """Return the task to predict every second known slice from the others; None where there are too few. The first and
-    the last slice are not left out, unless the volume is periodic."""
+    """Return the task to predict every second known slice from the others; None where there are too few, or the others
+    have no surface. The ends stay known, except the last slice in a periodic volume."""
     count = len(slices.places)
-    # In a periodic volume the first slice follows the last, which may go if its neighbours then stay.
+    # In a periodic volume the first slice follows the last: of an even number of slices, every second one leaves both
+    # neighbours of the last.
     last_may_go = slices.periodic and count % 2 == 0
     left_out = range(1, count if last_may_go else count - 1, 2)
     kept = [k for k in range(count) if k not in left_out]
@@ -184,9 +187,9 @@ def choose_by_masks(
     fill: Callable[[Given, Trial], np.ndarray],
     strengths: Sequence[float] = (),
 ) -> Trial:
-    """Return the trial with the best Dice on a task: a law where it beats the start by more than the noise. `fill`
-    fills the task's volume by a trial: a mask (Z, Y, X). The best of the trials is tried at other `strengths`,
-    ascending, its own among them, and then the others at the best strength; by default only at their own."""
+    """Return the trial with the best Dice on a task, or the start unless a law beats it by more than the noise. `fill`
+    makes a mask (Z, Y, X) of the task's volume by a trial. With `strengths`, which ascend, the best of the trials is
+    also tried at stronger and weaker ones (`search`), and the others at its best strength."""
 
     @cache
     def counts(trial: Trial) -> np.ndarray:
@@ -195,8 +198,8 @@ def choose_by_masks(
     def worth(trial: Trial) -> float:
         return float(dice_of(counts(trial).sum(0)))
 
-    # The best of several trials is better than it deserves, by about a standard error of the difference for a handful
-    # of trials that are alike; so a law must beat the start by more than that (`BEYOND`).
+    # The best of several trials scores too well by chance: for a handful of similar ones, by about a standard error of
+    # the difference. So a law must beat the start by more than that (`BEYOND`).
     start, best = Trial(), search(trials, strengths, worth)
     best = max((best, *(replace(trial, strength=best.strength) for trial in trials)), key=worth)
     gain, noise = gain_of(counts(best), counts(start))
@@ -205,12 +208,13 @@ def choose_by_masks(
 
 
 def tally(masks: np.ndarray, truth: np.ndarray, places: Sequence[int]) -> np.ndarray:
-    """Count, in each of T cubes, the voxels inside both stacks of slices, and those inside either added up: (T, 2)."""
-    pair = np.stack([masks & truth, masks.astype(np.uint8) + truth.astype(np.uint8)], axis=-1).astype(np.int64)
-    for axis, where in enumerate((places, *map(range, truth.shape[1:]))):
-        starts = np.unique(np.asarray(where) // CUBE, return_index=True)[1]
-        pair = np.add.reduceat(pair, starts, axis=axis)
-    return pair.reshape(-1, 2)
+    """Return the counts for `dice_of` in each of T cubes, (T, 2): the voxels inside both stacks of slices (N, Y, X) at
+    `places`, and the sum of those inside one and inside the other."""
+    counts = np.stack([masks & truth, masks.astype(np.uint8) + truth.astype(np.uint8)], axis=-1).astype(np.int64)
+    for axis, positions in enumerate((places, *map(range, truth.shape[1:]))):
+        starts = np.unique(np.asarray(positions) // CUBE, return_index=True)[1]
+        counts = np.add.reduceat(counts, starts, axis=axis)
+    return counts.reshape(-1, 2)
 
 
 def dice(mask: np.ndarray, truth: np.ndarray) -> float:
@@ -219,14 +223,14 @@ def dice(mask: np.ndarray, truth: np.ndarray) -> float:
 
 
 def dice_of(counts: np.ndarray) -> np.ndarray:
-    """Return the Dice coefficients of counts (..., 2), 1 where nothing is inside."""
+    """Return the Dice coefficients of counts (..., 2), as `tally` makes them; 1 where nothing is inside."""
     both, sizes = np.moveaxis(counts, -1, 0)
     return np.where(sizes == 0, 1.0, 2 * both / np.maximum(sizes, 1))
 
 
 def gain_of(after: np.ndarray, before: np.ndarray) -> tuple[float, float]:
-    """Return the difference of the Dice coefficients of two counts (T, 2), and its error by a jackknife over the cubes.
-    The errors of neighbouring voxels are correlated, those of cubes hardly."""
+    """Return the difference of the Dice coefficients of two counts (T, 2), and its standard error by a jackknife over
+    the cubes. The errors of neighbouring voxels are correlated, those of cubes hardly."""
     # Dice is a ratio of sums, so its error follows from leaving out one cube at a time: (T - 1) / T times the sum of
     # squares of what that changes, which is (T - 1) times their variance.
     whole = dice_of(after.sum(0)) - dice_of(before.sum(0))
