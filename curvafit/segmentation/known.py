@@ -1,4 +1,4 @@
-"""Which slices of a volume of labels are known, read some at once, and what is said of them."""
+"""Which slices of a volume of labels are known; reading them slab by slab; notes and refusals."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from curvafit.volumes.volume import Box, ScanError, Volume, check_finite, round_
 
 #: Slices of a file that are read at once, and their bytes at most.
 THICK, SLAB = CHUNK, 2**26
-#: Share of slices with labels, between a label's first and last, that may lack it if all count as known to all.
+#: Fraction of the slices with labels, between a label's first and last, that may lack it if all count as known.
 APART = 1 / 3
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Labels of a volume, the numbers of its known slices across an axis, ascending, and notes on which those are.
-    `marks` say what is known in the other slices, as those of `Slices`."""
+    """A volume of labels and which of its slices across `axis` are known: their indices `places`, ascending, `marks` of
+    known voxels in the others, as in `Slices`, and notes."""
 
     volume: Volume
     axis: int
@@ -38,45 +38,46 @@ class Known:
         cls, volume: Volume, run: Run, *, every: int | slice | None, known: Sequence[int] | None, ignore: int | None,
         axis: int,
     ) -> Known:  # fmt: skip
-        """Find which slices of a volume are known, as `reconstruct` says; with `ignore` in memory."""
+        """Find which slices of a volume are known by the options of `reconstruct`; `ignore` needs it in memory."""
         whole = cls(volume, axis)
         if ignore is not None:
             ignore = check_int(ignore, "a label to ignore", -SEEDS, IDS)
             places, marks = annotated_slices(whole.turn(volume.values), ignore)
             return replace(whole, places=tuple(places), marks=marks)
         if every is None and known is None:
-            places = choose_labelled(there := whole._look(run))
-            return replace(whole, places=tuple(places), notes=note_labelled(places, there))
+            labelled = whole._find_labelled(run)
+            places = choose_labelled(labelled)
+            return replace(whole, places=tuple(places), notes=note_labelled(places, labelled))
         return replace(whole, places=tuple(known_places(volume.shape[whole.axis], every, known)))
 
     def read(
         self, run: Run, periodic: bool = False, name: str = "the known slices"
     ) -> tuple[Slices, np.ndarray, np.ndarray]:
-        """Read the known slices; return them, where the run keeps its work, the labels that they have, and whether each
-        slice of the volume has labels.
+        """Read the known slices into the run's store; return them, their labels, and whether each slice of the volume
+        has labels, bool (length,).
 
         Raises `ScanError` if they hold grey levels, or are all empty or all full; the message calls them `name`.
         """
         length, *plane = axis_first(self.volume.shape, self.axis)
         inside = run.open("known", np.bool_, (len(self.places), *plane))
 
-        def keep(number: int, record: Record) -> Record:
-            which = record["which"]
-            if len(which):
-                inside[which[0] : which[-1] + 1] = record["inside"]
-            records = {"there": record["there"], "values": record["values"]}
-            return {**records, "count": np.count_nonzero(record["inside"])}
+        def keep(_: int, record: Record) -> Record:
+            rows = record["which"]
+            if len(rows):
+                inside[rows[0] : rows[-1] + 1] = record["inside"]
+            kept = {"there": record["there"], "values": record["values"]}
+            return {**kept, "count": np.count_nonzero(record["inside"])}
 
         records = run("reading known slices", partial(_read_slab, self, name), len(self._slabs), keep=keep)
-        values = np.unique(np.concatenate([block["values"] for block in records]))
-        if len(values) > LABELS:
-            raise ScanError(f"{name} must be a mask or have at most {LABELS} labels, got {len(values)} values")
-        count = sum(int(block["count"]) for block in records)
+        labels = np.unique(np.concatenate([record["values"] for record in records]))
+        if len(labels) > LABELS:
+            raise ScanError(f"{name} must be a mask or have at most {LABELS} labels, got {len(labels)} values")
+        count = sum(int(record["count"]) for record in records)
         self._check_label(count > 0)
         require_outline(count, len(self.places) * plane[0] * plane[1], name)
         edges = axis_first(self.volume.spacing, self.axis)
         slices = Slices(inside.stored, self.places, length, edges, self.volume.unit, periodic, self.marks)
-        return slices, values, np.concatenate([block["there"] for block in records])
+        return slices, labels, np.concatenate([record["there"] for record in records])
 
     def turn(self, values: np.ndarray) -> np.ndarray:
         """Move the axis across the slices to the front."""
@@ -87,59 +88,59 @@ class Known:
         return np.ascontiguousarray(np.moveaxis(values, 0, self.axis))
 
     def turn_box(self, box: Box) -> Box:
-        """Return a box, whose first edge is across the slices, in the volume's axes."""
-        rest = list(box)
-        rest.insert(self.axis, rest.pop(0))
-        return rest[0], rest[1], rest[2]
+        """Move the first edge of a box, which is across the slices, to its place."""
+        edges = list(box)
+        edges.insert(self.axis, edges.pop(0))
+        return edges[0], edges[1], edges[2]
 
     @property
     def _slabs(self) -> list[slice]:
-        """The slices that are read at once: of a volume in memory all."""
+        """The ranges of slices that are read at once: of a volume in memory all."""
         length, *plane = axis_first(self.volume.shape, self.axis)
-        thick = length
+        thickness = length
         if self.volume.in_file:
-            thick = min(THICK, max(1, SLAB // (plane[0] * plane[1] * self.volume.array.file.dtype.itemsize)))
-        return [slice(start, min(start + thick, length)) for start in range(0, length, thick)]
+            thickness = min(THICK, max(1, SLAB // (plane[0] * plane[1] * self.volume.array.file.dtype.itemsize)))
+        return [slice(start, min(start + thickness, length)) for start in range(0, length, thickness)]
 
-    def _slab(self, rows: slice) -> np.ndarray:
-        """Return the values (n, Y, X) of some slices."""
+    def _read(self, rows: slice) -> np.ndarray:
+        """Return the values (n, Y, X) of a range of slices."""
         _, *plane = axis_first(self.volume.shape, self.axis)
         values = self.volume.read(self.turn_box((rows, slice(0, plane[0]), slice(0, plane[1]))))
         if self.volume.in_file:
             check_finite(values, self.volume.source)
         return self.turn(round_labels(values))
 
-    def _look(self, run: Run) -> np.ndarray:
-        """Return whether each slice has labels, (length,)."""
-        found = run("looking for labels", partial(_read_slab, self, ""), len(self._slabs))
-        there = np.concatenate([each["there"] for each in found])
-        self._check_label(bool(there.any()))
-        return there
+    def _find_labelled(self, run: Run) -> np.ndarray:
+        """Return whether each slice has labels, bool (length,)."""
+        records = run("looking for labels", partial(_read_slab, self, ""), len(self._slabs))
+        labelled = np.concatenate([record["there"] for record in records])
+        self._check_label(bool(labelled.any()))
+        return labelled
 
-    def _check_label(self, found: bool) -> None:
-        """Raise ScanError where a label was not found in a file."""
-        if not found and self.volume.in_file and self.volume.array.label is not None:
+    def _check_label(self, present: bool) -> None:
+        """Raise ScanError where the label that was to be read from a file is not present."""
+        if not present and self.volume.in_file and self.volume.array.label is not None:
             raise ScanError(f"label {self.volume.array.label} is in none of the known slices")
 
 
 def _read_slab(known: Known, name: str, number: int) -> Record:
-    """Return which slices of a slab have labels, the numbers of the known ones among all, and of these which voxels
-    are inside, and which labels they have."""
-    rows = known._slabs[number]
-    values = known._slab(rows)
-    there = (values > 0).any((1, 2))
-    which = np.array([k for k, place in enumerate(known.places) if rows.start <= place < rows.stop], dtype=np.intp)
-    if not len(which):
-        return {"there": there, "which": which, "inside": np.empty(0, dtype=bool), "values": values[:0, 0, 0]}
-    values = require_labels(values[[known.places[k] - rows.start for k in which]], name)
-    return {"there": there, "which": which, "inside": values > 0, "values": np.unique(values)}
+    """Return the record of a slab: whether each slice has labels (`there`), which of the known slices it holds
+    (`which`), their masks (`inside`), and the different labels in them (`values`)."""
+    slab = known._slabs[number]
+    values = known._read(slab)
+    labelled = (values > 0).any((1, 2))
+    rows = np.array([k for k, place in enumerate(known.places) if slab.start <= place < slab.stop], dtype=np.intp)
+    if not len(rows):
+        return {"there": labelled, "which": rows, "inside": np.empty(0, dtype=bool), "values": values[:0, 0, 0]}
+    values = require_labels(values[[known.places[k] - slab.start for k in rows]], name)
+    return {"there": labelled, "which": rows, "inside": values > 0, "values": np.unique(values)}
 
 
 def check_which(
     shape: Sequence[int], every: int | slice | None, known: Sequence[int] | None, ignore: int | None, axis: int,
     suggest: int,
 ) -> None:  # fmt: skip
-    """Raise ValueError where what is said of the known slices of a volume of a shape cannot be, before it is read."""
+    """Raise ValueError where options of `reconstruct` do not fit the volume's shape or each other, before it is read."""
     length = shape[check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)]
     if ignore is not None and (every is not None or known is not None):
         raise ScanError("give either every, known or ignore")
@@ -151,7 +152,7 @@ def check_which(
 
 
 def known_places(length: int, every: int | slice | None, known: Sequence[int] | None) -> list[int]:
-    """Return the numbers of the known slices, ascending: every `every`-th, and those listed in `known`. Raises
+    """Return the indices of the known slices, ascending: every `every`-th, and those listed in `known`. Raises
     `ValueError` if neither is given, or they are not two or more slices of the volume."""
     if every is None and known is None:
         raise ScanError("give every or known: which slices are known")
@@ -167,10 +168,10 @@ def known_places(length: int, every: int | slice | None, known: Sequence[int] | 
     return places
 
 
-def choose_labelled(there: np.ndarray) -> list[int]:
-    """Return the numbers of the known slices, given whether each has labels, (Z,): those that have, and by their rhythm
-    (`next_in_rhythm`) the empty ones beside them."""
-    places = np.flatnonzero(there)
+def choose_labelled(labelled: np.ndarray) -> list[int]:
+    """Return the indices of the known slices, given whether each slice has labels, bool (Z,): those with labels, and
+    empty ones next to them in their rhythm (`next_in_rhythm`)."""
+    places = np.flatnonzero(labelled)
     if len(places) < 2:
         raise ScanError(f"two or more slices must have labels, got {len(places)}; or give every or known")
     if np.diff(places).max() == 1:
@@ -178,12 +179,12 @@ def choose_labelled(there: np.ndarray) -> list[int]:
             "no slice without labels lies between those with labels: give every or known, which slices count; slices "
             "that nobody annotated must be there too, empty"
         )
-    return sorted([*places.tolist(), *next_in_rhythm(places, len(there))])
+    return sorted([*places.tolist(), *next_in_rhythm(places, len(labelled))])
 
 
 def next_in_rhythm(places: Sequence[int] | np.ndarray, length: int) -> list[int]:
-    """Return the slices before the first and beyond the last of those with labels, if these are three or more, every
-    n-th: they are taken for rightly empty."""
+    """Return the slices one step before the first and beyond the last of those with labels, if these are three or more
+    at a constant step: they are taken for annotated and empty."""
     steps = set(np.diff(places).tolist())
     if len(places) < 3 or len(steps) > 1:
         return []
@@ -192,24 +193,25 @@ def next_in_rhythm(places: Sequence[int] | np.ndarray, length: int) -> list[int]
 
 
 def annotated_slices(values: np.ndarray, ignore: int) -> tuple[list[int], np.ndarray | None]:
-    """Return the numbers of the slices (Z, Y, X) that are annotated whole, and marks of the others. `ignore` is the
-    label of voxels that nobody annotated; 0 is known to be empty. Marks are those of `Slices`."""
-    seen = values != ignore
-    if seen.all():
+    """Return the indices of the slices (Z, Y, X) that are annotated whole, and marks of the others, as in `Slices`.
+    `ignore` is the label of voxels that nobody annotated; 0 is known to be empty."""
+    annotated = values != ignore
+    if annotated.all():
         raise ScanError(f"no voxel has the label {ignore}, which tells what nobody annotated")
-    whole = seen.all((1, 2))
+    whole = annotated.all((1, 2))
     places = np.flatnonzero(whole).tolist()
     if len(places) < 2:
         raise ScanError(f"two or more slices must have no voxel of the label {ignore}, got {places}")
-    seen[whole] = False
-    return places, np.where(seen, np.where(values > 0, 1, -1), 0).astype(np.int8) if seen.any() else None
+    annotated[whole] = False  # marks are of the other slices
+    marks = np.where(annotated, np.where(values > 0, 1, -1), 0).astype(np.int8)
+    return places, marks if annotated.any() else None
 
 
 def check_shared(values: np.ndarray, places: Sequence[int], labels: Sequence[int]) -> None:
-    """Raise ScanError where labels are drawn on slices (Z, Y, X) of their own, so that one's absence says nothing."""
+    """Raise ScanError where each label has annotated slices (Z, Y, X) of its own, so that it may be in the others."""
     for label in labels:
-        there = (values[list(places)] == label).any((1, 2))
-        span = there[there.argmax() : len(there) - there[::-1].argmax()]
+        present = (values[list(places)] == label).any((1, 2))
+        span = present[present.argmax() : len(present) - present[::-1].argmax()]
         if (missing := np.count_nonzero(~span)) > APART * len(span):
             some = f"label {label} is on {len(span) - missing} of the {len(span)} slices with labels that it spans"
             raise ScanError(
@@ -222,33 +224,34 @@ def _to_int(number: Any) -> Any:
     return int(number) if isinstance(number, float) and number.is_integer() else number
 
 
-def note_labelled(places: Sequence[int], there: np.ndarray) -> tuple[str, ...]:
-    """Return sentences on the known slices at `places`: those with labels, where `there`, and empty ones in their
-    rhythm."""
-    drawn, empty = ([k for k in places if there[k] == full] for full in (True, False))
-    which = f"The {len(drawn)} slices with labels are known: {list_numbers(drawn, 24)}."
-    return (f"{which} Another one that is rightly empty must be named.", *note_empty(empty))
+def note_labelled(places: Sequence[int], labelled: np.ndarray) -> tuple[str, ...]:
+    """Return notes on the known slices at `places`: those with labels, and empty ones in their rhythm."""
+    with_labels, empty = [k for k in places if labelled[k]], [k for k in places if not labelled[k]]
+    known = f"The {len(with_labels)} slices with labels are known: {list_numbers(with_labels, 24)}."
+    return (f"{known} Another one that is rightly empty must be named.", *note_empty(empty))
 
 
 def note_empty(empty: Sequence[int]) -> tuple[str, ...]:
-    """Return a sentence on slices that are taken for rightly empty."""
-    which = f"Taken for rightly empty, as next in the rhythm of those with labels: {list_numbers(empty)}."
-    return (f"{which} If that is wrong, name the known slices.",) if empty else ()
+    """Return a note on slices that are taken for rightly empty, if there are any."""
+    note = f"Taken for rightly empty, as next in the rhythm of those with labels: {list_numbers(empty)}."
+    return (f"{note} If that is wrong, name the known slices.",) if empty else ()
 
 
-def doubt_places(there: np.ndarray, places: Sequence[int]) -> tuple[str, ...]:
-    """Return a sentence where few slices have labels, and some of them are not among the known ones at `places`.
-    `there` says of each slice whether it has labels, (Z,)."""
-    labelled = np.flatnonzero(there)
-    strange = sorted(set(labelled.tolist()) - set(places))
-    if not strange or 2 * len(labelled) > np.ptp(labelled) + 1:
+def doubt_places(labelled: np.ndarray, places: Sequence[int]) -> tuple[str, ...]:
+    """Return a note where few slices have labels, and some of them are not among the known ones at `places`, given
+    whether each slice has labels, bool (Z,)."""
+    with_labels = np.flatnonzero(labelled)
+    unknown = sorted(set(with_labels.tolist()) - set(places))
+    if not unknown or 2 * len(with_labels) > np.ptp(with_labels) + 1:  # most have: the volume is labelled throughout
         return ()
-    few = f"Only {len(labelled)} of {len(there)} slices have labels, but {list_numbers(strange)} are not among the"
+    few = (
+        f"Only {len(with_labels)} of {len(labelled)} slices have labels, but {list_numbers(unknown)} are not among the"
+    )
     return (f"{few} known ones: if those are what you annotated, another every or first is meant, or known.",)
 
 
 def doubt_labels(values: np.ndarray, ignore: int | None = None) -> tuple[str, ...]:
-    """Return a sentence where known slices have several labels, given their values, each once."""
+    """Return a note where known slices have several labels, given their different values."""
     count = np.count_nonzero((values > 0) & (values != ignore))
     advice = "reconstruct_labels, or --labels all, fills each by itself"
     return (f"The known slices have {count} labels, which are filled as one structure: {advice}.",) if count > 1 else ()
