@@ -98,11 +98,9 @@ class GreyEvidence:
     def of(
         cls, volume: Volume, threshold: float | str = "otsu", dark: bool = False, apart: bool = False
     ) -> GreyEvidence:
-        """Measure a scan's classes on a sample of it; with `apart`, those that overlap once more.
-
-        A threshold of noisy levels leaves some of each phase on either side, which brings the two means together. They
-        are measured again `DEEP` voxels off the first guess of the surface, where few voxels are on the wrong side.
-        """
+        """Measure a scan's classes on a sample of it; with `apart`, those that overlap once more. A threshold of noisy
+        levels leaves some of each phase on either side, which brings the two means together. They are measured again
+        `DEEP` voxels off the first guess of the surface, where few voxels are on the wrong side."""
         sample, _ = subsample(volume)
         levels = grey_levels(sample, threshold)
         bounds = grey_bounds(sample.values.astype(np.float32), threshold)
@@ -212,12 +210,13 @@ def _split(values: np.ndarray, smooth: np.ndarray, threshold: float | str) -> tu
 
 
 def subsample(volume: Volume) -> tuple[Volume, list[Box]]:
-    """Return a sample of a volume, without an affine, and the boxes of the sample in which voxels are neighbours.
-
-    Along an axis of more than `RUNS` x `LONG` voxels, the sample has `RUNS` runs of `LONG` voxels, from the middles of
-    equal parts; along a shorter one it has all voxels.
-    """
-    runs = [_sample_runs(n) for n in volume.shape]
+    """Return a sample of a volume, without an affine, and the boxes of the sample in which voxels are neighbours. Along
+    an axis of more than `RUNS` x `LONG` voxels, the sample has `RUNS` runs of `LONG` voxels, from the middles of equal
+    parts; along a shorter one it has all voxels."""
+    runs = []
+    for n in volume.shape:
+        starts = [(2 * k + 1) * n // (2 * RUNS) - LONG // 2 for k in range(RUNS)]
+        runs.append([slice(start, start + LONG) for start in starts] if n > RUNS * LONG else [slice(0, n)])
     # The runs, which are of one length along an axis, lie end to end in the sample.
     shape = [sum(run.stop - run.start for run in axis) for axis in runs]
     sample = np.empty(shape, volume.dtype)
@@ -225,14 +224,6 @@ def subsample(volume: Volume) -> tuple[Volume, list[Box]]:
     for box, (z, y, x) in zip(boxes, product(*runs), strict=True):
         sample[box] = volume.read((z, y, x))
     return replace(volume, array=sample, affine=None), boxes
-
-
-def _sample_runs(n: int) -> list[slice]:
-    """Return the runs of a sample along an axis of n voxels."""
-    if n <= RUNS * LONG:
-        return [slice(0, n)]
-    starts = [(2 * k + 1) * n // (2 * RUNS) - LONG // 2 for k in range(RUNS)]
-    return [slice(start, start + LONG) for start in starts]
 
 
 def load_probabilities(
@@ -246,10 +237,8 @@ def load_probabilities(
     **reading: Any,
 ) -> Volume:
     """Load a network's probabilities, with spacing and affine of `like`, an image of the same voxels, if there is one.
-
     See `segment` for the parameters. Raises `ScanError` if the image has another shape, or both an image and a spacing
-    or unit are given.
-    """
+    or unit are given."""
     stated = spacing is not None or unit is not None
     if like is not None and stated:
         raise ScanError("give either an image that says where the voxels are, or a spacing and unit, got both")

@@ -118,15 +118,11 @@ def interpolate(distances: Tensor, heights: Tensor) -> tuple[Tensor, Tensor]:
     t = heights
     zero = torch.zeros_like(t)
     linear = torch.stack([zero, 1 - t, t, zero], dim=1)
-    cubic = torch.stack(
-        [
-            -0.5 * t**3 + t**2 - 0.5 * t,
-            1.5 * t**3 - 2.5 * t**2 + 1,
-            -1.5 * t**3 + 2 * t**2 + 0.5 * t,
-            0.5 * t**3 - 0.5 * t**2,
-        ],
-        dim=1,
-    )
+    first = -0.5 * t**3 + t**2 - 0.5 * t
+    second = 1.5 * t**3 - 2.5 * t**2 + 1
+    third = -1.5 * t**3 + 2 * t**2 + 0.5 * t
+    fourth = 0.5 * t**3 - 0.5 * t**2
+    cubic = torch.stack([first, second, third, fourth], dim=1)
     return torch.einsum("nk,bkyx->bnyx", linear, distances), torch.einsum("nk,bkyx->bnyx", cubic, distances)
 
 
@@ -275,7 +271,7 @@ def fill(
             part[:] = (SLOPE / raster.pixel) * distances[tuple(core)].astype(np.float32)
             unfilled = slices.unfilled[start:stop]
             part[unfilled] = np.minimum(part[unfilled], 0)
-    for indices, values in fill_gaps(slices, taught, raster, rows, evidence=evidence, progress=progress):
+    for indices, values in _fill_gaps(slices, taught, raster, rows, evidence, progress):
         in_box = (indices >= rows.start) & (indices < rows.stop)
         logits[indices[in_box] - rows.start] = values[in_box]
     positions, inside = slices.known((rows, *core))  # type: ignore[arg-type]
@@ -283,14 +279,8 @@ def fill(
     return logits
 
 
-def fill_gaps(
-    slices: Slices,
-    taught: Taught,
-    raster: Raster,
-    rows: slice,
-    *,
-    evidence: np.ndarray | None = None,
-    progress: Progress = silent,
+def _fill_gaps(
+    slices: Slices, taught: Taught, raster: Raster, rows: slice, evidence: np.ndarray | None, progress: Progress
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Fill each gap that overlaps `rows` of the volume: yield the indices of the slices in it, and their log-odds as
     `fill` returns them, float32 (n, Y, X), on the core of a raster."""
@@ -310,8 +300,9 @@ def fill_gaps(
         indices = np.arange(places[k] + 1, places[k] + gap) % slices.length
         known = np.stack([distances[row] for row in four])
         marks = None if slices.marks is None else raster.marks(slices.marks[(indices, *window)])
-        planes = None if evidence is None else evidence[(indices, *window)]
-        planes = None if planes is None else np.stack([raster.spread(plane) for plane in planes])
+        planes = (
+            None if evidence is None else np.stack([raster.spread(plane) for plane in evidence[(indices, *window)]])
+        )
         logits = _fill_gap(taught.filler, known, marks, planes, gap - 1, step) / taught.temperature(gap * step)
         yield indices, raster.to_slices(logits)
     progress("filling the gaps", 1.0)
@@ -513,11 +504,9 @@ class Taught:
 
     @classmethod
     def load(cls, path: str | Path | None = None, *, image: bool = False) -> Taught:
-        """Read a filler, by default a packaged one: without images, or for the evidence of an image.
-
-        Raises FileNotFoundError if there is no such file, and ValueError if it is something else, is damaged, of
-        another version or not for what is asked.
-        """
+        """Read a filler, by default a packaged one: without images, or for the evidence of an image. Raises
+        FileNotFoundError if there is no such file, and ValueError if it is something else, damaged, of another version,
+        or taught otherwise with regard to images."""
         if path is None:
             packaged = open_packaged("segmentation", "image.npz" if image else "filler.npz")
             return FILLER_FILE.read(packaged, cls._of, place="the packaged filler")

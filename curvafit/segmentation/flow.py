@@ -29,7 +29,7 @@ from curvafit.volumes.volume import ScanError, Volume
 STEPS = 400
 #: Shortest edge of a tile, in working voxels.
 SMALLEST = 8
-#: Least and greatest stiffness.
+#: Least and greatest stiffness of springs.
 STIFFEST = (1e-9, 1e12)
 #: Voxels of the grid around a volume that does not repeat: far enough for the border's right angles not to reach it.
 HALO = 6
@@ -87,10 +87,10 @@ class Working:
 def lower_energy(
     level: np.ndarray, law: Coefficients, data: Data, place: WorkingGrid, steps: int, progress: Progress = silent
 ) -> Flow:
-    """Lower D(u) + F_ε(u) from the set where a level is positive, with u = k ∗ v: Adam under a cooling schedule. The
-    `level` (Z, Y, X) is smooth, on the scan's grid. The scale of the law, whose lengths are in the scan's unit, does
-    not matter; D is on the working grid, in units of F_ε of a law with a20 + a02 = 2. Raises `ScanError` if a20 + a02
-    is not positive, or the energy does not stay finite."""
+    """Lower D(u) + F_ε(u), with u = k ∗ v, by Adam under a cooling schedule, from the set where the `level` (Z, Y, X),
+    smooth and on the scan's voxels, is positive. The `law` has lengths in the scan's unit, and is scaled to a20 + a02 =
+    2; the `data` term D is on the working grid, in units of its F_ε. Raises `ScanError` if a20 + a02 is not positive,
+    or the energy does not stay finite."""
     flow = descend(
         initial_field(level, place),
         law.scale(BENDING / bending(law)).in_unit(place.unit),
@@ -106,8 +106,8 @@ def lower_energy(
 
 
 def initial_field(level: np.ndarray, place: WorkingGrid) -> Tensor:
-    """Return the phase field, on the working grid, of the set where a smooth volume (Z, Y, X) is positive. A volume
-    that is positive everywhere or nowhere, as in a tile far from the surface, gives a field of 1 or -1."""
+    """Return the phase field, on the working grid, of the set where a smooth `level` (Z, Y, X) is positive: constant 1
+    or -1 where that is everywhere or nowhere, as in a tile far from the surface."""
     inside = place.to_grid(level) > 0
     if inside.all() or not inside.any():
         return 2 * inside.float() - 1
@@ -132,9 +132,9 @@ def choose_epsilon(scan: Volume, epsilon: float | None) -> float:
 
 @dataclass(frozen=True)
 class WorkingGrid:
-    """The grid of a flow: working units, axes refined until ε spans two voxels, and a halo without data. The `grid`
-    includes the halo, of `halo` voxels on the sides in `ends`; its boundary replicates, unless the scan repeats. A scan
-    voxel has `times` parts along each axis; a working length of 1 is `unit`, and ε `epsilon`, in the scan's unit."""
+    """The grid of a flow, in working units: a scan's voxels, split by `times` along each axis for ε to span two, and a
+    halo without data. The `grid` includes the `halo` voxels on each side marked in `ends`; its boundary replicates,
+    unless the scan is periodic. `unit` is the working length 1, and `epsilon` ε, both in the scan's unit."""
 
     grid: Grid
     times: tuple[int, int, int]
@@ -145,10 +145,8 @@ class WorkingGrid:
 
     @classmethod
     def of(cls, scan: Volume, epsilon: float | None, *, halo: int = 0, periodic: bool = False) -> WorkingGrid:
-        """Return the working grid of a scan, for the ε of `choose_epsilon`.
-
-        A periodic scan has no halo. Raises `ValueError` if ε is not positive or the scan is too small.
-        """
+        """Return the working grid of a scan, for the ε of `choose_epsilon`; a periodic scan has no halo. Raises
+        `ValueError` if ε is not positive or the scan is too small."""
         ε = choose_epsilon(scan, epsilon)
         if min(scan.shape) < 4:
             raise ScanError(f"the volume must have at least 4 voxels along each axis, got {scan.shape}")
@@ -160,10 +158,10 @@ class WorkingGrid:
         return cls(grid, times, unit, ε, halo)  # type: ignore[arg-type]
 
     def of_box(self, shape: Sequence[int], ends: Ends) -> WorkingGrid:
-        """Return the grid of a box of scan voxels, with a halo on the sides named in `ends`; a box is not periodic."""
-        pairs = zip(shape, self.times, ends, strict=True)
-        edges = tuple(n * times + self.halo * sum(sides) for n, times, sides in pairs)
-        return replace(self, grid=Grid(edges, self.grid.spacing, "replicate"), ends=ends)  # type: ignore[arg-type]
+        """Return the grid of a box of `shape` scan voxels, not periodic, with a halo on the sides marked in `ends`."""
+        axes = zip(shape, self.times, ends, strict=True)
+        size = tuple(n * times + self.halo * sum(sides) for n, times, sides in axes)
+        return replace(self, grid=Grid(size, self.grid.spacing, "replicate"), ends=ends)  # type: ignore[arg-type]
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -174,26 +172,26 @@ class WorkingGrid:
         return (f"ε spans fewer than 2 voxels on some axes: the flow ran on a grid refined {axes}.",)
 
     def to_grid(self, values: np.ndarray) -> Tensor:
-        """Interpolate a smooth volume to the grid, and repeat its outermost values in the halo."""
+        """Interpolate a smooth volume of the scan (Z, Y, X) to the grid, and repeat its border in the halo."""
         u = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
         for axis, n in enumerate(self.times):
             u = refine_axis(u, axis, n)
         return pad(u[None, None], self._sides, mode="replicate")[0, 0]
 
     def spread(self, values: np.ndarray, centre: int | None = None) -> Tensor:
-        """Share the evidence of each voxel among its parts; the halo has none, and along axis `centre` only the middle
-        parts get some."""
+        """Divide the evidence of each scan voxel (Z, Y, X) equally among its parts; the halo gets none. Along the axis
+        `centre` the middle part, or the middle two, get all of it each."""
         u = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
         for axis, n in enumerate(self.times):
-            share = torch.full((n,), 1 / n)
+            weights = torch.full((n,), 1 / n)
             if axis == centre:
-                share = (torch.arange(n) - (n - 1) / 2).abs().lt(1).float()
-            u = u.unsqueeze(axis + 1) * share.reshape(-1, *(1,) * (2 - axis))
+                weights = (torch.arange(n) - (n - 1) / 2).abs().lt(1).float()
+            u = u.unsqueeze(axis + 1) * weights.reshape(-1, *(1,) * (2 - axis))
             u = u.flatten(axis, axis + 1)
         return pad(u, self._sides)
 
     def to_scan(self, u: Tensor) -> np.ndarray:
-        """Average each scan voxel's parts, and drop the halo."""
+        """Drop the halo, and average the parts of each scan voxel: (Z, Y, X)."""
         for axis, (before, beyond) in enumerate(self.ends):
             u = u.narrow(axis, self.halo * before, u.shape[axis] - self.halo * (before + beyond))
         for axis, n in enumerate(self.times):

@@ -25,12 +25,10 @@ WIDTHS, LEAST = (0.7, 1.2, 2.0, 3.4, 5.6), 0.5
 SMOOTH = 0.7
 #: Most voxels that trees learn from; the number of trees, their learning rate and most leaves.
 LEARNT, TREES, RATE, LEAVES = 200_000, 120, 0.1, 31
-#: Furthest shift of an image that is looked for, in voxels; width of the local mean that is subtracted from its levels;
-#: least shift that is reported; the fraction by which the correlation there must exceed that without a shift, and how
-#: many times the root mean square over all shifts it must be.
+#: Furthest shift that is looked for, in voxels; width of the local mean that is subtracted; least shift that is reported;
+#: by what fraction its correlation must exceed that without a shift, and how many root mean squares of all it must be.
 FURTHEST, LOCAL, NEAREST, BETTER, CLEAR = 12, 61, 2, 0.1, 5.0
-#: Voxels whose features are computed at once, and the most voxels of an image whose features are kept, since they are
-#: read twice.
+#: Voxels whose features are computed at once; most voxels of an image whose features are kept for the second reading.
 HELD, KEPT = 4_000_000, 20_000_000
 
 
@@ -72,11 +70,8 @@ def read_image(values: np.ndarray, slices: Slices, progress: Progress = silent) 
 
 
 def find_shift(values: np.ndarray, slices: Slices) -> tuple[int, int]:
-    """Return the shift (y, x), in voxels, of an image (Z, Y, X) off the known slices; (0, 0) where none is clear.
-
-    It is where the cross-correlation of masks and grey levels is greatest; its sign, by which phase is the brighter
-    one, does not matter.
-    """
+    """Return the shift (y, x), in voxels, of an image (Z, Y, X) off the known slices; (0, 0) where none is clear. It is
+    the greatest cross-correlation, of either sign, of masks and grey levels."""
     correlation = np.zeros(slices.inside.shape[1:])
     for place, inside in zip(slices.places, slices.inside, strict=True):
         plane = values[place].astype(np.float64)

@@ -11,7 +11,7 @@ import numpy as np
 
 from curvafit.core.checks import SEEDS, check_int
 from curvafit.priors.grid import MOST
-from curvafit.segmentation.slices import IDS, LABELS, Slices, axis_first, require_labels, require_outline
+from curvafit.segmentation.slices import IDS, LABELS, Slices, axis_first, require_labels
 from curvafit.volumes.formats.zarr import CHUNK
 from curvafit.volumes.run import Record, Run
 from curvafit.volumes.volume import Box, ScanError, Volume, check_finite, round_labels
@@ -54,10 +54,8 @@ class Known:
         self, run: Run, periodic: bool = False, name: str = "the known slices"
     ) -> tuple[Slices, np.ndarray, np.ndarray]:
         """Read the known slices into the run's store; return them, their labels, and whether each slice of the volume
-        has labels, bool (length,).
-
-        Raises `ScanError` if they hold grey levels, or are all empty or all full; the message calls them `name`.
-        """
+        has labels, bool (length,). Raises `ScanError` if they hold grey levels, or are all empty or all full; the
+        message calls them `name`."""
         length, *plane = axis_first(self.volume.shape, self.axis)
         inside = run.open("known", np.bool_, (len(self.places), *plane))
 
@@ -65,8 +63,7 @@ class Known:
             rows = record["which"]
             if len(rows):
                 inside[rows[0] : rows[-1] + 1] = record["inside"]
-            kept = {"there": record["there"], "values": record["values"]}
-            return {**kept, "count": np.count_nonzero(record["inside"])}
+            return {"there": record["there"], "values": record["values"], "count": np.count_nonzero(record["inside"])}
 
         records = run("reading known slices", partial(_read_slab, self, name), len(self._slabs), keep=keep)
         labels = np.unique(np.concatenate([record["values"] for record in records]))
@@ -74,7 +71,11 @@ class Known:
             raise ScanError(f"{name} must be a mask or have at most {LABELS} labels, got {len(labels)} values")
         count = sum(int(record["count"]) for record in records)
         self._check_label(count > 0)
-        require_outline(count, len(self.places) * plane[0] * plane[1], name)
+        if count in (0, len(self.places) * plane[0] * plane[1]):
+            raise ScanError(
+                f"{name} must have voxels inside and outside, but all are {'full' if count else 'empty'}; is another "
+                "slice the first, is there a label that nobody annotated, or are there several labels?"
+            )
         edges = axis_first(self.volume.spacing, self.axis)
         slices = Slices(inside.stored, self.places, length, edges, self.volume.unit, periodic, self.marks)
         return slices, labels, np.concatenate([record["there"] for record in records])
@@ -140,7 +141,7 @@ def check_which(
     shape: Sequence[int], every: int | slice | None, known: Sequence[int] | None, ignore: int | None, axis: int,
     suggest: int,
 ) -> None:  # fmt: skip
-    """Raise ValueError where options of `reconstruct` do not fit the volume's shape or each other, before it is read."""
+    """Raise ValueError where options of `reconstruct` do not fit the volume's shape, or each other."""
     length = shape[check_int(axis, "an axis 0, 1 or 2 (z, y, x)", 0, 2)]
     if ignore is not None and (every is not None or known is not None):
         raise ScanError("give either every, known or ignore")
@@ -203,8 +204,9 @@ def annotated_slices(values: np.ndarray, ignore: int) -> tuple[list[int], np.nda
     if len(places) < 2:
         raise ScanError(f"two or more slices must have no voxel of the label {ignore}, got {places}")
     annotated[whole] = False  # marks are of the other slices
-    marks = np.where(annotated, np.where(values > 0, 1, -1), 0).astype(np.int8)
-    return places, marks if annotated.any() else None
+    if not annotated.any():
+        return places, None
+    return places, np.where(annotated, np.where(values > 0, 1, -1), 0).astype(np.int8)
 
 
 def check_shared(values: np.ndarray, places: Sequence[int], labels: Sequence[int]) -> None:
@@ -242,12 +244,10 @@ def doubt_places(labelled: np.ndarray, places: Sequence[int]) -> tuple[str, ...]
     whether each slice has labels, bool (Z,)."""
     with_labels = np.flatnonzero(labelled)
     unknown = sorted(set(with_labels.tolist()) - set(places))
-    if not unknown or 2 * len(with_labels) > np.ptp(with_labels) + 1:  # most have: the volume is labelled throughout
+    if not unknown or 2 * len(with_labels) > np.ptp(with_labels) + 1:  # where most have, `every` chooses among them
         return ()
-    few = (
-        f"Only {len(with_labels)} of {len(labelled)} slices have labels, but {list_numbers(unknown)} are not among the"
-    )
-    return (f"{few} known ones: if those are what you annotated, another every or first is meant, or known.",)
+    text = f"Only {len(with_labels)} of {len(labelled)} slices have labels, but {list_numbers(unknown)} are not among"
+    return (f"{text} the known ones: if those are what you annotated, another every or first is meant, or known.",)
 
 
 def doubt_labels(values: np.ndarray, ignore: int | None = None) -> tuple[str, ...]:

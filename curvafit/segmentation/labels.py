@@ -1,4 +1,4 @@
-"""Several structures between known slices: each is filled by `reconstruct`, and a voxel goes to one of them."""
+"""Several structures between known slices: each is filled by `reconstruct`, and each voxel gets one label."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from curvafit.core.checks import SEEDS, check_int
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.priors.law import LawLike
 from curvafit.segmentation.flow import Working
-from curvafit.segmentation.known import Known, check_shared, check_which, doubt_places
+from curvafit.segmentation.known import Known, check_shared, check_which, doubt_places, list_numbers
 from curvafit.segmentation.reconstruction import SHIFTED, SURE, UNTOLD, load_example, load_image, reconstruct
 from curvafit.segmentation.result import Segmentation, Uncertainty
-from curvafit.segmentation.slices import IDS, WHOLE, filled_range, index_labels, mark_known, require_labels
+from curvafit.segmentation.slices import IDS, WHOLE, filled_range, index_labels, require_labels
 from curvafit.segmentation.uncertainty import doubt, expected_dice, suggest_slices
 from curvafit.volumes.formats.base import smallest_type
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.run import Run
 from curvafit.volumes.volume import Box, ScanError, Volume, round_labels
 
-#: Which slices are known, unless it is said.
+#: Defaults of the options that say which slices are known.
 WHICH: dict[str, Any] = {"every": None, "known": None, "ignore": None, "axis": 0}
 #: Label of unknown voxels in the mask of one structure.
 UNKNOWN = 255
@@ -36,9 +36,8 @@ ONCE = "The labels are read in the image as instances of one structure (--no-ins
 APIECE = "Each label is read in the image by itself (--instances reads those of one kind, such as cells, as one)."
 #: Voxels around a label's box.
 ROOM = 16
-#: Of instances, labels of one kind that an image tells from the background but not from each other: the share of a
-#: label's area that is in one piece in each slice, the share of labels of which that holds, and the greatest share of
-#: the variance of grey levels that is due to which label they have.
+#: Labels are instances, objects of one kind that an image does not distinguish, if in the fraction `MOST` of them at
+#: least `PIECE` of the area is one piece in each slice, and they explain at most `ALIKE` of the grey levels' variance.
 PIECE, MOST, ALIKE = 0.9, 0.9, 0.5
 
 
@@ -90,22 +89,22 @@ def reconstruct_labels(
     if the known slices do not have a label, or none but 0.
     """
     reading = {"spacing": spacing, "unit": unit}
-    labels = _Labels.load(slices, chosen, image, example, working=working, reading=reading, **options)
+    inputs = _Inputs.load(slices, chosen, image, example, working=working, reading=reading, **options)
     first, rest = sub_progress(progress, 0.0, 0.5), sub_progress(progress, 0.5, 1.0)
-    whole, alone, notes = _fill_instances(labels, instances, first)
-    parts, reasons = _fill_each(alone, prior, progress if alone is labels else rest)
-    return _join_labels(labels, parts, whole, notes, reasons)
+    whole, alone, notes = _fill_instances(inputs, instances, first)
+    parts, reasons = _fill_each(alone, prior, progress if alone is inputs else rest)
+    return _join_labels(inputs, parts, whole, notes, reasons)
 
 
 @dataclass(frozen=True, eq=False)
-class _Labels:
-    """What labels are filled from: known slices with labels by their places (`index_labels`), the labels' numbers, the
-    known voxels (Z, Y, X), whether others are marked as such, and what goes to `reconstruct` for each."""
+class _Inputs:
+    """What labels are filled from: known slices; the `labels` to fill, and for each voxel (Z, Y, X) the index of its
+    label (`index_labels`); which voxels are known, and whether others are `marked`; and what `reconstruct` takes."""
 
-    given: Known
-    values: np.ndarray
-    numbers: list[int]
-    known: np.ndarray
+    known: Known
+    indices: np.ndarray
+    labels: list[int]
+    known_voxels: np.ndarray
     marked: bool
     periodic: bool
     suggest: int
@@ -117,66 +116,69 @@ class _Labels:
     def load(
         cls, slices: Source, chosen: Sequence[int] | None, image: Source | None, example: Source | None, *,
         working: Working, reading: dict[str, Any], suggest: int = 0, periodic: bool = False, **which: Any,
-    ) -> _Labels:  # fmt: skip
+    ) -> _Inputs:  # fmt: skip
         """Read labels, image and example, and find which slices and which labels are known."""
         which, volume = {**WHICH, **which}, load(slices, **reading)
         check_which(volume.shape, **which, suggest=suggest)
         volume = replace(volume, array=round_labels(volume.values))
-        given, ignore = Known.find(volume, Run(), **which), which["ignore"]
-        places, slices_first = list(given.places), given.turn(volume.values)
-        doubts = () if which["every"] is None else doubt_places(np.asarray((slices_first > 0).any((1, 2))), places)
-        suggest = check_int(suggest, "a number of slices from 0", 0, len(slices_first) - len(places))
-        numbers = find_labels(slices_first[places], chosen)
+        known, ignore = Known.find(volume, Run(), **which), which["ignore"]
+        places, values = list(known.places), known.turn(volume.values)
+        doubts = () if which["every"] is None else doubt_places(np.asarray((values > 0).any((1, 2))), places)
+        suggest = check_int(suggest, "a number of slices from 0", 0, len(values) - len(places))
+        labels = find_labels(values[places], chosen)
         if which["every"] is None and which["known"] is None and ignore is None:
-            check_shared(slices_first, places, numbers)
-        given = replace(given, notes=(*given.notes, *doubts))
-        values = index_labels(volume.values, numbers, ignore)
-        known = given.turn_back(mark_known(slices_first.shape, places, given.marks))
-        other = None if example is None else load_example(example, volume, reading)
-        levels = None if image is None else load_image(image, volume, reading)
+            check_shared(values, places, labels)
+        known = replace(known, notes=(*known.notes, *doubts))
+        indices = index_labels(volume.values, labels, ignore)
+        known_voxels = np.zeros(values.shape, dtype=bool) if known.marks is None else known.marks != 0
+        known_voxels[places] = True
+        annotated = None if example is None else load_example(example, volume, reading)
+        grey = None if image is None else load_image(image, volume, reading)
         return cls(
-            given, values, numbers, known, ignore is not None, periodic, suggest, levels, other, working
+            known, indices, labels, known.turn_back(known_voxels), ignore is not None, periodic, suggest, grey,
+            annotated, working,
         )  # fmt: skip
 
     @property
-    def drawn(self) -> np.ndarray:
-        """The places of labels in the known slices, from 1, 0 where there is none."""
-        return self.given.turn(self.values)[list(self.given.places)].clip(0)
+    def in_slices(self) -> np.ndarray:
+        """The indices of labels in the known slices (N, Y, X), 0 where there is none."""
+        return self.known.turn(self.indices)[list(self.known.places)].clip(0)
 
     @property
     def full(self) -> bool:
         """Whether every voxel of the known slices is labelled."""
-        return bool(self.drawn.all())
+        return bool(self.in_slices.all())
 
-    def fill(self, place: int | None, box: Box, law: LawLike | None = None, **more: Any) -> Segmentation:
-        """Fill one label in a box, by its place, or all as one structure."""
-        values, given, working = self.values[box], self.given, more.pop("working", self.working)
-        inside = (values > 0 if place is None else values == place).astype(np.uint8)
-        start, stop, _ = box[given.axis].indices(self.values.shape[given.axis])
-        which: dict[str, Any] = {"known": [k - start for k in given.places if start <= k < stop]}
+    def fill(self, index: int | None, box: Box, law: LawLike | None = None, **more: Any) -> Segmentation:
+        """Fill the label with an index in a box, or all labels as one structure; `more` goes to `reconstruct`."""
+        indices, known, working = self.indices[box], self.known, more.pop("working", self.working)
+        inside = (indices > 0 if index is None else indices == index).astype(np.uint8)
+        start, stop, _ = box[known.axis].indices(self.indices.shape[known.axis])
+        which: dict[str, Any] = {"known": [place - start for place in known.places if start <= place < stop]}
         if self.marked:
-            inside[values < 0], which = UNKNOWN, {"ignore": UNKNOWN}
-        mask = replace(given.volume, array=inside, affine=None, notes=())
+            inside[indices < 0], which = UNKNOWN, {"ignore": UNKNOWN}
+        mask = replace(known.volume, array=inside, affine=None, notes=())
         if law is None:
             working = replace(working, tile=None)  # a box of a label is filled at once
-        return reconstruct(mask, law, axis=given.axis, periodic=self.periodic, working=working, **which, **more)
+        return reconstruct(mask, law, axis=known.axis, periodic=self.periodic, working=working, **which, **more)
 
 
 def _fill_instances(
-    labels: _Labels, instances: bool | None, progress: Progress
-) -> tuple[Segmentation | None, _Labels, tuple[str, ...]]:
-    """Fill labels that are instances as one structure that the image tells, if there is one; return the structure, what
-    the labels are filled from then, and notes."""
-    image = labels.image
-    if image is None or labels.full or labels.periodic:
-        return None, labels, ()
+    inputs: _Inputs, instances: bool | None, progress: Progress
+) -> tuple[Segmentation | None, _Inputs, tuple[str, ...]]:
+    """Fill labels that are instances as one structure, by the image. Return this structure, None if they are not or the
+    image does not show it; the inputs from which each label is to be filled then; and notes."""
+    image = inputs.image
+    if image is None or inputs.full or inputs.periodic:
+        return None, inputs, ()
     if instances is None:
-        levels = labels.given.turn(image.values)[list(labels.given.places)]
-        instances = are_instances(labels.drawn, levels, len(labels.numbers))
+        levels = inputs.known.turn(image.values)[list(inputs.known.places)]
+        instances = are_instances(inputs.in_slices, levels, len(inputs.labels))
     if not instances:
-        return None, labels, (*image.notes, APIECE)
-    whole = labels.fill(None, WHOLE, image=replace(image, affine=None, notes=()), progress=progress)
-    alone = replace(labels, image=None, working=replace(labels.working, filler=None))  # that one reads images
+        return None, inputs, (*image.notes, APIECE)
+    whole = inputs.fill(None, WHOLE, image=replace(image, affine=None, notes=()), progress=progress)
+    # Without the image each label is filled by the packaged network: that of `working` reads images.
+    alone = replace(inputs, image=None, working=replace(inputs.working, filler=None))
     shifted = [note for note in whole.notes if note.startswith(SHIFTED.partition("{")[0])]
     if UNTOLD in whole.notes:
         return None, alone, (*image.notes, *shifted, UNTOLD)
@@ -184,198 +186,210 @@ def _fill_instances(
 
 
 def _join_labels(
-    labels: _Labels, parts: _Parts, whole: Segmentation | None, notes: Sequence[str], reasons: Sequence[str]
+    inputs: _Inputs, parts: _Parts, whole: Segmentation | None, notes: Sequence[str], reasons: Sequence[str]
 ) -> Segmentation:
-    """Return the result of labels that are filled one by one, or as parts of a whole."""
-    known, image, numbers = labels.given, labels.image, labels.numbers
+    """Return the result of labels that were filled one by one (`parts`), or that split a `whole`."""
+    known, image, labels = inputs.known, inputs.image, inputs.labels
     volume, places = known.volume, list(known.places)
-    length = volume.shape[known.axis]
-    far = np.ones(known.turn(labels.values).shape, dtype=bool)
-    far[slice(None) if labels.periodic or image is not None else filled_range(places, length)] = False
-    values, likely, phase, odds = _join_parts(labels, parts, labels.full, known.turn_back(far))
-    doubts = {number: part.uncertainty for number, (_, part) in zip(numbers, parts, strict=True)}
-    dice = {number: doubt.expected_dice for number, doubt in doubts.items() if doubt is not None}
+    unfilled = np.ones(known.turn(inputs.indices).shape, dtype=bool)
+    filled = filled_range(places, len(unfilled))
+    unfilled[slice(None) if inputs.periodic or image is not None else filled] = False
+    indices, likely, phase, odds = _join_parts(inputs, parts, inputs.full, known.turn_back(unfilled))
+    doubts = {label: part.uncertainty for label, (_, part) in zip(labels, parts, strict=True)}
+    dice = {label: doubt.expected_dice for label, doubt in doubts.items() if doubt is not None}
     if whole is not None:
-        values, likely, expected = _split_instances(labels, parts, whole, values, odds)
-        dice, phase, reasons = dict(zip(numbers, expected, strict=True)), whole.phase.values, whole.notes
-    likely = np.where(labels.known, 1.0, likely).astype(np.float32)
+        indices, likely, expected = _split_instances(inputs, parts, whole, indices, odds)
+        dice, phase, reasons = dict(zip(labels, expected, strict=True)), whole.phase.values, whole.notes
+    likely = np.where(inputs.known_voxels, 1.0, likely).astype(np.float32)
     error = max(doubt.calibration_error for doubt in (whole and whole.uncertainty, *doubts.values()) if doubt)
-    unsure = doubt(likely)
-    entropies = tuple(unsure.sum(tuple({0, 1, 2} - {axis})) for axis in range(3))
-    following = suggest_slices(entropies[known.axis], places, labels.suggest, labels.periodic)
-    table = np.array([0, *numbers], volume.values.dtype if volume.values.dtype.kind in "iu" else np.int64)
-    if (kind := smallest_type(table)).itemsize < 8:  # of 64 bits the given one
+    entropy = doubt(likely)
+    entropies = tuple(entropy.sum(tuple({0, 1, 2} - {axis})) for axis in range(3))
+    suggestions = suggest_slices(entropies[known.axis], places, inputs.suggest, inputs.periodic)
+    table = np.array([0, *labels], volume.values.dtype if volume.values.dtype.kind in "iu" else np.int64)
+    if (kind := smallest_type(table)).itemsize < 8:  # labels of 64 bits keep their type
         table = table.astype(kind)
     uncertain = Uncertainty(
-        replace(volume, array=likely, notes=()), error, following, min(dice.values()), dice, entropies=entropies
+        replace(volume, array=likely, notes=()), error, suggestions, min(dice.values()), dice, entropies=entropies
     )
     return Segmentation.of(
-        volume, values != 0, np.maximum(phase, -1), None, max(part.epsilon for _, part in parts),
-        (*known.notes, *notes, *reasons), weight=None, status=_describe_labels(parts, dice, whole, following),
-        image=image, labels=replace(volume, array=table[values], notes=()), uncertainty=uncertain,
+        volume, indices != 0, np.maximum(phase, -1), None, max(part.epsilon for _, part in parts),
+        (*known.notes, *notes, *reasons), weight=None, status=_describe_labels(parts, dice, whole, suggestions),
+        image=image, labels=replace(volume, array=table[indices], notes=()), uncertainty=uncertain,
     )  # fmt: skip
 
 
+#: The box in which each label was filled, and the result there.
 _Parts = list[tuple[Box, Segmentation]]
 
 
 def _fill_each(
-    labels: _Labels, prior: LawLike | Mapping[int, LawLike] | None, progress: Progress
+    inputs: _Inputs, prior: LawLike | Mapping[int, LawLike] | None, progress: Progress
 ) -> tuple[_Parts, Sequence[str]]:
-    """Fill each label in its box, or by the network alone where it is refused so; return boxes and labels, and
-    notes."""
-    parts, notes, count = [], dict[str, list[int]](), len(labels.numbers)
-    image, example, store = labels.image, labels.example, labels.working.store
-    laws = prior if isinstance(prior, Mapping) else dict.fromkeys(labels.numbers, prior)
-    for place, number in enumerate(labels.numbers, 1):
-        inside = (labels.values == place) & labels.known
-        box = WHOLE if labels.periodic else _box_of_label(inside, labels)
+    """Fill each label in its box, by the network alone where `reconstruct` refuses more; return the results, and notes
+    with the labels that they concern."""
+    parts, labels_of_note, count = [], dict[str, list[int]](), len(inputs.labels)
+    image, example, store = inputs.image, inputs.example, inputs.working.store
+    laws = prior if isinstance(prior, Mapping) else dict.fromkeys(inputs.labels, prior)
+    for index, label in enumerate(inputs.labels, 1):
+        inside = (inputs.indices == index) & inputs.known_voxels
+        box = WHOLE if inputs.periodic else _box_of_label(inside, inputs)
         more = {
             "image": image and replace(image, array=image.values[box], affine=None, notes=()),
-            "example": example and replace(example, array=(example.values == number).astype(np.uint8), notes=()),
-            "working": replace(labels.working, store=store and Path(store) / str(number)),
+            "example": example and replace(example, array=(example.values == label).astype(np.uint8), notes=()),
+            "working": replace(inputs.working, store=store and Path(store) / str(label)),
         }
-        step = sub_progress(progress, (place - 1) / count, place / count)
+        step = sub_progress(progress, (index - 1) / count, index / count)
         try:
-            part = labels.fill(place, box, laws.get(number), progress=step, **more)
+            part = inputs.fill(index, box, laws.get(label), progress=step, **more)
         except ScanError as reason:
-            part = labels.fill(place, box, progress=step, working=replace(labels.working, store=None))
-            notes[f"Filled by the network alone: {reason}."] = [number]
+            part = inputs.fill(index, box, progress=step, working=replace(inputs.working, store=None))
+            labels_of_note[f"Filled by the network alone: {reason}."] = [label]
         parts.append((box, part))
         for note in part.notes:
-            notes.setdefault(note, []).append(number)
-    named = {text: f"Label{'s' * (len(of) > 1)} {', '.join(map(str, of))}: {text}" for text, of in notes.items()}
-    return parts, [text if len(notes[text]) == count else line for text, line in named.items()]
+            labels_of_note.setdefault(note, []).append(label)
+    notes = []
+    for note, labels in labels_of_note.items():
+        names = f"Label{'s' * (len(labels) > 1)} {', '.join(map(str, labels))}: "
+        notes.append(note if len(labels) == count else names + note)
+    return parts, notes
 
 
-def _join_parts(labels: _Labels, parts: _Parts, full: bool, far: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the place of the label with the greatest phase field at each voxel, 0 where there is none or `far` from
-    known slices; how likely that is; this phase field; and the sum of the labels' odds."""
-    shape = labels.values.shape
-    deepest, owner = np.full(shape, -np.inf, dtype=np.float32), np.zeros(shape, dtype=np.int16)
-    largest, odds = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
-    for place, (box, part) in enumerate(parts, 1):
-        owner[box] = np.where(part.phase.values > deepest[box], place, owner[box])
-        deepest[box] = np.maximum(deepest[box], part.phase.values)
-        own = _odds(part)
-        largest[box], odds[box] = np.maximum(largest[box], own), odds[box] + own
-    if full and (unseen := np.isneginf(deepest)).any():  # in no label's box
-        spacing = labels.given.volume.spacing
-        near = ndimage.distance_transform_edt(unseen, spacing, return_distances=False, return_indices=True)
-        owner = owner[tuple(near)]  # type: ignore[arg-type]
-    values = np.where(labels.known, labels.values, np.where(((deepest > 0) | full) & ~far, owner, 0))
-    likely = np.where(values, largest, 1.0) / np.maximum(odds + ((values == 0) | (not full)), SURE)
-    return values, likely, deepest, odds
+def _join_parts(inputs: _Inputs, parts: _Parts, full: bool, unfilled: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return, for each voxel (Z, Y, X), the index of the label with the greatest phase field, 0 where there is none or
+    nothing is filled; the probability of this; the greatest phase field; and the sum of the labels' odds."""
+    shape = inputs.indices.shape
+    phase, owner = np.full(shape, -np.inf, dtype=np.float32), np.zeros(shape, dtype=np.int16)
+    largest, total = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+    for index, (box, part) in enumerate(parts, 1):
+        owner[box] = np.where(part.phase.values > phase[box], index, owner[box])
+        phase[box] = np.maximum(phase[box], part.phase.values)
+        odds = _odds(part)
+        largest[box], total[box] = np.maximum(largest[box], odds), total[box] + odds
+    if full and (uncovered := np.isneginf(phase)).any():  # in no label's box
+        owner = _take_nearest(owner, uncovered, inputs.known.volume.spacing)
+    indices = np.where(inputs.known_voxels, inputs.indices, np.where(((phase > 0) | full) & ~unfilled, owner, 0))
+    # The background has odds of 1; where every voxel has a label, there is none.
+    likely = np.where(indices, largest, 1.0) / np.maximum(total + ((indices == 0) | (not full)), SURE)
+    return indices, likely, phase, total
+
+
+def _take_nearest(values: np.ndarray, missing: np.ndarray, spacing: Sequence[float]) -> np.ndarray:
+    """Replace values (Z, Y, X) where they are missing by those of the nearest voxel that has one."""
+    nearest = ndimage.distance_transform_edt(missing, spacing, return_distances=False, return_indices=True)
+    return values[tuple(nearest)]  # type: ignore[arg-type]
 
 
 def _split_instances(
-    labels: _Labels, parts: _Parts, whole: Segmentation, values: np.ndarray, odds: np.ndarray
+    inputs: _Inputs, parts: _Parts, whole: Segmentation, indices: np.ndarray, odds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[float]]:
-    """Split what all labels fill as one structure by where each is alone; return places, their probabilities (that of
-    the structure times the label's share in the odds of all), and the Dice to expect of each."""
+    """Split the whole structure among its labels, given the `indices` (Z, Y, X) of labels filled alone. Return the new
+    indices; their probabilities, the structure's times the label's part of the summed `odds`; and each label's expected
+    Dice."""
     assert whole.probability is not None
-    values = split_structure(whole.mask.values, values, labels.known, labels.given.volume.spacing)
-    inside, known = whole.probability.values, labels.given
-    likely, dice = np.where(values, inside, 1 - inside), []
-    between = np.zeros(values.shape[known.axis], dtype=bool)
+    known = inputs.known
+    indices = split_structure(whole.mask.values, indices, inputs.known_voxels, known.volume.spacing)
+    inside = whole.probability.values
+    likely, dice = np.where(indices, inside, 1 - inside), []
+    between = np.zeros(indices.shape[known.axis], dtype=bool)
     between[known.places[0] : known.places[-1]] = True
     between[list(known.places)] = False
-    for number, (box, part) in enumerate(parts, 1):
-        chances, voxels = inside[box] * _odds(part) / np.maximum(odds[box], SURE), values[box] == number
-        likely[box] = np.where(voxels, chances, likely[box])
-        chances, voxels = (known.turn(each)[between[box[known.axis]]] for each in (chances, voxels))
-        dice.append(expected_dice(chances, voxels) if chances.size else 1.0)
-    return values, likely, dice
+    for index, (box, part) in enumerate(parts, 1):
+        probabilities, mask = inside[box] * _odds(part) / np.maximum(odds[box], SURE), indices[box] == index
+        likely[box] = np.where(mask, probabilities, likely[box])
+        rows = between[box[known.axis]]
+        probabilities, mask = known.turn(probabilities)[rows], known.turn(mask)[rows]
+        dice.append(expected_dice(probabilities, mask) if mask.size else 1.0)
+    return indices, likely, dice
 
 
-def _box_of_label(inside: np.ndarray, labels: _Labels) -> Box:
-    """Return the box in which a label may be, given where it is known to be (Z, Y, X): along the axis up to the known
-    slices without it, and across it `ROOM` voxels and two gaps beyond."""
-    places, axis, spacing = labels.given.places, labels.given.axis, labels.given.volume.spacing
-    step = 2 * max(np.diff(places)) * spacing[axis]
+def _box_of_label(inside: np.ndarray, inputs: _Inputs) -> Box:
+    """Return the box in which a label may be, given its known voxels, bool (Z, Y, X): from the last known slice before
+    them to the next known slice beyond; within slices `ROOM` voxels and two gaps more on each side."""
+    places, axis, spacing = inputs.known.places, inputs.known.axis, inputs.known.volume.spacing
+    two_gaps = 2 * max(np.diff(places)) * spacing[axis]
     box: list[slice] = []
     for k in range(3):
-        found = np.flatnonzero(inside.any(tuple({0, 1, 2} - {k})))
-        low, high = int(found[0]), int(found[-1])
+        positions = np.flatnonzero(inside.any(tuple({0, 1, 2} - {k})))
+        low, high = int(positions[0]), int(positions[-1])
         if k == axis:
-            before, beyond = [p for p in places if p < low], [p for p in places if p > high]
+            before, beyond = [place for place in places if place < low], [place for place in places if place > high]
             box.append(slice(before[-1] if before else 0, beyond[0] + 1 if beyond else inside.shape[k]))
         else:
-            margin = ROOM + math.ceil(step / spacing[k])
+            margin = ROOM + math.ceil(two_gaps / spacing[k])
             box.append(slice(max(low - margin, 0), min(high + 1 + margin, inside.shape[k])))
     return box[0], box[1], box[2]
 
 
 def _describe_labels(
-    parts: _Parts, dice: Mapping[int, float], whole: Segmentation | None, following: Sequence[int]
+    parts: _Parts, dice: Mapping[int, float], whole: Segmentation | None, suggestions: Sequence[int]
 ) -> str:
-    """Say how some labels were filled, and of many or of instances how well in the median and in the worst case."""
-    end = f"; annotate next: {', '.join(map(str, following))}" if following else ""
+    """Return the status: that of each of a few labels; of many, or of instances, the median Dice and the worst ones."""
+    end = f"; annotate next: {', '.join(map(str, suggestions))}" if suggestions else ""
     if len(parts) <= FEW and whole is None:
-        each = zip(dice, parts, strict=True)
-        return "; ".join(f"label {number}: {part.status}" for number, (_, part) in each) + end
-    worst = ", ".join(f"label {number} {dice[number]:.2f}" for number in sorted(dice, key=lambda n: dice[n])[:FEW])
+        return "; ".join(f"label {label}: {part.status}" for label, (_, part) in zip(dice, parts, strict=True)) + end
+    worst = ", ".join(f"label {label} {dice[label]:.2f}" for label in sorted(dice, key=lambda label: dice[label])[:FEW])
     median = f"expect a Dice of {np.median(list(dice.values())):.2f} between known slices in the median; least: {worst}"
-    way = "filled:" if whole is None else f"filled as instances of one structure, {whole.status}; of labels,"
-    return f"{len(parts)} labels {way} {median}{end}"
+    start = "filled:" if whole is None else f"filled as instances of one structure, {whole.status}; of labels,"
+    return f"{len(parts)} labels {start} {median}{end}"
 
 
 def _odds(part: Segmentation) -> np.ndarray:
-    """Return the odds of the inside, finite."""
+    """Return the odds of the inside in each voxel of a label's box, finite."""
     likely = np.clip(part.mask.values if part.probability is None else part.probability.values, SURE, 1 - SURE)
     return likely / (1 - likely)
 
 
 def find_labels(values: np.ndarray, chosen: Sequence[int] | None) -> list[int]:
-    """Return the labels in known slices that are structures, ascending: the chosen ones, or all but 0. Raises
+    """Return the labels to fill, ascending: the chosen ones, or all but 0 in the known slices (N, Y, X). Raises
     `ScanError` if the values are grey levels, a chosen label is missing, or there is none but 0."""
     if chosen is not None:
-        chosen = sorted({check_int(n, "labels that are whole numbers", -SEEDS, IDS) for n in chosen})
-        kept = require_labels(values, "the known slices", math.inf)  # of those that are not chosen any number
-        values = np.where(index_labels(kept, chosen), kept, 0)
+        chosen = sorted({check_int(label, "labels that are whole numbers", -SEEDS, IDS) for label in chosen})
+        values = require_labels(values, "the known slices", math.inf)  # only the chosen ones must be few
+        values = np.where(index_labels(values, chosen), values, 0)
     present = [int(value) for value in np.unique(require_labels(values, "the known slices"))]
-    numbers = [number for number in present if number] if chosen is None else chosen
-    listed = ", ".join(map(str, present[:12])) + (", …" if len(present) > 12 else "")
-    if not numbers or 0 in numbers:
-        raise ScanError(f"labels must be other than 0, got {'0' if numbers else f'{listed} in the known slices'}")
-    if missing := [number for number in numbers if number not in present]:
+    labels = [label for label in present if label] if chosen is None else chosen
+    listed = list_numbers(present, 12)
+    if not labels or 0 in labels:
+        raise ScanError(f"labels must be other than 0, got {'0' if labels else f'{listed} in the known slices'}")
+    if missing := [label for label in labels if label not in present]:
         raise ScanError(f"the known slices have the labels {listed}, but not {', '.join(map(str, missing))}")
-    return numbers
+    return labels
 
 
 def are_instances(labels: np.ndarray, levels: np.ndarray, count: int) -> bool:
-    """Return whether labels from 1 to `count` in slices (N, Y, X) are instances, as they are drawn and by grey levels
-    there: nine in ten are, but for a tenth of their area, one piece in each slice, and grey levels vary more within
-    labels than between them."""
-    own, grey = labels[labels > 0], levels[labels > 0].astype(np.float64)
-    total, largest = np.bincount(own, minlength=count + 1), np.zeros(count + 1)
+    """Return whether labels from 1 to `count` in slices (N, Y, X) with grey `levels` are instances: nine in ten are one
+    piece in each slice, but for a tenth of their area, and grey levels vary more within labels than between them."""
+    inside = labels > 0
+    owners, grey = labels[inside], levels[inside].astype(np.float64)
+    areas, largest = np.bincount(owners, minlength=count + 1), np.zeros(count + 1)
     for plane in labels:
         pieces = np.asarray(measure.label(plane, connectivity=2))
-        owner = np.zeros(pieces.max() + 1, dtype=np.intp)
-        owner[pieces] = plane
-        best = np.zeros(count + 1)
-        np.maximum.at(best, owner, np.bincount(pieces.ravel()))
-        largest += best
-    means = np.bincount(own, grey, minlength=count + 1) / np.maximum(total, 1)
-    whole = (largest >= PIECE * total)[1:].mean() >= MOST
-    return bool(whole and means[own].var() <= ALIKE * grey.var())
+        label_of_piece = np.zeros(pieces.max() + 1, dtype=np.intp)
+        label_of_piece[pieces] = plane
+        largest_here = np.zeros(count + 1)
+        np.maximum.at(largest_here, label_of_piece, np.bincount(pieces.ravel()))
+        largest += largest_here
+    means = np.bincount(owners, grey, minlength=count + 1) / np.maximum(areas, 1)
+    compact = (largest >= PIECE * areas)[1:].mean() >= MOST
+    return bool(compact and means[owners].var() <= ALIKE * grey.var())
 
 
 def split_structure(mask: np.ndarray, labels: np.ndarray, known: np.ndarray, spacing: Sequence[float]) -> np.ndarray:
-    """Return labels of a structure's mask (Z, Y, X): each voxel has the nearest of the `labels` (Z, Y, X), which are 0
-    where there is none, and those of `known` voxels stay. Each label is kept in one piece: of the pieces that it has,
-    those without a known voxel go to the label that they touch most, or to the background."""
-    near = ndimage.distance_transform_edt(labels == 0, spacing, return_distances=False, return_indices=True)
-    labelled = np.where(known, labels, np.where(mask, labels[tuple(near)], 0))  # type: ignore[arg-type]
+    """Split a structure's mask (Z, Y, X) among `labels` (Z, Y, X), 0 where there is none: each voxel gets the nearest,
+    and `known` voxels keep theirs. Each label is kept in one piece: a piece without a known voxel goes to the label
+    that it touches most, or to the background."""
+    labelled = np.where(known, labels, np.where(mask, _take_nearest(labels, labels == 0, spacing), 0))
     pieces = np.asarray(measure.label(labelled, connectivity=3))
-    owner, stays = np.zeros(pieces.max() + 1, dtype=labelled.dtype), np.zeros(pieces.max() + 1, dtype=bool)
-    owner[pieces], stays[pieces[known]], stays[0] = labelled, True, True
-    row = np.cumsum(~stays) - 1
-    touched = np.zeros((np.count_nonzero(~stays), int(labels.max()) + 1), dtype=np.intp)
+    label_of_piece = np.zeros(pieces.max() + 1, dtype=labelled.dtype)
+    label_of_piece[pieces] = labelled
+    anchored = np.zeros(len(label_of_piece), dtype=bool)  # pieces that keep their label, with the background, 0
+    anchored[pieces[known]] = anchored[0] = True
+    row_of_piece = np.cumsum(~anchored) - 1
+    contacts = np.zeros((np.count_nonzero(~anchored), int(labels.max()) + 1), dtype=np.intp)
     for axis in range(3):
         moved = np.moveaxis(pieces, axis, 0)
-        for here, there in ((moved[1:], moved[:-1]), (moved[:-1], moved[1:])):
-            meet = ~stays[here] & stays[there] & (there > 0)
-            np.add.at(touched, (row[here[meet]], owner[there[meet]]), 1)
-    owner[~stays] = touched.argmax(1)  # that is 0 where nothing is touched
-    return owner[pieces]
+        for piece, neighbour in ((moved[1:], moved[:-1]), (moved[:-1], moved[1:])):
+            touching = ~anchored[piece] & anchored[neighbour] & (neighbour > 0)
+            np.add.at(contacts, (row_of_piece[piece[touching]], label_of_piece[neighbour[touching]]), 1)
+    label_of_piece[~anchored] = contacts.argmax(1)  # 0 where nothing is touched
+    return label_of_piece[pieces]

@@ -267,10 +267,21 @@ def _choose_law(
         return Trial(), task, engine.taught.status
     if stiffness is not None:
         return Trial(laws[0], stiffness, steps), task, "the law is lowered from the network's volume"
-    task = _pose_task(slices if tiles == 1 else crop_to_surface(slices, PART)[0], example)
+    part = slices if tiles == 1 else crop_to_surface(slices, PART)[0]
+    task = leave_out_slices(part) if example is None else example.part
+    if task is None:
+        raise ScanError(
+            "to try the prior out, give three or more known slices with voxels inside and outside, an example or a "
+            f"stiffness, got {len(part.places)} slices"
+        )
     trials = [Trial(law, STIFFNESS, steps, pull) for law, pull in product(laws, PULLS)]
     best = choose_by_masks(task, trials, lambda slices, trial: engine.run(slices, trial) > 0)
-    return best, task, _describe_gain(best, "left out" if example is None else "of the example")
+    score, plain = f"{best.score:.3f}", f"{best.plain:.3f}"
+    where = "left out" if example is None else "of the example"
+    head = f"no law helps here: Dice {plain} on slices {where} by the network alone, {score} with a law"
+    if best.law is not None:
+        head = f"a law helps: Dice {score} on slices {where}, {plain} by the network alone"
+    return best, task, head
 
 
 @dataclass(frozen=True, eq=False)
@@ -530,17 +541,6 @@ def _profile(level: np.ndarray, epsilon: float) -> np.ndarray:
     return np.tanh(level / (math.sqrt(2) * epsilon))
 
 
-def _pose_task(slices: Slices, example: Example | None) -> Task[Slices]:
-    """Return the task on which laws are tried out: a part of the example, or else every second known slice."""
-    task = leave_out_slices(slices) if example is None else example.part
-    if task is None:
-        raise ScanError(
-            "to try the prior out, give three or more known slices with voxels inside and outside, an example or a "
-            f"stiffness, got {len(slices.places)} slices"
-        )
-    return task
-
-
 def _weigh_evidence(
     engine: _Engine, trial: Trial, task: Task[Slices] | None, known: Known, slices: Slices, lowered: LoweredVolume
 ) -> tuple[_Filled, _Engine]:
@@ -563,14 +563,6 @@ def _weigh_evidence(
     likely = probability(evidence(slices, lowered.phase, list(range(slices.length))), weights).reshape(slices.shape)
     likely[slices.unfilled] = np.minimum(likely[slices.unfilled], 0.5)
     return _Filled.of(known, slices, likely, mask), replace(engine, taught=replace(engine.taught, error=error))
-
-
-def _describe_gain(best: Trial, where: str) -> str:
-    """Return the beginning of a status: whether a law was chosen, and the Dice with it and without."""
-    score, plain = f"{best.score:.3f}", f"{best.plain:.3f}"
-    if best.law is None:
-        return f"no law helps here: Dice {plain} on slices {where} by the network alone, {score} with a law"
-    return f"a law helps: Dice {score} on slices {where}, {plain} by the network alone"
 
 
 def load_image(image: Source, volume: Volume, reading: dict[str, Any]) -> Volume:

@@ -1,4 +1,4 @@
-"""The result of a segmentation, what is said of it, and its files: mask, picture, record, probability, labels."""
+"""The result of a segmentation, its status, and its files: mask, picture, record, probability, labels."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from curvafit.volumes.write import is_streamed, pick_writer, save
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: A flow has settled where its last ten steps lower the energy by less than this share.
+#: A flow has settled where its last ten steps lower the energy by less than this fraction.
 SETTLED = 0.001
 #: `format` of the record beside a mask.
 FORMAT = Format("curvafit-mask-1", title="the record of a mask")
 #: Volumes that may lie beside a mask, by the ending of their names.
 MAPS = ("probability", "sure")
-#: The least expected Dice of a volume that slices tell.
+#: Expected Dice below which a note says that the known slices are too few.
 HALF = 0.5
-#: Least relative difference of two shares of a volume that is told.
+#: Relative difference of the mask's volume and that by known slices below which there is no note.
 LITTLE = 0.01
-#: What is said of a mask that is no estimate of a volume.
+#: The note on a mask whose volume is not that by known slices.
 OFF = (
     "The mask's share of the volume is not within the interval by the known slices alone: for a volume take theirs. "
     "The mask is the one with the best Dice to expect, which may be too large or too small."
@@ -152,21 +152,22 @@ class Segmentation(Pictured):
         if self.probability is None:
             raise ValueError("labels can be kept where they are sure only in a volume with probabilities")
         least = check_float(least, "a probability from 0.5 to 1", 0.5, 1.0)
-        labels, likely = self.mask.values if self.labels is None else self.labels.values, self.probability.values
-        likely = np.where(labels, likely, 1 - likely) if self.labels is None else likely
+        labels, likely = (self.mask if self.labels is None else self.labels).values, self.probability.values
+        if self.labels is None:  # the probability is that of the inside
+            likely = np.where(labels, likely, 1 - likely)
         lowest = max(int(labels.max()), 0) + 1
-        number = lowest if ignored is None else check_int(ignored, f"a label to ignore from {lowest}", lowest, IDS)
-        kind = np.promote_types(labels.dtype, np.min_scalar_type(number))
-        if labels.dtype.kind in "iu" and number <= np.iinfo(labels.dtype).max:
-            kind = labels.dtype  # signed and unsigned ones of 64 bits would be joined as floats
-        if kind.kind not in "iu":
+        ignored = lowest if ignored is None else check_int(ignored, f"a label to ignore from {lowest}", lowest, IDS)
+        dtype = np.promote_types(labels.dtype, np.min_scalar_type(ignored))
+        if labels.dtype.kind in "iu" and ignored <= np.iinfo(labels.dtype).max:
+            dtype = labels.dtype  # NumPy would promote signed and unsigned ones of 64 bits to floats
+        if dtype.kind not in "iu":
             raise ValueError(
-                f"a label to ignore must be higher than all others, but {number} is more than 64 bits hold"
+                f"a label to ignore must be higher than all others, but {ignored} is more than 64 bits hold"
             )
-        values = labels.astype(kind)
-        values[likely < least] = number
-        share = 100 * float((likely < least).mean())
-        note = f"{share:.3g} % of the voxels are less sure than {least:g} and have the label to ignore, {number}."
+        values, unsure = labels.astype(dtype), likely < least
+        values[unsure] = ignored
+        percent = f"{100 * float(unsure.mean()):.3g} %"
+        note = f"{percent} of the voxels are less sure than {least:g} and have the label to ignore, {ignored}."
         return replace(self.mask, array=values, notes=(note,))
 
     def __repr__(self) -> str:
@@ -175,15 +176,15 @@ class Segmentation(Pictured):
 
 
 def flow_summary(share: float, energy: Sequence[float] = (), steps: int = 0) -> str:
-    """Say whether a flow settled, if there was one, and which share of the volume is inside."""
+    """Return the part of a status on whether a flow settled, if there was one, and the fraction inside (`share`)."""
     inside = f"{100 * share:.2f} % of the volume is inside"
     if not steps:
         return inside
-    fall = (energy[0] - energy[-1]) / max(abs(energy[-1]), 1e-30) if len(energy) > 1 else 1.0
-    length = f"{steps} step" if steps == 1 else f"{steps} steps"
+    duration = f"{steps} step" if steps == 1 else f"{steps} steps"
     if share in (0.0, 1.0):
-        return f"no surface is left after {length}: the prior is too strong for the data, lower its weight"
-    return f"{'settled' if abs(fall) < SETTLED else 'still moving'} after {length}: {inside}"
+        return f"no surface is left after {duration}: the prior is too strong for the data, lower its weight"
+    change = (energy[0] - energy[-1]) / max(abs(energy[-1]), 1e-30) if len(energy) > 1 else 1.0
+    return f"{'settled' if abs(change) < SETTLED else 'still moving'} after {duration}: {inside}"
 
 
 def check_mask_target(
@@ -194,27 +195,28 @@ def check_mask_target(
     *,
     maps: Sequence[str] = (),
 ) -> Path:
-    """Return the path, or raise ValueError where the mask of a scan cannot be written there; called before the work.
-    None of the `inputs`, files or folders, may be overwritten, but the image that gets labels. `overwrite` says whether
-    files of other origin may be replaced, `maps` which of `MAPS` go beside the mask."""
+    """Return the path, or raise ValueError where the mask of a scan cannot be written there; to be called before the
+    work. None of the `inputs`, files or folders, may be overwritten, except that an image may get labels. `overwrite`
+    says whether files of other origin may be replaced, `maps` which of `MAPS` go beside the mask."""
     target, image = Path(path), image_of(Path(path))
     pick_writer(target, "mm" if scan is None else scan.unit)
     if scan is not None and not is_streamed(target):
         check_memory(scan.shape, 4, "a result that is not written into Zarr")
-    first, *more = beside(target, ".json"), beside(target, ".png"), *(map_path(target, name) for name in maps)
+    record, more = beside(target, ".json"), (beside(target, ".png"), *(map_path(target, name) for name in maps))
     if image is None:
-        return can_write(target, FORMAT, more=(first, *more), inputs=inputs, overwrite=overwrite)
+        return can_write(target, FORMAT, more=(record, *more), inputs=inputs, overwrite=overwrite)
     if scan is not None:
         check_place(scan, image)
     inputs = list(inputs)
-    own = [each for each in inputs if Path(str(each).replace("::", "/")).resolve().is_relative_to(target.resolve())]
-    can_write(target, lambda there: is_own_zarr(there, FORMAT.name), inputs=own, overwrite=overwrite)
-    can_write(first, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
+    # Labels lie within their image's store: only an input within the labels would be overwritten.
+    within = [path for path in inputs if Path(str(path).replace("::", "/")).resolve().is_relative_to(target.resolve())]
+    can_write(target, lambda path: is_own_zarr(path, FORMAT.name), inputs=within, overwrite=overwrite)
+    can_write(record, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
     return target
 
 
 def beside(target: Path, ending: str) -> Path:
-    """Return the path of what lies beside a mask: `mask.json` for `mask.nii.gz`. For labels of an image,
+    """Return the path of a file beside a mask, `mask.json` for `mask.nii.gz` and `.json`. For labels of an image,
     `scan.zarr/labels/NAME`, it is `scan_NAME.json`, beside the store."""
     if (image := image_of(target)) is None:
         return sibling(target, ending)
@@ -222,7 +224,7 @@ def beside(target: Path, ending: str) -> Path:
 
 
 def hidden_store(target: Path) -> Path:
-    """Return the folder beside a mask, and not within the user's store, where finished parts of a run are."""
+    """Return the folder for finished parts of a run, beside a mask and outside the user's store."""
     return beside(target, ".tiles").with_name(f".{target.name}.curvafit-tiles")
 
 
@@ -247,52 +249,51 @@ def write_mask(
     are NIfTI, the mask gets the same header but for type and range, and `unit`. `record` has entries to add to the
     record; with `overwrite` files of other origin may be replaced.
     """
-    maps = {name: each for name, each in zip(MAPS, (segmentation.probability, sure), strict=True) if each is not None}
+    maps = {MAPS[0]: segmentation.probability, MAPS[1]: sure}
+    maps = {name: volume for name, volume in maps.items() if volume is not None}
     inputs = () if like is None else (like,)
     target = check_mask_target(path, scan, inputs, overwrite, maps=list(maps))
     image = image_of(target)
 
-    def write(volume: Volume, place: Path) -> None:
-        if like is not None and all(str(each).lower().endswith(_NIFTI) for each in (like, target)):
-            write_nifti_like(volume.values, Path(like), place, unit)
+    def write(volume: Volume, file: Path) -> None:
+        if like is not None and all(str(path).lower().endswith(_NIFTI) for path in (like, target)):
+            write_nifti_like(volume.values, Path(like), file, unit)
         else:
-            save(replace(volume, spacing=scan.spacing, unit=scan.unit, affine=scan.affine), place, kind=FORMAT.name)
+            save(replace(volume, spacing=scan.spacing, unit=scan.unit, affine=scan.affine), file, kind=FORMAT.name)
 
     with temporary_folder(beside(target, ".json")) as work:
-        mask, values = segmentation.mask, segmentation.labels
-        if values is None:
-            whole = replace(mask.array, label=None) if mask.in_file else mask.values.view(np.uint8)
-            values = replace(mask, array=whole)
-        for name, each in maps.items():
-            write(each, work / map_path(target, name).name)
+        mask, labels = segmentation.mask, segmentation.labels
+        if labels is None:  # the mask, as 0 and 1
+            numbers = replace(mask.array, label=None) if mask.in_file else mask.values.view(np.uint8)
+            labels = replace(mask, array=numbers)
+        for name, volume in maps.items():
+            write(volume, work / map_path(target, name).name)
         if image is None:
-            write(values, work / target.name)
+            write(labels, work / target.name)
         else:
-            write_labels(replace(scan, array=values.array), work / target.name, image=image)
+            write_labels(replace(scan, array=labels.array), work / target.name, image=image)
             mark(work / target.name, FORMAT.name)
-        shown = None if maps else scan.values
-        rows = {} if shown is None else {"scan": (shown, None), "mask": (shown, mask.values)}
+        rows = {} if maps else {"scan": (scan.values, None), "mask": (scan.values, mask.values)}
         content = describe_run(segmentation, record or {}, scan)
         return _finish(work, target, list(maps), _figure(segmentation, rows), content)
 
 
 def _finish(work: Path, target: Path, maps: Sequence[str], figure: Figure, content: dict[str, Any]) -> tuple[Path, ...]:
-    """Write picture and record into the folder `work` beside a target, where the mask and its `maps` are; move all
-    together to where they belong, a mask of labels into its image, remove maps of an earlier run, return the paths."""
+    """Write picture and record into the folder `work`, where the mask and its `maps` are; move all files at once beside
+    the target, but labels into their image; remove maps of an earlier run, and return the paths."""
     from curvafit.drawing.plot import DPI
 
-    enclosing_image, note = image_of(target), beside(target, ".json")
-    listed = FORMAT.companions(target if enclosing_image is None else note)
+    image, record, picture = image_of(target), beside(target, ".json"), beside(target, ".png")
+    former = FORMAT.companions(target if image is None else record)
     others = [map_path(target, name) for name in MAPS if name not in maps]
-    old_maps = [path for path in others if path.name in listed]
-    parts = [work / beside(target, ending).name for ending in (".png", ".json")]
-    parts += [work / map_path(target, name).name for name in maps]
-    parts = parts if enclosing_image else [work / target.name, *parts]
-    figure.savefig(work / beside(target, ".png").name, dpi=DPI)
-    FORMAT.write(work / note.name, {**content, "files": [part.name for part in parts]})
+    old_maps = [path for path in others if path.name in former]
+    names = [] if image else [target.name]
+    names += [picture.name, record.name, *(map_path(target, name).name for name in maps)]
+    figure.savefig(work / picture.name, dpi=DPI)
+    FORMAT.write(work / record.name, {**content, "files": names})
     with hold_signals():
-        added = () if enclosing_image is None else (add_labels(work / target.name, enclosing_image, target.name),)
-        files = move_together(parts, note.parent)
+        added = () if image is None else (add_labels(work / target.name, image, target.name),)
+        files = move_together([work / name for name in names], record.parent)
         for path in old_maps:
             remove(path)
     return (*added, *files)
@@ -304,8 +305,8 @@ def segmentation_figure(segmentation: Segmentation) -> Figure:
 
 
 def _figure(segmentation: Segmentation, rows: Mapping[str, tuple[np.ndarray, np.ndarray | None]]) -> Figure:
-    """Draw rows of middle slices; or of a volume between known slices the most uncertain ones. There the outline is
-    drawn over the image, if there is one, or else over what is known; below is how unsure it is."""
+    """Draw `rows` of middle slices. Of a volume between known slices draw the most uncertain ones instead: the outline
+    over the image, if there is one, or else over the known voxels, and the entropy below."""
     from curvafit.drawing.plot import Sections, colour_labels, draw_sections, grey_limits, section_figure
 
     mask, labels, image = segmentation.mask, segmentation.labels, segmentation.image
@@ -313,24 +314,26 @@ def _figure(segmentation: Segmentation, rows: Mapping[str, tuple[np.ndarray, np.
     if uncertain is None:
         return section_figure(rows, mask.spacing, mask.unit)
     places = [int(sums.argmax()) for sums in uncertain.entropies]
-    outlines, likely = _read_planes(mask, places), _read_planes(uncertain.probability, places)
-    unsure, shown = [doubt(plane) for plane in likely], {}
+    masks, likely = _read_planes(mask, places), _read_planes(uncertain.probability, places)
+    entropies, sections = [doubt(plane) for plane in likely], {}
     if image is not None:
-        shown["image, filled"] = Sections(_read_planes(image, places), outlines, grey_limits(image.values))
-    elif labels is None:
-        known = [np.where(p % 1 == 0, 2 * m.astype(np.int8) - 1, 0) for p, m in zip(likely, outlines, strict=True)]
-        shown["known, filled"] = Sections(known, outlines, (-1.0, 1.0))
+        sections["image, filled"] = Sections(_read_planes(image, places), masks, grey_limits(image.values))
+    elif labels is None:  # known voxels have a probability of exactly 0 or 1
+        known = [np.where(p % 1 == 0, 2 * m.astype(np.int8) - 1, 0) for p, m in zip(likely, masks, strict=True)]
+        sections["known, filled"] = Sections(known, masks, (-1.0, 1.0))
     if labels is not None:
-        shown["filled"] = Sections([colour_labels(plane) for plane in _read_planes(labels, places)], None, (0.0, 1.0))
-    shown["how unsure"] = Sections(unsure, outlines, grey_limits(np.concatenate([plane.ravel() for plane in unsure])))
-    return draw_sections(shown, mask.spacing, mask.unit, places)
+        colours = [colour_labels(plane) for plane in _read_planes(labels, places)]
+        sections["filled"] = Sections(colours, None, (0.0, 1.0))
+    limits = grey_limits(np.concatenate([plane.ravel() for plane in entropies]))
+    sections["how unsure"] = Sections(entropies, masks, limits)
+    return draw_sections(sections, mask.spacing, mask.unit, places)
 
 
 def _read_planes(volume: Volume, places: Sequence[int]) -> list[np.ndarray]:
-    """Return slices of a volume across z, y and x."""
-    boxes = ([slice(0, n) for n in volume.shape] for _ in range(3))
+    """Return the slices of a volume at three `places`, across z, y and x."""
     planes = []
-    for axis, (box, place) in enumerate(zip(boxes, places, strict=True)):
+    for axis, place in enumerate(places):
+        box = [slice(0, n) for n in volume.shape]
         box[axis] = slice(place, place + 1)
         # A plane across y or x has a voxel in each page of a mapped file: it is read a few slices at once.
         slabs = [slice(z, z + CHUNK) for z in range(0, volume.shape[0], CHUNK)] if axis else box[:1]
@@ -339,33 +342,33 @@ def _read_planes(volume: Volume, places: Sequence[int]) -> list[np.ndarray]:
 
 
 def map_path(target: Path, name: str) -> Path:
-    """Return `mask_probability.nii.gz` for `mask.nii.gz` and `probability`."""
+    """Return the path of a map beside a mask: `mask_probability.nii.gz` for `mask.nii.gz` and `probability`."""
     suffix = ".zarr" if image_of(target) else target.name.removeprefix(sibling(target, "").name)
     return beside(target, f"_{name}{suffix}")
 
 
-def describe_run(found: Segmentation, options: Mapping[str, Any], scan: Volume) -> dict[str, Any]:
-    """Return the record of a mask of a scan: its status, the run's options, what was found, and notes."""
-    uncertain, doubts = found.uncertainty, {}
+def describe_run(segmentation: Segmentation, options: Mapping[str, Any], scan: Volume) -> dict[str, Any]:
+    """Return the record of a scan's segmentation: its status, the run's options, figures and notes."""
+    uncertain, figures = segmentation.uncertainty, {}
     if uncertain is not None:
-        doubts = {name: getattr(uncertain, name) for name in ("calibration_error", "suggestions", "expected_dice")}
+        figures = {name: getattr(uncertain, name) for name in ("calibration_error", "suggestions", "expected_dice")}
         if uncertain.dice_of_labels:
-            doubts["dice_of_labels"] = {str(number): dice for number, dice in uncertain.dice_of_labels.items()}
+            figures["dice_of_labels"] = {str(number): dice for number, dice in uncertain.dice_of_labels.items()}
         if uncertain.known_share:
-            doubts |= {"known_share": uncertain.known_share, "mean_probability": uncertain.mean_probability}
+            figures |= {"known_share": uncertain.known_share, "mean_probability": uncertain.mean_probability}
     return {
-        "status": found.status,
+        "status": segmentation.status,
         **options,
         "scan": scan.source,
         "shape": list(scan.shape),
         "spacing": list(scan.spacing),
         "unit": scan.unit,
-        "coefficients": None if found.coefficients is None else found.coefficients.as_dict(),
-        "epsilon": found.epsilon,
-        "weight": found.weight,
-        "volume_fraction": found.share,
-        **doubts,
-        "notes": list(found.notes),
+        "coefficients": None if segmentation.coefficients is None else segmentation.coefficients.as_dict(),
+        "epsilon": segmentation.epsilon,
+        "weight": segmentation.weight,
+        "volume_fraction": segmentation.share,
+        **figures,
+        "notes": list(segmentation.notes),
         "curvafit": version("curvafit"),
         "torch": version("torch"),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -376,32 +379,35 @@ def describe_filled(
     head: str, inside: str, share: float, uncertain: Uncertainty, places: Sequence[int], length: int, *, tested: str,
     image: bool = False, periodic: bool = False,
 ) -> tuple[str, tuple[str, ...]]:  # fmt: skip
-    """Return the status of a volume between the known slices at `places`, and sentences on what is doubtful. `head` is
-    how it was filled, `inside` a sentence on the mask, `share` its share of the volume, and `tested` what probabilities
-    were held to. With an image or in a periodic volume all slices are filled."""
-    reach = slice(0, length) if image or periodic else filled_range(places, length)
-    left = length - (reach.stop - reach.start)
+    """Return the status of a volume of `length` slices with known ones at `places`, and notes on doubts. `head` is how
+    it was filled, `inside` describes the mask, `share` is its fraction of the volume, and `tested` names what the
+    probabilities were tested on. With an image or in a periodic volume all slices are filled."""
+    filled = slice(0, length) if image or periodic else filled_range(places, length)
+    unfilled = length - (filled.stop - filled.start)
     known = uncertain.known_share
+    beyond = f", {unfilled} beyond them not filled" if unfilled > 0 else ""
     span = f" ({100 * known[1]:.2f} to {100 * known[2]:.2f})" if known[1:] else ""
     status = (
-        f"{head}: {len(places)} of {length} slices known{f', {left} beyond them not filled' * (left > 0)}, {inside}, "
+        f"{head}: {len(places)} of {length} slices known{beyond}, {inside}, "
         f"{100 * known[0]:.2f} %{span} by known slices alone, {100 * uncertain.mean_probability:.2f} % by "
         f"probabilities; expect a Dice of {uncertain.expected_dice:.2f} between known slices; "
         f"probabilities err by {uncertain.calibration_error:.3f} near the surface of {tested}"
     )
     if uncertain.suggestions:
         status += f"; annotate next: {', '.join(map(str, uncertain.suggestions))}"
-    low = "Known slices lie too far apart: what lies between them is more unknown than known."
-    off = bool(known[1:]) and not known[1] <= share <= known[2] and abs(share / known[0] - 1) > LITTLE
-    notes = (*(low,) * (uncertain.expected_dice < HALF), *(OFF,) * off)
-    return status, (*notes, *(() if periodic else _note_ends(places, length, reach, image)))
+    few = "Known slices lie too far apart: what lies between them is more unknown than known."
+    notes = [few] if uncertain.expected_dice < HALF else []
+    if known[1:] and not known[1] <= share <= known[2] and abs(share / known[0] - 1) > LITTLE:
+        notes.append(OFF)
+    return status, (*notes, *(() if periodic else _note_ends(places, length, filled, image)))
 
 
-def _note_ends(places: Sequence[int], length: int, reach: slice, image: bool) -> Iterator[str]:
-    """Yield sentences on the slices before the first known one and beyond the last."""
-    ends = ((places[0] - reach.start, reach.start), (reach.stop - 1 - places[-1], length - reach.stop))
-    for where, (count, beyond) in zip(("Before the first", "Beyond the last"), ends, strict=True):
-        how = "told by the image alone" if image else "as that one is"
-        more = f"; {beyond} further away {'are' if beyond > 1 else 'is'} not filled" if beyond else ""
-        if count or beyond:
-            yield f"{where} known slice: {count} slice{'s' * (count != 1)}, {how}{more}."
+def _note_ends(places: Sequence[int], length: int, filled: slice, image: bool) -> Iterator[str]:
+    """Yield notes on the slices before the first known one and beyond the last."""
+    before, beyond = places[0] - filled.start, filled.stop - 1 - places[-1]
+    ends = (("Before the first", before, filled.start), ("Beyond the last", beyond, length - filled.stop))
+    content = "told by the image alone" if image else "as that one is"
+    for position, count, unfilled in ends:
+        rest = f"; {unfilled} further away {'are' if unfilled > 1 else 'is'} not filled" if unfilled else ""
+        if count or unfilled:
+            yield f"{position} known slice: {count} slice{'s' * (count != 1)}, {content}{rest}."

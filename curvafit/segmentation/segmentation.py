@@ -111,10 +111,11 @@ def segment(
     notes = (*notes, f"{str(evidence.classes).capitalize()}.")
     if missing := _missing_phase(evidence, tiles):
         raise ScanError(f"the scan shows no {missing}: every voxel is on one side")
-    lowered = lower(evidence, trial, grid, tiles, store=working.store, workers=working.workers, progress=progress)
+    problem = EvidenceProblem(trial, evidence)
+    lowered = lower_volume(problem, grid, tiles, store=working.store, workers=working.workers, progress=progress)
     if weight is None and not _explains(evidence, lowered.mask, tiles):
         trial, head = replace(trial, law=None), "no prior helps here, the first guess explains the scan better: "
-        lowered = lower(evidence, trial, grid, tiles)
+        lowered = lower_volume(EvidenceProblem(trial, evidence), grid, tiles)
     return _describe(volume, lowered, trial, grid, notes, head)
 
 
@@ -142,8 +143,8 @@ def _segment_probabilities(
     evidence = probability_evidence(likely)
     notes = (*notes, f"Probabilities from {likely.values.min():.3g} to {likely.values.max():.3g}.")
     without_surface = trial.law is not None and _missing_phase(evidence, tiles)  # there is nothing to lower then
-    run = replace(trial, law=None) if without_surface else trial
-    lowered = lower(evidence, run, grid, tiles, store=working.store, workers=working.workers, progress=progress)
+    problem = EvidenceProblem(replace(trial, law=None) if without_surface else trial, evidence)
+    lowered = lower_volume(problem, grid, tiles, store=working.store, workers=working.workers, progress=progress)
     return _describe(volume, lowered, trial, grid, notes, head)
 
 
@@ -195,17 +196,10 @@ def check_given(
         raise ScanError("a label chooses the voxels of an example's mask: give an example, or leave the label out")
 
 
-def lower(
-    evidence: VolumeEvidence, trial: Trial, grid: WorkingGrid, tiles: Sequence[Box], **options: Any
-) -> LoweredVolume:
-    """Lower -log p(data | mask) + λ F_ε from the evidence's first guess, which is the result without a law. The trial's
-    strength is λ, in nats per unit of F_ε if a20 + a02 = 2; `options` are those of `lower_volume`."""
-    return lower_volume(EvidenceProblem(trial, evidence), grid, tiles, **options)
-
-
 @dataclass(frozen=True, eq=False)
 class EvidenceProblem(Problem):
-    """The evidence of a volume, and a law whose strength is in nats of a unit of F_ε."""
+    """-log p(data | mask) + λ F_ε, to be lowered from the evidence's first guess, which is the result without a law.
+    The trial's strength is λ, in nats per unit of F_ε if a20 + a02 = 2."""
 
     evidence: VolumeEvidence
 
@@ -331,7 +325,7 @@ def calibrate(
         count += 1
         progress("trying the prior out", min(count / expected, 1.0))
         try:
-            return lower(evidence, trial, grid, tiles).mask
+            return lower_volume(EvidenceProblem(trial, evidence), grid, tiles).mask
         except ScanError:  # the energy does not stay finite
             return np.zeros(part.shape, dtype=bool)
 

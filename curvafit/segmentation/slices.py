@@ -152,13 +152,6 @@ def filled_range(places: Sequence[int], length: int) -> slice:
     return slice(max(places[0] - before, 0), min(places[-1] + beyond + 1, length))
 
 
-def mark_known(shape: Sequence[int], places: Sequence[int], marks: np.ndarray | None) -> np.ndarray:
-    """Return which voxels of a volume are known, bool (Z, Y, X): the slices at `places`, and voxels with a mark."""
-    known = np.zeros(shape, dtype=bool) if marks is None else marks != 0
-    known[list(places)] = True
-    return known
-
-
 def harmonic_distance(places: Sequence[int], length: int, periodic: bool = False) -> np.ndarray:
     """Return d e / (d + e) for each slice, float64 (length,), where d and e are the distances to the known slices
     before and after it. The error of an interpolation grows in proportion. It is 0 at a known slice and a quarter of
@@ -194,15 +187,6 @@ def require_labels(values: np.ndarray, name: str, most: float = LABELS) -> np.nd
             f"{name} must be a mask or labels, got a grey image: {count} values, and most neighbours differ"
         )
     return values
-
-
-def require_outline(inside: int, count: int, name: str) -> None:
-    """Raise ScanError where none or all of `count` voxels are inside; the message calls them `name`."""
-    if inside in (0, count):
-        raise ScanError(
-            f"{name} must have voxels inside and outside, but all are {'full' if inside else 'empty'}; is another "
-            "slice the first, is there a label that nobody annotated, or are there several labels?"
-        )
 
 
 def load_with(source: Source, reading: Mapping[str, Any], *more: str, label: int | None = None) -> Volume:

@@ -1,7 +1,6 @@
 """Lowering the energy of a volume of any size: tile by tile, with finished tiles kept in a folder.
 
-Tiles overlap so far that a cut is not felt in their cores: tiling moves the result by a few voxels of the surface at
-most.
+Tiles overlap so far that their cores hardly change: tiling moves the result by a few voxels of the surface at most.
 """
 
 from __future__ import annotations
@@ -13,8 +12,6 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise, product
 from os import PathLike
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -27,7 +24,7 @@ from curvafit.segmentation.trials import Trial
 from curvafit.volumes.run import Record, open_run
 from curvafit.volumes.volume import Box, within
 
-#: Working voxels beyond a tile that are lowered with it: at that distance the cut is not felt any more.
+#: Working voxels beyond a tile that are lowered with it: the cut at this distance does not change the tile.
 OVERLAP = 24
 #: Most working voxels that are lowered at once by default, and the edge of a tile where there are more.
 WHOLE, EDGE = 256**3, 192
@@ -36,46 +33,43 @@ _LOWER = "lowering the energy"
 
 
 def cut_tiles(place: WorkingGrid, shape: Sequence[int], edge: int | None = None) -> list[Box]:
-    """Cut a volume of a shape into tiles of at most `edge` working voxels a side, which differ by a voxel at most.
-
-    By default the volume is one tile up to `WHOLE` working voxels, else tiles of `EDGE`.
-    """
-    whole = max(place.grid.shape) if math.prod(place.grid.shape) <= WHOLE else EDGE
-    edge = edge or whole
-    counts = [-(-n // max(1, edge // times)) for n, times in zip(shape, place.times, strict=True)]
-    ends = ([k * n // count for k in range(count + 1)] for n, count in zip(shape, counts, strict=True))
-    axes = ([slice(*pair) for pair in pairwise(axis)] for axis in ends)
+    """Cut a volume of a shape into tiles of at most `edge` working voxels a side, which differ by a voxel at most. By
+    default the volume is one tile up to `WHOLE` working voxels, else tiles of `EDGE`."""
+    edge = edge or (max(place.grid.shape) if math.prod(place.grid.shape) <= WHOLE else EDGE)
+    axes = []
+    for n, times in zip(shape, place.times, strict=True):
+        count = -(-n // max(1, edge // times))  # rounded up
+        axes.append([slice(*ends) for ends in pairwise(k * n // count for k in range(count + 1))])
     return [(z, y, x) for z, y, x in product(*axes)]
 
 
 def surround(tile: Box, place: WorkingGrid, shape: Sequence[int]) -> tuple[Box, WorkingGrid]:
     """Return the box in which the energy of a tile is lowered, and its working grid, in a volume of a shape on `place`.
-
-    The box is the tile with its overlap; in a periodic volume it may go beyond the ends.
-    """
+    The box is the tile with its overlap; in a periodic volume it may go beyond the ends."""
     if all(edge.stop - edge.start == n for edge, n in zip(tile, shape, strict=True)):
         return tile, place
     box, ends = [], []
     for edge, n, times in zip(tile, shape, place.times, strict=True):
-        first, last = edge.start - -(-OVERLAP // times), edge.stop + -(-OVERLAP // times)
-        before, beyond = first <= 0 and not place.grid.periodic, last >= n and not place.grid.periodic
-        box.append(slice(0 if before else first, n if beyond else last))
-        ends.append((before, beyond))
+        overlap = -(-OVERLAP // times)  # rounded up
+        start, stop = edge.start - overlap, edge.stop + overlap
+        at_start, at_end = start <= 0 and not place.grid.periodic, stop >= n and not place.grid.periodic
+        box.append(slice(0 if at_start else start, n if at_end else stop))
+        ends.append((at_start, at_end))
     z, y, x = box
     return (z, y, x), place.of_box([edge.stop - edge.start for edge in box], tuple(ends))
 
 
 @dataclass(frozen=True, eq=False)
 class Problem(ABC):
-    """An energy to lower, and the start; any box of the volume sees the same data. The trial's law has lengths in the
-    scan's unit; without a law the start is the result."""
+    """An energy to lower and the start, on any box of a volume. The trial's law has lengths in the scan's unit; without
+    a law the start is the result."""
 
     trial: Trial
 
     @property
     @abstractmethod
     def inputs(self) -> dict[str, object]:
-        """The inputs besides law and steps, by name: tiles of other inputs are another run's."""
+        """The inputs besides law and steps, by name: a store with tiles of other inputs is of another run."""
 
     @abstractmethod
     def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Data]:
@@ -83,7 +77,7 @@ class Problem(ABC):
 
     @abstractmethod
     def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
-        """Return the phase field on the scan's voxels where no law is lowered: that of the start's level."""
+        """Return the phase field (Z, Y, X) of the start's level: the result without a law."""
 
     def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
         """Return the mask, bool (Z, Y, X), of a phase field on a box."""
@@ -92,8 +86,8 @@ class Problem(ABC):
 
 @dataclass(frozen=True, eq=False)
 class LoweredVolume:
-    """A volume's mask (Z, Y, X), bool, and phase field, float32, the last two energies of its flow, and its steps: none
-    where nothing was lowered."""
+    """A volume's mask (Z, Y, X), bool, and phase field, float32; the last two energies of its flow, and its steps: none
+    where no law was lowered."""
 
     mask: np.ndarray
     phase: np.ndarray
@@ -110,14 +104,16 @@ def lower_volume(
     workers: Cluster | int | None = None,
     progress: Progress = silent,
 ) -> LoweredVolume:
-    """Lower a problem on each tile of a volume (`cut_tiles`), and return the whole; several tiles may have a `store`,
-    where finished ones stay, those of an earlier, killed run too, and workers."""
+    """Lower a problem on each tile of a volume (`cut_tiles`), and return the whole. Of several tiles, finished ones are
+    kept in the `store`, from which a killed run goes on, and workers share them."""
     trial, shape = problem.trial, tuple(edge.stop for edge in tiles[-1])
-    folder, workers = (None, None) if len(tiles) == 1 else (None if store is None else Path(store), workers)
-    counts = tuple(len({tile[axis].start for tile in tiles}) for axis in range(3))
-    parts: dict[str, Any] = {"law": trial.law, "steps": trial.steps, "tiles": counts, "place": place}
-    same = {} if folder is None else identity(**problem.inputs, **parts)  # digests take a while
-    with open_run(workers, folder, same, progress, {_LOWER: 1.0}) as run:
+    if len(tiles) == 1:
+        store, workers = None, None
+    settings = {}
+    if store is not None:  # digests take a while
+        counts = tuple(len({tile[axis].start for tile in tiles}) for axis in range(3))
+        settings = identity(**problem.inputs, law=trial.law, steps=trial.steps, tiles=counts, place=place)
+    with open_run(workers, store, settings, progress, {_LOWER: 1.0}) as run:
         mask, phase = run.open("mask", np.bool_, shape), run.open("phase", np.float32, shape)
 
         def keep(number: int, record: Record) -> Record:
@@ -131,15 +127,15 @@ def lower_volume(
 
 
 def _lower_tile(problem: Problem, whole: WorkingGrid, tiles: Sequence[Box], progress: Progress, number: int) -> Record:
-    """Return mask and phase field on a tile, and the last two energies of its flow."""
+    """Return the mask and the phase field of a tile, and the last two energies of its flow."""
     tile, trial, energies = tiles[number], problem.trial, ()
     box, place = surround(tile, whole, [edge.stop for edge in tiles[-1]])
-    level, term = problem.terms(box, place)
+    level, data = problem.terms(box, place)
     if trial.law is None:
         phase = problem.plain(level, place)
     else:
         step = sub_progress(progress, number / len(tiles), (number + 1) / len(tiles))
-        flow = lower_energy(level, trial.law, term, place, trial.steps, step)
+        flow = lower_energy(level, trial.law, data, place, trial.steps, step)
         phase, energies = place.to_scan(flow.field), tuple(map(float, flow.history.energy[-2:]))
     phase = np.ascontiguousarray(phase[within(tile, box)])
     return {"mask": problem.mask(phase, tile), "phase": phase, "energies": np.array(energies, dtype=np.float64)}

@@ -69,12 +69,12 @@ class FillSlicesd(MapTransform):
         return filled
 
     def _fill(self, label: np.ndarray, spacing: Sequence[float]) -> np.ndarray:
-        """Return the values (A, B, C) that take the place of a label (1, A, B, C)."""
+        """Fill a label (1, A, B, C); return its new values (A, B, C)."""
         if label.ndim != 4 or len(label) != 1:
             raise ScanError(f"a label must have one channel and three axes, (1, A, B, C), got {label.shape}")
         volume = Volume(label[0], spacing)  # type: ignore[arg-type]
         if self.soft:
             return reconstruct(volume, **self.options).probability.values  # type: ignore[union-attr]
-        found = reconstruct_labels(volume, **self.options)
-        values = (found.labels if self.sure is None else found.keep_sure(self.sure, self.ignored)).values  # type: ignore[union-attr]
+        filled = reconstruct_labels(volume, **self.options)
+        values = (filled.labels if self.sure is None else filled.keep_sure(self.sure, self.ignored)).values  # type: ignore[union-attr]
         return values.astype(np.promote_types(values.dtype, label.dtype))

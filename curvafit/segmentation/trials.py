@@ -122,10 +122,8 @@ class Example:
 
     @classmethod
     def of(cls, volume: Volume, places: Sequence[int], axis: int) -> Example:
-        """Cut an example's mask, `volume`, for another volume with known slices at `places` across `axis`.
-
-        Raises `ScanError` if it is not longer than a gap, is no mask, or has a part without a surface.
-        """
+        """Cut an example's mask, `volume`, for another volume with known slices at `places` across `axis`. Raises
+        `ScanError` if it is not longer than a gap, is no mask, or has a part without a surface."""
         gap, length = int(np.diff(places).max()), volume.shape[axis]
         if not 1 < gap < length:
             raise ScanError(

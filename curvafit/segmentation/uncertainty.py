@@ -134,7 +134,7 @@ def share_by_slices(
         return (share,)
     before, after = gaps[:-1], gaps[1:]
     residuals = shares[1:-1] - (shares[:-2] * after + shares[2:] * before) / (before + after)
-    # With the variances W of the walk and N of the noise, E[residual²] = a W + b N, E[difference²] = (mean gap) W + 2 N.
+    # With variances W of the walk and N of the noise, E[residual²] = a W + b N and E[difference²] = (mean gap) W + 2 N.
     a = (before * after / (before + after)).mean()
     b = (1 + (before**2 + after**2) / (before + after) ** 2).mean()
     residual, difference = np.mean(residuals**2), np.mean(np.diff(shares) ** 2)
