@@ -74,8 +74,8 @@ class Block(nn.Module):
 
 
 def _normalise(x: Tensor) -> Tensor:
-    """Divide features by their root mean square over channels."""
-    # Over channels of one pixel alone: means over a slice would depend on how much background there is around.
+    """Divide features by their root mean square over the channels of each pixel."""
+    # A mean over pixels too would depend on how much background there is around a structure.
     return x * torch.rsqrt(x.square().mean(1, keepdim=True) + 1e-3)
 
 
@@ -128,11 +128,8 @@ def interpolate(distances: Tensor, heights: Tensor) -> tuple[Tensor, Tensor]:
 
 class Filler(nn.Module):
     """The network: an encoder of the four slices, run once a gap; a decoder, run for each slice to fill; and a
-    convolution in 3D through the gap.
-
-    The cubic interpolation, times `SLOPE`, is added at the end, and the evidence of an image, times `TRUST`: the
-    network learns only how the log-odds differ from that.
-    """
+    convolution in 3D through the gap. The cubic interpolation, times `SLOPE`, is added at the end, and the evidence of
+    an image, times `TRUST`: the network learns only how the log-odds differ from that."""
 
     def __init__(self, width: int = 16, *, image: bool = False) -> None:
         super().__init__()
@@ -300,9 +297,7 @@ def _fill_gaps(
         indices = np.arange(places[k] + 1, places[k] + gap) % slices.length
         known = np.stack([distances[row] for row in four])
         marks = None if slices.marks is None else raster.marks(slices.marks[(indices, *window)])
-        planes = (
-            None if evidence is None else np.stack([raster.spread(plane) for plane in evidence[(indices, *window)]])
-        )
+        planes = None if evidence is None else np.stack([raster.spread(p) for p in evidence[(indices, *window)]])
         logits = _fill_gap(taught.filler, known, marks, planes, gap - 1, step) / taught.temperature(gap * step)
         yield indices, raster.to_slices(logits)
     progress("filling the gaps", 1.0)
@@ -473,10 +468,9 @@ def _fill_gap(
 
 @dataclass(frozen=True, eq=False)
 class Taught:
-    """A trained filler with its calibration. `temperatures` (2, k) are gaps in pixels, ascending, and the numbers by
-    which log-odds are divided there so that they are calibrated; `error` is the calibration error near surfaces on
-    held-out shapes, or an example. The `card`, of JSON's types, says what taught it and how well it does on held-out
-    shapes; `status` begins a sentence on what fills."""
+    """A trained filler with its calibration. `temperatures` (2, k) are gaps in pixels, ascending, and the numbers that
+    divide log-odds there; `error` is the calibration error near surfaces on held-out shapes, or an example. The `card`,
+    of JSON's types, says what taught it and how well it does on held-out shapes; `status` begins a sentence on it."""
 
     filler: Filler
     temperatures: np.ndarray

@@ -25,7 +25,7 @@ WIDTHS, LEAST = (0.7, 1.2, 2.0, 3.4, 5.6), 0.5
 SMOOTH = 0.7
 #: Most voxels that trees learn from; the number of trees, their learning rate and most leaves.
 LEARNT, TREES, RATE, LEAVES = 200_000, 120, 0.1, 31
-#: Furthest shift that is looked for, in voxels; width of the local mean that is subtracted; least shift that is reported;
+#: Furthest shift that is looked for, in voxels; width of the local mean that is subtracted; least shift that is noted;
 #: by what fraction its correlation must exceed that without a shift, and how many root mean squares of all it must be.
 FURTHEST, LOCAL, NEAREST, BETTER, CLEAR = 12, 61, 2, 0.1, 5.0
 #: Voxels whose features are computed at once; most voxels of an image whose features are kept for the second reading.
@@ -34,13 +34,11 @@ HELD, KEPT = 4_000_000, 20_000_000
 
 def read_image(values: np.ndarray, slices: Slices, progress: Progress = silent) -> tuple[np.ndarray, float]:
     """Return the log-odds of the inside by an image (Z, Y, X) whose known slices are given, float32 (Z, Y, X), and the
-    fraction of the entropy of held-out known slices that they explain.
+    fraction of the entropy of held-out known slices that they explain. Raises ImportError without scikit-learn.
 
     Trees learn from the known slices which voxels are inside, by grey levels, slopes and Hessians at several widths.
     They first learn from every second known slice: the others calibrate the log-odds, and give the fraction. Where one
     half has no inside or no outside, log-odds stay as they are, and the fraction is NaN.
-
-    Raises ImportError where scikit-learn is not installed.
     """
     known, slope, shift, gain = slices.inside, 1.0, 0.0, math.nan
     progress("learning from the image", 0.0)

@@ -283,8 +283,7 @@ def _split_instances(
     inputs: _Inputs, parts: _Parts, whole: Segmentation, indices: np.ndarray, odds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[float]]:
     """Split the whole structure among its labels, given the `indices` (Z, Y, X) of labels filled alone. Return the new
-    indices; their probabilities, the structure's times the label's part of the summed `odds`; and each label's expected
-    Dice."""
+    indices, probabilities (the structure's times the label's part of the summed `odds`), and each expected Dice."""
     assert whole.probability is not None
     known = inputs.known
     indices = split_structure(whole.mask.values, indices, inputs.known_voxels, known.volume.spacing)

@@ -110,10 +110,9 @@ class Texture:
 class Mix:
     """How windows are drawn at random; lengths in pixels. Intervals of the structures' `thickness` (uniform in the
     logarithm) and of the `gap`, the `most` slices to fill, and the deviation of the logarithm of each axis' `stretch`.
-    The others are probabilities of a window: to lie along the axes of the shape (`upright`), to have slices that are
-    not one pixel apart (`coarse`), to lack the known slice beyond an end of the gap (`ends`), to have structures of two
-    shapes (`pairs`) or inside and outside swapped (`holes`), to have known slices as a person draws them
-    (`trembling`), and to have slices to fill that are known in part (`partial`)."""
+    The others are probabilities of a window: to lie along the axes of the shape (`upright`); to have slices not one
+    pixel apart (`coarse`), no known slice beyond an end of the gap (`ends`), structures of two shapes (`pairs`), inside
+    and outside swapped (`holes`), outlines as a person draws them (`trembling`), voxels known between (`partial`)."""
 
     thickness: tuple[float, float] = (3.0, 14.0)
     gap: tuple[float, float] = (2.0, 20.0)
@@ -359,13 +358,14 @@ def image_shape(textures: Sequence[Sequence[Texture]], mix: ImageMix, seed: Sequ
         modality = MODALITIES[names[int(rng.integers(len(names)))]].draw(int(rng.integers(2**31)))
         order = rng.permutation(3)  # the modality's axes in the order of the result
         edges = np.array(modality.spacing)[order]
-        finest = float(edges[1:].min())  # the edge of a pixel
-        gap = int(rng.integers(mix.gap[0], max(mix.gap[0], min(mix.gap[1], int(mix.longest * finest / edges[0]))) + 1))
+        finest = float(edges[1:].min())  # about a pixel
+        longest = min(mix.gap[1], int(mix.longest * finest / edges[0]))
+        gap = int(rng.integers(mix.gap[0], max(mix.gap[0], longest) + 1))
         sides = np.ceil(mix.edge * finest / edges[1:]).astype(int)
         shape = np.empty(3, dtype=int)
         shape[order] = [mix.gaps * gap + 1, *sides]
         low, high = mix.thickness
-        low = min(max(low, mix.edge * texture.thickness / FINEST), high)
+        low = min(max(low, mix.edge * texture.thickness / FINEST), high)  # at most `FINEST` voxels a slice
         voxel = math.exp(rng.uniform(math.log(low), math.log(high))) * finest / texture.thickness
         size = field_shape(shape.tolist(), voxel, modality)
         corner = rng.integers(0, texture.values.shape)

@@ -58,10 +58,9 @@ def count_probabilities(probability: np.ndarray) -> np.ndarray:
 
 
 def best_threshold(counts: np.ndarray) -> float:
-    """Return the threshold of the probability, at most 1/2, whose mask has the best expected Dice, by the `counts` of
+    """Return the threshold of the probability, at most 1/2, whose mask has the best expected Dice, given `counts` of
     `count_probabilities`. A mask of N voxels whose probabilities add up to s has the expected Dice 2 s / (N + S), where
-    S is the sum over all voxels. The best threshold is half of this Dice: lower where structures are hard to predict,
-    which would get lost at 1/2."""
+    S is the sum over all voxels. The best threshold is half of it: at 1/2, what is hard to predict would get lost."""
     edges = np.linspace(0.0, 1.0, THRESHOLDS + 1)
     # N and s of the mask of the bins above each edge, from the highest down.
     sizes, sums = (np.cumsum(bins[::-1]) for bins in (counts, counts * (edges[1:] + edges[:-1]) / 2))
@@ -114,7 +113,7 @@ def share_by_slices(
     shares: np.ndarray, places: Sequence[int], length: int, *, periodic: bool = False, whole: bool = False
 ) -> tuple[float, ...]:
     """Return the inside's fraction of a volume by Cavalieri's principle, from the fractions `shares` (N,) of the known
-    slices at `places`; and its 95 % interval where three or more are known.
+    slices at `places`, and its 95 % interval where three or more are known.
 
     Fractions are interpolated linearly between known slices, and constant beyond them: in slices that are filled, or in
     the `whole` volume. The interval takes them for a random walk plus noise of single slices, as Gundersen and Jensen
@@ -171,8 +170,8 @@ def suggest_slices(entropies: np.ndarray, places: Sequence[int], count: int, per
 def remaining_entropy(
     entropies: np.ndarray, places: Sequence[int] | set[int], new: int, periodic: bool = False
 ) -> np.ndarray:
-    """Return the entropies (Z,) of all slices once the slice `new` is known besides those at `places`. The uncertain
-    layer of a slice is as thick as its `harmonic_distance`, so the entropy falls in proportion to it. Beyond other
-    known slices nothing changes."""
+    """Return the entropies (Z,) of all slices once the slice `new` is known besides those at `places`. They fall in
+    proportion to the `harmonic_distance`, which is how thick a slice's uncertain layer is; not beyond other known ones.
+    """
     before, after = (harmonic_distance(sorted(known), len(entropies), periodic) for known in (places, {*places, new}))
     return entropies * np.divide(after, before, out=np.zeros_like(before), where=before > 0)
