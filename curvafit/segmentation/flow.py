@@ -85,16 +85,16 @@ class Working:
 
 
 def lower_energy(
-    level: np.ndarray, law: Coefficients, data: Data, place: WorkingGrid, steps: int, progress: Progress = silent
+    level: np.ndarray, law: Coefficients, data: Data, grid: WorkingGrid, steps: int, progress: Progress = silent
 ) -> Flow:
     """Lower D(u) + F_ε(u), with u = k ∗ v, by Adam under a cooling schedule, from the set where the `level` (Z, Y, X),
     smooth and on the scan's voxels, is positive. The `law` has lengths in the scan's unit, and is scaled to a20 + a02 =
     2; the `data` term D is on the working grid, in units of its F_ε. Raises `ScanError` if a20 + a02 is not positive,
     or the energy does not stay finite."""
     flow = descend(
-        initial_field(level, place),
-        law.scale(BENDING / bending(law)).in_unit(place.unit),
-        place.grid,
+        initial_field(level, grid),
+        law.scale(BENDING / bending(law)).in_unit(grid.unit),
+        grid.grid,
         data=data,
         optimiser=Optimiser("adam", steps),
         blur=WORKING_BLUR,
@@ -105,13 +105,13 @@ def lower_energy(
     return flow
 
 
-def initial_field(level: np.ndarray, place: WorkingGrid) -> Tensor:
+def initial_field(level: np.ndarray, grid: WorkingGrid) -> Tensor:
     """Return the phase field, on the working grid, of the set where a smooth `level` (Z, Y, X) is positive: constant 1
     or -1 where that is everywhere or nowhere, as in a tile far from the surface."""
-    inside = place.to_grid(level) > 0
+    inside = grid.to_grid(level) > 0
     if inside.all() or not inside.any():
         return 2 * inside.float() - 1
-    return phase_field(inside, place.grid, WORKING_EPSILON)
+    return phase_field(inside, grid.grid, WORKING_EPSILON)
 
 
 def bending(law: Coefficients) -> float:

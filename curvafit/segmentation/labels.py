@@ -255,8 +255,8 @@ def _fill_each(
 
 
 def _join_parts(inputs: _Inputs, parts: _Parts, full: bool, unfilled: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return, for each voxel (Z, Y, X), the index of the label with the greatest phase field, 0 where there is none or
-    nothing is filled; the probability of this; the greatest phase field; and the sum of the labels' odds."""
+    """Return, for each voxel (Z, Y, X), the index of the label with the greatest phase field, 0 in the background and
+    where nothing is filled; the probability of it; the greatest phase field; and the sum of the labels' odds."""
     shape = inputs.indices.shape
     phase, owner = np.full(shape, -np.inf, dtype=np.float32), np.zeros(shape, dtype=np.int16)
     largest, total = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
@@ -268,7 +268,7 @@ def _join_parts(inputs: _Inputs, parts: _Parts, full: bool, unfilled: np.ndarray
     if full and (uncovered := np.isneginf(phase)).any():  # in no label's box
         owner = _take_nearest(owner, uncovered, inputs.known.volume.spacing)
     indices = np.where(inputs.known_voxels, inputs.indices, np.where(((phase > 0) | full) & ~unfilled, owner, 0))
-    # The background has odds of 1; where every voxel has a label, there is none.
+    # The background counts with odds of 1, unless every voxel is to have a label.
     likely = np.where(indices, largest, 1.0) / np.maximum(total + ((indices == 0) | (not full)), SURE)
     return indices, likely, phase, total
 

@@ -188,7 +188,8 @@ class _Inputs:
         in_blocks = large and prior is None and image is None and which["ignore"] is None and not periodic
         if not in_blocks:
             check_memory(volume.shape, LEAST_BYTES, "a volume that is filled at once, not in blocks,")
-            volume = replace(volume := volume.load(), array=round_labels(volume.values))
+            volume = volume.load()
+            volume = replace(volume, array=round_labels(volume.values))
         laws, notes = ((), ()) if prior is None else laws_of(prior, volume)
         if image is not None and (example is not None or laws):
             raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
@@ -419,7 +420,7 @@ def _fill_volume(
 
 class _Profile:
     """An array that computes its boxes on demand: the phase field of probabilities (Z, Y, X), whose level is their
-    log-odds less those of the `thresholds`, which broadcast to them, times the edge of a voxel."""
+    log-odds less those of the `thresholds`, which vary along one axis, times the edge of a voxel."""
 
     dtype, digest = np.dtype(np.float32), ""
 
@@ -429,8 +430,8 @@ class _Profile:
 
     def __getitem__(self, index: tuple[slice, ...]) -> np.ndarray:
         likely = np.clip(self.likely[index], SURE, 1 - SURE)
-        rows = tuple(edge if n > 1 else slice(None) for edge, n in zip(index, self.thresholds.shape, strict=True))
-        level = self.edge * (logit(likely) - logit(self.thresholds[rows]))
+        slabs = tuple(edge if n > 1 else slice(None) for edge, n in zip(index, self.thresholds.shape, strict=True))
+        level = self.edge * (logit(likely) - logit(self.thresholds[slabs]))
         return _profile(level, self.epsilon).astype(np.float32)
 
 
@@ -514,7 +515,7 @@ class SlicesProblem(Problem):
         springs = {"strength": trial.strength, "pull": trial.pull}
         return {"slices": digest_of(slices.inside), **geometry, "start": digest_of(self.level), **springs}
 
-    def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Data]:
+    def terms(self, box: Box, grid: WorkingGrid) -> tuple[np.ndarray, Data]:
         """Return the level on a box, and the springs of its voxels: on known ones the trial's strength; on others
         between known slices its pull times their log-odds, which are the level over the edge of a voxel."""
         slices, trial, indices = self.slices, self.trial, self.slices.indices(box)
@@ -526,11 +527,11 @@ class SlicesProblem(Problem):
         if slices.marks is not None:
             marks = slices.marks[np.ix_(*indices)]
             stiffness = np.where(marks == 0, stiffness, trial.strength * marks).astype(np.float32)
-        return level, Hinge(place.spread(stiffness, centre=0), MARGIN)
+        return level, Hinge(grid.spread(stiffness, centre=0), MARGIN)
 
-    def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
+    def plain(self, level: np.ndarray, grid: WorkingGrid) -> np.ndarray:
         """Return the optimal profile of the level."""
-        return _profile(level, place.epsilon)
+        return _profile(level, grid.epsilon)
 
     def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
         """Return the voxels where the phase field is positive, and the known ones as they are."""

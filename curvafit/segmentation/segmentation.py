@@ -207,11 +207,11 @@ class EvidenceProblem(Problem):
     def inputs(self) -> dict[str, object]:
         return {"evidence": self.evidence.digest, "nats": self.trial.strength}
 
-    def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Evidence]:
+    def terms(self, box: Box, grid: WorkingGrid) -> tuple[np.ndarray, Evidence]:
         evidence, nats = self.evidence.of_box(box), self.trial.strength or 1.0  # 0 where there is no law
-        return evidence.level, Evidence(place.spread(evidence.ratio) / (nats * place.grid.voxel_volume))
+        return evidence.level, Evidence(grid.spread(evidence.ratio) / (nats * grid.grid.voxel_volume))
 
-    def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
+    def plain(self, level: np.ndarray, grid: WorkingGrid) -> np.ndarray:
         return np.clip(2 * level, -1, 1)  # levels are p - 1/2, or grey levels off the middle, over the contrast
 
 

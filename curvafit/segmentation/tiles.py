@@ -32,31 +32,31 @@ WHOLE, EDGE = 256**3, 192
 _LOWER = "lowering the energy"
 
 
-def cut_tiles(place: WorkingGrid, shape: Sequence[int], edge: int | None = None) -> list[Box]:
+def cut_tiles(grid: WorkingGrid, shape: Sequence[int], edge: int | None = None) -> list[Box]:
     """Cut a volume of a shape into tiles of at most `edge` working voxels a side, which differ by a voxel at most. By
     default the volume is one tile up to `WHOLE` working voxels, else tiles of `EDGE`."""
-    edge = edge or (max(place.grid.shape) if math.prod(place.grid.shape) <= WHOLE else EDGE)
+    edge = edge or (max(grid.grid.shape) if math.prod(grid.grid.shape) <= WHOLE else EDGE)
     axes = []
-    for n, times in zip(shape, place.times, strict=True):
+    for n, times in zip(shape, grid.times, strict=True):
         count = -(-n // max(1, edge // times))  # rounded up
         axes.append([slice(*ends) for ends in pairwise(k * n // count for k in range(count + 1))])
     return [(z, y, x) for z, y, x in product(*axes)]
 
 
-def surround(tile: Box, place: WorkingGrid, shape: Sequence[int]) -> tuple[Box, WorkingGrid]:
-    """Return the box in which the energy of a tile is lowered, and its working grid, in a volume of a shape on `place`.
+def surround(tile: Box, grid: WorkingGrid, shape: Sequence[int]) -> tuple[Box, WorkingGrid]:
+    """Return the box in which the energy of a tile is lowered, and its working grid, in a volume of a shape on `grid`.
     The box is the tile with its overlap; in a periodic volume it may go beyond the ends."""
     if all(edge.stop - edge.start == n for edge, n in zip(tile, shape, strict=True)):
-        return tile, place
+        return tile, grid
     box, ends = [], []
-    for edge, n, times in zip(tile, shape, place.times, strict=True):
+    for edge, n, times in zip(tile, shape, grid.times, strict=True):
         overlap = -(-OVERLAP // times)  # rounded up
         start, stop = edge.start - overlap, edge.stop + overlap
-        at_start, at_end = start <= 0 and not place.grid.periodic, stop >= n and not place.grid.periodic
+        at_start, at_end = start <= 0 and not grid.grid.periodic, stop >= n and not grid.grid.periodic
         box.append(slice(0 if at_start else start, n if at_end else stop))
         ends.append((at_start, at_end))
     z, y, x = box
-    return (z, y, x), place.of_box([edge.stop - edge.start for edge in box], tuple(ends))
+    return (z, y, x), grid.of_box([edge.stop - edge.start for edge in box], tuple(ends))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +72,11 @@ class Problem(ABC):
         """The inputs besides law and steps, by name: a store with tiles of other inputs is of another run."""
 
     @abstractmethod
-    def terms(self, box: Box, place: WorkingGrid) -> tuple[np.ndarray, Data]:
+    def terms(self, box: Box, grid: WorkingGrid) -> tuple[np.ndarray, Data]:
         """Return the level of the start (Z, Y, X), positive inside, and the data term, on a box."""
 
     @abstractmethod
-    def plain(self, level: np.ndarray, place: WorkingGrid) -> np.ndarray:
+    def plain(self, level: np.ndarray, grid: WorkingGrid) -> np.ndarray:
         """Return the phase field (Z, Y, X) of the start's level: the result without a law."""
 
     def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
@@ -97,7 +97,7 @@ class LoweredVolume:
 
 def lower_volume(
     problem: Problem,
-    place: WorkingGrid,
+    grid: WorkingGrid,
     tiles: Sequence[Box],
     *,
     store: str | PathLike[str] | None = None,
@@ -106,13 +106,13 @@ def lower_volume(
 ) -> LoweredVolume:
     """Lower a problem on each tile of a volume (`cut_tiles`), and return the whole. Of several tiles, finished ones are
     kept in the `store`, from which a killed run goes on, and workers share them."""
-    trial, shape = problem.trial, tuple(edge.stop for edge in tiles[-1])
+    trial, shape = problem.trial, tuple(edge.stop for edge in tiles[-1])  # the last tile ends with the volume
     if len(tiles) == 1:
         store, workers = None, None
     settings = {}
     if store is not None:  # digests take a while
         counts = tuple(len({tile[axis].start for tile in tiles}) for axis in range(3))
-        settings = identity(**problem.inputs, law=trial.law, steps=trial.steps, tiles=counts, place=place)
+        settings = identity(**problem.inputs, law=trial.law, steps=trial.steps, tiles=counts, place=grid)
     with open_run(workers, store, settings, progress, {_LOWER: 1.0}) as run:
         mask, phase = run.open("mask", np.bool_, shape), run.open("phase", np.float32, shape)
 
@@ -120,7 +120,7 @@ def lower_volume(
             mask[tiles[number]], phase[tiles[number]] = record["mask"], record["phase"]
             return {"energies": record["energies"]}
 
-        lower = partial(_lower_tile, problem, place, tiles, progress if run.alone else silent)
+        lower = partial(_lower_tile, problem, grid, tiles, progress if run.alone else silent)
         records = run(_LOWER, lower, len(tiles), keep=keep)
         energies = np.sum([record["energies"] for record in records], axis=0)
     return LoweredVolume(mask.values, phase.values, tuple(energies.tolist()), 0 if trial.law is None else trial.steps)
@@ -129,13 +129,13 @@ def lower_volume(
 def _lower_tile(problem: Problem, whole: WorkingGrid, tiles: Sequence[Box], progress: Progress, number: int) -> Record:
     """Return the mask and the phase field of a tile, and the last two energies of its flow."""
     tile, trial, energies = tiles[number], problem.trial, ()
-    box, place = surround(tile, whole, [edge.stop for edge in tiles[-1]])
-    level, data = problem.terms(box, place)
+    box, grid = surround(tile, whole, [edge.stop for edge in tiles[-1]])
+    level, data = problem.terms(box, grid)
     if trial.law is None:
-        phase = problem.plain(level, place)
+        phase = problem.plain(level, grid)
     else:
         step = sub_progress(progress, number / len(tiles), (number + 1) / len(tiles))
-        flow = lower_energy(level, trial.law, data, place, trial.steps, step)
-        phase, energies = place.to_scan(flow.field), tuple(map(float, flow.history.energy[-2:]))
+        flow = lower_energy(level, trial.law, data, grid, trial.steps, step)
+        phase, energies = grid.to_scan(flow.field), tuple(map(float, flow.history.energy[-2:]))
     phase = np.ascontiguousarray(phase[within(tile, box)])
     return {"mask": problem.mask(phase, tile), "phase": phase, "energies": np.array(energies, dtype=np.float64)}
