@@ -102,13 +102,9 @@ def segment(
     grid = WorkingGrid.of(volume, working.epsilon, halo=HALO)
     tiles, head = cut_tiles(grid, volume.shape, working.tile), ""
     trial, notes = _weigh_law(prior, weight, volume, working)
-    if weight is None:
-        trial = replace(trial, strength=USUAL)
     _check_finite(volume)
     evidence = GreyEvidence.of(volume, threshold, dark, apart=weight is None)
-    if evidence.classes.faint and threshold == "otsu":
-        notes = (*notes, FAINT)
-    notes = (*notes, f"{str(evidence.classes).capitalize()}.")
+    doubts = (FAINT,) if evidence.classes.faint and threshold == "otsu" else ()
     if missing := _missing_phase(evidence, tiles):
         raise ScanError(f"the scan shows no {missing}: every voxel is on one side")
     problem = EvidenceProblem(trial, evidence)
@@ -116,7 +112,7 @@ def segment(
     if weight is None and not _explains(evidence, lowered.mask, tiles):
         trial, head = replace(trial, law=None), "no prior helps here, the first guess explains the scan better: "
         lowered = lower_volume(EvidenceProblem(trial, evidence), grid, tiles)
-    return _describe(volume, lowered, trial, grid, notes, head)
+    return _describe(volume, lowered, trial, grid, (*notes, *doubts, f"{str(evidence.classes).capitalize()}."), head)
 
 
 def _segment_probabilities(
@@ -151,11 +147,12 @@ def _segment_probabilities(
 def _weigh_law(
     prior: LawLike | None, weight: float | None, volume: Volume, working: Working
 ) -> tuple[Trial, tuple[str, ...]]:
-    """Return the law to lower with its weight, 0 where none is given, and notes on its origin."""
+    """Return the law to lower with its weight, by default `USUAL`, and notes on its origin."""
     law, notes = law_of(WILLMORE if prior is None else prior, volume)
     if prior is None:
         notes = ("No prior is given: the Willmore energy is lowered.",)
-    return Trial(law, (weight or 0.0) * bending(law) / BENDING, working.steps), notes
+    stiffness = bending(law)  # refuses a law before the work
+    return Trial(law, USUAL if weight is None else weight * stiffness / BENDING, working.steps), notes
 
 
 def _describe(
