@@ -289,6 +289,7 @@ def _fill_gaps(
     window, step, distances = raster.support, slices.spacing[0] / raster.pixel, dict[int, np.ndarray]()
     for done, (k, gap) in enumerate(gaps):
         progress("filling the gaps", done / len(gaps))
+        # The slices at both ends of the gap and the next beyond each; beyond the last known slice, that one again.
         four = [k - 1, k, k + 1, k + 2]
         four = [row % count for row in four] if slices.periodic else [min(max(row, 0), count - 1) for row in four]
         for row in four:
@@ -390,6 +391,7 @@ class Raster:
         ranges = []
         for edge, n, h in zip(self._pixels, self.shape, self.scale, strict=True):
             most = math.ceil((4 * math.ceil(n * h / 4) + REACH) / h)
+            # Distances are cut at `FAR`: outlines further away do not matter. Two voxels more are for interpolation.
             first = math.floor((edge.start - REACH - FAR) / h) - 2
             stop = math.ceil((edge.stop + REACH + FAR) / h) + 2
             ranges.append(slice(max(first, -math.ceil(REACH / h)), min(stop, most)))
