@@ -178,33 +178,33 @@ def diagram_on(
     shares, _, _ = np.histogram2d(points[:, 0], points[:, 1], bins=[edges, edges], weights=weights)
     shares = gaussian_filter(shares, 0.8).T
     highest = max(float(shares.max()), 1e-9)
-    shown = np.ma.masked_less(shares, highest * 10**-DECADES)
     norm = LogNorm(highest * 10**-DECADES, highest)
+    shown = np.ma.masked_less(shares, highest * 10**-DECADES)  # bins below the scale stay white
     picture = axes.pcolormesh(edges, edges, shown, cmap=DENSITY, norm=norm, rasterized=True, zorder=2)
     frame_diagram(axes, limits, unit, window)
     return picture
 
 
 def frame_diagram(axes: Axes, limits: Limits, unit: str, window: tuple[Limits, Limits] | None = None) -> None:
-    """Draw what is around the areas of a diagram: axes, the line κ1 = κ2, names of families; see `diagram_on`."""
+    """Draw the frame of a diagram: axes, the line κ1 = κ2 and the names of families; see `diagram_on`."""
     low, high = limits
     axes.add_patch(Polygon([(low, low), (low, high), (high, high)], color="#F3F4F6", zorder=0))
     axes.axhline(0, color=QUIET, linewidth=0.7, zorder=1)
     axes.axvline(0, color=QUIET, linewidth=0.7, zorder=1)
     axes.plot([low, high], [low, high], color=DIAGONAL, linewidth=1.4, zorder=3)
-    across, up = window or (limits, limits)
-    axes.set(xlim=across, ylim=up, aspect="equal")
+    x_limits, y_limits = window or (limits, limits)
+    axes.set(xlim=x_limits, ylim=y_limits, aspect="equal")
     axes.spines[:].set_color(QUIET)
     name = unit_name(unit)
     axes.set_xlabel(f"κ₁ (1/{name})", labelpad=2)
     axes.set_ylabel(f"κ₂ (1/{name})", labelpad=2)
     axes.locator_params(nbins=5)
     axes.tick_params(length=3, labelsize=9)
-    _name_families(axes, across, up)
+    _name_families(axes, x_limits, y_limits)
 
 
 def shared_limits(diagrams: Sequence[Diagram], *, length: float = 1.0) -> Limits:
-    """Return the interval that holds both curvatures of all diagrams, but for 0.6 % of the area at either end."""
+    """Return one interval for both curvatures of all diagrams: it holds 0 and all but 0.6 % of the area at each end."""
     bounds = [0.0, 0.0]
     for diagram in diagrams:
         for kappa in np.asarray(diagram.points).T / length:
@@ -215,29 +215,29 @@ def shared_limits(diagrams: Sequence[Diagram], *, length: float = 1.0) -> Limits
 
 
 def shown_window(diagrams: Sequence[Any]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the intervals of κ1 and of κ2 that hold 0 and `SHOWN` of each diagram's area, with a margin."""
-    ends = np.zeros((2, 2))
+    """Return an interval of κ1 and one of κ2 that hold 0 and `SHOWN` of each diagram's area, with a margin."""
+    intervals = np.zeros((2, 2))
     for diagram in diagrams:
-        for bounds, kappa in zip(ends, np.asarray(diagram.points).T, strict=True):
+        for interval, kappa in zip(intervals, np.asarray(diagram.points).T, strict=True):
             tails = [(1 - SHOWN) / 2, (1 + SHOWN) / 2]
             low, high = np.quantile(kappa, tails, weights=diagram.weights, method="inverted_cdf")
-            bounds[:] = min(bounds[0], low), max(bounds[1], high)
-    low, high = ends.T + 0.08 * np.ptp(ends) * np.array([[-1], [1]])
-    return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
+            interval[:] = min(interval[0], low), max(interval[1], high)
+    (low1, high1), (low2, high2) = (intervals + 0.08 * np.ptp(intervals) * np.array([-1, 1])).tolist()
+    return (low1, high1), (low2, high2)
 
 
-def _name_families(axes: Axes, across: Limits, up: Limits) -> None:
-    """Write small words where spheres, tubes and saddles lie, in the corners that hold no mass."""
-    pad = 0.02 * (across[1] - across[0])
+def _name_families(axes: Axes, x_limits: Limits, y_limits: Limits) -> None:
+    """Write the names of spheres, tubes and saddles beside the lines κ1 = κ2, κ2 = 0 and κ2 = -κ1, where they lie."""
+    pad = 0.02 * (x_limits[1] - x_limits[0])
     style = {"fontsize": 8.5, "color": "#5B616B", "style": "italic", "zorder": 4}
     style["path_effects"] = [withStroke(linewidth=2, foreground="white")]
-    at = min(across[1], up[1]) - 5 * pad
-    axes.text(at, at + pad, "spheres", rotation=45, rotation_mode="anchor", ha="right", va="bottom", **style)
-    axes.text(across[1] - pad, 0.4 * pad, "tubes", ha="right", va="bottom", **style)
-    if up[0] < -0.15 * across[1]:
-        end = min(across[1], -up[0])
+    corner = min(x_limits[1], y_limits[1]) - 5 * pad
+    axes.text(corner, corner + pad, "spheres", rotation=45, rotation_mode="anchor", ha="right", va="bottom", **style)
+    axes.text(x_limits[1] - pad, 0.4 * pad, "tubes", ha="right", va="bottom", **style)
+    if y_limits[0] < -0.15 * x_limits[1]:
+        end = min(x_limits[1], -y_limits[0])
         axes.plot([0, end], [0, -end], color=QUIET, linewidth=0.7, linestyle=(0, (2, 3)), zorder=1)
-        side = "right" if end > 0.8 * across[1] else "left"
+        side = "right" if end > 0.8 * x_limits[1] else "left"
         axes.text(end + (-pad if side == "right" else pad), pad - end, "saddles", ha=side, va="bottom", **style)
 
 
@@ -250,24 +250,22 @@ def field_figure(field: Volume) -> Figure:
 
 
 def section_figure(
-    rows: Mapping[str, tuple[np.ndarray, np.ndarray | None]],
-    spacing: Sequence[float],
-    unit: str,
+    rows: Mapping[str, tuple[np.ndarray, np.ndarray | None]], spacing: Sequence[float], unit: str
 ) -> Figure:
     """Return a figure of the middle slices across z, y and x, with the scale.
 
     `rows` holds for each row of pictures, by its title, values (Z, Y, X) and the mask that is outlined over them, or
     None. The spacing is voxel edges (z, y, x) in `unit`.
     """
-    places = [n // 2 for n in next(iter(rows.values()))[0].shape]
-    drawn = {}
+    indices = [n // 2 for n in next(iter(rows.values()))[0].shape]
+    sections = {}
     for title, (values, mask) in rows.items():
         if not values.size or (values.dtype.kind == "f" and not np.isfinite(values).all()):
             raise ValueError("a volume to draw needs voxels, all of finite values")
-        planes = [np.take(values, place, axis) for axis, place in enumerate(places)]
-        outlines = None if mask is None else [np.take(mask, place, axis) for axis, place in enumerate(places)]
-        drawn[title] = Sections(planes, outlines, grey_limits(values))
-    return draw_sections(drawn, spacing, unit, places)
+        planes = [np.take(values, index, axis) for axis, index in enumerate(indices)]
+        outlines = None if mask is None else [np.take(mask, index, axis) for axis, index in enumerate(indices)]
+        sections[title] = Sections(planes, outlines, grey_limits(values))
+    return draw_sections(sections, spacing, unit, indices)
 
 
 def colour_labels(plane: np.ndarray) -> np.ndarray:
@@ -284,15 +282,15 @@ class Sections(NamedTuple):
 
 
 def grey_limits(values: np.ndarray) -> Limits:
-    """Return the levels of black and white of a volume: the extremes of a few values, else percentiles."""
-    thinned = values[tuple(slice(None, None, -(-n // THIN)) for n in values.shape)].astype(np.float32)
+    """Return the levels of black and white of a volume: extremes where it has few values (masks), else percentiles."""
+    thinned = values[tuple(slice(None, None, math.ceil(n / THIN)) for n in values.shape)].astype(np.float32)
     levels = np.unique(thinned)
     low, high = levels[[0, -1]] if len(levels) <= FEW else np.percentile(thinned, TAILS)
     return float(low), float(high)
 
 
-def draw_sections(rows: Mapping[str, Sections], spacing: Sequence[float], unit: str, places: Sequence[int]) -> Figure:
-    """Return a figure of rows of slices by their titles, with the scale; `places` are the numbers of the slices."""
+def draw_sections(rows: Mapping[str, Sections], spacing: Sequence[float], unit: str, indices: Sequence[int]) -> Figure:
+    """Return a figure of rows of slices by their titles, with the scale; `indices` are the numbers of the slices."""
     figure = make_figure(7.2, 2.5 * len(rows), layout="constrained")
     axes = figure.subplots(len(rows), 3, squeeze=False)
     for row, (title, (planes, outlines, limits)) in zip(axes, rows.items(), strict=True):
@@ -303,7 +301,7 @@ def draw_sections(rows: Mapping[str, Sections], spacing: Sequence[float], unit: 
         row[0].set_ylabel(title)
     for axis, name in enumerate("zyx"):
         rows_name, columns_name = (other for other in "zyx" if other != name)
-        axes[0, axis].set_title(f"{name} = {places[axis]}  ({rows_name} down, {columns_name} across)", fontsize=8)
+        axes[0, axis].set_title(f"{name} = {indices[axis]}  ({rows_name} down, {columns_name} across)", fontsize=8)
     scale_on(axes[-1, 0], spacing[2], unit)
     return figure
 
@@ -314,10 +312,10 @@ def scale_on(axes: Axes, edge: float, unit: str) -> None:
     longest = abs(right - left) * edge / 3
     power = 10.0 ** math.floor(math.log10(longest))
     length = max((step * power for step in (1, 2, 5) if step * power <= longest), default=power)
-    end, bar = left + length / edge, axes.get_xaxis_transform()
-    axes.plot([left, end], [-0.05, -0.05], color=INK, linewidth=2.5, transform=bar, clip_on=False)
-    words = {"transform": bar, "va": "center", "fontsize": 8}
-    axes.text(end + 0.02 * (right - left), -0.05, format_length(length, unit, 1), **words)
+    end, below = left + length / edge, axes.get_xaxis_transform()  # x in voxels, y as a fraction of the axes' height
+    axes.plot([left, end], [-0.05, -0.05], color=INK, linewidth=2.5, transform=below, clip_on=False)
+    style = {"transform": below, "va": "center", "fontsize": 8}
+    axes.text(end + 0.02 * (right - left), -0.05, format_length(length, unit, 1), **style)
 
 
 def section_on(axes: Axes, plane: np.ndarray, outline: np.ndarray | None, limits: Limits, aspect: float) -> None:
@@ -344,7 +342,7 @@ def corner_figure(
     figure = make_figure(_SQUARE * d + 0.7, _SQUARE * d + 0.6)
     grid = figure.add_gridspec(d, d, left=0.09, right=0.985, bottom=0.085, top=0.985, wspace=0.09, hspace=0.09)
     styles = list(zip(marks.items(), ((CONTOUR, "o"), (INK, "x"), (QUIET, "+")), strict=False))
-    for row, column in [(k, other) for k in range(d) for other in range(k + 1)]:
+    for row, column in [(i, j) for i in range(d) for j in range(i + 1)]:
         axes = figure.add_subplot(grid[row, column])
         axes.set_xlim(limits[column])
         axes.spines[:].set_color(QUIET)
@@ -358,40 +356,39 @@ def corner_figure(
                 axes.axvline(point[column], color=colour, linewidth=1.6)
         else:
             axes.set_ylim(limits[row])
-            of = {"s": 3, "color": _DRAWN, "alpha": 0.35, "linewidth": 0, "rasterized": True}
-            axes.scatter(draws[:, column], draws[:, row], **of)
+            dots = {"s": 3, "color": _DRAWN, "alpha": 0.35, "linewidth": 0, "rasterized": True}
+            axes.scatter(draws[:, column], draws[:, row], **dots)
             axes.yaxis.set_major_locator(MaxNLocator(2, prune="both"))
             axes.set_ylabel(names[row], fontsize=11)
             for (name, point), (colour, symbol) in styles:
-                place = point[column], point[row]
-                axes.plot(*place, symbol, color=colour, markersize=6, markeredgewidth=1.8, label=name)
+                look = {"color": colour, "markersize": 6, "markeredgewidth": 1.8, "label": name}
+                axes.plot(point[column], point[row], symbol, **look)
         axes.label_outer()
-    handles, labels = figure.axes[1].get_legend_handles_labels() if d > 1 else ([], [])
+    handles, labels = figure.axes[1].get_legend_handles_labels() if d > 1 else ([], [])  # axes 1 show the first pair
     if handles:
         figure.legend(handles, labels, loc="upper right", bbox_to_anchor=(0.98, 0.98), frameon=False, fontsize=11)
     return figure
 
 
 def bands_figure(blocks: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
-    """Return a figure of blocks of numbers: the scan's `(k,)` on the bands that hold 50 and 90 % of simulated `(n, k)`.
+    """Return a figure with a panel for each block of numbers: a scan's `(k,)` over bands of simulated ones `(n, k)`.
 
-    Blocks have scales of their own; one of at most three numbers is dots on bars.
+    Bands hold 50 and 90 % of the simulations. A block of at most three numbers is drawn as dots on bars.
     """
-    columns = 3
-    rows = -(-len(blocks) // columns)
+    rows, columns = math.ceil(len(blocks) / 3), 3
     figure = make_figure(10.0, 1.95 * rows, layout="constrained")
-    for place, (name, (own, others)) in enumerate(blocks.items(), 1):
-        axes = figure.add_subplot(rows, columns, place)
-        at = np.arange(len(own))
-        for share, shade in ((90, DENSITY(0.12)), (50, DENSITY(0.35))):
-            low, high = np.percentile(others, (50 - share / 2, 50 + share / 2), axis=0)
-            if len(own) > 3:
-                axes.fill_between(at, low, high, color=shade, linewidth=0)
+    for panel, (name, (scan, simulations)) in enumerate(blocks.items(), 1):
+        axes = figure.add_subplot(rows, columns, panel)
+        x = np.arange(len(scan))
+        for percent, shade in ((90, DENSITY(0.12)), (50, DENSITY(0.35))):
+            low, high = np.percentile(simulations, (50 - percent / 2, 50 + percent / 2), axis=0)
+            if len(scan) > 3:
+                axes.fill_between(x, low, high, color=shade, linewidth=0)
             else:
-                axes.vlines(at, low, high, color=shade, linewidth=14)
-        axes.plot(at, own, "-" if len(own) > 3 else "o", color=CONTOUR, linewidth=1.8, markersize=6)
+                axes.vlines(x, low, high, color=shade, linewidth=14)
+        axes.plot(x, scan, "-" if len(scan) > 3 else "o", color=CONTOUR, linewidth=1.8, markersize=6)
         axes.set_title(name, fontsize=10)
-        axes.set_xlim(-0.5, len(own) - 0.5)
+        axes.set_xlim(-0.5, len(scan) - 0.5)
         axes.set_xticks([])
         axes.tick_params(length=2, labelsize=8)
         axes.spines[:].set_color(QUIET)

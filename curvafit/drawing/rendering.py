@@ -27,8 +27,8 @@ KEY_LIGHT = (-0.42, 0.68, 0.60)
 #: Pixels per inch of every picture, and a quiet grey for frames and notes.
 DPI = 160
 QUIET = "#8A8F98"
-#: Width of the box's edges in pixels, pixels to one along an axis as they are drawn, and opacity behind and in front.
-_LINE, _FINE, _OPACITY = 4 / 3, 3, (0.4, 0.55)
+#: The box's edges: width in pixels, points to a pixel along either axis, and opacity behind and in front of the shape.
+_EDGE_WIDTH, _EDGE_SUPERSAMPLE, _EDGE_OPACITY = 4 / 3, 3, (0.4, 0.55)
 #: Points to a pixel, along either axis.
 _SUPERSAMPLE = 2
 #: Distances, in the shortest voxel edge, over which occupancy is blurred for the light of the sky.
@@ -103,34 +103,35 @@ def render(
 
 def _colours(field: np.ndarray, camera: View, size: tuple[int, int]) -> np.ndarray:
     """Return the colours of {field > 0} at a picture's points, as RGBA bytes `(rows, columns, 4)`."""
-    sheet = np.zeros((*size[::-1], 4), np.uint8)
+    picture = np.zeros((*size[::-1], 4), np.uint8)
     if not field.max() > 0:
-        return sheet
-    last = np.array(field.shape) - 1
+        return picture
+    extent = np.array(field.shape) - 1
     vertices, faces = _mesh(field)
-    points = camera.project(vertices / last) * size - 0.5
-    nearness = (vertices / last - 0.5) * camera.box @ camera.frame[2]
-    front, weights = _draw(np.column_stack([points[:, ::-1], nearness]), faces, size[::-1])
-    drawn = front >= 0
-    number, weights = front[drawn], weights[drawn]
-    corners = faces[number]
-    seen = np.zeros(len(vertices), bool)
-    seen[corners] = True
-    glow = np.zeros(len(vertices), np.float32)
-    glow[seen] = _surface_glow(field, camera, vertices, faces, vertices[seen])
-    glow = np.einsum("pk,pk->p", glow[corners], weights)
-    # Corners on one side of the box make a cap, whose normal is that of the side.
-    sides = ((vertices == 0) | (vertices == last))[faces].all(axis=1)
-    capped = sides.any(axis=1)[number]
-    eye, light = np.abs(camera.frame[2]), np.sign(camera.frame[2]) * _light(camera)
-    glow[capped] = _glow(eye, np.maximum(light, 0), 1.0)[sides.argmax(axis=1)[number[capped]]]
+    pixels = camera.project(vertices / extent) * size - 0.5
+    nearness = (vertices / extent - 0.5) * camera.box @ camera.frame[2]
+    nearest, weights = _rasterise(np.column_stack([pixels[:, ::-1], nearness]), faces, size[::-1])
+    covered = nearest >= 0
+    face, weights = nearest[covered], weights[covered]
+    corners = faces[face]
+    visible = np.zeros(len(vertices), bool)
+    visible[corners] = True
+    at_vertices = np.zeros(len(vertices), np.float32)
+    at_vertices[visible] = _surface_brightness(field, camera, vertices, faces, vertices[visible])
+    brightness = np.einsum("pk,pk->p", at_vertices[corners], weights)
+    # A face whose corners all lie on one side of the box is a cap, whose normal is that of the side.
+    on_side = ((vertices == 0) | (vertices == extent))[faces].all(axis=1)
+    capped = on_side.any(axis=1)[face]
+    eye, key_light = np.abs(camera.frame[2]), np.sign(camera.frame[2]) * _light_direction(camera)
+    brightness[capped] = _brightness(eye, np.maximum(key_light, 0), 1.0)[on_side.argmax(axis=1)[face[capped]]]
     depth = np.clip(0.5 - np.einsum("pk,pk->p", nearness[corners], weights) / np.linalg.norm(camera.box), 0, 1)
-    haze, bright = 0.30 * depth**1.5, np.clip(glow, 0, 1.1) ** 0.9
+    # Colours fade with depth towards a light grey, since a parallel projection has no other sign of distance.
+    haze, shade = 0.30 * depth**1.5, np.clip(brightness, 0, 1.1) ** 0.9
     for channel, (surface, cap) in enumerate(zip(SURFACE, CAP, strict=True)):
         colour = np.where(capped, cap, surface) ** 0.9
-        sheet[drawn, channel] = 255 * (np.minimum(colour * bright, 1) * (1 - haze) + 0.93 * haze) + 0.5
-    sheet[drawn, 3] = 255
-    return sheet
+        picture[covered, channel] = 255 * (np.minimum(colour * shade, 1) * (1 - haze) + 0.93 * haze) + 0.5
+    picture[covered, 3] = 255
+    return picture
 
 
 def _mesh(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -140,87 +141,88 @@ def _mesh(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.clip(vertices - 1.0, 0, np.array(field.shape) - 1), faces
 
 
-def _draw(points: np.ndarray, faces: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nearest face, -1 for none, and the weights of its corners at each pixel, of points (row, column,
-    nearness) `(V, 3)`."""
-    front, weights = np.full(shape, -1), np.zeros((*shape, 3), np.float32)
-    _fill_depth(points, faces, front, np.full(shape, -np.inf), weights)
-    return front, weights
+def _rasterise(vertices: np.ndarray, faces: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return each pixel's nearest face, -1 for none, and its corners' weights, for vertices (row, column, nearness)."""
+    nearest, weights = np.full(shape, -1), np.zeros((*shape, 3), np.float32)
+    _fill_depth(vertices, faces, nearest, np.full(shape, -np.inf), weights)
+    return nearest, weights
 
 
 @njit(cache=True)
-def _fill_depth(points, faces, front, depth, weights):  # pragma: no cover
-    """Draw faces into buffers. It makes no array: Ctrl-C while compiled code returns one ends the process."""
+def _fill_depth(vertices, faces, nearest, depth, weights):  # pragma: no cover
+    """Fill the buffers of `_rasterise`. It makes no array: Ctrl-C while compiled code returns one ends the process."""
     for face in range(len(faces)):
-        a, b, c = points[faces[face, 0]], points[faces[face, 1]], points[faces[face, 2]]
+        a, b, c = vertices[faces[face, 0]], vertices[faces[face, 1]], vertices[faces[face, 2]]
         area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
         if area == 0:
             continue
         low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
         for i in range(max(0, math.ceil(low[0])), min(len(depth) - 1, math.floor(high[0])) + 1):
             for j in range(max(0, math.ceil(low[1])), min(depth.shape[1] - 1, math.floor(high[1])) + 1):
-                of_b = ((i - a[0]) * (c[1] - a[1]) - (j - a[1]) * (c[0] - a[0])) / area
-                of_c = ((b[0] - a[0]) * (j - a[1]) - (b[1] - a[1]) * (i - a[0])) / area
-                of_a = 1 - of_b - of_c
-                near = of_a * a[2] + of_b * b[2] + of_c * c[2]
-                if min(of_a, of_b, of_c) > -1e-6 and near > depth[i, j]:
-                    front[i, j], depth[i, j] = face, near
-                    weights[i, j, 0], weights[i, j, 1], weights[i, j, 2] = of_a, of_b, of_c
+                weight_b = ((i - a[0]) * (c[1] - a[1]) - (j - a[1]) * (c[0] - a[0])) / area
+                weight_c = ((b[0] - a[0]) * (j - a[1]) - (b[1] - a[1]) * (i - a[0])) / area
+                weight_a = 1 - weight_b - weight_c
+                nearness = weight_a * a[2] + weight_b * b[2] + weight_c * c[2]
+                # The tolerance leaves no gap at an edge that two faces share.
+                if min(weight_a, weight_b, weight_c) > -1e-6 and nearness > depth[i, j]:
+                    nearest[i, j], depth[i, j] = face, nearness
+                    weights[i, j, 0], weights[i, j, 1], weights[i, j, 2] = weight_a, weight_b, weight_c
 
 
 # ---- light -----------------------------------------------------------------------------------------------------------
 
 
-def _light(camera: View) -> np.ndarray:
+def _light_direction(camera: View) -> np.ndarray:
     """Return the direction towards the key light, (z, y, x)."""
     return np.array(KEY_LIGHT) / np.linalg.norm(KEY_LIGHT) @ camera.frame
 
 
-def _glow(eye: np.ndarray, lit: np.ndarray, sky: np.ndarray | float) -> np.ndarray:
-    """Return the light from a surface: the sky's, more where the surface faces the eye, and the key light's."""
-    return 1.12 * ((0.50 + 0.14 * eye) * sky + 0.52 * lit * (0.55 + 0.45 * sky))
+def _brightness(cosine: np.ndarray, key_light: np.ndarray, sky: np.ndarray | float) -> np.ndarray:
+    """Return the brightness of a surface, by its cosine towards the eye, its key light and its share of open sky."""
+    return 1.12 * ((0.50 + 0.14 * cosine) * sky + 0.52 * key_light * (0.55 + 0.45 * sky))
 
 
-def _surface_glow(
-    field: np.ndarray, camera: View, vertices: np.ndarray, faces: np.ndarray, at: np.ndarray
+def _surface_brightness(
+    field: np.ndarray, camera: View, vertices: np.ndarray, faces: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
-    """Return the light from the level set at points `(N, 3)` of a mesh, in voxels."""
-    edges, light = camera.box / (np.array(field.shape) - 1), _light(camera)
+    """Return the brightness `(N,)` of the level set at points `(N, 3)` of its mesh, in voxels."""
+    edges, light = camera.box / (np.array(field.shape) - 1), _light_direction(camera)
     smooth = gaussian_filter(field, 0.9 / edges, truncate=3)
-    slopes = [map_coordinates(part, at.T, order=1, mode="nearest") for part in np.gradient(smooth, *edges)]
+    slopes = [map_coordinates(slope, points.T, order=1, mode="nearest") for slope in np.gradient(smooth, *edges)]
     normal = -np.stack(slopes, axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    times = -(-max(field.shape) // COARSE)
-    inside = block_reduce((field > 0).astype(np.float32), times, np.mean)
+    factor = math.ceil(max(field.shape) / COARSE)
+    occupancy = block_reduce((field > 0).astype(np.float32), factor, np.mean)
 
-    def occupy(distance: float) -> np.ndarray:
-        blurred = gaussian_filter(inside, distance / times / edges, mode="constant")
-        places = (at + distance * normal / edges - (times - 1) / 2) / times
-        return map_coordinates(blurred, places.T, order=1, mode="nearest")
+    def occupancy_ahead(distance: float) -> np.ndarray:
+        blurred = gaussian_filter(occupancy, distance / factor / edges, mode="constant")
+        positions = (points + distance * normal / edges - (factor - 1) / 2) / factor
+        return map_coordinates(blurred, positions.T, order=1, mode="nearest")
 
-    close, wide = occupy(NEAR), occupy(FAR)
-    # The more of the phase there is in front of a point, near and far, the less of the sky it sees.
-    sky = (1 - np.clip((close - 0.12) * 1.5, 0, 0.7)) * (1 - np.clip((wide - 0.05) * 1.3, 0, 0.6))
-    shadow = _shadow(vertices * edges, faces, light, at * edges + 1.5 * normal + 2.0 * light)
-    return _glow(normal @ camera.frame[2], np.maximum(normal @ light, 0) * (1 - 0.6 * shadow), sky)
+    occupied_near, occupied_far = occupancy_ahead(NEAR), occupancy_ahead(FAR)
+    # The more of the phase there is in front of a point, near and far, the less of the sky is open to it.
+    sky = (1 - np.clip((occupied_near - 0.12) * 1.5, 0, 0.7)) * (1 - np.clip((occupied_far - 0.05) * 1.3, 0, 0.6))
+    # Points are lifted off the surface, which would shadow itself where the depth buffer is coarse.
+    shadow = _shadow(vertices * edges, faces, light, points * edges + 1.5 * normal + 2.0 * light)
+    return _brightness(normal @ camera.frame[2], np.maximum(normal @ light, 0) * (1 - 0.6 * shadow), sky)
 
 
-def _shadow(vertices: np.ndarray, faces: np.ndarray, light: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return the share of the key light that a mesh keeps from points `(N, 3)`: a mean over 3 × 3 edges of a voxel."""
-    across = np.linalg.svd(light[None])[2][1:]
-    frame = np.stack([*across, light])
-    points, places = vertices @ frame.T, at @ frame.T
-    corner = points[:, :2].min(0) - 2
-    points[:, :2] -= corner
-    shape = tuple(int(n) + 3 for n in points[:, :2].max(0))
-    front, weights = _draw(points, faces, shape)
-    nearest = np.where(front < 0, -np.inf, np.einsum("ijk,ijk->ij", points[faces[front], 2], weights))
-    low, part = np.divmod(places[:, :2].T - corner[:, None], 1)
-    rows, columns = (
-        np.clip(k + np.arange(-1, 3)[:, None], 0, n - 1).astype(int) for k, n in zip(low, shape, strict=True)
-    )
-    shares = [np.stack([1 - f, np.ones_like(f), np.ones_like(f), f]) / 3 for f in part]
-    return np.einsum("in,jn,ijn->n", *shares, nearest[rows[:, None], columns] > places[:, 2])
+def _shadow(vertices: np.ndarray, faces: np.ndarray, light: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the share of the key light that a mesh blocks at points `(N, 3)`, averaged over 3 × 3 pixels."""
+    plane_axes = np.linalg.svd(light[None])[2][1:]  # two directions perpendicular to the light
+    frame = np.stack([*plane_axes, light])
+    projected, positions = vertices @ frame.T, points @ frame.T
+    origin = projected[:, :2].min(0) - 2
+    projected[:, :2] -= origin
+    shape = tuple(int(n) + 3 for n in projected[:, :2].max(0))
+    nearest, weights = _rasterise(projected, faces, shape)
+    height = np.where(nearest < 0, -np.inf, np.einsum("ijk,ijk->ij", projected[faces[nearest], 2], weights))
+    cell, fraction = np.divmod(positions[:, :2].T - origin[:, None], 1)
+    indices = cell[:, None] + np.arange(-1, 3)[:, None]
+    rows, columns = (np.clip(k, 0, n - 1).astype(int) for k, n in zip(indices, shape, strict=True))
+    # A window 3 pixels wide covers the first and the last of 4 pixels in part.
+    window = [np.stack([1 - f, np.ones_like(f), np.ones_like(f), f]) / 3 for f in fraction]
+    return np.einsum("in,jn,ijn->n", *window, height[rows[:, None], columns] > positions[:, 2])
 
 
 # ---- a surface in its box --------------------------------------------------------------------------------------------
@@ -246,24 +248,24 @@ def render_in_box(u: np.ndarray, **options) -> np.ndarray:
         values = gaussian_filter(values.astype(np.float32), 0.7) - np.float32(0.5)
     surface, camera = render(values, **options)
     size = (surface.shape[1], surface.shape[0])
-    layers = (_edges(camera, size, front=False), Image.fromarray(surface), _edges(camera, size, front=True))
     sheet = Image.new("RGBA", size)
-    for layer in layers:
+    for layer in (_edges(camera, size, front=False), Image.fromarray(surface), _edges(camera, size, front=True)):
         sheet.alpha_composite(layer)
     return np.asarray(sheet)
 
 
 def _edges(camera: View, size: tuple[int, int], *, front: bool) -> Image.Image:
-    """Return a picture of the box's edges: of the nine in front of the shape, or of the three behind it."""
+    """Return a picture of the box's edges in front of the shape, or of the three behind it, at the farthest corner."""
     corners = np.array(list(np.ndindex(2, 2, 2)), dtype=float)
-    hidden = (corners == (camera.frame[2] < 0)).all(axis=1).argmax()
+    farthest = (corners == (camera.frame[2] < 0)).all(axis=1).argmax()
     pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(corners[a] - corners[b]).sum() == 1]
-    places = camera.project(corners) * np.array(size) * _FINE
-    fine = Image.new("L", (size[0] * _FINE, size[1] * _FINE))
-    pen = ImageDraw.Draw(fine)
+    positions = camera.project(corners) * np.array(size) * _EDGE_SUPERSAMPLE
+    opacity = Image.new("L", (size[0] * _EDGE_SUPERSAMPLE, size[1] * _EDGE_SUPERSAMPLE))
+    style = {"fill": round(255 * _EDGE_OPACITY[front]), "width": round(_EDGE_WIDTH * _EDGE_SUPERSAMPLE)}
+    pen = ImageDraw.Draw(opacity)
     for a, b in pairs:
-        if (hidden in (a, b)) != front:
-            pen.line([*places[a], *places[b]], fill=round(255 * _OPACITY[front]), width=round(_LINE * _FINE))
+        if (farthest in (a, b)) != front:
+            pen.line([*positions[a], *positions[b]], **style)
     layer = Image.new("RGBA", size, QUIET)
-    layer.putalpha(fine.reduce(_FINE))
+    layer.putalpha(opacity.reduce(_EDGE_SUPERSAMPLE))
     return layer

@@ -56,7 +56,8 @@ class Output:
         object.__setattr__(self, "voxel", edge * factor)
         form = "3 whole repeats of at least 1 (z, y, x)"
         tile = as_tuple(self.tile, "3 whole repeats (z, y, x)")
-        tile = tuple(check_int(n, form, 1, MOST, of=tile) for n in (tile if len(tile) == 3 else (None,)))
+        repeats = tile if len(tile) == 3 else (None,)  # None is refused, with the message of a wrong number
+        tile = tuple(check_int(n, form, 1, MOST, of=tile) for n in repeats)
         object.__setattr__(self, "tile", tile)
 
     def shape(self, grid: Grid) -> tuple[int, ...]:
@@ -85,13 +86,13 @@ def check_target(
     An unknown suffix, a unit that the format cannot hold, and a name that cannot be written are a ValueError.
     """
     target = Path(path)
-    known = (*WRITERS, *SUFFIXES)
-    if not target.name.lower().endswith(known):
-        raise ValueError(f"the name of a shape must end in one of {', '.join(known)}, got {target.name!r}")
+    suffixes = (*WRITERS, *SUFFIXES)
+    if not target.name.lower().endswith(suffixes):
+        raise ValueError(f"the name of a shape must end in one of {', '.join(suffixes)}, got {target.name!r}")
     if not target.name.lower().endswith(SUFFIXES):
         pick_writer(target, (output or Output()).unit)
-    more = [sibling(target, ".json"), *([sibling(target, ".png")] if picture else [])]
-    return can_write(target, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
+    companions = [sibling(target, suffix) for suffix in ((".json", ".png") if picture else (".json",))]
+    return can_write(target, FORMAT, more=companions, inputs=inputs, overwrite=overwrite)
 
 
 def write_shape(
@@ -112,23 +113,23 @@ def write_shape(
     """
     target = check_target(path, output, picture=picture, overwrite=overwrite)
     image = sibling(target, ".png")
-    former = picture or image.name in FORMAT.companions(target)
+    replaces_image = picture or image.name in FORMAT.companions(target)
     with temporary_folder(target) as work:
         shape = write_field(flow.field, flow.grid, work / target.name, output)
-        note = sibling(shape, ".json")
-        parts = [shape, note]
+        record_path = sibling(shape, ".json")
+        files = [shape, record_path]
         if picture:
             try:
                 surface_picture(flow.field.numpy(), work / image.name)
-                parts.append(work / image.name)
+                files.append(work / image.name)
             except (OSError, ValueError, MemoryError) as error:
                 reason = getattr(error, "strerror", None) or error
                 warnings.warn(f"no picture was drawn: {reason}", UserWarning, stacklevel=2)
-        FORMAT.write(note, {**(record or {}), "files": [part.name for part in parts]})
+        FORMAT.write(record_path, {**(record or {}), "files": [file.name for file in files]})
         with hold_signals():
-            if former:
+            if replaces_image:
                 remove(image)
-            return move_together(parts, target.parent)
+            return move_together(files, target.parent)
 
 
 def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | None = None) -> Path:
@@ -137,21 +138,20 @@ def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | No
     Another file of that name is replaced, another folder is not. A VTP surface has its level set's principal curvatures
     `kappa1` and `kappa2` at the vertices, 0 on caps.
     """
-    target, layout = Path(path), output or Output()
-    layout.shape(grid)
-    values, edges = np.tile(field.numpy(), layout.tile), (layout.voxel, layout.voxel, layout.voxel)
+    target, output = Path(path), output or Output()
+    output.shape(grid)  # raises where the field cannot be repeated so
+    values, spacing = np.tile(field.numpy(), output.tile), (output.voxel, output.voxel, output.voxel)
     if not target.name.lower().endswith(SUFFIXES):
-        return save(Volume(values, edges, layout.unit), target, kind=FORMAT.name)
-    box = Grid(values.shape, edges, grid.boundary)
-    mesh = solid_surface(values, box)
+        return save(Volume(values, spacing, output.unit), target, kind=FORMAT.name)
+    mesh = solid_surface(values, Grid(values.shape, spacing, grid.boundary))
     data = None
     if target.suffix.lower() == ".vtp":
-        data = _vertex_curvatures(mesh, field, Grid(grid.shape, edges, grid.boundary))
-        middle = (np.array(box.shape) - 1) / 2
-        reach = np.abs(mesh.vertices / np.array(box.spacing) - middle)
-        capped = np.any(reach > middle + 0.5 - 1e-6, axis=1)  # faces are half a voxel beyond the outermost centres
+        data = _vertex_curvatures(mesh, field, Grid(grid.shape, spacing, grid.boundary))
+        middle = (np.array(values.shape) - 1) / 2
+        offsets = np.abs(mesh.vertices / np.array(spacing) - middle)
+        capped = np.any(offsets > middle + 0.5 - 1e-6, axis=1)  # faces are half a voxel beyond the outermost centres
         data = {name: np.where(capped, 0, κ) for name, κ in data.items()}
-    return write_surface(mesh, target, unit=layout.unit, data=data)
+    return write_surface(mesh, target, unit=output.unit, data=data)
 
 
 def shape_record(
@@ -159,8 +159,8 @@ def shape_record(
 ) -> dict[str, Any]:
     """Return what is needed to make a shape again (parameters, sampling, seed, schedule, versions), and its status.
 
-    By default the mass is the flow's: that of the field, to float32. Of a parameter that varies in space, the least and
-    the greatest value are recorded.
+    By default the mass is the flow's, which is that of the field to float32. A parameter that varies in space is
+    recorded as its least and its greatest value.
     """
     return {
         "format": FORMAT.name,
@@ -184,8 +184,9 @@ def _vertex_curvatures(mesh: Surface, field: Tensor, grid: Grid) -> dict[str, np
     """Return κ1, κ2 `(V,)` of a field's level sets at a mesh's vertices, interpolated linearly."""
     ε = WORKING_EPSILON / WORKING_SPACING * grid.spacing[0]
     κ1, κ2, _, _ = geometric_curvatures(jet(profile_distance(field, ε), grid))
-    places = (mesh.vertices / np.array(grid.spacing)).T
-    beyond, sharpest = "grid-wrap" if grid.periodic else "nearest", 1 / grid.spacing[0]
-    known = {"kappa1": κ1, "kappa2": κ2}
-    known = {name: torch.nan_to_num(κ).clamp(-sharpest, sharpest).numpy() for name, κ in known.items()}
-    return {name: map_coordinates(κ, places, order=1, mode=beyond) for name, κ in known.items()}
+    positions = (mesh.vertices / np.array(grid.spacing)).T
+    mode = "grid-wrap" if grid.periodic else "nearest"
+    sharpest = 1 / grid.spacing[0]  # a voxel does not resolve a smaller radius of curvature
+    resolved = [torch.nan_to_num(κ).clamp(-sharpest, sharpest).numpy() for κ in (κ1, κ2)]
+    curvatures = (map_coordinates(κ, positions, order=1, mode=mode) for κ in resolved)
+    return dict(zip(("kappa1", "kappa2"), curvatures, strict=True))
