@@ -24,17 +24,17 @@ from curvafit.priors.grid import Grid
 if TYPE_CHECKING:
     import networkx as nx
 
-#: A spur is shorter than a voxel and so many radii of its other node.
+#: A spur is shorter than a voxel plus so many radii of its other node.
 SPUR = 1.0
-#: Voxels of a 3×3×3 block have numbers along x, y, z, and sets of them are bits: `FACES` and `EIGHTEEN` are the 6 and
-#: the 18 nearest to the middle; `CORNERS[k]` touch voxel k by a corner at least, `SIDES[k]` by a face within the 18.
+#: A set of voxels of a 3×3×3 block is an integer with a bit for each, x fastest: `FACES` and `EIGHTEEN` are the 6 and
+#: the 18 nearest to the middle, `CORNERS[k]` all neighbours of voxel k, `SIDES[k]` those by a face, within the 18.
 MIDDLE = 13
-_PLACES = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), 1)
-_STEPS, _BITS = np.abs(_PLACES[:, None] - _PLACES), 1 << np.arange(27)
-FACES = int((_STEPS[MIDDLE].sum(1) == 1) @ _BITS)
-EIGHTEEN = int(((_STEPS[MIDDLE].sum(1) > 0) & (_STEPS[MIDDLE].sum(1) < 3)) @ _BITS)
-CORNERS = ((_STEPS.max(2) == 1) @ _BITS) & ~(1 << MIDDLE)
-SIDES = ((_STEPS.sum(2) == 1) @ _BITS) & EIGHTEEN
+_POSITIONS = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), 1)
+_OFFSETS, _BITS = np.abs(_POSITIONS[:, None] - _POSITIONS), 1 << np.arange(27)
+FACES = int((_OFFSETS[MIDDLE].sum(1) == 1) @ _BITS)
+EIGHTEEN = int(((_OFFSETS[MIDDLE].sum(1) > 0) & (_OFFSETS[MIDDLE].sum(1) < 3)) @ _BITS)
+CORNERS = ((_OFFSETS.max(2) == 1) @ _BITS) & ~(1 << MIDDLE)
+SIDES = ((_OFFSETS.sum(2) == 1) @ _BITS) & EIGHTEEN
 
 
 def skeleton_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
@@ -47,15 +47,15 @@ def skeleton_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
     # Lee's thinning of the box, continued beyond its faces, finds the curves. They may be connected outside the box
     # alone, so the mask itself is thinned around those curves, and then once more.
     mask = distance > 0
-    width = math.ceil(float(distance.max()) / min(grid.spacing)) + 2
-    margin = [(min(n // 2, width),) * 2 for n in mask.shape]
+    thickest = math.ceil(float(distance.max()) / min(grid.spacing)) + 2
+    margin = [(min(n // 2, thickest),) * 2 for n in mask.shape]
     padded = np.pad(mask, margin, mode="wrap" if grid.periodic else "edge")
     inner = tuple(slice(m, m + n) for (m, _), n in zip(margin, mask.shape, strict=True))
-    lines = skeletonize(padded)[inner].astype(bool)
+    curves = skeletonize(padded)[inner].astype(bool)
     order = np.flatnonzero(mask)
-    order = order[np.argsort(distance.ravel()[order], kind="stable")]
+    order = order[np.argsort(distance.ravel()[order], kind="stable")]  # from the surface inwards
     skeleton = mask.astype(np.uint8)
-    _thin(skeleton, lines & mask, order.copy(), grid.periodic)
+    _thin(skeleton, curves & mask, order.copy(), grid.periodic)
     _thin(skeleton, np.zeros_like(mask), order[skeleton.ravel()[order] > 0], grid.periodic)
     return skeleton.astype(bool)
 
@@ -66,12 +66,12 @@ def _thin(mask, fixed, order, periodic):  # pragma: no cover
     nz, ny, nx = mask.shape
     changed = True
     while changed:
-        changed, kept = False, 0
+        changed, remaining = False, 0
         for i in order:
             z, y, x = i // (ny * nx), i // nx % ny, i % nx
             if fixed[z, y, x]:
                 continue
-            around, count = 0, 0
+            neighbours, count = 0, 0
             for k in range(27):
                 a, b, c = z + k // 9 - 1, y + k // 3 % 3 - 1, x + k % 3 - 1
                 if a < 0 or b < 0 or c < 0 or a >= nz or b >= ny or c >= nx:
@@ -79,36 +79,36 @@ def _thin(mask, fixed, order, periodic):  # pragma: no cover
                         continue
                     a, b, c = a % nz, b % ny, c % nx
                 if k != MIDDLE and mask[a, b, c]:
-                    around |= 1 << k
+                    neighbours |= 1 << k
                     count += 1
-            if count > 1 and _is_simple(around):
+            if count > 1 and _is_simple(neighbours):
                 mask[z, y, x] = 0
                 changed = True
             else:
-                order[kept] = i
-                kept += 1
-        order = order[:kept]
+                order[remaining] = i
+                remaining += 1
+        order = order[:remaining]  # those that another deletion may make simple
 
 
 @njit(cache=True)
-def _is_simple(around):  # pragma: no cover
-    """Return whether deleting the middle of 3×3×3 voxels keeps the topology; `around` are the mask's other voxels."""
+def _is_simple(neighbours):  # pragma: no cover
+    """Return whether deleting the middle of 3×3×3 voxels keeps the topology; `neighbours` are the mask's others."""
     # This is a simple point (Bertrand and Malandain 1994): the mask around it is one 26-connected piece, and the
     # outside voxels that touch the middle by a face are in one 6-connected piece of the 18 nearest.
-    outside = ~around & EIGHTEEN
+    outside = ~neighbours & EIGHTEEN
     one_outside = outside & FACES != 0 and _is_connected(outside, outside & FACES, SIDES)
-    return one_outside and _is_connected(around, around, CORNERS)
+    return one_outside and _is_connected(neighbours, neighbours, CORNERS)
 
 
 @njit(cache=True)
 def _is_connected(bits, wanted, touching):  # pragma: no cover
     """Return whether all `wanted` bits are in one piece of `bits`, where `touching[k]` are the neighbours of bit k."""
-    piece, larger = 0, wanted & -wanted
-    while larger != piece:
-        piece = larger
+    piece, grown = 0, wanted & -wanted  # begins with the lowest bit of `wanted`
+    while grown != piece:
+        piece = grown
         for k in range(27):
             if piece >> k & 1:
-                larger |= touching[k] & bits
+                grown |= touching[k] & bits
     return wanted & ~piece == 0
 
 
@@ -149,45 +149,46 @@ def write_graphml(graph: nx.MultiGraph, path: str | Path, unit: str = "voxel") -
     """
     nx = require("networkx", "synth", "a centreline")
     plain = nx.MultiGraph(unit=unit)
-    for node, of in graph.nodes(data=True):
-        z, y, x = map(float, of["position"])
-        plain.add_node(node, z=z, y=y, x=x, radius=float(of["radius"]), kind=of["kind"], rings=of["rings"])
-    for one, other, of in graph.edges(data=True):
-        points = ",".join(" ".join(f"{v:.7g}" for v in point) for point in of["points"])
-        radii = " ".join(f"{r:.7g}" for r in of["radii"])
-        plain.add_edge(one, other, length=of["length"], radius=of["radius"], points=points, radii=radii)
+    for node, data in graph.nodes(data=True):
+        z, y, x = map(float, data["position"])
+        plain.add_node(node, z=z, y=y, x=x, radius=float(data["radius"]), kind=data["kind"], rings=data["rings"])
+    for one, other, data in graph.edges(data=True):
+        points = ",".join(" ".join(f"{v:.7g}" for v in point) for point in data["points"])
+        radii = " ".join(f"{r:.7g}" for r in data["radii"])
+        plain.add_edge(one, other, length=data["length"], radius=data["radius"], points=points, radii=radii)
     return write_atomically(Path(path), lambda temporary: nx.write_graphml(plain, temporary))
 
 
 def _trace(skeleton: np.ndarray, distance: np.ndarray) -> nx.MultiGraph:
-    """Return nodes with `place` (voxels), `radius` and `rings`, and edges with the `line` (N, 3) of their voxels."""
+    """Return a graph: nodes have `centre` (in voxels), `radius` and `rings`, and edges the `line` (N, 3) of voxels."""
     nx = require("networkx", "synth", "a centreline")
-    places, voxels, graph = np.argwhere(skeleton), nx.Graph(), nx.MultiGraph()
-    voxels.add_nodes_from(range(len(places)))
-    voxels.add_edges_from(KDTree(places).query_pairs(1.8) if len(places) else ())
+    positions, voxels, graph = np.argwhere(skeleton), nx.Graph(), nx.MultiGraph()
+    voxels.add_nodes_from(range(len(positions)))
+    voxels.add_edges_from(KDTree(positions).query_pairs(1.8) if len(positions) else ())  # 26 neighbours, up to √3 away
     crossing = voxels.subgraph(i for i, degree in voxels.degree if degree > 2)
     groups = sorted(map(sorted, nx.connected_components(crossing)))
     groups += [[i] for i, degree in voxels.degree if degree < 2]
     # A line that closes on itself has neither junction nor end: its first voxel is its node.
     groups += [[min(piece)] for piece in nx.connected_components(voxels) if all(voxels.degree(i) == 2 for i in piece)]
-    node = {i: k for k, members in enumerate(groups) for i in members}
-    for k, members in enumerate(groups):
-        cloud = places[members]
-        block = np.zeros(np.ptp(cloud, axis=0) + 1, dtype=bool)
-        block[tuple((cloud - cloud.min(0)).T)] = True
-        rings = betti_numbers(block)[1] if len(cloud) > 3 else 0
-        graph.add_node(k, place=cloud.mean(0), radius=float(distance[tuple(cloud.T)].max()), rings=rings)
+    node_of = {i: node for node, members in enumerate(groups) for i in members}
+    for node, members in enumerate(groups):
+        cluster = positions[members]
+        block = np.zeros(np.ptp(cluster, axis=0) + 1, dtype=bool)
+        block[tuple((cluster - cluster.min(0)).T)] = True
+        rings = betti_numbers(block)[1] if len(cluster) > 3 else 0
+        graph.add_node(node, centre=cluster.mean(0), radius=float(distance[tuple(cluster.T)].max()), rings=rings)
     visited: set[int] = set()
-    for i, k in node.items():
-        for first in sorted(voxels[i]):
-            if first in visited or (first in node and node[first] <= k):
+    for i, node in node_of.items():
+        for neighbour in sorted(voxels[i]):
+            # Each line is followed once, and nodes that touch are joined once, from the lesser one.
+            if neighbour in visited or (neighbour in node_of and node_of[neighbour] <= node):
                 continue
-            path = [i, first]
-            while path[-1] not in node:  # a voxel on a line has one other neighbour
+            path = [i, neighbour]
+            while path[-1] not in node_of:  # a voxel on a line has one other neighbour
                 path.append(next(j for j in voxels[path[-1]] if j != path[-2]))
             visited.update(path[1:-1])
-            ends = [graph.nodes[node[j]]["place"] for j in (i, path[-1])]
-            _add_edge(graph, k, node[path[-1]], np.stack([ends[0], *places[path[1:-1]], ends[1]]))
+            ends = [graph.nodes[node_of[j]]["centre"] for j in (i, path[-1])]
+            _add_edge(graph, node, node_of[path[-1]], np.stack([ends[0], *positions[path[1:-1]], ends[1]]))
     return graph
 
 
@@ -198,7 +199,7 @@ def _add_edge(graph: nx.MultiGraph, one: int, other: int, line: np.ndarray) -> N
 
 def _prune(graph: nx.MultiGraph, steps: np.ndarray) -> None:
     while spurs := sorted(_find_spurs(graph, steps)):
-        for _, tip, root in spurs:
+        for _, tip, root in spurs:  # an earlier removal may have changed the graph
             if tip in graph and root in graph and graph.degree(tip) == 1 and graph.has_edge(tip, root):
                 graph.remove_node(tip)
                 _dissolve(graph, root)
@@ -210,9 +211,11 @@ def _find_spurs(graph: nx.MultiGraph, steps: np.ndarray) -> list[tuple[float, in
     for one, other, line in graph.edges(data="line"):
         for tip, root in ((one, other), (other, one)):
             if graph.degree(tip) == 1 and tip != root:
-                radii = graph.nodes[root]["radius"], graph.nodes[tip]["radius"]
+                root_radius, tip_radius = graph.nodes[root]["radius"], graph.nodes[tip]["radius"]
                 length = float(np.linalg.norm(np.diff(_smooth(line) * steps, axis=0), axis=1).sum())
-                if length < SPUR * radii[0] + steps.max() and (graph.degree(root) > 1 or radii[0] >= radii[1]):
+                # Of a line with two free ends, only the thinner one can be a tip.
+                is_tip = graph.degree(root) > 1 or root_radius >= tip_radius
+                if is_tip and length < SPUR * root_radius + steps.max():
                     spurs.append((length, tip, root))
     return spurs
 
@@ -231,60 +234,61 @@ def _dissolve(graph: nx.MultiGraph, node: int) -> None:
 
 def _move_to_axis(graph: nx.MultiGraph, distance: np.ndarray, steps: np.ndarray) -> None:
     """Move each line sideways to the middle of its tube, and each node by the mean move of its lines' ends."""
-    at = partial(ndimage.map_coordinates, distance, order=1, mode="nearest")
+    sample = partial(ndimage.map_coordinates, distance, order=1, mode="nearest")
     moves: dict[int, list[np.ndarray]] = defaultdict(list)
-    for one, other, of in graph.edges(data=True):
-        line = of["line"] = _smooth(of["line"]).copy()
-        along = _tangents(line, steps)
+    for one, other, data in graph.edges(data=True):
+        line = data["line"] = _smooth(data["line"]).copy()
+        tangents = _tangents(line, steps)
         # Half the difference of the distances one voxel to either side is how far a point is off the axis.
-        push = np.stack([at((line + e).T) - at((line - e).T) for e in np.eye(3)], 1) / 2
-        push -= (push * along).sum(1, keepdims=True) * along
-        line += push / steps
-        moves[min(one, other)].append(push[0] / steps)
-        moves[max(one, other)].append(push[-1] / steps)
+        shifts = np.stack([sample((line + e).T) - sample((line - e).T) for e in np.eye(3)], 1) / 2
+        shifts -= (shifts * tangents).sum(1, keepdims=True) * tangents
+        line += shifts / steps
+        moves[min(one, other)].append(shifts[0] / steps)
+        moves[max(one, other)].append(shifts[-1] / steps)
     for node, ends in moves.items():
-        graph.nodes[node]["place"] = graph.nodes[node]["place"] + np.mean(ends, axis=0)
-    for one, other, of in graph.edges(data=True):
-        of["line"][0], of["line"][-1] = (graph.nodes[node]["place"] for node in sorted((one, other)))
+        graph.nodes[node]["centre"] = graph.nodes[node]["centre"] + np.mean(ends, axis=0)
+    for one, other, data in graph.edges(data=True):
+        data["line"][0], data["line"][-1] = (graph.nodes[node]["centre"] for node in sorted((one, other)))
 
 
 def _tangents(line: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Return unit tangents, in physical space, of a line (N, 3) in voxels."""
-    along = np.gradient(line, axis=0) * steps
-    return along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    tangents = np.gradient(line, axis=0) * steps
+    return tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
 
 
 def _measure_radii(distance: np.ndarray, line: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Return radii (N,) at the points of a line (N, 3) in voxels: the mean over the 8 voxels around a point."""
-    low, along, radii = np.floor(line).astype(int), _tangents(line, steps), np.zeros(len(line))
+    floor, tangents = np.floor(line).astype(int), _tangents(line, steps)
+    radii = np.zeros(len(line))
     for corner in product((0, 1), repeat=3):
-        weight = np.prod(np.where(corner, line - low, 1 - line + low), axis=1)
-        off = (low + corner - line) * steps
-        off -= (off * along).sum(1, keepdims=True) * along
-        voxel = np.clip(low + corner, 0, np.array(distance.shape) - 1)
+        weight = np.prod(np.where(corner, line - floor, 1 - line + floor), axis=1)
+        offsets = (floor + corner - line) * steps
+        offsets -= (offsets * tangents).sum(1, keepdims=True) * tangents
+        voxels = np.clip(floor + corner, 0, np.array(distance.shape) - 1)
         # The axis of a tube misses the voxels, whose distance is too small by how far they are off the line.
-        radii += weight * (distance[tuple(voxel.T)] + np.linalg.norm(off, axis=1))
+        radii += weight * (distance[tuple(voxels.T)] + np.linalg.norm(offsets, axis=1))
     return np.maximum(radii, 0)
 
 
 def _finish(graph: nx.MultiGraph, distance: np.ndarray, steps: np.ndarray) -> None:
-    """Give nodes and edges what `centreline` promises of them, with lengths in spacing's unit."""
-    for node, of in graph.nodes(data=True):
-        kinds = ("point", "end", "loop" if graph.has_edge(node, node) else "junction", "junction")
-        of |= {"position": of.pop("place") * steps, "kind": kinds[min(graph.degree(node), 3)]}
-    for *ends, of in graph.edges(data=True):
-        line = _smooth(of.pop("line"))
+    """Replace the attributes of nodes and edges by those that `centreline` documents, lengths in spacing's unit."""
+    for node, data in graph.nodes(data=True):
+        kind_by_degree = ("point", "end", "loop" if graph.has_edge(node, node) else "junction", "junction")
+        data |= {"position": data.pop("centre") * steps, "kind": kind_by_degree[min(graph.degree(node), 3)]}
+    for *ends, data in graph.edges(data=True):
+        line = _smooth(data.pop("line"))
         points, radii = line * steps, _measure_radii(distance, line, steps)
-        pieces = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        mean = float(np.average((radii[1:] + radii[:-1]) / 2, weights=pieces)) if pieces.sum() else float(radii.mean())
-        of |= {"points": points, "radii": radii, "length": float(pieces.sum()), "radius": mean}
+        lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        mean = np.average((radii[1:] + radii[:-1]) / 2, weights=lengths) if lengths.sum() else radii.mean()
+        data |= {"points": points, "radii": radii, "length": float(lengths.sum()), "radius": float(mean)}
         for node, radius in zip(sorted(ends), (radii[0], radii[-1]), strict=True):
             graph.nodes[node]["radius"] = max(graph.nodes[node]["radius"], float(radius))
 
 
 def _smooth(line: np.ndarray) -> np.ndarray:
-    """Return the line after two moving averages; it is continued as a point reflection, so that its ends stay."""
+    """Return the line after two moving averages; it is continued by point reflection, so that its ends stay."""
     for _ in range(2 if len(line) > 2 else 0):
-        longer = np.pad(line, ((2, 2), (0, 0)), mode="reflect", reflect_type="odd")
-        line = ndimage.convolve1d(longer, (1 / 9, 2 / 9, 3 / 9, 2 / 9, 1 / 9), axis=0)[2:-2]
+        padded = np.pad(line, ((2, 2), (0, 0)), mode="reflect", reflect_type="odd")
+        line = ndimage.convolve1d(padded, (1 / 9, 2 / 9, 3 / 9, 2 / 9, 1 / 9), axis=0)[2:-2]
     return line

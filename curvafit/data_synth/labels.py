@@ -22,9 +22,9 @@ from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import profile_distance
 
-#: Pieces that touch are two where the neck between them is thinner than this part of the thinner one.
+#: Pieces that touch are two where the neck between them is thinner than this multiple of the thinner one's radius.
 NECK = 0.5
-#: Radius (voxels) of the sphere that stands for the surface as seen from far points.
+#: Radius (voxels) of the sphere that stands for the surface where the distance of far voxels is measured.
 BEND = 4.0
 #: Names of all labels.
 NAMES = ("mask", "distance", "skeleton", "instances", "kappa1", "kappa2", "radius", "betti")
@@ -85,21 +85,21 @@ def instances_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
     `NECK` times the thinner one's greatest radius. So beads on a thin tube are several, an even tube is one.
     """
     basins = watershed(-distance, mask=distance > 0, connectivity=3).astype(np.int64)
-    tops = np.zeros(basins.max() + 1, dtype=np.float32)
-    np.maximum.at(tops, basins.ravel(), distance.ravel())
-    tops[0] = 0
-    pieces = DisjointSet(range(len(tops)))
-    for width, one, other in _find_necks(basins, distance, grid):
-        a, b = pieces[one], pieces[other]
-        if a != b and width >= NECK * min(tops[a], tops[b]):
+    widest = np.zeros(basins.max() + 1, dtype=np.float32)
+    np.maximum.at(widest, basins.ravel(), distance.ravel())  # the greatest radius of each basin
+    widest[0] = 0
+    pieces = DisjointSet(range(len(widest)))
+    for width, first, second in _find_necks(basins, distance, grid):
+        a, b = pieces[first], pieces[second]
+        if a != b and width >= NECK * min(widest[a], widest[b]):
             pieces.merge(a, b)
-            tops[pieces[a]] = max(tops[a], tops[b])
+            widest[pieces[a]] = max(widest[a], widest[b])
     return number_pieces(np.array([pieces[k] for k in pieces])[basins])
 
 
 def _find_necks(basins: np.ndarray, distance: np.ndarray, grid: Grid) -> list[tuple[float, int, int]]:
-    """Return necks, widest first: the distance at which two basins touch (by faces), and both basins."""
-    # Of two basins only the widest neck matters: where it does not join them, no other does.
+    """Return the necks between basins that touch by faces, widest first: the neck's radius and both basins."""
+    # Radii are negated, so that `np.unique` sorts the widest first. Where that does not join two basins, none does.
     necks = []
     for axis in range(3):
         next_basins, next_distance = np.roll(basins, -1, axis), np.roll(distance, -1, axis)
@@ -114,17 +114,17 @@ def _find_necks(basins: np.ndarray, distance: np.ndarray, grid: Grid) -> list[tu
 def _measure_curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float) -> tuple[np.ndarray, np.ndarray]:
     """Return κ1, κ2 of {u = 0} in the voxels that touch it, NaN elsewhere."""
     # A voxel's centre lies on a level set at distance d from the surface; along the normal κ becomes κ / (1 + κ d).
-    near = jet(profile_distance(u, epsilon), grid)
-    slope = near.gradient.square().sum(-4).sqrt()
-    d = near.value / slope.clamp_min(LEAST_SLOPE)
-    κ1, κ2 = (κ / (1 + κ * d) for κ in geometric_curvatures(near)[:2])
+    distance = jet(profile_distance(u, epsilon), grid)
+    slope = distance.gradient.square().sum(-4).sqrt()
+    d = distance.value / slope.clamp_min(LEAST_SLOPE)
+    κ1, κ2 = (κ / (1 + κ * d) for κ in geometric_curvatures(distance)[:2])
     touching = find_boundaries(np.pad(mask, 1, mode="wrap"))[1:-1, 1:-1, 1:-1]  # by a face
     if not grid.periodic:
         inner = np.zeros_like(mask)
         inner[(slice(MARGIN, -MARGIN),) * 3] = True
         touching &= inner
-    known = find_resolved(slope, κ1, κ2, grid) & torch.from_numpy(touching)
-    return torch.where(known, κ1, torch.nan).float().numpy(), torch.where(known, κ2, torch.nan).float().numpy()
+    valid = find_resolved(slope, κ1, κ2, grid) & torch.from_numpy(touching)
+    return torch.where(valid, κ1, torch.nan).float().numpy(), torch.where(valid, κ2, torch.nan).float().numpy()
 
 
 def _check_field(field: Tensor | np.ndarray, grid: Grid, epsilon: float) -> Tensor:
@@ -149,70 +149,70 @@ def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
     A voxel further away takes the point of the nearest such voxel, as if the surface there were a sphere of radius
     `BEND`: right to 0.04 voxels on average, 0.4 at worst. A crop has no surface beyond its faces.
     """
-    near = profile_distance(field.detach().cpu().float(), epsilon).contiguous().numpy()
+    profile = profile_distance(field.detach().cpu().float(), epsilon).contiguous().numpy()
     edges = np.array(grid.spacing, dtype=np.float32)
-    touching, feet = np.zeros(near.shape, dtype=bool), np.zeros((*near.shape, 6), dtype=np.float32)
-    distance = np.full(near.shape, np.nan, dtype=np.float32)
-    _measure_near(near, edges, grid.periodic, touching, feet, distance)
+    touching, feet = np.zeros(profile.shape, dtype=bool), np.zeros((*profile.shape, 6), dtype=np.float32)
+    distance = np.full(profile.shape, np.nan, dtype=np.float32)
+    _measure_near(profile, edges, grid.periodic, touching, feet, distance)
     far = np.isnan(distance)
-    seed = _find_nearest(touching, edges, grid.periodic)[far]
-    # From the far voxel to the nearest one's point on the surface: the whole offset, and its part along the normal.
-    foot = feet[tuple((seed % near.shape).T)]
-    offset = (seed - np.argwhere(far)) * edges + foot[:, :3]
+    nearest = _find_nearest(touching, edges, grid.periodic)[far]
+    # The distance is the offset's part along the normal and the sagitta of a sphere of radius `BEND` across it.
+    foot = feet[tuple((nearest % profile.shape).T)]
+    offset = (nearest - np.argwhere(far)) * edges + foot[:, :3]
     square = np.square(offset).sum(1)
     along = np.abs((offset * foot[:, 3:]).sum(1))
-    bent = np.maximum(square - along**2, 0) / (2 * (np.sqrt(square) + BEND * edges.max()))
-    distance[far] = np.where(near[far] > 0, along + bent, -along - bent)
+    sagitta = np.maximum(square - along**2, 0) / (2 * (np.sqrt(square) + BEND * edges.max()))
+    distance[far] = np.where(profile[far] > 0, along + sagitta, -along - sagitta)
     return distance
 
 
 def _find_nearest(touching: np.ndarray, edges: np.ndarray, periodic: bool) -> np.ndarray:
-    """Return the indices (Z, Y, X, 3) of the nearest marked voxel of each voxel, beyond a periodic box's faces too."""
-    before = np.array(touching.shape) // 2 if periodic else np.zeros(3, dtype=int)
-    padded = np.pad(~touching, np.stack([before, before], 1), mode="wrap")
+    """Return the indices (Z, Y, X, 3) of the marked voxel nearest to each voxel, beyond a periodic box's faces too."""
+    margin = np.array(touching.shape) // 2 if periodic else np.zeros(3, dtype=int)
+    padded = np.pad(~touching, np.stack([margin, margin], 1), mode="wrap")
     nearest = ndimage.distance_transform_edt(padded, edges, return_distances=False, return_indices=True)
-    inner = tuple(slice(m, m + n) for m, n in zip(before, touching.shape, strict=True))
-    return np.moveaxis(np.asarray(nearest)[:, *inner], 0, -1) - before
+    inner = tuple(slice(m, m + n) for m, n in zip(margin, touching.shape, strict=True))
+    return np.moveaxis(np.asarray(nearest)[:, *inner], 0, -1) - margin
 
 
 @njit(cache=True)
-def _measure_near(near, edges, periodic, touching, feet, distance):  # pragma: no cover
-    """Fill the voxels that have a neighbour of the other sign in `near`, the distance that the profile states; for each
-    of them its offset to the surface, and the normal there (…, 6); and the distance of all voxels near the surface."""
+def _measure_near(profile, edges, periodic, touching, feet, distance):  # pragma: no cover
+    """Fill `touching`, the voxels with a neighbour of the other sign; `feet` (…, 6), their offset to the surface and
+    normal inwards; and the `distance` of all voxels near the surface. `profile` is the distance that tanh states."""
     # It returns no array: Ctrl-C while compiled code returns one ends the process.
-    shape, widest = near.shape, edges.max()
-    slope, at = np.zeros(3, dtype=np.float32), np.zeros(3, dtype=np.int64)
+    shape, widest = profile.shape, edges.max()
+    slope, neighbour = np.zeros(3, dtype=np.float32), np.zeros(3, dtype=np.int64)
     for z, y, x in np.ndindex(shape):
-        here = near[z, y, x]
-        least, side, way = np.float32(np.inf), -1, 0
+        value = profile[z, y, x]
+        shortest, nearest_axis, nearest_step = np.float32(np.inf), -1, 0
         for axis in range(3):
-            total, values = np.float32(0), 0
+            total, count = np.float32(0), 0
             for step in (-1, 1):
-                at[0], at[1], at[2] = z, y, x
-                at[axis] += step
-                if at[axis] < 0 or at[axis] >= shape[axis]:
+                neighbour[0], neighbour[1], neighbour[2] = z, y, x
+                neighbour[axis] += step
+                if neighbour[axis] < 0 or neighbour[axis] >= shape[axis]:
                     if not periodic:
                         continue
-                    at[axis] %= shape[axis]
-                other = near[at[0], at[1], at[2]]
-                values += 1
-                total += step * (other - here)
-                if (other > 0) != (here > 0):
-                    along = edges[axis] * abs(here) / (abs(here) + abs(other))
-                    if along < least:
-                        least, side, way = along, axis, step
-            slope[axis] = total / (values * edges[axis])
-        steep = np.sqrt(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2)
-        sign = 1 if here > 0 else -1
-        if side < 0:
-            # Off the surface the slope must be nearer 1, which it is where the profile is perfect, than for a normal.
-            if steep > 0.5 and abs(here) <= 1.5 * steep * widest:
-                distance[z, y, x] = here / steep
+                    neighbour[axis] %= shape[axis]
+                neighbour_value = profile[neighbour[0], neighbour[1], neighbour[2]]
+                count += 1
+                total += step * (neighbour_value - value)
+                if (neighbour_value > 0) != (value > 0):
+                    crossing = edges[axis] * abs(value) / (abs(value) + abs(neighbour_value))
+                    if crossing < shortest:
+                        shortest, nearest_axis, nearest_step = crossing, axis, step
+            slope[axis] = total / (count * edges[axis])
+        steepness = np.sqrt(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2)
+        sign = 1 if value > 0 else -1
+        if nearest_axis < 0:
+            # Away from the surface the profile is trusted where its slope is not far from 1, which a distance has.
+            if steepness > 0.5 and abs(value) <= 1.5 * steepness * widest:
+                distance[z, y, x] = value / steepness
             continue
         touching[z, y, x] = True
-        length = min(least, abs(here) / steep) if steep > LEAST_SLOPE else least
-        feet[z, y, x, 3 + side] = -sign * way
-        if steep > LEAST_SLOPE:
-            feet[z, y, x, 3:] = slope / steep
+        length = min(shortest, abs(value) / steepness) if steepness > LEAST_SLOPE else shortest
+        feet[z, y, x, 3 + nearest_axis] = -sign * nearest_step  # the axis stands for a normal that is not resolved
+        if steepness > LEAST_SLOPE:
+            feet[z, y, x, 3:] = slope / steepness
         feet[z, y, x, :3] = -sign * length * feet[z, y, x, 3:]
         distance[z, y, x] = sign * length
