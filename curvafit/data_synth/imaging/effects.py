@@ -32,7 +32,7 @@ Voxels = Float[Tensor, "z y x"]
 
 #: ε of a generated shape, in its voxels.
 EPSILON = WORKING_EPSILON / WORKING_SPACING
-#: Places that a speck tries before it is given up as having none outside the structure.
+#: Positions that are tried for a speck, until one is outside the structure.
 TRIES = 8
 #: Below this mean a Poisson quantile is summed up; above it, Giles's expansion is within a count.
 FEW = 2.0
@@ -65,8 +65,8 @@ def texture(like: Voxels, spacing: Lengths, deviation: float, length: float, see
 
 def blur(image: Voxels, spacing: Lengths, widths: Lengths) -> Voxels:
     """Return the image under a Gaussian point-spread function of standard deviations `widths` along (z, y, x)."""
-    every = zip(image.shape, _as_triple(widths), _as_triple(spacing), strict=True)
-    return _apply_matrices(image, *(_gaussian_matrix(n, σ / h, image) for n, σ, h in every))
+    axes = zip(image.shape, _as_triple(widths), _as_triple(spacing), strict=True)
+    return _apply_matrices(image, *(_gaussian_matrix(n, σ / h, image) for n, σ, h in axes))
 
 
 def blur_with_depth(
@@ -76,11 +76,11 @@ def blur_with_depth(
 
     Its deviations are σ(z) = σ(0) (1 + growth z), and light from depth z is weakened by exp(-attenuation z).
     """
-    steps = _as_triple(spacing)
-    depth = _centres(len(image), steps[0], image)[:, None]
-    wider = 1 + growth * depth
-    every = zip(image.shape, _as_triple(widths), steps, (wider, wider[..., None], wider[..., None]), strict=True)
-    maps = (_gaussian_matrix(n, σ / h * factor if σ else 0.0, image) for n, σ, h, factor in every)
+    edges = _as_triple(spacing)
+    depth = _centres(len(image), edges[0], image)[:, None]
+    wider = 1 + growth * depth  # of each row of z's matrix, and of each slice's matrices of y and x
+    axes = zip(image.shape, _as_triple(widths), edges, (wider, wider[..., None], wider[..., None]), strict=True)
+    maps = (_gaussian_matrix(n, σ / h * factor if σ else 0.0, image) for n, σ, h, factor in axes)
     return _apply_matrices(image, *maps) * torch.exp(-attenuation * depth)[..., None]
 
 
@@ -91,8 +91,8 @@ def sample(image: Voxels, spacing: Lengths, onto: Lengths, window: Lengths = 0.0
     voxels that do not fit into the box are left out. Along an axis whose window is narrower than an old voxel, the
     value is interpolated linearly.
     """
-    every = zip(image.shape, *map(_as_triple, (spacing, onto, window)), strict=True)
-    return _apply_matrices(image, *(_sampling_matrix(n, old, new, wide, image) for n, old, new, wide in every))
+    axes = zip(image.shape, *map(_as_triple, (spacing, onto, window)), strict=True)
+    return _apply_matrices(image, *(_sampling_matrix(n, old, new, width, image) for n, old, new, width in axes))
 
 
 # ---- specimen, light and detector ------------------------------------------------------------------------------------
@@ -116,36 +116,37 @@ def stripes(like: Voxels, spacing: Lengths, strength: float, width: float, seed:
 
 
 def rings(like: Voxels, spacing: Lengths, strength: float, width: float, seed: int) -> Voxels:
-    """Return the rings about an axis along z that defects of a CT detector leave: a term of mean 0.
+    """Return the rings about an axis along z that defects of a CT detector add to an image, of mean 0.
 
-    Its deviation is `strength`. A slice's rings are its own, since a detector's row makes a slice. Few are strong: the
-    profile over the radius is g|g|/√3 of a normal g, correlated by `width`. Their centre is drawn in the box and half
-    as far again on each side.
+    Their deviation is `strength`. Each slice has rings of its own, since a detector's row makes a slice. Few are
+    strong: the profile over the radius is g|g|/√3 of a normal g, correlated by `width`. Their centre is drawn from a
+    rectangle with the box's middle and twice its sides.
     """
     depth, *sides = like.shape
-    _, *steps = _as_triple(spacing)
-    shares = uniform(2, seed, "ring centre", like).tolist()
-    y, x = (_centres(n, h, like) - (2 * share - 0.5) * n * h for share, n, h in zip(shares, sides, steps, strict=True))
-    step = min(width, *steps)
+    _, *edges = _as_triple(spacing)
+    centre = uniform(2, seed, "ring centre", like).tolist()
+    y, x = (_centres(n, h, like) - (2 * c - 0.5) * n * h for c, n, h in zip(centre, sides, edges, strict=True))
+    step = min(width, *edges)
     radius = torch.hypot(y[:, None], x) / step
     count = int(radius.amax()) + 2
     normal = _correlated_field(like.new_empty(depth, 1, count), step, (0, 0, width), seed, "rings")[:, 0]
     profile = normal * normal.abs() / math.sqrt(3)
-    near = radius.long()
-    return torch.lerp(profile[:, near], profile[:, near + 1], radius - near) * strength
+    below = radius.long()
+    return torch.lerp(profile[:, below], profile[:, below + 1], radius - below) * strength
 
 
 def dropout(occupied: Voxels, spacing: Lengths, share: float, length: float, loss: float, seed: int) -> Voxels:
-    """Return the factor of lost stain: smooth, 1 where the stain holds and down to 1 - loss in stretches.
+    """Return the factor of lost stain: smooth, 1 where the stain holds, down to 1 - loss where it is lost.
 
-    A random field of correlation `length` decides: where that is over a tube's radius, stretches of tube fade. Of the
-    structure (voxels at least half full), `share` loses more than half of `loss`.
+    Stain is lost where a random field of correlation `length` is high: stretches of a tube, where `length` is over its
+    radius. A fraction `share` of the structure (voxels at least half full) loses more than half of `loss`.
     """
     field = _correlated_field(occupied, spacing, length, seed, "dropout")
     inside = field[occupied >= 0.5]
     lost = round(share * len(inside))
-    level = math.inf if lost == 0 else -math.inf if lost == len(inside) else inside.kthvalue(len(inside) - lost).values
-    return 1 - loss * torch.sigmoid((field - level) / 0.2)  # the stain fades at the end of a stretch
+    all_or_none = -math.inf if lost else math.inf
+    threshold = inside.kthvalue(len(inside) - lost).values if 0 < lost < len(inside) else all_or_none
+    return 1 - loss * torch.sigmoid((field - threshold) / 0.2)  # the stain fades at the end of a stretch
 
 
 def clutter(occupied: Voxels, spacing: Lengths, density: float, radius: float, seed: int) -> Voxels:
@@ -154,20 +155,20 @@ def clutter(occupied: Voxels, spacing: Lengths, density: float, radius: float, s
     Their number is Poisson's, at `density` a unit of volume; half-widths (deviations) along each axis are uniform in
     (½, 1½) radius, heights in (½, 1).
     """
-    steps = _as_triple(spacing)
-    sides = occupied.new_tensor([n * h for n, h in zip(occupied.shape, steps, strict=True)])
-    mean = occupied.new_tensor(density * math.prod(sides.tolist()))
+    edges = _as_triple(spacing)
+    box = occupied.new_tensor([n * h for n, h in zip(occupied.shape, edges, strict=True)])
+    mean = occupied.new_tensor(density * math.prod(box.tolist()))
     count = int(torch.poisson(mean, generator=_stream(seed, "clutter count", occupied.device)))
-    drawn = uniform(count * (3 * TRIES + 4), seed, "clutter", occupied).reshape(count, 3 * TRIES + 4)
-    # A speck stands at the first of its tries that is empty; without one it has no height.
-    tried = drawn[:, 4:].reshape(count, TRIES, 3)
-    voxel = (tried * torch.tensor(occupied.shape, device=tried.device)).long().unbind(-1)
+    random = uniform(count * (3 * TRIES + 4), seed, "clutter", occupied).reshape(count, 3 * TRIES + 4)
+    # A speck has a height, 3 widths and `TRIES` positions, and stands at the first that is empty, else has no height.
+    positions = random[:, 4:].reshape(count, TRIES, 3)
+    voxel = (positions * torch.tensor(occupied.shape, device=positions.device)).long().unbind(-1)
     free = occupied[voxel] == 0
-    position = tried[torch.arange(count, device=tried.device), free.long().argmax(1)] * sides
-    height = (0.5 + 0.5 * drawn[:, 0]) * free.any(1)
-    width = radius * (0.5 + drawn[:, 1:4])
-    centres = (_centres(n, h, position) for n, h in zip(occupied.shape, steps, strict=True))
-    z, y, x = (_bell((at - position[:, k, None]) / width[:, k, None]) for k, at in enumerate(centres))
+    position = positions[torch.arange(count, device=positions.device), free.long().argmax(1)] * box
+    height = (0.5 + 0.5 * random[:, 0]) * free.any(1)
+    width = radius * (0.5 + random[:, 1:4])
+    centres = (_centres(n, h, position) for n, h in zip(occupied.shape, edges, strict=True))
+    z, y, x = (_bell((centre - position[:, k, None]) / width[:, k, None]) for k, centre in enumerate(centres))
     planes = (height[:, None, None] * z[:, :, None] * y[:, None, :]).flatten(1)
     return (planes.mT @ x).reshape(occupied.shape).clamp_max_(1) * (1 - occupied)
 
@@ -197,14 +198,14 @@ def poisson_quantile(mean: Tensor, z: Tensor) -> Tensor:
     summing the probabilities, exact to `MOST` counts.
     """
     root = mean.clamp_min(FEW).sqrt_()
-    w2 = z.square()
-    many = (w2 / 270).add_(7 / 810).mul_(w2).sub_(8 / 405).div_(root)
-    many.sub_((w2 + 2).mul_(z), alpha=1 / 72).div_(root)
-    many.add_(w2, alpha=1 / 6).add_(1 / 3).addcmul_(root, root + z).floor_().clamp_min_(0)
-    few = mean < FEW
-    if bool(few.any()):
-        return torch.where(few, _sum_quantile(mean.clamp_max(FEW), z), many)
-    return many
+    z2 = z.square()
+    quantile = (z2 / 270).add_(7 / 810).mul_(z2).sub_(8 / 405).div_(root)
+    quantile.sub_((z2 + 2).mul_(z), alpha=1 / 72).div_(root)
+    quantile.add_(z2, alpha=1 / 6).add_(1 / 3).addcmul_(root, root + z).floor_().clamp_min_(0)
+    small = mean < FEW
+    if bool(small.any()):
+        return torch.where(small, _sum_quantile(mean.clamp_max(FEW), z), quantile)
+    return quantile
 
 
 def gaussian_noise(image: Voxels, deviation: float, seed: int, width: Lengths = 0.0) -> Voxels:
@@ -223,16 +224,16 @@ def rician(image: Voxels, deviation: float, seed: int, width: Lengths = 0.0) -> 
 
 def _sum_quantile(mean: Tensor, z: Tensor) -> Tensor:
     """Return the Poisson quantiles of small means: how many of the sums P(X ≤ k), k = 0, 1, …, are below Φ(z)."""
-    share = torch.special.ndtr(z)
+    probability = torch.special.ndtr(z)
     term = torch.exp(-mean)
-    total = term.clone()
+    cumulative = term.clone()
     count = torch.zeros_like(mean, dtype=torch.uint8)
-    highest = float(share.amax())
+    highest = float(probability.amax())
     for k in range(1, MOST + 1):
-        if float(total.amin()) > highest:
+        if float(cumulative.amin()) > highest:  # no voxel counts further
             break
-        count += (share > total).view(torch.uint8)
-        total += term.mul_(mean).mul_(1 / k)
+        count += (probability > cumulative).view(torch.uint8)
+        cumulative += term.mul_(mean).mul_(1 / k)
     return count.to(mean.dtype)
 
 
@@ -256,22 +257,23 @@ def _gaussian_matrix(count: int, width: float | Tensor, like: Tensor) -> Tensor 
     return weight / weight.sum(-1, keepdim=True)
 
 
-def _bell(far: Tensor) -> Tensor:
-    """Return exp(-½ far²), and 0 where far is over four."""
+def _bell(distance: Tensor) -> Tensor:
+    """Return exp(-½ distance²), and 0 where the distance is over four."""
     # The square is clipped first, since arithmetic with denormal numbers is slow.
-    square = far.square().clamp_max_(16)
+    square = distance.square().clamp_max_(16)
     return torch.exp(-0.5 * square).masked_fill_(square == 16, 0)
 
 
 def _sampling_matrix(count: int, spacing: float, onto: float, window: float, like: Tensor) -> Tensor | None:
     """Return the matrix of `sample` along an axis, None where nothing changes."""
     # A window narrower than a voxel is as wide as one: the means are then linear interpolations.
-    window, fits = max(window, spacing), max(1, math.floor(count * spacing / onto + 1e-6))
-    if fits == count and math.isclose(spacing, onto) and math.isclose(window, spacing):
+    window, samples = max(window, spacing), max(1, math.floor(count * spacing / onto + 1e-6))
+    if samples == count and math.isclose(spacing, onto) and math.isclose(window, spacing):
         return None
-    centre = (torch.arange(fits, dtype=torch.float64)[:, None] + 0.5) * onto
-    edge = torch.arange(count, dtype=torch.float64) * spacing
-    upper, lower = (centre + window / 2).minimum(edge + spacing), (centre - window / 2).maximum(edge)
+    centre = (torch.arange(samples, dtype=torch.float64)[:, None] + 0.5) * onto
+    start = torch.arange(count, dtype=torch.float64) * spacing
+    # A weight is the length by which the window and the voxel overlap.
+    upper, lower = (centre + window / 2).minimum(start + spacing), (centre - window / 2).maximum(start)
     weight = (upper - lower).clamp_min(0)
     return (weight / weight.sum(-1, keepdim=True)).to(like)
 
@@ -284,21 +286,21 @@ def _as_triple(value: Lengths) -> Triple:
 
 def _stream(seed: int, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
     """Return the random generator of a seed for one purpose; another device draws other numbers."""
-    words = np.random.SeedSequence(seed, spawn_key=(zlib.crc32(purpose.encode()),))
-    return torch.Generator(device).manual_seed(int(words.generate_state(1)[0]))
+    sequence = np.random.SeedSequence(seed, spawn_key=(zlib.crc32(purpose.encode()),))
+    return torch.Generator(device).manual_seed(int(sequence.generate_state(1)[0]))
 
 
 def _correlated_field(like: Voxels, spacing: Lengths, lengths: Lengths, seed: int, purpose: str) -> Voxels:
-    """Return a Gaussian random field of mean 0, variance 1 and correlation exp(-½ Σ (d/length)²) over a distance d; a
+    """Return a Gaussian random field of mean 0, variance 1 and correlation exp(-½ Σ (d/length)²) at a distance d; a
     length under half a voxel means no correlation, infinity a constant."""
-    every = zip(like.shape, _as_triple(lengths), _as_triple(spacing), strict=True)
-    return _map_noise(like, [_interpolate_nodes(n, length / h, like) for n, length, h in every], seed, purpose)
+    axes = zip(like.shape, _as_triple(lengths), _as_triple(spacing), strict=True)
+    return _map_noise(like, [_interpolate_nodes(n, length / h, like) for n, length, h in axes], seed, purpose)
 
 
 def _grainy_noise(like: Voxels, widths: Lengths, seed: int, purpose: str) -> Voxels:
     """Return noise of mean 0 and variance 1, smoothed by a Gaussian of deviations `widths` (z, y, x) in voxels."""
-    every = zip(like.shape, _as_triple(widths), strict=True)
-    return _map_noise(like, [_gaussian_matrix(n, width, like) for n, width in every], seed, purpose)
+    axes = zip(like.shape, _as_triple(widths), strict=True)
+    return _map_noise(like, [_gaussian_matrix(n, width, like) for n, width in axes], seed, purpose)
 
 
 def _map_noise(like: Voxels, maps: Sequence[Tensor | None], seed: int, purpose: str) -> Voxels:
@@ -316,7 +318,8 @@ def uniform(count: int, seed: int, purpose: str, like: Tensor) -> Tensor:
 
 def _interpolate_nodes(count: int, length: float, like: Tensor) -> Tensor | None:
     """Return the weights (count, nodes) that interpolate random nodes, or None where every voxel is a node."""
-    # Nodes are a deviation apart, at least a voxel, and go four deviations beyond the box.
+    # Nodes are a deviation apart, at least a voxel, and go four deviations beyond the box. White noise smoothed by a
+    # Gaussian of deviation w has the correlation exp(-d² / 4 w²), whose length is √2 w.
     if math.isinf(length):
         return torch.ones((count, 1), device=like.device, dtype=like.dtype)
     if length < 0.5:

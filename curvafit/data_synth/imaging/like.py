@@ -54,44 +54,46 @@ def fit_modality(scan: Volume, mask: np.ndarray | None = None) -> Modality:
     The mask is the structure's voxels, (Z, Y, X); by default what is bright. The modality's `base` holds the estimates,
     its `ranges` their surroundings (`SPREAD`), and its `voxel` is the finest edge of the scan's.
     """
-    values, given = _crop_middle(scan, mask)
-    steps = np.array(scan.spacing)
-    inside = _find_bright(values, steps) if given is None else given
+    values, cropped_mask = _crop_middle(scan, mask)
+    edges = np.array(scan.spacing)
+    inside = _find_bright(values, edges) if cropped_mask is None else cropped_mask
     if not inside.any() or inside.all():
         raise ValueError("the mask must have voxels inside and outside, got an empty or a full one")
-    ground = _measure_background(values, inside, steps)
-    structure = _measure_structure(values, inside, steps, ground.level)
-    noise = _measure_noise(values, inside, ground, steps, ground.level + structure[1])
-    base = _to_imaging(scan, ground, structure, noise)
-    known = {name: np.asarray(base[name]) for name in SPREAD if np.any(base[name])}
-    ranges = {name: tuple((end * value).tolist() for end in SPREAD[name]) for name, value in known.items()}
-    if base.illumination.bias:
+    background = _measure_background(values, inside, edges)
+    structure = _measure_structure(values, inside, edges, background.level)
+    noise = _measure_noise(values, inside, background, edges, background.level + structure[1])
+    imaging = _to_imaging(scan, background, structure, noise)
+    estimates = {name: np.asarray(imaging[name]) for name in SPREAD if np.any(imaging[name])}
+    ranges = {name: tuple((end * value).tolist() for end in SPREAD[name]) for name, value in estimates.items()}
+    if imaging.illumination.bias:
         low, high = ranges["illumination.bias"]
         ranges["illumination.bias"] = low, min(high, 1.0)
-    about = f"estimated from {scan.source or 'a scan'}, {'its mask' if given is not None else 'without a mask'}"
-    return Modality("like", about, float(min(scan.spacing)), base, ranges)
+    about = f"estimated from {scan.source or 'a scan'}, {'its mask' if cropped_mask is not None else 'without a mask'}"
+    return Modality("like", about, float(min(scan.spacing)), imaging, ranges)
 
 
-def _to_imaging(scan: Volume, ground: Background, structure: Structure, noise: tuple[float, float, float]) -> Imaging:
+def _to_imaging(scan: Volume, background: Background, structure: Structure, noise: Triple) -> Imaging:
     """Return the estimates as parameters of an image: levels in photons where there is a gain, textures before blur."""
-    (widths, contrast, texture, grain), (gain, read_noise, offset) = structure, noise
-    unit = gain or 1.0
-    low = max(ground.level - offset, 0.0) / unit
-    high = max(ground.level + contrast - offset, 0.0) / unit
-    shrunk = math.prod(1 + 2 * (σ / ground.length) ** 2 for σ in widths) ** 0.25
-    length = math.sqrt(max(ground.length**2 - 2 * min(widths) ** 2, min(scan.spacing) ** 2))
-    dark, bright = max(low * unit, 1e-9), max(high * unit, 1e-9)
-    below, above = min(ground.texture * shrunk / dark, 2.0), min(texture * abs(contrast) / bright, 2.0)
+    (widths, contrast, texture, texture_length), (gain, read_noise, offset) = structure, noise
+    scale = gain or 1.0  # counts of a photon
+    dark = max(background.level - offset, 0.0) / scale
+    bright = max(background.level + contrast - offset, 0.0) / scale
+    # The blur has lessened the deviation of the background's texture, and lengthened its correlation.
+    factor = math.prod(1 + 2 * (σ / background.length) ** 2 for σ in widths) ** 0.25
+    length = math.sqrt(max(background.length**2 - 2 * min(widths) ** 2, min(scan.spacing) ** 2))
+    dark_counts, bright_counts = max(dark * scale, 1e-9), max(bright * scale, 1e-9)
+    dark_texture = min(background.texture * factor / dark_counts, 2.0)
+    bright_texture = min(texture * abs(contrast) / bright_counts, 2.0)
     sides = (n * h for n, h in zip(scan.shape, scan.spacing, strict=True))
-    counts = scan.values.dtype.kind in "ui" and scan.values.min() >= 0
-    ceiling = float(np.iinfo(scan.values.dtype).max) if counts else None
+    counted = scan.values.dtype.kind in "ui" and scan.values.min() >= 0
+    ceiling = float(np.iinfo(scan.values.dtype).max) if counted else None
     return Imaging(
         unit=scan.unit,
         spacing=scan.spacing,
-        contrast=Contrast(low, high, below, length, above, grain * min(scan.spacing)),
+        contrast=Contrast(dark, bright, dark_texture, length, bright_texture, texture_length * min(scan.spacing)),
         optics=Optics(widths),
-        illumination=Illumination(min(ground.bias * abs(ground.level) / dark, 0.9), max(sides) / 2),
-        noise=Noise(gaussian=read_noise, width=ground.width),
+        illumination=Illumination(min(background.bias * abs(background.level) / dark_counts, 0.9), max(sides) / 2),
+        noise=Noise(gaussian=read_noise, width=background.width),
         detector=Detector(gain=gain, offset=offset, ceiling=ceiling),
     )
 
@@ -112,12 +114,12 @@ def _crop_middle(scan: Volume, mask: np.ndarray | None) -> tuple[np.ndarray, np.
     return values, None if mask is None else np.asarray(mask)[box].astype(bool)
 
 
-def _find_bright(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Guess the structure's voxels in grey values (Z, Y, X) on voxels of edges `steps`."""
+def _find_bright(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Guess the structure's voxels, bool (Z, Y, X), from grey values on voxels of `edges` (z, y, x)."""
     # A voxel is the structure's where its contrast is above half of the local one: the mean, weighted by brightness,
     # over nearby voxels above Otsu's threshold. So an edge does not depend on the structure's brightness. The threshold
-    # is found among square roots, which shows dim structures.
-    finest = steps.min() / steps
+    # is that of square roots, which shows dim structures.
+    finest = edges.min() / edges
     smooth = ndimage.gaussian_filter(values, 0.8 * finest)
     root = np.sqrt(np.maximum(smooth - np.quantile(smooth, 0.001), 0))
     above: np.ndarray = root > threshold_otsu(root)
@@ -128,13 +130,13 @@ def _find_bright(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
     return np.logical_and(contrast > local / 2, ndimage.maximum_filter(above, size=3))
 
 
-def _measure_structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray, level: float) -> Structure:
-    """Return the blur (z, y = x) by which the mask explains the scan near it best; the mean contrast inside, its
-    relative deviation (texture), and the texture's correlation length in voxels of the finest edge."""
-    finest = steps.min() / steps
+def _measure_structure(values: np.ndarray, inside: np.ndarray, edges: np.ndarray, level: float) -> Structure:
+    """Fit the blur of the mask to the scan near it. Return the blur's deviations (z, y = x), the mean contrast inside,
+    its relative deviation (texture), and the texture's correlation length in voxels of the finest edge."""
+    finest = edges.min() / edges
     window = tuple(WINDOW * finest)
     signal, mask = (torch.from_numpy(volume).float() for volume in (values - level, inside))
-    near = blur(mask, 1.0, tuple(2 * finest)) > 0.02
+    nearby = blur(mask, 1.0, tuple(2 * finest)) > 0.02
 
     def brightness(blurred: torch.Tensor) -> torch.Tensor:
         weight = blur(blurred * blurred, 1.0, window)
@@ -142,32 +144,33 @@ def _measure_structure(values: np.ndarray, inside: np.ndarray, steps: np.ndarray
 
     def misfit(logs: np.ndarray) -> float:
         blurred = blur(mask, 1.0, tuple(np.exp(logs[[0, 1, 1]])))
-        return float((signal - brightness(blurred) * blurred)[near].square().mean())
+        return float((signal - brightness(blurred) * blurred)[nearby].square().mean())
 
-    corner = np.log([max(finest[0], 0.5), 1.0])
-    simplex = corner + np.array([[0, 0], [0.5, 0], [0, 0.5]])
+    start = np.log([max(finest[0], 0.5), 1.0])
+    simplex = start + np.array([[0, 0], [0.5, 0], [0, 0.5]])
     options = {"xatol": 0.02, "fatol": math.inf, "maxfev": 80, "initial_simplex": simplex}
-    widths = np.exp(optimize.minimize(misfit, corner, method="Nelder-Mead", options=options).x[[0, 1, 1]])
+    widths = np.exp(optimize.minimize(misfit, start, method="Nelder-Mead", options=options).x[[0, 1, 1]])
     contrast = brightness(blur(mask, 1.0, tuple(widths))).numpy()
     mean = float(contrast[inside].mean())
-    z, y, x = (np.sqrt(np.maximum(widths**2 - 1 / 12, 0)) * steps).tolist()
-    return (z, y, x), mean, *_measure_texture(contrast / mean, inside, steps)
+    # The average over a voxel, of variance 1/12, is not the optics'.
+    z, y, x = (np.sqrt(np.maximum(widths**2 - 1 / 12, 0)) * edges).tolist()
+    return (z, y, x), mean, *_measure_texture(contrast / mean, inside, edges)
 
 
-def _measure_texture(relative: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
+def _measure_texture(relative: np.ndarray, inside: np.ndarray, edges: np.ndarray) -> tuple[float, float]:
     """Return the deviation and the correlation length, in voxels of the finest edge, of the brightness inside."""
-    # Both come from the covariance, in the plane, of the logarithm, whose variance voxels under `DIMMEST` would decide.
-    # The average over `WINDOW` lengthens the correlation, and lessens the deviation along a tube.
-    bright_part = inside & (relative > DIMMEST)
-    logs = np.log(np.where(bright_part, relative, 1.0))
-    weight = bright_part.astype(np.float32)
-    rest = (logs - logs[bright_part].mean()) * weight
-    first, second = (_autocovariance(rest, weight, axis) for axis in (1, 2))
+    # Both come from the covariance, in the plane, of the logarithm, which voxels under `DIMMEST` would dominate. The
+    # average over `WINDOW` lengthens the correlation, and lessens the deviation along a tube.
+    bright = inside & (relative > DIMMEST)
+    logs = np.log(np.where(bright, relative, 1.0))
+    weight = bright.astype(np.float32)
+    residual = (logs - logs[bright].mean()) * weight
+    first, second = (_autocovariance(residual, weight, axis) for axis in (1, 2))
     covariances = np.concatenate([first, second])
-    lags = np.concatenate([np.arange(len(first)) * steps[1], np.arange(len(second)) * steps[2]]) / steps.min()
-    share = covariances / max(covariances[0], 1e-12)
-    misfit = [np.square(share - np.exp(-0.5 * (lags / length) ** 2)).sum() for length in BRIGHTNESS_LENGTHS]
-    width = float(BRIGHTNESS_LENGTHS[int(np.argmin(misfit))])
+    lags = np.concatenate([np.arange(len(first)) * edges[1], np.arange(len(second)) * edges[2]]) / edges.min()
+    correlations = covariances / max(covariances[0], 1e-12)
+    misfits = [np.square(correlations - np.exp(-0.5 * (lags / length) ** 2)).sum() for length in BRIGHTNESS_LENGTHS]
+    width = float(BRIGHTNESS_LENGTHS[int(np.argmin(misfits))])
     length = math.sqrt(max(width**2 - 2 * WINDOW**2, WINDOW**2))
     return math.sqrt(math.expm1(float(covariances[0]) * max(width / length, 1.0))), length
 
@@ -185,97 +188,101 @@ class Background(NamedTuple):
     bias: float
 
 
-def _measure_background(values: np.ndarray, inside: np.ndarray, steps: np.ndarray) -> Background:
-    """Return the background's level, its noise and texture by their correlations, and how far its level drifts,
-    measured some voxels away from the structure."""
-    finest_edges = steps.min() / steps
-    away = ndimage.distance_transform_edt(~inside, sampling=steps) > 4 * steps.min()
-    where = away if away.mean() > 0.02 else ~inside
-    smooth = ndimage.gaussian_filter(values, 2 * finest_edges)
+def _measure_background(values: np.ndarray, inside: np.ndarray, edges: np.ndarray) -> Background:
+    """Measure the background some voxels away from the structure: its level, its noise and texture, which differ in
+    their correlations, and how far its level drifts."""
+    finest = edges.min() / edges
+    distant = ndimage.distance_transform_edt(~inside, sampling=edges) > 4 * edges.min()
+    where = distant if distant.mean() > 0.02 else ~inside
+    smooth = ndimage.gaussian_filter(values, 2 * finest)
     where = where & (smooth <= np.quantile(smooth[where], 0.98))  # without other bright things than the structure
     level = float(values[where].mean())
     weight = where.astype(np.float32)
-    rest = (values - level) * weight
-    covariances = [_autocovariance(rest, weight, axis) for axis in range(3)]
+    residual = (values - level) * weight
+    covariances = [_autocovariance(residual, weight, axis) for axis in range(3)]
     lags = min(map(len, covariances[1:]))
-    plane = (covariances[1][:lags] + covariances[2][:lags]) / 2
-    noise, lateral, texture, length = _split_covariance(plane)
+    in_plane = (covariances[1][:lags] + covariances[2][:lags]) / 2
+    noise, lateral, texture, length = _split_covariance(in_plane)
     _, axial, _, _ = _split_covariance(covariances[0])
     widths = [n / 8 for n in values.shape]
-    drift = ndimage.gaussian_filter(rest, widths) / np.maximum(ndimage.gaussian_filter(weight, widths), 1e-3)
+    drift = ndimage.gaussian_filter(residual, widths) / np.maximum(ndimage.gaussian_filter(weight, widths), 1e-3)
     low, high = np.quantile(drift, (0.01, 0.99))
     bias, width = float(high - low) / 2 / max(abs(level), 1e-9), (axial, lateral, lateral)
-    return Background(where, level, noise, width, math.sqrt(texture), length * float(steps[2]), bias)
+    return Background(where, level, noise, width, math.sqrt(texture), length * float(edges[2]), bias)
 
 
 def _measure_noise(
-    values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray, high: float
+    values: np.ndarray, inside: np.ndarray, background: Background, edges: np.ndarray, bright_level: float
 ) -> tuple[float, float, float]:
     """Return gain, read noise and offset: the counts' variance is gain · (mean - offset) + read_noise²."""
-    # The line goes through the background and the residuals' bins over the structure; it does not tell offset from read
-    # noise. A negative constant is taken as an offset, a positive one as read noise. The slope is limited so that the
+    # The line through the background is fitted to bins over the structure; it does not tell offset from read noise. A
+    # negative constant is taken as an offset, a positive one as read noise. The slope is limited so that the
     # offset is no brighter than the background's darkest voxels, since fine structure may pass for noise.
-    lines = _measure_bins(values, inside, ground, steps)
+    bins = _measure_bins(values, inside, background, edges)
     gain = 0.0
-    if len(lines) > 2:
-        mean, variance, count = np.array(lines).T
-        rise = count * (mean - ground.level)
-        slope = float((rise * (variance - ground.noise)).sum()), float((rise * (mean - ground.level)).sum())
-        gain = max(slope[0] / slope[1], 0.0) if slope[1] else 0.0
-    darkest = float(np.quantile(values[ground.where], 0.001))
-    gain = min(gain, ground.noise / max(ground.level - darkest, 1e-12))
-    if not gain or gain * abs(high - ground.level) < (GROWS - 1) * ground.noise:
-        floor = 0.0 if ground.level > 2 * ground.texture else ground.level - abs(high - ground.level)
-        return 0.0, math.sqrt(ground.noise), floor
-    constant = ground.noise - gain * ground.level
+    if len(bins) > 2:
+        mean, variance, count = np.array(bins).T
+        weighted = count * (mean - background.level)  # least squares, through the background
+        rise, run = (float((weighted * d).sum()) for d in (variance - background.noise, mean - background.level))
+        gain = max(rise / run, 0.0) if run else 0.0
+    darkest = float(np.quantile(values[background.where], 0.001))
+    gain = min(gain, background.noise / max(background.level - darkest, 1e-12))
+    contrast = abs(bright_level - background.level)
+    if not gain or gain * contrast < (GROWS - 1) * background.noise:
+        # Texture is relative to a level above the offset, which is lowered where the background would not be above it.
+        offset = 0.0 if background.level > 2 * background.texture else background.level - contrast
+        return 0.0, math.sqrt(background.noise), offset
+    constant = background.noise - gain * background.level
     return gain, math.sqrt(max(constant, 0.0)), max(-constant / gain, 0.0)
 
 
-def _autocovariance(rest: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
+def _autocovariance(residual: np.ndarray, weight: np.ndarray, axis: int) -> np.ndarray:
     """Return the autocovariance along an axis, at lags from 0, of a residual times its `weight`, which is 1 or 0."""
-    a, w = np.moveaxis(rest, axis, 0), np.moveaxis(weight, axis, 0)
-    lags = min(12, len(a) // 3)
-    sums = [(float((a[: len(a) - k] * a[k:]).sum()), float((w[: len(w) - k] * w[k:]).sum())) for k in range(lags + 1)]
-    return np.array([product / max(pairs, 1.0) for product, pairs in sums])
+    values, weights = np.moveaxis(residual, axis, 0), np.moveaxis(weight, axis, 0)
+    lags = min(12, len(values) // 3)
+    products = [float((values[: len(values) - k] * values[k:]).sum()) for k in range(lags + 1)]
+    pairs = [float((weights[: len(weights) - k] * weights[k:]).sum()) for k in range(lags + 1)]
+    return np.array(products) / np.maximum(pairs, 1.0)
 
 
 def _split_covariance(covariances: np.ndarray) -> tuple[float, float, float, float]:
     """Return variance and width of the noise, whose covariance is short, and variance and length of the texture."""
+    # White noise smoothed by a Gaussian of deviation w has the covariance exp(-(lag / 2w)²); a constant is a drift's.
     lag = np.arange(len(covariances))
-    short = [np.exp(-((lag / (2 * w)) ** 2)) if w else (lag == 0).astype(float) for w in GRAINS]
-    long = [np.exp(-0.5 * (lag / length) ** 2) for length in TEXTURE_LENGTHS]
+    noise_shapes = [np.exp(-((lag / (2 * w)) ** 2)) if w else (lag == 0).astype(float) for w in GRAINS]
+    texture_shapes = [np.exp(-0.5 * (lag / length) ** 2) for length in TEXTURE_LENGTHS]
     flat = np.ones(len(lag))
-    parts, _ = optimize.nnls(np.stack([*short, *long, flat], 1), covariances)
-    noise, texture = parts[: len(GRAINS)], parts[len(GRAINS) : -1]
-    total, spread = float(noise.sum()), float(texture.sum())
-    width = float(noise @ GRAINS / total) if total else 0.0
-    length = float(texture @ TEXTURE_LENGTHS / spread) if spread else TEXTURE_LENGTHS[0]
-    return total, width, spread, length
+    amplitudes, _ = optimize.nnls(np.stack([*noise_shapes, *texture_shapes, flat], 1), covariances)
+    noise, texture = amplitudes[: len(GRAINS)], amplitudes[len(GRAINS) : -1]
+    noise_variance, texture_variance = float(noise.sum()), float(texture.sum())
+    width = float(noise @ GRAINS / noise_variance) if noise_variance else 0.0
+    length = float(texture @ TEXTURE_LENGTHS / texture_variance) if texture_variance else TEXTURE_LENGTHS[0]
+    return noise_variance, width, texture_variance, length
 
 
 def _measure_bins(
-    values: np.ndarray, inside: np.ndarray, ground: Background, steps: np.ndarray
+    values: np.ndarray, inside: np.ndarray, background: Background, edges: np.ndarray
 ) -> list[tuple[float, float, int]]:
     """Return mean level, noise variance and number of voxels of the structure, in bins of its smoothed level."""
     # Second differences along both axes of the plane: no plane passes, and nothing else that a blur lets through much.
     residual = ndimage.convolve(values, np.outer((1, -2, 1), (1, -2, 1)).astype(np.float32)[None])
-    mean = ndimage.gaussian_filter(values, 1.5 * steps.min() / steps)
-    top = values.max()
+    mean = ndimage.gaussian_filter(values, 1.5 * edges.min() / edges)
+    highest = values.max()
     # Saturated voxels and their neighbours have no noise to measure.
-    used = inside & (ndimage.maximum_filter(values, 3) < top) if (values == top).mean() > 1e-5 else inside
-    # The share of the noise's variance that the filter lets through.
-    passed = max(_robust_square(residual[ground.where]), 1e-12) / max(ground.noise, 1e-12)
+    used = inside & (ndimage.maximum_filter(values, 3) < highest) if (values == highest).mean() > 1e-5 else inside
+    # The factor by which the filter changes the noise's variance.
+    transmission = max(_robust_square(residual[background.where]), 1e-12) / max(background.noise, 1e-12)
     bins = []
-    edges = np.quantile(mean[used], np.linspace(0, 1, 25)) if used.any() else np.zeros(1)
-    for low, high in itertools.pairwise(edges):
+    quantiles = np.quantile(mean[used], np.linspace(0, 1, 25)) if used.any() else np.zeros(1)
+    for low, high in itertools.pairwise(quantiles):
         bin_ = used & (mean >= low) & (mean <= high)
         if (count := int(bin_.sum())) >= 50:
-            bins.append((float(values[bin_].mean()), _robust_square(residual[bin_]) / passed, count))
+            bins.append((float(values[bin_].mean()), _robust_square(residual[bin_]) / transmission, count))
     return bins
 
 
 def _robust_square(residual: np.ndarray) -> float:
     """Return the mean square of a residual without outliers: those beyond four deviations by the median's estimate."""
-    square = np.square(residual)
-    near = square < 16 * np.median(square) / 0.455
-    return float(square[near].mean() if near.any() else square.mean())
+    square = np.square(residual)  # whose median is 0.455 times the variance, if the residual is normal
+    inlier = square < 16 * np.median(square) / 0.455
+    return float(square[inlier].mean() if inlier.any() else square.mean())

@@ -46,14 +46,14 @@ def _ranges(part: type) -> dict[str, tuple[Any, Range]]:
 
 
 def _number(name: str, value: Any, kind: Any, allowed: Range) -> Any:
-    """Return the value as a float or a triple of floats; None where the kind allows it."""
+    """Return the value as a float or a triple of floats, or None where the type `kind` allows that; else ValueError."""
     words, least, most = allowed
     if value is None and NoneType in get_args(kind):
         return None
     if kind is not Triple:
         return check_float(value, f"{name} as {words}", least, most)
     values = as_tuple(value, f"3 numbers for {name}")
-    values = values if len(values) == 3 else (None,)  # which no number is
+    values = values if len(values) == 3 else (None,)  # None is refused, with the message of a wrong number
     words = f"{name} as 3 numbers (z, y, x), each {words}"
     return tuple(check_float(number, words, least, most, of=value) for number in values)
 
@@ -166,10 +166,10 @@ class Imaging(Checked):
     def __post_init__(self) -> None:
         if self.unit not in (*METRES, "voxel"):
             raise ValueError(f"the unit must be {', '.join(METRES)} or voxel, got {quoted(self.unit)}")
-        for own in fields(self):
-            part, kind = getattr(self, own.name), type(own.default)
-            if is_dataclass(own.default) and not isinstance(part, kind):
-                raise ValueError(f"{own.name} must be of type {kind.__name__}, got {quoted(part)}")
+        for parameter in fields(self):
+            part, kind = getattr(self, parameter.name), type(parameter.default)
+            if is_dataclass(parameter.default) and not isinstance(part, kind):
+                raise ValueError(f"{parameter.name} must be of type {kind.__name__}, got {quoted(part)}")
         super().__post_init__()
 
     def __getitem__(self, name: str) -> Any:
@@ -180,12 +180,12 @@ class Imaging(Checked):
         """Return a copy with other values, by name: `imaging.assign({"optics.blur": (3, 1, 1), "visible": 0.1})`."""
         if unknown := sorted(set(values) - set(NAMES)):
             raise ValueError(f"an image has parameters such as optics.blur, got {', '.join(map(quoted, unknown))}")
-        parts: dict[str, dict[str, Any]] = {}
+        parts: dict[str, dict[str, Any]] = {"": {}}
         for name, value in values.items():
-            part, _, leaf = name.rpartition(".")
-            parts.setdefault(part, {})[leaf] = value
-        own = parts.pop("", {})
-        return replace(self, **own, **{name: replace(getattr(self, name), **part) for name, part in parts.items()})
+            part, _, parameter = name.rpartition(".")  # the part is "" for a parameter of the image itself
+            parts.setdefault(part, {})[parameter] = value
+        top = parts.pop("")
+        return replace(self, **top, **{name: replace(getattr(self, name), **part) for name, part in parts.items()})
 
     def as_dict(self) -> dict[str, Any]:
         """Return all parameters in JSON's types, each part an object of its own."""
@@ -239,12 +239,12 @@ class Modality:
     def draw(self, seed: int) -> Imaging:
         """Draw one image's parameters, each of which depends on the seed and its own name alone."""
         seed, drawn = check_seed(seed), {}
-        for name, (low, high) in self.ranges.items():
+        for name, ends in self.ranges.items():
             key = tuple(name.encode())
-            share = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key)).random()
-            a, b = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
-            positive = bool(np.all(a > 0) and np.all(b > 0))
-            value = np.exp(np.log(a) + share * (np.log(b) - np.log(a))) if positive else a + share * (b - a)
+            t = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key)).random()
+            low, high = (np.asarray(end, dtype=float) for end in ends)
+            positive = bool(np.all(low > 0) and np.all(high > 0))
+            value = np.exp(np.log(low) + t * (np.log(high) - np.log(low))) if positive else low + t * (high - low)
             drawn[name] = tuple(value.tolist()) if value.ndim else float(value)
         return self.base.assign(drawn)
 
@@ -288,19 +288,20 @@ def image(
     imaging's unit; ε of the field's profile is in voxels. Where `levels` are given, the field is those of several
     classes (C, Z, Y, X), the first in front, with the light of each: 0 as the background's, 1 as the structure's.
     """
-    fields, lights = (field[None], (1.0,)) if levels is None else (field, levels)
-    stain = torch.stack([light * share for light, share in zip(lights, share_voxels(fields, epsilon), strict=True)])
-    light, optics = _emit(stain.sum(0), spacing, imaging, seed), imaging.optics
+    fields, levels = (field[None], (1.0,)) if levels is None else (field, levels)
+    fractions = share_voxels(fields, epsilon)
+    stain = torch.stack([level * fraction for level, fraction in zip(levels, fractions, strict=True)]).sum(0)
+    light, optics = _emit(stain, spacing, imaging, seed), imaging.optics
     if optics.growth or optics.attenuation:
         light = effects.blur_with_depth(light, spacing, optics.blur, optics.growth, optics.attenuation)
     else:
         light = effects.blur(light, spacing, optics.blur)
     light = effects.sample(light, spacing, imaging.spacing, (imaging.thickness, *imaging.spacing[1:]))
-    lamp = imaging.illumination
-    if lamp.bias:
-        light = light * effects.bias(light, imaging.spacing, lamp.bias, lamp.bias_length, seed)
-    if lamp.stripes:
-        light = light * effects.stripes(light, imaging.spacing, lamp.stripes, lamp.stripe_width, seed)
+    uneven = imaging.illumination
+    if uneven.bias:
+        light = light * effects.bias(light, imaging.spacing, uneven.bias, uneven.bias_length, seed)
+    if uneven.stripes:
+        light = light * effects.stripes(light, imaging.spacing, uneven.stripes, uneven.stripe_width, seed)
     return _detect(light, imaging, seed)
 
 
@@ -314,21 +315,22 @@ def label_voxels(
 ) -> torch.Tensor:
     """Return the labels of the image's voxels, uint8: 0 outside, 1, 2, … in the classes of fields (C, Z, Y, X).
 
-    `sampled` is the field of all classes together on the image's voxels (`regrid`). Where it is above 0, a voxel is of
-    the first class whose field is, too. With `Imaging.visible` labels hold the voxels that this share of the light of
-    all classes reaches, stained alike, and a voxel is of the class with most of it.
+    `sampled` is the field of all classes together on the image's voxels (`regrid`). A voxel is labelled where that is
+    above 0, by the first class whose own field is. With `Imaging.visible`, a voxel is labelled where it gets more than
+    this share of the light that all classes, equally stained, can give; by the class that gives most.
     """
     if imaging.visible:
         optics, window = imaging.optics, (imaging.thickness, *imaging.spacing[1:])
         stains = share_voxels(fields, epsilon)
         lights = (effects.blur_with_depth(stain, spacing, optics.blur, optics.growth) for stain in stains)
-        shares = torch.stack([effects.sample(light, spacing, imaging.spacing, window) for light in lights])
-        return torch.where(shares.sum(0) > imaging.visible, shares.argmax(0) + 1, 0).to(torch.uint8)
+        fractions = torch.stack([effects.sample(light, spacing, imaging.spacing, window) for light in lights])
+        return torch.where(fractions.sum(0) > imaging.visible, fractions.argmax(0) + 1, 0).to(torch.uint8)
     if len(fields) == 1:
         return (sampled > 0).to(torch.uint8)
-    levels = torch.stack([regrid(field, spacing, imaging) for field in fields])
-    inside = levels > 0
-    first = torch.where(inside.any(0), inside.to(torch.uint8).argmax(0), levels.argmax(0))
+    values = torch.stack([regrid(field, spacing, imaging) for field in fields])
+    inside = values > 0
+    # Interpolated, each class may be below 0 where the field of all is above it: the greatest then decides.
+    first = torch.where(inside.any(0), inside.to(torch.uint8).argmax(0), values.argmax(0))
     return torch.where(inside.any(0) | (sampled > 0), first + 1, 0).to(torch.uint8)
 
 
@@ -349,32 +351,33 @@ def field_shape(shape: Sequence[int], spacing: float, imaging: Imaging) -> tuple
 
 
 def share_voxels(fields: torch.Tensor, epsilon: float) -> list[torch.Tensor]:
-    """Return the share of each voxel (Z, Y, X) that each class fills, of fields (C, Z, Y, X), the first in front.
+    """Return the fraction of each voxel (Z, Y, X) that each class fills, of fields (C, Z, Y, X), the first in front.
 
-    A class fills what those in front of it leave, as far as it reaches: classes that meet leave no gap.
+    A class fills at most what those in front of it leave: classes that meet leave no gap.
     """
-    shares, free = [], torch.ones_like(fields[0])
-    for one in fields:
-        shares.append(torch.minimum(free, effects.occupancy(one, epsilon)))
-        free = free - shares[-1]
-    return shares
+    fractions, remaining = [], torch.ones_like(fields[0])
+    for u in fields:
+        fractions.append(torch.minimum(remaining, effects.occupancy(u, epsilon)))
+        remaining = remaining - fractions[-1]
+    return fractions
 
 
 def _emit(occupied: torch.Tensor, spacing: float, imaging: Imaging, seed: int) -> torch.Tensor:
+    """Return the light of the specimen, before optics, where a fraction `occupied` of each voxel is structure."""
     contrast, specimen = imaging.contrast, imaging.specimen
-    inside = occupied
+    stain = occupied
     if specimen.dropout:
-        lost = specimen.dropout, specimen.dropout_length, specimen.dropout_loss
-        inside = occupied * effects.dropout(occupied, spacing, *lost, seed)
-    below = above = torch.ones_like(occupied[:1, :1, :1])
+        loss = specimen.dropout, specimen.dropout_length, specimen.dropout_loss
+        stain = occupied * effects.dropout(occupied, spacing, *loss, seed)
+    background_texture = foreground_texture = torch.ones_like(occupied[:1, :1, :1])
     if contrast.background_texture:
-        grain = contrast.background_texture, contrast.background_length
-        below = effects.texture(occupied, spacing, *grain, seed, "background texture")
+        texture = contrast.background_texture, contrast.background_length
+        background_texture = effects.texture(occupied, spacing, *texture, seed, "background texture")
     if contrast.foreground_texture:
-        grain = contrast.foreground_texture, contrast.foreground_length
-        above = effects.texture(occupied, spacing, *grain, seed, "foreground texture")
-    base = contrast.background * below
-    light = base + inside * (contrast.foreground * above - base)
+        texture = contrast.foreground_texture, contrast.foreground_length
+        foreground_texture = effects.texture(occupied, spacing, *texture, seed, "foreground texture")
+    background = contrast.background * background_texture
+    light = background + stain * (contrast.foreground * foreground_texture - background)
     if specimen.clutter:
         height = specimen.clutter_height * (contrast.foreground - contrast.background)
         light = light + height * effects.clutter(occupied, spacing, specimen.clutter, specimen.clutter_radius, seed)
@@ -382,6 +385,7 @@ def _emit(occupied: torch.Tensor, spacing: float, imaging: Imaging, seed: int) -
 
 
 def _detect(light: torch.Tensor, imaging: Imaging, seed: int) -> torch.Tensor:
+    """Return the counts that the detector makes of light: noise, then rings, rounded and cut where it saturates."""
     detector, noise, contrast = imaging.detector, imaging.noise, imaging.contrast
     counts = effects.poisson_gaussian(light, detector.gain, noise.gaussian, detector.offset, seed, noise.width)
     if noise.rician:
@@ -389,4 +393,4 @@ def _detect(light: torch.Tensor, imaging: Imaging, seed: int) -> torch.Tensor:
     if detector.rings:
         strength = detector.rings * abs(contrast.foreground - contrast.background) * (detector.gain or 1)
         counts = counts + effects.rings(counts, imaging.spacing, strength, detector.ring_width, seed)
-    return counts if detector.ceiling is None else counts.round().clamp_(0, detector.ceiling)  # where it saturates
+    return counts if detector.ceiling is None else counts.round().clamp_(0, detector.ceiling)
