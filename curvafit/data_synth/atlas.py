@@ -41,7 +41,7 @@ from curvafit.scan.measures import Reading, read_texture, scan_diagram
 from curvafit.scan.preparation import prepare, thinner_thickness
 from curvafit.volumes.volume import ScanError, Volume
 
-#: A build ends with an error where fewer than one draw in so many is viable.
+#: A build ends with an error where fewer than one draw in this many is viable.
 BARREN = 200
 #: Viable shapes that a store may be asked for.
 MOST = 10**7
@@ -105,26 +105,25 @@ def make_settings(
 
 
 def _fill(store: Store, count: int, workers: Cluster | None, progress: Progress) -> Store:
-    """Make draws in order, in rounds of as many as are needed at least, so that the last draw is viable."""
+    """Make draws in order until `count` are viable, in rounds of as many as are missing: so the last draw is viable."""
     store.want(count)
     viable = {index: store.viable(index) for index in store.indices()}
-    rest = (index for index in itertools.count() if index not in viable)
+    indices = (index for index in itertools.count() if index not in viable)
     while (missing := count - sum(viable.values())) > 0:
-        for record in run_jobs(partial(make_draw, store.path.resolve()), islice(rest, missing), workers):
+        for record in run_jobs(partial(make_draw, store.path.resolve()), islice(indices, missing), workers):
             viable[record.index] = record.viability.viable
-            made = sum(viable.values())
-            progress(f"{made} viable of {len(viable)} draws", made / count)
-            if len(viable) > BARREN * (1 + made):
-                what = f"hardly any draw of this design is viable: {made} of {len(viable)}"
-                raise ValueError(f"{what}; the last was not, as {record.status}")
+            shapes = sum(viable.values())
+            progress(f"{shapes} viable of {len(viable)} draws", shapes / count)
+            if len(viable) > BARREN * (1 + shapes):
+                message = f"hardly any draw of this design is viable: {shapes} of {len(viable)}"
+                raise ValueError(f"{message}; the last was not, as {record.status}")
     return store
 
 
 def make_draw(path: str | Path, index: int) -> Record:
-    """Make a draw of a store, unless it is there, and return its record: a worker's part of `build`.
+    """Make a draw of a store, unless it exists, and return its record: a worker's part of `build`.
 
-    It is made on one thread, so that a field depends on nothing but its store's settings, its index and the kind of
-    processor.
+    It is made on one thread, so that a field depends only on its store's settings, its index and the processor.
     """
     store, began = open_store(path), time.perf_counter()
     if store.has(index):
@@ -155,8 +154,8 @@ def make_draw(path: str | Path, index: int) -> Record:
 
 def versions() -> dict[str, str]:
     """Return the versions that a generated field's bits depend on: Python, libraries, processor."""
-    here = {"python": platform.python_version(), "processor": binding.get_host_cpu_name()}
-    return here | {name: version(name) for name in ("curvafit", "torch", "numpy", "numba")}
+    machine = {"python": platform.python_version(), "processor": binding.get_host_cpu_name()}
+    return machine | {name: version(name) for name in ("curvafit", "torch", "numpy", "numba")}
 
 
 @dataclass(frozen=True)
@@ -176,23 +175,23 @@ def verify(path: str | Path, progress: Progress = silent) -> Verdict:
     """
     store = open_store(path)
     indices, problems, notes, viable = store.indices(), [], [], 0
-    for k, index in enumerate(indices):
-        progress(f"{k} of {len(indices)} draws checked", k / len(indices))
+    for checked, index in enumerate(indices):
+        progress(f"{checked} of {len(indices)} draws checked", checked / len(indices))
         viable += store.viable(index)
         if not store.intact(index):
-            mend = f"delete draws/{index:06d}, and a build makes it again"
-            problems.append(f"draw {index} does not match its checksum: {mend}")
-    there = {int(entry.name) for entry in (store.path / "draws").iterdir() if entry.name.isdigit()}
-    torn = sorted(index for index in there - set(indices) if not store.has(index))  # a build may add some meanwhile
+            remedy = f"delete draws/{index:06d}, and a build makes it again"
+            problems.append(f"draw {index} does not match its checksum: {remedy}")
+    present = {int(entry.name) for entry in (store.path / "draws").iterdir() if entry.name.isdigit()}
+    torn = sorted(index for index in present - set(indices) if not store.has(index))  # a build may add some meanwhile
     problems += [f"draw {index} is torn: a part is missing, or it is another draw" for index in torn]
-    missing = sorted(set(range(max(there, default=-1) + 1)) - there)
-    lost = f"{len(missing)} draws are missing: {', '.join(map(str, missing[:9]))}"
+    missing = sorted(set(range(max(present, default=-1) + 1)) - present)
+    message = f"{len(missing)} draws are missing: {', '.join(map(str, missing[:9]))}"
     if missing and viable >= store.wanted:
-        problems.append(lost)
+        problems.append(message)
     elif viable < store.wanted:
-        notes.append(f"{viable} of {store.wanted} shapes are made" + f"; {lost}" * bool(missing))
-    finding = "nothing is wrong" if not problems else f"{len(problems)} things are wrong"
-    return Verdict(tuple(problems), tuple(notes), f"{len(indices)} draws, {viable} shapes checked: {finding}")
+        notes.append(f"{viable} of {store.wanted} shapes are made" + f"; {message}" * bool(missing))
+    outcome = "nothing is wrong" if not problems else f"{len(problems)} things are wrong"
+    return Verdict(tuple(problems), tuple(notes), f"{len(indices)} draws, {viable} shapes checked: {outcome}")
 
 
 def summarise(store: Store) -> dict[str, str]:
@@ -268,30 +267,30 @@ def shape_id(store: Store, index: int) -> str:
 def _measure_shape(store: Store, record: Record) -> tuple[float, float, Diagram, Diagram]:
     """Return the volume fraction, the thickness in voxels, and the diagrams of the field and of its mask as a scan."""
     u, settings = store.field(record.index), store.settings
-    whole = diagram(torch.from_numpy(u), Grid(settings.shape, settings.spacing), settings.epsilon)
+    field_diagram = diagram(torch.from_numpy(u), Grid(settings.shape, settings.spacing), settings.epsilon)
     mask = prepare(Volume((u > 0).astype(np.uint8)), kind="mask", periodic=True, one_scale=True)
-    as_field, as_mask = (one.thin(BIN_WIDTH, TAIL_SHARE) for one in (whole, scan_diagram(mask)))
-    return float((u > 0).mean()), thinner_thickness(u > 0), as_field, as_mask
+    field_diagram, mask_diagram = (full.thin(BIN_WIDTH, TAIL_SHARE) for full in (field_diagram, scan_diagram(mask)))
+    return float((u > 0).mean()), thinner_thickness(u > 0), field_diagram, mask_diagram
 
 
 def _provenance(draws: Sequence[tuple[Store, Record]], command: Sequence[str]) -> dict[str, Any]:
     stores = list({store.name: store for store, _ in draws}.values())
-    accounts = {}
+    summaries = {}
     for store in stores:
-        records = [record for own, record in draws if own is store]
+        records = [record for owner, record in draws if owner is store]
         generators = sorted({json.dumps(record.versions, sort_keys=True) for record in records})
-        accounts[store.name] = {
+        summaries[store.name] = {
             "draws": len(records),
             "viable": sum(record.viability.viable for record in records),
             "settings": dataclasses.asdict(store.settings),
             "generated_with": [json.loads(text) for text in generators],
         }
     return {
-        "command": [*(_build_command(store, accounts[store.name]["viable"]) for store in stores), *command],
+        "command": [*(_build_command(store, summaries[store.name]["viable"]) for store in stores), *command],
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "selection": {"extent_of_both_phases": FORMED},
         "settings": {name: getattr(stores[0].settings, name) for name in ("shape", "spacing", "epsilon")},
-        "stores": accounts,
+        "stores": summaries,
         "diagrams": {"curvature": "geometric", "bin_width": BIN_WIDTH, "tail_share": TAIL_SHARE, "unit": Diagram.unit},
         "measured_with": versions(),
     }
@@ -301,8 +300,8 @@ def _build_command(store: Store, viable: int) -> str:
     """Return the command that makes the same store: building stops at its last viable draw."""
     settings = store.settings
     shape, name = ",".join(map(str, settings.shape)), present_name(settings.schedule)
-    known = {json.dumps(design_box(law).as_dict()): law for law in ("random", "sobol")}
-    design = known.get(json.dumps(settings.design), f"{store.name}.yaml")
+    designs = {json.dumps(design_box(law).as_dict()): law for law in ("random", "sobol")}
+    design = designs.get(json.dumps(settings.design), f"{store.name}.yaml")
     options = f"--count {viable} --shape {shape} --seed {settings.seed} --design {design} --schedule {name}"
     if name in SCHEDULES and settings.schedule["steps"] != SCHEDULES[name].steps:
         options += f" --steps {settings.schedule['steps']}"
@@ -333,13 +332,14 @@ def describe(
     if unknown or not views:
         raise ValueError(f"views must be some of {', '.join(VIEWS)}, got {', '.join(unknown) or 'none'}")
     sources, path = open_all(stores), Path(out)
-    begun = load_table(path) if path.exists() and not overwrite else None
-    provenance, rows = _table_provenance(begun, sources, command), []
-    if begun is not None:
-        rows += zip(*(getattr(begun, column.name) for column in dataclasses.fields(begun)[:-1]), strict=True)
+    table = load_table(path) if path.exists() and not overwrite else None
+    provenance, rows = _table_provenance(table, sources, command), []
+    if table is not None:
+        columns = dataclasses.fields(table)[:-1]  # the last is the provenance
+        rows += zip(*(getattr(table, column.name) for column in columns), strict=True)
     present = {row[:2] for row in rows}
     jobs: list[tuple[Path, int, tuple[str, ...]]] = []  # shapes that lack views in the table
-    for store, index in ((own, k) for own in sources for k in own.indices()):
+    for store, index in ((source, k) for source in sources for k in source.indices()):
         missing = tuple(name for name in views if (f"{store.name}/{index:06d}", name) not in present)
         with suppress(KeyError):  # a draw that was removed since it was listed
             if missing and store.viable(index) and is_well_formed(store.record(index).viability):
@@ -373,7 +373,7 @@ def measure(job: tuple[Path, int, Sequence[str]]) -> list[Row]:
 
 
 def _measure_view(u: np.ndarray, name: str, seed: int) -> tuple[np.ndarray, float]:
-    """Return descriptors and amount of a field in one view, as `infer` reads a scan; NaN where that has no surface."""
+    """Return descriptors and amount of a field in one view, read as `infer` reads a scan; NaN without a surface."""
     reading: Reading | None = None
     with suppress(ScanError):
         view = VIEWS[name](u, np.random.default_rng([seed, *name.encode()]))
@@ -382,15 +382,15 @@ def _measure_view(u: np.ndarray, name: str, seed: int) -> tuple[np.ndarray, floa
 
 
 def _table_provenance(table: Table | None, stores: Sequence[Store], command: Sequence[str]) -> dict[str, Any]:
-    """Return the provenance of a table, begun or new, to which shapes of stores are added."""
-    before = {} if table is None else table.provenance
+    """Return the provenance of a table with stores added; ValueError where it has another store of such a name."""
+    previous = {} if table is None else table.provenance
     settings = {store.name: json.loads(json.dumps(dataclasses.asdict(store.settings))) for store in stores}
-    for name, now in settings.items():
-        if before.get("stores", {}).get(name, now) != now:
+    for name, current in settings.items():
+        if previous.get("stores", {}).get(name, current) != current:
             raise ValueError(f"the table was begun with another store {name}: choose another name, or overwrite it")
     return {
-        "stores": before.get("stores", {}) | settings,
-        "command": [*before.get("command", []), *command],
+        "stores": previous.get("stores", {}) | settings,
+        "command": [*previous.get("command", []), *command],
         "measured_with": versions(),
     }
 

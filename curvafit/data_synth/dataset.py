@@ -90,20 +90,21 @@ class Composition:
     def draw(
         self, source: ShapeSource, voxels: Sequence[int], voxel: float, index: int, rng: np.random.Generator
     ) -> tuple[Tensor, Tensor, float, list[dict[str, Any]]]:
-        """Return the phase fields (C, Z, Y, X) of the classes of case `index`, the first in front, on voxels of the
-        edge `voxel`, which is in the wall's unit; that of all together; their ε in voxels; and the shapes' origins."""
+        """Return the phase fields of case `index`, (C, Z, Y, X) of the classes, the first in front, and (Z, Y, X) of
+        all together; their ε in voxels; the shapes' origins. The edge `voxel` of a voxel is in the wall's unit."""
         if self.classes:
             shapes = [source.shape(voxels, k, rng) for k in range(len(self.names(source)))]
             values = torch.from_numpy(np.stack([shape.values for shape in shapes]))
             return values, values.amax(0), shapes[0].epsilon, [shape.origin for shape in shapes]
         margin = self.margin(source, voxel)
         shape = source.shape([n + 2 * margin for n in voxels], index, rng)
-        u, origin = torch.from_numpy(shape.values), shape.origin | ({"margin": margin} if margin else {})
+        u = torch.from_numpy(shape.values)
+        origin = shape.origin | ({"margin": margin} if margin else {})
         if self.wall is None:
             return u[None], u, shape.epsilon, [origin]
-        shell = shell_of(u, shape.epsilon, self.wall / voxel, periodic=source.edge == math.inf)
+        wall_and_lumen = shell_of(u, shape.epsilon, self.wall / voxel, periodic=source.edge == math.inf)
         inner = (..., *(slice(margin, margin + n) for n in voxels))
-        return shell[inner], u[inner], shape.epsilon, [origin]
+        return wall_and_lumen[inner], u[inner], shape.epsilon, [origin]
 
     def show(
         self, source: ShapeSource, shape: Sequence[int], voxel: float, imaging: Imaging, seed: int, index: int, rng: Any
@@ -116,12 +117,12 @@ class Composition:
         grey = image(fields, voxel, imaging, seed, epsilon, levels)
         labels = label_voxels(fields, sampled, voxel, imaging, epsilon)
         z, y, x = shape  # a field of whole voxels may give a few voxels more
-        grey, sampled, labels = (part[:z, :y, :x].contiguous().numpy() for part in (grey, sampled, labels))
+        grey, sampled, labels = (volume[:z, :y, :x].contiguous().numpy() for volume in (grey, sampled, labels))
         record = {"source": origins, "imaging": imaging.as_dict(), "image_seed": seed, "voxel": voxel}
         return Case(grey, sampled, labels, imaging.spacing, imaging.unit, epsilon * voxel, record)
 
     def margin(self, source: ShapeSource, voxel: float) -> int:
-        """Return by how many voxels a crop is larger on every side: walls of surfaces outside reach into it."""
+        """Return by how many voxels a crop is enlarged on every side, since surfaces outside have walls in it."""
         return 0 if self.wall is None or source.edge == math.inf else math.ceil(self.wall / voxel) + 2
 
 
@@ -169,10 +170,10 @@ class Recipe:
         object.__setattr__(self, "calibres", check_calibres(self.calibres))
         check_type(self.composition, Composition, "a Composition")
         self.composition.names(self.source)
-        wall, thickest = self.composition.wall, self._voxels[1]
-        if wall is not None and wall < thickest:
-            words = f"{thickest:g} {self.modality.base.unit}, got {wall:g}"
-            raise ValueError(f"a wall must be at least a shape's voxel thick, {words}")
+        wall, longest = self.composition.wall, self._voxels[1]
+        if wall is not None and wall < longest:
+            edge = f"{longest:g} {self.modality.base.unit}"
+            raise ValueError(f"a wall must be at least a shape's voxel thick, {edge}, got {wall:g}")
         for voxel in self._voxels:
             check_crop(self.source.edge, self.shape, voxel, self.modality, self.composition.margin(self.source, voxel))
 
@@ -190,20 +191,21 @@ class Recipe:
     def _voxels(self) -> tuple[float, float]:
         """The shortest and the longest edge that a shape's voxels can have."""
         low, high = self.calibres
-        least, most = (end(self.source.scales, default=1.0) for end in (min, max))
-        return self.voxel * low * least, self.voxel * high * most
+        scales = self.source.scales or (1.0,)
+        return self.voxel * low * min(scales), self.voxel * high * max(scales)
 
     def case(self, index: int) -> Case:
         """Make case number `index`, on one thread; ValueError where a class is not seen on the image's voxels."""
-        words = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(3)
-        rng, (for_imaging, seed) = np.random.default_rng(words[0]), (int(one.generate_state(1)[0]) for one in words[1:])
-        imaging = self.modality.draw(for_imaging)
+        sequences = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(3)
+        rng = np.random.default_rng(sequences[0])
+        imaging_seed, image_seed = (int(sequence.generate_state(1)[0]) for sequence in sequences[1:])
+        imaging = self.modality.draw(imaging_seed)
         scales = self.source.scales or (1.0,)
         voxel = draw_voxel(self.voxel, self.calibres, rng) * scales[index % len(scales)]
         names = self.classes
         with one_thread():
             for _ in range(TRIES):
-                case = self.composition.show(self.source, self.shape, voxel, imaging, seed, index, rng)
+                case = self.composition.show(self.source, self.shape, voxel, imaging, image_seed, index, rng)
                 counts = np.bincount(case.labels.ravel(), minlength=len(names) + 1)
                 if case.field.min() <= 0 < case.field.max() and counts.all():
                     break
@@ -212,10 +214,10 @@ class Recipe:
                 missing = "structure" if counts.all() else ("background", *names)[int(counts.argmin())]
                 mend = "take more voxels" + (", a thinner wall, or laws that fill less" if len(names) > 1 else "")
                 raise ValueError(f"{TRIES} shapes showed no {missing} on {edges} voxels: {mend}")
-        shares = {"volume_fraction": float((case.field > 0).mean())}
-        shares["class_fractions"] = (counts[1:] / case.labels.size).tolist()
+        fractions = {"volume_fraction": float((case.field > 0).mean())}
+        fractions["class_fractions"] = (counts[1:] / case.labels.size).tolist()
         grey = case.image.astype(np.uint16 if (imaging.detector.ceiling or math.inf) < 2**16 else np.float32)
-        return case._replace(image=grey, record={"index": index} | case.record | shares)
+        return case._replace(image=grey, record={"index": index} | case.record | fractions)
 
     def as_dict(self) -> dict[str, Any]:
         """Return all of the recipe in JSON's types."""
@@ -232,9 +234,9 @@ class Recipe:
 
 
 def shell_of(u: Tensor, epsilon: float, thickness: float, *, periodic: bool = False) -> Tensor:
-    """Return the phase fields (2, Z, Y, X) of a wall inside the surface of a shape, and of what it encloses.
+    """Return the phase fields (2, Z, Y, X) of a wall inside the surface of a shape `u`, and of the lumen in the wall.
 
-    All are in voxels, of the shape's profile. Where the shape is thinner than two walls, the wall fills it.
+    Lengths are in voxels; all profiles have the same ε. Where the shape is thinner than two walls, the wall fills it.
     """
     grid = Grid(tuple(u.shape), (1.0,) * 3, "periodic" if periodic else "replicate")  # type: ignore[arg-type]
     depth = torch.from_numpy(field_distance(u, grid, epsilon))
@@ -244,39 +246,41 @@ def shell_of(u: Tensor, epsilon: float, thickness: float, *, periodic: bool = Fa
 
 def check_shape(shape: Sequence[int]) -> tuple[int, int, int]:
     """Return the voxels (z, y, x) of an image as whole numbers above 0, or raise ValueError."""
-    words, edges = "3 whole numbers of voxels above 0 (z, y, x)", as_tuple(shape, "3 whole numbers of voxels")
-    z, y, x = (check_int(n, words, 1, MOST, of=edges) for n in (edges if len(edges) == 3 else (None,) * 3))
+    expected, edges = "3 whole numbers of voxels above 0 (z, y, x)", as_tuple(shape, "3 whole numbers of voxels")
+    numbers = edges if len(edges) == 3 else (None,) * 3  # None is refused, with the message of a wrong number
+    z, y, x = (check_int(n, expected, 1, MOST, of=edges) for n in numbers)
     return z, y, x
 
 
 def draw_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generator) -> float:
-    """Draw the edge of a shape's voxel, even in the logarithm between calibres; equal ones take no random number."""
+    """Draw the edge of a shape's voxel, uniform in the logarithm between calibres; equal ones use no random number."""
     low, high = calibres
     return voxel * (low if low == high else math.exp(rng.uniform(math.log(low), math.log(high))))
 
 
 def check_calibres(calibres: Sequence[float]) -> tuple[float, float]:
     """Return calibres as two positive factors, the lower first, or raise ValueError."""
-    words, pair = "calibres as two positive factors, the lower first", as_tuple(calibres, "two factors")
-    low, high = (check_float(n, words, 1e-3, 1e3, of=pair) for n in (pair if len(pair) == 2 else (None, None)))
+    expected, pair = "calibres as two positive factors, the lower first", as_tuple(calibres, "two factors")
+    low, high = (check_float(n, expected, 1e-3, 1e3, of=pair) for n in (pair if len(pair) == 2 else (None, None)))
     if low > high:
-        raise ValueError(f"expected {words}, got {quoted(pair)}")
+        raise ValueError(f"expected {expected}, got {quoted(pair)}")
     return low, high
 
 
 def check_crop(longest: float, shape: Sequence[int], voxel: float, modality: Modality, margin: int = 0) -> None:
     """Raise ValueError where images of `shape`, with a margin of voxels around their shapes, need shapes that are too
-    small, too large, or longer than `longest`."""
-    need = tuple(n + 2 * margin for n in field_shape(shape, voxel, modality.base))
-    images, crops = " x ".join(map(str, shape)), " x ".join(map(str, need))
+    small, too large, or longer than `longest`, which is infinite for shapes that are grown to size."""
+    crop = tuple(n + 2 * margin for n in field_shape(shape, voxel, modality.base))
+    images, crops = " x ".join(map(str, shape)), " x ".join(map(str, crop))
     if not 1 < math.prod(shape) <= MOST:
         raise ValueError(f"images must have 2 to {MOST:.0e} voxels, got {images}")
-    if (min if longest == math.inf else max)(need) < FEWEST or math.prod(need) > MOST:
+    edge = min(crop) if longest == math.inf else max(crop)  # a crop may be a single slice, a grown shape may not
+    if edge < FEWEST or math.prod(crop) > MOST:
         raise ValueError(
             f"shapes must have from {FEWEST} voxels along an edge to {MOST:.0e} in all, but images of {images} voxels "
             f"need {crops}: is a voxel of {voxel:g} {modality.base.unit} meant?"
         )
-    if max(need) > longest:
+    if max(crop) > longest:
         raise ValueError(
             f"the stored shapes have {longest} voxels along an edge, but images of {images} voxels of {modality.name} "
             f"need {crops}: take smaller images, or build a store with a larger --shape"
@@ -359,11 +363,11 @@ class TextureDataset(IterableDataset):
             normalise = NORMALISATIONS[normalise]
         self.normalise = normalise
         paths = [Path(item) for item in sources if isinstance(item, (str, PathLike))]
-        stores = len(paths) == len(sources) and all(path.is_dir() or path.suffix == ".zarr" for path in paths)
+        from_stores = len(paths) == len(sources) and all(path.is_dir() or path.suffix == ".zarr" for path in paths)
         edge = None if voxel is None else check_float(voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
-        self.voxels = [edge or choose_voxel([] if stores else sources, kind) for kind in self.modalities]
+        self.voxels = [edge or choose_voxel([] if from_stores else sources, kind) for kind in self.modalities]
         thinnest = [(kind, edge * self.calibres[0]) for kind, edge in zip(self.modalities, self.voxels, strict=True)]
-        if stores:
+        if from_stores:
             if volume_fraction is not None:
                 raise ValueError("volume_fraction applies to laws only; the source is a store of shapes")
             self.source = Stored(tuple(paths))
@@ -371,7 +375,7 @@ class TextureDataset(IterableDataset):
             generated = Generated.of(sources, volume_fraction)
             check_int(shapes, "a pool of at least 1 shape", 1, 4096)
             largest = max(max(field_shape(self.size, voxel, kind.base)) for kind, voxel in thinnest)
-            self.source = Pool(generated, max(shapes, len(generated.points)), 8 * -(-largest // 8))
+            self.source = Pool(generated, max(shapes, len(generated.points)), 8 * math.ceil(largest / 8))
         for kind, voxel in thinnest:
             check_crop(self.source.edge, self.size, voxel, kind)
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
@@ -385,15 +389,15 @@ class TextureDataset(IterableDataset):
         return self.length // self._rank()[1]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state with the rank, since a spawned worker is not in the group."""
+        """Return the state and the rank, since a spawned worker is not in the group."""
         return self.__dict__ | {"_group_rank": self._rank()}
 
     def _rank(self) -> tuple[int, int]:
         """Return the rank of this process, or of the one that spawned it, and the group's size."""
         group = torch.distributed
         grouped = group.is_available() and group.is_initialized()
-        live = (group.get_rank(), group.get_world_size()) if grouped else (0, 1)
-        return self.__dict__.get("_group_rank", live) if live == (0, 1) and get_worker_info() else live
+        current = (group.get_rank(), group.get_world_size()) if grouped else (0, 1)
+        return self.__dict__.get("_group_rank", current) if current == (0, 1) and get_worker_info() else current
 
     def set_epoch(self, epoch: int) -> None:
         """Set the next epoch, from 0, in persistent workers too."""
@@ -414,12 +418,12 @@ class TextureDataset(IterableDataset):
 
     def sample(self, number: int) -> Sample:
         """Return sample `number`, from 0, before the transform."""
-        words = np.random.SeedSequence(self.seed, spawn_key=(number,))
-        rng, (for_imaging, for_image) = np.random.default_rng(words), map(int, words.generate_state(2))
-        which = int(rng.integers(len(self.modalities)))
-        kind = self.modalities[which]
-        imaging, voxel = kind.draw(for_imaging), draw_voxel(self.voxels[which], self.calibres, rng)
-        case = Composition().show(self.source, self.size, voxel, imaging, for_image, 0, rng)  # type: ignore[arg-type]
+        sequence = np.random.SeedSequence(self.seed, spawn_key=(number,))
+        rng, (imaging_seed, image_seed) = np.random.default_rng(sequence), map(int, sequence.generate_state(2))
+        choice = int(rng.integers(len(self.modalities)))
+        kind = self.modalities[choice]
+        imaging, voxel = kind.draw(imaging_seed), draw_voxel(self.voxels[choice], self.calibres, rng)
+        case = Composition().show(self.source, self.size, voxel, imaging, image_seed, 0, rng)  # type: ignore[arg-type]
         image = torch.from_numpy(case.image)[None].float()
         image = image if self.normalise is None else self.normalise(image)
         record = {"number": number, "modality": kind.name} | case.record
@@ -427,7 +431,7 @@ class TextureDataset(IterableDataset):
 
 
 def as_dict(sample: Sample) -> dict[str, Tensor]:
-    """Return `image` and `label` as a dictionary, of which a `DataLoader` makes batches."""
+    """Return `image` and `label` as a dictionary, which a `DataLoader` can put into batches."""
     return {"image": sample.image, "label": sample.label}
 
 
@@ -452,7 +456,7 @@ def zscore(image: Tensor) -> Tensor:
 
 
 def percentile(image: Tensor) -> Tensor:
-    """Return an image whose percentiles `PERCENTILES` are 0 and 1, cut beyond."""
+    """Return an image whose percentiles `PERCENTILES` are mapped to 0 and 1; values beyond are cut."""
     low, high = np.percentile(image.numpy(), PERCENTILES)
     return ((image - low) / max(high - low, 1e-8)).clamp_(0, 1)
 

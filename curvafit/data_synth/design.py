@@ -48,12 +48,12 @@ class Draw(NamedTuple):
 
 @dataclass(frozen=True)
 class Design:
-    """A sequence of parameters, the same for ever for a seed: draw i depends on (seed, i) alone.
+    """A sequence of parameters that a seed reproduces: draw i depends on (seed, i) alone.
 
     Sampling is `"random"`, uniform and independent in a box; `"sobol"`, the same box, filled evenly by a scrambled
     Sobol sequence; or `"list"`, the points of seven numbers in turn, again and again with other noise. The box holds
-    intervals of (a20, a11, a02, a10, a01, a00, m₀) in working units; both ends are alike where one is fixed. Parameters
-    named in `log` are uniform in the logarithm; their intervals are above 0. A parameter out of range is a ValueError.
+    intervals of (a20, a11, a02, a10, a01, a00, m₀) in working units; a fixed one has equal ends. Parameters named in
+    `log` are uniform in the logarithm; their intervals are above 0. A parameter out of range is a ValueError.
     """
 
     sampling: Sampling
@@ -68,6 +68,7 @@ class Design:
             object.__setattr__(self, name, tuple(rows))
         if any(len(interval) != 2 for interval in self.box):
             raise ValueError("an interval in a box must be two numbers")
+        # Points to check: those of a list, or the lowest and the highest corner of the box.
         rows = self.points if self.sampling == "list" else tuple(zip(*self.box, strict=True))
         if not rows or any(len(row) != len(PARAMETERS) for row in rows):
             raise ValueError(f"a {self.sampling} design needs {len(PARAMETERS)} parameters ({', '.join(PARAMETERS)})")
@@ -88,14 +89,14 @@ class Design:
         """Return the parameters of draw `index` of a seed, both whole numbers from 0."""
         seed = check_int(seed, "a seed that is a whole number from 0", 0, SEEDS - 1)
         index = check_int(index, "an index that is a whole number from 0", 0, SEEDS - 1)
-        start = np.random.SeedSequence(seed, spawn_key=(index, 1)).generate_state(1)[0]
+        noise_seed = np.random.SeedSequence(seed, spawn_key=(index, 1)).generate_state(1)[0]
         values = self.points[index % len(self.points)] if self.sampling == "list" else self._draw_from_box(seed, index)
-        return Draw(Coefficients(*map(float, values[:-1])), float(values[-1]), int(start))
+        return Draw(Coefficients(*map(float, values[:-1])), float(values[-1]), int(noise_seed))
 
     def __str__(self) -> str:
         """Return the sampling with the number of points, or with the box."""
-        where = f"of {len(self.points)} points" if self.points else f"in {list(map(list, self.box))}"
-        return f"{self.sampling} {where}"
+        domain = f"of {len(self.points)} points" if self.points else f"in {list(map(list, self.box))}"
+        return f"{self.sampling} {domain}"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the design in JSON's types, for a store's record."""
@@ -111,35 +112,36 @@ class Design:
 
     def _draw_from_box(self, seed: int, index: int) -> list[float]:
         """Return the parameters of a draw; one that is fixed takes no random number."""
-        free, own = sum(low < high for low, high in self.box), index if self.sampling == "random" else 0
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(own, 0)))
+        dimension = sum(low < high for low, high in self.box)
+        stream = index if self.sampling == "random" else 0  # one scrambling for all points of a Sobol sequence
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream, 0)))
         if self.sampling == "random":
-            drawn = rng.random(free)
+            point = rng.random(dimension)
         else:
-            engine = qmc.Sobol(free, scramble=True, rng=rng)
-            drawn = (engine.fast_forward(index) if index else engine).random(1)[0]
-        shares, values = iter(drawn.tolist()), []
+            engine = qmc.Sobol(dimension, scramble=True, rng=rng)
+            point = (engine.fast_forward(index) if index else engine).random(1)[0]
+        coordinates, values = iter(point.tolist()), []
         for name, (low, high) in zip(PARAMETERS, self.box, strict=True):
-            share = next(shares) if low < high else 0.0
-            values.append(low * (high / low) ** share if name in self.log else low + (high - low) * share)
+            fraction = next(coordinates) if low < high else 0.0
+            values.append(low * (high / low) ** fraction if name in self.log else low + (high - low) * fraction)
         return values
 
 
 def design_box(
     sampling: Sampling = "random", log: Sequence[str] = (), /, **intervals: float | Sequence[float]
 ) -> Design:
-    """Return Experiment 4's box, with the intervals or fixed values that are given by name; see `Design` for `log`."""
+    """Return a design in Experiment 4's box, with given intervals or fixed values by name; see `Design` for `log`."""
     unknown = set(intervals) - set(PARAMETERS)
     if unknown:
         raise ValueError(f"parameters are {', '.join(PARAMETERS)}, got {', '.join(sorted(unknown))}")
-    whole: dict[str, tuple[float, float]] = {"a20": (1.0, 1.0), **INTERVALS}
+    box: dict[str, tuple[float, float]] = {"a20": (1.0, 1.0), **INTERVALS}
     for name, value in intervals.items():
         pair = as_tuple([value, value] if isinstance(value, Real) else value, f"two numbers as {name}")
         if len(pair) != 2:
             raise ValueError(f"{name} must be a number or two of them, got {quoted(value)}")
         low, high = (check_float(end, f"{name} as finite numbers", of=value) for end in pair)
-        whole[name] = low, high
-    return Design(sampling, tuple(whole[name] for name in PARAMETERS), log=log)  # type: ignore[arg-type]
+        box[name] = low, high
+    return Design(sampling, tuple(box[name] for name in PARAMETERS), log=log)  # type: ignore[arg-type]
 
 
 def design_around(point: Sequence[float], spread: float, sampling: Sampling = "random") -> Design:
@@ -191,8 +193,8 @@ def _decode_design(content: Any, folder: Path) -> Design:
     if len(kinds) != 1:
         raise ValueError(f"a design has one of the keys {', '.join(KEYS)}, got {quoted(content)}")
     (kind,) = kinds
-    if strange := [key for key in content if key not in (kind, *KEYS[kind])]:
-        raise ValueError(f"a design with the key {kind} has no key {quoted(strange[0])}")
+    if unknown := [key for key in content if key not in (kind, *KEYS[kind])]:
+        raise ValueError(f"a design with the key {kind} has no key {quoted(unknown[0])}")
     if kind == "list":
         points = as_tuple(content["list"], "points in list")
         return Design("list", points=tuple(read_point(point, folder) for point in points))
@@ -209,7 +211,7 @@ def _decode_design(content: Any, folder: Path) -> Design:
 
 
 def _parse_number(value: Any) -> Any:
-    """Return a value of YAML, or a list, with texts that are numbers, such as 1e3, as numbers."""
+    """Return a value or a list of YAML, with texts that are numbers, such as 1e3 (text to YAML), as numbers."""
     if isinstance(value, list):
         return [_parse_number(end) if isinstance(end, str) else end for end in value]
     try:
