@@ -174,7 +174,8 @@ def verify(path: str | Path, progress: Progress = silent) -> Verdict:
     or ValueError where there is no store of this version.
     """
     store = open_store(path)
-    indices, problems, notes, viable = store.indices(), [], [], 0
+    indices, viable = store.indices(), 0
+    problems, notes = [], []
     for checked, index in enumerate(indices):
         progress(f"{checked} of {len(indices)} draws checked", checked / len(indices))
         viable += store.viable(index)
@@ -322,8 +323,7 @@ def describe(
 
     The table `out` (.npz) is written every minute; with `overwrite` it is begun anew. A view depends only on the shape,
     its seed and the view's name: a resumed table has the same rows, possibly in another order. Shapes that a build adds
-    or removes meanwhile are left out. `workers` measure (`core.workers.cluster`), else this process; `command` is for
-    the provenance.
+    or removes meanwhile are left out. `workers` (see `cluster`) measure, or this process; `command` is for provenance.
 
     Raises FileNotFoundError or ValueError where a store is missing, two have one name, `out` is no table, a view is
     unknown, or no shape is well-formed.

@@ -134,7 +134,11 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, spacing: Sequence[flo
     graph = _trace(np.asarray(skeleton, dtype=bool), distance)
     for node in list(graph):
         _dissolve(graph, node)
-    _prune(graph, steps)
+    while spurs := sorted(_find_spurs(graph, steps)):
+        for _, tip, root in spurs:  # an earlier removal may have changed the graph
+            if tip in graph and root in graph and graph.degree(tip) == 1 and graph.has_edge(tip, root):
+                graph.remove_node(tip)
+                _dissolve(graph, root)
     for _ in range(2):
         _move_to_axis(graph, distance, steps)
     _finish(graph, distance, steps)
@@ -197,14 +201,6 @@ def _add_edge(graph: nx.MultiGraph, one: int, other: int, line: np.ndarray) -> N
     graph.add_edge(min(one, other), max(one, other), line=line if one <= other else line[::-1])
 
 
-def _prune(graph: nx.MultiGraph, steps: np.ndarray) -> None:
-    while spurs := sorted(_find_spurs(graph, steps)):
-        for _, tip, root in spurs:  # an earlier removal may have changed the graph
-            if tip in graph and root in graph and graph.degree(tip) == 1 and graph.has_edge(tip, root):
-                graph.remove_node(tip)
-                _dissolve(graph, root)
-
-
 def _find_spurs(graph: nx.MultiGraph, steps: np.ndarray) -> list[tuple[float, int, int]]:
     """Return the length, free node and other node of all spurs."""
     spurs = []
@@ -214,8 +210,7 @@ def _find_spurs(graph: nx.MultiGraph, steps: np.ndarray) -> list[tuple[float, in
                 root_radius, tip_radius = graph.nodes[root]["radius"], graph.nodes[tip]["radius"]
                 length = float(np.linalg.norm(np.diff(_smooth(line) * steps, axis=0), axis=1).sum())
                 # Of a line with two free ends, only the thinner one can be a tip.
-                is_tip = graph.degree(root) > 1 or root_radius >= tip_radius
-                if is_tip and length < SPUR * root_radius + steps.max():
+                if (graph.degree(root) > 1 or root_radius >= tip_radius) and length < SPUR * root_radius + steps.max():
                     spurs.append((length, tip, root))
     return spurs
 

@@ -212,8 +212,8 @@ class Recipe:
             else:
                 edges = " x ".join(map(str, self.shape))
                 missing = "structure" if counts.all() else ("background", *names)[int(counts.argmin())]
-                mend = "take more voxels" + (", a thinner wall, or laws that fill less" if len(names) > 1 else "")
-                raise ValueError(f"{TRIES} shapes showed no {missing} on {edges} voxels: {mend}")
+                remedy = "take more voxels" + (", a thinner wall, or laws that fill less" if len(names) > 1 else "")
+                raise ValueError(f"{TRIES} shapes showed no {missing} on {edges} voxels: {remedy}")
         fractions = {"volume_fraction": float((case.field > 0).mean())}
         fractions["class_fractions"] = (counts[1:] / case.labels.size).tolist()
         grey = case.image.astype(np.uint16 if (imaging.detector.ceiling or math.inf) < 2**16 else np.float32)

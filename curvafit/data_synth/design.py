@@ -94,7 +94,6 @@ class Design:
         return Draw(Coefficients(*map(float, values[:-1])), float(values[-1]), int(noise_seed))
 
     def __str__(self) -> str:
-        """Return the sampling with the number of points, or with the box."""
         domain = f"of {len(self.points)} points" if self.points else f"in {list(map(list, self.box))}"
         return f"{self.sampling} {domain}"
 

@@ -52,7 +52,7 @@ def labels_of(
         resolve the curvature, and within `diagram.MARGIN` voxels of the faces of a crop.
     radius
         float32: the radius of the largest ball inside that covers the voxel, in spacing's unit; 0 outside. Up to half a
-        voxel too little on tubes and balls; see `morphometry.local_thickness`.
+        voxel too little on tubes and balls; see `morphology.local_thickness`.
     betti
         b0 pieces, b1 tunnels, b2 cavities; see `topology.betti_numbers`.
     """

@@ -58,7 +58,7 @@ SAMPLES = {
 
 def list_samples() -> dict[str, tuple[str, str, str]]:
     """Return description, licence and source of each sample by name."""
-    about = {name: (what, "MIT", f"{_PACKAGE} (qim3d/examples/{file})") for name, (file, _, what) in SAMPLES.items()}
+    about = {name: (text, "MIT", f"{_PACKAGE} (qim3d/examples/{file})") for name, (file, _, text) in SAMPLES.items()}
     return about | {SYNTHETIC: ("a generated trabecular shape, imaged with blur and noise", "MIT", "made on the spot")}
 
 
@@ -73,15 +73,15 @@ def fetch(name: str) -> Path:
     folder = os.environ.get("CURVAFIT_CACHE")
     cache = Path(folder) if folder else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "curvafit"
     if name == SYNTHETIC:
-        made = cache / "synthetic.nii.gz"
-        return made if made.is_file() else synthetic_scan(made)
+        scan = cache / "synthetic.nii.gz"
+        return scan if scan.is_file() else synthetic_scan(scan)
     file, sha256, _ = SAMPLES[name]
     target = cache / file
     if target.is_file() and hashlib.sha256(target.read_bytes()).hexdigest() == sha256:
         return target
     content = _download(f"qim3d/examples/{file}")
-    if (other := hashlib.sha256(content).hexdigest()) != sha256:
-        raise SampleUnavailable(f"sample {name} has another SHA-256 than {sha256}: {other}")
+    if (actual := hashlib.sha256(content).hexdigest()) != sha256:
+        raise SampleUnavailable(f"sample {name} has another SHA-256 than {sha256}: {actual}")
     try:
         return write_content(target, content)
     except OSError as reason:
@@ -100,9 +100,9 @@ def synthetic_scan(path: str | os.PathLike[str], *, edge: int = 96) -> Path:
     if not flow.viability.viable:
         raise ValueError(f"no shape grows at an edge of {edge} voxels ({flow.viability.reason}): take another")
     sharp = ndimage.gaussian_filter((flow.field.numpy() > 0).astype(np.float32), 0.8, mode="wrap")
-    radius = sum(axis**2 for axis in np.meshgrid(*[np.linspace(-1, 1, edge)] * 3, indexing="ij"))
+    square_radius = sum(axis**2 for axis in np.meshgrid(*[np.linspace(-1, 1, edge)] * 3, indexing="ij"))
     noise = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal(sharp.shape), 0.6, mode="wrap")
-    image = (60 + 110 * sharp) * (0.95 + 0.05 * radius) + 12 * noise / noise.std()
+    image = (60 + 110 * sharp) * (0.95 + 0.05 * square_radius) + 12 * noise / noise.std()
     values = np.clip(np.rint(image), 0, 255).astype(np.uint8)
     return save(Volume(values, (0.02, 0.02, 0.02), "mm", source="synthetic"), path)
 

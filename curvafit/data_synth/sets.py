@@ -93,7 +93,7 @@ class SetSpec:
 def build_set(
     folder: str | Path, spec: SetSpec, count: int, progress: Progress = silent, *, workers: Cluster | None = None
 ) -> Path:
-    """Make the missing ones of cases 0 to `count` - 1 of a set, and the list that readers of its layout look for.
+    """Make those of cases 0 to `count` - 1 of a set that are missing, and the list that readers of its layout look for.
 
     The folder is new, empty, or a set of the same specification to go on with. Case i depends on the specification and
     i alone. The folder holds a valid set at any time; the list may lack cases after a killed run, and the next run
@@ -111,9 +111,9 @@ def build_set(
         check_set(folder, spec)  # another process may have begun it meanwhile
         _write_case(folder, spec, 0, first)
     cases, listed = set(list_cases(folder)), -math.inf
-    rest = (index for index in range(count) if index not in cases)
+    missing = (index for index in range(count) if index not in cases)
     try:
-        for case in run_jobs(partial(make_case, folder.resolve()), rest, workers):
+        for case in run_jobs(partial(make_case, folder.resolve()), missing, workers):
             cases.add(case)
             progress(f"{min(len(cases), count)} of {count} cases", min(len(cases), count) / count)
             if time.monotonic() > listed + 1:
@@ -137,7 +137,6 @@ def make_case(folder: str | Path, index: int) -> int:
 
 def read_spec(folder: str | Path) -> SetSpec:
     """Return the specification that a set was begun with, or raise ValueError."""
-
     try:
         return SET.read(Path(folder) / HEADER, lambda header, _: SetSpec.from_dict(header["order"]))
     except FileNotFoundError as error:
@@ -159,29 +158,27 @@ def check_set(folder: Path, spec: SetSpec) -> None:
     """Raise ValueError unless a folder is new, empty, or holds a set of this spec."""
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: name a folder for the set")
-    if not (folder / HEADER).exists():
-        if folder.is_dir() and any(folder.iterdir()):
-            raise ValueError(f"{folder} holds other things than a set: name a new or an empty folder")
-        return
-    check_same(read_spec(folder).as_dict(), spec.as_dict(), folder)
+    if (folder / HEADER).exists():
+        check_same(read_spec(folder).as_dict(), spec.as_dict(), folder)
+    elif folder.is_dir() and any(folder.iterdir()):
+        raise ValueError(f"{folder} holds other things than a set: name a new or an empty folder")
 
 
 def _write_list(folder: Path, spec: SetSpec) -> None:
     names, layout = list(map(case_name, list_cases(folder))), LAYOUTS[spec.layout]
     files = {name: (layout.image.format(case=name), layout.label.format(case=name)) for name in names}
     about = {"name": folder.resolve().name, "description": "synthetic; made by curvafit", "numTraining": len(names)}
-    channel, classes = {"0": spec.recipe.modality.name}, ("background", *spec.recipe.classes)
+    channels, classes = {"0": spec.recipe.modality.name}, ("background", *spec.recipe.classes)
     if layout.nnunet:  # cases by name, since the folders may hold a killed run's temporary files too
-        numbers = {name: number for number, name in enumerate(classes)}
+        labels = {name: number for number, name in enumerate(classes)}
         cases = {name: {"images": [image], "label": label} for name, (image, label) in files.items()}
-        kinds = {"channel_names": channel, "labels": numbers, "file_ending": ".nii.gz"}
-        listed = {**kinds, **about, "dataset": cases}
+        content = {"channel_names": channels, "labels": labels, "file_ending": ".nii.gz", **about, "dataset": cases}
     else:
         pairs = [{"image": image, "label": label} for image, label in files.values()]
         labels = {str(number): name for number, name in enumerate(classes)}
-        kinds = {"tensorImageSize": "3D", "modality": channel, "labels": labels}
-        listed = {**about, **kinds, "numTest": 0, "training": pairs, "test": []}
-    write_content(folder / LIST, json.dumps(listed, indent=2) + "\n")
+        content = {**about, "tensorImageSize": "3D", "modality": channels, "labels": labels}
+        content |= {"numTest": 0, "training": pairs, "test": []}
+    write_content(folder / LIST, json.dumps(content, indent=2) + "\n")
 
 
 def _write_case(folder: Path, spec: SetSpec, index: int, case: Case) -> None:
@@ -191,23 +188,25 @@ def _write_case(folder: Path, spec: SetSpec, index: int, case: Case) -> None:
     if record.exists():
         return
     labels = _measure_labels(case, spec.parts) if spec.parts else {}
-    known, graph = {part: labels.pop(part) for part in ("betti",) if part in labels}, labels.pop("centreline", None)
-    lines = layout.part.partition("{case}")[0].format(part="centreline") + f"{name}.graphml"
+    graph = labels.pop("centreline", None)
+    betti = {"betti": labels.pop("betti")} if "betti" in labels else {}
+    graph_path = layout.part.partition("{case}")[0].format(part="centreline") + f"{name}.graphml"
     volumes = {layout.part.format(part=part, case=name): values for part, values in labels.items()}
     volumes |= {layout.label.format(case=name): case.labels, layout.image.format(case=name): case.image}
     try:
         if graph is not None:
-            write_graphml(graph, folder / lines, case.unit)
+            write_graphml(graph, folder / graph_path, case.unit)
         for path, values in volumes.items():
             save(Volume(values, case.spacing, case.unit), folder / path)
-        both = {"image": case.image, "label": case.labels}
-        sums = {part: hashlib.sha256(np.ascontiguousarray(of).tobytes()).hexdigest() for part, of in both.items()}
-        content = case.record | known | {"sha256": sums, "versions": versions()}
+        arrays = {"image": case.image, "label": case.labels}
+        checksums = {part: hashlib.sha256(array.tobytes()).hexdigest() for part, array in arrays.items()}
+        content = case.record | betti | {"sha256": checksums, "versions": versions()}
         write_content(record, json.dumps(content, indent=2) + "\n")
     except BaseException:
         with hold_signals():
-            for path in () if record.exists() else (lines, *volumes):  # another process may have completed the case
-                remove(folder / path)
+            if not record.exists():  # unless another process has completed the case
+                for path in (graph_path, *volumes):
+                    remove(folder / path)
         raise
 
 
@@ -222,8 +221,8 @@ def _measure_labels(case: Case, parts: Sequence[str]) -> dict[str, Any]:
 
 
 def write_preview(folder: str | Path) -> Path:
-    """Write `preview.png` into a set's folder: of each of the first cases the slice with most of the structure, with
-    and without the labels' outlines."""
+    """Write `preview.png` into a set's folder. It shows the first cases, each by the slice with most of the structure,
+    without and with the labels' outlines."""
     folder = Path(folder)
     layout = LAYOUTS[read_spec(folder).layout]
     names = [case_name(index) for index in list_cases(folder)[:SHOWN]]
@@ -233,14 +232,14 @@ def write_preview(folder: str | Path) -> Path:
     for axis in axes.flat:
         axis.set_axis_off()
     for k, name in enumerate(names):
-        image, label = (load(folder / part.format(case=name)) for part in (layout.image, layout.label))
+        image, label = (load(folder / template.format(case=name)) for template in (layout.image, layout.label))
         row, column = 2 * (k // ROW), k % ROW
         plane = int(np.argmax((label.values > 0).sum((1, 2))))
         grey, classes = image.values[plane], label.values[plane]
         low, high = np.percentile(grey, (0.5, 99.5))
-        look = {"cmap": "gray", "vmin": low, "vmax": max(high, low + 1e-6)}
+        style = {"cmap": "gray", "vmin": low, "vmax": max(high, low + 1e-6)}
         for axis in (axes[row, column], axes[row + 1, column]):
-            axis.imshow(grey, aspect=image.spacing[1] / image.spacing[2], **look)
+            axis.imshow(grey, aspect=image.spacing[1] / image.spacing[2], **style)
         for number in np.unique(classes[classes > 0]):
             inside, colour = classes == number, OUTLINES[(number - 1) % len(OUTLINES)]
             if not inside.all():
@@ -254,19 +253,19 @@ def write_card(folder: str | Path, command: str = "") -> Path:
     card, spec = Path(folder) / CARD, read_spec(folder)
     if card.exists() and not card.read_text(encoding="utf-8", errors="replace").startswith(MARK):
         return card
-    recipe, made = spec.recipe, versions()
-    kind = recipe.modality
+    recipe, used = spec.recipe, versions()
+    modality, imaging = recipe.modality, recipe.modality.base
     facts = {
         "cases": len(list_cases(card.parent)),
         "voxels of an image": " x ".join(map(str, recipe.shape)),
-        "edges of a voxel": f"{' x '.join(map(format_number, kind.base.spacing))} {unit_name(kind.base.unit, 2)}",
+        "edges of a voxel": f"{' x '.join(map(format_number, imaging.spacing))} {unit_name(imaging.unit, 2)}",
         "labels": ", ".join(f"{number} {name}" for number, name in enumerate(("background", *recipe.classes))),
         "further labels": ", ".join(spec.parts) or "none",
         "shapes": recipe.source.about,
-        "images": f"{kind.name}: {kind.about}",
-        "drawn anew for each case": ", ".join(kind.ranges) or "nothing",
+        "images": f"{modality.name}: {modality.about}",
+        "drawn anew for each case": ", ".join(modality.ranges) or "nothing",
         "seed": recipe.seed,
-        "made with": ", ".join(f"{name} {made[name]}" for name in ("curvafit", "torch", "numpy")),
+        "made with": ", ".join(f"{name} {used[name]}" for name in ("curvafit", "torch", "numpy")),
     }
     lines = (
         *(MARK, f"# {card.parent.resolve().name}\n"),

@@ -37,7 +37,7 @@ from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread
 from curvafit.priors.law import LawLike, read_laws
 
-#: Seeds that are tried for a well-formed shape, and crops for one with both structure and background.
+#: Seeds that are tried for a well-formed shape, and crops that are tried for one with both structure and background.
 TRIES, CROPS = 8, 32
 #: Rotations and reflections of the cube: orders of the three axes times their directions.
 SYMMETRIES = 48
@@ -55,8 +55,8 @@ class PhaseField(NamedTuple):
 class Generated:
     """Shapes grown from points of seven numbers (`PARAMETERS`, working units), in turn; each point has a name.
 
-    Shapes fill a `fraction` of the volume instead of having the points' masses, where one is given; a shape's `origin`
-    says where `generate` misses it. Points may have voxels of their own: `scales` are their edges over a set's voxel.
+    Shapes fill a `fraction` of the volume if one is given, else have the points' masses; the status in their `origin`
+    says where the fraction is missed. `scales` are the edges of the points' voxels as multiples of a set's voxel.
     """
 
     points: tuple[tuple[float, ...], ...]
@@ -64,7 +64,7 @@ class Generated:
     schedule: str | Schedule = "fast"
     fraction: float | None = None
     scales: tuple[float, ...] = ()
-    edge = math.inf  # a shape is grown as large as it is wanted
+    edge = math.inf  # a shape is grown to any size
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", as_tuple(self.names, "names"))
@@ -78,28 +78,27 @@ class Generated:
     @property
     def about(self) -> str:
         """Return the source in a few words."""
-        more = f" and {len(self.names) - 9} more laws" if len(self.names) > 9 else ""
-        return f"grown by {', '.join(self.names[:9])}{more}"
+        others = f" and {len(self.names) - 9} more laws" if len(self.names) > 9 else ""
+        return f"grown by {', '.join(self.names[:9])}{others}"
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
         """Return a well-formed shape, from the first of some seeds that gives one; ValueError where none does."""
-        number = index % len(self.points)
-        *six, mass = self.points[number]
+        choice = index % len(self.points)
+        name, (*strengths, mass) = self.names[choice], self.points[choice]
+        mass = mass if self.fraction is None else None
         grid, status = Grid(tuple(voxels)), ""  # type: ignore[arg-type]
         options = {"volume_fraction": self.fraction, "schedule": self.schedule, "reject_early": True}
         for _ in range(TRIES):
             seed = int(rng.integers(2**32))
             with one_thread():
-                flow = generate(Coefficients(*six), mass if self.fraction is None else None, grid, seed=seed, **options)
+                flow = generate(Coefficients(*strengths), mass, grid, seed=seed, **options)
             if is_well_formed(flow.viability):
-                point = dict(zip(PARAMETERS, (*six, flow.mass), strict=True))
-                grown = {"seed": seed, "schedule": flow.schedule.as_dict(), "status": flow.status}
-                origin = {"name": self.names[number], "parameters": point, **grown}
+                point = dict(zip(PARAMETERS, (*strengths, flow.mass), strict=True))
+                origin = {"name": name, "parameters": point, "seed": seed}
+                origin |= {"schedule": flow.schedule.as_dict(), "status": flow.status}
                 return PhaseField(flow.field.numpy(), WORKING_EPSILON / WORKING_SPACING, origin)
             status = flow.status
-        raise ValueError(
-            f"{self.names[number]} grew from none of {TRIES} seeds ({status}): try another volume fraction or law"
-        )
+        raise ValueError(f"{name} grew from none of {TRIES} seeds ({status}): try another volume fraction or law")
 
     @staticmethod
     def of(laws: Iterable[LawLike], fraction: float | None = None) -> Generated:
@@ -107,32 +106,31 @@ class Generated:
 
         By default the fraction is that of the scan, where the laws are fits and agree on it. The schedule is the laws'.
         """
-        stated = tuple(laws)
-        known = read_laws(stated)
-        shares = {law.volume_fraction for law in known}
-        if fraction is None and len(shares) == 1:
-            (fraction,) = shares
+        sources = tuple(laws)
+        parsed = read_laws(sources)
+        fractions = {law.volume_fraction for law in parsed}
+        if fraction is None and len(fractions) == 1:
+            (fraction,) = fractions
         if fraction is not None:
-            known = [replace(law, mass=first_mass(fraction)) if law.mass is None else law for law in known]
+            parsed = [replace(law, mass=first_mass(fraction)) if law.mass is None else law for law in parsed]
         names = (
             Path(source).name if isinstance(source, (str, PathLike)) else law.origin
-            for source, law in zip(stated, known, strict=True)
+            for source, law in zip(sources, parsed, strict=True)
         )
-        return Generated(tuple(law.point for law in known), tuple(names), choose_schedule(known), fraction)
+        return Generated(tuple(law.point for law in parsed), tuple(names), choose_schedule(parsed), fraction)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the source in JSON's types, for a set's record; `decode_source` reads it."""
-        texture = {"names": list(self.names), "points": list(map(list, self.points))}
-        texture |= {"schedule": named_schedule(self.schedule).as_dict(), "fraction": self.fraction}
-        return {"kind": "generated", **texture} | ({"scales": list(self.scales)} if self.scales else {})
+        content = {"kind": "generated", "names": list(self.names), "points": list(map(list, self.points))}
+        content |= {"schedule": named_schedule(self.schedule).as_dict(), "fraction": self.fraction}
+        return content | ({"scales": list(self.scales)} if self.scales else {})
 
 
 @dataclass(frozen=True)
 class Stored:
     """Random crops of the well-formed shapes of one or more stores, under the symmetries of the cube.
 
-    `draws` is the number of well-formed shapes in all stores, by default the present one: a store that grew is another
-    source.
+    `draws` is the number of well-formed shapes in all stores, counted by default; a store that has grown is refused.
     """
 
     paths: tuple[Path, ...]
@@ -166,8 +164,8 @@ class Stored:
     def about(self) -> str:
         """Return the source in a few words."""
         viable = sum(store.viable(index) for store in map(open_store, self.paths) for index in store.indices())
-        most = "" if viable == self.draws else f", the well-formed ones of {viable}"
-        return f"{self.draws} shapes of {', '.join(path.name for path in self.paths)}{most}"
+        note = "" if viable == self.draws else f", the well-formed ones of {viable}"
+        return f"{self.draws} shapes of {', '.join(path.name for path in self.paths)}{note}"
 
     @property
     def edge(self) -> int:
@@ -175,8 +173,8 @@ class Stored:
         return min(min(store.settings.shape) for store, _ in find_well_formed(self.paths))
 
 
-def _find_room() -> Path:
-    """Return the temporary folder of this process and its children, which goes with it; or a place where none is."""
+def _shared_folder() -> Path:
+    """Return the temporary folder that this process, which deletes it, shares with its children; else a non-folder."""
     try:
         return Path(get_temp_dir())
     except OSError:
@@ -185,17 +183,16 @@ def _find_room() -> Path:
 
 @dataclass(frozen=True)
 class Pool:
-    """Random crops, turned as of `Stored`, of `count` shapes with `edge` voxels along each axis.
+    """Random crops, as those of `Stored`, of `count` shapes with `edge` voxels along each axis.
 
-    A shape is grown by whoever wants it first, kept in a folder of the process that made the pool, its `room`, and read
-    by all others: threads, workers, later epochs, other pools of the process. Where it cannot be kept, a warning says
-    so, and each process grows its own.
+    A shape is grown when first needed and kept in `room`, a folder of the process that made the pool, for all others:
+    threads, workers, later epochs, other pools. Where it cannot be kept, a warning says so: each process grows its own.
     """
 
     generated: Generated
     count: int
     edge: int
-    room: Path = field(default_factory=_find_room, compare=False)
+    room: Path = field(default_factory=_shared_folder, compare=False)
 
     @property
     def about(self) -> str:
@@ -208,8 +205,8 @@ class Pool:
 
     def whole(self, number: int) -> PhaseField:
         """Return a shape by its number; ValueError, the same everywhere, where none of its seeds gives one."""
-        # The room of a pool from an old file is gone.
-        folder = self.room if self.room.is_dir() else _find_room()
+        # A pool that was read from a file may name the folder of a process that has ended.
+        folder = self.room if self.room.is_dir() else _shared_folder()
         folder /= f"shapes-{hashlib.sha256(repr((self.generated, self.edge)).encode()).hexdigest()}"
         try:
             folder.mkdir(exist_ok=True)
@@ -237,9 +234,9 @@ class Pool:
         except ValueError as error:
             content = {"failure": str(error)}
         write_content(record, json.dumps(content))
-        there = sum(record.with_name(f"{k}.json").exists() for k in range(self.count))
-        if 20 * there // self.count != 20 * (there - 1) // self.count:
-            show_share(f"{there} of {self.count} shapes grown, once for all workers and epochs", there / self.count)
+        count = sum(record.with_name(f"{k}.json").exists() for k in range(self.count))
+        if 20 * count // self.count != 20 * (count - 1) // self.count:  # at every twentieth
+            show_share(f"{count} of {self.count} shapes grown, once for all workers and epochs", count / self.count)
 
 
 @lru_cache(maxsize=256)
@@ -264,12 +261,11 @@ def decode_source(content: dict[str, Any]) -> ShapeSource:
 def choose_voxel(laws: Iterable[LawLike], kind: Modality) -> float:
     """Return the voxel edge, in the modality's unit, that the fitted laws agree on, or else the modality's default.
 
-    A fit whose lengths are in voxels has no edge in a unit of length and is passed over. Fits that differ are a
-    ValueError.
+    A fit whose lengths are in voxels has no edge in a unit of length and is passed over. Fits that differ: ValueError.
     """
     unit = kind.base.unit
     fits = [(law.working_voxel, law.length_unit) for law in read_laws(laws) if law.working_voxel and law.length_unit]
-    edges = {convert_length(voxel, own, unit) for voxel, own in fits if own in METRES or own == unit}
+    edges = {convert_length(voxel, fit_unit, unit) for voxel, fit_unit in fits if fit_unit in (*METRES, unit)}
     if len(edges) > 1:
         raise ValueError(f"the fits' voxels have edges of {sorted(edges)}: give one voxel")
     return edges.pop() if edges else kind.voxel
@@ -279,24 +275,24 @@ def _crop_shape(choose: Callable[[], PhaseField], voxels: Sequence[int], rng: np
     """Return a random crop, with both structure and background, of the shapes that `choose` draws."""
     for _ in range(CROPS):
         whole = choose()
-        part, move = random_crop(whole.values, voxels, rng)
-        if part.min() < 0 < part.max():
-            return PhaseField(part, whole.epsilon, whole.origin | move)
+        crop, record = random_crop(whole.values, voxels, rng)
+        if crop.min() < 0 < crop.max():
+            return PhaseField(crop, whole.epsilon, whole.origin | record)
     edges = " x ".join(map(str, voxels))
     raise ValueError(f"{CROPS} crops of {edges} voxels show no structure, or nothing else: take larger ones")
 
 
 def apply_symmetry(values: np.ndarray, symmetry: int) -> np.ndarray:
     """Return a view of a volume (…, Z, Y, X) under one of the cube's symmetries, 0 to 47; 0 leaves it as it is."""
-    order, flips = divmod(symmetry, 8)
-    moved = np.moveaxis(values, list(permutations((-3, -2, -1)))[order], (-3, -2, -1))
-    return np.flip(moved, tuple(axis - 3 for axis in range(3) if flips >> axis & 1))
+    order, flips = divmod(symmetry, 8)  # of 6 orders of the axes; a bit for each axis to flip
+    permuted = np.moveaxis(values, list(permutations((-3, -2, -1)))[order], (-3, -2, -1))
+    return np.flip(permuted, tuple(axis - 3 for axis in range(3) if flips >> axis & 1))
 
 
 def crop_periodic(values: np.ndarray, corner: Sequence[int], shape: Sequence[int]) -> np.ndarray:
-    """Return the part of a periodic volume (Z, Y, X) that begins at a corner; it goes on across the faces."""
-    parts = zip(corner, shape, values.shape, strict=True)
-    return values[np.ix_(*(np.arange(first, first + part) % whole for first, part, whole in parts))]
+    """Return the crop of a periodic volume (Z, Y, X) that begins at a corner; it continues across the faces."""
+    axes = zip(corner, shape, values.shape, strict=True)
+    return values[np.ix_(*(np.arange(start, start + length) % period for start, length, period in axes))]
 
 
 def random_crop(
@@ -304,8 +300,8 @@ def random_crop(
 ) -> tuple[np.ndarray, dict[str, Any]]:
     """Return a crop of a periodic volume under a random symmetry of the cube, and how it was made."""
     symmetry = int(rng.integers(SYMMETRIES))
-    moved = apply_symmetry(values, symmetry)
-    if any(part > whole for part, whole in zip(shape, moved.shape, strict=True)):
-        raise ValueError(f"the crop must be within the shape's {moved.shape} voxels, got {tuple(shape)}")
-    corner = [int(rng.integers(whole)) for whole in moved.shape]
-    return np.ascontiguousarray(crop_periodic(moved, corner, shape)), {"symmetry": symmetry, "corner": corner}
+    oriented = apply_symmetry(values, symmetry)
+    if any(length > period for length, period in zip(shape, oriented.shape, strict=True)):
+        raise ValueError(f"the crop must be within the shape's {oriented.shape} voxels, got {tuple(shape)}")
+    corner = [int(rng.integers(period)) for period in oriented.shape]
+    return np.ascontiguousarray(crop_periodic(oriented, corner, shape)), {"symmetry": symmetry, "corner": corner}

@@ -108,7 +108,7 @@ class Store:
         return sorted(int(name) for name in names if name.isdigit() and self.has(int(name)))
 
     def has(self, index: int) -> bool:
-        """Return whether a draw is there, complete."""
+        """Return whether the store has a draw, complete."""
         return bool(self._attributes(index))
 
     def record(self, index: int) -> Record:
@@ -125,7 +125,7 @@ class Store:
 
     def field(self, index: int) -> np.ndarray:
         """Return the phase field of a viable draw, float32 (Z, Y, X); KeyError and ValueError as for `record`."""
-        folder = self._place(index) / "field"
+        folder = self._folder(index) / "field"
         if not self.has(index) or not folder.is_dir():
             raise KeyError(f"{self.path} has no viable draw {index}")
         try:
@@ -146,11 +146,11 @@ class Store:
         return _digest(attributes, field) == attributes["sha256"]
 
     def write(self, record: Record, field: np.ndarray | None) -> bool:
-        """Add a draw, whole or not at all; return False, and change nothing, where it was there already.
+        """Add a draw, whole or not at all; return False, and change nothing, where the store has it already.
 
         The phase field is float32 of the store's shape, or None where the draw is not viable.
         """
-        folder = self._place(record.index)
+        folder = self._folder(record.index)
         if self.has(record.index):
             return False
         for leftover in (self.path / "draws").glob(f".{PARTIAL}*"):
@@ -162,12 +162,12 @@ class Store:
                 return True
             if self.has(record.index):
                 return False
-            shutil.rmtree(folder)  # what is there is torn
+            shutil.rmtree(folder)  # an incomplete draw is in its place
             return _publish(partial / folder.name, folder)
 
     def _describe_damage(self, part: str, index: int, error: Exception) -> ValueError:
-        what = f"the {part} of draw {index} in {self.path} is damaged ({quoted(str(error))})"
-        return ValueError(f"{what}: `curvafit atlas verify` lists such draws")
+        damage = f"the {part} of draw {index} in {self.path} is damaged ({quoted(str(error))})"
+        return ValueError(f"{damage}: `curvafit atlas verify` lists such draws")
 
     def _require(self, index: int) -> dict[str, Any]:
         """Return a draw's attributes, or raise KeyError."""
@@ -175,16 +175,17 @@ class Store:
             return attributes
         raise KeyError(f"{self.path} has no complete draw {index}")
 
-    def _place(self, index: int) -> Path:
+    def _folder(self, index: int) -> Path:
         return self.path / "draws" / f"{index:06d}"
 
     def _attributes(self, index: int) -> dict[str, Any]:
         """Return a draw's attributes, none where a part of it is missing; the field is not read."""
-        folder = self._place(index)
+        folder = self._folder(index)
         attributes = _read_attributes(folder) or {}
-        viable = end.get("viable") if isinstance(end := attributes.get("viability"), dict) else None
-        whole = viable is False or (viable is True and (folder / "field/c/0/0/0").is_file())
-        return attributes if whole and attributes.get("index") == index and "sha256" in attributes else {}
+        viability = attributes.get("viability")
+        viable = viability.get("viable") if isinstance(viability, dict) else None
+        complete = viable is False or (viable is True and (folder / "field/c/0/0/0").is_file())
+        return attributes if complete and attributes.get("index") == index and "sha256" in attributes else {}
 
 
 def open_store(path: str | Path, settings: Settings | None = None) -> Store:
@@ -209,25 +210,25 @@ def open_store(path: str | Path, settings: Settings | None = None) -> Store:
         raise ValueError(f"the header of the store {path} is damaged ({quoted(str(error))})") from error
     if settings is not None:
         # Draws do not depend on the schedule's name.
-        was, now = (dataclasses.asdict(one) | {"schedule": one.schedule | {"name": ""}} for one in (stored, settings))
-        check_same(was, now, path)
+        old, new = (dataclasses.asdict(one) | {"schedule": one.schedule | {"name": ""}} for one in (stored, settings))
+        check_same(old, new, path)
     return Store(path, stored)
 
 
 @lru_cache(maxsize=16)
 def find_well_formed(paths: tuple[Path, ...]) -> list[tuple[Store, int]]:
-    """Return the well-formed draws of some stores, each with its store; found once in a process."""
+    """Return the well-formed draws of stores, each as its store and index; a process looks for them once."""
     draws = []
     for store in map(open_store, paths):
-        formed = [(store, index) for index in store.indices() if is_well_formed(store.record(index).viability)]
-        if not formed:
+        well_formed = [(store, index) for index in store.indices() if is_well_formed(store.record(index).viability)]
+        if not well_formed:
             raise ValueError(f"the store {store.path} has no well-formed shapes")
-        draws += formed
+        draws += well_formed
     return draws
 
 
 def check_same(stored: Any, wanted: Any, path: Path, name: str = "") -> None:
-    """Raise ValueError, with the name of the first nested value that differs, where a folder holds something else."""
+    """Raise ValueError where settings, stored and wanted, differ, with the name of the first nested value that does."""
     if isinstance(stored, dict) and isinstance(wanted, dict) and stored.keys() == wanted.keys():
         for key in stored:
             check_same(stored[key], wanted[key], path, f"{name}.{key}" if name else key)
@@ -248,13 +249,13 @@ def _decode_settings(attributes: dict[str, Any]) -> Settings:
 
 def _create(path: Path, settings: Settings) -> None:
     """Write an empty store, whole or not at all."""
-    there = path.is_dir()  # an empty folder, which may be another disk's
-    with temporary_folder(path / "store" if there else path) as partial:
+    exists = path.is_dir()  # an empty folder, which may be another disk's
+    with temporary_folder(path / "store" if exists else path) as partial:
         header = {"format": FORMAT, "version": VERSION, "settings": dataclasses.asdict(settings), "wanted": 0}
         with hold_signals():
             zarr.create_group(store=str(partial / "store"), attributes=header)
             zarr.create_group(store=str(partial / "store" / "draws"))
-        if there:
+        if exists:
             for part in ("draws", "zarr.json"):
                 os.replace(partial / "store" / part, path / part)
         else:
@@ -274,7 +275,7 @@ def _write_draw(folder: Path, record: Record, field: np.ndarray | None) -> None:
 
 
 def _publish(partial: Path, target: Path) -> bool:
-    """Flush a folder's files and rename it into its place; False where another process was first."""
+    """Flush a folder's files and rename it to `target`; return False where another process was first."""
     for file in partial.rglob("*"):
         if file.is_file():
             with file.open("rb+") as handle:
@@ -294,8 +295,8 @@ def _read_attributes(folder: Path) -> dict[str, Any] | None:
         text = parse_json((folder / "zarr.json").read_bytes(), "a Zarr group", folder)
     except (OSError, ValueError):
         return None
-    known = isinstance(text, dict) and text.get("node_type") == "group"
-    return attributes if known and isinstance(attributes := text.get("attributes"), dict) else None
+    attributes = text.get("attributes") if isinstance(text, dict) and text.get("node_type") == "group" else None
+    return attributes if isinstance(attributes, dict) else None
 
 
 def _digest(attributes: dict[str, Any], field: np.ndarray | None) -> str:
@@ -308,12 +309,12 @@ def _digest(attributes: dict[str, Any], field: np.ndarray | None) -> str:
 
 def _decode(attributes: dict[str, Any]) -> Record:
     viability = {field.name: attributes["viability"][field.name] for field in dataclasses.fields(Viability)}
-    figures = {name: _number(value) for name, value in viability.items() if name not in ("viable", "reason")}
+    numbers = {name: _number(value) for name, value in viability.items() if name not in ("viable", "reason")}
     return Record(
         **{name: check_int(attributes[name], name, 0, SEEDS - 1) for name in ("index", "seed", "steps")},
         **{name: _number(attributes[name]) for name in ("mass", "energy", "seconds")},
         coefficients=Coefficients(*(_number(attributes["coefficients"][name]) for name in NAMES)),
-        viability=Viability(**viability | figures),
+        viability=Viability(**viability | numbers),
         status=str(attributes["status"]),
         versions=dict(attributes["versions"]),
     )

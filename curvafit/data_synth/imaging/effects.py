@@ -2,14 +2,12 @@
 
 Pure, seeded functions of `(Z, Y, X)` tensors of a floating type, on any device; `modality.image` chains them. Lengths
 are in the unit of the spacing, which is one number for cubic voxels or three (z, y, x). Values are photons where noise
-is counted in photons, grey values elsewhere. Depth grows along z, from 0 at the face of the first voxel. The random
-numbers of an effect depend on its seed alone, whatever else is applied. Parameters are not checked here: `Imaging` says
-and checks their ranges.
+is counted in photons, grey values elsewhere. Depth grows along z, from 0 at the face of the first voxel. An effect's
+random numbers depend on its seed alone. `Imaging` documents the parameters and checks their ranges.
 
 Below the effects are linear maps along one axis at a time, as small dense matrices: at the sizes of training crops
-three matrix products take a sixth of the time of three passes of a convolution, and the width may change from one voxel
-to the next. Near the faces of the box a map's weights are divided by their sum: what lies beyond counts as what lies
-within.
+three matrix products take a sixth of the time of three convolutions, and the width may change from voxel to voxel.
+Near the faces of the box a map's weights are divided by their sum: what lies beyond counts as what lies within.
 """
 
 from __future__ import annotations
@@ -56,8 +54,7 @@ def occupancy(field: Voxels, epsilon: float = EPSILON) -> Voxels:
 def texture(like: Voxels, spacing: Lengths, deviation: float, length: float, seed: int, purpose: str) -> Voxels:
     """Return a random factor of mean 1 and standard deviation `deviation`, correlated by `length`.
 
-    The factor is lognormal; its logarithm is a `_correlated_field`. Textures of another `purpose` (a name) are
-    independent.
+    The factor is lognormal; its logarithm is a `_correlated_field`. Textures of different `purpose` are independent.
     """
     spread = math.sqrt(math.log1p(deviation**2))
     return _correlated_field(like, spacing, length, seed, purpose).mul_(spread).sub_(spread**2 / 2).exp_()
@@ -118,9 +115,8 @@ def stripes(like: Voxels, spacing: Lengths, strength: float, width: float, seed:
 def rings(like: Voxels, spacing: Lengths, strength: float, width: float, seed: int) -> Voxels:
     """Return the rings about an axis along z that defects of a CT detector add to an image, of mean 0.
 
-    Their deviation is `strength`. Each slice has rings of its own, since a detector's row makes a slice. Few are
-    strong: the profile over the radius is g|g|/√3 of a normal g, correlated by `width`. Their centre is drawn from a
-    rectangle with the box's middle and twice its sides.
+    Their deviation is `strength`. Each slice has its own, since a detector's row makes a slice. Few are strong: the
+    profile over the radius is g|g|/√3 of a normal g, correlated by `width`. The centre lies within twice the box.
     """
     depth, *sides = like.shape
     _, *edges = _as_triple(spacing)
@@ -272,14 +268,12 @@ def _sampling_matrix(count: int, spacing: float, onto: float, window: float, lik
         return None
     centre = (torch.arange(samples, dtype=torch.float64)[:, None] + 0.5) * onto
     start = torch.arange(count, dtype=torch.float64) * spacing
-    # A weight is the length by which the window and the voxel overlap.
     upper, lower = (centre + window / 2).minimum(start + spacing), (centre - window / 2).maximum(start)
-    weight = (upper - lower).clamp_min(0)
+    weight = (upper - lower).clamp_min(0)  # the length by which a window and a voxel overlap
     return (weight / weight.sum(-1, keepdim=True)).to(like)
 
 
 def _as_triple(value: Lengths) -> Triple:
-    """Return three numbers (z, y, x); one number counts for all."""
     z, y, x = (value,) * 3 if isinstance(value, (int, float)) else value
     return z, y, x
 
@@ -318,13 +312,12 @@ def uniform(count: int, seed: int, purpose: str, like: Tensor) -> Tensor:
 
 def _interpolate_nodes(count: int, length: float, like: Tensor) -> Tensor | None:
     """Return the weights (count, nodes) that interpolate random nodes, or None where every voxel is a node."""
-    # Nodes are a deviation apart, at least a voxel, and go four deviations beyond the box. White noise smoothed by a
-    # Gaussian of deviation w has the correlation exp(-d² / 4 w²), whose length is √2 w.
+    # Nodes are a deviation apart, at least a voxel, and go four deviations beyond the box.
     if math.isinf(length):
         return torch.ones((count, 1), device=like.device, dtype=like.dtype)
     if length < 0.5:
         return None
-    width = length / math.sqrt(2)
+    width = length / math.sqrt(2)  # white noise smoothed by this deviation has the correlation length
     step, beyond = max(width, 1.0), math.ceil(4 * width)
     nodes = torch.arange(0, count + 2 * beyond, step, device=like.device, dtype=like.dtype) - beyond
     position = torch.arange(count, device=like.device, dtype=like.dtype)

@@ -47,9 +47,8 @@ def fit_modality(scan: Volume, mask: np.ndarray | None = None) -> Modality:
     """Return a modality whose images look like a scan: its spacing, levels, textures, blur, noise and uneven light.
 
     The scan is taken to have two classes, a Gaussian blur of one width in the plane and one along z, and noise whose
-    variance is a line over the mean. Growth with depth, stripes, rings, lost stain and clutter stay
-    0. The blur is the one that makes the mask, times a local brightness, most like the scan. Whole numbers from 0 are
-    taken as counts that saturate at the highest of their type.
+    variance is a line over the mean. Growth with depth, stripes, rings, lost stain and clutter stay 0. The blur makes
+    the mask, times a local brightness, most like the scan. Whole numbers from 0 saturate at the highest of their type.
 
     The mask is the structure's voxels, (Z, Y, X); by default what is bright. The modality's `base` holds the estimates,
     its `ranges` their surroundings (`SPREAD`), and its `voxel` is the finest edge of the scan's.
@@ -152,8 +151,7 @@ def _measure_structure(values: np.ndarray, inside: np.ndarray, edges: np.ndarray
     widths = np.exp(optimize.minimize(misfit, start, method="Nelder-Mead", options=options).x[[0, 1, 1]])
     contrast = brightness(blur(mask, 1.0, tuple(widths))).numpy()
     mean = float(contrast[inside].mean())
-    # The average over a voxel, of variance 1/12, is not the optics'.
-    z, y, x = (np.sqrt(np.maximum(widths**2 - 1 / 12, 0)) * edges).tolist()
+    z, y, x = (np.sqrt(np.maximum(widths**2 - 1 / 12, 0)) * edges).tolist()  # without the average over a voxel
     return (z, y, x), mean, *_measure_texture(contrast / mean, inside, edges)
 
 
@@ -189,8 +187,7 @@ class Background(NamedTuple):
 
 
 def _measure_background(values: np.ndarray, inside: np.ndarray, edges: np.ndarray) -> Background:
-    """Measure the background some voxels away from the structure: its level, its noise and texture, which differ in
-    their correlations, and how far its level drifts."""
+    """Measure the background some voxels away from the structure; noise and texture differ in their correlations."""
     finest = edges.min() / edges
     distant = ndimage.distance_transform_edt(~inside, sampling=edges) > 4 * edges.min()
     where = distant if distant.mean() > 0.02 else ~inside
@@ -251,8 +248,7 @@ def _split_covariance(covariances: np.ndarray) -> tuple[float, float, float, flo
     lag = np.arange(len(covariances))
     noise_shapes = [np.exp(-((lag / (2 * w)) ** 2)) if w else (lag == 0).astype(float) for w in GRAINS]
     texture_shapes = [np.exp(-0.5 * (lag / length) ** 2) for length in TEXTURE_LENGTHS]
-    flat = np.ones(len(lag))
-    amplitudes, _ = optimize.nnls(np.stack([*noise_shapes, *texture_shapes, flat], 1), covariances)
+    amplitudes, _ = optimize.nnls(np.stack([*noise_shapes, *texture_shapes, np.ones(len(lag))], 1), covariances)
     noise, texture = amplitudes[: len(GRAINS)], amplitudes[len(GRAINS) : -1]
     noise_variance, texture_variance = float(noise.sum()), float(texture.sum())
     width = float(noise @ GRAINS / noise_variance) if noise_variance else 0.0

@@ -103,10 +103,7 @@ class Optics(Checked):
 
 @dataclass(frozen=True)
 class Illumination(Checked):
-    """Uneven light: a smooth factor between 1 - bias and 1 + bias, correlated over a length; and stripes along x.
-
-    `stripes` is the relative deviation of the stripes.
-    """
+    """Uneven light: a factor within 1 ± bias, smooth over `bias_length`; stripes along x, `stripes` their deviation."""
 
     bias: Annotated[float, SHARE] = 0.0
     bias_length: Annotated[float, ABOVE_ZERO] = 1.0
