@@ -231,8 +231,8 @@ def extract(stores: Sequence[str | Path | Store], command: Sequence[str] = (), p
     draws = [(store, store.record(index)) for store in sources for index in store.indices()]
     shapes = [(store, record) for store, record in draws if is_well_formed(record.viability)]
     if not shapes:
-        places = " or ".join(str(store.path) for store in sources)
-        raise ValueError(f"no well-formed shape in {places}, of {len(draws)} draws")
+        paths = " or ".join(str(store.path) for store in sources)
+        raise ValueError(f"no well-formed shape in {paths}, of {len(draws)} draws")
     measured = []
     for done, (store, record) in enumerate(shapes):
         progress(f"measuring {len(shapes)} shapes", done / len(shapes))

@@ -188,19 +188,19 @@ def read_point(source: Any, folder: Path = Path()) -> tuple[float, ...]:
 
 
 def _decode_design(content: Any, folder: Path) -> Design:
-    kinds = [key for key in KEYS if key in content] if isinstance(content, Mapping) else []
-    if len(kinds) != 1:
+    main_keys = [key for key in KEYS if key in content] if isinstance(content, Mapping) else []
+    if len(main_keys) != 1:
         raise ValueError(f"a design has one of the keys {', '.join(KEYS)}, got {quoted(content)}")
-    (kind,) = kinds
-    if unknown := [key for key in content if key not in (kind, *KEYS[kind])]:
-        raise ValueError(f"a design with the key {kind} has no key {quoted(unknown[0])}")
-    if kind == "list":
+    (main_key,) = main_keys
+    if unknown := [key for key in content if key not in (main_key, *KEYS[main_key])]:
+        raise ValueError(f"a design with the key {main_key} has no key {quoted(unknown[0])}")
+    if main_key == "list":
         points = as_tuple(content["list"], "points in list")
         return Design("list", points=tuple(read_point(point, folder) for point in points))
     sampling = content.get("law", "random")
     if sampling not in ("random", "sobol"):
         raise ValueError(f"law must be random or sobol, got {quoted(sampling)}")
-    if kind == "around":
+    if main_key == "around":
         spread = check_float(_parse_number(content.get("spread", SPREAD)), "a spread that is a number")
         return design_around(read_point(content["around"], folder), spread, sampling)
     if not isinstance(content["box"], Mapping):

@@ -214,7 +214,7 @@ def rician(image: Voxels, deviation: float, seed: int, width: Lengths = 0.0) -> 
 
     The mean square is v² + 2σ²; where there is no signal, the mean is σ √(π/2) (Gudbjartsson and Patz 1995).
     """
-    real, imaginary = (_grainy_noise(image, width, seed, f"{part} channel") for part in ("real", "imaginary"))
+    real, imaginary = (_grainy_noise(image, width, seed, f"{name} channel") for name in ("real", "imaginary"))
     return torch.hypot(image + deviation * real, deviation * imaginary)
 
 

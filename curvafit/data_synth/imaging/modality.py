@@ -35,8 +35,8 @@ class Checked:
     """A dataclass whose parameters with a `Range` in their annotation must lie in it, and become floats."""
 
     def __post_init__(self) -> None:
-        for name, (kind, allowed) in _ranges(type(self)).items():
-            object.__setattr__(self, name, _number(name, getattr(self, name), kind, allowed))
+        for name, (annotation, allowed) in _ranges(type(self)).items():
+            object.__setattr__(self, name, _number(name, getattr(self, name), annotation, allowed))
 
 
 @cache
@@ -45,17 +45,17 @@ def _ranges(part: type) -> dict[str, tuple[Any, Range]]:
     return {name: (hint.__origin__, *hint.__metadata__) for name, hint in hints if hasattr(hint, "__metadata__")}
 
 
-def _number(name: str, value: Any, kind: Any, allowed: Range) -> Any:
-    """Return the value as a float or a triple of floats, or None where the type `kind` allows that; else ValueError."""
-    words, least, most = allowed
-    if value is None and NoneType in get_args(kind):
+def _number(name: str, value: Any, annotation: Any, allowed: Range) -> Any:
+    """Return the value as a float, a triple of floats or None, whichever the annotation allows; else ValueError."""
+    expected, least, most = allowed
+    if value is None and NoneType in get_args(annotation):
         return None
-    if kind is not Triple:
-        return check_float(value, f"{name} as {words}", least, most)
+    if annotation is not Triple:
+        return check_float(value, f"{name} as {expected}", least, most)
     values = as_tuple(value, f"3 numbers for {name}")
     values = values if len(values) == 3 else (None,)  # None is refused, with the message of a wrong number
-    words = f"{name} as 3 numbers (z, y, x), each {words}"
-    return tuple(check_float(number, words, least, most, of=value) for number in values)
+    expected = f"{name} as 3 numbers (z, y, x), each {expected}"
+    return tuple(check_float(number, expected, least, most, of=value) for number in values)
 
 
 @dataclass(frozen=True)
@@ -235,15 +235,15 @@ class Modality:
 
     def draw(self, seed: int) -> Imaging:
         """Draw one image's parameters, each of which depends on the seed and its own name alone."""
-        seed, drawn = check_seed(seed), {}
+        seed, values = check_seed(seed), {}
         for name, ends in self.ranges.items():
             key = tuple(name.encode())
             t = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key)).random()
             low, high = (np.asarray(end, dtype=float) for end in ends)
             positive = bool(np.all(low > 0) and np.all(high > 0))
             value = np.exp(np.log(low) + t * (np.log(high) - np.log(low))) if positive else low + t * (high - low)
-            drawn[name] = tuple(value.tolist()) if value.ndim else float(value)
-        return self.base.assign(drawn)
+            values[name] = tuple(value.tolist()) if value.ndim else float(value)
+        return self.base.assign(values)
 
     def as_dict(self) -> dict[str, Any]:
         """Return all of the modality in JSON's types."""
