@@ -134,7 +134,6 @@ def _start(count: int | None, dashboard: int | None) -> Iterator[Client]:
         distributed.LocalCluster(
             n_workers=CPU_COUNT if count is None else count,
             threads_per_worker=1,
-            processes=True,
             host=LOOPBACK,
             dashboard_address=f"{LOOPBACK}:{dashboard or 0}",
             scheduler_kwargs={"dashboard": dashboard is not None},

@@ -388,8 +388,7 @@ def bands_figure(blocks: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
                 axes.vlines(x, low, high, color=shade, linewidth=14)
         axes.plot(x, scan, "-" if len(scan) > 3 else "o", color=CONTOUR, linewidth=1.8, markersize=6)
         axes.set_title(name, fontsize=10)
-        axes.set_xlim(-0.5, len(scan) - 0.5)
-        axes.set_xticks([])
+        axes.set(xlim=(-0.5, len(scan) - 0.5), xticks=[])
         axes.tick_params(length=2, labelsize=8)
         axes.spines[:].set_color(QUIET)
     return figure

@@ -116,11 +116,10 @@ class _Run:
             steps += 1 + stepper.run([plan.rate(step) for step in range(steps + 1, mark)])
             if checkpoint is not None and checkpoint.is_due():
                 checkpoint.save(self._pack_state(steps))
-        if checkpoint is not None:
-            if self._stopped_by_callback and not last:
-                checkpoint.save(self._pack_state(steps + 1))  # the next step was made before the callbacks
-            else:
-                checkpoint.close()
+        if checkpoint is not None and self._stopped_by_callback and not last:
+            checkpoint.save(self._pack_state(steps + 1))  # the next step was made before the callbacks
+        elif checkpoint is not None:
+            checkpoint.close()
 
     def _resume(self, checkpoint: Checkpoint | None) -> int:
         """Restore the checkpoint's state, if there is one, and return its number of steps, else 0."""

@@ -233,10 +233,9 @@ def compare_windows(posterior: Posterior, reading: Reading, twins: np.ndarray) -
     """Test whether windows of a scan `(k, 351)` differ from those of twins `(n, 351)` more than the model's shapes do.
 
     The law of the twins was fitted to the scan, and differs a little from the true one even if there is one. So the
-    scan's departure from them, in the emulator's uncorrelated directions, is ranked among those of shapes of the model
-    whose laws were fitted in the same way (`Posterior.departures`), and its discriminant among those of shapes in the
-    same view. The two tests are joined (`join_tests`). Without known departures, and for each block, which is compared
-    in deviations of the twins, the probability is that for a law chosen before the scan was seen.
+    scan's departure from them, in the emulator's uncorrelated directions, is ranked among those of shapes whose laws
+    were fitted in the same way (`Posterior.departures`), and its discriminant among those of the same view; the tests
+    are joined (`join_tests`). For each block, and without departures, p is that of a law chosen before the scan.
     """
     scan, references = reading.windows, posterior.departures
     scan_scores, twin_scores = map(posterior.emulator.decorrelate, (scan, twins))

@@ -229,9 +229,8 @@ def _minimiser() -> Callable[..., Any]:
     def minimise(columns, error, start):
         free = jnp.concatenate([jnp.log(start[:1] / start[2:3]), start[1:2], start[3:]])
         solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-10)
-        args = (columns, error)
-        free = optimistix.least_squares(residual, solver, free, args=args, max_steps=500, throw=False).value
-        return coefficients(free), jnp.linalg.norm(residual(free, args))
+        free = optimistix.least_squares(residual, solver, free, (columns, error), max_steps=500, throw=False).value
+        return coefficients(free), jnp.linalg.norm(residual(free, (columns, error)))
 
     return jax.jit(jax.vmap(minimise))
 

@@ -310,8 +310,7 @@ def _figure(segmentation: Segmentation, rows: Mapping[str, tuple[np.ndarray, np.
     from curvafit.drawing.plot import Sections, colour_labels, draw_sections, grey_limits, section_figure
 
     mask, labels, image = segmentation.mask, segmentation.labels, segmentation.image
-    uncertain = segmentation.uncertainty
-    if uncertain is None:
+    if (uncertain := segmentation.uncertainty) is None:
         return section_figure(rows, mask.spacing, mask.unit)
     places = [int(sums.argmax()) for sums in uncertain.entropies]
     masks, likely = _read_planes(mask, places), _read_planes(uncertain.probability, places)

@@ -537,10 +537,9 @@ def tune(taught: Taught, example: Example, progress: Progress = silent) -> Taugh
     """Train a filler further on an example's lesson, for a minute, and return it if it gains more than the noise on the
     task, else the filler as it was; either is calibrated on the task."""
     task, places = example.task, list(example.task.places)
-    filler = copy.deepcopy(taught.filler)
-    lessons = WholeLessons([Whole.of(example)], TUNING)
-    learn(filler, lessons, TUNING_RATE, workers=0, progress=lambda _, done: progress("tuning on the example", done))
-    tuned = replace(taught, filler=filler)
+    tuned, lessons = replace(taught, filler=copy.deepcopy(taught.filler)), WholeLessons([Whole.of(example)], TUNING)
+    step: Progress = lambda _, done: progress("tuning on the example", done)  # noqa: E731
+    learn(tuned.filler, lessons, TUNING_RATE, workers=0, progress=step)
     predictions = [fill(task.given, candidate)[places] for candidate in (taught, tuned)]
     before, after = (tally(logits > best_log_odds(logits), task.truth, places) for logits in predictions)
     gain, noise = gain_of(after, before)

@@ -132,9 +132,8 @@ class Example:
             )
         whole, *_ = Known(volume, axis, tuple(range(length))).read(Run(), name="the example's slices")
         inside = whole.inside[box_with_most_surface(whole.inside, LARGEST)]
-        size, notes = " x ".join(map(str, inside.shape)), ()
-        if inside.size < whole.inside.size:
-            notes = (f"Of the example {size} voxels are read, where most of its surface is.",)
+        size = " x ".join(map(str, inside.shape))
+        note = f"Of the example {size} voxels are read, where most of its surface is."
         longer = 1 + int(np.argmax(inside.shape[1:]))
         first, rest = np.array_split(inside, [2 * inside.shape[longer] // 3], axis=longer)
         known = range(0, len(inside), gap)
@@ -143,6 +142,7 @@ class Example:
         given = replace(whole, inside=rest[known], places=tuple(known), length=len(inside))
         if not between or any(not masks.any() or masks.all() for masks in (given.inside, first)):
             raise ScanError(f"expected an example with a surface in both its parts, longer than {gap} slices")
+        notes = (note,) if inside.size < whole.inside.size else ()
         return cls(lesson, Task(given, rest[between], between), notes)
 
     @property

@@ -327,9 +327,8 @@ def measure_each(
 ) -> list[tuple[Measures, ...]]:
     """Measure scans in this process or by several; with `labels` the instances of label images.
 
-    `options` are those of `measure`, or of `measure_instances`, and so are errors. Workers share the scans, or the
-    tiles of a single one; finished tiles are kept in the folder `store`. Diagrams of several scans are binned finely,
-    so that many take little memory.
+    `options` and errors are those of `measure`, or of `measure_instances`. Workers share the scans, or the tiles of a
+    single one, which the folder `store` keeps. Diagrams of several scans are binned finely, to take little memory.
     """
     several = len(scans) > 1
     options |= {"workers": 0 if several else workers}

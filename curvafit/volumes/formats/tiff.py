@@ -48,10 +48,9 @@ def read_tiff(path: Path, **_: object) -> Stated:
         series = file.series[0]
         base.check_array(series.shape, series.dtype or np.dtype("V1"), path)
         _check_pages(file, series)
-        values = np.asarray(series.asarray())
         steps, units, guesses = _read_spacing(file)
         axes = base.name_axes(series.axes)
-        values, calibration_notes = _calibrate(values, file.imagej_metadata or {})
+        values, calibration_notes = _calibrate(np.asarray(series.asarray()), file.imagej_metadata or {})
         count, nodata = len(file.series), series.pages[0].tags.get(42113)  # type: ignore[union-attr]
     tag_errors = [text for text in messages if text.startswith("<TiffTag")]
     # GDAL's value for what was not measured, tag 42113, may not fit the values' type.

@@ -76,8 +76,7 @@ def read_remote(url: str, key: str | None = None) -> Stated:
     array = node[name]
     if not isinstance(array, zarr.Array):  # the key names an image
         levels = _read_levels(name, array.attrs.asdict())
-        name = next(iter(levels), name)
-        array = node[name]
+        array = node[name := next(iter(levels), name)]
     return _state_array(array, None, levels.get(name), node)
 
 
