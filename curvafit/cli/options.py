@@ -91,7 +91,7 @@ def _check_inputs(values: Mapping[str, Any]) -> None:
     for parameter, option in _LAWS.items():
         text = values.get(parameter)
         for law in [] if text is None or text.endswith(".json") else text.split(","):
-            if simplify_name(law) not in PUBLISHED and not law.endswith(".json") and not os.path.isfile(text):
+            if simplify_name(law) not in PUBLISHED and not law.endswith(".json") and not os.path.isfile(str(text)):
                 presets = ", ".join(PUBLISHED)
                 raise ValueError(f"--{option} takes a preset among {presets}, or a fit.json, got {quoted(law)}")
 

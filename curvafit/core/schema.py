@@ -48,10 +48,10 @@ def decode(hint: Any, value: Any, name: str = "") -> Any:
     # Without tensors, which JSON cannot hold.
     kind: Any = next(kind for kind in kinds if kind is not NoneType and getattr(kind, "__name__", "") != "Tensor")
     nullable = NoneType in kinds or rule.unknown
-    if value is None and nullable:
-        return math.nan if rule.unknown else None
     expected, is_valid = _check_value(kind, rule, value)
     if not is_valid:
+        if value is None and nullable:
+            return math.nan if rule.unknown else None
         raise ValueError(f"{name or 'the content'} as {expected}{', or null' * nullable}, got {quoted(value)}")
     if dataclasses.is_dataclass(kind):
         return _decode_fields(kind, value, name)

@@ -261,11 +261,11 @@ def _edges(camera: View, size: tuple[int, int], *, front: bool) -> Image.Image:
     pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(corners[a] - corners[b]).sum() == 1]
     positions = camera.project(corners) * np.array(size) * _EDGE_SUPERSAMPLE
     opacity = Image.new("L", (size[0] * _EDGE_SUPERSAMPLE, size[1] * _EDGE_SUPERSAMPLE))
-    style = {"fill": round(255 * _EDGE_OPACITY[front]), "width": round(_EDGE_WIDTH * _EDGE_SUPERSAMPLE)}
+    grey, width = round(255 * _EDGE_OPACITY[front]), round(_EDGE_WIDTH * _EDGE_SUPERSAMPLE)
     pen = ImageDraw.Draw(opacity)
     for a, b in pairs:
         if (farthest in (a, b)) != front:
-            pen.line([*positions[a], *positions[b]], **style)
+            pen.line([*positions[a], *positions[b]], fill=grey, width=width)
     layer = Image.new("RGBA", size, QUIET)
     layer.putalpha(opacity.reduce(_EDGE_SUPERSAMPLE))
     return layer

@@ -238,7 +238,7 @@ class Combinations:
         combinations = []
         for ends, weights, sums in zip(self.ends, self.weights, self(draws).T, strict=True):
             low, high = (words and words + suffix for words in ends)
-            by_name = dict(zip(PARAMETERS, weights.tolist(), strict=True))
+            by_name: dict[str, float] = dict(zip(PARAMETERS, weights.tolist(), strict=True))
             least, median, most = np.quantile(sums, (0.05, 0.5, 0.95)).tolist()
             known = float(np.clip(1 - sums.var(), 0, 1))  # a sum's variance among laws is 1
             combinations.append(Combination(low, high, by_name, median, (least, most), known))

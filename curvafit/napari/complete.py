@@ -72,7 +72,7 @@ class Fill:
 
         def count_equal(state: np.ndarray) -> int:
             equal = np.bincount(slices[values.flat[indices] == state[changed]], minlength=count)
-            return np.count_nonzero((voxels > 0) & (equal == voxels))
+            return int(np.count_nonzero((voxels > 0) & (equal == voxels)))
 
         return 0 < count_equal(self.after) >= count_equal(self.before)
 

@@ -224,7 +224,7 @@ def farthest_points(places: np.ndarray, count: int) -> np.ndarray:
 def _columns(atlas: Atlas) -> dict[str, np.ndarray]:
     """Return the values of shapes by their titles in `COLUMNS`, without a₂₀ where all shapes have the same."""
     values = (*atlas.coefficients.T, atlas.masses, atlas.volume_fractions, atlas.thicknesses)
-    columns = dict(zip(COLUMNS, values, strict=True))
+    columns: dict[str, np.ndarray] = dict(zip(COLUMNS, values, strict=True))
     return columns if np.ptp(values[0]) > 0 else {title: columns[title] for title in COLUMNS[1:]}
 
 

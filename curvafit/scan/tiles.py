@@ -192,7 +192,7 @@ def measure_tile(plan: Plan, number: int) -> Record:
     if surface is not None:
         sums.gather("area", *surface)
     del mask, balls
-    return record | _measure_curvature(plan, core, sums) | sums.rows
+    return {**record, **_measure_curvature(plan, core, sums), **sums.rows}
 
 
 def _measure_wide(plan: Plan, number: int) -> Record:

@@ -190,7 +190,8 @@ class Comparison(Pictured):
             f"one of them {format_number(self.within, 2)} {unit} on average (sliced Wasserstein distance).",
         ]
         if self.p <= LEVEL and len(self.groups) <= 2:
-            low, high = self.groups or (f"{self.by} {label:g}" for label in (self.labels.min(), self.labels.max()))
+            ends = [f"{self.by} {label:g}" for label in (self.labels.min(), self.labels.max())]
+            low, high = self.groups if len(self.groups) == 2 else ends
             span = 1.0 if self.groups else float(np.ptp(self.labels))  # a difference by a number is a slope
             changes = sorted((span * self[f"share of {name}"].difference, name) for name in FAMILIES)
             (fall, falling), (rise, rising) = changes[0], changes[-1]

@@ -211,7 +211,7 @@ def _sum_windows(sums: np.ndarray, field: Volume, size: Sequence[int], stride: S
 def _cluster(values: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, float]:
     """Divide windows into `count` clusters by k-means of their standardised numbers (nz, ny, nx, Q). Returns labels
     (nz, ny, nx) uint8, as `Windows.clusters`, and the fraction of the variance that is between clusters."""
-    used = np.isfinite(values).any((0, 1, 2))  # a thin stack has no curvature
+    used = np.any(np.isfinite(values), axis=(0, 1, 2))  # a thin stack has no curvature
     used[NAMES.index("Euler number")] = False  # with Conn.D it would count twice
     thickness_column = int(used[: NAMES.index("thickness")].sum())
     selected = values[..., used]

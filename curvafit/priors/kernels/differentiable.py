@@ -70,9 +70,9 @@ def _save(ctx, inputs, output) -> None:
     ctx.mark_non_differentiable(output[1])
 
 
-def _backward(ctx, grad_energies, _):
+def _backward(ctx, *grad_outputs):
     """Multiply the saved gradients by the loss's gradient by the energies; the second output has no derivative."""
-    gradients, u = ctx.saved_tensors
+    (grad_energies, _), (gradients, u) = grad_outputs, ctx.saved_tensors
     return _PrecomputedGradient.apply(gradients, u) * grad_energies[:, None, None, None], None, None, None, None
 
 

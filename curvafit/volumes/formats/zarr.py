@@ -178,7 +178,7 @@ def _create_zarr(frame: Any, path: Path, version: str, labels: bool) -> Any:
     if is_format_2:
         naming = {"chunk_key_encoding": {"name": "v2", "separator": "/"}}
     attributes = content if is_format_2 else {"ome": {"version": version, **content}}
-    group = zarr.create_group(path, attributes=attributes, zarr_format=_FORMATS[version])
+    group = zarr.create_group(path, attributes=attributes, zarr_format=2 if is_format_2 else 3)
     dtype = np.dtype(dtype.newbyteorder("=").str)  # of the two 64-bit types of C, Zarr knows one
     for k, shape in enumerate(shapes):
         chunks = tuple(min(CHUNK, n) for n in shape)
