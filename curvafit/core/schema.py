@@ -89,7 +89,7 @@ def _check_value(kind: Any, rule: Rule, value: Any) -> tuple[str, bool]:
     if get_origin(kind) is tuple:
         items = get_args(kind)
         count = 0 if items[-1] is Ellipsis else len(items)  # 0: any number of items
-        is_long_enough = isinstance(value, (list, tuple)) and len(value) >= (count or int(rule.filled))
+        is_long_enough = isinstance(value, (list, tuple)) and len(value) >= (count or int(rule.filled))  # or longer
         return f"a list of {count} numbers" if count else "a list", is_long_enough
     return "an object", isinstance(value, Mapping)
 

@@ -78,7 +78,8 @@ def _fill_row(mask, step, reach, offset, both, squares):  # pragma: no cover
 
 @njit(cache=True)
 def _lower_columns(squares, step, offset, scratch):  # pragma: no cover
-    """Lower squares (n, columns) to the least of ((k - offset) step)² plus the square k voxels away in the column."""
+    """Lower squares (n, columns) of distances, negative outside, to the least of ((k - offset) step)² plus the square k
+    voxels away in the column; `offset` is the border's distance from a voxel's centre."""
     n, width = squares.shape
     zero, one = np.float32(0), np.float32(1)
     scratch[:n, :width] = squares

@@ -202,7 +202,7 @@ def _window_pairs(shape: tuple[int, ...], size: tuple[int, ...]) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def _shells(size: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the index of each offset's shell, a voxel wide, and the shells' counts and mean radii, beyond `RADII`."""
+    """Return the index of each offset's shell, a voxel wide, and the counts and mean radii of shells up to `RADII`."""
     axes = [np.minimum(np.arange(s), s - np.arange(s)) for s in size]
     distance = np.sqrt(axes[0][:, None, None] ** 2 + axes[1][:, None] ** 2 + axes[2] ** 2.0).ravel()
     shells = np.rint(distance).astype(int)

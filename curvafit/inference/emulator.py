@@ -148,10 +148,12 @@ def _minimise(
     emulator: Emulator, descriptors: np.ndarray, views: np.ndarray, amount: np.ndarray, starts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Minimise -2 log posterior of N rows from n starts `(N, n, 6)` each. Returns, for each start, the parameters, the
-    slopes of the whitened residuals by parameters in deviations of the prior, their sum of squares, and the minimum."""
+    slopes of the whitened residuals by parameters in deviations of the prior, the residuals' sum of squares, and the
+    minimum."""
     target = emulator.compression(descriptors)
     conditions = [np.repeat(column, starts.shape[1]) for column in (views, amount)]
     emulated = emulator(starts.reshape(-1, starts.shape[-1]), *conditions)
+    # One deviation a row, the mean over its starts: were it to change with parameters, the least squares would not be.
     deviation = np.sqrt(np.square(emulated.deviation).reshape(*starts.shape[:2], -1).mean(1))
     low, high = emulator.box.T
     fraction = np.clip((starts - low) / (high - low), 0.01, 0.99)

@@ -185,6 +185,7 @@ def _propagate_error(
     size = _ERROR_START
     for trial in range(1, _ERROR_STEPS + 1):
         change = integrate_columns(energy_gradients(u + size * error, grid, epsilon) - clean, grid, epsilon, width)
+        # A root of the columns' mean squares; the first column's coefficient is fixed, and it drops out.
         triangle = _compress(change.reshape(6, -1))[1:, 1:] / math.sqrt(change[0].size)
         problem = Problem(columns, triangle)
         # The least misfit in units of what an error of this size causes, so that at the size sought it is 1.

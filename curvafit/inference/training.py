@@ -221,7 +221,8 @@ def train_emulator(
 def _inflation(emulator: Emulator, table: Table, residuals: np.ndarray) -> float:
     """Return the mean square by which whitened residuals `(N, k)` move the best parameters, over its expectation if
     they were independent of variance 1."""
-    # A Gauss-Newton step moves parameters by covariance · slopesᵀ residuals; their prior has deviation 1.
+    # A Gauss-Newton step moves parameters by covariance · slopesᵀ residuals, here squared in units of that covariance:
+    # gradientᵀ covariance gradient. Their prior has deviation 1.
     squared, expected = 0.0, 0.0
     for view in emulator.views:
         in_view = table.views == view

@@ -232,7 +232,11 @@ def _list_applied(fills: Sequence[Fill], values: np.ndarray) -> list[Fill]:
 
 
 def _remember(filled: Filled, before: np.ndarray, after: np.ndarray, fills: Sequence[Fill]) -> Fill:
-    """Return the record of a fill that changes values (Z, Y, X) from `before` to `after`, without what users paint."""
+    """Return the record of a fill that changes values (Z, Y, X) from `before` to `after`, without what users paint.
+
+    Voxels that it leaves as they are belong to it too, where it or an earlier fill labels them, unless a user painted
+    them while it was computed: then they differ from `filled.before`.
+    """
     task = filled.task
     labelled = index_labels(after, task.labels) > 0
     for fill in fills:

@@ -135,7 +135,8 @@ class Prepared:
     def true_volume_fraction(self) -> float:
         """Return the structure's volume fraction, corrected for the bias of blur, noise and resampling.
 
-        The bias is estimated by scanning the main window's structure once more (`scan_alike`).
+        The bias is estimated by scanning the main window's structure once more (`scan_alike`), after its border was
+        moved to where the scan's blur had shifted it from.
         """
         if self.kind == "field":
             return self.volume_fraction

@@ -182,8 +182,9 @@ def read_region(
     If the field is a `crop` of a scan, `scan` and `reading` name the scan: a region without an affine lies on all of
     it, and is cropped in the same way. Raises ScanError where the region is empty, and as `lay`.
     """
-    region, target = load(roi), field if crop is None or scan is None else load(scan, **reading, lazy=True)
-    if region.affine is not None and target.affine is not None:
+    region = load(roi)
+    target = field if crop is None or scan is None else load(scan, **reading, lazy=True)
+    if region.affine is not None and target.affine is not None:  # affines put it on the field: nothing is cropped
         target, crop = field, None
     region, notes = lay(region, target, "the region of interest", "the scan")
     values = region.values if crop is None else region.crop(crop).values

@@ -511,7 +511,7 @@ def _summarise(plan: Plan, records: Sequence[Record], wide_records: Sequence[Rec
 
 
 def _sum_tiles(plan: Plan, records: Sequence[Record], wide_records: Sequence[Record], part: str) -> np.ndarray:
-    """Return the sums of all tiles over a part, for each of the finest blocks."""
+    """Return the sums of all tiles over a region, whose keys end in `part`, for each of the finest blocks."""
     table, rows, sums = np.zeros((plan.finest.count, len(whole.SUMS))), f"rows{part}", f"sums{part}"
     for record in records:
         if rows in record:
@@ -519,7 +519,7 @@ def _sum_tiles(plan: Plan, records: Sequence[Record], wide_records: Sequence[Rec
     for factor, names in zip(plan.factors, (("thickness", "thickness²"), ("gap",)), strict=True):
         if factor > 1:  # measured again, in `wide_records`
             table[:, [whole.SUMS.index(name) for name in names]] = 0
-    for record in wide_records:
+    for record in wide_records:  # their other columns are 0
         if rows in record:
             table[record[rows]] += record[sums]
     return table

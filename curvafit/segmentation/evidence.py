@@ -98,9 +98,9 @@ class GreyEvidence:
     def of(
         cls, volume: Volume, threshold: float | str = "otsu", dark: bool = False, apart: bool = False
     ) -> GreyEvidence:
-        """Measure a scan's classes on a sample of it; with `apart`, those that overlap once more. A threshold of noisy
-        levels leaves some of each phase on either side, which brings the two means together. They are measured again
-        `DEEP` voxels off the first guess of the surface, where few voxels are on the wrong side."""
+        """Measure a scan's classes on a sample of it; with `apart`, measure classes that overlap a second time. A
+        threshold of noisy levels leaves some of each phase on either side, which brings the two means together: at
+        `DEEP` voxels from the first guess of the surface few voxels are on the wrong side."""
         sample, _ = subsample(volume)
         levels = grey_levels(sample, threshold)
         bounds = grey_bounds(sample.values.astype(np.float32), threshold)

@@ -259,15 +259,14 @@ def _choose_law(
     engine: _Engine, slices: Slices, laws: Sequence[Coefficients], example: Example | None,
     strength: tuple[float | None, int], tiles: int,
 ) -> tuple[Trial, Task[Slices] | None, str]:  # fmt: skip
-    """Return the trial to run, with a law if one is better than the network alone; the task that decided; and the
-    beginning of the status. `strength` is the stiffness and the steps: a given stiffness takes the first law untried.
-    Of a volume of several `tiles`, laws are tried in a box."""
-    stiffness, steps = strength
-    task = None if example is None else example.task
+    """Return the trial to run, with a law if one is better than the network alone; the task that laws were tried on, or
+    else the example's; and the beginning of the status. `strength` is the stiffness and the steps: a given stiffness
+    takes the first law untried. Of a volume of several `tiles`, laws are tried in a box."""
+    (stiffness, steps), untried = strength, None if example is None else example.task
     if not laws:
-        return Trial(), task, engine.taught.status
+        return Trial(), untried, engine.taught.status
     if stiffness is not None:
-        return Trial(laws[0], stiffness, steps), task, "the law is lowered from the network's volume"
+        return Trial(laws[0], stiffness, steps), untried, "the law is lowered from the network's volume"
     part = slices if tiles == 1 else crop_to_surface(slices, PART)[0]
     task = leave_out_slices(part) if example is None else example.part
     if task is None:

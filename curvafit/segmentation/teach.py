@@ -299,11 +299,12 @@ class WholeLessons(Batches):
     halo: int = HALO
 
     def __getitem__(self, number: int) -> Lesson:
+        """Return a batch of gaps in windows of a volume drawn at random, flipped at random."""
         rng = np.random.default_rng([self.seed, number])
         whole = self.volumes[int(rng.integers(len(self.volumes)))]
         depth, edge = len(whole.distances), self.edge + 2 * self.halo
         gap, starts = whole.gap, np.arange(0, depth - whole.gap, whole.gap)
-        if whole.evidence is None:
+        if whole.evidence is None:  # any slice can then be a known one; evidence was learnt from every `gap`-th
             gap = max(min(whole.gap + int(rng.integers(-1, 2)), depth - 1), 2)
             starts = np.arange(depth - gap)
         gaps: list[list[np.ndarray]] = []

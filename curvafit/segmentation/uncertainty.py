@@ -170,8 +170,7 @@ def suggest_slices(entropies: np.ndarray, places: Sequence[int], count: int, per
 def remaining_entropy(
     entropies: np.ndarray, places: Sequence[int] | set[int], new: int, periodic: bool = False
 ) -> np.ndarray:
-    """Return the entropies (Z,) of all slices once the slice `new` is known besides those at `places`. They fall in
-    proportion to the `harmonic_distance`, which is how thick a slice's uncertain layer is; not beyond other known ones.
-    """
+    """Return the entropies (Z,) of all slices once the slice `new` is known besides those at `places`. They fall as the
+    `harmonic_distance` does, the thickness of a slice's uncertain layer; those beyond the next known slices stay."""
     before, after = (harmonic_distance(sorted(known), len(entropies), periodic) for known in (places, {*places, new}))
     return entropies * np.divide(after, before, out=np.zeros_like(before), where=before > 0)

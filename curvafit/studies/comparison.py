@@ -368,7 +368,7 @@ def _compare_bins(
     tested = (mean >= LEAST_SHARE * mean.max()) & (edges[1:, None] <= edges[None, 1:])  # κ2 ≤ κ1
     p = np.full(mean.shape, np.nan)
     p[tested] = permutation.correct_by_most(shares[:, tested], arrangements, blocks)
-    if np.issubdtype(labels.dtype, np.floating):
+    if np.issubdtype(labels.dtype, np.floating):  # the change along a line fitted from the lowest label to the highest
         x = permutation.center(labels, blocks)
         return edges, np.ptp(labels) * np.tensordot(x, shares, 1)[None] / (x @ x), p
     means = np.stack([shares[labels == group].mean(0) for group in np.unique(labels)])

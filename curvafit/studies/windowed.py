@@ -197,7 +197,7 @@ def _sum_windows(sums: np.ndarray, field: Volume, size: Sequence[int], stride: S
     for axis in range(3):
         sums = np.lib.stride_tricks.sliding_window_view(sums, size[axis] // stride[axis], axis).sum(-1)
     values = combine(sums)
-    # A layer across a window has two faces as large as the window's: with less surface, no edge holds a period.
+    # A layer across a window has two faces as large as the window's. With less surface, or none known, it is too small.
     edge = max(n * h for n, h in zip(size, field.spacing, strict=True))
     values[~(values[..., NAMES.index("surface density")] * edge >= 2)] = np.nan
     if np.isnan(values[..., 0]).all():

@@ -304,7 +304,7 @@ def _read_logs(path: Path) -> tuple[float, float, str] | None:
                 break
     if len(sizes) > 1:
         listed = " and ".join(f"{size:g} um in {log}" for size, (_, log) in list(sizes.items())[:2])
-        raise ScanError(f"the logs in {path} state voxel sizes of {listed}: leave that of these slices there alone")
+        raise ScanError(f"the logs in {path} state voxel sizes of {listed}: leave only the log of these slices there")
     return next(((size, *rest) for size, rest in sizes.items()), None)
 
 

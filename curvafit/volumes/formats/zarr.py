@@ -253,12 +253,12 @@ def check_place(field: Any, image: Path) -> None:
     for name, level in _read_levels("", group.attrs.asdict()).items():
         axes = level["axes"] or "zyx"
         zyx, count = [axes.index(letter) for letter in "zyx"], len(axes)
-        by_axis = (level["steps"] or (1.0,) * count, level["origin"] or (0.0,) * count, group[name].shape)
+        by_axis = (level["steps"] or (1.0,) * count, level.get("origin") or (0.0,) * count, group[name].shape)
         edges, origin, shape = (np.array([values[axis] for axis in zyx]) for values in by_axis)
-        common, factors = common_unit([level["units"][axis] for axis in zyx] if level["units"] else [None] * 3)
-        unit, factor = parse_unit(common)
-        same_edges = np.allclose(np.array(field.spacing) / factor, edges * factors, rtol=1e-3, atol=0)
-        first = (np.array(base.first_voxel(field)) / factor / factors - origin) / edges  # in voxels of the level
+        common, to_common = common_unit([level["units"][axis] for axis in zyx] if level["units"] else [None] * 3)
+        unit, from_common = parse_unit(common)  # lengths of the field are in `unit`, those of the level by axis
+        same_edges = np.allclose(np.array(field.spacing) / from_common, edges * to_common, rtol=1e-3, atol=0)
+        first = (np.array(base.first_voxel(field)) / from_common / to_common - origin) / edges  # in voxels of the level
         if unit == field.unit and same_edges and (first > -0.01).all() and (first + field.shape < shape + 0.01).all():
             return
     size = format_sampling(field.shape, field.spacing, field.unit)
