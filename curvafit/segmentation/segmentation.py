@@ -327,5 +327,6 @@ def calibrate(
             return np.zeros(part.shape, dtype=bool)
 
     task = Task(probability_evidence(part), inside[box], range(part.shape[0]))
-    best = choose_by_masks(task, [Trial(law, FIRST, working.steps) for law in tried], fill, NATS)
+    first = [Trial(law, FIRST, working.steps) for law in tried]  # a trial's strength is the weight, in nats
+    best = choose_by_masks(task, first, fill, NATS)
     return Calibration(best, best.law in laws, field, (*notes, *truth.notes, *place_notes))

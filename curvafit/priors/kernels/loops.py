@@ -221,7 +221,7 @@ def _store(typingctx, array, index, value):
 def _store_first(typingctx, array, index, value, count):
     """Store the first `count` floats of a vector."""
 
-    def generate(context, builder, sig, values):
+    def generate(context, builder, sig, values):  # emits a store of the lanes whose number is below `count`
         width = value.width
         integers = ir.VectorType(ir.IntType(64), width)
         undef = ir.Constant(integers, ir.Undefined)
