@@ -227,7 +227,7 @@ def _fill_runs(reach, spacing, runs):  # pragma: no cover
 
 @njit(cache=True)
 def _paint_ball(centre, balls, runs, position, shape, reach):  # pragma: no cover
-    """Paint the free voxels of a ball at `position`, which may lie beyond the box; `centre` is its index. `runs[dz, dy]`
+    """Paint the free voxels of a ball at `position`, which may lie beyond the box; `centre` its index. `runs[dz, dy]`
     is half the length of the ball's row along x, negative where it has none. Most blocks of 4 x 4 rows have none free.
     """
     blocks = balls[4]
