@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from itertools import combinations_with_replacement
+from itertools import combinations_with_replacement, product
 from typing import Any
 
 import numpy as np
@@ -18,29 +18,33 @@ from curvafit.core.runtime import Progress, silent
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.uncertainty import entropy, fit_weights
 
-#: Deviations of the Gaussians in voxels of the shortest edge, and the least one along an axis in its own voxels. Along
-#: a longer edge they shrink by the root of the ratio: optics ask for the ratio, outlines drawn by voxels for none.
+#: Deviations of the Gaussians, in edges of a voxel, and the least one along an axis in its own voxels.
 WIDTHS, LEAST = (0.7, 1.2, 2.0, 3.4, 5.6), 0.5
 #: Deviation of a second Gaussian before derivatives are taken.
 SMOOTH = 0.7
 #: Most voxels that trees learn from; the number of trees, their learning rate and most leaves.
-LEARNT, TREES, RATE, LEAVES = 200_000, 120, 0.1, 31
-#: Furthest shift that is looked for, in voxels; width of the local mean that is subtracted; least shift that is noted;
-#: by what fraction its correlation must exceed that without a shift, and how many root mean squares of all it must be.
-FURTHEST, LOCAL, NEAREST, BETTER, CLEAR = 12, 61, 2, 0.1, 5.0
+LEARNT, TREES, RATE, LEAVES = 200_000, 120, 0.1, 127
+#: Furthest shift that is looked for, in voxels; most slices compared for it; least shift that is noted; by what
+#: fraction correlations must be better there; and what fraction of the entropy of held-out slices it must explain.
+FURTHEST, COMPARED, NEAREST, BETTER, CLEAR = 12, 16, 2, 0.1, 0.25
 #: Voxels whose features are computed at once; most voxels of an image whose features are kept for the second reading.
 HELD, KEPT = 4_000_000, 20_000_000
+#: By less than this fraction voxels' edges differ where they are cubes.
+CUBIC = 0.01
 
 
-def read_image(values: np.ndarray, slices: Slices, progress: Progress = silent) -> tuple[np.ndarray, float]:
-    """Return the log-odds of the inside by an image (Z, Y, X) whose known slices are given, float32 (Z, Y, X), and the
-    fraction of the entropy of held-out known slices that they explain. Raises ImportError without scikit-learn.
+def read_image(
+    values: np.ndarray, slices: Slices, progress: Progress = silent
+) -> tuple[np.ndarray, float, tuple[int, int]]:
+    """Return the log-odds of the inside by an image (Z, Y, X) whose known slices are given, float32 (Z, Y, X); the
+    fraction of the entropy of held-out known slices that they explain; and the shift (y, x), in voxels, at which the
+    image would explain them better, (0, 0) where there is none. Raises ImportError without scikit-learn.
 
     Trees learn from the known slices which voxels are inside, by grey levels, slopes and Hessians at several widths.
     They first learn from every second known slice: the others calibrate the log-odds, and give the fraction. Where one
     half has no inside or no outside, log-odds stay as they are, and the fraction is NaN.
     """
-    known, slope, shift, gain = slices.inside, 1.0, 0.0, math.nan
+    known, slope, constant, gain, shift = slices.inside, 1.0, 0.0, math.nan, (0, 0)
     progress("learning from the image", 0.0)
     levels = ((values - values.mean()) / max(float(values.std()), 1e-12)).astype(np.float32)
     compute_features = partial(_features, levels, slices.spacing)
@@ -49,12 +53,11 @@ def read_image(values: np.ndarray, slices: Slices, progress: Progress = silent) 
     features = np.concatenate([block[np.isin(rows, slices.places)] for rows, block in blocks])
     progress("learning from the image", 0.2)
     if all(half.any() and not half.all() for half in (known[::2], known[1::2])):
-        trees = _train_trees(features[::2], known[::2])
-        logits = trees.decision_function(features[1::2].reshape(-1, features.shape[-1]))
-        truth = known[1::2].ravel()
-        slope, shift = fit_weights(logits[:, None], truth)
-        loss = float(np.logaddexp(0, np.where(truth, -1, 1) * (slope * logits + shift)).mean())
-        gain = 1 - loss / float(entropy(truth.mean()))
+        slope, constant, gain = _hold_out(features, known)
+        shift = find_shift(features, known)
+        if shift != (0, 0):
+            moved = np.roll(features, [-voxels for voxels in shift], (1, 2))
+            shift = shift if _hold_out(moved, known)[2] > max(gain, CLEAR) else (0, 0)
     progress("learning from the image", 0.35)
     trees = _train_trees(features, known)
     evidence = np.empty(values.shape, dtype=np.float32)
@@ -62,27 +65,44 @@ def read_image(values: np.ndarray, slices: Slices, progress: Progress = silent) 
         progress("reading the image", 0.6 + 0.4 * rows[0] / len(values))
         for row, plane in zip(rows, block, strict=True):
             logits = trees.decision_function(plane.reshape(-1, plane.shape[-1]))
-            evidence[row] = (slope * logits + shift).reshape(plane.shape[:2])
+            evidence[row] = (slope * logits + constant).reshape(plane.shape[:2])
     progress("reading the image", 1.0)
-    return evidence, gain
+    return evidence, gain, shift
 
 
-def find_shift(values: np.ndarray, slices: Slices) -> tuple[int, int]:
-    """Return the shift (y, x), in voxels, of an image (Z, Y, X) off the known slices; (0, 0) where none is clear. It is
-    the greatest cross-correlation, of either sign, of masks and grey levels."""
-    correlation = np.zeros(slices.inside.shape[1:])
-    for place, inside in zip(slices.places, slices.inside, strict=True):
-        plane = values[place].astype(np.float64)
-        plane -= ndimage.uniform_filter(plane, LOCAL, mode="nearest")
-        mask, grey = np.fft.rfft2(inside - inside.mean()), np.fft.rfft2(plane / max(plane.std(), 1e-12))
-        correlation += np.fft.irfft2(mask.conj() * grey, correlation.shape)
-    furthest = [min(FURTHEST, n // 4) for n in correlation.shape]
-    centred = np.roll(correlation, furthest, (0, 1))[: 2 * furthest[0] + 1, : 2 * furthest[1] + 1]
-    strength = np.abs(centred)  # no shift is its middle
+def find_shift(features: np.ndarray, inside: np.ndarray) -> tuple[int, int]:
+    """Return the shift (y, x) at which features (N, Y, X, F) of an image correlate best with masks (N, Y, X) of known
+    slices; (0, 0) where no other is better by the fraction `BETTER`.
+
+    The multiple correlation is cᵀ C⁻¹ c: c are the cross-correlations of masks with each feature, at all shifts at
+    once by the Fourier transform, and C is the features' covariance. A line or a wall, on which no grey level is
+    greatest or least, correlates with no feature alone.
+    """
+    rows = np.unique(np.linspace(0, len(inside) - 1, COMPARED).astype(int))
+    masks, table = inside[rows] - inside[rows].mean(), features[rows]
+    sample = table.reshape(-1, table.shape[-1])[:: max(1, masks.size // LEARNT)].astype(np.float64)
+    mean, deviation = sample.mean(0), sample.std(0) + 1e-6
+    covariance = np.cov((sample - mean) / deviation, rowvar=False) + 1e-3 * np.eye(len(mean))
+    furthest = [min(FURTHEST, n // 4) for n in masks.shape[1:]]
+    window, spectra = np.ix_(*(np.arange(-n, n + 1) for n in furthest)), np.fft.rfft2(masks).conj()
+    correlations = np.empty((*(2 * n + 1 for n in furthest), len(mean)))
+    for k in range(len(mean)):
+        products = spectra * np.fft.rfft2((table[..., k] - mean[k]) / deviation[k])
+        correlations[..., k] = np.fft.irfft2(products.sum(0), masks.shape[1:])[window]
+    strength = np.einsum("yxf,fg,yxg->yx", correlations, np.linalg.inv(covariance), correlations)
     y, x = (int(k) - n for k, n in zip(np.unravel_index(strength.argmax(), strength.shape), furthest, strict=True))
-    background = float(np.sqrt(np.square(correlation).mean()))
-    threshold = max((1 + BETTER) * strength[furthest[0], furthest[1]], CLEAR * background)
-    return (y, x) if max(abs(y), abs(x)) >= NEAREST and strength.max() > threshold else (0, 0)
+    better = strength.max() > (1 + BETTER) * strength[furthest[0], furthest[1]]  # the middle is without a shift
+    return (y, x) if better and max(abs(y), abs(x)) >= NEAREST else (0, 0)
+
+
+def _hold_out(features: np.ndarray, inside: np.ndarray) -> tuple[float, float, float]:
+    """Train trees on every second known slice. Return the weight and the constant that calibrate their log-odds on the
+    others, and the fraction of the entropy of those that they explain."""
+    trees, truth = _train_trees(features[::2], inside[::2]), inside[1::2].ravel()
+    logits = trees.decision_function(features[1::2].reshape(-1, features.shape[-1]))
+    slope, constant = fit_weights(logits[:, None], truth)
+    loss = float(np.logaddexp(0, np.where(truth, -1, 1) * (slope * logits + constant)).mean())
+    return slope, constant, 1 - loss / float(entropy(truth.mean()))
 
 
 def _train_trees(features: np.ndarray, inside: np.ndarray) -> Any:
@@ -99,33 +119,39 @@ def _train_trees(features: np.ndarray, inside: np.ndarray) -> Any:
 
 
 def _features(levels: np.ndarray, spacing: Sequence[float]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the indices (n,) of some slices at a time with their features (n, Y, X, F), float16: at each width the
-    smoothed level, its slope, and the eigenvalues of its Hessian. Blocks of slices are computed in parallel threads."""
-    edges = [math.sqrt(edge / min(spacing)) for edge in spacing]
-    # Gaussians are cut at 4 deviations, and each of two derivatives reads one more slice.
-    halo, depth = int(4 * (max(WIDTHS) + SMOOTH) / edges[0]) + 3, len(levels)
-    thickness = max(1, HELD // levels[0].size)
-    pairs = list(combinations_with_replacement(range(3), 2))
+    """Yield the indices (n,) of some slices at a time with their features (n, Y, X, F), float16: the level, and at each
+    width the smoothed level, its slope, and the eigenvalues of its Hessian. Blocks are computed in parallel threads.
 
-    def blur(values: np.ndarray, width: float) -> np.ndarray:
-        return ndimage.gaussian_filter(values, [max(width / edge, LEAST) for edge in edges], mode="nearest")
+    Widths are lengths, as optics blur; and where voxels are not cubes they are also numbers of voxels, as people draw.
+    """
+    lengths = np.array(spacing) / min(spacing)
+    metrics = [lengths] if np.ptp(lengths) < CUBIC else [lengths, np.ones(3)]
+    # Gaussians are cut at 4 deviations, and each of two derivatives reads one more slice.
+    halo, depth = int(4 * (max(WIDTHS) + SMOOTH)) + 3, len(levels)
+    thickness = max(1, HELD // levels[0].size)
 
     def compute_block(start: int) -> tuple[np.ndarray, np.ndarray]:
         rows, low = np.arange(start, min(start + thickness, depth)), max(start - halo, 0)
-        slab, features = levels[low : rows[-1] + halo + 1], []
-        for width in WIDTHS:
-            smooth = blur(slab, width)
-            gradient = np.gradient(blur(smooth, SMOOTH), *edges)
-            hessian = [np.gradient(gradient[i], edges[j], axis=j) for i, j in pairs]
-            slope = np.sqrt(sum(component**2 for component in gradient))
-            for values in (smooth, slope, *_eigenvalues(*hessian)):
-                features.append(values[rows - low].astype(np.float16))
+        slab = levels[low : rows[-1] + halo + 1]
+        features = [slab[rows - low].astype(np.float16)]
+        for edges, width in product(metrics, WIDTHS):
+            features += [values[rows - low].astype(np.float16) for values in _describe_at(slab, edges, width)]
         return rows, np.stack(features, axis=-1)
 
     starts, count = range(0, depth, thickness), torch.get_num_threads()
     with ThreadPoolExecutor(count) as threads:
         for k in range(0, len(starts), count):  # `map` alone would compute all blocks ahead, and hold them
             yield from threads.map(compute_block, starts[k : k + count])
+
+
+def _describe_at(levels: np.ndarray, edges: np.ndarray, width: float) -> tuple[np.ndarray, ...]:
+    """Return levels smoothed by a Gaussian, their slope, and the eigenvalues of their Hessian (Z, Y, X)."""
+    blur: Any = partial(ndimage.gaussian_filter, mode="nearest")
+    smooth = blur(levels, np.maximum(width / edges, LEAST))
+    gradient = np.gradient(blur(smooth, np.maximum(SMOOTH / edges, LEAST)), *edges)
+    pairs = combinations_with_replacement(range(3), 2)
+    hessian = [np.gradient(gradient[i], edges[j], axis=j) for i, j in pairs]
+    return smooth, np.sqrt(sum(component**2 for component in gradient)), *_eigenvalues(*hessian)
 
 
 def _eigenvalues(

@@ -32,7 +32,7 @@ from curvafit.scan.preparation import LARGEST_BOX
 from curvafit.scan.structure import add_records
 from curvafit.segmentation.filler import REACH, SLOPE, TILE, Raster, Taught, fill
 from curvafit.segmentation.flow import HALO, Working, WorkingGrid, choose_epsilon
-from curvafit.segmentation.image import find_shift, read_image
+from curvafit.segmentation.image import read_image
 from curvafit.segmentation.known import SLAB, Known, check_which, doubt_labels, doubt_places
 from curvafit.segmentation.result import Segmentation, Uncertainty, describe_filled, flow_summary
 from curvafit.segmentation.slices import (
@@ -579,10 +579,10 @@ def _read_evidence(
     levels: np.ndarray, slices: Slices, axis: int, progress: Progress
 ) -> tuple[np.ndarray | None, tuple[str, ...]]:
     """Return an image's log-odds (length, Y, X), None where they do not predict known slices, and notes on doubts."""
+    evidence, gain, shift = read_image(levels, slices, progress=progress)
     names = "zyx".replace("zyx"[axis], "")  # the axes within a slice
-    shifts = zip(find_shift(levels, slices), names, strict=True)
+    shifts = zip(shift, names, strict=True)
     doubts = tuple(SHIFTED.format(f"{voxels:+d}", name) for voxels, name in shifts if voxels)
-    evidence, gain = read_image(levels, slices, progress=progress)
     return (None, (*doubts, UNTOLD)) if gain < LEAST_GAIN else (evidence, doubts)
 
 

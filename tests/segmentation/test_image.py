@@ -10,7 +10,7 @@ from skimage import measure
 
 import curvafit.segmentation.image as room
 from curvafit.segmentation.filler import Filler, Gaps, Taught, fill
-from curvafit.segmentation.image import find_shift, read_image
+from curvafit.segmentation.image import read_image
 from curvafit.segmentation.labels import are_instances, reconstruct_labels, split_structure
 from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.teach import ImageMix, Texture, image_shape, teach
@@ -165,11 +165,22 @@ def test_cells_with_their_image_are_each_one_piece_and_better() -> None:
     assert likely[values == truth].mean() > likely[values != truth].mean() + 0.1
 
 
-@pytest.mark.parametrize("sign", [1, -1])
-def test_an_image_that_lies_off_the_slices_is_told(sign: int) -> None:
+def walls(n: int = 37) -> np.ndarray:
+    """Walls two voxels thick around cells, which no grey level tells by itself: their inside is like the outside."""
+    z, y, x = np.mgrid[:n, :n, :n]
+    centres = np.random.default_rng(0).uniform(0, n, (20, 3))
+    distances = np.sort([np.linalg.norm([z - a, y - b, x - c], axis=0) for a, b, c in centres], axis=0)
+    return distances[1] - distances[0] < 2
+
+
+@pytest.mark.parametrize("mask", [rods(), ~rods(), walls()], ids=["rods", "dark rods", "walls"])
+def test_an_image_that_lies_off_the_slices_is_told(mask: np.ndarray) -> None:
+    image, slices = photograph(mask, 0.7), known(mask)
+    assert read_image(image, slices)[2] == (0, 0)
+    assert read_image(np.roll(image, (4, -3), (1, 2)), slices)[2] == (4, -3)
+
+
+def test_an_image_of_something_else_lies_nowhere() -> None:
     mask = rods()
-    image, slices = sign * photograph(mask, 1.0), known(mask)
-    assert find_shift(image, slices) == (0, 0)
-    assert find_shift(np.roll(image, (4, -3), (1, 2)), slices) == (4, -3)
     for seed in range(5):
-        assert find_shift(photograph(np.zeros_like(mask), seed=seed), slices) == (0, 0)
+        assert read_image(photograph(np.zeros_like(mask), seed=seed), known(mask))[2] == (0, 0)
