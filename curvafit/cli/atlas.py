@@ -188,7 +188,7 @@ def teach_filler(
     """Teach the network that `reconstruct` fills volumes with. The same command resumes one that was stopped."""
     from curvafit.core.files import remove
     from curvafit.segmentation.filler import FILLER_FILE, Taught
-    from curvafit.segmentation.teach import FEW, VOLUMES, load_textures, teach
+    from curvafit.segmentation.teach import FEW, VOLUMES, image_folder, load_textures, teach
 
     if filler is not None and not images:
         raise ValueError("--filler goes with --images")
@@ -204,7 +204,8 @@ def teach_filler(
         card["command"] = command_line()
         taught = teach(sources, card, **settings, checkpoint=checkpoint, progress=progress)
     taught.save(out)
-    remove(checkpoint)
+    for path in (checkpoint, image_folder(checkpoint)):
+        remove(path)
     loss, cubic = taught.card["held_out_loss"], taught.card["held_out_cubic"]
     say(f"cross entropy of shapes held out {loss:.4f}, of the cubic interpolation {cubic:.4f}", to=error_console())
     say(str(out))

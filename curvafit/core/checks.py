@@ -67,13 +67,13 @@ def check_open_interval(value: Any, expected: str, low: float, high: float) -> f
     return number
 
 
-def as_tuple(values: Any, name: str) -> tuple[Any, ...]:
-    """Return the values of a sequence of any type but text, or raise ValueError."""
+def as_tuple(values: Any, name: str, count: int | None = None) -> tuple[Any, ...]:
+    """Return the values of a sequence of any type but text, of any length or of `count`, or raise ValueError."""
     try:
         items = None if isinstance(values, (str, bytes)) else tuple(values)
     except TypeError:
         items = None
-    if items is None:
+    if items is None or count not in (None, len(items)):
         raise ValueError(f"expected a sequence of {name}, got {quoted(values)}")
     return items
 

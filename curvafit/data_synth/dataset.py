@@ -246,9 +246,8 @@ def shell_of(u: Tensor, epsilon: float, thickness: float, *, periodic: bool = Fa
 
 def check_shape(shape: Sequence[int]) -> tuple[int, int, int]:
     """Return the voxels (z, y, x) of an image as whole numbers above 0, or raise ValueError."""
-    expected, edges = "3 whole numbers of voxels above 0 (z, y, x)", as_tuple(shape, "3 whole numbers of voxels")
-    numbers = edges if len(edges) == 3 else (None,) * 3  # None is refused, with the message of a wrong number
-    z, y, x = (check_int(n, expected, 1, MOST, of=edges) for n in numbers)
+    expected = "3 whole numbers of voxels above 0 (z, y, x)"
+    z, y, x = (check_int(n, expected, 1, MOST, of=shape) for n in as_tuple(shape, expected, 3))
     return z, y, x
 
 
@@ -260,10 +259,10 @@ def draw_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generator
 
 def check_calibres(calibres: Sequence[float]) -> tuple[float, float]:
     """Return calibres as two positive factors, the lower first, or raise ValueError."""
-    expected, pair = "calibres as two positive factors, the lower first", as_tuple(calibres, "two factors")
-    low, high = (check_float(n, expected, 1e-3, 1e3, of=pair) for n in (pair if len(pair) == 2 else (None, None)))
+    expected = "calibres as two positive factors, the lower first"
+    low, high = (check_float(n, expected, 1e-3, 1e3, of=calibres) for n in as_tuple(calibres, expected, 2))
     if low > high:
-        raise ValueError(f"expected {expected}, got {quoted(pair)}")
+        raise ValueError(f"expected {expected}, got {quoted(calibres)}")
     return low, high
 
 

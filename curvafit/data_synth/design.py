@@ -135,9 +135,9 @@ def design_box(
         raise ValueError(f"parameters are {', '.join(PARAMETERS)}, got {', '.join(sorted(unknown))}")
     box: dict[str, tuple[float, float]] = {"a20": (1.0, 1.0), **INTERVALS}
     for name, value in intervals.items():
-        pair = as_tuple([value, value] if isinstance(value, Real) else value, f"two numbers as {name}")
-        if len(pair) != 2:
-            raise ValueError(f"{name} must be a number or two of them, got {quoted(value)}")
+        pair = as_tuple(
+            [value, value] if isinstance(value, Real) else value, f"two numbers as {name}, or one number", 2
+        )
         low, high = (check_float(end, f"{name} as finite numbers", of=value) for end in pair)
         box[name] = low, high
     return Design(sampling, tuple(box[name] for name in PARAMETERS), log=log)  # type: ignore[arg-type]

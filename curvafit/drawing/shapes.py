@@ -54,10 +54,8 @@ class Output:
         object.__setattr__(self, "unit", unit)
         edge = check_float(self.voxel, "a positive voxel edge", SHORTEST, LONGEST)
         object.__setattr__(self, "voxel", edge * factor)
-        form = "3 whole repeats of at least 1 (z, y, x)"
-        tile = as_tuple(self.tile, "3 whole repeats (z, y, x)")
-        repeats = tile if len(tile) == 3 else (None,)  # None is refused, with the message of a wrong number
-        tile = tuple(check_int(n, form, 1, MOST, of=tile) for n in repeats)
+        expected = "3 whole repeats of at least 1 (z, y, x)"
+        tile = tuple(check_int(n, expected, 1, MOST, of=self.tile) for n in as_tuple(self.tile, expected, 3))
         object.__setattr__(self, "tile", tile)
 
     def shape(self, grid: Grid) -> tuple[int, ...]:

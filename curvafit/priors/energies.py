@@ -105,9 +105,9 @@ def orientation(direction: Sequence[int | float] | Tensor, strength: int | float
     symmetric `(3, 3)`, float64; a sum of orientations is an orientation too.
     """
     expected = "a direction of 3 finite numbers (z, y, x), not all 0"
-    components = [check_float(component, expected, of=direction) for component in as_tuple(direction, "3 numbers")]
+    components = [check_float(component, expected, of=direction) for component in as_tuple(direction, expected, 3)]
     θ = torch.tensor(components, dtype=torch.float64)
-    if tuple(θ.shape) != (3,) or not bool(θ.any()):
+    if not bool(θ.any()):
         raise ValueError(f"expected {expected}, got {quoted(direction)}")
     strength = check_float(strength, "a finite strength")
     _, exponent = math.frexp(float(θ.abs().max()))

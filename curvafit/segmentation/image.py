@@ -74,9 +74,8 @@ def find_shift(features: np.ndarray, inside: np.ndarray) -> tuple[int, int]:
     """Return the shift (y, x) at which features (N, Y, X, F) of an image correlate best with masks (N, Y, X) of known
     slices; (0, 0) where no other is better by the fraction `BETTER`.
 
-    The multiple correlation is cᵀ C⁻¹ c: c are the cross-correlations of masks with each feature, at all shifts at
-    once by the Fourier transform, and C is the features' covariance. A line or a wall, on which no grey level is
-    greatest or least, correlates with no feature alone.
+    The multiple correlation is cᵀ C⁻¹ c: c are the cross-correlations of masks with each feature, at all shifts at once
+    by the Fourier transform, C is the features' covariance. A wall correlates with no grey level alone, but with many.
     """
     rows = np.unique(np.linspace(0, len(inside) - 1, COMPARED).astype(int))
     masks, table = inside[rows] - inside[rows].mean(), features[rows]

@@ -46,6 +46,7 @@ from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.trials import BEYOND, Example, dice_of, gain_of, tally
 from curvafit.segmentation.uncertainty import UNSURE, best_log_odds, calibration_error, fit_temperature
 from curvafit.volumes.read import load
+from curvafit.volumes.run import open_run
 
 #: Steps of teaching, with images too, and of tuning, and the greatest rates of teaching and tuning; imaged volumes.
 STEPS, IMAGE_STEPS, TUNING, VOLUMES = 4500, 1500, 150, 160
@@ -460,7 +461,7 @@ def teach(
     steps
         By default 4500, or 1500 with images.
     checkpoint
-        A file by which a run that was stopped goes on; the caller deletes it.
+        A file by which a run that was stopped goes on, beside the `image_folder`; the caller deletes both.
     workers
         Processes that cut windows: 1, or 0 for this one.
 
@@ -483,13 +484,9 @@ def teach(
         tests = Lessons([held_out], replace(mix, partial=0.0), seed + 1, JUDGED)
         settings |= {"shapes": sum(map(len, training)), "held_out": len(held_out), "mix": asdict(mix)}
     else:
-        held_out_sources = [source[HELD_OUT - 1 :: HELD_OUT] or source for source in sources]
-        training = [[texture for k, texture in enumerate(source) if (k + 1) % HELD_OUT] for source in sources]
-        count, wholes = volumes + max(volumes // 10, 1), []
-        for number in range(count):
-            progress(f"imaging shape {number + 1} of {count}", 0.3 * number / count)
-            textures = training if number < volumes else held_out_sources
-            wholes.append(image_shape(textures, ImageMix(), (seed, number)))
+        store = None if checkpoint is None else image_folder(checkpoint)
+        step = sub_progress(progress, 0.0, 0.3)
+        wholes = _image_shapes(sources, volumes, seed, store, {"sources": card.get("sources")}, step)
         lessons, tests = WholeLessons(wholes[:volumes], steps, seed), WholeLessons(wholes[volumes:], JUDGED, seed + 1)
         settings |= {"plain": plain.card, "volumes": volumes, "mix": asdict(ImageMix())}
         progress = sub_progress(progress, 0.3, 1.0)
@@ -498,6 +495,29 @@ def teach(
     temperatures, figures, error = judge(filler, tests)
     progress("judging on shapes held out", 1.0)
     return Taught(filler, temperatures, {**card, **settings, "losses": losses, **figures}, error)
+
+
+def image_folder(checkpoint: Path) -> Path:
+    """Return the folder in which `teach` keeps imaged shapes, beside a checkpoint."""
+    return checkpoint.with_name(f"{checkpoint.name}-images")
+
+
+def _image_shapes(
+    sources: Sequence[Sequence[Texture]], volumes: int, seed: int, store: Path | None, same: dict[str, Any],
+    progress: Progress,
+) -> list[Whole]:  # fmt: skip
+    """Return so many imaged shapes that teach, and a tenth as many, of shapes held out, that judge. They are kept in a
+    folder, for a run that is stopped; `same` is what such runs have in common."""
+    held_out = [source[HELD_OUT - 1 :: HELD_OUT] or source for source in sources]
+    training = [[texture for k, texture in enumerate(source) if (k + 1) % HELD_OUT] for source in sources]
+
+    def image_number(number: int) -> dict[str, Any]:
+        return vars(image_shape(training if number < volumes else held_out, ImageMix(), (seed, number)))
+
+    same = {**same, "volumes": volumes, "seed": seed}
+    with open_run(None, store, same, progress, {"imaging shapes": 1.0}) as run:
+        records = run("imaging shapes", image_number, volumes + max(volumes // 10, 1))
+    return [Whole(row["distances"], int(row["gap"]), float(row["step"]), row["evidence"]) for row in records]
 
 
 @torch.inference_mode()

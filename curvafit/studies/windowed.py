@@ -176,10 +176,8 @@ def _check_grid(shape: Sequence[int], *sizes: int | Sequence[int]) -> tuple[tupl
     """Return the size and the stride along all axes, or raise ValueError where they do not fit the scan."""
     triples = []
     for edges in sizes:
-        triple = (edges,) * 3 if isinstance(edges, int) else as_tuple(edges, "three sizes (z, y, x)")
+        triple = (edges,) * 3 if isinstance(edges, int) else as_tuple(edges, "three sizes (z, y, x), or one size", 3)
         triples.append(tuple(check_int(n, "one size in voxels, or three", 1, 10**6, of=edges) for n in triple))
-        if len(triple) != 3:
-            raise ValueError(f"expected one size in voxels, or three (z, y, x), got {edges}")
     size, stride = triples
     for axis, n, edge, step in zip("zyx", shape, size, stride, strict=True):
         if edge > n:

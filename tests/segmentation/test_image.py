@@ -1,6 +1,8 @@
 """What an image says of a volume, a filler that weighs it, and labels that it does not tell from each other."""
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from curvafit.segmentation.filler import Filler, Gaps, Taught, fill
 from curvafit.segmentation.image import read_image
 from curvafit.segmentation.labels import are_instances, reconstruct_labels, split_structure
 from curvafit.segmentation.reconstruction import reconstruct
-from curvafit.segmentation.teach import ImageMix, Texture, image_shape, teach
+from curvafit.segmentation.teach import ImageMix, Texture, Whole, image_shape, teach
 from curvafit.segmentation.trials import dice
 from curvafit.volumes.volume import Volume
 
@@ -94,12 +96,28 @@ def test_imaged_shapes_depend_on_their_seed_alone() -> None:
 
 
 @pytest.mark.slow
-def test_teaching_with_images_makes_a_filler_for_images(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_teaching_with_images_makes_a_filler_for_images_and_goes_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr("curvafit.segmentation.teach.JUDGED", 6)
     plain = Taught(Filler(4).eval(), np.array([[2.0, 16.0], [1.0, 1.0]]), {"name": "plain"}, 0.0)
     taught = teach([[texture()]], {}, plain=plain, steps=2, volumes=2, workers=0)
     assert taught.filler.image and taught.card["plain"] == {"name": "plain"} and taught.card["volumes"] == 2
     assert set(taught.card["losses"]) and np.isfinite(taught.card["held_out_loss"])
+    imaged: list[int] = []
+
+    def image_two(textures: object, mix: ImageMix, seed: tuple[int, int]) -> Whole:
+        if len(imaged) == 2:
+            raise KeyboardInterrupt
+        imaged.append(seed[1])
+        return image_shape(textures, mix, seed)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("curvafit.segmentation.teach.image_shape", image_two)
+    options: dict[str, Any] = {"plain": plain, "steps": 2, "volumes": 2, "workers": 0, "checkpoint": tmp_path / "steps"}
+    with pytest.raises(KeyboardInterrupt):
+        teach([[texture()]], {}, **options)
+    imaged[:] = imaged[1:]
+    assert teach([[texture()]], {}, **options).card["losses"] == taught.card["losses"] and imaged == [1, 2]
 
 
 def cells() -> np.ndarray:

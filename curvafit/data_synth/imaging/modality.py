@@ -52,10 +52,8 @@ def _number(name: str, value: Any, annotation: Any, allowed: Range) -> Any:
         return None
     if annotation is not Triple:
         return check_float(value, f"{name} as {expected}", least, most)
-    values = as_tuple(value, f"3 numbers for {name}")
-    values = values if len(values) == 3 else (None,)  # None is refused, with the message of a wrong number
     expected = f"{name} as 3 numbers (z, y, x), each {expected}"
-    return tuple(check_float(number, expected, least, most, of=value) for number in values)
+    return tuple(check_float(number, expected, least, most, of=value) for number in as_tuple(value, expected, 3))
 
 
 @dataclass(frozen=True)
