@@ -89,7 +89,7 @@ def _check_inputs(values: Mapping[str, Any]) -> None:
     from curvafit.priors.published import PUBLISHED
 
     for parameter, option in _LAWS.items():
-        text = values.get(parameter)
+        text = values.get(parameter)  # laws between commas, or a file, which may have a comma in its name
         for law in [] if text is None or text.endswith(".json") else text.split(","):
             if simplify_name(law) not in PUBLISHED and not law.endswith(".json") and not os.path.isfile(str(text)):
                 presets = ", ".join(PUBLISHED)

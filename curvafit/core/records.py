@@ -149,7 +149,7 @@ class Format:
         """Return the names of the files written together with `target`, from its record `sibling(target, ".json")`.
 
         Returns none if the record is missing, is of another format, or does not list `target`. Files that were changed
-        after they were written are left out.
+        after they were written are left out; what is no file has no such time, and stays.
         """
         record = sibling(target, ".json")
         header = _read_header(record)

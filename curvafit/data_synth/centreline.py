@@ -221,7 +221,7 @@ def _dissolve(graph: nx.MultiGraph, node: int) -> None:
     if graph.degree(node) != 2 or len(edges) != 2 or graph.nodes[node]["rings"]:
         return
     (_, one, first), (_, other, second) = edges
-    first = first if node > one else first[::-1]  # towards the node
+    first = first if node > one else first[::-1]  # towards the node; lines run from the lower to the higher one
     second = second if node < other else second[::-1]  # away from it
     graph.remove_node(node)
     _add_edge(graph, one, other, np.concatenate([first[:-1], second]))

@@ -363,8 +363,9 @@ class TextureDataset(IterableDataset):
         self.normalise = normalise
         paths = [Path(item) for item in sources if isinstance(item, (str, PathLike))]
         from_stores = len(paths) == len(sources) and all(path.is_dir() or path.suffix == ".zarr" for path in paths)
-        edge = None if voxel is None else check_float(voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
-        self.voxels = [edge or choose_voxel([] if from_stores else sources, kind) for kind in self.modalities]
+        chosen = None if voxel is None else check_float(voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
+        self.voxels = [chosen or choose_voxel([] if from_stores else sources, kind) for kind in self.modalities]
+        # An image takes most of a shape at the thinnest calibre, where a shape's voxel is smallest.
         thinnest = [(kind, edge * self.calibres[0]) for kind, edge in zip(self.modalities, self.voxels, strict=True)]
         if from_stores:
             if volume_fraction is not None:
@@ -373,11 +374,11 @@ class TextureDataset(IterableDataset):
         else:
             generated = Generated.of(sources, volume_fraction)
             check_int(shapes, "a pool of at least 1 shape", 1, 4096)
-            largest = max(max(field_shape(self.size, voxel, kind.base)) for kind, voxel in thinnest)
+            largest = max(max(field_shape(self.size, edge, kind.base)) for kind, edge in thinnest)
             self.source = Pool(generated, max(shapes, len(generated.points)), 8 * math.ceil(largest / 8))
-        for kind, voxel in thinnest:
-            check_crop(self.source.edge, self.size, voxel, kind)
-        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+        for kind, edge in thinnest:
+            check_crop(self.source.edge, self.size, edge, kind)
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # with a loader's workers
 
     def __repr__(self) -> str:
         kinds, size = ", ".join(kind.name for kind in self.modalities), " x ".join(map(str, self.size))

@@ -119,7 +119,8 @@ def _colours(field: np.ndarray, camera: View, size: tuple[int, int]) -> np.ndarr
     at_vertices = np.zeros(len(vertices), np.float32)
     at_vertices[visible] = _surface_brightness(field, camera, vertices, faces, vertices[visible])
     brightness = np.einsum("pk,pk->p", at_vertices[corners], weights)
-    # A face whose corners all lie on one side of the box is a cap, whose normal is that of the side.
+    # A face whose corners all lie on one side of the box is a cap, with the normal of the side. Of the three sides that
+    # face the camera, these are the normals' cosines with the eye and with the light.
     on_side = ((vertices == 0) | (vertices == extent))[faces].all(axis=1)
     capped = on_side.any(axis=1)[face]
     eye, key_light = np.abs(camera.frame[2]), np.sign(camera.frame[2]) * _light_direction(camera)

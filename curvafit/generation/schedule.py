@@ -75,7 +75,8 @@ class Schedule:
         phases = tuple(Phase(**phase) if isinstance(phase, dict) else phase for phase in opening)
         for phase in phases:
             check_type(phase, Phase, "an opening of phases as Phase")
-        check_open_interval(sum(phase.share for phase in phases), "phases with shares below 1 in all", -1, 1)
+        total = sum(phase.share for phase in phases)  # 0 where there is no opening
+        check_open_interval(total, "phases with shares below 1 in all", -1, 1)
         object.__setattr__(self, "opening", phases)
 
     def check_step(self, step: int) -> int:

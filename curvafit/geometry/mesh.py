@@ -180,7 +180,7 @@ def _stl(mesh: Surface, remark: str, _: Data) -> bytes:
     record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     triangles = np.zeros(len(mesh.faces), dtype=record)
     triangles["normal"] = vectors / np.where(lengths > 0, lengths, 1)
-    triangles["corners"] = mesh.vertices[mesh.faces][:, :, ::-1]
+    triangles["corners"] = mesh.vertices[mesh.faces][:, :, ::-1]  # z, y, x, unlike the area vectors
     return remark.encode().ljust(80) + np.uint32(len(triangles)).astype("<u4").tobytes() + triangles.tobytes()
 
 

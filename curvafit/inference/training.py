@@ -288,8 +288,9 @@ def learn(
     network: Network, rows: tuple[Tensor, Tensor], validation: Tensor,
     cost: Callable[[Network, Tensor, Tensor], Tensor], plan: Plan, report: Callable[[int, float], object],
 ) -> Network:  # fmt: skip
-    """Fit a network by AdamW to the rows (inputs, targets) outside `validation`, and return it as it was where those
-    within cost least; `report` is called with the number of each epoch, from 1, and the least cost so far."""
+    """Fit a network by AdamW to the rows (inputs, targets) outside `validation`. Return it with its weights after the
+    epoch in which the rows of `validation` cost least; `report` is called with the number of each epoch, from 1, and
+    the least cost so far."""
     optimiser = torch.optim.AdamW(network.parameters(), lr=plan.rate, weight_decay=plan.decay)
     scheduler = torch.optim.lr_scheduler.ReduceLROnPlateau(optimiser, factor=0.5, patience=plan.patience // 3)
     x, y = (column[~validation] for column in rows)

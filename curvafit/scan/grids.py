@@ -138,7 +138,7 @@ def profile_mask(mask: np.ndarray) -> np.ndarray:
     np.multiply(blurred, 2, out=distance)
     distance -= gaussian_blur(blurred, voxels, STAIRS)
     error = blurred  # its memory is used again
-    for _ in range(SWEEPS):
+    for _ in range(SWEEPS):  # until no smoothed distance has a sign that is not the mask's
         if not _fill_errors(distance, mask, error):
             break
         distance -= np.float32(PULL) * gaussian_blur(error, voxels, PULL_WIDTH)

@@ -149,7 +149,8 @@ def _measure_white_noise(levels: np.ndarray) -> float:
 
 
 def _smoothing_factor(grain: float, spacing: Sequence[float]) -> float:
-    """Return the factor by which smoothing by a voxel of the finest axis lowers the deviation of noise of a grain."""
+    """Return the factor by which smoothing by a voxel of the finest axis lowers the deviation of noise, which is white
+    noise that was smoothed by `grain` such voxels."""
     # White noise that is filtered has a deviation proportional to the norm of the filter's response to an impulse.
     impulse, factor = np.eye(1, 65, 32)[0], 1.0
     for edge in spacing:

@@ -136,7 +136,7 @@ def find_levels(structure: Structure, box: Box, periodic: bool = False) -> np.nd
         smooth = smooth[within(box, around)]
         signed = structure.level - smooth if structure.dark else smooth - structure.level
         if padding is not None and padding.sure:
-            signed[np.isnan(signed)] = -padding.deviation  # padding is background
+            signed[np.isnan(signed)] = -padding.deviation  # background; padding that is doubted stays NaN
         return signed
     values = structure.read(box)
     if structure.kind == "field":

@@ -436,7 +436,7 @@ def _bin(plan: Plan, diagram: Diagram, kept: np.ndarray, part: str) -> Record:
     """Return the bins of a part's points: for each its two indices ("bins"), and the area times 1, κ1, κ2 and κ1² + κ2²
     ("areas"); and an estimate of the part's area whose curvature is not resolved ("lost")."""
     points, weights = diagram.points[kept], diagram.weights[kept]
-    width = _BIN * BIN_WIDTH * WORKING_SPACING / plan.edge
+    width = _BIN * BIN_WIDTH * WORKING_SPACING / plan.edge  # a part of a diagram's bin, in working units, in 1 / length
     bins = np.floor(points / width).astype(np.int64)
     first = bins.min(0, initial=0)
     columns = int(bins[:, 1].max(initial=0) - first[1]) + 1

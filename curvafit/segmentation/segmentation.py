@@ -323,7 +323,7 @@ def calibrate(
         progress("trying the prior out", min(count / expected, 1.0))
         try:
             return lower_volume(EvidenceProblem(trial, evidence), grid, tiles).mask
-        except ScanError:  # the energy does not stay finite
+        except ScanError:  # the energy does not stay finite: the trial scores as an empty mask
             return np.zeros(part.shape, dtype=bool)
 
     task = Task(probability_evidence(part), inside[box], range(part.shape[0]))

@@ -95,7 +95,8 @@ class Texture:
 
     def cut(self, rng: np.random.Generator, axes: Sequence[np.ndarray], thickness: float, mix: Mix) -> np.ndarray:
         """Cut a window, bool (Z, Y, X), anywhere in the shape, turned and stretched at random. `axes` are the positions
-        of its voxels along three axes, and `thickness` that of its structures in the same unit."""
+        of its voxels along three axes; its structures get the `thickness`, in the same unit. A shape that ends is
+        turned by right angles alone: beyond its ends it is a mirror image."""
         voxels_per_unit = self.thickness / thickness
         if rng.random() < mix.upright or not self.periodic:
             rotation = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)[:, None]
@@ -556,7 +557,7 @@ def near_error(logits: Tensor, truth: Tensor) -> float:
 
 def tune(taught: Taught, example: Example, progress: Progress = silent) -> Taught:
     """Train a filler further on an example's lesson, for a minute, and return it if it gains more than the noise on the
-    task, else the filler as it was; either is calibrated on the task."""
+    task, which is another part of the example, else the filler as it was; either is calibrated on the task."""
     task, places = example.task, list(example.task.places)
     tuned, lessons = replace(taught, filler=copy.deepcopy(taught.filler)), WholeLessons([Whole.of(example)], TUNING)
     step: Progress = lambda _, done: progress("tuning on the example", done)  # noqa: E731
@@ -572,7 +573,7 @@ def tune(taught: Taught, example: Example, progress: Progress = silent) -> Taugh
     scores = f"Dice {dice_before:.3f} on a part of the example, {dice_after:.3f} tuned on the rest"
     return replace(
         tuned if better else taught,
-        temperatures=taught.temperatures * [[1.0], [temperature]],
+        temperatures=taught.temperatures * [[1.0], [temperature]],  # rows: gaps, and the temperature of each
         error=near_error(logits / temperature, truth),
         status=f"filled by the network{', tuned on the example' if better else ''} ({scores})",
     )

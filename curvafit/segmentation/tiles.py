@@ -44,13 +44,13 @@ def cut_tiles(grid: WorkingGrid, shape: Sequence[int], edge: int | None = None) 
 
 
 def surround(tile: Box, grid: WorkingGrid, shape: Sequence[int]) -> tuple[Box, WorkingGrid]:
-    """Return the box in which the energy of a tile is lowered, and its working grid, in a volume of a shape on `grid`.
-    The box is the tile with its overlap; in a periodic volume it may go beyond the ends."""
+    """Return the box in which the energy of a tile is lowered, and its working grid, in a volume of `shape` voxels of
+    `grid.times` working voxels each. The box is the tile with its overlap; in a periodic volume it may leave the ends."""
     if all(edge.stop - edge.start == n for edge, n in zip(tile, shape, strict=True)):
         return tile, grid
     box, ends = [], []
     for edge, n, times in zip(tile, shape, grid.times, strict=True):
-        overlap = -(-OVERLAP // times)  # rounded up
+        overlap = -(-OVERLAP // times)  # in voxels, rounded up
         start, stop = edge.start - overlap, edge.stop + overlap
         at_start, at_end = start <= 0 and not grid.grid.periodic, stop >= n and not grid.grid.periodic
         box.append(slice(0 if at_start else start, n if at_end else stop))

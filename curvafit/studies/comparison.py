@@ -389,7 +389,8 @@ def _compare_numbers(
     scan: Measures, values: np.ndarray, errors: np.ndarray, labels: np.ndarray, arrangements: np.ndarray,
     blocks: np.ndarray | None,
 ) -> tuple[Number, ...]:  # fmt: skip
-    """Test each quantity of subjects' values (S, K); `scan` has the quantities' names."""
+    """Test each quantity of subjects' values (S, K); `scan` has the quantities' names, and the first of the
+    `arrangements` is that of the labels as they are."""
     finite = np.asarray(np.isfinite(values).all(0))
     p, family, holm, discovery = np.full((4, len(finite)), np.nan)
     p[finite] = permutation.share_beyond(permutation.correlate(values[:, finite], arrangements, blocks))
@@ -398,9 +399,9 @@ def _compare_numbers(
     numbers, p_values = [], np.stack([p, family, holm, discovery], axis=1).tolist()
     for quantity, column, error, tests in zip(scan.quantities, values.T, errors.T, p_values, strict=True):
         means, deviations, difference, effect, variance = _measure_change(column, labels, arrangements[0], blocks)
-        known = float((error**2).mean() / variance) if variance > 0 else math.nan
+        error_share = float((error**2).mean() / variance) if variance > 0 else math.nan
         names = quantity.name, quantity.symbol, quantity.power
-        numbers.append(Number(*names, means, deviations, difference, *effect, *tests, known))  # type: ignore[call-arg]
+        numbers.append(Number(*names, means, deviations, difference, *effect, *tests, error_share))  # type: ignore[call-arg]
     return tuple(numbers)
 
 

@@ -301,7 +301,7 @@ def measure_scans(
     settings = options | reading
     measured: dict[int, Any] = {k: (case.source,) for k, case in enumerate(cases) if isinstance(case.source, Measures)}
     tasks: dict[int, Task] = {
-        k: partial(_measure_one, case.source, case.name, False, settings)
+        k: partial(_measure_one, case.source, case.name, False, settings)  # no labels
         for k, case in enumerate(cases)
         if k not in measured
     }

@@ -361,10 +361,9 @@ def _make_constants(weights: list, grid: Grid) -> np.ndarray:
 
 
 def _join_weights(weights: list, block: int, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Return `local` and `table` of `loops._differentiate`: all weights in one array; their offsets and if they vary.
-
-    A weight is a flat volume where it varies, else one vector. After them come the signs of x in a block of rows, -1
-    where x is mirrored.
+    """Return `local` and `table` of `loops._differentiate`: all weights in one array, and for each a row of its offset
+    and whether it varies. A weight is a flat volume where it varies, else `WIDE` equal numbers, a vector. After them
+    come the signs of x in a block of rows, -1 where x is mirrored.
     """
     arrays, varies = [], [np.ndim(value) > 0 for value in weights]
     for value, varying in zip(weights, varies, strict=True):
