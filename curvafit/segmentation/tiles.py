@@ -45,7 +45,7 @@ def cut_tiles(grid: WorkingGrid, shape: Sequence[int], edge: int | None = None) 
 
 def surround(tile: Box, grid: WorkingGrid, shape: Sequence[int]) -> tuple[Box, WorkingGrid]:
     """Return the box in which the energy of a tile is lowered, and its working grid, in a volume of `shape` voxels of
-    `grid.times` working voxels each. The box is the tile with its overlap; in a periodic volume it may leave the ends."""
+    `grid.times` working voxels each. The box is the tile with its overlap; in a periodic volume it may go beyond."""
     if all(edge.stop - edge.start == n for edge, n in zip(tile, shape, strict=True)):
         return tile, grid
     box, ends = [], []
