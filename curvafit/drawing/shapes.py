@@ -157,8 +157,8 @@ def shape_record(
 ) -> dict[str, Any]:
     """Return what is needed to make a shape again (parameters, sampling, seed, schedule, versions), and its status.
 
-    By default the mass is the flow's, which is that of the field to float32. A parameter that varies in space is
-    recorded as its least and its greatest value.
+    By default the mass is that of the flow, the mean of its field. A parameter that varies in space is recorded as its
+    least and its greatest value.
     """
     return {
         "format": FORMAT.name,

@@ -373,14 +373,15 @@ def _measure_curvature(plan: Plan, core: Box, sums: _Sums) -> Record:
         smallest, cut = smallest_piece(plan.thickness / plan.edge), _cut_out(working_core, box, plan.working)
         cleaned, *specks = remove_specks(mask, smallest, False, cut)
         record |= {"specks": np.array(specks), "changed": np.count_nonzero((cleaned != mask)[inner])}
-        mask, values = cleaned, values[:0]  # frees the levels: the profile of the mask takes over
+        mask, values = cleaned, np.empty(0)  # frees the levels: the profile of the mask takes over
         del cleaned
     record["filled"] = np.count_nonzero(mask[inner])
     bounds = [(MARGIN, n - 1 - MARGIN) for n in plan.working]  # of the cells that are measured at all
     cells = [(max(e.start, low), min(e.stop, high)) for e, (low, high) in zip(working_core, bounds, strict=True)]
     if any(start >= stop for start, stop in cells) or mask.all() or not mask.any():
         return record
-    # A grid has at least three cells along an axis: a thin core takes neighbours along, whose triangles are not kept.
+    # A grid has at least three cells along an axis: a thin core takes neighbours along, whose triangles are not kept;
+    # along other axes all triangles are the core's, also those on its end.
     stops = [min(max(stop, start + 3), high) for (start, stop), (_, high) in zip(cells, bounds, strict=True)]
     wide = [(max(min(start, stop - 3), MARGIN), stop) for (start, _), stop in zip(cells, stops, strict=True)]
     window: Box = tuple(slice(start - MARGIN, stop + MARGIN + 1) for start, stop in wide)  # type: ignore[assignment]
