@@ -54,7 +54,7 @@ def read_image(
     progress("learning from the image", 0.2)
     if all(half.any() and not half.all() for half in (known[::2], known[1::2])):
         slope, constant, gain = _hold_out(features, known)
-        shift = find_shift(features, known)
+        shift = _find_shift(features, known)
         if shift != (0, 0):
             moved = np.roll(features, [-voxels for voxels in shift], (1, 2))
             shift = shift if _hold_out(moved, known)[2] > max(gain, CLEAR) else (0, 0)
@@ -70,7 +70,7 @@ def read_image(
     return evidence, gain, shift
 
 
-def find_shift(features: np.ndarray, inside: np.ndarray) -> tuple[int, int]:
+def _find_shift(features: np.ndarray, inside: np.ndarray) -> tuple[int, int]:
     """Return the shift (y, x) at which features (N, Y, X, F) of an image correlate best with masks (N, Y, X) of known
     slices; (0, 0) where no other is better by the fraction `BETTER`.
 
