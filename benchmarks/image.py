@@ -4,8 +4,8 @@ Needs $CURVAFIT_DATA, and scikit-learn. All ways know the same slices, and the i
 
 - `ours`: `reconstruct(image=…)`; `alone`: without the image; `trees`: its reading of the image, at the threshold of
   the greatest expected Dice.
-- `forest`: a random forest of 60 trees on smoothed levels, edges and Hessian eigenvalues, as ilastik has them, at the
-  threshold that is best in hindsight.
+- `forest`: a random forest on smoothed levels, edges and Hessian eigenvalues, as ilastik has them: the best in hindsight
+  of `FORESTS` and of thresholds.
 
 Dice counts unknown slices alone. Intervals: a jackknife over slabs between slices times 32² pixels. VesselExpress, the
 membranes and Poon's first half chose features and trees, and shapes the mix; on the second half and bone none chose.
@@ -35,6 +35,8 @@ from curvafit.volumes.volume import Volume
 
 WAYS = ("ours", "alone", "trees", "forest")
 EVERY = 8
+#: The number of trees of a forest, the least samples of a leaf, and its widest Gaussian.
+FORESTS = ((60, 3, 6.0), (300, 1, 6.0), (300, 3, 16.0))
 #: Thresholds of the forest.
 THRESHOLDS = np.linspace(0.2, 0.6, 17)
 
@@ -78,17 +80,18 @@ def read(name: str) -> tuple[Volume, Volume]:
     return Volume(grey, mask.spacing, mask.unit), mask
 
 
-def forest(grey: np.ndarray, truth: np.ndarray, places: list[int]) -> np.ndarray:
+def forest(grey: np.ndarray, truth: np.ndarray, places: list[int], trees: int, leaf: int, widest: float) -> np.ndarray:
     """Return the probabilities of a random forest that learns from the known slices."""
     from skimage.feature import multiscale_basic_features
     from sklearn.ensemble import RandomForestClassifier
 
-    features = multiscale_basic_features(grey, sigma_min=0.7, sigma_max=6.0, workers=1)
+    features = multiscale_basic_features(grey, sigma_min=0.7, sigma_max=widest, workers=1)
     random = np.random.default_rng(0)
     table, inside = features[places].reshape(-1, features.shape[-1]), truth[places].ravel()
     rows = random.permutation(len(table))[:200_000]
-    trees = RandomForestClassifier(60, min_samples_leaf=3, n_jobs=-1, random_state=0).fit(table[rows], inside[rows])
-    return np.stack([trees.predict_proba(each.reshape(-1, each.shape[-1]))[:, 1] for each in features]).reshape(
+    learner = RandomForestClassifier(trees, min_samples_leaf=leaf, n_jobs=-1, random_state=0)
+    learner.fit(table[rows], inside[rows])
+    return np.stack([learner.predict_proba(each.reshape(-1, each.shape[-1]))[:, 1] for each in features]).reshape(
         grey.shape
     )
 
@@ -105,8 +108,11 @@ def case(name: str, way: str) -> Values:
         inside, likely = (np.moveaxis(each.values, axis, 0) for each in (found.mask, found.probability))
         inside, status = inside > 0, found.status
     elif way == "forest":
-        likely = forest(grey, truth, places)
-        inside = likely > max(THRESHOLDS, key=lambda least: dice(likely[unknown] > least, truth[unknown]))
+        forests = (forest(grey, truth, places, *settings) for settings in FORESTS)
+        likely, least = max(
+            product(forests, THRESHOLDS), key=lambda pair: dice(pair[0][unknown] > pair[1], truth[unknown])
+        )
+        inside = likely > least
     else:
         edges = (mask.spacing[axis], *(h for k, h in enumerate(mask.spacing) if k != axis))
         logits = read_image(grey, Slices(truth[places], tuple(places), len(truth), edges, mask.unit))[0]
