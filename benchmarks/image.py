@@ -4,8 +4,8 @@ Needs $CURVAFIT_DATA, and scikit-learn. All ways know the same slices, and the i
 
 - `ours`: `reconstruct(image=…)`; `alone`: without the image; `trees`: its reading of the image, at the threshold of
   the greatest expected Dice.
-- `forest`: a random forest on smoothed levels, edges and Hessian eigenvalues, as ilastik has them: the best in hindsight
-  of `FORESTS` and of thresholds.
+- `forest`: a random forest on smoothed levels, edges and Hessian eigenvalues, as ilastik has them: of `FORESTS` and of
+  thresholds the best in hindsight.
 
 Dice counts unknown slices alone. Intervals: a jackknife over slabs between slices times 32² pixels. VesselExpress, the
 membranes and Poon's first half chose features and trees, and shapes the mix; on the second half and bone none chose.

@@ -172,15 +172,19 @@ def train_atlas(
 
 
 @command(
-    "curvafit atlas teach store.zarr -o filler.npz",
-    "curvafit atlas teach presets.zarr box.zarr corner.zarr -o filler.npz",
-    "curvafit atlas teach presets.zarr box.zarr corner.zarr --images 160 -o image.npz",
+    "curvafit atlas teach mixed -o filler.npz",
+    "curvafit atlas teach mixed store.zarr --filler filler.npz -o more.npz",
+    "curvafit atlas teach mixed store.zarr --images 160 -o image.npz",
 )
 def teach_filler(
-    stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, or masks.")],
+    stores: Annotated[
+        list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, masks, or `mixed`: textures of no law.")
+    ],
     out: Annotated[Path, typer.Option("-o", "--output", help="The weights (.npz) to write.")],
     images: Annotated[int, typer.Option(help="Teach for `reconstruct --image`, from so many shapes.", min=0)] = 0,
-    filler: Annotated[Path | None, typer.Option(help="With --images: filler to begin with, else the packaged.")] = None,
+    filler: Annotated[
+        Path | None, typer.Option(help="Filler to begin with; else a new one; with --images the packaged.")
+    ] = None,
     steps: Annotated[int | None, typer.Option(help="Steps, by default 4500; 1500 with --images.", min=1)] = None,
     seed: Annotated[int, typer.Option(help="Seed of the teaching.")] = 0,
     overwrite: OverwriteOption = False,
@@ -188,19 +192,17 @@ def teach_filler(
     """Teach the network that `reconstruct` fills volumes with. The same command resumes one that was stopped."""
     from curvafit.core.files import remove
     from curvafit.segmentation.filler import FILLER_FILE, Taught
-    from curvafit.segmentation.teach import FEW, VOLUMES, image_folder, load_textures, teach
+    from curvafit.segmentation.teach import FEW, image_folder, load_textures, teach
 
-    if filler is not None and not images:
-        raise ValueError("--filler goes with --images")
     _check_archive(out, FILLER_FILE, stores if filler is None else [*stores, filler], overwrite)
     checkpoint = out.with_name(f".{out.name}.curvafit-steps")
     with resumable(), show_stages() as progress:
         # With images, a filler that was taught on masks alone learns to use them.
-        plain = Taught.load(filler) if images else None
+        first = Taught.load(filler) if images or filler else None
         sources, card = load_textures(stores, progress)
         if (count := sum(map(len, sources))) < FEW:
             say_notes([f"{count} shapes teach little: {FEW} or more are better"])
-        settings = {"plain": plain, "volumes": images or VOLUMES, "steps": steps, "seed": seed}
+        settings = {"first": first, "volumes": images, "steps": steps, "seed": seed}
         card["command"] = command_line()
         taught = teach(sources, card, **settings, checkpoint=checkpoint, progress=progress)
     taught.save(out)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -97,12 +96,6 @@ def generate(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make a shape from parameters, with a record (.json) and a picture (.png) beside it."""
-    from curvafit.generation.slabs import count_processes, serve
-
-    rank, _ = count_processes()
-    if rank != 0:  # torchrun started several processes: the first runs the command, the others help it
-        serve()
-        return
     from curvafit.drawing.shapes import Output, check_target, shape_record
     from curvafit.generation.flow import Execution
     from curvafit.generation.schedule import choose_schedule
@@ -200,17 +193,13 @@ def _grow(options: dict[str, Any]) -> Flow:
     """Run the flow with progress; exit with code 1 where it failed or has no surface."""
     from curvafit.generation.flow import generate as make
     from curvafit.generation.result import Watch
-    from curvafit.generation.slabs import count_processes, lead
 
     checkpoint = options["execution"].checkpoint
-    _, processes = count_processes()
-    if processes > 1:
-        options["execution"] = replace(options["execution"], backend="slabs")
 
     def resume_command() -> str:
         return "the same command" if checkpoint is not None and checkpoint.exists() else ""
 
-    with resumable(resume_command), show_stages() as progress, lead() if processes > 1 else nullcontext():
+    with resumable(resume_command), show_stages() as progress:
         progress("starting (a first run compiles the kernels for this processor)", 0.0)
         watch = Watch(callbacks=[lambda step, total, _: progress("growing", step / total)])
         flow = make(**options, watch=watch)

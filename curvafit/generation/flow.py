@@ -16,7 +16,6 @@ from curvafit.generation.problem import FORMS, Blur, Cost, Data, DivergenceForm,
 from curvafit.generation.result import Flow, Watch
 from curvafit.generation.schedule import Schedule, choose_schedule
 from curvafit.generation.schedule import schedule as named_schedule
-from curvafit.generation.slabs import SlabStepper
 from curvafit.generation.stepper import FusedStepper, LbfgsStepper, Stepper, TorchStepper
 from curvafit.priors import kernels, stencils
 from curvafit.priors.grid import WORKING_EPSILON, Bool, Float, Grid
@@ -25,7 +24,7 @@ from curvafit.priors.law import Law, LawLike
 #: Standard deviation of the published blur, in working units (two voxels).
 WORKING_BLUR = 0.02
 #: The ways to run a flow: see `Execution`.
-Backend = Literal["auto", "torch", "fused", "slabs"]
+Backend = Literal["auto", "torch", "fused"]
 BACKENDS = get_args(Backend)
 
 
@@ -37,7 +36,7 @@ class Execution:
     ----------
     backend
         `"auto"` takes the fused step on processors and plain torch elsewhere; `"torch"` and `"fused"` take only that
-        step. `"slabs"` is the fused step over the processes of `slabs.lead`.
+        step.
     device
         Where torch runs, such as `"cpu"` or `"cuda"`.
     checkpoint, checkpoint_every
@@ -241,10 +240,6 @@ def _make_stepper(
     has_kernel, plain = kernels.has_kernel(device), execution.backend == "torch"
     if execution.backend == "fused" and not has_kernel:
         raise ValueError(f"the device {device} has no fused step: take backend='torch', or the device 'cpu'")
-    if execution.backend == "slabs":
-        if not has_kernel or not isinstance(form, DivergenceForm) or method != "adam" or frozen is not None:
-            raise ValueError("slabs are for a flow of `generate` on processors: leave the backend out")
-        return SlabStepper(start, form, cost, betas)
     if method == "adam" and cost.data is None and not plain and has_kernel and isinstance(form, DivergenceForm):
         return FusedStepper(start, form, cost, betas, frozen)
     stepper = LbfgsStepper if method == "lbfgs" else TorchStepper
@@ -259,9 +254,7 @@ def _open_checkpoint(
         return None
     settings = {**vars(options.cost), "schedule": options.plan, "volume_fraction": options.volume_fraction, **start}
     settings |= {"snapshots": [*options.watch.snapshots], "device": execution.device}
-    # Slabs have the names of one process's flow, as either resumes what the other saved.
-    name = FusedStepper.__name__ if isinstance(stepper, SlabStepper) else type(stepper).__name__
-    settings |= {"stepper": name, "backend": execution.backend.replace("slabs", "auto")}
+    settings |= {"stepper": type(stepper).__name__, "backend": execution.backend}
     return Checkpoint(execution.checkpoint, execution.checkpoint_every, identity(**settings), execution.keep_checkpoint)
 
 

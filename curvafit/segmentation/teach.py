@@ -28,6 +28,7 @@ from curvafit.core.checks import check_int, check_seed
 from curvafit.core.files import write_atomically
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.data_synth.store import find_well_formed
+from curvafit.data_synth.textures import KINDS
 from curvafit.scan.grids import centre_distance
 from curvafit.segmentation.filler import (
     FAR,
@@ -48,15 +49,19 @@ from curvafit.segmentation.uncertainty import UNSURE, best_log_odds, calibration
 from curvafit.volumes.read import load
 from curvafit.volumes.run import open_run
 
-#: Steps of teaching, with images too, and of tuning, and the greatest rates of teaching and tuning; imaged volumes.
-STEPS, IMAGE_STEPS, TUNING, VOLUMES = 4500, 1500, 150, 160
+#: Steps of teaching, with images too, and of tuning, and the greatest rates of teaching and tuning.
+STEPS, IMAGE_STEPS, TUNING = 4500, 1500, 150
 RATE, TUNING_RATE = 2e-3, 5e-4
 #: Largest norm of a step's gradient.
 STEEPEST = 1.0
+#: Whether convolutions are taught in bfloat16: where the processor multiplies matrices in it, that takes half the time.
+HALF = getattr(torch.cpu, "get_capabilities", dict)().get("amx_bf16", False)
 #: Steps between two checkpoints.
 SAVED = 100
 #: Shares of a volume between which a shape teaches, and the number of shapes below which they teach little.
 FILLED, FEW = (0.02, 0.75), 200
+#: The source that is no file: `TEXTURES` of each of `textures.KINDS`.
+MIXED, TEXTURES = "mixed", 90
 #: Voxels of an imaged shape along a slice, at most but for the thinnest structures, and shares as `FILLED` of it.
 FINEST, IMAGED = 160, (0.01, 0.9)
 #: The largest gap, in thicknesses of a structure, that can be learnt.
@@ -116,7 +121,7 @@ class Mix:
     pixel apart (`coarse`), no known slice beyond an end of the gap (`ends`), structures of two shapes (`pairs`), inside
     and outside swapped (`holes`), outlines as a person draws them (`trembling`), voxels known between (`partial`)."""
 
-    thickness: tuple[float, float] = (3.0, 14.0)
+    thickness: tuple[float, float] = (3.0, 24.0)
     gap: tuple[float, float] = (2.0, 20.0)
     most: int = 15
     upright: float = 0.6
@@ -141,7 +146,9 @@ class Batches(Dataset, ABC):
     def loss(self, network: nn.Module, lesson: Lesson) -> Tensor:
         """Return the loss of a network on a batch."""
         *inputs, truth = lesson
-        return F.binary_cross_entropy_with_logits(network(Gaps(*inputs))[self.inner], truth[self.inner])  # type: ignore[arg-type,index]
+        with torch.autocast("cpu", torch.bfloat16, enabled=HALF):
+            logits = network(Gaps(*inputs))[self.inner]  # type: ignore[arg-type]
+        return F.binary_cross_entropy_with_logits(logits.float(), truth[self.inner])  # type: ignore[index]
 
     @property
     def inner(self) -> tuple[Any, ...]:
@@ -158,7 +165,7 @@ class Lessons(Batches):
     mix: Mix
     seed: int
     length: int
-    size: int = 3
+    size: int = 8
     edge: int = 80
     halo: int = HALO
 
@@ -245,11 +252,15 @@ def load_textures(
     sources: Sequence[str | Path], progress: Progress = silent
 ) -> tuple[list[list[Texture]], dict[str, Any]]:
     """Load the shapes of stores and mask files that can teach, one list for each source, and a card that describes
-    them. All well-formed shapes of a store are periodic, a mask is not; those that fill between `FILLED` are taken.
-    Raises ValueError and FileNotFoundError as `open_store` and `load`."""
+    them; `MIXED` is a source for each of `KINDS`. All well-formed shapes of a store are periodic, a mask is not; those
+    that fill between `FILLED` are taken. Raises ValueError and FileNotFoundError as `open_store` and `load`."""
     textures, origins = [], []
-    for number, source in enumerate(map(Path, sources)):
-        if (source / "draws").is_dir():
+    named = [each for source in map(str, sources) for each in (KINDS if source == MIXED else (source,))]
+    for number, source in enumerate(map(Path, named)):
+        if (kind := str(source)) in KINDS:
+            shapes = [Texture(KINDS[kind](np.random.default_rng([*kind.encode(), k]))) for k in range(TEXTURES)]
+            origin = {"seeds": TEXTURES}
+        elif (source / "draws").is_dir():
             draws = find_well_formed((source,))
             shapes = [Texture(store.field(index)) for store, index in draws]
             settings = draws[0][0].settings
@@ -263,7 +274,7 @@ def load_textures(
             raise ValueError(f"{source} has no shape that can teach")
         textures.append(shapes)
         origins.append({"source": source.name, "shapes": len(shapes), **origin})
-        progress(f"reading {source.name}", (number + 1) / len(sources))
+        progress(f"reading {source.name}", (number + 1) / len(named))
     return textures, {"sources": origins, "curvafit": version("curvafit"), "torch": version("torch")}
 
 
@@ -339,7 +350,7 @@ class ImageMix:
     next, which are at most `longest` pixels apart; the `edge` of a slice, and the number of `gaps` of a volume. The
     probability that an image is `noisy` beyond its modality, and the interval of the `noise`, in contrasts."""
 
-    thickness: tuple[float, float] = (3.0, 14.0)
+    thickness: tuple[float, float] = (3.0, 24.0)
     gap: tuple[int, int] = (2, 15)
     longest: float = 20.0
     edge: int = 80
@@ -440,8 +451,8 @@ def teach(
     sources: Sequence[Sequence[Texture]],
     card: dict[str, Any],
     *,
-    plain: Taught | None = None,
-    volumes: int = VOLUMES,
+    first: Taught | None = None,
+    volumes: int = 0,
     steps: int | None = None,
     seed: int = 0,
     mix: Mix | None = None,
@@ -449,7 +460,7 @@ def teach(
     workers: int = 1,
     progress: Progress = silent,
 ) -> Taught:
-    """Teach a filler by shapes, every tenth of which is held out to judge it; or a plain one to weigh images of them.
+    """Teach a filler by shapes, every tenth of which is held out to judge it; with `volumes`, to weigh images of them.
 
     Parameters
     ----------
@@ -457,8 +468,10 @@ def teach(
         Shapes by where they come from, each source at least one; with fewer than 200 in all the filler knows little.
     card
         Where they come from, kept beside the weights.
-    plain, volumes
-        A filler that learns to weigh the evidence of images, and the imaged shapes that teach; a tenth as many judge.
+    first
+        A filler that learns on, by default a new one.
+    volumes
+        If any, the filler learns to weigh the evidence of images, of so many shapes; a tenth as many judge.
     steps
         By default 4500, or 1500 with images.
     checkpoint
@@ -468,16 +481,17 @@ def teach(
 
     Raises ValueError if a source is empty, or an argument is out of range.
     """
-    default = STEPS if plain is None else IMAGE_STEPS
+    default = IMAGE_STEPS if volumes else STEPS
     steps = check_int(default if steps is None else steps, "a number of steps from 1", 1, 10**7)
-    seed, volumes = check_seed(seed), check_int(volumes, "a number of volumes from 1", 1, 10**5)
+    seed, volumes = check_seed(seed), check_int(volumes, "a number of volumes from 0", 0, 10**5)
     if not sources or not all(sources):
         raise ValueError("expected sources with one shape or more to teach with")
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        filler = Filler() if plain is None else Filler.with_image(plain.filler)
-    settings = {"steps": steps, "seed": seed}
-    if plain is None:
+        filler = Filler() if first is None else copy.deepcopy(first.filler)
+        filler = Filler.with_image(filler) if volumes and not filler.image else filler
+    settings = {"steps": steps, "seed": seed} | ({} if first is None else {"first": first.card})
+    if not volumes:
         held_out = [texture for source in sources for texture in source[HELD_OUT - 1 :: HELD_OUT]] or [sources[-1][-1]]
         training = [[texture for texture in source if texture not in held_out] or list(source) for source in sources]
         mix = mix or Mix()
@@ -489,7 +503,7 @@ def teach(
         step = sub_progress(progress, 0.0, 0.3)
         wholes = _image_shapes(sources, volumes, seed, store, {"sources": card.get("sources")}, step)
         lessons, tests = WholeLessons(wholes[:volumes], steps, seed), WholeLessons(wholes[volumes:], JUDGED, seed + 1)
-        settings |= {"plain": plain.card, "volumes": volumes, "mix": asdict(ImageMix())}
+        settings |= {"volumes": volumes, "mix": asdict(ImageMix())}
         progress = sub_progress(progress, 0.3, 1.0)
     step = sub_progress(progress, 0.0, 0.97)
     losses = learn(filler, lessons, RATE, checkpoint=checkpoint, workers=workers, progress=step)

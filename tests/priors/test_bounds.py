@@ -21,7 +21,6 @@ from curvafit.drawing.shapes import Output
 from curvafit.generation import Execution, Optimiser, Schedule, Watch, descend, generate, white_noise
 from curvafit.generation.problem import Evidence, Hinge
 from curvafit.generation.schedule import Phase, schedule
-from curvafit.generation.slabs import divide
 from curvafit.priors import kernels, stencils
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energies import energy, orientation
@@ -158,7 +157,6 @@ REFUSALS: list[tuple[Callable, str, Sequence[Any], str]] = [
     (plan, "momentum", [1], "momentum in"), (plan, "memory", [1], "memory in"),
     (phase, "share", [0.0, 1.0, -0.5], "share"), (plan, "opening", [(phase(share=0.5),) * 2], "share"),
     (plan, "opening", [(3,)], "opening"),
-    (partial(divide, Grid((36, 8, 8)), 4), "halo", [10], "at least 10 planes"),
     (partial(design_around, POINT), "spread", [1e300, math.nan, -1, "wide"], "spread"),
     (design_box, "a10", [(0, 1e300)], "a10"),
     (partial(Generated, names=("far",)), "points", [((*POINT[:5], 1e300, -0.6),)], "a00"),

@@ -101,8 +101,8 @@ def test_teaching_with_images_makes_a_filler_for_images_and_goes_on(
 ) -> None:
     monkeypatch.setattr("curvafit.segmentation.teach.JUDGED", 6)
     plain = Taught(Filler(4).eval(), np.array([[2.0, 16.0], [1.0, 1.0]]), {"name": "plain"}, 0.0)
-    taught = teach([[texture()]], {}, plain=plain, steps=2, volumes=2, workers=0)
-    assert taught.filler.image and taught.card["plain"] == {"name": "plain"} and taught.card["volumes"] == 2
+    taught = teach([[texture()]], {}, first=plain, steps=2, volumes=2, workers=0)
+    assert taught.filler.image and taught.card["first"] == {"name": "plain"} and taught.card["volumes"] == 2
     assert set(taught.card["losses"]) and np.isfinite(taught.card["held_out_loss"])
     imaged: list[int] = []
 
@@ -113,7 +113,7 @@ def test_teaching_with_images_makes_a_filler_for_images_and_goes_on(
         return image_shape(textures, mix, seed)  # type: ignore[arg-type]
 
     monkeypatch.setattr("curvafit.segmentation.teach.image_shape", image_two)
-    options: dict[str, Any] = {"plain": plain, "steps": 2, "volumes": 2, "workers": 0, "checkpoint": tmp_path / "steps"}
+    options: dict[str, Any] = {"first": plain, "steps": 2, "volumes": 2, "workers": 0, "checkpoint": tmp_path / "steps"}
     with pytest.raises(KeyboardInterrupt):
         teach([[texture()]], {}, **options)
     imaged[:] = imaged[1:]

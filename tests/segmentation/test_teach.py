@@ -11,6 +11,7 @@ from calling import call, done, refused
 
 import curvafit.segmentation.teach as room
 from curvafit.data_synth.atlas import build
+from curvafit.data_synth.textures import KINDS
 from curvafit.generation.schedule import schedule
 from curvafit.segmentation.filler import FAR, Filler, Taught
 from curvafit.segmentation.teach import Lessons, Mix, Texture, Whole, WholeLessons, learn, load_textures, teach
@@ -115,12 +116,13 @@ def test_teaching_lowers_the_loss_of_shapes_held_out(monkeypatch: pytest.MonkeyP
     assert taught.temperatures.shape == (2, room.TEMPERATURES) and (np.diff(taught.temperatures[0]) >= 0).all()
 
 
-def test_stores_and_masks_teach(tmp_path: Path) -> None:
+def test_stores_masks_and_textures_teach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(room, "TEXTURES", 2)
     build(tmp_path / "store.zarr", 2, (16, 16, 16), 0, schedule("fast", 300))
     save(Volume((rods() > 0).astype(np.uint8)), tmp_path / "mask.npy")
-    sources, card = load_textures([tmp_path / "store.zarr", tmp_path / "mask.npy"])
-    assert [texture.periodic for source in sources for texture in source][-1] is False
-    assert [each["source"] for each in card["sources"]] == ["store.zarr", "mask.npy"]
+    sources, card = load_textures([tmp_path / "store.zarr", tmp_path / "mask.npy", "mixed"])
+    assert [source[-1].periodic for source in sources] == [True, False, True, True, True]
+    assert [each["source"] for each in card["sources"]] == ["store.zarr", "mask.npy", *KINDS]
     assert card["sources"][0]["shapes"] == len(sources[0]) >= 1 and "design" in card["sources"][0]
     nearly = np.zeros((8, 8, 8), np.uint8)
     nearly[4, 4, 4] = 1
@@ -139,6 +141,8 @@ def test_the_command_teaches_and_refuses(tmp_path: Path, monkeypatch: pytest.Mon
     assert not list(tmp_path.glob(".*"))
     refused(call("atlas", "teach", tmp_path / "mask.npy", "-o", tmp_path / "filler.txt"), "npz")
     refused(call("atlas", "teach", tmp_path / "none.zarr", "-o", tmp_path / "new.npz"), "none")
-    new = ("atlas", "teach", tmp_path / "mask.npy", "-o", tmp_path / "new.npz", "--filler", target)
-    refused(call(*new), "--images")
+    new = ("atlas", "teach", tmp_path / "mask.npy", "-o", tmp_path / "new.npz", "--steps", 2, "--filler")
+    refused(call(*new, tmp_path / "mask.npy"), "mask.npy")
     assert not (tmp_path / "new.npz").exists()
+    done(*new, target)
+    assert Taught.load(tmp_path / "new.npz").card["first"] == Taught.load(target).card

@@ -13,7 +13,6 @@ the plane is in the cache.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -59,26 +58,16 @@ def gaussian_blur(u: np.ndarray, grid: Grid, width: float) -> np.ndarray:
     return _view_field(volume, grid).copy()
 
 
-def halo(grid: Grid, width: float) -> int:
-    """Return how many planes beyond its own a slab needs for a step: the blur's radius, and the stencils' two."""
-    _, radius = _pad_taps(width / grid.spacing[0])
-    return radius + EDGE
-
-
 class FusedFlow:
     """The flow u = k ∗ (div A + base) under Adam on A, stepped in place; its cost is as in `fused_energy_gradient`.
 
     `start` is A at the first step, `(3, Z, Y, X)`, components z, y, x; None for zeros, to be filled in place through
     `vector`. `base` is k ∗ base: the mass m₀, or a blurred field. `width` is the blur's standard deviation in spacing's
     unit; A is constant in `frozen` voxels; `betas` and `adam_eps` are `torch.optim.Adam`'s.
-
-    Where the grid is a slab of a larger box, `own` are the planes whose energy and gradient count. `exchange` then
-    fills the others, `halo` of them on either side, of a volume `(Z, …)` in which the own planes are filled.
     """
 
     def __init__(
-        self, start, base, a, grid: Grid, epsilon, width: float, frozen=None, *, betas, adam_eps, orientation=None,
-        own: slice = slice(None), exchange: Callable[[np.ndarray], object] | None = None,
+        self, start, base, a, grid: Grid, epsilon, width: float, frozen=None, *, betas, adam_eps, orientation=None
     ) -> None:  # fmt: skip
         Z, Y, X = grid.shape
         self.grid, self.taken = grid, 0
@@ -87,7 +76,6 @@ class FusedFlow:
         self.betas = betas
         self._threads = threads = _choose_threads(grid)
         voxels = Z * Y * X
-        self._own, self._exchange = own, exchange
         self._vector, self._first, self._second = (_make_zeros(3 * voxels + 2 * SLACK) for _ in range(3))
         #: Whether `_gradient` holds div A, blurred along y and x, which the last step computed for the next one.
         self._divergence_ready = False
@@ -96,7 +84,7 @@ class FusedFlow:
         self._half = np.array([0.5 / h for h in grid.spacing], np.float32)
         self._blur, self._density = _Blur(grid, width, threads), _Density(a, grid, epsilon, threads, orientation)
         self._mass, self._base = (base, _NO_FIELD) if np.ndim(base) == 0 else (0.0, _pad_field(base, grid))
-        self._keep, self._free_count = np.empty(0, np.float32), 3 * len(range(Z)[own]) * Y * X
+        self._keep, self._free_count = np.empty(0, np.float32), 3 * voxels
         if frozen is not None:
             self._keep = _make_zeros(voxels + 2 * SLACK)
             self._keep[SLACK:-SLACK] = 1 - np.asarray(frozen, np.float32).ravel()
@@ -140,16 +128,14 @@ class FusedFlow:
         if not self._divergence_ready:
             self._adam_step(ALL, np.zeros(6, np.float32))
         self._divergence_ready = False
-        self._fill_halos()
         self._blur.along_z(self._gradient, self._field, self._mass, self._base)
-        return self._density(self._field, self._gradient, self._own)
+        return self._density(self._field, self._gradient)
 
     def update(self, rate: float) -> tuple[float, float]:
         """Make an Adam step of length `rate` along the last gradient; return maximum and mean of |∂F_ε/∂A|.
 
         These are the last two passes. The next step's div A, blurred along y and x, is then in `_gradient`.
         """
-        self._fill_halos()
         self._blur.along_z(self._gradient, self._gradient_along_z, 0.0, _NO_FIELD)
         self.taken, self._divergence_ready = self.taken + 1, True
         β1, β2 = self.betas
@@ -158,15 +144,8 @@ class FusedFlow:
         adam = np.array([1 - β1, β2, 1 - β2, corrected_rate, root_factor, self._adam_eps], np.float32)
         self._adam_step(MOVE, adam)
         self._adam_step(ENDS, adam)
-        highest, total = self._highest[self._own].max().view(np.float32), self._sums[self._own].sum()
+        highest, total = self._highest.max().view(np.float32), self._sums.sum()
         return float(highest), float(total) / max(1, self._free_count)
-
-    def _fill_halos(self) -> None:
-        """Fill the planes of `_gradient` that other processes own, whether it holds the gradient or div A."""
-        if self._exchange is not None:
-            Z, Y, X = self.grid.shape
-            pitch = loops.pitch(Y, X)
-            self._exchange(self._gradient[SLACK : SLACK + Z * pitch].reshape(Z, pitch))
 
     def _adam_step(self, phase: int, adam: np.ndarray) -> None:
         """Run a phase of `loops.adam_step`, the last pass of a step."""
@@ -241,13 +220,13 @@ class _Density:
         plane_size = _round_up(max(self._tile, self._block + 1) * stride) + SLACK
         self._sums = _make_scratch(threads, 4 * plane_size + 2 * SLACK)
 
-    def __call__(self, u: np.ndarray, gradient: np.ndarray, planes: slice = slice(None)) -> float:
-        """Fill `gradient` with ∂F_ε/∂u of the volume `u`; return the energy of `planes`."""
+    def __call__(self, u: np.ndarray, gradient: np.ndarray) -> float:
+        """Fill `gradient` with ∂F_ε/∂u of the volume `u`; return the energy."""
         loops.fill_gradient(
             self._threads, u, gradient, self._energies, self._rings, self._sums, self._inside, self._constants,
             *self._optional, self._index, self._block, self._tile, *self._grid.shape,
         )  # fmt: skip
-        return float(self._energies[:, planes].sum())
+        return float(self._energies.sum())
 
 
 def _choose_threads(grid: Grid) -> int:

@@ -1,0 +1,128 @@
+"""Textures that no law makes, each drawn in a second: level cuts of random fields, walls of cells, branching tubes.
+
+They teach the filler (`atlas teach mixed`) how structures go on between slices. Each is a field, float32 (N, N, N),
+that repeats along all axes; it is positive inside, and about a distance in voxels near its surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+#: Edge of a texture in voxels.
+EDGE = 80
+#: Deviation of points that are moved at random, as a fraction of the edge, and the waves of the motion along an edge.
+MOVED, WAVES = 0.05, 3.0
+#: Numbers of cells in a texture, and of trees of tubes.
+CELLS, TREES = (12, 90), (2, 7)
+#: Radii of the stem of a tree, and the least of a branch, in voxels; the most pieces of a tree.
+STEM, TWIG, PIECES = (3.0, 9.0), 1.5, 120
+
+
+def draw_level_cut(rng: np.random.Generator, edge: int = EDGE) -> np.ndarray:
+    """Draw a level cut of Gaussian random fields: a sponge of one field's values above a level, sheets where a field is
+    near 0, or tubes where two are."""
+    waves, octaves = rng.uniform(3, 9), rng.uniform(0.1, 0.7)
+    u, v = (_random_field(rng, edge, waves, octaves) for _ in range(2))
+    height = (u, -np.abs(u), -np.hypot(u, v))[int(rng.integers(3))]
+    height = height - np.quantile(height, 1 - rng.uniform(0.06, 0.5))
+    slope = np.sqrt(sum(np.square((np.roll(height, -1, k) - np.roll(height, 1, k)) / 2) for k in range(3)))
+    return (height / max(float(slope[np.abs(height) < slope].mean()), 1e-6)).astype(np.float32)
+
+
+def draw_walls(rng: np.random.Generator, edge: int = EDGE) -> np.ndarray:
+    """Draw the walls of a foam, curved at random: faces of a Laguerre tessellation whose cells differ in size. Some
+    neighbours are one cell, and have no wall between them."""
+    count = int(np.exp(rng.uniform(*np.log(CELLS))))
+    centres, moved = rng.uniform(0, edge, (count, 3)), _move_points(rng, edge)
+    size = edge / count ** (1 / 3)
+    weights = rng.uniform(0, 0.5) * size**2 * rng.random(count)
+    owners = np.where(rng.random(count) < 0.1, rng.integers(count, size=count), np.arange(count))
+    first, second = np.full((2, edge, edge, edge), np.inf, dtype=np.float32)
+    for owner in np.unique(owners):
+        # The power distance of a cell that consists of several is the least of theirs.
+        members = np.flatnonzero(owners == owner)
+        power = np.min([_periodic_square(moved, centres[k], edge) - weights[k] for k in members], axis=0)
+        second = np.where(power < first, first, np.minimum(second, power))
+        first = np.minimum(first, power)
+    # Half the difference of the power distances over the distance of the centres, about a size, is that from the face.
+    depth = (second - first) / (2 * size)
+    return (rng.uniform(0.03, 0.13) * size - depth).astype(np.float32)
+
+
+def draw_tubes(rng: np.random.Generator, edge: int = EDGE) -> np.ndarray:
+    """Draw trees of tubes of mixed calibre that bend and fork. At a fork the cube of the radius is shared, as Murray's
+    law of vessels has it."""
+    height = np.full((edge, edge, edge), -4.0, dtype=np.float32)
+    for _ in range(int(rng.integers(*TREES))):
+        stem = float(np.exp(rng.uniform(*np.log(STEM))))
+        tips = [(rng.uniform(0, edge, 3), _direction(rng), stem)]
+        for _ in range(PIECES):
+            if not tips:
+                break
+            start, heading, radius = tips.pop(0)
+            heading = heading + rng.uniform(0.2, 0.6) * _direction(rng)
+            heading /= np.linalg.norm(heading)
+            stop = start + heading * rng.uniform(1.5, 3.0) * max(radius, 2.5)
+            _add_capsule(height, start, stop, radius)
+            if rng.random() < 0.3:
+                share = rng.uniform(0.1, 0.5)
+                turn = np.cross(heading, _direction(rng))
+                branches = [(share, 1.0), (1 - share, -0.5)]
+                tips += [(stop, heading + bend * turn, radius * part ** (1 / 3)) for part, bend in branches]
+            else:
+                tips.append((stop, heading, radius * rng.uniform(0.93, 1.05)))
+            tips = [tip for tip in tips if tip[2] > TWIG]
+    return height
+
+
+#: The textures that `draw_mixed` draws, by name.
+KINDS: dict[str, Callable[[np.random.Generator], np.ndarray]] = {
+    "level cuts": draw_level_cut,
+    "cell walls": draw_walls,
+    "branching tubes": draw_tubes,
+}
+
+
+def _random_field(rng: np.random.Generator, edge: int, waves: float, octaves: float) -> np.ndarray:
+    """Draw a Gaussian field of variance 1 that repeats, with about so many waves along an edge, in a band this wide."""
+    stretch = np.exp(0.25 * rng.standard_normal(3))
+    numbers = np.meshgrid(*(np.fft.fftfreq(edge, 1 / edge) * s for s in stretch), indexing="ij")
+    length = np.sqrt(sum(np.square(number) for number in numbers))
+    amplitude = np.exp(-0.5 * (np.log2(np.maximum(length, 0.1) / waves) / octaves) ** 2) / np.maximum(length, 1)
+    field = np.fft.ifftn(np.fft.fftn(rng.standard_normal((edge,) * 3)) * amplitude).real
+    return field / field.std()
+
+
+def _move_points(rng: np.random.Generator, edge: int) -> list[np.ndarray]:
+    """Return the coordinates of all voxels, three arrays (N, N, N), moved by smooth random fields."""
+    grid = np.meshgrid(*(np.arange(edge, dtype=np.float32),) * 3, indexing="ij")
+    shift = MOVED * edge * rng.random()
+    return [axis + shift * _random_field(rng, edge, WAVES, 0.5).astype(np.float32) for axis in grid]
+
+
+def _periodic_square(points: list[np.ndarray], centre: np.ndarray, edge: int) -> np.ndarray:
+    """Return squared distances of points (N, N, N) from a centre in a box that repeats."""
+    offsets = (x - c for x, c in zip(points, centre.astype(np.float32), strict=True))
+    return np.asarray(sum(np.square(offset - edge * np.round(offset / edge)) for offset in offsets))
+
+
+def _direction(rng: np.random.Generator) -> np.ndarray:
+    """Draw a unit vector."""
+    vector = rng.standard_normal(3)
+    return vector / np.linalg.norm(vector)
+
+
+def _add_capsule(height: np.ndarray, start: np.ndarray, stop: np.ndarray, radius: float) -> None:
+    """Join a tube with round ends to a field that repeats, in place."""
+    reach = radius + 3
+    low, high = np.floor(np.minimum(start, stop) - reach), np.ceil(np.maximum(start, stop) + reach)
+    axes = [np.arange(a, b + 1) for a, b in zip(low, high, strict=True)]
+    axes = [axis[:n] for axis, n in zip(axes, height.shape, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - start
+    along = stop - start
+    t = np.clip(points @ along / max(float(along @ along), 1e-6), 0, 1)
+    box = np.ix_(*(axis.astype(int) % n for axis, n in zip(axes, height.shape, strict=True)))
+    depth = radius - np.linalg.norm(points - t[..., None] * along, axis=-1)
+    height[box] = np.maximum(height[box], depth.astype(np.float32))
