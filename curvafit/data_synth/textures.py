@@ -39,13 +39,7 @@ def draw_walls(rng: np.random.Generator, edge: int = EDGE) -> np.ndarray:
     size = edge / count ** (1 / 3)
     weights = rng.uniform(0, 0.5) * size**2 * rng.random(count)
     owners = np.where(rng.random(count) < 0.1, rng.integers(count, size=count), np.arange(count))
-    first, second = np.full((2, edge, edge, edge), np.inf, dtype=np.float32)
-    for owner in np.unique(owners):
-        # The power distance of a cell that consists of several is the least of theirs.
-        members = np.flatnonzero(owners == owner)
-        power = np.min([_periodic_square(moved, centres[k], edge) - weights[k] for k in members], axis=0)
-        second = np.where(power < first, first, np.minimum(second, power))
-        first = np.minimum(first, power)
+    first, second = _two_least_powers(moved, centres, weights, owners)
     # Half the difference of the power distances over the distance of the centres, about a size, is that from the face.
     depth = (second - first) / (2 * size)
     return (rng.uniform(0.03, 0.13) * size - depth).astype(np.float32)
@@ -56,24 +50,7 @@ def draw_tubes(rng: np.random.Generator, edge: int = EDGE) -> np.ndarray:
     law of vessels has it."""
     height = np.full((edge, edge, edge), -4.0, dtype=np.float32)
     for _ in range(int(rng.integers(*TREES))):
-        stem = float(np.exp(rng.uniform(*np.log(STEM))))
-        tips = [(rng.uniform(0, edge, 3), _direction(rng), stem)]
-        for _ in range(PIECES):
-            if not tips:
-                break
-            start, heading, radius = tips.pop(0)
-            heading = heading + rng.uniform(0.2, 0.6) * _direction(rng)
-            heading /= np.linalg.norm(heading)
-            stop = start + heading * rng.uniform(1.5, 3.0) * max(radius, 2.5)
-            _add_capsule(height, start, stop, radius)
-            if rng.random() < 0.3:
-                share = rng.uniform(0.1, 0.5)
-                turn = np.cross(heading, _direction(rng))
-                branches = [(share, 1.0), (1 - share, -0.5)]
-                tips += [(stop, heading + bend * turn, radius * part ** (1 / 3)) for part, bend in branches]
-            else:
-                tips.append((stop, heading, radius * rng.uniform(0.93, 1.05)))
-            tips = [tip for tip in tips if tip[2] > TWIG]
+        _grow_tree(height, rng, float(np.exp(rng.uniform(*np.log(STEM)))))
     return height
 
 
@@ -102,10 +79,46 @@ def _move_points(rng: np.random.Generator, edge: int) -> list[np.ndarray]:
     return [axis + shift * _random_field(rng, edge, WAVES, 0.5).astype(np.float32) for axis in grid]
 
 
+def _two_least_powers(
+    points: list[np.ndarray], centres: np.ndarray, weights: np.ndarray, owners: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the second power distance of points (N, N, N) from cells. All centres (M, 3) of one owner, an
+    entry of `owners` (M,), are one cell: the least of their distances counts."""
+    edge = len(points[0])
+    first, second = np.full((2, edge, edge, edge), np.inf, dtype=np.float32)
+    for owner in np.unique(owners):
+        members = np.flatnonzero(owners == owner)
+        power = np.min([_periodic_square(points, centres[k], edge) - weights[k] for k in members], axis=0)
+        second = np.where(power < first, first, np.minimum(second, power))
+        first = np.minimum(first, power)
+    return first, second
+
+
 def _periodic_square(points: list[np.ndarray], centre: np.ndarray, edge: int) -> np.ndarray:
     """Return squared distances of points (N, N, N) from a centre in a box that repeats."""
     offsets = (x - c for x, c in zip(points, centre.astype(np.float32), strict=True))
     return np.asarray(sum(np.square(offset - edge * np.round(offset / edge)) for offset in offsets))
+
+
+def _grow_tree(height: np.ndarray, rng: np.random.Generator, stem: float) -> None:
+    """Join a tree of tubes, whose first piece has the radius `stem`, to a field that repeats, in place."""
+    tips = [(rng.uniform(0, len(height), 3), _direction(rng), stem)]
+    for _ in range(PIECES):
+        if not tips:
+            return
+        start, heading, radius = tips.pop(0)
+        heading = heading + rng.uniform(0.2, 0.6) * _direction(rng)
+        heading /= np.linalg.norm(heading)
+        stop = start + heading * rng.uniform(1.5, 3.0) * max(radius, 2.5)
+        _add_capsule(height, start, stop, radius)
+        if rng.random() < 0.3:
+            share = rng.uniform(0.1, 0.5)
+            turn = np.cross(heading, _direction(rng))
+            branches = [(share, 1.0), (1 - share, -0.5)]
+            tips += [(stop, heading + bend * turn, radius * part ** (1 / 3)) for part, bend in branches]
+        else:
+            tips.append((stop, heading, radius * rng.uniform(0.93, 1.05)))
+        tips = [tip for tip in tips if tip[2] > TWIG]
 
 
 def _direction(rng: np.random.Generator) -> np.ndarray:
