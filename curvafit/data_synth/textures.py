@@ -82,8 +82,8 @@ def _move_points(rng: np.random.Generator, edge: int) -> list[np.ndarray]:
 def _two_least_powers(
     points: list[np.ndarray], centres: np.ndarray, weights: np.ndarray, owners: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the second power distance of points (N, N, N) from cells. All centres (M, 3) of one owner, an
-    entry of `owners` (M,), are one cell: the least of their distances counts."""
+    """Return the least and the second power distance of points (N, N, N) from cells. Centres (M, 3) of one owner, whose
+    numbers are `owners` (M,), are one cell: the least of their distances counts."""
     edge = len(points[0])
     first, second = np.full((2, edge, edge, edge), np.inf, dtype=np.float32)
     for owner in np.unique(owners):
