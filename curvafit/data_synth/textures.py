@@ -1,4 +1,4 @@
-"""Textures that no law makes, each drawn in a second: level cuts of random fields, walls of cells, branching tubes.
+"""Textures that no law makes, each drawn in a second: level cuts of random fields, cells, grains, tubes and fibres.
 
 They teach the filler (`atlas teach mixed`) how structures go on between slices. Each is a field, float32 (N, N, N),
 that repeats along all axes; it is positive inside, and about a distance in voxels near its surface.
@@ -14,10 +14,10 @@ import numpy as np
 EDGE = 80
 #: Deviation of points that are moved at random, as a fraction of the edge, and the waves of the motion along an edge.
 MOVED, WAVES = 0.05, 3.0
-#: Numbers of cells in a texture, and of trees of tubes.
-CELLS, TREES = (12, 90), (2, 7)
-#: Radii of the stem of a tree, and the least of a branch, in voxels; the most pieces of a tree.
-STEM, TWIG, PIECES = (3.0, 9.0), 1.5, 120
+#: Numbers of cells, grains, trees and fibres in a texture.
+CELLS, GRAINS, TREES, FIBRES = (12, 90), (20, 200), (2, 7), (8, 80)
+#: Radii of the stem of a tree and of a fibre, and the least of a branch, in voxels; the most pieces of a tree.
+STEM, FIBRE, TWIG, PIECES = (3.0, 9.0), (1.8, 4.0), 1.5, 120
 
 
 def draw_level_cut(rng: np.random.Generator, edge: int = EDGE) -> np.ndarray:
@@ -45,6 +45,33 @@ def draw_walls(rng: np.random.Generator, edge: int = EDGE) -> np.ndarray:
     return (rng.uniform(0.03, 0.13) * size - depth).astype(np.float32)
 
 
+def draw_grains(rng: np.random.Generator, edge: int = EDGE) -> np.ndarray:
+    """Draw grains: balls of many sizes, bent at random, that overlap, or are pressed flat where they meet."""
+    count = int(np.exp(rng.uniform(*np.log(GRAINS))))
+    size = edge / count ** (1 / 3)
+    radii = size * rng.uniform(0.25, 0.45) * np.exp(0.3 * rng.standard_normal(count))
+    centres = rng.uniform(0, edge, (count, 3))
+    first, second = _two_least_powers(_move_points(rng, edge), centres, radii**2, np.arange(count))
+    height = -first / (2 * float(np.mean(radii)))
+    if rng.random() < 0.6:
+        height = np.minimum(height, (second - first) / (2 * size) - rng.uniform(0.5, 1.5))
+    return height.astype(np.float32)
+
+
+def draw_fibres(rng: np.random.Generator, edge: int = EDGE) -> np.ndarray:
+    """Draw long fibres of about one calibre, nearly straight, that cross each other or run along one direction."""
+    height = np.full((edge, edge, edge), -4.0, dtype=np.float32)
+    radius, along, spread = float(np.exp(rng.uniform(*np.log(FIBRE)))), _direction(rng), rng.uniform(0.1, 3.0)
+    for _ in range(int(np.exp(rng.uniform(*np.log(FIBRES))))):
+        start, heading = rng.uniform(0, edge, 3), along + spread * _direction(rng)
+        for _ in range(int(rng.integers(5, 25))):
+            heading = heading / np.linalg.norm(heading) + 0.1 * _direction(rng)
+            stop = start + 5 * heading
+            _add_capsule(height, start, stop, radius)
+            start = stop
+    return height
+
+
 def draw_tubes(rng: np.random.Generator, edge: int = EDGE) -> np.ndarray:
     """Draw trees of tubes of mixed calibre that bend and fork. At a fork the cube of the radius is shared, as Murray's
     law of vessels has it."""
@@ -59,6 +86,8 @@ KINDS: dict[str, Callable[[np.random.Generator], np.ndarray]] = {
     "level cuts": draw_level_cut,
     "cell walls": draw_walls,
     "branching tubes": draw_tubes,
+    "grains": draw_grains,
+    "fibres": draw_fibres,
 }
 
 
