@@ -8,7 +8,8 @@ those of their first halves (`--half 0`); the second halves are reported.
 - `spline`, `linear`, `nearest`, `ITK` (its morphological contour interpolation, where its package is installed): plain
   interpolations. Gains are held to the best of them *in hindsight*, case by case.
 - `filler`: `reconstruct` without an example; `tuned`: with one; `law`, `willmore`: with one, and its law or the
-  Willmore energy tried.
+  Willmore energy tried; `laws`: filled by weights that shapes of laws alone taught; `gated`: a blend of filler and
+  spline, whose weights are those that are best on every second known slice, left out.
 
 Dice and the calibration error within 3 voxels of the surface count the unknown slices between the first and the last
 known one; the sum of the Betti numbers' errors counts all between them. Choices were made on the structures of
@@ -18,6 +19,7 @@ known one; the sum of the Betti numbers' errors counts all between them. Choices
 from __future__ import annotations
 
 import argparse
+import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -29,18 +31,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
+from scipy.special import expit
 
-from benchmarks.harness import Cases, Figure, Values, bootstrap, data, scores, show
+from benchmarks.harness import CACHE, ROOT, Cases, Figure, Values, bootstrap, data, scores, show, write_whole
 from curvafit.data_synth.design import design_box
 from curvafit.generation.flow import generate
 from curvafit.inference.fit import Fit
 from curvafit.inference.inference import infer
 from curvafit.priors.coefficients import Coefficients
+from curvafit.segmentation.filler import SLOPE, Raster, Taught, fill
+from curvafit.segmentation.flow import Working
 from curvafit.segmentation.known import Known
 from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices, filled_range
-from curvafit.segmentation.trials import dice
-from curvafit.segmentation.uncertainty import calibration_error, near_surface
+from curvafit.segmentation.trials import dice, leave_out_slices
+from curvafit.segmentation.uncertainty import best_log_odds, calibration_error, near_surface
 from curvafit.volumes.read import load
 from curvafit.volumes.run import Run
 from curvafit.volumes.volume import Volume
@@ -57,7 +62,11 @@ ITK = "ITK"
 #: Willmore's energy, and costs twenty times as much as that of tubes 8 voxels thick.
 LAWS_TRIED = {"willmore": Coefficients.willmore(), "area": Coefficients(0.05, 0.1, 0.05, 0, 0, 1 / 16)}
 #: Ways that are no plain interpolation.
-OURS = ("filler", "tuned", "law", "willmore")
+OURS = ("filler", "tuned", "law", "willmore", "laws", "gated")
+#: The commit whose packaged filler was taught by shapes of laws alone, without `mixed` textures.
+TAUGHT_BY_LAWS = "a755c804"
+#: Weights of the spline in a blend with the filler, of which `gated` takes the best on every second known slice.
+BLENDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 #: Errors of the volume by the mask, Cavalieri's principle and the mean probability, in per cent; and whether the
 #: interval of Cavalieri's covers it.
 VOLUMES = ("mask_bias", "cavalieri_bias", "mean_bias", "covered")
@@ -128,9 +137,12 @@ def filled(
     """Return the scores of a way to fill a mask of which some slices are known."""
     begun, first, status = time.perf_counter(), np.moveaxis(truth.values > 0, axis, 0), ""
     likely, volumes = None, dict[str, float]()
-    if way in OURS:
-        law, shown = prior() if way == "law" else LAWS_TRIED.get(way), None if way == "filler" else example()
-        found = reconstruct(truth, law, known=places, axis=axis, example=shown)
+    if way == "gated":
+        mask, likely = gated(Known(truth, axis, tuple(places)).read(Run())[0])
+    elif way in OURS:
+        law, shown = prior() if way == "law" else LAWS_TRIED.get(way), None if way in ("filler", "laws") else example()
+        working = Working(filler=weights_of(TAUGHT_BY_LAWS) if way == "laws" else None)
+        found = reconstruct(truth, law, known=places, axis=axis, example=shown, working=working)
         mask, likely = (np.moveaxis(each.values, axis, 0) for each in (found.mask, found.probability))
         status, uncertain = found.status, found.uncertainty
         share = float(first[filled_range(places, len(first))].sum()) / first.size
@@ -148,6 +160,34 @@ def filled(
         near = near_surface(mask)[unknown]
         values["calibration"] = calibration_error(likely[unknown][near], first[unknown][near])
     return {**values, "seconds": time.perf_counter() - begun}
+
+
+def weights_of(commit: str) -> Path:
+    """Return the packaged filler of a commit, as a file."""
+    path = CACHE / f"filler-{commit}.npz"
+    if not path.exists():
+        command = ("git", "show", f"{commit}:curvafit/segmentation/data/filler.npz")
+        shown = subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stdout
+        write_whole(path, lambda target: target.write_bytes(shown))
+    return path
+
+
+def gated(slices: Slices) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mask and the probabilities of the blend of filler and spline that is best on known slices left out."""
+    taught, task = Taught.load(), leave_out_slices(slices)
+
+    def blended(given: Slices, weight: float) -> np.ndarray:
+        raster = Raster.of(given)
+        return (1 - weight) * fill(given, taught, raster=raster) + weight * SLOPE * given.level("spline") / raster.pixel
+
+    def worth(weight: float) -> float:
+        assert task is not None
+        logits = blended(task.given, weight)[list(task.places)]
+        return dice(logits > best_log_odds(logits), task.truth)
+
+    logits = blended(slices, 0.0 if task is None else max(BLENDS, key=worth))
+    mask = logits > np.where(slices.between, best_log_odds(logits[slices.between]), 0)[:, None, None]
+    return slices.keep_known(mask), expit(logits)
 
 
 def shape_case(way: str, law: str, seed: int, every: int, cases: Cases) -> Values:
