@@ -35,8 +35,8 @@ from curvafit.volumes.volume import Volume
 
 WAYS = ("ours", "alone", "trees", "forest")
 EVERY = 8
-#: The number of trees of a forest, the least samples of a leaf, and its widest Gaussian.
-FORESTS = ((60, 3, 6.0), (300, 1, 6.0), (300, 3, 16.0))
+#: The trees of a forest, the least samples of a leaf, and its widest Gaussian: a small one, and one of ilastik's size.
+FORESTS = ((60, 3, 6.0), (100, 1, 10.0))
 #: Thresholds of the forest.
 THRESHOLDS = np.linspace(0.2, 0.6, 17)
 
