@@ -121,7 +121,7 @@ def test_stores_masks_and_textures_teach(tmp_path: Path, monkeypatch: pytest.Mon
     build(tmp_path / "store.zarr", 2, (16, 16, 16), 0, schedule("fast", 300))
     save(Volume((rods() > 0).astype(np.uint8)), tmp_path / "mask.npy")
     sources, card = load_textures([tmp_path / "store.zarr", tmp_path / "mask.npy", "mixed"])
-    assert [source[-1].periodic for source in sources] == [True, False, True, True, True]
+    assert [source[-1].periodic for source in sources] == [True, False, *[True] * len(KINDS)]
     assert [each["source"] for each in card["sources"]] == ["store.zarr", "mask.npy", *KINDS]
     assert card["sources"][0]["shapes"] == len(sources[0]) >= 1 and "design" in card["sources"][0]
     nearly = np.zeros((8, 8, 8), np.uint8)
