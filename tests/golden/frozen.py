@@ -111,7 +111,10 @@ def _content(path: Path) -> Any:
             return [[cell if rounded(cell) is None else rounded(cell) for cell in row][:8] for row in csv.reader(file)]
     if name.endswith(".npz"):
         with np.load(path, allow_pickle=False) as arrays:
-            return {key: volume(arrays[key]) for key in sorted(arrays.files) if arrays[key].dtype.kind in "biuf"}
+            content = {key: volume(arrays[key]) for key in sorted(arrays.files) if arrays[key].dtype.kind in "biuf"}
+            if "header" in content:  # JSON, some of whose texts, as the processor's name, differ
+                content["header"] = rounded(json.loads(arrays["header"].tobytes()))
+            return content
     return "file"
 
 
