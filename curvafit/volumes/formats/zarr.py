@@ -420,6 +420,7 @@ def _missing_chunks(array: Any, folder: Path) -> tuple[str, ...]:
     edges, count = array.shards or array.chunks, math.prod(_counts(array.shape, array.chunks))
     if count > _MOST:
         raise ScanError(f"a Zarr array may have at most {_MOST:,} chunks, got {count:,} in {folder}")
+    has_blosc = "blosc" in type(array.compressors[-1] if array.compressors else None).__name__.lower()
     missing = count
     for path in folder.rglob("*"):
         name = path.relative_to(folder).as_posix()
@@ -433,7 +434,7 @@ def _missing_chunks(array: Any, folder: Path) -> tuple[str, ...]:
         missing -= math.prod(counts)
         if array.shards:
             missing += _count_missing(array, path, counts)
-        elif "blosc" in type(array.compressors[-1] if array.compressors else None).__name__.lower():
+        elif has_blosc:
             _check_blosc(path)
     note = f"{missing} of {count} chunks are not stored: their voxels have the fill value {array.fill_value}."
     return (note,) if missing else ()
