@@ -19,6 +19,11 @@ from curvafit.volumes.volume import Box
 
 #: Median thickness is measured in a box of at most this many voxels a side.
 MEASURED = 160
+#: Deviations, in voxels, of the Gaussians that smooth stairs after that of `priors.profile.STAIRS`, where the border
+#: moves by less than so many voxels, a root mean square over what is near: a Gaussian, in a band on either side.
+WIDER, MOVED, NEARBY, BAND = (2.5, 3.0), 0.1, 2.0, 2.5
+#: Voxels of a periodic mask beyond its box on which its phase field depends.
+REPEATED = 36
 
 
 def bounding_box(shape: tuple[int, int, int], region: np.ndarray | None, longest: int) -> tuple[Box, tuple[str, ...]]:
@@ -123,27 +128,42 @@ def centre_distance(
     return np.clip(np.where(mask, inner - half, half - outer), -limit, limit).astype(dtype)  # type: ignore[operator]
 
 
-def profile_mask(mask: np.ndarray) -> np.ndarray:
-    """Return the phase field of a mask (Z, Y, X) as `priors.phase_field` does, by compiled loops in less memory.
+def profile_mask(mask: np.ndarray, periodic: bool = False) -> np.ndarray:
+    """Return the phase field of a mask (Z, Y, X) whose curvature is measured, float32.
 
-    The mask is neither empty nor full, and continues as a mirror image beyond its box.
+    It is that of `priors.phase_field`, but stairs are smoothed by wider Gaussians, too, one after the other, wherever
+    that moves the border by less than `MOVED` voxels: curvature of what is thicker or flatter than the first width asks
+    for has half the error, and thin parts stay (Lepski's rule for a bandwidth). The mask is neither empty nor full, and
+    continues beyond its box as a mirror image, or repeats.
     """
+    if periodic:
+        margin = [(min(n, REPEATED),) * 2 for n in mask.shape]
+        inner = tuple(slice(low, -high) for low, high in margin)
+        return profile_mask(np.pad(mask, margin, mode="wrap"))[inner]
     voxels = Grid(mask.shape, (1.0, 1.0, 1.0), "replicate")  # type: ignore[arg-type]
-    reach = 6 * WORKING_EPSILON / WORKING_SPACING + math.ceil(4 * STAIRS)
+    reach = 6 * WORKING_EPSILON / WORKING_SPACING + math.ceil(4 * WIDER[-1])
     squares = square_distances(mask, (1.0, 1.0, 1.0), reach, offset=0.5, both=True)
-    distance = np.copysign(np.sqrt(np.abs(squares)), squares)
+    exact = np.copysign(np.sqrt(np.abs(squares)), squares)
     del squares
-    # With the blur G, 2 G - G² smooths the voxels' stairs, and shrinks curved surfaces less than G does.
-    blurred = gaussian_blur(distance, voxels, STAIRS)
-    np.multiply(blurred, 2, out=distance)
-    distance -= gaussian_blur(blurred, voxels, STAIRS)
-    error = blurred  # its memory is used again
+    distance = _smooth_stairs(exact, voxels, STAIRS)
+    for width in WIDER:
+        move = _smooth_stairs(exact, voxels, width) - distance
+        near = (np.abs(distance) < BAND).astype(np.float32)
+        squares, near = (gaussian_blur(each, voxels, NEARBY) for each in (near * move**2, near))
+        distance += np.exp(-squares / (np.float32(MOVED**2) * np.maximum(near, np.float32(1e-6)))) * move
+    error = exact  # its memory is used again
     for _ in range(SWEEPS):  # until no smoothed distance has a sign that is not the mask's
         if not _fill_errors(distance, mask, error):
             break
         distance -= np.float32(PULL) * gaussian_blur(error, voxels, PULL_WIDTH)
     distance *= np.float32(WORKING_SPACING / (math.sqrt(2) * WORKING_EPSILON))
     return np.tanh(distance, out=distance)
+
+
+def _smooth_stairs(distance: np.ndarray, voxels: Grid, width: float) -> np.ndarray:
+    """Return 2 G - G² of a distance with the blur G: it smooths a mask's stairs and shrinks curves less than G does."""
+    blurred = gaussian_blur(distance, voxels, width)
+    return 2 * blurred - gaussian_blur(blurred, voxels, width)
 
 
 @njit(cache=True)

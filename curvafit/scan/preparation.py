@@ -252,7 +252,7 @@ def prepare(
     options = {"kind": kind, "threshold": threshold, "dark": dark, "region": region, "periodic": periodic}
     extremes = (field.values.min(), field.values.max())
     detected, signed = structure.find_structure(cropped, extremes=extremes, **options)  # type: ignore[arg-type]
-    prepared = _put_on_grid(_Scan(detected, signed, periodic, region, one_scale), _choose_box, _profile)
+    prepared = _put_on_grid(_Scan(detected, signed, periodic, region, one_scale), _choose_box)
     if detected == "image" and quality is None:
         quality = measure_quality(-cropped.values if dark else cropped.values, signed.values > 0, cropped.spacing)
     origin = tuple(edge.start + start for edge, start in zip(box, prepared.origin, strict=True))
@@ -269,9 +269,7 @@ def prepare_whole(kind: Kind, signed: Volume, periodic: bool, most: int) -> Prep
             raise TooLarge(f"expected at most {most} working voxels in one piece, got {_join_sides(shape)}")
         return (0, 0, 0), shape, ()
 
-    # These scans may be large: compiled loops, which know no periodic box, need less memory. They differ by some 1e-7.
-    profile = _profile if periodic else lambda mask, _: grids.profile_mask(mask)
-    return _put_on_grid(_Scan(kind, signed, periodic, None, one_scale=False), take_all, profile)
+    return _put_on_grid(_Scan(kind, signed, periodic, None, one_scale=False), take_all)
 
 
 @dataclass(frozen=True)
@@ -300,13 +298,9 @@ class _Scan:
         return (~inside if self.region is None else ~inside & self.region), "background"
 
 
-def _put_on_grid(
-    scan: _Scan,
-    choose_box: Callable[[_Scan, tuple[float, float, float]], _Extent],
-    profile: Callable[[np.ndarray, Grid], np.ndarray],
-) -> Prepared:
+def _put_on_grid(scan: _Scan, choose_box: Callable[[_Scan, tuple[float, float, float]], _Extent]) -> Prepared:
     """Put a scan on the working grid: choose the working voxel, resample the box that `choose_box` returns, drop
-    specks, make the phase field of the mask with `profile`, and choose windows."""
+    specks, make the phase field of the mask, and choose windows."""
     spacing = scan.field.spacing
     noise = scan.kind != "field" and structure.is_noise(scan.field.values > 0)
     keeps_grid = scan.kind == "field" or noise  # a phase field has its ε, and noise no thickness
@@ -324,6 +318,8 @@ def _put_on_grid(
     inverted = note_on_filling(float((mask if region is None else mask[region]).mean()))
     if not windows:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
+    # The descriptors by which laws are read have one width of smoothing.
+    profile = _profile if scan.one_scale else lambda mask, grid: grids.profile_mask(mask, grid.periodic)
     if scan.kind != "field":
         phase = profile(mask, grid)
     else:

@@ -7,13 +7,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from exact import Sphere, centres
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
+from shapes import grown
 
+from curvafit.geometry.diagrams import diagram
 from curvafit.priors import Grid, phase_field
 from curvafit.scan import preparation as preparing
-from curvafit.scan.grids import boxes_by_surface, centre_distance, median_thickness, remove_specks, resample
+from curvafit.scan.grids import (
+    boxes_by_surface,
+    centre_distance,
+    median_thickness,
+    profile_mask,
+    remove_specks,
+    resample,
+)  # fmt: skip
 from curvafit.scan.preparation import WORKING_THICKNESS, Prepared, coarser_level, is_ball, prepare, read_scan
 from curvafit.scan.quality import Quality, measure_quality, sample_mask
 from curvafit.scan.structure import find_structure, is_noise
@@ -122,11 +132,34 @@ def test_a_phase_field_stays_as_it_is() -> None:
 
 def test_a_mask_is_profiled_as_the_atlas_profiles_its_masks() -> None:
     mask = tube_mask((24, 24, 24), (1, 1, 1), 5)
-    prepared = prepare(Volume(mask))
+    prepared = prepare(Volume(mask), one_scale=True)
     assert prepared.grid.boundary == "replicate"
     assert np.array_equal(prepared.mask, mask)
     assert np.array_equal(prepared.phase, phase_field(torch.from_numpy(mask.copy()), prepared.grid, 0.02).numpy())
     assert prepared.phase.dtype == np.float32
+
+
+@pytest.mark.parametrize(("radius", "share"), [(4, 1.1), (8, 0.6), (12, 0.6)])
+def test_what_is_thick_is_smoothed_more_widely(radius: int, share: float) -> None:
+    """The error of κ of a ball's mask nearly halves from a radius of 8 voxels on, and stays at 4."""
+    ball, n = Sphere(radius, (radius + 12.3, radius + 11.9, radius + 12.1)), 2 * radius + 24
+    grid = Grid((n, n, n), (1.0, 1.0, 1.0), "replicate")
+    mask = ball.distance(centres(grid)) > 0
+    errors = []
+    for phase in (phase_field(mask, grid, 2.0), profile_mask(mask.numpy())):
+        found = diagram(phase, grid, 2.0, margin=10).normalised
+        errors.append(found.weights @ ((found.points * radius - 1) ** 2).sum(1))
+    assert errors[1] < share**2 * errors[0]
+    assert found.mean().mean() * radius == pytest.approx(1, abs=0.06 if radius == 4 else 0.02)
+
+
+def test_a_periodic_mask_is_profiled_without_a_seam_and_thin_plates_survive() -> None:
+    mask = grown("tubes", 48, 1).numpy() > 0
+    moved = np.roll(profile_mask(np.roll(mask, 20, (0, 1, 2)), periodic=True), -20, (0, 1, 2))
+    assert profile_mask(mask, periodic=True) == pytest.approx(moved, abs=1e-5)
+    plate = np.zeros((40, 40, 40), dtype=bool)
+    plate[18:21] = True
+    assert np.array_equal(profile_mask(plate) > 0, plate)
 
 
 def test_the_image_of_a_mask_gives_the_mask_back() -> None:
