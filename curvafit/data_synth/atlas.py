@@ -369,10 +369,10 @@ def measure(job: tuple[Path, int, Sequence[str]]) -> list[Row]:
     except KeyError:
         return []
     numbers = parameters_of(record.coefficients, record.mass), thinner_thickness(u > 0)
-    return [(f"{store.name}/{index:06d}", name, *numbers, *_measure_view(u, name, record.seed)) for name in views]
+    return [(f"{store.name}/{index:06d}", name, *numbers, *measure_view(u, name, record.seed)) for name in views]
 
 
-def _measure_view(u: np.ndarray, name: str, seed: int) -> tuple[np.ndarray, float]:
+def measure_view(u: np.ndarray, name: str, seed: int) -> tuple[np.ndarray, float]:
     """Return descriptors and amount of a field in one view, read as `infer` reads a scan; NaN without a surface."""
     reading: Reading | None = None
     with suppress(ScanError):
