@@ -75,7 +75,7 @@ def timed(job: str, edge: int, workers: int, cases: Cases, flag: str = "") -> Va
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--command", choices=["measure", "infer", "segment", "reconstruct"], default="measure")
     parser.add_argument("--edge", type=int, default=1024)
-    parser.add_argument("--of-infer", choices=["fast", "no-test"], default="", help="an option that `infer` is given")
+    parser.add_argument("--of-infer", choices=["test"], default="", help="an option that `infer` is given")
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:

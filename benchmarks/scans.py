@@ -14,6 +14,7 @@ import numpy as np
 
 from benchmarks.harness import Cases, Figure, Values, data, show
 from curvafit.inference.inference import infer
+from curvafit.inference.simulate import Growth
 from curvafit.volumes.read import load
 from curvafit.volumes.volume import ScanError, Volume
 
@@ -53,7 +54,7 @@ def read(name: str) -> Volume:
 def report(name: str) -> Values:
     """Return what a whole `infer` says of a scan."""
     try:
-        fit = infer(load(name), kind=SCANS[name].kind).fit  # type: ignore[arg-type]
+        fit = infer(load(name), kind=SCANS[name].kind, growth=Growth()).fit  # type: ignore[arg-type]
     except ScanError as error:
         return {"verdict": f"refused: {error}"}
     own, voxel, twins = fit.morphometry, fit.working_voxel, () if fit.best is None else fit.best.twins

@@ -18,19 +18,21 @@ def parse_inference(
     atlas: Annotated[Path | None, typer.Option(help="Atlas (.npz) instead of the packaged one.")] = None,
     posterior: Annotated[Path | None, typer.Option(help="Posterior (.npz) instead of the packaged one.")] = None,
     method: Annotated[str, typer.Option(help="posterior, or match: the nearest shape, refined.")] = "posterior",
-    fast: Annotated[bool, typer.Option("--fast", help="Seconds, not minutes: nothing is grown or checked.")] = False,
-    test: Annotated[bool, typer.Option(help="Grow shapes to test whether the law can have made the scan.")] = True,
+    test: Annotated[bool, typer.Option("--test", help="Grow shapes: can the law have made the scan? Minutes.")] = False,
+    fast: Annotated[bool, typer.Option("--fast", hidden=True)] = False,
 ) -> dict[str, Any]:
     """Return the options by which a law is inferred and tested, by name."""
-    return {"atlas": atlas, "posterior": posterior, "method": method, "fast": fast, "test": test}
+    if fast:
+        raise ValueError("`--fast` is gone: without --test nothing is grown")
+    return {"atlas": atlas, "posterior": posterior, "method": method, "test": test}
 
 
 @command(
     "curvafit infer bone.tif --spacing 0.0195 --unit mm -o bone",
-    "curvafit infer vessels.nii.gz --kind mask -o vessels",
+    "curvafit infer vessels.nii.gz --kind mask --test -o vessels",
     "curvafit infer cells.ome.zarr --channel 1 --crop 0:64,100:300,100:300 --dark --threshold 90 -o cells",
     "curvafit infer fibres.raw --raw-shape 128,128,128 --dtype u1 -o fibres",
-    "curvafit infer mouse1.nii.gz mouse2.nii.gz mouse3.nii.gz --fast -o mice",
+    "curvafit infer mouse1.nii.gz mouse2.nii.gz mouse3.nii.gz -o mice",
 )
 def infer(
     scans: Annotated[list[str], typer.Argument(help=FILES)],
@@ -51,8 +53,7 @@ def infer(
         from curvafit.inference.simulate import Growth
         from curvafit.report.inference import check_report, infer_scans, with_command, write_inference
 
-        growth = Growth(test=law.pop("test"))
-        law["growth"] = None if law.pop("fast") else growth
+        law["growth"] = Growth() if law.pop("test") else None
         options = {**structure, **law, "roi": roi, "seed": seed, **reading}
         if len(scans) > 1:
             settings = {"workers": workers, "command": command_line(), "overwrite": overwrite, "progress": progress}

@@ -40,7 +40,7 @@ EDGES = (32, 100)
 #: The probability below which a law is not believed to have made a scan.
 UNBELIEVABLE = 0.05
 #: What a verdict begins with where no law is the scan's, and where it is not known.
-UNBELIEVED, UNDECIDED = "No believable twin", "Undecided"
+UNBELIEVED, UNDECIDED, UNTESTED = "No believable twin", "Undecided", "Not tested"
 #: Familiar numbers in which twins may differ from the scan, and the relative difference of all twins that is named.
 FAMILIAR = {"thickness": "thickness_mean", "spacing": "spacing_mean", "connectivity": "connectivity_density"}
 NEAR = 0.15
@@ -201,7 +201,8 @@ class Misfit:
     `probability` is of all descriptors together, `blocks` of each block alone; `method` says what was compared with.
     `departure` is the mean distance of the scan from shapes of the law, less the mean distance between these, in the
     emulator's uncorrelated directions; None where nothing grew. `level_cut` is the fraction of the model's shapes that
-    look as much like a level cut of a random field as the scan does; None where the posterior cannot say.
+    look as much like a level cut of a random field as the scan does; None where the posterior cannot say. `grain` is
+    the step in which `probability` comes: what it was ranked among is finite.
     """
 
     probability: Annotated[float, Rule(least=0, most=1)]
@@ -209,6 +210,7 @@ class Misfit:
     method: str
     departure: float | None = None
     level_cut: Annotated[float | None, Rule(least=0, most=1)] = None
+    grain: Annotated[float, Rule(least=0, most=1)] = 0.0
 
 
 def join_tests(*probabilities: float) -> float:
@@ -220,26 +222,32 @@ def join_tests(*probabilities: float) -> float:
 
 
 def verdict(
-    candidates: Sequence[Candidate], misfit: Misfit | None, scan: Morphometry, *, fast: bool = False
+    candidates: Sequence[Candidate], misfit: Misfit | None, scan: Morphometry, *, grown: bool = True
 ) -> tuple[str | None, str]:
     """Return the name of the best supported law of a scan, and the verdict on it; no name where nothing grew.
 
     The test of the misfit alone decides whether a law is believable; one that is not is still named, as the nearest
-    there is. `fast` says that nothing was grown.
+    there is. A p that is nearer to `UNBELIEVABLE` than its grain decides nothing. `grown` says whether shapes were.
     """
-    if fast:
-        return candidates[0].name, _join(_describe_misfit(misfit), "Nothing was grown to check the law (--fast).")
+    if not grown:
+        law = f"{UNTESTED} ({TITLES[candidates[0].name]}): no shape was grown (--test grows some)."
+        return candidates[0].name, _join(law, _describe_misfit(misfit))
     best = best_candidate(candidates)
     if best is None or best.distance is None:
         return None, _join("No law: nothing grew from any candidate.", candidates[0].status)
     noise = seed_noise_of(candidates)
     distances = f"its twins lie {best.distance:.1f} from the scan's curvature diagram"
     distances += f", {noise:.1f} from each other." if noise else "."
-    if misfit is None:
-        rating, reason = UNDECIDED, "The law was not tested."
-    else:
-        rating = UNBELIEVED if misfit.probability < UNBELIEVABLE else "Supported"
+    rating, reason = UNDECIDED, "Too few shapes grew to test the law."
+    if misfit is not None:
         reason = _describe_misfit(misfit)
+        if misfit.probability < UNBELIEVABLE:
+            rating = UNBELIEVED
+            reason += " Measures and comparisons need no law (curvafit measure, compare)."
+        elif misfit.probability < UNBELIEVABLE + misfit.grain:
+            reason += f" That is too near to {UNBELIEVABLE:g} for a test that knows p in steps of {misfit.grain:.2g}."
+        else:
+            rating = "Supported"
     differences = ", ".join(find_differences(scan, best.twins))
     ratios = f"Twins over scan: {differences}." if differences else ""
     return best.name, _join(f"{rating} ({TITLES[best.name]}): {distances}", reason, ratios, best.status)
@@ -273,13 +281,13 @@ def _describe_misfit(misfit: Misfit | None) -> str:
     p = format_number(misfit.probability, 2)
     if misfit.probability >= UNBELIEVABLE:
         if misfit.departure is None:
-            return f"A quick reading does not rule this law out (p = {p})."
+            return f"A quick reading does not rule it out (p = {p})."
         return f"Shapes of this law look like the scan (p = {p})."
     # The level cut is one of two joined tests, so that its probability is doubled here as it is there.
     like_level_cut = misfit.level_cut is not None and join_tests(1.0, misfit.level_cut) < UNBELIEVABLE
     note = "It looks more like a level cut of a random field, which no law made." if like_level_cut else ""
     if misfit.departure is None:
-        return _join(f"A quick reading rules this law out (p = {p}).", note)
+        return _join(f"A quick reading rules it out (p = {p}).", note)
     blocks = sorted(misfit.blocks.items(), key=itemgetter(1))
     unlikely = [name for name, probability in blocks if probability < UNBELIEVABLE]
     difference = f"what differs most: {', '.join(unlikely)}" if unlikely else "no descriptor tells it alone"

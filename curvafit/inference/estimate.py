@@ -109,7 +109,8 @@ def estimate_law(
         unexplained = misfits(posterior.emulator, *reading.columns, parameters[None, :STARTS])[0]
         p = tail_probability(posterior.misfits[reading.view], unexplained)
         p, level_cut = _join_level_cut(p, posterior, reading)
-        misfit = Misfit(p, {}, "by the best fit, nothing grown", level_cut=level_cut)
+        grain = _grain(posterior, len(posterior.misfits[reading.view]))
+        misfit = Misfit(p, {}, "by the best fit, nothing grown", level_cut=level_cut, grain=grain)
         candidates = (middle, _best_fit(posterior, described, parameters[:STARTS], thickness))
         return replace(estimate, candidates=candidates, misfit=misfit)
     pool = posterior.draw(reading, POOL, seed)[:, :-1]
@@ -229,6 +230,11 @@ def _join_level_cut(p: float, posterior: Posterior, reading: Reading) -> tuple[f
     return join_tests(p, level_cut), level_cut
 
 
+def _grain(posterior: Posterior, ranked: int) -> float:
+    """Return the step in which a probability comes that was ranked among so many values, and joined with another."""
+    return (2 if len(posterior.discriminant) else 1) / (1 + ranked)
+
+
 def compare_windows(posterior: Posterior, reading: Reading, twins: np.ndarray) -> Misfit:
     """Test whether windows of a scan `(k, 351)` differ from those of twins `(n, 351)` more than the model's shapes do.
 
@@ -250,4 +256,5 @@ def compare_windows(posterior: Posterior, reading: Reading, twins: np.ndarray) -
         blocks[name] = probability_alike(scan_block / spread, twin_block / spread)
     ranking = f", ranked among {len(references)} shapes" if ranked else ""
     method = f"{len(twins)} windows of shapes of the law, {len(scan)} of the scan{ranking}"
-    return Misfit(p, blocks, method, departure, level_cut)
+    grain = _grain(posterior, len(references) or RELABELLED)
+    return Misfit(p, blocks, method, departure, level_cut, grain)

@@ -108,15 +108,16 @@ def infer(
     atlas: str | Path | Atlas | None = None,
     posterior: str | Path | Posterior | None = None,
     method: Literal["posterior", "match"] = "posterior",
-    growth: Growth | None = Growth(),
+    growth: Growth | None = None,
     seed: int = 0,
     progress: Progress | None = None,
     **reading: Any,
 ) -> Inference:
     """Infer the generation parameters (a, m₀) of a scanned volume.
 
-    A posterior of the parameters is read from the scan's descriptors; laws drawn from it, the nearest shape of the
-    atlas and, of a phase field, its stationarity are grown, and what grows is compared with the scan.
+    A posterior of the parameters is read from the scan's descriptors. With `growth`, laws drawn from it, the nearest
+    shape of the atlas and, of a phase field, its stationarity are grown; what grows is compared with the scan, and the
+    best law is tested.
 
     With `method="match"` a law is inferred as the paper's author would: the shape of the atlas whose curvature diagram
     is nearest in Wasserstein distance (geomloss), then gradient refinement from it by Levenberg and Marquardt's method
@@ -139,8 +140,8 @@ def infer(
     method
         `"posterior"`, or `"match"`: nearest match, then gradient refinement. A match alone has no intervals.
     growth
-        Which shapes are grown to refine, compare and test laws. None grows nothing: the result takes seconds instead
-        of minutes, but no law is checked by a twin.
+        Which shapes are grown to refine, compare and test laws: `Growth()` takes minutes. By default nothing is grown:
+        the result takes seconds, and its law is `Not tested`.
     seed, progress
         Seed of draws and shapes. `progress` is called with a sentence and the share done; by default the logger
         `curvafit` gets each stage once, at level INFO.
@@ -180,7 +181,7 @@ def _infer_prepared(
             estimate, twins = _grow(estimate, diagram, prepared, growth, seed, progress)
             misfit = _test_law(estimate, prepared, described, references, growth, seed, progress)
             estimate = estimate if misfit is None else replace(estimate, misfit=misfit)
-        judgement = _judge(estimate, prepared, figures, checked=growth is not None)
+        judgement = _judge(estimate, prepared, figures, grown=growth is not None)
         progress("done", 1.0)
     provenance = _describe_provenance(volume, shape, references, growth, seed)
     fit = _build_fit(prepared, diagram, figures, estimate, judgement, provenance)
@@ -252,7 +253,7 @@ def _grow(
 ) -> tuple[Estimate, dict[str, tuple[Twin, ...]]]:
     """Grow a twin of each law, and `growth.twins` of the best; return the compared laws, and the twins by law."""
     twins: dict[str, tuple[Twin, ...]] = {}
-    stage = sub_progress(progress, 0.6, 0.8 if growth.test else 1.0)
+    stage = sub_progress(progress, 0.6, 0.8)
 
     def grow(law: Candidate, fraction_done: float) -> Candidate:
         earlier = twins.get(law.name, ())
@@ -275,9 +276,9 @@ def _test_law(
     estimate: Estimate, prepared: Prepared, described: Described | None, references: _References, growth: Growth,
     seed: int, progress: Progress,
 ) -> Misfit | None:  # fmt: skip
-    """Test the best law by further shapes; None where nothing grew, none is asked for, or there are no descriptors."""
+    """Test the best law by further shapes; None where nothing grew, or there are no descriptors."""
     best = best_candidate(estimate.candidates)
-    if best is None or described is None or not growth.test:
+    if best is None or described is None:
         return None
     options = {"seed": seed + TWINS, "schedule": growth.schedule, "progress": sub_progress(progress, 0.8, 1.0)}
     return check_law(best, prepared, described, references.posterior, **options)
@@ -296,9 +297,9 @@ class Judgement(NamedTuple):
     drift: float | None = None
 
 
-def _judge(estimate: Estimate, prepared: Prepared, figures: Morphometry, *, checked: bool) -> Judgement:
-    """Choose a law and say what supports it; `checked` says whether shapes were grown."""
-    chosen, status = verdict(estimate.candidates, estimate.misfit, figures, fast=not checked)
+def _judge(estimate: Estimate, prepared: Prepared, figures: Morphometry, *, grown: bool) -> Judgement:
+    """Choose a law and say what supports it; `grown` says whether shapes were."""
+    chosen, status = verdict(estimate.candidates, estimate.misfit, figures, grown=grown)
     law = next((law for law in estimate.candidates if law.name == chosen), None)
     if law is None:
         return Judgement(status, chosen)

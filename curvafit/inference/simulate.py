@@ -34,7 +34,7 @@ BARREN, REACH = 50.0, 0.3
 
 @dataclass(frozen=True)
 class Growth:
-    """Which shapes are grown to refine, compare and test the laws that are read of a scan.
+    """Which shapes are grown to refine, compare and test the laws that are read of a scan; more test the best law.
 
     Attributes
     ----------
@@ -43,8 +43,6 @@ class Growth:
         by the shapes before.
     twins
         How many shapes of the best law are grown.
-    test
-        Whether further shapes of the best law are grown to test whether it can have made the scan.
     schedule
         Steps of each shape.
     """
@@ -52,7 +50,6 @@ class Growth:
     simulations: int = 16
     rounds: int = ROUNDS
     twins: int = 3
-    test: bool = True
     schedule: Schedule | str = LEARNED
 
 

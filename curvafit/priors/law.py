@@ -112,7 +112,8 @@ class Law:
         """A sentence of warning where the fit's status is not `Supported`; else empty."""
         if not self.status or self.status.startswith("Supported"):
             return ""
-        return f"The law ({self.origin}) is of a fit that is not `Supported`: it may not be that of its scan."
+        state = "was not tested" if self.status.startswith("Not tested") else "is not `Supported`"
+        return f"The law ({self.origin}) is of a fit that {state}: it may not be that of its scan."
 
     @property
     def fitted(self) -> bool:

@@ -28,7 +28,7 @@ from curvafit.core.units import (
 )
 from curvafit.drawing import plot
 from curvafit.geometry.diagrams import Diagram
-from curvafit.inference.candidates import TITLES, UNBELIEVED, UNDECIDED, Candidate, seed_noise_of
+from curvafit.inference.candidates import TITLES, Candidate, seed_noise_of
 from curvafit.inference.fit import Fit
 from curvafit.inference.inference import Inference, infer
 from curvafit.inference.posterior import KNOWN
@@ -323,7 +323,7 @@ def _is_framed(inference: Inference) -> bool:
 def _shapes(inference: Inference) -> list[page.Picture]:
     """Return pictures of the surfaces of the scan and of each candidate's shape, in boxes of one size."""
     fit = inference.fit
-    verdict = "the nearest" if fit.status.startswith((UNBELIEVED, UNDECIDED)) else "best supported"
+    verdict = "best supported" if fit.status.startswith("Supported") else "the nearest"
     pictures = [_shape(inference, "The scan", scan_box(inference))]
     for candidate in _chosen_first(inference):
         distance = "" if candidate.distance is None else f"; distance {candidate.distance:.1f}"

@@ -278,33 +278,35 @@ def test_a_candidate_comes_back_from_its_json() -> None:
 BARE = dataclasses.replace(ODD, blocks={"gaps": 0.3})
 QUICK = [dataclasses.replace(each, departure=None) for each in (USUAL, ODD)]
 EDGE = dataclasses.replace(USUAL, probability=UNBELIEVABLE)
+COARSE = dataclasses.replace(EDGE, grain=0.01)
 BARREN = (law("posterior", status="No shape grew: one phase."), law("match"))
 THICK = dataclasses.replace(NUMBERS, thickness_mean=1.5 * NUMBERS.thickness_mean)
 NEAR, FAR = law("match", 0.9, 0.5), law("match", 9.0, 0.5)
 FAT = dataclasses.replace(NEAR, twins=(THICK,))
-#: Candidates, their test and whether nothing was grown; the law that is named, and words of the verdict in order.
+#: Candidates, their test and whether shapes were grown; the law that is named, and words of the verdict in order.
 VERDICTS: list[tuple[tuple[Candidate, ...], Misfit | None, bool, str | None, tuple[str, ...]]] = [
-    ((law("optimum"), law("match")), None, True, "optimum", ("Nothing was grown",)),
-    ((law("optimum"),), QUICK[0], True, "optimum", ("does not rule this law out (p = 0.40)", "Nothing was grown")),
-    ((law("optimum"),), QUICK[1], True, "optimum", ("rules this law out (p = 0.0010)", "Nothing was grown")),
-    (BARREN, USUAL, False, None, ("No law: nothing grew", "No shape grew: one phase.")),
-    ((NEAR,), USUAL, False, "match", ("Supported (nearest match)", "lie 0.9", "0.5 from each other", "p = 0.40")),
-    ((law("match", 0.9, status="Hm."),), USUAL, False, "match", ("Supported", "look like the scan", "Hm.")),
-    ((FAR,), EDGE, False, "match", ("Supported",)),  # whatever the distances are
-    ((FAR,), None, False, "match", ("Undecided (nearest match)", "lie 9.0", "was not tested")),
-    ((FAT,), USUAL, False, "match", ("Supported", "Twins over scan: thickness 1.5.")),  # which do not decide
-    ((FAT,), ODD, False, "match", ("No believable twin", "Twins over scan: thickness 1.5.")),
-    ((law("simulation", 0.1, 0.5), FAR), ODD, False, "simulation", ("No believable twin", "depths, gaps.")),
-    ((law("simulation", 0.1),), BARE, False, "simulation", ("no descriptor tells it alone",)),
-    ((law("simulation", 0.1),), dataclasses.replace(BARE, level_cut=0.01), False, "simulation", ("level cut",)),
-    ((law("simulation", 0.1),), dataclasses.replace(ODD, blocks={"fabric": 0.001}), False, "simulation",
+    ((law("optimum"), law("match")), None, False, "optimum", ("Not tested (best fit of the descriptors)",)),
+    ((law("optimum"),), QUICK[0], False, "optimum", ("Not tested", "does not rule it out (p = 0.40)")),
+    ((law("optimum"),), QUICK[1], False, "optimum", ("Not tested", "rules it out (p = 0.0010)")),
+    (BARREN, USUAL, True, None, ("No law: nothing grew", "No shape grew: one phase.")),
+    ((NEAR,), USUAL, True, "match", ("Supported (nearest match)", "lie 0.9", "0.5 from each other", "p = 0.40")),
+    ((law("match", 0.9, status="Hm."),), USUAL, True, "match", ("Supported", "look like the scan", "Hm.")),
+    ((FAR,), EDGE, True, "match", ("Supported",)),  # whatever the distances are
+    ((FAR,), COARSE, True, "match", ("Undecided", "p = 0.050", "steps of 0.01")),
+    ((FAR,), None, True, "match", ("Undecided (nearest match)", "lie 9.0", "Too few shapes")),
+    ((FAT,), USUAL, True, "match", ("Supported", "Twins over scan: thickness 1.5.")),  # which do not decide
+    ((FAT,), ODD, True, "match", ("No believable twin", "Twins over scan: thickness 1.5.")),
+    ((law("simulation", 0.1, 0.5), FAR), ODD, True, "simulation", ("No believable twin", "depths, gaps.")),
+    ((law("simulation", 0.1),), BARE, True, "simulation", ("no descriptor tells it alone",)),
+    ((law("simulation", 0.1),), dataclasses.replace(BARE, level_cut=0.01), True, "simulation", ("level cut",)),
+    ((law("simulation", 0.1),), dataclasses.replace(ODD, blocks={"fabric": 0.001}), True, "simulation",
      ("has a direction (fabric)",)),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("candidates", "misfit", "fast", "name", "words"), VERDICTS)
-def test_the_test_decides_and_the_verdict_says_what_led_to_it(candidates, misfit, fast, name, words) -> None:
-    found, status = verdict(candidates, misfit, NUMBERS, fast=fast)
+@pytest.mark.parametrize(("candidates", "misfit", "grown", "name", "words"), VERDICTS)
+def test_the_test_decides_and_the_verdict_says_what_led_to_it(candidates, misfit, grown, name, words) -> None:
+    found, status = verdict(candidates, misfit, NUMBERS, grown=grown)
     assert found == name
     assert re.search(".*".join(map(re.escape, words)), status), status
 
