@@ -32,6 +32,7 @@ from curvafit.inference.candidates import join_tests
 from curvafit.inference.estimate import measure_descriptors, rank_level_cut, tail_probability
 from curvafit.inference.inference import infer
 from curvafit.inference.posterior import Posterior, load_posterior, save_posterior
+from curvafit.inference.simulate import Growth
 from curvafit.inference.table import column_names, load_table, parameters_of
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.scan.preparation import prepare
@@ -55,7 +56,7 @@ def masked(store: Store, index: int, cut: bool) -> Volume:
 
 def case(store: Store, index: int, cut: bool) -> Values:
     """Return p, of all descriptors and by block, the departure and the verdict of a shape or of its level cut."""
-    fit = infer(masked(store, index, cut), kind="mask", seed=index).fit
+    fit = infer(masked(store, index, cut), kind="mask", growth=Growth(), seed=index).fit
     found: Values = {"status": fit.status.partition(":")[0]}
     if not cut and (best := fit.best) is not None and fit.draws is not None:
         truth, law = (parameters_of(each.coefficients, each.mass) for each in (store.record(index), best))
