@@ -1,15 +1,16 @@
 """The volume between known slices: plain interpolations, the network and laws, on generated shapes and real structures.
 
 `--on shapes`: a shape of 64³, cut out of what does not repeat, is known at every so many slices; the law is inferred by
-`infer --fast` from the mask of another seed, the example. `--on scans` ($CURVAFIT_DATA): blocks of real masks; law and
+`infer` from the mask of another seed, the example. `--on scans` ($CURVAFIT_DATA): blocks of real masks; law and
 example are of the other volume, or of the other half. `--on fresh`: the same of volumes that came after all choices but
 those of their first halves (`--half 0`); the second halves are reported.
 
 - `spline`, `linear`, `nearest`, `ITK` (its morphological contour interpolation, where its package is installed): plain
   interpolations. Gains are held to the best of them *in hindsight*, case by case.
-- `filler`: `reconstruct` without an example; `tuned`: with one; `law`, `willmore`: with one, and its law or the
-  Willmore energy tried; `laws`: filled by weights that shapes of laws alone taught; `gated`: a blend of filler and
-  spline, whose weights are those that are best on every second known slice, left out.
+- `filler`: `reconstruct` without an example; `mixed`: tuned on textures like the slices; `tuned`: with an example;
+  `law`, `willmore`: with one, and its law or the Willmore energy tried; `laws`: filled by weights that shapes of laws
+  alone taught; `gated`: a blend of filler and spline, whose weights are those that are best on every second known
+  slice, left out.
 
 Dice and the calibration error within 3 voxels of the surface count the unknown slices between the first and the last
 known one; the sum of the Betti numbers' errors counts all between them. Choices were made on the structures of
@@ -44,6 +45,7 @@ from curvafit.segmentation.flow import Working
 from curvafit.segmentation.known import Known
 from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices, filled_range
+from curvafit.segmentation.teach import MIXED
 from curvafit.segmentation.trials import dice, leave_out_slices
 from curvafit.segmentation.uncertainty import best_log_odds, calibration_error, near_surface
 from curvafit.volumes.read import load
@@ -62,7 +64,7 @@ ITK = "ITK"
 #: Willmore's energy, and costs twenty times as much as that of tubes 8 voxels thick.
 LAWS_TRIED = {"willmore": Coefficients.willmore(), "area": Coefficients(0.05, 0.1, 0.05, 0, 0, 1 / 16)}
 #: Ways that are no plain interpolation.
-OURS = ("filler", "tuned", "law", "willmore", "laws", "gated")
+OURS = ("filler", MIXED, "tuned", "law", "willmore", "laws", "gated")
 #: The commit whose packaged filler was taught by shapes of laws alone, without `mixed` textures.
 TAUGHT_BY_LAWS = "a755c804"
 #: Weights of the spline in a blend with the filler, of which `gated` takes the best on every second known slice.
@@ -140,7 +142,8 @@ def filled(
     if way == "gated":
         mask, likely = gated(Known(truth, axis, tuple(places)).read(Run())[0])
     elif way in OURS:
-        law, shown = prior() if way == "law" else LAWS_TRIED.get(way), None if way in ("filler", "laws") else example()
+        law = prior() if way == "law" else LAWS_TRIED.get(way)
+        shown = None if way in ("filler", "laws") else MIXED if way == MIXED else example()
         working = Working(filler=weights_of(TAUGHT_BY_LAWS) if way == "laws" else None)
         found = reconstruct(truth, law, known=places, axis=axis, example=shown, working=working)
         mask, likely = (np.moveaxis(each.values, axis, 0) for each in (found.mask, found.probability))

@@ -30,6 +30,7 @@ from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import profile_distance
 from curvafit.scan.preparation import LARGEST_BOX
 from curvafit.scan.structure import add_records
+from curvafit.segmentation.alike import tune_alike
 from curvafit.segmentation.filler import REACH, SLOPE, TILE, Raster, Taught, fill
 from curvafit.segmentation.flow import HALO, Working, WorkingGrid, choose_epsilon
 from curvafit.segmentation.image import read_image
@@ -44,7 +45,7 @@ from curvafit.segmentation.slices import (
     plane_distances,
     require_labels,
 )
-from curvafit.segmentation.teach import tune
+from curvafit.segmentation.teach import MIXED, tune
 from curvafit.segmentation.tiles import LoweredVolume, Problem, cut_tiles, lower_volume
 from curvafit.segmentation.trials import (
     PART,
@@ -147,6 +148,7 @@ def reconstruct(
         with neither example nor law.
     example
         A mask of another volume of the same kind, known whole. A file or an array has the slices' `spacing` and `unit`.
+        `"mixed"` stands for textures that look like the known slices, by which the network is tuned without a trial.
     suggest
         Number of slices to suggest for annotation next.
     periodic
@@ -173,7 +175,7 @@ class _Inputs:
     notes: tuple[str, ...]
     taught: Taught
     image: Volume | None
-    example: Volume | None
+    example: Volume | str | None
     periodic: bool
     in_blocks: bool
 
@@ -203,7 +205,7 @@ class _Inputs:
         if not self.in_blocks or working.store is None:
             return open_run(None, None, {}, progress if self.in_blocks else silent, _ENDS)
         identity = {"labels": self.volume.digest, **self.which, "filler": self.taught.digest, "tile": working.tile}
-        identity |= {"example": self.example and self.example.digest}
+        identity |= {"example": getattr(self.example, "digest", self.example)}
         crew = working.workers if self.volume.in_file else None
         return open_run(crew, working.store, identity, progress, _ENDS)
 
@@ -216,9 +218,13 @@ def _fill_between(inputs: _Inputs, suggest: int, run: Run, working: Working, pro
     slices, labels, labelled = known.read(run, periodic)
     doubts = () if inputs.which["every"] is None else doubt_places(labelled, known.places)
     notes = (*known.notes, *doubts, *doubt_labels(labels, inputs.which["ignore"]), *inputs.notes)
-    example = None if inputs.example is None else Example.of(inputs.example, known.places, known.axis)
+    alike, example = inputs.example == MIXED, None
+    if isinstance(inputs.example, Volume):
+        example = Example.of(inputs.example, known.places, known.axis)
     step = sub_progress(progress, *((_READ, _READ) if inputs.in_blocks else (0.0, 0.5)))
     taught, evidence, input_notes = _adapt(inputs.taught, known, slices, inputs.image, example, step)
+    if alike:
+        taught, input_notes = tune_alike(taught, slices, step)
     notes = (*notes, *input_notes)
     engine = _Engine(taught, evidence, working.epsilon, progress)
     grid, tiles = engine.cut(slices, working.tile) if inputs.laws else (None, [])
@@ -586,8 +592,11 @@ def _read_evidence(
     return (None, (*doubts, UNTOLD)) if gain < LEAST_GAIN else (evidence, doubts)
 
 
-def load_example(example: Source, volume: Volume, reading: dict[str, Any]) -> Volume:
-    """Load an example, read with the spacing and unit of the slices' `volume`; raise ScanError where it differs."""
+def load_example(example: Source, volume: Volume, reading: dict[str, Any]) -> Volume | str:
+    """Load an example, read with the spacing and unit of the slices' `volume`; raise ScanError where it differs. It is
+    `MIXED` itself where that is asked for."""
+    if str(example) == MIXED:
+        return MIXED
     mask = load_with(example, reading)
     check_spacing(mask, volume, "the slices")
     require_labels(mask.values, "the example")

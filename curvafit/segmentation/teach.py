@@ -171,21 +171,28 @@ class Lessons(Batches):
 
     def __getitem__(self, number: int) -> Lesson:
         rng = np.random.default_rng([self.seed, number])
-        count = int(rng.integers(1, self.mix.most + 1))
+        count = self._draw_count(rng)
         gaps: list[tuple[np.ndarray, float, np.ndarray, np.ndarray]] = []
         while len(gaps) < self.size:
-            step = 1.0
-            if rng.random() < self.mix.coarse:
-                step = float(np.exp(rng.uniform(math.log(0.5), math.log(6))))
-            low, high = self.mix.gap
-            if not low <= step * (count + 1) <= high:
-                step = float(rng.uniform(low, high)) / (count + 1)
+            step = self._draw_step(rng, count)
             window = self._draw_window(rng, count, step)
             answer = window[2:-2][self.inner]
             if answer.any() and not answer.all():  # else there is nothing to learn
                 gaps.append(self._pose(rng, window, step))
         distances, steps, marks, truth = zip(*gaps, strict=True)
         return np.stack(distances), np.array(steps, np.float32), np.stack(marks), None, np.stack(truth)
+
+    def _draw_count(self, rng: np.random.Generator) -> int:
+        """Draw the number of slices to fill in the gaps of a batch."""
+        return int(rng.integers(1, self.mix.most + 1))
+
+    def _draw_step(self, rng: np.random.Generator, count: int) -> float:
+        """Draw the distance between slices, of which so many lie in a gap."""
+        step = 1.0
+        if rng.random() < self.mix.coarse:
+            step = float(np.exp(rng.uniform(math.log(0.5), math.log(6))))
+        low, high = self.mix.gap
+        return step if low <= step * (count + 1) <= high else float(rng.uniform(low, high)) / (count + 1)
 
     def _draw_window(self, rng: np.random.Generator, count: int, step: float) -> np.ndarray:
         """Draw slices of a structure, bool (count + 4, Y, X): two known ones, those to fill, two known ones. Three gaps
@@ -248,6 +255,11 @@ def _draw_known(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
     return known
 
 
+def draw_texture(kind: str, number: int) -> Texture:
+    """Draw a texture of one of `KINDS`; the same number gives the same texture."""
+    return Texture(KINDS[kind](np.random.default_rng([*kind.encode(), number])))
+
+
 def load_textures(
     sources: Sequence[str | Path], progress: Progress = silent
 ) -> tuple[list[list[Texture]], dict[str, Any]]:
@@ -258,7 +270,7 @@ def load_textures(
     named = [each for source in map(str, sources) for each in (KINDS if source == MIXED else (source,))]
     for number, source in enumerate(map(Path, named)):
         if (kind := str(source)) in KINDS:
-            shapes = [Texture(KINDS[kind](np.random.default_rng([*kind.encode(), k]))) for k in range(TEXTURES)]
+            shapes = [draw_texture(kind, k) for k in range(TEXTURES)]
             origin = {"seeds": TEXTURES}
         elif (source / "draws").is_dir():
             draws = find_well_formed((source,))
