@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy import ndimage
 
 from curvafit.geometry.balls import square_distances
@@ -151,9 +150,9 @@ def profile_mask(mask: np.ndarray, periodic: bool = False) -> np.ndarray:
         near = (np.abs(distance) < BAND).astype(np.float32)
         squares, near = (gaussian_blur(each, voxels, NEARBY) for each in (near * move**2, near))
         distance += np.exp(-squares / (np.float32(MOVED**2) * np.maximum(near, np.float32(1e-6)))) * move
-    error = exact  # its memory is used again
     for _ in range(SWEEPS):  # until no smoothed distance has a sign that is not the mask's
-        if not _fill_errors(distance, mask, error):
+        error = np.where(mask, np.minimum(distance, 0), np.maximum(distance, 0))
+        if not error.any():
             break
         distance -= np.float32(PULL) * gaussian_blur(error, voxels, PULL_WIDTH)
     distance *= np.float32(WORKING_SPACING / (math.sqrt(2) * WORKING_EPSILON))
@@ -164,18 +163,6 @@ def _smooth_stairs(distance: np.ndarray, voxels: Grid, width: float) -> np.ndarr
     """Return 2 G - G² of a distance with the blur G: it smooths a mask's stairs and shrinks curves less than G does."""
     blurred = gaussian_blur(distance, voxels, width)
     return 2 * blurred - gaussian_blur(blurred, voxels, width)
-
-
-@njit(cache=True)
-def _fill_errors(distance, mask, error):  # pragma: no cover
-    """Fill `error` with the distances whose sign is not the mask's, 0 elsewhere; return whether there are any."""
-    any_wrong = False
-    distances, inside, errors = distance.ravel(), mask.ravel(), error.ravel()
-    for i in range(len(distances)):
-        errors[i] = min(distances[i], np.float32(0)) if inside[i] else max(distances[i], np.float32(0))
-        if errors[i] != 0:
-            any_wrong = True
-    return any_wrong
 
 
 def resample(

@@ -318,21 +318,22 @@ def _put_on_grid(scan: _Scan, choose_box: Callable[[_Scan, tuple[float, float, f
     inverted = note_on_filling(float((mask if region is None else mask[region]).mean()))
     if not windows:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
-    # The descriptors by which laws are read have one width of smoothing.
-    profile = _profile if scan.one_scale else lambda mask, grid: grids.profile_mask(mask, grid.periodic)
+
+    def profile(mask: np.ndarray) -> np.ndarray:
+        if not scan.one_scale:
+            return grids.profile_mask(mask, grid.periodic)
+        # The descriptors by which laws are read have one width of smoothing.
+        return phase_field(torch.from_numpy(mask), grid, WORKING_EPSILON).numpy()
+
     if scan.kind != "field":
-        phase = profile(mask, grid)
+        phase = profile(mask)
     else:
-        phase = values if region is None or region.all() else np.minimum(values, profile(region, grid))
+        phase = values if region is None or region.all() else np.minimum(values, profile(region))
     phase, size = np.ascontiguousarray(phase, dtype=np.float32), (scale, edge, scan.field.unit, thickness / edge)
     notes = (*scan.field.notes, thickness_note, *why, *cut, *dropped, *inverted)
     origin = tuple(first * step for first, step in zip(start, scale, strict=True))
     known = {"roi": region, "noise": noise, "one_scale": scan.one_scale}
     return Prepared(scan.kind, phase, mask, grid, *size, tuple(windows), notes, origin, **known)  # type: ignore[arg-type]
-
-
-def _profile(mask: np.ndarray, grid: Grid) -> np.ndarray:
-    return phase_field(torch.from_numpy(mask), grid, WORKING_EPSILON).numpy()
 
 
 def note_on_filling(share: float) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -147,7 +148,7 @@ def tune_alike(taught: Taught, slices: Slices, progress: Progress = silent) -> t
     if expected_dice(expit(logits), logits > best_log_odds(logits)) > WELL:
         return taught, ("Known slices tell the volume well: the network is not tuned.",)
     looks = Looks.of(slices)
-    names, distance = looks.find()
+    names, distance = looks.find() if math.isfinite(looks.thickness) else ([], math.inf)
     if distance > FARTHEST:
         return taught, ("No texture looks like the known slices: the network is not tuned.",)
     textures = []

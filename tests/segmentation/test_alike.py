@@ -63,6 +63,8 @@ def test_the_network_stays_where_slices_tell_all_or_are_like_nothing(monkeypatch
     monkeypatch.setattr(alike, "FARTHEST", 0.0)
     tuned, notes = tune_alike(taught, slices)
     assert tuned is taught and "No texture" in notes[0]
+    whole = np.arange(4)[:, None, None] % 2 * np.ones((1, 24, 24)) > 0  # no slice has an outline
+    assert tune_alike(taught, Slices(whole, (0, 8, 16, 24), 25, (1.0, 1.0, 1.0)))[0] is taught
     rod = np.repeat(np.hypot(*np.mgrid[-32:32, -32:32])[None] < 12, 5, axis=0)
     tuned, notes = tune_alike(taught, Slices(rod, (0, 8, 16, 24, 32), 33, (1.0, 1.0, 1.0)))
     assert tuned is taught and "tell the volume well" in notes[0]
