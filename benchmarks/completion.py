@@ -376,7 +376,8 @@ def on_scans(options: argparse.Namespace, ways: list[str], cases: Cases) -> dict
         whole |= {f"{prefix}_{key}": bootstrap(values) for key, values in each.items()}
         whole[f"{prefix}_least"] = Figure(min(each["least"]))
         whole[f"{prefix}_worst_calibration"] = Figure(float(np.nanmax([*each["calibration"], 0.0])))
-    summary = {"filler_gain": "all", "filler_least": "least", "tuned_gain": "tuned_all", "tuned_least": "tuned_least"}
+    summary = {"filler_gain": "all", "filler_least": "least", "mixed_gain": "mixed_all", "mixed_least": "mixed_least",
+               "tuned_gain": "tuned_all", "tuned_least": "tuned_least"}  # fmt: skip
     whole |= {f"filled.{name}": whole[f"gaps.8.{key}"] for key, name in summary.items() if f"gaps.8.{key}" in whole}
     return whole | (figures if every == 8 else {}) if not fresh or options.half else {}
 
