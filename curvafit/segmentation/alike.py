@@ -22,7 +22,7 @@ from curvafit.data_synth.textures import KINDS
 from curvafit.segmentation.filler import REACH, Raster, Taught, fill, plane_thickness
 from curvafit.segmentation.slices import Slices
 from curvafit.segmentation.teach import FILLED, TEXTURES, TUNING, TUNING_RATE, Lessons, Mix, draw_texture, learn
-from curvafit.segmentation.trials import PART, crop_to_surface
+from curvafit.segmentation.trials import PART, crop_to_surface, dice
 from curvafit.segmentation.uncertainty import best_log_odds, expected_dice
 
 #: Thicknesses in pixels at which the looks within slices are kept, and gaps over thicknesses for those between them.
@@ -63,7 +63,7 @@ def describe_planes(masks: np.ndarray, thickness: float) -> np.ndarray:
 def overlap(masks: np.ndarray) -> float:
     """Return the Dice coefficient of neighbours among masks (n, Y, X), the mean over pairs that are not empty."""
     pairs = [(a, b) for a, b in itertools.pairwise(masks) if a.any() or b.any()]
-    return float(np.mean([2 * (a & b).sum() / (a.sum() + b.sum()) for a, b in pairs])) if pairs else 1.0
+    return float(np.mean([dice(a, b) for a, b in pairs])) if pairs else 1.0
 
 
 def tabulate(kind: str, number: int) -> np.ndarray:

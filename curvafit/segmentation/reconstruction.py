@@ -218,13 +218,10 @@ def _fill_between(inputs: _Inputs, suggest: int, run: Run, working: Working, pro
     slices, labels, labelled = known.read(run, periodic)
     doubts = () if inputs.which["every"] is None else doubt_places(labelled, known.places)
     notes = (*known.notes, *doubts, *doubt_labels(labels, inputs.which["ignore"]), *inputs.notes)
-    alike, example = inputs.example == MIXED, None
-    if isinstance(inputs.example, Volume):
-        example = Example.of(inputs.example, known.places, known.axis)
+    shown = isinstance(inputs.example, Volume)
+    example = Example.of(inputs.example, known.places, known.axis) if shown else None  # type: ignore[arg-type]
     step = sub_progress(progress, *((_READ, _READ) if inputs.in_blocks else (0.0, 0.5)))
-    taught, evidence, input_notes = _adapt(inputs.taught, known, slices, inputs.image, example, step)
-    if alike:
-        taught, input_notes = tune_alike(taught, slices, step)
+    taught, evidence, input_notes = _adapt(inputs, known, slices, example, step)
     notes = (*notes, *input_notes)
     engine = _Engine(taught, evidence, working.epsilon, progress)
     grid, tiles = engine.cut(slices, working.tile) if inputs.laws else (None, [])
@@ -250,14 +247,19 @@ def _fill_between(inputs: _Inputs, suggest: int, run: Run, working: Working, pro
 
 
 def _adapt(
-    taught: Taught, known: Known, slices: Slices, image: Volume | None, example: Example | None, progress: Progress
+    inputs: _Inputs, known: Known, slices: Slices, example: Example | None, progress: Progress
 ) -> tuple[Taught, np.ndarray | None, tuple[str, ...]]:
-    """Return the network, tuned on the example if there is one; an image's log-odds (length, Y, X); and notes."""
+    """Return the network, tuned on the example if there is one, or on textures like the slices if that is asked for;
+    an image's log-odds (length, Y, X); and notes."""
+    taught, image = inputs.taught, inputs.image
     if image is not None:
         evidence, doubts = _read_evidence(known.turn(image.values), slices, known.axis, progress)
         return Taught.load() if evidence is None else taught, evidence, (*image.notes, *doubts)
     if example is not None:
         return tune(taught, example, progress), None, example.notes
+    if inputs.example == MIXED:
+        tuned, notes = tune_alike(taught, slices, progress)
+        return tuned, None, notes
     return taught, None, ()
 
 
