@@ -53,8 +53,6 @@ class Fit(Pictured):
         structure fills over half.
     misfit
         Test of whether the chosen law can have made the scan's descriptors; None where it was not tested.
-    drift
-        Root mean square distance, in working voxels, by which a short flow of the chosen law moves the scan's surface.
     scale
         Working voxel in scan voxels, (z, y, x).
     working_voxel, length_unit
@@ -88,7 +86,6 @@ class Fit(Pictured):
     view: str = ""
     combinations: tuple[Combination, ...] = ()
     misfit: Misfit | None = None
-    drift: Annotated[float | None, Rule(least=0)] = None
     matches: tuple[Match, ...] = ()
 
     def __repr__(self) -> str:
@@ -225,7 +222,7 @@ def draw_laws(law: LawLike, count: int) -> list[Law]:
 ENTRIES = (
     "format", "status", "kind", "family", "coefficients", "mass", "uncertainty", "chosen", "scale", "working_voxel",
     "length_unit", "thickness", "coefficients_physical", "epsilon_physical", "intervals", "intervals_physical",
-    "combinations", "misfit", "drift", "candidates", "matches", "morphometry", "notes", "provenance", "posterior",
+    "combinations", "misfit", "candidates", "matches", "morphometry", "notes", "provenance", "posterior",
     "diagram",
 )  # fmt: skip
 

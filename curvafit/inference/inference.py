@@ -32,13 +32,11 @@ from curvafit.inference.estimate import (
 from curvafit.inference.fit import KINDS, Fit
 from curvafit.inference.posterior import Posterior, load_posterior
 from curvafit.inference.simulate import Growth
-from curvafit.inference.stationary import drift, stationarity
-from curvafit.priors.grid import WORKING_EPSILON, Grid
+from curvafit.inference.stationary import stationarity
+from curvafit.priors.grid import WORKING_EPSILON
 from curvafit.priors.law import Law
-from curvafit.priors.profile import phase_field
 from curvafit.scan.measures import scan_diagram
 from curvafit.scan.preparation import HALF, NOISE, Prepared, coarser_level, prepare, read_scan, why_no_texture
-from curvafit.scan.quality import sample_mask
 from curvafit.scan.structure import check_options, is_rounded, read_region
 from curvafit.volumes.read import Source
 from curvafit.volumes.volume import Volume
@@ -169,10 +167,10 @@ def _infer_prepared(
     progress("measuring curvature", 0.05)
     diagram = None if prepared.noise else scan_diagram(prepared)
     figures = morphometry(prepared.mask, prepared.working_voxel, prepared.unit, periodic=prepared.grid.periodic)
-    no_law = NOISE if diagram is None else why_no_texture(prepared, diagram)
-    estimate, judgement = Estimate(), Judgement(no_law)
+    status = NOISE if diagram is None else why_no_texture(prepared, diagram)
+    estimate, chosen = Estimate(), None
     twins: dict[str, tuple[Twin, ...]] = {}
-    if diagram is not None and not no_law:
+    if diagram is not None and not status:
         progress("measuring descriptors", 0.1)
         described = measure_descriptors(prepared)
         settings = {"refined": refined, "growth": growth, "seed": seed, "progress": progress}
@@ -181,10 +179,10 @@ def _infer_prepared(
             estimate, twins = _grow(estimate, diagram, prepared, growth, seed, progress)
             misfit = _test_law(estimate, prepared, described, references, growth, seed, progress)
             estimate = estimate if misfit is None else replace(estimate, misfit=misfit)
-        judgement = _judge(estimate, prepared, figures, grown=growth is not None)
+        chosen, status = verdict(estimate.candidates, estimate.misfit, figures, grown=growth is not None)
         progress("done", 1.0)
     provenance = _describe_provenance(volume, shape, references, growth, seed)
-    fit = _build_fit(prepared, diagram, figures, estimate, judgement, provenance)
+    fit = _build_fit(prepared, diagram, figures, estimate, chosen, status, provenance)
     return Inference(volume, prepared, diagram, twins, fit, estimate.simulated)
 
 
@@ -224,7 +222,9 @@ def _estimate(
     if prepared.kind == "field" and not is_rounded(prepared.phase):
         starts = [law.coefficients for law in (*estimate.candidates[:1], *matches[:STARTS])]
         options = {"starts": starts, "seed": seed, "progress": sub_progress(progress, 0.5, 0.6)}
-        laws = (stationarity(*_main_window(prepared), WORKING_EPSILON, **options), *laws)
+        window = prepared.windows[0]
+        phase = torch.from_numpy(np.ascontiguousarray(prepared.phase[window]))
+        laws = (stationarity(phase, prepared.part(window), WORKING_EPSILON, **options), *laws)
     return replace(estimate, candidates=laws, matches=matches)
 
 
@@ -236,16 +236,6 @@ def _find_matches(prepared: Prepared, diagram: Diagram, atlas: Atlas, *, exact: 
     query = diagram.mirrored if inverted else diagram
     matches = nearest(query, atlas, seen_as=seen_as, count=MATCHES, exact=exact)
     return tuple(map(mirror_match, matches)) if inverted else tuple(matches)
-
-
-def _main_window(prepared: Prepared, step: float = 1.0) -> tuple[torch.Tensor, Grid]:
-    """Return the phase field of the main window and its grid, on voxels of `step` working voxels."""
-    window = prepared.windows[0]
-    if step == 1:
-        return torch.from_numpy(np.ascontiguousarray(prepared.phase[window])), prepared.part(window)
-    mask = sample_mask(prepared.mask[window], [step] * 3, prepared.grid.periodic)
-    grid = Grid(mask.shape, prepared.grid.spacing, prepared.grid.boundary)
-    return phase_field(torch.from_numpy(mask), grid, WORKING_EPSILON), grid
 
 
 def _grow(
@@ -284,32 +274,6 @@ def _test_law(
     return check_law(best, prepared, described, references.posterior, **options)
 
 
-class Judgement(NamedTuple):
-    """The verdict on a scan, and the name of the law that was chosen, if any.
-
-    `ratio` is the edge, in working voxels of the scan, of the voxel with which the law's shapes are as thick as
-    the scan's structure. `drift` is how far, in working voxels, a short flow of the law moves that structure's surface.
-    """
-
-    status: str
-    chosen: str | None = None
-    ratio: float = 1.0
-    drift: float | None = None
-
-
-def _judge(estimate: Estimate, prepared: Prepared, figures: Morphometry, *, grown: bool) -> Judgement:
-    """Choose a law and say what supports it; `grown` says whether shapes were."""
-    chosen, status = verdict(estimate.candidates, estimate.misfit, figures, grown=grown)
-    law = next((law for law in estimate.candidates if law.name == chosen), None)
-    if law is None:
-        return Judgement(status, chosen)
-    # The voxel of a phase field follows from its interface width; a mask shows none, so its thickness decides.
-    scaled = prepared.kind != "field" and law.thickness is not None
-    ratio = prepared.thickness / law.thickness if scaled else 1.0  # type: ignore[operator]
-    distance = drift(*_main_window(prepared, ratio), WORKING_EPSILON, law.coefficients)
-    return Judgement(status, chosen, ratio, distance)
-
-
 def _read_and_prepare(
     scan: Source, options: Mapping[str, Any], reading: Mapping[str, Any]
 ) -> tuple[Volume, tuple[int, int, int], Prepared]:
@@ -335,10 +299,12 @@ def _read_and_prepare(
 
 
 def _build_fit(
-    prepared: Prepared, diagram: Diagram | None, figures: Morphometry, estimate: Estimate, judgement: Judgement,
-    provenance: dict[str, Any],
+    prepared: Prepared, diagram: Diagram | None, figures: Morphometry, estimate: Estimate, chosen: str | None,
+    status: str, provenance: dict[str, Any],
 ) -> Fit:  # fmt: skip
-    grid, ratio = prepared.grid, judgement.ratio
+    grid, thickness = prepared.grid, next((law.thickness for law in estimate.candidates if law.name == chosen), None)
+    # The voxel of a phase field follows from its interface width; a mask shows none, so its thickness decides.
+    ratio = 1.0 if thickness is None or prepared.kind == "field" else prepared.thickness / thickness
     return Fit(
         kind=prepared.kind,
         family="noise" if diagram is None else family_of(diagram, prepared.thickness / 2 * grid.spacing[0]),
@@ -346,18 +312,17 @@ def _build_fit(
         working_voxel=ratio * prepared.working_voxel,
         length_unit=prepared.unit,
         thickness=prepared.thickness * prepared.working_voxel,
-        status=judgement.status,
+        status=status,
         morphometry=figures,
         notes=prepared.notes,
         provenance=provenance,
         diagram=None if diagram is None else diagram.thin(BIN_WIDTH, TAIL_SHARE),
         candidates=estimate.candidates,
-        chosen=judgement.chosen,
+        chosen=chosen,
         draws=estimate.draws,
         view=estimate.view,
         combinations=estimate.combinations,
         misfit=estimate.misfit,
-        drift=judgement.drift,
         matches=estimate.matches,
     )
 

@@ -5,8 +5,7 @@ differences, so ordinary least squares is biased; here the misfit is measured in
 causes (total least squares with the noise propagated through the columns), and the error's size is the one at which
 both are equal.
 
-Stationarity reads how a profile deviates from tanh, so it says nothing of a mask, whose profile is made up. There a
-short flow (`drift`) first mends the profile, and then moves the interface: the better the law, the less.
+Stationarity reads how a profile deviates from tanh, so it says nothing of a mask, whose profile is made up.
 """
 
 from __future__ import annotations
@@ -22,15 +21,12 @@ from torch import Tensor
 
 from curvafit.core.checks import require
 from curvafit.core.runtime import Progress, silent
-from curvafit.generation.flow import WORKING_BLUR, Optimiser, descend
-from curvafit.generation.schedule import Schedule
 from curvafit.inference.candidates import Candidate
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.curvature import jet
 from curvafit.priors.energies import energy_terms
 from curvafit.priors.grid import Float, Grid
-from curvafit.priors.stencils import gaussian_blur, gradient, pad
-from curvafit.scan.grids import boxes_by_surface, surface_voxels
+from curvafit.priors.stencils import gaussian_blur, pad
 from curvafit.scan.structure import is_rounded
 
 #: Standard deviation of the test functions, in voxels; less in a crop, whose borders their support must not reach.
@@ -43,12 +39,6 @@ _REACH = 2
 _SLAB = 24
 #: The field's error is modelled as white noise of this width (voxels); its amplitude is searched from the first value.
 _ERROR_WIDTH, _ERROR_START, _ERROR_LIMITS, _ERROR_STEPS = 1.0, 1e-3, (1e-6, 3e-2), 4
-#: The short flow: Adam steps of 1e-3 as published.
-SHORT_FLOW = Schedule("short", 150, 1e-3, 1e-3, "constant")
-#: Longest edge of the box that is flowed, and the width of the halo that is held at the sides of a crop, in voxels.
-LARGEST_BOX, HALO = 64, 8
-#: Standard deviation in voxels of the low-pass on the displacement, and every how many voxels it is read.
-LOW_PASS, STRIDE = 2.0, 2
 
 
 class Problem(NamedTuple):
@@ -264,57 +254,6 @@ def clip_to_domain(values: np.ndarray) -> np.ndarray:
     scaled = 2 * values / max(values[0] + values[2], 1e-12)
     fraction = np.clip(scaled[0] / 2, 0.01, 0.99)
     return np.concatenate(([2 * fraction, scaled[1], 2 - 2 * fraction], scaled[3:]))
-
-
-# ---- drift -----------------------------------------------------------------------------------------------------------
-
-
-def drift(phase: Float[Tensor, "z y x"], grid: Grid, epsilon: float, coefficients: Coefficients) -> float | None:
-    """Return the root mean square distance, in voxels, by which a short flow of a law moves the surface of `phase`.
-
-    The displacement is low-passed. Coefficients count up to scale: the flow takes them in their gauge. None where the
-    box is too small to have an inside between its halos.
-    """
-    if not grid.periodic and min(grid.shape) <= 2 * HALO + STRIDE:
-        return None
-    values = phase.detach().to("cpu", torch.float32)
-    if max(grid.shape) > LARGEST_BOX:  # flow the box with the most surface
-        windows = boxes_by_surface(surface_voxels((values > 0).numpy()), LARGEST_BOX)
-        values = values[windows[0]].contiguous()
-        grid = Grid(tuple(values.shape), grid.spacing, "replicate")  # type: ignore[arg-type]
-    start = deblur(values, grid, epsilon)
-    law, _ = fix_gauge(np.array([float(value) for value in coefficients]))
-    options = {"optimiser": Optimiser("adam", SHORT_FLOW.steps, SHORT_FLOW), "epsilon": epsilon, "blur": WORKING_BLUR}
-    flow = descend(start, law, grid, flow="h-1", frozen=halo_of(grid), **options)
-    before = gaussian_blur(start, grid, epsilon)
-    moved = (flow.field - before).double()
-    if not bool(torch.isfinite(moved).all()):
-        return 10.0  # the flow diverged
-    margin = 0 if grid.periodic else HALO
-    sampled = tuple(slice(margin, n - margin, STRIDE) for n in grid.shape)
-    # The displacement is the low-passed change of u over the low-passed |∇u|, by which it is weighted in the mean.
-    steepness = gradient(before.double(), grid).square().sum(-4).sqrt()
-    voxel = grid.spacing[0]
-    slope, change = (gaussian_blur(field, grid, LOW_PASS * voxel)[sampled] for field in (steepness, moved))
-    interface = slope > 0.02 * slope.max()
-    return float((change[interface].square() / slope[interface]).sum() / slope[interface].sum()) ** 0.5 / voxel
-
-
-def halo_of(grid: Grid) -> Tensor | None:
-    """Return the voxels at the sides of a crop that a flow holds; None where the box repeats."""
-    if grid.periodic:
-        return None
-    halo = torch.ones(grid.shape, dtype=torch.bool)
-    halo[HALO:-HALO, HALO:-HALO, HALO:-HALO] = False
-    return halo
-
-
-def deblur(phase: Tensor, grid: Grid, width: float) -> Tensor:
-    """Return v₀ with k ∗ v₀ close to `phase`, by two Van Cittert steps."""
-    v = phase
-    for _ in range(2):
-        v = v + phase - gaussian_blur(v, grid, width)
-    return v
 
 
 # ---- JAX -------------------------------------------------------------------------------------------------------------

@@ -125,20 +125,6 @@ def _interpolate(value: float, places: Sequence[float], rows: np.ndarray) -> np.
     return rows[:, low] + (at - low) * (rows[:, low + 1] - rows[:, low])
 
 
-@dataclass(frozen=True, eq=False)
-class AlikeLessons(Lessons):
-    """Lessons with one number of slices to fill, and one distance between them in pixels."""
-
-    count: int = 1
-    step: float = 1.0
-
-    def _draw_count(self, rng: np.random.Generator) -> int:
-        return self.count
-
-    def _draw_step(self, rng: np.random.Generator, count: int) -> float:
-        return self.step
-
-
 def tune_alike(taught: Taught, slices: Slices, progress: Progress = silent) -> tuple[Taught, tuple[str, ...]]:
     """Train a filler further on textures that look like known slices, or like the part of large ones that has most
     surface; return it with notes. Where the filler as it was fills the volume well, or nothing looks like the slices,
@@ -158,7 +144,7 @@ def tune_alike(taught: Taught, slices: Slices, progress: Progress = silent) -> t
     narrow = (looks.thickness / 1.18, looks.thickness * 1.18)
     mix = Mix(thickness=narrow, pairs=0.0, holes=0.0, trembling=0.0, partial=0.0)
     step = looks.gap / (looks.count + 1)
-    lessons = AlikeLessons([textures], mix, 0, TUNING, size=3, edge=64, count=looks.count, step=step)
+    lessons = Lessons([textures], mix, 0, TUNING, size=3, edge=64, count=looks.count, step=step)
     tuned = replace(taught, filler=copy.deepcopy(taught.filler))
     report: Progress = lambda _, done: progress("tuning on textures like the slices", 0.3 + 0.7 * done)  # noqa: E731
     learn(tuned.filler, lessons, TUNING_RATE, workers=0, progress=report)

@@ -1,4 +1,4 @@
-"""What pins the parameters down, and what does not: stationarity of fields, and drift of masks."""
+"""What pins the parameters of a phase field down, and what does not: its stationarity."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -10,14 +10,12 @@ import pytest
 import torch
 from emulated import BOX, linear, reading, row
 from loss_cases import noise
-from shapes import grown
 
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
 from curvafit.inference.emulator import best_parameters
-from curvafit.inference.stationary import clip_to_domain, drift, energy_gradients, integrate_columns, stationarity
-from curvafit.priors import WORKING_EPSILON, Coefficients, Grid, energy_terms, jet, phase_field, preset
-from curvafit.priors.stencils import gaussian_blur
+from curvafit.inference.stationary import clip_to_domain, energy_gradients, integrate_columns, stationarity
+from curvafit.priors import WORKING_EPSILON, Coefficients, Grid, energy_terms, jet, preset
 from curvafit.scan.structure import is_rounded
 
 EDGE = 36
@@ -156,38 +154,6 @@ def test_the_authors_sponge_gives_its_coefficients_back(data) -> None:
     assert found.name == "stationarity" and found.coefficients.a20 == 1
 
 
-# ---- drift: what a short flow moves ----------------------------------------------------------------------------------
-
-
-MASK = Grid((32, 32, 32))
-
-
-@pytest.fixture(scope="module")
-def mask_phase() -> torch.Tensor:
-    return phase_field(grown("tubes", 32) > 0, MASK, WORKING_EPSILON)
-
-
-def test_the_right_parameters_leave_a_mask_where_it_is(mask_phase: torch.Tensor) -> None:
-    """Of six seeds the interface moves by 0.25 to 0.71 voxels, by 0.08 to 0.26 of what the wrong ones move it."""
-    truth, wrong = (drift(mask_phase, MASK, WORKING_EPSILON, preset(name).coefficients) for name in ("tubes", "sponge"))
-    assert truth is not None and wrong is not None
-    assert truth < 1
-    assert truth < 0.7 * wrong
-
-
-def test_only_the_direction_of_a_counts(mask_phase: torch.Tensor) -> None:
-    shape = preset("tubes").coefficients
-    weak, strong = (drift(mask_phase, MASK, WORKING_EPSILON, shape.scale(c)) for c in (0.5, 2))
-    assert weak == pytest.approx(strong, abs=1e-6)
-
-
-def test_sharpening_undoes_most_of_the_blur(mask_phase: torch.Tensor) -> None:
-    blurred = gaussian_blur(mask_phase, MASK, WORKING_EPSILON)
-    kept = gaussian_blur(room.deblur(mask_phase, MASK, WORKING_EPSILON), MASK, WORKING_EPSILON)
-    assert (kept - mask_phase).abs().mean() < 0.35 * (blurred - mask_phase).abs().mean()
-    assert float(kept.double().mean()) == pytest.approx(float(mask_phase.double().mean()), abs=1e-5)
-
-
 @pytest.mark.slow
 def test_a_fit_in_float64_leaves_jax_as_it_is() -> None:
     """As other threads see it while fits run, two at once, and afterwards."""
@@ -204,14 +170,3 @@ def test_a_fit_in_float64_leaves_jax_as_it_is() -> None:
     assert jnp.ones(1).dtype == (jnp.float64 if before else jnp.float32)
     for end, _ in ends:
         assert end == pytest.approx(at, abs=1e-4 * np.ptp(BOX))
-
-
-def test_a_law_without_a20_has_a_drift_and_a_crop_without_an_inside_has_none(mask_phase: torch.Tensor) -> None:
-    """The gauge is a02 then: over a20 the coefficients would be beyond what a flow computes. All of the crop would be
-    the halo that is held."""
-    law = Coefficients(1e-9, 1.0, 1.0, -20.0, 0.0, 100.0)
-    assert np.isfinite(drift(mask_phase, MASK, WORKING_EPSILON, law) or np.nan)
-    frozen = room.halo_of(Grid((32, 32, 32), boundary="replicate"))
-    assert frozen is not None and bool(frozen[0].all()) and not bool(frozen[16, 16, 16])
-    grid = Grid((16, 24, 24), boundary="replicate")
-    assert drift(torch.ones(grid.shape), grid, WORKING_EPSILON, preset("tubes").coefficients) is None
