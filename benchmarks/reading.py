@@ -1,0 +1,125 @@
+"""What `infer` says in seconds: of shapes of laws that no choice has seen, by three schedules, and of what no law made.
+
+Laws are the presets and the random ones of `completion`; each grows a shape of 64³ by `deep`, by `fast` and by `paper`
+with half its steps, in a periodic box. Each is seen as a mask, cut open, and as a bad scan, on a scanner's voxels, as
+`curvafit atlas describe` sees them. Other textures are those that teach the network that fills volumes: level cuts,
+walls of cells, grains, trees of tubes, fibres, so many of each, seen in the same way.
+
+`size` is the part of laws' shapes whose quick p is below .05, `power` that of others. Errors are of the posterior's
+medians, in deviations of the box; `in 90` is the part of laws within the central 90 % of the draws.
+"""
+
+from __future__ import annotations
+
+import argparse
+import zlib
+from functools import partial
+from itertools import product
+
+import numpy as np
+from scipy import stats
+
+from benchmarks.closure import PRIOR, SLUGS, over_laws
+from benchmarks.completion import DRAWN, EDGE, LAWS, SOBOL, shape
+from benchmarks.harness import Cases, Figure, Values, show
+from curvafit.data_synth.design import design_box
+from curvafit.data_synth.textures import KINDS
+from curvafit.generation.flow import generate
+from curvafit.generation.schedule import Schedule, schedule
+from curvafit.inference.candidates import UNBELIEVABLE
+from curvafit.inference.inference import infer
+from curvafit.inference.table import VIEWS, parameters_of
+from curvafit.priors import preset
+from curvafit.volumes.volume import ScanError
+
+SEED = 2
+SCHEDULES: dict[str, Schedule] = {"deep": schedule("deep"), "fast": schedule("fast"), "paper": schedule("paper", 4000)}
+SEEN = ("mask", "scan")
+TEXTURES = 20
+
+
+def law_of(name: str) -> tuple[np.ndarray, tuple]:
+    """Return the parameters `(6,)` of a law, and what `generate` takes."""
+    if name.startswith("draw-"):
+        draw = design_box("sobol", ["a02"]).draw(SOBOL, int(name.removeprefix("draw-")))
+        return parameters_of(draw.coefficients, draw.mass), (draw.coefficients, draw.mass)
+    law = preset(name)
+    return parameters_of(law.coefficients, law.mass), (name,)
+
+
+def grow(name: str, by: str, cases: Cases) -> np.ndarray:
+    """Return the mask of a law by a schedule, grown once."""
+    if by == "deep":
+        return shape(name, SEED, cases)
+
+    def made() -> np.ndarray:
+        flow = generate(*law_of(name)[1], grid=EDGE, schedule=SCHEDULES[by], seed=SEED)
+        return np.packbits(flow.field.numpy() > 0)
+
+    return np.unpackbits(cases.array(f"{by}-{name}", made)).reshape(EDGE, EDGE, EDGE) > 0
+
+
+def read(mask: np.ndarray, name: str, seen: str, truth: np.ndarray | None) -> Values:
+    """Return what `infer` says of a mask as it is seen: p, and of a law errors in deviations, and what is covered."""
+    random = np.random.default_rng([SEED, zlib.crc32(f"{name}-{seen}".encode())])
+    try:
+        scan, kind, periodic = VIEWS[seen](np.where(mask, 1.0, -1.0).astype(np.float32), random)
+        fit = infer(scan, kind=kind, periodic=periodic).fit
+    except ScanError as error:
+        return {"status": str(error)}
+    found: Values = {"status": fit.status, "p": None if fit.misfit is None else fit.misfit.probability}
+    if truth is not None and fit.draws is not None:
+        draws = fit.draws[:, :-1]
+        least, median, most = np.quantile(draws, (0.05, 0.5, 0.95), axis=0)
+        found["error"] = np.round((median - truth) / PRIOR, 3).tolist()
+        found["in 90"] = ((least <= truth) & (truth <= most)).tolist()
+    return found
+
+
+def law_case(name: str, by: str, seen: str, cases: Cases) -> Values:
+    return read(grow(name, by, cases), name, seen, law_of(name)[0])
+
+
+def texture_case(kind: str, number: int, seen: str) -> Values:
+    random = np.random.default_rng([SEED, *kind.encode(), number])  # other textures than those that taught
+    return read(KINDS[kind](random) > 0, f"{kind}-{number}", seen, None)
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--share", default="0/1", help="of the cases, for several processes")
+
+
+def ruled_out(rows: list[Values]) -> Figure:
+    """Return the part of cases that a quick reading rules out, of those that it can read."""
+    p = [row["p"] for row in rows if row.get("p") is not None]
+    hits = sum(value < UNBELIEVABLE for value in p)
+    interval = stats.binomtest(hits, len(p)).proportion_ci(method="wilson") if p else (np.nan, np.nan)
+    return Figure(hits / max(len(p), 1), *map(float, interval))
+
+
+def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    laws, number = ((LAWS[:1], 1) if options.quick else ((*LAWS, *DRAWN), TEXTURES))
+    jobs = {f"{by}-{name}-{seen}": partial(law_case, name, by, seen, cases)
+            for by, name, seen in product(SCHEDULES, laws, SEEN)}  # fmt: skip
+    jobs |= {f"{kind}-{k}-{seen}": partial(texture_case, kind, k, seen)
+             for kind, k, seen in product(KINDS, range(number), SEEN)}  # fmt: skip
+    share, shares = map(int, options.share.split("/"))
+    found = cases.all(dict(list(jobs.items())[share::shares]), SEED)
+    figures: dict[str, Figure] = {}
+    for seen in SEEN:
+        for by in SCHEDULES:
+            rows = {name: found[case] for name in laws if (case := f"{by}-{name}-{seen}") in found}
+            figures[f"reading.{seen}.{by}.size"] = ruled_out(list(rows.values()))
+            known = {name: row for name, row in rows.items() if "error" in row}
+            if known:
+                names = np.array(list(known))
+                away = np.abs([row["error"] for row in known.values()])
+                covered = np.array([row["in 90"] for row in known.values()], dtype=float)
+                errors = over_laws(away, names, np.median)
+                figures |= {f"reading.{seen}.{by}.error.{slug}": each for slug, each in zip(SLUGS, errors, strict=True)}
+                figures[f"reading.{seen}.{by}.in90"] = over_laws(covered.mean(1, keepdims=True), names, np.mean)[0]
+        for kind in KINDS:
+            rows = [found[case] for k in range(number) if (case := f"{kind}-{k}-{seen}") in found]
+            figures[f"reading.{seen}.{kind.replace(' ', '_')}.power"] = ruled_out(rows)
+    show(["", ""], list(figures.items()))
+    return {} if options.quick or shares > 1 else figures
