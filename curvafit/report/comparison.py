@@ -24,7 +24,16 @@ from curvafit.core.records import Format
 from curvafit.core.units import format_number, format_percent, per_unit, plain_unit, power_name
 from curvafit.drawing import plot
 from curvafit.geometry.distances import DIRECTIONS, QUANTILES
-from curvafit.report.page import Chosen, check_result_folder, render, start_record, write_study
+from curvafit.report.page import (
+    MOST_OUTLINES,
+    Chosen,
+    check_result_folder,
+    name_parts,
+    outlines_figure,
+    render,
+    start_record,
+    write_study,
+)
 from curvafit.scan.measures import Measures
 from curvafit.studies.comparison import BINS, LEVEL, SMOOTH, Comparison, Number, join_names
 from curvafit.studies.scans import count_notes
@@ -35,7 +44,7 @@ FORMAT = Format("curvafit comparison", 1, title="the record of a comparison")
 TESTS = ("p", "family-wise", "Holm", "BH")
 #: What a comparison writes into its folder.
 FILES = ("compare.json", "compare.html", "measures.csv", "numbers.csv")
-FILES += ("difference.svg", "difference.png", "numbers.svg", "numbers.png")
+FILES += ("difference.svg", "difference.png", "numbers.svg", "numbers.png", "outlines.svg", "outlines.png")
 #: Colours of what is less and of what is more.
 MORE = LinearSegmentedColormap.from_list("more", [plot.FIRST, "#8CC0E0", "#FFFFFF", "#F0B48A", plot.SECOND])
 #: Larger and smaller panels of numbers in a row.
@@ -70,11 +79,13 @@ def write_comparison(
         "title": c.verdict, "scans": "; ".join(_count_scans(c)) + ".", "effect": c.effect,
         "head": ["", "", *c.groups, "difference" if c.groups else "slope", c.effect, "95 %", *TESTS, "known error"],
         "rows": [_format_row(number, c) for number in c.numbers], "level": f"{LEVEL:.2g}",
-        "differs": bool(c.significant.any()),
+        "differs": bool(c.significant.any()), "omitted": max(0, len(c.measures) - MOST_OUTLINES),
     }  # fmt: skip
+    outlines = outlines_figure(name_parts(c.measures), [scan.outline for scan in c.measures], c.unit)
     figures = {
         "difference": (comparison_figure(c), "Mean curvature diagrams and their difference"),
         "numbers": (numbers_figure(c), f"Each number by {c.by}"),
+        "outlines": (outlines, "Three slices of each scan, and the outline of its structure"),
     }
     columns = [{"subject": case.subject, label: case.label} for case in c.cases]
     rows = (row for scan, more in zip(c.measures, columns, strict=True) for row in scan.rows(**more))

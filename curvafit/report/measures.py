@@ -18,7 +18,15 @@ from curvafit.core.records import Format
 from curvafit.core.units import format_length, format_number, format_percent, power_name, unit_name
 from curvafit.drawing import plot
 from curvafit.report.comparison import describe_measures, name_quantity
-from curvafit.report.page import check_result_folder, start_record, write_study
+from curvafit.report.page import (
+    MOST_OUTLINES,
+    check_result_folder,
+    name_parts,
+    outlines_figure,
+    shorten,
+    start_record,
+    write_study,
+)
 from curvafit.scan.measures import QUANTITIES, Measures, Quantity
 from curvafit.studies.scans import count_notes, list_rows
 from curvafit.studies.windowed import NAMES, Windows
@@ -27,10 +35,12 @@ from curvafit.studies.windowed import NAMES, Windows
 FORMAT = Format("curvafit measured scans", 1, title="the record of measured scans")
 #: What is written into the folder.
 FILES = ("measures.json", "measures.html", "measures.csv", "diagrams.svg", "diagrams.png", "numbers.svg", "numbers.png")
+FILES += ("outlines.svg", "outlines.png")
 #: Of a scan measured in windows, `format` of the record.
 WINDOWS_FORMAT = Format("curvafit windows", 1, title="the record of a scan measured in windows")
 #: Of a scan measured in windows, what is written into the folder beside the maps.
 WINDOWS_FILES = ("windows.json", "windows.html", "windows.csv", "windows.svg", "windows.png")
+WINDOWS_FILES += ("outlines.svg", "outlines.png")
 #: Grey of structure whose windows are not known.
 UNKNOWN = 0.88
 #: Colours of clusters from 0 on: the strong ones of labels first.
@@ -39,8 +49,8 @@ COLOURS = np.vstack([plot.LABELS[:1], plot.LABELS[1::2], plot.LABELS[2::2]])
 check_measures = partial(check_result_folder, FORMAT, FILES)
 #: The most scans whose diagrams and numbers are drawn.
 MOST_DIAGRAMS, MOST_ROWS = 25, 100
-#: Diagrams in a row, and panels of numbers in a row; letters of a scan's name that a panel has room for.
-DIAGRAMS, PANELS, WORD = 5, 4, 22
+#: Diagrams in a row, and panels of numbers in a row.
+DIAGRAMS, PANELS = 5, 4
 
 
 def write_measures(
@@ -81,11 +91,14 @@ def write_measures(
         "title": f"{len(measures)} scans measured" if len(measures) > 1 else "One scan measured",
         "head": ["scan", *titles, *((symbol, power_name(unit, measures[0][symbol].power)) for symbol in symbols)],
         "kinds": [""] * (1 + len(titles)), "methods": describe_measures(measures), "rows": rows,
-        "omitted": {"diagrams": max(0, len(rows) - MOST_DIAGRAMS), "numbers": max(0, len(rows) - MOST_ROWS)},
+        "omitted": {"diagrams": max(0, len(rows) - MOST_DIAGRAMS), "numbers": max(0, len(rows) - MOST_ROWS),
+                    "outlines": max(0, len(measures) - MOST_OUTLINES)},
     }  # fmt: skip
     diagrams = diagrams_figure(names[:MOST_DIAGRAMS], parts[:MOST_DIAGRAMS])
     intervals = intervals_figure(names[:MOST_ROWS], parts[:MOST_ROWS])
+    outlines = outlines_figure(name_parts(measures), [scan.outline for scan in measures], unit)
     figures = {
+        "outlines": (outlines, "Three slices of each scan, and the outline of its structure"),
         "diagrams": (diagrams, "The curvature diagram of each scan"),
         "numbers": (intervals, "Numbers of each scan with their intervals"),
     }
@@ -112,19 +125,6 @@ def describe_range(parts: Sequence[Measures]) -> str:
         span = f"from {low} ({names[extremes[0]]}) to {high} ({names[extremes[1]]})" if len(known) > 1 else low
         sentences.append(f"{title[0].upper()}{title[1:]} {span}.")
     return " ".join(sentences)
-
-
-def name_parts(parts: Sequence[Measures]) -> list[str]:
-    """Return a name for each scan or part of one: its file, or the path where two files have one name, and its part."""
-    sources: dict[str, set[str]] = {}
-    for part in parts:
-        sources.setdefault(Path(part.source).name, set()).add(part.source)
-    names = []
-    for k, part in enumerate(parts, 1):
-        file = Path(part.source).name
-        name = file if file and len(sources[file]) == 1 else part.source or f"array {k}"
-        names.append(f"{name}, {' '.join(map(str, part.part))}" if part.part else name)
-    return names
 
 
 # ---- figures ---------------------------------------------------------------------------------------------------------
@@ -186,12 +186,6 @@ def intervals_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figu
     return figure
 
 
-def shorten(names: Sequence[str]) -> list[str]:
-    """Return names that a panel has room for: the end of a long name, with a number where two would be the same."""
-    short = [name if len(name) <= WORD else f"…{name[1 - WORD :]}" for name in names]
-    return [name if short.count(name) == 1 else f"{k} {name}" for k, name in enumerate(short, 1)]
-
-
 # ---- a scan in windows -----------------------------------------------------------------------------------------------
 
 
@@ -223,7 +217,11 @@ def write_windows(windows: Windows, directory: str | Path, *, command: str = "",
     clusters = (f"cluster {k}" for k in range(1, 1 + int(windows.clusters.values.max())))
     head = ["", "", "least", "median", "most", *clusters, "between"]
     page = {"title": "A scan in windows", "head": head, "rows": rows}
-    figures = {"windows": (windows_figure(windows), "The structure, coloured by clusters and by six numbers")}
+    outlines = outlines_figure([Path(source).name], [windows.outline], windows.unit)
+    figures = {
+        "outlines": (outlines, "Three slices of the scan, and the outline of its structure"),
+        "windows": (windows_figure(windows), "The structure, coloured by clusters and by six numbers"),
+    }
     volumes = (windows.clusters, *map(windows.__getitem__, NAMES))
     maps = dict(zip(files[len(WINDOWS_FILES) :], volumes, strict=True))
     shown = ("scan", "command", "date", "options")

@@ -15,6 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from matplotlib.figure import Figure
 
@@ -22,11 +23,15 @@ from curvafit.core.files import move_together, remove, temporary_folder
 from curvafit.core.records import Format, can_write, has_mark
 from curvafit.core.runtime import hold_signals
 from curvafit.core.units import format_number
+from curvafit.drawing import plot
 from curvafit.drawing.plot import png, svg
+from curvafit.scan.measures import Measures, Outline
 from curvafit.studies.scans import format_csv
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
+#: Letters of a scan's name that a panel has room for, and the most scans whose outlines are drawn.
+WORD, MOST_OUTLINES = 22, 25
 #: The mark by which a page is known as this program's.
 MARK = '<meta name="generator" content="curvafit'
 
@@ -126,7 +131,7 @@ def write_study(
     values: Mapping[str, Any],
     tables: Mapping[str, Iterable[dict[str, Any]]],
     *,
-    figures: Mapping[str, tuple[Figure, str]] | None = None,
+    figures: Mapping[str, tuple[Figure | None, str]] | None = None,
     maps: Mapping[str, Volume] | None = None,
     shown: Sequence[str] = ("command", "date"),
 ) -> Path:
@@ -136,7 +141,8 @@ def write_study(
     record, `values` and the figures, each of which comes with a description; it ends with the entries of the record
     that `shown` names. Return the page's path.
     """
-    pictures = {name: picture_of(figure, alt) for name, (figure, alt) in (figures or {}).items()}
+    drawn = {name: (figure, alt) for name, (figure, alt) in (figures or {}).items() if figure is not None}
+    pictures = {name: picture_of(*drawn[name]) if name in drawn else None for name in figures or ()}
     made = {name: record[name] for name in shown if record[name] not in ("", {})}
     texts = {files[1]: render(files[1], made=made, **record | pictures | dict(values))}
     texts |= {name: format_csv(list(rows)) for name, rows in tables.items()}
@@ -145,8 +151,48 @@ def write_study(
             save(volume, work / name, kind=form.name)
         for name, text in texts.items():
             (work / name).write_text(text, encoding="utf-8", newline="")
-        for name, (figure, _) in (figures or {}).items():
-            (work / f"{name}.png").write_bytes(base64.b64decode(pictures[name].data or ""))
+        for name, (figure, _) in drawn.items():
+            (work / f"{name}.png").write_bytes(png(figure))
             (work / f"{name}.svg").write_bytes(svg(figure))
         form.write(work / files[0], record | {"files": list(files)})
     return target / files[1]
+
+
+# ---- scans -----------------------------------------------------------------------------------------------------------
+
+
+def name_parts(parts: Sequence[Measures]) -> list[str]:
+    """Return a name for each scan or part of one: its file, or the path where two files have one name, and its part."""
+    sources: dict[str, set[str]] = {}
+    for part in parts:
+        sources.setdefault(Path(part.source).name, set()).add(part.source)
+    names = []
+    for k, part in enumerate(parts, 1):
+        file = Path(part.source).name
+        name = file if file and len(sources[file]) == 1 else part.source or f"array {k}"
+        names.append(f"{name}, {' '.join(map(str, part.part))}" if part.part else name)
+    return names
+
+
+def shorten(names: Sequence[str]) -> list[str]:
+    """Return names that a panel has room for: the end of a long name, with a number where two would be the same."""
+    short = [name if len(name) <= WORD else f"…{name[1 - WORD :]}" for name in names]
+    return [name if short.count(name) == 1 else f"{k} {name}" for k, name in enumerate(short, 1)]
+
+
+def outlines_figure(names: Sequence[str], outlines: Sequence[Outline | None], unit: str) -> Figure | None:
+    """Return a figure of what was taken for the structure in scans of one unit, a row of three slices for each of the
+    first `MOST_OUTLINES`; None where no scan has an outline."""
+    known = [(name, each) for name, each in zip(shorten(names), outlines, strict=True) if each][:MOST_OUTLINES]
+    if not known:
+        return None
+    figure = plot.make_figure(7.6, 2.6 * len(known), layout="constrained")
+    for row, (name, outline) in zip(figure.subplots(len(known), 3, squeeze=False), known, strict=True):
+        limits = plot.grey_limits(np.concatenate([plane.ravel() for plane in outline.levels]))
+        for axis, axes in enumerate(row):
+            down, across = np.delete(outline.spacing, axis)
+            plot.section_on(axes, outline.levels[axis], outline.inside[axis], limits, down / across)
+            axes.set_title(f"{'zyx'[axis]} = {outline.places[axis]}", fontsize=8)
+        row[0].set_ylabel(plot.plain(name), fontsize=9)
+        plot.scale_on(row[0], outline.spacing[2], unit)
+    return figure

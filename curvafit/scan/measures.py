@@ -28,7 +28,7 @@ from curvafit.scan import preparation
 from curvafit.scan.grids import median_thickness, remove_specks
 from curvafit.scan.preparation import LARGEST_WINDOW, Prepared
 from curvafit.scan.structure import Kind, find_structure, is_rounded
-from curvafit.volumes.volume import ScanError, Volume, cut_boxes
+from curvafit.volumes.volume import Box, ScanError, Volume, cut_boxes
 
 #: Columns of a table of measures; a CSV file begins with them.
 COLUMNS = ("scan", "quantity", "symbol", "value", "low", "high", "unit", "direction", "version")
@@ -48,6 +48,8 @@ FEWEST_SLICES = 10
 TOO_THIN = f"it needs {FEWEST_SLICES} slices or more, or a surface away from the borders of fewer"
 #: How sure intervals are.
 SURE = 0.95
+#: Most voxels of a slice along an axis that are kept for pictures.
+SHOWN = 320
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,46 @@ QUANTITIES: tuple[tuple[str, str, int, Callable[[Sums], np.ndarray]], ...] = (
 )
 
 
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """What was taken for the structure, for pictures: three slices of a scan, across z, y and x.
+
+    Attributes
+    ----------
+    levels, inside
+        Of each slice, the scan's values and the structure that counts, bool; every n-th voxel, so that at most `SHOWN`
+        remain along each axis.
+    places
+        The slices' positions, in voxels.
+    spacing
+        Edges (z, y, x) of the voxels that are kept, in the scan's unit.
+    """
+
+    levels: tuple[np.ndarray, ...]
+    inside: tuple[np.ndarray, ...]
+    places: tuple[int, ...]
+    spacing: tuple[float, ...]
+
+    @classmethod
+    def cut(cls, scan: Volume, find_inside: Callable[[Box], np.ndarray], region: Volume | None = None) -> Outline:
+        """Cut a scan's middle slices, or those through the middle of a region, in which alone structure counts.
+        `find_inside` returns the structure of a box of the scan."""
+        places, steps = [n // 2 for n in scan.shape], [math.ceil(n / SHOWN) for n in scan.shape]
+        if region is not None:
+            occupied = [np.flatnonzero(region.values.any(axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
+            places = [int(places[0] + places[-1]) // 2 for places in occupied]
+        levels, inside = [], []
+        for axis, place in enumerate(places):
+            z, y, x = (slice(place, place + 1) if k == axis else slice(0, n) for k, n in enumerate(scan.shape))
+            thin = tuple(0 if k == axis else slice(None, None, step) for k, step in enumerate(steps))
+            structure = find_inside((z, y, x))[thin]
+            counts = True if region is None else region.read((z, y, x))[thin] != 0
+            levels.append(np.ascontiguousarray(scan.read((z, y, x))[thin]))
+            inside.append(structure & counts)
+        edges = tuple(h * step for h, step in zip(scan.spacing, steps, strict=True))
+        return cls(tuple(levels), tuple(inside), tuple(places), edges)
+
+
 @dataclass(frozen=True, repr=False, eq=False)
 class Measures(Pictured):
     """What a scan measures.
@@ -118,6 +160,8 @@ class Measures(Pictured):
         What of the scan this is, by a label: `("compartment", 2)` or `("instance", 7)`; None of all of it.
     compartments
         The measures within each label of the region, by label.
+    outline
+        What was taken for the structure; None of a compartment or an instance.
     """
 
     source: str
@@ -130,6 +174,7 @@ class Measures(Pictured):
     notes: tuple[str, ...]
     part: tuple[str, int] | None = None
     compartments: Mapping[int, Measures] = default(default_factory=dict)
+    outline: Outline | None = None
 
     def __repr__(self) -> str:
         values = ", ".join(f"{quantity.symbol} {quantity.value:.4g}" for quantity in self.quantities[:4])
@@ -192,7 +237,9 @@ class Measures(Pictured):
         diagram = replace(old, points=old.points / factor, weights=old.weights * factor**2, places=places)
         diagram = replace(diagram, unit=f"1/{unit}", spread=old.spread / factor)
         compartments = {label: measures.scale(factor, unit) for label, measures in self.compartments.items()}
-        return replace(self, unit=unit, quantities=quantities, diagram=diagram, compartments=compartments)
+        outline = self.outline and replace(self.outline, spacing=tuple(h * factor for h in self.outline.spacing))
+        scaled = {"quantities": quantities, "diagram": diagram, "compartments": compartments, "outline": outline}
+        return replace(self, unit=unit, **scaled)
 
 
 def find_quantity(rows: Sequence[Row], name: str) -> Row:

@@ -19,6 +19,7 @@ from scipy import ndimage
 from skimage.filters import threshold_otsu
 
 from curvafit.core.checks import SEEDS, check_choice, check_float, check_int
+from curvafit.core.units import format_percent
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.run import Record, Run
 from curvafit.volumes.volume import Box, Crop, ScanError, Volume, cut_boxes, grow, lay, round_labels, within
@@ -49,6 +50,9 @@ SEVERAL = (
 #: A constant may be padding where it fills more than the first share of the scan, and the second share of it is reached
 #: from the ends of rows. Other levels have two phases from this bimodality on.
 PADDED, REACHED, TWO_PHASES = 0.1, 0.95, 0.45
+#: A threshold is moved by so much of the contrast to see what that changes, and is weak where that is so much of the
+#: structure.
+MOVED, WEAK = 0.1, 0.1
 #: A field of a few thousand values was rounded.
 _ROUNDED_VALUES = 4096
 #: Values of a box that count for a threshold.
@@ -60,7 +64,8 @@ class Structure:
     """What in a volume is structure: the caller's options, completed by `find_split`.
 
     The threshold of a padded scan is taken where `region` is not 0; with `alone`, that of any scan. `find_split` sets
-    the kind, the extremes, whether they are the only `two` values, and the threshold (`level`) and padding of an image.
+    the kind, the extremes, whether they are the only `two` values, and the threshold (`level`) and padding of an image,
+    and of Otsu's threshold the `contrast`: the difference of the means of the levels on its sides.
     """
 
     volume: Volume
@@ -73,6 +78,7 @@ class Structure:
     highest: float = 0.0
     two: bool = False
     level: float = 0.0
+    contrast: float = 0.0
     padding: Padding | None = None
 
     def read(self, box: Box) -> np.ndarray:
@@ -112,7 +118,7 @@ def find_structure(
     values = find_levels(structure, (z, y, x), periodic)
     counted = values if region is None else values[region]
     if structure.kind == "image":
-        note = describe_image(structure, float(counted.min()), float(counted.max()))
+        note = describe_image(structure, count_levels(structure, counted))
     check_phases(int(np.count_nonzero(counted > 0)), counted.size)
     return structure.kind, replace(field, array=values, notes=(*field.notes, note))
 
@@ -261,10 +267,19 @@ def is_rounded(u: np.ndarray) -> bool:
     return len(np.unique(np.asarray(u))) <= min(_ROUNDED_VALUES, math.prod(u.shape) // 16)
 
 
-def describe_image(structure: Structure, lowest: float, highest: float) -> str:
-    """Return the note on padding and threshold, given the extremes of `find_levels`; raise ScanError where the
+def count_levels(structure: Structure, levels: np.ndarray) -> Record:
+    """Return the extremes of levels as `find_levels` gives them, and how many are above 0, and would be if the
+    threshold were `MOVED` contrasts lower, and higher."""
+    moved = MOVED * structure.contrast
+    above = np.array([np.count_nonzero(levels > level) for level in (0, -moved, moved)])
+    return {"lowest": levels.min(), "highest": levels.max(), "above": above}
+
+
+def describe_image(structure: Structure, total: Record) -> str:
+    """Return the note on padding and threshold, given `count_levels` of all that counts; raise ScanError where the
     threshold is not within the range of the smoothed levels."""
     otsu, level = structure.threshold == "otsu", structure.level
+    lowest, highest = float(total["lowest"]), float(total["highest"])
     low, high = (level - highest, level - lowest) if structure.dark else (level + lowest, level + highest)
     if not low < level < high:
         raise ScanError(f"expected a threshold within the smoothed scan's {low:.4g} to {high:.4g}, got {level:.4g}")
@@ -272,6 +287,11 @@ def describe_image(structure: Structure, lowest: float, highest: float) -> str:
     padding = structure.padding
     note = "" if padding is None else _describe_padding(padding, otsu, structure.region is not None)
     note += f"Smoothed by one voxel, split at {source} threshold of {level:.4g}: the {side} phase is the structure."
+    inside, *moved = total["above"].tolist()
+    more, less = (count / max(inside, 1) - 1 for count in moved)
+    if more - less > 2 * WEAK:
+        changes = f"{format_percent(more)} more structure, or {format_percent(-less)} less"
+        note += f" A threshold off by a tenth of the contrast gives {changes}: look at the outline."
     return note
 
 
@@ -351,7 +371,8 @@ def _split_image(structure: Structure, bars: Sequence[Box], total: Record, value
         if not counted or counted["lowest"] == counted["highest"]:
             raise ScanError("expected grey levels that differ where they count, got one of them only")
         extremes = (counted["lowest"], counted["highest"])
-    return replace(structure, level=_find_threshold(levels, bars, *extremes, run))
+    level, contrast = _find_threshold(levels, bars, *extremes, run)
+    return replace(structure, level=level, contrast=contrast)
 
 
 def _look_at_values(structure: Structure, bars: Sequence[Box], value: Any, number: int) -> Record:
@@ -431,8 +452,8 @@ def _look_at_levels(levels: Levels, bars: Sequence[Box], number: int) -> Record:
     return {"lowest": values.min(), "highest": values.max()} if values.size else {}
 
 
-def _find_threshold(levels: Levels, bars: Sequence[Box], lowest: Any, highest: Any, run: Run) -> float:
-    """Return the middle between the means of the levels on the two sides of Otsu's threshold."""
+def _find_threshold(levels: Levels, bars: Sequence[Box], lowest: Any, highest: Any, run: Run) -> tuple[float, float]:
+    """Return the middle between the means of the levels on the two sides of Otsu's threshold, and their difference."""
     lowest, highest = lowest[()], highest[()]  # scalars of arrays without axes
     integers = lowest.dtype.kind in "iu"
     if integers and int(highest) - int(lowest) >= _MOST_LEVELS:
@@ -443,11 +464,12 @@ def _find_threshold(levels: Levels, bars: Sequence[Box], lowest: Any, highest: A
         centres = np.arange(int(lowest), int(highest) + 1)
         high = centres > threshold_otsu(hist=(counts, centres))
         means = [np.dot(counts[side], centres[side].astype(np.float64)) / counts[side].sum() for side in (high, ~high)]
-        return float(sum(means)) / 2
+        return float(sum(means)) / 2, float(means[0] - means[1])
     edges = np.histogram_bin_edges(np.empty(0, lowest.dtype), 256, (lowest, highest))
     otsu = threshold_otsu(hist=(counts, (edges[1:] + edges[:-1]) / 2))
     sums = add_records(run(f"{name}'s sides", partial(_sum_sides, levels, bars, otsu), len(bars)))["sums"]
-    return float(sums[0, 1] / sums[0, 0] + sums[1, 1] / sums[1, 0]) / 2
+    bright, dark = (sums[:, 1] / sums[:, 0]).tolist()
+    return (bright + dark) / 2, bright - dark
 
 
 def _count_levels(levels: Levels, bars: Sequence[Box], lowest: Any, highest: Any, number: int) -> Record:

@@ -67,8 +67,8 @@ def survey(structure: Structure, run: Run) -> Plan:
     pieces = cut_boxes(volume.shape, round(splitting.PIECE ** (1 / 3)))
     total = add_records(run("counting the structure", partial(_count_structure, structure, pieces), len(pieces)))
     if structure.kind == "image":
-        note = splitting.describe_image(structure, float(total["lowest"]), float(total["highest"]))
-    size, filled = math.prod(volume.shape), int(total["filled"])
+        note = splitting.describe_image(structure, total)
+    size, filled = math.prod(volume.shape), int(total["above"][0])
     splitting.check_phases(filled, size)
     noise = structure.kind != "field" and splitting.pairs_of_noise(volume.shape, filled / size, total["pairs"])
     plan = Plan(structure, noise, (*volume.notes, note))
@@ -112,8 +112,7 @@ def _count_structure(structure: Structure, pieces: Sequence[Box], number: int) -
         tuple(slice(max(a.start - b.start, 0), max(a.stop - b.start, 0)) for a, b in zip(candidate, core, strict=True))
         for candidate in candidate_boxes(shape, MEASURED)
     ]
-    record = {"lowest": levels[inner].min(), "highest": levels[inner].max()}
-    record["filled"] = np.int64(np.count_nonzero(mask[inner]))
+    record = splitting.count_levels(structure, levels[inner])
     for name, phase in (("surface", mask), ("other surface", ~mask)):
         surface = surface_voxels(phase)[inner]
         record[name] = np.array([np.count_nonzero(surface[overlap]) for overlap in overlaps], dtype=np.int64)

@@ -29,7 +29,7 @@ from curvafit.priors.grid import WORKING_SPACING, Grid
 from curvafit.priors.kernels.threads import one_thread
 from curvafit.scan import measures as whole
 from curvafit.scan.grids import CutOut, distance_reach, profile_mask, remove_specks, resample, resample_mask
-from curvafit.scan.measures import Blocks, Measures
+from curvafit.scan.measures import Blocks, Measures, Outline
 from curvafit.scan.preparation import DROPPED, LARGEST_BOX, WORKED, Prepared, TooLarge, note_on_filling, smallest_piece
 from curvafit.scan.structure import Kind, Structure, check_options, find_levels, read_labels, read_region
 from curvafit.scan.survey import Plan, survey
@@ -135,7 +135,8 @@ def _measure_whole(field: Volume, periodic: bool, progress: Progress, kind: Kind
     connectivity = measure_connectivity(maps.mask, field.spacing, periodic=periodic)
     period = sum(float(phase[phase > 0].mean(dtype=np.float64)) for phase in (maps.thickness, maps.gap))
     blocks = Blocks.divide(maps.mask.shape, field.spacing, period)
-    return whole.summarise_sums(field, maps.kind, blocks, maps.sum(blocks), connectivity, maps.diagram, maps.notes)
+    found = whole.summarise_sums(field, maps.kind, blocks, maps.sum(blocks), connectivity, maps.diagram, maps.notes)
+    return replace(found, outline=Outline.cut(field, maps.mask.__getitem__))
 
 
 def _describe_tiles(plan: Plan, processes: int) -> str:
@@ -505,10 +506,12 @@ def _summarise(plan: Plan, records: Sequence[Record], wide_records: Sequence[Rec
         table, name = _merge(tables[part], finest, blocks), None if label is None else ("compartment", label)
         return whole.summarise_sums(volume, plan.structure.kind, blocks, table, connectivity, diagram, notes, part=name)
 
+    outline = Outline.cut(volume, lambda box: find_levels(plan.structure, box) > 0, plan.structure.region)
     if plan.structure.region is None:
-        return summarise(_WHOLE)
+        return replace(summarise(_WHOLE), outline=outline)
     labels = sorted(int(part) for part in parts - {_WHOLE, INSIDE})
-    return replace(summarise(INSIDE), compartments={label: summarise(str(label), label) for label in labels})
+    compartments = {label: summarise(str(label), label) for label in labels}
+    return replace(summarise(INSIDE), compartments=compartments, outline=outline)
 
 
 def _sum_tiles(plan: Plan, records: Sequence[Record], wide_records: Sequence[Record], part: str) -> np.ndarray:

@@ -13,7 +13,7 @@ from scipy.cluster.vq import kmeans, vq
 from curvafit.core.checks import as_tuple, check_int, check_seed
 from curvafit.core.runtime import Pictured, Progress, silent
 from curvafit.core.units import format_length, format_number, format_percent, format_sampling, unit_name
-from curvafit.scan.measures import QUANTITIES, Blocks, combine, measure_maps
+from curvafit.scan.measures import QUANTITIES, Blocks, Outline, combine, measure_maps
 from curvafit.scan.structure import check_options
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.volume import Volume
@@ -43,6 +43,8 @@ class Windows(Pictured):
         The fraction of the variance of standardised numbers that is between clusters.
     structure
         The structure, for pictures: every n-th voxel, so that at most `MOST_SHOWN` remain along each axis.
+    outline
+        What was taken for the structure, on three slices.
     """
 
     kind: str
@@ -52,6 +54,7 @@ class Windows(Pictured):
     clusters: Volume
     explained: float
     structure: Volume
+    outline: Outline
     options: dict[str, Any]
     notes: tuple[str, ...]
 
@@ -168,7 +171,8 @@ def windows(
     settings = {"size": sizes, "stride": strides, "clusters": clusters, "seed": seed, "kind": kind}
     return Windows(
         kind=maps.kind, size=sizes, stride=strides, values=values, clusters=cluster_map, explained=explained,
-        structure=structure, options=settings | options | reading, notes=tuple(notes),
+        structure=structure, outline=Outline.cut(field, maps.mask.__getitem__),
+        options=settings | options | reading, notes=tuple(notes),
     )  # fmt: skip
 
 

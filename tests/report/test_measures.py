@@ -9,9 +9,11 @@ from calling import call, done, refused
 from found import lattice, without_drawing
 
 from curvafit.report.inference import infer_scans, name_folders
-from curvafit.report.measures import WORD, describe_range, name_parts, shorten
+from curvafit.report.measures import describe_range
+from curvafit.report.page import WORD, name_parts, outlines_figure, shorten
 from curvafit.scan.measures import Measures
 from curvafit.scan.tiles import measure
+from curvafit.volumes.read import load
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
@@ -42,8 +44,27 @@ def test_a_folder_has_page_figures_and_table(scans: list[Path], tmp_path: Path) 
     alone = [measure(scan).convert("mm")["Tb.Th"].value for scan in scans]
     assert thickness == pytest.approx(alone, rel=1e-9)
     assert {row["unit"] for row in rows if row["symbol"] == "Tb.Th"} == {"mm"}
+    page = (tmp_path / "out" / "measures.html").read_text(encoding="utf-8")
+    assert "What was taken for the structure" in page and (tmp_path / "out" / "outlines.png").exists()
     done(*words)  # the same command replaces its own
     refused(call("measure", scans[0], "-o", tmp_path / "out"), "not free", progress=True)
+
+
+def test_an_outline_shows_what_counted(scans: list[Path]) -> None:
+    """Slices through the middle of a region, in which alone structure is outlined; lengths in the measures' unit."""
+    found, region = measure(scans[0]), np.zeros((56, 56, 56), np.uint8)
+    region[30:50, 4:20, 8:] = 1
+    part = measure(scans[0], roi=region).convert("um").outline
+    assert found.outline is not None and part is not None
+    assert found.outline.places == (28, 28, 28) and part.places == (39, 11, 31)
+    assert part.spacing == pytest.approx([1000 * h for h in found.outline.spacing])
+    mask = load(scans[0]).values > 0
+    assert (part.inside[0] == (mask & (region > 0))[39]).all() and (
+        part.levels[2] == load(scans[0]).values[..., 31]
+    ).all()
+    figure = outlines_figure(["a", "b", "c"], [part, None, part], "um")
+    assert figure is not None and len(figure.axes) == 6
+    assert outlines_figure(["a"], [None], "um") is None
 
 
 @pytest.mark.slow

@@ -523,6 +523,18 @@ def test_two_sharp_levels_are_split_in_their_middle() -> None:
     assert np.mean(found.values > 0) == pytest.approx(BODIES.mean(), rel=0.03)
 
 
+def test_a_threshold_that_decides_is_said() -> None:
+    """Of sharp bodies nothing depends on it; blurred by their own width, a tenth of the contrast moves much of them."""
+    sharp, soft = (ndimage.gaussian_filter(200.0 * BODIES, width, mode="wrap") for width in (0.3, 2.5))
+    found = [find_structure(Volume(levels, CUBIC, "voxel"), kind="image", periodic=True)[1] for levels in (sharp, soft)]
+    assert ["look at the outline" in scan.notes[-1] for scan in found] == [False, True]
+    more, less = map(float, re.findall(r"(\d+)\s?% (?:more|less)", found[1].notes[-1]))
+    values, level = found[1].values, threshold_of(found[1])
+    contrast = soft[soft > level].mean() - soft[soft <= level].mean()
+    for change, moved in ((more, -0.1), (-less, 0.1)):
+        assert np.mean(values > moved * contrast) / np.mean(values > 0) - 1 == pytest.approx(change / 100, abs=0.02)
+
+
 def test_an_image_knows_its_imaging_and_a_mask_has_none() -> None:
     grey = image(BODIES, 1.0, 0.1)
     scan = prepare(Volume(grey, CUBIC, "voxel"), kind="image", periodic=True)

@@ -62,6 +62,9 @@ def check_alike(found: Measures, whole: Measures) -> None:
     assert found.direction == pytest.approx(whole.direction, abs=1e-6)
     assert found.diagram.area == pytest.approx(whole.diagram.area, rel=1e-6)
     assert found.diagram.mean() == pytest.approx(whole.diagram.mean(), rel=1e-5)
+    assert found.outline is not None and whole.outline is not None and found.outline.places == whole.outline.places
+    for one, other in zip(found.outline.inside, whole.outline.inside, strict=True):
+        assert (one != other).mean() < 0.01  # specks, which tiles outline as well
 
 
 @pytest.mark.parametrize(
