@@ -71,7 +71,7 @@ def infer(
 
 def _print_result(inference: Inference) -> None:
     """Print the description, the verdict, the table of parameters, and the distances of the regrown shapes."""
-    from curvafit.core.units import format_length, format_number
+    from curvafit.core.units import format_length, format_number, unit_name
     from curvafit.inference.candidates import TITLES
     from curvafit.report.inference import describe, parameter_table
 
@@ -81,7 +81,7 @@ def _print_result(inference: Inference) -> None:
     for combination in fit.combinations:
         say(str(combination))
     if rows := parameter_table(inference):
-        heads = ("", "working units", "±", "90 % of the posterior", f"with lengths in {fit.length_unit}")
+        heads = ("", "working units", "±", "90 % of the posterior", f"with lengths in {unit_name(fit.length_unit)}")
         print_table(heads, rows, right=range(1, 5))
     if inference.twins:
         distances = [

@@ -90,7 +90,7 @@ def format_sampling(shape: Sequence[int], spacing: Sequence[float], unit: str = 
     """Return the number and the size of voxels (z, y, x) as text; three equal edges are written once."""
     is_isotropic = len(set(spacing)) == 1
     edges = " x ".join(f"{h:.4g}" for h in spacing[: 1 if is_isotropic else 3])
-    size = "" if (edges, unit) == ("1", "voxel") else f" of {edges} {unit}".rstrip()
+    size = "" if (edges, unit) == ("1", "voxel") else f" of {edges} {unit_name(unit)}".rstrip()
     return f"{' x '.join(map(str, shape))} voxels{size}"
 
 

@@ -16,7 +16,7 @@ from curvafit.core.checks import check_int, quoted
 from curvafit.core.files import write_content
 from curvafit.core.runtime import Pictured
 from curvafit.core.schema import Rule, decode, encode
-from curvafit.core.units import METRES
+from curvafit.core.units import METRES, unit_name
 from curvafit.geometry.diagrams import Diagram
 from curvafit.geometry.morphology import Morphometry
 from curvafit.inference.atlas import Match
@@ -91,7 +91,7 @@ class Fit(Pictured):
     def __repr__(self) -> str:
         values = "none" if self.best is None else f"({', '.join(f'{a:.4g}' for a in self.best.coefficients)})"
         mass = "" if self.best is None else f", mass {self.best.mass:.3g}"
-        voxel = f"working voxel {self.working_voxel:.4g} {self.length_unit}"
+        voxel = f"working voxel {self.working_voxel:.4g} {unit_name(self.length_unit)}"
         return f"Fit({self.family} from {KINDS[self.kind]}, a = {values}{mass}, {voxel}: {self.status})"
 
     @property

@@ -17,7 +17,7 @@ from scipy import ndimage, stats
 
 from curvafit.core.checks import require
 from curvafit.core.runtime import Pictured, Progress, silent
-from curvafit.core.units import convert_length, format_number, plain_unit, power_name
+from curvafit.core.units import convert_length, format_number, plain_unit, power_name, unit_name
 from curvafit.geometry.description import descriptors
 from curvafit.geometry.diagrams import FAMILIES, MARGIN, Diagram, diagram, families, join_diagrams
 from curvafit.geometry.mesh import NoSurface, Surface, area_vectors
@@ -178,7 +178,7 @@ class Measures(Pictured):
 
     def __repr__(self) -> str:
         values = ", ".join(f"{quantity.symbol} {quantity.value:.4g}" for quantity in self.quantities[:4])
-        return f"Measures({values}, in {self.unit}, of {self.source or 'an array'})"
+        return f"Measures({values}, in {unit_name(self.unit)}, of {self.source or 'an array'})"
 
     def _repr_html_(self) -> str:
         """Return a table, with a column of values for each compartment where there are some."""

@@ -267,7 +267,7 @@ def is_rounded(u: np.ndarray) -> bool:
     return len(np.unique(np.asarray(u))) <= min(_ROUNDED_VALUES, math.prod(u.shape) // 16)
 
 
-def count_levels(structure: Structure, levels: np.ndarray) -> Record:
+def count_levels(structure: Structure, levels: np.ndarray) -> dict[str, Any]:
     """Return the extremes of levels as `find_levels` gives them, and how many are above 0, and would be if the
     threshold were `MOVED` contrasts lower, and higher."""
     moved = MOVED * structure.contrast

@@ -14,6 +14,7 @@ from torch.nn.functional import pad
 
 from curvafit.core.checks import LONGEST, SHORTEST, check_float, check_int
 from curvafit.core.runtime import Progress, silent
+from curvafit.core.units import unit_name
 from curvafit.core.workers import Cluster
 from curvafit.generation.flow import WORKING_BLUR, Flow, Optimiser, descend
 from curvafit.generation.problem import Data
@@ -127,7 +128,7 @@ def choose_epsilon(scan: Volume, epsilon: float | None) -> float:
     """Return ε, by default twice the smallest voxel edge; raise ValueError where it is not positive."""
     if epsilon is None:
         return RESOLVED * min(scan.spacing)
-    return check_float(epsilon, f"a positive epsilon in {scan.unit}", SHORTEST, LONGEST)
+    return check_float(epsilon, f"a positive epsilon in {unit_name(scan.unit)}", SHORTEST, LONGEST)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from curvafit.core.units import METRES
+from curvafit.core.units import METRES, unit_name
 from curvafit.inference.candidates import load_candidates
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import Law, LawLike
@@ -49,7 +49,7 @@ def law_of(prior: LawLike, scan: Volume) -> tuple[Coefficients, tuple[str, ...]]
     if not law.fitted:
         note = f"The {law.origin}, at a working voxel of one scan voxel."
         return coefficients, (note,) if law.working else ()
-    note = f"The prior's lengths, in {law.length_unit}, are converted to {scan.unit}."
+    note = f"The prior's lengths, in {unit_name(law.length_unit)}, are converted to {unit_name(scan.unit)}."
     notes = () if law.length_unit == scan.unit else (note,)
     return coefficients, (*notes, f"{law.doubt} Compare the mask with the scan.") if law.doubt else notes
 

@@ -26,7 +26,7 @@ from curvafit.core.checks import as_tuple, quoted, require
 from curvafit.core.files import write_atomically, write_content
 from curvafit.core.records import Format, can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.units import format_number
+from curvafit.core.units import format_number, unit_name
 from curvafit.core.workers import cluster, run_jobs
 from curvafit.scan.instances import measure_instances
 from curvafit.scan.measures import COLUMNS, Measures
@@ -42,6 +42,8 @@ FEWEST = 2
 FINE = 0.1
 #: Relative difference of the groups' voxel edges above which there is a note.
 ALIKE_EDGES = 0.1
+#: Thickness in µm from which numbers are in mm, as those of bone are written.
+THICK = 10.0
 #: What is done with one scan, given its progress; workers need a function that can be pickled.
 Task = Callable[[Progress], Any]
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
@@ -292,12 +294,12 @@ def _read_table(table: Path, needed: Sequence[str]) -> list[dict[str, str]]:
 def measure_scans(
     cases: Sequence[Case], options: dict[str, Any], reading: dict[str, Any], workers: int, progress: Progress
 ) -> tuple[list[Measures], list[str]]:
-    """Measure scans with `options` of `measure`; return their measures, in the first scan's unit, and notes.
+    """Measure scans with `options` of `measure`; return their measures, in one unit (`to_one_unit`), and notes.
 
     All are read before the first is measured. Raises ValueError, with the scan's name, as `measure`; and where only
     some scans have a physical unit.
     """
-    unit, notes = _check_scans(cases, reading, sub_progress(progress, 0.0, 0.05))
+    notes = _check_scans(cases, reading, sub_progress(progress, 0.0, 0.05))
     settings = options | reading
     measured: dict[int, Any] = {k: (case.source,) for k, case in enumerate(cases) if isinstance(case.source, Measures)}
     tasks: dict[int, Task] = {
@@ -312,8 +314,19 @@ def measure_scans(
             f"{flat[0]}: expected a scan with curvature, got a stack too thin for it: measure has its numbers"
         )
     units = {scan.unit for scan in measures}
-    notes += [] if len(units) == 1 else [f"Lengths in {', '.join(sorted(units))} were converted to {unit}."]
-    return [scan.convert(unit) for scan in measures], notes
+    measures = to_one_unit(measures, reading.get("unit"))
+    unit = measures[0].unit
+    if len(units) > 1:
+        notes.append(f"Lengths in {', '.join(map(unit_name, sorted(units)))} were converted to {unit_name(unit)}.")
+    return measures, notes
+
+
+def to_one_unit(measures: Sequence[Measures], stated: str | None = None) -> list[Measures]:
+    """Return scans in the first one's unit; in mm, as bone is measured, where that is µm, the first scan's structure is
+    `THICK` or thicker, and no unit is `stated`. Raises ValueError where only some are in a physical unit."""
+    first = measures[0]
+    bone = stated is None and first.unit == "um" and first["thickness"].value >= THICK
+    return [scan.convert("mm" if bone else first.unit) for scan in measures]
 
 
 def measure_each(
@@ -337,7 +350,10 @@ def measure_each(
         tiles = {} if labels or store is None else {"store": store / f"{k:04d}"}
         tasks[k] = partial(_measure_one, scan, scan if several else "", labels, options | tiles)
     measured = share_out(tasks, scans, workers if several else 0, progress)
-    return [measured[k] for k in tasks]
+    results = [measured[k] for k in tasks]
+    if labels or any(scan.unit == "voxel" for (scan,) in results):
+        return results
+    return [(scan,) for scan in to_one_unit([scan for (scan,) in results], options.get("unit"))]
 
 
 def _measure_one(
@@ -407,8 +423,8 @@ def count_notes(measures: Sequence[Measures]) -> Iterator[str]:
         yield note if len(scans) == len(measures) else f"Of {len(scans)} of {len(measures)} scans: {note}"
 
 
-def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progress) -> tuple[str, list[str]]:
-    """Read all scans once, so that errors come before long work; return the first scan's unit, and notes."""
+def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progress) -> list[str]:
+    """Read all scans once, so that errors come before long work; return notes."""
     units: dict[str, str] = {}
     edges: dict[str | float, list[float]] = {}
     for k, case in enumerate(cases):
@@ -430,8 +446,8 @@ def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progr
     medians = [float(np.median(edge)) for edge in edges.values()]
     if medians and len(units) == 1 and min(medians) < (1 - ALIKE_EDGES) * max(medians):
         ends = " and ".join(format_number(end) for end in (min(medians), max(medians)))
-        notes.append(f"Voxels differ, {ends} {next(iter(units))}: so does what they resolve.")
-    return next(iter(units)), notes
+        notes.append(f"Voxels differ, {ends} {unit_name(next(iter(units)))}: so does what they resolve.")
+    return notes
 
 
 def check_units(scans: Sequence[str], progress: Progress = silent, **reading: Any) -> None:

@@ -18,6 +18,7 @@ from curvafit.studies.scans import write_table
 from curvafit.studies.windowed import NAMES, Windows, windows
 from curvafit.volumes.read import load
 from curvafit.volumes.volume import Volume
+from curvafit.volumes.write import save
 
 N = 48
 
@@ -366,3 +367,20 @@ def test_windows_smaller_than_the_structure_are_refused() -> None:
     sparse[20:28, 20:28, 20:28] = 1
     with pytest.raises(ValueError, match="larger"):
         windows(sparse, 24, 24)
+
+
+def test_numbers_of_bone_are_in_mm(tmp_path: Path) -> None:
+    """Where a file states µm and its structure is 10 µm thick or more, unless a unit is stated."""
+    coarse, fine = (save(Volume(tubes(), (h, h, h), "um"), tmp_path / f"{h:g}.nii.gz") for h in (12.0, 0.5))
+
+    def unit_of(*words: object) -> tuple[str, float]:
+        done("measure", *words, "-o", table := tmp_path / f"{len(list(tmp_path.iterdir()))}.csv")
+        rows = list(csv.DictReader(table.open()))
+        density, thickness = (next(row for row in rows if row["symbol"] == name) for name in ("Conn.D", "Tb.Th"))
+        assert density["unit"] == f"1/{thickness['unit']}^3"
+        return thickness["unit"], float(thickness["value"])
+
+    unit, thickness = unit_of(coarse)
+    assert unit == "mm" and thickness == pytest.approx(measure(coarse)["Tb.Th"].value / 1000)
+    assert unit_of(fine)[0] == "um" and unit_of(coarse, "--unit", "um")[0] == "um"
+    assert unit_of(coarse, fine)[0] == "mm" and unit_of(fine, coarse)[0] == "um"  # the first scan's

@@ -97,7 +97,7 @@ def test_no_job_drops_an_option_in_silence(job) -> None:
 
 def test_a_field_is_one_line_and_equals_itself() -> None:
     field = Volume(ramp(), (3.0, 2.0, 1.0), "um", source="scan\n.nii.gz")
-    assert repr(field) == "Volume(4 x 5 x 6 voxels of 3 x 2 x 1 um, float32 from 0 to 119, from scan\\n.nii.gz)"
+    assert repr(field) == "Volume(4 x 5 x 6 voxels of 3 x 2 x 1 µm, float32 from 0 to 119, from scan\\n.nii.gz)"
     assert (
         repr(Volume(ramp(dtype="uint8"), 0.0195, "mm")) == "Volume(4 x 5 x 6 voxels of 0.0195 mm, uint8 from 0 to 119)"
     )

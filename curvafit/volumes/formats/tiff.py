@@ -239,7 +239,7 @@ def read_slices(path: Path, **_: object) -> Stated:
         size, step, log = logged
         with_units = first._replace(units=[unit or first.custom for unit in first.units])
         if first.steps is not None and not _have_same_size(with_units, Stated(None, "zyx", [size] * 3, ["um"] * 3)):
-            raise ScanError(f"{files[0].name} states another pixel size than the {size:g} um of {log} in {path}")
+            raise ScanError(f"{files[0].name} states another pixel size than the {size:g} µm of {log} in {path}")
         first = first._replace(steps=[step * size, size, size], units=["um"] * 3, guesses=())
         notes += (f"The voxel size is that of {log}.",)
     axes = "zyxs"[: planes[0].ndim + 1]
@@ -303,7 +303,7 @@ def _read_logs(path: Path) -> tuple[float, float, str] | None:
                 sizes[float(match[1])] = (float(step[1]) if step else 1.0, log.name)
                 break
     if len(sizes) > 1:
-        listed = " and ".join(f"{size:g} um in {log}" for size, (_, log) in list(sizes.items())[:2])
+        listed = " and ".join(f"{size:g} µm in {log}" for size, (_, log) in list(sizes.items())[:2])
         raise ScanError(f"the logs in {path} state voxel sizes of {listed}: leave only the log of these slices there")
     return next(((size, *rest) for size, rest in sizes.items()), None)
 
