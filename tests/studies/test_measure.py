@@ -375,7 +375,7 @@ def test_numbers_of_bone_are_in_mm(tmp_path: Path) -> None:
 
     def unit_of(*words: object) -> tuple[str, float]:
         done("measure", *words, "-o", table := tmp_path / f"{len(list(tmp_path.iterdir()))}.csv")
-        rows = list(csv.DictReader(table.open()))
+        rows = list(csv.DictReader(table.read_text("utf-8").splitlines()))
         density, thickness = (next(row for row in rows if row["symbol"] == name) for name in ("Conn.D", "Tb.Th"))
         assert density["unit"] == f"1/{thickness['unit']}^3"
         return thickness["unit"], float(thickness["value"])
