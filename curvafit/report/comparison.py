@@ -7,6 +7,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from string import ascii_lowercase
@@ -21,9 +22,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from curvafit.core.records import Format
-from curvafit.core.units import format_number, format_percent, per_unit, plain_unit, power_name
+from curvafit.core.units import format_number, format_percent, plain_unit, power_name
 from curvafit.drawing import plot
-from curvafit.geometry.distances import DIRECTIONS, QUANTILES
 from curvafit.report.page import (
     MOST_OUTLINES,
     Chosen,
@@ -35,8 +35,8 @@ from curvafit.report.page import (
     write_study,
 )
 from curvafit.scan.measures import Measures
-from curvafit.studies.comparison import BINS, LEVEL, SMOOTH, Comparison, Number, join_names
-from curvafit.studies.scans import count_notes
+from curvafit.studies.comparison import LEVEL, Comparison, Number, join_names
+from curvafit.studies.scans import merge_notes
 
 #: `format` of a comparison's record.
 FORMAT = Format("curvafit comparison", 1, title="the record of a comparison")
@@ -73,7 +73,11 @@ def write_comparison(
         {"scan": scan.source, "subject": case.subject, label: case.label, "kind": scan.kind, "notes": list(scan.notes)}
         for scan, case in zip(c.measures, c.cases, strict=True)
     ]
-    record |= {"energy" if c.groups else "distance_correlation": c.statistic, "apart": c.apart, "within": c.within}
+    record |= {
+        "energy" if c.groups else "distance_correlation": c.statistic,
+        "apart": c.apart,
+        "by_chance": c.by_chance,
+    }
     record |= {"tests": tests, "methods": describe_methods(c)}
     page = {
         "title": c.verdict, "scans": "; ".join(_count_scans(c)) + ".", "effect": c.effect,
@@ -94,13 +98,8 @@ def write_comparison(
 
 
 def describe_methods(comparison: Comparison) -> str:
-    """Return a paragraph, for a paper, on what was done and what came of it."""
-    c = comparison
-    return describe_measures(
-        c.measures, c=c, scans=join_names(_count_scans(c)), unit=per_unit(c.unit, 1), level=f"{LEVEL:.2g}",
-        directions=DIRECTIONS, quantiles=QUANTILES, bins=BINS, smooth=f"{SMOOTH:g}",
-        differ=[number for number in c.numbers if number.family <= LEVEL], tested=int(np.isfinite(c.bins_p).sum()),
-    )  # fmt: skip
+    """Return a paragraph, for a paper, on what was done."""
+    return describe_measures(comparison.measures, c=comparison, scans=join_names(_count_scans(comparison)))
 
 
 def describe_measures(measures: Sequence[Measures], **values: Any) -> str:
@@ -108,10 +107,14 @@ def describe_measures(measures: Sequence[Measures], **values: Any) -> str:
 
     It is `templates/methods.txt`, filled with `values`.
     """
-    counts = Counter(scan.kind for scan in measures).items()
-    kinds = " and ".join(f"{n} were taken for {kind}s" for kind, n in counts)
-    text = render("methods.txt", measures=measures, kinds=kinds, notes=list(count_notes(measures)), **values)
-    return re.sub("[ \n]+", " ", text).strip()
+    how = {"mask": "masks were taken as they are", "field": "phase fields were split at 0"}
+    otsu = any("Otsu's threshold" in note for scan in measures for note in scan.notes)
+    how["image"] = f"grey levels were smoothed by one voxel and split at {'Otsu’s' if otsu else 'a given'} threshold"
+    kinds = join_names([how[kind] for kind in dict.fromkeys(scan.kind for scan in measures)])
+    sampled = [replace(scan, notes=scan.notes[:1]) for scan in measures]  # the first note states the voxels
+    sampling = "; ".join(note.rstrip(".") for _, note in merge_notes(sampled))
+    text = render("methods.txt", measures=measures, kinds=kinds, sampling=sampling, **values)
+    return re.sub("[ \n]+", " ", text).replace(" ;", ";").replace(" .", ".").strip()
 
 
 def _count_scans(comparison: Comparison) -> list[str]:
@@ -119,7 +122,7 @@ def _count_scans(comparison: Comparison) -> list[str]:
     side_of = dict(zip(comparison.subjects, comparison.sides.tolist(), strict=True))
     scans = Counter(side_of[case.label, case.subject] for case in comparison.cases)
     return [
-        f"{name} ({scans[side]} scans of {subjects} subjects)"
+        f"{name} ({subjects} subjects{f', {scans[side]} scans' if scans[side] > subjects else ''})"
         for side, (name, subjects) in enumerate(zip(comparison.parts, comparison.counts, strict=True))
     ]
 

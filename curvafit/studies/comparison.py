@@ -30,6 +30,10 @@ PERMUTATIONS = 9999
 LEVEL = 1 - SURE
 #: The familiar numbers, without those of curvature.
 FAMILIAR = ("BV/TV", "Tb.Th", "Tb.Th.SD", "Tb.Sp", "Tb.N", "Conn.D", "χ", "BS/BV", "BS/TV", "DA")
+#: Numbers that differ and are named in the answer; those that may be negative, which have no change in per cent.
+NAMED, SIGNED = 3, ("χ", "Conn.D", "H", "K", "κ1", "κ2")
+#: Most arrangements of the labels that tell how far apart mean diagrams lie by chance.
+CHANCE = 500
 #: Bins along each axis of the difference of diagrams, and the width in bins of the Gaussian that smooths it.
 BINS, SMOOTH = 48, 2.0
 #: Bins with less than this fraction of the fullest one's area are not tested.
@@ -101,8 +105,9 @@ class Comparison(Pictured):
     sides, diagrams
         The index (S,) of each subject's part: its group, or the lower or upper half of the numbers; and the mean
         diagram of each part, of total area 1.
-    apart, within
-        Sliced Wasserstein distances: the greatest of two parts' mean diagrams, and the mean of two subjects of a part.
+    apart, by_chance
+        The greatest sliced Wasserstein distance of the means of two parts' diagrams (barycentres in each direction),
+        and what it is at most in 95 % of the arrangements of the labels.
     edges, differences, bins_p
         Edges (B + 1,) of bins in κ1 and κ2; over them (κ2, κ1) the second group's mean diagram less the first's, or
         each group's less that of all, or the slope from the least number to the greatest, `(M, B, B)`; and the
@@ -129,7 +134,7 @@ class Comparison(Pictured):
     sides: np.ndarray
     diagrams: tuple[Diagram, ...]
     apart: float
-    within: float
+    by_chance: float
     edges: np.ndarray
     differences: np.ndarray
     bins_p: np.ndarray
@@ -173,32 +178,35 @@ class Comparison(Pictured):
         return self.bins_p <= LEVEL
 
     @property
+    def found(self) -> tuple[Number, ...]:
+        """Return the numbers that differ by their family-wise p: familiar ones first, then the largest effects."""
+        differing = [number for number in self.numbers if number.family <= LEVEL]
+        return tuple(sorted(differing, key=lambda number: (number.symbol not in FAMILIAR, -abs(number.effect))))
+
+    @property
     def status(self) -> str:
-        """Return the answer in a sentence or a few: whether, by how much, in which direction."""
-        unit = per_unit(self.unit, 1)
-        strongest = max((self[name] for name in FAMILIAR), key=lambda number: abs(np.nan_to_num(number.effect)))
+        """Return the answer in a few sentences, which name what the tests support and no more."""
         few = f"So few subjects cannot give a p below {format_number(self.least, 2)}: nothing can be shown to differ."
         lines = [few] if self.least > LEVEL else []
         if self.primary:
-            lines.append(f"{self.verdict}, named beforehand: {self._describe(self.primary)}.")
-        lines += [
-            f"{self._judge(self.p, 'curvature diagrams')}: p = {format_number(self.p, 2)}.",
-            f"Of the familiar numbers the one that differs most: {self._describe(strongest)}, "
-            f"{format_number(strongest.family, 2)} among all {len(self.numbers)} numbers.",
-            f"In curvature the mean diagrams of {join_names(self.parts)} lie "
-            f"{'up to ' * (len(self.parts) > 2)}{format_number(self.apart, 2)} {unit} apart, those of two subjects of "
-            f"one of them {format_number(self.within, 2)} {unit} on average (sliced Wasserstein distance).",
-        ]
-        if self.p <= LEVEL and len(self.groups) <= 2:
-            ends = [f"{self.by} {label:g}" for label in (self.labels.min(), self.labels.max())]
-            low, high = self.groups if len(self.groups) == 2 else ends
-            span = 1.0 if self.groups else float(np.ptp(self.labels))  # a difference by a number is a slope
-            changes = sorted((span * self[f"share of {name}"].difference, name) for name in FAMILIES)
-            (fall, falling), (rise, rising) = changes[0], changes[-1]
+            lines.append(f"{self.verdict}, named beforehand: {self._describe(self.primary, alone=True)}.")
+        found, count, level = self.found, len(self.numbers), f"family-wise p at most {LEVEL:.2g}"
+        if found:
+            rest = f"; and {len(found) - NAMED} more" if len(found) > NAMED else ""
+            described = "; ".join(map(self._describe, found[:NAMED]))
+            lines.append(f"Of {count} numbers {len(found)} differ ({level}): {described}{rest}.")
+        else:
+            strongest = max((self[name] for name in FAMILIAR), key=lambda number: abs(np.nan_to_num(number.effect)))
             lines.append(
-                f"From {low} to {high} the share of {falling} falls by {format_percent(-fall)} "
-                f"of the surface, and that of {rising} rises by {format_percent(rise)}."
+                f"None of {count} numbers is seen to differ ({level}). Of the familiar ones the effect on "
+                f"{self._describe(strongest)} is the largest."
             )
+        unit, most = per_unit(self.unit, 1), "up to " * (len(self.parts) > 2)
+        lines.append(
+            f"Curvature diagrams {'differ' if self.p <= LEVEL else 'are not told apart'}: p = "
+            f"{format_number(self.p, 2)}; their means lie {most}{format_number(self.apart, 2)} {unit} apart, and up to "
+            f"{format_number(self.by_chance, 2)} by chance (sliced Wasserstein distance)."
+        )
         return " ".join(lines)
 
     @property
@@ -209,24 +217,38 @@ class Comparison(Pictured):
 
     @property
     def verdict(self) -> str:
-        """Return whether subjects differ, in a few words: in the number named beforehand, or in their diagrams."""
+        """Return whether subjects differ, in a few words: in the number named beforehand, or else in up to two numbers,
+        or in their diagrams."""
+        differ, alike = ("differ", "are not told apart") if self.groups else ("differ", "are not seen to differ")
+        who = join_names(self.groups) if self.groups else f"With {self.by} subjects"
         if self.primary:
-            return self._judge(self.primary.p, self.primary.name)
-        return self._judge(self.p, "curvature diagrams")
+            return f"{who} {differ if self.primary.p <= LEVEL else alike} by their {self.primary.name}"
+        if self.found:
+            return f"{who} {differ}: {', '.join(map(self._summarise, self.found[:2]))}"
+        return f"{who} {differ if self.p <= LEVEL else alike} by their curvature diagrams"
 
-    def _judge(self, p: float, quantity: str) -> str:
-        if not self.groups:
-            return f"With {self.by} subjects {'differ' if p <= LEVEL else 'are not seen to differ'} by their {quantity}"
-        return f"{join_names(self.groups)} {'differ' if p <= LEVEL else 'are not told apart'} by their {quantity}"
+    def _summarise(self, number: Number) -> str:
+        """Return a number's symbol, and its change in per cent where it cannot be negative."""
+        symbol = number.symbol if number.symbol not in FAMILIES else number.name
+        return f"{symbol} {self._change(number)}".rstrip()
 
-    def _describe(self, number: Number) -> str:
-        """Return a number with its means or its slope, and its p, as text."""
+    def _change(self, number: Number) -> str:
+        if len(number.means) != 2 or number.symbol in SIGNED:
+            return ""
+        sign = "+" if number.difference > 0 else ""
+        return f"{sign}{format_percent(number.difference / number.means[0])}"
+
+    def _describe(self, number: Number, alone: bool = False) -> str:
+        """Return a number with its means or its slope, its effect and a p, family-wise or `alone`, as text."""
         unit = power_name(self.unit, number.power)
+        symbol = [number.symbol] if number.symbol not in FAMILIES else []
         if self.groups:
-            change = f"goes from {' to '.join(map(format_number, number.means))} {unit}".rstrip()
+            change = f"from {' to '.join(map(format_number, number.means))} {unit}".rstrip()
         else:
-            change = f"changes by {format_number(number.difference)} {unit}".rstrip() + f" a unit of {self.by}"
-        return f"{number.name} ({number.symbol}) {change}, p = {format_number(number.p, 2)} alone"
+            change = f"{format_number(number.difference)} {unit}".rstrip() + f" a unit of {self.by}"
+        p = f"p = {format_number(number.p if alone else number.family, 2)}"
+        facts = ", ".join([*symbol, change, f"{self.effect} = {format_number(number.effect, 2)}", p])
+        return " ".join(filter(None, (number.name, self._change(number), f"({facts})")))
 
 
 def join_names(names: Sequence[str]) -> str:
@@ -322,7 +344,8 @@ def _compare_measures(
     statistics = test(distances, arrangements, blocks)
     sides = labels if groups else _halve(labels)
     means = tuple(_pool([diagrams[k] for k in np.flatnonzero(sides == side)]) for side in np.unique(sides))
-    same_side = (sides[:, None] == sides) & ~np.eye(len(sides), dtype=bool)
+    tried = arrangements[:: math.ceil(len(arrangements) / CHANCE)]
+    by_chance = [_apart(embeddings, each if groups else _halve(each)) for each in tried]
     edges, differences, bins_p = _compare_bins(diagrams, labels, arrangements, blocks)
     values, errors, halves = _average(measures, scans)
     # The least possible p is that of a quantity equal to the labels.
@@ -332,12 +355,16 @@ def _compare_measures(
         subjects=tuple(subjects), labels=labels, blocks=blocks, values=values, errors=errors, halves=halves,
         numbers=_compare_numbers(measures[0], values, errors, labels, arrangements, blocks),
         statistic=float(statistics[0]), p=float(permutation.share_beyond(statistics)), least=float(least_p),
-        sides=sides, diagrams=means,
-        apart=float(pdist(np.stack([sliced_embedding(mean) for mean in means])).max()),
-        within=float(distances[same_side].mean()), edges=edges, differences=differences, bins_p=bins_p,
+        sides=sides, diagrams=means, apart=_apart(embeddings, sides), by_chance=float(np.quantile(by_chance, SURE)),
+        edges=edges, differences=differences, bins_p=bins_p,
         permutations=len(arrangements), exact=exact, options=options,
         notes=(*notes, *gather_notes(measures, cases)),
     )  # fmt: skip
+
+
+def _apart(embeddings: np.ndarray, sides: np.ndarray) -> float:
+    """Return the greatest distance between the means of two parts' embeddings."""
+    return float(pdist(np.stack([embeddings[sides == side].mean(0) for side in np.unique(sides)])).max())
 
 
 def _halve(numbers: np.ndarray) -> np.ndarray:

@@ -251,7 +251,8 @@ def test_the_number_named_beforehand_leads_by_its_own_p() -> None:
         scans[k] = replace(scan, quantities=tuple(rows))
     plain, named = (compare(scans[:4], scans[4:], primary=name) for name in (None, "Tb.Th"))
     assert plain.primary is None and named.primary == plain["thickness"] and named.primary.p == pytest.approx(2 / 70)
-    assert "not told apart" in plain.verdict and "not told apart" not in named.verdict
+    assert plain.verdict.startswith("A and B differ: Tb.Th +") and [each.symbol for each in plain.found] == ["Tb.Th"]
+    assert "diagrams are not told apart" in plain.status and named.verdict == "A and B differ by their thickness"
     assert named.verdict in named.status and named.verdict not in plain.status
     assert "thickness" in plain.status and "Tb.Th" in describe_methods(named)  # it differs most
     with pytest.raises(ValueError, match="primary"):
@@ -319,7 +320,9 @@ def shapes() -> Comparison:
 
 def test_tubes_and_balls_differ_in_the_direction_that_they_do(shapes: Comparison) -> None:
     assert shapes.p == pytest.approx(2 / 70)
-    assert "differ" in shapes.status and re.search("of tubes falls .* of spheres rises", shapes.status)
+    assert shapes.verdict.startswith("A and B differ: ") and re.search("Of 22 numbers [0-9]+ differ", shapes.status)
+    assert re.search("Curvature diagrams differ: p = 0.029; their means lie .* apart, and up to .* by chance", shapes.status)
+    assert shapes.apart > shapes.by_chance
     assert shapes["share of spheres"].difference > 0.9 and shapes["share of tubes"].difference < -0.9
     assert shapes["κ2"].low > 0 and shapes["share of spheres"].family == pytest.approx(2 / 70)
     κ2, κ1 = np.meshgrid(*[(shapes.edges[1:] + shapes.edges[:-1]) / 2] * 2, indexing="ij")
@@ -436,3 +439,11 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(home: Path, arguments:
     before = sorted(home.rglob("*"))
     refused(call("compare", "--output", "out", *arguments.split()), word, progress=True)
     assert sorted(home.rglob("*")) == before
+
+
+def test_methods_can_be_copied(shapes: Comparison) -> None:
+    """What was done, in the words of a paper: no results, no notes; some 120 words."""
+    text = describe_methods(shapes)
+    assert 90 <= len(text.split()) <= 140
+    assert "32 x 32 x 32 voxels of 0.01 mm" in text and "all 70 permutations of groups" in text
+    assert not re.search(r"p = |E = |Of curvature|Dropped", text)
