@@ -49,8 +49,9 @@ def law_of(prior: LawLike, scan: Volume) -> tuple[Coefficients, tuple[str, ...]]
     if not law.fitted:
         note = f"The {law.origin}, at a working voxel of one scan voxel."
         return coefficients, (note,) if law.working else ()
-    note = f"The prior's lengths, in {unit_name(law.length_unit)}, are converted to {unit_name(scan.unit)}."
-    notes = () if law.length_unit == scan.unit else (note,)
+    notes = ()
+    if law.length_unit not in (None, scan.unit):
+        notes = (f"The prior's lengths, in {unit_name(law.length_unit)}, are converted to {unit_name(scan.unit)}.",)
     return coefficients, (*notes, f"{law.doubt} Compare the mask with the scan.") if law.doubt else notes
 
 
