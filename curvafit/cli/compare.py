@@ -15,6 +15,7 @@ from curvafit.cli.options import OverwriteOption, Reading, Structure, command
     "curvafit compare control/ treated/ --spacing 0.0195 --unit mm -o compared",
     "curvafit compare control/ low/ high/ --subjects mice.csv -o compared",
     "curvafit compare before/ after/ --paired -o compared",
+    "curvafit compare sham/ ovx/ --roi '{stem}_roi.tif' -o compared",
     "curvafit compare study.csv --by age -o compared",
     "curvafit compare study.csv --by treatment --paired -o compared",
     "curvafit compare day0.tif day7.tif day14.tif day28.tif day56.tif --by 0,7,14,28,56 -o healing",
@@ -31,6 +32,10 @@ def compare(
         bool, typer.Option("--paired", help="Compare within subjects of one name (of a file, or in the CSV).")
     ] = False,
     subjects: Annotated[Path | None, typer.Option(help="CSV for folders, or scans: scan, subject.")] = None,
+    roi: Annotated[
+        str | None,
+        typer.Option(help="Region of each scan, from its folder: {stem}_roi.tif. Or a column roi of the CSV."),
+    ] = None,
     *,
     structure: Structure,
     reading: Reading,
@@ -47,7 +52,7 @@ def compare(
 
         check_comparison(out, [*scans, *([] if subjects is None else [subjects])], overwrite, command_line())
         settings = {"primary": primary, "permutations": permutations, "seed": seed, "subjects": subjects}
-        settings |= {"workers": workers, "progress": progress, "paired": paired}
+        settings |= {"roi": roi, "workers": workers, "progress": progress, "paired": paired}
         # `--by 0,7,14` has a number for each scan of one list; otherwise each argument is a group or a CSV.
         labels = by.split(",") if by and "," in by else by
         groups = [scans] if isinstance(labels, list) else scans

@@ -71,6 +71,7 @@ def write_comparison(
     record |= {"exact": c.exact, "p": c.p, "least_p": c.least, "by": c.by, "groups": list(c.groups)}
     record["scans"] = [
         {"scan": scan.source, "subject": case.subject, label: case.label, "kind": scan.kind, "notes": list(scan.notes)}
+        | ({} if case.roi is None else {"roi": str(case.roi)})
         for scan, case in zip(c.measures, c.cases, strict=True)
     ]
     record |= {

@@ -261,6 +261,7 @@ def compare(
     by: str | Sequence[Any] | None = None,
     paired: bool = False,
     subjects: str | PathLike[str] | None = None,
+    roi: str | None = None,
     kind: Literal["auto", "field", "mask", "image"] = "auto",
     periodic: bool = False,
     threshold: Literal["otsu"] | float = "otsu",
@@ -295,6 +296,9 @@ def compare(
         column subject of a table, one file name in folders, and one position in sequences.
     subjects
         A CSV table of the columns scan and subject, for groups. Without it each scan is a subject.
+    roi
+        Where each scan's region lies, from the scan's folder: `"{stem}_roi.tif"` or `"../regions/{name}"`; `{stem}` is
+        its file's name up to the first point. A table of scans may have a column roi instead.
     kind, periodic, threshold, dark
         As in `measure`.
     primary
@@ -314,12 +318,12 @@ def compare(
     if primary is not None:
         names = {word for name, symbol, *_ in QUANTITIES for word in (name, symbol)}
         check_choice(primary, names, f"a primary number of {', '.join(symbol for _, symbol, *_ in QUANTITIES)}")
-    cases, notes = list_cases(groups, by, subjects, paired)
+    cases, notes = list_cases(groups, by, subjects, paired, roi)
     options = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark}
     measures, measure_notes = measure_scans(cases, options, reading, workers, sub_progress(progress, 0.0, 0.97))
     progress("comparing", 0.97)
     name = by if isinstance(by, str) else "group" if isinstance(cases[0].label, str) else "the number"
-    parameters = {**options, **reading, "by": name, "paired": paired, "primary": primary}
+    parameters = {**options, **reading, "roi": roi, "by": name, "paired": paired, "primary": primary}
     parameters |= {"permutations": permutations, "seed": seed}
     return _compare_measures(measures, cases, parameters, [*notes, *measure_notes])
 

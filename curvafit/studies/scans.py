@@ -58,22 +58,25 @@ FORMAT = Format("curvafit measures 1", title="a table of measures")
 
 
 class Case(NamedTuple):
-    """A scan, its name, its subject, and its label: the name of its group, or a number."""
+    """A scan, its name, its subject, and its label: the name of its group, or a number; and its region of interest."""
 
     source: Source | Measures
     name: str
     subject: str
     label: str | float
+    roi: Path | None = None
 
 
 def list_cases(
-    groups: Sequence[Group], by: str | Sequence[Any] | None, table: str | PathLike[str] | None, paired: bool
-) -> tuple[list[Case], list[str]]:
+    groups: Sequence[Group], by: str | Sequence[Any] | None, table: str | PathLike[str] | None, paired: bool,
+    roi: str | None = None,
+) -> tuple[list[Case], list[str]]:  # fmt: skip
     """Return the scans of a study, those of one group together, and notes on what was assumed.
 
     They are those of several groups; of a single sequence, with a label for each in `by`; or of a single table, with
-    labels in its column `by`. Raises ValueError where labels cannot be exchanged between subjects; FileNotFoundError
-    where a folder, a table, or a scan that it names is not there.
+    labels in its column `by`, and regions in its column `roi`. Else `roi` is where the region of each scan lies. Raises
+    ValueError where labels cannot be exchanged between subjects; FileNotFoundError where a folder, a table, or a scan
+    or region that it names is not there.
     """
     notes: list[str] = []
     if len(groups) == 1 and isinstance(groups[0], str | PathLike):
@@ -96,9 +99,29 @@ def list_cases(
             if common := sum(count > 1 for count in groups_of.values()):
                 notes.append(f"The groups have {common} names in common: they count as different subjects.")
                 cases = [case._replace(subject=f"{case.label}/{case.subject}") for case in cases]
-    cases = _name_labels(cases, by)
+    cases = _name_labels(cases if roi is None else _find_regions(cases, roi), by)
     _check_labels(cases, paired)
     return cases, notes
+
+
+def _find_regions(cases: Sequence[Case], pattern: str) -> list[Case]:
+    """Return scans with their regions: `{name}` in the pattern is a scan's file name, `{stem}` that up to its first
+    point, and a path is from the scan's folder. Files that are regions of others are no scans."""
+    if "{name}" not in pattern and "{stem}" not in pattern:
+        raise ValueError(f"expected regions with {{stem}} or {{name}} for the scan's own, got {pattern}")
+    found = []
+    for case in cases:
+        if not isinstance(case.source, str | PathLike):
+            raise ValueError(f"a region goes with a file that is measured, got one for {case.name}")
+        scan = Path(case.source)
+        names = {"{name}": scan.name, "{stem}": scan.name.partition(".")[0]}
+        filled = re.sub(r"{name}|{stem}", lambda found, names=names: names[found[0]], pattern)
+        found.append(case._replace(roi=scan.parent / filled))
+    regions = {case.roi for case in found}
+    scans = [case for case in found if Path(str(case.source)) not in regions]
+    if missing := [case for case in scans if case.roi is not None and not case.roi.exists()]:
+        raise FileNotFoundError(f"no such file: {missing[0].roi}, the region of {missing[0].name}")
+    return scans
 
 
 def _name_labels(cases: Sequence[Case], by: Any) -> list[Case]:
@@ -242,7 +265,10 @@ def _read_cases(table: Path, by: str, paired: bool) -> list[Case]:
         path = next((path for path in paths if Path(str(path).partition("::")[0]).exists()), None)
         if path is None:
             raise FileNotFoundError(f"no such file: {row['scan']}, which {table} names")
-        cases.append(Case(str(path), path.name, row.get("subject") or row["scan"], row[by]))
+        region = table.parent / row["roi"] if row.get("roi") else None
+        if region is not None and not region.exists():
+            raise FileNotFoundError(f"no such file: {row['roi']}, which {table} names")
+        cases.append(Case(str(path), path.name, row.get("subject") or row["scan"], row[by], region))
     return cases
 
 
@@ -303,7 +329,7 @@ def measure_scans(
     settings = options | reading
     measured: dict[int, Any] = {k: (case.source,) for k, case in enumerate(cases) if isinstance(case.source, Measures)}
     tasks: dict[int, Task] = {
-        k: partial(_measure_one, case.source, case.name, False, settings)  # no labels
+        k: partial(_measure_one, case.source, case.name, False, {**settings, "roi": case.roi})  # no labels
         for k, case in enumerate(cases)
         if k not in measured
     }

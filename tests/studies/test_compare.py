@@ -21,6 +21,7 @@ from curvafit.core.permutation import correct_by_most, correct_holm, correlate, 
 from curvafit.geometry.diagrams import Diagram
 from curvafit.report.comparison import FILES, check_comparison, describe_methods, numbers_figure
 from curvafit.scan.measures import QUANTITIES, Measures, Quantity
+from curvafit.scan.tiles import measure
 from curvafit.studies.comparison import Comparison, compare
 from curvafit.studies.scans import merge_notes
 from curvafit.volumes.volume import Volume
@@ -411,6 +412,23 @@ def test_a_table_names_groups_subjects_and_numbers(home: Path) -> None:
     assert times["BV/TV"].difference == pytest.approx(np.mean(slopes))
 
 
+def test_each_scan_is_measured_in_its_region(home: Path) -> None:
+    """Beside the scans, by a pattern, or in a column of a table: with a table's numbers those of `measure --roi`."""
+    for path in SCANS:
+        region = np.zeros((N,) * 3, np.uint8)
+        region[4:, 2:30] = 1
+        np.save(path.replace(".npy", "_roi.npy"), region)
+    found = compare("control", "treated", roi="{stem}_roi.npy")
+    assert found.counts == (3, 3) and len(found.cases) == 6
+    alone = [measure(path, roi=path.replace(".npy", "_roi.npy")) for path in SCANS]
+    assert [scan["BV/TV"].value for scan in found.measures] == [scan["BV/TV"].value for scan in alone]
+    assert found.measures[0]["BV/TV"].value != measure(SCANS[0])["BV/TV"].value
+    rows = [f"{path},{path[:7]},{path.replace('.npy', '_roi.npy')}" for path in SCANS]
+    (home / "study.csv").write_text("\n".join(["scan,group,roi", *rows]), encoding="utf-8")
+    again = compare(home / "study.csv")
+    assert again.p == found.p and [case.roi for case in again.cases] == [home / row.split(",")[2] for row in rows]
+
+
 TIMES = "".join(f"{path},{path[:7]},{path[:7]},{k}\n" for k, path in enumerate(SCANS))
 EACH, OF = " ".join(SCANS), "control treated --subjects table.csv"
 
@@ -429,6 +447,8 @@ EACH, OF = " ".join(SCANS), "control treated --subjects table.csv"
         ("table.csv", "scan,group\nnowhere.npy,1\ncontrol/m0.npy,2\n", "nowhere.npy"),
         ("table.csv --by time", "scan,subject,group,time\n" + TIMES, "--paired"),
         ("table.csv --by time", "scan,subject,group,time\n" + TIMES.replace(",5", ","), "row without"),
+        ("control treated --roi {stem}_roi.npy", "", "m0_roi.npy"), ("control treated --roi table.csv", "", "{stem}"),
+        ("table.csv", "scan,group,roi\ncontrol/m0.npy,1,no.npy\n", "no.npy"),
         (OF, "scan,subject\nm0.npy,1\n", "row for each scan"), (OF, "scan,subject,group\nm0.npy,1,a\n", "groups once"),
     ],
 )  # fmt: skip
