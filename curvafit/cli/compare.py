@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from curvafit.cli.console import command_line, print_table, say, say_notes, show_stages
-from curvafit.cli.options import OverwriteOption, Reading, Structure, command
+from curvafit.cli.options import OverwriteOption, PanelsOption, Reading, Structure, command, parse_panels
 
 
 @command(
@@ -39,6 +39,7 @@ def compare(
     *,
     structure: Structure,
     reading: Reading,
+    panels: PanelsOption = None,
     primary: Annotated[str | None, typer.Option(help="One number named beforehand, tested alone: Tb.Th.")] = None,
     permutations: Annotated[int, typer.Option(help="Permutations of subjects; all where there are fewer.")] = 9999,
     seed: Annotated[int, typer.Option(help="Seed of the permutations, where not all are tried.")] = 0,
@@ -50,6 +51,7 @@ def compare(
         from curvafit.report.comparison import check_comparison, write_comparison
         from curvafit.studies.comparison import compare as compare_scans
 
+        shown = parse_panels(panels)
         check_comparison(out, [*scans, *([] if subjects is None else [subjects])], overwrite, command_line())
         settings = {"primary": primary, "permutations": permutations, "seed": seed, "subjects": subjects}
         settings |= {"roi": roi, "workers": workers, "progress": progress, "paired": paired}
@@ -58,7 +60,7 @@ def compare(
         groups = [scans] if isinstance(labels, list) else scans
         comparison = compare_scans(*groups, by=labels, **structure, **settings, **reading)
         progress("drawing the page", 1.0)
-        page = write_comparison(comparison, out, command=command_line(), overwrite=overwrite)
+        page = write_comparison(comparison, out, panels=shown, command=command_line(), overwrite=overwrite)
     say_notes(comparison.notes)
     say(comparison.status, style="bold")
     from curvafit.core.units import format_number

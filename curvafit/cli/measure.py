@@ -16,9 +16,11 @@ from curvafit.cli.options import (
     FILES,
     Group,
     OverwriteOption,
+    PanelsOption,
     Reading,
     Structure,
     command,
+    parse_panels,
     parse_structure,
     parse_whole_triple,
 )
@@ -79,12 +81,15 @@ def measure(
     workers: Annotated[
         int, typer.Option(help="Processes that share scans, or one scan's tiles; 0 is this one.", min=0)
     ] = 0,
+    panels: PanelsOption = None,
     structure: Structure,
     reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure scans in seconds: morphometry, fabric and curvature in physical units, with 95 % intervals."""
     folder = _choose_folder(out, labels, subjects)
+    if panels is not None and (folder is None or grid is not None):
+        raise ValueError("--panels is for the figure of a page: give a name without a suffix with -o")
     if labels and (roi is not None or tile is not None or structure != parse_structure()):
         raise ValueError(
             "--labels states the structure of instances, each in a box of its own: leave out --roi, --tile, --kind, "
@@ -105,12 +110,12 @@ def measure(
         if folder is None:
             _write_table(scans, out, subjects, overwrite, options, reading)
         else:
-            _write_page(scans, folder, subjects, overwrite, options, reading)
+            _write_page(scans, folder, subjects, parse_panels(panels), overwrite, options, reading)
 
 
 def _write_page(
-    scans: list[str], folder: Path, subjects: Path | None, overwrite: bool, options: dict[str, Any],
-    reading: dict[str, Any],
+    scans: list[str], folder: Path, subjects: Path | None, panels: tuple[str, ...], overwrite: bool,
+    options: dict[str, Any], reading: dict[str, Any],
 ) -> None:  # fmt: skip
     """Measure scans, and write a page of them."""
     with show_stages() as progress:
@@ -127,7 +132,7 @@ def _write_page(
         progress("drawing the page", 1.0)
         recorded = {name: value for name, value in options.items() if name not in ("store", "labels", "workers")}
         settings: dict[str, Any] = {"options": recorded | reading, "command": command_line(), "overwrite": overwrite}
-        page = write_measures(results, folder, columns=columns, **settings)
+        page = write_measures(results, folder, columns=columns, panels=panels, **settings)
     say_notes(tuple(count_notes(results)))
     say(str(page))
 

@@ -412,17 +412,17 @@ def flow_figure(flow: Flow, **options: Any) -> Figure:
 # ---- files -----------------------------------------------------------------------------------------------------------
 
 
-def png(figure: Figure) -> bytes:
-    """Return the figure as a PNG."""
+def png(figure: Figure, dpi: int = DPI) -> bytes:
+    """Return the figure as a PNG, of so many pixels per inch."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI)
+    figure.savefig(buffer, format="png", dpi=dpi)
     return buffer.getvalue()
 
 
 def svg(figure: Figure) -> bytes:
-    """Return the figure as an SVG, the same for the same figure."""
+    """Return the figure as an SVG whose text is text, the same for the same figure."""
     buffer = io.BytesIO()
-    with rc_context({"svg.hashsalt": "curvafit"}):
+    with rc_context({"svg.hashsalt": "curvafit", "svg.fonttype": "none"}):
         figure.savefig(buffer, format="svg", dpi=DPI, metadata={"Date": None})
     return buffer.getvalue()
 

@@ -36,14 +36,14 @@ from curvafit.report.page import (
 )
 from curvafit.scan.measures import Measures
 from curvafit.studies.comparison import LEVEL, Comparison, Number, join_names
-from curvafit.studies.scans import merge_notes
+from curvafit.studies.scans import list_wide, merge_notes
 
 #: `format` of a comparison's record.
 FORMAT = Format("curvafit comparison", 1, title="the record of a comparison")
 #: The tests of each quantity as the page's table heads them.
 TESTS = ("p", "family-wise", "Holm", "BH")
 #: What a comparison writes into its folder.
-FILES = ("compare.json", "compare.html", "measures.csv", "numbers.csv")
+FILES = ("compare.json", "compare.html", "measures.csv", "wide.csv", "numbers.csv")
 FILES += ("difference.svg", "difference.png", "numbers.svg", "numbers.png", "outlines.svg", "outlines.png")
 #: Colours of what is less and of what is more.
 MORE = LinearSegmentedColormap.from_list("more", [plot.FIRST, "#8CC0E0", "#FFFFFF", "#F0B48A", plot.SECOND])
@@ -56,12 +56,18 @@ check_comparison = partial(check_result_folder, FORMAT, FILES)
 
 
 def write_comparison(
-    comparison: Comparison, directory: str | Path, *, command: str = "", overwrite: bool = False
+    comparison: Comparison,
+    directory: str | Path,
+    *,
+    panels: Sequence[str] = (),
+    command: str = "",
+    overwrite: bool = False,
 ) -> Path:
     """Write the page, figures, tables and record of a comparison into a folder, and return the page's path.
 
     The files (`FILES`) are moved into the folder once all are whole. Those of the same command are replaced;
-    others are a ValueError without `overwrite`. `command` is what the record calls the command line.
+    others are a ValueError without `overwrite`. `panels` are the symbols of the numbers that the figure shows, by
+    default all; `command` is what the record calls the command line.
     """
     target = check_comparison(directory, overwrite=overwrite, command=command)
     c, tests = comparison, list(_test_rows(comparison))
@@ -89,12 +95,13 @@ def write_comparison(
     outlines = outlines_figure(name_parts(c.measures), [scan.outline for scan in c.measures], c.unit)
     figures = {
         "difference": (comparison_figure(c), "Mean curvature diagrams and their difference"),
-        "numbers": (numbers_figure(c), f"Each number by {c.by}"),
+        "numbers": (numbers_figure(c, panels), f"Each number by {c.by}"),
         "outlines": (outlines, "Three slices of each scan, and the outline of its structure"),
     }
     columns = [{"subject": case.subject, label: case.label} for case in c.cases]
     rows = (row for scan, more in zip(c.measures, columns, strict=True) for row in scan.rows(**more))
-    tables, shown = {"measures.csv": rows, "numbers.csv": tests}, ("command", "date", *permutation)
+    tables: dict[str, Any] = {"measures.csv": rows, "wide.csv": list_wide(c.measures, columns), "numbers.csv": tests}
+    shown = ("command", "date", *permutation)
     return write_study(target, FORMAT, FILES, record, page, tables, figures=figures, shown=shown)
 
 
@@ -231,20 +238,22 @@ def _outline_on(axes: Axes, edges: np.ndarray, inside: np.ndarray) -> None:
     axes.add_collection(LineCollection(list(np.concatenate(lines)), colors=plot.INK, linewidths=1.2, zorder=3.5))
 
 
-def numbers_figure(comparison: Comparison) -> Figure:
-    """Return a figure of each quantity: subjects by group or over the number, with the 95 % intervals of their scans.
+def numbers_figure(comparison: Comparison, symbols: Sequence[str] = ()) -> Figure:
+    """Return a figure of each quantity, or of some: subjects by group or over the number, with the 95 % intervals of
+    their scans.
 
     A long line is a group's mean, or the regression line; a thin line joins the values of one subject in paired groups.
     The names of quantities that differ significantly, all tested, are bold.
     """
     c = comparison
-    figure, panels = _panels(c)
+    figure, panels = _panels(c, symbols)
     pairs = [] if c.blocks is None else [np.flatnonzero(c.blocks == block) for block in np.unique(c.blocks)]
     x = np.array(c.labels, dtype=float)
     for group, count in enumerate(c.counts if c.groups and not pairs else ()):
         x[c.sides == group] += np.linspace(-0.18, 0.18, count)  # side by side, so that intervals do not overlap
     members = [c.sides == group for group in range(len(c.counts))] if c.groups else [np.ones(len(x), dtype=bool)]
-    for k, (axes, number) in enumerate(zip(panels, c.numbers, strict=True)):
+    for k, axes in panels.items():
+        number = c.numbers[k]
         values, halves = c.values[:, k], c.halves[:, k]
         low, high = values - halves, values + halves
         low = low if number.symbol in plot.SIGNED else np.maximum(low, 0)
@@ -278,20 +287,23 @@ def numbers_figure(comparison: Comparison) -> Figure:
     return figure
 
 
-def _panels(comparison: Comparison) -> tuple[Figure, list[Axes]]:
-    """Return a figure and its panel for each number, with the tests above it; familiar numbers are first and larger."""
-    numbers, ranks = comparison.numbers, {symbol: k for k, symbol in enumerate(plot.FIRST_SHOWN)}
+def _panels(comparison: Comparison, symbols: Sequence[str]) -> tuple[Figure, dict[int, Axes]]:
+    """Return a figure and its panel for each number by its index, with the tests above it; those named, or else the
+    familiar ones, are first and larger."""
+    numbers, ranks = comparison.numbers, {symbol: k for k, symbol in enumerate(symbols or plot.FIRST_SHOWN)}
     order = sorted(range(len(numbers)), key=lambda k: ranks.get(numbers[k].symbol, len(ranks)))
     familiar = sum(number.symbol in ranks for number in numbers)
-    large_rows, small_rows = math.ceil(familiar / LARGE), math.ceil((len(numbers) - familiar) / SMALL)
-    figure = plot.make_figure(13.2, 3.1 * large_rows + 2.5 * small_rows, layout="constrained")
+    order = order[:familiar] if symbols else order
+    large_rows, small_rows = math.ceil(familiar / LARGE), math.ceil((len(order) - familiar) / SMALL)
+    across = min(LARGE, familiar) if symbols else LARGE
+    figure = plot.make_figure(3.3 * across, 3.1 * large_rows + 2.5 * small_rows + 0.4, layout="constrained")
     heights = max(3.1 * large_rows, 0.01), max(2.5 * small_rows, 0.01)
     halves = figure.add_gridspec(2, 1, height_ratios=heights)
-    large, small = halves[0].subgridspec(max(large_rows, 1), LARGE), halves[1].subgridspec(max(small_rows, 1), SMALL)
+    large, small = halves[0].subgridspec(max(large_rows, 1), across), halves[1].subgridspec(max(small_rows, 1), SMALL)
     panels: dict[int, Axes] = {}
     for rank, k in enumerate(order):
         number, is_large = numbers[k], rank < familiar
-        cell = large[divmod(rank, LARGE)] if is_large else small[divmod(rank - familiar, SMALL)]
+        cell = large[divmod(rank, across)] if is_large else small[divmod(rank - familiar, SMALL)]
         axes = figure.add_subplot(cell)
         unit = power_name(comparison.unit, number.power)
         weight = "bold" if number.family <= comparison.level else "normal"
@@ -304,4 +316,4 @@ def _panels(comparison: Comparison) -> tuple[Figure, list[Axes]]:
         axes.tick_params(length=2, labelsize=8)
         axes.spines[:].set_color(plot.QUIET)
         panels[k] = axes
-    return figure, [panels[k] for k in range(len(numbers))]
+    return figure, panels

@@ -28,13 +28,22 @@ from curvafit.report.page import (
     write_study,
 )
 from curvafit.scan.measures import QUANTITIES, Measures, Quantity
-from curvafit.studies.scans import count_notes, list_rows
+from curvafit.studies.scans import count_notes, list_rows, list_wide
 from curvafit.studies.windowed import NAMES, Windows
 
 #: `format` of the record.
 FORMAT = Format("curvafit measured scans", 1, title="the record of measured scans")
 #: What is written into the folder.
-FILES = ("measures.json", "measures.html", "measures.csv", "diagrams.svg", "diagrams.png", "numbers.svg", "numbers.png")
+FILES = (
+    "measures.json",
+    "measures.html",
+    "measures.csv",
+    "wide.csv",
+    "diagrams.svg",
+    "diagrams.png",
+    "numbers.svg",
+    "numbers.png",
+)
 FILES += ("outlines.svg", "outlines.png")
 #: Of a scan measured in windows, `format` of the record.
 WINDOWS_FORMAT = Format("curvafit windows", 1, title="the record of a scan measured in windows")
@@ -59,15 +68,16 @@ def write_measures(
     *,
     columns: Sequence[Mapping[str, str]] | None = None,
     options: Mapping[str, Any] | None = None,
+    panels: Sequence[str] = (),
     command: str = "",
     overwrite: bool = False,
 ) -> Path:
-    """Write the page, figures, table and record of scans into a folder, and return the page's path.
+    """Write the page, figures, tables and record of scans into a folder, and return the page's path.
 
     Lengths are in the first scan's unit. A scan with compartments has a row for each of them. The files (`FILES`) are
     moved into the folder once all are whole; those of the same command are replaced, others are a ValueError without
-    `overwrite`. `columns` has further columns of each scan, such as its subject; `options` and `command` are for the
-    record.
+    `overwrite`. `columns` has further columns of each scan, such as its subject; `panels` are the symbols of numbers
+    that the figure shows; `options` and `command` are for the record.
     """
     if not measures:
         raise ValueError("expected at least one scan, got none")
@@ -95,14 +105,15 @@ def write_measures(
                     "outlines": max(0, len(measures) - MOST_OUTLINES)},
     }  # fmt: skip
     diagrams = diagrams_figure(names[:MOST_DIAGRAMS], parts[:MOST_DIAGRAMS])
-    intervals = intervals_figure(names[:MOST_ROWS], parts[:MOST_ROWS])
+    shown = panels or plot.FIRST_SHOWN
+    intervals = intervals_figure(names[:MOST_ROWS], parts[:MOST_ROWS], shown) if len(parts) > 1 else None
     outlines = outlines_figure(name_parts(measures), [scan.outline for scan in measures], unit)
     figures = {
         "outlines": (outlines, "Three slices of each scan, and the outline of its structure"),
         "diagrams": (diagrams, "The curvature diagram of each scan"),
         "numbers": (intervals, "Numbers of each scan with their intervals"),
     }
-    tables = {"measures.csv": list_rows(measures, columns)}
+    tables = {"measures.csv": list_rows(measures, columns), "wide.csv": list_wide(measures, columns)}
     return write_study(target, FORMAT, FILES, record, page, tables, figures=figures)
 
 
@@ -160,13 +171,15 @@ def diagrams_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figur
     return figure
 
 
-def intervals_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figure:
-    """Return a figure of eight numbers of scans of one unit, a row for each scan, with 95 % intervals."""
-    rows = math.ceil(len(plot.FIRST_SHOWN) / PANELS)
-    figure = plot.make_figure(12.0, rows * (0.9 + 0.19 * max(len(names), 4)), layout="constrained")
-    panels = figure.subplots(rows, PANELS, sharey=True)
+def intervals_figure(names: Sequence[str], measures: Sequence[Measures], symbols: Sequence[str]) -> Figure:
+    """Return a figure of numbers of scans of one unit, a row for each scan, with 95 % intervals."""
+    rows, columns = math.ceil(len(symbols) / PANELS), min(PANELS, len(symbols))
+    figure = plot.make_figure(3.0 * columns, rows * (0.9 + 0.19 * max(len(names), 4)), layout="constrained")
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False)
     heights = range(len(names), 0, -1)  # the first scan on top
-    for axes, symbol in zip(panels.ravel(), plot.FIRST_SHOWN, strict=True):
+    for axes in panels.ravel()[len(symbols) :]:
+        axes.set_axis_off()
+    for axes, symbol in zip(panels.ravel(), symbols, strict=False):
         quantities = [scan[symbol] for scan in measures]
         values = np.array([quantity.value for quantity in quantities])
         halves = np.nan_to_num([quantity.half for quantity in quantities])

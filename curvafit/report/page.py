@@ -30,6 +30,8 @@ from curvafit.studies.scans import format_csv
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
+#: Pixels per inch of figures in files, as journals ask for them.
+PRINTED = 300
 #: Letters of a scan's name that a panel has room for, and the most scans whose outlines are drawn.
 WORD, MOST_OUTLINES = 22, 25
 #: The mark by which a page is known as this program's.
@@ -152,7 +154,7 @@ def write_study(
         for name, text in texts.items():
             (work / name).write_text(text, encoding="utf-8", newline="")
         for name, (figure, _) in drawn.items():
-            (work / f"{name}.png").write_bytes(png(figure))
+            (work / f"{name}.png").write_bytes(png(figure, PRINTED))
             (work / f"{name}.svg").write_bytes(svg(figure))
         form.write(work / files[0], record | {"files": list(files)})
     return target / files[1]

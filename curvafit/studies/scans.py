@@ -540,6 +540,16 @@ def list_rows(measures: Sequence[Measures], columns: Sequence[Mapping[str, str]]
     return [{name: row.get(name) for name in names} for row in rows]
 
 
+def list_wide(measures: Sequence[Measures], columns: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return a row for each scan of one unit, or for each of its compartments, and a column for each number."""
+    wide = []
+    for scan, more in zip(measures, columns, strict=True):
+        for part in scan.compartments.values() or (scan,):
+            numbers = {f"{row['symbol']} ({row['unit']})".removesuffix(" ()"): row["value"] for row in part.rows()}
+            wide.append({"scan": scan.source} | dict([part.part] if part.part else []) | dict(more) | numbers)
+    return wide
+
+
 def format_csv(rows: Sequence[dict[str, Any]]) -> str:
     """Return rows of the same columns as CSV; None is an empty cell.
 

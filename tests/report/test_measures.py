@@ -46,8 +46,23 @@ def test_a_folder_has_page_figures_and_table(scans: list[Path], tmp_path: Path) 
     assert {row["unit"] for row in rows if row["symbol"] == "Tb.Th"} == {"mm"}
     page = (tmp_path / "out" / "measures.html").read_text(encoding="utf-8")
     assert "What was taken for the structure" in page and (tmp_path / "out" / "outlines.png").exists()
+    wide = rows_of(tmp_path / "out" / "wide.csv")
+    assert [row["group"] for row in wide] == ["a", "b"]
+    assert [float(row["Tb.Th (mm)"]) for row in wide] == thickness and "BV/TV" in wide[0]
+    assert "<text" in (tmp_path / "out" / "numbers.svg").read_text(encoding="utf-8")
     done(*words)  # the same command replaces its own
     refused(call("measure", scans[0], "-o", tmp_path / "out"), "not free", progress=True)
+
+
+def test_a_figure_shows_the_numbers_that_are_asked_for(scans: list[Path], tmp_path: Path) -> None:
+    for scan, name in zip(scans, ("a", "b"), strict=True):
+        done("measure", scan, "--panels", "Tb.Sp, volume fraction", "-o", tmp_path / name)
+        assert not (tmp_path / name / "numbers.svg").exists()  # of one scan the table is enough
+    done("measure", *scans, "--panels", "Tb.Sp,volume fraction", "-o", tmp_path / "both")
+    text = (tmp_path / "both" / "numbers.svg").read_text(encoding="utf-8")
+    assert "Tb.Sp" in text and "BV/TV" in text and "Conn.D" not in text
+    refused(call("measure", *scans, "--panels", "Tb.Xy", "-o", tmp_path / "other"), "Tb.Xy", progress=True)
+    refused(call("measure", *scans, "--panels", "Tb.Th", "-o", tmp_path / "other.csv"), "--panels", progress=True)
 
 
 def test_an_outline_shows_what_counted(scans: list[Path]) -> None:

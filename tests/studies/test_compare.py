@@ -380,6 +380,11 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 SCANS = [f"{group}/m{k}.npy" for group in ("control", "treated") for k in range(3)]
 
 
+def test_a_figure_of_some_numbers(shapes: Comparison) -> None:
+    titles = [axes.get_title() for axes in numbers_figure(shapes, ["Tb.Th", "BV/TV"]).axes]
+    assert titles == ["Tb.Th (mm)", "BV/TV"] and len(numbers_figure(shapes).axes) == len(shapes.numbers)
+
+
 @pytest.mark.slow
 def test_the_command_writes_a_folder_and_replaces_its_own(home: Path) -> None:
     done("compare", *SCANS, "--by", "a,a,b,b,$c,$c", "--periodic", "-o", "out")  # $c is no formula
