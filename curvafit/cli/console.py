@@ -6,6 +6,7 @@ import os
 import re
 import shlex
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -24,6 +25,8 @@ from curvafit.core.runtime import Terminated, exit_code, one_line
 DEBUG = "CURVAFIT_DEBUG"
 #: Most characters of a sentence; a longer one is cut in its middle.
 LONGEST = 700
+#: Seconds after which the time that is left is told.
+TOLD = 20.0
 #: Characters that look better on a page, but are copied from a terminal, and that some encodings lack.
 _PLAIN = str.maketrans({"\u2212": "-", "\u2013": "-", "\u202f": " ", "\u00a0": " "})
 #: The exception of an option that typer cannot parse; its name and module change with typer's versions.
@@ -170,16 +173,25 @@ def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Sequ
     (console if console.is_terminal else Console(highlight=False, width=160)).print(table)
 
 
+def _time_left(elapsed: float, share: float) -> str:
+    """Return how many minutes are left of a job that is so far after so many seconds, where that can be told."""
+    if elapsed < TOLD or not 0 < share < 1:
+        return ""
+    minutes = elapsed * (1 - share) / share / 60
+    return f", {'under a minute' if minutes < 1 else f'about {minutes:.0f} min'} left"
+
+
 @contextmanager
 def show_stages() -> Iterator[Callable[[str, float], None]]:
     """Show a progress bar for a job that names its stages; call it with a sentence and the share done.
 
-    Without a terminal each new sentence is a line, and one that differs only in its numbers is a line every 5 %. A line
-    at share 0 waits for the next line, so that a job that fails at its start prints its error alone.
+    Without a terminal each new sentence is a line, and one that differs only in its numbers is a line every 5 %, with
+    the time that is left once that can be told. A line at share 0 waits for the next line, so that a job that fails at
+    its start prints its error alone.
     """
     console = error_console()
     if not console.is_terminal:
-        stage, last_share = "", 0.0
+        stage, last_share, begun = "", 0.0, time.monotonic()
         waiting: list[str] = []  # lines that are not printed yet
 
         def write(text: str, share: float) -> None:
@@ -187,7 +199,7 @@ def show_stages() -> Iterator[Callable[[str, float], None]]:
             without_numbers = re.sub(r"\d+", "", text)
             if without_numbers != stage or share >= last_share + 0.05:
                 stage, last_share = without_numbers, share
-                waiting.append(f"[{100 * share:3.0f} %] {text}")
+                waiting.append(f"[{100 * share:3.0f} %] {text}{_time_left(time.monotonic() - begun, share)}")
                 while len(waiting) > (1 if share == 0 else 0):
                     say(waiting.pop(0), to=console)
 

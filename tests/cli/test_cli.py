@@ -221,6 +221,18 @@ def test_a_warning_becomes_a_note_where_the_command_succeeds(tmp_path: Path) -> 
     refused(call("generate", *law, "--mass", "0", "--steps", "0"), "steps")
 
 
+def test_a_line_tells_the_time_that_is_left(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seconds = iter((0.0, 10.0, 60.0, 150.0, 240.0))
+    monkeypatch.setattr("time.monotonic", lambda: next(seconds))
+    with show_stages() as progress:
+        for text, share in (("reading", 0.1), ("growing", 0.2), ("testing", 0.5), ("drawing", 0.9)):
+            progress(text, share)
+    told = ["reading", "growing, about 4 min left", "testing, about 2 min left", "drawing, under a minute left"]
+    assert [line.partition("] ")[2] for line in capsys.readouterr().err.splitlines()] == told
+
+
 def test_a_stage_that_counts_on_is_a_line_every_five_percent(capsys: pytest.CaptureFixture[str]) -> None:
     """Progress where there is no terminal: lines that a log can hold."""
     with show_stages() as progress:
