@@ -57,6 +57,7 @@ def parse_windows(
     "curvafit measure femur.nii.gz --roi compartments.nii.gz -o femur.csv",
     "curvafit measure mitochondria_labels.tif --labels --spacing 5 --unit nm -o mitochondria.csv",
     "curvafit measure lung_2048.ome.zarr --workers 2 -o lung.csv",
+    "curvafit measure bone.tif --maps -o bone",
     "curvafit measure bone.tif --windows 64 --stride 32 -o maps",
 )
 def measure(
@@ -81,6 +82,9 @@ def measure(
     workers: Annotated[
         int, typer.Option(help="Processes that share scans, or one scan's tiles; 0 is this one.", min=0)
     ] = 0,
+    maps: Annotated[
+        bool, typer.Option("--maps", help="Of one scan: structure and thickness at each voxel, into the folder -o.")
+    ] = False,
     panels: PanelsOption = None,
     structure: Structure,
     reading: Reading,
@@ -90,6 +94,8 @@ def measure(
     folder = _choose_folder(out, labels, subjects)
     if panels is not None and (folder is None or grid is not None):
         raise ValueError("--panels is for the figure of a page: give a name without a suffix with -o")
+    if maps and (folder is None or grid is not None or len(scans) > 1):
+        raise ValueError("--maps is of one scan, beside its page: give a name without a suffix with -o")
     if labels and (roi is not None or tile is not None or structure != parse_structure()):
         raise ValueError(
             "--labels states the structure of instances, each in a box of its own: leave out --roi, --tile, --kind, "
@@ -104,7 +110,7 @@ def measure(
         _map_windows(scans[0], folder, overwrite, {**grid, **structure, **reading})
         return
     store = None if out is None else out.with_name(f".{out.name}.curvafit-tiles")
-    options = {} if labels else {"roi": roi, "tile": tile, "store": store, **structure}
+    options = {} if labels else {"roi": roi, "tile": tile, "store": store, "maps": maps, **structure}
     options |= {"labels": labels, "workers": workers}
     with _keep_tiles(store):
         if folder is None:

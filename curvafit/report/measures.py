@@ -15,7 +15,7 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from curvafit.core.records import Format
-from curvafit.core.units import format_length, format_number, format_percent, power_name, unit_name
+from curvafit.core.units import convert_length, format_length, format_number, format_percent, power_name, unit_name
 from curvafit.drawing import plot
 from curvafit.report.comparison import describe_measures, name_quantity
 from curvafit.report.page import (
@@ -45,6 +45,8 @@ FILES = (
     "numbers.png",
 )
 FILES += ("outlines.svg", "outlines.png")
+#: Maps of one scan, and the pictures of the second.
+FILES += ("structure.nii.gz", "thickness.nii.gz", "thickness.svg", "thickness.png")
 #: Of a scan measured in windows, `format` of the record.
 WINDOWS_FORMAT = Format("curvafit windows", 1, title="the record of a scan measured in windows")
 #: Of a scan measured in windows, what is written into the folder beside the maps.
@@ -110,11 +112,13 @@ def write_measures(
     outlines = outlines_figure(name_parts(measures), [scan.outline for scan in measures], unit)
     figures = {
         "outlines": (outlines, "Three slices of each scan, and the outline of its structure"),
+        "thickness": (thickness_figure(measures[0]), "The thickness at each voxel, on three slices"),
         "diagrams": (diagrams, "The curvature diagram of each scan"),
         "numbers": (intervals, "Numbers of each scan with their intervals"),
     }
     tables = {"measures.csv": list_rows(measures, columns), "wide.csv": list_wide(measures, columns)}
-    return write_study(target, FORMAT, FILES, record, page, tables, figures=figures)
+    maps = {f"{name}.nii.gz": volume for name, volume in measures[0].maps.items()}
+    return write_study(target, FORMAT, FILES, record, page, tables, figures=figures, maps=maps)
 
 
 def _format_cell(quantity: Quantity) -> tuple[str, str]:
@@ -139,6 +143,31 @@ def describe_range(parts: Sequence[Measures]) -> str:
 
 
 # ---- figures ---------------------------------------------------------------------------------------------------------
+
+
+def thickness_figure(measures: Measures) -> Figure | None:
+    """Return a figure of the thickness at each voxel on the slices of the outline; None where it was not kept."""
+    outline, volume = measures.outline, measures.maps.get("thickness")
+    if outline is None or volume is None:
+        return None
+    factor = convert_length(1.0, volume.unit, measures.unit)
+    steps = [round(kept / (h * factor)) for kept, h in zip(outline.spacing, volume.spacing, strict=True)]
+    thin = volume.values[tuple(slice(None, None, step) for step in steps)]
+    most = factor * float(np.percentile(thin[thin > 0], 99.5)) if (thin > 0).any() else 1.0
+    figure = plot.make_figure(8.4, 2.8, layout="constrained")
+    panels = figure.subplots(1, 3)
+    for axis, axes in enumerate(panels):
+        index = tuple(outline.places[k] if k == axis else slice(None, None, step) for k, step in enumerate(steps))
+        plane, (down, across) = factor * volume.values[index], np.delete(outline.spacing, axis)
+        limits = plot.grey_limits(np.concatenate([each.ravel() for each in outline.levels]))
+        plot.section_on(axes, outline.levels[axis], None, limits, down / across)
+        colours = {"cmap": "viridis", "vmin": 0.0, "vmax": most, "aspect": down / across, "interpolation": "nearest"}
+        picture = axes.imshow(np.where(plane > 0, plane, np.nan), **colours)
+        axes.set_title(f"{'zyx'[axis]} = {outline.places[axis]}", fontsize=8)
+    plot.scale_on(panels[0], outline.spacing[2], measures.unit)
+    bar = figure.colorbar(picture, ax=list(panels), label=f"Tb.Th ({unit_name(measures.unit, 2)})", shrink=0.85)
+    bar.ax.tick_params(labelsize=8, length=2)
+    return figure
 
 
 def measures_figure(measures: Measures) -> Figure:

@@ -162,6 +162,9 @@ class Measures(Pictured):
         The measures within each label of the region, by label.
     outline
         What was taken for the structure; None of a compartment or an instance.
+    maps
+        Where asked for, the `structure` (uint8) and its `thickness` at each voxel (float32, 0 outside), as volumes on
+        the scan's voxels and in the scan's own unit.
     """
 
     source: str
@@ -175,6 +178,7 @@ class Measures(Pictured):
     part: tuple[str, int] | None = None
     compartments: Mapping[int, Measures] = default(default_factory=dict)
     outline: Outline | None = None
+    maps: Mapping[str, Volume] = default(default_factory=dict)
 
     def __repr__(self) -> str:
         values = ", ".join(f"{quantity.symbol} {quantity.value:.4g}" for quantity in self.quantities[:4])

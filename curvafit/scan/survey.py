@@ -31,7 +31,8 @@ class Plan:
     `smallest` is the fewest voxels of a piece of an image's structure that is no speck, 0 where all pieces count;
     `scale` is the edges of a working voxel in the volume's voxels, `edge` its edge in the volume's unit, and `working`
     the number of working voxels along (z, y, x); `reach` is the radius of the largest ball where the thickness was
-    measured. Tiles have `cores`; balls of structure and background are painted on grids coarser by `factors`.
+    measured. Tiles have `cores`; balls of structure and background are painted on grids coarser by `factors`. With
+    `maps`, structure and thickness are kept at each voxel.
     """
 
     structure: Structure
@@ -46,6 +47,7 @@ class Plan:
     working_notes: tuple[str, ...] = ()
     cores: tuple[Box, ...] = ()
     factors: tuple[int, int] = (1, 1)
+    maps: bool = False
 
     @property
     def volume(self) -> Volume:

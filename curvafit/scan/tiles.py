@@ -46,6 +46,8 @@ HALO = 32
 LARGEST_TILE, SHORTEST = 224**3, 32
 #: Bytes that a voxel of a tile with its surroundings takes, and those of the program itself.
 _VOXEL_BYTES, _PROGRAM_BYTES = 100, 300 * 2**20
+#: What is kept at each voxel where it is asked for, and the bytes that a voxel then takes, with its tile's.
+MAPS, KEPT = {"structure": np.uint8, "thickness": np.float32}, 12
 #: Bins of the stored curvature diagram, in `diagrams.BIN_WIDTH`.
 _BIN = 0.25
 #: Parts of a volume: all of it, and its region of interest; the region's labels are others.
@@ -67,6 +69,7 @@ def measure(
     tile: int | None = None,
     workers: Cluster | int | None = None,
     store: str | PathLike[str] | None = None,
+    maps: bool = False,
     progress: Progress = silent,
     **reading: Any,
 ) -> Measures:
@@ -97,6 +100,8 @@ def measure(
         Processes that measure tiles of a file without a region, or dask's workers; by default this process does.
     store
         A folder where finished tiles stay, so that a killed run goes on; by default there is none.
+    maps
+        Whether structure and thickness are kept at each voxel (`Measures.maps`), in memory.
     reading
         Options of reading a file, or the place of an array: see `curvafit.load`.
     """
@@ -106,7 +111,7 @@ def measure(
     if periodic and (roi is not None or tile is not None):
         raise ValueError("a scan that repeats is measured in one piece and without a region: leave out tile and roi")
     label, region = reading.pop("label", None), None
-    volume = load(scan, label=label, **reading, lazy=True)
+    frame = volume = load(scan, label=label, **reading, lazy=True)
     if roi is not None:
         region, region_notes = read_region(roi, volume, scan, **reading)
         region = replace(region, array=read_labels(region, "a region of interest with labels"))
@@ -120,23 +125,42 @@ def measure(
     if periodic or (region is None and tile is None and max(volume.shape) <= LARGEST_BOX):
         check_memory(volume.shape, WORKED, "a scan in one piece")
         try:
-            return _measure_whole(volume.load(), periodic, progress, **options).scale(edge, unit)  # type: ignore[arg-type]
+            found, arrays = _measure_whole(volume.load(), periodic, progress, **options)  # type: ignore[arg-type]
+            return _keep_maps(found.scale(edge, unit), arrays if maps else {}, frame, edge, None)
         except TooLarge:
             if periodic:
                 raise
+    if maps:
+        check_memory(volume.shape, KEPT, "structure and thickness at each voxel, maps,")
     structure = Structure(volume, region=region, **options)  # type: ignore[arg-type]
-    return _measure_tiles(structure, tile, workers, store, progress).scale(edge, unit)
+    found, arrays = _measure_tiles(structure, tile, workers, store, maps, progress)
+    return _keep_maps(found.scale(edge, unit), arrays, frame, edge, region)
 
 
-def _measure_whole(field: Volume, periodic: bool, progress: Progress, kind: Kind, **options: Any) -> Measures:
-    """Measure a scan in one piece."""
+def _keep_maps(
+    measures: Measures, arrays: dict[str, np.ndarray], frame: Volume, edge: float, region: Volume | None
+) -> Measures:
+    """Return measures with arrays (Z, Y, X) as maps on a scan's voxels, 0 outside a region; lengths were in `edge`."""
+    volumes = {}
+    for name, values in arrays.items():
+        counted = values if region is None else np.where(region.values != 0, values, 0)
+        scaled = counted * np.float32(edge) if name == "thickness" else counted
+        volumes[name] = replace(frame, array=scaled, notes=())
+    return replace(measures, maps=volumes)
+
+
+def _measure_whole(
+    field: Volume, periodic: bool, progress: Progress, kind: Kind, **options: Any
+) -> tuple[Measures, dict[str, np.ndarray]]:
+    """Measure a scan in one piece; return its structure and thickness at each voxel as well."""
     most = memory() // WORKED if periodic else LARGEST_BOX**3
     maps = whole.measure_maps(field, kind, {**options, "periodic": periodic}, progress, most)
     connectivity = measure_connectivity(maps.mask, field.spacing, periodic=periodic)
     period = sum(float(phase[phase > 0].mean(dtype=np.float64)) for phase in (maps.thickness, maps.gap))
     blocks = Blocks.divide(maps.mask.shape, field.spacing, period)
     found = whole.summarise_sums(field, maps.kind, blocks, maps.sum(blocks), connectivity, maps.diagram, maps.notes)
-    return replace(found, outline=Outline.cut(field, maps.mask.__getitem__))
+    arrays = {"structure": maps.mask.astype(np.uint8), "thickness": maps.thickness.astype(np.float32)}
+    return replace(found, outline=Outline.cut(field, maps.mask.__getitem__)), arrays
 
 
 def _describe_tiles(plan: Plan, processes: int) -> str:
@@ -182,6 +206,7 @@ def measure_tile(plan: Plan, number: int) -> Record:
     sums.add("volume", np.ones(mask[inner].shape, dtype=bool), voxel)
     sums.add("inside", mask[inner], voxel)
     sums.add_thickness(balls, voxel)
+    maps = {"structure": mask[inner].astype(np.uint8), "thickness": balls.thickness[0].astype(np.float32)}
     # A voxel's share of χ depends on the voxels before it: a layer before the core is taken along, where there is one.
     extended = tuple(slice(edge.start - (edge.start > 0), edge.stop) for edge in inner)
     in_core = tuple(slice(edge.start - outer.start, None) for edge, outer in zip(inner, extended, strict=True))
@@ -193,7 +218,7 @@ def measure_tile(plan: Plan, number: int) -> Record:
     if surface is not None:
         sums.gather("area", *surface)
     del mask, balls
-    return {**record, **_measure_curvature(plan, core, sums), **sums.rows}
+    return {**record, **_measure_curvature(plan, core, sums), **sums.rows, **(maps if plan.maps else {})}
 
 
 def _measure_wide(plan: Plan, number: int) -> Record:
@@ -201,7 +226,8 @@ def _measure_wide(plan: Plan, number: int) -> Record:
     core = plan.cores[number]
     sums, balls = _Sums(plan, core), _measure_balls(plan, core, plan.factors)
     sums.add_thickness(balls, math.prod(plan.volume.spacing), *(factor > 1 for factor in plan.factors))
-    return sums.rows
+    wide = plan.maps and plan.factors[0] > 1
+    return {**sums.rows, **({"thickness": balls.thickness[0].astype(np.float32)} if wide else {})}
 
 
 class _Sums:
@@ -459,17 +485,18 @@ def _measure_tiles(
     edge: int | None,
     workers: Cluster | int | None,
     store: str | PathLike[str] | None,
+    maps: bool,
     progress: Progress,
-) -> Measures:
+) -> tuple[Measures, dict[str, np.ndarray]]:
     options: dict[str, Any] = {}
     workers = workers if structure.volume.in_file and structure.region is None else None
     if store is not None:  # digests take a while
         region = structure.region and structure.region.digest
-        options = {"scan": structure.volume.digest, "region": region, "tile": edge}
+        options = {"scan": structure.volume.digest, "region": region, "tile": edge, "maps": maps}
         options |= {name: getattr(structure, name) for name in ("kind", "threshold", "dark")}
     with open_run(workers, store, options, progress, {_FIRST: 0.95, _AGAIN: 1.0}) as run, one_thread():
         plan = survey(structure, run)
-        plan = replace(plan, cores=tuple(cut_boxes(plan.volume.shape, edge or _choose_edges(plan))))
+        plan = replace(plan, cores=tuple(cut_boxes(plan.volume.shape, edge or _choose_edges(plan))), maps=maps)
         tiles_note = _describe_tiles(plan, run.processes)
         records = run(_FIRST, partial(measure_tile, plan), len(plan.cores), tiles_note)
         # The factors that `morphology.local_thickness` would choose for the whole volume.
@@ -478,7 +505,12 @@ def _measure_tiles(
         wide_records: list[Record] = []
         if max(plan.factors) > 1:
             wide_records = run(_AGAIN, partial(_measure_wide, plan), len(plan.cores))
-    return _summarise(plan, records, wide_records, tiles_note)
+    arrays = {name: np.zeros(plan.volume.shape, kind) for name, kind in MAPS.items()} if maps else {}
+    for some in (records, wide_records):
+        for core, record in zip(plan.cores, some, strict=False):
+            for name in arrays.keys() & record.keys():
+                arrays[name][core] = record[name]
+    return _summarise(plan, records, wide_records, tiles_note), arrays
 
 
 def _summarise(plan: Plan, records: Sequence[Record], wide_records: Sequence[Record], tiles_note: str) -> Measures:

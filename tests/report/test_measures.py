@@ -65,6 +65,17 @@ def test_a_figure_shows_the_numbers_that_are_asked_for(scans: list[Path], tmp_pa
     refused(call("measure", *scans, "--panels", "Tb.Th", "-o", tmp_path / "other.csv"), "--panels", progress=True)
 
 
+def test_maps_lie_beside_the_page_of_one_scan(scans: list[Path], tmp_path: Path) -> None:
+    done("measure", scans[0], "--maps", "-o", tmp_path / "out")
+    thickness = load(tmp_path / "out" / "thickness.nii.gz")
+    assert thickness.spacing == pytest.approx(load(scans[0]).spacing) and thickness.unit == load(scans[0]).unit
+    assert thickness.values[thickness.values > 0].mean() == pytest.approx(measure(scans[0])["Tb.Th"].value, rel=1e-4)
+    assert "Thickness at each voxel" in (tmp_path / "out" / "measures.html").read_text(encoding="utf-8")
+    for words in (scans, [scans[0], "--windows", "16"]):
+        refused(call("measure", *words, "--maps", "-o", tmp_path / "other"), "--maps", progress=True)
+    refused(call("measure", scans[0], "--maps", "-o", tmp_path / "other.csv"), "--maps", progress=True)
+
+
 def test_an_outline_shows_what_counted(scans: list[Path]) -> None:
     """Slices through the middle of a region, in which alone structure is outlined; lengths in the measures' unit."""
     found, region = measure(scans[0]), np.zeros((56, 56, 56), np.uint8)

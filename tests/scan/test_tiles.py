@@ -255,3 +255,33 @@ def test_the_command_writes_rows_for_each_instance(labels: np.ndarray, tmp_path:
         (("labels.npy", "--roi", path), "--roi"), (("labels.npy", "--label", 5), "label"),
     ):  # fmt: skip
         refused(call("measure", tmp_path / arguments[0], "--labels", *arguments[1:]), word, progress=True)
+
+
+# ---- maps ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["image", "slices"])
+def test_maps_are_those_of_the_whole_on_the_scan_s_voxels(name: str) -> None:
+    """Their mean is the thickness that is measured; in tiles they are the same, and 0 outside a region."""
+    scan = scans()[name]
+    whole, in_tiles = measure(scan, maps=True), measure(scan, maps=True, tile=33)
+    structure, thickness = (whole.maps[each].values for each in ("structure", "thickness"))
+    assert whole.maps["thickness"].spacing == scan.spacing and whole.maps["thickness"].unit == scan.unit
+    assert structure.mean() == pytest.approx(whole["BV/TV"].value) and ((thickness > 0) == (structure > 0)).all()
+    assert thickness[structure > 0].mean() == pytest.approx(whole["Tb.Th"].value, rel=1e-5)
+    for each, volume in whole.maps.items():
+        assert np.allclose(in_tiles.maps[each].values, volume.values, rtol=1e-5), each
+    region = np.zeros(scan.shape, np.uint8)
+    region[4:20, 10:40, 8:] = 1
+    part = measure(scan, roi=region, maps=True).maps["structure"].values
+    assert (part == structure * region).all()
+    assert not measure(scan).maps
+
+
+def test_maps_of_wide_balls_are_painted_where_they_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiles, "COARSE", 3)
+    mask = np.zeros((40, 40, 40), np.uint8)
+    mask[8:32, 8:32, 8:32] = 1
+    found = measure(mask, maps=True, tile=32)
+    thickness = found.maps["thickness"].values
+    assert thickness[mask > 0].mean() == pytest.approx(found["Tb.Th"].value, rel=1e-4) and thickness.max() > 20
