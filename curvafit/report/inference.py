@@ -18,7 +18,6 @@ from curvafit.core.files import write_content
 from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import (
-    GLOSSARY,
     format_density,
     format_length,
     format_number,
@@ -112,7 +111,7 @@ def report_html(inference: Inference) -> str:
         diagrams=[] if inference.diagram is None else _diagrams(inference), distances=_distances(inference),
         unit=format_length(fit.length, fit.length_unit, 3), twins=0 if fit.best is None else len(fit.best.twins),
         numbers=_number_rows(inference), strips=list_strips(fit), law=_law(inference), corner=_corner(inference),
-        bands=bands(inference), symbols=[symbol for symbol, _, _ in _TERMS.values()], glossary=GLOSSARY,
+        bands=bands(inference), symbols=[symbol for symbol, _, _ in _TERMS.values()],
     )  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from curvafit.core.files import move_together, remove, temporary_folder
 from curvafit.core.records import Format, can_write, has_mark
 from curvafit.core.runtime import hold_signals
-from curvafit.core.units import format_number
+from curvafit.core.units import GLOSSARY, format_number
 from curvafit.drawing import plot
 from curvafit.drawing.plot import png, svg
 from curvafit.scan.measures import Measures, Outline
@@ -69,7 +69,8 @@ def render(name: str, **values: Any) -> str:
         loader=PackageLoader("curvafit.report"), autoescape=select_autoescape(), undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
-    return environment.get_template(name).render({"version": version("curvafit"), "number": format_number} | values)
+    environment.globals |= {"version": version("curvafit"), "number": format_number, "glossary": GLOSSARY}
+    return environment.get_template(name).render(values)
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------

@@ -670,3 +670,15 @@ def test_a_file_without_a_structure_is_not_copied(tmp_path: Path, suffix: str, t
         nibabel.save(nibabel.Nifti1Image(values, np.eye(4)), source)
     with pytest.raises(ScanError, match="vary|finite"):
         save(source, tmp_path / target)
+
+
+def test_masks_and_labels_are_not_shown_black(tmp_path: Path) -> None:
+    """ImageJ shows 0 to the greatest label; grey levels are shown as it chooses. Values are as they were."""
+    for most, shown in ((1, (0.0, 1.0)), (7, (0.0, 7.0)), (200, (None, None))):
+        values = np.zeros((3, 4, 5), np.uint8)
+        values[1, 2, 3] = most
+        save(Volume(values), path := tmp_path / f"{most}.tif")
+        with tifffile.TiffFile(path) as file:
+            stated = file.imagej_metadata or {}
+        assert (stated.get("min"), stated.get("max")) == shown
+        assert (load(path).values == values).all()

@@ -19,6 +19,8 @@ from curvafit.volumes.formats.base import ScanError, Stated
 if TYPE_CHECKING:
     import tifffile
 
+#: Whole numbers below which the greatest one are a mask or labels: they are shown from 0 to that.
+LABELS = 64
 #: Bytes beyond which ImageJ's TIFF cannot point.
 _IMAGEJ_LIMIT = 2**32 - 2**25
 #: Most voxels per unit that TIFF's resolution can state.
@@ -105,7 +107,9 @@ def write_tiff(field: Any, path: Path) -> None:
     if values.dtype in (np.uint8, np.uint16, np.float32) and within_limits:
         exact = {"curvafit_spacing": f"{z!r},{y!r},{x!r}", "curvafit_unit": field.unit}  # resolutions are rounded
         unit = {"um": "micron", "voxel": "pixel"}.get(field.unit, field.unit)
-        metadata = {"axes": "ZYX", "spacing": z, "unit": unit, **exact}
+        most = int(values.max(initial=0)) if values.dtype.kind == "u" else 0
+        shown = {"min": 0, "max": most} if 0 < most < LABELS else {}  # else ImageJ shows a mask of 0 and 1 black
+        metadata = {"axes": "ZYX", "spacing": z, "unit": unit, **exact, **shown}
         options = {"imagej": True, "resolution": (1 / x, 1 / y), "metadata": metadata}
         tifffile.imwrite(path, values, photometric="minisblack", **options)
     elif values.dtype.kind == "f" or values.dtype.itemsize < 8:
