@@ -17,12 +17,14 @@ from curvafit.cli.options import OverwriteOption, PanelsOption, Reading, Structu
     "curvafit compare before/ after/ --paired -o compared",
     "curvafit compare sham/ ovx/ --roi '{stem}_roi.tif' -o compared",
     "curvafit compare study.csv --by age -o compared",
+    "curvafit compare measured --by group -o compared",
     "curvafit compare study.csv --by treatment --paired -o compared",
     "curvafit compare day0.tif day7.tif day14.tif day28.tif day56.tif --by 0,7,14,28,56 -o healing",
 )
 def compare(
     scans: Annotated[
-        list[Path], typer.Argument(help="Two folders of scans or more; or a CSV: scan, group (or --by), subject.")
+        list[Path],
+        typer.Argument(help="Folders of scans, two or more; a CSV: scan, group, subject; a folder of measure."),
     ],
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for compare.html, figures and tables.")],
     by: Annotated[

@@ -28,23 +28,14 @@ from curvafit.report.page import (
     write_study,
 )
 from curvafit.scan.measures import QUANTITIES, Measures, Quantity
-from curvafit.studies.scans import count_notes, list_rows, list_wide
+from curvafit.studies.scans import MEASURED, count_notes, list_rows, list_wide, write_measured
 from curvafit.studies.windowed import NAMES, Windows
 
 #: `format` of the record.
 FORMAT = Format("curvafit measured scans", 1, title="the record of measured scans")
 #: What is written into the folder.
-FILES = (
-    "measures.json",
-    "measures.html",
-    "measures.csv",
-    "wide.csv",
-    "diagrams.svg",
-    "diagrams.png",
-    "numbers.svg",
-    "numbers.png",
-)
-FILES += ("outlines.svg", "outlines.png")
+FILES = ("measures.json", "measures.html", "measures.csv", "wide.csv", MEASURED)
+FILES += ("diagrams.svg", "diagrams.png", "numbers.svg", "numbers.png", "outlines.svg", "outlines.png")
 #: Maps of one scan, and the pictures of the second.
 FILES += ("structure.nii.gz", "thickness.nii.gz", "thickness.svg", "thickness.png")
 #: Of a scan measured in windows, `format` of the record.
@@ -118,7 +109,8 @@ def write_measures(
     }
     tables = {"measures.csv": list_rows(measures, columns), "wide.csv": list_wide(measures, columns)}
     maps = {f"{name}.nii.gz": volume for name, volume in measures[0].maps.items()}
-    return write_study(target, FORMAT, FILES, record, page, tables, figures=figures, maps=maps)
+    more = {MEASURED: partial(write_measured, measures, columns)}
+    return write_study(target, FORMAT, FILES, record, page, tables, figures=figures, maps=maps, more=more)
 
 
 def _format_cell(quantity: Quantity) -> tuple[str, str]:

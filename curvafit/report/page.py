@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -136,9 +136,10 @@ def write_study(
     *,
     figures: Mapping[str, tuple[Figure | None, str]] | None = None,
     maps: Mapping[str, Volume] | None = None,
+    more: Mapping[str, Callable[[Path], object]] | None = None,
     shown: Sequence[str] = ("command", "date"),
 ) -> Path:
-    """Write a study's record, page, tables, maps, and figures as PNG and SVG, into a folder together.
+    """Write a study's record, page, tables, maps, figures as PNG and SVG, and what `more` writes, into a folder.
 
     `files` are their names, the record's and the page's first. The page is the template of its name, filled with the
     record, `values` and the figures, each of which comes with a description; it ends with the entries of the record
@@ -152,6 +153,8 @@ def write_study(
     with fill_folder(target, files) as work:
         for name, volume in (maps or {}).items():
             save(volume, work / name, kind=form.name)
+        for name, write in (more or {}).items():
+            write(work / name)
         for name, text in texts.items():
             (work / name).write_text(text, encoding="utf-8", newline="")
         for name, (figure, _) in drawn.items():

@@ -28,8 +28,9 @@ from curvafit.core.records import Format, can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number, unit_name
 from curvafit.core.workers import cluster, run_jobs
+from curvafit.geometry.diagrams import Diagram
 from curvafit.scan.instances import measure_instances
-from curvafit.scan.measures import COLUMNS, Measures
+from curvafit.scan.measures import COLUMNS, QUANTITIES, Measures, Quantity
 from curvafit.scan.tiles import measure
 from curvafit.volumes.read import Source, load, pick_reader
 from curvafit.volumes.volume import ScanError
@@ -57,6 +58,11 @@ _FORMULA = re.compile(r"[=@\t\r]|[-+](?![\d.eE\s-]*$)")
 FORMAT = Format("curvafit measures 1", title="a table of measures")
 
 
+#: Scans that were measured, in a folder of `measure`, so that `compare` need not measure them again.
+MEASURED = "measured.npz"
+MEASURED_FILE = Format("curvafit measured", 1, "measured scans", "measure them again")
+
+
 class Case(NamedTuple):
     """A scan, its name, its subject, and its label: the name of its group, or a number; and its region of interest."""
 
@@ -82,7 +88,9 @@ def list_cases(
     if len(groups) == 1 and isinstance(groups[0], str | PathLike):
         if not isinstance(by, str | None) or table is not None:
             raise ValueError("expected a table alone, or scans with a label for each, or two groups or more")
-        cases = _read_cases(Path(groups[0]), by or "group", paired)
+        measured = Path(groups[0]) / MEASURED
+        read = _read_measured if measured.exists() else _read_cases
+        cases = read(measured if measured.exists() else Path(groups[0]), by or "group", paired)
     else:
         cases = _list_labelled(groups[0], by) if len(groups) == 1 else _list_groups(groups, by, paired, notes)
         if table is not None:
@@ -269,6 +277,38 @@ def _read_cases(table: Path, by: str, paired: bool) -> list[Case]:
         if region is not None and not region.exists():
             raise FileNotFoundError(f"no such file: {row['roi']}, which {table} names")
         cases.append(Case(str(path), path.name, row.get("subject") or row["scan"], row[by], region))
+    return cases
+
+
+def write_measured(measures: Sequence[Measures], columns: Sequence[Mapping[str, str]], path: Path) -> Path:
+    """Write scans that were measured, with further columns such as their subject, for `compare`."""
+    scans = [{name: getattr(scan, name) for name in ("source", "unit", "kind", "blocks", "notes")} for scan in measures]
+    arrays = {"directions": np.array([scan.direction for scan in measures])}
+    arrays["numbers"] = np.array([[(each.value, each.half) for each in scan.quantities] for scan in measures])
+    for k, scan in enumerate(measures):
+        arrays |= {f"points{k}": scan.diagram.points, f"weights{k}": scan.diagram.weights}
+    return MEASURED_FILE.write(path, {"scans": scans, "columns": list(map(dict, columns))}, arrays)
+
+
+def _read_measured(path: Path, by: str, paired: bool) -> list[Case]:
+    """Return scans that were measured before, with their labels from the column `by` that `measure` was given."""
+
+    def build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[tuple[Measures, dict[str, str]]]:
+        found = []
+        for k, (scan, columns) in enumerate(zip(header["scans"], header["columns"], strict=True)):
+            pairs = zip(QUANTITIES, arrays["numbers"][k].tolist(), strict=True)
+            quantities = tuple(Quantity(*names[:2], value, half, names[2]) for names, (value, half) in pairs)
+            diagram = Diagram(arrays[f"points{k}"], arrays[f"weights{k}"], f"1/{scan['unit']}")
+            facts = scan["source"], scan["unit"], scan["kind"], quantities, tuple(arrays["directions"][k].tolist())
+            found.append((Measures(*facts, diagram, tuple(scan["blocks"]), tuple(scan["notes"])), columns))  # type: ignore[arg-type]
+        return found
+
+    cases = []
+    for scan, row in MEASURED_FILE.read(path, build):
+        if by not in row or (paired and "subject" not in row):
+            needed = f"{by} and subject" if paired else by
+            raise ValueError(f"expected scans measured with --subjects, and its column {needed}, got {path.parent}")
+        cases.append(Case(scan, Path(scan.source).name, row.get("subject") or scan.source, row[by]))
     return cases
 
 

@@ -23,7 +23,7 @@ from curvafit.report.comparison import FILES, check_comparison, describe_methods
 from curvafit.scan.measures import QUANTITIES, Measures, Quantity
 from curvafit.scan.tiles import measure
 from curvafit.studies.comparison import Comparison, compare
-from curvafit.studies.scans import merge_notes
+from curvafit.studies.scans import MEASURED, merge_notes
 from curvafit.volumes.volume import Volume
 
 N = 32
@@ -432,6 +432,24 @@ def test_each_scan_is_measured_in_its_region(home: Path) -> None:
     (home / "study.csv").write_text("\n".join(["scan,group,roi", *rows]), encoding="utf-8")
     again = compare(home / "study.csv")
     assert again.p == found.p and [case.roi for case in again.cases] == [home / row.split(",")[2] for row in rows]
+
+
+def test_nothing_is_measured_twice(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder of `measure` is compared as its scans are, by any column that it was given; none is read again."""
+    rows = [f"{path},{path[:7]},{k % 3},{k}" for k, path in enumerate(SCANS)]
+    (home / "study.csv").write_text("\n".join(["scan,group,subject,dose", *rows]), encoding="utf-8")
+    done("measure", *SCANS, "--subjects", "study.csv", "--kind", "mask", "-o", "measured")
+    fresh = {by: compare("study.csv", by=by, kind="mask", paired=True) for by in ("group", "dose")}
+    monkeypatch.setattr("curvafit.studies.scans._measure_one", None)
+    for by, expected in fresh.items():
+        found = compare("measured", by=by, paired=True)
+        assert (found.groups, found.subjects) == (expected.groups, expected.subjects)
+        assert (found.p, found.statistic) == pytest.approx((expected.p, expected.statistic))
+        assert [each.family for each in found.numbers] == pytest.approx([each.family for each in expected.numbers])
+    for words in (("measured", "--by", "age"), ("measured", "--by", "group", "--subjects", "study.csv")):
+        refused(call("compare", *words, "-o", "out"), "", progress=True)
+    (home / "measured" / MEASURED).write_bytes(b"no")
+    refused(call("compare", "measured", "-o", "out"), MEASURED, progress=True)
 
 
 TIMES = "".join(f"{path},{path[:7]},{path[:7]},{k}\n" for k, path in enumerate(SCANS))
