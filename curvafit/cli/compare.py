@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from curvafit.cli.console import command_line, print_table, say, say_notes, show_stages
-from curvafit.cli.options import OverwriteOption, PanelsOption, Reading, Structure, command, parse_panels
+from curvafit.cli.options import Group, OverwriteOption, PanelsOption, Reading, Structure, command, parse_panels
+
+
+def parse_tests(
+    primary: Annotated[str | None, typer.Option(help="One number named beforehand, tested alone: Tb.Th.")] = None,
+    permutations: Annotated[int, typer.Option(help="Permutations of subjects; all where there are fewer.")] = 9999,
+    seed: Annotated[int, typer.Option(help="Seed of the permutations, where not all are tried.")] = 0,
+) -> dict[str, Any]:
+    """Return how `curvafit.compare` tests."""
+    return {"primary": primary, "permutations": permutations, "seed": seed}
 
 
 @command(
@@ -42,9 +51,7 @@ def compare(
     structure: Structure,
     reading: Reading,
     panels: PanelsOption = None,
-    primary: Annotated[str | None, typer.Option(help="One number named beforehand, tested alone: Tb.Th.")] = None,
-    permutations: Annotated[int, typer.Option(help="Permutations of subjects; all where there are fewer.")] = 9999,
-    seed: Annotated[int, typer.Option(help="Seed of the permutations, where not all are tried.")] = 0,
+    tests: Annotated[dict[str, Any], Group(parse_tests)],
     workers: Annotated[int, typer.Option(help="Processes that measure; 0 is this one.")] = 0,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -55,7 +62,7 @@ def compare(
 
         shown = parse_panels(panels)
         check_comparison(out, [*scans, *([] if subjects is None else [subjects])], overwrite, command_line())
-        settings = {"primary": primary, "permutations": permutations, "seed": seed, "subjects": subjects}
+        settings: dict[str, Any] = {**tests, "subjects": subjects}
         settings |= {"roi": roi, "workers": workers, "progress": progress, "paired": paired}
         # `--by 0,7,14` has a number for each scan of one list; otherwise each argument is a group or a CSV.
         labels = by.split(",") if by and "," in by else by

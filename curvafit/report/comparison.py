@@ -306,7 +306,7 @@ def _panels(comparison: Comparison, symbols: Sequence[str]) -> tuple[Figure, dic
         cell = large[divmod(rank, across)] if is_large else small[divmod(rank - familiar, SMALL)]
         axes = figure.add_subplot(cell)
         unit = power_name(comparison.unit, number.power)
-        weight = "bold" if number.family <= comparison.level else "normal"
+        weight = "bold" if number.family <= LEVEL else "normal"
         title = number.symbol + (f" ({unit})" if unit else "")
         axes.set_title(title, fontsize=11 if is_large else 9.5, fontweight=weight, pad=26)
         label = f"{comparison.effect} = {format_number(number.effect, 2)}, p = {format_number(number.p, 2)}"

@@ -102,18 +102,9 @@ QUANTITIES: tuple[tuple[str, str, int, Callable[[Sums], np.ndarray]], ...] = (
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """What was taken for the structure, for pictures: three slices of a scan, across z, y and x.
-
-    Attributes
-    ----------
-    levels, inside
-        Of each slice, the scan's values and the structure that counts, bool; every n-th voxel, so that at most `SHOWN`
-        remain along each axis.
-    places
-        The slices' positions, in voxels.
-    spacing
-        Edges (z, y, x) of the voxels that are kept, in the scan's unit.
-    """
+    """What was taken for the structure, for pictures: the `levels` of three slices of a scan, across z, y and x, and the
+    structure that counts `inside` them, bool. Every n-th voxel is kept, so that at most `SHOWN` remain along an axis:
+    `spacing` is their edges (z, y, x), in the scan's unit; `places` are the slices' positions, in the scan's voxels."""
 
     levels: tuple[np.ndarray, ...]
     inside: tuple[np.ndarray, ...]

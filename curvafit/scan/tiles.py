@@ -113,13 +113,10 @@ def measure(
     label, region = reading.pop("label", None), None
     frame = volume = load(scan, label=label, **reading, lazy=True)
     if roi is not None:
-        region, region_notes = read_region(roi, volume, scan, **reading)
-        region = replace(region, array=read_labels(region, "a region of interest with labels"))
-        if (count := len(np.unique(region.values))) > MOST_COMPARTMENTS:
-            raise ScanError(f"expected at most {MOST_COMPARTMENTS} labels in a region of interest, got {count}")
+        region, region_notes = _read_compartments(roi, volume, scan, reading)
         volume = replace(volume, notes=(*volume.notes, *region_notes))
     sampling, unit, edge = format_sampling(volume.shape, volume.spacing, volume.unit), volume.unit, min(volume.spacing)
-    # Lengths are counted in the finest edge: which of two lengths is greater must not depend on a unit.
+    # Lengths are counted in the finest edge: which of two is greater must not depend on a unit.
     spacing = tuple(round(h / edge, 12) for h in volume.spacing)
     volume = replace(volume, spacing=spacing, unit="voxel", affine=None, notes=(f"{sampling}.", *volume.notes))  # type: ignore[arg-type]
     if periodic or (region is None and tile is None and max(volume.shape) <= LARGEST_BOX):
@@ -135,6 +132,17 @@ def measure(
     structure = Structure(volume, region=region, **options)  # type: ignore[arg-type]
     found, arrays = _measure_tiles(structure, tile, workers, store, maps, progress)
     return _keep_maps(found.scale(edge, unit), arrays, frame, edge, region)
+
+
+def _read_compartments(
+    roi: Source, volume: Volume, scan: Source, reading: dict[str, Any]
+) -> tuple[Volume, tuple[str, ...]]:
+    """Return a region of interest with its labels, on a scan's voxels, and notes on how it was laid."""
+    region, notes = read_region(roi, volume, scan, **reading)
+    region = replace(region, array=read_labels(region, "a region of interest with labels"))
+    if (count := len(np.unique(region.values))) > MOST_COMPARTMENTS:
+        raise ScanError(f"expected at most {MOST_COMPARTMENTS} labels in a region of interest, got {count}")
+    return region, notes
 
 
 def _keep_maps(

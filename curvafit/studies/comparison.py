@@ -168,11 +168,6 @@ class Comparison(Pictured):
         return "r" if not self.groups else "g" if len(self.groups) == 2 else "η"
 
     @property
-    def level(self) -> float:
-        """Return what a p must not exceed for a difference that is significant."""
-        return LEVEL
-
-    @property
     def significant(self) -> np.ndarray:
         """Return the bins (κ2, κ1) whose difference is significant among all, bool `(B, B)`."""
         return self.bins_p <= LEVEL

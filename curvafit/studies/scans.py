@@ -113,8 +113,7 @@ def list_cases(
 
 
 def _find_regions(cases: Sequence[Case], pattern: str) -> list[Case]:
-    """Return scans with their regions: `{name}` in the pattern is a scan's file name, `{stem}` that up to its first
-    point, and a path is from the scan's folder. Files that are regions of others are no scans."""
+    """Return scans with their regions, which `compare` explains; files that are regions of others are no scans."""
     if "{name}" not in pattern and "{stem}" not in pattern:
         raise ValueError(f"expected regions with {{stem}} or {{name}} for the scan's own, got {pattern}")
     found = []

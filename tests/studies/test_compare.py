@@ -22,7 +22,7 @@ from curvafit.geometry.diagrams import Diagram
 from curvafit.report.comparison import FILES, check_comparison, describe_methods, numbers_figure
 from curvafit.scan.measures import QUANTITIES, Measures, Quantity
 from curvafit.scan.tiles import measure
-from curvafit.studies.comparison import Comparison, compare
+from curvafit.studies.comparison import LEVEL, Comparison, compare
 from curvafit.studies.scans import MEASURED, merge_notes
 from curvafit.volumes.volume import Volume
 
@@ -200,9 +200,9 @@ def test_any_false_finding_is_as_rare_as_said_and_power_grows(name: str) -> None
     found = [MAKE[name](seed, 0.0) for seed in range(80)]
     most = 0.05 + 3 * math.sqrt(0.05 * 0.95 / len(found))
     for any_found in (
-        [each.p <= each.level for each in found],
-        [min(number.family for number in each.numbers) <= each.level for each in found],
-        [min(number.holm for number in each.numbers) <= each.level for each in found],
+        [each.p <= LEVEL for each in found],
+        [min(number.family for number in each.numbers) <= LEVEL for each in found],
+        [min(number.holm for number in each.numbers) <= LEVEL for each in found],
         [bool(each.significant.any()) for each in found],
     ):
         assert np.mean(any_found) <= most
