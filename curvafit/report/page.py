@@ -187,8 +187,7 @@ def shorten(names: Sequence[str]) -> list[str]:
 
 
 def outlines_figure(names: Sequence[str], outlines: Sequence[Outline | None], unit: str) -> Figure | None:
-    """Return a figure of what was taken for the structure in scans of one unit, a row of three slices for each of the
-    first `MOST_OUTLINES`; None where no scan has an outline."""
+    """Return a figure of what was taken for the structure in the first `MOST_OUTLINES` scans of one unit, or None."""
     known = [(name, each) for name, each in zip(shorten(names), outlines, strict=True) if each][:MOST_OUTLINES]
     if not known:
         return None

@@ -102,9 +102,9 @@ QUANTITIES: tuple[tuple[str, str, int, Callable[[Sums], np.ndarray]], ...] = (
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """What was taken for the structure, for pictures: the `levels` of three slices of a scan, across z, y and x, and the
-    structure that counts `inside` them, bool. Every n-th voxel is kept, so that at most `SHOWN` remain along an axis:
-    `spacing` is their edges (z, y, x), in the scan's unit; `places` are the slices' positions, in the scan's voxels."""
+    """What was taken for the structure, for pictures: the `levels` of three slices of a scan, across z, y and x, and
+    what counts `inside` them, bool; every n-th voxel, at most `SHOWN` along an axis, of the edges `spacing` (z, y, x)
+    in the scan's unit. `places` are the slices' positions in its voxels."""
 
     levels: tuple[np.ndarray, ...]
     inside: tuple[np.ndarray, ...]
