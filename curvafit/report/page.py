@@ -30,10 +30,8 @@ from curvafit.studies.scans import format_csv
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
-#: Pixels per inch of figures in files, as journals ask for them.
-PRINTED = 300
-#: Letters of a scan's name that a panel has room for, and the most scans whose outlines are drawn.
-WORD, MOST_OUTLINES = 22, 25
+#: Pixels per inch of figures in files; letters of a scan's name in a panel; the most scans whose outlines are drawn.
+PRINTED, WORD, MOST_OUTLINES = 300, 22, 25
 #: The mark by which a page is known as this program's.
 MARK = '<meta name="generator" content="curvafit'
 
