@@ -92,7 +92,7 @@ def test_a_prior_comes_in_the_scan_s_unit(tmp_path: Path) -> None:
     assert law_of(path, mm)[0] == fit.coefficients_physical
     law, notes = law_of(str(path), um)
     assert law.as_dict() == pytest.approx(fit.coefficients_physical.in_unit(1e-3).as_dict())
-    assert "mm" in notes[0] and "um" in notes[0]
+    assert "mm" in notes[0] and "µm" in notes[0]
     with pytest.raises(ValueError, match="--unit"):
         law_of(path, Volume(np.zeros((4, 4, 4))))
     with pytest.raises(ValueError, match="preset"):
