@@ -43,9 +43,9 @@ def compare(
         bool, typer.Option("--paired", help="Compare within subjects of one name (of a file, or in the CSV).")
     ] = False,
     subjects: Annotated[Path | None, typer.Option(help="CSV for folders, or scans: scan, subject.")] = None,
-    roi: Annotated[
+    regions: Annotated[
         str | None,
-        typer.Option(help="Region of each scan, from its folder: {stem}_roi.tif. Or a column roi of the CSV."),
+        typer.Option("--roi", help="Region of each scan, from its folder: {stem}_roi.tif. Or a column roi of the CSV."),
     ] = None,
     *,
     structure: Structure,
@@ -63,7 +63,7 @@ def compare(
         shown = parse_panels(panels)
         check_comparison(out, [*scans, *([] if subjects is None else [subjects])], overwrite, command_line())
         settings: dict[str, Any] = {**tests, "subjects": subjects}
-        settings |= {"roi": roi, "workers": workers, "progress": progress, "paired": paired}
+        settings |= {"roi": regions, "workers": workers, "progress": progress, "paired": paired}
         # `--by 0,7,14` has a number for each scan of one list; otherwise each argument is a group or a CSV.
         labels = by.split(",") if by and "," in by else by
         groups = [scans] if isinstance(labels, list) else scans

@@ -100,8 +100,7 @@ def _check_inputs(values: Mapping[str, Any]) -> None:
     for volumes in filter(None, map(values.get, _VOLUMES)):
         for path in map(str, volumes if isinstance(volumes, list) else [volumes]):
             file = path.rpartition("::")[0] or path  # without the key of an array, as in file.h5::key
-            is_pattern = "{stem}" in path or "{name}" in path
-            if not (os.path.exists(path) or os.path.exists(file) or is_url(path) or is_pattern):
+            if not (os.path.exists(path) or os.path.exists(file) or is_url(path)):
                 raise FileNotFoundError(f"no such file: {file}")
     from curvafit.core.checks import quoted, simplify_name
     from curvafit.priors.published import PUBLISHED

@@ -293,17 +293,22 @@ def draw_sections(rows: Mapping[str, Sections], spacing: Sequence[float], unit: 
     """Return a figure of rows of slices by their titles, with the scale; `indices` are the numbers of the slices."""
     figure = make_figure(7.2, 2.5 * len(rows), layout="constrained")
     axes = figure.subplots(len(rows), 3, squeeze=False)
-    for row, (title, (planes, outlines, limits)) in zip(axes, rows.items(), strict=True):
-        for axis in range(3):
-            edges = [spacing[other] for other in range(3) if other != axis]
-            outline = None if outlines is None else outlines[axis]
-            section_on(row[axis], planes[axis], outline, limits, edges[0] / edges[1])
+    for row, (title, sections) in zip(axes, rows.items(), strict=True):
+        sections_on(row, sections, spacing)
         row[0].set_ylabel(title)
     for axis, name in enumerate("zyx"):
         rows_name, columns_name = (other for other in "zyx" if other != name)
         axes[0, axis].set_title(f"{name} = {indices[axis]}  ({rows_name} down, {columns_name} across)", fontsize=8)
     scale_on(axes[-1, 0], spacing[2], unit)
     return figure
+
+
+def sections_on(row: Sequence[Axes], sections: Sections, spacing: Sequence[float]) -> None:
+    """Draw slices across z, y and x beside each other; the spacing is of their voxels (z, y, x)."""
+    planes, outlines, limits = sections
+    for axis, axes in enumerate(row):
+        down, across = (spacing[other] for other in range(3) if other != axis)
+        section_on(axes, planes[axis], None if outlines is None else outlines[axis], limits, down / across)
 
 
 def scale_on(axes: Axes, edge: float, unit: str) -> None:

@@ -117,7 +117,8 @@ def describe_measures(measures: Sequence[Measures], **values: Any) -> str:
     """
     how = {"mask": "masks were taken as they are", "field": "phase fields were split at 0"}
     otsu = any("Otsu's threshold" in note for scan in measures for note in scan.notes)
-    how["image"] = f"grey levels were smoothed by one voxel and split at {'Otsu’s' if otsu else 'a given'} threshold"
+    whose = "Otsu's" if otsu else "a given"
+    how["image"] = f"grey levels were smoothed by one voxel and split at {whose} threshold"
     kinds = join_names([how[kind] for kind in dict.fromkeys(scan.kind for scan in measures)])
     sampled = [replace(scan, notes=scan.notes[:1]) for scan in measures]  # the first note states the voxels
     sampling = "; ".join(note.rstrip(".") for _, note in merge_notes(sampled))

@@ -21,6 +21,7 @@ from curvafit.report.comparison import describe_measures, name_quantity
 from curvafit.report.page import (
     MOST_OUTLINES,
     check_result_folder,
+    draw_outline,
     name_parts,
     outlines_figure,
     shorten,
@@ -148,15 +149,12 @@ def thickness_figure(measures: Measures) -> Figure | None:
     most = factor * float(np.percentile(thin[thin > 0], 99.5)) if (thin > 0).any() else 1.0
     figure = plot.make_figure(8.4, 2.8, layout="constrained")
     panels = figure.subplots(1, 3)
+    draw_outline(panels, outline, None, measures.unit)
     for axis, axes in enumerate(panels):
         index = tuple(outline.places[k] if k == axis else slice(None, None, step) for k, step in enumerate(steps))
         plane, (down, across) = factor * volume.values[index], np.delete(outline.spacing, axis)
-        limits = plot.grey_limits(np.concatenate([each.ravel() for each in outline.levels]))
-        plot.section_on(axes, outline.levels[axis], None, limits, down / across)
         colours = {"cmap": "viridis", "vmin": 0.0, "vmax": most, "aspect": down / across, "interpolation": "nearest"}
         picture = axes.imshow(np.where(plane > 0, plane, np.nan), **colours)
-        axes.set_title(f"{'zyx'[axis]} = {outline.places[axis]}", fontsize=8)
-    plot.scale_on(panels[0], outline.spacing[2], measures.unit)
     bar = figure.colorbar(picture, ax=list(panels), label=f"Tb.Th ({unit_name(measures.unit, 2)})", shrink=0.85)
     bar.ax.tick_params(labelsize=8, length=2)
     return figure

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from curvafit.core.files import move_together, remove, temporary_folder
@@ -191,11 +192,15 @@ def outlines_figure(names: Sequence[str], outlines: Sequence[Outline | None], un
         return None
     figure = plot.make_figure(7.6, 2.6 * len(known), layout="constrained")
     for row, (name, outline) in zip(figure.subplots(len(known), 3, squeeze=False), known, strict=True):
-        limits = plot.grey_limits(np.concatenate([plane.ravel() for plane in outline.levels]))
-        for axis, axes in enumerate(row):
-            down, across = np.delete(outline.spacing, axis)
-            plot.section_on(axes, outline.levels[axis], outline.inside[axis], limits, down / across)
-            axes.set_title(f"{'zyx'[axis]} = {outline.places[axis]}", fontsize=8)
+        draw_outline(row, outline, outline.inside, unit)
         row[0].set_ylabel(plot.plain(name), fontsize=9)
-        plot.scale_on(row[0], outline.spacing[2], unit)
     return figure
+
+
+def draw_outline(row: Sequence[Axes], outline: Outline, inside: Sequence[np.ndarray] | None, unit: str) -> None:
+    """Draw the slices of an outline, their positions and the scale, with what is outlined, if anything is."""
+    limits = plot.grey_limits(np.concatenate([plane.ravel() for plane in outline.levels]))
+    plot.sections_on(row, plot.Sections(outline.levels, inside, limits), outline.spacing)
+    for axes, name, place in zip(row, "zyx", outline.places, strict=True):
+        axes.set_title(f"{name} = {place}", fontsize=8)
+    plot.scale_on(row[0], outline.spacing[2], unit)

@@ -153,7 +153,7 @@ def _keep_maps(
     for name, values in arrays.items():
         counted = values if region is None else np.where(region.values != 0, values, 0)
         scaled = counted * np.float32(edge) if name == "thickness" else counted
-        volumes[name] = replace(frame, array=scaled, notes=())
+        volumes[name] = replace(frame, array=scaled.astype(MAPS[name], copy=False), notes=())
     return replace(measures, maps=volumes)
 
 
@@ -167,8 +167,8 @@ def _measure_whole(
     period = sum(float(phase[phase > 0].mean(dtype=np.float64)) for phase in (maps.thickness, maps.gap))
     blocks = Blocks.divide(maps.mask.shape, field.spacing, period)
     found = whole.summarise_sums(field, maps.kind, blocks, maps.sum(blocks), connectivity, maps.diagram, maps.notes)
-    arrays = {"structure": maps.mask.astype(np.uint8), "thickness": maps.thickness.astype(np.float32)}
-    return replace(found, outline=Outline.cut(field, maps.mask.__getitem__)), arrays
+    found = replace(found, outline=Outline.cut(field, maps.mask.__getitem__))
+    return found, {"structure": maps.mask, "thickness": maps.thickness}
 
 
 def _describe_tiles(plan: Plan, processes: int) -> str:
@@ -214,7 +214,7 @@ def measure_tile(plan: Plan, number: int) -> Record:
     sums.add("volume", np.ones(mask[inner].shape, dtype=bool), voxel)
     sums.add("inside", mask[inner], voxel)
     sums.add_thickness(balls, voxel)
-    maps = {"structure": mask[inner].astype(np.uint8), "thickness": balls.thickness[0].astype(np.float32)}
+    maps = {"structure": mask[inner].copy(), "thickness": balls.thickness[0]} if plan.maps else {}
     # A voxel's share of χ depends on the voxels before it: a layer before the core is taken along, where there is one.
     extended = tuple(slice(edge.start - (edge.start > 0), edge.stop) for edge in inner)
     in_core = tuple(slice(edge.start - outer.start, None) for edge, outer in zip(inner, extended, strict=True))
@@ -226,7 +226,7 @@ def measure_tile(plan: Plan, number: int) -> Record:
     if surface is not None:
         sums.gather("area", *surface)
     del mask, balls
-    return {**record, **_measure_curvature(plan, core, sums), **sums.rows, **(maps if plan.maps else {})}
+    return {**record, **_measure_curvature(plan, core, sums), **sums.rows, **maps}
 
 
 def _measure_wide(plan: Plan, number: int) -> Record:
@@ -235,7 +235,7 @@ def _measure_wide(plan: Plan, number: int) -> Record:
     sums, balls = _Sums(plan, core), _measure_balls(plan, core, plan.factors)
     sums.add_thickness(balls, math.prod(plan.volume.spacing), *(factor > 1 for factor in plan.factors))
     wide = plan.maps and plan.factors[0] > 1
-    return {**sums.rows, **({"thickness": balls.thickness[0].astype(np.float32)} if wide else {})}
+    return {**sums.rows, **({"thickness": balls.thickness[0]} if wide else {})}
 
 
 class _Sums:

@@ -17,7 +17,7 @@ from curvafit.core import permutation
 from curvafit.core.checks import check_choice, check_int, check_seed
 from curvafit.core.runtime import Pictured, Progress, silent, sub_progress
 from curvafit.core.units import format_number, format_percent, per_unit, power_name
-from curvafit.drawing.plot import shared_limits
+from curvafit.drawing.plot import SIGNED, shared_limits
 from curvafit.geometry.diagrams import FAMILIES, Diagram
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.scan.measures import QUANTITIES, SURE, Measures, find_quantity, interval_reach
@@ -30,8 +30,8 @@ PERMUTATIONS = 9999
 LEVEL = 1 - SURE
 #: The familiar numbers, without those of curvature.
 FAMILIAR = ("BV/TV", "Tb.Th", "Tb.Th.SD", "Tb.Sp", "Tb.N", "Conn.D", "χ", "BS/BV", "BS/TV", "DA")
-#: Numbers that differ and are named in the answer; those that may be negative, which have no change in per cent.
-NAMED, SIGNED = 3, ("χ", "Conn.D", "H", "K", "κ1", "κ2")
+#: Most numbers that differ and are named in the answer.
+NAMED = 3
 #: Most arrangements of the labels that tell how far apart mean diagrams lie by chance.
 CHANCE = 500
 #: Bins along each axis of the difference of diagrams, and the width in bins of the Gaussian that smooths it.

@@ -89,8 +89,8 @@ def list_cases(
         if not isinstance(by, str | None) or table is not None:
             raise ValueError("expected a table alone, or scans with a label for each, or two groups or more")
         measured = Path(groups[0]) / MEASURED
-        read = _read_measured if measured.exists() else _read_cases
-        cases = read(measured if measured.exists() else Path(groups[0]), by or "group", paired)
+        read, path = (_read_measured, measured) if measured.exists() else (_read_cases, Path(groups[0]))
+        cases = read(path, by or "group", paired)
     else:
         cases = _list_labelled(groups[0], by) if len(groups) == 1 else _list_groups(groups, by, paired, notes)
         if table is not None:

@@ -84,10 +84,9 @@ def test_an_outline_shows_what_counted(scans: list[Path]) -> None:
     assert found.outline is not None and part is not None
     assert found.outline.places == (28, 28, 28) and part.places == (39, 11, 31)
     assert part.spacing == pytest.approx([1000 * h for h in found.outline.spacing])
-    mask = load(scans[0]).values > 0
-    assert (part.inside[0] == (mask & (region > 0))[39]).all() and (
-        part.levels[2] == load(scans[0]).values[..., 31]
-    ).all()
+    values = load(scans[0]).values
+    assert (part.inside[0] == ((values > 0) & (region > 0))[39]).all()
+    assert (part.levels[2] == values[..., 31]).all()
     figure = outlines_figure(["a", "b", "c"], [part, None, part], "um")
     assert figure is not None and len(figure.axes) == 6
     assert outlines_figure(["a"], [None], "um") is None
