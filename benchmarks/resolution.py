@@ -3,9 +3,9 @@
 From each law (eight presets, and random ones of `completion`) a step is made in a random direction of the box, of so
 many deviations (root mean square over the six parameters). Of each end shapes of 64³ are grown by `deep`, each from a
 seed of its own, and read as masks. `d2` is the squared distance of their means in the emulator's uncorrelated
-directions, each in the deviation between seeds, without the seeds' own share (the product of different pairs). Two
-windows, one of each law, are named rightly by a likelihood with probability Φ(√d2 / 2), and n windows with Φ(√(n d2) / 2);
-`named` is what that gives by measurement: of a shape of either end, given three others of each.
+directions, each in the deviation between seeds, without the seeds' own share (the product of different pairs). A
+likelihood names a window rightly with probability Φ(√d2 / 2), and n windows of one law with Φ(√(n d2) / 2); `named` is
+measured: the part of shapes of either end that are named rightly by the means of three others of each.
 
 `resolution.n` is the distance at which n windows are named rightly 19 times of 20, from a line through log d2 and log
 distance.
@@ -59,7 +59,7 @@ def step_from(name: str, length: float, emulator: Emulator) -> np.ndarray:
 
 
 def grow(name: str, length: float, emulator: Emulator) -> np.ndarray:
-    """Return the uncorrelated descriptors of shapes `(n, k)`, at most SHAPES; those that are not well formed are tried anew."""
+    """Return the uncorrelated descriptors of shapes `(n, k)`, SHAPES of them if so many of twice as many are formed."""
     parameters, rows = step_from(name, length, emulator), list[np.ndarray]()
     for number in range(2 * SHAPES):
         if len(rows) == SHAPES:

@@ -54,7 +54,7 @@ def read(name: str) -> Volume:
 def report(name: str) -> Values:
     """Return what a whole `infer` says of a scan."""
     try:
-        fit = infer(load(name), kind=SCANS[name].kind, growth=Growth()).fit  # type: ignore[arg-type]
+        fit = infer(read(name), kind=SCANS[name].kind, growth=Growth()).fit  # type: ignore[arg-type]
     except ScanError as error:
         return {"verdict": f"refused: {error}"}
     own, voxel, twins = fit.morphometry, fit.working_voxel, () if fit.best is None else fit.best.twins

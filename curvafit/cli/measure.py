@@ -51,6 +51,19 @@ def parse_windows(
     return {"size": size, "stride": steps, "clusters": 2 if clusters is None else clusters}
 
 
+def parse_page(
+    maps: Annotated[
+        bool, typer.Option("--maps", help="Of one scan: structure and thickness at each voxel, into the folder -o.")
+    ] = False,
+    graph: Annotated[
+        bool, typer.Option("--graph", help="Of one scan: its centreline with branches, into the folder -o.")
+    ] = False,
+    panels: PanelsOption = None,
+) -> dict[str, Any]:
+    """Return what stands in the folder of a page besides the numbers."""
+    return {"maps": maps, "graph": graph, "panels": parse_panels(panels)}
+
+
 @command(
     "curvafit measure bone.tif --spacing 0.0195 --unit mm",
     "curvafit measure mouse1.nii.gz mouse2.nii.gz mouse3.nii.gz --subjects mice.csv -o measures.csv",
@@ -58,6 +71,7 @@ def parse_windows(
     "curvafit measure mitochondria_labels.tif --labels --spacing 5 --unit nm -o mitochondria.csv",
     "curvafit measure lung_2048.ome.zarr --workers 2 -o lung.csv",
     "curvafit measure bone.tif --maps -o bone",
+    "curvafit measure vessels.tif --graph --spacing 2 --unit um -o vessels",
     "curvafit measure bone.tif --windows 64 --stride 32 -o maps",
 )
 def measure(
@@ -82,20 +96,19 @@ def measure(
     workers: Annotated[
         int, typer.Option(help="Processes that share scans, or one scan's tiles; 0 is this one.", min=0)
     ] = 0,
-    maps: Annotated[
-        bool, typer.Option("--maps", help="Of one scan: structure and thickness at each voxel, into the folder -o.")
-    ] = False,
-    panels: PanelsOption = None,
+    page: Annotated[dict[str, Any], Group(parse_page)],
     structure: Structure,
     reading: Reading,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure scans in seconds: morphometry, fabric and curvature in physical units, with 95 % intervals."""
     folder = _choose_folder(out, labels, subjects)
-    if panels is not None and (folder is None or grid is not None):
-        raise ValueError("--panels is for the figure of a page: give a name without a suffix with -o")
-    if maps and (folder is None or grid is not None or len(scans) > 1):
-        raise ValueError("--maps is of one scan, beside its page: give a name without a suffix with -o")
+    if any(page.values()) and (folder is None or grid is not None):
+        raise ValueError("--maps, --graph and --panels are for a page: give a name without a suffix with -o")
+    if (page["maps"] or page["graph"]) and len(scans) > 1:
+        raise ValueError("--maps and --graph are of one scan: give one")
+    if page["graph"] and (roi is not None or structure["periodic"]):
+        raise ValueError("--graph traces a whole scan that does not repeat: leave out --roi and --periodic, or --crop")
     if labels and (roi is not None or tile is not None or structure != parse_structure()):
         raise ValueError(
             "--labels states the structure of instances, each in a box of its own: leave out --roi, --tile, --kind, "
@@ -110,35 +123,40 @@ def measure(
         _map_windows(scans[0], folder, overwrite, {**grid, **structure, **reading})
         return
     store = None if out is None else out.with_name(f".{out.name}.curvafit-tiles")
-    options = {} if labels else {"roi": roi, "tile": tile, "store": store, "maps": maps, **structure}
+    options = {} if labels else {"roi": roi, "tile": tile, "store": store, **structure}
     options |= {"labels": labels, "workers": workers}
     with _keep_tiles(store):
         if folder is None:
             _write_table(scans, out, subjects, overwrite, options, reading)
         else:
-            _write_page(scans, folder, subjects, parse_panels(panels), overwrite, options, reading)
+            _write_page(scans, folder, subjects, page, overwrite, options, reading)
 
 
 def _write_page(
-    scans: list[str], folder: Path, subjects: Path | None, panels: tuple[str, ...], overwrite: bool,
+    scans: list[str], folder: Path, subjects: Path | None, shown: dict[str, Any], overwrite: bool,
     options: dict[str, Any], reading: dict[str, Any],
 ) -> None:  # fmt: skip
     """Measure scans, and write a page of them."""
     with show_stages() as progress:
         from curvafit.core.runtime import sub_progress
         from curvafit.report.measures import check_measures, write_measures
+        from curvafit.scan.centreline import trace
         from curvafit.studies.scans import check_units, count_notes, measure_each
 
+        options["maps"] = shown["maps"] or shown["graph"]
         check_measures(folder, _inputs(scans, options.get("roi"), subjects), overwrite, command_line())
         check_units(scans, sub_progress(progress, 0.0, 0.05), **reading)
         columns = _read_subjects(subjects, scans)
         measuring = sub_progress(progress, 0.05, 1.0)
         # A page is for scans, of which each has one result; instances have a table only.
         results = [measures for (measures,) in measure_each(scans, progress=measuring, **options, **reading)]
+        if shown["graph"]:
+            progress("tracing the centreline", 1.0)
+        traced = {"centreline": trace(results[0]) if shown["graph"] else None, "maps": shown["maps"]}
         progress("drawing the page", 1.0)
         recorded = {name: value for name, value in options.items() if name not in ("store", "labels", "workers")}
         settings: dict[str, Any] = {"options": recorded | reading, "command": command_line(), "overwrite": overwrite}
-        page = write_measures(results, folder, columns=columns, panels=panels, **settings)
+        page = write_measures(results, folder, columns=columns, panels=shown["panels"], **traced, **settings)
     say_notes(tuple(count_notes(results)))
     say(str(page))
 

@@ -13,7 +13,7 @@ from scipy.cluster.hierarchy import DisjointSet
 from skimage.segmentation import find_boundaries, watershed
 from torch import Tensor
 
-from curvafit.data_synth.centreline import skeleton_of
+from curvafit.geometry.centreline import skeleton_of
 from curvafit.geometry.diagrams import LEAST_SLOPE, MARGIN, find_resolved
 from curvafit.geometry.mesh import NoSurface
 from curvafit.geometry.morphology import local_thickness

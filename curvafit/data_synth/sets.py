@@ -21,11 +21,11 @@ from curvafit.core.runtime import Progress, hold_signals, silent
 from curvafit.core.units import format_number, unit_name
 from curvafit.core.workers import Cluster, run_jobs
 from curvafit.data_synth.atlas import versions
-from curvafit.data_synth.centreline import centreline, write_graphml
 from curvafit.data_synth.dataset import Case, Recipe
 from curvafit.data_synth.labels import NAMES, labels_of
 from curvafit.data_synth.store import check_same
 from curvafit.drawing.plot import CONTOUR, make_figure, write_picture
+from curvafit.geometry.centreline import centreline, write_graphml
 from curvafit.priors.grid import Grid
 from curvafit.volumes.read import load
 from curvafit.volumes.volume import Volume

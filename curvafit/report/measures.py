@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
@@ -28,6 +29,7 @@ from curvafit.report.page import (
     start_record,
     write_study,
 )
+from curvafit.scan.centreline import Centreline
 from curvafit.scan.measures import QUANTITIES, Measures, Quantity
 from curvafit.studies.scans import MEASURED, count_notes, list_rows, list_wide, write_measured
 from curvafit.studies.windowed import NAMES, Windows
@@ -37,8 +39,9 @@ FORMAT = Format("curvafit measured scans", 1, title="the record of measured scan
 #: What is written into the folder.
 FILES = ("measures.json", "measures.html", "measures.csv", "wide.csv", MEASURED)
 FILES += ("diagrams.svg", "diagrams.png", "numbers.svg", "numbers.png", "outlines.svg", "outlines.png")
-#: Maps of one scan, and the pictures of the second.
+#: Maps of one scan, and the pictures of the second; its centreline.
 FILES += ("structure.nii.gz", "thickness.nii.gz", "thickness.svg", "thickness.png")
+FILES += ("branches.csv", "centreline.graphml", "centreline.swc", "centreline.svg", "centreline.png")
 #: Of a scan measured in windows, `format` of the record.
 WINDOWS_FORMAT = Format("curvafit windows", 1, title="the record of a scan measured in windows")
 #: Of a scan measured in windows, what is written into the folder beside the maps.
@@ -63,6 +66,8 @@ def write_measures(
     columns: Sequence[Mapping[str, str]] | None = None,
     options: Mapping[str, Any] | None = None,
     panels: Sequence[str] = (),
+    centreline: Centreline | None = None,
+    maps: bool = True,
     command: str = "",
     overwrite: bool = False,
 ) -> Path:
@@ -71,7 +76,8 @@ def write_measures(
     Lengths are in the first scan's unit. A scan with compartments has a row for each of them. The files (`FILES`) are
     moved into the folder once all are whole; those of the same command are replaced, others are a ValueError without
     `overwrite`. `columns` has further columns of each scan, such as its subject; `panels` are the symbols of numbers
-    that the figure shows; `options` and `command` are for the record.
+    that the figure shows; `centreline` is the first scan's, whose `maps` are written if it has some; `options` and
+    `command` are for the record.
     """
     if not measures:
         raise ValueError("expected at least one scan, got none")
@@ -104,14 +110,19 @@ def write_measures(
     outlines = outlines_figure(name_parts(measures), [scan.outline for scan in measures], unit)
     figures = {
         "outlines": (outlines, "Three slices of each scan, and the outline of its structure"),
-        "thickness": (thickness_figure(measures[0]), "The thickness at each voxel, on three slices"),
+        "thickness": (thickness_figure(measures[0]) if maps else None, "The thickness at each voxel, on three slices"),
+        "centreline": (centreline and centreline_figure(measures[0], centreline), "The centreline, from three sides"),
         "diagrams": (diagrams, "The curvature diagram of each scan"),
         "numbers": (intervals, "Numbers of each scan with their intervals"),
     }
+    page["branches"] = [(q.name, *q.format(unit)) for q in (centreline.quantities if centreline else ())]
     tables = {"measures.csv": list_rows(measures, columns), "wide.csv": list_wide(measures, columns)}
-    maps = {f"{name}.nii.gz": volume for name, volume in measures[0].maps.items()}
-    more = {MEASURED: partial(write_measured, measures, columns)}
-    return write_study(target, FORMAT, FILES, record, page, tables, figures=figures, maps=maps, more=more)
+    volumes = {f"{name}.nii.gz": volume for name, volume in measures[0].maps.items() if maps}
+    more: dict[str, Callable[[Path], object]] = {MEASURED: partial(write_measured, measures, columns)}
+    if centreline is not None:
+        tables["branches.csv"] = centreline.rows()
+        more |= {"centreline.swc": centreline.write_swc, "centreline.graphml": centreline.write_graphml}
+    return write_study(target, FORMAT, FILES, record, page, tables, figures=figures, maps=volumes, more=more)
 
 
 def _format_cell(quantity: Quantity) -> tuple[str, str]:
@@ -156,6 +167,34 @@ def thickness_figure(measures: Measures) -> Figure | None:
         colours = {"cmap": "viridis", "vmin": 0.0, "vmax": most, "aspect": down / across, "interpolation": "nearest"}
         picture = axes.imshow(np.where(plane > 0, plane, np.nan), **colours)
     bar = figure.colorbar(picture, ax=list(panels), label=f"Tb.Th ({unit_name(measures.unit, 2)})", shrink=0.85)
+    bar.ax.tick_params(labelsize=8, length=2)
+    return figure
+
+
+def centreline_figure(measures: Measures, centreline: Centreline) -> Figure | None:
+    """Return a figure of a centreline from three sides, coloured by radius; None where it has no branch."""
+    volume, unit = measures.maps["structure"], measures.unit
+    spacing = np.multiply(volume.spacing, convert_length(1.0, volume.unit, unit))
+    if not (edges := [data for *_, data in centreline.graph.edges(data=True)]):
+        return None
+    pieces = np.concatenate([np.stack([each["points"][:-1], each["points"][1:]], 1) for each in edges])
+    radii = np.concatenate([each["radii"][1:] for each in edges])
+    figure = plot.make_figure(9.0, 3.2, layout="constrained")
+    panels = figure.subplots(1, 3)
+    for axis, axes in enumerate(panels):
+        down, across = (k for k in range(3) if k != axis)
+        height, width = (volume.shape[k] * spacing[k] for k in (down, across))
+        ends = (-spacing[across] / 2, width - spacing[across] / 2, height - spacing[down] / 2, -spacing[down] / 2)
+        depth = volume.values.mean(axis)
+        axes.imshow(depth, cmap="Greys", extent=ends, vmin=0, vmax=2 * depth.max(), interpolation="nearest")
+        order = np.argsort(radii)  # the thickest on top
+        lines = LineCollection(list(pieces[order][:, :, [across, down]]), array=radii[order], linewidths=1.2)
+        drawn = axes.add_collection(lines, autolim=False)
+        axes.set_title(f"along {'zyx'[axis]}", fontsize=9)
+        axes.set(xticks=[], yticks=[])
+        axes.spines[:].set_color(plot.QUIET)
+    plot.scale_on(panels[0], 1.0, unit)
+    bar = figure.colorbar(drawn, ax=list(panels), label=f"radius ({unit_name(unit, 2)})", shrink=0.85)
     bar.ax.tick_params(labelsize=8, length=2)
     return figure
 

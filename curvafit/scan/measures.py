@@ -37,6 +37,7 @@ SUMS = ("volume", "inside", "thickness", "thickness²", "gap", "χ", "area", *(f
 SUMS += ("curved", "H", "H²", "K", "κ1", "κ2", "C", *FAMILIES)
 _UPPER = np.triu_indices(3)
 Sums = Mapping[str, np.ndarray]
+Formula = tuple[str, str, int, Callable[[Sums], np.ndarray]]
 Row = TypeVar("Row", bound=Any)
 #: Least edges, in working voxels: of a cube whose descriptors are measured; of the windows of a larger scan, which are
 #: about as large as those of training.
@@ -79,7 +80,7 @@ class Quantity:
 
 
 #: Name, symbol and power of each quantity, and how it comes from sums.
-QUANTITIES: tuple[tuple[str, str, int, Callable[[Sums], np.ndarray]], ...] = (
+QUANTITIES: tuple[Formula, ...] = (
     ("volume fraction", "BV/TV", 0, lambda s: s["inside"] / s["volume"]),
     ("thickness", "Tb.Th", 1, lambda s: s["thickness"] / s["inside"]),
     ("thickness deviation", "Tb.Th.SD", 1, lambda s: _deviation(s, "thickness", "thickness²", "inside")),
@@ -392,11 +393,11 @@ def measure_curvatures(prepared: Prepared) -> tuple[tuple[np.ndarray, np.ndarray
     return (positions, columns * physical.weights[:, None]), physical
 
 
-def combine(sums: np.ndarray) -> np.ndarray:
-    """Return the quantities (…, K) that follow from sums (…, C)."""
-    named = dict(zip(SUMS, np.moveaxis(sums, -1, 0), strict=True))
+def combine(sums: np.ndarray, names: Sequence[str] = SUMS, quantities: Sequence[Formula] = QUANTITIES) -> np.ndarray:
+    """Return the quantities (…, K) that follow from sums (…, C) of these names."""
+    named = dict(zip(names, np.moveaxis(sums, -1, 0), strict=True))
     with np.errstate(divide="ignore", invalid="ignore"):  # blocks without surface
-        return np.stack([figure(named) for *_, figure in QUANTITIES], axis=-1)
+        return np.stack([figure(named) for *_, figure in quantities], axis=-1)
 
 
 def _deviation(sums: Sums, values: str, squares: str, counted: str) -> np.ndarray:

@@ -7,9 +7,9 @@ from exact import Cylinder, Plane, Shape, Sphere, Torus, Tubes, centres, profile
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from curvafit.data_synth.centreline import skeleton_of
 from curvafit.data_synth.labels import NAMES, field_distance, instances_of, labels_of
 from curvafit.geometry import betti_numbers, surface
+from curvafit.geometry.centreline import skeleton_of
 from curvafit.geometry.diagrams import MARGIN
 from curvafit.priors.grid import Grid
 

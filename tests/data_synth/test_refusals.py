@@ -12,12 +12,12 @@ import torch
 from exact_store import FLAT, flat_recipe
 
 from curvafit.data_synth import Contrast, Imaging, Modality, TextureDataset, design_box, labels_of, open_store
-from curvafit.data_synth.centreline import centreline
 from curvafit.data_synth.dataset import Composition, Recipe
 from curvafit.data_synth.imaging.like import fit_modality
 from curvafit.data_synth.samples import fetch
 from curvafit.data_synth.sets import SetSpec, build_set, make_case, read_spec
 from curvafit.data_synth.sources import Generated, decode_source, random_crop
+from curvafit.geometry.centreline import centreline
 from curvafit.priors import Grid, preset
 from curvafit.volumes.volume import Volume
 

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import networkx as nx
 import numpy as np
 from numba import njit
 from scipy import ndimage
 from scipy.spatial import KDTree
-from skimage.morphology import skeletonize
+from skimage import measure
 
-from curvafit.core.checks import require
 from curvafit.core.files import write_atomically
 from curvafit.geometry.topology import betti_numbers
 from curvafit.priors.grid import Grid
-
-if TYPE_CHECKING:
-    import networkx as nx
 
 #: A spur is shorter than a voxel plus so many radii of its other node.
 SPUR = 1.0
@@ -44,19 +39,18 @@ def skeleton_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
     tunnels and cavities as the mask; a cavity keeps a closed sheet around it. Curves run up to the faces of a crop, and
     across those of a periodic box.
     """
-    # Lee's thinning of the box, continued beyond its faces, finds the curves. They may be connected outside the box
-    # alone, so the mask itself is thinned around those curves, and then once more.
-    mask = distance > 0
-    thickest = math.ceil(float(distance.max()) / min(grid.spacing)) + 2
-    margin = [(min(n // 2, thickest),) * 2 for n in mask.shape]
-    padded = np.pad(mask, margin, mode="wrap" if grid.periodic else "edge")
-    inner = tuple(slice(m, m + n) for (m, _), n in zip(margin, mask.shape, strict=True))
-    curves = skeletonize(padded)[inner].astype(bool)
-    order = np.flatnonzero(mask)
-    order = order[np.argsort(distance.ravel()[order], kind="stable")]  # from the surface inwards
-    skeleton = mask.astype(np.uint8)
-    _thin(skeleton, curves & mask, order.copy(), grid.periodic)
-    _thin(skeleton, np.zeros_like(mask), order[skeleton.ravel()[order] > 0], grid.periodic)
+    skeleton = (distance > 0).astype(np.uint8)
+    # From the surface inwards; equals come in random order, as one along a tube would eat it from its end.
+    order = np.random.default_rng(0).permutation(np.flatnonzero(skeleton))
+    order = order[np.argsort(distance.ravel()[order], kind="stable")]
+    fixed = np.zeros(skeleton.shape, dtype=bool)
+    for axis, side in [] if grid.periodic else product(range(3), (0, -1)):
+        face = np.moveaxis(distance, axis, 0)[side]
+        pieces, count = measure.label(face > 0, return_num=True)  # type: ignore
+        middles = np.array(ndimage.maximum_position(face, pieces, range(1, count + 1)), dtype=int).reshape(-1, 2)
+        np.moveaxis(fixed, axis, 0)[side][tuple(middles.T)] = True
+    _thin(skeleton, fixed, order.copy(), grid.periodic)
+    _thin(skeleton, np.zeros_like(fixed), order[skeleton.ravel()[order] > 0], grid.periodic)
     return skeleton.astype(bool)
 
 
@@ -142,7 +136,7 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, spacing: Sequence[flo
     for _ in range(2):
         _move_to_axis(graph, distance, steps)
     _finish(graph, distance, steps)
-    return require("networkx", "synth", "a centreline").convert_node_labels_to_integers(graph, ordering="sorted")
+    return nx.convert_node_labels_to_integers(graph, ordering="sorted")  # type: ignore
 
 
 def write_graphml(graph: nx.MultiGraph, path: str | Path, unit: str = "voxel") -> Path:
@@ -151,7 +145,6 @@ def write_graphml(graph: nx.MultiGraph, path: str | Path, unit: str = "voxel") -
     Nodes have `z`, `y`, `x`, `radius`, `kind` and `rings`; edges `length`, `radius`, and as texts `points` ("z y x",
     with commas between points) and `radii`.
     """
-    nx = require("networkx", "synth", "a centreline")
     plain = nx.MultiGraph(unit=unit)
     for node, data in graph.nodes(data=True):
         z, y, x = map(float, data["position"])
@@ -165,7 +158,6 @@ def write_graphml(graph: nx.MultiGraph, path: str | Path, unit: str = "voxel") -
 
 def _trace(skeleton: np.ndarray, distance: np.ndarray) -> nx.MultiGraph:
     """Return a graph: nodes have `centre` (in voxels), `radius` and `rings`, and edges the `line` (N, 3) of voxels."""
-    nx = require("networkx", "synth", "a centreline")
     positions, voxels, graph = np.argwhere(skeleton), nx.Graph(), nx.MultiGraph()
     voxels.add_nodes_from(range(len(positions)))
     voxels.add_edges_from(KDTree(positions).query_pairs(1.8) if len(positions) else ())  # 26 neighbours, up to √3 away
