@@ -1,3 +1,5 @@
+from .centreline import Centreline as Centreline
+from .centreline import trace as trace
 from .instances import measure_instances as measure_instances
 from .measures import Measures as Measures
 from .measures import Quantity as Quantity
