@@ -1,10 +1,9 @@
 """Centrelines of exact tubes and of real vessels and cells: lengths, loops, radii, beside skan on a plain skeleton.
 
 Phantoms lie at three random places, straight and turned, of radii 2 to 6 voxels: a cubic lattice of tubes that the
-window cuts, a torus, a tree whose tips are balls. Errors are of the length in percent, of the number of loops, and of
-the mean radius in voxels (of the lattice and the tree away from branch points). skan gets scikit-image's skeleton, and
-as a radius the distance to the nearest voxel outside. Real masks come from $CURVAFIT_DATA; there loops are beside those
-that the mask has.
+window cuts, a torus, a tree whose tips are balls. Errors are of the length in percent, where `trace` counts it, of the
+number of loops, and of the median radius in voxels. skan gets scikit-image's skeleton, and as a radius the distance to
+the nearest voxel outside; its length is that of the whole window. Real masks come from $CURVAFIT_DATA.
 """
 
 from __future__ import annotations
@@ -70,12 +69,12 @@ def fill(lines: Lines, radius: float) -> np.ndarray:
     return apart < radius
 
 
-def length_inside(lines: Lines) -> float:
-    """Return the length of lines between the centres of the window's outer voxels."""
+def length_inside(lines: Lines, margin: int) -> float:
+    """Return the length of lines in the window without so many voxels from its faces."""
     total = 0.0
     for a, b in lines:
         along = a + np.linspace(0, 1, 2001)[:, None] * (b - a)
-        total += ((along >= 0) & (along <= EDGE - 1)).all(1).mean() * np.linalg.norm(b - a)
+        total += ((along >= margin - 0.5) & (along <= EDGE - margin - 0.5)).all(1).mean() * np.linalg.norm(b - a)
     return float(total)
 
 
@@ -85,8 +84,10 @@ def ours(volume: Volume) -> Values:
     edges = [of for *_, of in line.graph.edges(data=True)]
     lengths = [of["length"] for of in edges]
     thin = np.concatenate([of["radii"] for of in edges])  # the median leaves out what bulges
-    return {"length": sum(lengths), "loops": line["loops"].value, "radius": float(np.median(thin)),
-            "ends": line["ends"].value, "branches": len(edges), "pieces": line["pieces"].value}  # fmt: skip
+    margin = line.margin[0]
+    inner = line["length density"].value * float(np.prod(np.subtract(volume.shape, 2 * margin)))
+    counts = {name: line[f"N.{name}"].value for name in ("loops", "ends", "branches", "pieces")}
+    return {"inner": inner, "margin": margin, "length": sum(lengths), "radius": float(np.median(thin))} | counts
 
 
 def theirs(volume: Volume) -> Values:
@@ -102,7 +103,8 @@ def theirs(volume: Volume) -> Values:
     nodes = set(table["node-id-src"]) | set(table["node-id-dst"])
     pieces = table["skeleton-id"].nunique()
     places = tuple(np.asarray(skeleton.coordinates).T.astype(int))
-    return {"length": float(table["branch-distance"].sum()), "loops": len(table) - len(nodes) + pieces,
+    length = float(table["branch-distance"].sum())
+    return {"inner": length, "margin": 0, "length": length, "loops": len(table) - len(nodes) + pieces,
             "radius": float(np.median(distance[places])), "ends": int((np.asarray(skeleton.degrees) == 1).sum()),
             "branches": len(table), "pieces": pieces}  # fmt: skip
 
@@ -111,11 +113,11 @@ def phantom(name: str, radius: float, place: int) -> Values:
     """Return the errors of both on a phantom."""
     lines = lines_of(name, place)
     mask = fill(lines, radius)
-    truth = {"length": length_inside(lines), "loops": betti_numbers(mask)[1], "radius": radius}
+    truth = {"loops": betti_numbers(mask)[1], "radius": radius}
     found: Values = {}
     for program, trace_by in (("curvafit", ours), ("skan", theirs)):
         row = trace_by(Volume(mask.astype(np.uint8), (1.0, 1.0, 1.0), "um"))
-        found[f"{program} length"] = round(100 * (row["length"] / truth["length"] - 1), 2)
+        found[f"{program} length"] = round(100 * (row["inner"] / length_inside(lines, row["margin"]) - 1), 2)
         found[f"{program} loops"] = row["loops"] - truth["loops"]
         found[f"{program} radius"] = round(row["radius"] - truth["radius"], 3)
     return found

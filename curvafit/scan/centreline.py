@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,12 +18,15 @@ from curvafit.core.files import write_content
 from curvafit.core.units import convert_length
 from curvafit.geometry.centreline import centreline, skeleton_of, write_graphml
 from curvafit.geometry.morphology import smooth_surface
+from curvafit.geometry.topology import betti_numbers
 from curvafit.priors.grid import Grid
 from curvafit.scan.measures import LEAST, Blocks, Formula, Measures, Quantity, combine, errors, find_quantity
 from curvafit.volumes.volume import ScanError
 
 #: Most voxels of a scan, which is traced as a whole.
 MOST = 400**3
+#: Ends nearer to a face, in voxels, are cut by the window.
+FACE = 2.0
 #: A radius is the mean distance to so many triangles, the nearest ones; that of one is a tenth of a voxel too small.
 TRIANGLES = 16
 #: What is summed over blocks: volume, length, ∫ radius, half of the ends of branches; length and distance between the
@@ -52,12 +56,16 @@ class Centreline:
         "loop") and `cut`, whether the window cuts there; edges with `points` (N, 3), `radii` (N,), `length`, `radius`.
     quantities
         Densities and means (`QUANTITIES`) with 95 % intervals, and counts of the window.
+    margin
+        Voxels along z, y, x from the window's faces that densities and means leave out: the median radius, since the
+        axis of a tube that grazes a face lies outside.
     """
 
     source: str
     unit: str
     graph: nx.MultiGraph
     quantities: tuple[Quantity, ...]
+    margin: tuple[int, int, int]
 
     def __getitem__(self, name: str) -> Quantity:
         """Return the quantity of a name or a symbol; raise KeyError where there is none."""
@@ -104,9 +112,8 @@ class Centreline:
 def trace(measures: Measures) -> Centreline:
     """Trace the centreline of a scan that was measured with `maps`, by thinning that keeps its topology.
 
-    Lengths are in the measures' unit. Radii are distances to the smoothed surface. Branches that the window cuts count
-    as parts of a branch: an end there is none. Raises ValueError without maps, of part of a scan, or of more than
-    `MOST` voxels.
+    Lengths are in the measures' unit; radii are distances to the smoothed surface. Raises ValueError without maps, of
+    part of a scan, or of more than `MOST` voxels.
     """
     volume = measures.maps.get("structure")
     if volume is None or measures.compartments:
@@ -123,22 +130,36 @@ def trace(measures: Measures) -> Centreline:
     triangles = KDTree(smooth_surface(mask, edges).barycentres)
     inside = np.where(mask[tuple(near.T)], 1, -1)
     distance[tuple(near.T)] = inside * triangles.query(near * spacing, TRIANGLES)[0].mean(1)
-    graph = centreline(skeleton, distance, edges)
-    last = np.array(mask.shape) - 1
+    # Of a tube that grazes a face there is a line on the face: what lies there is taken away.
+    inner = np.zeros_like(skeleton)
+    inner[1:-1, 1:-1, 1:-1] = skeleton[1:-1, 1:-1, 1:-1]
+    graph = centreline(inner, distance, edges)
+    last, radii = np.array(mask.shape) - 1, [data["radius"] for *_, data in graph.edges(data=True)]
     for _, data in graph.nodes(data=True):
         place = data["position"] / spacing
-        data["cut"] = data["kind"] == "end" and bool(((place < 1) | (place > last - 1)).any())
-    return Centreline(measures.source, measures.unit, graph, _summarise(graph, mask.shape, spacing, measures))
+        data["cut"] = data["kind"] == "end" and bool(((place < FACE) | (place > last - FACE)).any())
+    pieces, loops, _ = betti_numbers(mask)
+    nodes = Counter(KINDS.get(data["kind"]) for _, data in graph.nodes(data=True) if not data["cut"])
+    counts = {"branches": graph.number_of_edges()} | {name: nodes[name] for name in KINDS.values()}
+    counts |= {"loops": loops, "pieces": pieces}
+    numbers = (Quantity(name, f"N.{name}", float(value), math.nan, 0) for name, value in counts.items())
+    margin = np.minimum(np.ceil(np.median(radii or edges) / spacing), last // 4).astype(int)
+    quantities = _summarise(graph, last + 1 - 2 * margin, margin, spacing, measures)
+    return Centreline(measures.source, measures.unit, graph, (*quantities, *numbers), tuple(margin.tolist()))
 
 
-def _summarise(graph: nx.MultiGraph, shape: Any, spacing: np.ndarray, measures: Measures) -> tuple[Quantity, ...]:
-    """Return densities and means with the intervals of blocks of a period, and counts."""
-    blocks = Blocks.divide(shape, spacing.tolist(), measures["Tb.Th"].value + measures["Tb.Sp"].value)
+def _summarise(
+    graph: nx.MultiGraph, shape: np.ndarray, margin: np.ndarray, spacing: np.ndarray, measures: Measures
+) -> tuple[Quantity, ...]:
+    """Return densities and means within a margin of the faces, with the intervals of blocks of a period."""
+    blocks = Blocks.divide(shape.tolist(), spacing.tolist(), measures["Tb.Th"].value + measures["Tb.Sp"].value)
     table = np.zeros((blocks.count, len(SUMS)))
     table[:, 0] = math.prod(spacing) * blocks.sums(np.ones(shape, bool))
 
     def count(name: str, places: np.ndarray, values: Any) -> None:
-        table[:, SUMS.index(name)] += blocks.gather(np.atleast_2d(places) / spacing, np.atleast_1d(values))
+        voxels, weights = np.atleast_2d(places) / spacing - margin, np.atleast_1d(values)
+        inside = ((voxels > -0.5) & (voxels < shape - 0.5)).all(1)
+        table[:, SUMS.index(name)] += blocks.gather(voxels[inside], weights[inside])
 
     for *_, data in graph.edges(data=True):
         points, radii = data["points"], data["radii"]
@@ -149,16 +170,12 @@ def _summarise(graph: nx.MultiGraph, shape: Any, spacing: np.ndarray, measures: 
             count("open", points[len(points) // 2], data["length"])
             count("distance", points[len(points) // 2], distance)
     for node, data in graph.nodes(data=True):
-        if not data["cut"]:
-            count("branches", data["position"], graph.degree(node) / 2)
-            if data["kind"] in KINDS:
-                count(KINDS[data["kind"]], data["position"], 1.0)
+        if data["cut"]:
+            continue
+        count("branches", data["position"], graph.degree(node) / 2)
+        if data["kind"] in KINDS:
+            count(KINDS[data["kind"]], data["position"], 1.0)
     figures = partial(combine, names=SUMS, quantities=QUANTITIES)
     halves = errors(table, blocks, figures) if blocks.count >= LEAST else np.full(len(QUANTITIES), np.nan)
-    found = [Quantity(name, symbol, float(value), float(half), power) for (name, symbol, power, _), value, half
-             in zip(QUANTITIES, figures(table.sum(0)), halves, strict=True)]  # fmt: skip
-    pieces, branches = nx.number_connected_components(graph), graph.number_of_edges()
-    rings = sum(data["rings"] for _, data in graph.nodes(data=True))
-    counts = {"branches": branches} | {name: table[:, SUMS.index(name)].sum() for name in KINDS.values()}
-    counts |= {"loops": branches - len(graph) + pieces + rings, "pieces": pieces}
-    return *found, *(Quantity(name, f"N.{name}", float(value), math.nan, 0) for name, value in counts.items())
+    found = zip(QUANTITIES, figures(table.sum(0)), halves, strict=True)
+    return tuple(Quantity(*names[:2], float(value), float(half), names[2]) for names, value, half in found)

@@ -46,8 +46,10 @@ def traced(scan: Volume) -> Centreline:
 def test_a_lattice_that_the_window_cuts(spacing: tuple[float, float, float]) -> None:
     """Lengths to 2 %, loops exactly, radii to half a voxel; what is cut is no end, and counts as half a branch."""
     found = traced(scan_of(LATTICE, spacing))
-    length = 9 * sum(64 - h for h in spacing)
-    assert found["length density"].value == pytest.approx(length / 64**3, rel=0.02)
+    edges = [(round(64 / h) - 2 * m) * h for h, m in zip(spacing, found.margin, strict=True)]
+    assert [m * h >= 3.4 for m, h in zip(found.margin, spacing, strict=True)] == [True] * 3
+    length = 9 * sum(edges)
+    assert found["length density"].value == pytest.approx(length / math.prod(edges), rel=0.02)
     assert (found["N.loops"].value, found["N.pieces"].value, found["N.ends"].value) == (28, 1, 0)
     assert found["N.branch points"].value == 27 and found["N.branches"].value == 54 + 54
     assert found["branch length"].value == pytest.approx(length / (27 * 3), rel=0.02)
@@ -55,7 +57,24 @@ def test_a_lattice_that_the_window_cuts(spacing: tuple[float, float, float]) -> 
     radii = np.concatenate([data["radii"] for *_, data in found.graph.edges(data=True)])
     assert np.median(radii) == pytest.approx(3.4, abs=0.5)
     assert sum(data["cut"] for _, data in found.graph.nodes(data=True)) == 54
-    assert 0 < found["length density"].half < found["length density"].value
+
+
+def test_a_window_of_eight_periods_has_intervals() -> None:
+    steps = (8.1, 20.1, 32.1, 44.1, 56.1)
+    lines = (np.insert([[a, b], [a, b]], axis, (-FAR, FAR), axis=1) for axis in range(3) for a in steps for b in steps)
+    found = traced(scan_of(Tubes(2.5, tuple(lines))))
+    for symbol in ("L.D", "J.D", "Br.L", "Br.T", "Br.R"):
+        assert 0 <= found[symbol].half < 0.3 * found[symbol].value, symbol
+    assert math.isnan(found["N.loops"].half)
+
+
+def test_a_tube_that_grazes_the_window_is_left_out() -> None:
+    """Its axis is outside: what lies on the face is no line of the structure."""
+    grazing = np.array([(-2.0, -FAR, 32.0), (-2.0, FAR, 32.0)])
+    through = np.array([(32.0, -FAR, 32.0), (32.0, FAR, 32.0)])
+    found = traced(scan_of(Tubes(5.0, (grazing, through))))
+    assert sum(row["length"] for row in found.rows()) == pytest.approx(61, abs=1)
+    assert (found["N.branches"].value, found["N.pieces"].value) == (1, 2)
 
 
 @pytest.mark.parametrize("spacing", [CUBES, FLAT])
