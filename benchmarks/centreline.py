@@ -151,6 +151,8 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
             figures[f"centreline.{name}_{program}.{key}"] = Figure(float(max(values, key=abs)))
     if not options.quick:
         for name, row in cases.all({name: partial(real, name) for name in REAL}).items():
-            figures |= {f"vessels.{name}.{key.replace(' ', '_')}": Figure(float(value)) for key, value in row.items()}
+            for key, value in row.items():
+                program, _, number = key.partition(" ")
+                figures[f"vessels.{name}_{program}.{number}"] = Figure(float(value))
     show(["", ""], list(figures.items()), "greatest errors: length in %, loops, radius in voxels")
     return {} if options.quick else figures

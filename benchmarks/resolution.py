@@ -7,8 +7,7 @@ directions, each in the deviation between seeds, without the seeds' own share (t
 likelihood names a window rightly with probability Φ(√d2 / 2), and n windows of one law with Φ(√(n d2) / 2); `named` is
 measured: the part of shapes of either end that are named rightly by the means of three others of each.
 
-`resolution.n` is the distance at which n windows are named rightly 19 times of 20, from a line through log d2 and log
-distance.
+`resolution.windows_n` is the distance at which n windows are named rightly 19 times of 20, from the medians of d2.
 """
 
 from __future__ import annotations
@@ -91,10 +90,10 @@ def pair(name: str, length: float, cases: Cases) -> Values:
 
 
 def resolve(lengths: np.ndarray, distances: np.ndarray) -> np.ndarray:
-    """Return the distance at which so many windows are named rightly, from medians of d2 `(laws, steps)`."""
-    power, constant = np.polyfit(np.log(lengths), np.log(np.maximum(np.median(distances, 0), 1e-3)), 1)
-    needed = 4 * stats.norm.ppf(RIGHT) ** 2 / np.array(WINDOWS)
-    return np.append(np.exp((np.log(needed) - constant) / power), power)
+    """Return the distance at which so many windows are named rightly, from d2 `(laws, steps)`: of laws so close, means
+    grow apart in proportion."""
+    slope = np.exp(np.mean(np.log(np.maximum(np.median(distances, 0), 1e-3)) - 2 * np.log(lengths)))
+    return np.sqrt(4 * stats.norm.ppf(RIGHT) ** 2 / np.array(WINDOWS) / slope)
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -114,11 +113,11 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     drawn = random.integers(len(whole), size=(2000, len(whole)))
     steps = np.array(STEPS)
     low, high = np.quantile([resolve(steps, rows[0][each]) for each in drawn], (0.025, 0.975), axis=0)
-    for name, *each in zip([*map(str, WINDOWS), "power"], resolve(steps, rows[0]), low, high, strict=True):
+    for name, *each in zip([f"windows_{n}" for n in WINDOWS], resolve(steps, rows[0]), low, high, strict=True):
         figures[f"resolution.{name}"] = Figure(*map(float, each))
     for key, values, middle in (("d2", rows[0], np.median), ("named", rows[1], np.mean)):
         ends = np.quantile([middle(values[each], axis=0) for each in drawn], (0.025, 0.975), axis=0)
         for step, *each in zip(STEPS, middle(values, axis=0), *ends, strict=True):
-            figures[f"resolution.{key}_{round(100 * step):02d}"] = Figure(*map(float, each))
+            figures[f"resolution.{round(100 * step):02d}.{key}"] = Figure(*map(float, each))
     show(["", ""], list(figures.items()), f"{len(whole)} laws")
     return figures

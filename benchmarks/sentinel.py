@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from benchmarks import belief, completion, convergence, curvature, prior, step, transductive
+from benchmarks import belief, centreline, completion, convergence, curvature, prior, step, transductive
 from benchmarks.harness import SENTINEL, append_lines, provenance, read_lines, show
 from curvafit.geometry.diagrams import diagram
 from curvafit.geometry.distances import wasserstein
@@ -149,6 +149,12 @@ def relative(share: float, **values: float) -> Checked:
     return {name: (value, share * abs(value)) for name, value in values.items()}
 
 
+def check_centreline() -> Checked:
+    tree = centreline.fill(centreline.lines_of("tree", 0), 3.5)
+    found = centreline.ours(Volume(tree.astype(np.uint8)))
+    return {"length": (found["length"], 0.5), "radius": (found["radius"], 0.02)}
+
+
 #: What stands for topics.
 SENTINELS: dict[str, Callable[[], Checked]] = {
     "step": check_step,
@@ -157,11 +163,12 @@ SENTINELS: dict[str, Callable[[], Checked]] = {
     "convergence": check_convergence,
     "curvature": check_curvature,
     "texture": check_texture,
-    "closure belief scans": check_reading,
+    "closure belief scans reading learning resolution": check_reading,
     "completion": check_completion,
     "image": check_image,
     "instances": check_instances,
     "phantoms large windows": check_measures,
+    "centreline": check_centreline,
     "groups": check_groups,
     "noise": check_noise,
     "transductive": check_networks,
