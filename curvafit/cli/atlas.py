@@ -21,6 +21,7 @@ _Store = Annotated[Path, typer.Argument(help="Folder of the Zarr store.")]
 
 @command(
     "curvafit atlas build store.zarr --count 1000 --shape 64",
+    "curvafit atlas build store.zarr --count 1500 --shape 64",
     "curvafit atlas build tubes.zarr --around tubes --spread 0.2 --count 100",
     "curvafit atlas build box.zarr --design box.yaml --scheduler tcp://node1:8786",
 )
@@ -37,7 +38,7 @@ def build_atlas(
     *,
     crew: Workers,
 ) -> None:
-    """Generate shapes into a store until enough are viable. The same command resumes a build that was stopped."""
+    """Generate shapes into a store until enough are viable. The same command resumes; a larger --count adds to it."""
     size = parse_whole_triple(shape, "--shape")
     law_design = _choose_design(design, around, spread)
     from curvafit.core.files import check_folder
@@ -53,28 +54,6 @@ def build_atlas(
     check_folder(store.parent)
     with crew.start() as (workers, progress):
         build(store, count, size, seed, plan, progress, design=law_design, workers=workers)
-    say(str(store))
-
-
-@command("curvafit atlas extend store.zarr --count 500")
-def extend_atlas(
-    store: _Store,
-    count: Annotated[int, typer.Option(help="Number of viable shapes to add; 0 resumes what was stopped.")] = 100,
-    *,
-    crew: Workers,
-) -> None:
-    """Add shapes to a store, with the design and the settings of the store."""
-    from curvafit.data_synth.atlas import extend
-    from curvafit.data_synth.store import open_store
-
-    target = open_store(store).wanted + count
-
-    def resume_command() -> str:
-        # Once the store states the new target, the same command would add `count` shapes a second time.
-        return "`--count 0`" if open_store(store).wanted == target else "the same command"
-
-    with crew.start(resume_command) as (workers, progress):
-        extend(store, count, progress, workers=workers)
     say(str(store))
 
 
@@ -232,7 +211,7 @@ def map_atlas(
     say(str(page))
 
 
-add_commands(atlas_app, build_atlas, extend_atlas, info_atlas, verify_atlas)
+add_commands(atlas_app, build_atlas, info_atlas, verify_atlas)
 add_commands(atlas_app, extract_atlas, describe_atlas, train_atlas, teach_filler, map_atlas)
 
 

@@ -207,7 +207,6 @@ class Crew:
         None
     )
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler, tcp://HOST:PORT.")] = None
-    dashboard: Annotated[int | None, typer.Option(help="Port of dask's dashboard on 127.0.0.1.")] = None
 
     def __post_init__(self) -> None:
         from curvafit.core.workers import check_workers
@@ -222,13 +221,13 @@ class Crew:
             check_memory(shape, FLOW, "a shape")
 
     @contextmanager
-    def start(self, again: Callable[[], str] = lambda: "the same command") -> Iterator[tuple[Cluster | None, Progress]]:
-        """Start the workers and their progress bar; `again` returns the command that resumes after an interrupt."""
+    def start(self) -> Iterator[tuple[Cluster | None, Progress]]:
+        """Start the workers and their progress bar; after an interrupt the same command resumes."""
         from curvafit.core.workers import cluster
 
-        with resumable(again), show_stages() as progress:
+        with resumable(), show_stages() as progress:
             progress("starting workers", 0.0)
-            with cluster(self.workers, self.scheduler, self.dashboard) as workers:
+            with cluster(self.workers, self.scheduler) as workers:
                 yield workers, progress
 
 

@@ -89,9 +89,7 @@ def check_workers(count: int | None, scheduler: str | None) -> None:
 
 
 @contextmanager
-def cluster(
-    count: int | None = None, scheduler: str | None = None, dashboard: int | None = None
-) -> Iterator[Cluster | None]:
+def cluster(count: int | None = None, scheduler: str | None = None) -> Iterator[Cluster | None]:
     """Start `count` workers on this machine, or take those of a dask scheduler; end them with the block.
 
     Raises ImportError if dask.distributed is needed and not installed, and OSError if there is no scheduler at the
@@ -104,15 +102,13 @@ def cluster(
         may use. With 0 the block gets None: this process does the work.
     scheduler
         Address of a scheduler, whose workers are used.
-    dashboard
-        Port of dask's own page on the loopback; by default there is none.
     """
     check_workers(count, scheduler)
     if count == 0 and scheduler is None:
         yield None
         return
     require("distributed", "synth", "work by several processes")
-    with _connect(scheduler) if scheduler is not None else _start(count, dashboard) as client:
+    with _connect(scheduler) if scheduler is not None else _start(count) as client:
         yield Cluster(client)
 
 
@@ -122,7 +118,7 @@ def join_workers(workers: Cluster | int | None) -> AbstractContextManager[Cluste
 
 
 @contextmanager
-def _start(count: int | None, dashboard: int | None) -> Iterator[Client]:
+def _start(count: int | None) -> Iterator[Client]:
     """Start workers on this machine."""
     import dask.config
     import distributed
@@ -135,8 +131,8 @@ def _start(count: int | None, dashboard: int | None) -> Iterator[Client]:
             n_workers=CPU_COUNT if count is None else count,
             threads_per_worker=1,
             host=LOOPBACK,
-            dashboard_address=f"{LOOPBACK}:{dashboard or 0}",
-            scheduler_kwargs={"dashboard": dashboard is not None},
+            dashboard_address=f"{LOOPBACK}:0",
+            scheduler_kwargs={"dashboard": False},
             memory_limit=0,
             silence_logs=logging.ERROR,
             preload=_IGNORE_INTERRUPTS,

@@ -1,6 +1,5 @@
 from .atlas import build as build
 from .atlas import describe as describe
-from .atlas import extend as extend
 from .atlas import extract as extract
 from .dataset import TextureDataset as TextureDataset
 from .dataset import as_dict as as_dict

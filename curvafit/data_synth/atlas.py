@@ -82,16 +82,6 @@ def build(
     return _fill(open_store(store_path, settings), count, workers, progress)
 
 
-def extend(store_path: str | Path, count: int, progress: Progress = silent, *, workers: Cluster | None = None) -> Store:
-    """Continue a store, by its own settings, until it has `count` more viable shapes than were wanted so far.
-
-    A count of 0 finishes a build that was stopped. Raises FileNotFoundError where there is no store, and as `build`.
-    """
-    check_int(count, "a count of shapes from 0", 0, MOST)
-    store = open_store(store_path)
-    return _fill(store, store.wanted + count, workers, progress)
-
-
 def make_settings(
     shape: int | Sequence[int], seed: int = 0, schedule: str | Schedule = "fast", design: Design | None = None
 ) -> Settings:

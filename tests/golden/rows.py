@@ -44,15 +44,15 @@ COMMANDS = {
     "synth": "synth -o out --atlas store.zarr --modality confocal --shape 8,10,10 --count 2 --workers 0",
     "synth-like": "synth -o out --atlas store.zarr --like scan.tif --shape 10 --count 2 --workers 0 --layout monai",
     "atlas-build": "atlas build out.zarr --shape 16 --around tubes --spread 0.05 --steps 40 --count 2 --workers 0",
-    "atlas-extend": "atlas extend store.zarr --count 1 --workers 0", "atlas-info": "atlas info store.zarr",
-    "atlas-verify": "atlas verify store.zarr", "atlas-extract": "atlas extract store.zarr -o out.npz",
+    "atlas-info": "atlas info store.zarr", "atlas-verify": "atlas verify store.zarr",
+    "atlas-extract": "atlas extract store.zarr -o out.npz",
     "atlas-describe": "atlas describe store.zarr -o out.npz --workers 0",
 }  # fmt: skip
 #: Rows that agree less closely. A flow from noise is chaotic: on another processor it grows another shape of the law,
 #: of which few numbers are alike. An emulator's optimum is flat along some directions.
 CLOSENESS = {
     **dict.fromkeys(("generate-preset", "generate-law", "generate-maps", "generate-mesh", "flows"), 0.25),
-    **dict.fromkeys(("atlas-build", "atlas-extend"), 1.0),
+    "atlas-build": 1.0,
     **dict.fromkeys(("infer-fast", "infer-match"), 0.05),
 }
 

@@ -53,8 +53,8 @@ pytestmark = [
 
 #: Bytes that a command may map, and seconds of processor that it may take.
 ROOM, SECONDS = 3 << 30, 60
-#: Commands that keep finished parts where they fail, and those that go on with a store that is there.
-KEEPING, GROWING = ("atlas build", "atlas extend", "atlas describe", "synth"), ("atlas extend",)
+#: Commands that keep finished parts where they fail.
+KEEPING = ("atlas build", "atlas describe", "synth")
 #: Commands that may end with 1: a store with damage, a flow without a surface.
 JUDGING = ("atlas verify", "generate")
 #: A name that the program gives to what it has not finished.
@@ -74,7 +74,7 @@ def obey(folder: Path, words: Sequence[str]) -> int:
     if result.exit_code == 1:
         assert result.stderr.strip(), said
     stands = tree(folder)
-    replaced = "out" if "--overwrite" in words else "store.zarr" if begins(words, GROWING) else None
+    replaced = "out" if "--overwrite" in words else None
     lost = [name for name in kept if stands.get(name) != kept[name] and not (replaced and name.startswith(replaced))]
     assert not lost, (said, lost)
     new = sorted(path.relative_to(folder) for path in folder.rglob("*") if path not in names)
