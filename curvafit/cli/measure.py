@@ -71,7 +71,7 @@ def parse_page(
     "curvafit measure mitochondria_labels.tif --labels --spacing 5 --unit nm -o mitochondria.csv",
     "curvafit measure lung_2048.ome.zarr --workers 2 -o lung.csv",
     "curvafit measure bone.tif --maps -o bone",
-    "curvafit measure vessels.tif --graph --spacing 2 --unit um -o vessels",
+    "curvafit measure vessels.tif --graph --spacing 0.002 --unit mm -o vessels",
     "curvafit measure bone.tif --windows 64 --stride 32 -o maps",
 )
 def measure(
@@ -103,7 +103,9 @@ def measure(
 ) -> None:
     """Measure scans in seconds: morphometry, fabric and curvature in physical units, with 95 % intervals."""
     folder = _choose_folder(out, labels, subjects)
-    if any(page.values()) and (folder is None or grid is not None):
+    if any(page.values()) and grid is not None:
+        raise ValueError("--maps, --graph and --panels are of a scan as a whole: leave out --windows")
+    if any(page.values()) and folder is None:
         raise ValueError("--maps, --graph and --panels are for a page: give a name without a suffix with -o")
     if (page["maps"] or page["graph"]) and len(scans) > 1:
         raise ValueError("--maps and --graph are of one scan: give one")

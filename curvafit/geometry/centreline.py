@@ -142,13 +142,14 @@ def centreline(skeleton: np.ndarray, distance: np.ndarray, spacing: Sequence[flo
 def write_graphml(graph: nx.MultiGraph, path: str | Path, unit: str = "voxel") -> Path:
     """Write a `centreline` as GraphML, with its `unit` of length.
 
-    Nodes have `z`, `y`, `x`, `radius`, `kind` and `rings`; edges `length`, `radius`, and as texts `points` ("z y x",
-    with commas between points) and `radii`.
+    Nodes have `z`, `y`, `x`, `radius`, `kind`, `rings` and, of a scan, `cut`; edges `length`, `radius`, and as texts
+    `points` ("z y x", with commas between points) and `radii`.
     """
     plain = nx.MultiGraph(unit=unit)
     for node, data in graph.nodes(data=True):
         z, y, x = map(float, data["position"])
-        plain.add_node(node, z=z, y=y, x=x, radius=float(data["radius"]), kind=data["kind"], rings=data["rings"])
+        facts = {name: data[name] for name in ("kind", "rings", "cut") if name in data}
+        plain.add_node(node, z=z, y=y, x=x, radius=float(data["radius"]), **facts)
     for one, other, data in graph.edges(data=True):
         points = ",".join(" ".join(f"{v:.7g}" for v in point) for point in data["points"])
         radii = " ".join(f"{r:.7g}" for r in data["radii"])

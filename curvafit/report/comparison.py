@@ -36,7 +36,7 @@ from curvafit.report.page import (
 )
 from curvafit.scan.measures import Measures
 from curvafit.studies.comparison import LEVEL, Comparison, Number, join_names
-from curvafit.studies.scans import list_wide, merge_notes
+from curvafit.studies.scans import THRESHOLD, list_wide, merge_notes
 
 #: `format` of a comparison's record.
 FORMAT = Format("curvafit comparison", 1, title="the record of a comparison")
@@ -116,9 +116,11 @@ def describe_measures(measures: Sequence[Measures], **values: Any) -> str:
     It is `templates/methods.txt`, filled with `values`.
     """
     how = {"mask": "masks were taken as they are", "field": "phase fields were split at 0"}
-    otsu = any("Otsu's threshold" in note for scan in measures for note in scan.notes)
-    whose = "Otsu's" if otsu else "a given"
-    how["image"] = f"grey levels were smoothed by one voxel and split at {whose} threshold"
+    levels = [found for scan in measures for note in scan.notes if (found := THRESHOLD.search(note))]
+    if levels:
+        low, *_, high = sorted([found[2] for found in levels], key=float) * 2
+        how["image"] = f"grey levels were smoothed by one voxel and split at {levels[0][1]} threshold, {low}"
+        how["image"] += f" to {high}" * (low != high)
     kinds = join_names([how[kind] for kind in dict.fromkeys(scan.kind for scan in measures)])
     sampled = [replace(scan, notes=scan.notes[:1]) for scan in measures]  # the first note states the voxels
     sampling = "; ".join(note.rstrip(".") for _, note in merge_notes(sampled))

@@ -30,7 +30,7 @@ from curvafit.report.page import (
     write_study,
 )
 from curvafit.scan.centreline import Centreline
-from curvafit.scan.measures import QUANTITIES, Measures, Quantity
+from curvafit.scan.measures import QUANTITIES, Measures, Quantity, list_quantities
 from curvafit.studies.scans import MEASURED, count_notes, list_rows, list_wide, write_measured
 from curvafit.studies.windowed import NAMES, Windows
 
@@ -41,7 +41,7 @@ FILES = ("measures.json", "measures.html", "measures.csv", "wide.csv", MEASURED)
 FILES += ("diagrams.svg", "diagrams.png", "numbers.svg", "numbers.png", "outlines.svg", "outlines.png")
 #: Maps of one scan, and the pictures of the second; its centreline.
 FILES += ("structure.nii.gz", "thickness.nii.gz", "thickness.svg", "thickness.png")
-FILES += ("branches.csv", "centreline.graphml", "centreline.swc", "centreline.svg", "centreline.png")
+FILES += ("branches.csv", "centreline.csv", "centreline.graphml", "centreline.swc", "centreline.svg", "centreline.png")
 #: Of a scan measured in windows, `format` of the record.
 WINDOWS_FORMAT = Format("curvafit windows", 1, title="the record of a scan measured in windows")
 #: Of a scan measured in windows, what is written into the folder beside the maps.
@@ -115,14 +115,23 @@ def write_measures(
         "diagrams": (diagrams, "The curvature diagram of each scan"),
         "numbers": (intervals, "Numbers of each scan with their intervals"),
     }
-    page["branches"] = [(q.name, *q.format(unit)) for q in (centreline.quantities if centreline else ())]
+    lines = centreline.quantities if centreline else ()
+    page["branches"] = [(line.name, line.symbol, *_format_line(line, unit)) for line in lines]
     tables = {"measures.csv": list_rows(measures, columns), "wide.csv": list_wide(measures, columns)}
     volumes = {f"{name}.nii.gz": volume for name, volume in measures[0].maps.items() if maps}
     more: dict[str, Callable[[Path], object]] = {MEASURED: partial(write_measured, measures, columns)}
     if centreline is not None:
         tables["branches.csv"] = centreline.rows()
+        tables["centreline.csv"] = list_quantities(centreline.source, unit, centreline.quantities)
         more |= {"centreline.swc": centreline.write_swc, "centreline.graphml": centreline.write_graphml}
     return write_study(target, FORMAT, FILES, record, page, tables, figures=figures, maps=volumes, more=more)
+
+
+def _format_line(quantity: Quantity, unit: str) -> tuple[str, str, str]:
+    """Return a number of a centreline, its interval and its unit as text; a count is whole and has none."""
+    if quantity.symbol.startswith("N."):
+        return f"{quantity.value:.0f}", "", ""
+    return quantity.format(unit)
 
 
 def _format_cell(quantity: Quantity) -> tuple[str, str]:

@@ -159,7 +159,8 @@ def write_study(
         for name, (figure, _) in drawn.items():
             (work / f"{name}.png").write_bytes(png(figure, PRINTED))
             (work / f"{name}.svg").write_bytes(svg(figure))
-        form.write(work / files[0], record | {"files": list(files)})
+        written = [name for name in files if name == files[0] or (work / name).exists()]
+        form.write(work / files[0], record | {"files": written})
     return target / files[1]
 
 

@@ -84,7 +84,7 @@ class Centreline:
         return rows
 
     def write_graphml(self, path: str | Path) -> Path:
-        """Write GraphML, with the attributes of the graph but `cut`."""
+        """Write GraphML, with the attributes of the graph."""
         return write_graphml(self.graph, path, self.unit)
 
     def write_swc(self, path: str | Path) -> Path:
@@ -137,7 +137,8 @@ def trace(measures: Measures) -> Centreline:
     last, radii = np.array(mask.shape) - 1, [data["radius"] for *_, data in graph.edges(data=True)]
     for _, data in graph.nodes(data=True):
         place = data["position"] / spacing
-        data["cut"] = data["kind"] == "end" and bool(((place < FACE) | (place > last - FACE)).any())
+        data["cut"] = data["kind"] in ("end", "point") and bool(((place < FACE) | (place > last - FACE)).any())
+    graph.remove_nodes_from([node for node, data in graph.nodes(data=True) if data["cut"] and data["kind"] == "point"])
     pieces, loops, _ = betti_numbers(mask)
     nodes = Counter(KINDS.get(data["kind"]) for _, data in graph.nodes(data=True) if not data["cut"])
     counts = {"branches": graph.number_of_edges()} | {name: nodes[name] for name in KINDS.values()}

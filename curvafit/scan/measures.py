@@ -172,6 +172,11 @@ class Measures(Pictured):
     outline: Outline | None = None
     maps: Mapping[str, Volume] = default(default_factory=dict)
 
+    @property
+    def with_intervals(self) -> bool:
+        """Return whether the scan was large enough for intervals."""
+        return any(math.isfinite(quantity.half) for quantity in self.quantities)
+
     def __repr__(self) -> str:
         values = ", ".join(f"{quantity.symbol} {quantity.value:.4g}" for quantity in self.quantities[:4])
         return f"Measures({values}, in {unit_name(self.unit)}, of {self.source or 'an array'})"
@@ -199,17 +204,8 @@ class Measures(Pictured):
         A compartment or an instance adds a column of that name with its label. `more` adds columns whose value is the
         same in every row.
         """
-        release, (z, y, x) = version("curvafit"), self.direction
         shared = dict([self.part] if self.part else []) | more
-        rows = []
-        for quantity in self.quantities:
-            bounds = (quantity.value, quantity.value - quantity.half, quantity.value + quantity.half)
-            value, low, high = (bound if math.isfinite(bound) else None for bound in bounds)
-            axis = f"{z:.4f} {y:.4f} {x:.4f}" if quantity.symbol == "DA" and math.isfinite(z) else ""
-            unit = plain_unit(self.unit, quantity.power)
-            cells = (self.source, quantity.name, quantity.symbol, value, low, high, unit, axis, release)
-            rows.append(dict(zip(COLUMNS, cells, strict=True)) | shared)
-        return rows
+        return [row | shared for row in list_quantities(self.source, self.unit, self.quantities, self.direction)]
 
     def __getitem__(self, name: str) -> Quantity:
         """Return the quantity of a name or a symbol; raise KeyError where there is none."""
@@ -236,6 +232,20 @@ class Measures(Pictured):
         outline = self.outline and replace(self.outline, spacing=tuple(h * factor for h in self.outline.spacing))
         scaled = {"quantities": quantities, "diagram": diagram, "compartments": compartments, "outline": outline}
         return replace(self, unit=unit, **scaled)
+
+
+def list_quantities(
+    source: str, unit: str, quantities: Sequence[Quantity], direction: Sequence[float] = (math.nan,) * 3
+) -> list[dict[str, Any]]:
+    """Return a row for each quantity of a scan (`COLUMNS`); the direction is the anisotropy's."""
+    rows, release, (z, y, x) = [], version("curvafit"), direction
+    for quantity in quantities:
+        bounds = (quantity.value, quantity.value - quantity.half, quantity.value + quantity.half)
+        value, low, high = (bound if math.isfinite(bound) else None for bound in bounds)
+        axis = f"{z:.4f} {y:.4f} {x:.4f}" if quantity.symbol == "DA" and math.isfinite(z) else ""
+        cells = (source, quantity.name, quantity.symbol, value, low, high, plain_unit(unit, quantity.power), axis)
+        rows.append(dict(zip(COLUMNS, (*cells, release), strict=True)))
+    return rows
 
 
 def find_quantity(rows: Sequence[Row], name: str) -> Row:

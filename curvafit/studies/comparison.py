@@ -22,7 +22,7 @@ from curvafit.geometry.diagrams import FAMILIES, Diagram
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.scan.measures import QUANTITIES, SURE, Measures, find_quantity, interval_reach
 from curvafit.scan.structure import check_options
-from curvafit.studies.scans import Case, Group, gather_notes, list_cases, measure_scans
+from curvafit.studies.scans import Case, Group, gather_notes, list_cases, measure_scans, note_thresholds
 
 #: Most arrangements of the labels that are tried; all are, where there are no more.
 PERMUTATIONS = 9999
@@ -188,8 +188,8 @@ class Comparison(Pictured):
         found, count, level = self.found, len(self.numbers), f"family-wise p at most {LEVEL:.2g}"
         if found:
             rest = f"; and {len(found) - NAMED} more" if len(found) > NAMED else ""
-            described = "; ".join(map(self._describe, found[:NAMED]))
-            lines.append(f"Of {count} numbers {len(found)} differ ({level}): {described}{rest}.")
+            described, s = "; ".join(map(self._describe, found[:NAMED])), "s" * (len(found) == 1)
+            lines.append(f"Of {count} numbers {len(found)} differ{s} ({level}): {described}{rest}.")
         else:
             strongest = max((self[name] for name in FAMILIAR), key=lambda number: abs(np.nan_to_num(number.effect)))
             lines.append(
@@ -357,7 +357,7 @@ def _compare_measures(
         sides=sides, diagrams=means, apart=_apart(embeddings, sides), by_chance=float(np.quantile(by_chance, SURE)),
         edges=edges, differences=differences, bins_p=bins_p,
         permutations=len(arrangements), exact=exact, options=options,
-        notes=(*notes, *gather_notes(measures, cases)),
+        notes=(*notes, *(note_thresholds(measures, cases) if groups else ()), *gather_notes(measures, cases)),
     )  # fmt: skip
 
 

@@ -227,4 +227,5 @@ def _cluster(values: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, flo
     centres = centres[np.argsort(centres[:, thickness_column])]
     indices, distances = vq(scaled, centres)
     labels[complete] = indices + 1
-    return labels, float(1 - (distances**2).sum() / max((scaled**2).sum(), 1e-30))
+    total = float((scaled**2).sum())
+    return labels, 1 - float((distances**2).sum()) / total if total > 0 else 0.0  # windows alike have no clusters

@@ -13,6 +13,7 @@ from found import made_inference, without_drawing
 
 from curvafit.cli.app import GONE
 from curvafit.cli.console import LONGEST, error_console, sentence, show_stages, writable
+from curvafit.cli.options import _check_inputs
 
 # ---- what is refused -------------------------------------------------------------------------------------------------
 
@@ -258,3 +259,10 @@ def test_a_sentence_is_one_line_that_shows() -> None:
     assert sentence("κ1 ≥ κ2, é") == "error: κ1 ≥ κ2, é"
     assert len(sentence("expected " + "x" * 10**6)) < LONGEST + 20
     writable("\udcff é", error_console()).encode(error_console().encoding)
+
+
+def test_textures_like_the_slices_are_no_file() -> None:
+    """`--example mixed` names no file; any other name is that of one."""
+    _check_inputs({"example": "mixed"})
+    with pytest.raises(FileNotFoundError, match="no such file: mixt"):
+        _check_inputs({"example": "mixt"})
