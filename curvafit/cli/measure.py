@@ -61,7 +61,7 @@ def parse_page(
     panels: PanelsOption = None,
 ) -> dict[str, Any]:
     """Return what stands in the folder of a page besides the numbers."""
-    return {"maps": maps, "graph": graph, "panels": parse_panels(panels)}
+    return {"maps": maps, "graph": graph, "panels": panels}
 
 
 @command(
@@ -145,7 +145,7 @@ def _write_page(
         from curvafit.scan.centreline import trace
         from curvafit.studies.scans import check_units, count_notes, measure_each
 
-        options["maps"] = shown["maps"] or shown["graph"]
+        options["maps"], panels = shown["maps"] or shown["graph"], parse_panels(shown["panels"])
         check_measures(folder, _inputs(scans, options.get("roi"), subjects), overwrite, command_line())
         check_units(scans, sub_progress(progress, 0.0, 0.05), **reading)
         columns = _read_subjects(subjects, scans)
@@ -158,7 +158,7 @@ def _write_page(
         progress("drawing the page", 1.0)
         recorded = {name: value for name, value in options.items() if name not in ("store", "labels", "workers")}
         settings: dict[str, Any] = {"options": recorded | reading, "command": command_line(), "overwrite": overwrite}
-        page = write_measures(results, folder, columns=columns, panels=shown["panels"], **traced, **settings)
+        page = write_measures(results, folder, columns=columns, panels=panels, **traced, **settings)
     say_notes(tuple(count_notes(results)))
     say(str(page))
 

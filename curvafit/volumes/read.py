@@ -22,7 +22,7 @@ from curvafit.core.checks import SEEDS, check_int, quoted
 from curvafit.core.files import is_url
 from curvafit.core.records import is_zarr, read_archive
 from curvafit.core.runtime import one_line
-from curvafit.core.units import common_unit, convert_length, is_unit, parse_unit
+from curvafit.core.units import common_unit, convert_length, format_length, is_unit, parse_unit
 from curvafit.priors.coefficients import NAMES
 from curvafit.volumes.formats import arrays, base, dicom, headers, nifti, tiff, zarr
 from curvafit.volumes.formats.base import ScanError, Stated
@@ -426,6 +426,11 @@ def _find_lengths(
         if unit is None and name == "voxel" and edges.min() != 1:  # edges of which the smallest is 1 are ratios
             raise ScanError(f"expected the unit of the spacing {quoted(spacing)} of {source}, such as mm, got none")
         edges = edges if unit is None else factor * edges
+        if stated.steps is not None and len(stated.steps) == 3 and names_length and name != "voxel":
+            own = np.array(factors) * convert_length(1.0, common, name) * _take_zyx(stated.steps, order, stated.axes)
+            if not np.allclose(own, edges, rtol=1e-3):
+                written = " x ".join(format_length(edge, name, 4) for edge in own)
+                note = (f"The spacing is the one given; the file states {written} (z, y, x).",)
     elif steps is not None:
         edges = scale * steps
     else:
