@@ -142,7 +142,6 @@ def _write_page(
     with show_stages() as progress:
         from curvafit.core.runtime import sub_progress
         from curvafit.report.measures import check_measures, write_measures
-        from curvafit.scan.centreline import trace
         from curvafit.studies.scans import check_units, count_notes, measure_each
 
         options["maps"], panels = shown["maps"] or shown["graph"], parse_panels(shown["panels"])
@@ -152,9 +151,12 @@ def _write_page(
         measuring = sub_progress(progress, 0.05, 1.0)
         # A page is for scans, of which each has one result; instances have a table only.
         results = [measures for (measures,) in measure_each(scans, progress=measuring, **options, **reading)]
+        traced: dict[str, Any] = {"maps": shown["maps"]}
         if shown["graph"]:
+            from curvafit.scan.centreline import trace
+
             progress("tracing the centreline", 1.0)
-        traced = {"centreline": trace(results[0]) if shown["graph"] else None, "maps": shown["maps"]}
+            traced["centreline"] = trace(results[0])
         progress("drawing the page", 1.0)
         recorded = {name: value for name, value in options.items() if name not in ("store", "labels", "workers")}
         settings: dict[str, Any] = {"options": recorded | reading, "command": command_line(), "overwrite": overwrite}

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -29,10 +29,12 @@ from curvafit.report.page import (
     start_record,
     write_study,
 )
-from curvafit.scan.centreline import Centreline
 from curvafit.scan.measures import QUANTITIES, Measures, Quantity, list_quantities
 from curvafit.studies.scans import MEASURED, count_notes, list_rows, list_wide, write_measured
 from curvafit.studies.windowed import NAMES, Windows
+
+if TYPE_CHECKING:
+    from curvafit.scan.centreline import Centreline
 
 #: `format` of the record.
 FORMAT = Format("curvafit measured scans", 1, title="the record of measured scans")
