@@ -159,6 +159,7 @@ def _write_page(
             traced["centreline"] = trace(results[0])
         progress("drawing the page", 1.0)
         recorded = {name: value for name, value in options.items() if name not in ("store", "labels", "workers")}
+        recorded |= {"maps": shown["maps"], "graph": shown["graph"]}
         settings: dict[str, Any] = {"options": recorded | reading, "command": command_line(), "overwrite": overwrite}
         page = write_measures(results, folder, columns=columns, panels=panels, **traced, **settings)
     say_notes(tuple(count_notes(results)))

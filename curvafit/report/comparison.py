@@ -116,11 +116,13 @@ def describe_measures(measures: Sequence[Measures], **values: Any) -> str:
     It is `templates/methods.txt`, filled with `values`.
     """
     how = {"mask": "masks were taken as they are", "field": "phase fields were split at 0"}
-    levels = [found for scan in measures for note in scan.notes if (found := THRESHOLD.search(note))]
-    if levels:
-        low, *_, high = sorted([found[2] for found in levels], key=float) * 2
-        how["image"] = f"grey levels were smoothed by one voxel and split at {levels[0][1]} threshold, {low}"
-        how["image"] += f" to {high}" * (low != high)
+    stated = [match for scan in measures for note in scan.notes if (match := THRESHOLD.search(note))]
+    how["image"] = (
+        f"grey levels were smoothed by one voxel and split at {stated[0][1] if stated else 'a given'} threshold"
+    )
+    if stated:
+        low, high = (extreme((match[2] for match in stated), key=float) for extreme in (min, max))
+        how["image"] += f", {low}" if low == high else f", {low} to {high}"
     kinds = join_names([how[kind] for kind in dict.fromkeys(scan.kind for scan in measures)])
     sampled = [replace(scan, notes=scan.notes[:1]) for scan in measures]  # the first note states the voxels
     sampling = "; ".join(note.rstrip(".") for _, note in merge_notes(sampled))

@@ -190,6 +190,7 @@ def centreline_figure(measures: Measures, centreline: Centreline) -> Figure | No
         return None
     pieces = np.concatenate([np.stack([each["points"][:-1], each["points"][1:]], 1) for each in edges])
     radii = np.concatenate([each["radii"][1:] for each in edges])
+    order = np.argsort(radii)  # the thickest on top
     figure = plot.make_figure(9.0, 3.2, layout="constrained")
     panels = figure.subplots(1, 3)
     for axis, axes in enumerate(panels):
@@ -198,7 +199,6 @@ def centreline_figure(measures: Measures, centreline: Centreline) -> Figure | No
         ends = (-spacing[across] / 2, width - spacing[across] / 2, height - spacing[down] / 2, -spacing[down] / 2)
         depth = volume.values.mean(axis)
         axes.imshow(depth, cmap="Greys", extent=ends, vmin=0, vmax=2 * depth.max(), interpolation="nearest")
-        order = np.argsort(radii)  # the thickest on top
         lines = LineCollection(list(pieces[order][:, :, [across, down]]), array=radii[order], linewidths=1.2)
         drawn = axes.add_collection(lines, autolim=False)
         axes.set_title(f"along {'zyx'[axis]}", fontsize=9)

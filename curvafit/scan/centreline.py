@@ -131,9 +131,7 @@ def trace(measures: Measures) -> Centreline:
     inside = np.where(mask[tuple(near.T)], 1, -1)
     distance[tuple(near.T)] = inside * triangles.query(near * spacing, TRIANGLES)[0].mean(1)
     # Of a tube that grazes a face there is a line on the face: what lies there is taken away.
-    inner = np.zeros_like(skeleton)
-    inner[1:-1, 1:-1, 1:-1] = skeleton[1:-1, 1:-1, 1:-1]
-    graph = centreline(inner, distance, edges)
+    graph = centreline(np.pad(skeleton[1:-1, 1:-1, 1:-1], 1), distance, edges)
     last, radii = np.array(mask.shape) - 1, [data["radius"] for *_, data in graph.edges(data=True)]
     for _, data in graph.nodes(data=True):
         place = data["position"] / spacing
