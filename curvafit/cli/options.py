@@ -28,7 +28,7 @@ OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace file
 _VOLUMES = ("scan", "scans", "slices", "roi", "image", "example", "example_probabilities", "like",
             "like_mask")  # fmt: skip
 _LAWS = {"preset": "preset", "prior": "prior", "laws": "preset"}
-#: What stands for an example of textures that look like the slices.
+#: What is no file of an example: `segmentation.teach.MIXED`, whose module imports torch.
 MIXED = "mixed"
 
 
