@@ -7,7 +7,7 @@ those of their first halves (`--half 0`); the second halves are reported.
 
 - `spline`, `linear`, `nearest`, `ITK` (its morphological contour interpolation, where its package is installed): plain
   interpolations. Gains are held to the best of them *in hindsight*, case by case.
-- `filler`: `reconstruct` without an example; `mixed`: tuned on textures like the slices; `tuned`: with an example;
+- `filler`: `reconstruct` without an example; `tuned`: with one;
   `law`, `willmore`: with one, and its law or the Willmore energy tried; `laws`: filled by weights that shapes of laws
   alone taught; `gated`: a blend of filler and spline, whose weights are those that are best on every second known
   slice, left out.
@@ -45,7 +45,6 @@ from curvafit.segmentation.flow import Working
 from curvafit.segmentation.known import Known
 from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.slices import WAYS, Slices, filled_range
-from curvafit.segmentation.teach import MIXED
 from curvafit.segmentation.trials import dice, leave_out_slices
 from curvafit.segmentation.uncertainty import best_log_odds, calibration_error, near_surface
 from curvafit.volumes.read import load
@@ -64,7 +63,7 @@ ITK = "ITK"
 #: Willmore's energy, and costs twenty times as much as that of tubes 8 voxels thick.
 LAWS_TRIED = {"willmore": Coefficients.willmore(), "area": Coefficients(0.05, 0.1, 0.05, 0, 0, 1 / 16)}
 #: Ways that are no plain interpolation.
-OURS = ("filler", MIXED, "tuned", "law", "willmore", "laws", "gated")
+OURS = ("filler", "tuned", "law", "willmore", "laws", "gated")
 #: The commit whose packaged filler was taught by shapes of laws alone, without `mixed` textures.
 TAUGHT_BY_LAWS = "a755c804"
 #: Weights of the spline in a blend with the filler, of which `gated` takes the best on every second known slice.
@@ -143,7 +142,7 @@ def filled(
         mask, likely = gated(Known(truth, axis, tuple(places)).read(Run())[0])
     elif way in OURS:
         law = prior() if way == "law" else LAWS_TRIED.get(way)
-        shown = None if way in ("filler", "laws") else MIXED if way == MIXED else example()
+        shown = None if way in ("filler", "laws") else example()
         working = Working(filler=weights_of(TAUGHT_BY_LAWS) if way == "laws" else None)
         found = reconstruct(truth, law, known=places, axis=axis, example=shown, working=working)
         mask, likely = (np.moveaxis(each.values, axis, 0) for each in (found.mask, found.probability))
@@ -376,8 +375,7 @@ def on_scans(options: argparse.Namespace, ways: list[str], cases: Cases) -> dict
         whole |= {f"{prefix}_{key}": bootstrap(values) for key, values in each.items()}
         whole[f"{prefix}_least"] = Figure(min(each["least"]))
         whole[f"{prefix}_worst_calibration"] = Figure(float(np.nanmax([*each["calibration"], 0.0])))
-    summary = {"filler_gain": "all", "filler_least": "least", "mixed_gain": "mixed_all", "mixed_least": "mixed_least",
-               "tuned_gain": "tuned_all", "tuned_least": "tuned_least"}  # fmt: skip
+    summary = {"filler_gain": "all", "filler_least": "least", "tuned_gain": "tuned_all", "tuned_least": "tuned_least"}
     whole |= {f"filled.{name}": whole[f"gaps.8.{key}"] for key, name in summary.items() if f"gaps.8.{key}" in whole}
     return whole | (figures if every == 8 else {}) if not fresh or options.half else {}
 

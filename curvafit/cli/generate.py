@@ -83,7 +83,7 @@ def parse_output(
 )
 def generate(
     out: Annotated[
-        Path, _out("-o", "--output", help="Volume (.nii.gz .nii .tif .npy .mrc .zarr) or surface (.stl .ply .vtp).")
+        Path, _out("-o", "--output", help="Volume (.nii.gz .nii .tif .npy .mrc .zarr) or surface (.stl .ply).")
     ],
     wanted: Annotated[dict[str, Any], Group(parse_law)],
     shape: Annotated[str | None, _what(help=f"Voxels: N or Z,Y,X; {EDGE} or the maps' by default.")] = None,

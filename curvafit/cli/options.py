@@ -28,8 +28,6 @@ OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace file
 _VOLUMES = ("scan", "scans", "slices", "roi", "image", "example", "example_probabilities", "like",
             "like_mask")  # fmt: skip
 _LAWS = {"preset": "preset", "prior": "prior", "laws": "preset"}
-#: What is no file of an example: `segmentation.teach.MIXED`, whose module imports torch.
-MIXED = "mixed"
 
 
 # ---- commands --------------------------------------------------------------------------------------------------------
@@ -102,7 +100,7 @@ def _check_inputs(values: Mapping[str, Any]) -> None:
     for volumes in filter(None, map(values.get, _VOLUMES)):
         for path in map(str, volumes if isinstance(volumes, list) else [volumes]):
             file = path.rpartition("::")[0] or path  # without the key of an array, as in file.h5::key
-            if path != MIXED and not (os.path.exists(path) or os.path.exists(file) or is_url(path)):
+            if not (os.path.exists(path) or os.path.exists(file) or is_url(path)):
                 raise FileNotFoundError(f"no such file: {file}")
     from curvafit.core.checks import quoted, simplify_name
     from curvafit.priors.published import PUBLISHED

@@ -133,7 +133,7 @@ def write_shape(
 def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | None = None) -> Path:
     """Write a field `(Z, Y, X)` as a volume or a surface, by suffix, without picture and record.
 
-    Another file of that name is replaced, another folder is not. A VTP surface has its level set's principal curvatures
+    Another file of that name is replaced, another folder is not. A PLY surface has its level set's principal curvatures
     `kappa1` and `kappa2` at the vertices, 0 on caps.
     """
     target, output = Path(path), output or Output()
@@ -143,7 +143,7 @@ def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | No
         return save(Volume(values, spacing, output.unit), target, kind=FORMAT.name)
     mesh = solid_surface(values, Grid(values.shape, spacing, grid.boundary))
     data = None
-    if target.suffix.lower() == ".vtp":
+    if target.suffix.lower() == ".ply":
         data = _vertex_curvatures(mesh, field, Grid(grid.shape, spacing, grid.boundary))
         middle = (np.array(values.shape) - 1) / 2
         offsets = np.abs(mesh.vertices / np.array(spacing) - middle)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ LEAST_PART = 5e-4
 #: Greatest random relative change that makes equal values differ: marching cubes leaves holes where a face has ties.
 TIE = np.float32(1e-4)
 #: Suffixes that `write_surface` knows.
-SUFFIXES = (".stl", ".ply", ".vtp")
+SUFFIXES = (".stl", ".ply")
 
 Data = Mapping[str, np.ndarray]
 
@@ -158,10 +157,10 @@ def _weld(mesh: Surface) -> Surface:
 
 
 def write_surface(mesh: Surface, path: str | Path, *, unit: str = "voxel", data: Data | None = None) -> Path:
-    """Write a binary STL, PLY or VTP file by suffix; whole or not at all.
+    """Write a binary STL or PLY file by suffix; whole or not at all.
 
-    The unit of the lengths is written as a remark: none of the formats has a field for it. `data` is numbers `(V,)` at
-    the vertices by name, for PLY and VTP; STL cannot hold them. Another suffix or shape is a ValueError.
+    The unit of the lengths is written as a remark: neither format has a field for it. `data` is numbers `(V,)` at the
+    vertices by name, for PLY; STL cannot hold them. Another suffix or shape is a ValueError.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -170,7 +169,7 @@ def write_surface(mesh: Surface, path: str | Path, *, unit: str = "voxel", data:
     for name, values in (data or {}).items():
         if np.shape(values) != (len(mesh.vertices),):
             raise ValueError(f"expected {name} of shape ({len(mesh.vertices)},), got {np.shape(values)}")
-    encode = {".stl": _stl, ".ply": _ply, ".vtp": _vtp}[suffix]
+    encode = {".stl": _stl, ".ply": _ply}[suffix]
     return write_content(path, encode(mesh, f"curvafit surface, lengths in {unit}", data or {}))
 
 
@@ -196,28 +195,3 @@ def _ply(mesh: Surface, remark: str, data: Data) -> bytes:
     faces["count"], faces["corners"] = 3, mesh.faces
     vertices = np.stack([properties[name] for name in names], axis=1).astype("<f4")
     return header.encode() + vertices.tobytes() + faces.tobytes()
-
-
-def _vtp(mesh: Surface, remark: str, data: Data) -> bytes:
-    """Return XML PolyData; every array is inline, as base64 of its length in bytes and its numbers."""
-    ends = np.arange(3, 3 * len(mesh.faces) + 1, 3)  # of the faces in "connectivity"
-    lines = (
-        '<?xml version="1.0"?>',
-        f"<!-- {remark} -->",
-        '<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">',
-        "<PolyData>",
-        f'<Piece NumberOfPoints="{len(mesh.vertices)}" NumberOfVerts="0" NumberOfLines="0" NumberOfStrips="0" '
-        f'NumberOfPolys="{len(mesh.faces)}">',
-        *("<PointData>", *(_vtk_array(name, values, "f4") for name, values in data.items()), "</PointData>"),
-        *("<Points>", _vtk_array("Points", mesh.vertices[:, ::-1], "f4", 3), "</Points>"),
-        *("<Polys>", _vtk_array("connectivity", mesh.faces, "i8"), _vtk_array("offsets", ends, "i8"), "</Polys>"),
-        *("</Piece>", "</PolyData>", "</VTKFile>", ""),
-    )
-    return "\n".join(lines).encode()
-
-
-def _vtk_array(name: str, values: np.ndarray, kind: str, components: int = 1) -> str:
-    content = np.ascontiguousarray(values, dtype=f"<{kind}").tobytes()
-    text = base64.b64encode(np.uint64(len(content)).astype("<u8").tobytes() + content).decode()
-    form = f'type="{np.dtype(kind).name.capitalize()}" Name="{name}" NumberOfComponents="{components}" format="binary"'
-    return f"<DataArray {form}>{text}</DataArray>"

@@ -109,7 +109,7 @@ class _Inputs:
     periodic: bool
     suggest: int
     image: Volume | None
-    example: Volume | str | None
+    example: Volume | None
     working: Working
 
     @classmethod
@@ -235,11 +235,9 @@ def _fill_each(
         box = WHOLE if inputs.periodic else _box_of_label(inside, inputs)
         more = {
             "image": image and replace(image, array=image.values[box], affine=None, notes=()),
-            "example": example,
+            "example": example and replace(example, array=(example.values == label).astype(np.uint8), notes=()),
             "working": replace(inputs.working, store=store and Path(store) / str(label)),
         }
-        if isinstance(example, Volume):
-            more["example"] = replace(example, array=(example.values == label).astype(np.uint8), notes=())
         step = sub_progress(progress, (index - 1) / count, index / count)
         try:
             part = inputs.fill(index, box, laws.get(label), progress=step, **more)

@@ -30,7 +30,6 @@ from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import profile_distance
 from curvafit.scan.preparation import LARGEST_BOX
 from curvafit.scan.structure import add_records
-from curvafit.segmentation.alike import tune_alike
 from curvafit.segmentation.filler import REACH, SLOPE, TILE, Raster, Taught, fill
 from curvafit.segmentation.flow import HALO, Working, WorkingGrid, choose_epsilon
 from curvafit.segmentation.image import read_image
@@ -45,7 +44,7 @@ from curvafit.segmentation.slices import (
     plane_distances,
     require_labels,
 )
-from curvafit.segmentation.teach import MIXED, tune
+from curvafit.segmentation.teach import tune
 from curvafit.segmentation.tiles import LoweredVolume, Problem, cut_tiles, lower_volume
 from curvafit.segmentation.trials import (
     PART,
@@ -148,7 +147,6 @@ def reconstruct(
         with neither example nor law.
     example
         A mask of another volume of the same kind, known whole. A file or an array has the slices' `spacing` and `unit`.
-        `"mixed"` stands for textures that look like the known slices, by which the network is tuned without a trial.
     suggest
         Number of slices to suggest for annotation next.
     periodic
@@ -175,7 +173,7 @@ class _Inputs:
     notes: tuple[str, ...]
     taught: Taught
     image: Volume | None
-    example: Volume | str | None
+    example: Volume | None
     periodic: bool
     in_blocks: bool
 
@@ -205,7 +203,7 @@ class _Inputs:
         if not self.in_blocks or working.store is None:
             return open_run(None, None, {}, progress if self.in_blocks else silent, _ENDS)
         identity = {"labels": self.volume.digest, **self.which, "filler": self.taught.digest, "tile": working.tile}
-        identity |= {"example": getattr(self.example, "digest", self.example)}
+        identity |= {"example": None if self.example is None else self.example.digest}
         crew = working.workers if self.volume.in_file else None
         return open_run(crew, working.store, identity, progress, _ENDS)
 
@@ -218,8 +216,7 @@ def _fill_between(inputs: _Inputs, suggest: int, run: Run, working: Working, pro
     slices, labels, labelled = known.read(run, periodic)
     doubts = () if inputs.which["every"] is None else doubt_places(labelled, known.places)
     notes = (*known.notes, *doubts, *doubt_labels(labels, inputs.which["ignore"]), *inputs.notes)
-    shown = isinstance(inputs.example, Volume)
-    example = Example.of(inputs.example, known.places, known.axis) if shown else None  # type: ignore[arg-type]
+    example = None if inputs.example is None else Example.of(inputs.example, known.places, known.axis)
     step = sub_progress(progress, *((_READ, _READ) if inputs.in_blocks else (0.0, 0.5)))
     taught, evidence, input_notes = _adapt(inputs, known, slices, example, step)
     notes = (*notes, *input_notes)
@@ -249,17 +246,13 @@ def _fill_between(inputs: _Inputs, suggest: int, run: Run, working: Working, pro
 def _adapt(
     inputs: _Inputs, known: Known, slices: Slices, example: Example | None, progress: Progress
 ) -> tuple[Taught, np.ndarray | None, tuple[str, ...]]:
-    """Return the network, tuned on the example if there is one, or on textures like the slices if that is asked for;
-    an image's log-odds (length, Y, X); and notes."""
+    """Return the network, tuned on the example if there is one; an image's log-odds (length, Y, X); and notes."""
     taught, image = inputs.taught, inputs.image
     if image is not None:
         evidence, doubts = _read_evidence(known.turn(image.values), slices, known.axis, progress)
         return Taught.load() if evidence is None else taught, evidence, (*image.notes, *doubts)
     if example is not None:
         return tune(taught, example, progress), None, example.notes
-    if inputs.example == MIXED:
-        tuned, notes = tune_alike(taught, slices, progress)
-        return tuned, None, notes
     return taught, None, ()
 
 
@@ -594,11 +587,8 @@ def _read_evidence(
     return (None, (*doubts, UNTOLD)) if gain < LEAST_GAIN else (evidence, doubts)
 
 
-def load_example(example: Source, volume: Volume, reading: dict[str, Any]) -> Volume | str:
-    """Load an example, read with the spacing and unit of the slices' `volume`; raise ScanError where it differs. It is
-    `MIXED` itself where that is asked for."""
-    if str(example) == MIXED:
-        return MIXED
+def load_example(example: Source, volume: Volume, reading: dict[str, Any]) -> Volume:
+    """Load an example, read with the spacing and unit of the slices' `volume`; raise ScanError where it differs."""
     mask = load_with(example, reading)
     check_spacing(mask, volume, "the slices")
     require_labels(mask.values, "the example")

@@ -254,11 +254,6 @@ def _draw_known(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
     return known
 
 
-def draw_texture(kind: str, number: int) -> Texture:
-    """Draw a texture of one of `KINDS`; the same number gives the same texture."""
-    return Texture(KINDS[kind](np.random.default_rng([*kind.encode(), number])))
-
-
 def load_textures(
     sources: Sequence[str | Path], progress: Progress = silent
 ) -> tuple[list[list[Texture]], dict[str, Any]]:
@@ -269,7 +264,7 @@ def load_textures(
     named = [each for source in map(str, sources) for each in (KINDS if source == MIXED else (source,))]
     for number, source in enumerate(map(Path, named)):
         if (kind := str(source)) in KINDS:
-            shapes = [draw_texture(kind, k) for k in range(TEXTURES)]
+            shapes = [Texture(KINDS[kind](np.random.default_rng([*kind.encode(), k]))) for k in range(TEXTURES)]
             origin = {"seeds": TEXTURES}
         elif (source / "draws").is_dir():
             draws = find_well_formed((source,))

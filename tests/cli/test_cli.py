@@ -261,8 +261,6 @@ def test_a_sentence_is_one_line_that_shows() -> None:
     writable("\udcff é", error_console()).encode(error_console().encoding)
 
 
-def test_textures_like_the_slices_are_no_file() -> None:
-    """`--example mixed` names no file; any other name is that of one."""
-    _check_inputs({"example": "mixed"})
+def test_a_file_that_is_not_there_is_named_before_slow_imports() -> None:
     with pytest.raises(FileNotFoundError, match="no such file: mixt"):
         _check_inputs({"example": "mixt"})

@@ -28,7 +28,7 @@ REFUSALS: list[tuple[str, type[ValueError], Callable[[Path], object]]] = [
     ("finite", ValueError, lambda _: surface(TORN, GRID)),
     ("exceeds", NoSurface, lambda _: solid_surface(-ONES, CUBE)),
     ("stl", ValueError, lambda folder: write_surface(BALL, folder / "ball.obj")),
-    ("kappa1", ValueError, lambda folder: write_surface(BALL, folder / "ball.vtp", data={"kappa1": np.zeros(3)})),
+    ("kappa1", ValueError, lambda folder: write_surface(BALL, folder / "ball.ply", data={"kappa1": np.zeros(3)})),
     ("30 voxels", ValueError, lambda _: diagram(U, GRID, 2.0, margin=13)),
     ("part", NoSurface, lambda _: diagram(U, GRID, 2.0, where=NOWHERE)),
     ("mask", ValueError, lambda _: diagram(U, GRID, 2.0, where=NOWHERE[1:])),
