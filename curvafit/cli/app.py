@@ -13,7 +13,7 @@ import typer
 from curvafit.cli import compare, generate, infer, measure, samples, segment, synth
 from curvafit.cli.atlas import atlas_app
 from curvafit.cli.console import Commands, say
-from curvafit.cli.options import add_commands, add_gone
+from curvafit.cli.options import add_commands
 
 app = typer.Typer(
     help="Shape texture of tubes and membranes in 3D: a scan in, its parameters out; parameters in, shapes out.",
@@ -26,16 +26,6 @@ add_commands(app, generate.generate, generate.presets, synth.synth)
 add_commands(app, segment.segment, segment.reconstruct)
 app.add_typer(samples.samples_app, name="samples")
 app.add_typer(atlas_app, name="atlas")
-
-#: Commands that are gone, and what to type in their place; to be deleted after one release.
-GONE = {
-    "nnunet": "`python -m curvafit.nnunet PRIOR` prints the variables to set",
-    "refine": "type `curvafit segment PROBABILITIES --probabilities` with --example, or with --prior and --weight",
-    "trajectory": "type `curvafit compare SCAN… --by 0,7,14 -o DIR`, with a time for each scan",
-    "windows": "type `curvafit measure SCAN --windows 64 --stride 32 -o DIR`",
-}
-for _name, _instead in GONE.items():
-    add_gone(app, _name, _instead)
 
 
 def main() -> None:

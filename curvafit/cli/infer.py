@@ -19,11 +19,8 @@ def parse_inference(
     posterior: Annotated[Path | None, typer.Option(help="Posterior (.npz) instead of the packaged one.")] = None,
     method: Annotated[str, typer.Option(help="posterior, or match: the nearest shape, refined.")] = "posterior",
     test: Annotated[bool, typer.Option("--test", help="Grow shapes: can the law have made the scan? Minutes.")] = False,
-    fast: Annotated[bool, typer.Option("--fast", hidden=True)] = False,
 ) -> dict[str, Any]:
     """Return the options by which a law is inferred and tested, by name."""
-    if fast:
-        raise ValueError("`--fast` is gone: without --test nothing is grown")
     return {"atlas": atlas, "posterior": posterior, "method": method, "test": test}
 
 

@@ -119,15 +119,6 @@ def add_commands(app: typer.Typer, *functions: Callable[..., None]) -> None:
         app.command(function.__name__.partition("_")[0], epilog=getattr(function, "examples", None))(function)
 
 
-def add_gone(app: typer.Typer, name: str, instead: str) -> None:
-    """Add a hidden command that accepts any arguments, and fails with the advice what to type instead."""
-
-    @app.command(name, hidden=True, context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
-    @command()
-    def _refuse() -> None:
-        raise ValueError(f"`curvafit {name}` is gone: {instead}")
-
-
 _read = partial(typer.Option, rich_help_panel="How to read the file")
 _work = partial(typer.Option, rich_help_panel="How to work")
 

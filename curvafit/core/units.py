@@ -109,14 +109,6 @@ def format_length(value: float, unit: str, digits: int = 2) -> str:
     return f"{format_number(metres / METRES[best], digits)}{_GLUE}{unit_name(best)}"
 
 
-def format_density(value: float, unit: str, power: int) -> str:
-    """Return a number per length to a power as text, in another unit of length if it would be tiny or huge."""
-    units = [unit, *(other for other in ("mm", "um", "nm", "m") if unit in METRES and other != unit)]
-    scaled = {other: value * (METRES[other] / METRES[unit]) ** power if other != unit else value for other in units}
-    best = next((other for other in units if 0.1 <= abs(scaled[other]) < 1e4), unit)
-    return f"{format_number(scaled[best])}{_GLUE}{per_unit(best, power)[1:]}"  # without the 1 of 1/mm
-
-
 def per_unit(unit: str, power: int) -> str:
     """Return one over a unit to a power: 1/µm, 1/µm² or 1/µm³."""
     return f"1/{unit_name(unit)}{ {1: '', 2: '²', 3: '³'}[power] }"

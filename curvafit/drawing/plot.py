@@ -151,8 +151,8 @@ def diagram_figure(
     if not diagram.area > 0:
         raise ValueError("the diagram is empty: it has no area to draw")
     unit = diagram.unit.removeprefix("1/") if unit is None else unit
-    figure = make_figure(4.2, 4.2)
-    axes = figure.add_axes((0.16, 0.13, 0.82, 0.85))
+    figure = make_figure(4.2, 4.2, layout="constrained")
+    axes = figure.subplots()
     diagram_on(axes, diagram, limits=limits or shared_limits([diagram], length=length), unit=unit, length=length)
     return figure
 

@@ -97,11 +97,10 @@ def place_of_field(field: Volume) -> dict[str, Any]:
 
 
 def list_layers(viewer: Any, *kinds: str) -> list[tuple[str, Any]]:
-    """Return (name, layer) of the layers of kinds such as `"Image"`, without the images that the plugin added."""
-    layers = [(type(layer).__name__, layer) for layer in viewer.layers]
-    layers = [
-        layer for kind, layer in layers if kind in kinds and (kind != "Image" or "curvafit" not in layer.metadata)
-    ]
+    """Return (name, layer) of the layers of kinds such as `"Image"`, the first kind first, without the images that the
+    plugin added."""
+    layers = [layer for kind in kinds for layer in viewer.layers if type(layer).__name__ == kind]
+    layers = [layer for layer in layers if type(layer).__name__ != "Image" or "curvafit" not in layer.metadata]
     return [(layer.name, layer) for layer in layers]
 
 
@@ -287,9 +286,7 @@ class Measure(Dock):
             self.canvas.deleteLater()
             self.canvas = None
         if diagram is not None and len(diagram.points):
-            figure = diagram_figure(diagram)
-            figure.set_layout_engine("tight")
-            self.canvas = FigureCanvasQTAgg(figure)
+            self.canvas = FigureCanvasQTAgg(diagram_figure(diagram))
             self.canvas.setMinimumHeight(280)
             # As wide as the dock is: its own width would widen the window.
             self.canvas.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)

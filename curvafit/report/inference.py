@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from importlib.metadata import version
 from operator import attrgetter, itemgetter
@@ -17,14 +17,7 @@ from matplotlib.figure import Figure
 from curvafit.core.files import write_content
 from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, silent
-from curvafit.core.units import (
-    format_density,
-    format_length,
-    format_number,
-    format_percent,
-    per_unit,
-    unit_name,
-)
+from curvafit.core.units import format_length, format_number, format_percent, per_unit, power_name, unit_name
 from curvafit.drawing import plot
 from curvafit.geometry.diagrams import Diagram
 from curvafit.inference.candidates import TITLES, Candidate, seed_noise_of
@@ -174,21 +167,21 @@ def _number_rows(inference: Inference) -> list[list[str]]:
     """Return rows of familiar numbers: the scan's, the twins' mean with its range, and the ratio of mean and scan."""
     scan, best = inference.fit.morphometry, inference.fit.best
     twins, unit = () if best is None else best.twins, scan.unit
-    quantities: tuple[tuple[str, str, str, Callable[[float], str]], ...] = (
-        ("Volume fraction", "BV/TV", "volume_fraction", format_percent),
-        ("Mean thickness", "Tb.Th", "thickness_mean", lambda x: format_length(x, unit)),
-        ("Mean spacing", "Tb.Sp", "spacing_mean", lambda x: format_length(x, unit)),
-        ("Connectivity density", "Conn.D", "connectivity_density", lambda x: format_density(x, unit, 3)),
-        ("Surface to volume", "BS/BV", "surface_to_volume", lambda x: format_density(x, unit, 1)),
+    quantities = (
+        ("volume fraction", "BV/TV", "volume_fraction", 0),
+        ("thickness", "Tb.Th", "thickness_mean", 1),
+        ("spacing", "Tb.Sp", "spacing_mean", 1),
+        ("connectivity density", "Conn.D", "connectivity_density", -3),
+        ("surface to volume", "BS/BV", "surface_to_volume", -1),
     )
     rows = []
-    for name, symbol, key, text in quantities:
+    for name, symbol, key, power in quantities:
         value, twin_values = float(getattr(scan, key)), [float(getattr(twin, key)) for twin in twins]
-        row = [name, symbol, text(value)]
+        row = [name, symbol, f"{format_number(value, 4)} {power_name(unit, power)}".rstrip()]
         if twin_values:
-            mean = sum(twin_values) / len(twin_values)
-            extremes = f" ({text(min(twin_values))} to {text(max(twin_values))})" if len(twin_values) > 1 else ""
-            row += [text(mean) + extremes, format_number(mean / value, 2) if value else "–"]
+            mean, *ends = (format_number(x, 4) for x in (np.mean(twin_values), min(twin_values), max(twin_values)))
+            extremes = f" ({ends[0]} to {ends[1]})" if len(twin_values) > 1 else ""
+            row += [mean + extremes, format_number(np.mean(twin_values) / value, 2) if value else "–"]
         rows.append(row)
     return rows
 

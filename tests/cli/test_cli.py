@@ -11,7 +11,6 @@ from calling import LAW, QUICK, call, done, refused
 from exact_store import exact_store
 from found import made_inference, without_drawing
 
-from curvafit.cli.app import GONE
 from curvafit.cli.console import LONGEST, error_console, sentence, show_stages, writable
 from curvafit.cli.options import _check_inputs
 
@@ -113,11 +112,6 @@ def test_a_refusal_is_one_sentence_and_nothing_is_begun(
     for words, key in REFUSALS[command].items():
         refused(call(*command.split(), *words.split(" ") if words else ()), key, progress=True)
         assert sorted(folder.iterdir()) == before, words
-
-
-@pytest.mark.parametrize("name", GONE)
-def test_a_command_that_is_gone_says_what_to_type(name: str) -> None:
-    refused(call(name, "whatever", "--more"), GONE[name])
 
 
 def test_a_set_without_any_case_is_removed(tmp_path: Path) -> None:
