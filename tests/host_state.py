@@ -145,7 +145,6 @@ def calls(folder: Path) -> dict[str, Callable[[], object]]:
         "diffuse_curvatures": lambda: priors.diffuse_curvatures(priors.jet(u, grid), 0.02),
         "geometric_curvatures": lambda: priors.geometric_curvatures(priors.jet(u, grid)),
         "cahn_hilliard_area": lambda: priors.cahn_hilliard_area(u, grid, 0.02),
-        "discrepancy_ratio": lambda: priors.discrepancy_ratio(u, grid, 0.02),
         "orientation": lambda: priors.orientation((1, 0, 0), 2.0),
         "optimal_profile": lambda: priors.optimal_profile(u, 0.02),
         "profile_distance": lambda: priors.profile_distance(u, 0.02),

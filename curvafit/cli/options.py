@@ -42,7 +42,12 @@ def command(*examples: str) -> Callable[[Callable[..., None]], Callable[..., Non
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         parameters = inspect.signature(function, eval_str=True).parameters
-        makers = {name: make for name, value in parameters.items() if (make := _maker_of(value.annotation)) is not None}
+        makers = {
+            name: extra.make
+            for name, value in parameters.items()
+            for extra in get_args(value.annotation)[1:]
+            if isinstance(extra, Group)
+        }
         groups = {name: inspect.signature(make, eval_str=True).parameters for name, make in makers.items()}
 
         @functools.wraps(function)
@@ -86,11 +91,6 @@ class Group(NamedTuple):
     """A parameter that is made from several options, `Annotated[dict[str, Any], Group(make)]`: those of `make`."""
 
     make: Callable[..., Any]
-
-
-def _maker_of(annotation: Any) -> Callable[..., Any] | None:
-    """Return the function that makes the value of a group of options; None for a single option."""
-    return next((extra.make for extra in get_args(annotation)[1:] if isinstance(extra, Group)), None)
 
 
 def _check_inputs(values: Mapping[str, Any]) -> None:

@@ -137,7 +137,7 @@ def viability(u: Float[Tensor, "z y x"], grid: Grid, epsilon: float | Tensor) ->
 
 
 def _discrepancy(u: Tensor, grid: Grid, epsilon: float | Tensor) -> float:
-    """Return `discrepancy_ratio`, summed in float64 over a few planes at a time to save memory."""
+    """Return ∫|ε/2 |∇u|² - W(u)/ε| / 𝓐_ε, from 0 (the optimal profile) to 1, a few planes at a time to save memory."""
     Z, Y, X = grid.shape
     ε = epsilon.expand(grid.shape) if isinstance(epsilon, Tensor) else epsilon
     difference = total = 0.0

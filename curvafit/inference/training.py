@@ -189,13 +189,14 @@ def train_emulator(
     inputs = untrained.inputs(table.parameters, table.views, table.amount)
     x, y = torch.from_numpy(inputs).float(), torch.from_numpy(target).float()
 
-    means = _train_ensemble(x, y, fold, _mean_square, plan, seed, sub_progress(progress, 0.0, 0.5))
+    first, second = sub_progress(progress, 0.0, 0.5), sub_progress(progress, 0.5, 1.0)
+    means = _train_ensemble(x, y, fold, lambda net, x, y: (net(x) - y).square().mean(), plan, seed, first)
     errors = y - _predict_held_out(means, x, fold)
     values, vectors = np.linalg.eigh(np.cov(errors.double().numpy().T))
     # Rows are the principal directions of the errors, greatest variance first, scaled so that theirs along each is 1.
     basis = (vectors / np.sqrt(np.maximum(values, 1e-9 * values.max()))).T[::-1].astype(np.float32)
     whitened = errors @ torch.from_numpy(basis).T
-    spreads = _train_ensemble(x, whitened, fold, _normal_nats, plan, seed, sub_progress(progress, 0.5, 1.0))
+    spreads = _train_ensemble(x, whitened, fold, _normal_nats, plan, seed, second)
     deviation = torch.exp(_predict_held_out(spreads, x, fold)).clamp(min=FAINTEST)
     emulator = Emulator(compression, views, box, _layers(means), _layers(spreads), basis, 1.0)
     residuals = (whitened / deviation).double().numpy()
@@ -233,10 +234,6 @@ def _inflation(emulator: Emulator, table: Table, residuals: np.ndarray) -> float
         squared += np.einsum("nd,nde,ne->", gradients, covariance, gradients)
         expected += np.einsum("nde,ned->", covariance, information)
     return float(squared / expected)
-
-
-def _mean_square(network: nn.Module, x: Tensor, target: Tensor) -> Tensor:
-    return (network(x) - target).square().mean()
 
 
 def _normal_nats(network: nn.Module, x: Tensor, target: Tensor) -> Tensor:

@@ -261,7 +261,7 @@ class Measure(Dock):
             cells = [[format_number(value, 4) for value in row] for row in values]
             self.table.value = {"data": cells, "columns": names, "index": list(map(str, labels))}
         else:
-            cells = [[format_number(q.value, 4), f"± {format_number(q.half, 2)}"] for q in first.quantities]
+            cells = [list(quantity.format(first.unit)[:2]) for quantity in first.quantities]
             self.table.value = {"data": cells, "columns": ["value", "95 %"], "index": names}
         self.table.native.resizeColumnsToContents()
         self._draw(join_diagrams([measures.diagram for measures in result]))

@@ -3,7 +3,6 @@ from .curvature import diffuse_curvatures as diffuse_curvatures
 from .curvature import geometric_curvatures as geometric_curvatures
 from .curvature import jet as jet
 from .energies import cahn_hilliard_area as cahn_hilliard_area
-from .energies import discrepancy_ratio as discrepancy_ratio
 from .energies import energy as energy
 from .energies import energy_gradient as energy_gradient
 from .energies import energy_terms as energy_terms

@@ -151,13 +151,6 @@ def cahn_hilliard_area(u: Tensor, grid: Grid, epsilon: float | Tensor) -> Tensor
     return (gradient_part + well_part).sum((-3, -2, -1)) * grid.voxel_volume
 
 
-def discrepancy_ratio(u: Tensor, grid: Grid, epsilon: float | Tensor) -> Tensor:
-    """Return ∫|ε/2 |∇u|² - W(u)/ε| / 𝓐_ε, from 0 (the optimal profile) to 1 (paper, Experiment 4)."""
-    gradient_part, well_part = cahn_hilliard_parts(u, grid, epsilon)
-    space = (-3, -2, -1)
-    return (gradient_part - well_part).abs().sum(space) / (gradient_part + well_part).sum(space)
-
-
 def cahn_hilliard_parts(u: Tensor, grid: Grid, epsilon: float | Tensor) -> tuple[Tensor, Tensor]:
     """Return ε/2 |∇u|² and W(u)/ε in every voxel."""
     ε, slope2 = _match_field(epsilon, u), gradient(u, grid).square().sum(-4)

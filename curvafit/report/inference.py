@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib.metadata import version
 from operator import attrgetter, itemgetter
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from curvafit.inference.posterior import KNOWN
 from curvafit.inference.table import parameters_of
 from curvafit.priors.law import FORMAT
 from curvafit.report import page
+from curvafit.scan.measures import QUANTITIES
 from curvafit.studies.scans import Task, name_errors, share_out
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
@@ -167,21 +169,16 @@ def _number_rows(inference: Inference) -> list[list[str]]:
     """Return rows of familiar numbers: the scan's, the twins' mean with its range, and the ratio of mean and scan."""
     scan, best = inference.fit.morphometry, inference.fit.best
     twins, unit = () if best is None else best.twins, scan.unit
-    quantities = (
-        ("volume fraction", "BV/TV", "volume_fraction", 0),
-        ("thickness", "Tb.Th", "thickness_mean", 1),
-        ("spacing", "Tb.Sp", "spacing_mean", 1),
-        ("connectivity density", "Conn.D", "connectivity_density", -3),
-        ("surface to volume", "BS/BV", "surface_to_volume", -1),
-    )
+    keys = {"BV/TV": "volume_fraction", "Tb.Th": "thickness_mean", "Tb.Sp": "spacing_mean"}
+    keys |= {"Conn.D": "connectivity_density", "BS/BV": "surface_to_volume"}
     rows = []
-    for name, symbol, key, power in quantities:
-        value, twin_values = float(getattr(scan, key)), [float(getattr(twin, key)) for twin in twins]
+    for name, symbol, power, _ in (quantity for quantity in QUANTITIES if quantity[1] in keys):
+        value, twin_values = float(getattr(scan, keys[symbol])), [float(getattr(twin, keys[symbol])) for twin in twins]
         row = [name, symbol, f"{format_number(value, 4)} {power_name(unit, power)}".rstrip()]
         if twin_values:
-            mean, *ends = (format_number(x, 4) for x in (np.mean(twin_values), min(twin_values), max(twin_values)))
-            extremes = f" ({ends[0]} to {ends[1]})" if len(twin_values) > 1 else ""
-            row += [mean + extremes, format_number(np.mean(twin_values) / value, 2) if value else "–"]
+            average, least, most = fmean(twin_values), min(twin_values), max(twin_values)
+            extremes = f" ({format_number(least, 4)} to {format_number(most, 4)})" if len(twin_values) > 1 else ""
+            row += [format_number(average, 4) + extremes, format_number(average / value, 2) if value else "–"]
         rows.append(row)
     return rows
 

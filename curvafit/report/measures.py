@@ -94,7 +94,7 @@ def write_measures(
     names, rows = name_parts(parts), []
     for scan_parts, row in zip(compartments, columns, strict=True):
         for part in scan_parts:
-            cells = (_format_cell(part[symbol]) for symbol in symbols)
+            cells = (part[symbol].format(unit)[:2] for symbol in symbols)
             rows.append([names[len(rows)], *(row.get(title, "") for title in titles), *cells])
     scans = [{"scan": scan.source, "kind": scan.kind, "notes": scan.notes} for scan in measures]
     facts = {"status": describe_range(parts), "scans": scans, "notes": list(count_notes(parts))}
@@ -134,11 +134,6 @@ def _format_line(quantity: Quantity, unit: str) -> tuple[str, str, str]:
     if quantity.symbol.startswith("N."):
         return f"{quantity.value:.0f}", "", ""
     return quantity.format(unit)
-
-
-def _format_cell(quantity: Quantity) -> tuple[str, str]:
-    half = f"± {format_number(quantity.half, 2)}" if math.isfinite(quantity.half) else ""
-    return format_number(quantity.value), half
 
 
 def describe_range(parts: Sequence[Measures]) -> str:

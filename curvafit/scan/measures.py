@@ -75,8 +75,9 @@ class Quantity:
     power: int
 
     def format(self, unit: str) -> tuple[str, str, str]:
-        """Return the number, its interval and its unit as text, of a scan in `unit`."""
-        return format_number(self.value, 4), f"± {format_number(self.half, 2)}", power_name(unit, self.power)
+        """Return the number, its interval where there is one, and its unit as text, of a scan in `unit`."""
+        half = f"± {format_number(self.half, 2)}" if math.isfinite(self.half) else ""
+        return format_number(self.value, 4), half, power_name(unit, self.power)
 
 
 #: Name, symbol and power of each quantity, and how it comes from sums.

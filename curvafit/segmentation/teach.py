@@ -159,8 +159,7 @@ class Batches(Dataset, ABC):
 @dataclass(frozen=True, eq=False)
 class Lessons(Batches):
     """Batches of `size` gaps in windows of shapes; batch k depends on (seed, k) alone. Each of the `sources` of shapes
-    is drawn as often as the others; `edge` pixels of a window's side count for the loss. `count` slices are filled, and
-    slices lie `step` pixels apart: by default both are drawn."""
+    is drawn as often as the others; `edge` pixels of a window's side count for the loss."""
 
     sources: Sequence[Sequence[Texture]]
     mix: Mix
@@ -169,15 +168,13 @@ class Lessons(Batches):
     size: int = 8
     edge: int = 80
     halo: int = HALO
-    count: int | None = None
-    step: float | None = None
 
     def __getitem__(self, number: int) -> Lesson:
         rng = np.random.default_rng([self.seed, number])
-        count = self.count or int(rng.integers(1, self.mix.most + 1))
+        count = int(rng.integers(1, self.mix.most + 1))
         gaps: list[tuple[np.ndarray, float, np.ndarray, np.ndarray]] = []
         while len(gaps) < self.size:
-            step = self.step or self._draw_step(rng, count)
+            step = self._draw_step(rng, count)
             window = self._draw_window(rng, count, step)
             answer = window[2:-2][self.inner]
             if answer.any() and not answer.all():  # else there is nothing to learn

@@ -10,12 +10,12 @@ from kernel_cases import rough
 from shapes import grown
 from torch.testing import assert_close
 
+from curvafit.generation.result import viability
 from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.curvature import Jet, diffuse_curvatures, jet, second_form
 from curvafit.priors.energies import (
     cahn_hilliard_area,
-    discrepancy_ratio,
     energy,
     energy_gradient,
     energy_gradient_by_autograd,
@@ -222,9 +222,9 @@ def test_cahn_hilliard_area_of_a_plane_from_below() -> None:
 def test_discrepancy_is_zero_for_the_profile_and_one_for_a_constant() -> None:
     ε, grid = 0.1, Grid((200, 4, 4), (0.01, 0.1, 0.1), "replicate")
     u, steep = (optimal_profile(centres(grid)[..., 0] - 1.0, width) for width in (ε, ε / 2))
-    assert float(discrepancy_ratio(u, grid, ε)) < 0.01
-    assert float(discrepancy_ratio(torch.full_like(u, -0.6), grid, ε)) == pytest.approx(1)
-    assert 0.5 < float(discrepancy_ratio(steep, grid, ε)) < 1
+    assert viability(u, grid, ε).discrepancy < 0.01
+    assert viability(torch.full_like(u, -0.6), grid, ε).discrepancy == pytest.approx(1)
+    assert 0.5 < viability(steep, grid, ε).discrepancy < 1
 
 
 # ---- convergence -----------------------------------------------------------------------------------------------------
@@ -328,7 +328,7 @@ def test_a_width_that_varies_is_each_width_where_it_holds(grid: Grid) -> None:
     parts = [((half == ε).double(), float(ε)) for ε in half.unique()]  # where each width holds, and it
     terms = [energy(u, Coefficients(1e-30, 0, 1e-30, a00=2.0 * mask), grid, ε) for mask, ε in parts]
     assert_close(energy(u, a00, grid, half), sum(terms), rtol=1e-12, atol=0)
-    assert 0 < float(discrepancy_ratio(u, grid, half)) <= 1
+    assert 0 < viability(u, grid, half.expand(grid.shape)).discrepancy <= 1
     two = torch.stack([u, u])
     each = torch.stack([energy(u, UNEQUAL, grid, ε) for ε in (0.5, 0.8)])
     batch = torch.tensor([0.5, 0.8], dtype=torch.float64)[:, None, None, None]
