@@ -72,13 +72,14 @@ def compare(
         page = write_comparison(comparison, out, panels=shown, command=command_line(), overwrite=overwrite)
     say_notes(comparison.notes)
     say(comparison.status, style="bold")
-    from curvafit.core.units import format_number
+    from curvafit.core.units import format_number, power_name
 
     rows = []
     for number in comparison.numbers:
         estimates = number.means or (number.difference,)  # the mean of each group, or the slope
         values = (*estimates, number.effect, number.p, number.family)
-        rows.append((number.name, number.symbol, *map(format_number, values)))
-    head = ("", "", *(comparison.groups or ("slope",)), comparison.effect, "p", "family-wise p")
-    print_table(head, rows, right=range(2, len(head)))
+        unit = power_name(comparison.unit, number.power) if number.means else ""
+        rows.append((number.name, number.symbol, unit, *map(format_number, values)))
+    head = ("", "", "", *(comparison.groups or ("slope",)), comparison.effect, "p", "family-wise p")
+    print_table(head, rows, right=range(3, len(head)))
     say(str(page))

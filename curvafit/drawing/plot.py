@@ -345,13 +345,13 @@ def corner_figure(
     """
     d = draws.shape[1]
     figure = make_figure(_SQUARE * d + 0.7, _SQUARE * d + 0.6)
-    grid = figure.add_gridspec(d, d, left=0.09, right=0.985, bottom=0.085, top=0.985, wspace=0.09, hspace=0.09)
+    grid = figure.add_gridspec(d, d, left=0.09, right=0.985, bottom=0.085, top=0.985, wspace=0.16, hspace=0.16)
     styles = list(zip(marks.items(), ((CONTOUR, "o"), (INK, "x"), (QUIET, "+")), strict=False))
     for row, column in [(i, j) for i in range(d) for j in range(i + 1)]:
         axes = figure.add_subplot(grid[row, column])
         axes.set_xlim(limits[column])
         axes.spines[:].set_color(QUIET)
-        axes.tick_params(length=2, labelsize=8)
+        axes.tick_params(length=2, labelsize=7)
         axes.xaxis.set_major_locator(MaxNLocator(2, prune="both"))
         axes.set_xlabel(names[column], fontsize=11)
         if row == column:

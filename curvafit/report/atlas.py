@@ -274,7 +274,7 @@ def _map_figure(
         choices.append({"label": f"colour: {title}", "method": "restyle", "args": [{"visible": visible}]})
     menu = {"buttons": choices, "x": 0, "y": 1.07, "xanchor": "left", "yanchor": "bottom", "bgcolor": "white"}
     first, second = (
-        {"title": f"{rank} main direction of the diagrams, in 1/thickness ({fraction:.0%} of variance)"}
+        {"title": f"{rank} direction, {fraction:.0%} of the variance"}
         for rank, fraction in zip(("first", "second"), fractions, strict=True)
     )
     small = {"title_font_size": 13}
