@@ -16,12 +16,12 @@ from curvafit.priors.coefficients import POWERS, Coefficients, check_strengths
 from curvafit.priors.grid import WORKING_EPSILON, Float, Grid
 from curvafit.priors.kernels.differentiable import energies
 from curvafit.priors.law import Law, LawLike, read_laws
-from curvafit.priors.stencils import refine_axis
+from curvafit.priors.profile import refine_profile
 
 #: Voxels that ε spans; an axis on which it spans fewer, by more than a tenth, is refined, at most `FINEST`-fold.
 RESOLVED, FINEST = 2, 16
-#: Voxels are at most so many ε long if their energy, interpolated, is to be that of fine ones within some per cent.
-LONGEST = 1.1
+#: Voxels are at most so many ε long if their energy, interpolated, is to be that of fine ones within a fifth.
+LONGEST = 2.05
 #: The greatest ε in voxels of the smallest edge; no window is longer.
 COARSEST = 10_000
 #: The greatest weight, or value of a mask, whose products float32 holds.
@@ -68,9 +68,9 @@ class CurvaturePrior(nn.Module):
     epsilon
         ε in spacing's unit; twice the smallest edge by default. Structures thinner than twice the smallest edge do not
         survive. An axis on which ε spans fewer than two voxels, by more than a tenth, is interpolated, and a warning
-        says so. Up to voxels as long as ε the energy is that of fine ones within 3 %; where they are longer by more
-        than a tenth it is larger (up to 1.7-fold at 1.5 ε), and the warning says that. A refinement of more than
-        16-fold is refused, and so is an ε longer than the window.
+        says so. Up to voxels as long as ε the energy is that of fine ones within 4 %, up to 2 ε within 20 %; where they
+        are longer it is up to 2 times larger, and the warning says that. A refinement of more than 16-fold is refused,
+        and so is an ε longer than the window.
     weight
         A factor, or one for each class; classes of weight 0 are not computed.
     border
@@ -123,7 +123,7 @@ class CurvaturePrior(nn.Module):
             axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", refinement, strict=True) if n > 1)
             message = f"ε = {self.epsilon:g} spans fewer than 2 voxels: interpolating {axes}"
             if longest > LONGEST * self.epsilon:
-                message += f"; voxels longer than ε inflate F_ε, 1.7-fold at 1.5 ε: state an ε of {longest:g} or more"
+                message += f"; voxels longer than 2 ε inflate F_ε, 2-fold at 4 ε: state an ε of {longest / 2:g} or more"
             warnings.warn(message, stacklevel=2)
 
     def extra_repr(self) -> str:
@@ -347,8 +347,8 @@ def curvature_prior(
     law
         `Coefficients` in spacing's unit, a preset's name, or a fit or its path, as in `CurvaturePrior`.
     spacing, epsilon
-        Voxel edges (z, y, x), and ε in their unit. An axis whose voxels are longer than .55 ε is refined by spline
-        interpolation until they are ε / 2 or shorter.
+        Voxel edges (z, y, x), and ε in their unit. An axis whose voxels are longer than .55 ε is interpolated
+        (`refine_profile`) until they are ε / 2 or shorter.
     mask
         Weights of the energy's density.
     normalize
@@ -432,9 +432,10 @@ def _measure_window(
     u, inside = 2 * probability - 1, probability.new_zeros(shape)
     inside[tuple(slice(border, n - border) for n in shape)].fill_(1)
     weights = inside[None] if mask is None else inside * mask.to(inside)
-    for axis, n in enumerate(refinement):
-        if n > 1:
-            u, weights = refine_axis(u, axis, n), weights.repeat_interleave(n, axis - 3)
+    if max(refinement) > 1:
+        u = refine_profile(u, refinement)
+        for axis, n in enumerate(refinement):
+            weights = weights.repeat_interleave(n, axis - 3)
     # In working units, where ξ and the floor under the root are small, whatever the unit of length.
     unit = epsilon / WORKING_EPSILON
     edges = tuple(h / n / unit for h, n in zip(spacing, refinement, strict=True))

@@ -14,6 +14,7 @@ from torch.testing import assert_close
 from curvafit.priors import Coefficients, CurvaturePrior, Grid, curvature_prior, energy, optimal_profile
 from curvafit.priors.coefficients import NAMES
 from curvafit.priors.loss import choose_refinement
+from curvafit.priors.profile import refine_profile
 from curvafit.priors.stencils import gaussian_blur, refine_axis
 
 pytestmark = pytest.mark.filterwarnings("ignore:ε = .* interpolating", "ignore:a20 > 0")
@@ -129,9 +130,9 @@ def test_the_quintic_spline_is_of_sixth_order_under_mirrors(times):
 
 @pytest.mark.parametrize("law", [Coefficients.willmore(), Coefficients(1, 2, 6, -0.4, -0.4, 0.04)])
 @pytest.mark.parametrize("turn", [0.0, 0.9])
-def test_thick_slices_up_to_epsilon_keep_the_energy(law, turn):
+def test_thick_slices_up_to_four_edges_keep_the_energy(law, turn):
     """An exact torus, ε = 2, along z and turned: slices of 1.5 and 2, refined to .75 and 1, where the stencils' own
-    error, of the order of (Δ/ε)², parts by 3 %; twice as thick as ε they are said."""
+    error, of the order of (Δ/ε)², parts by 3 %; of 4, within a fifth; thicker ones are said."""
 
     def total(step: float) -> float:
         z, y, x = radii((int(48 // step), 48, 48), (step, 1.0, 1.0))
@@ -142,17 +143,17 @@ def test_thick_slices_up_to_epsilon_keep_the_energy(law, turn):
         )
 
     fine = total(1.0)
-    for step in (1.5, 2.0):
-        assert total(step) == pytest.approx(fine, rel=0.05)
+    for step, most in ((1.5, 0.05), (2.0, 0.05), (4.0, 0.2)):
+        assert total(step) == pytest.approx(fine, rel=most)
     with pytest.warns(UserWarning, match="inflate"):
-        total(4.0)
+        total(6.0)
 
 
 @types
 @pytest.mark.parametrize("normalize", [True, False])
 def test_an_interpolated_axis_is_a_finer_grid(dtype, normalize):
     p, mask = probabilities(2, 8, 10, 10).to(dtype), noise(2, 8, 10, 10).abs().to(dtype)
-    fine, parts = (refine_axis(2 * p - 1, 0, 3) + 1) / 2, mask.repeat_interleave(3, 1)
+    fine, parts = (refine_profile(2 * p - 1, (3, 1, 1)) + 1) / 2, mask.repeat_interleave(3, 1)
     options = {"normalize": normalize, "border": 0}
     found = curvature_prior(p, LAW, (3.0, 1.0, 1.0), 2.0, mask=mask, **options)
     expected = curvature_prior(fine, LAW, (1.0, 1.0, 1.0), 2.0, mask=parts, **options)
