@@ -4,7 +4,7 @@ A volume of 64³ (twelve random laws, `trabec`, two bones, mitochondria: each te
 blurred, under noise of two contrasts; slices 21 and 42 are annotated. `plain` learns them alone; `pseudo` what
 `reconstruct --image` fills, each voxel as sure as it is; the others start as `pseudo` does, and from the second third
 on add a form of the energy (`benchmarks.forms`) of all voxels: `area`, `willmore`, the law of another volume's mask
-(`law`; `law+mass`, with the mean held at that law's mass; `levels`; `distance`), or another texture's law (`wrong`).
+(`law`; `law+mass`, with the mean held at that law's mass), or another texture's law (`wrong`, at the share of `law`).
 `flow` learns, from then on and renewed twice, the mask to which F_ε is lowered from what the network says, and `refine`
 does so once, afterwards (`segment --probabilities`). `filled` is no network.
 
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import argparse
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import product
 
@@ -48,9 +48,9 @@ KNOWN, SLAB, UNKNOWN = (21, 42), range(50, 58), 2
 #: The seeds of a volume and of the one whose law is read.
 SEED, OTHER = 2, 3
 STEPS, RATE, PATCH, NOISE, BLUR, WARM = 240, 6e-3, 48, 2.0, 0.7, 24
-LAW_FORMS = {"law": "product", "law+mass": "product", "levels": "levels", "distance": "distance", "wrong": "product"}
+LAW_FORMS = {"law": "product", "law+mass": "product", "wrong": "product"}
 FORMS = {"area": "area", "willmore": "willmore"} | LAW_FORMS
-SHARES = (0.03, 0.1, 0.3, 1.0)
+SHARES = (0.1, 1.0, 3.0, 10.0)
 #: Ways that lower F_ε, and their weights, in multiples of `segment`'s default.
 LOWERING, WEIGHTS = ("flow", "refine"), (0.1, 0.3, 1.0, 3.0)
 WAYS = ("plain", "filled", "pseudo", *FORMS, *LOWERING)
@@ -278,38 +278,43 @@ def options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore", category=UserWarning)
-    steps, ways = (6, ("pseudo", "levels")) if cases.quick else (STEPS, tuple(options.ways.split(",")))
+    steps, ways = (6, ("pseudo", "law+mass")) if cases.quick else (STEPS, tuple(options.ways.split(",")))
     part, parts = map(int, options.share.split("/"))
 
-    def scored(way: str, share: float, textures: Iterable[str]) -> None:
-        cases.all({f"{texture}-{way}-{share:g}-{steps}": partial(case, way, share, texture, steps, cases)
-                   for texture in textures})  # fmt: skip
+    def scored(way: str, share: float, textures: Sequence[str]) -> list[Values]:
+        """Make this process's part; return the values of all textures, if all are there."""
+        names = {texture: f"{texture}-{way}-{share:g}-{steps}" for texture in textures}
+        cases.all(
+            {names[texture]: partial(case, way, share, texture, steps, cases) for texture in textures[part::parts]}
+        )
+        rows = [cases.kept[name]["values"] for name in names.values() if name in cases.kept]
+        return rows if len(rows) == len(textures) else []
 
-    def kept(way: str, share: float, textures: Iterable[str]) -> list[Values]:
-        names = (f"{texture}-{way}-{share:g}-{steps}" for texture in textures)
-        return [cases.kept[name]["values"] for name in names if name in cases.kept]
-
-    tried = {way: WEIGHTS if way in LOWERING else SHARES if way in FORMS else (0.0,) for way in ways}
-    chosen = {way: shares[0] for way, shares in tried.items()}
-    for way, shares in tried.items():
-        if len(shares) == 1 or cases.quick:
-            continue
-        for share in shares:
-            scored(way, share, TUNING[part::parts])
-        slabs = {share: [values["slab"] for values in kept(way, share, TUNING)] for share in shares}
-        if any(len(rows) < len(TUNING) for rows in slabs.values()):
-            chosen.pop(way)
-            continue
-        chosen[way] = max(slabs, key=lambda share: float(np.mean(slabs[share])))
-        show(["share", *TUNING], [[f"{share:g}", *rows] for share, rows in slabs.items()], way)
-    for way, share in chosen.items():
-        scored(way, share, TEXTURES[:1] if cases.quick else TEXTURES[part::parts])
-    found = {way: kept(way, share, TEXTURES) for way, share in chosen.items()}
-    found = {way: rows for way, rows in found.items() if len(rows) == len(TEXTURES)}
-    if cases.quick or "pseudo" not in found:
+    chosen = dict.fromkeys(ways, SHARES[0]) if cases.quick else choose(ways, scored)
+    found = {way: scored(way, share, TEXTURES[: 1 if cases.quick else None]) for way, share in chosen.items()}
+    if cases.quick or not found.get("pseudo"):
         return {}
-    table = {way: np.array([[row[key] for key in KEYS] for row in rows]) for way, rows in found.items()}
+    table = {way: np.array([[row[key] for key in KEYS] for row in rows]) for way, rows in found.items() if rows}
     show(["way", "share", *KEYS], [[way, f"{chosen[way]:g}", *rows.mean(0).tolist()] for way, rows in table.items()])
+    return compare_ways(table)
+
+
+def choose(ways: Sequence[str], scored: Callable[[str, float, Sequence[str]], list[Values]]) -> dict[str, float]:
+    """Return the share of each way that is best on the slabs; without ways of which not all is made."""
+    chosen = {}
+    for way in ways:
+        shares = WEIGHTS if way in LOWERING else SHARES if way in FORMS and way != "wrong" else (0.0,)
+        slabs = {share: [row["slab"] for row in scored(way, share, TUNING)] if share else [0.0] for share in shares}
+        if all(slabs.values()):
+            chosen[way] = max(slabs, key=lambda share: float(np.mean(slabs[share])))
+            if len(slabs) > 1:
+                show(["share", *TUNING], [[f"{share:g}", *rows] for share, rows in slabs.items()], way)
+    return chosen | ({"wrong": chosen["law"]} if "wrong" in ways and "law" in chosen else {})
+
+
+def compare_ways(table: dict[str, np.ndarray]) -> dict[str, Figure]:
+    """Return gains on `pseudo`, and what laws gain on rivals, in points of Dice: with p, and with the gain that a
+    paired test of so many textures, which spread so, finds with a probability of .8."""
     figures = {f"networks.{way}.{key}": bootstrap(rows[:, k] - table["pseudo"][:, k], np.mean)
                for way, rows in table.items() if way != "pseudo" for k, key in enumerate(KEYS)}  # fmt: skip
     for way, rival in product(table, ("area", "willmore", "wrong")):
@@ -318,7 +323,6 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
         less = 100 * (table[way] - table[rival])[:, 0]
         figures[f"networks.{way}_less_{rival}"] = bootstrap(less, np.mean)
         figures[f"networks.{way}_less_{rival}.p"] = Figure(float(stats.wilcoxon(less)[1]))
-        # What a paired test of sixteen textures finds with a probability of .8, at a level of .05.
         figures[f"networks.{way}_less_{rival}.power"] = Figure(float(2.8 * less.std(ddof=1) / len(less) ** 0.5))
     show(["figure", "value"], list(figures.items()))
     return figures

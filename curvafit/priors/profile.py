@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +15,7 @@ from curvafit.priors.stencils import gaussian_blur, refine_axis
 SIGMA = 4 / (3 * math.sqrt(2))
 
 #: By how much a phase field is scaled before its distance is taken, which is infinite at ±1.
-TOLD = 0.9
+TOLD = 0.88
 #: Deviation, in voxels, of the Gaussian that smooths a mask's stairs.
 STAIRS = 2.0
 #: Number, strength and width (voxels) of the corrections where the smoothing changed the sign.
@@ -58,8 +59,8 @@ def signed_distance(
     return _measure_distance(~inside, grid, cutoff) - _measure_distance(inside, grid, cutoff)
 
 
-def refine_profile(u: Float[Tensor, "*batch z y x"], times: tuple[int, int, int]) -> Float[Tensor, "*batch Z Y X"]:
-    """Return a phase field with every voxel along (z, y, x) split into so many; differentiable.
+def refine_profile(u: Tensor, times: tuple[Any, Any, Any]) -> Tensor:
+    """Return a phase field `(..., Z, Y, X)` with every voxel along (z, y, x) split into so many; differentiable.
 
     What is interpolated is the distance that the profile states, artanh u: between slices thicker than ε the profile
     jumps, and a spline through its values swings, but the distance is nearly linear. That of ±1 is that of ±`TOLD`.
