@@ -4,9 +4,10 @@ A volume of 64³ (twelve random laws, `trabec`, two bones, mitochondria: each te
 blurred, under noise of two contrasts; slices 21 and 42 are annotated. `plain` learns them alone; `pseudo` what
 `reconstruct --image` fills, each voxel as sure as it is; the others start as `pseudo` does, and from the second third
 on add a form of the energy (`benchmarks.forms`) of all voxels: `area`, `willmore`, the law of another volume's mask
-(`law`; `law+mass`, with the mean held at that law's mass), or another texture's law (`wrong`, at the share of `law`).
-`flow` learns, from then on and renewed twice, the mask to which F_ε is lowered from what the network says, and `refine`
-does so once, afterwards (`segment --probabilities`). `filled` is no network.
+(`law`), or another texture's (`wrong`, at the share of `law`). `…+volume` holds the mean of p besides, at the fraction
+of the volume that the law was read from (of a network's sharp p that is the mass of the paper's flow), and `volume`
+does that alone. `flow` learns, from then on and renewed twice, the mask to which F_ε is lowered from what the network
+says, and `refine` does so once, afterwards (`segment --probabilities`). `filled` is no network.
 
 Shares of the gradient (of `flow` and `refine` weights) are chosen for each way by eight slices, `SLAB`, of four other
 random laws. Dice counts the slices that nobody annotated.
@@ -48,8 +49,8 @@ KNOWN, SLAB, UNKNOWN = (21, 42), range(50, 58), 2
 #: The seeds of a volume and of the one whose law is read.
 SEED, OTHER = 2, 3
 STEPS, RATE, PATCH, NOISE, BLUR, WARM = 240, 6e-3, 48, 2.0, 0.7, 24
-LAW_FORMS = {"law": "product", "law+mass": "product", "wrong": "product"}
-FORMS = {"area": "area", "willmore": "willmore"} | LAW_FORMS
+LAW_FORMS = {"law": "product", "law+volume": "product", "wrong": "product"}
+FORMS = {"area": "area", "area+volume": "area", "willmore": "willmore", "volume": ""} | LAW_FORMS
 SHARES = (0.1, 1.0, 3.0, 10.0)
 #: Ways that lower F_ε, and their weights, in multiples of `segment`'s default.
 LOWERING, WEIGHTS = ("flow", "refine"), (0.1, 0.3, 1.0, 3.0)
@@ -85,16 +86,13 @@ def annotated(truth: np.ndarray, slices: Iterable[int]) -> np.ndarray:
     return target
 
 
-def law_of(texture: str, cases: Cases) -> tuple[Coefficients, float]:
-    """Return the law of another volume's mask with lengths in voxels, and its mass."""
-    if texture in BLOCKS:
-        mask = truth_of(texture, cases, OTHER).astype(np.uint8)
-        path = cases.text(f"fit-{texture}.json", lambda: infer(mask, kind="mask", growth=None).fit.to_json())
-        fit = Fit.load(path)
-    else:
-        fit = fitted(texture, OTHER, cases)
-    assert fit.best is not None
-    return Law.of(fit).in_unit(None, 1.0), float(fit.best.mass)
+def law_of(texture: str, cases: Cases) -> Coefficients:
+    """Return the law of another volume's mask with lengths in voxels."""
+    if texture not in BLOCKS:
+        return Law.of(fitted(texture, OTHER, cases)).in_unit(None, 1.0)
+    mask = truth_of(texture, cases, OTHER).astype(np.uint8)
+    path = cases.text(f"fit-{texture}.json", lambda: infer(mask, kind="mask", growth=None).fit.to_json())
+    return Law.of(Fit.load(path)).in_unit(None, 1.0)
 
 
 def filled(texture: str, cases: Cases) -> np.ndarray:
@@ -202,21 +200,22 @@ def train(way: str, share: float, texture: str, steps: int, cases: Cases) -> np.
     base = dice_ce if way == "plain" else soft_loss
     others = (*TEXTURES, *TUNING)
     source = others[(others.index(texture) + 1) % len(others)] if way == "wrong" else texture
-    law, mass = law_of(source, cases) if way in LAW_FORMS or way == "flow" else (Coefficients.willmore(), 0.0)
+    law = law_of(source, cases) if way in LAW_FORMS or way == "flow" else Coefficients.willmore()
+    fraction = float(truth_of(texture, cases, OTHER).mean())
     lesson, losses = [lessons(image, target, SEED)], list[Loss]()
 
     def loss_at(step: int) -> Loss:
         if way in FORMS and step == steps // 3:
-            form = form_of(FORMS[way], tuple(law))
+            form = form_of(FORMS[way], tuple(law)) if FORMS[way] else lambda z: z.sum() * 0
             pairs = [(predict(net, x).detach(), y) for x, y in map(lesson[0], range(-5, 0))]
-            weight = share * float(np.median([norm(soft_loss, *pair) / norm(lambda z, _: form(z[0, 0]), *pair)
+            weight = share and share * float(np.median([norm(soft_loss, *pair) / norm(lambda z, _: form(z[0, 0]), *pair)
                                               for pair in pairs]))  # fmt: skip
 
             def both(logits: Tensor, y: Tensor, begun: int = steps // 3) -> Tensor:
                 grown = min(1.0, (counted[0] - begun) / WARM)
                 loss = base(logits, y) + grown * weight * form(logits[0, 0])
-                if way.endswith("+mass"):
-                    loss = loss + FIRM * ((2 * logits.sigmoid() - 1).mean() - mass) ** 2
+                if way.endswith("volume"):
+                    loss = loss + 4 * FIRM * (logits.sigmoid().mean() - fraction) ** 2
                 return loss
 
             losses.append(both)
@@ -253,7 +252,7 @@ def case(way: str, share: float, texture: str, steps: int, cases: Cases) -> Valu
         p = filled(texture, cases)
     else:
         p = predicted("pseudo" if way == "refine" else way, 0.0 if way == "refine" else share, texture, steps, cases)
-    mask = lowered(p, law_of(texture, cases)[0], share) if way == "refine" else p > 0.5
+    mask = lowered(p, law_of(texture, cases), share) if way == "refine" else p > 0.5
     rest = np.setdiff1d(np.arange(len(truth)), KNOWN)
     return {"dice": dice(mask[rest], truth[rest]), "betti": scores(mask, truth)["betti"], "cldice": cldice(mask, truth),
             "slab": dice(mask[SLAB], truth[SLAB])}  # fmt: skip
@@ -278,7 +277,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore", category=UserWarning)
-    steps, ways = (6, ("pseudo", "law+mass")) if cases.quick else (STEPS, tuple(options.ways.split(",")))
+    steps, ways = (6, ("pseudo", "law+volume")) if cases.quick else (STEPS, tuple(options.ways.split(",")))
     part, parts = map(int, options.share.split("/"))
 
     def scored(way: str, share: float, textures: Sequence[str]) -> list[Values]:
@@ -303,7 +302,7 @@ def choose(ways: Sequence[str], scored: Callable[[str, float, Sequence[str]], li
     """Return the share of each way that is best on the slabs; without ways of which not all is made."""
     chosen = {}
     for way in ways:
-        shares = WEIGHTS if way in LOWERING else SHARES if way in FORMS and way != "wrong" else (0.0,)
+        shares = WEIGHTS if way in LOWERING else SHARES if way in FORMS and way not in ("wrong", "volume") else (0.0,)
         slabs = {share: [row["slab"] for row in scored(way, share, TUNING)] if share else [0.0] for share in shares}
         if all(slabs.values()):
             chosen[way] = max(slabs, key=lambda share: float(np.mean(slabs[share])))
@@ -317,7 +316,7 @@ def compare_ways(table: dict[str, np.ndarray]) -> dict[str, Figure]:
     paired test of so many textures, which spread so, finds with a probability of .8."""
     figures = {f"networks.{way}.{key}": bootstrap(rows[:, k] - table["pseudo"][:, k], np.mean)
                for way, rows in table.items() if way != "pseudo" for k, key in enumerate(KEYS)}  # fmt: skip
-    for way, rival in product(table, ("area", "willmore", "wrong")):
+    for way, rival in product(table, ("area", "willmore", "wrong", "area+volume", "volume")):
         if way not in (*LAW_FORMS, *LOWERING) or rival not in table or way == rival:
             continue
         less = 100 * (table[way] - table[rival])[:, 0]
