@@ -209,6 +209,37 @@ def diffuse_integrals(shape: Shape, epsilon: float, reach: float, nodes: int = 4
     return sum(part * shape.integrals(at) for part, at in zip(density, d, strict=True)) / SIGMA
 
 
+def recovery_profile(distance: Tensor, epsilon: float) -> Tensor:
+    """The profile γ_ε of the paper's recovery sequence (Appendix): tanh, then a parabolic arc, then ±1."""
+    ε, s = epsilon, distance.abs()
+    b, c = recovery_ends(ε)
+    arc = 1 - (s - c) ** 2 / (1 + ε**2) ** 3
+    ends = torch.where(s < c, arc, torch.ones_like(s))
+    return torch.sign(distance) * torch.where(s < b, torch.tanh(s / (math.sqrt(2) * ε)), ends)
+
+
+def recovery_ends(epsilon: float) -> tuple[float, float]:
+    """Where the arc of `recovery_profile` begins and ends."""
+    begins = math.sqrt(2) * epsilon * abs(math.log(epsilon))
+    return begins, begins + math.sqrt(2) * (epsilon + epsilon**3)
+
+
+def recovery_integrals(shape: "Torus", epsilon: float, nodes: int = 60, around: int = 48) -> np.ndarray:
+    """The six terms of F_ε / σ of the recovery sequence's field on a torus, by exact jets at Gauss points."""
+    x, w = np.polynomial.legendre.leggauss(nodes)
+    b, c = recovery_ends(epsilon)
+    pieces = [(low, high) for end in (1, -1) for low, high in sorted(((0, end * b), (end * b, end * c)))]
+    d = np.concatenate([(high + low + (high - low) * x) / 2 for low, high in map(sorted, pieces)])
+    weights = np.concatenate([abs(high - low) * w / 2 for low, high in pieces])
+    angle = 2 * math.pi * np.arange(around) / around
+    minor = (shape.minor - d)[:, None]
+    wide = shape.major + minor * np.cos(angle)
+    points = np.stack([minor * np.sin(angle), np.zeros_like(wide), wide], -1)
+    area = torch.from_numpy(weights[:, None] * (2 * math.pi) ** 2 / around * wide * minor)
+    field = exact_jet(lambda p: recovery_profile(shape.distance(p), epsilon), torch.from_numpy(points)[None])
+    return (energy_terms(field, epsilon)[..., 0, :, :] * area).sum((-2, -1)).numpy() / SIGMA
+
+
 def grid_integrals(shape: Torus, epsilon: float, h: float) -> np.ndarray:
     """The six terms of F_ε / σ of a torus's profile on a grid of spacing h: an octant, mirrored."""
     tall, wide = (math.ceil((r + 6 * epsilon) / h) for r in (shape.minor, shape.major + shape.minor))

@@ -5,7 +5,17 @@ import math
 import numpy as np
 import pytest
 import torch
-from exact import Torus, centres, diffuse_integrals, exact_jet, grid_integrals, profile
+from exact import (
+    Torus,
+    centres,
+    diffuse_integrals,
+    exact_jet,
+    grid_integrals,
+    profile,
+    recovery_ends,
+    recovery_integrals,
+    recovery_profile,
+)
 from kernel_cases import rough
 from shapes import grown
 from torch.testing import assert_close
@@ -244,6 +254,24 @@ def test_limit_in_epsilon_with_spacing_epsilon_squared() -> None:
     assert ((orders[[0, 2, 3, 5]] > 1.8) & (orders[[0, 2, 3, 5]] < 2.8)).all()
     assert (errors[:, [0, 2]] > 0).all() and (errors[:, 5] < 0).all()
     assert np.abs(errors[-1]).max() < 0.02 * TORUS.integrals().max()
+
+
+def test_the_recovery_sequence_of_the_theorem_attains_the_sharp_energy_with_order_2() -> None:
+    """Theorem 1, on a torus: the arc joins tanh and ±1 with their values and slopes, and all six terms of F_ε / σ tend
+    to ∫ κ^α dA."""
+    for ε in (0.1, 0.01):
+        for end in recovery_ends(ε):
+            near = torch.tensor([end - 1e-7, end + 1e-7], dtype=torch.float64, requires_grad=True)
+            value = recovery_profile(near, ε)
+            (slope,) = torch.autograd.grad(value.sum(), near)
+            assert_close(value[0], value[1], rtol=0, atol=1e-5)
+            assert_close(slope[0], slope[1], rtol=0, atol=1e-4)
+    widths = (0.04, 0.02, 0.01)
+    errors = np.abs([recovery_integrals(TORUS, ε) - TORUS.integrals() for ε in widths])
+    least = 1e-3 * TORUS.integrals().max()  # below, nothing is left to fall: ∫κ1κ2 = 0
+    orders = np.log2(errors[:-1] / errors[1:])
+    assert (errors[-1] < least).all()
+    assert (orders[errors[:-1] > least] > 1.6).all() and (errors[0] > least).any()
 
 
 def test_order_in_the_spacing() -> None:
