@@ -4,6 +4,7 @@
 - `levels`: ∫ p(κ1, κ2) |∇p| with the curvatures of the level sets of p: by the co-area formula the mean of the sharp
   energy over all of them.
 - `distance`: F_ε of tanh(d / √2ε), d = z / |∇z|, which does not know how steep the logits z are.
+- `mask`: F_ε of the phase field of p > 1/2, which has no gradient: a number to watch.
 - `flow`: no loss but `segment`, which lowers F_ε of the law by a flow that holds nothing; its weight in hindsight, too.
 - `…+mass`: with the mean of u held at the law's mass, as in the paper's flow.
 
@@ -35,6 +36,7 @@ from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.curvature import jet
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import Law
+from curvafit.priors.profile import phase_field
 from curvafit.segmentation.segmentation import segment
 from curvafit.segmentation.trials import dice
 
@@ -43,7 +45,7 @@ EDGE, SEED, EPSILON, NOISE, BLUR = 40, 2, 2.0, 2.0, 0.7
 FORMS = ("area", "willmore", "product", "levels", "distance")
 WAYS = (*FORMS, *(f"{form}+mass" for form in FORMS))
 #: Shares of the gradient that hindsight chooses from, widths of a Gaussian in voxels, and steps.
-SHARES, WIDTHS, STEPS, RATE = (0.1, 0.3, 1.0, 3.0, 10.0), (1.0, 1.5, 2.0, 2.5, 3.0), 250, 0.1
+SHARES, WIDTHS, STEPS, RATE = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0), (1.0, 1.5, 2.0, 2.5, 3.0), 250, 0.1
 #: Weights of `segment`, in multiples of its default.
 FLOWS = (0.3, 1.0, 3.0)
 #: Slopes of logits: the profile of ε, and a confident network's. How firmly a mass is held; widths of flat logits.
@@ -81,6 +83,8 @@ def form_of(way: str, law: tuple[float, ...]) -> Form:
         elif form == "distance":
             slope = (jet(z, grid).gradient.square().sum(-4) + FLAT).sqrt()
             value = energy((2**0.5 / EPSILON * z / slope).sigmoid()[None, None])  # tanh(d / √2ε) = 2 σ(√2 d / ε) - 1
+        elif form == "mask":
+            value = energy((phase_field(z > 0, grid, EPSILON)[None, None] + 1) / 2)
         else:
             value = energy(p[None, None])
         return value
@@ -218,7 +222,7 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     shares = dict.fromkeys(ways, SHARES[2:3] if cases.quick else SHARES)
     shares |= {"smoothing": WIDTHS, "flow": FLOWS, "flow willmore": FLOWS}
     told: dict[str, list[Values]] = {}
-    for way, texture in product(FORMS, textures if not cases.quick else ()):
+    for way, texture in product((*FORMS, "mask"), textures if not cases.quick else ()):
         made = cases.all({f"value-{way}-{texture}": partial(value_case, way, texture, cases)})
         told.setdefault(way, []).extend(made.values())
     left = {way: list(cases.all({f"alone-{way}-{texture}": partial(alone_case, way, texture, cases)
@@ -230,7 +234,8 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
         made = cases.all(jobs)
         if len(made) == len(jobs):
             gained.setdefault(way, []).append(max(values["dice"] for values in made.values()))
-    figures: dict[str, Figure] = {}
+    figures = {f"forms.mask.value_{key}": bootstrap([values[key] for values in told["mask"]])
+               for key in ("steep", "fault", "fault_steep") if len(told.get("mask", [])) == len(TEXTURES)}  # fmt: skip
     for way, rows in gained.items():
         if len(rows) < len(TEXTURES):
             continue

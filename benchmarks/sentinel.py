@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from benchmarks import belief, centreline, completion, convergence, curvature, prior, step, transductive
+from benchmarks import belief, centreline, completion, convergence, curvature, networks, prior, step
 from benchmarks.harness import SENTINEL, append_lines, provenance, read_lines, show
 from curvafit.geometry.diagrams import diagram
 from curvafit.geometry.distances import wasserstein
@@ -107,7 +107,7 @@ def check_completion() -> Checked:
 
 def check_image() -> Checked:
     truth = texture(32, 2.5)
-    found = reconstruct(Volume(truth), every=8, image=Volume(transductive.image_of(truth, 0)))
+    found = reconstruct(Volume(truth), every=8, image=Volume(networks.image_of(truth, 0)))
     return {"Dice": (dice(found.mask.values > 0, truth > 0), 0.02)}
 
 
@@ -137,12 +137,12 @@ def check_noise() -> Checked:
 
 
 def check_networks() -> Checked:
-    truth, net = texture(56, 4.0), transductive.network(0)
-    batch = transductive.lessons(transductive.image_of(truth, 0), transductive.annotated(truth, (21, 42)), 0)
-    transductive.learn(net, batch, 1, 6e-3)
+    truth, net = texture(56, 4.0), networks.network(0)
+    batch = networks.lessons(networks.image_of(truth, 0), networks.annotated(truth, (21, 42)), 0)
+    networks.learn(net, batch, 1, 6e-3)
     x, y = batch(99)
     with torch.no_grad():
-        return {"loss": (float(transductive.dice_ce(transductive.predict(net, x), y)), 0.05)}
+        return {"loss": (float(networks.dice_ce(networks.predict(net, x), y)), 0.05)}
 
 
 def relative(share: float, **values: float) -> Checked:
@@ -171,7 +171,7 @@ SENTINELS: dict[str, Callable[[], Checked]] = {
     "centreline": check_centreline,
     "groups": check_groups,
     "noise": check_noise,
-    "transductive": check_networks,
+    "networks": check_networks,
 }
 
 

@@ -4,13 +4,19 @@ The two programs take turns, so that a busy machine slows both, in a process of 
 defaults, which give large arrays back to the system at each step. The floor is the time that the bytes which the fused
 step must move take at the bandwidth of a plain copy, the best seen in the same rounds: from main memory no step is
 faster than that.
+
+`--author FOLDER` names a checkout of the paper's program (github.com/annasongmaths/curvatubes, MIT; it needs matplotlib
+and nibabel): its step on this processor, by turns with ours, in processes of their own. It asks for a GPU, so its types
+and transfers are replaced by those of a processor; nothing else is changed.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -30,6 +36,8 @@ COPIED = 2**26
 PLAIN = 200
 #: Rounds, and voxels that a measurement steps through, about: larger cubes get fewer rounds.
 ROUNDS, WORK = 10, 10**8
+#: The edge of the paper's shapes.
+PUBLISHED = 100
 #: Bytes a voxel that a step must move: floats read and written by the blur, the energy, its blur, Adam and blurs.
 BYTES = 4 * (2 + 2 + 2 + 20)
 
@@ -76,11 +84,55 @@ def apart(size: int, rounds: int) -> dict[str, float]:
     return json.loads(run_python("-c", script).splitlines()[-1])
 
 
+#: The paper's program on a processor: the median milliseconds of a step, between two updates by Adam.
+AUTHOR = """
+import json, sys, time, matplotlib
+matplotlib.use("Agg")
+import numpy as np, torch
+torch.cuda.FloatTensor = torch.FloatTensor
+torch.Tensor.cuda = torch.nn.Module.cuda = lambda self, *others: self
+from cvtub import generator
+times, step = [], torch.optim.Adam.step
+def timed(self, *others):
+    times.append(time.perf_counter())
+    return step(self, *others)
+torch.optim.Adam.step = timed
+generator.slices = generator.plt.show = lambda *others, **more: None
+folder, edge = sys.argv[1], int(sys.argv[2])
+start = 40 * 0.01 * torch.rand((3, edge, edge, edge))
+plan = dict(maxeval=24, sigma_blur=2, display_it_nb=10**9, fill_curve_nb=1, betas=(0.9, 0.999), lr=1e-3, eps_adam=1e-2,
+            weight_decay=0, amsgrad=False)
+generator._generate_shape(start, (0.02, 1, 2, 6, -40, -40, 400), 0.01, 1e-6, "adam", plan, "cons", "periodic", M0=-0.6,
+                          snapshot_folder=folder + "/", display_all=False)
+print(json.dumps(1e3 * float(np.median(np.diff(times)[4:]))))
+"""
+
+
+def author(folder: str, size: int, rounds: int = 3) -> dict[str, float]:
+    """Return the milliseconds of a step of the paper's program and of ours, medians of turns."""
+    found: dict[str, list[float]] = {"author": [], "ours": []}
+    for _ in range(rounds):
+        with tempfile.TemporaryDirectory() as results:
+            Path(results, "Curves").mkdir()
+            printed = run_python("-c", AUTHOR, results, size, PYTHONPATH=str(Path(folder).resolve()))
+        found["author"].append(json.loads(printed.splitlines()[-1]))
+        found["ours"].append(apart(size, 4)["fused"])
+    return {name: float(np.median(times)) for name, times in found.items()}
+
+
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sizes", default="64,100")
+    parser.add_argument("--author", metavar="FOLDER", help="of the paper's program, to run beside ours at 100³")
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
+    if options.author is not None:
+        ms = cases.all({f"author-{PUBLISHED}": lambda: author(options.author, PUBLISHED)})[f"author-{PUBLISHED}"]
+        figures = {"step.author": Figure(ms["author"] / ms["ours"]), "step.author_ms": Figure(ms["author"])}
+        # 8000 steps, as published: 150 s on a GPU.
+        figures |= {"step.shape_seconds": Figure(8 * ms["ours"]), "step.published": Figure(150 / (8 * ms["ours"]))}
+        show(["a step at 100³", "figure"], list(figures.items()), f"{torch.get_num_threads()} threads")
+        return figures
     sizes = [32] if options.quick else [int(size) for size in options.sizes.split(",")]
     found = cases.all({f"{size}-default": lambda size=size: apart(size, ROUNDS) for size in sizes})
     figures: dict[str, Figure] = {}
