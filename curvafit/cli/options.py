@@ -43,11 +43,9 @@ def command(*examples: str) -> Callable[[Callable[..., None]], Callable[..., Non
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         parameters = inspect.signature(function, eval_str=True).parameters
         makers = {
-            name: extra.make
-            for name, value in parameters.items()
-            for extra in get_args(value.annotation)[1:]
+            name: extra.make for name, value in parameters.items() for extra in get_args(value.annotation)[1:]
             if isinstance(extra, Group)
-        }
+        }  # fmt: skip
         groups = {name: inspect.signature(make, eval_str=True).parameters for name, make in makers.items()}
 
         @functools.wraps(function)

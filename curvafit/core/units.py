@@ -88,8 +88,7 @@ def format_number(value: float | None, digits: int = 3) -> str:
 
 def format_sampling(shape: Sequence[int], spacing: Sequence[float], unit: str = "") -> str:
     """Return the number and the size of voxels (z, y, x) as text; three equal edges are written once."""
-    is_isotropic = len(set(spacing)) == 1
-    edges = " x ".join(f"{h:.4g}" for h in spacing[: 1 if is_isotropic else 3])
+    edges = " x ".join(f"{h:.4g}" for h in spacing[: 1 if len(set(spacing)) == 1 else 3])
     size = "" if (edges, unit) == ("1", "voxel") else f" of {edges} {unit_name(unit)}".rstrip()
     return f"{' x '.join(map(str, shape))} voxels{size}"
 
@@ -127,6 +126,4 @@ def power_name(unit: str, power: int) -> str:
 
 def unit_name(unit: str, count: float = 1) -> str:
     """Return a unit as written in text: µm for `um`, voxels for several."""
-    if unit == "um":
-        return "µm"
-    return "voxels" if unit == "voxel" and count != 1 else unit
+    return "µm" if unit == "um" else "voxels" if unit == "voxel" and count != 1 else unit

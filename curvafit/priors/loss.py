@@ -269,8 +269,7 @@ class CurvaturePrior(nn.Module):
 class CombinedLoss(nn.Module):
     """base(input, target) + weight × prior(input, target), where the prior's weight grows over the first calls.
 
-    Weight, warm-up and the number of calls are part of the state: a resumed training goes on with them. An older
-    checkpoint, which has the calls alone, leaves the other two as they are.
+    Weight, warm-up and the number of calls are part of the state: a resumed training goes on with them.
 
     Parameters
     ----------
@@ -310,11 +309,6 @@ class CombinedLoss(nn.Module):
     def set_extra_state(self, state: Tensor) -> None:
         """Take weight and warm-up, from `load_state_dict`."""
         self.weight, self.warmup = float(state[0]), int(state[1])
-
-    def _load_from_state_dict(self, state_dict, prefix, *options) -> None:
-        """Load a state, also an older one without weight and warm-up."""
-        state_dict.setdefault(f"{prefix}_extra_state", self.get_extra_state())
-        super()._load_from_state_dict(state_dict, prefix, *options)
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
         """Return the weighted sum; `mask` is passed to the prior."""

@@ -62,8 +62,7 @@ def signed_distance(
 def refine_profile(u: Tensor, times: tuple[Any, Any, Any]) -> Tensor:
     """Return a phase field `(..., Z, Y, X)` with every voxel along (z, y, x) split into so many; differentiable.
 
-    What is interpolated is the distance that the profile states, artanh u: between slices thicker than ε the profile
-    jumps, and a spline through its values swings, but the distance is nearly linear. That of ±1 is that of ±`TOLD`.
+    A spline through the profile swings where slices are thicker than ε; one through its distance, artanh u, does not.
     """
     distance = torch.atanh(TOLD * u.clamp(-1, 1))
     for axis, n in enumerate(times):

@@ -273,15 +273,12 @@ def _map_figure(
         visible = [title == "family"] * len(present) + [title == column for column in columns] + [True, True]
         choices.append({"label": f"colour: {title}", "method": "restyle", "args": [{"visible": visible}]})
     menu = {"buttons": choices, "x": 0, "y": 1.07, "xanchor": "left", "yanchor": "bottom", "bgcolor": "white"}
-    first, second = (
-        {"title": f"{rank} direction, {fraction:.0%} of the variance"}
-        for rank, fraction in zip(("first", "second"), fractions, strict=True)
-    )
-    small = {"title_font_size": 13}
+    titles = [f"direction {k}, {share:.0%} of the variance" for k, share in enumerate(fractions, 1)]
+    first, second = ({"title": title, "title_font_size": 13} for title in titles)
     figure.update_layout(
         margin={"l": 62, "r": 8, "t": 84, "b": 50}, template="simple_white", uirevision="kept", hovermode="closest",
         dragmode="pan", updatemenus=[menu], legend={"orientation": "h", "y": 1.0, "yanchor": "bottom"}, font_color=INK,
-        xaxis=first | small, yaxis=second | small | {"scaleanchor": "x"},
+        xaxis=first, yaxis=second | {"scaleanchor": "x"},
     )  # fmt: skip
     return figure
 

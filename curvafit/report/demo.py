@@ -121,8 +121,7 @@ def demo_page(
     gallery = {f"{rank} texture": u for rank, u in zip(PLACES, textures, strict=False)}
     shapes, slices = _shape_figure(completion, inference.scan.spacing), _slice_figure(inference.scan, completion)
     blocks = int(np.prod(measures.blocks)) if np.isfinite(measures["BV/TV"].half) else 0
-    quantities = [measures[symbol] for symbol in ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D", "BS/BV", "DA", "H", "K")]
-    rows = [(quantity.name, quantity.symbol, *quantity.format(measures.unit)) for quantity in quantities]
+    quantities = map(measures.__getitem__, ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D", "BS/BV", "DA", "H", "K"))
     (_, network), *plain = ((name, f"{score:.3f}") for name, score in completion.dice.items())
     return render(
         "demo.html", title=f"{describe(inference)}.", made={}, scan=describe_scan(inference), every=EVERY,
@@ -130,7 +129,8 @@ def demo_page(
         shapes=picture_of(shapes, "Known slices, the filled volume, and the scan"),
         slices=picture_of(slices, "A left-out slice, as it is and as filled"),
         scores=[("the network", Chosen(network)), *((f"plain interpolation, {name}", score) for name, score in plain)],
-        measures=rows, blocks=blocks, count=len(atlas),
+        measures=[(each.name, each.symbol, *each.format(measures.unit)) for each in quantities],
+        blocks=blocks, count=len(atlas),
         map=picture_of(_map_figure(inference, atlas), "The scan's curvature diagram, and its place on the atlas's map"),
         near=picture_of(gallery_figure(gallery, columns=3, width=1500), "The nearest textures") if gallery else None,
         misfit=fit.misfit, reading=fit.status,

@@ -145,10 +145,9 @@ def describe_range(parts: Sequence[Measures]) -> str:
         if not known:
             continue
         extremes = [extreme(known, key=lambda k: quantities[k].value) for extreme in (min, max)]
-        title, unit = quantities[0].name, power_name(parts[0].unit, quantities[0].power)
-        low, high = (f"{format_number(quantities[k].value)} {unit}".strip() for k in extremes)
+        low, high = (" ".join(quantities[k].format(parts[0].unit)[::2]).strip() for k in extremes)
         span = f"from {low} ({names[extremes[0]]}) to {high} ({names[extremes[1]]})" if len(known) > 1 else low
-        sentences.append(f"{title[0].upper()}{title[1:]} {span}.")
+        sentences.append(f"{quantities[0].name.capitalize()} {span}.")
     return " ".join(sentences)
 
 

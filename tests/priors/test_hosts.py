@@ -48,7 +48,7 @@ def test_combined_loss_is_the_weighted_sum_and_its_parts_are_there_to_log():
 
 
 def test_the_warm_up_counts_training_steps_and_survives_a_restart():
-    """Weight, warm-up and count go with the state, however it is kept; an older state has the count alone."""
+    """Weight, warm-up and count go with the state, however it is kept."""
     loss, alone, ours = CombinedLoss(BCE, PRIOR, 2.0, warmup=4), BCE(LOGITS, TARGET), 2 * PRIOR(LOGITS)
     for share in (0.25, 0.5, 0.75):
         assert_close(loss(LOGITS, TARGET), alone + share * ours)
@@ -66,9 +66,6 @@ def test_the_warm_up_counts_training_steps_and_survives_a_restart():
         assert_close(again(LOGITS, TARGET), alone + ours)
     again.eval()
     assert int(again.calls) == 6 and again(LOGITS, TARGET) is not None and int(again.calls) == 6
-    older = CombinedLoss(BCE, PRIOR, 0.5, warmup=3)
-    older.load_state_dict({"calls": torch.tensor(4)})
-    assert (older.weight, older.warmup, int(older.calls)) == (0.5, 3, 4)
 
 
 def test_it_can_be_copied_and_shown():
