@@ -429,7 +429,7 @@ def _measure_window(
     if max(refinement) > 1:
         u = refine_profile(u, refinement)
         for axis, n in enumerate(refinement):
-            weights = weights.repeat_interleave(n, axis - 3)
+            weights = weights.repeat_interleave(n, axis - 3) if n > 1 else weights
     # In working units, where ξ and the floor under the root are small, whatever the unit of length.
     unit = epsilon / WORKING_EPSILON
     edges = tuple(h / n / unit for h, n in zip(spacing, refinement, strict=True))

@@ -64,10 +64,10 @@ def refine_profile(u: Tensor, times: tuple[Any, Any, Any]) -> Tensor:
 
     A spline through the profile swings where slices are thicker than ε; one through its distance, artanh u, does not.
     """
-    distance = torch.atanh(TOLD * u.clamp(-1, 1))
+    distance = torch.logit((1 + TOLD * u.clamp(-1, 1)) / 2)  # 2 artanh; and 2σ - 1 is quicker than tanh
     for axis, n in enumerate(times):
         distance = refine_axis(distance, axis, n)
-    return torch.tanh(distance) / TOLD
+    return (2 * torch.sigmoid(distance) - 1) / TOLD
 
 
 def phase_field(mask: Bool[Tensor, "*batch z y x"], grid: Grid, epsilon: float) -> Float[Tensor, "*batch z y x"]:
