@@ -80,6 +80,11 @@ def training_times(edge: int, rounds: int) -> Values:
     return {name: taken.tolist() for name, taken in in_turns(actions, rounds).items()}
 
 
+def law_of(name: str) -> Coefficients:
+    """Return a preset, or the Willmore energy, with lengths in voxels."""
+    return Coefficients.willmore() if name == "willmore" else Law.of(name).in_unit(None, 1.0)
+
+
 def sharp_terms(law: Coefficients, form: str, radius: float, length: float) -> np.ndarray:
     """Return the six terms of ∫ p dA of a ball or a cylinder of some length."""
     κ = (1 / radius, 1 / radius if form == "ball" else 0.0)
@@ -95,7 +100,7 @@ def errors(form: str, radius: float) -> Values:
     distance = radius - ((0 if form == "cylinder" else z**2) + y**2 + x**2).sqrt()
     u, found = optimal_profile(distance, EPSILON), {}
     for name in LAWS:
-        law = Coefficients.willmore() if name == "willmore" else Law.of(name).in_unit(None, 1.0)
+        law = law_of(name)
         prior = CurvaturePrior(law, epsilon=EPSILON, reduction="sum", border=0)
         terms = SIGMA * sharp_terms(law, form, radius, edge)
         found[name] = float(100 * (float(prior((u + 1)[None, None] / 2)) - terms.sum()) / np.abs(terms).sum())
@@ -106,7 +111,7 @@ def thick(edges: int) -> Values:
     """Return by how much slices so many edges thick change the value of tori, by law, radius and tilt."""
     found = {}
     for name, (wide, radius), tilt in product(LAWS, ((16, 7), (11, 5), (15, 5.5)), (0.25, 0.7, 1.05, 1.4)):
-        law = Coefficients.willmore() if name == "willmore" else Law.of(name).in_unit(None, 1.0)
+        law = law_of(name)
         values = []
         for step in (1, edges):
             axes = [(torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * h for n, h in ((60 // step, step), (56, 1))]

@@ -69,7 +69,7 @@ class CurvaturePrior(nn.Module):
         ε in spacing's unit; twice the smallest edge by default. Structures thinner than twice the smallest edge do not
         survive. An axis on which ε spans fewer than two voxels, by more than a tenth, is interpolated, and a warning
         says so. Up to voxels as long as ε the energy is that of fine ones within 4 %, up to 2 ε within 20 %; where they
-        are longer it is up to 2 times larger, and the warning says that. A refinement of more than 16-fold is refused,
+        are longer it is up to 3 times larger, and the warning says that. A refinement of more than 16-fold is refused,
         and so is an ε longer than the window.
     weight
         A factor, or one for each class; classes of weight 0 are not computed.
@@ -123,7 +123,7 @@ class CurvaturePrior(nn.Module):
             axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", refinement, strict=True) if n > 1)
             message = f"ε = {self.epsilon:g} spans fewer than 2 voxels: interpolating {axes}"
             if longest > LONGEST * self.epsilon:
-                message += f"; voxels longer than 2 ε inflate F_ε, 2-fold at 4 ε: state an ε of {longest / 2:g} or more"
+                message += f"; voxels longer than 2 ε inflate F_ε, 3-fold at 4 ε: state an ε of {longest / 2:g} or more"
             warnings.warn(message, stacklevel=2)
 
     def extra_repr(self) -> str:

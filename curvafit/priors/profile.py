@@ -15,7 +15,7 @@ from curvafit.priors.stencils import gaussian_blur, refine_axis
 SIGMA = 4 / (3 * math.sqrt(2))
 
 #: By how much a phase field is scaled before its distance is taken, which is infinite at ±1.
-TOLD = 0.88
+SHRINK = 0.88
 #: Deviation, in voxels, of the Gaussian that smooths a mask's stairs.
 STAIRS = 2.0
 #: Number, strength and width (voxels) of the corrections where the smoothing changed the sign.
@@ -64,10 +64,10 @@ def refine_profile(u: Tensor, times: tuple[Any, Any, Any]) -> Tensor:
 
     A spline through the profile swings where slices are thicker than ε; one through its distance, artanh u, does not.
     """
-    distance = torch.logit((1 + TOLD * u.clamp(-1, 1)) / 2)  # 2 artanh; and 2σ - 1 is quicker than tanh
+    distance = torch.logit((1 + SHRINK * u.clamp(-1, 1)) / 2)  # 2 artanh; and 2σ - 1 is quicker than tanh
     for axis, n in enumerate(times):
         distance = refine_axis(distance, axis, n)
-    return (2 * torch.sigmoid(distance) - 1) / TOLD
+    return (2 * torch.sigmoid(distance) - 1) / SHRINK
 
 
 def phase_field(mask: Bool[Tensor, "*batch z y x"], grid: Grid, epsilon: float) -> Float[Tensor, "*batch z y x"]:
