@@ -1,7 +1,7 @@
 """Exact Euclidean distances in a mask, and the balls that fit into it: which is the largest that covers a voxel.
 
-`_paint` visits balls in descending size, so that each voxel is painted once; bits of the voxels that are still free
-show at once that most balls paint nothing.
+`_paint` visits balls in descending size, so that each voxel is painted once. Whoever paints a voxel decides whether the
+ball around it will be painted, too; bits of the voxels that are still free show at once that most balls paint nothing.
 """
 
 from __future__ import annotations
@@ -15,6 +15,16 @@ from skimage.measure import block_reduce
 
 #: Columns whose distances are computed together.
 _COLUMNS = 16
+#: Balls are sorted in stages, each down to this part of the radius where the one before ended.
+_STAGE = .7
+#: Rows along y that are looked up together.
+_LANES = 8
+#: An index that is not negative, so that numba need not count from the end.
+_at = np.uint64
+#: A power of two times this number has its exponent's own six bits on top, which give the exponent.
+_DE_BRUIJN = np.uint64(0x03F79D71B4CB0A89)
+_INDEX = np.zeros(64, dtype=np.int64)
+_INDEX[[(int(_DE_BRUIJN) << k & (1 << 64) - 1) >> 58 for k in range(64)]] = range(64)
 #: A ball may keep a smaller one, which it nearly contains, from being painted: balls that end this many voxels, of the
 #: finest axis, before a core count there.
 NEAR = 8
@@ -138,18 +148,24 @@ def paint_balls(
     edge = float(min(spacing)) if edge is None else edge
     steps, rim = np.asarray(spacing, dtype=np.float32), np.float32(edge)
     radius = np.ascontiguousarray(radius)
-    dtype = np.int32 if radius.size < 2**31 else np.int64
-    order = np.flatnonzero(radius if core is None else _find_reaching(radius, spacing, core)).astype(dtype)
-    order = order[np.argsort(-radius.ravel()[order], kind="stable")]
-    painted, owner = np.zeros(radius.size, dtype=np.float32), np.full(radius.size, -1, dtype=dtype)
-    # A bit for each voxel that is free, in words for 64 voxels of a row; and the words of 4 x 4 rows joined by "or".
-    rows = np.pad(radius > 0, ((0, 0), (0, 0), (0, -radius.shape[2] % 64)))
-    free = blocks = np.packbits(rows, axis=2, bitorder="little").view("<u8").astype(np.uint64)
-    for axis in (0, 1):
-        blocks = np.bitwise_or.reduceat(blocks, np.arange(0, radius.shape[axis], 4), axis)
-    runs = np.empty([int((float(radius.max(initial=0)) + edge) / h) + 2 for h in steps[:2]], dtype=np.int64)
-    balls = (radius.ravel(), painted, owner, free.ravel(), blocks.ravel())
-    _paint(order, balls, runs, np.array(radius.shape), steps, rim, periodic)
+    largest = float(radius.max(initial=0))
+    alive = radius > 0 if core is None else _find_reaching(radius, spacing, core)
+    reach = [int((largest + edge) / h) + 1 for h in steps]
+    # A bit for each voxel that is free, in words for 64 voxels along x, which lie side by side along y.
+    padded = np.pad(radius > 0, ((0, 0), (reach[1], reach[1] + _LANES), (0, -radius.shape[2] % 64)))
+    free = np.packbits(padded, axis=2, bitorder="little").view("<u8").astype(np.uint64).transpose(0, 2, 1).copy()
+    del padded
+    rows = np.empty((reach[0] + 1, 2 * reach[1] + 1 + _LANES), dtype=np.uint64)
+    painted = np.zeros(radius.size, dtype=np.float32)
+    balls = (radius.ravel(), painted, alive.ravel(), free)
+    slack = np.float32(0.51 * edge + math.hypot(*steps))  # a ball's rim, and how far two voxels are from their cells' centres
+    while largest > 0:  # in stages, each of which leaves few of the smaller balls to the next ones
+        least = _STAGE * largest if largest > edge else 0.0
+        distance = _measure_free(free[:, :, reach[1] : -reach[1] - _LANES], steps, 0.0 if periodic else largest + 2 * float(slack))
+        order = _find_useful(radius, alive, distance, slack, np.float32(least))
+        order = order[np.argsort(-balls[0][order], kind="stable")]
+        _paint(order, balls, rows, np.array(radius.shape), steps, rim, periodic)
+        largest = least
     return painted.reshape(radius.shape)
 
 
@@ -171,130 +187,108 @@ def _find_reaching(radius: np.ndarray, spacing: Sequence[float], core: tuple[sli
     return reaching
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _gap(index, low, high):  # pragma: no cover
     """Return how many voxels an index lies outside the interval low..high - 1."""
     return low - index if index < low else index - high + 1 if index >= high else 0
 
 
-@njit(cache=True)
-def _paint(order, balls, runs, shape, spacing, edge, periodic):  # pragma: no cover
-    """Paint balls in descending size; a voxel keeps the radius and centre of the first ball that covers it."""
-    radius, _, owner, _, _ = balls
+def _measure_free(free: np.ndarray, steps: np.ndarray, reach: float) -> np.ndarray:
+    """Return the squared distance of each cell of 2³ voxels to the nearest one with a free voxel; at most `reach`²."""
+    cells = free.transpose(0, 2, 1)
+    for axis in (0, 1):
+        cells = np.bitwise_or.reduceat(cells, np.arange(0, cells.shape[axis], 2), axis)
+    bits = np.unpackbits(cells.view(np.uint8), axis=2, bitorder="little")
+    return square_distances((bits[:, :, ::2] | bits[:, :, 1::2]) == 0, 2 * steps, reach)
+
+
+@njit(cache=True, nogil=True)
+def _find_useful(radius, alive, squares, slack, least):  # pragma: no cover
+    """Return the indices of balls that are alive, of more than the least radius and near a free voxel; those that are
+    not near are alive no longer. `squares` are those of `_measure_free`."""
+    nz, ny, nx = radius.shape
+    found = np.empty(np.count_nonzero(alive), dtype=np.int64)
+    count = 0
+    for z in range(nz):
+        for y in range(ny):
+            for x in range(nx):
+                if alive[z, y, x] and radius[z, y, x] > least:
+                    if squares[z // 2, y // 2, x // 2] <= (radius[z, y, x] + slack) ** 2:
+                        found[count] = (z * ny + y) * nx + x
+                        count += 1
+                    else:
+                        alive[z, y, x] = False
+    return found[:count]
+
+
+@njit(cache=True, nogil=True)
+def _paint(order, balls, rows, shape, spacing, edge, periodic):  # pragma: no cover
+    """Paint balls in descending size, and none that is no longer alive: a voxel keeps the radius of the first ball that
+    covers it."""
+    radius, _, alive, _ = balls
     nz, ny, nx = shape
     hz, hy, hx = spacing
     copies = 1 if periodic else 0  # of a ball, a period before and after it along each axis
     last = np.float32(0)
     for centre in order:
-        r = radius[centre]
-        if owner[centre] >= 0 and _is_nearly_inside(centre, owner[centre], radius, shape, spacing, edge, periodic):
+        if not alive[centre]:
             continue
+        alive[centre] = False
+        r = radius[centre]
         reach = r + 0.5 * edge
         if r != last:
             last = r
-            _fill_runs(reach, spacing, runs)
+            _fill_rows(reach, spacing, rows)
         z, y, x = centre // (ny * nx), centre // nx % ny, centre % nx
         kz, ky, kx = int(reach / hz), int(reach / hy), int(reach / hx)
+        ball = (r, max(0.5 * edge, 0.05 * r))
         for k in range(z - copies * nz, z + copies * nz + 1, nz):
             for j in range(y - copies * ny, y + copies * ny + 1, ny):
                 for i in range(x - copies * nx, x + copies * nx + 1, nx):
                     if _gap(k, 0, nz) <= kz and _gap(j, 0, ny) <= ky and _gap(i, 0, nx) <= kx:
-                        _paint_ball(centre, balls, runs, (k, j, i), shape, (kz, ky))
+                        _paint_ball(ball, balls, rows, (k, j, i), shape, (kz, ky), spacing)
 
 
 @njit(cache=True)
-def _is_nearly_inside(centre, o, radius, shape, spacing, edge, periodic):  # pragma: no cover
-    """Return whether a ball sticks out of the ball around the voxel `o` so little that it need not be painted."""
-    nz, ny, nx = shape
+def _fill_rows(reach, spacing, rows):  # pragma: no cover
+    """Fill in the rows of a ball's voxels along x, at each distance in voxels along z and y, as bits around bit 32."""
     hz, hy, hx = spacing
-    dz, dy = abs(centre // (ny * nx) - o // (ny * nx)), abs(centre // nx % ny - o // nx % ny)
-    dx = abs(centre % nx - o % nx)
-    if periodic:
-        dz, dy, dx = min(dz, nz - dz), min(dy, ny - dy), min(dx, nx - dx)
-    excess = np.sqrt((dz * hz) ** 2 + (dy * hy) ** 2 + (dx * hx) ** 2) + radius[centre] - radius[o]
-    return excess <= max(0.5 * edge, 0.05 * radius[o])
+    for k in range(rows.shape[0]):
+        for j in range(rows.shape[1]):
+            rest = reach * reach - (k * hz) ** 2 - ((j - (rows.shape[1] - _LANES) // 2) * hy) ** 2
+            half = np.uint64(min(int(np.sqrt(rest) / hx), 31)) if rest >= 0 else np.uint64(0)
+            ones = ~np.uint64(0) >> np.uint64(63 - 2 * half)
+            rows[k, j] = ones << (np.uint64(32) - half) if rest >= 0 else np.uint64(0)
 
 
-@njit(cache=True)
-def _fill_runs(reach, spacing, runs):  # pragma: no cover
-    """Fill `runs` with how many voxels a ball reaches along x, at each distance in voxels along z and y; -1: none."""
-    hz, hy, hx = spacing
-    for k in range(int(reach / hz) + 1):
-        for j in range(int(reach / hy) + 1):
-            rest = reach * reach - (k * hz) ** 2 - (j * hy) ** 2
-            runs[k, j] = int(np.sqrt(rest) / hx) if rest >= 0 else -1
-
-
-@njit(cache=True)
-def _paint_ball(centre, balls, runs, position, shape, reach):  # pragma: no cover
-    """Paint the free voxels of a ball at `position`, which may lie beyond the box; `centre` its index. `runs[dz, dy]`
-    is half the length of the ball's row along x, negative where it has none. Most blocks of 4 x 4 rows have none free.
-    """
-    blocks = balls[4]
-    nz, ny, nx = shape
-    z, y, x = position
-    lowest, highest = max(0, z - reach[0]), min(nz, z + reach[0] + 1)
-    front, back = max(0, y - reach[1]), min(ny, y + reach[1] + 1)
-    words, blocks_y = (nx + 63) // 64, (ny + 3) // 4
-    for bz in range(lowest // 4, (highest + 3) // 4):
-        dz = _gap(z, 4 * bz, 4 * bz + 4)
-        for by in range(front // 4, (back + 3) // 4):
-            kx = runs[dz, _gap(y, 4 * by, 4 * by + 4)]
-            row = (bz * blocks_y + by) * words
-            if kx < 0 or not _any_free(blocks, row, max(0, x - kx), min(nx, x + kx + 1)):
+@njit(cache=True, forceinline=True)
+def _paint_ball(ball, balls, rows, position, shape, reach, spacing):  # pragma: no cover
+    """Paint the free voxels of a ball at `position`, which may lie beyond the box; `rows` are those of `_fill_rows`."""
+    radius, painted, alive, free = balls
+    (r, slack), (nz, ny, nx), (hz, hy, hx), (z, y, x) = ball, shape, spacing, position
+    middle, count = (rows.shape[1] - _LANES) // 2, (2 * reach[1] + _LANES) // _LANES * _LANES
+    for word in range(max(x - 32, 0) // 64, min(x + 31, nx - 1) // 64 + 1):
+        # Of a ball's rows, whose centre is bit 32, the word has the part after so many bits, or before.
+        shift = x - 32 - 64 * word
+        left, right = np.uint64(max(shift, 0)), np.uint64(max(-shift, 0))
+        for k in range(max(0, z - reach[0]), min(nz, z + reach[0] + 1)):
+            ball_rows, words = rows[abs(k - z)], free[k, word]
+            first, covered = _at(middle - reach[1]), np.uint64(0)
+            for j in range(count):
+                covered |= words[_at(j + y) + first] & (ball_rows[_at(j) + first] << left >> right)
+            if not covered:
                 continue
-            painted = 0
-            for k in range(max(lowest, 4 * bz), min(highest, 4 * bz + 4)):
-                for j in range(max(front, 4 * by), min(back, 4 * by + 4)):
-                    kx = runs[abs(k - z), abs(j - y)]
-                    if kx >= 0:
-                        painted += _paint_run(centre, balls, k * ny + j, max(0, x - kx), min(nx, x + kx + 1), nx)
-            if painted:
-                _update_block(balls, bz, by, shape)
-
-
-@njit(cache=True)
-def _update_block(balls, bz, by, shape):  # pragma: no cover
-    """Join the bits of the free voxels of 4 x 4 rows again, after some were painted."""
-    free, blocks = balls[3], balls[4]
-    nz, ny, nx = shape
-    words, blocks_y = (nx + 63) // 64, (ny + 3) // 4
-    row = (bz * blocks_y + by) * words
-    for word in range(words):
-        blocks[row + word] = 0
-        for k in range(4 * bz, min(nz, 4 * bz + 4)):
-            for j in range(4 * by, min(ny, 4 * by + 4)):
-                blocks[row + word] |= free[(k * ny + j) * words + word]
-
-
-@njit(cache=True)
-def _any_free(bits, row, start, stop):  # pragma: no cover
-    """Return whether any bit from `start` to `stop` of a row of words is set."""
-    for word in range(start // 64, (stop + 63) // 64):
-        if bits[row + word] & _between(start - 64 * word, stop - 64 * word):
-            return True
-    return False
-
-
-@njit(cache=True)
-def _between(start, stop):  # pragma: no cover
-    """Return a word whose bits from `start` to `stop` are set."""
-    ones = np.uint64(0xFFFFFFFFFFFFFFFF)
-    return (ones << np.uint64(max(start, 0))) & (ones >> np.uint64(64 - min(stop, 64)))
-
-
-@njit(cache=True)
-def _paint_run(centre, balls, row, start, stop, nx):  # pragma: no cover
-    """Paint the free voxels from `start` to `stop` of a row; return how many there were."""
-    radius, painted, owner, free, _ = balls
-    words, count = (nx + 63) // 64, 0
-    for word in range(start // 64, (stop + 63) // 64):
-        bits = free[row * words + word] & _between(start - 64 * word, stop - 64 * word)
-        if bits:
-            free[row * words + word] ^= bits  # no longer free
-            for k in range(max(start - 64 * word, 0), min(stop - 64 * word, 64)):
-                if bits & (np.uint64(1) << np.uint64(k)):
-                    painted[row * nx + 64 * word + k] = radius[centre]
-                    owner[row * nx + 64 * word + k] = centre
-                    count += 1
-    return count
+            for j in range(middle - reach[1], middle + reach[1] + 1):
+                covered = words[j + y] & (ball_rows[j] << left >> right)
+                if covered:
+                    words[j + y] ^= covered
+                    square, start = ((k - z) * hz) ** 2 + ((j - middle) * hy) ** 2, (k * ny + y + j - middle) * nx + 64 * word
+                    while covered:
+                        lowest = covered & (~covered + np.uint64(1))
+                        covered ^= lowest
+                        i = _INDEX[lowest * _DE_BRUIJN >> np.uint64(58)]
+                        painted[start + i] = r
+                        # A ball that sticks out of this one by no more than the slack is left out.
+                        room = slack + (r - radius[start + i])
+                        if room >= 0 and square + ((64 * word + i - x) * hx) ** 2 <= room * room:
+                            alive[start + i] = False
