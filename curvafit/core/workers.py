@@ -21,8 +21,8 @@ PATIENCE = 10
 #: megabyte are then mapped anew each time, and measuring shapes takes nearly four times as long.
 _ENVIRONMENT = {
     "DASK_LOGGING__DISTRIBUTED": "critical",
-    "MALLOC_TRIM_THRESHOLD_": 1 << 28,
-    "MALLOC_MMAP_THRESHOLD_": 1 << 25,
+    "MALLOC_TRIM_THRESHOLD_": 1 << 26,
+    "MALLOC_MMAP_THRESHOLD_": 1 << 23,
 }
 #: What a worker on this machine runs first: Ctrl-C in the terminal is for the main process, which ends its workers.
 _IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"

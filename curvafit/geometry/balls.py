@@ -16,7 +16,7 @@ from skimage.measure import block_reduce
 #: Columns whose distances are computed together.
 _COLUMNS = 16
 #: Balls are sorted in stages, each down to this part of the radius where the one before ended.
-_STAGE = .7
+_STAGE = 0.7
 #: Rows along y that are looked up together.
 _LANES = 8
 #: An index that is not negative, so that numba need not count from the end.
@@ -55,7 +55,7 @@ def square_distances(
     return squares
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _square_distances(mask, steps, reach, offset, both, squares, scratch):  # pragma: no cover
     """Fill `squares` with the squared distances along x, then lower them along y and z; see `square_distances`."""
     nz, ny, nx = mask.shape
@@ -110,18 +110,20 @@ def _lower_columns(squares, step, offset, scratch):  # pragma: no cover
 # ---- balls -----------------------------------------------------------------------------------------------------------
 
 
-def ball_radii(mask: np.ndarray, spacing: tuple[float, float, float], limit: float = math.inf) -> np.ndarray:
+def ball_radii(
+    mask: np.ndarray, spacing: tuple[float, float, float], limit: float = math.inf, *, both: bool = False
+) -> np.ndarray:
     """Return the distance of each voxel of a mask to the nearest voxel outside, at most `limit`; float32 (Z, Y, X).
 
-    Distances are exact, from centre to centre, in spacing's unit.
+    Distances are exact, from centre to centre, in spacing's unit. With `both`, those outside to the mask are negative.
     """
     edge = float(min(spacing))
     steps = np.array(spacing, dtype=np.float32) / np.float32(edge)
     reach = min(limit / edge, 2.0 * math.hypot(*(n * h for n, h in zip(mask.shape, steps.tolist(), strict=True))))
-    squares = square_distances(mask, steps, reach)
-    np.sqrt(squares, out=squares)
-    squares *= np.float32(edge)
-    return squares
+    squares = square_distances(mask, steps, reach, both=both)
+    outside = np.signbit(squares) if both else False
+    np.sqrt(np.abs(squares, out=squares), out=squares)
+    return np.multiply(squares, np.where(outside, np.float32(-edge), np.float32(edge)), out=squares)
 
 
 def paint_coarse_balls(radius: np.ndarray, spacing: tuple[float, float, float], factor: int) -> np.ndarray:
@@ -151,18 +153,18 @@ def paint_balls(
     largest = float(radius.max(initial=0))
     alive = radius > 0 if core is None else _find_reaching(radius, spacing, core)
     reach = [int((largest + edge) / h) + 1 for h in steps]
-    # A bit for each voxel that is free, in words for 64 voxels along x, which lie side by side along y.
-    padded = np.pad(radius > 0, ((0, 0), (reach[1], reach[1] + _LANES), (0, -radius.shape[2] % 64)))
+    # A bit for each voxel that is free and counts, in words for 64 voxels along x, which lie side by side along y.
+    padded = np.pad(alive, ((0, 0), (reach[1], reach[1] + _LANES), (0, -radius.shape[2] % 64)))
     free = np.packbits(padded, axis=2, bitorder="little").view("<u8").astype(np.uint64).transpose(0, 2, 1).copy()
     del padded
     rows = np.empty((reach[0] + 1, 2 * reach[1] + 1 + _LANES), dtype=np.uint64)
     painted = np.zeros(radius.size, dtype=np.float32)
     balls = (radius.ravel(), painted, alive.ravel(), free)
-    slack = np.float32(0.51 * edge + math.hypot(*steps))  # a ball's rim, and how far two voxels are from their cells' centres
+    slack = 0.51 * edge + math.hypot(*steps)  # a ball's rim, and how far two voxels are from their cells' centres
     while largest > 0:  # in stages, each of which leaves few of the smaller balls to the next ones
-        least = _STAGE * largest if largest > edge else 0.0
-        distance = _measure_free(free[:, :, reach[1] : -reach[1] - _LANES], steps, 0.0 if periodic else largest + 2 * float(slack))
-        order = _find_useful(radius, alive, distance, slack, np.float32(least))
+        least, limit = _STAGE * largest if largest > edge else 0.0, 0.0 if periodic else largest + 2 * slack
+        squares = _measure_free(free[:, :, reach[1] : -reach[1] - _LANES], steps, limit)
+        order = _find_useful(radius, alive, squares, np.float32(slack), np.float32(least))
         order = order[np.argsort(-balls[0][order], kind="stable")]
         _paint(order, balls, rows, np.array(radius.shape), steps, rim, periodic)
         largest = least
@@ -282,7 +284,8 @@ def _paint_ball(ball, balls, rows, position, shape, reach, spacing):  # pragma: 
                 covered = words[j + y] & (ball_rows[j] << left >> right)
                 if covered:
                     words[j + y] ^= covered
-                    square, start = ((k - z) * hz) ** 2 + ((j - middle) * hy) ** 2, (k * ny + y + j - middle) * nx + 64 * word
+                    square = ((k - z) * hz) ** 2 + ((j - middle) * hy) ** 2
+                    start = (k * ny + y + j - middle) * nx + 64 * word
                     while covered:
                         lowest = covered & (~covered + np.uint64(1))
                         covered ^= lowest

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numba import njit
 from skimage.measure import marching_cubes
 from torch import Tensor
 
@@ -42,7 +43,7 @@ class Surface:
     @property
     def barycentres(self) -> np.ndarray:
         """Return the centre of each triangle, `(F, 3)`."""
-        return self.vertices[self.faces].mean(1)
+        return _measure_triangles(self.vertices, self.faces)[0]
 
 
 def surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Surface:
@@ -114,8 +115,40 @@ def areas(mesh: Surface) -> np.ndarray:
 
 def area_vectors(mesh: Surface) -> np.ndarray:
     """Return half the cross product of each triangle's edges, `(F, 3)` in (x, y, z)."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]][:, ::-1] for k in range(3))
-    return np.cross(b - a, c - a) / 2
+    return _measure_triangles(mesh.vertices, mesh.faces)[1]
+
+
+def fabric(mesh: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """Return the triangles' centres, `(F, 3)`, and columns `(F, 7)`, float32: area, and the parts zz zy zx yy yx xx of
+    n⊗n dA with the normal n."""
+    centres, vectors = _measure_triangles(mesh.vertices, mesh.faces)
+    return centres, _measure_fabric(vectors)
+
+
+@njit(cache=True, nogil=True)
+def _measure_triangles(vertices, faces):  # pragma: no cover
+    """Return the centres (z, y, x) of triangles, and half the cross products (x, y, z) of their edges, `(F, 3)`."""
+    centres, vectors = np.empty((len(faces), 3)), np.empty((len(faces), 3))
+    for k in range(len(faces)):
+        (az, ay, ax), (bz, by, bx) = vertices[faces[k, 0]], vertices[faces[k, 1]]
+        cz, cy, cx = vertices[faces[k, 2]]
+        centres[k, 0], centres[k, 1], centres[k, 2] = (az + bz + cz) / 3, (ay + by + cy) / 3, (ax + bx + cx) / 3
+        bz, by, bx, cz, cy, cx = bz - az, by - ay, bx - ax, cz - az, cy - ay, cx - ax
+        vectors[k, 0], vectors[k, 1] = (by * cz - bz * cy) / 2, (bz * cx - bx * cz) / 2
+        vectors[k, 2] = (bx * cy - by * cx) / 2
+    return centres, vectors
+
+
+@njit(cache=True, nogil=True)
+def _measure_fabric(vectors):  # pragma: no cover
+    """Return the columns of `fabric` of triangles with these vectors (x, y, z)."""
+    columns = np.zeros((len(vectors), 7), np.float32)
+    for k in range(len(vectors)):
+        x, y, z = vectors[k]
+        area = math.sqrt(x * x + y * y + z * z)
+        if area > 0:
+            columns[k] = area, z * z / area, z * y / area, z * x / area, y * y / area, y * x / area, x * x / area
+    return columns
 
 
 def volume(mesh: Surface) -> float:

@@ -158,7 +158,7 @@ def _summarise(
     def count(name: str, places: np.ndarray, values: Any) -> None:
         voxels, weights = np.atleast_2d(places) / spacing - margin, np.atleast_1d(values)
         inside = ((voxels > -0.5) & (voxels < shape - 0.5)).all(1)
-        table[:, SUMS.index(name)] += blocks.gather(voxels[inside], weights[inside])
+        table[:, SUMS.index(name)] += blocks.gather(voxels[inside], weights[inside, None])[:, 0]
 
     for *_, data in graph.edges(data=True):
         points, radii = data["points"], data["radii"]

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
+from numba import njit
 from scipy import ndimage
 
 from curvafit.geometry.balls import square_distances
@@ -14,6 +15,7 @@ from curvafit.geometry.morphology import local_thickness
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.kernels.cpu import gaussian_blur
 from curvafit.priors.profile import PULL, PULL_WIDTH, STAIRS, SWEEPS
+from curvafit.priors.stencils import gaussian_taps
 from curvafit.volumes.volume import Box
 
 #: Median thickness is measured in a box of at most this many voxels a side.
@@ -21,6 +23,8 @@ MEASURED = 160
 #: Deviations, in voxels, of the Gaussians that smooth stairs after that of `priors.profile.STAIRS`, where the border
 #: moves by less than so many voxels, a root mean square over what is near: a Gaussian, in a band on either side.
 WIDER, MOVED, NEARBY, BAND = (2.5, 3.0), 0.1, 2.0, 2.5
+#: Weights, some of them zero, that are added at once: a number that is known when the loop is compiled.
+_TAPS = 16
 #: Voxels of a periodic mask beyond its box on which its phase field depends.
 REPEATED = 36
 
@@ -142,27 +146,78 @@ def profile_mask(mask: np.ndarray, periodic: bool = False) -> np.ndarray:
     voxels = Grid(mask.shape, (1.0, 1.0, 1.0), "replicate")  # type: ignore[arg-type]
     reach = 6 * WORKING_EPSILON / WORKING_SPACING + math.ceil(4 * WIDER[-1])
     squares = square_distances(mask, (1.0, 1.0, 1.0), reach, offset=0.5, both=True)
-    exact = np.copysign(np.sqrt(np.abs(squares)), squares)
-    del squares
+    inside = np.where(np.signbit(squares), np.float32(-1), np.float32(1))
+    exact = np.sqrt(np.abs(squares, out=squares), out=squares)
+    exact *= inside
+    del squares, inside
     distance = _smooth_stairs(exact, voxels, STAIRS)
     for width in WIDER:
-        move = _smooth_stairs(exact, voxels, width) - distance
+        move = _smooth_stairs(exact, voxels, width)
+        move -= distance
         near = (np.abs(distance) < BAND).astype(np.float32)
-        squares, near = (gaussian_blur(each, voxels, NEARBY) for each in (near * move**2, near))
-        distance += np.exp(-squares / (np.float32(MOVED**2) * np.maximum(near, np.float32(1e-6)))) * move
-    for _ in range(SWEEPS):  # until no smoothed distance has a sign that is not the mask's
-        error = np.where(mask, np.minimum(distance, 0), np.maximum(distance, 0))
-        if not error.any():
-            break
-        distance -= np.float32(PULL) * gaussian_blur(error, voxels, PULL_WIDTH)
+        ratio = gaussian_blur(near * move**2, voxels, NEARBY)
+        near = gaussian_blur(near, voxels, NEARBY)
+        ratio /= np.maximum(near, np.float32(1e-6), out=near)
+        ratio /= np.float32(-(MOVED**2))
+        distance += np.multiply(np.exp(ratio, out=ratio), move, out=move)
+    pull = gaussian_taps(PULL_WIDTH)
+    padded = np.array(pull + (0.0,) * (_TAPS - len(pull)), np.float32)
+    flat, inside = distance.ravel(), mask.ravel()
+    for _ in range(SWEEPS):  # until no smoothed distance has a sign that is not the mask's, as in `priors.phase_field`
+        wrong = _find_wrong(flat, inside)
+        _add_gaussians(distance, wrong, np.float32(-PULL) * flat[wrong], padded, len(pull) // 2)
     distance *= np.float32(WORKING_SPACING / (math.sqrt(2) * WORKING_EPSILON))
     return np.tanh(distance, out=distance)
+
+
+@njit(cache=True, nogil=True)
+def _find_wrong(distance, mask):  # pragma: no cover
+    """Return the indices at which the sign of flat distances is not the mask's."""
+    wrong = [np.int64(0) for _ in range(0)]  # so numba knows the type
+    for i in range(distance.size):
+        if distance[i] < 0 if mask[i] else distance[i] > 0:
+            wrong.append(np.int64(i))
+    return np.array(wrong)
+
+
+@njit(cache=True, nogil=True)
+def _add_gaussians(distance, voxels, heights, taps, reach):  # pragma: no cover
+    """Add Gaussians at flat indices of distances, in place; their weights from -reach on are `taps`, which has zeros up
+    to `_TAPS`."""
+    nz, ny, nx = distance.shape
+    n = 2 * reach + 1
+    places = np.empty((3, n), np.int64)
+    for which in range(len(voxels)):
+        voxel, height = voxels[which], heights[which]
+        z, y, x = voxel // (ny * nx), voxel // nx % ny, voxel % nx
+        for k in range(n):
+            places[0, k], places[1, k] = _mirror(z + k - reach, nz), _mirror(y + k - reach, ny)
+            places[2, k] = _mirror(x + k - reach, nx)
+        for k in range(n):
+            for j in range(n):
+                row, weight = distance[places[0, k], places[1, j]], height * taps[k] * taps[j]
+                if reach <= x <= nx + reach - _TAPS:
+                    for i in range(_TAPS):
+                        row[np.uint64(x - reach + i)] += weight * taps[np.uint64(i)]
+                else:
+                    for i in range(n):
+                        row[places[2, i]] += weight * taps[i]
+
+
+@njit(cache=True, nogil=True)
+def _mirror(index, n):  # pragma: no cover
+    """Return the index inside of a sample beyond 0..n - 1, of a box that continues as a mirror image."""
+    index %= 2 * n
+    return min(index, 2 * n - 1 - index)
 
 
 def _smooth_stairs(distance: np.ndarray, voxels: Grid, width: float) -> np.ndarray:
     """Return 2 G - G² of a distance with the blur G: it smooths a mask's stairs and shrinks curves less than G does."""
     blurred = gaussian_blur(distance, voxels, width)
-    return 2 * blurred - gaussian_blur(blurred, voxels, width)
+    twice = gaussian_blur(blurred, voxels, width)
+    blurred *= 2
+    blurred -= twice
+    return blurred
 
 
 def resample(
@@ -252,8 +307,8 @@ def _small_pieces(
     mask: np.ndarray, smallest: float, part: CutOut, structure: np.ndarray | None
 ) -> tuple[np.ndarray, int]:
     """Return the voxels of pieces of fewer than `smallest` voxels, and how many such pieces belong to the core."""
-    labels: np.ndarray = ndimage.label(mask, structure)[0]  # type: ignore[index]
-    small: np.ndarray = np.bincount(labels.ravel()) < smallest
+    labels, count = cast(tuple[np.ndarray, int], ndimage.label(mask, structure))
+    small = _count_labels(labels, count) < smallest
     small[0] = False
     for axis, cut_ends in enumerate(part.cut):  # a piece at a cut may be larger than what is visible of it
         for end, cut in zip((0, -1), cut_ends, strict=True):
@@ -262,9 +317,20 @@ def _small_pieces(
     pieces = small[labels]
     voxels = np.flatnonzero(pieces)
     first_voxels = voxels[np.unique(labels.ravel()[voxels], return_index=True)[1]]
-    in_core = np.zeros(mask.shape, dtype=bool)
-    in_core[part.core] = True  # several tiles may read a piece: the one whose core has its first voxel counts it
-    return pieces, int(np.count_nonzero(in_core.ravel()[first_voxels]))
+    in_core = np.ones(len(first_voxels), dtype=bool)
+    for index, edge in zip(np.unravel_index(first_voxels, mask.shape), part.core, strict=True):
+        in_core &= (index >= edge.start) & (index < edge.stop)
+    # Several tiles may read a piece: the one whose core has its first voxel counts it.
+    return pieces, int(np.count_nonzero(in_core))
+
+
+@njit(cache=True, nogil=True)
+def _count_labels(labels, count):  # pragma: no cover
+    """Return how many voxels have each label from 0 to `count`."""
+    counts = np.zeros(count + 1, np.int64)
+    for label in labels.flat:
+        counts[label] += 1
+    return counts
 
 
 def _middle(interval: slice, longest: int) -> slice:

@@ -6,13 +6,16 @@ import contextlib
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from dataclasses import field as default
+from functools import partial
 from html import escape
 from importlib.metadata import version
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from numba import njit
 from scipy import ndimage, stats
 
 from curvafit.core.checks import require
@@ -20,10 +23,11 @@ from curvafit.core.runtime import Pictured, Progress, silent
 from curvafit.core.units import convert_length, format_number, plain_unit, power_name, unit_name
 from curvafit.geometry.description import descriptors
 from curvafit.geometry.diagrams import FAMILIES, MARGIN, Diagram, diagram, families, join_diagrams
-from curvafit.geometry.mesh import NoSurface, Surface, area_vectors
+from curvafit.geometry.mesh import NoSurface, Surface, fabric
 from curvafit.geometry.morphology import border_weights, local_thickness, smooth_surface
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
+from curvafit.priors.kernels.threads import count_threads
 from curvafit.scan import preparation
 from curvafit.scan.grids import median_thickness, remove_specks
 from curvafit.scan.preparation import LARGEST_WINDOW, Prepared
@@ -329,25 +333,35 @@ def measure_maps(
     periodic: bool = options["periodic"]
     progress("finding the structure", 0.0)
     detected, signed = find_structure(field, kind=kind, **options)  # type: ignore[arg-type]
-    mask, notes = _drop_specks(detected, signed, periodic)
-    progress("measuring curvature", 0.1)
+    progress("measuring thickness and curvature", 0.1)
+    pool = ThreadPoolExecutor(1) if count_threads() > 1 else None
+    measure = partial(_measure_voxels, detected, signed, periodic)
+    others = pool.submit(measure) if pool else None  # most of either work lets the other one run
     try:
         if most is None:
             prepared = preparation.prepare(field, kind=detected, **options)
         else:
             prepared = preparation.prepare_whole(detected, signed, periodic, most)
         curved, diagram = measure_curvatures(prepared)
-        curvature_notes = tuple(f"Of curvature: {note}" for note in prepared.notes if note not in notes)
+        of_curvature, lost = prepared.notes, ()
     except ValueError as reason:
         if isinstance(reason, preparation.TooLarge) or min(field.shape) >= FEWEST_SLICES:
             raise
-        curved, diagram, curvature_notes = no_curvature(field.unit, TOO_THIN)
-    progress("measuring thickness", 0.5)
-    thickness, gap = (local_thickness(phase, field.spacing, periodic=periodic) for phase in (mask, ~mask))
-    euler = euler_shares(mask, periodic=periodic)
-    surface = measure_surface(mask, field.spacing, periodic)
-    notes = (*notes, *curvature_notes)
-    return Maps(field.spacing, mask, thickness, gap, euler, surface, curved, diagram, detected, notes)
+        of_curvature, (curved, diagram, lost) = (), no_curvature(field.unit, TOO_THIN)
+    finally:
+        if pool:
+            pool.shutdown()
+    (mask, *voxels), notes = others.result() if others else measure()
+    notes = (*notes, *(f"Of curvature: {note}" for note in of_curvature if note not in notes), *lost)
+    return Maps(field.spacing, mask, *voxels, curved, diagram, detected, notes)  # type: ignore[call-arg]
+
+
+def _measure_voxels(kind: Kind, signed: Volume, periodic: bool) -> tuple[tuple[Any, ...], tuple[str, ...]]:
+    """Return mask, thickness, gap, shares of χ and surface of a scan's structure, as `Maps` has them, and notes."""
+    mask, notes = _drop_specks(kind, signed, periodic)
+    thickness, gap = (local_thickness(phase, signed.spacing, periodic=periodic) for phase in (mask, ~mask))
+    surface = measure_surface(mask, signed.spacing, periodic)
+    return (mask, thickness, gap, euler_shares(mask, periodic=periodic), surface), notes
 
 
 def no_curvature(unit: str, reason: object) -> tuple[tuple[np.ndarray, np.ndarray], Diagram, tuple[str, ...]]:
@@ -377,15 +391,14 @@ def measure_surface(
     """Return the triangles' positions (M, 3) in voxels, and columns (M, 7): area, and the upper triangle of n⊗n dA.
     Those at a window's faces also count for what lies beyond the outer voxels' centres (`border_weights`)."""
     positions, columns = tabulate_surface(smooth_surface(mask, spacing, periodic=periodic), spacing)
-    return positions, columns if periodic else columns * border_weights(positions, mask.shape)[:, None]
+    columns *= 1 if periodic else border_weights(positions, mask.shape)[:, None]
+    return positions, columns
 
 
 def tabulate_surface(mesh: Surface, spacing: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
     """Return the positions and the columns of `measure_surface` of a mesh, without its weights."""
-    vectors = area_vectors(mesh)[:, ::-1]  # n dA in the order (z, y, x)
-    area = np.linalg.norm(vectors, axis=1)
-    tensors = vectors[:, _UPPER[0]] * vectors[:, _UPPER[1]] / np.where(area > 0, area, 1)[:, None]
-    return mesh.barycentres / np.array(spacing), np.column_stack([area, tensors])
+    centres, columns = fabric(mesh)
+    return centres / np.array(spacing), columns
 
 
 def measure_curvatures(prepared: Prepared) -> tuple[tuple[np.ndarray, np.ndarray], Diagram]:
@@ -397,11 +410,22 @@ def measure_curvatures(prepared: Prepared) -> tuple[tuple[np.ndarray, np.ndarray
     physical = replace(working, points=points, weights=weights, unit=f"1/{prepared.unit}")
     from_corner = (np.asarray(working.places) / WORKING_SPACING + 0.5) * np.array(prepared.scale)
     positions = from_corner - 0.5 + np.array(prepared.origin)
-    κ1, κ2 = physical.points.T
-    H = (κ1 + κ2) / 2
-    one_hot = np.eye(len(FAMILIES))[families(working.points, prepared.thickness / 2 * WORKING_SPACING)]
-    columns = np.column_stack([np.ones_like(H), H, H**2, κ1 * κ2, κ1, κ2, np.hypot(κ1, κ2) / math.sqrt(2), one_hot])
-    return (positions, columns * physical.weights[:, None]), physical
+    family = families(working.points, prepared.thickness / 2 * WORKING_SPACING)
+    return (positions, _tabulate_curvatures(physical.points, physical.weights, family)), physical
+
+
+@njit(cache=True, nogil=True)
+def _tabulate_curvatures(points, weights, family):  # pragma: no cover
+    """Return the columns (M, C) of `SUMS` from "curved" on of points (κ1, κ2) with areas and families."""
+    columns = np.zeros((len(points), 7 + len(FAMILIES)), np.float32)
+    for k in range(len(points)):
+        κ1, κ2 = points[k]
+        H, area = (κ1 + κ2) / 2, weights[k]
+        columns[k, 0], columns[k, 1], columns[k, 2], columns[k, 3] = area, H * area, H * H * area, κ1 * κ2 * area
+        columns[k, 4], columns[k, 5] = κ1 * area, κ2 * area
+        columns[k, 6] = math.sqrt((κ1 * κ1 + κ2 * κ2) / 2) * area
+        columns[k, 7 + family[k]] = area
+    return columns
 
 
 def combine(sums: np.ndarray, names: Sequence[str] = SUMS, quantities: Sequence[Formula] = QUANTITIES) -> np.ndarray:
@@ -563,20 +587,44 @@ class Blocks:
 
     def sums(self, values: np.ndarray) -> np.ndarray:
         """Return the sum of a volume (Z, Y, X) over each block, float64 (N,)."""
-        dtype = np.float64 if values.dtype.kind == "f" else np.int64
-        for axis, starts in enumerate(self.starts):
-            values = np.add.reduceat(values, starts, axis=axis, dtype=dtype)
-        return values.ravel().astype(np.float64)
+        sums, (z, y, x) = np.zeros(self.counts), (self._of_voxels(axis) for axis in range(3))
+        _sum_blocks(np.ascontiguousarray(values), z, y, x, sums)
+        return sums.ravel()
 
-    def gather(self, positions: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Return sums over blocks, (N, …), of weights (M, …) at positions (M, 3) in voxels from the first centre."""
-        voxels = np.clip(np.rint(positions), 0, np.array(self.shape) - 1).astype(np.int64).T
-        index = np.zeros(len(positions), dtype=np.int64)  # of the block that each position is in
-        for axis, starts in enumerate(self.starts):
-            index = index * len(starts) + np.searchsorted(starts, voxels[axis], side="right") - 1
-        columns = weights.reshape(len(weights), math.prod(weights.shape[1:]))
-        sums = [np.bincount(index, column, minlength=self.count) for column in columns.T]
-        return np.stack(sums, axis=1).reshape(self.count, *weights.shape[1:])
+    def gather(self, positions: np.ndarray, weights: np.ndarray, kept: np.ndarray | None = None) -> np.ndarray:
+        """Return sums over blocks, (N, C), of those weights (M, C) that are kept, by default all, at positions (M, 3)
+        in voxels from the first centre."""
+        kept = np.ones(len(positions), bool) if kept is None else kept
+        sums, (z, y, x) = np.zeros((*self.counts, weights.shape[1])), (self._of_voxels(axis) for axis in range(3))
+        _sum_positions(positions, weights, kept, z, y, x, sums)
+        return sums.reshape(self.count, -1)
+
+    def _of_voxels(self, axis: int) -> np.ndarray:
+        """Return the index of each voxel's block along an axis."""
+        return np.searchsorted(self.starts[axis], np.arange(self.shape[axis]), side="right") - 1
+
+
+@njit(cache=True, nogil=True)
+def _sum_blocks(values, block_z, block_y, block_x, sums):  # pragma: no cover
+    """Add values (Z, Y, X) to sums over blocks, whose indices along each axis are given for each voxel."""
+    nz, ny, nx = values.shape
+    for z in range(nz):
+        for y in range(ny):
+            row = sums[block_z[z], block_y[y]]
+            for x in range(nx):
+                row[block_x[x]] += values[z, y, x]
+
+
+@njit(cache=True, nogil=True)
+def _sum_positions(positions, weights, kept, block_z, block_y, block_x, sums):  # pragma: no cover
+    """Add the weights (M, C) that are kept at positions (M, 3) to sums (…, C) over blocks, as `_sum_blocks` does."""
+    last_z, last_y, last_x = len(block_z) - 1, len(block_y) - 1, len(block_x) - 1
+    for k in np.flatnonzero(kept):
+        z, y, x = positions[k]
+        z, y, x = min(max(round(z), 0), last_z), min(max(round(y), 0), last_y), min(max(round(x), 0), last_x)
+        total = sums[block_z[z], block_y[y], block_x[x]]
+        for column in range(weights.shape[1]):
+            total[column] += weights[k, column]
 
 
 def errors(

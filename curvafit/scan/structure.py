@@ -139,8 +139,10 @@ def find_levels(structure: Structure, box: Box, periodic: bool = False) -> np.nd
     if structure.kind == "image":
         around, padding = grow(box, SMOOTHED, structure.volume.shape), structure.padding
         smooth = _smooth_levels(structure.read(around), structure.volume.spacing, periodic, padding)
-        smooth = smooth[within(box, around)]
-        signed = structure.level - smooth if structure.dark else smooth - structure.level
+        signed = smooth[within(box, around)]
+        signed -= np.float32(structure.level)
+        if structure.dark:
+            np.negative(signed, out=signed)
         if padding is not None and padding.sure:
             signed[np.isnan(signed)] = -padding.deviation  # background; padding that is doubted stays NaN
         return signed

@@ -99,8 +99,8 @@ def _measure_thickness(plan: Plan, order: Sequence[Box], inside: bool) -> tuple[
     mask, surface = (voxels[within(box, around)] for voxels in (phase, surface_voxels(phase)))
     median, thick = thickness_beneath(mask, surface, spacing)
     half = max(n * h for n, h in zip(mask.shape, spacing, strict=True)) / 2
-    radii = [float(ball_radii(voxels, spacing, half).max()) for voxels in (mask, ~mask) if voxels.any()]
-    return median, thick, replace(plan, reach=max(plan.reach, *radii))
+    reach = float(np.abs(ball_radii(mask, spacing, half, both=True)).max())
+    return median, thick, replace(plan, reach=max(plan.reach, reach))
 
 
 def _count_structure(structure: Structure, pieces: Sequence[Box], number: int) -> Record:

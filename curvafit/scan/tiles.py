@@ -39,13 +39,13 @@ from curvafit.volumes.volume import Box, ScanError, Volume, cut_boxes, grow, wit
 
 #: Radius, in voxels of the finest axis, from which balls are painted on a coarser grid, and the largest ball's.
 COARSE, WIDEST = 24, 48
-#: Working voxels around a core that its curvature depends on: a profile is made of distances of 20 voxels, blurred by
-#: 16, and corrected at thin places.
-HALO = 32
+#: Working voxels around a core that its curvature depends on, to a ten-millionth: a profile is made of distances of 20
+#: voxels, blurred by 16, and corrected at thin places.
+HALO = 24
 #: Voxels of a tile with its surroundings, by default; the shortest edge of a core.
-LARGEST_TILE, SHORTEST = 224**3, 32
+LARGEST_TILE, SHORTEST = 260**3, 32
 #: Bytes that a voxel of a tile with its surroundings takes, and those of the program itself.
-_VOXEL_BYTES, _PROGRAM_BYTES = 100, 300 * 2**20
+_VOXEL_BYTES, _PROGRAM_BYTES = 30, 350 * 2**20
 #: What is kept at each voxel where it is asked for, and the bytes that a voxel then takes, with its tile's.
 MAPS, KEPT = {"structure": np.uint8, "thickness": np.float32}, 12
 #: Bins of the stored curvature diagram, in `diagrams.BIN_WIDTH`.
@@ -278,12 +278,13 @@ class _Sums:
         if gaps:
             self.add("gap", gap, factor)
 
-    def gather(self, name: str, positions: np.ndarray, columns: np.ndarray) -> None:
-        """Add columns (M, C), the first of which is `name`, at positions (M, 3) in voxels from the first centre."""
+    def gather(self, name: str, positions: np.ndarray, columns: np.ndarray, kept: np.ndarray | bool = True) -> None:
+        """Add those columns (M, C) that are kept, the first of which is `name`, at positions (M, 3) in voxels from the
+        first centre."""
         first = whole.SUMS.index(name)
         for part, table in self.tables.items():
-            inside = self.select(part, positions)
-            table[:, first : first + columns.shape[1]] += self._finest.gather(positions[inside], columns[inside])
+            inside = self.select(part, positions) & kept
+            table[:, first : first + columns.shape[1]] += self._finest.gather(positions, columns, inside)
 
     def select(self, part: str, positions: np.ndarray) -> np.ndarray:
         """Return which positions (M, 3), in voxels from the volume's first centre, lie in a part, bool (M,)."""
@@ -326,7 +327,9 @@ def _measure_balls(plan: Plan, core: Box, factors: tuple[int, int]) -> _Balls:
     while True:  # until all balls that overlap the core are whole
         box, mask, pieces = _find_structure(plan, core, distance)
         inner = within(core, box)
-        radii = [ball_radii(phase, spacing, WIDEST * finest) for phase in (mask, ~mask)]
+        signed = ball_radii(mask, spacing, WIDEST * finest, both=True)
+        radii = [np.maximum(signed, 0), np.maximum(-signed, 0)]
+        del signed
         largest = [reaching_radius(radius, spacing, inner) for radius in radii]
         needed = _read_distance(max(largest), finest)
         if needed <= distance * (1 + 1e-6):
@@ -340,7 +343,10 @@ def _measure_balls(plan: Plan, core: Box, factors: tuple[int, int]) -> _Balls:
         if factor > 1:
             painted = paint_coarse_balls(radius, spacing, factor)[inner]
         elif largest_radius <= COARSE * finest:
-            painted = paint_balls(radius, spacing, core=inner)[inner]
+            least = largest_radius + (NEAR + 1) * finest  # so far from the core is what counts there
+            near = grow(inner, [math.ceil(least / h) for h in spacing], radius.shape)
+            place = within(inner, near)
+            painted = paint_balls(radius[near], spacing, core=place)[place]
         else:
             painted = np.zeros_like(radius[inner])
         thickness.append(2 * painted)
@@ -383,7 +389,8 @@ def _measure_surface(plan: Plan, mask: np.ndarray, box: Box, core: Box) -> tuple
         return None
     positions, columns = whole.tabulate_surface(mesh, spacing)
     positions = positions + [edge.start for edge in corners]
-    return positions, columns * border_weights(positions, shape)[:, None]
+    columns *= border_weights(positions, shape)[:, None]
+    return positions, columns
 
 
 def _working_boxes(plan: Plan, core: Box) -> tuple[Box, Box]:
@@ -434,7 +441,8 @@ def _measure_curvature(plan: Plan, core: Box, sums: _Sums) -> Record:
     kept = np.ones(len(positions), dtype=bool)
     for position, (start, stop), widened in zip(working_positions.T, cells, wide, strict=True):
         kept &= ((start, stop) == widened) | ((position >= start) & (position < stop))
-    sums.gather("curved", positions[kept], columns[kept])
+    sums.gather("curved", positions, columns, kept)
+    del columns
     for part in sums.tables:
         record |= _bin(plan, diagram, kept & sums.select(part, positions), part)
     return record
