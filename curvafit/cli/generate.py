@@ -79,7 +79,6 @@ def parse_output(
     "curvafit generate --preset sponge --volume-fraction 0.3 --shape 64 -o sponge.zarr",
     "curvafit generate --prior bone/fit.json --shape 128 --seed 3 -o more_bone.tif",
     "curvafit generate --preset tubes --shape 300 --checkpoint run.pt -o large.nii.gz",
-    "torchrun --nproc-per-node 2 -m curvafit generate --preset tubes -o large.zarr",
 )
 def generate(
     out: Annotated[

@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 import torch
 from numba import njit
-from scipy.integrate import cumulative_trapezoid
 from torch import Tensor
 
 from curvafit.core.checks import LONGEST, SHORTEST, check_choice, check_float, check_type
@@ -314,5 +313,5 @@ def half_thickness(diagram: Diagram, volume: float) -> float:
         block = slice(start, start + _TOGETHER)
         factors = np.clip(1 - diagram.points[block, :, None] * depths, 0, None)
         inner_areas += diagram.weights[block] @ factors.prod(axis=1)
-    swept = cumulative_trapezoid(inner_areas, depths, initial=0)
+    swept = np.append(0, np.cumsum(inner_areas[1:] + inner_areas[:-1]) * depths[1] / 2)
     return float(depths[np.searchsorted(swept, min(volume, swept[-1]) * (1 - 1e-9))])

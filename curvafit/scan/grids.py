@@ -15,7 +15,6 @@ from curvafit.geometry.morphology import local_thickness
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
 from curvafit.priors.kernels.cpu import gaussian_blur
 from curvafit.priors.profile import PULL, PULL_WIDTH, STAIRS, SWEEPS
-from curvafit.priors.stencils import gaussian_taps
 from curvafit.volumes.volume import Box
 
 #: Median thickness is measured in a box of at most this many voxels a side.
@@ -23,8 +22,6 @@ MEASURED = 160
 #: Deviations, in voxels, of the Gaussians that smooth stairs after that of `priors.profile.STAIRS`, where the border
 #: moves by less than so many voxels, a root mean square over what is near: a Gaussian, in a band on either side.
 WIDER, MOVED, NEARBY, BAND = (2.5, 3.0), 0.1, 2.0, 2.5
-#: Weights, some of them zero, that are added at once: a number that is known when the loop is compiled.
-_TAPS = 16
 #: Voxels of a periodic mask beyond its box on which its phase field depends.
 REPEATED = 36
 
@@ -160,55 +157,15 @@ def profile_mask(mask: np.ndarray, periodic: bool = False) -> np.ndarray:
         ratio /= np.maximum(near, np.float32(1e-6), out=near)
         ratio /= np.float32(-(MOVED**2))
         distance += np.multiply(np.exp(ratio, out=ratio), move, out=move)
-    pull = gaussian_taps(PULL_WIDTH)
-    padded = np.array(pull + (0.0,) * (_TAPS - len(pull)), np.float32)
-    flat, inside = distance.ravel(), mask.ravel()
-    for _ in range(SWEEPS):  # until no smoothed distance has a sign that is not the mask's, as in `priors.phase_field`
-        wrong = _find_wrong(flat, inside)
-        _add_gaussians(distance, wrong, np.float32(-PULL) * flat[wrong], padded, len(pull) // 2)
+    for _ in range(SWEEPS):  # until no smoothed distance has a sign that is not the mask's
+        error = np.where(mask, np.minimum(distance, 0), np.maximum(distance, 0))
+        if not error.any():
+            break
+        error = gaussian_blur(error, voxels, PULL_WIDTH)
+        error *= np.float32(-PULL)
+        distance += error
     distance *= np.float32(WORKING_SPACING / (math.sqrt(2) * WORKING_EPSILON))
     return np.tanh(distance, out=distance)
-
-
-@njit(cache=True, nogil=True)
-def _find_wrong(distance, mask):  # pragma: no cover
-    """Return the indices at which the sign of flat distances is not the mask's."""
-    wrong = [np.int64(0) for _ in range(0)]  # so numba knows the type
-    for i in range(distance.size):
-        if distance[i] < 0 if mask[i] else distance[i] > 0:
-            wrong.append(np.int64(i))
-    return np.array(wrong)
-
-
-@njit(cache=True, nogil=True)
-def _add_gaussians(distance, voxels, heights, taps, reach):  # pragma: no cover
-    """Add Gaussians at flat indices of distances, in place; their weights from -reach on are `taps`, which has zeros up
-    to `_TAPS`."""
-    nz, ny, nx = distance.shape
-    n = 2 * reach + 1
-    places = np.empty((3, n), np.int64)
-    for which in range(len(voxels)):
-        voxel, height = voxels[which], heights[which]
-        z, y, x = voxel // (ny * nx), voxel // nx % ny, voxel % nx
-        for k in range(n):
-            places[0, k], places[1, k] = _mirror(z + k - reach, nz), _mirror(y + k - reach, ny)
-            places[2, k] = _mirror(x + k - reach, nx)
-        for k in range(n):
-            for j in range(n):
-                row, weight = distance[places[0, k], places[1, j]], height * taps[k] * taps[j]
-                if reach <= x <= nx + reach - _TAPS:
-                    for i in range(_TAPS):
-                        row[np.uint64(x - reach + i)] += weight * taps[np.uint64(i)]
-                else:
-                    for i in range(n):
-                        row[places[2, i]] += weight * taps[i]
-
-
-@njit(cache=True, nogil=True)
-def _mirror(index, n):  # pragma: no cover
-    """Return the index inside of a sample beyond 0..n - 1, of a box that continues as a mirror image."""
-    index %= 2 * n
-    return min(index, 2 * n - 1 - index)
 
 
 def _smooth_stairs(distance: np.ndarray, voxels: Grid, width: float) -> np.ndarray:

@@ -16,7 +16,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
-from scipy import ndimage, stats
+from scipy import ndimage
+from scipy.special import stdtrit
 
 from curvafit.core.checks import require
 from curvafit.core.runtime import Pictured, Progress, silent
@@ -656,7 +657,7 @@ def interval_reach(counts: Sequence[int]) -> float:
 
 
 def _student_quantile(form: np.ndarray) -> float:
-    return float(stats.t.ppf((1 + SURE) / 2, np.trace(form) ** 2 / (form**2).sum()))
+    return float(stdtrit(np.trace(form) ** 2 / (form**2).sum(), (1 + SURE) / 2))
 
 
 def _neighbour_forms(counts: Sequence[int], weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
