@@ -70,7 +70,9 @@ def tubes(edge: int, cases: Cases) -> dict[str, np.ndarray]:
 def diagrams(count: int, cases: Cases) -> dict[str, np.ndarray]:
     """Return so many normal clouds of 300 points (κ1, κ2), of weight 1."""
     random = np.random.default_rng(0)
-    points = random.normal(random.uniform(-40, 40, (count, 1, 2)), random.uniform(5, 20, (count, 1, 2)), (count, 300, 2))
+    points = random.normal(
+        random.uniform(-40, 40, (count, 1, 2)), random.uniform(5, 20, (count, 1, 2)), (count, 300, 2)
+    )
     return {"points": points, "weights": np.full((count, 300), 1 / 300)}
 
 
@@ -106,7 +108,9 @@ import itertools
 points, weights = given["points"], given["weights"]
 pairs = list(itertools.combinations(range(len(points)), 2))
 """
-_POT = "import ot\ndef one(i, j):\n    return ot.emd2(weights[i], weights[j], ot.dist(points[i], points[j]) / 2) ** 0.5\n"
+_POT = (
+    "import ot\ndef one(i, j):\n    return ot.emd2(weights[i], weights[j], ot.dist(points[i], points[j]) / 2) ** 0.5\n"
+)
 _GEOMLOSS = """
 import torch
 from geomloss import SamplesLoss
@@ -310,7 +314,11 @@ def options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     figures, rows = {}, []
     names = options.jobs.split(",")[:1] if options.quick else options.jobs.split(",")
-    chosen = {f"{name}-{size}": (JOBS[name], size) for name in names for size in JOBS[name].sizes[: 1 if options.quick else None]}
+    chosen = {
+        f"{name}-{size}": (JOBS[name], size)
+        for name in names
+        for size in JOBS[name].sizes[: 1 if options.quick else None]
+    }
     found = cases.all({
         case: partial(timed, job, size, options.rounds, options.python, cases) for case, (job, size) in chosen.items()
     })  # fmt: skip

@@ -28,7 +28,7 @@ from curvafit.geometry.mesh import NoSurface, Surface, fabric
 from curvafit.geometry.morphology import border_weights, local_thickness, smooth_surface
 from curvafit.geometry.topology import euler_shares
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
-from curvafit.priors.kernels.threads import count_threads
+from curvafit.priors.kernels.threads import count_threads, one_thread
 from curvafit.scan import preparation
 from curvafit.scan.grids import median_thickness, remove_specks
 from curvafit.scan.preparation import LARGEST_WINDOW, Prepared
@@ -335,24 +335,21 @@ def measure_maps(
     progress("finding the structure", 0.0)
     detected, signed = find_structure(field, kind=kind, **options)  # type: ignore[arg-type]
     progress("measuring thickness and curvature", 0.1)
-    pool = ThreadPoolExecutor(1) if count_threads() > 1 else None
-    measure = partial(_measure_voxels, detected, signed, periodic)
-    others = pool.submit(measure) if pool else None  # most of either work lets the other one run
-    try:
-        if most is None:
-            prepared = preparation.prepare(field, kind=detected, **options)
-        else:
-            prepared = preparation.prepare_whole(detected, signed, periodic, most)
-        curved, diagram = measure_curvatures(prepared)
-        of_curvature, lost = prepared.notes, ()
-    except ValueError as reason:
-        if isinstance(reason, preparation.TooLarge) or min(field.shape) >= FEWEST_SLICES:
-            raise
-        of_curvature, (curved, diagram, lost) = (), no_curvature(field.unit, TOO_THIN)
-    finally:
-        if pool:
-            pool.shutdown()
-    (mask, *voxels), notes = others.result() if others else measure()
+    alone, measure = count_threads() == 1, partial(_measure_voxels, detected, signed, periodic)
+    with one_thread(), ThreadPoolExecutor(1) as pool:  # each of the two works has a thread, where there are two
+        others = None if alone else pool.submit(measure)
+        try:
+            if most is None:
+                prepared = preparation.prepare(field, kind=detected, **options)
+            else:
+                prepared = preparation.prepare_whole(detected, signed, periodic, most)
+            curved, diagram = measure_curvatures(prepared)
+            of_curvature, lost = prepared.notes, ()
+        except ValueError as reason:
+            if isinstance(reason, preparation.TooLarge) or min(field.shape) >= FEWEST_SLICES:
+                raise
+            of_curvature, (curved, diagram, lost) = (), no_curvature(field.unit, TOO_THIN)
+        (mask, *voxels), notes = others.result() if others else measure()
     notes = (*notes, *(f"Of curvature: {note}" for note in of_curvature if note not in notes), *lost)
     return Maps(field.spacing, mask, *voxels, curved, diagram, detected, notes)  # type: ignore[call-arg]
 
