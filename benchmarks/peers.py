@@ -24,7 +24,7 @@ from benchmarks.completion import EDGE, shape
 from benchmarks.harness import Cases, Figure, Values, run_python, show
 
 #: What the peers' environment has.
-PEERS = "localthickness porespy scikit-image POT geomloss monai topolosses torchio sbi itk-morphologicalcontourinterpolation"
+PEERS = "localthickness porespy POT geomloss monai topolosses torchio sbi itk-morphologicalcontourinterpolation"
 PROGRAM = """
 import json, sys, time, warnings
 from resource import RUSAGE_SELF, getrusage
@@ -89,7 +89,7 @@ def logits(edge: int, cases: Cases) -> dict[str, np.ndarray]:
 _NUMBERS = """
 from skimage.measure import euler_number, marching_cubes, mesh_surface_area
 def measure(mask):
-    numbers = [2 * thickness(phase)[phase].mean() for phase in (mask, ~mask)]
+    numbers = [2 * local_thickness(phase)[phase].mean() for phase in (mask, ~mask)]
     vertices, faces, _, _ = marching_cubes(mask.astype(np.float32), 0.5)
     return [*numbers, mesh_surface_area(vertices, faces) / mask.sum(), euler_number(mask)]
 mask = given["mask"]
@@ -108,6 +108,7 @@ import itertools
 points, weights = given["points"], given["weights"]
 pairs = list(itertools.combinations(range(len(points)), 2))
 """
+_MEAN = "[sum(one(i, j) for i, j in pairs) / len(pairs)]"
 _POT = (
     "import ot\ndef one(i, j):\n    return ot.emd2(weights[i], weights[j], ot.dist(points[i], points[j]) / 2) ** 0.5\n"
 )
@@ -138,7 +139,8 @@ def warm():
 """
 _IMAGE = """
 import torchio as tio
-chain = tio.Compose([tio.RandomBlur((1, 1)), tio.RandomAnisotropy(downsampling=2), tio.RandomBiasField(), tio.RandomNoise()])
+ways = [tio.RandomBlur((1, 1)), tio.RandomAnisotropy(downsampling=2), tio.RandomBiasField(), tio.RandomNoise()]
+chain = tio.Compose(ways)
 import torch
 volume = torch.from_numpy(given["mask"].astype(np.float32))[None]
 chain(volume[:, :32, :32, :32])
@@ -174,7 +176,6 @@ posterior.draw(seen, 10)
 count = len(given["count"])
 """
 _SLICES = """
-from skimage.metrics import adapted_rand_error
 truth = given["mask"]
 places = range(0, len(truth), 8)
 def dice(mask):
@@ -219,8 +220,8 @@ JOBS = {
         tubes,
         {
             "curvafit": Side(_OUR_NUMBERS, "numbers()", True),
-            "localthickness": Side("from localthickness import local_thickness as thickness\n" + _NUMBERS, "measure(mask)"),
-            "porespy": Side("from porespy.filters import local_thickness as thickness\n" + _NUMBERS, "measure(mask)"),
+            "localthickness": Side("from localthickness import local_thickness\n" + _NUMBERS, "measure(mask)"),
+            "porespy": Side("from porespy.filters import local_thickness\n" + _NUMBERS, "measure(mask)"),
         },
     ),
     "distances": Job(
@@ -228,8 +229,8 @@ JOBS = {
         diagrams,
         {
             "curvafit": Side(_OUR_PAIRS, "[pairwise(diagrams)[np.triu_indices(len(diagrams), 1)].mean()]", True),
-            "POT": Side(_PAIRS + _POT + "one(0, 1)\n", "[sum(one(i, j) for i, j in pairs) / len(pairs)]"),
-            "geomloss": Side(_PAIRS + _GEOMLOSS + "one(0, 1)\n", "[sum(one(i, j) for i, j in pairs) / len(pairs)]", most=30),
+            "POT": Side(_PAIRS + _POT + "one(0, 1)\n", _MEAN),
+            "geomloss": Side(_PAIRS + _GEOMLOSS + "one(0, 1)\n", _MEAN, most=30),
         },
     ),
     "loss": Job(
@@ -260,8 +261,7 @@ JOBS = {
         (64, 128, 192),
         tubes,
         {
-            "curvafit": Side(_SLICES.replace("from skimage.metrics import adapted_rand_error\n", "") + _OUR_FILLING,
-                             "dice(fill(truth))", True),
+            "curvafit": Side(_SLICES + _OUR_FILLING, "dice(fill(truth))", True),
             "ITK": Side(_SLICES + _ITK, "dice(fill(truth))"),
             "spline": Side(_SLICES + _SPLINE, "dice(fill(truth))"),
         },
