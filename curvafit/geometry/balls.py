@@ -153,8 +153,10 @@ def paint_balls(
     largest = float(radius.max(initial=0))
     alive = radius > 0 if core is None else _find_reaching(radius, spacing, core)
     reach = [int((largest + edge) / h) + 1 for h in steps]
-    # A bit for each voxel that is free and counts, in words for 64 voxels along x, which lie side by side along y.
-    padded = np.pad(alive, ((0, 0), (reach[1], reach[1] + _LANES), (0, -radius.shape[2] % 64)))
+    # A bit for each voxel that is free and counts, in words for 64 voxels along x, which lie side by side along y. A
+    # ball, or its copy a period away, reaches into the margin.
+    margin = reach[1] * (2 if periodic else 1)
+    padded = np.pad(alive, ((0, 0), (margin, margin + _LANES), (0, -radius.shape[2] % 64)))
     free = np.packbits(padded, axis=2, bitorder="little").view("<u8").astype(np.uint64).transpose(0, 2, 1).copy()
     del padded
     rows = np.empty((reach[0] + 1, 2 * reach[1] + 1 + _LANES), dtype=np.uint64)
@@ -163,7 +165,7 @@ def paint_balls(
     slack = 0.51 * edge + math.hypot(*steps)  # a ball's rim, and how far two voxels are from their cells' centres
     while largest > 0:  # in stages, each of which leaves few of the smaller balls to the next ones
         least, limit = _STAGE * largest if largest > edge else 0.0, 0.0 if periodic else largest + 2 * slack
-        squares = _measure_free(free[:, :, reach[1] : -reach[1] - _LANES], steps, limit)
+        squares = _measure_free(free[:, :, margin : -margin - _LANES], steps, limit)
         order = _find_useful(radius, alive, squares, np.float32(slack), np.float32(least))
         order = order[np.argsort(-balls[0][order], kind="stable")]
         _paint(order, balls, rows, np.array(radius.shape), steps, rim, periodic)
@@ -269,21 +271,22 @@ def _paint_ball(ball, balls, rows, position, shape, reach, spacing):  # pragma: 
     radius, painted, alive, free = balls
     (r, slack), (nz, ny, nx), (hz, hy, hx), (z, y, x) = ball, shape, spacing, position
     middle, count = (rows.shape[1] - _LANES) // 2, (2 * reach[1] + _LANES) // _LANES * _LANES
+    shift_y = y - middle + (free.shape[2] - ny - _LANES) // 2  # from a ball's rows to those of the words
     for word in range(max(x - 32, 0) // 64, min(x + 31, nx - 1) // 64 + 1):
         # Of a ball's rows, whose centre is bit 32, the word has the part after so many bits, or before.
         shift = x - 32 - 64 * word
         left, right = np.uint64(max(shift, 0)), np.uint64(max(-shift, 0))
         for k in range(max(0, z - reach[0]), min(nz, z + reach[0] + 1)):
             ball_rows, words = rows[abs(k - z)], free[k, word]
-            first, covered = _at(middle - reach[1]), np.uint64(0)
+            first, covered = middle - reach[1], np.uint64(0)
             for j in range(count):
-                covered |= words[_at(j + y) + first] & (ball_rows[_at(j) + first] << left >> right)
+                covered |= words[_at(first + shift_y + j)] & (ball_rows[_at(first + j)] << left >> right)
             if not covered:
                 continue
             for j in range(middle - reach[1], middle + reach[1] + 1):
-                covered = words[j + y] & (ball_rows[j] << left >> right)
+                covered = words[j + shift_y] & (ball_rows[j] << left >> right)
                 if covered:
-                    words[j + y] ^= covered
+                    words[j + shift_y] ^= covered
                     square = ((k - z) * hz) ** 2 + ((j - middle) * hy) ** 2
                     start = (k * ny + y + j - middle) * nx + 64 * word
                     while covered:
