@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from curvafit.geometry.balls import ball_radii, paint_balls
 from curvafit.geometry.morphology import local_thickness, morphometry
 from curvafit.geometry.topology import betti_numbers, components, euler_number, euler_of_window
 from curvafit.volumes.read import load
@@ -75,6 +76,37 @@ def test_thickness_never_exceeds_the_largest_ball_and_never_undercuts_the_own_on
     assert here.euler == there.euler
     assert here.surface_to_volume == pytest.approx(there.surface_to_volume, rel=1e-6)
     assert here.thickness_mean == pytest.approx(there.thickness_mean, rel=0.02)
+
+
+@pytest.mark.parametrize("periodic", [False, True])
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (1.5, 0.75, 1.25)])
+def test_balls_are_painted_by_the_rule(spacing: tuple[float, float, float], periodic: bool) -> None:
+    """One by one, in descending size, unless one sticks out of the ball that painted its centre by less than half the
+    finest edge or a twentieth: across words of 64 voxels, and beside a box that repeats."""
+    mask = ndimage.gaussian_filter(np.random.default_rng(2).standard_normal((10, 11, 100)), 2.0) > -0.02
+    radius = np.minimum(ball_radii(mask, spacing), 3.0)
+    places, finest = np.argwhere(np.ones(mask.shape)), min(spacing)
+    flat = radius.ravel()
+    painted, owner = np.zeros(mask.size, np.float32), np.full(mask.size, -1)
+
+    def away(voxel: int) -> np.ndarray:
+        steps = np.abs(places - places[voxel])
+        steps = np.minimum(steps, np.array(mask.shape) - steps) if periodic else steps
+        return np.sqrt(np.square(steps * np.float32(spacing).astype(float)).sum(1))
+
+    for voxel in np.argsort(-flat, kind="stable"):
+        if not flat[voxel]:
+            break
+        distances, centre = away(voxel), owner[voxel]
+        if centre >= 0:
+            excess = distances[centre] + flat[voxel] - flat[centre]
+            if excess <= max(0.5 * finest, 0.05 * flat[centre]):
+                continue
+        covered = (distances <= flat[voxel] + 0.5 * finest) & (owner < 0) & mask.ravel()
+        painted[covered], owner[covered] = flat[voxel], voxel
+    found = paint_balls(radius, spacing, periodic=periodic)
+    assert len(np.unique(owner)) > 100
+    assert np.array_equal(found.ravel(), painted)
 
 
 def test_euler_numbers_of_known_shapes() -> None:
