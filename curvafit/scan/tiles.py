@@ -39,9 +39,9 @@ from curvafit.volumes.volume import Box, ScanError, Volume, cut_boxes, grow, wit
 
 #: Radius, in voxels of the finest axis, from which balls are painted on a coarser grid, and the largest ball's.
 COARSE, WIDEST = 24, 48
-#: Working voxels around a core that its curvature depends on, to a ten-millionth: a profile is made of distances of 20
+#: Working voxels around a core that its curvature depends on, to a millionth: a profile is made of distances of 20
 #: voxels, blurred by 16, and corrected at thin places.
-HALO = 24
+HALO = 28
 #: Voxels of a tile with its surroundings, by default; the shortest edge of a core.
 LARGEST_TILE, SHORTEST = 260**3, 32
 #: Bytes that a voxel of a tile with its surroundings takes, and those of the program itself.
