@@ -26,11 +26,12 @@ from benchmarks.harness import Cases, Figure, Values, run_python, show
 #: What the peers' environment has.
 PEERS = "localthickness porespy POT geomloss monai topolosses torchio sbi itk-morphologicalcontourinterpolation"
 PROGRAM = """
-import json, sys, time, warnings
+import json, os, sys, time, warnings
 from resource import RUSAGE_SELF, getrusage
 import numpy as np
 warnings.simplefilter("ignore")
 given = np.load(sys.argv[1])
+os.chdir(os.path.dirname(sys.argv[1]))  # some peers write logs where they run
 SETUP
 begun, used = time.perf_counter(), time.process_time()
 found = JOB
@@ -177,7 +178,6 @@ count = len(given["count"])
 """
 _SLICES = """
 truth = given["mask"]
-places = range(0, len(truth), 8)
 def dice(mask):
     return [2 * (mask & truth).sum() / (mask.sum() + truth.sum())]
 """
@@ -185,7 +185,7 @@ _ITK = """
 import itk
 def fill(truth):
     labels = np.zeros(truth.shape, np.uint8)
-    labels[list(places)[: len(range(0, len(truth), 8))]] = truth[::8]
+    labels[::8] = truth[::8]
     interpolator = itk.MorphologicalContourInterpolator.New(itk.image_from_array(labels))
     interpolator.SetAxis(2)
     interpolator.Update()
@@ -306,7 +306,7 @@ def timed(job: Job, size: int, rounds: int, python: Path, cases: Cases) -> Value
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--python", type=Path, default=Path(sys.executable), help="an interpreter that has the peers")
+    parser.add_argument("--python", type=Path, default=Path(sys.executable), help=f"an interpreter that has {PEERS}")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--jobs", default=",".join(JOBS))
 

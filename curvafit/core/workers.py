@@ -18,7 +18,8 @@ LOOPBACK = "127.0.0.1"
 #: Seconds that a scheduler has to answer.
 PATIENCE = 10
 #: A worker's environment, which this process gets too. Dask has the C library give memory back at once: arrays of a
-#: megabyte are then mapped anew each time, and measuring shapes takes nearly four times as long.
+#: megabyte are then mapped anew each time, and measuring shapes takes nearly four times as long. From eight
+#: megabytes on, as tiles have them, they are given back.
 _ENVIRONMENT = {
     "DASK_LOGGING__DISTRIBUTED": "critical",
     "MALLOC_TRIM_THRESHOLD_": 1 << 26,

@@ -19,6 +19,8 @@ _COLUMNS = 16
 _STAGE = 0.7
 #: Rows along y that are looked up together.
 _LANES = 8
+#: The longest radius, in voxels along x, of a ball whose rows fit into words.
+_WIDEST = 31
 #: An index that is not negative, so that numba need not count from the end.
 _at = np.uint64
 #: A power of two times this number has its exponent's own six bits on top, which give the exponent.
@@ -153,6 +155,8 @@ def paint_balls(
     largest = float(radius.max(initial=0))
     alive = radius > 0 if core is None else _find_reaching(radius, spacing, core)
     reach = [int((largest + edge) / h) + 1 for h in steps]
+    if (largest + 0.5 * edge) / steps[2] >= _WIDEST + 1:
+        raise ValueError(f"expected balls of a radius of {_WIDEST} voxels along x at most, got {largest / steps[2]:g}")
     # A bit for each voxel that is free and counts, in words for 64 voxels along x, which lie side by side along y. A
     # ball, or its copy a period away, reaches into the margin.
     margin = reach[1] * (2 if periodic else 1)
@@ -260,7 +264,7 @@ def _fill_rows(reach, spacing, rows):  # pragma: no cover
     for k in range(rows.shape[0]):
         for j in range(rows.shape[1]):
             rest = reach * reach - (k * hz) ** 2 - ((j - (rows.shape[1] - _LANES) // 2) * hy) ** 2
-            half = np.uint64(min(int(np.sqrt(rest) / hx), 31)) if rest >= 0 else np.uint64(0)
+            half = np.uint64(min(int(np.sqrt(rest) / hx), _WIDEST)) if rest >= 0 else np.uint64(0)
             ones = ~np.uint64(0) >> np.uint64(63 - 2 * half)
             rows[k, j] = ones << (np.uint64(32) - half) if rest >= 0 else np.uint64(0)
 

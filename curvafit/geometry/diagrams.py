@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from numba import njit
+from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from curvafit.core.checks import LONGEST, SHORTEST, check_choice, check_float, check_type
@@ -196,7 +196,7 @@ def diagram(
     if not counted.any():
         raise NoSurface("expected a surface in the part that counts, got none")
     weights, centres = weights[counted], centres[counted]
-    points, kept = _interpolate(kappa1, kappa2, resolved, centres, grid.periodic)
+    points, kept = _interpolate((kappa1, kappa2), resolved, centres, grid.periodic)
     if not kept.any():
         raise NoSurface("expected a surface whose curvature the grid resolves, got none")
     excluded = 1 - float(weights[kept].sum() / weights.sum())
@@ -238,32 +238,16 @@ def _voxel_curvatures(values: Tensor, grid: Grid, epsilon: float, curvature: str
     return tuple(field.detach().cpu().numpy() for field in fields)
 
 
-@njit(cache=True, nogil=True)
-def _interpolate(kappa1, kappa2, resolved, centres, periodic):  # pragma: no cover
+def _interpolate(
+    fields: tuple[np.ndarray, ...], resolved: np.ndarray, centres: np.ndarray, periodic: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Interpolate two fields at `centres` `(N, 3)`, in voxels, from the resolved voxels around each, if there are any;
     return values `(N, 2)` and whether there are. Fields are 0 elsewhere: sums over the resolved weight are means."""
-    points, kept = np.zeros((len(centres), 2)), np.zeros(len(centres), np.bool_)
-    corners, weights = np.empty((2, 3), np.int64), np.empty((2, 3))
-    for row in range(len(centres)):
-        for axis in range(3):
-            n, place = resolved.shape[axis], centres[row, axis]
-            below = math.floor(place)
-            weights[0, axis], weights[1, axis] = 1 - (place - below), place - below
-            for side in range(2):
-                index = below + side
-                corners[side, axis] = index % n if periodic else min(max(index, 0), n - 1)
-        total = 0.0
-        for k in range(8):
-            a, b, c = k >> 2, k >> 1 & 1, k & 1
-            z, y, x = corners[a, 0], corners[b, 1], corners[c, 2]
-            weight = weights[a, 0] * weights[b, 1] * weights[c, 2]
-            points[row, 0] += weight * kappa1[z, y, x]
-            points[row, 1] += weight * kappa2[z, y, x]
-            total += weight * resolved[z, y, x]
-        kept[row] = total > 0
-        if total > 0:
-            points[row] /= total
-    return points, kept
+    *sums, total = (
+        map_coordinates(values, centres.T, np.float64, order=1, mode="grid-wrap" if periodic else "nearest")
+        for values in (*fields, resolved)
+    )
+    return np.stack(sums, axis=1) / np.where(total > 0, total, 1)[:, None], total > 0
 
 
 def family_shares(diagram: Diagram, radius: float) -> dict[str, float]:

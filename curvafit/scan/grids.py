@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import NamedTuple, cast
 
 import numpy as np
-from numba import njit
 from scipy import ndimage
 
 from curvafit.geometry.balls import square_distances
@@ -265,7 +264,10 @@ def _small_pieces(
 ) -> tuple[np.ndarray, int]:
     """Return the voxels of pieces of fewer than `smallest` voxels, and how many such pieces belong to the core."""
     labels, count = cast(tuple[np.ndarray, int], ndimage.label(mask, structure))
-    small = _count_labels(labels, count) < smallest
+    sizes = np.zeros(count + 1, dtype=np.int64)
+    for plane in labels:  # numpy counts a copy in 64 bits
+        sizes += np.bincount(plane.ravel(), minlength=count + 1)
+    small = sizes < smallest
     small[0] = False
     for axis, cut_ends in enumerate(part.cut):  # a piece at a cut may be larger than what is visible of it
         for end, cut in zip((0, -1), cut_ends, strict=True):
@@ -279,15 +281,6 @@ def _small_pieces(
         in_core &= (index >= edge.start) & (index < edge.stop)
     # Several tiles may read a piece: the one whose core has its first voxel counts it.
     return pieces, int(np.count_nonzero(in_core))
-
-
-@njit(cache=True, nogil=True)
-def _count_labels(labels, count):  # pragma: no cover
-    """Return how many voxels have each label from 0 to `count`."""
-    counts = np.zeros(count + 1, np.int64)
-    for label in labels.flat:
-        counts[label] += 1
-    return counts
 
 
 def _middle(interval: slice, longest: int) -> slice:

@@ -107,6 +107,8 @@ def test_balls_are_painted_by_the_rule(spacing: tuple[float, float, float], peri
     found = paint_balls(radius, spacing, periodic=periodic)
     assert len(np.unique(owner)) > 100
     assert np.array_equal(found.ravel(), painted)
+    with pytest.raises(ValueError, match="31 voxels"):
+        paint_balls(np.full((3, 3, 90), 40.0 * spacing[2], np.float32), spacing)
 
 
 def test_euler_numbers_of_known_shapes() -> None:
