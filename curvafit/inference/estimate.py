@@ -30,6 +30,7 @@ from curvafit.inference.table import (
     to_columns,
 )  # fmt: skip
 from curvafit.priors.grid import Grid
+from curvafit.priors.kernels.threads import map_threads
 from curvafit.scan.measures import Reading, read_texture, windows_along
 from curvafit.scan.preparation import HALF, Prepared
 
@@ -190,16 +191,20 @@ def check_law(
     reading = described.reading
     across = windows_along(prepared, [edge.stop - edge.start for edge in prepared.windows[0]])
     count = math.ceil(TESTED / math.prod(across))
-    windows = []
-    for k in range(2 * count):
-        grown = twin(law, prepared, seed + k, schedule, longest=EDGE * max(across))
-        if grown.seen is not None:
-            scanned = grown.seen.inverted if described.background else grown.seen
-            if (twin_reading := read_texture(scanned, reading.view, across)) is not None:
-                windows.append(twin_reading.windows)
-        progress(f"testing the law: {len(windows)} of {count} shapes", len(windows) / count)
-        if len(windows) == count:
-            break
+
+    def read_twin(seed: int) -> Reading | None:
+        grown = twin(law, prepared, seed, schedule, longest=EDGE * max(across)).seen
+        if grown is None:
+            return None
+        return read_texture(grown.inverted if described.background else grown, reading.view, across)
+
+    windows, tried = [], 0
+    while len(windows) < count and tried < 2 * count:
+        more = min(count - len(windows), 2 * count - tried)
+        for twin_reading in map_threads(read_twin, range(seed + tried, seed + tried + more)):
+            windows += [] if twin_reading is None else [twin_reading.windows]
+            progress(f"testing the law: {len(windows)} of {count} shapes", len(windows) / count)
+        tried += more
     if len(windows) < 2 or sum(map(len, windows)) < FEWEST:
         return None
     return compare_windows(posterior, reading, np.concatenate(windows))

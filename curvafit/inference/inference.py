@@ -34,6 +34,7 @@ from curvafit.inference.posterior import Posterior, load_posterior
 from curvafit.inference.simulate import Growth
 from curvafit.inference.stationary import stationarity
 from curvafit.priors.grid import WORKING_EPSILON
+from curvafit.priors.kernels.threads import map_threads
 from curvafit.priors.law import Law
 from curvafit.scan.measures import scan_diagram
 from curvafit.scan.preparation import HALF, NOISE, Prepared, coarser_level, prepare, read_scan, why_no_texture
@@ -242,24 +243,24 @@ def _grow(
     estimate: Estimate, diagram: Diagram, prepared: Prepared, growth: Growth, seed: int, progress: Progress
 ) -> tuple[Estimate, dict[str, tuple[Twin, ...]]]:
     """Grow a twin of each law, and `growth.twins` of the best; return the compared laws, and the twins by law."""
-    twins: dict[str, tuple[Twin, ...]] = {}
+    laws = {law.name: law for law in estimate.candidates}
+    twins: dict[str, tuple[Twin, ...]] = dict.fromkeys(laws, ())
     stage = sub_progress(progress, 0.6, 0.8)
 
-    def grow(law: Candidate, fraction_done: float) -> Candidate:
-        earlier = twins.get(law.name, ())
-        twin_seed = seed + len(earlier)
-        stage(f"growing: {TITLES[law.name]}, seed {twin_seed}", fraction_done)
-        twins[law.name] = (*earlier, twin(law, prepared, twin_seed, growth.schedule))
-        return law.compare(diagram, twins[law.name])
+    def grow(wanted: list[tuple[str, int]]) -> None:
+        shapes = map_threads(lambda one: twin(laws[one[0]], prepared, seed + one[1], growth.schedule), wanted)
+        for (name, _), shape in zip(wanted, shapes, strict=True):
+            twins[name] = (*twins[name], shape)
+            stage(f"grown: {TITLES[name]}, shape {len(twins[name])}", min(1.0, sum(map(len, twins.values())) / total))
+        laws.update({name: laws[name].compare(diagram, twins[name]) for name in {name for name, _ in wanted}})
 
-    laws = estimate.candidates
-    laws = tuple(grow(law, 0.7 * k / len(laws)) for k, law in enumerate(laws))
-    tries = 2 * growth.twins  # more than one law needs, as another twin may make another law the best
-    for k in range(tries):
-        best = best_candidate(laws)
-        if best is not None and len(twins[best.name]) < growth.twins:
-            laws = tuple(grow(law, 0.7 + 0.3 * k / tries) if law is best else law for law in laws)
-    return replace(estimate, candidates=laws), twins
+    total = len(laws) + growth.twins - 1
+    grow([(name, 0) for name in laws])
+    for _ in range(2):  # the second time, further twins may have made another law the best
+        best = best_candidate(tuple(laws.values()))
+        if best is not None:
+            grow([(best.name, k) for k in range(len(twins[best.name]), growth.twins)])
+    return replace(estimate, candidates=tuple(laws.values())), twins
 
 
 def _test_law(

@@ -19,6 +19,7 @@ from curvafit.core.checks import check_int
 from curvafit.core.runtime import Progress, silent
 from curvafit.generation.schedule import LEARNED, Schedule
 from curvafit.inference.emulator import Emulator
+from curvafit.priors.kernels.threads import map_threads
 from curvafit.scan.measures import Reading
 
 #: Rounds, simulations in a round, and most rounds at the end that simulate the likeliest parameters alone.
@@ -85,11 +86,11 @@ def simulate_draws(
     """Grow shapes from `count` of a posterior's draws `(n, 6)`, chosen at random; the k-th has the seed `seed` + k."""
     count = check_int(count, "a number of simulations", 1, len(draws))
     chosen = draws[np.random.default_rng(seed).choice(len(draws), count, replace=False)]
-    readings = []
-    for k, parameters in enumerate(chosen):
-        readings.append(simulate(parameters, seed + k))
-        progress(f"simulated {k + 1} of {count}", (k + 1) / count)
-    return Simulations(chosen[:0], np.arange(0), (), 0).add(chosen, seed + np.arange(count), readings)
+    seeds, readings = seed + np.arange(count), []
+    for reading in map_threads(lambda k: simulate(chosen[k], int(seeds[k])), range(count)):
+        readings.append(reading)
+        progress(f"simulated {len(readings)} of {count}", len(readings) / count)
+    return Simulations(chosen[:0], np.arange(0), (), 0).add(chosen, seeds, readings)
 
 
 class Process(NamedTuple):
@@ -156,7 +157,7 @@ class Search:
             others = rng.choice(len(candidates), BATCH - 1 if k < rounds else 0, p=likelihood / likelihood.sum())
             chosen = candidates[[int(deviance.argmin()), *others]]
             seeds = seed + simulated.count + np.arange(len(chosen))
-            readings = list(map(simulate, chosen, seeds.tolist()))
+            readings = list(map_threads(lambda law: simulate(*law), zip(chosen, seeds.tolist(), strict=True)))
             grown = np.array([reading is not None for reading in readings])
             failed = np.concatenate([failed, chosen[~grown]])
             simulated = simulated.add(chosen, seeds, readings)
