@@ -24,7 +24,10 @@ from benchmarks.completion import EDGE, shape
 from benchmarks.harness import Cases, Figure, Values, run_python, show
 
 #: What the peers' environment has.
-PEERS = "localthickness porespy POT geomloss monai topolosses torchio sbi itk-morphologicalcontourinterpolation"
+PEERS = (
+    "localthickness porespy bone-microarchitecture pykarambola POT geomloss monai topolosses torchio sbi "
+    "itk-morphologicalcontourinterpolation"
+)
 PROGRAM = """
 import json, os, sys, time, warnings
 from resource import RUSAGE_SELF, getrusage
@@ -93,6 +96,20 @@ def measure(mask):
     numbers = [2 * local_thickness(phase)[phase].mean() for phase in (mask, ~mask)]
     vertices, faces, _, _ = marching_cubes(mask.astype(np.float32), 0.5)
     return [*numbers, mesh_surface_area(vertices, faces) / mask.sum(), euler_number(mask)]
+mask = given["mask"]
+measure(mask[:40, :40, :40])
+"""
+_BONE = """
+from bone_microarchitecture import hildebrand_thickness_map
+def local_thickness(phase):
+    return hildebrand_thickness_map(phase, (1, 1, 1), backend="cpu") / 2
+"""
+#: Volume, surface and Euler number of one mesh, with the tensors of its curvature; no thickness.
+_KARAMBOLA = """
+from pykarambola import minkowski_tensors_from_label_image
+def measure(mask):
+    found = minkowski_tensors_from_label_image(mask.astype(np.int32))[1]
+    return [3 * found["w100"] / found["w000"], found["w300"] / (4 * np.pi / 3)]
 mask = given["mask"]
 measure(mask[:40, :40, :40])
 """
@@ -222,6 +239,8 @@ JOBS = {
             "curvafit": Side(_OUR_NUMBERS, "numbers()", True),
             "localthickness": Side("from localthickness import local_thickness\n" + _NUMBERS, "measure(mask)"),
             "porespy": Side("from porespy.filters import local_thickness\n" + _NUMBERS, "measure(mask)"),
+            "bone-microarchitecture": Side(_BONE + _NUMBERS, "measure(mask)", most=128),
+            "pykarambola": Side(_KARAMBOLA, "measure(mask)"),
         },
     ),
     "distances": Job(

@@ -78,7 +78,7 @@ def measure(
     scans: Annotated[list[str], typer.Argument(help=FILES)],
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="Table (.csv .json .parquet), or a folder for page, figures, table."),
+        typer.Option("-o", "--output", help="Table (.csv), or a folder for page, figures, table."),
     ] = None,
     roi: Annotated[
         Path | None, typer.Option(help="Region to measure, placed by its affine; each label by itself.")

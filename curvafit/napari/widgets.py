@@ -222,7 +222,7 @@ class Measure(Dock):
     def __init__(self, napari_viewer: Any) -> None:
         self.layer = ComboBox(label="layer", choices=lambda _: list_layers(napari_viewer, "Labels", "Image"))
         self.dark = CheckBox(text="dark", tooltip="Of an image: the structure is darker than what is around it.")
-        self.file = FileEdit(label="save as", mode="w", filter="*.csv *.json *.parquet", nullable=True)
+        self.file = FileEdit(label="save as", mode="w", filter="*.csv", nullable=True)
         super().__init__(napari_viewer, [self.layer, self.dark, self.file], "Measure")
         self.table, self.canvas = Table(), None
         self.append(self.table)

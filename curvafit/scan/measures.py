@@ -19,7 +19,6 @@ from numba import njit
 from scipy import ndimage
 from scipy.special import stdtrit
 
-from curvafit.core.checks import require
 from curvafit.core.runtime import Pictured, Progress, silent
 from curvafit.core.units import convert_length, format_number, plain_unit, power_name, unit_name
 from curvafit.geometry.description import descriptors
@@ -198,11 +197,6 @@ class Measures(Pictured):
             rows.append((name, symbol, *(f"{value} {interval}" for value, interval, _ in texts), unit))
         lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
         return f"<code>{escape(repr(self))}</code><table><tr>{'</tr><tr>'.join(lines)}</tr></table>"
-
-    def to_frame(self) -> Any:
-        """Return the numbers as a pandas data frame, as tables have them; ImportError where pandas is missing."""
-        rows = [row for measures in self.compartments.values() or (self,) for row in measures.rows()]
-        return require("pandas", "tables", "a data frame").DataFrame(rows)
 
     def rows(self, **more: str | float) -> list[dict[str, Any]]:
         """Return a row for each quantity, as values by column name; a value that is not known is None.

@@ -1,7 +1,7 @@
 """Many scans: their subjects and groups, their measures in one unit, and tables of their numbers.
 
-Scans come from folders, sequences or a table. All are read once before long work. Numbers are written as CSV, JSON or
-Parquet, a row for each scan and quantity.
+Scans come from folders, sequences or a table. All are read once before long work. Numbers are written as CSV, a row for
+each scan and quantity.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from curvafit.core.checks import as_tuple, quoted, require
-from curvafit.core.files import write_atomically, write_content
+from curvafit.core.checks import as_tuple, quoted
+from curvafit.core.files import write_content
 from curvafit.core.records import Format, can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number, unit_name
@@ -53,16 +53,10 @@ THRESHOLD = re.compile(r"split at (Otsu's|the given) threshold of (-?[\d.]+(?:e[
 #: Medians of groups' thresholds differ where one is so many times the other; the most groups that are named.
 APART, MOST_THRESHOLDS = 1.1, 6
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
-#: Suffixes of the files that are written.
-SUFFIXES = (".csv", ".json", ".parquet")
 #: Further columns in rows of a part of a scan.
 OF_PARTS = ("compartment", "instance")
 #: The start of a formula in a spreadsheet: a plus or minus counts unless it is a number's.
 _FORMULA = re.compile(r"[=@\t\r]|[-+](?![\d.eE\s-]*$)")
-#: `format` of a JSON table.
-FORMAT = Format("curvafit measures 1", title="a table of measures")
-
-
 #: Scans that were measured, in a folder of `measure`, so that `compare` need not measure them again.
 MEASURED = "measured.npz"
 MEASURED_FILE = Format("curvafit measured", 1, "measured scans", "measure them again")
@@ -550,15 +544,11 @@ def name_errors(name: str) -> Iterator[None]:
 
 
 def check_table(path: str | PathLike[str], inputs: Sequence[str | Path] = (), overwrite: bool = False) -> Path:
-    """Return the path of a table that may be written, else raise ValueError; ImportError for Parquet without pandas."""
+    """Return the path of a table that may be written, else raise ValueError."""
     target = Path(path)
-    if target.suffix.lower() not in SUFFIXES:
-        raise ValueError(
-            f"the name of a table must end in {', '.join(SUFFIXES)}, and a folder's has no suffix, got {target}"
-        )
-    if target.suffix.lower() == ".parquet":
-        _pandas()
-    return can_write(target, _is_measures_table, inputs=inputs, overwrite=overwrite)
+    if target.suffix.lower() != ".csv":
+        raise ValueError(f"the name of a table must end in .csv, and a folder's has no suffix, got {target}")
+    return can_write(target, partial(has_mark, mark=",".join(COLUMNS)), inputs=inputs, overwrite=overwrite)
 
 
 def write_table(
@@ -568,23 +558,12 @@ def write_table(
     columns: Sequence[Mapping[str, str]] | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Write a table of scans as `.csv`, `.json` or `.parquet`, and return its path; errors are `check_table`'s.
+    """Write a table of scans as `.csv`, and return its path; errors are `check_table`'s.
 
     A scan with compartments has the rows of each of them. `columns` has further ones of each scan, such as its subject.
     """
     target = check_table(path, overwrite=overwrite)
-    rows = list_rows(measures, columns or [{}] * len(measures))
-    if target.suffix.lower() == ".parquet":
-        frame = _pandas().DataFrame(rows)
-        return write_atomically(target, lambda temporary: frame.to_parquet(temporary, index=False))
-    if target.suffix.lower() == ".json":
-        scans = [
-            {"scan": scan.source, "kind": scan.kind, "blocks": scan.blocks, "notes": scan.notes}
-            | dict([scan.part] if scan.part else [])
-            for scan in measures
-        ]
-        return FORMAT.write(target, {"scans": scans, "rows": rows})
-    return write_content(target, format_csv(rows))
+    return write_content(target, format_csv(list_rows(measures, columns or [{}] * len(measures))))
 
 
 def list_rows(measures: Sequence[Measures], columns: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
@@ -617,15 +596,3 @@ def format_csv(rows: Sequence[dict[str, Any]]) -> str:
         [f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) else cell for cell in row] for row in cells
     )
     return text.getvalue()
-
-
-def _is_measures_table(target: Path) -> bool:
-    """Return whether a file is a table that this program wrote, which may be replaced."""
-    if target.suffix.lower() == ".csv":
-        return has_mark(target, ",".join(COLUMNS))
-    return target.suffix.lower() == ".json" and FORMAT.owns(target)
-
-
-def _pandas() -> Any:
-    require("pyarrow", "tables", "a Parquet table")
-    return require("pandas", "tables", "a Parquet table")

@@ -203,7 +203,7 @@ def test_formulas_are_kept_out_of_a_spreadsheet() -> None:
 
 
 def test_measures_show_in_a_notebook() -> None:
-    """A table of all numbers, of each compartment; a data frame with the columns of a file; a figure."""
+    """A table of all numbers, of each compartment; a figure."""
     phase = np.indices((32, 32, 32)).sum(0) % 16 < 8
     halves = np.ones(phase.shape, np.uint8)
     halves[16:] = 2
@@ -213,8 +213,6 @@ def test_measures_show_in_a_notebook() -> None:
         assert all(each.symbol in table for each in found.quantities)
         assert table.count("<td>") == (len(found.quantities) + 1) * (3 + columns)
         assert len(found.plot().axes) >= columns
-        frame = found.to_frame()
-        assert tuple(frame)[: len(COLUMNS)] == COLUMNS and len(frame) == columns * len(found.quantities)
 
 
 def test_the_stages_of_an_inference_are_logged(caplog: pytest.LogCaptureFixture) -> None:

@@ -12,7 +12,7 @@ from tests.golden import FOLDER
 from tests.golden.rows import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[2]
-EXTRAS = "jax jaxlib optimistix equinox zuko geomloss dask distributed sklearn plotly pandas pyarrow nrrd aiohttp"
+EXTRAS = "jax jaxlib optimistix equinox zuko geomloss dask distributed sklearn plotly pandas nrrd aiohttp"
 
 SCRIPT = f"""
 import json, os, shutil, sys
