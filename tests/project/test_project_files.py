@@ -1,5 +1,6 @@
 """Files beside the package, and the archives of a release: one version, pins that hold, links that lead somewhere."""
 
+import json
 import re
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -19,8 +21,23 @@ ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
+#: Packages that conda calls by another name.
+ELSEWHERE = {"torch": "pytorch", "matplotlib": "matplotlib-base"}
+
+
 def text(name: str) -> str:
     return (ROOT / name).read_text(encoding="utf-8")
+
+
+def test_the_recipe_for_conda_asks_for_what_the_package_asks_for() -> None:
+    recipe = yaml.safe_load(text("conda/recipe.yaml"))
+    assert recipe["context"]["version"] == PROJECT["version"]
+    wanted = {Requirement(each).name: str(Requirement(each).specifier) for each in PROJECT["dependencies"]}
+    given = dict(each.split(" ", 1) for each in recipe["requirements"]["run"])
+    assert given.pop("python") == PROJECT["requires-python"]
+    names = {canonicalize_name(name): Requirement(f"x{bounds}").specifier for name, bounds in given.items()}
+    expected = {ELSEWHERE.get(name, canonicalize_name(name)): bounds for name, bounds in wanted.items()}
+    assert names == {name: Requirement(f"x{bounds}").specifier for name, bounds in expected.items()}
 
 
 def test_one_version_everywhere() -> None:
@@ -28,6 +45,7 @@ def test_one_version_everywhere() -> None:
     version = PROJECT["version"]
     assert re.findall(r"^## \[(\d[^\]]*)\]", text("CHANGELOG.md"), re.MULTILINE)[0] == version
     assert re.findall(r"^version: (\S+)$", text("CITATION.cff"), re.MULTILINE) == [version]
+    assert json.loads(text("codemeta.json"))["version"] == version
     assert curvafit.__version__ == version
     (script,) = entry_points(group="console_scripts", name="curvafit")
     assert callable(script.load())
