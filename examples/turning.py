@@ -27,7 +27,7 @@ ENDS, LAWS = ("bilinear-layers", "bilinear-tubes"), 9
 #: Pictures of a turn, a picture's edge in pixels, and the quality of the strips.
 FRAMES, PIXELS, QUALITY = 24, 260, 62
 #: Shapes, pixels and colours of the README's picture, and milliseconds between its frames.
-MOVING, SMALLER, COLOURS, PAUSE = ("tubes", "sponge", "pearls"), 220, 40, 110
+MOVING, SMALLER, COLOURS, PAUSE = ("tubes", "sponge", "trabec"), 220, 40, 110
 KEPT = Path(".turning")
 
 
