@@ -27,9 +27,9 @@ def organelles(shift: int = 0) -> np.ndarray:
     return np.where(one, 2, np.where(other, 7, 0)).astype(np.uint8)
 
 
-def known(mask: np.ndarray, every: int = 6, spacing=EDGES, *, periodic: bool = False) -> Slices:
+def known(mask: np.ndarray, every: int = 6, spacing=EDGES) -> Slices:
     places = tuple(range(0, len(mask), every))
-    return Slices(mask[list(places)], places, len(mask), spacing, periodic=periodic)
+    return Slices(mask[list(places)], places, len(mask), spacing)
 
 
 def stirred() -> Filler:

@@ -56,7 +56,6 @@ def parse_known(
     known: Annotated[str | None, _what(help="Or also: numbers of known slices, 0,7,15.")] = None,
     ignore: Annotated[int | None, _what(help="Or: the label of voxels that nobody annotated.")] = None,
     axis: Annotated[str, _what(help="Axis across the slices: z, y or x (first, second, last axis of an array).")] = "z",
-    periodic: Annotated[bool, _what("--periodic", help="The volume repeats, as generated ones do.")] = False,
 ) -> dict[str, Any]:
     """Return which slices are known, as `reconstruct` takes it; raise ValueError where options do not go together."""
     if axis.lower() not in ("z", "y", "x"):
@@ -67,7 +66,7 @@ def parse_known(
         raise ValueError(f"--first {first} goes with --every")
     slices = None if known is None else list(parse_whole_numbers(known, "--known"))
     rhythm = every if first is None else slice(first, None, every)
-    return {"every": rhythm, "known": slices, "ignore": ignore, "axis": "zyx".index(axis.lower()), "periodic": periodic}
+    return {"every": rhythm, "known": slices, "ignore": ignore, "axis": "zyx".index(axis.lower())}
 
 
 def parse_labels(

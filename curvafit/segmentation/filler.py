@@ -258,7 +258,7 @@ def fill(
     before, beyond = slice(0, slices.places[0]), slice(slices.places[-1] + 1, slices.length)
     for known_row, outer in ((0, before), (-1, beyond)):
         start, stop = max(outer.start, rows.start), min(outer.stop, rows.stop)
-        if start < stop and not slices.periodic:
+        if start < stop:
             part = logits[start - rows.start : stop - rows.start]  # a view
             if evidence is not None:
                 part[:] = evidence[(slice(start, stop), *core)]
@@ -281,21 +281,19 @@ def _fill_gaps(
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Fill each gap that overlaps `rows` of the volume: yield the indices of the slices in it, and their log-odds as
     `fill` returns them, float32 (n, Y, X), on the core of a raster."""
-    places, count = list(slices.places), len(slices.places)
+    places, last = list(slices.places), len(slices.places) - 1
     start, stop, _ = rows.indices(slices.length)
-    pairs = count if slices.periodic else count - 1  # the first known slice follows the last in a periodic volume
-    lengths = [(k, (places[(k + 1) % count] - places[k]) % slices.length) for k in range(pairs)]
+    lengths = enumerate(np.diff(places).tolist())
     gaps = [(k, gap) for k, gap in lengths if gap > 1 and places[k] + 1 < stop and places[k] + gap > start]
     window, step, distances = raster.support, slices.spacing[0] / raster.pixel, dict[int, np.ndarray]()
     for done, (k, gap) in enumerate(gaps):
         progress("filling the gaps", done / len(gaps))
         # The slices at both ends of the gap and the next beyond each; beyond the last known slice, that one again.
-        four = [k - 1, k, k + 1, k + 2]
-        four = [row % count for row in four] if slices.periodic else [min(max(row, 0), count - 1) for row in four]
+        four = [max(k - 1, 0), k, k + 1, min(k + 2, last)]
         for row in four:
             if row not in distances:
                 distances[row] = raster.distances(slices.inside[(row, *window)])
-        indices = np.arange(places[k] + 1, places[k] + gap) % slices.length
+        indices = np.arange(places[k] + 1, places[k] + gap)
         known = np.stack([distances[row] for row in four])
         marks = None if slices.marks is None else raster.marks(slices.marks[(indices, *window)])
         planes = None if evidence is None else np.stack([raster.spread(p) for p in evidence[(indices, *window)]])

@@ -32,7 +32,7 @@ STEPS = 400
 SMALLEST = 8
 #: Least and greatest stiffness of springs.
 STIFFEST = (1e-9, 1e12)
-#: Voxels of the grid around a volume that does not repeat: far enough for the border's right angles not to reach it.
+#: Voxels of the grid around a volume: far enough for the border's right angles not to reach it.
 HALO = 6
 #: a20 + a02 of the law in a flow, on which the steps of Adam depend; the Willmore energy has it.
 BENDING = 2.0
@@ -134,8 +134,8 @@ def choose_epsilon(scan: Volume, epsilon: float | None) -> float:
 @dataclass(frozen=True)
 class WorkingGrid:
     """The grid of a flow, in working units: a scan's voxels, split by `times` along each axis for ε to span two, and a
-    halo without data. The `grid` includes the `halo` voxels on each side marked in `ends`; its boundary replicates,
-    unless the scan is periodic. `unit` is the working length 1, and `epsilon` ε, both in the scan's unit."""
+    halo without data. The `grid` includes the `halo` voxels on each side marked in `ends`; its boundary replicates.
+    `unit` is the working length 1, and `epsilon` ε, both in the scan's unit."""
 
     grid: Grid
     times: tuple[int, int, int]
@@ -145,21 +145,20 @@ class WorkingGrid:
     ends: Ends = ((True, True), (True, True), (True, True))
 
     @classmethod
-    def of(cls, scan: Volume, epsilon: float | None, *, halo: int = 0, periodic: bool = False) -> WorkingGrid:
-        """Return the working grid of a scan, for the ε of `choose_epsilon`; a periodic scan has no halo. Raises
-        `ValueError` if ε is not positive or the scan is too small."""
+    def of(cls, scan: Volume, epsilon: float | None, *, halo: int = 0) -> WorkingGrid:
+        """Return the working grid of a scan, for the ε of `choose_epsilon`. Raises `ValueError` if ε is not positive or
+        the scan is too small."""
         ε = choose_epsilon(scan, epsilon)
         if min(scan.shape) < 4:
             raise ScanError(f"the volume must have at least 4 voxels along each axis, got {scan.shape}")
         times, unit = choose_refinement(scan.spacing, ε), ε / WORKING_EPSILON
-        halo = 0 if periodic else halo
         shape = tuple(n * t + 2 * halo for n, t in zip(scan.shape, times, strict=True))
         spacing = tuple(h / t / unit for h, t in zip(scan.spacing, times, strict=True))
-        grid = Grid(shape, spacing, "periodic" if periodic else "replicate")  # type: ignore[arg-type]
+        grid = Grid(shape, spacing, "replicate")  # type: ignore[arg-type]
         return cls(grid, times, unit, ε, halo)  # type: ignore[arg-type]
 
     def of_box(self, shape: Sequence[int], ends: Ends) -> WorkingGrid:
-        """Return the grid of a box of `shape` scan voxels, not periodic, with a halo on the sides marked in `ends`."""
+        """Return the grid of a box of `shape` scan voxels, with a halo on the sides marked in `ends`."""
         axes = zip(shape, self.times, ends, strict=True)
         size = tuple(n * times + self.halo * sum(sides) for n, times, sides in axes)
         return replace(self, grid=Grid(size, self.grid.spacing, "replicate"), ends=ends)  # type: ignore[arg-type]

@@ -50,9 +50,7 @@ class Known:
             return replace(whole, places=tuple(places), notes=note_labelled(places, labelled))
         return replace(whole, places=tuple(known_places(volume.shape[whole.axis], every, known)))
 
-    def read(
-        self, run: Run, periodic: bool = False, name: str = "the known slices"
-    ) -> tuple[Slices, np.ndarray, np.ndarray]:
+    def read(self, run: Run, name: str = "the known slices") -> tuple[Slices, np.ndarray, np.ndarray]:
         """Read the known slices into the run's store; return them, their labels, and whether each slice of the volume
         has labels, bool (length,). Raises `ScanError` if they hold grey levels, or are all empty or all full; the
         message calls them `name`."""
@@ -77,7 +75,7 @@ class Known:
                 "slice the first, is there a label that nobody annotated, or are there several labels?"
             )
         edges = axis_first(self.volume.spacing, self.axis)
-        slices = Slices(inside.stored, self.places, length, edges, self.volume.unit, periodic, self.marks)
+        slices = Slices(inside.stored, self.places, length, edges, self.volume.unit, self.marks)
         return slices, labels, np.concatenate([record["there"] for record in records])
 
     def turn(self, values: np.ndarray) -> np.ndarray:

@@ -78,10 +78,9 @@ def reconstruct_labels(
     instances
         Whether labels are of one kind that the image tells from the background, but not from each other; else it is
         read for each by itself. By default they are if nine in ten are one piece in each known slice and grey levels
-        vary more within them than between them. Where every voxel is labelled, or the volume repeats, each is read by
-        itself.
+        vary more within them than between them. Where every voxel is labelled, each is read by itself.
     options
-        Those of `reconstruct`, as are the others: every, known, ignore, axis, suggest and periodic.
+        Those of `reconstruct`, as are the others: every, known, ignore, axis and suggest.
 
     In the result `labels` has the label of the structure at each voxel, `mask` whether there is one, `phase` the
     greatest phase field, `probability` that of the voxel's label; there are no coefficients. Its `status` is that of
@@ -106,7 +105,6 @@ class _Inputs:
     labels: list[int]
     known_voxels: np.ndarray
     marked: bool
-    periodic: bool
     suggest: int
     image: Volume | None
     example: Volume | None
@@ -115,7 +113,7 @@ class _Inputs:
     @classmethod
     def load(
         cls, slices: Source, chosen: Sequence[int] | None, image: Source | None, example: Source | None, *,
-        working: Working, reading: dict[str, Any], suggest: int = 0, periodic: bool = False, **which: Any,
+        working: Working, reading: dict[str, Any], suggest: int = 0, **which: Any,
     ) -> _Inputs:  # fmt: skip
         """Read labels, image and example, and find which slices and which labels are known."""
         which, volume = {**WHICH, **which}, load(slices, **reading)
@@ -135,8 +133,8 @@ class _Inputs:
         annotated = None if example is None else load_example(example, volume, reading)
         grey = None if image is None else load_image(image, volume, reading)
         return cls(
-            known, indices, labels, known.turn_back(known_voxels), ignore is not None, periodic, suggest, grey,
-            annotated, working,
+            known, indices, labels, known.turn_back(known_voxels), ignore is not None, suggest, grey, annotated,
+            working,
         )  # fmt: skip
 
     @property
@@ -160,7 +158,7 @@ class _Inputs:
         mask = replace(known.volume, array=inside, affine=None, notes=())
         if law is None:
             working = replace(working, tile=None)  # a box of a label is filled at once
-        return reconstruct(mask, law, axis=known.axis, periodic=self.periodic, working=working, **which, **more)
+        return reconstruct(mask, law, axis=known.axis, working=working, **which, **more)
 
 
 def _fill_instances(
@@ -169,7 +167,7 @@ def _fill_instances(
     """Fill labels that are instances as one structure, by the image. Return this structure, None if they are not or the
     image does not show it; the inputs from which each label is to be filled then; and notes."""
     image = inputs.image
-    if image is None or inputs.full or inputs.periodic:
+    if image is None or inputs.full:
         return None, inputs, ()
     if instances is None:
         levels = inputs.known.turn(image.values)[list(inputs.known.places)]
@@ -193,7 +191,7 @@ def _join_labels(
     volume, places = known.volume, list(known.places)
     unfilled = np.ones(known.turn(inputs.indices).shape, dtype=bool)
     filled = filled_range(places, len(unfilled))
-    unfilled[slice(None) if inputs.periodic or image is not None else filled] = False
+    unfilled[slice(None) if image is not None else filled] = False
     indices, likely, phase, odds = _join_parts(inputs, parts, inputs.full, known.turn_back(unfilled))
     doubts = {label: part.uncertainty for label, (_, part) in zip(labels, parts, strict=True)}
     dice = {label: doubt.expected_dice for label, doubt in doubts.items() if doubt is not None}
@@ -204,7 +202,7 @@ def _join_labels(
     error = max(doubt.calibration_error for doubt in (whole and whole.uncertainty, *doubts.values()) if doubt)
     entropy = doubt(likely)
     entropies = tuple(entropy.sum(tuple({0, 1, 2} - {axis})) for axis in range(3))
-    suggestions = suggest_slices(entropies[known.axis], places, inputs.suggest, inputs.periodic)
+    suggestions = suggest_slices(entropies[known.axis], places, inputs.suggest)
     table = np.array([0, *labels], volume.values.dtype if volume.values.dtype.kind in "iu" else np.int64)
     if (kind := smallest_type(table)).itemsize < 8:  # labels of 64 bits keep their type
         table = table.astype(kind)
@@ -232,7 +230,7 @@ def _fill_each(
     laws = prior if isinstance(prior, Mapping) else dict.fromkeys(inputs.labels, prior)
     for index, label in enumerate(inputs.labels, 1):
         inside = (inputs.indices == index) & inputs.known_voxels
-        box = WHOLE if inputs.periodic else _box_of_label(inside, inputs)
+        box = _box_of_label(inside, inputs)
         more = {
             "image": image and replace(image, array=image.values[box], affine=None, notes=()),
             "example": example and replace(example, array=(example.values == label).astype(np.uint8), notes=()),

@@ -110,7 +110,6 @@ def reconstruct(
     image: Source | None = None,
     example: Source | None = None,
     suggest: int = 0,
-    periodic: bool = False,
     working: Working = Working(),
     progress: Progress = silent,
     **reading: Any,
@@ -122,7 +121,7 @@ def reconstruct(
     inside, and the network weighs what they say of the others. With a law, F_ε is lowered from there if this is better:
     it is tried out on the part of the example that did not tune, or else on every second known slice. Known slices stay
     as they are. Labels in a file with a side of more than 256 voxels, or any with a `tile`, are filled in blocks, but
-    with a law, an image, `ignore` or `periodic`, where `store` and `workers` serve a law alone.
+    with a law, an image or `ignore`, where `store` and `workers` serve a law alone.
 
     Raises ValueError and FileNotFoundError as `segment`; or if known slices are fewer than two, or than a law is tried
     out on, all empty, all full or grey levels; or if an example's spacing or an image's voxels are other ones.
@@ -149,15 +148,13 @@ def reconstruct(
         A mask of another volume of the same kind, known whole. A file or an array has the slices' `spacing` and `unit`.
     suggest
         Number of slices to suggest for annotation next.
-    periodic
-        Whether the volume repeats, as generated ones do.
     working, progress, reading
         As in `segment`.
     """
     volume = load(slices, **reading, lazy=True)
     which = {"every": every, "known": known, "ignore": ignore, "axis": axis}
     check_which(volume.shape, **which, suggest=suggest)  # type: ignore[arg-type]
-    inputs = _Inputs.load(volume, which, prior, image, example, periodic, working=working, reading=reading)
+    inputs = _Inputs.load(volume, which, prior, image, example, working=working, reading=reading)
     with inputs.open_run(working, progress) as run:
         return _fill_between(inputs, suggest, run, working, progress)
 
@@ -174,18 +171,17 @@ class _Inputs:
     taught: Taught
     image: Volume | None
     example: Volume | None
-    periodic: bool
     in_blocks: bool
 
     @classmethod
     def load(
         cls, volume: Volume, which: dict[str, Any], prior: LawLike | None, image: Source | None,
-        example: Source | None, periodic: bool, *, working: Working, reading: dict[str, Any],
+        example: Source | None, *, working: Working, reading: dict[str, Any],
     ) -> _Inputs:  # fmt: skip
         """Load the inputs, and the volume if it is filled at once; raise ScanError where inputs exclude each other."""
         choose_epsilon(volume, working.epsilon)  # refuses an ε before the work
         large = working.tile is not None or (volume.in_file and max(volume.shape) > LARGEST_BOX)
-        in_blocks = large and prior is None and image is None and which["ignore"] is None and not periodic
+        in_blocks = large and prior is None and image is None and which["ignore"] is None
         if not in_blocks:
             check_memory(volume.shape, LEAST_BYTES, "a volume that is filled at once, not in blocks,")
             volume = volume.load()
@@ -196,7 +192,7 @@ class _Inputs:
         taught = Taught.load(working.filler, image=image is not None)
         grey = None if image is None else load_image(image, volume, reading)
         annotated = None if example is None else load_example(example, volume, reading)
-        return cls(volume, which, laws, notes, taught, grey, annotated, periodic, in_blocks)
+        return cls(volume, which, laws, notes, taught, grey, annotated, in_blocks)
 
     def open_run(self, working: Working, progress: Progress) -> AbstractContextManager[Run]:
         """Open the run of the blocks; a volume that is filled at once is one block in memory."""
@@ -210,10 +206,10 @@ class _Inputs:
 
 def _fill_between(inputs: _Inputs, suggest: int, run: Run, working: Working, progress: Progress) -> Segmentation:
     """Read the known slices, adapt the network, choose a law, fill the volume, and say how sure each voxel is."""
-    volume, periodic = inputs.volume, inputs.periodic
+    volume = inputs.volume
     known = Known.find(volume, run, **inputs.which)
     suggest = check_int(suggest, "a number of slices from 0", 0, volume.shape[known.axis] - len(known.places))
-    slices, labels, labelled = known.read(run, periodic)
+    slices, labels, labelled = known.read(run)
     doubts = () if inputs.which["every"] is None else doubt_places(labelled, known.places)
     notes = (*known.notes, *doubts, *doubt_labels(labels, inputs.which["ignore"]), *inputs.notes)
     example = None if inputs.example is None else Example.of(inputs.example, known.places, known.axis)
@@ -235,7 +231,7 @@ def _fill_between(inputs: _Inputs, suggest: int, run: Run, working: Working, pro
         inside = flow_summary(float(lowered.mask.mean()), lowered.energies, lowered.steps)
     uncertain = filled.judge(known, slices, engine, suggest)
     tested = "the example" if example else "slices left out" if trial.law else "generated shapes"
-    options = {"tested": tested, "image": evidence is not None, "periodic": periodic}
+    options = {"tested": tested, "image": evidence is not None}
     status, doubts = describe_filled(head, inside, filled.share, uncertain, known.places, slices.length, **options)
     return Segmentation.of(
         volume, filled.mask, phase, trial.law, choose_epsilon(volume, working.epsilon), (*notes, *doubts),
@@ -328,7 +324,7 @@ class _Engine:
 
     def cut(self, slices: Slices, edge: int | None = None) -> tuple[WorkingGrid, list[Box]]:
         """Return the working grid on which a law is lowered, and the tiles."""
-        grid = WorkingGrid.of(slices.frame, self.epsilon, halo=HALO, periodic=slices.periodic)
+        grid = WorkingGrid.of(slices.frame, self.epsilon, halo=HALO)
         return grid, cut_tiles(grid, slices.shape, edge)
 
     def _fill(self, slices: Slices) -> tuple[Raster, np.ndarray]:
@@ -365,15 +361,15 @@ class _Filled:
 
     def judge(self, known: Known, slices: Slices, engine: _Engine, suggest: int) -> Uncertainty:
         """Return how sure the volume is, and which slices to annotate next."""
-        sums, ends = self.sums, {"periodic": slices.periodic, "whole": engine.evidence is not None}
+        sums, whole = self.sums, engine.evidence is not None
         dice = float(2 * sums["both"] / max(sums["count"] + sums["sum"], 1e-9)) if slices.between.any() else 1.0
         order = axis_first((0, 1, 2), known.axis)  # the volume's axes in the order of the sums
         return Uncertainty(
             replace(known.volume, array=self.likely, notes=()),
             engine.taught.error,
-            suggest_slices(sums["along 0"], slices.places, suggest, slices.periodic),
+            suggest_slices(sums["along 0"], slices.places, suggest),
             dice,
-            known_share=share_by_slices(slices.areas, slices.places, slices.length, **ends),
+            known_share=share_by_slices(slices.areas, slices.places, slices.length, whole=whole),
             mean_probability=float(sums["total"]) / math.prod(slices.shape),
             entropies=tuple(sums[f"along {order.index(axis)}"] for axis in range(3)),
         )
@@ -511,21 +507,20 @@ class SlicesProblem(Problem):
     @property
     def inputs(self) -> dict[str, object]:
         slices, trial = self.slices, self.trial
-        geometry = {"places": slices.places, "spacing": slices.spacing, "periodic": slices.periodic}
+        geometry = {"places": slices.places, "spacing": slices.spacing}
         springs = {"strength": trial.strength, "pull": trial.pull}
         return {"slices": digest_of(slices.inside), **geometry, "start": digest_of(self.level), **springs}
 
     def terms(self, box: Box, grid: WorkingGrid) -> tuple[np.ndarray, Data]:
         """Return the level on a box, and the springs of its voxels: on known ones the trial's strength; on others
         between known slices its pull times their log-odds, which are the level over the edge of a voxel."""
-        slices, trial, indices = self.slices, self.trial, self.slices.indices(box)
+        slices, trial, level = self.slices, self.trial, self.level[box]
         positions, inside = slices.known(box)
-        level = self.level[np.ix_(*indices)]
-        between = slices.between[indices[0], None, None]
+        between = slices.between[box[0], None, None]
         stiffness = np.where(between, trial.pull / min(slices.spacing[1:]) * level, 0).astype(np.float32)
         stiffness[positions] = np.where(inside, trial.strength, -trial.strength)
         if slices.marks is not None:
-            marks = slices.marks[np.ix_(*indices)]
+            marks = slices.marks[box]
             stiffness = np.where(marks == 0, stiffness, trial.strength * marks).astype(np.float32)
         return level, Hinge(grid.spread(stiffness, centre=0), MARGIN)
 

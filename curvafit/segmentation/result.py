@@ -376,12 +376,12 @@ def describe_run(segmentation: Segmentation, options: Mapping[str, Any], scan: V
 
 def describe_filled(
     head: str, inside: str, share: float, uncertain: Uncertainty, places: Sequence[int], length: int, *, tested: str,
-    image: bool = False, periodic: bool = False,
+    image: bool = False,
 ) -> tuple[str, tuple[str, ...]]:  # fmt: skip
     """Return the status of a volume of `length` slices with known ones at `places`, and notes on doubts. `head` is how
     it was filled, `inside` describes the mask, `share` is its fraction of the volume, and `tested` names what the
-    probabilities were tested on. With an image or in a periodic volume all slices are filled."""
-    filled = slice(0, length) if image or periodic else filled_range(places, length)
+    probabilities were tested on. With an image all slices are filled."""
+    filled = slice(0, length) if image else filled_range(places, length)
     unfilled = length - (filled.stop - filled.start)
     known = uncertain.known_share
     beyond = f", {unfilled} beyond them not filled" if unfilled > 0 else ""
@@ -398,7 +398,7 @@ def describe_filled(
     notes = [few] if uncertain.expected_dice < HALF else []
     if known[1:] and not known[1] <= share <= known[2] and abs(share / known[0] - 1) > LITTLE:
         notes.append(OFF)
-    return status, (*notes, *(() if periodic else _note_ends(places, length, filled, image)))
+    return status, (*notes, *_note_ends(places, length, filled, image))
 
 
 def _note_ends(places: Sequence[int], length: int, filled: slice, image: bool) -> Iterator[str]:

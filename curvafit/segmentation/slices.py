@@ -30,16 +30,14 @@ WHOLE: Box = (slice(0, None), slice(0, None), slice(0, None))
 @dataclass(frozen=True, eq=False)
 class Slices:
     """The known slices across the first axis of a volume of `length` slices. `inside` holds their masks, bool
-    (N, Y, X), in memory or in a file, and `places` their indices, ascending. In a `periodic` volume the first slice
-    follows the last. `marks` holds known voxels of the other slices, int8 (length, Y, X): 1 inside, -1 outside, 0
-    unknown; None if there are none."""
+    (N, Y, X), in memory or in a file, and `places` their indices, ascending. `marks` holds known voxels of the other
+    slices, int8 (length, Y, X): 1 inside, -1 outside, 0 unknown; None if there are none."""
 
     inside: np.ndarray
     places: tuple[int, ...]
     length: int
     spacing: tuple[float, float, float]
     unit: str = "voxel"
-    periodic: bool = False
     marks: np.ndarray | None = None
 
     def crop(self, box: Box) -> Slices:
@@ -47,7 +45,7 @@ class Slices:
         positions, inside = self.known(box)
         marks = None if self.marks is None else self.marks[box]
         length = box[0].stop - box[0].start
-        return replace(self, inside=inside, places=tuple(positions), length=length, periodic=False, marks=marks)
+        return replace(self, inside=inside, places=tuple(positions), length=length, marks=marks)
 
     def keep_known(self, mask: np.ndarray, box: Box = WHOLE) -> np.ndarray:
         """Return a copy of the mask (Z, Y, X) of a box in which all known voxels have their known value."""
@@ -55,7 +53,7 @@ class Slices:
         corrected = mask.copy()
         corrected[positions] = inside
         if self.marks is not None:
-            marks = self.marks[np.ix_(*self.indices(box))]
+            marks = self.marks[box]
             corrected = np.where(marks == 0, corrected, marks > 0)
         return corrected
 
@@ -74,39 +72,29 @@ class Slices:
         """The fraction of each known slice that is inside, (N,)."""
         return np.array([self.inside[k].mean() for k in range(len(self.places))])
 
-    def indices(self, box: Box) -> list[np.ndarray]:
-        """Return the indices of a box's voxels along each axis; in a periodic volume a box may cross the ends."""
-        edges = zip(box, self.shape, strict=True)
-        return [np.arange(edge.start, n if edge.stop is None else edge.stop) % n for edge, n in edges]
-
     @property
     def unfilled(self) -> np.ndarray:
         """Whether each slice is too far beyond the known ones to be filled (`filled_range`), bool (length,)."""
-        unfilled = np.full(self.length, not self.periodic)
+        unfilled = np.ones(self.length, dtype=bool)
         unfilled[filled_range(self.places, self.length)] = False
         return unfilled
 
     def known(self, box: Box) -> tuple[list[int], np.ndarray]:
         """Return the known slices of a box: their positions, counted from its first slice, and their masks within the
         box, bool (N, Y, X)."""
-        zs, ys, xs = self.indices(box)
-        row_of_place = {place: row for row, place in enumerate(self.places)}
-        positions = [position for position, z in enumerate(zs) if z in row_of_place]
-        return positions, self.inside[[row_of_place[int(zs[position])] for position in positions]][:, ys][:, :, xs]
+        start, stop, _ = box[0].indices(self.length)
+        rows = [row for row, place in enumerate(self.places) if start <= place < stop]
+        return [self.places[row] - start for row in rows], self.inside[rows][:, box[1], box[2]]
 
     def level(self, way: str) -> np.ndarray:
         """Interpolate signed distances between the known slices by one of `WAYS`: float32 (length, Y, X), positive
-        inside. Before the first known slice and beyond the last, the distances of the nearest are repeated; a periodic
-        volume is interpolated across its ends. An empty slice has minus the largest gap, a full one plus this gap."""
+        inside. Before the first known slice and beyond the last, the distances of the nearest are repeated. An empty
+        slice has minus the largest gap, a full one plus this gap."""
         places = np.array(self.places)
         distances = plane_distances(self.inside, self.spacing[1:], self.gap * self.spacing[0])
         positions = np.arange(self.length).clip(places[0], places[-1])
-        if self.periodic:  # the first known slice is also the last, a period further on
-            positions = (np.arange(self.length) - places[0]) % self.length + places[0]
-            places = np.append(places, places[0] + self.length)
-            distances = np.concatenate([distances, distances[:1]])
         if way == "spline":
-            curve = CubicSpline(places, distances, bc_type="periodic" if self.periodic else "natural")
+            curve = CubicSpline(places, distances, bc_type="natural")
         elif way == "linear":
             curve = make_interp_spline(places, distances, k=1)
         else:
@@ -117,17 +105,15 @@ class Slices:
     @property
     def gap(self) -> int:
         """The largest distance, in slices, between a known slice and the next."""
-        steps = np.diff(self.places)
-        return int(max(*steps, self.places[0] + self.length - self.places[-1]) if self.periodic else steps.max())
+        return int(np.diff(self.places).max())
 
     @property
     def between(self) -> np.ndarray:
         """Whether each slice of the volume lies between two known ones, bool (length,)."""
-        unknown = np.ones(self.length, dtype=bool)
-        unknown[list(self.places)] = False
-        if not self.periodic:
-            unknown[: self.places[0]] = unknown[self.places[-1] :] = False
-        return unknown
+        between = np.zeros(self.length, dtype=bool)
+        between[self.places[0] : self.places[-1]] = True
+        between[list(self.places)] = False
+        return between
 
 
 def axis_first(values: Sequence[Any], axis: int) -> tuple[Any, Any, Any]:
@@ -152,14 +138,11 @@ def filled_range(places: Sequence[int], length: int) -> slice:
     return slice(max(places[0] - before, 0), min(places[-1] + beyond + 1, length))
 
 
-def harmonic_distance(places: Sequence[int], length: int, periodic: bool = False) -> np.ndarray:
+def harmonic_distance(places: Sequence[int], length: int) -> np.ndarray:
     """Return d e / (d + e) for each slice, float64 (length,), where d and e are the distances to the known slices
     before and after it. The error of an interpolation grows in proportion. It is 0 at a known slice and a quarter of
     the gap in the middle; with a known slice on one side only, it is the distance to that one."""
-    known, positions = np.array(places), np.arange(length)
-    if periodic:
-        known = np.concatenate([known - length, known, known + length])
-    known = np.concatenate([[-np.inf], known, [np.inf]])
+    known, positions = np.array([-np.inf, *places, np.inf]), np.arange(length)
     before = positions - known[known.searchsorted(positions, "right") - 1]
     after = known[known.searchsorted(positions)] - positions
     d, e = np.minimum(before, after), np.maximum(before, after)

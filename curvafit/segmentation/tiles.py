@@ -45,16 +45,15 @@ def cut_tiles(grid: WorkingGrid, shape: Sequence[int], edge: int | None = None) 
 
 def surround(tile: Box, grid: WorkingGrid, shape: Sequence[int]) -> tuple[Box, WorkingGrid]:
     """Return the box in which the energy of a tile is lowered, and its working grid, in a volume of `shape` voxels of
-    `grid.times` working voxels each. The box is the tile with its overlap; in a periodic volume it may go beyond."""
+    `grid.times` working voxels each. The box is the tile with its overlap."""
     if all(edge.stop - edge.start == n for edge, n in zip(tile, shape, strict=True)):
         return tile, grid
     box, ends = [], []
     for edge, n, times in zip(tile, shape, grid.times, strict=True):
         overlap = -(-OVERLAP // times)  # in voxels, rounded up
         start, stop = edge.start - overlap, edge.stop + overlap
-        at_start, at_end = start <= 0 and not grid.grid.periodic, stop >= n and not grid.grid.periodic
-        box.append(slice(0 if at_start else start, n if at_end else stop))
-        ends.append((at_start, at_end))
+        box.append(slice(max(start, 0), min(stop, n)))
+        ends.append((start <= 0, stop >= n))
     z, y, x = box
     return (z, y, x), grid.of_box([edge.stop - edge.start for edge in box], tuple(ends))
 

@@ -167,12 +167,9 @@ def crop_to_surface(slices: Slices, edge: int) -> tuple[Slices, Box]:
 
 def leave_out_slices(slices: Slices) -> Task[Slices] | None:
     """Return the task to predict every second known slice from the others; None where there are too few, or the others
-    have no surface. The ends stay known, except the last slice in a periodic volume."""
+    have no surface. The ends stay known."""
     count = len(slices.places)
-    # In a periodic volume the first slice follows the last: of an even number of slices, every second one leaves both
-    # neighbours of the last.
-    last_may_go = slices.periodic and count % 2 == 0
-    left_out = range(1, count if last_may_go else count - 1, 2)
+    left_out = range(1, count - 1, 2)
     kept = [k for k in range(count) if k not in left_out]
     given = replace(slices, inside=slices.inside[kept], places=tuple(slices.places[k] for k in kept))
     if not left_out or len(kept) < 2 or given.inside.all() or not given.inside.any():

@@ -110,7 +110,7 @@ def doubt(probability: np.ndarray) -> np.ndarray:
 
 
 def share_by_slices(
-    shares: np.ndarray, places: Sequence[int], length: int, *, periodic: bool = False, whole: bool = False
+    shares: np.ndarray, places: Sequence[int], length: int, *, whole: bool = False
 ) -> tuple[float, ...]:
     """Return the inside's fraction of a volume by Cavalieri's principle, from the fractions `shares` (N,) of the known
     slices at `places`, and its 95 % interval where three or more are known.
@@ -123,9 +123,6 @@ def share_by_slices(
     noise's, by the sum of the squared weights of the slices.
     """
     filled, at = slice(0, length) if whole else filled_range(places, length), np.array(places, dtype=np.int64)
-    if periodic:
-        at, shares = np.append(at, at[0] + length), np.append(shares, shares[0])
-        filled = slice(int(at[0]), int(at[-1]))
     rows = np.arange(filled.start, filled.stop)
     weights = np.array([np.interp(rows, at, basis).sum() for basis in np.eye(len(at))])
     gaps, share = np.diff(at), float(weights @ shares) / length
@@ -149,14 +146,14 @@ def _with_constant(evidence: np.ndarray) -> np.ndarray:
     return np.concatenate([evidence, np.ones_like(evidence[:, :1])], axis=1)
 
 
-def suggest_slices(entropies: np.ndarray, places: Sequence[int], count: int, periodic: bool = False) -> tuple[int, ...]:
+def suggest_slices(entropies: np.ndarray, places: Sequence[int], count: int) -> tuple[int, ...]:
     """Return up to `count` slices to annotate next, given entropies (Z,). Each is the one that lowers the sum of the
     entropies most, once those before it are known; there are fewer if none lowers it."""
     known, remaining = set(places), np.asarray(entropies, dtype=np.float64)
     chosen: list[int] = []
     for _ in range(count):
         unknown = [n for n in range(len(remaining)) if n not in known]
-        options = [remaining_entropy(remaining, known, n, periodic) for n in unknown]
+        options = [remaining_entropy(remaining, known, n) for n in unknown]
         sums = [option.sum() for option in options]
         if not sums or min(sums) >= remaining.sum():
             break
@@ -167,10 +164,8 @@ def suggest_slices(entropies: np.ndarray, places: Sequence[int], count: int, per
     return tuple(chosen)
 
 
-def remaining_entropy(
-    entropies: np.ndarray, places: Sequence[int] | set[int], new: int, periodic: bool = False
-) -> np.ndarray:
+def remaining_entropy(entropies: np.ndarray, places: Sequence[int] | set[int], new: int) -> np.ndarray:
     """Return the entropies (Z,) of all slices once the slice `new` is known besides those at `places`. They fall as the
     `harmonic_distance` does, the thickness of a slice's uncertain layer; those beyond the next known slices stay."""
-    before, after = (harmonic_distance(sorted(known), len(entropies), periodic) for known in (places, {*places, new}))
+    before, after = (harmonic_distance(sorted(known), len(entropies)) for known in (places, {*places, new}))
     return entropies * np.divide(after, before, out=np.zeros_like(before), where=before > 0)

@@ -41,24 +41,12 @@ def straight(length: int = 24) -> np.ndarray:
 
 
 @pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("periodic", [False, True])
-def test_an_interpolation_keeps_the_known_slices(way: str, periodic: bool) -> None:
+def test_an_interpolation_keeps_the_known_slices(way: str) -> None:
     mask = ball()
-    slices = known(mask, 5, periodic=periodic)
+    slices = known(mask, 5)
     level = slices.level(way)
     assert level.shape == mask.shape and np.array_equal(level[::5] > 0, mask[::5])
-    assert np.array_equal(known(straight(), 5, periodic=periodic).level(way) > 0, straight())
-
-
-def test_a_volume_that_repeats_is_interpolated_across_its_end() -> None:
-    one, other = (np.hypot(*(np.mgrid[:24, :24] - 11.5)) < radius for radius in (9, 4))
-    slices = Slices(np.stack([one, other]), (0, 6), 12, EDGES, periodic=True)
-    for way in ("linear", "spline"):
-        level = slices.level(way)
-        np.testing.assert_allclose(level[1:6], level[11:6:-1], atol=1e-4)  # even about slice 0
-        rolled = Slices(np.stack([other, one]), (2, 8), 12, EDGES, periodic=True).level(way)
-        np.testing.assert_allclose(np.roll(rolled, 4, axis=0), level, atol=1e-4)
-    assert slices.gap == 6 and known(ball(), 5, periodic=True).gap == 5
+    assert np.array_equal(known(straight(), 5).level(way) > 0, straight())
 
 
 def test_distances_are_those_of_the_slices_around() -> None:
@@ -73,8 +61,6 @@ def test_distances_are_those_of_the_slices_around() -> None:
     np.testing.assert_allclose(distance[4], (distance[2] + distance[6]) / 2, atol=1e-6)
     slices = Slices(inside, (1, 5), 8, EDGES)
     assert slices.between.tolist() == [False, False, True, True, True, False, False, False]
-    around = replace(slices, periodic=True)
-    assert around.between.tolist() == [True, False, True, True, True, False, True, True]
 
 
 def pancakes(thin: int, seed: int = 0, width: int = 32) -> np.ndarray:
@@ -116,18 +102,13 @@ def test_a_halo_is_cut_off_again() -> None:
         shared = place.spread(values, centre=0)
         np.testing.assert_array_equal(place.to_scan(shared), bare.to_scan(bare.spread(values, centre=0)))
         assert float(shared.sum()) == pytest.approx(float(bare.spread(values, centre=0).sum()), rel=1e-5)
-    whole = WorkingGrid.of(Volume(values), None, halo=5, periodic=True)
-    assert whole.grid.periodic and whole.grid.shape == values.shape
 
 
-@pytest.mark.parametrize(
-    ("count", "periodic", "out"),
-    [(3, False, [1]), (4, False, [1]), (5, False, [1, 3]), (4, True, [1, 3]), (5, True, [1, 3])],
-)
-def test_every_second_slice_is_left_out(count: int, periodic: bool, out: list[int]) -> None:
+@pytest.mark.parametrize(("count", "out"), [(3, [1]), (4, [1]), (5, [1, 3])])
+def test_every_second_slice_is_left_out(count: int, out: list[int]) -> None:
     mask = ball()
     places = tuple(range(8, 8 + 4 * count, 4))
-    task = room.leave_out_slices(Slices(mask[list(places)], places, len(mask), EDGES, periodic=periodic))
+    task = room.leave_out_slices(Slices(mask[list(places)], places, len(mask), EDGES))
     assert task is not None and list(task.places) == [places[k] for k in out]
     assert task.given.places == tuple(place for k, place in enumerate(places) if k not in out)
     assert np.array_equal(task.truth, mask[task.places])

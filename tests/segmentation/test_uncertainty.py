@@ -15,8 +15,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
 def test_the_reach_is_that_of_both_sides_and_a_new_slice_lowers_that_of_its_gap_alone() -> None:
     np.testing.assert_allclose(harmonic_distance([1, 5], 8), [1, 0, 3 / 4, 1, 3 / 4, 0, 1, 2])
-    np.testing.assert_allclose(harmonic_distance([1, 5], 8, periodic=True), [3 / 4, 0, 3 / 4, 1, 3 / 4, 0, 3 / 4, 1])
-    np.testing.assert_allclose(harmonic_distance([2], 4, periodic=True), [1, 3 / 4, 0, 3 / 4])
+    np.testing.assert_allclose(harmonic_distance([2], 4), [2, 1, 0, 1])
     before, after = harmonic_distance([0, 8, 16], 20), harmonic_distance([0, 3, 8, 16], 20)
     assert (after[1:8] < before[1:8]).all() and np.array_equal(after[8:], before[8:])
 
@@ -90,7 +89,6 @@ def test_the_volume_by_known_slices_is_that_of_what_is_filled() -> None:
     flat = room.share_by_slices(np.full(4, 0.3), [6, 10, 14, 18], 40)
     assert flat == pytest.approx((0.3 * 17 / 40,) * 3)  # slices 4 to 20
     assert room.share_by_slices(np.full(4, 0.3), [6, 10, 14, 18], 40, whole=True) == pytest.approx((0.3,) * 3)
-    assert room.share_by_slices(np.full(4, 0.3), [0, 10, 20, 30], 40, periodic=True) == pytest.approx((0.3,) * 3)
     assert room.share_by_slices(np.array([0.0, 1.0]), [0, 4], 5) == pytest.approx((0.5,))  # no interval of two
 
 
@@ -148,14 +146,13 @@ def test_suggestions_are_unknown_slices_in_any_order_of_the_known_and_mirrored()
     assert room.suggest_slices(np.zeros(10), [0, 9], 3) == () and room.suggest_slices(np.ones(4), [0, 1, 2], 3) == (3,)
 
 
-@pytest.mark.parametrize("periodic", [False, True])
-def test_each_suggestion_lowers_the_entropy(periodic: bool) -> None:
+def test_each_suggestion_lowers_the_entropy() -> None:
     left, places = ENTROPIES.copy(), list(PLACES)
     left[places] = 0
-    for new in room.suggest_slices(left, PLACES, 5, periodic):
-        after = room.remaining_entropy(left, places, new, periodic)
+    for new in room.suggest_slices(left, PLACES, 5):
+        after = room.remaining_entropy(left, places, new)
         assert (after <= left).all() and after[new] == 0 and after.sum() < left.sum()
-        others = [room.remaining_entropy(left, places, n, periodic).sum() for n in range(40) if n not in places]
+        others = [room.remaining_entropy(left, places, n).sum() for n in range(40) if n not in places]
         assert after.sum() == min(others)
         left, places = after, [*places, new]
 
