@@ -6,4 +6,3 @@ from .result import write_mask as write_mask
 from .segmentation import Calibration as Calibration
 from .segmentation import calibrate as calibrate
 from .segmentation import segment as segment
-from .transforms import FillSlicesd as FillSlicesd
