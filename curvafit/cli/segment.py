@@ -198,7 +198,6 @@ def reconstruct(
     learning: Annotated[dict[str, Any], Group(parse_learning)],
     stiffness: Annotated[float | None, _what(help="Stiffness of springs on the known slices: try nothing out.")] = None,
     suggest: Annotated[int, _what(help="Number of slices to suggest for annotation next.", min=0)] = 0,
-    sure: Annotated[float | None, _what(help="Also write labels, ignored where less sure.", min=0.5, max=1)] = None,
     working: Working,
     reading: Reading,
     overwrite: OverwriteOption = False,
@@ -212,13 +211,12 @@ def reconstruct(
         raise ValueError("--instances goes with --labels and --image")
     filler, every = learning["filler"], which["every"]
     volume_files = _without(learning, "filler")
-    record: dict[str, Any] = {"job": "reconstruct", "sure": sure, "suggest": suggest, **which, **volume_files}
+    record: dict[str, Any] = {"job": "reconstruct", "suggest": suggest, **which, **volume_files}
     record |= {"filler": filler, "stiffness": stiffness, **_without(working, "workers")}
     # JSON has no slices: their step and start are recorded.
     record |= {"every": every.step, "first": every.start} if isinstance(every, slice) else {"first": 0}
     record |= {} if several is None else _without(several, "chosen")
     inputs = [path for path in learning.values() if path is not None]
-    maps = ("probability",) if sure is None else ("probability", "sure")
 
     def compute(volume: Volume, **options: Any) -> Segmentation:
         from curvafit.segmentation.labels import reconstruct_labels
@@ -233,11 +231,11 @@ def reconstruct(
         options |= {**which, "suggest": suggest}
         if several is not None:
             return reconstruct_labels(volume.load(), prior, **_without(several, "labels"), **options)
-        return fill(volume if sure is None else volume.load(), prior, **options)
+        return fill(volume, prior, **options)
 
-    job = _Job(slices, out, prior, reading, record, overwrite, inputs, maps)
+    job = _Job(slices, out, prior, reading, record, overwrite, inputs, ("probability",))
     working |= {"filler": filler, "stiffness": stiffness}
-    _run(job, compute, partial(load, slices, **reading, lazy=True), working, sure)
+    _run(job, compute, partial(load, slices, **reading, lazy=True), working)
 
 
 @dataclass(frozen=True)
@@ -270,23 +268,20 @@ class _Job:
         return {"command": command_line(), "prior": self.prior, **self.record}
 
 
-def _run(
-    job: _Job, compute: Callable[..., Segmentation], read: Callable[[], Volume], working: dict[str, Any],
-    sure: float | None = None,
-) -> None:  # fmt: skip
-    """Compute a volume's mask and write it; finished tiles are kept until then. `sure` adds labels to train with."""
+def _run(job: _Job, compute: Callable[..., Segmentation], read: Callable[[], Volume], working: dict[str, Any]) -> None:
+    """Compute a volume's mask and write it; finished tiles are kept until then."""
     from curvafit.core.files import remove
     from curvafit.segmentation.flow import Working
     from curvafit.segmentation.result import hidden_store, write_mask
     from curvafit.volumes.write import check_labels, note_lost
 
-    record, reading = job.record, job.reading
+    reading = job.reading
     job.check()
     with show_stages() as progress:
         progress("reading", 0.0)
         volume = read()
         job.check(volume)  # again: only now is the unit known, which the output's format may not hold
-        if record.get("labels"):
+        if job.record.get("labels"):
             volume = volume.load()
             check_labels(job.out, volume)
         lost = note_lost(job.out, volume)  # what the output's format does not hold
@@ -295,14 +290,12 @@ def _run(
         with resumable(lambda: "the same command" if store.exists() else ""):
             result = compute(volume, progress=progress, working=Working(**working, store=store))
             progress("writing", 1.0)
-            sure_labels = None if sure is None else result.keep_sure(sure)
-            result = result if sure_labels is None else replace(result, notes=(*result.notes, *sure_labels.notes))
             # The mask gets the source's header unless an option of reading makes that wrong for its voxels.
             changing = ("spacing", "crop") if job.image else ("spacing", "crop", "channel", "time")
             like = (job.image or job.source) if all(reading[name] is None for name in changing) else None
-            settings = {"sure": sure_labels, "like": like, "unit": reading["unit"], "overwrite": job.overwrite}
-            settings["record"] = job.content | ({"not_held": lost} if lost else {})
-            paths = write_mask(result, volume, job.out, **settings)
+            record = job.content | ({"not_held": lost} if lost else {})
+            settings = {"like": like, "unit": reading["unit"], "overwrite": job.overwrite}
+            paths = write_mask(result, volume, job.out, record=record, **settings)
         remove(store)
     for note in result.notes:
         say(note)

@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from curvafit.core.checks import check_float, check_int
 from curvafit.core.files import move_together, remove, temporary_folder
 from curvafit.core.records import Format, can_write, is_own_zarr, sibling
 from curvafit.core.runtime import Pictured, check_memory, hold_signals
 from curvafit.core.units import format_sampling
 from curvafit.priors.coefficients import Coefficients
-from curvafit.segmentation.slices import IDS, filled_range
+from curvafit.segmentation.slices import filled_range
 from curvafit.segmentation.uncertainty import doubt
 from curvafit.volumes.formats.nifti import write_nifti_like
 from curvafit.volumes.formats.zarr import CHUNK, add_labels, check_place, image_of, mark, store_of, write_labels
@@ -33,7 +32,7 @@ SETTLED = 0.001
 #: `format` of the record beside a mask.
 FORMAT = Format("curvafit-mask-1", title="the record of a mask")
 #: Volumes that may lie beside a mask, by the ending of their names.
-MAPS = ("probability", "sure")
+MAPS = ("probability",)
 #: Expected Dice below which a note says that the known slices are too few.
 HALF = 0.5
 #: Relative difference of the mask's volume and that by known slices below which there is no note.
@@ -143,33 +142,6 @@ class Segmentation(Pictured):
         """The probability of the inside, of a volume between known slices."""
         return None if self.uncertainty is None else self.uncertainty.probability
 
-    def keep_sure(self, least: float = 0.9, ignored: int | None = None) -> Volume:
-        """Return labels to train a network with: where one is less probable than `least`, it is replaced by `ignored`.
-
-        `ignored` is by default the highest label + 1, as nnU-Net demands. Known voxels keep their labels, of which one
-        structure has 0 and 1. Raises ValueError if there is no probability, or a label is as high as `ignored`.
-        """
-        if self.probability is None:
-            raise ValueError("labels can be kept where they are sure only in a volume with probabilities")
-        least = check_float(least, "a probability from 0.5 to 1", 0.5, 1.0)
-        labels, likely = (self.mask if self.labels is None else self.labels).values, self.probability.values
-        if self.labels is None:  # the probability is that of the inside
-            likely = np.where(labels, likely, 1 - likely)
-        lowest = max(int(labels.max()), 0) + 1
-        ignored = lowest if ignored is None else check_int(ignored, f"a label to ignore from {lowest}", lowest, IDS)
-        dtype = np.promote_types(labels.dtype, np.min_scalar_type(ignored))
-        if labels.dtype.kind in "iu" and ignored <= np.iinfo(labels.dtype).max:
-            dtype = labels.dtype  # NumPy would promote signed and unsigned ones of 64 bits to floats
-        if dtype.kind not in "iu":
-            raise ValueError(
-                f"a label to ignore must be higher than all others, but {ignored} is more than 64 bits hold"
-            )
-        values, unsure = labels.astype(dtype), likely < least
-        values[unsure] = ignored
-        percent = f"{100 * float(unsure.mean()):.3g} %"
-        note = f"{percent} of the voxels are less sure than {least:g} and have the label to ignore, {ignored}."
-        return replace(self.mask, array=values, notes=(note,))
-
     def __repr__(self) -> str:
         size = format_sampling(self.mask.shape, self.mask.spacing, self.mask.unit)
         return f"Segmentation({size}: {self.status})"
@@ -233,7 +205,6 @@ def write_mask(
     scan: Volume,
     path: str | Path,
     *,
-    sure: Volume | None = None,
     like: str | Path | None = None,
     unit: str | None = None,
     record: dict[str, Any] | None = None,
@@ -245,12 +216,10 @@ def write_mask(
     their paths are returned. Former ones of `MAPS` are removed. Of labels in an image, `scan.zarr/labels/NAME`, all
     others lie beside the store: `scan_NAME.png` and so on.
 
-    `sure` are labels of `Segmentation.keep_sure`, for `mask_sure.nii.gz`. Where the scan's file, `like`, and the target
-    are NIfTI, the mask gets the same header but for type and range, and `unit`. `record` has entries to add to the
-    record; with `overwrite` files of other origin may be replaced.
+    Where the scan's file, `like`, and the target are NIfTI, the mask gets the same header but for type and range, and
+    `unit`. `record` has entries to add to the record; with `overwrite` files of other origin may be replaced.
     """
-    maps = {MAPS[0]: segmentation.probability, MAPS[1]: sure}
-    maps = {name: volume for name, volume in maps.items() if volume is not None}
+    maps = {} if segmentation.probability is None else {MAPS[0]: segmentation.probability}
     inputs = () if like is None else (like,)
     target = check_mask_target(path, scan, inputs, overwrite, maps=list(maps))
     image = image_of(target)

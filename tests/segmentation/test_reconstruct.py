@@ -21,7 +21,6 @@ from curvafit.scan.grids import box_with_most_surface
 from curvafit.segmentation.flow import Working, WorkingGrid
 from curvafit.segmentation.labels import reconstruct_labels
 from curvafit.segmentation.reconstruction import MARGIN, STIFFNESS, reconstruct
-from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.segmentation.segmentation import FIRST, NATS, calibrate
 from curvafit.segmentation.slices import WAYS, Slices
 from curvafit.segmentation.trials import Task, Trial, choose_by_masks, dice, laws_of
@@ -372,39 +371,6 @@ def test_the_law_of_each_label_is_inferred_from_the_example(tmp_path: Path, monk
     truth, values = organelles(), np.load(out)
     assert dice(values == 2, truth == 2) > 0.95
     assert dice(values == 7, truth == 7) > 0.95
-
-
-def segmentation(mask: list[bool], likely: list[float], labels: list[int] | None = None) -> Segmentation:
-    """One row of voxels with these probabilities, of the inside or of their labels."""
-    inside, chances = (Volume(np.array(each)[None, None]) for each in (mask, np.float32(likely)))
-    several = None if labels is None else Volume(np.array(labels, dtype=np.uint8)[None, None])
-    uncertain = Uncertainty(chances, 0.0, (), 1.0)
-    return Segmentation(inside, chances, None, None, 1.0, "", (), uncertain, several)
-
-
-def test_labels_are_kept_where_they_are_sure() -> None:
-    """The mask may hold what is less likely than one half: such voxels are sure in neither way."""
-    one = segmentation([False, False, False, True, True, True, True], [0, 0.05, 0.2, 0.05, 0.8, 0.95, 1])
-    assert one.keep_sure().values.ravel().tolist() == [0, 0, 2, 2, 2, 1, 1]
-    assert one.keep_sure(0.7).values.ravel().tolist() == [0, 0, 0, 2, 1, 1, 1]
-    assert one.keep_sure(1.0, 5).values.ravel().tolist() == [0, 5, 5, 5, 5, 5, 1]
-    several = segmentation([True, True, True, True, False, False], [1, 0.95, 0.5, 0.3, 0.95, 0.6], [2, 7, 2, 7, 0, 0])
-    assert several.keep_sure().values.ravel().tolist() == [2, 7, 8, 8, 0, 8]
-    assert "50 %" in several.keep_sure().notes[0] and "8" in several.keep_sure().notes[0]
-    assert (one.keep_sure().values.dtype, several.keep_sure().values.dtype) == (np.uint8, np.uint8)
-    high = segmentation([True, False], [1, 0.6], [255, 0]).keep_sure()
-    assert high.values.dtype == np.uint16 and high.values.ravel().tolist() == [255, 256]
-
-
-def test_known_voxels_are_never_ignored() -> None:
-    truth = leaning(33)
-    labels = np.full(truth.shape, 7, dtype=np.uint8)
-    labels[::8], labels[..., 8] = truth[::8], truth[..., 8]
-    sure = reconstruct(labels, ignore=7).keep_sure(1.0).values
-    assert np.array_equal(sure[labels != 7], labels[labels != 7]) and (sure[labels == 7] == 2).any()
-    several = np.where(truth, np.where(np.indices(truth.shape)[2] < 17, 1, 3), 0).astype(np.uint8)
-    sure = reconstruct_labels(several, every=8, chosen=[3]).keep_sure(1.0).values
-    assert np.array_equal(sure[::8], np.where(several == 3, 3, 0)[::8]) and (sure == 4).any()
 
 
 def decided(better: np.ndarray) -> Trial:
