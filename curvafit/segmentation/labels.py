@@ -17,7 +17,7 @@ from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.priors.law import LawLike
 from curvafit.segmentation.flow import Working
 from curvafit.segmentation.known import Known, check_shared, check_which, doubt_places, list_numbers
-from curvafit.segmentation.reconstruction import SHIFTED, SURE, UNTOLD, load_example, load_image, reconstruct
+from curvafit.segmentation.reconstruction import SHIFTED, UNTOLD, load_example, load_image, reconstruct
 from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.segmentation.slices import IDS, WHOLE, filled_range, index_labels, require_labels
 from curvafit.segmentation.uncertainty import doubt, expected_dice, suggest_slices
@@ -36,6 +36,8 @@ ONCE = "The labels are read in the image as instances of one structure (--no-ins
 APIECE = "Each label is read in the image by itself (--instances reads those of one kind, such as cells, as one)."
 #: Voxels around a label's box.
 ROOM = 16
+#: Probabilities are clipped by this much from 0 and 1 before odds are taken.
+SURE = 1e-6
 #: Labels are instances, objects of one kind that an image does not distinguish, if in the fraction `MOST` of them at
 #: least `PIECE` of the area is one piece in each slice, and they explain at most `ALIKE` of the grey levels' variance.
 PIECE, MOST, ALIKE = 0.9, 0.9, 0.5
@@ -56,13 +58,13 @@ def reconstruct_labels(
     **options: Any,
 ) -> Segmentation:
     """Fill several structures between known slices, each by `reconstruct`; a voxel that two of them claim goes to the
-    one with the greater phase field there.
+    more probable one.
 
     With an image, labels that are instances, such as cells, are filled as one structure, in which each voxel has the
     label that is nearest as filled without the image, and each label is kept in one piece.
 
     Each label is filled in the box where it may be. Where every voxel of the known slices is labelled, so is every
-    voxel that is filled: an unclaimed voxel goes to the label with the largest phase value, or to the nearest. A label
+    voxel that is filled: an unclaimed voxel goes to the most probable label, or to the nearest. A label
     for which slices or example are too few for what is asked is filled by the network alone, and a note says why.
 
     Parameters
@@ -82,9 +84,9 @@ def reconstruct_labels(
     options
         Those of `reconstruct`, as are the others: every, known, ignore, axis and suggest.
 
-    In the result `labels` has the label of the structure at each voxel, `mask` whether there is one, `phase` the
-    greatest phase field, `probability` that of the voxel's label; there are no coefficients. Its `status` is that of
-    `reconstruct` for each label, or of many a summary. Raises ValueError as `reconstruct`, if it refuses all labels; or
+    In the result `labels` has the label of the structure at each voxel, `mask` whether there is one, `probability` that
+    of the voxel's label; there are neither coefficients nor a phase field. Its `status` is that of `reconstruct` for
+    each label, or of many a summary. Raises ValueError as `reconstruct`, if it refuses all labels; or
     if the known slices do not have a label, or none but 0.
     """
     reading = {"spacing": spacing, "unit": unit}
@@ -192,12 +194,12 @@ def _join_labels(
     unfilled = np.ones(known.turn(inputs.indices).shape, dtype=bool)
     filled = filled_range(places, len(unfilled))
     unfilled[slice(None) if image is not None else filled] = False
-    indices, likely, phase, odds = _join_parts(inputs, parts, inputs.full, known.turn_back(unfilled))
+    indices, likely, odds = _join_parts(inputs, parts, inputs.full, known.turn_back(unfilled))
     doubts = {label: part.uncertainty for label, (_, part) in zip(labels, parts, strict=True)}
     dice = {label: doubt.expected_dice for label, doubt in doubts.items() if doubt is not None}
     if whole is not None:
         indices, likely, expected = _split_instances(inputs, parts, whole, indices, odds)
-        dice, phase, reasons = dict(zip(labels, expected, strict=True)), whole.phase.values, whole.notes
+        dice, reasons = dict(zip(labels, expected, strict=True)), whole.notes
     likely = np.where(inputs.known_voxels, 1.0, likely).astype(np.float32)
     error = max(doubt.calibration_error for doubt in (whole and whole.uncertainty, *doubts.values()) if doubt)
     entropy = doubt(likely)
@@ -210,7 +212,7 @@ def _join_labels(
         replace(volume, array=likely, notes=()), error, suggestions, min(dice.values()), dice, entropies=entropies
     )
     return Segmentation.of(
-        volume, indices != 0, np.maximum(phase, -1), None, max(part.epsilon for _, part in parts),
+        volume, indices != 0, None, None, max(part.epsilon for _, part in parts),
         (*known.notes, *notes, *reasons), weight=None, status=_describe_labels(parts, dice, whole, suggestions),
         image=image, labels=replace(volume, array=table[indices], notes=()), uncertainty=uncertain,
     )  # fmt: skip
@@ -253,22 +255,26 @@ def _fill_each(
 
 
 def _join_parts(inputs: _Inputs, parts: _Parts, full: bool, unfilled: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return, for each voxel (Z, Y, X), the index of the label with the greatest phase field, 0 in the background and
-    where nothing is filled; the probability of it; the greatest phase field; and the sum of the labels' odds."""
+    """Return, for each voxel (Z, Y, X), the index of the most probable label of those that claim it, 0 in the
+    background and where nothing is filled; the probability of it; and the sum of the labels' odds. Where voxels must
+    have a label (`full`), one that none claims goes to the most probable of all."""
     shape = inputs.indices.shape
-    phase, owner = np.full(shape, -np.inf, dtype=np.float32), np.zeros(shape, dtype=np.int16)
+    score, owner = np.full(shape, -1, dtype=np.float32), np.zeros(shape, dtype=np.int16)
     largest, total = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+    claimed = np.full(shape, full)
     for index, (box, part) in enumerate(parts, 1):
-        owner[box] = np.where(part.phase.values > phase[box], index, owner[box])
-        phase[box] = np.maximum(phase[box], part.phase.values)
+        assert part.probability is not None
+        own = part.probability.values + part.mask.values  # a label that claims a voxel comes before all that do not
+        owner[box] = np.where(own > score[box], index, owner[box])
+        score[box], claimed[box] = np.maximum(score[box], own), claimed[box] | part.mask.values
         odds = _odds(part)
         largest[box], total[box] = np.maximum(largest[box], odds), total[box] + odds
-    if full and (uncovered := np.isneginf(phase)).any():  # in no label's box
+    if full and (uncovered := owner == 0).any():  # in no label's box
         owner = _take_nearest(owner, uncovered, inputs.known.volume.spacing)
-    indices = np.where(inputs.known_voxels, inputs.indices, np.where(((phase > 0) | full) & ~unfilled, owner, 0))
+    indices = np.where(inputs.known_voxels, inputs.indices, np.where(claimed & ~unfilled, owner, 0))
     # The background counts with odds of 1, unless every voxel is to have a label.
     likely = np.where(indices, largest, 1.0) / np.maximum(total + ((indices == 0) | (not full)), SURE)
-    return indices, likely, phase, total
+    return indices, likely, total
 
 
 def _take_nearest(values: np.ndarray, missing: np.ndarray, spacing: Sequence[float]) -> np.ndarray:
@@ -332,7 +338,8 @@ def _describe_labels(
 
 def _odds(part: Segmentation) -> np.ndarray:
     """Return the odds of the inside in each voxel of a label's box, finite."""
-    likely = np.clip(part.mask.values if part.probability is None else part.probability.values, SURE, 1 - SURE)
+    assert part.probability is not None
+    likely = np.clip(part.probability.values, SURE, 1 - SURE)
     return likely / (1 - likely)
 
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.special import expit, logit
+from scipy.special import expit
 
 from curvafit.core.checks import check_int, require
 from curvafit.core.runtime import Progress, check_memory, silent, sub_progress
@@ -88,8 +88,6 @@ LEAST_BYTES = 30
 LEAST_GAIN = 0.1
 SHIFTED = "The image seems to lie off the annotated slices by {} voxels along {}: it fits them better when it is moved."
 UNTOLD = "The image does not tell the structure in annotated slices held out: it is left out."
-#: Probabilities are clipped by this much from 0 and 1 before odds or log-odds are taken.
-SURE = 1e-6
 #: Slices of a block by default, and voxels a side across them at most.
 DEEP, WIDE = 2 * CHUNK, 4 * CHUNK
 #: Bytes of memory for each pixel of a slice in the network, for each voxel of a block, and for the program itself.
@@ -221,7 +219,7 @@ def _fill_between(inputs: _Inputs, suggest: int, run: Run, working: Working, pro
     strength = (working.stiffness, working.steps)
     trial, task, head = _choose_law(engine, slices, inputs.laws, example, strength, len(tiles))
     if grid is None or trial.law is None:
-        filled, phase = _fill_volume(known, slices, engine, run, working.tile, inputs.in_blocks)
+        filled, phase = _fill_volume(known, slices, engine, run, working.tile, inputs.in_blocks), None
         inside = flow_summary(filled.share)
     else:
         problem, store, workers = SlicesProblem(trial, slices, engine.level(slices)), working.store, working.workers
@@ -272,7 +270,11 @@ def _choose_law(
             f"stiffness, got {len(part.places)} slices"
         )
     trials = [Trial(law, STIFFNESS, steps, pull) for law, pull in product(laws, PULLS)]
-    best = choose_by_masks(task, trials, lambda slices, trial: engine.run(slices, trial) > 0)
+
+    def fill_part(part: Slices, trial: Trial) -> np.ndarray:
+        return (engine.level(part) if trial.law is None else engine.lower(part, trial)) > 0
+
+    best = choose_by_masks(task, trials, fill_part)
     score, plain = f"{best.score:.3f}", f"{best.plain:.3f}"
     where = "left out" if example is None else "of the example"
     head = f"no law helps here: Dice {plain} on slices {where} by the network alone, {score} with a law"
@@ -311,10 +313,8 @@ class _Engine:
         level = level - np.where(self.thresholded(slices), threshold, 0)[:, None, None]
         return (min(slices.spacing[1:]) * level).astype(np.float32)
 
-    def run(self, slices: Slices, trial: Trial) -> np.ndarray:
-        """Return the phase field (Z, Y, X) of a trial; its scores, which are set later, do not matter."""
-        if trial.law is None:
-            return _profile(self.level(slices), choose_epsilon(slices.frame, self.epsilon))
+    def lower(self, slices: Slices, trial: Trial) -> np.ndarray:
+        """Return the phase field (Z, Y, X) of a trial's law; its scores, which are set later, do not matter."""
         key = (slices, trial.law, trial.strength, trial.steps, trial.pull)
         if key not in self.lowered:
             step: Progress = lambda _, fraction: self.progress("trying the law out", fraction)  # noqa: E731
@@ -375,11 +375,9 @@ class _Filled:
         )
 
 
-def _fill_volume(
-    known: Known, slices: Slices, engine: _Engine, run: Run, tile: int | None, in_blocks: bool
-) -> tuple[_Filled, Any]:
-    """Fill a volume by the network alone, at once or in blocks; return it and its phase field (Z, Y, X). The threshold
-    of the mask follows from the probabilities of all blocks, so that a second pass makes the mask."""
+def _fill_volume(known: Known, slices: Slices, engine: _Engine, run: Run, tile: int | None, in_blocks: bool) -> _Filled:
+    """Fill a volume by the network alone, at once or in blocks. The threshold of the mask follows from the
+    probabilities of all blocks, so that a second pass makes the mask."""
     shape, raster = known.volume.shape, Raster.of(slices) if in_blocks else None
     cores = cut_boxes(slices.shape, slices.shape if raster is None else _choose_edges(raster, tile))
     likely, mask = run.open("probability", np.float32, shape), run.open("mask", np.uint8, shape)
@@ -406,29 +404,7 @@ def _fill_volume(
         inside = block > thresholds[core[0]]
         mask[box] = np.moveaxis(inside, 0, known.axis)
         compared.append(_compare(block, inside, slices.between[core[0]]))
-    filled = _Filled(_voxels(likely.stored), _voxels(mask.stored, label=1), sums | add_records(compared))
-    if raster is None:
-        return filled, known.turn_back(engine.run(slices, Trial()))
-    epsilon = choose_epsilon(slices.frame, engine.epsilon)
-    profile = _Profile(likely.stored, np.moveaxis(thresholds, 0, known.axis), min(slices.spacing[1:]), epsilon)
-    return filled, _voxels(profile)
-
-
-class _Profile:
-    """An array that computes its boxes on demand: the phase field of probabilities (Z, Y, X), whose level is their
-    log-odds less those of the `thresholds`, which vary along one axis, times the edge of a voxel."""
-
-    dtype, digest = np.dtype(np.float32), ""
-
-    def __init__(self, likely: Any, thresholds: np.ndarray, edge: float, epsilon: float) -> None:
-        self.likely, self.shape, self.thresholds = likely, likely.shape, thresholds
-        self.edge, self.epsilon = edge, epsilon
-
-    def __getitem__(self, index: tuple[slice, ...]) -> np.ndarray:
-        likely = np.clip(self.likely[index], SURE, 1 - SURE)
-        slabs = tuple(edge if n > 1 else slice(None) for edge, n in zip(index, self.thresholds.shape, strict=True))
-        level = self.edge * (logit(likely) - logit(self.thresholds[slabs]))
-        return _profile(level, self.epsilon).astype(np.float32)
+    return _Filled(_voxels(likely.stored), _voxels(mask.stored, label=1), sums | add_records(compared))
 
 
 def fill_block(slices: Slices, taught: Taught, raster: Raster, cores: Sequence[Box], number: int) -> Record:
@@ -524,17 +500,9 @@ class SlicesProblem(Problem):
             stiffness = np.where(marks == 0, stiffness, trial.strength * marks).astype(np.float32)
         return level, Hinge(grid.spread(stiffness, centre=0), MARGIN)
 
-    def plain(self, level: np.ndarray, grid: WorkingGrid) -> np.ndarray:
-        """Return the optimal profile of the level."""
-        return _profile(level, grid.epsilon)
-
     def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
         """Return the voxels where the phase field is positive, and the known ones as they are."""
         return self.slices.keep_known(phase > 0, box)
-
-
-def _profile(level: np.ndarray, epsilon: float) -> np.ndarray:
-    return np.tanh(level / (math.sqrt(2) * epsilon))
 
 
 def _weigh_evidence(
@@ -551,7 +519,7 @@ def _weigh_evidence(
     mask = slices.keep_known(lowered.mask & ~slices.unfilled[:, None, None])
     if task is None:
         return _Filled.of(known, slices, expit(engine.logits(slices)), mask), engine
-    rows, phase = list(task.places), engine.run(task.given, trial)
+    rows, phase = list(task.places), engine.lower(task.given, trial)
     task_evidence = evidence(task.given, phase, rows)
     weights = fit_weights(task_evidence, task.truth.ravel())
     predicted, near = probability(task_evidence, weights).reshape(task.truth.shape), near_surface(phase > 0)[rows]

@@ -83,12 +83,13 @@ class Uncertainty:
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Segmentation(Pictured):
-    """A mask, with its phase field, its energy and its status.
+    """A mask, with its status, and its phase field and energy where a law made it.
 
     Attributes
     ----------
     mask, phase
-        The mask, bool, and the phase field u, float32, with the scan's grid, spacing, unit and affine.
+        The mask, bool, and the phase field u, float32, with the scan's grid, spacing, unit and affine; no phase field
+        of a volume between known slices that no law filled.
     weight
         λ, in nats per unit of F_ε; None for a reconstruction from known slices.
     coefficients, epsilon
@@ -106,7 +107,7 @@ class Segmentation(Pictured):
     """
 
     mask: Volume
-    phase: Volume
+    phase: Volume | None
     weight: float | None
     coefficients: Coefficients | None
     epsilon: float
@@ -133,8 +134,10 @@ class Segmentation(Pictured):
         notes: tuple[str, ...],
         **more: Any,
     ) -> Segmentation:
-        """Return a segmentation whose mask and phase field (Z, Y, X) lie as the scan does; `more` are attributes."""
-        inside, field = (replace(scan, array=values, notes=()) for values in (mask, phase))
+        """Return a segmentation whose mask and phase field (Z, Y, X), or None, lie as the scan does; `more` are
+        attributes."""
+        inside = replace(scan, array=mask, notes=())
+        field = None if phase is None else replace(scan, array=phase, notes=())
         return cls(inside, field, coefficients=law, epsilon=epsilon, notes=(*scan.notes, *notes), **more)
 
     @property
@@ -270,7 +273,8 @@ def _finish(work: Path, target: Path, maps: Sequence[str], figure: Figure, conte
 
 def segmentation_figure(segmentation: Segmentation) -> Figure:
     """Draw the mask's outline on the phase field, in the middle slices or the most uncertain ones."""
-    return _figure(segmentation, {"mask": (segmentation.phase.values, segmentation.mask.values)})
+    mask, phase = segmentation.mask, segmentation.phase
+    return _figure(segmentation, {} if phase is None else {"mask": (phase.values, mask.values)})
 
 
 def _figure(segmentation: Segmentation, rows: Mapping[str, tuple[np.ndarray, np.ndarray | None]]) -> Figure:

@@ -208,9 +208,6 @@ class EvidenceProblem(Problem):
         evidence, nats = self.evidence.of_box(box), self.trial.strength or 1.0  # 0 where there is no law
         return evidence.level, Evidence(grid.spread(evidence.ratio) / (nats * grid.grid.voxel_volume))
 
-    def plain(self, level: np.ndarray, grid: WorkingGrid) -> np.ndarray:
-        return np.clip(2 * level, -1, 1)  # levels are p - 1/2, or grey levels off the middle, over the contrast
-
 
 def _explains(evidence: VolumeEvidence, mask: np.ndarray, tiles: Sequence[Box]) -> bool:
     """Return whether a mask keeps nearly all the evidence that the first guess has for its rarer phase. A mask that

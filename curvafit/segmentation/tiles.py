@@ -74,10 +74,6 @@ class Problem(ABC):
     def terms(self, box: Box, grid: WorkingGrid) -> tuple[np.ndarray, Data]:
         """Return the level of the start (Z, Y, X), positive inside, and the data term, on a box."""
 
-    @abstractmethod
-    def plain(self, level: np.ndarray, grid: WorkingGrid) -> np.ndarray:
-        """Return the phase field (Z, Y, X) of the start's level: the result without a law."""
-
     def mask(self, phase: np.ndarray, box: Box) -> np.ndarray:
         """Return the mask, bool (Z, Y, X), of a phase field on a box."""
         return phase > 0
@@ -131,7 +127,7 @@ def _lower_tile(problem: Problem, whole: WorkingGrid, tiles: Sequence[Box], prog
     box, grid = surround(tile, whole, [edge.stop for edge in tiles[-1]])
     level, data = problem.terms(box, grid)
     if trial.law is None:
-        phase = problem.plain(level, grid)
+        phase = np.clip(2 * level, -1, 1)  # levels are p - 1/2, or grey levels off the middle, over the contrast
     else:
         step = sub_progress(progress, number / len(tiles), (number + 1) / len(tiles))
         flow = lower_energy(level, trial.law, data, grid, trial.steps, step)

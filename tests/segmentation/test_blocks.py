@@ -174,16 +174,6 @@ def test_what_is_mistyped_leaves_no_folder_that_refuses_what_is_right(labels: Pa
     assert not list(tmp_path.iterdir())
 
 
-def test_blocks_have_a_phase_field_read_where_it_is_asked_for(labels: Path, tmp_path: Path) -> None:
-    whole = reconstruct(load(labels), every=8)
-    found = reconstruct(labels, every=8, working=Working(tile=33, store=tmp_path / "store"))
-    between = [k for k in range(SHAPE[0]) if k % 8]
-    assert found.phase.in_file and found.phase.dtype == np.float32
-    sure = np.abs(whole.phase.values[between]) < 0.9
-    assert np.abs(found.phase.values[between] - whole.phase.values[between])[sure].max() < 1e-3
-    assert ((found.phase.values > 0) == found.mask.values).all()
-
-
 def test_bad_input_ends_in_one_sentence_and_leaves_nothing(labels: Path, tmp_path: Path) -> None:
     values = texture()
     grey = np.random.default_rng(0).integers(0, 999, SHAPE).astype(np.int16)
