@@ -24,27 +24,21 @@ WIDTHS, LEAST = (0.7, 1.2, 2.0, 3.4, 5.6), 0.5
 SMOOTH = 0.7
 #: Most voxels that trees learn from; the number of trees, their learning rate and most leaves.
 LEARNT, TREES, RATE, LEAVES = 200_000, 120, 0.1, 127
-#: Furthest shift that is looked for, in voxels; most slices compared for it; least shift that is noted; by what
-#: fraction correlations must be better there; and what fraction of the entropy of held-out slices it must explain.
-FURTHEST, COMPARED, NEAREST, BETTER, CLEAR = 12, 16, 2, 0.1, 0.25
 #: Voxels whose features are computed at once; most voxels of an image whose features are kept for the second reading.
 HELD, KEPT = 4_000_000, 20_000_000
 #: By less than this fraction voxels' edges differ where they are cubes.
 CUBIC = 0.01
 
 
-def read_image(
-    values: np.ndarray, slices: Slices, progress: Progress = silent
-) -> tuple[np.ndarray, float, tuple[int, int]]:
-    """Return the log-odds of the inside by an image (Z, Y, X) whose known slices are given, float32 (Z, Y, X); the
-    fraction of the entropy of held-out known slices that they explain; and the shift (y, x), in voxels, at which the
-    image would explain them better, (0, 0) where there is none. Raises ImportError without scikit-learn.
+def read_image(values: np.ndarray, slices: Slices, progress: Progress = silent) -> tuple[np.ndarray, float]:
+    """Return the log-odds of the inside by an image (Z, Y, X) whose known slices are given, float32 (Z, Y, X); and the
+    fraction of the entropy of held-out known slices that they explain. Raises ImportError without scikit-learn.
 
     Trees learn from the known slices which voxels are inside, by grey levels, slopes and Hessians at several widths.
     They first learn from every second known slice: the others calibrate the log-odds, and give the fraction. Where one
     half has no inside or no outside, log-odds stay as they are, and the fraction is NaN.
     """
-    known, slope, constant, gain, shift = slices.inside, 1.0, 0.0, math.nan, (0, 0)
+    known, slope, constant, gain = slices.inside, 1.0, 0.0, math.nan
     progress("learning from the image", 0.0)
     levels = ((values - values.mean()) / max(float(values.std()), 1e-12)).astype(np.float32)
     compute_features = partial(_features, levels, slices.spacing)
@@ -54,10 +48,6 @@ def read_image(
     progress("learning from the image", 0.2)
     if all(half.any() and not half.all() for half in (known[::2], known[1::2])):
         slope, constant, gain = _hold_out(features, known)
-        shift = _find_shift(features, known)
-        if shift != (0, 0):
-            moved = np.roll(features, [-voxels for voxels in shift], (1, 2))
-            shift = shift if _hold_out(moved, known)[2] > max(gain, CLEAR) else (0, 0)
     progress("learning from the image", 0.35)
     trees = _train_trees(features, known)
     evidence = np.empty(values.shape, dtype=np.float32)
@@ -67,31 +57,7 @@ def read_image(
             logits = trees.decision_function(plane.reshape(-1, plane.shape[-1]))
             evidence[row] = (slope * logits + constant).reshape(plane.shape[:2])
     progress("reading the image", 1.0)
-    return evidence, gain, shift
-
-
-def _find_shift(features: np.ndarray, inside: np.ndarray) -> tuple[int, int]:
-    """Return the shift (y, x) at which features (N, Y, X, F) of an image correlate best with masks (N, Y, X) of known
-    slices; (0, 0) where no other is better by the fraction `BETTER`.
-
-    The multiple correlation is cᵀ C⁻¹ c: c are the cross-correlations of masks with each feature, at all shifts at once
-    by the Fourier transform, C is the features' covariance. A wall correlates with no grey level alone, but with many.
-    """
-    rows = np.unique(np.linspace(0, len(inside) - 1, COMPARED).astype(int))
-    masks, table = inside[rows] - inside[rows].mean(), features[rows]
-    sample = table.reshape(-1, table.shape[-1])[:: max(1, masks.size // LEARNT)].astype(np.float64)
-    mean, deviation = sample.mean(0), sample.std(0) + 1e-6
-    covariance = np.cov((sample - mean) / deviation, rowvar=False) + 1e-3 * np.eye(len(mean))
-    furthest = [min(FURTHEST, n // 4) for n in masks.shape[1:]]
-    window, spectra = np.ix_(*(np.arange(-n, n + 1) for n in furthest)), np.fft.rfft2(masks).conj()
-    correlations = np.empty((*(2 * n + 1 for n in furthest), len(mean)))
-    for k in range(len(mean)):
-        products = spectra * np.fft.rfft2((table[..., k] - mean[k]) / deviation[k])
-        correlations[..., k] = np.fft.irfft2(products.sum(0), masks.shape[1:])[window]
-    strength = np.einsum("yxf,fg,yxg->yx", correlations, np.linalg.inv(covariance), correlations)
-    y, x = (int(k) - n for k, n in zip(np.unravel_index(strength.argmax(), strength.shape), furthest, strict=True))
-    better = strength.max() > (1 + BETTER) * strength[furthest[0], furthest[1]]  # the middle is without a shift
-    return (y, x) if better and max(abs(y), abs(x)) >= NEAREST else (0, 0)
+    return evidence, gain
 
 
 def _hold_out(features: np.ndarray, inside: np.ndarray) -> tuple[float, float, float]:

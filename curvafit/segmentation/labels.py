@@ -17,7 +17,7 @@ from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.priors.law import LawLike
 from curvafit.segmentation.flow import Working
 from curvafit.segmentation.known import Known, check_shared, check_which, doubt_places, list_numbers
-from curvafit.segmentation.reconstruction import SHIFTED, UNTOLD, load_example, load_image, reconstruct
+from curvafit.segmentation.reconstruction import UNTOLD, load_example, load_image, reconstruct
 from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.segmentation.slices import IDS, WHOLE, filled_range, index_labels, require_labels
 from curvafit.segmentation.uncertainty import doubt, expected_dice, suggest_slices
@@ -179,10 +179,9 @@ def _fill_instances(
     whole = inputs.fill(None, WHOLE, image=replace(image, affine=None, notes=()), progress=progress)
     # Without the image each label is filled by the packaged network: that of `working` reads images.
     alone = replace(inputs, image=None, working=replace(inputs.working, filler=None))
-    shifted = [note for note in whole.notes if note.startswith(SHIFTED.partition("{")[0])]
     if UNTOLD in whole.notes:
-        return None, alone, (*image.notes, *shifted, UNTOLD)
-    return whole, alone, (*image.notes, ONCE, *shifted)
+        return None, alone, (*image.notes, UNTOLD)
+    return whole, alone, (*image.notes, ONCE)
 
 
 def _join_labels(

@@ -86,7 +86,6 @@ GREY, SAMPLED = 8, 1_000_000
 LEAST_BYTES = 30
 #: Least share of the entropy of slices held out that an image takes away: that of the structure takes half or more.
 LEAST_GAIN = 0.1
-SHIFTED = "The image seems to lie off the annotated slices by {} voxels along {}: it fits them better when it is moved."
 UNTOLD = "The image does not tell the structure in annotated slices held out: it is left out."
 #: Slices of a block by default, and voxels a side across them at most.
 DEEP, WIDE = 2 * CHUNK, 4 * CHUNK
@@ -243,8 +242,10 @@ def _adapt(
     """Return the network, tuned on the example if there is one; an image's log-odds (length, Y, X); and notes."""
     taught, image = inputs.taught, inputs.image
     if image is not None:
-        evidence, doubts = _read_evidence(known.turn(image.values), slices, known.axis, progress)
-        return Taught.load() if evidence is None else taught, evidence, (*image.notes, *doubts)
+        evidence, gain = read_image(known.turn(image.values), slices, progress)
+        if gain < LEAST_GAIN:
+            return Taught.load(), None, (*image.notes, UNTOLD)
+        return taught, evidence, image.notes
     if example is not None:
         return tune(taught, example, progress), None, example.notes
     return taught, None, ()
@@ -537,17 +538,6 @@ def load_image(image: Source, volume: Volume, reading: dict[str, Any]) -> Volume
     if (count := len(np.unique(grey.values.ravel()[::stride]))) < GREY:
         raise ScanError(f"the image must have grey levels, but has {count} values: is it a mask?")
     return replace(grey, notes=notes)
-
-
-def _read_evidence(
-    levels: np.ndarray, slices: Slices, axis: int, progress: Progress
-) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """Return an image's log-odds (length, Y, X), None where they do not predict known slices, and notes on doubts."""
-    evidence, gain, shift = read_image(levels, slices, progress=progress)
-    names = "zyx".replace("zyx"[axis], "")  # the axes within a slice
-    shifts = zip(shift, names, strict=True)
-    doubts = tuple(SHIFTED.format(f"{voxels:+d}", name) for voxels, name in shifts if voxels)
-    return (None, (*doubts, UNTOLD)) if gain < LEAST_GAIN else (evidence, doubts)
 
 
 def load_example(example: Source, volume: Volume, reading: dict[str, Any]) -> Volume:

@@ -181,24 +181,3 @@ def test_cells_with_their_image_are_each_one_piece_and_better() -> None:
     likely = told.probability.values
     assert likely.min() >= 0 and likely.max() <= 1 and (likely[::EVERY] == 1).all()
     assert likely[values == truth].mean() > likely[values != truth].mean() + 0.1
-
-
-def walls(n: int = 37) -> np.ndarray:
-    """Walls two voxels thick around cells, which no grey level tells by itself: their inside is like the outside."""
-    z, y, x = np.mgrid[:n, :n, :n]
-    centres = np.random.default_rng(0).uniform(0, n, (20, 3))
-    distances = np.sort([np.linalg.norm([z - a, y - b, x - c], axis=0) for a, b, c in centres], axis=0)
-    return distances[1] - distances[0] < 2
-
-
-@pytest.mark.parametrize("mask", [rods(), ~rods(), walls()], ids=["rods", "dark rods", "walls"])
-def test_an_image_that_lies_off_the_slices_is_told(mask: np.ndarray) -> None:
-    image, slices = photograph(mask, 0.7), known(mask)
-    assert read_image(image, slices)[2] == (0, 0)
-    assert read_image(np.roll(image, (4, -3), (1, 2)), slices)[2] == (4, -3)
-
-
-def test_an_image_of_something_else_lies_nowhere() -> None:
-    mask = rods()
-    for seed in range(5):
-        assert read_image(photograph(np.zeros_like(mask), seed=seed), known(mask))[2] == (0, 0)
