@@ -50,10 +50,9 @@ class Known:
             return replace(whole, places=tuple(places), notes=note_labelled(places, labelled))
         return replace(whole, places=tuple(known_places(volume.shape[whole.axis], every, known)))
 
-    def read(self, run: Run, name: str = "the known slices") -> tuple[Slices, np.ndarray, np.ndarray]:
-        """Read the known slices into the run's store; return them, their labels, and whether each slice of the volume
-        has labels, bool (length,). Raises `ScanError` if they hold grey levels, or are all empty or all full; the
-        message calls them `name`."""
+    def read(self, run: Run, name: str = "the known slices") -> tuple[Slices, np.ndarray]:
+        """Read the known slices into the run's store; return them and their labels. Raises `ScanError` if they hold
+        grey levels, or are all empty or all full; the message calls them `name`."""
         length, *plane = axis_first(self.volume.shape, self.axis)
         inside = run.open("known", np.bool_, (len(self.places), *plane))
 
@@ -61,7 +60,7 @@ class Known:
             rows = record["which"]
             if len(rows):
                 inside[rows[0] : rows[-1] + 1] = record["inside"]
-            return {"there": record["there"], "values": record["values"], "count": np.count_nonzero(record["inside"])}
+            return {"values": record["values"], "count": np.count_nonzero(record["inside"])}
 
         records = run("reading known slices", partial(_read_slab, self, name), len(self._slabs), keep=keep)
         labels = np.unique(np.concatenate([record["values"] for record in records]))
@@ -75,8 +74,7 @@ class Known:
                 "slice the first, is there a label that nobody annotated, or are there several labels?"
             )
         edges = axis_first(self.volume.spacing, self.axis)
-        slices = Slices(inside.stored, self.places, length, edges, self.volume.unit, self.marks)
-        return slices, labels, np.concatenate([record["there"] for record in records])
+        return Slices(inside.stored, self.places, length, edges, self.volume.unit, self.marks), labels
 
     def turn(self, values: np.ndarray) -> np.ndarray:
         """Move the axis across the slices to the front."""
@@ -235,17 +233,6 @@ def note_empty(empty: Sequence[int]) -> tuple[str, ...]:
     """Return a note on slices that are taken for rightly empty, if there are any."""
     note = f"Taken for rightly empty, as next in the rhythm of those with labels: {list_numbers(empty)}."
     return (f"{note} If that is wrong, name the known slices.",) if empty else ()
-
-
-def doubt_places(labelled: np.ndarray, places: Sequence[int]) -> tuple[str, ...]:
-    """Return a note where few slices have labels, and some of them are not among the known ones at `places`, given
-    whether each slice has labels, bool (Z,)."""
-    with_labels = np.flatnonzero(labelled)
-    unknown = sorted(set(with_labels.tolist()) - set(places))
-    if not unknown or 2 * len(with_labels) > np.ptp(with_labels) + 1:  # where most have, `every` chooses among them
-        return ()
-    text = f"Only {len(with_labels)} of {len(labelled)} slices have labels, but {list_numbers(unknown)} are not among"
-    return (f"{text} the known ones: if those are what you annotated, another every or first is meant, or known.",)
 
 
 def doubt_labels(values: np.ndarray, ignore: int | None = None) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from curvafit.core.checks import SEEDS, check_int
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.priors.law import LawLike
 from curvafit.segmentation.flow import Working
-from curvafit.segmentation.known import Known, check_shared, check_which, doubt_places, list_numbers
+from curvafit.segmentation.known import Known, check_shared, check_which, list_numbers
 from curvafit.segmentation.reconstruction import UNTOLD, load_example, load_image, reconstruct
 from curvafit.segmentation.result import Segmentation, Uncertainty
 from curvafit.segmentation.slices import IDS, WHOLE, filled_range, index_labels, require_labels
@@ -123,12 +123,10 @@ class _Inputs:
         volume = replace(volume, array=round_labels(volume.values))
         known, ignore = Known.find(volume, Run(), **which), which["ignore"]
         places, values = list(known.places), known.turn(volume.values)
-        doubts = () if which["every"] is None else doubt_places(np.asarray((values > 0).any((1, 2))), places)
         suggest = check_int(suggest, "a number of slices from 0", 0, len(values) - len(places))
         labels = find_labels(values[places], chosen)
         if which["every"] is None and which["known"] is None and ignore is None:
             check_shared(values, places, labels)
-        known = replace(known, notes=(*known.notes, *doubts))
         indices = index_labels(volume.values, labels, ignore)
         known_voxels = np.zeros(values.shape, dtype=bool) if known.marks is None else known.marks != 0
         known_voxels[places] = True

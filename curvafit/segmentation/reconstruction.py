@@ -33,7 +33,7 @@ from curvafit.scan.structure import add_records
 from curvafit.segmentation.filler import REACH, SLOPE, TILE, Raster, Taught, fill
 from curvafit.segmentation.flow import HALO, Working, WorkingGrid, choose_epsilon
 from curvafit.segmentation.image import read_image
-from curvafit.segmentation.known import SLAB, Known, check_which, doubt_labels, doubt_places
+from curvafit.segmentation.known import SLAB, Known, check_which, doubt_labels
 from curvafit.segmentation.result import Segmentation, Uncertainty, describe_filled, flow_summary
 from curvafit.segmentation.slices import (
     WHOLE,
@@ -206,9 +206,8 @@ def _fill_between(inputs: _Inputs, suggest: int, run: Run, working: Working, pro
     volume = inputs.volume
     known = Known.find(volume, run, **inputs.which)
     suggest = check_int(suggest, "a number of slices from 0", 0, volume.shape[known.axis] - len(known.places))
-    slices, labels, labelled = known.read(run)
-    doubts = () if inputs.which["every"] is None else doubt_places(labelled, known.places)
-    notes = (*known.notes, *doubts, *doubt_labels(labels, inputs.which["ignore"]), *inputs.notes)
+    slices, labels = known.read(run)
+    notes = (*known.notes, *doubt_labels(labels, inputs.which["ignore"]), *inputs.notes)
     example = None if inputs.example is None else Example.of(inputs.example, known.places, known.axis)
     step = sub_progress(progress, *((_READ, _READ) if inputs.in_blocks else (0.0, 0.5)))
     taught, evidence, input_notes = _adapt(inputs, known, slices, example, step)

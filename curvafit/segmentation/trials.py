@@ -131,7 +131,7 @@ class Example:
                 "expected known slices with others between them, and an example longer than their distance, got slices "
                 f"{gap} apart and an example of {length}"
             )
-        whole, *_ = Known(volume, axis, tuple(range(length))).read(Run(), name="the example's slices")
+        whole, _ = Known(volume, axis, tuple(range(length))).read(Run(), name="the example's slices")
         inside = whole.inside[box_with_most_surface(whole.inside, LARGEST)]
         size = " x ".join(map(str, inside.shape))
         note = f"Of the example {size} voxels are read, where most of its surface is."
