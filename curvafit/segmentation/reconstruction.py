@@ -30,10 +30,10 @@ from curvafit.priors.loss import RESOLVED
 from curvafit.priors.profile import profile_distance
 from curvafit.scan.preparation import LARGEST_BOX
 from curvafit.scan.structure import add_records
-from curvafit.segmentation.filler import REACH, SLOPE, TILE, Raster, Taught, fill
+from curvafit.segmentation.filler import SLOPE, TILE, Raster, Taught, fill
 from curvafit.segmentation.flow import HALO, Working, WorkingGrid, choose_epsilon
 from curvafit.segmentation.image import read_image
-from curvafit.segmentation.known import SLAB, Known, check_which, doubt_labels
+from curvafit.segmentation.known import Known, check_which, doubt_labels
 from curvafit.segmentation.result import Segmentation, Uncertainty, describe_filled, flow_summary
 from curvafit.segmentation.slices import (
     WHOLE,
@@ -89,8 +89,6 @@ LEAST_GAIN = 0.1
 UNTOLD = "The image does not tell the structure in annotated slices held out: it is left out."
 #: Slices of a block by default, and voxels a side across them at most.
 DEEP, WIDE = 2 * CHUNK, 4 * CHUNK
-#: Bytes of memory for each pixel of a slice in the network, for each voxel of a block, and for the program itself.
-_PIXEL, _VOXEL, _PROGRAM = 800, 24, 600 * 2**20
 #: The pass that fills, and the fraction of the work that is done after each pass.
 _FILL, _READ = "filling blocks", 0.07
 _ENDS = {"looking for labels": 0.02, "reading known slices": _READ, _FILL: 0.98}
@@ -392,7 +390,8 @@ def _fill_volume(known: Known, slices: Slices, engine: _Engine, run: Run, tile: 
     if raster is None:
         records = run(_FILL, fill_all, 1, keep=keep)
     else:
-        message = _describe_blocks(slices, raster, cores, run.processes)
+        sides = " x ".join(str(edge.stop - edge.start) for edge in cores[0])
+        message = f"{len(cores)} blocks of {sides} voxels."
         records = run(_FILL, partial(fill_block, slices, engine.taught, raster, cores), len(cores), message, keep)
     sums = add_records(_pad_entropies(record, core, slices.shape) for core, record in zip(cores, records, strict=True))
     compared: list[Record] = []
@@ -449,16 +448,6 @@ def _choose_edges(raster: Raster, tile: int | None) -> tuple[int, ...]:
         return (tile,) * 3
     # Whole chunks of a store: no two blocks write to the same one.
     return (DEEP, *(min(max(int(TILE / scale) // CHUNK, 1) * CHUNK, WIDE) for scale in raster.scale))
-
-
-def _describe_blocks(slices: Slices, raster: Raster, cores: Sequence[Box], processes: int) -> str:
-    """Return how many blocks there are, and how much memory they take at most, as a sentence."""
-    sides = [edge.stop - edge.start for edge in cores[0]]
-    pixels = [min(TILE, n * scale) + 2 * REACH for n, scale in zip(sides[1:], raster.scale, strict=True)]
-    network, known = _PIXEL * math.prod(pixels) * (slices.gap - 1), math.prod(slices.inside.shape)
-    programs = processes + (processes > 1)  # workers, and the process that waits for them
-    total = processes * (network + _VOXEL * math.prod(sides) + SLAB) + programs * _PROGRAM + known
-    return f"{len(cores)} blocks of {' x '.join(map(str, sides))} voxels, in about {total / 1e9:.2g} GB of memory."
 
 
 def _voxels(stored: Any, label: int | None = None) -> Any:
