@@ -22,7 +22,7 @@ from curvafit.segmentation.slices import check_spacing, load_with, require_label
 from curvafit.segmentation.tiles import LoweredVolume, Problem, cut_tiles, lower_volume
 from curvafit.segmentation.trials import Task, Trial, choose_by_masks, law_of, laws_of
 from curvafit.volumes.read import Source, load
-from curvafit.volumes.volume import Box, ScanError, Volume, cut_boxes, lay
+from curvafit.volumes.volume import Box, ScanError, Volume, check_finite, lay
 
 #: The law where none is given; `calibrate` also tries it beside those of a prior.
 WILLMORE = Coefficients.willmore()
@@ -37,8 +37,6 @@ WEIGHTS = (1e-9, 1e9)
 EDGE, TRIALS = 96, 0.7
 #: Fraction of the evidence for the first guess that a mask must keep, where no weight is given.
 KEPT = 0.95
-#: Voxels that are checked at once.
-_SLAB = 2**24
 #: A note on classes that may be noise.
 FAINT = "The classes differ by less than the noise: look at the mask. If the structure is rare, give a threshold."
 
@@ -102,7 +100,8 @@ def segment(
     grid = WorkingGrid.of(volume, working.epsilon, halo=HALO)
     tiles, head = cut_tiles(grid, volume.shape, working.tile), ""
     trial, notes = _weigh_law(prior, weight, volume, working)
-    _check_finite(volume)
+    for tile in tiles:
+        check_finite(volume.read(tile), volume.source)
     evidence = GreyEvidence.of(volume, threshold, dark, apart=weight is None)
     doubts = (FAINT,) if evidence.classes.faint and threshold == "otsu" else ()
     if missing := _missing_phase(evidence, tiles):
@@ -220,14 +219,6 @@ def _explains(evidence: VolumeEvidence, mask: np.ndarray, tiles: Sequence[Box]) 
         voxels += [np.count_nonzero(part.level > 0), np.count_nonzero(part.level <= 0)]
     rarer = int(voxels.argmin())
     return bool(kept[rarer] >= KEPT * guessed[rarer] and 0 < mask.mean() < 1)
-
-
-def _check_finite(volume: Volume) -> None:
-    """Read a volume slab by slab, and raise ScanError where values are not finite."""
-    shape = volume.shape
-    slabs = cut_boxes(shape, (max(1, _SLAB // max(1, shape[1] * shape[2])), *shape[1:]))
-    if faults := sum(np.count_nonzero(~np.isfinite(volume.read(slab))) for slab in slabs):
-        raise ScanError(f"a volume must be finite, got {faults} values that are not")
 
 
 def _missing_phase(evidence: VolumeEvidence, tiles: Sequence[Box]) -> str:
