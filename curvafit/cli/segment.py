@@ -60,8 +60,6 @@ def parse_known(
     """Return which slices are known, as `reconstruct` takes it; raise ValueError where options do not go together."""
     if axis.lower() not in ("z", "y", "x"):
         raise ValueError(f"--axis must be z, y or x, got {axis!r}")
-    if ignore is not None and (every, known) != (None, None):
-        raise ValueError("give either --every and --known, which slices are known, or --ignore, what is not")
     if every is None and first is not None:
         raise ValueError(f"--first {first} goes with --every")
     slices = None if known is None else list(parse_whole_numbers(known, "--known"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -150,16 +149,14 @@ def check_which(
 
 def known_places(length: int, every: int | slice | None, known: Sequence[int] | None) -> list[int]:
     """Return the indices of the known slices, ascending: every `every`-th, and those listed in `known`. Raises
-    `ValueError` if neither is given, or they are not two or more slices of the volume."""
-    if every is None and known is None:
-        raise ScanError("give every or known: which slices are known")
+    `ValueError` if they are not two or more slices of the volume."""
     known = [*(known or ())]
     if every is not None:
         first, step = (every.start or 0, every.step or 1) if isinstance(every, slice) else (0, every)
-        step = check_int(_to_int(step), "every, a whole number from 1", 1, MOST)
-        known += range(check_int(_to_int(first), "first, a whole number from 0", 0, MOST), length, step)
+        step = check_int(step, "every, a whole number from 1", 1, MOST)
+        known += range(check_int(first, "first, a whole number from 0", 0, MOST), length, step)
     form = f"known slices that are whole numbers from 0 to {length - 1}"
-    places = sorted({check_int(_to_int(number), form, 0, length - 1) for number in known})
+    places = sorted({check_int(number, form, 0, length - 1) for number in known})
     if len(places) < 2:
         raise ScanError(f"two or more slices within 0 to {length - 1} must be known, got {places}")
     return places
@@ -215,11 +212,6 @@ def check_shared(values: np.ndarray, places: Sequence[int], labels: Sequence[int
             raise ScanError(
                 f"{some}: fill labels that have slices of their own one after the other, or name known slices"
             )
-
-
-def _to_int(number: Any) -> Any:
-    """Return a float that is a whole number as an int."""
-    return int(number) if isinstance(number, float) and number.is_integer() else number
 
 
 def note_labelled(places: Sequence[int], labelled: np.ndarray) -> tuple[str, ...]:

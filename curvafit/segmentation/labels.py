@@ -123,7 +123,6 @@ class _Inputs:
         volume = replace(volume, array=round_labels(volume.values))
         known, ignore = Known.find(volume, Run(), **which), which["ignore"]
         places, values = list(known.places), known.turn(volume.values)
-        suggest = check_int(suggest, "a number of slices from 0", 0, len(values) - len(places))
         labels = find_labels(values[places], chosen)
         if which["every"] is None and which["known"] is None and ignore is None:
             check_shared(values, places, labels)

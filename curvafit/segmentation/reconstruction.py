@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from scipy.special import expit
 
-from curvafit.core.checks import check_int, require
+from curvafit.core.checks import require
 from curvafit.core.runtime import Progress, check_memory, silent, sub_progress
 from curvafit.generation.problem import Data, Hinge
 from curvafit.priors.coefficients import Coefficients
@@ -203,7 +203,6 @@ def _fill_between(inputs: _Inputs, suggest: int, run: Run, working: Working, pro
     """Read the known slices, adapt the network, choose a law, fill the volume, and say how sure each voxel is."""
     volume = inputs.volume
     known = Known.find(volume, run, **inputs.which)
-    suggest = check_int(suggest, "a number of slices from 0", 0, volume.shape[known.axis] - len(known.places))
     slices, labels = known.read(run)
     notes = (*known.notes, *doubt_labels(labels, inputs.which["ignore"]), *inputs.notes)
     example = None if inputs.example is None else Example.of(inputs.example, known.places, known.axis)

@@ -190,7 +190,7 @@ REFUSALS: dict[str, dict[str, str]] = {
     "segment none.tif": {"": "no such file"},
     "reconstruct ball.nii": {"--known 1,a": "--known", "--known 0,4 --first 2": "--first"},
     "reconstruct ball.nii --every 4": {
-        "--axis w": "--axis", "--ignore 2": "--ignore", "--filler fit.json": "fit.json",
+        "--axis w": "--axis", "--ignore 2": "ignore", "--filler fit.json": "fit.json",
         "--example coarse.nii": "spacing", "--example other.nii": "spacing",
         "--labels all --example grey.nii": "example",
         "--filler version.npz": "version 2", "--filler cut.npz": "truncated", "--filler arrays.npz": "filler",

@@ -168,7 +168,7 @@ REFUSALS: dict[str, list[dict]] = {
     "between": [{"example": BALL, "every": None, "known": [15, 16]}], "longer": [{"example": BALL[:8]}],
     "spacing": [{"example": Volume(BALL, (1.0,) * 3, "mm")}], "two or more": [{"every": None, "known": [3]}],
     "empty": [{"example": 0 * BALL}, {"every": None, "ignore": 1}, {"slices": 0 * BALL}],
-    "12.5": [{"every": None, "known": [0.0, 12.5]}],
+    "12.5": [{"every": None, "known": [0, 12.5]}],
     "whole numbers": [{"example": BALL * np.float32(0.5)}, {"slices": BALL * np.float32(0.5)}],
     "every": [{"every": None}, {"every": 0}], "ignore": [{"every": None, "known": [3], "ignore": 1}, {"ignore": 1}],
     "31": [{"every": None, "known": [3, 99]}], "whole number": [{"every": math.nan}, {"every": slice(0.5, None, 8)}],
@@ -245,7 +245,7 @@ def test_labels_count_as_inside_and_what_is_extrapolated_is_said() -> None:
     truth = leaning()
     labels = np.where(truth, np.random.default_rng(0).integers(1, 200, truth.shape), 0).astype(np.float32)
     labels[1::2] += 0.5  # these are not read
-    found = reconstruct(Volume(labels), WILLMORE, every=slice(2, None, 8.0), working=Working(steps=1, stiffness=1e7))  # type: ignore[arg-type]
+    found = reconstruct(Volume(labels), WILLMORE, every=slice(2, None, 8), working=Working(steps=1, stiffness=1e7))
     plain = reconstruct(Volume(truth), WILLMORE, known=[2, 10, 18, 26], working=Working(steps=1, stiffness=1e7))
     assert np.array_equal(found.mask.values, plain.mask.values) and set(plain.notes) <= set(found.notes)
     assert [note for note in found.notes if "one structure" in note] and len(found.notes) == len(plain.notes) + 1
