@@ -1,4 +1,4 @@
-"""What all widgets share: layers as volumes, work in a thread; and those that measure a layer and grow a texture."""
+"""What both widgets share: layers as volumes, work in a thread; and the one that measures a layer."""
 
 from __future__ import annotations
 
@@ -9,18 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from magicgui.widgets import (
-    CheckBox,
-    ComboBox,
-    Container,
-    FileEdit,
-    FloatSpinBox,
-    Label,
-    ProgressBar,
-    PushButton,
-    SpinBox,
-    Table,
-)
+from magicgui.widgets import CheckBox, ComboBox, Container, FileEdit, Label, ProgressBar, PushButton, Table
 from matplotlib.backends.backend_qtagg import FigureCanvasQTAgg
 from napari.qt.threading import create_worker
 from qtpy.QtCore import QTimer
@@ -28,21 +17,17 @@ from qtpy.QtWidgets import QSizePolicy
 from scipy import ndimage
 
 from curvafit.core.runtime import Progress
-from curvafit.core.units import METRES, convert_length, format_number, is_unit, parse_unit, power_name
+from curvafit.core.units import convert_length, format_number, is_unit, parse_unit, power_name
 from curvafit.drawing.plot import diagram_figure
 from curvafit.generation.flow import generate
-from curvafit.generation.result import Flow, Watch
 from curvafit.generation.schedule import schedule
 from curvafit.geometry.diagrams import Diagram, join_diagrams
-from curvafit.priors.law import PRESETS
 from curvafit.scan.instances import measure_instances
 from curvafit.scan.measures import Measures
 from curvafit.scan.tiles import measure as measure_scan
 from curvafit.studies.scans import check_table, write_table
 from curvafit.volumes.volume import ScanError, Volume
 
-#: Our unit -> napari's.
-_UNITS = {"voxel": "pixel", "nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter"}
 #: Milliseconds between looks at the work's progress.
 _PAUSE = 100
 
@@ -89,11 +74,6 @@ def place_of_layer(layer: Any) -> dict[str, Any]:
         "scale": layer.scale[-3:], "translate": layer.translate[-3:], "rotate": layer.rotate[-3:, -3:],
         "shear": layer.shear if len(layer.scale) == 3 else None, "units": layer.units[-3:],
     }  # fmt: skip
-
-
-def place_of_field(field: Volume) -> dict[str, Any]:
-    """Return options by which a new layer gets the spacing and the unit of a volume."""
-    return {"scale": field.spacing, "units": (_UNITS[field.unit],) * 3}
 
 
 def list_layers(viewer: Any, *kinds: str) -> list[tuple[str, Any]]:
@@ -293,40 +273,7 @@ class Measure(Dock):
             self.native.layout().addWidget(self.canvas)
 
 
-# ---- growing, and the plugin's sample: tubes in noise, of which every 8th slice is annotated -------------------------
-
-
-class Generate(Dock):
-    """Grow a shape of a published texture, as labels."""
-
-    def __init__(self, napari_viewer: Any) -> None:
-        self.preset = ComboBox(label="texture", choices=sorted(PRESETS), value="tubes")
-        self.edge = SpinBox(label="voxels a side", value=64, min=24, max=512)
-        self.seed = SpinBox(label="seed", value=0, min=0, max=2**31 - 1)
-        self.steps = SpinBox(label="steps", value=1000, min=1, max=20000, tooltip="More give a smoother shape.")
-        self.spacing = FloatSpinBox(label="voxel edge", value=1.0, min=1e-6, max=1e6, step=0.1)
-        self.unit = ComboBox(label="unit", choices=["voxel", *METRES], value="voxel")
-        choices = [self.preset, self.edge, self.seed, self.steps, self.spacing, self.unit]
-        super().__init__(napari_viewer, choices, "Grow")
-
-    def prepare(self) -> Callable[[Progress], Flow]:
-        """Read the choices."""
-        options = {"grid": self.edge.value, "seed": self.seed.value, "schedule": schedule("fast", self.steps.value)}
-        law = self.preset.value
-
-        def grow(progress: Progress) -> Flow:
-            watch = Watch(callbacks=[lambda step, total, _: progress("growing", step / total)])
-            return generate(law, watch=watch, **options)
-
-        return grow
-
-    def show_result(self, result: Flow) -> str:
-        """Add the shape."""
-        edge = 1.0 if self.unit.value == "voxel" else self.spacing.value
-        shape = Volume((result.field.numpy() > 0).astype(np.uint8), (edge, edge, edge), self.unit.value)
-        name = f"{self.preset.value}, seed {self.seed.value}"
-        put_layer(self.viewer, "labels", shape.values, name, **place_of_field(shape))
-        return f"{result.status}."
+# ---- the plugin's sample: tubes in noise, of which every 8th slice is annotated --------------------------------------
 
 
 def annotated_tubes() -> list[tuple[Any, dict[str, Any], str]]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from curvafit.core.runtime import Progress
 from curvafit.segmentation.trials import dice
 
 napari = pytest.importorskip("napari")
@@ -17,7 +18,7 @@ from qtpy.QtTest import QTest  # noqa: E402
 from qtpy.QtWidgets import QApplication  # noqa: E402
 
 from curvafit.napari.complete import Complete  # noqa: E402
-from curvafit.napari.widgets import Generate, Measure, annotated_tubes, field_of_layer  # noqa: E402
+from curvafit.napari.widgets import Dock, Measure, annotated_tubes, field_of_layer  # noqa: E402
 from curvafit.volumes import ScanError  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
@@ -163,14 +164,34 @@ def test_what_is_painted_meanwhile_stays(viewer: Any) -> None:
     viewer.layers.remove(layer)
     wait(lambda: widget.run_button.enabled)
     assert "gone" in widget.status.value and layer not in viewer.layers
-    widget = docked(viewer, Generate)
-    widget.edge.value, widget.steps.value = 64, 20000
+
+
+class Endless(Dock):
+    """A widget whose work ends only where it is stopped."""
+
+    def __init__(self, napari_viewer: Any) -> None:
+        super().__init__(napari_viewer, [], "Begin")
+
+    def prepare(self) -> Callable[[Progress], None]:
+        def work(progress: Progress) -> None:
+            while True:
+                progress("working", 0.5)
+                time.sleep(0.01)
+
+        return work
+
+    def show_result(self, result: None) -> str:
+        return "Done."
+
+
+def test_work_ends_where_it_is_stopped(viewer: Any) -> None:
+    widget = docked(viewer, Endless)
     click(widget.run_button)
     assert not widget.run_button.enabled
-    wait(lambda: "Growing" in widget.status.value)
+    wait(lambda: "Working" in widget.status.value)
     click(widget.stop_button)
     wait(lambda: widget.run_button.enabled, 30)
-    assert widget.status.value == "Stopped." and not len(viewer.layers)
+    assert widget.status.value == "Stopped."
 
 
 def test_labels_on_slices_of_their_own_are_filled_one_after_the_other(viewer: Any) -> None:
@@ -201,20 +222,17 @@ def test_an_image_and_another_axis(viewer: Any) -> None:
     assert dice(layer.data > 0, truth > 0) > 0.93
 
 
-def test_a_texture_is_grown_at_its_scale_and_measured(viewer: Any, tmp_path: Any) -> None:
+def test_a_structure_is_measured_at_its_scale(viewer: Any, tmp_path: Any) -> None:
     """And each label has its row, and its numbers beneath the mouse."""
-    widget = docked(viewer, Generate)
-    widget.edge.value, widget.steps.value, widget.spacing.value, widget.unit.value = 40, 300, 0.5, "um"
-    run(widget)
-    layer = viewer.layers["tubes, seed 0"]
+    layer = viewer.add_labels((RODS == 3).astype(np.uint8), name="rod", scale=(0.5,) * 3, units=("micrometer",) * 3)
     field = field_of_layer(layer)
-    assert field.shape == (40, 40, 40) and field.spacing == (0.5,) * 3 and field.unit == "um"
+    assert field.shape == RODS.shape and field.spacing == (0.5,) * 3 and field.unit == "um"
     gauge = docked(viewer, Measure)
-    gauge.layer.value, gauge.file.value = layer, tmp_path / "tubes.csv"
-    assert "tubes.csv written" in run(gauge)
+    gauge.layer.value, gauge.file.value = layer, tmp_path / "rod.csv"
+    assert "rod.csv written" in run(gauge)
     rows = dict(zip(gauge.table.row_headers, gauge.table.data.to_list(), strict=True))
-    assert 3 < float(rows["Tb.Th (µm)"][0]) < 7 and gauge.canvas is not None
-    assert "thickness" in (tmp_path / "tubes.csv").read_text()
+    assert 4 < float(rows["Tb.Th (µm)"][0]) < 6 and gauge.canvas is not None
+    assert "thickness" in (tmp_path / "rod.csv").read_text()
     gauge.file.value = tmp_path / "mine.csv"
     gauge.file.value.write_text("mine")
     assert "not free" in run(gauge) and gauge.file.value.read_text() == "mine"
@@ -274,7 +292,7 @@ def test_the_manifest_names_what_is_there(viewer: Any) -> None:
     manager = PluginManager.instance()
     manager.discover()
     names = {each.display_name for each in manager.get_manifest("curvafit").contributions.widgets}
-    assert names == {"Complete", "Measure", "Generate"}
+    assert names == {"Complete", "Measure"}
     for name in names:
         viewer.window.add_plugin_dock_widget("curvafit", name)
     viewer.open_sample("curvafit", "tubes")
