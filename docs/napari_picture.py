@@ -27,7 +27,7 @@ fill.run()
 while not fill.run_button.enabled:
     settle(0.1)
 _, gauge = viewer.window.add_plugin_dock_widget("curvafit", "Measure", tabify=False)
-gauge.layer.value = labels
+gauge.layer.value = viewer.layers["filled every 8th slice"]
 gauge.run()
 while not gauge.run_button.enabled:
     settle(0.1)

@@ -218,13 +218,9 @@ def note_labelled(places: Sequence[int], labelled: np.ndarray) -> tuple[str, ...
     """Return notes on the known slices at `places`: those with labels, and empty ones in their rhythm."""
     with_labels, empty = [k for k in places if labelled[k]], [k for k in places if not labelled[k]]
     known = f"The {len(with_labels)} slices with labels are known: {list_numbers(with_labels, 24)}."
-    return (f"{known} Another one that is rightly empty must be named.", *note_empty(empty))
-
-
-def note_empty(empty: Sequence[int]) -> tuple[str, ...]:
-    """Return a note on slices that are taken for rightly empty, if there are any."""
-    note = f"Taken for rightly empty, as next in the rhythm of those with labels: {list_numbers(empty)}."
-    return (f"{note} If that is wrong, name the known slices.",) if empty else ()
+    notes = (f"{known} Another one that is rightly empty must be named.",)
+    taken = f"Taken for rightly empty, as next in the rhythm of those with labels: {list_numbers(empty)}."
+    return (*notes, f"{taken} If that is wrong, name the known slices.") if empty else notes
 
 
 def doubt_labels(values: np.ndarray, ignore: int | None = None) -> tuple[str, ...]:
