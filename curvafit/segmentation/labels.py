@@ -64,8 +64,8 @@ def reconstruct_labels(
     label that is nearest as filled without the image, and each label is kept in one piece.
 
     Each label is filled in the box where it may be. Where every voxel of the known slices is labelled, so is every
-    voxel that is filled: an unclaimed voxel goes to the most probable label, or to the nearest. A label
-    for which slices or example are too few for what is asked is filled by the network alone, and a note says why.
+    voxel that is filled: an unclaimed voxel goes to the most probable label, or to the nearest. A label for which
+    slices or example are too few for what is asked is filled by the network alone, and a note says why.
 
     Parameters
     ----------
@@ -86,8 +86,8 @@ def reconstruct_labels(
 
     In the result `labels` has the label of the structure at each voxel, `mask` whether there is one, `probability` that
     of the voxel's label; there are neither coefficients nor a phase field. Its `status` is that of `reconstruct` for
-    each label, or of many a summary. Raises ValueError as `reconstruct`, if it refuses all labels; or
-    if the known slices do not have a label, or none but 0.
+    each label, or of many a summary. Raises ValueError as `reconstruct`, if it refuses all labels; or if the known
+    slices do not have a label, or none but 0.
     """
     reading = {"spacing": spacing, "unit": unit}
     inputs = _Inputs.load(slices, chosen, image, example, working=working, reading=reading, **options)
