@@ -121,10 +121,10 @@ def synth(
     if source.edge == math.inf:  # shapes are grown at any size, not cropped from a store
         crew.check_memory(recipe.largest)
     with crew.start() as (workers, progress):
-        sets.build_set(out, spec, count, progress, workers=workers)
+        sets.build_set(out, spec, count, progress, workers=workers, command=command_line())
     if (total := len(sets.list_cases(out))) > count:
         say(f"note: {out} holds {total} cases, more than --count {count}: all are listed", to=error_console())
-    for path in (out / "dataset.json", sets.write_preview(out), sets.write_card(out, command_line())):
+    for path in (out / "dataset.json", sets.write_preview(out)):
         say(str(path))
 
 

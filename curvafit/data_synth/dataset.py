@@ -380,10 +380,6 @@ class TextureDataset(IterableDataset):
             check_crop(self.source.edge, self.size, edge, kind)
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # with a loader's workers
 
-    def __repr__(self) -> str:
-        kinds, size = ", ".join(kind.name for kind in self.modalities), " x ".join(map(str, self.size))
-        return f"TextureDataset({self.source.about}; {kinds}; {size} voxels; {self.length} samples an epoch)"
-
     def __len__(self) -> int:
         """Return the number of samples that this rank gives in an epoch."""
         return self.length // self._rank()[1]

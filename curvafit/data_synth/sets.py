@@ -18,7 +18,6 @@ from curvafit.core.checks import as_tuple, check_choice, check_int, check_type
 from curvafit.core.files import remove, write_content
 from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, hold_signals, silent
-from curvafit.core.units import format_number, unit_name
 from curvafit.core.workers import Cluster, run_jobs
 from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.dataset import Case, Recipe
@@ -34,8 +33,6 @@ from curvafit.volumes.write import save
 SET = Format("curvafit set", 3, "a set of curvafit", remedy="begin it anew in another folder")
 #: The record of the set, the folder of its cases' records, and the list that readers of its layout look for.
 HEADER, RECORDS, LIST = "curvafit.json", "cases", "dataset.json"
-#: The data card, and its first line: a card without it is somebody's own, and is left alone.
-CARD, MARK = "card.md", "<!-- written by curvafit synth, which replaces it; without this line it stays as it is -->"
 #: Labels besides the mask that a set can have.
 PARTS = (*(name for name in NAMES if name != "mask"), "centreline")
 #: Cases in the picture, and in a row of it.
@@ -91,13 +88,19 @@ class SetSpec:
 
 
 def build_set(
-    folder: str | Path, spec: SetSpec, count: int, progress: Progress = silent, *, workers: Cluster | None = None
+    folder: str | Path,
+    spec: SetSpec,
+    count: int,
+    progress: Progress = silent,
+    *,
+    workers: Cluster | None = None,
+    command: str = "",
 ) -> Path:
     """Make those of cases 0 to `count` - 1 of a set that are missing, and the list that readers of its layout look for.
 
     The folder is new, empty, or a set of the same specification to go on with. Case i depends on the specification and
     i alone. The folder holds a valid set at any time; the list may lack cases after a killed run, and the next run
-    completes it.
+    completes it. `command` is the command line, for the set's record.
 
     Raises ValueError where the folder holds something else or a set of another spec; OSError where it can't be written
     or the workers are gone. Finished cases are kept.
@@ -107,7 +110,7 @@ def build_set(
     check_set(folder, spec)
     if not (folder / HEADER).exists():
         first = spec.recipe.case(0)  # where none can be made, nothing is written
-        SET.write(folder / HEADER, {"versions": versions(), "order": spec.as_dict()})
+        SET.write(folder / HEADER, {"command": command, "versions": versions(), "order": spec.as_dict()})
         check_set(folder, spec)  # another process may have begun it meanwhile
         _write_case(folder, spec, 0, first)
     cases, listed = set(list_cases(folder)), -math.inf
@@ -246,35 +249,3 @@ def write_preview(folder: str | Path) -> Path:
                 axes[row + 1, column].contour(inside, [0.5], colors=colour, linewidths=0.8)
         axes[row, column].set_title(name, fontsize=8)
     return write_picture(figure, folder / "preview.png")
-
-
-def write_card(folder: str | Path, command: str = "") -> Path:
-    """Write `card.md` into a set's folder, unless somebody else's is there, and return its path."""
-    card, spec = Path(folder) / CARD, read_spec(folder)
-    if card.exists() and not card.read_text(encoding="utf-8", errors="replace").startswith(MARK):
-        return card
-    recipe, used = spec.recipe, versions()
-    modality, imaging = recipe.modality, recipe.modality.base
-    facts = {
-        "cases": len(list_cases(card.parent)),
-        "voxels of an image": " x ".join(map(str, recipe.shape)),
-        "edges of a voxel": f"{' x '.join(map(format_number, imaging.spacing))} {unit_name(imaging.unit, 2)}",
-        "labels": ", ".join(f"{number} {name}" for number, name in enumerate(("background", *recipe.classes))),
-        "further labels": ", ".join(spec.parts) or "none",
-        "shapes": recipe.source.about,
-        "images": f"{modality.name}: {modality.about}",
-        "drawn anew for each case": ", ".join(modality.ranges) or "nothing",
-        "seed": recipe.seed,
-        "made with": ", ".join(f"{name} {used[name]}" for name in ("curvafit", "torch", "numpy")),
-    }
-    lines = (
-        *(MARK, f"# {card.parent.resolve().name}\n"),
-        "Synthetic 3D images of generated shapes, with labels that are exact because the shapes are known.\n",
-        "![Some of the cases](preview.png)\n",
-        *(f"- {name}: {fact}" for name, fact in facts.items()),
-        *((f"\nThe command:\n\n    {command}",) if command else ()),
-        f"\nCase i depends on `{HEADER}`, which has all settings, and on i alone; `{RECORDS}/` has a record of each.",
-        "Images are simulated: a network that has seen these alone has seen no scan. A mask is where the structure is,",
-        "not what an annotator would draw on the image. No person, animal or sample is shown.\n",
-    )
-    return write_content(card, "\n".join(lines))

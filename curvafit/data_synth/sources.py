@@ -26,7 +26,7 @@ from curvafit.core.runtime import show_share
 from curvafit.core.units import METRES, convert_length
 from curvafit.data_synth.design import PARAMETERS, Design
 from curvafit.data_synth.imaging.modality import Modality
-from curvafit.data_synth.store import find_well_formed, open_store
+from curvafit.data_synth.store import find_well_formed
 from curvafit.generation.flow import generate
 from curvafit.generation.loop import first_mass
 from curvafit.generation.result import is_well_formed
@@ -74,12 +74,6 @@ class Generated:
             first_mass(self.fraction)
         object.__setattr__(self, "schedule", named_schedule(self.schedule))
         object.__setattr__(self, "points", Design("list", points=self.points).points)
-
-    @property
-    def about(self) -> str:
-        """Return the source in a few words."""
-        others = f" and {len(self.names) - 9} more laws" if len(self.names) > 9 else ""
-        return f"grown by {', '.join(self.names[:9])}{others}"
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
         """Return a well-formed shape, from the first of some seeds that gives one; ValueError where none does."""
@@ -161,13 +155,6 @@ class Stored:
         return {"kind": "stored", "paths": list(map(str, self.paths)), "draws": self.draws}
 
     @property
-    def about(self) -> str:
-        """Return the source in a few words."""
-        viable = sum(store.viable(index) for store in map(open_store, self.paths) for index in store.indices())
-        note = "" if viable == self.draws else f", the well-formed ones of {viable}"
-        return f"{self.draws} shapes of {', '.join(path.name for path in self.paths)}{note}"
-
-    @property
     def edge(self) -> int:
         """Return the least edge of the stores' shapes, in voxels; no crop may be longer."""
         return min(min(store.settings.shape) for store, _ in find_well_formed(self.paths))
@@ -193,11 +180,6 @@ class Pool:
     count: int
     edge: int
     room: Path = field(default_factory=_shared_folder, compare=False)
-
-    @property
-    def about(self) -> str:
-        """Return the source in a few words."""
-        return f"{self.count} shapes of {', '.join(self.generated.names)}"
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
         """Return a crop of any of the pool's shapes that shows both structure and background."""

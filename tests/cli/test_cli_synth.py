@@ -40,9 +40,10 @@ def recipe(folder: Path) -> dict:
 def test_a_set_from_a_store(tmp_path, store):
     out = tmp_path / "Dataset001_S"
     lines = made(out, "--atlas", store, *QUICK).stdout.splitlines()
-    assert [Path(line).name for line in lines] == ["dataset.json", "preview.png", "card.md"]
+    assert [Path(line).name for line in lines] == ["dataset.json", "preview.png"]
     assert all(Path(line).is_file() for line in lines)
     assert listed(out)["numTraining"] == 2 and listed(out)["channel_names"] == {"0": "confocal"}
+    assert json.loads((out / "curvafit.json").read_text())["command"].startswith("curvafit synth")
     image = load(out / "imagesTr" / "case_00001_0000.nii.gz")
     assert image.shape == (8, 16, 16) and image.spacing == (1.0, 0.5, 0.5) and image.unit == "um"
     (out / "cases" / ".1a2b.case_00002.json").write_text("torn")  # a killed run's

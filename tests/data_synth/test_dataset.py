@@ -121,7 +121,6 @@ def test_one_number_is_a_cube_and_a_name_a_modality(store, tmp_path):
     assert dataset[0].image.shape == (1, 12, 12, 12) and dataset[0].record["modality"] == "micro-ct"
     batch = next(iter(DataLoader(TextureDataset(store, "micro-ct", 12, transform=as_dict), batch_size=3)))
     assert batch["image"].shape == batch["label"].shape == (3, 1, 12, 12, 12)
-    assert repr(dataset) == "TextureDataset(7 shapes of s.zarr; micro-ct; 12 x 12 x 12 voxels; 5 samples an epoch)"
     dataset = TextureDataset(store, QUIET, SHAPE, calibres=(1.0, 1.5))
     voxels = [dataset.sample(k).record["voxel"] for k in range(4)]
     assert len(set(voxels)) == 4 and 1.5 * QUIET.voxel >= max(voxels) > min(voxels) >= QUIET.voxel
@@ -131,7 +130,7 @@ def test_one_number_is_a_cube_and_a_name_a_modality(store, tmp_path):
     four, record = exact_store(tmp_path / "s.zarr", 4), exact_record(4)
     torn = dataclasses.replace(record, viability=dataclasses.replace(record.viability, highest=7.0))
     four.write(torn, exact_field(4))
-    assert "3 shapes of s.zarr, the well-formed ones of 4;" in repr(TextureDataset(four.path, "micro-ct", 12))
+    assert TextureDataset(four.path, "micro-ct", 12).source.draws == 3  # the well-formed ones of 4
 
 
 def test_images_are_normalised_as_asked(store):
@@ -154,9 +153,9 @@ def test_shapes_of_laws():
         sample = dataset[0]
         assert 0 < float(sample.label.float().mean()) < 1
         assert sample.record["source"][0]["parameters"]["a02"] in (tubes.coefficients.a02, sponge.coefficients.a02)
-    assert repr(dataset).startswith("TextureDataset(2 shapes of preset tubes, sponge; quiet; 12 x 12 x 12 voxels")
+    assert dataset.source.count == 2 and dataset.source.generated.names == ("preset tubes", "sponge")
     filled = TextureDataset(tubes.coefficients, QUIET, 12, shapes=1, volume_fraction=0.2)
-    assert dataset.voxels == filled.voxels == [QUIET.voxel] and "1 shapes of coefficients" in repr(filled)
+    assert dataset.voxels == filled.voxels == [QUIET.voxel] and filled.source.generated.names == ("coefficients",)
     in_um = dataclasses.replace(made_fit(), length_unit="um", working_voxel=0.25)
     in_voxels = dataclasses.replace(in_um, length_unit="voxel")
     kind, of_voxels = Modality("um", "", 0.5, Imaging()), Modality("voxel", "", 0.5, Imaging(unit="voxel"))

@@ -15,7 +15,7 @@ from exact_store import CROP as SHAPE
 from exact_store import flat_recipe
 
 from curvafit.data_synth import sets
-from curvafit.data_synth.sets import SetSpec, build_set, make_case, read_spec, write_card
+from curvafit.data_synth.sets import SetSpec, build_set, make_case, read_spec
 from curvafit.volumes.read import load, read_values
 
 
@@ -201,12 +201,3 @@ def test_a_damaged_header_is_one_sentence(tmp_path, folder, wide, wrong):
     with pytest.raises(ValueError, match="curvafit.json"):
         build_set(tmp_path, wide, 1)
     assert file.read_text() == text
-
-
-def test_the_card_tells_what_a_set_is_and_spares_another_s(tmp_path, folder, wide):
-    whole = shutil.copytree(folder, tmp_path / "set")
-    text = write_card(whole, "curvafit synth -o set").read_text(encoding="utf-8")
-    for part in ("cases: 1", "8 x 16 x 16", "flat: for tests", *wide.recipe.modality.ranges, "curvafit synth -o set"):
-        assert part in text
-    (whole / "card.md").write_text("my own words")
-    assert write_card(whole).read_text(encoding="utf-8") == "my own words"
