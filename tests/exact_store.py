@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from curvafit.data_synth import Detector, Imaging, Modality, Optics, Record, Settings, Store, design_box, open_store
+from curvafit.data_synth import Detector, Imaging, Modality, Optics, Store, design_box, open_store
 from curvafit.data_synth.dataset import Recipe
 from curvafit.data_synth.sources import Stored
+from curvafit.data_synth.store import Record, Settings
 from curvafit.generation.result import Viability
 from curvafit.priors.coefficients import Coefficients
 

@@ -130,7 +130,6 @@ def train_atlas(
     table: Annotated[Path, typer.Argument(help="A table made by `curvafit atlas describe`.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="The posterior (.npz) to write.")],
     views: Annotated[str | None, typer.Option(help="Views to learn from, between commas; by default all.")] = None,
-    members: Annotated[int, typer.Option(help="Number of flows, whose equal mixture the posterior is.")] = 4,
     seed: Annotated[int, typer.Option(help="Seed of the training.")] = 0,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -144,7 +143,7 @@ def train_atlas(
     if views is not None:
         descriptors = descriptors.select_views(views.split(","))
     with show_stages() as progress:
-        posterior = train_posterior(descriptors, members=members, seed=seed, progress=progress)
+        posterior = train_posterior(descriptors, seed=seed, progress=progress)
     save_posterior(posterior, out)
     say(f"{posterior.provenance['shapes']} shapes", to=error_console())
     say(str(out))

@@ -36,7 +36,7 @@ Parts = Annotated[
 
 def parse_shapes(
     laws: Laws = None,
-    atlas: Annotated[Path | None, _what(help="Store of shapes to crop, or atlas (.npz) of laws to grow.")] = None,
+    atlas: Annotated[Path | None, _what(help="Store of shapes to crop.")] = None,
     volume_fraction: Annotated[float | None, _what(help="Share of the volume inside; by default the fit's.")] = None,
     draws: Annotated[int | None, _what(help="Laws drawn from each fit's posterior, in place of its best.")] = None,
 ) -> dict[str, Any]:
@@ -65,16 +65,6 @@ def parse_imaging(
     return {"name": modality, "like": like, "mask": like_mask, "visible": visible}
 
 
-def parse_sampling(
-    shape: Annotated[str, _out(help="Voxels of an image: N or Z,Y,X.")] = "96",
-    voxel: Annotated[float | None, _image(help="Edge of a shape's voxel, in --unit; by default the law's.")] = None,
-    calibres: Annotated[str, _image(help="LOW,HIGH: a case is thicker by a factor in between.")] = "1,1",
-) -> dict[str, Any]:
-    """Return the size of images and of the shapes in them."""
-    low, high = parse_numbers(calibres, "--calibres", 2)
-    return {"shape": parse_whole_triple(shape, "--shape"), "voxel": voxel, "calibres": (low, high)}
-
-
 @command(
     "curvafit synth -o Dataset101_Tubes --preset tubes,sponge --modality confocal --count 200 --shape 96",
     "curvafit synth -o Dataset102_Bone --prior bone/fit.json --like bone.nii.gz --count 200 --shape 64",
@@ -88,7 +78,9 @@ def synth(
     shapes: Annotated[dict[str, Any], Group(parse_shapes)],
     composition: Annotated[dict[str, Any], Group(parse_composition)],
     imaging: Annotated[dict[str, Any], Group(parse_imaging)],
-    sampling: Annotated[dict[str, Any], Group(parse_sampling)],
+    shape: Annotated[str, _out(help="Voxels of an image: N or Z,Y,X.")] = "96",
+    voxel: Annotated[float | None, _image(help="Edge of a shape's voxel, in --unit; by default the law's.")] = None,
+    calibres: Annotated[str, _image(help="LOW,HIGH: a case is thicker by a factor in between.")] = "1,1",
     reading: Reading,
     layout: Annotated[str, _out(help="nnunet (v2, raw), monai (decathlon's list) or zarr.")] = "nnunet",
     labels: Parts = None,
@@ -96,7 +88,7 @@ def synth(
     crew: Workers,
 ) -> None:
     """Make a training set: images of generated shapes with exact labels."""
-    unit, wall, voxel = reading["unit"], composition["wall"], sampling["voxel"]
+    unit, wall = reading["unit"], composition["wall"]
     if unit is not None and reading["spacing"] is None:
         if voxel is None and wall is None:
             raise ValueError("--unit needs --spacing, --voxel or --wall")
@@ -114,7 +106,8 @@ def synth(
     edge = choose_voxel(laws, modality) if voxel is None else convert_length(voxel, unit, modality.base.unit)
     thickness = None if wall is None else convert_length(wall, unit, modality.base.unit)
     content = Composition(composition["classes"], thickness, composition["levels"])
-    recipe = Recipe(source, modality, sampling["shape"], edge, seed, sampling["calibres"], content)
+    low, high = parse_numbers(calibres, "--calibres", 2)
+    recipe = Recipe(source, modality, parse_whole_triple(shape, "--shape"), edge, seed, (low, high), content)
     spec = sets.SetSpec(recipe, layout, tuple(labels.split(",")) if labels else ())
     check_folder(out)
     sets.check_set(out, spec)
@@ -142,16 +135,9 @@ def _choose_source(
         return _draw_source(laws, volume_fraction, int(draws or 0))
     if draws is not None:
         raise ValueError("--draws is for fits, not for an atlas")
-    if atlas.suffix.lower() != ".npz":
-        if volume_fraction is not None:
-            raise ValueError("--volume-fraction is for shapes that are grown, not for those of a store")
-        return Stored((atlas.resolve(),)), []
-    from curvafit.inference.atlas import load_atlas
-
-    shapes = load_atlas(atlas)
-    parameters = zip(shapes.coefficients, shapes.masses, strict=True)
-    points = tuple((*map(float, coefficients), float(mass)) for coefficients, mass in parameters)
-    return Generated(points, shapes.ids, fraction=volume_fraction), []
+    if volume_fraction is not None:
+        raise ValueError("--volume-fraction is for shapes that are grown, not for those of a store")
+    return Stored((atlas.resolve(),)), []
 
 
 def _draw_source(laws: list[str], volume_fraction: float | None, count: int) -> tuple[ShapeSource, list[Any]]:

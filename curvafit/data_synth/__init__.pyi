@@ -4,12 +4,8 @@ from .atlas import extract as extract
 from .dataset import TextureDataset as TextureDataset
 from .dataset import as_dict as as_dict
 from .dataset import as_monai as as_monai
-from .design import INTERVALS as INTERVALS
 from .design import Design as Design
-from .design import Draw as Draw
-from .design import design_around as design_around
 from .design import design_box as design_box
-from .design import read_design as read_design
 from .imaging.modality import MODALITIES as MODALITIES
 from .imaging.modality import Contrast as Contrast
 from .imaging.modality import Detector as Detector
@@ -21,7 +17,5 @@ from .imaging.modality import Optics as Optics
 from .imaging.modality import Specimen as Specimen
 from .imaging.modality import modality as modality
 from .labels import labels_of as labels_of
-from .store import Record as Record
-from .store import Settings as Settings
 from .store import Store as Store
 from .store import open_store as open_store

@@ -226,8 +226,6 @@ class Recipe:
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Recipe:
         """Return the recipe that `as_dict` wrote."""
-        if content["composition"].get("blend"):
-            raise ValueError("it blends textures, which curvafit does not do: it cannot be continued, begin another")
         source, modality = decode_source(content["source"]), Modality.from_dict(content["modality"])
         composition = decode(Composition, content["composition"])
         return Recipe(**{**content, "source": source, "modality": modality, "composition": composition})

@@ -23,22 +23,20 @@ from curvafit.data_synth.atlas import versions
 from curvafit.data_synth.dataset import Case, Recipe
 from curvafit.data_synth.labels import NAMES, labels_of
 from curvafit.data_synth.store import check_same
-from curvafit.drawing.plot import CONTOUR, make_figure, write_picture
+from curvafit.drawing.plot import grey_limits, make_figure, section_on, write_picture
 from curvafit.geometry.centreline import centreline, write_graphml
 from curvafit.priors.grid import Grid
 from curvafit.volumes.read import load
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
-SET = Format("curvafit set", 3, "a set of curvafit", remedy="begin it anew in another folder")
+SET = Format("curvafit set", 4, "a set of curvafit", remedy="begin it anew in another folder")
 #: The record of the set, the folder of its cases' records, and the list that readers of its layout look for.
 HEADER, RECORDS, LIST = "curvafit.json", "cases", "dataset.json"
 #: Labels besides the mask that a set can have.
 PARTS = (*(name for name in NAMES if name != "mask"), "centreline")
 #: Cases in the picture, and in a row of it.
 SHOWN, ROW = 8, 4
-#: Colours of the classes' outlines, which begin again after the last (Okabe & Ito 2008).
-OUTLINES = (CONTOUR, "#56B4E9", "#CC79A7", "#009E73", "#F0E442")
 
 
 class Layout(NamedTuple):
@@ -225,7 +223,7 @@ def _measure_labels(case: Case, parts: Sequence[str]) -> dict[str, Any]:
 
 def write_preview(folder: str | Path) -> Path:
     """Write `preview.png` into a set's folder. It shows the first cases, each by the slice with most of the structure,
-    without and with the labels' outlines."""
+    without and with the label's outline."""
     folder = Path(folder)
     layout = LAYOUTS[read_spec(folder).layout]
     names = [case_name(index) for index in list_cases(folder)[:SHOWN]]
@@ -237,15 +235,10 @@ def write_preview(folder: str | Path) -> Path:
     for k, name in enumerate(names):
         image, label = (load(folder / template.format(case=name)) for template in (layout.image, layout.label))
         row, column = 2 * (k // ROW), k % ROW
-        plane = int(np.argmax((label.values > 0).sum((1, 2))))
-        grey, classes = image.values[plane], label.values[plane]
-        low, high = np.percentile(grey, (0.5, 99.5))
-        style = {"cmap": "gray", "vmin": low, "vmax": max(high, low + 1e-6)}
-        for axis in (axes[row, column], axes[row + 1, column]):
-            axis.imshow(grey, aspect=image.spacing[1] / image.spacing[2], **style)
-        for number in np.unique(classes[classes > 0]):
-            inside, colour = classes == number, OUTLINES[(number - 1) % len(OUTLINES)]
-            if not inside.all():
-                axes[row + 1, column].contour(inside, [0.5], colors=colour, linewidths=0.8)
+        inside = label.values > 0
+        plane = int(np.argmax(inside.sum((1, 2))))
+        limits, aspect = grey_limits(image.values), image.spacing[1] / image.spacing[2]
+        for axis, outline in ((axes[row, column], None), (axes[row + 1, column], inside[plane])):
+            section_on(axis, image.values[plane], outline, limits, aspect)
         axes[row, column].set_title(name, fontsize=8)
     return write_picture(figure, folder / "preview.png")

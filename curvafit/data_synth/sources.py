@@ -233,8 +233,6 @@ ShapeSource = Generated | Stored
 def decode_source(content: dict[str, Any]) -> ShapeSource:
     """Return the source that `as_dict` wrote."""
     if content["kind"] == "stored":
-        if content.get("rotate"):
-            raise ValueError("it turns shapes by any angle, which curvafit does not do: begin another")
         return Stored(tuple(map(Path, content["paths"])), content["draws"])
     points, plan = tuple(map(tuple, content["points"])), Schedule(**content["schedule"])
     return Generated(points, tuple(content["names"]), plan, content["fraction"], tuple(content.get("scales", ())))

@@ -100,12 +100,12 @@ def test_blur_has_its_widths_and_is_scipys_within() -> None:
 
 def test_blur_keeps_a_uniform_image_to_its_faces_and_widens_with_depth() -> None:
     torch.testing.assert_close(effects.blur(EMPTY + 3, 1.0, (3, 2, 1)), EMPTY + 3)
-    deep = effects.blur_with_depth(EMPTY + 3, 1.0, (3, 2, 0), 0.05, 0.02)
+    deep = effects.blur(EMPTY + 3, 1.0, (3, 2, 0), 0.05, 0.02)
     torch.testing.assert_close(deep[:, 3, 5], 3 * torch.exp(-0.02 * (torch.arange(N) + 0.5)).double())
     for z in (6, 20, 33):
         line, wider = torch.zeros(N, 60, 60, dtype=torch.float64), 1 + 0.03 * 2 * (z + 0.5)
         line[z, 30, 30] = 1
-        _, y, x = moments(effects.blur_with_depth(line, (2.0, 1.0, 1.0), (0.0, 1.2, 0.8), 0.03), (2.0, 1.0, 1.0))
+        _, y, x = moments(effects.blur(line, (2.0, 1.0, 1.0), (0.0, 1.2, 0.8), 0.03), (2.0, 1.0, 1.0))
         assert (y, x) == pytest.approx((1.2 * wider, 0.8 * wider), rel=0.01)
 
 

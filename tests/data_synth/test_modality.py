@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from operator import attrgetter
 
 import pytest
 import torch
@@ -38,7 +39,7 @@ def test_presets_make_images(name: str) -> None:
         drawn = kind.draw(seed)
         seen, inside = image(field, kind.voxel, drawn, seed), regrid(field, kind.voxel, drawn) > 0
         assert seen.shape == inside.shape and bool(torch.isfinite(seen).all())
-        assert float(seen.amin()) >= 0 and float(seen.amax()) <= drawn["detector.ceiling"]
+        assert float(seen.amin()) >= 0 and float(seen.amax()) <= drawn.detector.ceiling
         assert torch.equal(seen, seen.round())
         sign = 1 if drawn.contrast.foreground > drawn.contrast.background else -1
         contrast = sign * float(seen[inside].mean() - seen[~inside].mean())
@@ -103,7 +104,7 @@ def test_parameters_are_drawn_in_range_and_reproducibly() -> None:
         draws = [kind.draw(seed) for seed in range(40)]
         assert draws[3] == kind.draw(3) and draws[3] != draws[4]
         for name, (low, high) in kind.ranges.items():
-            values = [each[name] for each in draws]
+            values = [attrgetter(name)(each) for each in draws]
             first = [value[0] if isinstance(value, tuple) else value for value in values]
             ends = [end[0] if isinstance(end, tuple) else end for end in (low, high)]
             assert ends[0] <= min(first) < max(first) <= ends[1], name

@@ -186,12 +186,11 @@ def test_what_others_began_is_left_alone(tmp_path, folder, wide):
 #: Headers and records that are refused: as whole texts, or as entries in place of those that are there.
 TORN = ("{", "null", "[]", "NaN", "[" * 100_000, '{"version": ' + "9" * 5000 + "}", '{"version": NaN}', "{}")
 HEADERS = {"version": 1, "order.recipe": 7, "order.layout": "cubes", "order.parts": None, "order.recipe.source": []}
-HEADERS["order.recipe.composition"] = {"blend": 0.2}
 
 
 @pytest.mark.parametrize("wrong", [*TORN, *HEADERS])
 def test_a_damaged_header_is_one_sentence(tmp_path, folder, wide, wrong):
-    """And is left alone; so is that of a set that blends textures."""
+    """And is left alone."""
     file, header = tmp_path / "curvafit.json", json.loads((folder / "curvafit.json").read_text())
     if wrong in HEADERS:
         *path, name = wrong.split(".")

@@ -20,8 +20,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from curvafit.data_synth import Record, Settings, Store, build, open_store
+from curvafit.data_synth import Store, build, open_store
 from curvafit.data_synth.atlas import summarise, verify
+from curvafit.data_synth.store import Record, Settings
 from curvafit.generation.result import Viability
 from curvafit.generation.schedule import schedule
 from curvafit.priors.coefficients import Coefficients

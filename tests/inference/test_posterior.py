@@ -194,7 +194,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "PLANS", ONCE)
     source, out = tmp_path / "table.npz", tmp_path / "posterior.npz"
     room.save_table(table(80), source)
-    result = done("atlas", "train", source, "-o", out, "--views", "mask", "--members", 1)
+    result = done("atlas", "train", source, "-o", out, "--views", "mask")
     assert result.stdout.strip() == str(out)
     assert load_posterior(out).views == ("mask",)
 

@@ -60,25 +60,19 @@ def texture(like: Voxels, spacing: Lengths, deviation: float, length: float, see
     return _correlated_field(like, spacing, length, seed, purpose).mul_(spread).sub_(spread**2 / 2).exp_()
 
 
-def blur(image: Voxels, spacing: Lengths, widths: Lengths) -> Voxels:
-    """Return the image under a Gaussian point-spread function of standard deviations `widths` along (z, y, x)."""
-    axes = zip(image.shape, _as_triple(widths), _as_triple(spacing), strict=True)
-    return _apply_matrices(image, *(_gaussian_matrix(n, σ / h, image) for n, σ, h in axes))
+def blur(image: Voxels, spacing: Lengths, widths: Lengths, growth: float = 0.0, attenuation: float = 0.0) -> Voxels:
+    """Return the image under a Gaussian point-spread function of standard deviations `widths` along (z, y, x).
 
-
-def blur_with_depth(
-    image: Voxels, spacing: Lengths, widths: Lengths, growth: float, attenuation: float = 0.0
-) -> Voxels:
-    """Blur an image by a Gaussian that widens with depth, as scatter and aberrations make it.
-
-    Its deviations are σ(z) = σ(0) (1 + growth z), and light from depth z is weakened by exp(-attenuation z).
+    With depth scatter and aberrations widen it to σ(z) = σ(0) (1 + growth z), and weaken light by exp(-attenuation z).
     """
     edges = _as_triple(spacing)
     depth = _centres(len(image), edges[0], image)[:, None]
     wider = 1 + growth * depth  # of each row of z's matrix, and of each slice's matrices of y and x
-    axes = zip(image.shape, _as_triple(widths), edges, (wider, wider[..., None], wider[..., None]), strict=True)
+    factors = (wider, wider[..., None], wider[..., None]) if growth else (1.0, 1.0, 1.0)
+    axes = zip(image.shape, _as_triple(widths), edges, factors, strict=True)
     maps = (_gaussian_matrix(n, σ / h * factor if σ else 0.0, image) for n, σ, h, factor in axes)
-    return _apply_matrices(image, *maps) * torch.exp(-attenuation * depth)[..., None]
+    seen = _apply_matrices(image, *maps)
+    return seen * torch.exp(-attenuation * depth)[..., None] if attenuation else seen
 
 
 def sample(image: Voxels, spacing: Lengths, onto: Lengths, window: Lengths = 0.0) -> Float[Tensor, "Z Y X"]:

@@ -167,10 +167,6 @@ class Imaging(Checked):
                 raise ValueError(f"{parameter.name} must be of type {kind.__name__}, got {quoted(part)}")
         super().__post_init__()
 
-    def __getitem__(self, name: str) -> Any:
-        """Return the value of a parameter by its name, `optics.blur` or `spacing`."""
-        return attrgetter(name)(self)
-
     def assign(self, values: Mapping[str, Any]) -> Imaging:
         """Return a copy with other values, by name: `imaging.assign({"optics.blur": (3, 1, 1), "visible": 0.1})`."""
         if unknown := sorted(set(values) - set(NAMES)):
@@ -224,7 +220,8 @@ class Modality:
     def __post_init__(self) -> None:
         check_float(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
         ranges = {
-            name: tuple(self.base.assign({name: end})[name] for end in ends) for name, ends in self.ranges.items()
+            name: tuple(attrgetter(name)(self.base.assign({name: end})) for end in ends)
+            for name, ends in self.ranges.items()
         }
         for name, (low, high) in ranges.items():
             if np.any(np.asarray(low) > np.asarray(high)):
@@ -287,10 +284,7 @@ def image(
     fractions = share_voxels(fields, epsilon)
     stain = torch.stack([level * fraction for level, fraction in zip(levels, fractions, strict=True)]).sum(0)
     light, optics = _emit(stain, spacing, imaging, seed), imaging.optics
-    if optics.growth or optics.attenuation:
-        light = effects.blur_with_depth(light, spacing, optics.blur, optics.growth, optics.attenuation)
-    else:
-        light = effects.blur(light, spacing, optics.blur)
+    light = effects.blur(light, spacing, optics.blur, optics.growth, optics.attenuation)
     light = effects.sample(light, spacing, imaging.spacing, (imaging.thickness, *imaging.spacing[1:]))
     uneven = imaging.illumination
     if uneven.bias:
@@ -317,7 +311,7 @@ def label_voxels(
     if imaging.visible:
         optics, window = imaging.optics, (imaging.thickness, *imaging.spacing[1:])
         stains = share_voxels(fields, epsilon)
-        lights = (effects.blur_with_depth(stain, spacing, optics.blur, optics.growth) for stain in stains)
+        lights = (effects.blur(stain, spacing, optics.blur, optics.growth) for stain in stains)
         fractions = torch.stack([effects.sample(light, spacing, imaging.spacing, window) for light in lights])
         return torch.where(fractions.sum(0) > imaging.visible, fractions.argmax(0) + 1, 0).to(torch.uint8)
     if len(fields) == 1:
