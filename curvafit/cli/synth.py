@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from curvafit.data_synth.sources import ShapeSource
 
 _what = partial(typer.Option, rich_help_panel="Shapes: one of these")
-_show = partial(typer.Option, rich_help_panel="What an image shows")
 _image = partial(typer.Option, rich_help_panel="Images")
 _out = partial(typer.Option, rich_help_panel="Output")
 
@@ -38,21 +37,10 @@ def parse_shapes(
     laws: Laws = None,
     atlas: Annotated[Path | None, _what(help="Store of shapes to crop.")] = None,
     volume_fraction: Annotated[float | None, _what(help="Share of the volume inside; by default the fit's.")] = None,
-    draws: Annotated[int | None, _what(help="Laws drawn from each fit's posterior, in place of its best.")] = None,
 ) -> dict[str, Any]:
     """Return the options on the source of shapes, by name."""
     names = [] if laws is None else laws.split(",")
-    return {"laws": names, "atlas": atlas, "volume_fraction": volume_fraction, "draws": draws}
-
-
-def parse_composition(
-    classes: Annotated[bool, _show("--classes", help="A shape of each law in every image, one class each.")] = False,
-    wall: Annotated[float | None, _show(help="Shells: thickness of a wall around a lumen, in --unit.")] = None,
-    levels: Annotated[str | None, _show(help="Light of each class: 0 as background, 1 as structure.")] = None,
-) -> dict[str, Any]:
-    """Return the options on classes, walls and light levels in an image, by name."""
-    light_levels = None if levels is None else tuple(parse_numbers(levels, "--levels", levels.count(",") + 1))
-    return {"classes": classes, "wall": wall, "levels": light_levels}
+    return {"laws": names, "atlas": atlas, "volume_fraction": volume_fraction}
 
 
 def parse_imaging(
@@ -68,7 +56,6 @@ def parse_imaging(
 @command(
     "curvafit synth -o Dataset101_Tubes --preset tubes,sponge --modality confocal --count 200 --shape 96",
     "curvafit synth -o Dataset102_Bone --prior bone/fit.json --like bone.nii.gz --count 200 --shape 64",
-    "curvafit synth -o Dataset104_Cell --presets sponge,tubes --classes --levels 1,0.6 --modality confocal --shape 64",
     "curvafit synth -o set --atlas store.zarr --modality micro-ct --layout monai --labels distance --shape 48",
 )
 def synth(
@@ -76,7 +63,6 @@ def synth(
     count: Annotated[int, _out(help="Number of cases in the set at the end.")] = 200,
     *,
     shapes: Annotated[dict[str, Any], Group(parse_shapes)],
-    composition: Annotated[dict[str, Any], Group(parse_composition)],
     imaging: Annotated[dict[str, Any], Group(parse_imaging)],
     shape: Annotated[str, _out(help="Voxels of an image: N or Z,Y,X.")] = "96",
     voxel: Annotated[float | None, _image(help="Edge of a shape's voxel, in --unit; by default the law's.")] = None,
@@ -88,26 +74,22 @@ def synth(
     crew: Workers,
 ) -> None:
     """Make a training set: images of generated shapes with exact labels."""
-    unit, wall = reading["unit"], composition["wall"]
+    unit = reading["unit"]
     if unit is not None and reading["spacing"] is None:
-        if voxel is None and wall is None:
-            raise ValueError("--unit needs --spacing, --voxel or --wall")
-        reading["unit"] = None  # it is that of --voxel and --wall, not of --like
+        if voxel is None:
+            raise ValueError("--unit needs --spacing or --voxel")
+        reading["unit"] = None  # it is that of --voxel, not of --like
     source, laws = _choose_source(**shapes)
-    if composition["classes"] and shapes["draws"] is not None:
-        raise ValueError("--classes takes one law for each class: leave out --draws")
     modality = _choose_modality(**imaging, reading=reading)
     from curvafit.core.files import check_folder
     from curvafit.core.units import convert_length
     from curvafit.data_synth import sets
-    from curvafit.data_synth.dataset import Composition, Recipe
+    from curvafit.data_synth.dataset import Recipe
     from curvafit.data_synth.sources import choose_voxel
 
     edge = choose_voxel(laws, modality) if voxel is None else convert_length(voxel, unit, modality.base.unit)
-    thickness = None if wall is None else convert_length(wall, unit, modality.base.unit)
-    content = Composition(composition["classes"], thickness, composition["levels"])
     low, high = parse_numbers(calibres, "--calibres", 2)
-    recipe = Recipe(source, modality, parse_whole_triple(shape, "--shape"), edge, seed, (low, high), content)
+    recipe = Recipe(source, modality, parse_whole_triple(shape, "--shape"), edge, seed, (low, high))
     spec = sets.SetSpec(recipe, layout, tuple(labels.split(",")) if labels else ())
     check_folder(out)
     sets.check_set(out, spec)
@@ -121,39 +103,17 @@ def synth(
         say(str(path))
 
 
-def _choose_source(
-    laws: list[str], atlas: Path | None, volume_fraction: float | None, draws: int | None
-) -> tuple[ShapeSource, list[Any]]:
+def _choose_source(laws: list[str], atlas: Path | None, volume_fraction: float | None) -> tuple[ShapeSource, list[str]]:
     """Return the source of shapes that the options name, and the laws whose fits state the size of a voxel."""
     if bool(laws) == (atlas is not None):
         raise ValueError(f"give either --prior (or --preset) or --atlas, got {'both' if laws else 'neither'}")
     from curvafit.data_synth.sources import Generated, Stored
 
-    if atlas is None and draws is None:
-        return Generated.of(laws, volume_fraction), laws
     if atlas is None:
-        return _draw_source(laws, volume_fraction, int(draws or 0))
-    if draws is not None:
-        raise ValueError("--draws is for fits, not for an atlas")
+        return Generated.of(laws, volume_fraction), laws
     if volume_fraction is not None:
         raise ValueError("--volume-fraction is for shapes that are grown, not for those of a store")
     return Stored((atlas.resolve(),)), []
-
-
-def _draw_source(laws: list[str], volume_fraction: float | None, count: int) -> tuple[ShapeSource, list[Any]]:
-    """Draw `count` laws from a fit's posterior; return the source of their shapes, and a law of median voxel edge."""
-    from statistics import median
-
-    from curvafit.data_synth.sources import Generated
-    from curvafit.inference.fit import draw_laws
-
-    if len(laws) > 1:
-        raise ValueError(f"--draws takes one fit, got {len(laws)}")
-    draws = draw_laws(laws[0], count)
-    edges = [float(law.working_voxel or 1.0) for law in draws]
-    scales = tuple(edge / median(edges) for edge in edges)  # so that each law's shapes keep their own size
-    source = replace(Generated.of(draws, volume_fraction), scales=scales)
-    return source, [replace(draws[0], working_voxel=median(edges))]
 
 
 def _choose_modality(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from numbers import Real
 from os import PathLike
 from pathlib import Path
@@ -26,11 +26,9 @@ from curvafit.core.checks import (
     check_type,
     quoted,
 )
-from curvafit.core.schema import decode, encode
+from curvafit.core.schema import encode
 from curvafit.data_synth.imaging.modality import Imaging, Modality, field_shape, image, label_voxels, modality, regrid
-from curvafit.data_synth.labels import field_distance
 from curvafit.data_synth.sources import Generated, Pool, ShapeSource, Stored, choose_voxel, decode_source
-from curvafit.priors.grid import Grid
 from curvafit.priors.kernels.threads import one_thread
 from curvafit.priors.law import LAW_TYPES, LawLike
 from curvafit.volumes.formats.nifti import affine_in_file
@@ -40,97 +38,15 @@ from curvafit.volumes.volume import Volume
 TRIES = 8
 #: The most voxels of a shape; and the least along each edge of a grown one, or along the longest edge of a crop.
 MOST, FEWEST = 10**9, 4
-#: The brightest that a class can be, as a multiple of the structure's contrast; and the most classes of a set.
-BRIGHTEST, MOST_CLASSES = 100.0, 200
 #: Percentiles that `percentile` makes 0 and 1.
 PERCENTILES = (0.5, 99.5)
-
-
-@dataclass(frozen=True)
-class Composition:
-    """What a case shows: one structure by default.
-
-    Attributes
-    ----------
-    classes
-        Every case shows a shape of each law, in front of those of later laws; the classes of the labels.
-    wall
-        Thickness of a wall along the surface of the shape, inside it, in the modality's unit: the labels' class 1; what
-        the wall encloses is class 2, the lumen.
-    levels
-        Light of each class: 0 is as dark as the background, 1 as bright as the structure. By default 1, the lumen 0.
-    """
-
-    classes: bool = False
-    wall: float | None = None
-    levels: tuple[float, ...] | None = None
-
-    def __post_init__(self) -> None:
-        if self.wall is not None:
-            object.__setattr__(self, "wall", check_float(self.wall, "a wall of positive thickness", SHORTEST, LONGEST))
-        if self.classes and self.wall is not None:
-            raise ValueError("give either classes or a wall, not both")
-        if self.levels is not None:
-            levels = as_tuple(self.levels, "a level of each class")
-            checked = tuple(check_float(n, f"levels from 0 to {BRIGHTEST:g}", 0, BRIGHTEST, of=levels) for n in levels)
-            object.__setattr__(self, "levels", checked)
-
-    def names(self, source: ShapeSource) -> tuple[str, ...]:
-        """Return the names of the classes, 1, 2, …; ValueError where the source or the levels do not fit."""
-        names: tuple[str, ...] = ("structure",) if self.wall is None else ("wall", "lumen")
-        if self.classes:
-            if not isinstance(source, Generated) or not 2 <= len(source.names) <= MOST_CLASSES:
-                raise ValueError(f"classes need from 2 to {MOST_CLASSES} laws to grow shapes of, one for each class")
-            ambiguous = len(set(source.names)) < len(source.names)
-            names = tuple(f"{name} {k}" if ambiguous else name for k, name in enumerate(source.names, 1))
-        if self.levels is not None and len(self.levels) != len(names):
-            raise ValueError(f"give a level for each of {', '.join(names)}, got {len(self.levels)} levels")
-        return names
-
-    def draw(
-        self, source: ShapeSource, voxels: Sequence[int], voxel: float, index: int, rng: np.random.Generator
-    ) -> tuple[Tensor, Tensor, float, list[dict[str, Any]]]:
-        """Return the phase fields of case `index`, (C, Z, Y, X) of the classes, the first in front, and (Z, Y, X) of
-        all together; their ε in voxels; the shapes' origins. The edge `voxel` of a voxel is in the wall's unit."""
-        if self.classes:
-            shapes = [source.shape(voxels, k, rng) for k in range(len(self.names(source)))]
-            values = torch.from_numpy(np.stack([shape.values for shape in shapes]))
-            return values, values.amax(0), shapes[0].epsilon, [shape.origin for shape in shapes]
-        margin = self.margin(source, voxel)
-        shape = source.shape([n + 2 * margin for n in voxels], index, rng)
-        u = torch.from_numpy(shape.values)
-        origin = shape.origin | ({"margin": margin} if margin else {})
-        if self.wall is None:
-            return u[None], u, shape.epsilon, [origin]
-        wall_and_lumen = shell_of(u, shape.epsilon, self.wall / voxel, periodic=source.edge == math.inf)
-        inner = (..., *(slice(margin, margin + n) for n in voxels))
-        return wall_and_lumen[inner], u[inner], shape.epsilon, [origin]
-
-    def show(
-        self, source: ShapeSource, shape: Sequence[int], voxel: float, imaging: Imaging, seed: int, index: int, rng: Any
-    ) -> Case:
-        """Return case `index` of `shape`, its image in real numbers; `voxel` is the edge of a shape's voxels."""
-        voxels = field_shape(shape, voxel, imaging)
-        fields, whole, epsilon, origins = self.draw(source, voxels, voxel, index, rng)
-        levels = self.levels or ((1.0,) * len(fields) if self.wall is None else (1.0, 0.0))
-        sampled = regrid(whole, voxel, imaging)
-        grey = image(fields, voxel, imaging, seed, epsilon, levels)
-        labels = label_voxels(fields, sampled, voxel, imaging, epsilon)
-        z, y, x = shape  # a field of whole voxels may give a few voxels more
-        grey, sampled, labels = (volume[:z, :y, :x].contiguous().numpy() for volume in (grey, sampled, labels))
-        record = {"source": origins, "imaging": imaging.as_dict(), "image_seed": seed, "voxel": voxel}
-        return Case(grey, sampled, labels, imaging.spacing, imaging.unit, epsilon * voxel, record)
-
-    def margin(self, source: ShapeSource, voxel: float) -> int:
-        """Return by how many voxels a crop is enlarged on every side, since surfaces outside have walls in it."""
-        return 0 if self.wall is None or source.edge == math.inf else math.ceil(self.wall / voxel) + 2
 
 
 class Case(NamedTuple):
     """An image, the phase field of what it shows and its labels, (Z, Y, X) on one grid of `spacing`.
 
-    The field is that of all classes together. Labels are uint8: 0 outside, 1, 2, … in the classes. ε is in spacing's
-    unit; `record` says how the case was made, in JSON's types.
+    Labels are uint8: 0 outside, 1 in the structure. ε is in spacing's unit; `record` says how the case was made, in
+    JSON's types.
     """
 
     image: np.ndarray
@@ -148,7 +64,7 @@ class Recipe:
 
     `shape` is the voxels (z, y, x) of the images; `voxel` is the edge of a shape's voxels in the modality's unit, which
     sets how thick structures are in the images; `calibres` are the least and the greatest factor of it, between which
-    every case draws its own; `composition` is what a case shows of the source's shapes.
+    every case draws its own.
     """
 
     source: ShapeSource
@@ -157,7 +73,6 @@ class Recipe:
     voxel: float
     seed: int = 0
     calibres: tuple[float, float] = (1.0, 1.0)
-    composition: Composition = field(default_factory=Composition)
 
     def __post_init__(self) -> None:
         check_type(self.modality, Modality, "a Modality")
@@ -168,54 +83,31 @@ class Recipe:
         object.__setattr__(self, "voxel", voxel)
         object.__setattr__(self, "seed", check_seed(self.seed))
         object.__setattr__(self, "calibres", check_calibres(self.calibres))
-        check_type(self.composition, Composition, "a Composition")
-        self.composition.names(self.source)
-        wall, longest = self.composition.wall, self._voxels[1]
-        if wall is not None and wall < longest:
-            edge = f"{longest:g} {self.modality.base.unit}"
-            raise ValueError(f"a wall must be at least a shape's voxel thick, {edge}, got {wall:g}")
-        for voxel in self._voxels:
-            check_crop(self.source.edge, self.shape, voxel, self.modality, self.composition.margin(self.source, voxel))
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Return the names of the labels' classes 1, 2, …"""
-        return self.composition.names(self.source)
+        for calibre in self.calibres:
+            check_crop(self.source.edge, self.shape, voxel * calibre, self.modality)
 
     @property
     def largest(self) -> tuple[int, int, int]:
         """Return the most voxels (z, y, x) that a shape can have: those at the least calibre."""
-        return field_shape(self.shape, self._voxels[0], self.modality.base)
-
-    @property
-    def _voxels(self) -> tuple[float, float]:
-        """The shortest and the longest edge that a shape's voxels can have."""
-        low, high = self.calibres
-        scales = self.source.scales or (1.0,)
-        return self.voxel * low * min(scales), self.voxel * high * max(scales)
+        return field_shape(self.shape, self.voxel * self.calibres[0], self.modality.base)
 
     def case(self, index: int) -> Case:
-        """Make case number `index`, on one thread; ValueError where a class is not seen on the image's voxels."""
+        """Make case number `index`, on one thread; ValueError where the image's voxels show no structure."""
         sequences = np.random.SeedSequence(self.seed, spawn_key=(index,)).spawn(3)
         rng = np.random.default_rng(sequences[0])
         imaging_seed, image_seed = (int(sequence.generate_state(1)[0]) for sequence in sequences[1:])
         imaging = self.modality.draw(imaging_seed)
-        scales = self.source.scales or (1.0,)
-        voxel = draw_voxel(self.voxel, self.calibres, rng) * scales[index % len(scales)]
-        names = self.classes
+        voxel = draw_voxel(self.voxel, self.calibres, rng)
         with one_thread():
             for _ in range(TRIES):
-                case = self.composition.show(self.source, self.shape, voxel, imaging, image_seed, index, rng)
-                counts = np.bincount(case.labels.ravel(), minlength=len(names) + 1)
-                if case.field.min() <= 0 < case.field.max() and counts.all():
+                case = _show(self.source, self.shape, voxel, imaging, image_seed, index, rng)
+                share = float(case.labels.mean())
+                if case.field.min() <= 0 < case.field.max() and 0 < share < 1:
                     break
             else:
-                edges = " x ".join(map(str, self.shape))
-                missing = "structure" if counts.all() else ("background", *names)[int(counts.argmin())]
-                remedy = "take more voxels" + (", a thinner wall, or laws that fill less" if len(names) > 1 else "")
-                raise ValueError(f"{TRIES} shapes showed no {missing} on {edges} voxels: {remedy}")
-        fractions = {"volume_fraction": float((case.field > 0).mean())}
-        fractions["class_fractions"] = (counts[1:] / case.labels.size).tolist()
+                edges, missing = " x ".join(map(str, self.shape)), "structure" if share < 1 else "background"
+                raise ValueError(f"{TRIES} shapes showed no {missing} on {edges} voxels: take more voxels")
+        fractions = {"volume_fraction": float((case.field > 0).mean()), "label_fraction": share}
         grey = case.image.astype(np.uint16 if (imaging.detector.ceiling or math.inf) < 2**16 else np.float32)
         return case._replace(image=grey, record={"index": index} | case.record | fractions)
 
@@ -227,19 +119,22 @@ class Recipe:
     def from_dict(content: Mapping[str, Any]) -> Recipe:
         """Return the recipe that `as_dict` wrote."""
         source, modality = decode_source(content["source"]), Modality.from_dict(content["modality"])
-        composition = decode(Composition, content["composition"])
-        return Recipe(**{**content, "source": source, "modality": modality, "composition": composition})
+        return Recipe(**{**content, "source": source, "modality": modality})
 
 
-def shell_of(u: Tensor, epsilon: float, thickness: float, *, periodic: bool = False) -> Tensor:
-    """Return the phase fields (2, Z, Y, X) of a wall inside the surface of a shape `u`, and of the lumen in the wall.
-
-    Lengths are in voxels; all profiles have the same ε. Where the shape is thinner than two walls, the wall fills it.
-    """
-    grid = Grid(tuple(u.shape), (1.0,) * 3, "periodic" if periodic else "replicate")  # type: ignore[arg-type]
-    depth = torch.from_numpy(field_distance(u, grid, epsilon))
-    distances = torch.stack([torch.minimum(depth, thickness - depth), depth - thickness])
-    return torch.tanh(distances / (math.sqrt(2) * epsilon)).to(u.dtype)
+def _show(
+    source: ShapeSource, shape: Sequence[int], voxel: float, imaging: Imaging, seed: int, index: int, rng: Any
+) -> Case:
+    """Return case `index` of `shape`, its image in real numbers; `voxel` is the edge of a shape's voxels."""
+    grown = source.shape(field_shape(shape, voxel, imaging), index, rng)
+    u = torch.from_numpy(grown.values)
+    sampled = regrid(u, voxel, imaging)
+    grey = image(u, voxel, imaging, seed, grown.epsilon)
+    labels = label_voxels(u, sampled, voxel, imaging, grown.epsilon)
+    z, y, x = shape  # a field of whole voxels may give a few voxels more
+    grey, sampled, labels = (volume[:z, :y, :x].contiguous().numpy() for volume in (grey, sampled, labels))
+    record = {"source": grown.origin, "imaging": imaging.as_dict(), "image_seed": seed, "voxel": voxel}
+    return Case(grey, sampled, labels, imaging.spacing, imaging.unit, grown.epsilon * voxel, record)
 
 
 def check_shape(shape: Sequence[int]) -> tuple[int, int, int]:
@@ -264,10 +159,10 @@ def check_calibres(calibres: Sequence[float]) -> tuple[float, float]:
     return low, high
 
 
-def check_crop(longest: float, shape: Sequence[int], voxel: float, modality: Modality, margin: int = 0) -> None:
-    """Raise ValueError where images of `shape`, with a margin of voxels around their shapes, need shapes that are too
-    small, too large, or longer than `longest`, which is infinite for shapes that are grown to size."""
-    crop = tuple(n + 2 * margin for n in field_shape(shape, voxel, modality.base))
+def check_crop(longest: float, shape: Sequence[int], voxel: float, modality: Modality) -> None:
+    """Raise ValueError where images of `shape` need shapes that are too small, too large, or longer than `longest`,
+    which is infinite for shapes that are grown to size."""
+    crop = field_shape(shape, voxel, modality.base)
     images, crops = " x ".join(map(str, shape)), " x ".join(map(str, crop))
     if not 1 < math.prod(shape) <= MOST:
         raise ValueError(f"images must have 2 to {MOST:.0e} voxels, got {images}")
@@ -417,7 +312,7 @@ class TextureDataset(IterableDataset):
         choice = int(rng.integers(len(self.modalities)))
         kind = self.modalities[choice]
         imaging, voxel = kind.draw(imaging_seed), draw_voxel(self.voxels[choice], self.calibres, rng)
-        case = Composition().show(self.source, self.size, voxel, imaging, image_seed, 0, rng)  # type: ignore[arg-type]
+        case = _show(self.source, self.size, voxel, imaging, image_seed, 0, rng)  # type: ignore[arg-type]
         image = torch.from_numpy(case.image)[None].float()
         image = image if self.normalise is None else self.normalise(image)
         record = {"number": number, "modality": kind.name} | case.record

@@ -169,14 +169,14 @@ def _write_list(folder: Path, spec: SetSpec) -> None:
     names, layout = list(map(case_name, list_cases(folder))), LAYOUTS[spec.layout]
     files = {name: (layout.image.format(case=name), layout.label.format(case=name)) for name in names}
     about = {"name": folder.resolve().name, "description": "synthetic; made by curvafit", "numTraining": len(names)}
-    channels, classes = {"0": spec.recipe.modality.name}, ("background", *spec.recipe.classes)
+    channels = {"0": spec.recipe.modality.name}
     if layout.nnunet:  # cases by name, since the folders may hold a killed run's temporary files too
-        labels = {name: number for number, name in enumerate(classes)}
+        labels = {"background": 0, "structure": 1}
         cases = {name: {"images": [image], "label": label} for name, (image, label) in files.items()}
         content = {"channel_names": channels, "labels": labels, "file_ending": ".nii.gz", **about, "dataset": cases}
     else:
         pairs = [{"image": image, "label": label} for image, label in files.values()]
-        labels = {str(number): name for number, name in enumerate(classes)}
+        labels = {"0": "background", "1": "structure"}
         content = {**about, "tensorImageSize": "3D", "modality": channels, "labels": labels}
         content |= {"numTest": 0, "training": pairs, "test": []}
     write_content(folder / LIST, json.dumps(content, indent=2) + "\n")

@@ -56,14 +56,13 @@ class Generated:
     """Shapes grown from points of seven numbers (`PARAMETERS`, working units), in turn; each point has a name.
 
     Shapes fill a `fraction` of the volume if one is given, else have the points' masses; the status in their `origin`
-    says where the fraction is missed. `scales` are the edges of the points' voxels as multiples of a set's voxel.
+    says where the fraction is missed.
     """
 
     points: tuple[tuple[float, ...], ...]
     names: tuple[str, ...]
     schedule: str | Schedule = "fast"
     fraction: float | None = None
-    scales: tuple[float, ...] = ()
     edge = math.inf  # a shape is grown to any size
 
     def __post_init__(self) -> None:
@@ -116,8 +115,7 @@ class Generated:
     def as_dict(self) -> dict[str, Any]:
         """Return the source in JSON's types, for a set's record; `decode_source` reads it."""
         content = {"kind": "generated", "names": list(self.names), "points": list(map(list, self.points))}
-        content |= {"schedule": named_schedule(self.schedule).as_dict(), "fraction": self.fraction}
-        return content | ({"scales": list(self.scales)} if self.scales else {})
+        return content | {"schedule": named_schedule(self.schedule).as_dict(), "fraction": self.fraction}
 
 
 @dataclass(frozen=True)
@@ -129,7 +127,6 @@ class Stored:
 
     paths: tuple[Path, ...]
     draws: int | None = None
-    scales = ()
 
     def __post_init__(self) -> None:
         if self.draws is None:
@@ -235,7 +232,7 @@ def decode_source(content: dict[str, Any]) -> ShapeSource:
     if content["kind"] == "stored":
         return Stored(tuple(map(Path, content["paths"])), content["draws"])
     points, plan = tuple(map(tuple, content["points"])), Schedule(**content["schedule"])
-    return Generated(points, tuple(content["names"]), plan, content["fraction"], tuple(content.get("scales", ())))
+    return Generated(points, tuple(content["names"]), plan, content["fraction"])
 
 
 def choose_voxel(laws: Iterable[LawLike], kind: Modality) -> float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from dataclasses import dataclass, fields, make_dataclass, replace
 from os import PathLike
@@ -12,7 +11,6 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import numpy as np
 
-from curvafit.core.checks import check_int, quoted
 from curvafit.core.files import write_content
 from curvafit.core.runtime import Pictured
 from curvafit.core.schema import Rule, decode, encode
@@ -25,7 +23,7 @@ from curvafit.inference.posterior import Combination
 from curvafit.inference.table import COLUMNS, to_columns
 from curvafit.priors.coefficients import POWERS, Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING
-from curvafit.priors.law import FORMAT, Law, LawLike, Mass, Positive, parse_fit, preset_name, read_fit
+from curvafit.priors.law import FORMAT, Law, Mass, Positive, parse_fit, read_fit
 
 #: What a scan was taken for, in words.
 KINDS = {"field": "a phase field", "mask": "a mask", "image": "an image"}
@@ -195,25 +193,6 @@ class Fit(Pictured):
     def load(cls, path: str | PathLike[str]) -> Fit:
         """Read a `fit.json`; raise FileNotFoundError if there is none, ValueError as `from_json`."""
         return _fit_of(read_fit(path, _File))
-
-
-def draw_laws(law: LawLike, count: int) -> list[Law]:
-    """Return `count` laws of the posterior of a fit, an inference or a `fit.json`, evenly spaced among its draws.
-
-    Each has the voxel in which its shapes are as thick as the scan's structure, and the scan's volume fraction. Raises
-    ValueError where there are no draws, or fewer.
-    """
-    is_path = preset_name(law) is None and isinstance(law, (str, PathLike))
-    fit = Fit.load(law) if is_path else getattr(law, "fit", law)  # type: ignore[arg-type]
-    if not isinstance(fit, Fit) or fit.draws is None:
-        raise ValueError(f"expected a fit with draws of a posterior, got {quoted(law)}")
-    check_int(count, f"from 1 to {len(fit.draws)} draws", 1, len(fit.draws))
-    rows = np.linspace(0, len(fit.draws) - 1, count).round().astype(int).tolist()
-    source = f" of {os.fspath(law)}" if is_path else ""  # type: ignore[arg-type]
-    return [
-        fit._law(Coefficients(1.0, *others), mass, f"draw {row}{source}", fit.thickness / thickness)
-        for row, (*others, mass, thickness) in zip(rows, to_columns(fit.draws[rows]).T.tolist(), strict=True)
-    ]
 
 
 # ---- the file --------------------------------------------------------------------------------------------------------

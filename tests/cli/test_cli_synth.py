@@ -10,7 +10,6 @@ from calling import call, done, refused
 from exact_store import exact_store
 from found import made_fit
 
-from curvafit.inference.table import to_columns
 from curvafit.priors.law import FORMAT
 from curvafit.volumes.read import load
 from curvafit.volumes.volume import Volume
@@ -69,41 +68,16 @@ def test_a_set_of_inferred_shapes_like_a_scan(tmp_path):
     image = load(out / "imagesTr" / "case_00000_0000.nii.gz")
     assert image.spacing == pytest.approx(edges) and image.unit == "mm"
     record = json.loads((out / "cases" / "case_00000.json").read_text())
-    assert record["source"][0]["parameters"]["a02"] == 6 and record["voxel"] == pytest.approx(0.001)
+    assert record["source"]["parameters"]["a02"] == 6 and record["voxel"] == pytest.approx(0.001)
     assert 0.01 <= record["imaging"]["visible"] < 0.5 and recipe(out)["source"]["fraction"] == 0.2
-
-
-def test_shells_and_classes(tmp_path, store):
-    shells = ["--atlas", store, *QUICK, "--wall", "800", "--unit", "nm", "--levels", "1,0.2", "--voxel", "500"]
-    made(tmp_path / "shells", *shells)
-    assert listed(tmp_path / "shells")["labels"] == {"background": 0, "wall": 1, "lumen": 2}
-    assert recipe(tmp_path / "shells")["composition"]["wall"] == pytest.approx(0.8)
-    assert recipe(tmp_path / "shells")["voxel"] == pytest.approx(0.5)
-    refused(call("synth", "-o", tmp_path / "shells", *shells, "--levels", "1,0.3"), "another")
-    made(tmp_path / "classes", "--presets", "sponge,tubes", "--classes", *ONE)
-    assert listed(tmp_path / "classes")["labels"] == {"background": 0, "sponge": 1, "tubes": 2}
-
-
-def test_laws_are_drawn_from_a_posterior(tmp_path):
-    fit, file = made_fit(), tmp_path / "fit.json"
-    fit.save(file)
-    made(tmp_path / "s", "--prior", file, "--draws", "3", *ONE)
-    source, columns = recipe(tmp_path / "s")["source"], to_columns(fit.draws)
-    assert len(source["points"]) == 3 and source["fraction"] == pytest.approx(0.187)
-    ratios = np.array(source["scales"]) * columns[6, [0, 30, 59]]  # every shape is as thick as the scan
-    assert ratios == pytest.approx(np.full(3, ratios[0])) and min(source["scales"]) < 1 < max(source["scales"])
-    assert all("fit.json" in name for name in source["names"])
-    for point, row in zip(source["points"], (0, 30, 59), strict=True):
-        assert point[0] == 1 and point[1:6] == pytest.approx(columns[:5, row], rel=1e-4)
 
 
 #: What is typed (FIT, STORE, MASK, TAKEN and NONE are files and folders), and a word of what is said of it.
 REFUSALS = {
     "--modality confocal": {
         "--atlas NONE": "none.zarr", "": "--prior", "--prior tube": "preset", "--presets tubes --voxel 0.001": "1e+09",
-        "--presets tubes --volume-fraction 2": "volume fraction", "--preset tubes --draws 3": "posterior",
-        "--prior FIT,FIT --draws 3": "one fit", "--prior FIT --draws 3 --classes": "--draws",
-        "--prior FIT --draws 99": "60 draws", "-o TAKEN --presets tubes": "folder",
+        "--presets tubes --volume-fraction 2": "volume fraction",
+        "-o TAKEN --presets tubes": "folder",
     },
     "--atlas STORE": {
         "": "--modality", "--modality x-ray": "two-photon", "--like MASK --label 0": "--label",
@@ -112,8 +86,7 @@ REFUSALS = {
     "--atlas STORE --modality confocal": {
         "--count 0 --shape 8,16,16 --voxel 0.5": "count", "--presets tubes": "--prior", "--calibres 2": "--calibres",
         "--shape 2,8,8 --labels betti": "4 voxels", "--visible 1.5": "visible", "--like-mask MASK": "--like-mask",
-        "--channel 0": "--channel", "--volume-fraction 0.2": "--volume-fraction", "--draws 3": "--draws",
-        "--shape 8 --classes": "classes", "--shape 8 --wall 0": "wall", "--unit um": "--wall",
+        "--channel 0": "--channel", "--volume-fraction 0.2": "--volume-fraction", "--unit um": "--voxel",
         "--shape 8 --labels depth": "labels", "--shape 8 --layout bids": "layout",
     },
 }  # fmt: skip

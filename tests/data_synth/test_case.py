@@ -1,21 +1,18 @@
-"""Cases of a training set: one shape, its image and mask by number alone; where shapes come from, and walls."""
+"""Cases of a training set: one shape, its image and mask by number alone; where shapes come from."""
 
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from exact import Sphere, centres, profile
 from exact_store import CROP as SHAPE
 from exact_store import flat_recipe
 
 from curvafit.data_synth import sources
-from curvafit.data_synth.dataset import Composition, Recipe, shell_of
-from curvafit.data_synth.imaging.effects import occupancy
-from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality, share_voxels
+from curvafit.data_synth.dataset import Recipe
+from curvafit.data_synth.imaging.modality import Imaging, Modality
 from curvafit.data_synth.sources import SYMMETRIES, Generated, PhaseField, apply_symmetry, crop_periodic, random_crop
 from curvafit.generation import loop as steering
-from curvafit.priors.grid import Grid
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +59,7 @@ def test_a_shape_that_falls_between_the_slices_is_not_a_case():
     class Sheets:
         """Half sheets beside the only slice, the third one on it, if asked for."""
 
-        edge, scales = 11.0, ()
+        edge = 11.0
 
         def __init__(self, third: int) -> None:
             self.asked, self.places = 0, [0, 0, third]
@@ -118,61 +115,3 @@ def test_a_crop_goes_on_across_the_faces():
     again, _ = random_crop(VALUES, (3, 3, 3), np.random.default_rng(5))
     assert found.shape == (3, 3, 3) and (found == again).all() and found.flags["C_CONTIGUOUS"]
     assert (crop_periodic(apply_symmetry(VALUES, how["symmetry"]), how["corner"], (3, 3, 3)) == found).all()
-
-
-N, EPSILON = 48, 2.0
-GRID = Grid((N, N, N), (1.0, 1.0, 1.0))
-MIDDLE = (N / 2, N / 2, N / 2)
-CLEAR = Modality("clear", "for tests", 1.0, Imaging(contrast=Contrast(10.0, 110.0)))
-
-
-@pytest.mark.parametrize("thickness", [4.0, 6.5])
-def test_the_wall_of_a_ball_is_a_shell_and_the_lumen_a_ball(thickness):
-    distance = Sphere(16.0, MIDDLE).distance(centres(GRID))
-    wall, lumen = shell_of(profile(Sphere(16.0, MIDDLE), centres(GRID), EPSILON).float(), EPSILON, thickness)
-    inner = 4 / 3 * np.pi * (16 - thickness) ** 3
-    assert float(occupancy(wall, EPSILON).sum()) == pytest.approx(4 / 3 * np.pi * 16**3 - inner, rel=0.02)
-    assert float(occupancy(lumen, EPSILON).sum()) == pytest.approx(inner, rel=0.03)
-    depth = distance.numpy()
-    assert (wall.numpy()[(depth > 0.5) & (depth < thickness - 0.5)] > 0).all()
-    assert (wall.numpy()[(depth < -0.1) | (depth > thickness + 0.5)] < 0).all()
-
-
-def test_wall_and_lumen_fill_the_shape_without_a_gap():
-    u = profile(Sphere(16.3, MIDDLE), centres(GRID), EPSILON).float()
-    shares, whole = share_voxels(shell_of(u, EPSILON, 5.0), EPSILON), occupancy(u, EPSILON)
-    assert float((sum(shares) - whole).abs().max()) < 0.1
-    assert float(sum(shares).sum() / whole.sum()) == pytest.approx(1, abs=1e-3)
-    assert float(shares[1][whole < 1].max()) == 0  # no light of the lumen at the outer surface
-
-
-def test_a_shell_has_a_bright_wall_and_a_dark_lumen(recipe):
-    shell = replace(recipe, composition=Composition(wall=0.8))
-    case, whole = shell.case(2), recipe.case(2)
-    assert shell.classes == ("wall", "lumen") and case.labels.dtype == np.uint8
-    assert ((case.labels > 0) == (case.field > 0)).all() and set(np.unique(case.labels)) == {0, 1, 2}
-    wall, lumen, outside = (float(case.image[case.labels == k].mean()) for k in (1, 2, 0))
-    assert wall > 2 * lumen and lumen < 0.5 * whole.image[whole.labels > 0].mean() and outside < lumen
-    counts = [float((case.labels == k).mean()) for k in (1, 2)]
-    assert case.record["class_fractions"] == pytest.approx(counts) and sum(counts) < 1
-    one_slice = replace(shell, shape=(1, 16, 16)).case(0)
-    assert set(np.unique(one_slice.labels)) == {0, 1, 2}
-    wide = replace(recipe.modality, base=recipe.modality.base.assign({"visible": 0.2}))
-    exact, seen = shell.case(2), replace(shell, modality=wide).case(2)
-    assert set(np.unique(seen.labels[exact.labels == 0])) == {0, 1}  # what is seen beyond the surface is wall
-    counts = [[np.count_nonzero(case.labels == k) for k in (1, 2)] for case in (exact, seen)]
-    assert counts[1][0] > counts[0][0] and counts[1][1] > 0.5 * counts[0][1]
-
-
-def test_classes_are_a_shape_of_each_law_the_first_in_front():
-    two, alone = (
-        Recipe(Generated.of(laws), CLEAR, (16, 16, 16), 1.0, composition=composition).case(0)
-        for laws, composition in (
-            (["tubes", "sponge"], Composition(classes=True, levels=(1, 0.4))),
-            (["tubes"], Composition()),
-        )
-    )
-    assert [origin["name"] for origin in two.record["source"]] == ["tubes", "sponge"]
-    assert ((two.labels == 1) == (alone.labels == 1)).all()  # no part of the first is hidden
-    assert [np.median(two.image[two.labels == k]) for k in range(3)] == pytest.approx([10, 110, 50])
-    assert Composition(classes=True).names(Generated.of(["tubes", "tubes"])) == ("tubes 1", "tubes 2")

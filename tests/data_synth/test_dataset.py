@@ -52,7 +52,7 @@ def test_a_pair_is_a_crop_of_a_shape_and_its_image(store):
         image, label, spacing, record = dataset[number]
         assert image.shape == label.shape == (1, *SHAPE)
         assert image.dtype == torch.float32 and label.dtype == torch.uint8 and spacing == (1.0, 1.0, 1.0)
-        (origin,) = record["source"]
+        origin = record["source"]
         whole = apply_symmetry(open_store(store).field(int(origin["name"].split()[-1])), origin["symmetry"])
         field = crop_periodic(whole, origin["corner"], SHAPE)
         assert (label[0].numpy() == (field > 0)).all()
@@ -152,7 +152,7 @@ def test_shapes_of_laws():
         assert dataset.source.edge == 16
         sample = dataset[0]
         assert 0 < float(sample.label.float().mean()) < 1
-        assert sample.record["source"][0]["parameters"]["a02"] in (tubes.coefficients.a02, sponge.coefficients.a02)
+        assert sample.record["source"]["parameters"]["a02"] in (tubes.coefficients.a02, sponge.coefficients.a02)
     assert dataset.source.count == 2 and dataset.source.generated.names == ("preset tubes", "sponge")
     filled = TextureDataset(tubes.coefficients, QUIET, 12, shapes=1, volume_fraction=0.2)
     assert dataset.voxels == filled.voxels == [QUIET.voxel] and filled.source.generated.names == ("coefficients",)

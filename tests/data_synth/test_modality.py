@@ -84,7 +84,7 @@ def test_masks_of_what_is_seen() -> None:
     """With even stain and no noise, a share of the light is that share of the contrast, but where the image is within
     what float32 rounds off some fifty levels."""
     how = replace(PLAIN, spacing=(2.5, 1.0, 1.0), thickness=2.5, optics=Optics((3.0, 1.0, 1.0), 0.02), visible=0.1)
-    found = torch.stack([label_voxels(u[None], u, 1.0, how) > 0 for u in FIELDS])
+    found = torch.stack([label_voxels(u, u, 1.0, how) > 0 for u in FIELDS])
     clean = torch.stack([image(u, 1.0, how, 1) for u in FIELDS])
     clear = (clean - (10 + 0.1 * 50)).abs() > 1e-4
     assert found.dtype == torch.bool and torch.equal(found[clear], clean[clear] > 10 + 0.1 * 50)

@@ -12,7 +12,7 @@ import torch
 from exact_store import FLAT, flat_recipe
 
 from curvafit.data_synth import Contrast, Imaging, Modality, TextureDataset, design_box, labels_of, open_store
-from curvafit.data_synth.dataset import Composition, Recipe
+from curvafit.data_synth.dataset import Recipe
 from curvafit.data_synth.imaging.like import fit_modality
 from curvafit.data_synth.samples import fetch
 from curvafit.data_synth.sets import SetSpec, build_set, make_case, read_spec
@@ -31,9 +31,6 @@ class Given(NamedTuple):
 
     def set(self, *arguments: Any, **options: Any) -> TextureDataset:
         return TextureDataset(self.store, *(arguments or (FLAT, 12)), **options)
-
-    def composed(self, *shape: int, **options: Any) -> Recipe:
-        return replace(self.recipe, shape=shape or self.recipe.shape, composition=Composition(**options))
 
 
 @pytest.fixture(scope="module")
@@ -54,14 +51,8 @@ def label(field: torch.Tensor, epsilon: float = 1.0, which: str = "mask") -> obj
 
 
 REFUSALS: list[tuple[str, Callable[[Given], object]]] = [
-    ("24 voxels", lambda g: replace(g.recipe, shape=(32, 16, 16))),
+    ("24 voxels .*larger --shape", lambda g: replace(g.recipe, shape=(32, 16, 16))),
     ("calibres", lambda g: replace(g.recipe, calibres=(2.0, 1.0))), ("voxel", lambda g: replace(g.recipe, voxel=0)),
-    ("a Composition", lambda g: replace(g.recipe, composition=0.5)),
-    ("classes or a wall", lambda g: Composition(classes=True, wall=2)),
-    ("levels from 0", lambda g: Composition(levels=(1, -1))),
-    ("a level for each of wall, lumen", lambda g: g.composed(wall=1, levels=(1,))),
-    ("voxel thick, 0.5 um, got 0.4", lambda g: g.composed(wall=0.4)), ("larger --shape", lambda g: g.composed(wall=50)),
-    ("8 shapes showed no", lambda g: g.composed(4, 8, 8, wall=2.9).case(0)),
     ("folder", lambda g: build_set(g.taken, SetSpec(g.recipe), 1)), ("taken", lambda g: read_spec(g.taken)),
     ("nowhere", lambda g: make_case(g.taken / "nowhere", 0)),
     *(("voxels", lambda g, size=size: g.set(FLAT, size)) for size in (16.5, "16", (8, 8), (8, 8, 0))),

@@ -48,7 +48,7 @@ def test_a_layout_holds_the_cases(tmp_path, order, layout):
         assert (image.values == case.image).all() and (label.values == (case.field > 0)).all()
     record = json.loads((folder / "cases" / "case_00001.json").read_text())
     assert record["imaging"]["contrast"]["foreground"] == case.record["imaging"]["contrast"]["foreground"]
-    assert set(record["source"][0]["parameters"]) == {"a20", "a11", "a02", "a10", "a01", "a00", "mass"}
+    assert set(record["source"]["parameters"]) == {"a20", "a11", "a02", "a10", "a01", "a00", "mass"}
 
 
 def test_a_set_goes_on_and_ends_the_same(tmp_path, order):
@@ -169,7 +169,7 @@ def test_labels_besides_the_mask_are_of_the_structure_itself(folder, wide):
     assert (label == case.labels).all() and label[inside].all() and label.sum() > 1.1 * inside.sum()
     record = json.loads((folder / "cases" / "case_00000.json").read_text())
     assert len(record["betti"]) == 3 and record["betti"][0] >= 1
-    assert record["class_fractions"] == [label.mean()] and label.mean() > record["volume_fraction"] > 0
+    assert record["label_fraction"] == label.mean() and label.mean() > record["volume_fraction"] > 0
     assert record["imaging"]["visible"] == 0.1
 
 

@@ -272,18 +272,13 @@ def image(
     imaging: Imaging,
     seed: int,
     epsilon: float = EPSILON,
-    levels: Sequence[float] | None = None,
 ) -> Float[torch.Tensor, "Z Y X"]:
     """Return the image of a phase field, of the field's floating type and the shape that `regrid` gives.
 
-    The order is classes, blur, sampling, light, noise. `spacing` is the edge of the field's cubic voxels, in the
-    imaging's unit; ε of the field's profile is in voxels. Where `levels` are given, the field is those of several
-    classes (C, Z, Y, X), the first in front, with the light of each: 0 as the background's, 1 as the structure's.
+    The order is light, blur, sampling, unevenness, noise. `spacing` is the edge of the field's cubic voxels, in the
+    imaging's unit; ε of the field's profile is in voxels.
     """
-    fields, levels = (field[None], (1.0,)) if levels is None else (field, levels)
-    fractions = share_voxels(fields, epsilon)
-    stain = torch.stack([level * fraction for level, fraction in zip(levels, fractions, strict=True)]).sum(0)
-    light, optics = _emit(stain, spacing, imaging, seed), imaging.optics
+    light, optics = _emit(effects.occupancy(field, epsilon), spacing, imaging, seed), imaging.optics
     light = effects.blur(light, spacing, optics.blur, optics.growth, optics.attenuation)
     light = effects.sample(light, spacing, imaging.spacing, (imaging.thickness, *imaging.spacing[1:]))
     uneven = imaging.illumination
@@ -300,27 +295,17 @@ def regrid(field: Voxels, spacing: float, imaging: Imaging) -> Float[torch.Tenso
 
 
 def label_voxels(
-    fields: torch.Tensor, sampled: torch.Tensor, spacing: float, imaging: Imaging, epsilon: float = EPSILON
+    field: Voxels, sampled: torch.Tensor, spacing: float, imaging: Imaging, epsilon: float = EPSILON
 ) -> torch.Tensor:
-    """Return the labels of the image's voxels, uint8: 0 outside, 1, 2, … in the classes of fields (C, Z, Y, X).
+    """Return the labels of the image's voxels, uint8: 1 where `sampled`, the field on them (`regrid`), is above 0.
 
-    `sampled` is the field of all classes together on the image's voxels (`regrid`). A voxel is labelled where that is
-    above 0, by the first class whose own field is. With `Imaging.visible`, a voxel is labelled where it gets more than
-    this share of the light that all classes, equally stained, can give; by the class that gives most.
+    With `Imaging.visible`, a voxel is labelled where it gets more than this share of an evenly stained field's light.
     """
-    if imaging.visible:
-        optics, window = imaging.optics, (imaging.thickness, *imaging.spacing[1:])
-        stains = share_voxels(fields, epsilon)
-        lights = (effects.blur(stain, spacing, optics.blur, optics.growth) for stain in stains)
-        fractions = torch.stack([effects.sample(light, spacing, imaging.spacing, window) for light in lights])
-        return torch.where(fractions.sum(0) > imaging.visible, fractions.argmax(0) + 1, 0).to(torch.uint8)
-    if len(fields) == 1:
+    if not imaging.visible:
         return (sampled > 0).to(torch.uint8)
-    values = torch.stack([regrid(field, spacing, imaging) for field in fields])
-    inside = values > 0
-    # Interpolated, each class may be below 0 where the field of all is above it: the greatest then decides.
-    first = torch.where(inside.any(0), inside.to(torch.uint8).argmax(0), values.argmax(0))
-    return torch.where(inside.any(0) | (sampled > 0), first + 1, 0).to(torch.uint8)
+    optics, window = imaging.optics, (imaging.thickness, *imaging.spacing[1:])
+    light = effects.blur(effects.occupancy(field, epsilon), spacing, optics.blur, optics.growth)
+    return (effects.sample(light, spacing, imaging.spacing, window) > imaging.visible).to(torch.uint8)
 
 
 def annotator_threshold(imaging: Imaging) -> float:
@@ -337,18 +322,6 @@ def field_shape(shape: Sequence[int], spacing: float, imaging: Imaging) -> tuple
     """Return the number of voxels (z, y, x) of edge `spacing` that an image of `shape` is made from."""
     z, y, x = (math.ceil(n * h / spacing - 1e-6) for n, h in zip(shape, imaging.spacing, strict=True))
     return z, y, x
-
-
-def share_voxels(fields: torch.Tensor, epsilon: float) -> list[torch.Tensor]:
-    """Return the fraction of each voxel (Z, Y, X) that each class fills, of fields (C, Z, Y, X), the first in front.
-
-    A class fills at most what those in front of it leave: classes that meet leave no gap.
-    """
-    fractions, remaining = [], torch.ones_like(fields[0])
-    for u in fields:
-        fractions.append(torch.minimum(remaining, effects.occupancy(u, epsilon)))
-        remaining = remaining - fractions[-1]
-    return fractions
 
 
 def _emit(occupied: torch.Tensor, spacing: float, imaging: Imaging, seed: int) -> torch.Tensor:
