@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 from os import PathLike
 from pathlib import Path
@@ -26,6 +26,7 @@ from curvafit.core.checks import (
     check_type,
     quoted,
 )
+from curvafit.core.runtime import Progress, silent
 from curvafit.core.schema import encode
 from curvafit.data_synth.imaging.modality import Imaging, Modality, field_shape, image, label_voxels, modality, regrid
 from curvafit.data_synth.sources import Generated, Pool, ShapeSource, Stored, choose_voxel, decode_source
@@ -78,11 +79,18 @@ class Recipe:
         check_type(self.modality, Modality, "a Modality")
         if not callable(getattr(self.source, "shape", None)):
             raise ValueError(f"the source must be a source of shapes, got {quoted(self.source)}")
-        object.__setattr__(self, "shape", check_shape(self.shape))
+        expected = "3 whole numbers of voxels above 0 (z, y, x)"
+        shape = tuple(check_int(n, expected, 1, MOST, of=self.shape) for n in as_tuple(self.shape, expected, 3))
+        object.__setattr__(self, "shape", shape)
         voxel = check_float(self.voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
         object.__setattr__(self, "voxel", voxel)
         object.__setattr__(self, "seed", check_seed(self.seed))
-        object.__setattr__(self, "calibres", check_calibres(self.calibres))
+        expected = "calibres as two positive factors, the lower first"
+        calibres = as_tuple(self.calibres, expected, 2)
+        low, high = (check_float(n, expected, 1e-3, 1e3, of=calibres) for n in calibres)
+        if low > high:
+            raise ValueError(f"expected {expected}, got {quoted(calibres)}")
+        object.__setattr__(self, "calibres", (low, high))
         for calibre in self.calibres:
             check_crop(self.source.edge, self.shape, voxel * calibre, self.modality)
 
@@ -97,7 +105,8 @@ class Recipe:
         rng = np.random.default_rng(sequences[0])
         imaging_seed, image_seed = (int(sequence.generate_state(1)[0]) for sequence in sequences[1:])
         imaging = self.modality.draw(imaging_seed)
-        voxel = draw_voxel(self.voxel, self.calibres, rng)
+        low, high = self.calibres  # equal ones use no random number
+        voxel = self.voxel * (low if low == high else math.exp(rng.uniform(math.log(low), math.log(high))))
         with one_thread():
             for _ in range(TRIES):
                 case = _show(self.source, self.shape, voxel, imaging, image_seed, index, rng)
@@ -135,28 +144,6 @@ def _show(
     grey, sampled, labels = (volume[:z, :y, :x].contiguous().numpy() for volume in (grey, sampled, labels))
     record = {"source": grown.origin, "imaging": imaging.as_dict(), "image_seed": seed, "voxel": voxel}
     return Case(grey, sampled, labels, imaging.spacing, imaging.unit, grown.epsilon * voxel, record)
-
-
-def check_shape(shape: Sequence[int]) -> tuple[int, int, int]:
-    """Return the voxels (z, y, x) of an image as whole numbers above 0, or raise ValueError."""
-    expected = "3 whole numbers of voxels above 0 (z, y, x)"
-    z, y, x = (check_int(n, expected, 1, MOST, of=shape) for n in as_tuple(shape, expected, 3))
-    return z, y, x
-
-
-def draw_voxel(voxel: float, calibres: Sequence[float], rng: np.random.Generator) -> float:
-    """Draw the edge of a shape's voxel, uniform in the logarithm between calibres; equal ones use no random number."""
-    low, high = calibres
-    return voxel * (low if low == high else math.exp(rng.uniform(math.log(low), math.log(high))))
-
-
-def check_calibres(calibres: Sequence[float]) -> tuple[float, float]:
-    """Return calibres as two positive factors, the lower first, or raise ValueError."""
-    expected = "calibres as two positive factors, the lower first"
-    low, high = (check_float(n, expected, 1e-3, 1e3, of=calibres) for n in as_tuple(calibres, expected, 2))
-    if low > high:
-        raise ValueError(f"expected {expected}, got {quoted(calibres)}")
-    return low, high
 
 
 def check_crop(longest: float, shape: Sequence[int], voxel: float, modality: Modality) -> None:
@@ -202,8 +189,8 @@ class TextureDataset(IterableDataset):
     ----------
     source
         Where shapes come from: folders of one or more stores of `curvafit atlas build`; or one or more laws
-        (coefficients, presets, `fit.json`s, fits), of which `shapes` shapes are generated when first wanted, each once
-        for all workers and epochs, into a temporary folder.
+        (coefficients, presets, `fit.json`s, fits), of which `shapes` shapes are generated at once, for all workers and
+        epochs, into a temporary folder that goes with the program.
     modalities
         The kinds of image, as `Modality` or by name, of which each sample draws one. Batches need one spacing.
     size
@@ -222,6 +209,8 @@ class TextureDataset(IterableDataset):
         volume that they fill, by default that of the law's mass or scan.
     transform
         A function of each `Sample`: `as_dict`, `as_monai`, or your own.
+    progress
+        Called with a sentence and the share of the shapes that are generated.
     """
 
     def __init__(
@@ -238,15 +227,14 @@ class TextureDataset(IterableDataset):
         shapes: int = 16,
         volume_fraction: float | None = None,
         transform: Callable[[Sample], Any] | None = None,
+        progress: Progress = silent,
     ) -> None:
         kinds = [modalities] if isinstance(modalities, (str, Modality)) else list(modalities)
-        self.modalities = [modality(kind) if isinstance(kind, str) else kind for kind in kinds]
-        self.size = check_shape((size,) * 3 if isinstance(size, (int, Real)) else size)
-        self.length, self.seed, self.transform = int(length), check_seed(seed), transform
-        self.calibres = check_calibres(calibres)
+        kinds = [modality(kind) if isinstance(kind, str) else kind for kind in kinds]
         sources: list[Any] = [source] if isinstance(source, LAW_TYPES) else list(as_tuple(source, "laws or stores"))
-        if not (sources and self.modalities):
-            raise ValueError(f"give a source and a modality, got {len(sources)} and {len(self.modalities)}")
+        if not (sources and kinds):
+            raise ValueError(f"give a source and a modality, got {len(sources)} and {len(kinds)}")
+        self.length, self.transform = int(length), transform
         if self.length < 1:
             raise ValueError(f"length must be above 0, got {self.length}")
         if not callable(normalise) and normalise is not None:
@@ -254,23 +242,23 @@ class TextureDataset(IterableDataset):
             check_choice(normalise, NORMALISATIONS, names)
             normalise = NORMALISATIONS[normalise]
         self.normalise = normalise
-        paths = [Path(item) for item in sources if isinstance(item, (str, PathLike))]
+        paths = tuple(Path(item) for item in sources if isinstance(item, (str, PathLike)))
         from_stores = len(paths) == len(sources) and all(path.is_dir() or path.suffix == ".zarr" for path in paths)
-        chosen = None if voxel is None else check_float(voxel, "a shape's voxel of positive length", SHORTEST, LONGEST)
-        self.voxels = [chosen or choose_voxel([] if from_stores else sources, kind) for kind in self.modalities]
-        # An image takes most of a shape at the thinnest calibre, where a shape's voxel is smallest.
-        thinnest = [(kind, edge * self.calibres[0]) for kind, edge in zip(self.modalities, self.voxels, strict=True)]
-        if from_stores:
-            if volume_fraction is not None:
-                raise ValueError("volume_fraction applies to laws only; the source is a store of shapes")
-            self.source = Stored(tuple(paths))
-        else:
-            generated = Generated.of(sources, volume_fraction)
-            check_int(shapes, "a pool of at least 1 shape", 1, 4096)
-            largest = max(max(field_shape(self.size, edge, kind.base)) for kind, edge in thinnest)
-            self.source = Pool(generated, max(shapes, len(generated.points)), 8 * math.ceil(largest / 8))
-        for kind, edge in thinnest:
-            check_crop(self.source.edge, self.size, edge, kind)
+        if from_stores and volume_fraction is not None:
+            raise ValueError("volume_fraction applies to laws only; the source is a store of shapes")
+        laws = [] if from_stores else sources
+        origin = Stored(paths) if from_stores else Pool(Generated.of(laws, volume_fraction), shapes)
+        edges = [choose_voxel(laws, kind) if voxel is None else voxel for kind in kinds]
+        voxels = (size,) * 3 if isinstance(size, Real) else size
+        #: One recipe for each modality.
+        self.recipes = [
+            Recipe(origin, kind, voxels, edge, seed, calibres)  # type: ignore[arg-type]
+            for kind, edge in zip(kinds, edges, strict=True)
+        ]
+        if isinstance(origin, Pool):
+            largest = max(max(recipe.largest) for recipe in self.recipes)
+            grown = origin.grow(8 * math.ceil(largest / 8), progress)
+            self.recipes = [replace(recipe, source=grown) for recipe in self.recipes]
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # with a loader's workers
 
     def __len__(self) -> int:
@@ -307,16 +295,13 @@ class TextureDataset(IterableDataset):
 
     def sample(self, number: int) -> Sample:
         """Return sample `number`, from 0, before the transform."""
-        sequence = np.random.SeedSequence(self.seed, spawn_key=(number,))
-        rng, (imaging_seed, image_seed) = np.random.default_rng(sequence), map(int, sequence.generate_state(2))
-        choice = int(rng.integers(len(self.modalities)))
-        kind = self.modalities[choice]
-        imaging, voxel = kind.draw(imaging_seed), draw_voxel(self.voxels[choice], self.calibres, rng)
-        case = _show(self.source, self.size, voxel, imaging, image_seed, 0, rng)  # type: ignore[arg-type]
-        image = torch.from_numpy(case.image)[None].float()
+        rng = np.random.default_rng(np.random.SeedSequence(self.recipes[0].seed, spawn_key=(number,)))
+        recipe = self.recipes[int(rng.integers(len(self.recipes)))]
+        case = recipe.case(number)
+        image = torch.from_numpy(case.image.astype(np.float32))[None]
         image = image if self.normalise is None else self.normalise(image)
-        record = {"number": number, "modality": kind.name} | case.record
-        return Sample(image, torch.from_numpy(case.labels)[None], imaging.spacing, record)
+        record = {"modality": recipe.modality.name} | case.record
+        return Sample(image, torch.from_numpy(case.labels)[None], case.spacing, record)
 
 
 def as_dict(sample: Sample) -> dict[str, Tensor]:

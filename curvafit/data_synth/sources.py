@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
-import os
-import warnings
+import sys
+import tempfile
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from itertools import permutations
 from multiprocessing.util import get_temp_dir
 from os import PathLike
@@ -17,12 +14,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from filelock import FileLock
 
-from curvafit.core.checks import as_tuple
-from curvafit.core.files import write_atomically, write_content
-from curvafit.core.records import parse_json
-from curvafit.core.runtime import show_share
+from curvafit.core.checks import as_tuple, check_int
+from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import METRES, convert_length
 from curvafit.data_synth.design import PARAMETERS, Design
 from curvafit.data_synth.imaging.modality import Modality
@@ -34,7 +28,7 @@ from curvafit.generation.schedule import Schedule, choose_schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import WORKING_EPSILON, WORKING_SPACING, Grid
-from curvafit.priors.kernels.threads import one_thread
+from curvafit.priors.kernels.threads import map_threads, one_thread
 from curvafit.priors.law import LawLike, read_laws
 
 #: Seeds that are tried for a well-formed shape, and crops that are tried for one with both structure and background.
@@ -157,70 +151,46 @@ class Stored:
         return min(min(store.settings.shape) for store, _ in find_well_formed(self.paths))
 
 
-def _shared_folder() -> Path:
-    """Return the temporary folder that this process, which deletes it, shares with its children; else a non-folder."""
-    try:
-        return Path(get_temp_dir())
-    except OSError:
-        return Path(os.devnull)
-
-
 @dataclass(frozen=True)
 class Pool:
-    """Random crops, as those of `Stored`, of `count` shapes with `edge` voxels along each axis.
+    """Random crops, as those of `Stored`, of `count` shapes with `edge` voxels along each axis, at least one of a law.
 
-    A shape is grown when first needed and kept in `room`, a folder of the process that made the pool, for all others:
-    threads, workers, later epochs, other pools. Where it cannot be kept, a warning says so: each process grows its own.
+    `grow` makes them. They are files in a temporary folder of the process that grew them, which deletes it at its end;
+    its workers read them there.
     """
 
     generated: Generated
     count: int
-    edge: int
-    room: Path = field(default_factory=_shared_folder, compare=False)
+    edge: int = sys.maxsize
+    shapes: tuple[tuple[Path, float, dict[str, Any]], ...] = ()
+
+    def __post_init__(self) -> None:
+        count = check_int(self.count, "a pool of at least 1 shape", 1, 4096)
+        object.__setattr__(self, "count", max(count, len(self.generated.points)))
+
+    def grow(self, edge: int, progress: Progress = silent) -> Pool:
+        """Return the pool with its shapes, which grow side by side; ValueError where a law gives none."""
+        folder = Path(tempfile.mkdtemp(prefix="shapes-", dir=get_temp_dir()))
+
+        def keep(number: int) -> tuple[Path, float, dict[str, Any]]:
+            grown = self.generated.shape((edge,) * 3, number, np.random.default_rng(number))
+            np.save(path := folder / f"{number}.npy", grown.values)
+            return path, grown.epsilon, grown.origin
+
+        shapes = []
+        for shape in map_threads(keep, range(self.count)):
+            shapes.append(shape)
+            progress(f"{len(shapes)} of {self.count} shapes grown", len(shapes) / self.count)
+        return replace(self, edge=edge, shapes=tuple(shapes))
 
     def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
         """Return a crop of any of the pool's shapes that shows both structure and background."""
-        return _crop_shape(lambda: self.whole(int(rng.integers(self.count))), voxels, rng)
 
-    def whole(self, number: int) -> PhaseField:
-        """Return a shape by its number; ValueError, the same everywhere, where none of its seeds gives one."""
-        # A pool that was read from a file may name the folder of a process that has ended.
-        folder = self.room if self.room.is_dir() else _shared_folder()
-        folder /= f"shapes-{hashlib.sha256(repr((self.generated, self.edge)).encode()).hexdigest()}"
-        try:
-            folder.mkdir(exist_ok=True)
-            values, record = folder / f"{number}.npy", folder / f"{number}.json"
-            if not record.exists():
-                with FileLock(folder / f"{number}.lock"):  # the system ends the lock of a process that dies
-                    if not record.exists():
-                        self._keep(number, values, record)
-            content = parse_json(record.read_bytes(), "the record of a shape", record)
-            if "failure" in content:
-                raise ValueError(content["failure"])
-            return PhaseField(np.asarray(np.load(values, mmap_mode="r")), content["epsilon"], content["origin"])
-        except (OSError, NotImplementedError) as error:  # a disk may know no locks
-            warnings.warn(f"each process grows its own shapes, as they cannot be kept: {error}", stacklevel=2)
-            return _grow_pool_shape(self.generated, number, self.edge)
+        def choose() -> PhaseField:
+            path, epsilon, origin = self.shapes[int(rng.integers(self.count))]
+            return PhaseField(np.asarray(np.load(path, mmap_mode="r")), epsilon, origin)
 
-    def _keep(self, number: int, values: Path, record: Path) -> None:
-        """Grow a shape and write it, its record last, or the record of its failure; show how many there are."""
-        if not any(values.parent.glob("*.json")):
-            show_share(f"0 of {self.count} shapes grown, once for all workers and epochs", 0.0)
-        try:
-            grown = _grow_pool_shape(self.generated, number, self.edge)
-            content: dict[str, Any] = {"epsilon": grown.epsilon, "origin": grown.origin}
-            write_atomically(values, lambda temporary: np.save(temporary, grown.values))
-        except ValueError as error:
-            content = {"failure": str(error)}
-        write_content(record, json.dumps(content))
-        count = sum(record.with_name(f"{k}.json").exists() for k in range(self.count))
-        if 20 * count // self.count != 20 * (count - 1) // self.count:  # at every twentieth
-            show_share(f"{count} of {self.count} shapes grown, once for all workers and epochs", count / self.count)
-
-
-@lru_cache(maxsize=256)
-def _grow_pool_shape(generated: Generated, number: int, edge: int) -> PhaseField:
-    return generated.shape((edge,) * 3, number, np.random.default_rng(number))
+        return _crop_shape(choose, voxels, rng)
 
 
 #: Endless shapes for a set: `shape(voxels, index, rng)` depends on its arguments alone; no side is longer than `edge`.

@@ -1,32 +1,25 @@
-"""Pairs on the fly: by number alone, shared out, none twice; and a pool of shapes that are each grown once."""
+"""Pairs on the fly: by number alone, shared out, none twice; and a pool of shapes that are grown once."""
 
 import dataclasses
-import json
+import hashlib
 import multiprocessing
 import os
 import pickle
-import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
-from unittest.mock import Mock
 
 import numpy as np
-import pool_run
 import pytest
 import torch
 from exact_store import exact_field, exact_record, exact_store
 from found import made_fit
-from pool_run import SHAPES, balls, brief
 from torch.utils.data import DataLoader
 
 from curvafit.data_synth import dataset as training
-from curvafit.data_synth import sources
-from curvafit.data_synth.dataset import TextureDataset, as_dict, as_monai
+from curvafit.data_synth.dataset import Sample, TextureDataset, as_dict, as_monai
 from curvafit.data_synth.imaging.modality import Contrast, Imaging, Modality, Noise, Optics
 from curvafit.data_synth.sources import apply_symmetry, choose_voxel, crop_periodic
 from curvafit.data_synth.store import open_store
@@ -40,6 +33,11 @@ SHAPE = (12, 16, 20)
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return exact_store(tmp_path_factory.mktemp("shapes") / "s.zarr", 8).path
+
+
+def brief(sample: Sample) -> str:
+    voxels = hashlib.sha256(sample.image.numpy().tobytes()).hexdigest()
+    return f"{sample.record['index']} {voxels} {sample.record['source']}"
 
 
 def numbers(samples: Iterable[str]) -> list[int]:
@@ -130,7 +128,7 @@ def test_one_number_is_a_cube_and_a_name_a_modality(store, tmp_path):
     four, record = exact_store(tmp_path / "s.zarr", 4), exact_record(4)
     torn = dataclasses.replace(record, viability=dataclasses.replace(record.viability, highest=7.0))
     four.write(torn, exact_field(4))
-    assert TextureDataset(four.path, "micro-ct", 12).source.draws == 3  # the well-formed ones of 4
+    assert TextureDataset(four.path, "micro-ct", 12).recipes[0].source.draws == 3  # the well-formed ones of 4
 
 
 def test_images_are_normalised_as_asked(store):
@@ -149,13 +147,15 @@ def test_shapes_of_laws():
     tubes, sponge = preset("tubes"), preset("sponge")
     for laws in ("tubes", [tubes, "sponge"]):
         dataset = TextureDataset(laws, QUIET, 12, shapes=1, seed=1)
-        assert dataset.source.edge == 16
+        assert dataset.recipes[0].source.edge == 16
         sample = dataset[0]
         assert 0 < float(sample.label.float().mean()) < 1
         assert sample.record["source"]["parameters"]["a02"] in (tubes.coefficients.a02, sponge.coefficients.a02)
-    assert dataset.source.count == 2 and dataset.source.generated.names == ("preset tubes", "sponge")
+    pool = dataset.recipes[0].source
+    assert pool.count == len(pool.shapes) == 2 and pool.generated.names == ("preset tubes", "sponge")
     filled = TextureDataset(tubes.coefficients, QUIET, 12, shapes=1, volume_fraction=0.2)
-    assert dataset.voxels == filled.voxels == [QUIET.voxel] and filled.source.generated.names == ("coefficients",)
+    assert dataset.recipes[0].voxel == filled.recipes[0].voxel == QUIET.voxel
+    assert filled.recipes[0].source.generated.names == ("coefficients",)
     in_um = dataclasses.replace(made_fit(), length_unit="um", working_voxel=0.25)
     in_voxels = dataclasses.replace(in_um, length_unit="voxel")
     kind, of_voxels = Modality("um", "", 0.5, Imaging()), Modality("voxel", "", 0.5, Imaging(unit="voxel"))
@@ -163,65 +163,33 @@ def test_shapes_of_laws():
     assert choose_voxel([in_voxels], kind) == 0.5
 
 
-def start(*arguments: object, **room: str) -> subprocess.Popen[str]:
-    room = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OMP_NUM_THREADS": "1"} | room
-    command, pipe = [sys.executable, pool_run.__file__, *map(str, arguments)], subprocess.PIPE
-    return subprocess.Popen(command, env=room, text=True, stdout=pipe, stderr=pipe, start_new_session=os.name != "nt")
-
-
-def grown(log: Path) -> list[int]:
-    return sorted(int(line.split()[0]) for line in log.read_text().splitlines())
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "persistent"), [("fork", 0), ("spawn", 1)])
-def test_workers_and_epochs_share_shapes(tmp_path, method, persistent):
-    """Two workers, which stay or are new in each of two epochs, grow no shape twice."""
+@pytest.mark.parametrize(("method", "persistent"), [("fork", False), ("spawn", True)])
+def test_workers_and_epochs_share_shapes(method, persistent):
+    """Two workers, which stay or are new in each of two epochs, read the shapes that their parent grew."""
     if method not in multiprocessing.get_all_start_methods():
         pytest.skip(f"this system has no {method}")
-    run = start(method, 2, persistent, tmp_path / "log")
-    alone = balls(str(tmp_path / "other"))
-    expected = sorted(alone[k] for k in range(24))
-    out, errors = run.communicate()
-    assert run.returncode == 0, errors
-    found = json.loads(out)
-    assert grown(tmp_path / "log") == list(range(SHAPES)) and f"{SHAPES} of {SHAPES} shapes grown" in errors
-    assert found["samples"] == expected
-    assert found["there"] and not Path(found["room"]).exists()
+    pairs = TextureDataset("tubes", QUIET, 12, length=6, shapes=2, transform=brief)
+    paths = [path for path, *_ in pairs.recipes[0].source.shapes]
+    before, found = [path.stat().st_mtime_ns for path in paths], []
+    loader = DataLoader(pairs, None, num_workers=2, multiprocessing_context=method, persistent_workers=persistent)
+    for epoch in range(2):
+        pairs.set_epoch(epoch)
+        found += list(loader)
+    assert sorted(found) == sorted(pairs[k] for k in range(12))
+    assert [path.stat().st_mtime_ns for path in paths] == before  # they end, and the shapes stay
+
+
+PROGRAM = """
+from curvafit.data_synth import TextureDataset
+pairs = TextureDataset("tubes", "micro-ct", 8, shapes=1, progress=lambda text, share: print(text))
+print(pairs.recipes[0].source.shapes[0][0])
+"""
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(os.name == "nt", reason="Ctrl-C of a terminal goes to a group of processes")
-def test_an_interrupted_training_leaves_nothing(tmp_path):
-    log, temporary = tmp_path / "log", tmp_path / "temporary"
-    temporary.mkdir()
-    run = start("fork", 2, 0, log, TMPDIR=str(temporary))
-    while not log.exists() and run.poll() is None:
-        time.sleep(0.05)
-    assert list(temporary.glob("*"))
-    os.killpg(run.pid, signal.SIGINT)
-    assert "KeyboardInterrupt" in run.communicate()[1]
-    assert not list(temporary.glob("*"))
-
-
-def test_threads_and_other_sets_share_shapes(tmp_path, capsys):
-    first = balls(str(tmp_path / "log"))
-    others = [first, pickle.loads(pickle.dumps(first)), balls(str(tmp_path / "log"))]
-    with ThreadPoolExecutor(3) as crew:
-        samples = list(crew.map(lambda pairs: [pairs[k] for k in range(8)], others))
-    assert samples[0] == samples[1] == samples[2]
-    assert grown(tmp_path / "log") == sorted(set(grown(tmp_path / "log")))
-    assert "shapes grown" in capsys.readouterr().err
-    assert [first[k] for k in range(8)] == samples[0]
-    assert not capsys.readouterr().err  # what is there is read in silence
-
-
-@pytest.mark.parametrize("fault", ["read-only", "full"])
-def test_without_room_a_process_keeps_its_own_shapes(tmp_path, monkeypatch, fault):
-    refuse = Mock(side_effect=OSError(28, "No space left on device"))
-    expected = [balls(str(tmp_path / "log"))[k] for k in range(4)]
-    monkeypatch.setattr(sources, "get_temp_dir" if fault == "read-only" else "write_content", refuse)
-    pairs = balls(str(tmp_path / "own"))
-    with pytest.warns(UserWarning, match="each process grows its own"):
-        assert [pairs[k] for k in range(4)] == expected
-    assert grown(tmp_path / "own") == grown(tmp_path / "log")
+@pytest.mark.parametrize("end", ["", "raise KeyboardInterrupt"])
+def test_shapes_go_with_their_program(tmp_path, end):
+    command, room = [sys.executable, "-c", PROGRAM + end], os.environ | {"TMPDIR": str(tmp_path), "TEMP": str(tmp_path)}
+    told, path = subprocess.run(command, env=room, text=True, capture_output=True).stdout.splitlines()
+    assert told == "1 of 1 shapes grown" and tmp_path in Path(path).parents and not list(tmp_path.iterdir())
