@@ -12,7 +12,6 @@ from curvafit.cli.options import OverwriteOption, Workers, add_commands, command
 
 if TYPE_CHECKING:
     from curvafit.core.records import Format
-    from curvafit.data_synth.design import Design
 
 atlas_app = typer.Typer(help="Collections of generated shapes to match scans against.", no_args_is_help=True)
 
@@ -22,7 +21,6 @@ _Store = Annotated[Path, typer.Argument(help="Folder of the Zarr store.")]
 @command(
     "curvafit atlas build store.zarr --count 1000 --shape 64",
     "curvafit atlas build store.zarr --count 1500 --shape 64",
-    "curvafit atlas build tubes.zarr --around tubes --spread 0.2 --count 100",
     "curvafit atlas build box.zarr --design box.yaml --scheduler tcp://node1:8786",
 )
 def build_atlas(
@@ -31,8 +29,6 @@ def build_atlas(
     shape: Annotated[str, typer.Option(help="Voxels of a shape: N or Z,Y,X.")] = "64",
     seed: Annotated[int, typer.Option(help="Seed of the design.")] = 0,
     design: Annotated[str, typer.Option(help="random, sobol, or a YAML file (docs/howto/atlas.md).")] = "random",
-    around: Annotated[str | None, typer.Option(help="Preset or fit.json to draw parameters around.")] = None,
-    spread: Annotated[float | None, typer.Option(help="With --around: share of the random law's intervals.")] = None,
     schedule: Annotated[str, typer.Option(help="Schedule of the flow: fast, paper, deep or cosine.")] = "fast",
     steps: Annotated[int | None, typer.Option(help="Number of steps, instead of the schedule's.")] = None,
     *,
@@ -40,20 +36,17 @@ def build_atlas(
 ) -> None:
     """Generate shapes into a store until enough are viable. The same command resumes; a larger --count adds to it."""
     size = parse_whole_triple(shape, "--shape")
-    law_design = _choose_design(design, around, spread)
     from curvafit.core.files import check_folder
-    from curvafit.data_synth.atlas import build, make_settings
-    from curvafit.data_synth.store import open_store
+    from curvafit.data_synth.atlas import build
+    from curvafit.data_synth.design import design_box, read_design
     from curvafit.generation.schedule import schedule as make_schedule
 
+    rule = design_box(design) if design in ("random", "sobol") else read_design(design)  # type: ignore[arg-type]
     crew.check_memory(size)
     plan = make_schedule(schedule, steps)
-    settings = make_settings(size, seed, plan, law_design)
-    if store.exists():
-        open_store(store, settings)  # refuses a store of other settings, before workers start
     check_folder(store.parent)
     with crew.start() as (workers, progress):
-        build(store, count, size, seed, plan, progress, design=law_design, workers=workers)
+        build(store, count, size, seed, plan, progress, design=rule, workers=workers)
     say(str(store))
 
 
@@ -103,24 +96,22 @@ def extract_atlas(
 
 @command(
     "curvafit atlas describe store.zarr -o table.npz",
-    "curvafit atlas describe box.zarr corner.zarr -o table.npz --views mask,scan",
+    "curvafit atlas describe box.zarr corner.zarr -o table.npz",
 )
 def describe_atlas(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="The table (.npz) to write; one that exists goes on.")],
-    views: Annotated[str | None, typer.Option(help="Views of each shape, between commas; by default all.")] = None,
     *,
     crew: Workers,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure each shape of stores as field, mask and scan: the table that `atlas train` reads."""
     from curvafit.data_synth.atlas import describe
-    from curvafit.inference.table import TABLE_FILE, VIEWS
+    from curvafit.inference.table import TABLE_FILE
 
     _check_archive(out, TABLE_FILE, stores, overwrite)
-    names = tuple(VIEWS) if views is None else tuple(views.split(","))
     with crew.start() as (workers, progress):
-        table = describe(stores, out, names, progress, workers=workers, command=[command_line()], overwrite=overwrite)
+        table = describe(stores, out, progress, workers=workers, command=[command_line()], overwrite=overwrite)
     say(f"{len(set(table.shapes.tolist()))} shapes, {len(table)} views", to=error_console())
     say(str(out))
 
@@ -221,19 +212,3 @@ def _check_archive(out: Path, kind: Format, inputs: list[Path], overwrite: bool)
     if out.suffix.lower() != ".npz":
         raise ValueError(f"the output's name must end in .npz, got {out.name!r}")
     can_write(out, kind, inputs=inputs, overwrite=overwrite)
-
-
-def _choose_design(name: str, around: str | None, spread: float | None) -> Design:
-    """Return the design that the options name."""
-    from curvafit.data_synth import design
-
-    if around is not None:
-        if name not in ("random", "sobol"):
-            raise ValueError(f"give either --around or the file of a design, got {around} and {name}")
-        width = design.SPREAD if spread is None else spread
-        return design.design_around(design.read_point(around), width, name)  # type: ignore[arg-type]
-    if spread is not None:
-        raise ValueError("--spread needs --around")
-    if name in ("random", "sobol"):
-        return design.design_box(name)  # type: ignore[arg-type]
-    return design.read_design(name)

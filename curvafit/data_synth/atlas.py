@@ -29,8 +29,8 @@ from curvafit.core.workers import Cluster, run_jobs
 from curvafit.data_synth.design import Design, design_box
 from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.generation.flow import WORKING_BLUR, generate
-from curvafit.generation.result import FORMED, is_well_formed
-from curvafit.generation.schedule import SCHEDULES, Schedule, present_name
+from curvafit.generation.result import is_well_formed
+from curvafit.generation.schedule import Schedule, present_name
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE, Diagram, diagram
 from curvafit.inference.atlas import Atlas
@@ -76,30 +76,17 @@ def build(
     is viable; OSError where the store can't be written or the workers are gone. Finished draws are kept.
     """
     check_int(count, "a count of shapes from 1", 1, MOST)
-    if workers is None:
-        check_memory(Grid(shape).shape, FLOW, "a shape")  # type: ignore[arg-type]
-    settings = make_settings(shape, seed, schedule, design)
-    return _fill(open_store(store_path, settings), count, workers, progress)
-
-
-def make_settings(
-    shape: int | Sequence[int], seed: int = 0, schedule: str | Schedule = "fast", design: Design | None = None
-) -> Settings:
-    """Return the settings of the store that `build` makes from these arguments, or raise ValueError."""
     grid = Grid(shape)  # type: ignore[arg-type]
-    check_memory(grid.shape, FILE, "a shape")
+    check_memory(grid.shape, FLOW if workers is None else FILE, "a shape")
     if design is not None:
         check_type(design, Design, "a Design")
-    plan, design = named_schedule(schedule).as_dict(), design or design_box()
-    return Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, design.as_dict(), check_seed(seed), plan)
-
-
-def _fill(store: Store, count: int, workers: Cluster | None, progress: Progress) -> Store:
-    """Make draws in order until `count` are viable, in rounds of as many as are missing: so the last draw is viable."""
+    plan, rule = named_schedule(schedule).as_dict(), (design or design_box()).as_dict()
+    settings = Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, rule, check_seed(seed), plan)
+    store = open_store(store_path, settings)
     store.want(count)
     viable = {index: store.viable(index) for index in store.indices()}
     indices = (index for index in itertools.count() if index not in viable)
-    while (missing := count - sum(viable.values())) > 0:
+    while (missing := count - sum(viable.values())) > 0:  # in rounds of as many as are missing: so the last is viable
         for record in run_jobs(partial(make_draw, store.path.resolve()), islice(indices, missing), workers):
             viable[record.index] = record.viability.viable
             shapes = sum(viable.values())
@@ -210,8 +197,8 @@ def summarise(store: Store) -> dict[str, str]:
 def extract(stores: Sequence[str | Path | Store], command: Sequence[str] = (), progress: Progress = silent) -> Atlas:
     """Measure every well-formed shape of stores (`generation.result.is_well_formed`), as field and as mask.
 
-    `command` is command lines for the provenance, after those that make the stores. Raises FileNotFoundError or
-    ValueError where a store is missing or of another version or grid, two have one name, or none holds such a shape.
+    `command` is command lines for the provenance. Raises FileNotFoundError or ValueError where a store is missing or of
+    another version or grid, two have one name, or none holds such a shape.
     """
     sources = open_all(stores)
     grids = {(store.settings.shape, store.settings.spacing, store.settings.epsilon) for store in sources}
@@ -237,7 +224,11 @@ def extract(stores: Sequence[str | Path | Store], command: Sequence[str] = (), p
         thicknesses=np.array(thicknesses),
         field_diagrams=field_diagrams,
         mask_diagrams=mask_diagrams,
-        provenance=_provenance(draws, command),
+        provenance=_provenance(None, sources, command)
+        | {
+            "settings": {name: getattr(sources[0].settings, name) for name in ("shape", "spacing", "epsilon")},
+            "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        },
     )
 
 
@@ -264,45 +255,9 @@ def _measure_shape(store: Store, record: Record) -> tuple[float, float, Diagram,
     return float((u > 0).mean()), thinner_thickness(u > 0), field_diagram, mask_diagram
 
 
-def _provenance(draws: Sequence[tuple[Store, Record]], command: Sequence[str]) -> dict[str, Any]:
-    stores = list({store.name: store for store, _ in draws}.values())
-    summaries = {}
-    for store in stores:
-        records = [record for owner, record in draws if owner is store]
-        generators = sorted({json.dumps(record.versions, sort_keys=True) for record in records})
-        summaries[store.name] = {
-            "draws": len(records),
-            "viable": sum(record.viability.viable for record in records),
-            "settings": dataclasses.asdict(store.settings),
-            "generated_with": [json.loads(text) for text in generators],
-        }
-    return {
-        "command": [*(_build_command(store, summaries[store.name]["viable"]) for store in stores), *command],
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "selection": {"extent_of_both_phases": FORMED},
-        "settings": {name: getattr(stores[0].settings, name) for name in ("shape", "spacing", "epsilon")},
-        "stores": summaries,
-        "diagrams": {"curvature": "geometric", "bin_width": BIN_WIDTH, "tail_share": TAIL_SHARE, "unit": Diagram.unit},
-        "measured_with": versions(),
-    }
-
-
-def _build_command(store: Store, viable: int) -> str:
-    """Return the command that makes the same store: building stops at its last viable draw."""
-    settings = store.settings
-    shape, name = ",".join(map(str, settings.shape)), present_name(settings.schedule)
-    designs = {json.dumps(design_box(law).as_dict()): law for law in ("random", "sobol")}
-    design = designs.get(json.dumps(settings.design), f"{store.name}.yaml")
-    options = f"--count {viable} --shape {shape} --seed {settings.seed} --design {design} --schedule {name}"
-    if name in SCHEDULES and settings.schedule["steps"] != SCHEDULES[name].steps:
-        options += f" --steps {settings.schedule['steps']}"
-    return f"curvafit atlas build {store.path.name} {options}"
-
-
 def describe(
     stores: Sequence[str | Path],
     out: str | Path,
-    views: Sequence[str] = tuple(VIEWS),
     progress: Progress = silent,
     *,
     workers: Cluster | None = None,
@@ -315,22 +270,19 @@ def describe(
     its seed and the view's name: a resumed table has the same rows, possibly in another order. Shapes that a build adds
     or removes meanwhile are left out. `workers` (see `cluster`) measure, or this process; `command` is for provenance.
 
-    Raises FileNotFoundError or ValueError where a store is missing, two have one name, `out` is no table, a view is
-    unknown, or no shape is well-formed.
+    Raises FileNotFoundError or ValueError where a store is missing, two have one name, `out` is no table, or no shape
+    is well-formed.
     """
-    unknown = [name for name in views if name not in VIEWS]
-    if unknown or not views:
-        raise ValueError(f"views must be some of {', '.join(VIEWS)}, got {', '.join(unknown) or 'none'}")
     sources, path = open_all(stores), Path(out)
     table = load_table(path) if path.exists() and not overwrite else None
-    provenance, rows = _table_provenance(table, sources, command), []
+    provenance, rows = _provenance(table, sources, command), []
     if table is not None:
         columns = dataclasses.fields(table)[:-1]  # the last is the provenance
         rows += zip(*(getattr(table, column.name) for column in columns), strict=True)
     present = {row[:2] for row in rows}
     jobs: list[tuple[Path, int, tuple[str, ...]]] = []  # shapes that lack views in the table
     for store, index in ((source, k) for source in sources for k in source.indices()):
-        missing = tuple(name for name in views if (f"{store.name}/{index:06d}", name) not in present)
+        missing = tuple(name for name in VIEWS if (f"{store.name}/{index:06d}", name) not in present)
         with suppress(KeyError):  # a draw that was removed since it was listed
             if missing and store.viable(index) and is_well_formed(store.record(index).viability):
                 jobs.append((store.path.resolve(), index, missing))
@@ -371,8 +323,9 @@ def measure_view(u: np.ndarray, name: str, seed: int) -> tuple[np.ndarray, float
     return to_row(reading).astype(np.float32), math.nan if reading is None else reading.amount
 
 
-def _table_provenance(table: Table | None, stores: Sequence[Store], command: Sequence[str]) -> dict[str, Any]:
-    """Return the provenance of a table with stores added; ValueError where it has another store of such a name."""
+def _provenance(table: Table | None, stores: Sequence[Store], command: Sequence[str]) -> dict[str, Any]:
+    """Return the provenance of what is measured of stores, or of a table with stores added; ValueError where the table
+    has another store of such a name."""
     previous = {} if table is None else table.provenance
     settings = {store.name: json.loads(json.dumps(dataclasses.asdict(store.settings))) for store in stores}
     for name, current in settings.items():

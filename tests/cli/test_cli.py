@@ -64,7 +64,7 @@ REFUSALS: dict[str, dict[str, str]] = {
     "reconstruct scan.npy --prior tubes -o out.npy": {"--known 0,8 --first 2": "--first"},
     "atlas": {"frob": "(see curvafit atlas --help)"},
     "atlas build s.zarr": {
-        f"--count {10**9}": "count", "--around tubes --spread 1e300": "spread", "--around tubes --spread nan": "spread",
+        f"--count {10**9}": "count", "--design wide.yaml": "spread", "--design odd.yaml": "spread",
         f"--workers {10**6}": "workers", "--workers 2 --scheduler tcp://x:1": "scheduler", "--shape 1e5": "memory",
         "--design box.yaml": "a10", "--design laughs.yaml": "", "--design nest.yaml": "", "--design code.yaml": "",
     },
@@ -93,6 +93,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     laughs = "".join(f", &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 9))
     texts = {
         "scan.xyz": "12345", "empty.json": "{}", "torn.json": "[1", "other.json": '{"format": "x"}',
+        "wide.yaml": "around: tubes\nspread: 1e300\n", "odd.yaml": "around: tubes\nspread: .nan\n",
         "box.yaml": "box:\n  a10: [0, 1e300]\n",
         "laughs.yaml": f"around: tubes\nspread: [&a0 [1, 1]{laughs}]\n",
         "nest.yaml": "box: " + "[" * 3000,

@@ -57,8 +57,9 @@ def test_a_fit_without_a_law_is_refused_by_all_that_take_one(tmp_path: Path, mon
     for words in ("generate -o out.npy", "segment scan.npy -o out.npy", "reconstruct scan.npy --every 4 -o out.npy",
                   "synth --modality confocal -o out"):  # fmt: skip
         refused(call(*words.split(), "--prior", "fit.json"), "law")
-    refused(call(*["atlas", "build", "out.zarr", "--around", "fit.json", "--count", "1"]), "law")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["fit.json", "scan.npy"]
+    Path("near.yaml").write_text("around: fit.json")
+    refused(call(*["atlas", "build", "out.zarr", "--design", "near.yaml", "--count", "1"]), "law")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fit.json", "near.yaml", "scan.npy"]
 
 
 # ---- what is handed on, and what is written --------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from exact import Gyroid, centres, profile
 from exact_store import exact_record, exact_store
 
 from curvafit.core.workers import cluster
+from curvafit.data_synth import atlas as measuring
 from curvafit.data_synth.atlas import describe
 from curvafit.geometry.description import BLOCKS, descriptors
 from curvafit.inference import table as tables
@@ -20,6 +21,11 @@ from curvafit.scan.preparation import WORKING_THICKNESS, prepare, thinner_thickn
 from curvafit.volumes.volume import ScanError
 
 FAST = ("field", "mask")
+
+
+def see(patch: pytest.MonkeyPatch, *names: str) -> None:
+    """Let shapes be seen in some views alone."""
+    patch.setattr(measuring, "VIEWS", {name: VIEWS[name] for name in names})
 
 
 def gyroid(n: int = 48) -> tuple[np.ndarray, Grid]:
@@ -76,9 +82,10 @@ def test_what_is_pooled_is_as_if_one_scan_had_shown_it() -> None:
     assert (pooled.parameters[6:] == rows.parameters[0]).all()
 
 
-def test_a_table_has_each_view_of_each_shape(tmp_path: Path) -> None:
+def test_a_table_has_each_view_of_each_shape(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    see(monkeypatch, *FAST)
     store = exact_store(tmp_path / "store.zarr", 8)
-    table = describe([store.path], tmp_path / "table.npz", FAST)
+    table = describe([store.path], tmp_path / "table.npz")
     viable = [index for index in range(8) if index % 7 != 2]
     rows = [(f"store/{index:06d}", view) for index in viable for view in FAST]
     assert sorted(zip(table.shapes, table.views, strict=True)) == rows
@@ -95,8 +102,9 @@ def test_a_table_has_each_view_of_each_shape(tmp_path: Path) -> None:
 
 
 def test_a_stopped_table_goes_on_and_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    see(monkeypatch, *FAST)
     store = exact_store(tmp_path / "store.zarr", 4)
-    whole = describe([store.path], tmp_path / "whole.npz", FAST)
+    whole = describe([store.path], tmp_path / "whole.npz")
     measured: list[int] = []
 
     def stops(u, rng):
@@ -106,25 +114,27 @@ def test_a_stopped_table_goes_on_and_grows(tmp_path: Path, monkeypatch: pytest.M
         return tables.see_field(u, rng)
 
     with monkeypatch.context() as patch:
-        patch.setitem(VIEWS, "field", stops)
+        patch.setitem(measuring.VIEWS, "field", stops)
         with pytest.raises(KeyboardInterrupt):
-            describe([store.path], tmp_path / "table.npz", FAST)
+            describe([store.path], tmp_path / "table.npz")
     assert len(load_table(tmp_path / "table.npz")) == 2
-    table = describe([store.path], tmp_path / "table.npz", FAST)
+    table = describe([store.path], tmp_path / "table.npz")
     for name in ("shapes", "views", "parameters", "descriptors"):
         assert np.array_equal(getattr(table, name), getattr(whole, name)), name
     exact_store(store.path, 6, first=4)
-    grown = describe([store.path], tmp_path / "table.npz", ("scan",))
+    see(monkeypatch, "scan")
+    grown = describe([store.path], tmp_path / "table.npz")
     assert grown.views.tolist() == whole.views.tolist() + ["scan"] * 5
     assert np.array_equal(grown.descriptors[: len(whole)], whole.descriptors)
 
 
 @pytest.mark.slow
-def test_workers_measure_the_same(tmp_path: Path) -> None:
+def test_workers_measure_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    see(monkeypatch, "mask", "scan")
     store = exact_store(tmp_path / "store.zarr", 6)
-    alone = describe([store.path], tmp_path / "alone.npz", ("mask", "scan"))
+    alone = describe([store.path], tmp_path / "alone.npz")
     with cluster(2) as workers:
-        table = describe([store.path], tmp_path / "table.npz", ("mask", "scan"), workers=workers)
+        table = describe([store.path], tmp_path / "table.npz", workers=workers)
     order, other = (np.lexsort((each.views, each.shapes)) for each in (table, alone))
     assert np.array_equal(table.shapes[order], alone.shapes[other])
     expected = alone.descriptors[other]  # a worker has one thread, which sums in another order
@@ -132,8 +142,9 @@ def test_workers_measure_the_same(tmp_path: Path) -> None:
 
 
 def test_a_view_without_a_surface_is_a_row_without_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(VIEWS, "scan", Mock(side_effect=ScanError("expected a surface, got none")))
-    table = describe([exact_store(tmp_path / "store.zarr", 2).path], tmp_path / "table.npz", ("mask", "scan"))
+    see(monkeypatch, "mask", "scan")
+    monkeypatch.setitem(measuring.VIEWS, "scan", Mock(side_effect=ScanError("expected a surface, got none")))
+    table = describe([exact_store(tmp_path / "store.zarr", 2).path], tmp_path / "table.npz")
     assert table.visible.views.tolist() == ["mask", "mask"]
     assert np.isnan(table.descriptors[table.views == "scan"]).all()
 
@@ -188,7 +199,7 @@ def test_the_command_refuses_in_one_sentence(tmp_path: Path, monkeypatch: pytest
     exact_store(tmp_path / "store.zarr", 1)
     np.savez(tmp_path / "mine.npz", a=1)
     for words, key in {
-        "store.zarr -o table.txt": ".npz", "store.zarr -o table.npz --views mask,ghost": "views",
+        "store.zarr -o table.txt": ".npz",
         "nothing.zarr -o table.npz": "store", "store.zarr -o mine.npz": "mine.npz",
         "store.zarr store.zarr -o table.npz": "names",
     }.items():  # fmt: skip
@@ -196,14 +207,15 @@ def test_the_command_refuses_in_one_sentence(tmp_path: Path, monkeypatch: pytest
         assert not (tmp_path / "table.npz").exists()
 
 
-def test_another_store_of_the_same_name_is_not_taken_for_the_first(tmp_path: Path) -> None:
+def test_another_store_of_the_same_name_is_not_taken_for_the_first(tmp_path, monkeypatch) -> None:
+    see(monkeypatch, "field")
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     first, store = (exact_store(tmp_path / each / "s.zarr", 1).path for each in ("a", "b"))
-    describe([first], tmp_path / "t.npz", ("field",))
+    describe([first], tmp_path / "t.npz")
     header = store / "zarr.json"
     header.write_text(header.read_text().replace('"seed": 3', '"seed": 4'))
     with pytest.raises(ValueError, match="store"):
-        describe([store], tmp_path / "t.npz", ("field",))
-    describe([store], tmp_path / "t.npz", ("field",), overwrite=True)
+        describe([store], tmp_path / "t.npz")
+    describe([store], tmp_path / "t.npz", overwrite=True)
     assert load_table(tmp_path / "t.npz").provenance["stores"]["s"]["seed"] == 4

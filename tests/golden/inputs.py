@@ -41,10 +41,12 @@ def make(folder: Path = FOLDER) -> None:
     law = {"a20": 1, "a11": 2, "a02": 6, "a10": -40, "a01": -40, "a00": 400}
     values = {name: np.full((16,) * 3, value, np.float32) for name, value in law.items()}
     np.savez_compressed(folder / "maps.npz", **values, mass=np.float32(-0.6))
+    for name, spread in (("near.yaml", 0.05), ("around.yaml", 0.1)):
+        (folder / name).write_text(f"around: tubes\nspread: {spread}\n")
     store = folder / "store.zarr"
     shutil.rmtree(store, ignore_errors=True)
-    build = "--shape 20 --around tubes --spread 0.1 --steps 200 --workers 0 --count 6"
-    done("atlas", "build", store, *build.split())
+    build = "--shape 20 --steps 200 --workers 0 --count 6 --design"
+    done("atlas", "build", store, *build.split(), folder / "around.yaml")
 
 
 def tubes(shape: tuple[int, int, int], period: float, radius: float, shift: float = 0.0) -> np.ndarray:

@@ -43,7 +43,7 @@ COMMANDS = {
     "reconstruct-cells": "reconstruct cells.tif --every 4 --labels all --image light.tif -o out.tif",
     "synth": "synth -o out --atlas store.zarr --modality confocal --shape 8,10,10 --count 2 --workers 0",
     "synth-like": "synth -o out --atlas store.zarr --like scan.tif --shape 10 --count 2 --workers 0 --layout monai",
-    "atlas-build": "atlas build out.zarr --shape 16 --around tubes --spread 0.05 --steps 40 --count 2 --workers 0",
+    "atlas-build": "atlas build out.zarr --shape 16 --design near.yaml --steps 40 --count 2 --workers 0",
     "atlas-info": "atlas info store.zarr", "atlas-verify": "atlas verify store.zarr",
     "atlas-extract": "atlas extract store.zarr -o out.npz",
     "atlas-describe": "atlas describe store.zarr -o out.npz --workers 0",

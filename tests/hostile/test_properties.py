@@ -290,7 +290,7 @@ LAW = "generate --coefficients 1,2,6,-40,-40,400 --mass=-0.6 --shape 16"
 QUICK = f"{LAW} --steps 30"
 LONG = f"{LAW} --steps 120 --checkpoint run.pt --checkpoint-every 0 -o out.npy"
 SYNTH = "synth -o out --atlas store.zarr --modality confocal --shape 6 --count 3 --workers 0"
-BUILD = "atlas build out.zarr --shape 16 --around tubes --spread 0.05 --count 2 --workers 0"
+BUILD = "atlas build out.zarr --shape 16 --design near.yaml --count 2 --workers 0"
 SEGMENT = "segment scan.tif --prior tubes --steps 2"
 
 

@@ -144,12 +144,9 @@ def test_an_atlas_holds_what_the_store_does(store, atlas):
     for measured in atlas.diagrams("field"):  # balls: κ1 and κ2 are 1/R all over, the area 4πR²
         κ = np.average(measured.points, axis=0, weights=measured.weights)
         assert measured.weights.sum() * κ[0] * κ[1] == pytest.approx(4 * np.pi, rel=0.12)
-    build = f"curvafit atlas build s.zarr --count {len(viable)} --shape 20,20,20 --seed 2"
-    build += " --design random --schedule fast"
-    assert atlas.provenance["command"] == [build, "then this"]
+    assert atlas.provenance["command"] == ["then this"]
     assert atlas.provenance["settings"]["shape"] == (SHAPE,) * 3
-    account = atlas.provenance["stores"]["s"]
-    assert (account["settings"]["seed"], account["draws"]) == (2, len(store.indices()))
+    assert atlas.provenance["stores"]["s"]["seed"] == 2
 
 
 def test_an_atlas_of_two_stores_holds_both(tmp_path, balls):
@@ -159,7 +156,6 @@ def test_an_atlas_of_two_stores_holds_both(tmp_path, balls):
     assert both.ids == alone[0].ids + alone[1].ids and len(set(both.ids)) == 4
     np.testing.assert_array_equal(both.masses, np.concatenate([each.masses for each in alone]))
     assert list(both.provenance["stores"]) == ["one", "other"]
-    assert [line.split()[3] for line in both.provenance["command"]] == ["one.zarr", "other.zarr"]
 
 
 def test_stores_of_one_name_of_two_grids_or_without_shapes_make_no_atlas(tmp_path, balls):
@@ -177,9 +173,7 @@ def test_faint_and_over_sharp_shapes_stay_in_the_store_and_out_of_the_atlas(tmp_
     for count, highest in enumerate((1.0, 0.4, 4.0, 1.5), 1):
         balls.highest = highest
         store = building.build(tmp_path / "s.zarr", count, SHAPE)
-    whole = extract([store])
-    assert len(whole) == 2
-    assert whole.provenance["stores"]["s"]["viable"] == 4
+    assert len(extract([store])) == 2 and sum(map(store.viable, store.indices())) == 4
 
 
 def test_an_atlas_file_comes_back_within_its_stated_rounding(saved, atlas):
