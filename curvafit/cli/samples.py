@@ -51,10 +51,9 @@ add_commands(samples_app, get_sample)
 def demo(
     sample: Annotated[str | None, typer.Argument(help="A sample; by default shell, else the synthetic one.")] = None,
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for demo.html and its files.")] = Path("demo_out"),
-    seed: Annotated[int, typer.Option(help="Seed of the reading.")] = 0,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Fill a real scan from every 8th slice, measure it, and find textures like it: one page, in a minute."""
+    """Fill a real scan from every 8th slice, measure and read it: one page, in a minute."""
     with show_stages() as progress:
         from curvafit.data_synth.samples import SYNTHETIC, SampleUnavailable, fetch
         from curvafit.report.demo import EVERY, write_demo
@@ -69,10 +68,9 @@ def demo(
                 raise
             say(f"{error}; taking the synthetic scan", to=error_console())
             path = fetch(SYNTHETIC)
-        page, completion = write_demo(load(path), out, seed=seed, overwrite=overwrite, progress=progress)
-    dice = dict(completion.dice)
-    network = dice.pop("curvafit")
-    plain = max(dice.values())
+        page, scores = write_demo(load(path), out, overwrite=overwrite, progress=progress)
+    network, *others = scores.values()
+    plain = max(others)
     say(f"Filled from every {EVERY}th slice: Dice {network:.3f}; by the best plain interpolation {plain:.3f}.")
     say(str(page))
 

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from PIL import Image
 from scipy.ndimage import gaussian_filter
@@ -72,32 +71,6 @@ def families_of(atlas: Atlas) -> tuple[str, ...]:
         leading_family(family_shares(diagram, half_thickness(diagram, float(fraction) * box_volume)))
         for diagram, fraction in zip(atlas.field_diagrams, atlas.volume_fractions, strict=True)
     )
-
-
-def map_on(axes: Axes, atlas: Atlas, seen_as: str, embeddings: np.ndarray) -> np.ndarray:
-    """Draw an atlas's shapes on the two principal axes of their curvature diagrams.
-
-    `embeddings` (n, 288) are sliced embeddings of further diagrams, in working units; return their positions (n, 2).
-    """
-    atlas_embeddings = atlas.embeddings(seen_as)
-    positions, fractions = place_on_plane(atlas_embeddings, np.concatenate([atlas_embeddings, embeddings]))
-    positions, further = positions[: len(atlas)], positions[len(atlas) :]
-    families = np.array(families_of(atlas))
-    for family, colour in FAMILY_COLOURS.items():
-        if (families == family).any():
-            axes.scatter(*positions[families == family].T, s=9, c=colour, linewidths=0, alpha=0.75, label=family)
-    extremes = np.concatenate([np.percentile(positions, (0.3, 99.7), axis=0), further])  # outliers may be cut off
-    low, high = extremes.min(0), extremes.max(0)
-    margin = 0.06 * (high - low)
-    (left, bottom), (right, top) = low - margin, high + margin
-    axes.set(xlim=(left, right), ylim=(bottom, top), xticks=[], yticks=[])
-    legend = {"fontsize": 8, "frameon": False, "handletextpad": 0, "columnspacing": 0.9}
-    axes.legend(loc="lower center", ncols=6, bbox_to_anchor=(0.5, -0.15), **legend)
-    axes.set_title(f"its place among {len(atlas)} grown textures", fontsize=11)
-    note = f"the directions hold {fractions.sum():.0%} of their spread"
-    axes.text(0.99, 0.015, note, transform=axes.transAxes, ha="right", fontsize=7.5, color="#5b616b")
-    axes.spines[:].set_color("#dfe2e6")
-    return further
 
 
 # ---- the page --------------------------------------------------------------------------------------------------------

@@ -184,7 +184,7 @@ def test_workers_and_epochs_share_shapes(method, persistent):
 
 PROGRAM = """
 from curvafit.data_synth import TextureDataset
-pairs = TextureDataset("tubes", "micro-ct", 8, shapes=1, progress=lambda text, share: print(text))
+pairs = TextureDataset("tubes", "micro-ct", 16, shapes=1, progress=lambda text, share: print(text))
 print(pairs.recipes[0].source.shapes[0][0])
 """
 

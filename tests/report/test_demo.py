@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from found import SCALE, lattice, made_inference
 
-from curvafit.inference.atlas import load_atlas
-from curvafit.report.demo import demo_page, score_completion, write_demo
+from curvafit.report.demo import demo_page, score, shape_figure, write_demo
 from curvafit.scan.tiles import measure
 from curvafit.segmentation.slices import WAYS
 from curvafit.volumes.volume import Volume
@@ -24,26 +23,23 @@ def test_scores_are_of_the_slices_left_out_alone() -> None:
     truth = cone()
     known = np.zeros_like(truth)
     known[::8] = truth[::8]
-    assert score_completion(truth, truth).dice["curvafit"] == 1
-    completion = score_completion(truth, known)
-    assert completion.dice["curvafit"] == 0 and np.array_equal(completion.known, known)
-    assert set(completion.dice) == {"curvafit", *WAYS}
-    assert completion.dice["linear"] > 0.98 > completion.dice["nearest"]
+    assert score(truth, truth, 0)["curvafit"] == 1
+    scores = score(truth, known, 0)
+    assert scores["curvafit"] == 0 and set(scores) == {"curvafit", *WAYS}
+    assert scores["linear"] > 0.98 > scores["nearest"]
     truth, filled = cone(37), cone(37)
     filled[33:] = False  # beyond the last known slice, which does not count
-    assert score_completion(truth, filled).dice["curvafit"] == 1
+    assert score(truth, filled, 0)["curvafit"] == 1
 
 
 @pytest.mark.slow
 def test_the_page_stands_alone_and_escapes_what_it_is_told() -> None:
     inference, mask = made_inference(), lattice(48, 24, 5.0) > 0
-    measures = measure(Volume(mask, (SCALE,) * 3, "mm"))
-    texture = lattice(16, 8, 2.0)
-    for textures, pictures in (([texture, texture], 4), ([], 3)):
-        page = demo_page(inference, measures, score_completion(mask, mask, axis=1), textures, load_atlas())
-        assert "tubes &lt;b&gt;&amp;.tif" in page and page.count("data:image/png;base64,") == pictures
-        assert re.findall(r'(?:src|href)="(?!data:|report\.html)', page) == []
-        assert 'chosen">1.000</td>' in page and "1/mm" in page and "--axis y" in page
+    measures, scores = measure(Volume(mask, (SCALE,) * 3, "mm"), maps=True), score(mask, mask, 1)
+    page = demo_page(inference, measures, shape_figure(mask, mask, 1, (SCALE,) * 3), scores, 1)
+    assert "tubes &lt;b&gt;&amp;.tif" in page and page.count("data:image/png;base64,") == 3
+    assert set(re.findall(r'(?:src|href)="(?!data:)([^"]*)', page)) == {"measures.html", "report.html"}
+    assert 'chosen">1.000</td>' in page and "--axis y" in page
 
 
 def test_another_program_s_page_is_kept(tmp_path: Path) -> None:
