@@ -89,8 +89,9 @@ def _check_value(kind: Any, rule: Rule, value: Any) -> tuple[str, bool]:
     if get_origin(kind) is tuple:
         items = get_args(kind)
         count = 0 if items[-1] is Ellipsis else len(items)  # 0: any number of items
-        is_long_enough = isinstance(value, (list, tuple)) and len(value) >= (count or int(rule.filled))  # or longer
-        return f"a list of {count} numbers" if count else "a list", is_long_enough
+        is_list = isinstance(value, (list, tuple))
+        is_full = is_list and (len(value) == count if count else len(value) >= int(rule.filled))
+        return f"a list of {count} numbers" if count else "a list", is_full
     return "an object", isinstance(value, Mapping)
 
 

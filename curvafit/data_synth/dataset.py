@@ -27,7 +27,7 @@ from curvafit.core.checks import (
     quoted,
 )
 from curvafit.core.runtime import Progress, silent
-from curvafit.core.schema import encode
+from curvafit.core.schema import decode, encode
 from curvafit.data_synth.imaging.modality import Imaging, Modality, field_shape, image, label_voxels, modality, regrid
 from curvafit.data_synth.sources import Generated, Pool, ShapeSource, Stored, choose_voxel, decode_source
 from curvafit.priors.kernels.threads import one_thread
@@ -127,7 +127,7 @@ class Recipe:
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Recipe:
         """Return the recipe that `as_dict` wrote."""
-        source, modality = decode_source(content["source"]), Modality.from_dict(content["modality"])
+        source, modality = decode_source(content["source"]), decode(Modality, content["modality"])
         return Recipe(**{**content, "source": source, "modality": modality})
 
 
@@ -142,7 +142,7 @@ def _show(
     labels = label_voxels(u, sampled, voxel, imaging, grown.epsilon)
     z, y, x = shape  # a field of whole voxels may give a few voxels more
     grey, sampled, labels = (volume[:z, :y, :x].contiguous().numpy() for volume in (grey, sampled, labels))
-    record = {"source": grown.origin, "imaging": imaging.as_dict(), "image_seed": seed, "voxel": voxel}
+    record = {"source": grown.origin, "imaging": encode(imaging), "image_seed": seed, "voxel": voxel}
     return Case(grey, sampled, labels, imaging.spacing, imaging.unit, grown.epsilon * voxel, record)
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 from exact import Cylinder, Sphere, centres, profile
 
+from curvafit.core.schema import decode, encode
 from curvafit.data_synth.imaging import effects
 from curvafit.data_synth.imaging.modality import (
     MODALITIES,
@@ -112,7 +113,7 @@ def test_parameters_are_drawn_in_range_and_reproducibly() -> None:
     both = replace(one, ranges={"illumination.stripes": (0.1, 0.2), **one.ranges})
     assert one.draw(3).illumination == replace(both.draw(3).illumination, stripes=0.0)
     for name, kind in MODALITIES.items():
-        assert kind.name == name and Modality.from_dict(json.loads(json.dumps(kind.as_dict()))) == kind
-        assert Imaging.from_dict(json.loads(json.dumps(kind.draw(5).as_dict()))) == kind.draw(5)
+        assert kind.name == name and decode(Modality, json.loads(json.dumps(encode(kind)))) == kind
+        assert decode(Imaging, json.loads(json.dumps(encode(kind.draw(5))))) == kind.draw(5)
         for written in (name, name.replace("-", "_"), name.upper(), f" {name.replace('-', ' ')} "):
             assert modality(written) is kind

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -62,8 +63,8 @@ def fit_modality(scan: Volume, mask: np.ndarray | None = None) -> Modality:
     structure = _measure_structure(values, inside, edges, background.level)
     noise = _measure_noise(values, inside, background, edges, background.level + structure[1])
     imaging = _to_imaging(scan, background, structure, noise)
-    estimates = {name: np.asarray(imaging[name]) for name in SPREAD if np.any(imaging[name])}
-    ranges = {name: tuple((end * value).tolist() for end in SPREAD[name]) for name, value in estimates.items()}
+    estimates = {name: np.asarray(attrgetter(name)(imaging)) for name in SPREAD}
+    ranges = {name: tuple((end * v).tolist() for end in SPREAD[name]) for name, v in estimates.items() if v.any()}
     if imaging.illumination.bias:
         low, high = ranges["illumination.bias"]
         ranges["illumination.bias"] = low, min(high, 1.0)

@@ -3,57 +3,51 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
-from functools import cache
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, is_dataclass, replace
 from importlib.resources import files
 from operator import attrgetter
-from types import NoneType
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import numpy as np
 import torch
 import yaml
 
-from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_seed, quoted, simplify_name
-from curvafit.core.schema import encode
+from curvafit.core.checks import (
+    LONGEST,
+    SHORTEST,
+    check_choice,
+    check_float,
+    check_seed,
+    check_type,
+    quoted,
+    simplify_name,
+)
+from curvafit.core.schema import Rule, decode
 from curvafit.core.units import METRES
 from curvafit.data_synth.imaging import effects
-from curvafit.data_synth.imaging.effects import EPSILON, Triple, Voxels
+from curvafit.data_synth.imaging.effects import EPSILON, Voxels
 from curvafit.priors.grid import Float
 
-#: What a parameter may be, in words, and the least and the greatest number.
-Range = tuple[str, float, float]
-FINITE: Range = ("a finite number", -math.inf, math.inf)
-FROM_ZERO: Range = ("a number from 0", 0.0, math.inf)
-ABOVE_ZERO: Range = ("a number above 0", math.ulp(0.0), math.inf)
-SHARE: Range = ("a share", 0.0, 1.0)
-PARTIAL: Range = ("a share below 1", 0.0, math.nextafter(1.0, 0.0))
+Amount = Annotated[float, Rule(least=0)]
+Positive = Annotated[float, Rule(above=0)]
+Share = Annotated[float, Rule(least=0, most=1)]
+#: Numbers along (z, y, x).
+Amounts = tuple[Amount, Amount, Amount]
+Positives = tuple[Positive, Positive, Positive]
 
 
 class Checked:
-    """A dataclass whose parameters with a `Range` in their annotation must lie in it, and become floats."""
+    """A dataclass whose parameters must be as their types say, or ValueError; numbers become floats."""
 
     def __post_init__(self) -> None:
-        for name, (annotation, allowed) in _ranges(type(self)).items():
-            object.__setattr__(self, name, _number(name, getattr(self, name), annotation, allowed))
-
-
-@cache
-def _ranges(part: type) -> dict[str, tuple[Any, Range]]:
-    hints = get_type_hints(part, include_extras=True).items()
-    return {name: (hint.__origin__, *hint.__metadata__) for name, hint in hints if hasattr(hint, "__metadata__")}
-
-
-def _number(name: str, value: Any, annotation: Any, allowed: Range) -> Any:
-    """Return the value as a float, a triple of floats or None, whichever the annotation allows; else ValueError."""
-    expected, least, most = allowed
-    if value is None and NoneType in get_args(annotation):
-        return None
-    if annotation is not Triple:
-        return check_float(value, f"{name} as {expected}", least, most)
-    expected = f"{name} as 3 numbers (z, y, x), each {expected}"
-    return tuple(check_float(number, expected, least, most, of=value) for number in as_tuple(value, expected, 3))
+        for name, hint in get_type_hints(type(self), include_extras=True).items():
+            value = getattr(self, name)
+            if is_dataclass(hint):
+                check_type(value, hint, f"{name} of type {hint.__name__}")  # type: ignore[arg-type]
+            else:
+                plain = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+                object.__setattr__(self, name, decode(hint, plain, f"expected {name}"))
 
 
 @dataclass(frozen=True)
@@ -63,12 +57,12 @@ class Contrast(Checked):
     A texture is the relative deviation of a level, and its length that of the deviation's correlation.
     """
 
-    background: Annotated[float, FROM_ZERO] = 10.0
-    foreground: Annotated[float, FROM_ZERO] = 100.0
-    background_texture: Annotated[float, FROM_ZERO] = 0.0
-    background_length: Annotated[float, ABOVE_ZERO] = 1.0
-    foreground_texture: Annotated[float, FROM_ZERO] = 0.0
-    foreground_length: Annotated[float, ABOVE_ZERO] = 1.0
+    background: Amount = 10.0
+    foreground: Amount = 100.0
+    background_texture: Amount = 0.0
+    background_length: Positive = 1.0
+    foreground_texture: Amount = 0.0
+    foreground_length: Positive = 1.0
 
 
 @dataclass(frozen=True)
@@ -79,12 +73,12 @@ class Specimen(Checked):
     `clutter` is the number of specks per unit of volume; their height is a share of the contrast.
     """
 
-    dropout: Annotated[float, SHARE] = 0.0
-    dropout_length: Annotated[float, ABOVE_ZERO] = 1.0
-    dropout_loss: Annotated[float, SHARE] = 1.0
-    clutter: Annotated[float, FROM_ZERO] = 0.0
-    clutter_radius: Annotated[float, ABOVE_ZERO] = 1.0
-    clutter_height: Annotated[float, FROM_ZERO] = 1.0
+    dropout: Share = 0.0
+    dropout_length: Positive = 1.0
+    dropout_loss: Share = 1.0
+    clutter: Amount = 0.0
+    clutter_radius: Positive = 1.0
+    clutter_height: Amount = 1.0
 
 
 @dataclass(frozen=True)
@@ -94,19 +88,19 @@ class Optics(Checked):
     `growth` is the relative growth of the deviations, `attenuation` the loss of light, per unit of depth.
     """
 
-    blur: Annotated[Triple, FROM_ZERO] = (0.0, 0.0, 0.0)
-    growth: Annotated[float, FROM_ZERO] = 0.0
-    attenuation: Annotated[float, FROM_ZERO] = 0.0
+    blur: Amounts = (0.0, 0.0, 0.0)
+    growth: Amount = 0.0
+    attenuation: Amount = 0.0
 
 
 @dataclass(frozen=True)
 class Illumination(Checked):
     """Uneven light: a factor within 1 ± bias, smooth over `bias_length`; stripes along x, `stripes` their deviation."""
 
-    bias: Annotated[float, SHARE] = 0.0
-    bias_length: Annotated[float, ABOVE_ZERO] = 1.0
-    stripes: Annotated[float, FROM_ZERO] = 0.0
-    stripe_width: Annotated[float, ABOVE_ZERO] = 1.0
+    bias: Share = 0.0
+    bias_length: Positive = 1.0
+    stripes: Amount = 0.0
+    stripe_width: Positive = 1.0
 
 
 @dataclass(frozen=True)
@@ -117,9 +111,9 @@ class Noise(Checked):
     noise is smoothed by a Gaussian of deviations `width` (z, y, x), in voxels of the image.
     """
 
-    gaussian: Annotated[float, FROM_ZERO] = 0.0
-    rician: Annotated[float, FROM_ZERO] = 0.0
-    width: Annotated[Triple, FROM_ZERO] = (0.0, 0.0, 0.0)
+    gaussian: Amount = 0.0
+    rician: Amount = 0.0
+    width: Amounts = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -131,11 +125,11 @@ class Detector(Checked):
     numbers where it is None.
     """
 
-    gain: Annotated[float, FROM_ZERO] = 0.0
-    offset: Annotated[float, FINITE] = 0.0
-    rings: Annotated[float, FROM_ZERO] = 0.0
-    ring_width: Annotated[float, ABOVE_ZERO] = 1.0
-    ceiling: Annotated[float | None, ABOVE_ZERO] = None
+    gain: Amount = 0.0
+    offset: float = 0.0
+    rings: Amount = 0.0
+    ring_width: Positive = 1.0
+    ceiling: Annotated[float | None, Rule(above=0)] = None
 
 
 @dataclass(frozen=True)
@@ -148,57 +142,31 @@ class Imaging(Checked):
     """
 
     unit: str = "um"
-    spacing: Annotated[Triple, ABOVE_ZERO] = (1.0, 1.0, 1.0)
-    thickness: Annotated[float, FROM_ZERO] = 0.0
+    spacing: Positives = (1.0, 1.0, 1.0)
+    thickness: Amount = 0.0
     contrast: Contrast = Contrast()
     specimen: Specimen = Specimen()
     optics: Optics = Optics()
     illumination: Illumination = Illumination()
     noise: Noise = Noise()
     detector: Detector = Detector()
-    visible: Annotated[float, PARTIAL] = 0.0
+    visible: Share = 0.0
 
     def __post_init__(self) -> None:
-        if self.unit not in (*METRES, "voxel"):
-            raise ValueError(f"the unit must be {', '.join(METRES)} or voxel, got {quoted(self.unit)}")
-        for parameter in fields(self):
-            part, kind = getattr(self, parameter.name), type(parameter.default)
-            if is_dataclass(parameter.default) and not isinstance(part, kind):
-                raise ValueError(f"{parameter.name} must be of type {kind.__name__}, got {quoted(part)}")
         super().__post_init__()
+        check_choice(self.unit, (*METRES, "voxel"), f"a unit among {', '.join(METRES)} and voxel")
 
     def assign(self, values: Mapping[str, Any]) -> Imaging:
         """Return a copy with other values, by name: `imaging.assign({"optics.blur": (3, 1, 1), "visible": 0.1})`."""
-        if unknown := sorted(set(values) - set(NAMES)):
-            raise ValueError(f"an image has parameters such as optics.blur, got {', '.join(map(quoted, unknown))}")
         parts: dict[str, dict[str, Any]] = {"": {}}
         for name, value in values.items():
             part, _, parameter = name.rpartition(".")  # the part is "" for a parameter of the image itself
             parts.setdefault(part, {})[parameter] = value
         top = parts.pop("")
-        return replace(self, **top, **{name: replace(getattr(self, name), **part) for name, part in parts.items()})
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return all parameters in JSON's types, each part an object of its own."""
-        return encode(self)
-
-    @staticmethod
-    def from_dict(content: Mapping[str, Any]) -> Imaging:
-        """Return the image's parameters that `as_dict` wrote; those that are missing are as in `Imaging()`."""
-        return Imaging().assign(dict(_leaves(content)))
-
-
-def _leaves(content: Mapping[str, Any], part: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the names, such as `optics.blur`, and values in nested objects."""
-    for name, value in content.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{part}{name}.")
-        else:
-            yield f"{part}{name}", value
-
-
-#: The names of all parameters, those of a part as `optics.blur`.
-NAMES = tuple(name for name, _ in _leaves(asdict(Imaging())))
+        try:
+            return replace(self, **top, **{name: replace(getattr(self, name), **part) for name, part in parts.items()})
+        except (AttributeError, TypeError) as error:
+            raise ValueError(f"an image has parameters such as optics.blur, got {quoted(', '.join(values))}") from error
 
 
 @dataclass(frozen=True)
@@ -240,19 +208,10 @@ class Modality:
             values[name] = tuple(value.tolist()) if value.ndim else float(value)
         return self.base.assign(values)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return all of the modality in JSON's types."""
-        return encode(self)
-
-    @staticmethod
-    def from_dict(content: Mapping[str, Any]) -> Modality:
-        """Return the modality that `as_dict` wrote."""
-        return Modality(**{**content, "base": Imaging.from_dict(content["base"])})
-
 
 _PRESETS = yaml.safe_load(files("curvafit.data_synth.imaging").joinpath("modalities.yaml").read_text("utf-8"))
 #: The presets of `modalities.yaml` by name, as at the command line.
-MODALITIES = {name: Modality.from_dict({"name": name, **part}) for name, part in _PRESETS.items()}
+MODALITIES = {name: decode(Modality, {"name": name, **part}) for name, part in _PRESETS.items()}
 
 
 def modality(name: str) -> Modality:
