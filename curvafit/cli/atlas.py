@@ -15,16 +15,16 @@ if TYPE_CHECKING:
 
 atlas_app = typer.Typer(help="Collections of generated shapes to match scans against.", no_args_is_help=True)
 
-_Store = Annotated[Path, typer.Argument(help="Folder of the Zarr store.")]
+_Store = Annotated[Path, typer.Argument(help="Folder of the store.")]
 
 
 @command(
-    "curvafit atlas build store.zarr --count 1000 --shape 64",
-    "curvafit atlas build store.zarr --count 1500 --shape 64",
-    "curvafit atlas build box.zarr --design box.yaml --scheduler tcp://node1:8786",
+    "curvafit atlas build store --count 1000 --shape 64",
+    "curvafit atlas build store --count 1500 --shape 64",
+    "curvafit atlas build box --design box.yaml --scheduler tcp://node1:8786",
 )
 def build_atlas(
-    store: Annotated[Path, typer.Argument(help="Folder of the Zarr store; a store that exists is resumed.")],
+    store: Annotated[Path, typer.Argument(help="Folder of the store; a store that exists is resumed.")],
     count: Annotated[int, typer.Option(help="Number of viable shapes in the store at the end.")] = 1000,
     shape: Annotated[str, typer.Option(help="Voxels of a shape: N or Z,Y,X.")] = "64",
     seed: Annotated[int, typer.Option(help="Seed of the design.")] = 0,
@@ -50,7 +50,7 @@ def build_atlas(
     say(str(store))
 
 
-@command("curvafit atlas info store.zarr")
+@command("curvafit atlas info store")
 def info_atlas(store: _Store) -> None:
     """Show the content of a store, and how it was made."""
     from curvafit.data_synth.atlas import summarise
@@ -60,15 +60,13 @@ def info_atlas(store: _Store) -> None:
         say(f"{name}: {value}")
 
 
-@command("curvafit atlas verify store.zarr")
+@command("curvafit atlas verify store")
 def verify_atlas(store: _Store) -> None:
     """Check every draw of a store; exit with code 1 where one is missing, torn or changed."""
     from curvafit.data_synth.atlas import verify
 
     with show_stages() as progress:
         verdict = verify(store, progress)
-    for note in verdict.notes:
-        say(f"note: {note}")
     for problem in verdict.problems:
         say(f"error: {problem}", to=error_console())
     say(verdict.status)
@@ -76,7 +74,7 @@ def verify_atlas(store: _Store) -> None:
         raise typer.Exit(1)
 
 
-@command("curvafit atlas extract store.zarr -o atlas.npz", "curvafit atlas extract box.zarr corner.zarr -o atlas.npz")
+@command("curvafit atlas extract store -o atlas.npz", "curvafit atlas extract box corner -o atlas.npz")
 def extract_atlas(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, of one grid.")],
     out: Annotated[Path, typer.Option("-o", "--output", help="The atlas (.npz) to write.")],
@@ -95,8 +93,8 @@ def extract_atlas(
 
 
 @command(
-    "curvafit atlas describe store.zarr -o table.npz",
-    "curvafit atlas describe box.zarr corner.zarr -o table.npz",
+    "curvafit atlas describe store -o table.npz",
+    "curvafit atlas describe box corner -o table.npz",
 )
 def describe_atlas(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`.")],
@@ -142,8 +140,8 @@ def train_atlas(
 
 @command(
     "curvafit atlas teach mixed -o filler.npz",
-    "curvafit atlas teach mixed store.zarr --filler filler.npz -o more.npz",
-    "curvafit atlas teach mixed store.zarr --images 160 -o image.npz",
+    "curvafit atlas teach mixed store --filler filler.npz -o more.npz",
+    "curvafit atlas teach mixed store --images 160 -o image.npz",
 )
 def teach_filler(
     stores: Annotated[
@@ -183,8 +181,8 @@ def teach_filler(
 
 
 @command(
-    "curvafit atlas map store.zarr -o map.html",
-    "curvafit atlas map box.zarr corner.zarr --fit bone/fit.json --fit lung/fit.json -o map.html",
+    "curvafit atlas map store -o map.html",
+    "curvafit atlas map box corner --fit bone/fit.json --fit lung/fit.json -o map.html",
 )
 def map_atlas(
     stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, of one grid.")],

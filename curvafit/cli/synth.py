@@ -56,7 +56,7 @@ def parse_imaging(
 @command(
     "curvafit synth -o Dataset101_Tubes --preset tubes,sponge --modality confocal --count 200 --shape 96",
     "curvafit synth -o Dataset102_Bone --prior bone/fit.json --like bone.nii.gz --count 200 --shape 64",
-    "curvafit synth -o set --atlas store.zarr --modality micro-ct --layout monai --labels distance --shape 48",
+    "curvafit synth -o set --atlas store --modality micro-ct --layout monai --labels distance --shape 48",
 )
 def synth(
     out: Annotated[Path, _out("-o", "--output", help="Folder of the set; a set that exists is resumed.")],

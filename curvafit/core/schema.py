@@ -81,6 +81,7 @@ def _check_value(kind: Any, rule: Rule, value: Any) -> tuple[str, bool]:
         return _PLAIN[kind], isinstance(value, kind)
     if kind in (int, float):
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        is_number = is_number and (kind is float or value == int(value))
         is_within = is_number and rule.least <= value <= rule.most and rule.above < value < rule.below
         return _describe_number(rule), is_within
     if get_origin(kind) is Literal:

@@ -83,7 +83,6 @@ def build(
     plan, rule = named_schedule(schedule).as_dict(), (design or design_box()).as_dict()
     settings = Settings(grid.shape, grid.spacing, WORKING_EPSILON, WORKING_BLUR, rule, check_seed(seed), plan)
     store = open_store(store_path, settings)
-    store.want(count)
     viable = {index: store.viable(index) for index in store.indices()}
     indices = (index for index in itertools.count() if index not in viable)
     while (missing := count - sum(viable.values())) > 0:  # in rounds of as many as are missing: so the last is viable
@@ -137,39 +136,31 @@ def versions() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The outcome of `verify`: problems and notes, a sentence each, and a `status` in one sentence."""
+    """The outcome of `verify`: problems, a sentence each, and a `status` in one sentence."""
 
     problems: tuple[str, ...]
-    notes: tuple[str, ...]
     status: str
 
 
 def verify(path: str | Path, progress: Progress = silent) -> Verdict:
-    """Check that every draw of a store is there and matches its checksum.
+    """Check that every draw of a store up to the last is there, can be read and matches its checksums.
 
-    Missing draws are a problem of a finished store, and a note on one whose build was stopped. Raises FileNotFoundError
-    or ValueError where there is no store of this version.
+    Raises FileNotFoundError or ValueError where there is no store of this version.
     """
     store = open_store(path)
-    indices, viable = store.indices(), 0
-    problems, notes = [], []
+    indices, viable, problems = store.indices(), 0, []
     for checked, index in enumerate(indices):
         progress(f"{checked} of {len(indices)} draws checked", checked / len(indices))
-        viable += store.viable(index)
-        if not store.intact(index):
-            remedy = f"delete draws/{index:06d}, and a build makes it again"
-            problems.append(f"draw {index} does not match its checksum: {remedy}")
-    present = {int(entry.name) for entry in (store.path / "draws").iterdir() if entry.name.isdigit()}
-    torn = sorted(index for index in present - set(indices) if not store.has(index))  # a build may add some meanwhile
-    problems += [f"draw {index} is torn: a part is missing, or it is another draw" for index in torn]
-    missing = sorted(set(range(max(present, default=-1) + 1)) - present)
-    message = f"{len(missing)} draws are missing: {', '.join(map(str, missing[:9]))}"
-    if missing and viable >= store.wanted:
-        problems.append(message)
-    elif viable < store.wanted:
-        notes.append(f"{viable} of {store.wanted} shapes are made" + f"; {message}" * bool(missing))
+        if store.intact(index):
+            viable += store.viable(index)
+        else:
+            remedy = f"delete {index:06d}.npz, and a build makes it again"
+            problems.append(f"draw {index} is damaged, or another draw: {remedy}")
+    if missing := sorted(set(range(max(indices, default=-1))) - set(indices)):
+        names = ", ".join(map(str, missing[:9]))
+        problems.append(f"{len(missing)} draws are missing ({names}): run the build again")
     outcome = "nothing is wrong" if not problems else f"{len(problems)} things are wrong"
-    return Verdict(tuple(problems), tuple(notes), f"{len(indices)} draws, {viable} shapes checked: {outcome}")
+    return Verdict(tuple(problems), f"{len(indices)} draws, {viable} shapes checked: {outcome}")
 
 
 def summarise(store: Store) -> dict[str, str]:
@@ -179,7 +170,6 @@ def summarise(store: Store) -> dict[str, str]:
     makers = Counter(", ".join(f"{name} {version}" for name, version in record.versions.items()) for record in records)
     return {
         "shapes": str(viable),
-        "wanted": str(store.wanted),
         "draws": str(len(records)),
         "voxels": " x ".join(map(str, settings.shape)),
         "epsilon": f"{settings.epsilon:g} (voxel edges {', '.join(f'{edge:g}' for edge in settings.spacing)})",

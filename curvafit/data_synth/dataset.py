@@ -243,7 +243,7 @@ class TextureDataset(IterableDataset):
             normalise = NORMALISATIONS[normalise]
         self.normalise = normalise
         paths = tuple(Path(item) for item in sources if isinstance(item, (str, PathLike)))
-        from_stores = len(paths) == len(sources) and all(path.is_dir() or path.suffix == ".zarr" for path in paths)
+        from_stores = len(paths) == len(sources) and all(path.is_dir() for path in paths)
         if from_stores and volume_fraction is not None:
             raise ValueError("volume_fraction applies to laws only; the source is a store of shapes")
         laws = [] if from_stores else sources

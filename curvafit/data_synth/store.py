@@ -1,15 +1,14 @@
-"""A store of generated shapes: Zarr groups, one a draw, each visible whole or not at all.
+"""A store of generated shapes: a folder of plain files, one for each draw, whole or not there.
 
-Layout, version 2 (every attribute is JSON in a group's `zarr.json`)::
+Layout, version 3::
 
-    STORE/                 format, version, settings (shape, spacing, epsilon, blur, design, seed, schedule), and how
-                           many viable shapes are wanted
-    STORE/draws/000012/    the record of draw 12: parameters, mass, seed, steps, viability, energy, software versions;
-                           and the SHA-256 of all that and the field
-    STORE/draws/000012/field   the phase field, float32 (Z, Y, X), one checksummed chunk; absent where not viable
+    STORE/curvafit.json    format, version and settings (shape, spacing, epsilon, blur, design, seed, schedule)
+    STORE/000012.npz       draw 12: its record as JSON in `header` (parameters, mass, seed, steps, viability, energy,
+                           software versions); and `field`, float32 (Z, Y, X), absent where not viable
 
-A draw is written beside its place, flushed to disk and renamed into it, so that a killed process loses no more than the
-draw it was at. Draws that were not viable keep their record: a resumed build does not make them again.
+A draw is written beside its place, flushed to disk and linked into it, so that a killed process loses no more than the
+draw it was at; the checksums of NPZ files notice changed bytes. Draws that were not viable keep their record: a resumed
+build does not make them again.
 
 Fields are float32, not float16: the stationarity fit reads Hess u where |u| is near 1 and ∇u near 0, and there
 float16's half step of 2.4e-4 is a second difference of up to 1e-3 / Δx² = 10 in working units.
@@ -18,34 +17,33 @@ float16's half step of 2.4e-4 is a second difference of up to 1e-3 / Δx² = 10 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
-import math
 import os
 import shutil
 import time
+import zipfile
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-import zarr
-from zarr.codecs import BloscCodec, Crc32cCodec
 
-from curvafit.core.checks import SEEDS, check_float, check_int, quoted
-from curvafit.core.files import temporary_folder, write_content
-from curvafit.core.records import parse_json
-from curvafit.core.runtime import hold_signals
+from curvafit.core.checks import quoted
+from curvafit.core.files import temporary_folder
+from curvafit.core.records import Format, parse_json, read_member
+from curvafit.core.schema import Rule, decode, encode
 from curvafit.generation.result import Viability, is_well_formed
 from curvafit.generation.schedule import Schedule
-from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 
-FORMAT = "curvafit shapes"
-VERSION = 2
-#: Name, behind a dot, of an unfinished draw's folder.
-PARTIAL = "partial"
+STORE = Format("curvafit shapes", 3, "a store of shapes", remedy="build it anew in another folder")
+DRAW = Format("curvafit shape", title="a draw of a store")
+#: The record of the store.
+HEADER = "curvafit.json"
+#: A number that may be NaN.
+Unknown = Annotated[float, Rule(unknown=True)]
 
 
 @dataclass(frozen=True)
@@ -54,10 +52,10 @@ class Settings:
 
     shape: tuple[int, int, int]
     spacing: tuple[float, float, float]
-    epsilon: float
-    blur: float
+    epsilon: Annotated[float, Rule(above=0)]
+    blur: Annotated[float, Rule(least=0)]
     design: dict[str, Any]
-    seed: int
+    seed: Annotated[int, Rule(least=0)]
     schedule: dict[str, Any]
 
 
@@ -66,13 +64,13 @@ class Record:
     """The record of one draw: index, parameters, noise seed, steps made (fewer where rejected early), viability, final
     F_ε, the flow's status sentence, software versions and the seconds it took."""
 
-    index: int
+    index: Annotated[int, Rule(least=0)]
     coefficients: Coefficients
     mass: float
-    seed: int
-    steps: int
+    seed: Annotated[int, Rule(least=0)]
+    steps: Annotated[int, Rule(least=0)]
     viability: Viability
-    energy: float
+    energy: Unknown
     status: str
     versions: dict[str, str]
     seconds: float
@@ -86,128 +84,106 @@ class Store:
 
     @property
     def name(self) -> str:
-        """Return the name of the store's folder without the suffix, which names the store in atlases and tables."""
-        return self.path.resolve().name.removesuffix(".zarr")
-
-    @property
-    def wanted(self) -> int:
-        """Return how many viable shapes the store is to have."""
-        return int((_read_attributes(self.path) or {"wanted": 0})["wanted"])
-
-    def want(self, count: int) -> None:
-        """Raise the number of viable shapes that are wanted to `count`; for one process at a time."""
-        if count > self.wanted:
-            file = self.path / "zarr.json"
-            text = parse_json(file.read_bytes(), "a Zarr group", self.path)
-            text["attributes"]["wanted"] = count
-            write_content(file, json.dumps(text, indent=2))
+        """Return the name of the store's folder, which names the store in atlases and tables."""
+        return self.path.resolve().name
 
     def indices(self) -> list[int]:
-        """Return the draws with a complete record, in increasing order."""
-        names = (entry.name for entry in (self.path / "draws").iterdir())
-        return sorted(int(name) for name in names if name.isdigit() and self.has(int(name)))
+        """Return the draws, in increasing order."""
+        return sorted(int(path.stem) for path in self.path.glob("*.npz") if path.stem.isdigit())
 
     def has(self, index: int) -> bool:
-        """Return whether the store has a draw, complete."""
-        return bool(self._attributes(index))
+        """Return whether the store has a draw."""
+        return self._file(index).is_file()
 
     def record(self, index: int) -> Record:
         """Return the record of a draw; KeyError where the draw is missing, ValueError where it is damaged."""
-        attributes = self._require(index)
         try:
-            return _decode(attributes)
-        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            header = parse_json(self._member(index, "header").tobytes(), "a record", self._file(index))
+            record = decode(Record, header)
+            if record.index != index:
+                raise ValueError(f"it is draw {record.index}")
+        except ValueError as error:
             raise self._describe_damage("record", index, error) from error
+        return record
 
     def viable(self, index: int) -> bool:
-        """Return whether a draw is recorded as a shape; KeyError where the draw is missing."""
-        return self._require(index)["viability"]["viable"]
+        """Return whether a draw is recorded as a shape; errors as for `record`."""
+        return self.record(index).viability.viable
 
     def field(self, index: int) -> np.ndarray:
         """Return the phase field of a viable draw, float32 (Z, Y, X); KeyError and ValueError as for `record`."""
-        folder = self._folder(index) / "field"
-        if not self.has(index) or not folder.is_dir():
-            raise KeyError(f"{self.path} has no viable draw {index}")
         try:
-            array = zarr.open_array(store=str(folder), mode="r")
-            if array.shape != self.settings.shape or array.dtype != np.float32:
-                raise ValueError(f"{array.dtype} of shape {array.shape}")
-            return np.asarray(array[...])
-        except Exception as error:  # zarr and its codecs have many ways to say that a field is damaged
+            field = self._member(index, "field")
+            if field.shape != self.settings.shape or field.dtype != np.float32:
+                raise ValueError(f"{field.dtype} of shape {field.shape}")
+        except ValueError as error:
             raise self._describe_damage("field", index, error) from error
+        return field
 
     def intact(self, index: int) -> bool:
-        """Return whether a draw's record and field match their checksum; KeyError where the draw is missing."""
-        attributes = self._require(index)
+        """Return whether a draw's record, and its field if it is viable, are there and match their checksums."""
         try:
-            field = self.field(index) if attributes["viability"]["viable"] else None
-        except ValueError:  # a chunk that is truncated, or whose own checksum is wrong
+            if self.viable(index):
+                self.field(index)
+        except (KeyError, ValueError):
             return False
-        return _digest(attributes, field) == attributes["sha256"]
+        return True
 
     def write(self, record: Record, field: np.ndarray | None) -> bool:
         """Add a draw, whole or not at all; return False, and change nothing, where the store has it already.
 
         The phase field is float32 of the store's shape, or None where the draw is not viable.
         """
-        folder = self._folder(record.index)
         if self.has(record.index):
             return False
-        for leftover in (self.path / "draws").glob(f".{PARTIAL}*"):
+        for leftover in self.path.glob(".*"):
             if time.time() - leftover.stat().st_mtime > 600:  # a killed process left it
                 shutil.rmtree(leftover, ignore_errors=True)
-        with temporary_folder(self.path / "draws" / PARTIAL) as partial:
-            _write_draw(partial / folder.name, record, field)
-            if _publish(partial / folder.name, folder):
-                return True
-            if self.has(record.index):
-                return False
-            shutil.rmtree(folder)  # an incomplete draw is in its place
-            return _publish(partial / folder.name, folder)
+        # NumPy's numbers become Python's, and NaN and infinity null.
+        text = json.dumps(dataclasses.asdict(record), default=np.generic.item)
+        header, target = json.loads(text, parse_constant=lambda _: None), self._file(record.index)
+        with temporary_folder(target) as work:
+            DRAW.write(work / target.name, header, {} if field is None else {"field": field})
+            return _publish(work / target.name, target)
+
+    def _file(self, index: int) -> Path:
+        return self.path / f"{index:06d}.npz"
+
+    def _member(self, index: int, name: str) -> np.ndarray:
+        """Return the record (`header`) or the field of a draw; errors as for `record`."""
+        file = self._file(index)
+        if not file.is_file():
+            raise KeyError(f"{self.path} has no draw {index}")
+        try:
+            with zipfile.ZipFile(file) as archive:
+                present = f"{name}.npy" in archive.namelist()
+                member = read_member(archive, f"{name}.npy") if present else None
+        except Exception as error:  # zipfile, zlib and numpy raise a dozen types of error
+            raise ValueError(str(error)) from error
+        if member is None:
+            raise KeyError(f"{self.path} has no viable draw {index}")
+        return member
 
     def _describe_damage(self, part: str, index: int, error: Exception) -> ValueError:
         damage = f"the {part} of draw {index} in {self.path} is damaged ({quoted(str(error))})"
         return ValueError(f"{damage}: `curvafit atlas verify` lists such draws")
 
-    def _require(self, index: int) -> dict[str, Any]:
-        """Return a draw's attributes, or raise KeyError."""
-        if attributes := self._attributes(index):
-            return attributes
-        raise KeyError(f"{self.path} has no complete draw {index}")
-
-    def _folder(self, index: int) -> Path:
-        return self.path / "draws" / f"{index:06d}"
-
-    def _attributes(self, index: int) -> dict[str, Any]:
-        """Return a draw's attributes, none where a part of it is missing; the field is not read."""
-        folder = self._folder(index)
-        attributes = _read_attributes(folder) or {}
-        viability = attributes.get("viability")
-        viable = viability.get("viable") if isinstance(viability, dict) else None
-        complete = viable is False or (viable is True and (folder / "field/c/0/0/0").is_file())
-        return attributes if complete and attributes.get("index") == index and "sha256" in attributes else {}
-
 
 def open_store(path: str | Path, settings: Settings | None = None) -> Store:
-    """Open a store; with `settings`, create it where there is none.
+    """Open a store; with `settings`, create it where there is none, or an empty folder.
 
     Raises FileNotFoundError where there is none and no settings were given; ValueError where `path` holds something
     else, or a store of another version or of other settings.
     """
     path = Path(path)
-    if not path.exists() or (settings is not None and path.is_dir() and not any(path.iterdir())):
+    header = path / HEADER
+    if not header.exists():
+        if path.exists() and (settings is None or not _is_free(path)):
+            raise ValueError(f"{path} is not a store of shapes: it has no {HEADER}")
         if settings is None:
             raise FileNotFoundError(f"found no store of shapes at {path}")
-        _create(path, settings)
-    attributes = _read_attributes(path)
-    if attributes is None or attributes.get("format") != FORMAT:
-        raise ValueError(f"{path} is not a store of shapes")
-    if (version := attributes.get("version")) != VERSION:
-        raise ValueError(f"{path} is a store of version {quoted(version)}; this curvafit reads version {VERSION}")
-    try:
-        stored = _decode_settings(attributes)
-    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise ValueError(f"the header of the store {path} is damaged ({quoted(str(error))})") from error
+        STORE.write(header, {"settings": encode(settings)})
+    stored = STORE.read(header, lambda content, _: _decode_settings(content["settings"]))
     if settings is not None:
         # Draws do not depend on the schedule's name.
         old, new = (dataclasses.asdict(one) | {"schedule": one.schedule | {"name": ""}} for one in (stored, settings))
@@ -236,90 +212,24 @@ def check_same(stored: Any, wanted: Any, path: Path, name: str = "") -> None:
         raise ValueError(f"{path} was begun with {name} {stored} and not {wanted}: choose another folder, or delete it")
 
 
-def _decode_settings(attributes: dict[str, Any]) -> Settings:
-    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in attributes["settings"].items()}
-    settings = Settings(**values)
+def _decode_settings(content: Any) -> Settings:
+    settings = decode(Settings, content, "settings")
     Grid(settings.shape, settings.spacing)
-    sound = len(settings.shape) == len(settings.spacing) == 3 and bool(Schedule(**settings.schedule).steps)
-    least = min(settings.blur, settings.seed, int(attributes["wanted"]))
-    if not (sound and settings.epsilon > 0 and least >= 0):
-        raise ValueError("a setting is missing or negative")
+    Schedule(**settings.schedule)
     return settings
 
 
-def _create(path: Path, settings: Settings) -> None:
-    """Write an empty store, whole or not at all."""
-    exists = path.is_dir()  # an empty folder, which may be another disk's
-    with temporary_folder(path / "store" if exists else path) as partial:
-        header = {"format": FORMAT, "version": VERSION, "settings": dataclasses.asdict(settings), "wanted": 0}
-        with hold_signals():
-            zarr.create_group(store=str(partial / "store"), attributes=header)
-            zarr.create_group(store=str(partial / "store" / "draws"))
-        if exists:
-            for part in ("draws", "zarr.json"):
-                os.replace(partial / "store" / part, path / part)
-        else:
-            _publish(partial / "store", path)
+def _is_free(path: Path) -> bool:
+    """Return whether a folder is empty, but for files that a process is writing."""
+    return path.is_dir() and all(entry.name.startswith(".") for entry in path.iterdir())
 
 
-@hold_signals()  # Zarr writes in threads of its own, which would go on beside what cleans up
-def _write_draw(folder: Path, record: Record, field: np.ndarray | None) -> None:
-    content = dataclasses.asdict(record) | {"coefficients": record.coefficients.as_dict()}
-    # NumPy's numbers become Python's, and NaN and infinity null.
-    attributes = json.loads(json.dumps(content, default=np.generic.item), parse_constant=lambda _: None)
-    zarr.create_group(store=str(folder), attributes=attributes | {"sha256": _digest(attributes, field)})
-    if field is not None:
-        codecs = [BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"), Crc32cCodec()]
-        options = {"chunks": field.shape, "compressors": codecs, "dimension_names": ("z", "y", "x")}
-        zarr.create_array(store=str(folder / "field"), data=field, **options)
-
-
-def _publish(partial: Path, target: Path) -> bool:
-    """Flush a folder's files and rename it to `target`; return False where another process was first."""
-    for file in partial.rglob("*"):
-        if file.is_file():
-            with file.open("rb+") as handle:
-                os.fsync(handle.fileno())
+def _publish(file: Path, target: Path) -> bool:
+    """Give a finished file its name on the same disk; return False where another process was first."""
     try:
-        os.replace(partial, target)
-    except OSError:
-        if not target.is_dir():
-            raise
+        os.link(file, target)
+    except FileExistsError:
         return False
+    except OSError:  # a disk that knows no links
+        os.replace(file, target)
     return True
-
-
-def _read_attributes(folder: Path) -> dict[str, Any] | None:
-    """Return the attributes of the Zarr group in a folder, None where there is no readable one."""
-    try:
-        text = parse_json((folder / "zarr.json").read_bytes(), "a Zarr group", folder)
-    except (OSError, ValueError):
-        return None
-    attributes = text.get("attributes") if isinstance(text, dict) and text.get("node_type") == "group" else None
-    return attributes if isinstance(attributes, dict) else None
-
-
-def _digest(attributes: dict[str, Any], field: np.ndarray | None) -> str:
-    """Return the SHA-256 of a record as canonical JSON, and of the field's bytes."""
-    content = {name: value for name, value in attributes.items() if name != "sha256"}
-    checksum = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
-    checksum.update(b"" if field is None else np.ascontiguousarray(field).tobytes())
-    return checksum.hexdigest()
-
-
-def _decode(attributes: dict[str, Any]) -> Record:
-    viability = {field.name: attributes["viability"][field.name] for field in dataclasses.fields(Viability)}
-    numbers = {name: _number(value) for name, value in viability.items() if name not in ("viable", "reason")}
-    return Record(
-        **{name: check_int(attributes[name], name, 0, SEEDS - 1) for name in ("index", "seed", "steps")},
-        **{name: _number(attributes[name]) for name in ("mass", "energy", "seconds")},
-        coefficients=Coefficients(*(_number(attributes["coefficients"][name]) for name in NAMES)),
-        viability=Viability(**viability | numbers),
-        status=str(attributes["status"]),
-        versions=dict(attributes["versions"]),
-    )
-
-
-def _number(value: Any) -> Any:
-    """Return a number of a record; null is NaN."""
-    return math.nan if value is None else check_float(value, "a number")

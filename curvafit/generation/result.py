@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from curvafit.core.checks import as_tuple, quoted
 from curvafit.core.runtime import Pictured
+from curvafit.core.schema import Rule
 from curvafit.core.units import format_sampling
 from curvafit.generation.schedule import Schedule
 from curvafit.priors.coefficients import Coefficients
@@ -32,9 +34,9 @@ FORMED = (0.5, 2.0)
 class Viability:
     """The discrepancy ratio, max u and min u of a field, whether they are those of a shape, and the reason if not."""
 
-    discrepancy: float
-    highest: float
-    lowest: float
+    discrepancy: Annotated[float, Rule(unknown=True)]
+    highest: Annotated[float, Rule(unknown=True)]
+    lowest: Annotated[float, Rule(unknown=True)]
     viable: bool
     reason: str
 

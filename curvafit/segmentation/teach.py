@@ -27,7 +27,7 @@ from torch.utils.data import DataLoader, Dataset, Subset
 from curvafit.core.checks import check_int, check_seed
 from curvafit.core.files import write_atomically
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.data_synth.store import find_well_formed
+from curvafit.data_synth.store import HEADER, find_well_formed
 from curvafit.data_synth.textures import KINDS
 from curvafit.scan.grids import centre_distance
 from curvafit.segmentation.filler import (
@@ -263,7 +263,7 @@ def load_textures(
         if (kind := str(source)) in KINDS:
             shapes = [Texture(KINDS[kind](np.random.default_rng([*kind.encode(), k]))) for k in range(TEXTURES)]
             origin = {"seeds": TEXTURES}
-        elif (source / "draws").is_dir():
+        elif (source / HEADER).is_file():
             draws = find_well_formed((source,))
             shapes = [Texture(store.field(index)) for store, index in draws]
             settings = draws[0][0].settings

@@ -63,7 +63,7 @@ REFUSALS: dict[str, dict[str, str]] = {
     "segment scan.npy -o b.npy --prior tubes": {"--steps 0": "(see curvafit segment --help)"},
     "reconstruct scan.npy --prior tubes -o out.npy": {"--known 0,8 --first 2": "--first"},
     "atlas": {"frob": "(see curvafit atlas --help)"},
-    "atlas build s.zarr": {
+    "atlas build s": {
         f"--count {10**9}": "count", "--design wide.yaml": "spread", "--design odd.yaml": "spread",
         f"--workers {10**6}": "workers", "--workers 2 --scheduler tcp://x:1": "scheduler", "--shape 1e5": "memory",
         "--design box.yaml": "a10", "--design laughs.yaml": "", "--design nest.yaml": "", "--design code.yaml": "",
@@ -117,11 +117,11 @@ def test_a_refusal_is_one_sentence_and_nothing_is_begun(
 
 def test_a_set_without_any_case_is_removed(tmp_path: Path) -> None:
     """All that such images show of the stored shapes is background."""
-    store = exact_store(tmp_path / "s.zarr", 1).path
+    store = exact_store(tmp_path / "s", 1).path
     words = ["synth", "--atlas", store, "--modality", "confocal", "--workers", "0", "--shape", "1,1,2", "--voxel", 0.5]
     result = call(*words, "-o", tmp_path / "a" / "set")
     assert result.exit_code == 2 and "error: " in result.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["s.zarr"]
+    assert [path.name for path in tmp_path.iterdir()] == ["s"]
     (tmp_path / "mine").mkdir()
     assert call(*words, "-o", tmp_path / "mine").exit_code == 2
     assert list((tmp_path / "mine").iterdir()) == []

@@ -58,7 +58,7 @@ def test_a_fit_without_a_law_is_refused_by_all_that_take_one(tmp_path: Path, mon
                   "synth --modality confocal -o out"):  # fmt: skip
         refused(call(*words.split(), "--prior", "fit.json"), "law")
     Path("near.yaml").write_text("around: fit.json")
-    refused(call(*["atlas", "build", "out.zarr", "--design", "near.yaml", "--count", "1"]), "law")
+    refused(call(*["atlas", "build", "out", "--design", "near.yaml", "--count", "1"]), "law")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fit.json", "near.yaml", "scan.npy"]
 
 

@@ -21,7 +21,7 @@ QUICK = ["--modality", "confocal", "--count", "2", "--shape", "8,16,16", "--work
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return exact_store(tmp_path_factory.mktemp("shapes") / "s.zarr", 8).path
+    return exact_store(tmp_path_factory.mktemp("shapes") / "s", 8).path
 
 
 def made(folder: Path, *options: object) -> Any:
@@ -75,7 +75,7 @@ def test_a_set_of_inferred_shapes_like_a_scan(tmp_path):
 #: What is typed (FIT, STORE, MASK, TAKEN and NONE are files and folders), and a word of what is said of it.
 REFUSALS = {
     "--modality confocal": {
-        "--atlas NONE": "none.zarr", "": "--prior", "--prior tube": "preset", "--presets tubes --voxel 0.001": "1e+09",
+        "--atlas NONE": "none", "": "--prior", "--prior tube": "preset", "--presets tubes --voxel 0.001": "1e+09",
         "--presets tubes --volume-fraction 2": "volume fraction",
         "-o TAKEN --presets tubes": "folder",
     },
@@ -99,7 +99,7 @@ def places(tmp_path_factory: pytest.TempPathFactory, store: Path) -> dict[str, P
     (folder / "taken" / "notes.txt").write_text("mine")
     (folder / "m.nii.gz").touch()
     made_fit().save(folder / "fit.json")
-    names = {"FIT": "fit.json", "MASK": "m.nii.gz", "TAKEN": "taken", "NONE": "none.zarr", "OUT": "set"}
+    names = {"FIT": "fit.json", "MASK": "m.nii.gz", "TAKEN": "taken", "NONE": "none", "OUT": "set"}
     return {"STORE": store, **{name: folder / file for name, file in names.items()}}
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from calling import QUICK, call, done, made, refused
 from disk import tree
-from exact_store import exact_store
+from exact_store import SETTINGS, exact_store
 from found import made_inference
 
 from curvafit.data_synth.store import open_store
@@ -112,7 +112,7 @@ def test_infer_leaves_other_peoples_files(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_atlases_leave_other_peoples_files(tmp_path: Path) -> None:
-    store, folder = tmp_path / "store.zarr", thesis(tmp_path / "home.zarr")
+    store, folder = tmp_path / "store", thesis(tmp_path / "home.zarr")
     exact_store(store, 7)
     (tmp_path / "atlas.npz").write_text("mine")
     before = tree(tmp_path)
@@ -126,10 +126,10 @@ def test_atlases_leave_other_peoples_files(tmp_path: Path) -> None:
 def test_a_store_may_begin_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And records the number of steps that was asked for."""
     monkeypatch.setattr("curvafit.data_synth.atlas.build", build := Mock())
-    (tmp_path / "s.zarr").mkdir()
-    told = ["atlas", "build", tmp_path / "s.zarr", "--count", 1, "--shape", 12, "--workers", 0, "--schedule", "paper"]
+    (tmp_path / "s").mkdir()
+    assert open_store(tmp_path / "s", SETTINGS).indices() == open_store(tmp_path / "s").indices() == []
+    told = ["atlas", "build", tmp_path / "other", "--count", 1, "--shape", 12, "--workers", 0, "--schedule", "paper"]
     done(*told, "--steps", 700)
-    assert open_store(tmp_path / "s.zarr").indices() == []
     plan = build.call_args.args[4]
     assert (plan.name, plan.steps) == ("paper", 700)
 

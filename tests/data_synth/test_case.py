@@ -17,7 +17,7 @@ from curvafit.generation import loop as steering
 
 @pytest.fixture(scope="module")
 def recipe(tmp_path_factory: pytest.TempPathFactory) -> Recipe:
-    return flat_recipe(tmp_path_factory.mktemp("shapes") / "s.zarr")
+    return flat_recipe(tmp_path_factory.mktemp("shapes") / "s")
 
 
 def test_a_case_is_the_image_of_its_field(recipe):

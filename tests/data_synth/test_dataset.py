@@ -33,7 +33,7 @@ SHAPE = (12, 16, 20)
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return exact_store(tmp_path_factory.mktemp("shapes") / "s.zarr", 8).path
+    return exact_store(tmp_path_factory.mktemp("shapes") / "s", 8).path
 
 
 def brief(sample: Sample) -> str:
@@ -127,7 +127,7 @@ def test_one_number_is_a_cube_and_a_name_a_modality(store, tmp_path):
     loud = Modality("loud", "for tests", 1.0, Imaging(contrast=Contrast(foreground=1000.0)))
     pairs = TextureDataset(store, [QUIET, loud], SHAPE)
     assert {pairs[k].record["modality"] for k in range(12)} == {"quiet", "loud"}
-    four, record = exact_store(tmp_path / "s.zarr", 4), exact_record(4)
+    four, record = exact_store(tmp_path / "s", 4), exact_record(4)
     torn = dataclasses.replace(record, viability=dataclasses.replace(record.viability, highest=7.0))
     four.write(torn, exact_field(4))
     assert TextureDataset(four.path, "micro-ct", 12).recipes[0].source.draws == 3  # the well-formed ones of 4

@@ -84,7 +84,7 @@ def test_what_is_pooled_is_as_if_one_scan_had_shown_it() -> None:
 
 def test_a_table_has_each_view_of_each_shape(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     see(monkeypatch, *FAST)
-    store = exact_store(tmp_path / "store.zarr", 8)
+    store = exact_store(tmp_path / "store", 8)
     table = describe([store.path], tmp_path / "table.npz")
     viable = [index for index in range(8) if index % 7 != 2]
     rows = [(f"store/{index:06d}", view) for index in viable for view in FAST]
@@ -103,7 +103,7 @@ def test_a_table_has_each_view_of_each_shape(tmp_path: Path, monkeypatch: pytest
 
 def test_a_stopped_table_goes_on_and_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     see(monkeypatch, *FAST)
-    store = exact_store(tmp_path / "store.zarr", 4)
+    store = exact_store(tmp_path / "store", 4)
     whole = describe([store.path], tmp_path / "whole.npz")
     measured: list[int] = []
 
@@ -131,7 +131,7 @@ def test_a_stopped_table_goes_on_and_grows(tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.slow
 def test_workers_measure_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     see(monkeypatch, "mask", "scan")
-    store = exact_store(tmp_path / "store.zarr", 6)
+    store = exact_store(tmp_path / "store", 6)
     alone = describe([store.path], tmp_path / "alone.npz")
     with cluster(2) as workers:
         table = describe([store.path], tmp_path / "table.npz", workers=workers)
@@ -144,7 +144,7 @@ def test_workers_measure_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_a_view_without_a_surface_is_a_row_without_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     see(monkeypatch, "mask", "scan")
     monkeypatch.setitem(measuring.VIEWS, "scan", Mock(side_effect=ScanError("expected a surface, got none")))
-    table = describe([exact_store(tmp_path / "store.zarr", 2).path], tmp_path / "table.npz")
+    table = describe([exact_store(tmp_path / "store", 2).path], tmp_path / "table.npz")
     assert table.visible.views.tolist() == ["mask", "mask"]
     assert np.isnan(table.descriptors[table.views == "scan"]).all()
 
@@ -196,12 +196,12 @@ def test_damaged_tables_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_the_command_refuses_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    exact_store(tmp_path / "store.zarr", 1)
+    exact_store(tmp_path / "store", 1)
     np.savez(tmp_path / "mine.npz", a=1)
     for words, key in {
-        "store.zarr -o table.txt": ".npz",
-        "nothing.zarr -o table.npz": "store", "store.zarr -o mine.npz": "mine.npz",
-        "store.zarr store.zarr -o table.npz": "names",
+        "store -o table.txt": ".npz",
+        "nothing -o table.npz": "store", "store -o mine.npz": "mine.npz",
+        "store store -o table.npz": "names",
     }.items():  # fmt: skip
         refused(call("atlas", "describe", *words.split(), "--workers", 0), key, progress=True)
         assert not (tmp_path / "table.npz").exists()
@@ -211,9 +211,9 @@ def test_another_store_of_the_same_name_is_not_taken_for_the_first(tmp_path, mon
     see(monkeypatch, "field")
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
-    first, store = (exact_store(tmp_path / each / "s.zarr", 1).path for each in ("a", "b"))
+    first, store = (exact_store(tmp_path / each / "s", 1).path for each in ("a", "b"))
     describe([first], tmp_path / "t.npz")
-    header = store / "zarr.json"
+    header = store / "curvafit.json"
     header.write_text(header.read_text().replace('"seed": 3', '"seed": 4'))
     with pytest.raises(ValueError, match="store"):
         describe([store], tmp_path / "t.npz")

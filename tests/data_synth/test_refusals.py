@@ -38,7 +38,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Given:
     folder = tmp_path_factory.mktemp("shapes")
     (folder / "taken").mkdir()
     (folder / "taken" / "notes.txt").write_text("mine")
-    return Given(flat_recipe(folder / "s.zarr"), folder / "s.zarr", folder / "taken")
+    return Given(flat_recipe(folder / "s"), folder / "s", folder / "taken")
 
 
 RNG = np.random.default_rng(0)
@@ -61,7 +61,7 @@ REFUSALS: list[tuple[str, Callable[[Given], object]]] = [
     ("24 voxels", lambda g: g.set(FLAT, (25, 8, 8))), ("modality", lambda g: g.set([], 8)),
     ("length", lambda g: g.set(length=0)), ("normalis", lambda g: g.set(normalise="minmax")),
     ("volume_fraction", lambda g: g.set(volume_fraction=0.2)),
-    ("missing.zarr", lambda g: TextureDataset(g.taken / "missing.zarr", FLAT, 12)),
+    ("missing", lambda g: TextureDataset(g.taken / "missing", FLAT, 12)),
     ("mass", lambda g: TextureDataset(preset("tubes").coefficients, FLAT, 12)),
     ("preset", lambda g: TextureDataset("tubez", FLAT, 12)),
     ("3", lambda g: TextureDataset(3, FLAT, 12)),  # type: ignore[arg-type]

@@ -21,7 +21,7 @@ from curvafit.volumes.read import load, read_values
 
 @pytest.fixture(scope="module")
 def order(tmp_path_factory: pytest.TempPathFactory) -> SetSpec:
-    return SetSpec(flat_recipe(tmp_path_factory.mktemp("shapes") / "s.zarr"))
+    return SetSpec(flat_recipe(tmp_path_factory.mktemp("shapes") / "s"))
 
 
 def sums(folder: Path) -> dict[str, dict[str, str]]:

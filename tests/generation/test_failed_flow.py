@@ -95,8 +95,8 @@ def test_the_command_writes_nothing_of_it(tmp_path: Path, monkeypatch: pytest.Mo
 def test_the_atlas_records_it_as_not_viable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(atlas, "BARREN", 1)
     with pytest.raises(ValueError, match="not finite"):
-        atlas.build(tmp_path / "s.zarr", 1, 12, schedule=RUNAWAY)
-    store = open_store(tmp_path / "s.zarr")
+        atlas.build(tmp_path / "s", 1, 12, schedule=RUNAWAY)
+    store = open_store(tmp_path / "s")
     records = [store.record(index) for index in store.indices()]
     assert [record.viability.viable for record in records] == [False, False]
     assert all("not finite" in record.viability.reason and not np.isfinite(record.energy) for record in records)

@@ -83,6 +83,7 @@ def rounded(value: Any) -> Any:
 def files(folder: Path, before: set[Path]) -> dict[str, Any]:
     """Return the content of the files in a folder that are new."""
     stores = [path for path in folder.rglob("*.zarr") if path not in before]
+    stores += [path.parent for path in folder.rglob("000000.npz") if path.parent not in before]
     found: dict[str, Any] = {}
     for path in sorted(set(folder.rglob("*")) - before):
         inside = any(store in path.parents for store in stores)
@@ -97,6 +98,8 @@ def _content(path: Path) -> Any:
     from curvafit.volumes.read import load
 
     name = path.name.lower()
+    if (path / "000000.npz").exists():
+        return "folder"
     if name.endswith((".nii.gz", ".tif", ".npy", ".nrrd", ".mrc", ".zarr")):
         try:
             field = load(path)

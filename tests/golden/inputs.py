@@ -43,7 +43,7 @@ def make(folder: Path = FOLDER) -> None:
     np.savez_compressed(folder / "maps.npz", **values, mass=np.float32(-0.6))
     for name, spread in (("near.yaml", 0.05), ("around.yaml", 0.1)):
         (folder / name).write_text(f"around: tubes\nspread: {spread}\n")
-    store = folder / "store.zarr"
+    store = folder / "store"
     shutil.rmtree(store, ignore_errors=True)
     build = "--shape 20 --steps 200 --workers 0 --count 6 --design"
     done("atlas", "build", store, *build.split(), folder / "around.yaml")

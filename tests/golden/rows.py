@@ -41,12 +41,12 @@ COMMANDS = {
     "reconstruct-image": "reconstruct mask.nii.gz --every 5 --image scan.tif -o out.nii.gz",
     "reconstruct-labels": "reconstruct cells.tif --every 4 --labels all -o out.tif",
     "reconstruct-cells": "reconstruct cells.tif --every 4 --labels all --image light.tif -o out.tif",
-    "synth": "synth -o out --atlas store.zarr --modality confocal --shape 8,10,10 --count 2 --workers 0",
-    "synth-like": "synth -o out --atlas store.zarr --like scan.tif --shape 10 --count 2 --workers 0 --layout monai",
-    "atlas-build": "atlas build out.zarr --shape 16 --design near.yaml --steps 40 --count 2 --workers 0",
-    "atlas-info": "atlas info store.zarr", "atlas-verify": "atlas verify store.zarr",
-    "atlas-extract": "atlas extract store.zarr -o out.npz",
-    "atlas-describe": "atlas describe store.zarr -o out.npz --workers 0",
+    "synth": "synth -o out --atlas store --modality confocal --shape 8,10,10 --count 2 --workers 0",
+    "synth-like": "synth -o out --atlas store --like scan.tif --shape 10 --count 2 --workers 0 --layout monai",
+    "atlas-build": "atlas build out --shape 16 --design near.yaml --steps 40 --count 2 --workers 0",
+    "atlas-info": "atlas info store", "atlas-verify": "atlas verify store",
+    "atlas-extract": "atlas extract store -o out.npz",
+    "atlas-describe": "atlas describe store -o out.npz --workers 0",
 }  # fmt: skip
 #: Rows that agree less closely. A flow from noise is chaotic: on another processor it grows another shape of the law,
 #: of which few numbers are alike. An emulator's optimum is flat along some directions.
@@ -152,7 +152,7 @@ def _training(_: Path) -> dict[str, Any]:
     """Samples of a set without end."""
     from curvafit.data_synth import TextureDataset
 
-    pairs = TextureDataset(FOLDER / "store.zarr", ["confocal", "micro-ct"], (8, 10, 10), length=4, seed=3)
+    pairs = TextureDataset(FOLDER / "store", ["confocal", "micro-ct"], (8, 10, 10), length=4, seed=3)
     samples = [pairs.sample(number) for number in range(3)]
     return {
         "images": [volume(sample.image.numpy()) for sample in samples],

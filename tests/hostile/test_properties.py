@@ -136,7 +136,7 @@ FEW, MANY = (settings(DRAWN, max_examples=EXAMPLES or n, derandomize=not EXAMPLE
 #: Commands that fetch a file.
 FETCHING = {"demo", "samples get"}
 #: What is typed to draw, which is no table, and to teach, which takes hours.
-REFUSED = ("atlas map none.zarr -o out", "atlas train none.npz -o out.npz", "atlas teach none.zarr -o out.npz")
+REFUSED = ("atlas map none -o out", "atlas train none.npz -o out.npz", "atlas teach none -o out.npz")
 
 NUMBERS = "0 -0 1 -1 2 7 0.5 -0.5 1e-300 1e30 -1e30 1e300 nan inf -inf 18446744073709551616 1,2 0,0,1 1,2,3 -1,-1,-1"
 WORDS = (
@@ -289,8 +289,8 @@ MEMORY, SWOLLEN = 1 << 30, 2 << 30
 LAW = "generate --coefficients 1,2,6,-40,-40,400 --mass=-0.6 --shape 16"
 QUICK = f"{LAW} --steps 30"
 LONG = f"{LAW} --steps 120 --checkpoint run.pt --checkpoint-every 0 -o out.npy"
-SYNTH = "synth -o out --atlas store.zarr --modality confocal --shape 6 --count 3 --workers 0"
-BUILD = "atlas build out.zarr --shape 16 --design near.yaml --count 2 --workers 0"
+SYNTH = "synth -o out --atlas store --modality confocal --shape 6 --count 3 --workers 0"
+BUILD = "atlas build out --shape 16 --design near.yaml --count 2 --workers 0"
 SEGMENT = "segment scan.tif --prior tubes --steps 2"
 
 
@@ -428,6 +428,7 @@ def values(folder: Path) -> dict[str, bytes]:
     """The volumes that a command made, by name; all can be read, but for those that bear a temporary name."""
     names = [str(path.relative_to(folder)) for path in files_of(folder) if path.name.endswith((".npy", ".nii.gz"))]
     found = {name: load(folder / name).values.tobytes() for name in names if "/." not in f"/{name}"}
-    for path in folder.glob("out.zarr/draws/*/field"):
-        found[str(path.relative_to(folder))] = np.asarray(zarr.open_array(path, mode="r")[...]).tobytes()
+    for path in folder.glob("out/[0-9]*.npz"):
+        with np.load(path) as draw:
+            found[path.name] = draw["field"].tobytes() if "field" in draw else b""
     return found

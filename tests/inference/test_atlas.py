@@ -63,7 +63,7 @@ def balls(monkeypatch):
 def store(tmp_path_factory) -> building.Store:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(building, "generate", Balls())
-        return building.build(tmp_path_factory.mktemp("balls") / "s.zarr", 6, SHAPE, seed=2)
+        return building.build(tmp_path_factory.mktemp("balls") / "s", 6, SHAPE, seed=2)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def saved(atlas, tmp_path_factory) -> Path:
 
 def test_building_draws_in_order_until_enough_are_viable(tmp_path, balls):
     said = []
-    store = building.build(tmp_path / "s.zarr", 5, SHAPE, seed=1, progress=lambda *news: said.append(news))
+    store = building.build(tmp_path / "s", 5, SHAPE, seed=1, progress=lambda *news: said.append(news))
     records = [store.record(index) for index in store.indices()]
     assert store.indices() == list(range(len(records)))
     assert sum(record.viability.viable for record in records) == 5 and records[-1].viability.viable
@@ -96,18 +96,18 @@ def test_building_draws_in_order_until_enough_are_viable(tmp_path, balls):
 def test_an_interrupted_build_resumes_to_the_same_store_and_makes_no_draw_twice(tmp_path, monkeypatch):
     whole, first, second = Balls(), Balls(stop_after=4), Balls()
     monkeypatch.setattr(building, "generate", whole)
-    straight = building.build(tmp_path / "straight.zarr", 5, SHAPE)
+    straight = building.build(tmp_path / "straight", 5, SHAPE)
     monkeypatch.setattr(building, "generate", first)
     with pytest.raises(KeyboardInterrupt):
-        building.build(tmp_path / "s.zarr", 5, SHAPE)
+        building.build(tmp_path / "s", 5, SHAPE)
     monkeypatch.setattr(building, "generate", second)
-    resumed = building.build(tmp_path / "s.zarr", 5, SHAPE)
+    resumed = building.build(tmp_path / "s", 5, SHAPE)
     assert len(first.seeds) == 4 and first.seeds + second.seeds == whole.seeds
     assert resumed.indices() == straight.indices()
     for index in straight.indices():
         one, other = (dataclasses.replace(s.record(index), seconds=0) for s in (straight, resumed))
         assert one == other
-    building.build(tmp_path / "s.zarr", 5, SHAPE)
+    building.build(tmp_path / "s", 5, SHAPE)
     assert first.seeds + second.seeds == whole.seeds  # a finished store asks for nothing
 
 
@@ -115,7 +115,7 @@ def test_an_interrupted_build_resumes_to_the_same_store_and_makes_no_draw_twice(
 def test_a_real_draw_is_what_its_record_says(tmp_path):
     quick = dataclasses.replace(schedule("fast"), name="quick", steps=30)
     grid = Grid((16,) * 3)
-    store = open_store(tmp_path / "s.zarr", _settings(grid, quick))
+    store = open_store(tmp_path / "s", _settings(grid, quick))
     record = building.make_draw(store.path, 0)
     assert store.record(0) == record and record.versions == building.versions()
     assert 0 < record.steps <= 30 and np.isfinite(record.energy)
@@ -125,13 +125,13 @@ def test_a_real_draw_is_what_its_record_says(tmp_path):
 
 def test_wrong_counts_and_other_settings_are_refused(tmp_path, balls):
     with pytest.raises(ValueError, match="count"):
-        building.build(tmp_path / "s.zarr", 0, SHAPE)
+        building.build(tmp_path / "s", 0, SHAPE)
     with pytest.raises(ValueError, match="seed"):
-        building.build(tmp_path / "s.zarr", 1, SHAPE, seed=-1)
+        building.build(tmp_path / "s", 1, SHAPE, seed=-1)
     assert not list(tmp_path.iterdir())
-    building.build(tmp_path / "s.zarr", 1, SHAPE)
+    building.build(tmp_path / "s", 1, SHAPE)
     with pytest.raises(ValueError, match="seed"):
-        building.build(tmp_path / "s.zarr", 1, SHAPE, seed=3)
+        building.build(tmp_path / "s", 1, SHAPE, seed=3)
 
 
 def test_an_atlas_holds_what_the_store_does(store, atlas):
@@ -150,8 +150,8 @@ def test_an_atlas_holds_what_the_store_does(store, atlas):
 
 
 def test_an_atlas_of_two_stores_holds_both(tmp_path, balls):
-    one, other = (building.build(tmp_path / f"{name}.zarr", 2, SHAPE, seed=4) for name in ("one", "other"))
-    both = extract([one, tmp_path / "other.zarr"])
+    one, other = (building.build(tmp_path / f"{name}", 2, SHAPE, seed=4) for name in ("one", "other"))
+    both = extract([one, tmp_path / "other"])
     alone = [extract([store]) for store in (one, other)]
     assert both.ids == alone[0].ids + alone[1].ids and len(set(both.ids)) == 4
     np.testing.assert_array_equal(both.masses, np.concatenate([each.masses for each in alone]))
@@ -159,10 +159,10 @@ def test_an_atlas_of_two_stores_holds_both(tmp_path, balls):
 
 
 def test_stores_of_one_name_of_two_grids_or_without_shapes_make_no_atlas(tmp_path, balls):
-    one = building.build(tmp_path / "one.zarr", 1, SHAPE)
+    one = building.build(tmp_path / "one", 1, SHAPE)
     with pytest.raises(ValueError, match="names"):
         extract([one, one])
-    larger = open_store(tmp_path / "larger.zarr", _settings(Grid((24, 20, 20)), schedule("fast")))
+    larger = open_store(tmp_path / "larger", _settings(Grid((24, 20, 20)), schedule("fast")))
     with pytest.raises(ValueError, match="grid"):
         extract([one, larger])
     with pytest.raises(ValueError, match="well-formed"):
@@ -172,7 +172,7 @@ def test_stores_of_one_name_of_two_grids_or_without_shapes_make_no_atlas(tmp_pat
 def test_faint_and_over_sharp_shapes_stay_in_the_store_and_out_of_the_atlas(tmp_path, balls):
     for count, highest in enumerate((1.0, 0.4, 4.0, 1.5), 1):
         balls.highest = highest
-        store = building.build(tmp_path / "s.zarr", count, SHAPE)
+        store = building.build(tmp_path / "s", count, SHAPE)
     assert len(extract([store])) == 2 and sum(map(store.viable, store.indices())) == 4
 
 

@@ -48,7 +48,7 @@ NEEDED |= dict.fromkeys(("reconstruct-image", "reconstruct-cells"), "image")
 MORE = {
     "mask": "measure mask.nii.gz",
     "workers": "synth -o out --preset tubes --modality micro-ct --count 1 --shape 16",
-    "map": "atlas map store.zarr -o out",
+    "map": "atlas map store -o out",
     "remote": "measure https://example.org/scan.zarr",
 }
 

@@ -40,12 +40,12 @@ class Made(NamedTuple):
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     folder = tmp_path_factory.mktemp("map")
-    atlas = extract([exact_store(folder / "s.zarr", 16)])
+    atlas = extract([exact_store(folder / "s", 16)])
     like = dataclasses.replace(made_fit(), kind="mask", diagram=atlas.mask_diagrams[5])
     full = dataclasses.replace(like.morphometry, volume_fraction=0.8)
     paths = [like.save(folder / "fit.json")]
     paths += [dataclasses.replace(like, morphometry=full, diagram=like.diagram.mirrored).save(folder / "full.json")]
-    page = write([folder / "s.zarr"], folder / "map.html", fits=paths, command="curvafit atlas map <s>")
+    page = write([folder / "s"], folder / "map.html", fits=paths, command="curvafit atlas map <s>")
     found = re.search(r'id="data">(.*?)</script>', page.read_text(encoding="utf-8"), re.DOTALL)
     assert found
     return Made(page, atlas, json.loads(found[1]))
@@ -114,13 +114,13 @@ def test_a_solid_has_the_surface_where_it_was(made: Made) -> None:
 
 def test_what_cannot_be_mapped_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    exact_store(tmp_path / "s.zarr", 5)
+    exact_store(tmp_path / "s", 5)
     made_fit().save("bare.json")
     Path("mine.html").write_text("mine")
     for words, said in {
-        "none.zarr -o m.html": "none", "s.zarr -o m.html": "6 shapes", "s.zarr -o m": ".html",
-        "s.zarr -o mine.html": "overwrite", "s.zarr -o s.zarr/m.html": "input",
-        "s.zarr -o m.html --fit bare.json": "diagram", "s.zarr -o m.html --fit mine.html": "mine.html",
+        "none -o m.html": "none", "s -o m.html": "6 shapes", "s -o m": ".html",
+        "s -o mine.html": "overwrite", "s -o s/m.html": "input",
+        "s -o m.html --fit bare.json": "diagram", "s -o m.html --fit mine.html": "mine.html",
     }.items():  # fmt: skip
         refused(call("atlas", "map", *words.split()), said, progress=True)
         assert not Path("m.html").exists() and Path("mine.html").read_text() == "mine"

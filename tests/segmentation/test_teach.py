@@ -118,11 +118,11 @@ def test_teaching_lowers_the_loss_of_shapes_held_out(monkeypatch: pytest.MonkeyP
 
 def test_stores_masks_and_textures_teach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(room, "TEXTURES", 2)
-    build(tmp_path / "store.zarr", 2, (16, 16, 16), 0, schedule("fast", 300))
+    build(tmp_path / "store", 2, (16, 16, 16), 0, schedule("fast", 300))
     save(Volume((rods() > 0).astype(np.uint8)), tmp_path / "mask.npy")
-    sources, card = load_textures([tmp_path / "store.zarr", tmp_path / "mask.npy", "mixed"])
+    sources, card = load_textures([tmp_path / "store", tmp_path / "mask.npy", "mixed"])
     assert [source[-1].periodic for source in sources] == [True, False, *[True] * len(KINDS)]
-    assert [each["source"] for each in card["sources"]] == ["store.zarr", "mask.npy", *KINDS]
+    assert [each["source"] for each in card["sources"]] == ["store", "mask.npy", *KINDS]
     assert card["sources"][0]["shapes"] == len(sources[0]) >= 1 and "design" in card["sources"][0]
     nearly = np.zeros((8, 8, 8), np.uint8)
     nearly[4, 4, 4] = 1
@@ -140,7 +140,7 @@ def test_the_command_teaches_and_refuses(tmp_path: Path, monkeypatch: pytest.Mon
     assert "200" in result.stderr and Taught.load(target).card["steps"] == 2
     assert not list(tmp_path.glob(".*"))
     refused(call("atlas", "teach", tmp_path / "mask.npy", "-o", tmp_path / "filler.txt"), "npz")
-    refused(call("atlas", "teach", tmp_path / "none.zarr", "-o", tmp_path / "new.npz"), "none")
+    refused(call("atlas", "teach", tmp_path / "none", "-o", tmp_path / "new.npz"), "none")
     new = ("atlas", "teach", tmp_path / "mask.npy", "-o", tmp_path / "new.npz", "--steps", 2, "--filler")
     refused(call(*new, tmp_path / "mask.npy"), "mask.npy")
     assert not (tmp_path / "new.npz").exists()
