@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from curvafit.cli.console import command_line, print_table, say, say_notes, show_stages
-from curvafit.cli.options import Group, OverwriteOption, PanelsOption, Reading, Structure, command, parse_panels
+from curvafit.cli.options import Group, OverwriteOption, Reading, Structure, command
 
 
 def parse_tests(
@@ -50,7 +50,6 @@ def compare(
     *,
     structure: Structure,
     reading: Reading,
-    panels: PanelsOption = None,
     tests: Annotated[dict[str, Any], Group(parse_tests)],
     workers: Annotated[int, typer.Option(help="Processes that measure; 0 is this one.")] = 0,
     overwrite: OverwriteOption = False,
@@ -60,7 +59,6 @@ def compare(
         from curvafit.report.comparison import check_comparison, write_comparison
         from curvafit.studies.comparison import compare as compare_scans
 
-        shown = parse_panels(panels)
         check_comparison(out, [*scans, *([] if subjects is None else [subjects])], overwrite, command_line())
         settings: dict[str, Any] = {**tests, "subjects": subjects}
         settings |= {"roi": regions, "workers": workers, "progress": progress, "paired": paired}
@@ -69,7 +67,7 @@ def compare(
         groups = [scans] if isinstance(labels, list) else scans
         comparison = compare_scans(*groups, by=labels, **structure, **settings, **reading)
         progress("drawing the page", 1.0)
-        page = write_comparison(comparison, out, panels=shown, command=command_line(), overwrite=overwrite)
+        page = write_comparison(comparison, out, command=command_line(), overwrite=overwrite)
     say_notes(comparison.notes)
     say(comparison.status, style="bold")
     from curvafit.core.units import format_number, power_name

@@ -16,11 +16,9 @@ from curvafit.cli.options import (
     FILES,
     Group,
     OverwriteOption,
-    PanelsOption,
     Reading,
     Structure,
     command,
-    parse_panels,
     parse_structure,
     parse_whole_triple,
 )
@@ -58,10 +56,9 @@ def parse_page(
     graph: Annotated[
         bool, typer.Option("--graph", help="Of one scan: its centreline with branches, into the folder -o.")
     ] = False,
-    panels: PanelsOption = None,
 ) -> dict[str, Any]:
     """Return what stands in the folder of a page besides the numbers."""
-    return {"maps": maps, "graph": graph, "panels": panels}
+    return {"maps": maps, "graph": graph}
 
 
 @command(
@@ -104,9 +101,9 @@ def measure(
     """Measure scans in seconds: morphometry, fabric and curvature in physical units, with 95 % intervals."""
     folder = _choose_folder(out, labels, subjects)
     if any(page.values()) and grid is not None:
-        raise ValueError("--maps, --graph and --panels are of a scan as a whole: leave out --windows")
+        raise ValueError("--maps and --graph are of a scan as a whole: leave out --windows")
     if any(page.values()) and folder is None:
-        raise ValueError("--maps, --graph and --panels are for a page: give a name without a suffix with -o")
+        raise ValueError("--maps and --graph are for a page: give a name without a suffix with -o")
     if (page["maps"] or page["graph"]) and len(scans) > 1:
         raise ValueError("--maps and --graph are of one scan: give one")
     if page["graph"] and (roi is not None or structure["periodic"]):
@@ -144,7 +141,7 @@ def _write_page(
         from curvafit.report.measures import check_measures, write_measures
         from curvafit.studies.scans import check_units, count_notes, measure_each
 
-        options["maps"], panels = shown["maps"] or shown["graph"], parse_panels(shown["panels"])
+        options["maps"] = shown["maps"] or shown["graph"]
         check_measures(folder, _inputs(scans, options.get("roi"), subjects), overwrite, command_line())
         check_units(scans, sub_progress(progress, 0.0, 0.05), **reading)
         columns = _read_subjects(subjects, scans)
@@ -161,7 +158,7 @@ def _write_page(
         recorded = {name: value for name, value in options.items() if name not in ("store", "labels", "workers")}
         recorded |= {"maps": shown["maps"], "graph": shown["graph"]}
         settings: dict[str, Any] = {"options": recorded | reading, "command": command_line(), "overwrite": overwrite}
-        page = write_measures(results, folder, columns=columns, panels=panels, **traced, **settings)
+        page = write_measures(results, folder, columns=columns, **traced, **settings)
     say_notes(tuple(count_notes(results)))
     say(str(page))
 

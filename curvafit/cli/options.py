@@ -68,23 +68,6 @@ def command(*examples: str) -> Callable[[Callable[..., None]], Callable[..., Non
     return decorate
 
 
-def parse_panels(text: str | None) -> tuple[str, ...]:
-    """Return the symbols of quantities between commas, in the order of the text; ValueError where one is unknown."""
-    from curvafit.core.checks import check_choice
-    from curvafit.scan.measures import QUANTITIES
-
-    known = {word: symbol for name, symbol, *_ in QUANTITIES for word in (name, symbol)}
-    words = [word.strip() for word in (text or "").split(",") if word.strip()]
-    for word in words:
-        check_choice(word, known, f"panels among {', '.join(dict.fromkeys(known.values()))}")
-    return tuple(dict.fromkeys(known[word] for word in words))
-
-
-PanelsOption = Annotated[
-    str | None, typer.Option("--panels", help="Numbers that the figure shows: BV/TV,Tb.Th.", metavar="SYMBOLS")
-]
-
-
 class Group(NamedTuple):
     """A parameter that is made from several options, `Annotated[dict[str, Any], Group(make)]`: those of `make`."""
 

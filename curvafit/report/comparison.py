@@ -47,9 +47,7 @@ FILES = ("compare.json", "compare.html", "measures.csv", "wide.csv", "numbers.cs
 FILES += ("difference.svg", "difference.png", "numbers.svg", "numbers.png", "outlines.svg", "outlines.png")
 #: Colours of what is less and of what is more.
 MORE = LinearSegmentedColormap.from_list("more", [plot.FIRST, "#8CC0E0", "#FFFFFF", "#F0B48A", plot.SECOND])
-#: Larger and smaller panels of numbers in a row.
-LARGE, SMALL = 4, 7
-#: Letters of groups' names that a panel has room for, and diagrams that a row has.
+#: Letters of groups' names that a panel has room for, and diagrams or panels in a row.
 WORDS, ROW = 28, 4
 #: Returns the folder if `write_comparison` can write there, else raises ValueError; call it before the work.
 check_comparison = partial(check_result_folder, FORMAT, FILES)
@@ -59,15 +57,13 @@ def write_comparison(
     comparison: Comparison,
     directory: str | Path,
     *,
-    panels: Sequence[str] = (),
     command: str = "",
     overwrite: bool = False,
 ) -> Path:
     """Write the page, figures, tables and record of a comparison into a folder, and return the page's path.
 
     The files (`FILES`) are moved into the folder once all are whole. Those of the same command are replaced;
-    others are a ValueError without `overwrite`. `panels` are the symbols of the numbers that the figure shows, by
-    default all; `command` is what the record calls the command line.
+    others are a ValueError without `overwrite`. `command` is what the record calls the command line.
     """
     target = check_comparison(directory, overwrite=overwrite, command=command)
     c, tests = comparison, list(_test_rows(comparison))
@@ -95,7 +91,7 @@ def write_comparison(
     outlines = outlines_figure(name_parts(c.measures), [scan.outline for scan in c.measures], c.unit)
     figures = {
         "difference": (comparison_figure(c), "Mean curvature diagrams and their difference"),
-        "numbers": (numbers_figure(c, panels), f"Each number by {c.by}"),
+        "numbers": (numbers_figure(c), f"Each number by {c.by}"),
         "outlines": (outlines, "Three slices of each scan, and the outline of its structure"),
     }
     columns = [{"subject": case.subject, label: case.label} for case in c.cases]
@@ -243,15 +239,14 @@ def _outline_on(axes: Axes, edges: np.ndarray, inside: np.ndarray) -> None:
     axes.add_collection(LineCollection(list(np.concatenate(lines)), colors=plot.INK, linewidths=1.2, zorder=3.5))
 
 
-def numbers_figure(comparison: Comparison, symbols: Sequence[str] = ()) -> Figure:
-    """Return a figure of each quantity, or of some: subjects by group or over the number, with the 95 % intervals of
-    their scans.
+def numbers_figure(comparison: Comparison) -> Figure:
+    """Return a figure of each quantity: subjects by group or over the number, with the 95 % intervals of their scans.
 
     A long line is a group's mean, or the regression line; a thin line joins the values of one subject in paired groups.
     The names of quantities that differ significantly, all tested, are bold.
     """
     c = comparison
-    figure, panels = _panels(c, symbols)
+    figure, panels = _draw_panels(c)
     pairs = [] if c.blocks is None else [np.flatnonzero(c.blocks == block) for block in np.unique(c.blocks)]
     x = np.array(c.labels, dtype=float)
     for group, count in enumerate(c.counts if c.groups and not pairs else ()):
@@ -292,33 +287,21 @@ def numbers_figure(comparison: Comparison, symbols: Sequence[str] = ()) -> Figur
     return figure
 
 
-def _panels(comparison: Comparison, symbols: Sequence[str]) -> tuple[Figure, dict[int, Axes]]:
-    """Return a figure and its panel for each number by its index, with the tests above it; those named, or else the
-    familiar ones, are first and larger."""
-    numbers, ranks = comparison.numbers, {symbol: k for k, symbol in enumerate(symbols or plot.FIRST_SHOWN)}
+def _draw_panels(comparison: Comparison) -> tuple[Figure, dict[int, Axes]]:
+    """Return a figure and its panel for each number by its index, `FIRST_SHOWN` first, with the tests above it."""
+    numbers, ranks = comparison.numbers, {symbol: k for k, symbol in enumerate(plot.FIRST_SHOWN)}
     order = sorted(range(len(numbers)), key=lambda k: ranks.get(numbers[k].symbol, len(ranks)))
-    familiar = sum(number.symbol in ranks for number in numbers)
-    order = order[:familiar] if symbols else order
-    large_rows, small_rows = math.ceil(familiar / LARGE), math.ceil((len(order) - familiar) / SMALL)
-    across = min(LARGE, familiar) if symbols else LARGE
-    figure = plot.make_figure(3.3 * across, 3.1 * large_rows + 2.5 * small_rows + 0.4, layout="constrained")
-    heights = max(3.1 * large_rows, 0.01), max(2.5 * small_rows, 0.01)
-    halves = figure.add_gridspec(2, 1, height_ratios=heights)
-    large, small = halves[0].subgridspec(max(large_rows, 1), across), halves[1].subgridspec(max(small_rows, 1), SMALL)
-    panels: dict[int, Axes] = {}
-    for rank, k in enumerate(order):
-        number, is_large = numbers[k], rank < familiar
-        cell = large[divmod(rank, across)] if is_large else small[divmod(rank - familiar, SMALL)]
-        axes = figure.add_subplot(cell)
-        unit = power_name(comparison.unit, number.power)
+    rows = math.ceil(len(order) / ROW)
+    figure = plot.make_figure(3.3 * ROW, 3.1 * rows + 0.4, layout="constrained")
+    panels = {k: figure.add_subplot(rows, ROW, place) for place, k in enumerate(order, 1)}
+    for k, axes in panels.items():
+        number, unit = numbers[k], power_name(comparison.unit, numbers[k].power)
         weight = "bold" if number.family <= LEVEL else "normal"
-        title = number.symbol + (f" ({unit})" if unit else "")
-        axes.set_title(title, fontsize=11 if is_large else 9.5, fontweight=weight, pad=26)
+        axes.set_title(number.symbol + (f" ({unit})" if unit else ""), fontsize=11, fontweight=weight, pad=26)
         label = f"{comparison.effect} = {format_number(number.effect, 2)}, p = {format_number(number.p, 2)}"
         label += f"\nfamily-wise p = {format_number(number.family, 2)}"
         axes.annotate(label, (0.5, 1), (0, 3), "axes fraction", "offset points", ha="center", va="bottom", fontsize=7.5)
         axes.yaxis.set_major_locator(MaxNLocator(4))
         axes.tick_params(length=2, labelsize=8)
         axes.spines[:].set_color(plot.QUIET)
-        panels[k] = axes
     return figure, panels

@@ -67,7 +67,6 @@ def write_measures(
     *,
     columns: Sequence[Mapping[str, str]] | None = None,
     options: Mapping[str, Any] | None = None,
-    panels: Sequence[str] = (),
     centreline: Centreline | None = None,
     maps: bool = True,
     command: str = "",
@@ -77,9 +76,8 @@ def write_measures(
 
     Lengths are in the first scan's unit. A scan with compartments has a row for each of them. The files (`FILES`) are
     moved into the folder once all are whole; those of the same command are replaced, others are a ValueError without
-    `overwrite`. `columns` has further columns of each scan, such as its subject; `panels` are the symbols of numbers
-    that the figure shows; `centreline` is the first scan's, whose `maps` are written if it has some; `options` and
-    `command` are for the record.
+    `overwrite`. `columns` has further columns of each scan, such as its subject; `centreline` is the first scan's,
+    whose `maps` are written if it has some; `options` and `command` are for the record.
     """
     if not measures:
         raise ValueError("expected at least one scan, got none")
@@ -107,8 +105,7 @@ def write_measures(
                     "outlines": max(0, len(measures) - MOST_OUTLINES)},
     }  # fmt: skip
     diagrams = diagrams_figure(names[:MOST_DIAGRAMS], parts[:MOST_DIAGRAMS])
-    shown = panels or plot.FIRST_SHOWN
-    intervals = intervals_figure(names[:MOST_ROWS], parts[:MOST_ROWS], shown) if len(parts) > 1 else None
+    intervals = intervals_figure(names[:MOST_ROWS], parts[:MOST_ROWS]) if len(parts) > 1 else None
     outlines = outlines_figure(name_parts(measures), [scan.outline for scan in measures], unit)
     figures = {
         "outlines": (outlines, "Three slices of each scan, and the outline of its structure"),
@@ -234,15 +231,13 @@ def diagrams_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figur
     return figure
 
 
-def intervals_figure(names: Sequence[str], measures: Sequence[Measures], symbols: Sequence[str]) -> Figure:
-    """Return a figure of numbers of scans of one unit, a row for each scan, with 95 % intervals."""
-    rows, columns = math.ceil(len(symbols) / PANELS), min(PANELS, len(symbols))
-    figure = plot.make_figure(3.0 * columns, rows * (0.9 + 0.19 * max(len(names), 4)), layout="constrained")
-    panels = figure.subplots(rows, columns, sharey=True, squeeze=False)
+def intervals_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figure:
+    """Return a figure of the numbers `FIRST_SHOWN` of scans of one unit, a row for each scan, with 95 % intervals."""
+    rows = math.ceil(len(plot.FIRST_SHOWN) / PANELS)
+    figure = plot.make_figure(3.0 * PANELS, rows * (0.9 + 0.19 * max(len(names), 4)), layout="constrained")
+    panels = figure.subplots(rows, PANELS, sharey=True)
     heights = range(len(names), 0, -1)  # the first scan on top
-    for axes in panels.ravel()[len(symbols) :]:
-        axes.set_axis_off()
-    for axes, symbol in zip(panels.ravel(), symbols, strict=False):
+    for axes, symbol in zip(panels.ravel(), plot.FIRST_SHOWN, strict=True):
         quantities = [scan[symbol] for scan in measures]
         values = np.array([quantity.value for quantity in quantities])
         halves = np.nan_to_num([quantity.half for quantity in quantities])
