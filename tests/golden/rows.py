@@ -18,7 +18,7 @@ from tests.golden.frozen import CLOSE, exact, files, rounded, volume
 Row = Callable[[Path], dict[str, Any]]
 #: Commands, as they are typed in a folder with the inputs.
 COMMANDS = {
-    "measure-mask": "measure mask.nii.gz -o out.csv", "measure-field": "measure field.nii.gz --periodic -o out.json",
+    "measure-mask": "measure mask.nii.gz -o out.csv", "measure-field": "measure field.nii.gz --periodic -o out.csv",
     "measure-image": "measure scan.tif -o out.csv",
     "measure-dark": "measure scan.tif --dark --threshold 115 -o out.csv",
     "measure-roi": "measure scan.tif --roi halves.nii.gz -o out.csv",

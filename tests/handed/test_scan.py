@@ -14,7 +14,7 @@ from scipy import ndimage
 
 import curvafit
 from curvafit.core.runtime import log_stages
-from curvafit.scan.measures import COLUMNS, measure_surface
+from curvafit.scan.measures import measure_surface
 from curvafit.studies.scans import format_csv
 from curvafit.volumes.volume import Volume
 

@@ -281,7 +281,7 @@ KINDS = st.sampled_from(["f8", "f4", "f2", "i8", "u8", "i1", "u2", "?", "c16", "
 def test_any_array_is_measured_or_refused(data: st.DataObject, kind: str, shape: tuple[int, ...]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         np.save(Path(folder, "scan.npy"), data.draw(arrays(kind, shape)))
-        obey(Path(folder), ["measure", "scan.npy", "-o", "out.json"])
+        obey(Path(folder), ["measure", "scan.npy", "-o", "out.csv"])
 
 
 #: Bytes that a command may map beyond what its libraries do, and zeros that a bomb swells to.
