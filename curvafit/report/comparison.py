@@ -36,7 +36,7 @@ from curvafit.report.page import (
 )
 from curvafit.scan.measures import Measures
 from curvafit.studies.comparison import LEVEL, Comparison, Number, join_names
-from curvafit.studies.scans import THRESHOLD, list_wide, merge_notes
+from curvafit.studies.scans import list_wide, merge_notes
 
 #: `format` of a comparison's record.
 FORMAT = Format("curvafit comparison", 1, title="the record of a comparison")
@@ -112,13 +112,7 @@ def describe_measures(measures: Sequence[Measures], **values: Any) -> str:
     It is `templates/methods.txt`, filled with `values`.
     """
     how = {"mask": "masks were taken as they are", "field": "phase fields were split at 0"}
-    stated = [match for scan in measures for note in scan.notes if (match := THRESHOLD.search(note))]
-    how["image"] = (
-        f"grey levels were smoothed by one voxel and split at {stated[0][1] if stated else 'a given'} threshold"
-    )
-    if stated:
-        low, high = (extreme((match[2] for match in stated), key=float) for extreme in (min, max))
-        how["image"] += f", {low}" if low == high else f", {low} to {high}"
+    how["image"] = "grey levels were smoothed by one voxel and split at a threshold"
     kinds = join_names([how[kind] for kind in dict.fromkeys(scan.kind for scan in measures)])
     sampled = [replace(scan, notes=scan.notes[:1]) for scan in measures]  # the first note states the voxels
     sampling = "; ".join(note.rstrip(".") for _, note in merge_notes(sampled))

@@ -22,7 +22,7 @@ from curvafit.geometry.diagrams import FAMILIES, Diagram
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.scan.measures import QUANTITIES, SURE, Measures, find_quantity, interval_reach
 from curvafit.scan.structure import check_options
-from curvafit.studies.scans import Case, Group, gather_notes, list_cases, measure_scans, note_thresholds
+from curvafit.studies.scans import Case, Group, gather_notes, list_cases, measure_scans
 
 #: Most arrangements of the labels that are tried; all are, where there are no more.
 PERMUTATIONS = 9999
@@ -357,7 +357,7 @@ def _compare_measures(
         sides=sides, diagrams=means, apart=_apart(embeddings, sides), by_chance=float(np.quantile(by_chance, SURE)),
         edges=edges, differences=differences, bins_p=bins_p,
         permutations=len(arrangements), exact=exact, options=options,
-        notes=(*notes, *(note_thresholds(measures, cases) if groups else ()), *gather_notes(measures, cases)),
+        notes=(*notes, *gather_notes(measures, cases)),
     )  # fmt: skip
 
 

@@ -18,7 +18,6 @@ from functools import partial
 from itertools import permutations
 from os import PathLike
 from pathlib import Path
-from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,10 +47,6 @@ ALIKE_EDGES = 0.1
 THICK = 10.0
 #: What is done with one scan, given its progress; workers need a function that can be pickled.
 Task = Callable[[Progress], Any]
-#: Whose threshold, and which, a scan's note states.
-THRESHOLD = re.compile(r"split at (Otsu's|the given) threshold of (-?[\d.]+(?:e[-+]?\d+)?)")
-#: Medians of groups' thresholds differ where one is so many times the other; the most groups that are named.
-APART, MOST_THRESHOLDS = 1.1, 6
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 #: Further columns in rows of a part of a scan.
 OF_PARTS = ("compartment", "instance")
@@ -462,18 +457,6 @@ def gather_notes(measures: Sequence[Measures], cases: Sequence[Case]) -> Iterato
         first, others = cases[scans[0]].name, len(scans) - 1
         some = f"{first} and {others} more" if others else first
         yield f"{some if len(scans) < len(cases) else f'All {len(cases)} scans'}: {note}"
-
-
-def note_thresholds(measures: Sequence[Measures], cases: Sequence[Case]) -> Iterator[str]:
-    """Yield a note where groups were split at different thresholds, which are then part of what differs."""
-    levels: dict[str, list[float]] = {}
-    for scan, case in zip(measures, cases, strict=True):
-        found = [float(match[2]) for note in scan.notes if (match := THRESHOLD.search(note))]
-        levels.setdefault(str(case.label), []).extend(found)
-    middles = [median(each) for each in levels.values() if each]
-    if 1 < len(middles) <= MOST_THRESHOLDS and max(middles) > APART * min(middles):
-        each = ", ".join(f"{name} {min(of):.4g} to {max(of):.4g}" for name, of in levels.items() if of)
-        yield f"Thresholds differ with the groups: {each}. Where grey levels are comparable give one by --threshold."
 
 
 def merge_notes(measures: Sequence[Measures]) -> Iterator[tuple[list[int], str]]:

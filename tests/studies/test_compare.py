@@ -492,24 +492,3 @@ def test_methods_can_be_copied(shapes: Comparison) -> None:
     assert 90 <= len(text.split()) <= 140
     assert "32 x 32 x 32 voxels of 0.01 mm" in text and "all 70 permutations of groups" in text
     assert not re.search(r"p = |E = |Of curvature|Dropped", text)
-
-
-def test_groups_that_are_split_at_different_thresholds_are_named(tmp_path: Path) -> None:
-    """A brighter group may differ by its brightness alone; methods state the range."""
-    groups = {}
-    for name, bright in (("dim", 60.0), ("lit", 120.0)):
-        levels = [bright + 40 * np.sign(ball(20, 6.0 + k)) + k for k in range(3)]
-        groups[name] = [Volume(each.astype(np.float32), (1.0, 1.0, 1.0), "um", source=f"{name}{k}.tif")
-                        for k, each in enumerate(levels)]  # fmt: skip
-    compared = compare(*groups.values(), kind="image")
-    (note,) = [note for note in compared.notes if note.startswith("Thresholds differ")]
-    assert re.search(r"A 6\d[^,]* to 6\d.*, B 12\d[^,]* to 12\d", note) and "--threshold" in note
-    assert re.search(r"Otsu's threshold, 6\d\S* to 12\d", describe_methods(compared))
-    given = compare(*groups.values(), kind="image", threshold=90)
-    assert not any(note.startswith("Thresholds differ") for note in given.notes)
-    assert "the given threshold, 90;" in describe_methods(given).replace(".", ";")
-
-
-def ball(edge: int, radius: float) -> np.ndarray:
-    """Return the distance to a ball's surface, positive inside, (edge, edge, edge)."""
-    return radius - np.linalg.norm(np.indices((edge,) * 3) - (edge - 1) / 2, axis=0)
