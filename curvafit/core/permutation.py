@@ -157,15 +157,6 @@ def correct_by_most(values: np.ndarray, arranged: np.ndarray, blocks: np.ndarray
     return 1 - np.searchsorted(largest, observed * (1 - TIE)) / len(largest)
 
 
-def correct_holm(p: np.ndarray) -> np.ndarray:
-    """Return p-values (K,) by Holm's correction, which bounds the chance of any false finding among all K."""
-    order = np.argsort(p)
-    raised = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
-    corrected = np.empty_like(p)
-    corrected[order] = np.minimum(raised, 1)
-    return corrected
-
-
 # ---- effects, with 95 % intervals for normal numbers -----------------------------------------------------------------
 
 

@@ -40,8 +40,6 @@ from curvafit.studies.scans import list_wide, merge_notes
 
 #: `format` of a comparison's record.
 FORMAT = Format("curvafit comparison", 1, title="the record of a comparison")
-#: The tests of each quantity as the page's table heads them.
-TESTS = ("p", "family-wise", "Holm", "BH")
 #: What a comparison writes into its folder.
 FILES = ("compare.json", "compare.html", "measures.csv", "wide.csv", "numbers.csv")
 FILES += ("difference.svg", "difference.png", "numbers.svg", "numbers.png", "outlines.svg", "outlines.png")
@@ -66,26 +64,19 @@ def write_comparison(
     others are a ValueError without `overwrite`. `command` is what the record calls the command line.
     """
     target = check_comparison(directory, overwrite=overwrite, command=command)
-    c, tests = comparison, list(_test_rows(comparison))
-    label = "group" if c.groups else "number"
-    permutation = {"seed": c.options["seed"], "permutations": c.permutations}
-    record = start_record(command, unit=c.unit, options=c.options, status=c.status, notes=c.notes, **permutation)
-    record |= {"exact": c.exact, "p": c.p, "least_p": c.least, "by": c.by, "groups": list(c.groups)}
+    c = comparison
+    label, change = ("group", "difference") if c.groups else ("number", "slope")
+    record = start_record(command, unit=c.unit, options=c.options, status=c.status, notes=c.notes)
     record["scans"] = [
         {"scan": scan.source, "subject": case.subject, label: case.label, "kind": scan.kind, "notes": list(scan.notes)}
         | ({} if case.roi is None else {"roi": str(case.roi)})
         for scan, case in zip(c.measures, c.cases, strict=True)
     ]
-    record |= {
-        "energy" if c.groups else "distance_correlation": c.statistic,
-        "apart": c.apart,
-        "by_chance": c.by_chance,
-    }
-    record |= {"tests": tests, "methods": describe_methods(c)}
     page = {
-        "title": c.verdict, "scans": "; ".join(_count_scans(c)) + ".", "effect": c.effect,
-        "head": ["", "", *c.groups, "difference" if c.groups else "slope", c.effect, "95 %", *TESTS, "known error"],
+        "title": c.verdict, "scans": "; ".join(_count_scans(c)) + ".", "groups": c.groups, "effect": c.effect,
+        "head": ["", "", *c.groups, change, c.effect, "95 %", "p", "family-wise", "known error"],
         "rows": [_format_row(number, c) for number in c.numbers], "level": f"{LEVEL:.2g}",
+        "methods": describe_methods(c),
         "differs": bool(c.significant.any()), "omitted": max(0, len(c.measures) - MOST_OUTLINES),
     }  # fmt: skip
     outlines = outlines_figure(name_parts(c.measures), [scan.outline for scan in c.measures], c.unit)
@@ -96,9 +87,9 @@ def write_comparison(
     }
     columns = [{"subject": case.subject, label: case.label} for case in c.cases]
     rows = (row for scan, more in zip(c.measures, columns, strict=True) for row in scan.rows(**more))
-    tables: dict[str, Any] = {"measures.csv": rows, "wide.csv": list_wide(c.measures, columns), "numbers.csv": tests}
-    shown = ("command", "date", *permutation)
-    return write_study(target, FORMAT, FILES, record, page, tables, figures=figures, shown=shown)
+    tables: dict[str, Any] = {"measures.csv": rows, "wide.csv": list_wide(c.measures, columns)}
+    tables["numbers.csv"] = _test_rows(c)
+    return write_study(target, FORMAT, FILES, record, page, tables, figures=figures)
 
 
 def describe_methods(comparison: Comparison) -> str:
@@ -131,22 +122,19 @@ def _count_scans(comparison: Comparison) -> list[str]:
 
 
 def _format_row(number: Number, comparison: Comparison) -> list[str]:
-    """Return a number's row of the page's table; it stands out where its family-wise p is significant.
-
-    The p values are uncorrected, family-wise, of Holm, and of Benjamini and Hochberg; the known error comes last.
-    """
+    """Return a number's row of the page's table; it stands out where its family-wise p is significant."""
     means = [
         f"{format_number(mean)} ± {format_number(sd, 2)}"
         for mean, sd in zip(number.means, number.deviations, strict=True)
     ]
     interval = "–" if math.isnan(number.low) else f"{format_number(number.low, 2)} to {format_number(number.high, 2)}"
-    p, family, holm, discovery = (format_number(x, 2) for x in (number.p, number.family, number.holm, number.discovery))
+    p, family = format_number(number.p, 2), format_number(number.family, 2)
     difference, effect = format_number(number.difference), format_number(number.effect, 2)
     if number.family <= LEVEL:
         difference, effect, family = map(Chosen, (difference, effect, family))
     known = "–" if math.isnan(number.known) else "all" if number.known >= 1 else format_percent(number.known)
     titles = name_quantity(number.name, number.symbol, number.power, comparison.unit)
-    return [*titles, *means, difference, effect, interval, p, family, holm, discovery, known]
+    return [*titles, *means, difference, effect, interval, p, family, known]
 
 
 def name_quantity(name: str, symbol: str, power: int, unit: str) -> tuple[str, str]:
@@ -155,7 +143,7 @@ def name_quantity(name: str, symbol: str, power: int, unit: str) -> tuple[str, s
     return name[0].upper() + name[1:], ", ".join(part for part in parts if part)
 
 
-# ---- tables and record -----------------------------------------------------------------------------------------------
+# ---- tables ------------------------------------------------------------------------------------------------------
 
 
 def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
@@ -165,7 +153,7 @@ def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
     columns = ["quantity", "symbol", "unit", *(f"mean_{k}" for k in suffixes), *(f"sd_{k}" for k in suffixes)]
     effect = {"g": "g", "η": "eta", "r": "r"}[c.effect]
     columns += ["slope" if c.effect == "r" else "difference", effect, f"{effect}_low", f"{effect}_high"]
-    columns += ["p", "p_family", "p_holm", "p_bh", "known_error"]
+    columns += ["p", "p_family", "known_error"]
     diagrams: dict[str, Any] = {"quantity": "curvature diagram", "p": c.p}
     if c.groups:
         diagrams |= {"symbol": "E", "unit": plain_unit(c.unit, -1), "difference": c.statistic}
@@ -174,8 +162,7 @@ def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
     yield dict.fromkeys(columns) | diagrams
     for number in c.numbers:
         cells = (number.name, number.symbol, plain_unit(c.unit, number.power), *number.means, *number.deviations)
-        cells += (number.difference, number.effect, number.low, number.high)
-        cells += (number.p, number.family, number.holm, number.discovery, number.known)
+        cells += (number.difference, number.effect, number.low, number.high, number.p, number.family, number.known)
         finite = (None if isinstance(cell, float) and not math.isfinite(cell) else cell for cell in cells)
         yield dict(zip(columns, finite, strict=True))
 

@@ -95,7 +95,7 @@ def write_measures(
             cells = (part[symbol].format(unit)[:2] for symbol in symbols)
             rows.append([names[len(rows)], *(row.get(title, "") for title in titles), *cells])
     scans = [{"scan": scan.source, "kind": scan.kind, "notes": scan.notes} for scan in measures]
-    facts = {"status": describe_range(parts), "scans": scans, "notes": list(count_notes(parts))}
+    facts = {"scans": scans, "notes": list(count_notes(parts))}
     record = start_record(command, unit=unit, options=dict(options or {}), **facts)
     page = {
         "title": f"{len(measures)} scans measured" if len(measures) > 1 else "One scan measured",
@@ -131,21 +131,6 @@ def _format_line(quantity: Quantity, unit: str) -> tuple[str, str, str]:
     if quantity.symbol.startswith("N."):
         return f"{quantity.value:.0f}", "", ""
     return quantity.format(unit)
-
-
-def describe_range(parts: Sequence[Measures]) -> str:
-    """Return sentences on the least and greatest volume fraction, thickness and spacing of scans of one unit."""
-    sentences, names = [], name_parts(parts)
-    for symbol in ("BV/TV", "Tb.Th", "Tb.Sp"):
-        quantities = [part[symbol] for part in parts]
-        known = [k for k, quantity in enumerate(quantities) if math.isfinite(quantity.value)]
-        if not known:
-            continue
-        extremes = [extreme(known, key=lambda k: quantities[k].value) for extreme in (min, max)]
-        low, high = (" ".join(quantities[k].format(parts[0].unit)[::2]).strip() for k in extremes)
-        span = f"from {low} ({names[extremes[0]]}) to {high} ({names[extremes[1]]})" if len(known) > 1 else low
-        sentences.append(f"{quantities[0].name.capitalize()} {span}.")
-    return " ".join(sentences)
 
 
 # ---- figures ---------------------------------------------------------------------------------------------------------
@@ -295,9 +280,8 @@ def write_windows(windows: Windows, directory: str | Path, *, command: str = "",
     }
     volumes = (windows.clusters, *map(windows.__getitem__, NAMES))
     maps = dict(zip(files[len(WINDOWS_FILES) :], volumes, strict=True))
-    shown = ("scan", "command", "date", "options")
     tables = {"windows.csv": _rows(windows)}
-    return write_study(target, WINDOWS_FORMAT, files, record, page, tables, figures=figures, maps=maps, shown=shown)
+    return write_study(target, WINDOWS_FORMAT, files, record, page, tables, figures=figures, maps=maps)
 
 
 def _rows(windows: Windows) -> Iterator[dict[str, Any]]:

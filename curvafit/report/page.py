@@ -136,17 +136,15 @@ def write_study(
     figures: Mapping[str, tuple[Figure | None, str]] | None = None,
     maps: Mapping[str, Volume] | None = None,
     more: Mapping[str, Callable[[Path], object]] | None = None,
-    shown: Sequence[str] = ("command", "date"),
 ) -> Path:
     """Write a study's record, page, tables, maps, figures as PNG and SVG, and what `more` writes, into a folder.
 
     `files` are their names, the record's and the page's first. The page is the template of its name, filled with the
-    record, `values` and the figures, each of which comes with a description; it ends with the entries of the record
-    that `shown` names. Return the page's path.
+    record, `values` and the figures, each of which comes with a description. Return the page's path.
     """
     drawn = {name: (figure, alt) for name, (figure, alt) in (figures or {}).items() if figure is not None}
     pictures = {name: picture_of(*drawn[name]) if name in drawn else None for name in figures or ()}
-    made = {name: record[name] for name in shown if record[name] not in ("", {})}
+    made = {name: record[name] for name in ("command", "date") if record[name]}
     texts = {files[1]: render(files[1], made=made, **record | pictures | dict(values))}
     texts |= {name: format_csv(list(rows)) for name, rows in tables.items()}
     with fill_folder(target, files) as work:

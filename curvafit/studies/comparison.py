@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
-from scipy.spatial.distance import cdist, pdist
-from scipy.stats import false_discovery_control, rankdata
+from scipy.spatial.distance import cdist
+from scipy.stats import rankdata
 
 from curvafit.core import permutation
 from curvafit.core.checks import check_choice, check_int, check_seed
@@ -32,8 +32,6 @@ LEVEL = 1 - SURE
 FAMILIAR = ("BV/TV", "Tb.Th", "Tb.Th.SD", "Tb.Sp", "Tb.N", "Conn.D", "χ", "BS/BV", "BS/TV", "DA")
 #: Most numbers that differ and are named in the answer.
 NAMED = 3
-#: Most arrangements of the labels that tell how far apart mean diagrams lie by chance.
-CHANCE = 500
 #: Bins along each axis of the difference of diagrams, and the width in bins of the Gaussian that smooths it.
 BINS, SMOOTH = 48, 2.0
 #: Bins with less than this fraction of the fullest one's area are not tested.
@@ -55,10 +53,9 @@ class Number:
         correlation r with its rank. Of more groups the correlation ratio η, without an interval.
     p
         Share of arrangements of the labels with at least that effect.
-    family, holm, discovery
-        p corrected for all quantities. The first two control the chance of any false finding: by the greatest effect of
-        all quantities in each arrangement, and by Holm, whose p cannot be small with few subjects. The third, by
-        Benjamini and Hochberg, controls the share of false findings.
+    family
+        p corrected for all quantities, which controls the chance of any false finding: by the greatest effect of all
+        quantities in each arrangement.
     known
         The fraction of the variance left by the labels that the scans' own intervals explain.
     """
@@ -74,8 +71,6 @@ class Number:
     high: float
     p: float
     family: float
-    holm: float
-    discovery: float
     known: float
 
 
@@ -105,9 +100,6 @@ class Comparison(Pictured):
     sides, diagrams
         The index (S,) of each subject's part: its group, or the lower or upper half of the numbers; and the mean
         diagram of each part, of total area 1.
-    apart, by_chance
-        The greatest sliced Wasserstein distance of the means of two parts' diagrams (barycentres in each direction),
-        and what it is at most in 95 % of the arrangements of the labels.
     edges, differences, bins_p
         Edges (B + 1,) of bins in κ1 and κ2; over them (κ2, κ1) the second group's mean diagram less the first's, or
         each group's less that of all, or the slope from the least number to the greatest, `(M, B, B)`; and the
@@ -133,8 +125,6 @@ class Comparison(Pictured):
     least: float
     sides: np.ndarray
     diagrams: tuple[Diagram, ...]
-    apart: float
-    by_chance: float
     edges: np.ndarray
     differences: np.ndarray
     bins_p: np.ndarray
@@ -196,12 +186,9 @@ class Comparison(Pictured):
                 f"None of {count} numbers is seen to differ ({level}). Of the familiar ones the effect on "
                 f"{self._describe(strongest)} is the largest."
             )
-        unit, most = per_unit(self.unit, 1), "up to " * (len(self.parts) > 2)
-        lines.append(
-            f"Curvature diagrams {'differ' if self.p <= LEVEL else 'are not told apart'}: p = "
-            f"{format_number(self.p, 2)}; their means lie {most}{format_number(self.apart, 2)} {unit} apart, and up to "
-            f"{format_number(self.by_chance, 2)} by chance (sliced Wasserstein distance)."
-        )
+        verdict, p = "differ" if self.p <= LEVEL else "are not told apart", format_number(self.p, 2)
+        name, unit = ("energy distance", f" {per_unit(self.unit, 1)}") if self.groups else ("distance correlation", "")
+        lines.append(f"Curvature diagrams {verdict}: p = {p}, {name} {format_number(self.statistic, 2)}{unit}.")
         return " ".join(lines)
 
     @property
@@ -339,12 +326,9 @@ def _compare_measures(
     test = permutation.measure_energy if groups else permutation.measure_dependence
     diagrams = [_pool([measures[k].diagram for k in own_scans]) for own_scans in scans]
     embeddings = np.stack([sliced_embedding(diagram) for diagram in diagrams])
-    distances = cdist(embeddings, embeddings)
-    statistics = test(distances, arrangements, blocks)
+    statistics = test(cdist(embeddings, embeddings), arrangements, blocks)
     sides = labels if groups else _halve(labels)
     means = tuple(_pool([diagrams[k] for k in np.flatnonzero(sides == side)]) for side in np.unique(sides))
-    tried = arrangements[:: math.ceil(len(arrangements) / CHANCE)]
-    by_chance = [_apart(embeddings, each if groups else _halve(each)) for each in tried]
     edges, differences, bins_p = _compare_bins(diagrams, labels, arrangements, blocks)
     values, errors, halves = _average(measures, scans)
     # The least possible p is that of a quantity equal to the labels.
@@ -354,16 +338,10 @@ def _compare_measures(
         subjects=tuple(subjects), labels=labels, blocks=blocks, values=values, errors=errors, halves=halves,
         numbers=_compare_numbers(measures[0], values, errors, labels, arrangements, blocks),
         statistic=float(statistics[0]), p=float(permutation.share_beyond(statistics)), least=float(least_p),
-        sides=sides, diagrams=means, apart=_apart(embeddings, sides), by_chance=float(np.quantile(by_chance, SURE)),
-        edges=edges, differences=differences, bins_p=bins_p,
+        sides=sides, diagrams=means, edges=edges, differences=differences, bins_p=bins_p,
         permutations=len(arrangements), exact=exact, options=options,
         notes=(*notes, *gather_notes(measures, cases)),
     )  # fmt: skip
-
-
-def _apart(embeddings: np.ndarray, sides: np.ndarray) -> float:
-    """Return the greatest distance between the means of two parts' embeddings."""
-    return float(pdist(np.stack([embeddings[sides == side].mean(0) for side in np.unique(sides)])).max())
 
 
 def _halve(numbers: np.ndarray) -> np.ndarray:
@@ -418,11 +396,10 @@ def _compare_numbers(
     """Test each quantity of subjects' values (S, K); `scan` has the quantities' names, and the first of the
     `arrangements` is that of the labels as they are."""
     finite = np.asarray(np.isfinite(values).all(0))
-    p, family, holm, discovery = np.full((4, len(finite)), np.nan)
+    p, family = np.full((2, len(finite)), np.nan)
     p[finite] = permutation.share_beyond(permutation.correlate(values[:, finite], arrangements, blocks))
-    holm[finite], discovery[finite] = permutation.correct_holm(p[finite]), false_discovery_control(p[finite])
     family[finite] = permutation.correct_by_most(values[:, finite], arrangements, blocks)
-    numbers, p_values = [], np.stack([p, family, holm, discovery], axis=1).tolist()
+    numbers, p_values = [], np.stack([p, family], axis=1).tolist()
     for quantity, column, error, tests in zip(scan.quantities, values.T, errors.T, p_values, strict=True):
         means, deviations, difference, effect, variance = _measure_change(column, labels, arrangements[0], blocks)
         error_share = float((error**2).mean() / variance) if variance > 0 else math.nan
