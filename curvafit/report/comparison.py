@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, QuadMesh
+from matplotlib.collections import QuadMesh
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -76,8 +76,7 @@ def write_comparison(
         "title": c.verdict, "scans": "; ".join(_count_scans(c)) + ".", "groups": c.groups, "effect": c.effect,
         "head": ["", "", *c.groups, change, c.effect, "95 %", "p", "family-wise", "known error"],
         "rows": [_format_row(number, c) for number in c.numbers], "level": f"{LEVEL:.2g}",
-        "methods": describe_methods(c),
-        "differs": bool(c.significant.any()), "omitted": max(0, len(c.measures) - MOST_OUTLINES),
+        "methods": describe_methods(c), "omitted": max(0, len(c.measures) - MOST_OUTLINES),
     }  # fmt: skip
     outlines = outlines_figure(name_parts(c.measures), [scan.outline for scan in c.measures], c.unit)
     figures = {
@@ -174,7 +173,7 @@ def comparison_figure(comparison: Comparison) -> Figure:
     """Return a figure of the mean curvature diagrams of groups, or halves of numbers, and their differences.
 
     A difference is the second of two groups less the first; each of more groups less the mean of all; or the change
-    from the least number to the greatest. Outlines surround the bins that differ significantly, all tested.
+    from the least number to the greatest.
     """
     c, names, edges = comparison, [plot.plain(name) for name in comparison.parts], comparison.edges
     limits, unit, window = (edges[0], edges[-1]), c.unit, plot.shown_window(c.diagrams)
@@ -196,7 +195,6 @@ def comparison_figure(comparison: Comparison) -> Figure:
         axes = figure.add_subplot(rows, columns, k + (3 if single else rows // 2 * columns + 1))
         picture = axes.pcolormesh(edges, edges, difference, rasterized=True, zorder=0.5, **colours)
         plot.frame_diagram(axes, limits, unit, window)
-        _outline_on(axes, edges, c.significant)
         axes.set_title(f"{title}, p = {format_number(c.p, 2)}", fontsize=11)
         _bar_on(axes, picture, ticks=MaxNLocator(4, symmetric=True))
     return figure
@@ -207,17 +205,6 @@ def _bar_on(axes: Axes, picture: QuadMesh, **options: Any) -> None:
     bar.set_label("% of the surface a bin", fontsize=8)
     bar.ax.tick_params(labelsize=8, length=2)
     bar.outline.set_linewidth(0.5)
-
-
-def _outline_on(axes: Axes, edges: np.ndarray, inside: np.ndarray) -> None:
-    """Draw the border of a set of bins, bool (rows, columns), along the bins' edges."""
-    lines = []
-    for transposed, mask in ((False, inside), (True, inside.T)):  # first horizontal lines, then vertical ones
-        rows, columns = np.nonzero(np.diff(np.pad(mask, ((1, 1), (0, 0))).astype(int), axis=0))
-        ends = np.stack([edges[columns], edges[columns + 1]], axis=1)
-        level = np.repeat(edges[rows][:, None], 2, axis=1)
-        lines.append(np.stack([level, ends] if transposed else [ends, level], axis=-1))
-    axes.add_collection(LineCollection(list(np.concatenate(lines)), colors=plot.INK, linewidths=1.2, zorder=3.5))
 
 
 def numbers_figure(comparison: Comparison) -> Figure:

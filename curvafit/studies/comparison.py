@@ -34,8 +34,6 @@ FAMILIAR = ("BV/TV", "Tb.Th", "Tb.Th.SD", "Tb.Sp", "Tb.N", "Conn.D", "χ", "BS/B
 NAMED = 3
 #: Bins along each axis of the difference of diagrams, and the width in bins of the Gaussian that smooths it.
 BINS, SMOOTH = 48, 2.0
-#: Bins with less than this fraction of the fullest one's area are not tested.
-LEAST_SHARE = 0.02
 
 
 @dataclass(frozen=True)
@@ -100,10 +98,9 @@ class Comparison(Pictured):
     sides, diagrams
         The index (S,) of each subject's part: its group, or the lower or upper half of the numbers; and the mean
         diagram of each part, of total area 1.
-    edges, differences, bins_p
-        Edges (B + 1,) of bins in κ1 and κ2; over them (κ2, κ1) the second group's mean diagram less the first's, or
-        each group's less that of all, or the slope from the least number to the greatest, `(M, B, B)`; and the
-        family-wise p of each bin, NaN where there is too little area to test.
+    edges, differences
+        Edges (B + 1,) of bins in κ1 and κ2; and over them (κ2, κ1) the second group's mean diagram less the first's, or
+        each group's less that of all, or the slope from the least number to the greatest, `(M, B, B)`.
     permutations, exact
         How many arrangements were tried, and whether they are all.
     """
@@ -127,7 +124,6 @@ class Comparison(Pictured):
     diagrams: tuple[Diagram, ...]
     edges: np.ndarray
     differences: np.ndarray
-    bins_p: np.ndarray
     permutations: int
     exact: bool
     options: dict[str, Any]
@@ -156,11 +152,6 @@ class Comparison(Pictured):
     def effect(self) -> str:
         """Return the name of the numbers' effect: g, η or r."""
         return "r" if not self.groups else "g" if len(self.groups) == 2 else "η"
-
-    @property
-    def significant(self) -> np.ndarray:
-        """Return the bins (κ2, κ1) whose difference is significant among all, bool `(B, B)`."""
-        return self.bins_p <= LEVEL
 
     @property
     def found(self) -> tuple[Number, ...]:
@@ -259,10 +250,10 @@ def compare(
 
     Each scan is measured (`curvafit.measure`). Scans of a subject are averaged: the subject is what counts. Diagrams of
     groups are compared by the energy distance of the subjects' diagrams, by a number by their distance correlation with
-    its rank; each quantity, and each bin of the diagram, by its correlation with the labels: all over the same
-    arrangements of the labels. Raises ValueError where labels cannot be exchanged (fewer than two groups of two
-    subjects, fewer than three numbers, a subject with several labels that is not `paired`, or with one that is), a scan
-    is listed twice, or only some have a physical unit; and as `measure`, with the scan's name.
+    its rank; each quantity by its correlation with the labels: all over the same arrangements of the labels. Raises
+    ValueError where labels cannot be exchanged (fewer than two groups of two subjects, fewer than three numbers, a
+    subject with several labels that is not `paired`, or with one that is), a scan is listed twice, or only some have a
+    physical unit; and as `measure`, with the scan's name.
 
     Parameters
     ----------
@@ -329,7 +320,7 @@ def _compare_measures(
     statistics = test(cdist(embeddings, embeddings), arrangements, blocks)
     sides = labels if groups else _halve(labels)
     means = tuple(_pool([diagrams[k] for k in np.flatnonzero(sides == side)]) for side in np.unique(sides))
-    edges, differences, bins_p = _compare_bins(diagrams, labels, arrangements, blocks)
+    edges, differences = _compare_bins(diagrams, labels, blocks)
     values, errors, halves = _average(measures, scans)
     # The least possible p is that of a quantity equal to the labels.
     least_p = permutation.share_beyond(permutation.correlate(scores[:, None], arrangements, blocks))[0]
@@ -338,7 +329,7 @@ def _compare_measures(
         subjects=tuple(subjects), labels=labels, blocks=blocks, values=values, errors=errors, halves=halves,
         numbers=_compare_numbers(measures[0], values, errors, labels, arrangements, blocks),
         statistic=float(statistics[0]), p=float(permutation.share_beyond(statistics)), least=float(least_p),
-        sides=sides, diagrams=means, edges=edges, differences=differences, bins_p=bins_p,
+        sides=sides, diagrams=means, edges=edges, differences=differences,
         permutations=len(arrangements), exact=exact, options=options,
         notes=(*notes, *gather_notes(measures, cases)),
     )  # fmt: skip
@@ -358,9 +349,9 @@ def _pool(diagrams: Sequence[Diagram]) -> Diagram:
 
 
 def _compare_bins(
-    diagrams: Sequence[Diagram], labels: np.ndarray, arrangements: np.ndarray, blocks: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `edges`, `differences` and `bins_p` of a `Comparison`."""
+    diagrams: Sequence[Diagram], labels: np.ndarray, blocks: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return `edges` and `differences` of a `Comparison`."""
     edges = np.linspace(*shared_limits(diagrams), BINS + 1)
     histograms = []
     for diagram in diagrams:
@@ -368,15 +359,11 @@ def _compare_bins(
         histogram, _, _ = np.histogram2d(κ2, κ1, bins=(edges, edges), weights=diagram.weights)
         histograms.append(gaussian_filter(histogram, SMOOTH))
     shares = np.stack(histograms)
-    mean = shares.mean(0)
-    tested = (mean >= LEAST_SHARE * mean.max()) & (edges[1:, None] <= edges[None, 1:])  # κ2 ≤ κ1
-    p = np.full(mean.shape, np.nan)
-    p[tested] = permutation.correct_by_most(shares[:, tested], arrangements, blocks)
     if np.issubdtype(labels.dtype, np.floating):  # the change along a line fitted from the lowest label to the highest
         x = permutation.center(labels, blocks)
-        return edges, np.ptp(labels) * np.tensordot(x, shares, 1)[None] / (x @ x), p
+        return edges, np.ptp(labels) * np.tensordot(x, shares, 1)[None] / (x @ x)
     means = np.stack([shares[labels == group].mean(0) for group in np.unique(labels)])
-    return edges, means[1:] - means[:1] if len(means) == 2 else means - mean, p
+    return edges, means[1:] - means[:1] if len(means) == 2 else means - shares.mean(0)
 
 
 def _average(measures: Sequence[Measures], scans: Sequence[Sequence[int]]) -> tuple[np.ndarray, ...]:
