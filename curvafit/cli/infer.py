@@ -48,7 +48,7 @@ def infer(
     with show_stages() as progress:
         from curvafit.inference.inference import infer as infer_scan
         from curvafit.inference.simulate import Growth
-        from curvafit.report.inference import check_report, infer_scans, with_command, write_inference
+        from curvafit.report.inference import check_report, infer_scans, write_inference
 
         law["growth"] = Growth() if law.pop("test") else None
         options = {**structure, **law, "roi": roi, "seed": seed, **reading}
@@ -61,7 +61,7 @@ def infer(
         inference = infer_scan(scans[0], progress=progress, **options)
         progress("drawing the report", 1.0)
         say_notes(inference.scan.notes)
-        report = write_inference(with_command(inference, command_line()), out, overwrite=overwrite)
+        report = write_inference(inference, out, command=command_line(), overwrite=overwrite)
     _print_result(inference)
     say(str(report))
 

@@ -55,8 +55,6 @@ TAILS, THIN = (0.5, 99.5), 256
 #: Symbols of the familiar numbers, of those that a figure of numbers shows first, and of those that can be negative.
 FAMILIAR = ("BV/TV", "Tb.Th", "Tb.Sp", "Tb.N", "Conn.D", "DA")
 FIRST_SHOWN, SIGNED = (*FAMILIAR, "H", "K"), ("χ", "Conn.D", "H", "K", "κ1", "κ2")
-#: Share of each curvature's area that a diagram's axis holds at the least.
-SHOWN = 0.995
 #: Most values of masks and labels, which are drawn from the least to the greatest.
 FEW = 3
 
@@ -164,12 +162,11 @@ def diagram_on(
     limits: Limits,
     unit: str = "working unit",
     length: float = 1.0,
-    window: tuple[Limits, Limits] | None = None,
 ) -> QuadMesh:
     """Draw the share of area over (κ1, κ2): κ1 to the right, κ2 up, colours by the logarithm.
 
     The diagram's own unit of length is `length` in `unit`: curvatures are divided by it. `limits`, in 1 / `unit`, are
-    those of both axes; `window` is what of these is shown, of κ1 and κ2. Returns the picture, for a colour bar.
+    those of both axes. Returns the picture, for a colour bar.
     """
     low, high = limits
     edges = np.linspace(low, high, BINS + 1)
@@ -181,26 +178,25 @@ def diagram_on(
     norm = LogNorm(highest * 10**-DECADES, highest)
     shown = np.ma.masked_less(shares, highest * 10**-DECADES)  # bins below the scale stay white
     picture = axes.pcolormesh(edges, edges, shown, cmap=DENSITY, norm=norm, rasterized=True, zorder=2)
-    frame_diagram(axes, limits, unit, window)
+    frame_diagram(axes, limits, unit)
     return picture
 
 
-def frame_diagram(axes: Axes, limits: Limits, unit: str, window: tuple[Limits, Limits] | None = None) -> None:
+def frame_diagram(axes: Axes, limits: Limits, unit: str) -> None:
     """Draw the frame of a diagram: axes, the line κ1 = κ2 and the names of families; see `diagram_on`."""
     low, high = limits
     axes.add_patch(Polygon([(low, low), (low, high), (high, high)], color="#F3F4F6", zorder=0))
     axes.axhline(0, color=QUIET, linewidth=0.7, zorder=1)
     axes.axvline(0, color=QUIET, linewidth=0.7, zorder=1)
     axes.plot([low, high], [low, high], color=DIAGONAL, linewidth=1.4, zorder=3)
-    x_limits, y_limits = window or (limits, limits)
-    axes.set(xlim=x_limits, ylim=y_limits, aspect="equal")
+    axes.set(xlim=limits, ylim=limits, aspect="equal")
     axes.spines[:].set_color(QUIET)
     name = unit_name(unit)
     axes.set_xlabel(f"κ₁ (1/{name})", labelpad=2)
     axes.set_ylabel(f"κ₂ (1/{name})", labelpad=2)
     axes.locator_params(nbins=5)
     axes.tick_params(length=3, labelsize=9)
-    _name_families(axes, x_limits, y_limits)
+    _name_families(axes, limits)
 
 
 def shared_limits(diagrams: Sequence[Diagram], *, length: float = 1.0) -> Limits:
@@ -214,30 +210,19 @@ def shared_limits(diagrams: Sequence[Diagram], *, length: float = 1.0) -> Limits
     return bounds[0] - 0.08 * width, bounds[1] + 0.08 * width
 
 
-def shown_window(diagrams: Sequence[Any]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return an interval of κ1 and one of κ2 that hold 0 and `SHOWN` of each diagram's area, with a margin."""
-    intervals = np.zeros((2, 2))
-    for diagram in diagrams:
-        for interval, kappa in zip(intervals, np.asarray(diagram.points).T, strict=True):
-            tails = [(1 - SHOWN) / 2, (1 + SHOWN) / 2]
-            low, high = np.quantile(kappa, tails, weights=diagram.weights, method="inverted_cdf")
-            interval[:] = min(interval[0], low), max(interval[1], high)
-    (low1, high1), (low2, high2) = (intervals + 0.08 * np.ptp(intervals) * np.array([-1, 1])).tolist()
-    return (low1, high1), (low2, high2)
-
-
-def _name_families(axes: Axes, x_limits: Limits, y_limits: Limits) -> None:
+def _name_families(axes: Axes, limits: Limits) -> None:
     """Write the names of spheres, tubes and saddles beside the lines κ1 = κ2, κ2 = 0 and κ2 = -κ1, where they lie."""
-    pad = 0.02 * (x_limits[1] - x_limits[0])
+    low, high = limits
+    pad = 0.02 * (high - low)
     style = {"fontsize": 8.5, "color": "#5B616B", "style": "italic", "zorder": 4}
     style["path_effects"] = [withStroke(linewidth=2, foreground="white")]
-    corner = min(x_limits[1], y_limits[1]) - 5 * pad
+    corner = high - 5 * pad
     axes.text(corner, corner + pad, "spheres", rotation=45, rotation_mode="anchor", ha="right", va="bottom", **style)
-    axes.text(x_limits[1] - pad, 0.4 * pad, "tubes", ha="right", va="bottom", **style)
-    if y_limits[0] < -0.15 * x_limits[1]:
-        end = min(x_limits[1], -y_limits[0])
+    axes.text(high - pad, 0.4 * pad, "tubes", ha="right", va="bottom", **style)
+    if low < -0.15 * high:
+        end = min(high, -low)
         axes.plot([0, end], [0, -end], color=QUIET, linewidth=0.7, linestyle=(0, (2, 3)), zorder=1)
-        side = "right" if end > 0.8 * x_limits[1] else "left"
+        side = "right" if end > 0.8 * high else "left"
         axes.text(end + (-pad if side == "right" else pad), pad - end, "saddles", ha=side, va="bottom", **style)
 
 

@@ -6,9 +6,7 @@ as the light sees the mesh, and the sky as far as a blurred occupancy leaves it 
 
 from __future__ import annotations
 
-import io
 import math
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +14,6 @@ from numba import njit
 from PIL import Image, ImageDraw
 from scipy.ndimage import gaussian_filter, map_coordinates
 from skimage.measure import block_reduce, marching_cubes
-
-from curvafit.core.files import write_content
 
 #: Colour of the level set and of the cut faces, linear in [0, 1].
 SURFACE = (0.945, 0.865, 0.715)
@@ -78,14 +74,13 @@ def render(
     *,
     spacing: tuple[float, float, float] = (1.0, 1.0, 1.0),
     width: int = 720,
-    height: int | None = None,
     azimuth: float = 32.0,
     elevation: float = 24.0,
 ) -> tuple[np.ndarray, View]:
     """Return a picture of the zero level of `u` `(Z, Y, X)`, and the projection that it shows.
 
-    The picture is RGBA bytes, transparent where there is nothing; it is `width` pixels wide, or less where it would be
-    higher than `height`. A volume that has no 3 axes of at least 4 voxels, or is not finite, is a ValueError.
+    The picture is RGBA bytes, transparent where there is nothing, and `width` pixels wide. A volume that has
+    no 3 axes of at least 4 voxels, or is not finite, is a ValueError.
     """
     field = np.asarray(u, dtype=np.float32)
     if field.ndim != 3 or min(field.shape) < 4:
@@ -93,8 +88,6 @@ def render(
     if not np.isfinite(field).all():
         raise ValueError("a volume to draw needs finite values, got NaN or infinity")
     camera = view(field.shape, spacing, azimuth=azimuth, elevation=elevation)
-    if height is not None:
-        width = max(2, min(width, round(height * camera.half[0] / camera.half[1])))
     height = max(2, round(width * camera.half[1] / camera.half[0]))
     size = (width * _SUPERSAMPLE, height * _SUPERSAMPLE)
     picture = Image.fromarray(_colours(field, camera, size))
@@ -227,16 +220,6 @@ def _shadow(vertices: np.ndarray, faces: np.ndarray, light: np.ndarray, points: 
 
 
 # ---- a surface in its box --------------------------------------------------------------------------------------------
-
-
-def surface_picture(u: np.ndarray, path: str | Path, *, width: int = 900, **options) -> Path:
-    """Write a square picture, `width` pixels wide, of the surface of `u` `(Z, Y, X)`; options are `render_in_box`'s."""
-    picture = Image.fromarray(render_in_box(u, width=width, height=width, **options))
-    sheet = Image.new("RGB", (width, width), "white")
-    sheet.paste(picture, ((width - picture.width) // 2, (width - picture.height) // 2), picture)
-    buffer = io.BytesIO()
-    sheet.save(buffer, format="png", dpi=(DPI, DPI), compress_level=3)
-    return write_content(Path(path), buffer.getvalue())
 
 
 def render_in_box(u: np.ndarray, **options) -> np.ndarray:

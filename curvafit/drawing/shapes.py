@@ -20,7 +20,7 @@ from curvafit.core.files import move_together, remove, temporary_folder
 from curvafit.core.records import Format, can_write, sibling
 from curvafit.core.runtime import FILE, check_memory, hold_signals
 from curvafit.core.units import parse_unit
-from curvafit.drawing.rendering import surface_picture
+from curvafit.drawing.plot import surface_figure, write_picture
 from curvafit.generation.flow import Flow
 from curvafit.geometry.mesh import SUFFIXES, Surface, solid_surface, write_surface
 from curvafit.priors.coefficients import NAMES
@@ -118,7 +118,7 @@ def write_shape(
         files = [shape, record_path]
         if picture:
             try:
-                surface_picture(flow.field.numpy(), work / image.name)
+                write_picture(surface_figure(flow.field.numpy(), width=900), work / image.name)
                 files.append(work / image.name)
             except (OSError, ValueError, MemoryError) as error:
                 reason = getattr(error, "strerror", None) or error

@@ -3,5 +3,4 @@ from .comparison import write_comparison as write_comparison
 from .inference import describe as describe
 from .inference import report_html as report_html
 from .inference import write_inference as write_inference
-from .inference import write_report as write_report
 from .measures import write_measures as write_measures

@@ -176,14 +176,14 @@ def comparison_figure(comparison: Comparison) -> Figure:
     from the least number to the greatest.
     """
     c, names, edges = comparison, [plot.plain(name) for name in comparison.parts], comparison.edges
-    limits, unit, window = (edges[0], edges[-1]), c.unit, plot.shown_window(c.diagrams)
+    limits, unit = (edges[0], edges[-1]), c.unit
     single = len(c.differences) == 1  # in one row with the two diagrams; else differences lie in rows of their own
     columns = 3 if single else min(len(names), ROW)
     rows = 1 if single else 2 * math.ceil(len(names) / columns)
     figure = plot.make_figure(13.2, 3.6 * rows * 3 / max(columns, 3), layout="constrained")
     for k, (name, diagram) in enumerate(zip(names, c.diagrams, strict=True)):
         axes = figure.add_subplot(rows, columns, k + 1)
-        picture = plot.diagram_on(axes, diagram, limits=limits, unit=unit, window=window)
+        picture = plot.diagram_on(axes, diagram, limits=limits, unit=unit)
         axes.set_title(f"{name}, {c.counts[k]} subjects", fontsize=11, color=plot.GROUPS[k % len(plot.GROUPS)])
         _bar_on(axes, picture, format=FuncFormatter(lambda share, _: f"{100 * share:g}"))
     titles = [f"{names[1]} less {names[0]}"] if c.groups else ["from the least to the most"]
@@ -194,7 +194,7 @@ def comparison_figure(comparison: Comparison) -> Figure:
     for k, (title, difference) in enumerate(zip(titles, percents, strict=True)):
         axes = figure.add_subplot(rows, columns, k + (3 if single else rows // 2 * columns + 1))
         picture = axes.pcolormesh(edges, edges, difference, rasterized=True, zorder=0.5, **colours)
-        plot.frame_diagram(axes, limits, unit, window)
+        plot.frame_diagram(axes, limits, unit)
         axes.set_title(f"{title}, p = {format_number(c.p, 2)}", fontsize=11)
         _bar_on(axes, picture, ticks=MaxNLocator(4, symmetric=True))
     return figure

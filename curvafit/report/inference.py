@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from curvafit.core.files import write_content
 from curvafit.core.records import Format
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import format_length, format_number, format_percent, per_unit, power_name, unit_name
@@ -60,32 +59,24 @@ _ROUND: dict[str, Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarra
 check_report = partial(page.check_result_folder, Format(FORMAT), FILES)
 
 
-def write_inference(inference: Inference, directory: str | Path, *, overwrite: bool = False) -> Path:
+def write_inference(inference: Inference, directory: str | Path, *, command: str = "", overwrite: bool = False) -> Path:
     """Write `fit.json`, `report.html` and, if a shape was regenerated, `regenerated.nii.gz` into a folder.
 
     Return the report's path. The files are moved into the folder once all are whole. Those of an earlier inference by
-    the same command are replaced; others are a ValueError without `overwrite`.
+    the same command are replaced; others are a ValueError without `overwrite`. `command` is what the fit's provenance
+    calls the command line.
     """
-    command = inference.fit.provenance.get("command", "")
+    if command:
+        provenance = {**inference.fit.provenance, "command": command}
+        inference = dataclasses.replace(inference, fit=dataclasses.replace(inference.fit, provenance=provenance))
     target = check_report(directory, overwrite=overwrite, command=command)
     with page.fill_folder(target, FILES) as work:
         (work / "fit.json").write_text(inference.fit.to_json(), encoding="utf-8")
-        write_report(inference, work / "report.html")
+        (work / "report.html").write_text(report_html(inference), encoding="utf-8")
         if inference.best is not None:
             edge = inference.fit.working_voxel
             save(Volume(inference.best, (edge, edge, edge), inference.fit.length_unit), work / "regenerated.nii.gz")
     return target / "report.html"
-
-
-def with_command(inference: Inference, command: str) -> Inference:
-    """Return the inference with the command line noted in its provenance."""
-    provenance = {**inference.fit.provenance, "command": command}
-    return dataclasses.replace(inference, fit=dataclasses.replace(inference.fit, provenance=provenance))
-
-
-def write_report(inference: Inference, path: str | Path) -> Path:
-    """Write the report of an inference as one HTML page without outside parts, and return its path."""
-    return write_content(Path(path), report_html(inference))
 
 
 def report_html(inference: Inference) -> str:
@@ -442,7 +433,7 @@ def _infer_one(
 ) -> None:
     with name_errors(scan):
         inference = infer(scan, progress=progress, **options)
-    write_inference(with_command(inference, command), folder, overwrite=overwrite)
+    write_inference(inference, folder, command=command, overwrite=overwrite)
 
 
 def _is_done(folder: Path, command: str) -> bool:

@@ -22,7 +22,6 @@ from curvafit.report.comparison import describe_measures, name_quantity
 from curvafit.report.page import (
     MOST_OUTLINES,
     check_result_folder,
-    draw_outline,
     name_parts,
     outlines_figure,
     shorten,
@@ -41,8 +40,8 @@ FORMAT = Format("curvafit measured scans", 1, title="the record of measured scan
 #: What is written into the folder.
 FILES = ("measures.json", "measures.html", "measures.csv", "wide.csv", MEASURED)
 FILES += ("diagrams.svg", "diagrams.png", "numbers.svg", "numbers.png", "outlines.svg", "outlines.png")
-#: Maps of one scan, and the pictures of the second; its centreline.
-FILES += ("structure.nii.gz", "thickness.nii.gz", "thickness.svg", "thickness.png")
+#: Maps of one scan; its centreline.
+FILES += ("structure.nii.gz", "thickness.nii.gz")
 FILES += ("branches.csv", "centreline.csv", "centreline.graphml", "centreline.swc", "centreline.svg", "centreline.png")
 #: Of a scan measured in windows, `format` of the record.
 WINDOWS_FORMAT = Format("curvafit windows", 1, title="the record of a scan measured in windows")
@@ -109,7 +108,6 @@ def write_measures(
     outlines = outlines_figure(name_parts(measures), [scan.outline for scan in measures], unit)
     figures = {
         "outlines": (outlines, "Three slices of each scan, and the outline of its structure"),
-        "thickness": (thickness_figure(measures[0]) if maps else None, "The thickness at each voxel, on three slices"),
         "centreline": (centreline and centreline_figure(measures[0], centreline), "The centreline, from three sides"),
         "diagrams": (diagrams, "The curvature diagram of each scan"),
         "numbers": (intervals, "Numbers of each scan with their intervals"),
@@ -134,28 +132,6 @@ def _format_line(quantity: Quantity, unit: str) -> tuple[str, str, str]:
 
 
 # ---- figures ---------------------------------------------------------------------------------------------------------
-
-
-def thickness_figure(measures: Measures) -> Figure | None:
-    """Return a figure of the thickness at each voxel on the slices of the outline; None where it was not kept."""
-    outline, volume = measures.outline, measures.maps.get("thickness")
-    if outline is None or volume is None:
-        return None
-    factor = convert_length(1.0, volume.unit, measures.unit)
-    steps = [round(kept / (h * factor)) for kept, h in zip(outline.spacing, volume.spacing, strict=True)]
-    thin = volume.values[tuple(slice(None, None, step) for step in steps)]
-    most = factor * float(np.percentile(thin[thin > 0], 99.5)) if (thin > 0).any() else 1.0
-    figure = plot.make_figure(8.4, 2.8, layout="constrained")
-    panels = figure.subplots(1, 3)
-    draw_outline(panels, outline, None, measures.unit)
-    for axis, axes in enumerate(panels):
-        index = tuple(outline.places[k] if k == axis else slice(None, None, step) for k, step in enumerate(steps))
-        plane, (down, across) = factor * volume.values[index], np.delete(outline.spacing, axis)
-        colours = {"cmap": "viridis", "vmin": 0.0, "vmax": most, "aspect": down / across, "interpolation": "nearest"}
-        picture = axes.imshow(np.where(plane > 0, plane, np.nan), **colours)
-    bar = figure.colorbar(picture, ax=list(panels), label=f"Tb.Th ({unit_name(measures.unit, 2)})", shrink=0.85)
-    bar.ax.tick_params(labelsize=8, length=2)
-    return figure
 
 
 def centreline_figure(measures: Measures, centreline: Centreline) -> Figure | None:
@@ -194,12 +170,9 @@ def measures_figure(measures: Measures) -> Figure:
 
 def diagrams_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figure:
     """Return a figure of the curvature diagrams of scans of one unit, all on the same axes."""
-    diagrams = [scan.diagram for scan in measures if scan.diagram.area > 0]
-    x, y = plot.shown_window(diagrams) if diagrams else ((0.0, 1.0), (0.0, 1.0))
-    limits = min(x[0], y[0]), max(x[1], y[1])
+    limits = plot.shared_limits([scan.diagram for scan in measures if scan.diagram.area > 0])
     columns, rows = min(DIAGRAMS, len(names)), math.ceil(len(names) / DIAGRAMS)
-    ratio = min(1.6, (y[1] - y[0]) / (x[1] - x[0]))
-    figure = plot.make_figure(2.6 * columns, (2.1 * ratio + 0.6) * rows, layout="constrained")
+    figure = plot.make_figure(2.6 * columns, 2.7 * rows, layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in panels[len(names) :]:
         axes.set_axis_off()
@@ -209,7 +182,7 @@ def diagrams_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figur
             axes.text(0.5, 0.5, "no surface", ha="center", transform=axes.transAxes, color=plot.QUIET)
             axes.set(xticks=[], yticks=[])
             continue
-        plot.diagram_on(axes, scan.diagram, limits=limits, unit=scan.unit, window=(x, y))
+        plot.diagram_on(axes, scan.diagram, limits=limits, unit=scan.unit)
         axes.tick_params(labelsize=7)
         for label in (axes.xaxis.label, axes.yaxis.label):
             label.set_fontsize(8)

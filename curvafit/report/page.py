@@ -191,15 +191,15 @@ def outlines_figure(names: Sequence[str], outlines: Sequence[Outline | None], un
         return None
     figure = plot.make_figure(7.6, 2.6 * len(known), layout="constrained")
     for row, (name, outline) in zip(figure.subplots(len(known), 3, squeeze=False), known, strict=True):
-        draw_outline(row, outline, outline.inside, unit)
+        draw_outline(row, outline, unit)
         row[0].set_ylabel(plot.plain(name), fontsize=9)
     return figure
 
 
-def draw_outline(row: Sequence[Axes], outline: Outline, inside: Sequence[np.ndarray] | None, unit: str) -> None:
-    """Draw the slices of an outline, their positions and the scale, with what is outlined, if anything is."""
+def draw_outline(row: Sequence[Axes], outline: Outline, unit: str) -> None:
+    """Draw the slices of an outline with what counts inside, their positions and the scale."""
     limits = plot.grey_limits(np.concatenate([plane.ravel() for plane in outline.levels]))
-    plot.sections_on(row, plot.Sections(outline.levels, inside, limits), outline.spacing)
+    plot.sections_on(row, plot.Sections(outline.levels, outline.inside, limits), outline.spacing)
     for axes, name, place in zip(row, "zyx", outline.places, strict=True):
         axes.set_title(f"{name} = {place}", fontsize=8)
     plot.scale_on(row[0], outline.spacing[2], unit)

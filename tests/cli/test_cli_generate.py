@@ -15,7 +15,9 @@ import torch
 import trimesh
 from calling import LAW, QUICK, call, done, made, refused
 from found import made_fit
+from matplotlib.figure import Figure
 
+from curvafit.drawing.plot import make_figure
 from curvafit.generation.schedule import schedule
 from curvafit.priors.energies import orientation
 from curvafit.priors.grid import Grid
@@ -29,7 +31,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 def undrawn(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """Empty pictures, but where a test is named after its own."""
     if "a_field_a_picture" not in request.node.name:
-        monkeypatch.setattr("curvafit.drawing.shapes.surface_picture", lambda u, path: path.write_bytes(b""))
+        monkeypatch.setattr("curvafit.drawing.shapes.surface_figure", lambda u, width: make_figure(1, 1))
 
 
 @pytest.fixture
@@ -206,12 +208,12 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint(tmp_path: Path, monkeypa
 def test_a_picture_that_fails_is_one_line_and_undoes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The former one, of another shape, goes."""
 
-    def drawn(u: np.ndarray, path: Path) -> None:
+    def drawn(figure: Figure, path: Path) -> None:
         assert names(path.parent) == ["out.npy"]
         full()
 
     made(*QUICK, "-o", tmp_path / "out.npy")
-    monkeypatch.setattr("curvafit.drawing.shapes.surface_picture", drawn)
+    monkeypatch.setattr("curvafit.drawing.shapes.write_picture", drawn)
     result = call("generate", *QUICK, "--seed", 1, "-o", tmp_path / "out.npy")
     assert result.exit_code == 0 and "note: " in result.stderr and "picture" in result.stderr
     assert names(tmp_path) == ["out.json", "out.npy"]

@@ -12,6 +12,7 @@ from exact_store import SETTINGS, exact_store
 from found import made_inference
 
 from curvafit.data_synth.store import open_store
+from curvafit.drawing.plot import make_figure
 from curvafit.report.inference import FILES, write_inference
 from curvafit.volumes import Volume, load, save
 
@@ -23,7 +24,7 @@ MASK = Volume((np.indices((12, 12, 12)).sum(0) % 12 < 6).astype(np.uint8))
 
 @pytest.fixture(autouse=True)
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("curvafit.drawing.shapes.surface_picture", lambda u, path: path.write_bytes(b""))
+    monkeypatch.setattr("curvafit.drawing.shapes.surface_figure", lambda u, width: make_figure(1, 1))
 
 
 def thesis(folder: Path) -> Path:
@@ -90,7 +91,7 @@ def test_a_record_speaks_for_its_own_files_alone(tmp_path: Path) -> None:
 
 def test_infer_leaves_other_peoples_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = '<meta name="generator" content="curvafit 0">'
-    monkeypatch.setattr("curvafit.report.inference.write_report", lambda found, path: path.write_text(page))
+    monkeypatch.setattr("curvafit.report.inference.report_html", lambda found: page)
     monkeypatch.setattr(
         importlib.import_module("curvafit.inference.inference"), "infer", lambda *_, **__: made_inference()
     )

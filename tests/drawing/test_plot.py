@@ -15,7 +15,7 @@ import torch
 import curvafit
 from curvafit.core.runtime import Pictured
 from curvafit.drawing import plot
-from curvafit.drawing.rendering import render, surface_picture, view
+from curvafit.drawing.rendering import render, view
 from curvafit.generation import Schedule, generate
 from curvafit.geometry.diagrams import Diagram
 from curvafit.volumes.volume import Volume
@@ -163,13 +163,13 @@ def test_a_slice_shows_its_contour_in_physical_places() -> None:
 
 
 def test_pictures_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
-    made = surface_picture(ball((12, 12, 12), 4) > 0, tmp_path / "ball.png", width=160)
+    made = plot.write_picture(plot.surface_figure(ball((12, 12, 12), 4) > 0, width=160), tmp_path / "ball.png")
     assert matplotlib.image.imread(made).shape[:2] == (160, 160)
     two = plot.gallery_figure({"one": ball((12, 12, 12), 4), "two": ball((12, 12, 12), 3)}, width=320)
     plot.write_picture(two, tmp_path / "two.png")
     assert matplotlib.image.imread(tmp_path / "two.png").shape[1] == 320
     with pytest.raises(ValueError, match="finite"):
-        surface_picture(np.full((8, 8, 8), np.inf), tmp_path / "no.png")
+        plot.write_picture(plot.surface_figure(np.full((8, 8, 8), np.inf)), tmp_path / "no.png")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.png", "two.png"]
 
 

@@ -22,7 +22,6 @@ from curvafit.report.inference import (
     family_radius,
     parameter_table,
     report_html,
-    with_command,
     write_inference,
 )
 from curvafit.volumes.read import load
@@ -120,8 +119,8 @@ def regrown(inference: Inference, phase: np.ndarray) -> Inference:
 
 
 def test_an_inference_is_written_whole(tmp_path: Path, undrawn: None) -> None:
-    found = with_command(made_inference(), "curvafit infer 'a b.tif' -o out")
-    report = write_inference(found, tmp_path / "deep" / "out")
+    found = made_inference()
+    report = write_inference(found, tmp_path / "deep" / "out", command="curvafit infer 'a b.tif' -o out")
     assert report == tmp_path / "deep" / "out" / "report.html"
     names = sorted(path.name for path in report.parent.iterdir())
     assert names == ["fit.json", "regenerated.nii.gz", "report.html"]
