@@ -47,9 +47,7 @@ def made_inference(
     grey = np.clip(110 + 60 * phase + noise, 0, 255).astype(np.uint8)
     grid = Grid(phase.shape, 0.01, "replicate")
     whole = (slice(0, n), slice(0, n), slice(0, n))
-    prepared = Prepared(
-        "image", phase, phase > 0, grid, (1.0,) * 3, SCALE, "mm", 2 * RADIUS, (whole,), ("Split at 110.",)
-    )
+    prepared = Prepared("image", phase, phase > 0, grid, (1.0,) * 3, SCALE, "mm", 2 * RADIUS, whole, ("Split at 110.",))
     barren = Twin(None, -0.58, None, None, "the field is of one phase")
     twins = {"posterior": (barren,) if lost else (twin_of(regrown),) * 2, "match": (twin_of(matched),)}
     scan, fit = Volume(grey, (SCALE,) * 3, "mm", source=source), made_fit("match" if lost else chosen, lost)

@@ -1,5 +1,4 @@
 from .plot import diagram_figure as diagram_figure
-from .plot import slice_figure as slice_figure
 from .plot import surface_figure as surface_figure
 from .plot import write_picture as write_picture
 from .rendering import View as View

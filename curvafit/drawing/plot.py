@@ -19,7 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon, Rectangle
+from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 from scipy.ndimage import gaussian_filter
@@ -94,48 +94,6 @@ def gallery_figure(fields: Mapping[str, np.ndarray], *, columns: int = 4, width:
         axes = figure.add_axes((column / columns + 0.004, bottom + 0.11 / rows, 1 / columns - 0.008, 0.88 / rows))
         surface_on(axes, u, width=round(width / columns), **options)
         figure.text((column + 0.5) / columns, bottom + 0.05 / rows, name, ha="center", va="center", fontsize=12)
-    return figure
-
-
-# ---- slices ----------------------------------------------------------------------------------------------------------
-
-
-def slice_figure(
-    image: np.ndarray,
-    structure: np.ndarray,
-    *,
-    image_extent: tuple[float, float, float, float],
-    extent: tuple[float, float, float, float],
-    limits: Limits,
-    unit: str,
-    axes_names: tuple[str, str],
-    window: tuple[float, float, float, float] | None = None,
-) -> Figure:
-    """Return a figure of a grey slice with the zero contour of `structure` over it, and a frame around a `window`.
-
-    Image and structure are two-dimensional, rows first, over rectangles (left, right, bottom, top) in `unit`. `limits`
-    are the grey values shown as black and white, `axes_names` those of the vertical and the horizontal axis.
-    """
-    left, right, bottom, top = extent
-    ratio = min(max(abs(top - bottom) / abs(right - left), 0.25), 2.0)
-    figure = make_figure(4.2, 3.9 * ratio + 0.4, layout="constrained")
-    axes = figure.subplots()
-    axes.spines[:].set_color(QUIET)
-    axes.imshow(image, cmap="gray", vmin=limits[0], vmax=limits[1], extent=image_extent, interpolation="nearest")
-    rows, columns = structure.shape
-    x = left + (np.arange(columns) + 0.5) / columns * (right - left)
-    y = top + (np.arange(rows) + 0.5) / rows * (bottom - top)
-    if structure.min() < 0 < structure.max():
-        axes.contour(x, y, structure, levels=[0.0], colors=CONTOUR, linewidths=1.3)
-    if window is not None:
-        corner = (min(window[:2]), min(window[2:]))
-        box = Rectangle(corner, abs(window[1] - window[0]), abs(window[3] - window[2]), fill=False)
-        box.set(edgecolor="white", linestyle=(0, (4, 3)), linewidth=1.2)
-        axes.add_patch(box)
-    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
-    axes.set_ylabel(axes_names[0], rotation=0, labelpad=6)
-    axes.set_xlabel(axes_names[1], labelpad=2)
-    scale_on(axes, 1.0, unit)
     return figure
 
 

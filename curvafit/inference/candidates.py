@@ -169,7 +169,7 @@ def twin(
     (`Prepared.true_volume_fraction`), or at the law's own mass where nothing grows at that.
     """
     ratio = 1.0 if law.thickness is None else law.thickness / prepared.thickness
-    z, y, x = (int(np.clip(ratio * (edge.stop - edge.start), EDGES[0], longest)) for edge in prepared.windows[0])
+    z, y, x = (int(np.clip(ratio * (edge.stop - edge.start), EDGES[0], longest)) for edge in prepared.window)
     grid = Grid((z, y, x), prepared.grid.spacing, "periodic")
     options = {"schedule": schedule, "seed": seed, "reject_early": True}
     if law.name == "match" and prepared.kind != "field":

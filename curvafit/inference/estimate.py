@@ -189,7 +189,7 @@ def check_law(
     grow.
     """
     reading = described.reading
-    across = windows_along(prepared, [edge.stop - edge.start for edge in prepared.windows[0]])
+    across = windows_along(prepared, [edge.stop - edge.start for edge in prepared.window])
     count = math.ceil(TESTED / math.prod(across))
 
     def read_twin(seed: int) -> Reading | None:

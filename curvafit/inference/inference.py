@@ -223,7 +223,7 @@ def _estimate(
     if prepared.kind == "field" and not is_rounded(prepared.phase):
         starts = [law.coefficients for law in (*estimate.candidates[:1], *matches[:STARTS])]
         options = {"starts": starts, "seed": seed, "progress": sub_progress(progress, 0.5, 0.6)}
-        window = prepared.windows[0]
+        window = prepared.window
         phase = torch.from_numpy(np.ascontiguousarray(prepared.phase[window]))
         laws = (stationarity(phase, prepared.part(window), WORKING_EPSILON, **options), *laws)
     return replace(estimate, candidates=laws, matches=matches)

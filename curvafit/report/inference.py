@@ -27,9 +27,9 @@ from curvafit.inference.posterior import KNOWN
 from curvafit.inference.table import parameters_of
 from curvafit.priors.law import FORMAT
 from curvafit.report import page
-from curvafit.scan.measures import QUANTITIES
+from curvafit.scan.measures import QUANTITIES, Outline
 from curvafit.studies.scans import Task, name_errors, share_out
-from curvafit.volumes.volume import Volume
+from curvafit.volumes.volume import Box, Volume
 from curvafit.volumes.write import save
 
 #: What an inference writes into its folder.
@@ -81,7 +81,8 @@ def write_inference(inference: Inference, directory: str | Path, *, command: str
 
 def report_html(inference: Inference) -> str:
     """Return the report of an inference as the text of its page."""
-    fit, limits = inference.fit, plot.grey_limits(inference.scan.values)
+    fit, scan = inference.fit, inference.scan
+    slices = page.outlines_figure([name_source(scan.source) or "the scan"], [_outline(inference)], scan.unit)
     made = {str(name).replace("_", " "): _to_words(value) for name, value in fit.provenance.items()}
     matches = []
     for match in fit.matches:
@@ -91,8 +92,7 @@ def report_html(inference: Inference) -> str:
         "report.html", title=f"{describe(inference)}.", made=made, version=fit.provenance.get("curvafit", ""), fit=fit,
         status=fit.status, voxel=format_length(inference.prepared.working_voxel, fit.length_unit, 3),
         scan=describe_scan(inference), matches=matches,
-        slices=[_slice(inference, axis, limits) for axis in range(3)],
-        windows=len(inference.prepared.windows) if _is_framed(inference) else 0,
+        slices=page.picture_of(slices, "Three slices with the outline of the structure"),
         shapes=_shapes(inference) if inference.twins else [],
         diagrams=[] if inference.diagram is None else _diagrams(inference), distances=_distances(inference),
         unit=format_length(fit.length, fit.length_unit, 3), twins=0 if fit.best is None else len(fit.best.twins),
@@ -268,36 +268,20 @@ def inference_figure(inference: Inference, **options: Any) -> Figure:
     return plot.gallery_figure(shapes, **{"columns": 2, "width": 900, **options})
 
 
-def _slice(inference: Inference, axis: int, limits: tuple[float, float]) -> page.Picture:
-    """Return a picture of the slice through the middle of the main window: the scan, and the outline of the surface."""
-    scan, prepared, window = inference.scan, inference.prepared, inference.prepared.windows[0]
-    shape, name = scan.values.shape, "zyx"[axis]
-    working_index = (window[axis].start + window[axis].stop) // 2
-    index = int(np.clip(prepared.origin[axis] + (working_index + 0.5) * prepared.scale[axis], 0, shape[axis] - 1))
-    # Positions of voxel faces in the scan's unit: the working grid lies somewhere within the scan.
-    start, step = np.array(prepared.origin) * scan.spacing, np.array(prepared.scale) * scan.spacing
-    down, across = (k for k in range(3) if k != axis)
+def _outline(inference: Inference) -> Outline:
+    """Cut three slices through the middle of what was measured, with the structure on the working grid."""
+    prepared = inference.prepared
+    padded = np.pad(prepared.mask, 1)  # nothing is inside beyond the grid
 
-    def extent(low: np.ndarray, high: np.ndarray) -> tuple[float, float, float, float]:
-        return low[across], high[across], high[down], low[down]
+    def find_inside(box: Box) -> np.ndarray:
+        indices = [
+            np.clip(np.floor((np.arange(side.start, side.stop) + 0.5 - first) / step).astype(int), -1, n) + 1
+            for side, first, step, n in zip(box, prepared.origin, prepared.scale, prepared.mask.shape, strict=True)
+        ]
+        return padded[np.ix_(*indices)]
 
-    low, high = start + step * [side.start for side in window], start + step * [side.stop for side in window]
-    figure = plot.slice_figure(
-        np.asarray(scan.values.take(index, axis), dtype=np.float32), prepared.phase.take(working_index, axis),
-        image_extent=extent(np.zeros(3), np.array(shape) * scan.spacing),
-        extent=extent(start, start + step * prepared.phase.shape), limits=limits, unit=scan.unit,
-        axes_names=("zyx"[down], "zyx"[across]), window=extent(low, high) if _is_framed(inference) else None,
-    )  # fmt: skip
-    depth = format_length((index + 0.5) * scan.spacing[axis], scan.unit)
-    is_crop = list(shape) != inference.fit.provenance.get("scan_shape", list(shape))
-    text = f"Slice {index} of {shape[axis]}{' of the part that was read' if is_crop else ''}, at {depth}"
-    return page.picture_of(figure, f"Slice across {name} with the surface's outline", title=f"Across {name}", text=text)
-
-
-def _is_framed(inference: Inference) -> bool:
-    """Return whether the main window is smaller than the whole working grid."""
-    shape = inference.prepared.phase.shape
-    return any(side.stop - side.start < n for side, n in zip(inference.prepared.windows[0], shape, strict=True))
+    middle = np.array(prepared.origin) + np.array(prepared.scale) * prepared.mask.shape / 2
+    return Outline.cut(inference.scan, find_inside, places=[int(place) for place in middle])
 
 
 def _shapes(inference: Inference) -> list[page.Picture]:
@@ -324,7 +308,7 @@ def _shape(inference: Inference, title: str, u: np.ndarray | None, note: str = "
 
 def scan_box(inference: Inference) -> np.ndarray:
     """Return the main window's phase field, cut to the size of the regenerated shape so that both have one scale."""
-    phase = inference.prepared.phase[inference.prepared.windows[0]]
+    phase = inference.prepared.phase[inference.prepared.window]
     if inference.best is None:
         return phase
     shape = inference.best.shape

@@ -40,11 +40,11 @@ def bounding_box(shape: tuple[int, int, int], region: np.ndarray | None, longest
 
 def median_thickness(mask: np.ndarray, spacing: tuple[float, float, float], periodic: bool) -> tuple[float, float]:
     """Return the median and 95th percentile of the local thickness over the structure's surface, measured in the box of
-    at most `MEASURED` voxels a side that `boxes_by_surface` puts first."""
+    at most `MEASURED` voxels a side that `box_by_surface` picks."""
     # Weighed by surface, not by volume, as a curvature diagram is: else a rind around thin struts would set the scale.
     surface = surface_voxels(mask)
-    boxes = boxes_by_surface(surface, MEASURED)
-    cropped, surface = (mask[boxes[0]], surface[boxes[0]]) if boxes else (mask, mask)
+    box = box_by_surface(surface, MEASURED)
+    cropped, surface = (mask[box], surface[box]) if box else (mask, mask)
     return thickness_beneath(cropped, surface, spacing, periodic and cropped.shape == mask.shape)
 
 
@@ -61,11 +61,11 @@ def surface_voxels(mask: np.ndarray) -> np.ndarray:
     return mask & ~ndimage.binary_erosion(mask, border_value=1)  # pyright: ignore[reportOperatorIssue]
 
 
-def boxes_by_surface(content: np.ndarray, size: int | Sequence[int]) -> list[Box]:
-    """Return the boxes of `candidate_boxes` in which `content` has voxels, that with most first; but the middle box
-    before all others, unless it has less than half of the average."""
+def box_by_surface(content: np.ndarray, size: int | Sequence[int]) -> Box | None:
+    """Return the one of `candidate_boxes` that `pick_box` picks by its voxels of `content`; None where it has none."""
     candidates = candidate_boxes(content.shape, size)
-    return order_boxes(candidates, [int(np.count_nonzero(content[box])) for box in candidates])
+    counts = [int(np.count_nonzero(content[box])) for box in candidates]
+    return pick_box(candidates, counts) if any(counts) else None
 
 
 def candidate_boxes(shape: Sequence[int], size: int | Sequence[int]) -> list[Box]:
@@ -76,14 +76,11 @@ def candidate_boxes(shape: Sequence[int], size: int | Sequence[int]) -> list[Box
     return [middle] + [(z, y, x) for z in tiles[0] for y in tiles[1] for x in tiles[2] if (z, y, x) != middle]  # type: ignore[list-item]
 
 
-def order_boxes(candidates: Sequence[Box], counts: Sequence[int]) -> list[Box]:
-    """Return the boxes of `candidate_boxes` whose count of voxels is above 0, in the order of `boxes_by_surface`."""
-    filled = [(count, box) for count, box in zip(counts, candidates, strict=True) if count]
-    ordered = [box for _, box in sorted(filled, key=lambda pair: -pair[0])]
-    if ordered and counts[0] >= 0.5 * sum(counts) / len(counts):  # of the middle box
-        ordered.remove(candidates[0])
-        ordered.insert(0, candidates[0])
-    return ordered
+def pick_box(candidates: Sequence[Box], counts: Sequence[int]) -> Box:
+    """Return the middle box, the first of `candidate_boxes`, unless its count of voxels is less than half of the
+    average; then the box with most."""
+    middle_will_do = counts[0] >= 0.5 * sum(counts) / len(counts)
+    return candidates[0 if middle_will_do else int(np.argmax(counts))]
 
 
 def box_with_most_surface(mask: np.ndarray, edge: int | Sequence[int]) -> Box:

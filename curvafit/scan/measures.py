@@ -118,10 +118,13 @@ class Outline:
     spacing: tuple[float, ...]
 
     @classmethod
-    def cut(cls, scan: Volume, find_inside: Callable[[Box], np.ndarray], region: Volume | None = None) -> Outline:
-        """Cut a scan's middle slices, or those through the middle of a region, in which alone structure counts.
-        `find_inside` returns the structure of a box of the scan."""
-        places, steps = [n // 2 for n in scan.shape], [math.ceil(n / SHOWN) for n in scan.shape]
+    def cut(
+        cls, scan: Volume, find_inside: Callable[[Box], np.ndarray], region: Volume | None = None,
+        places: Sequence[int] | None = None,
+    ) -> Outline:  # fmt: skip
+        """Cut slices of a scan at `places`, by default the middle ones, or those through the middle of a region, in
+        which alone structure counts. `find_inside` returns the structure of a box of the scan."""
+        places, steps = places or [n // 2 for n in scan.shape], [math.ceil(n / SHOWN) for n in scan.shape]
         if region is not None:
             occupied = [np.flatnonzero(region.values.any(axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
             places = [int(places[0] + places[-1]) // 2 for places in occupied]

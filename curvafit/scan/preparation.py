@@ -1,4 +1,4 @@
-"""From a scan to the working grid: what is structure, on which voxels, seen through which windows."""
+"""From a scan to the working grid: what is structure, on which voxels, seen through which window."""
 
 from __future__ import annotations
 
@@ -73,8 +73,8 @@ class Prepared:
         Edge of a working voxel in `unit`.
     thickness
         Median thickness beneath the surface, in working voxels, of the phase that fills less of the volume.
-    windows
-        Overlapping boxes of at most 128 voxels a side that cover the surface, the main one first.
+    window
+        The middle box, of at most 128 voxels a side, or that with most surface where the middle has little.
     origin
         Scan voxel coordinates (z, y, x) of the corner of the first working voxel.
     roi
@@ -97,7 +97,7 @@ class Prepared:
     working_voxel: float
     unit: str
     thickness: float
-    windows: tuple[Box, ...]
+    window: Box
     notes: tuple[str, ...]
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     roi: np.ndarray | None = None
@@ -141,7 +141,7 @@ class Prepared:
         if self.kind == "field":
             return self.volume_fraction
         shift = 0.0 if self.quality is None else self.quality.boundary_shift / max(self.scale)
-        inside = grids.centre_distance(self.mask[self.windows[0]], (1.0, 1.0, 1.0), 4.0) > shift
+        inside = grids.centre_distance(self.mask[self.window], (1.0, 1.0, 1.0), 4.0) > shift
         try:
             rescanned = self.scan_alike(inside, 0).volume_fraction
         except ScanError:
@@ -300,7 +300,7 @@ class _Scan:
 
 def _put_on_grid(scan: _Scan, choose_box: Callable[[_Scan, tuple[float, float, float]], _Extent]) -> Prepared:
     """Put a scan on the working grid: choose the working voxel, resample the box that `choose_box` returns, drop
-    specks, make the phase field of the mask, and choose windows."""
+    specks, make the phase field of the mask, and choose the window."""
     spacing = scan.field.spacing
     noise = scan.kind != "field" and structure.is_noise(scan.field.values > 0)
     keeps_grid = scan.kind == "field" or noise  # a phase field has its ε, and noise no thickness
@@ -314,9 +314,9 @@ def _put_on_grid(scan: _Scan, choose_box: Callable[[_Scan, tuple[float, float, f
     values, region = _resample(scan, scale, start, shape)
     grid = Grid(shape, boundary="periodic" if scan.periodic and not cut else "replicate")
     mask, dropped = _clean_mask(scan.kind, values, region, thickness / edge, grid.periodic)
-    windows = grids.boxes_by_surface(grids.surface_voxels(mask), LARGEST_WINDOW)
+    window = grids.box_by_surface(grids.surface_voxels(mask), LARGEST_WINDOW)
     inverted = note_on_filling(float((mask if region is None else mask[region]).mean()))
-    if not windows:
+    if window is None:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
 
     def profile(mask: np.ndarray) -> np.ndarray:
@@ -333,7 +333,7 @@ def _put_on_grid(scan: _Scan, choose_box: Callable[[_Scan, tuple[float, float, f
     notes = (*scan.field.notes, thickness_note, *why, *cut, *dropped, *inverted)
     origin = tuple(first * step for first, step in zip(start, scale, strict=True))
     known = {"roi": region, "noise": noise, "one_scale": scan.one_scale}
-    return Prepared(scan.kind, phase, mask, grid, *size, tuple(windows), notes, origin, **known)  # type: ignore[arg-type]
+    return Prepared(scan.kind, phase, mask, grid, *size, window, notes, origin, **known)  # type: ignore[arg-type]
 
 
 def note_on_filling(share: float) -> tuple[str, ...]:
@@ -405,8 +405,8 @@ def _choose_box(scan: _Scan, scale: tuple[float, float, float]) -> _Extent:
         return (0, 0, 0), shape, ()
     sides = [min(n, LARGEST_BOX) for n in shape]
     scan_sides = [math.ceil(side * step) for side, step in zip(sides, scale, strict=True)]
-    boxes = grids.boxes_by_surface(grids.surface_voxels(scan.counted), scan_sides)
-    box = boxes[0] if boxes else tuple(slice(0, side) for side in scan_sides)
+    box = grids.box_by_surface(grids.surface_voxels(scan.counted), scan_sides)
+    box = box or tuple(slice(0, side) for side in scan_sides)
     latest = [n - side for n, side in zip(shape, sides, strict=True)]  # starts at which the box ends with the scan
     z, y, x = (min(int(edge.start / step), end) for edge, step, end in zip(box, scale, latest, strict=True))
     note = f"Of {_join_sides(shape)} working voxels, {_join_sides(sides)} from {(z, y, x)} on are used."
@@ -461,7 +461,7 @@ def _join_sides(shape: Iterable[int]) -> str:
 
 def why_no_texture(prepared: Prepared, diagram: Diagram) -> str:
     """Return a sentence on why no law can be read from a scan's texture; empty where one can."""
-    edge = max(s.stop - s.start for s in prepared.windows[0]) * prepared.grid.spacing[0]
+    edge = max(s.stop - s.start for s in prepared.window) * prepared.grid.spacing[0]
     curvature = np.average(np.hypot(*np.asarray(diagram.points).T), weights=np.asarray(diagram.weights))
     if curvature * edge < FLATTEST:
         return "No law: the surface is flat, and a flat surface says nothing of how it would bend."

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from curvafit.scan.grids import boxes_by_surface, centre_distance, resample, resample_mask, surface_voxels
+from curvafit.scan.grids import box_by_surface, centre_distance, resample, resample_mask, surface_voxels
 from curvafit.volumes.volume import ScanError
 
 #: Blurs, shifts of the boundary and grains that are tried, in voxels of the finest axis.
@@ -97,7 +97,7 @@ def measure_quality(image: np.ndarray, mask: np.ndarray, spacing: tuple[float, f
     lighting (Immerkær 1996). The mask of the structure is bool, of the image's shape `(Z, Y, X)`. Raises ScanError if
     the grey levels have no contrast between structure and background.
     """
-    box = next(iter(boxes_by_surface(surface_voxels(mask), _MEASURED)), (slice(None),) * 3)
+    box = box_by_surface(surface_voxels(mask), _MEASURED) or (slice(None),) * 3
     image, mask = image[box].astype(np.float32), mask[box]
     levels = image - image.mean()
     edges = [h / min(spacing) for h in spacing]

@@ -17,7 +17,7 @@ import numpy as np
 from curvafit.geometry.balls import ball_radii
 from curvafit.scan import preparation
 from curvafit.scan import structure as splitting
-from curvafit.scan.grids import MEASURED, candidate_boxes, order_boxes, surface_voxels, thickness_beneath
+from curvafit.scan.grids import MEASURED, candidate_boxes, pick_box, surface_voxels, thickness_beneath
 from curvafit.scan.measures import MOST, Blocks
 from curvafit.scan.structure import LAGS, Structure, add_records, find_levels
 from curvafit.volumes.run import Record, Run
@@ -76,12 +76,12 @@ def survey(structure: Structure, run: Run) -> Plan:
     plan = Plan(structure, noise, (*volume.notes, note))
     structure_is_thinner = filled <= preparation.HALF * size
     candidates = candidate_boxes(volume.shape, MEASURED)
-    median, thick, plan = _measure_thickness(plan, order_boxes(candidates, total["surface"].tolist()), True)
+    median, thick, plan = _measure_thickness(plan, pick_box(candidates, total["surface"].tolist()), True)
     if structure.kind == "image":
         plan = replace(plan, smallest=preparation.smallest_piece(median) / math.prod(volume.spacing))
     if not structure_is_thinner:
-        order = order_boxes(candidates, total["other surface"].tolist())
-        median, thick, plan = _measure_thickness(plan, order, False)
+        box = pick_box(candidates, total["other surface"].tolist())
+        median, thick, plan = _measure_thickness(plan, box, False)
     # the working grid, as `preparation.prepare` chooses it
     keeps_grid, name = structure.kind == "field" or noise, "structure" if structure_is_thinner else "background"
     note = preparation.judge_thickness(name, median, thick, volume.spacing, keeps_grid)
@@ -91,9 +91,9 @@ def survey(structure: Structure, run: Run) -> Plan:
     return replace(plan, thickness=median, scale=scale, working=working, edge=edge, working_notes=(note, *why))
 
 
-def _measure_thickness(plan: Plan, order: Sequence[Box], inside: bool) -> tuple[float, float, Plan]:
-    """Return the median and 95th percentile of a phase's thickness in the first box, and the plan with its reach."""
-    spacing, box = plan.volume.spacing, order[0]
+def _measure_thickness(plan: Plan, box: Box, inside: bool) -> tuple[float, float, Plan]:
+    """Return the median and 95th percentile of a phase's thickness in a box, and the plan with its reach."""
+    spacing = plan.volume.spacing
     around = grow(box, 1, plan.volume.shape)  # a voxel is on the surface by its neighbours
     phase = (find_levels(plan.structure, around) > 0) == inside
     mask, surface = (voxels[within(box, around)] for voxels in (phase, surface_voxels(phase)))

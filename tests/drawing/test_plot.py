@@ -149,19 +149,6 @@ def test_a_diagram_puts_its_mass_where_the_curvatures_are() -> None:
     assert len(diagonal) == 1 and np.array_equal(*diagonal[0].get_data())
 
 
-def test_a_slice_shows_its_contour_in_physical_places() -> None:
-    structure = ball((32, 32, 32), 8)[16]
-    figure = plot.slice_figure(
-        structure, structure, image_extent=(0, 3.2, 3.2, 0), extent=(0, 3.2, 3.2, 0), limits=(-1, 1), unit="mm",
-        axes_names=("y", "x"),
-    )  # fmt: skip
-    outline = np.concatenate([path.vertices for path in figure.axes[0].collections[0].get_paths()])
-    radii = np.hypot(*(outline - 1.6).T)
-    assert radii == pytest.approx(0.8, abs=0.02)
-    (bar,) = figure.axes[0].lines
-    assert np.ptp(bar.get_xdata()) == pytest.approx(1) and figure.axes[0].texts[0].get_text() == "1\xa0mm"
-
-
 def test_pictures_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
     made = plot.write_picture(plot.surface_figure(ball((12, 12, 12), 4) > 0, width=160), tmp_path / "ball.png")
     assert matplotlib.image.imread(made).shape[:2] == (160, 160)

@@ -331,7 +331,7 @@ def check(prepared: Prepared, monkeypatch: pytest.MonkeyPatch, grow: Callable[..
 def test_shapes_show_as_many_windows_as_the_scan(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(estimate, "TESTED", 8)
     prepared, lengths = gyroid(0.1, (40, 40, 96)), []
-    shown = windows_along(prepared, prepared.mask[prepared.windows[0]].shape)
+    shown = windows_along(prepared, prepared.mask[prepared.window].shape)
     assert shown == [1, 1, 2]
 
     def grow(*_: object, longest: int, **__: object) -> Twin:

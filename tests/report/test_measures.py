@@ -10,7 +10,7 @@ from found import lattice, without_drawing
 
 from curvafit.report.inference import infer_scans, name_folders
 from curvafit.report.page import WORD, name_parts, outlines_figure, shorten
-from curvafit.scan.measures import Measures
+from curvafit.scan.measures import Measures, Outline
 from curvafit.scan.tiles import measure
 from curvafit.volumes.read import load
 from curvafit.volumes.volume import Volume
@@ -78,6 +78,19 @@ def test_an_outline_shows_what_counted(scans: list[Path]) -> None:
     figure = outlines_figure(["a", "b", "c"], [part, None, part], "um")
     assert figure is not None and len(figure.axes) == 6
     assert outlines_figure(["a"], [None], "um") is None
+
+
+def test_a_slice_shows_its_contour_in_physical_places() -> None:
+    """The outline of a ball of voxels of 0.1 mm misses its radius by half of one at most; the bar is 1 mm long."""
+    inside = np.linalg.norm(np.indices((32, 32, 32)) - 15.5, axis=0) < 8
+    outline = Outline.cut(Volume(inside.astype(np.uint8), (0.1,) * 3, "mm"), inside.__getitem__)
+    figure = outlines_figure(["ball"], [outline], "mm")
+    assert figure is not None
+    for axes, width in zip(figure.axes, (1.0, 0.0, 0.0), strict=True):
+        border = np.concatenate([path.vertices for path in axes.collections[0].get_paths()])
+        assert 0.1 * np.hypot(*(border - 15.5).T) == pytest.approx(0.8, abs=0.05)
+        assert sum(0.1 * np.ptp(bar.get_xdata()) for bar in axes.lines) == pytest.approx(width)
+    assert figure.axes[0].texts[0].get_text() == "1\xa0mm"
 
 
 @pytest.mark.slow

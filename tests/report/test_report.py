@@ -67,14 +67,14 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_page_stands_alone_and_is_well_formed(html: str) -> None:
     page = Page(html)
     links = [value or "" for name, value in page.attributes if name in ("src", "action", "srcset")]
-    assert len(links) == 10 and all(link.startswith("data:image/png;base64,") for link in links)
+    assert len(links) == 8 and all(link.startswith("data:image/png;base64,") for link in links)
     hrefs = [value or "" for name, value in page.attributes if name == "href"]
     assert {href.removeprefix(GLOSSARY) for href in hrefs} == {"#law", "#working-unit"}
     assert len(re.findall(r"https?:", html)) == len(hrefs) and "url(" not in html and "<script" not in html
     assert "tubes <b>" not in html and "tubes &lt;b&gt;&amp;.tif" in html
     assert all(base64.b64decode(link.partition(",")[2])[:4] == b"\x89PNG" for link in links)
     alts = [value for name, value in page.attributes if name == "alt"]
-    assert len(alts) == 10 and all(alts)
+    assert len(alts) == 8 and all(alts)
     assert len(html) < 4_000_000
 
 
