@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from curvafit.cli.console import command_line, print_table, say, say_notes, show_stages
-from curvafit.cli.options import FILES, Group, OverwriteOption, Reading, Structure, command
+from curvafit.cli.options import Group, Input, OverwriteOption, Reading, Structure, command
 
 if TYPE_CHECKING:
     from curvafit.inference.inference import Inference
@@ -29,36 +29,29 @@ def parse_inference(
     "curvafit infer vessels.nii.gz --kind mask --test -o vessels",
     "curvafit infer cells.ome.zarr --channel 1 --crop 0:64,100:300,100:300 --dark --threshold 90 -o cells",
     "curvafit infer fibres.raw --raw-shape 128,128,128 --dtype u1 -o fibres",
-    "curvafit infer mouse1.nii.gz mouse2.nii.gz mouse3.nii.gz -o mice",
 )
 def infer(
-    scans: Annotated[list[str], typer.Argument(help=FILES)],
-    out: Annotated[Path, typer.Option("-o", "--output", help="Folder for the report; of several scans, for theirs.")],
+    scan: Input,
+    out: Annotated[Path, typer.Option("-o", "--output", help="Folder for the report.")],
     *,
     law: Annotated[dict[str, Any], Group(parse_inference)],
     roi: Annotated[Path | None, typer.Option(help="Mask of the region to measure, placed by its affine.")] = None,
     structure: Structure,
     reading: Reading,
     seed: Annotated[int, typer.Option(help="Seed of the shapes that are generated for comparison.")] = 0,
-    workers: Annotated[int, typer.Option(help="Processes that infer several scans; 0 is this one.")] = 0,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Infer the parameters of scanned volumes, and write a report of each; of several, a table and a page of all."""
+    """Infer the parameters of a scanned volume, and write a report."""
     files = [path for path in (roi, law["atlas"], law["posterior"]) if path is not None]
     with show_stages() as progress:
         from curvafit.inference.inference import infer as infer_scan
         from curvafit.inference.simulate import Growth
-        from curvafit.report.inference import check_report, infer_scans, write_inference
+        from curvafit.report.inference import check_report, write_inference
 
         law["growth"] = Growth() if law.pop("test") else None
         options = {**structure, **law, "roi": roi, "seed": seed, **reading}
-        if len(scans) > 1:
-            settings = {"workers": workers, "command": command_line(), "overwrite": overwrite, "progress": progress}
-            page = infer_scans(scans, out, **settings, **options)
-            say(str(page))
-            return
-        check_report(out, [*scans, *files], overwrite, command_line())
-        inference = infer_scan(scans[0], progress=progress, **options)
+        check_report(out, [scan, *files], overwrite, command_line())
+        inference = infer_scan(scan, progress=progress, **options)
         progress("drawing the report", 1.0)
         say_notes(inference.scan.notes)
         report = write_inference(inference, out, command=command_line(), overwrite=overwrite)

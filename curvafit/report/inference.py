@@ -1,13 +1,11 @@
-"""The report of an inference: a page, `fit.json` and the regenerated volume; of many, a page and a table besides."""
+"""The report of an inference: a page, `fit.json` and the regenerated volume."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from functools import partial
-from importlib.metadata import version
-from operator import attrgetter, itemgetter
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -16,27 +14,22 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from curvafit.core.records import Format
-from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import format_length, format_number, format_percent, per_unit, power_name, unit_name
 from curvafit.drawing import plot
 from curvafit.geometry.diagrams import Diagram
 from curvafit.inference.candidates import TITLES, Candidate, seed_noise_of
 from curvafit.inference.fit import Fit
-from curvafit.inference.inference import Inference, infer
+from curvafit.inference.inference import Inference
 from curvafit.inference.posterior import KNOWN
 from curvafit.inference.table import parameters_of
 from curvafit.priors.law import FORMAT
 from curvafit.report import page
 from curvafit.scan.measures import QUANTITIES, Outline
-from curvafit.studies.scans import Task, name_errors, share_out
 from curvafit.volumes.volume import Box, Volume
 from curvafit.volumes.write import save
 
 #: What an inference writes into its folder.
 FILES = ("fit.json", "report.html", "regenerated.nii.gz")
-#: Of many inferences, `format` of the record, and what is written beside the scans' folders.
-LAWS_FORMAT = Format("curvafit laws", 1, title="the record of many inferences")
-LAWS_FILES = ("laws.json", "laws.html", "laws.csv")
 #: Each parameter as it is written, what it multiplies, and the power of 1/length that it carries in physical units.
 _TERMS = {
     "a20": ("a₂₀", "κ₁²", 0), "a11": ("a₁₁", "κ₁κ₂", 0), "a02": ("a₀₂", "κ₂²", 0), "a10": ("a₁₀", "κ₁", 1),
@@ -360,82 +353,3 @@ def bands(inference: Inference) -> page.Picture | None:
         text="Orange: the scan. Bands: 50 and 90 % of shapes grown from draws of the posterior, seen as the scan is. "
         "Lengths in working units; quantiles from the least to the greatest.",
     )
-
-
-# ---- many scans ------------------------------------------------------------------------------------------------------
-
-
-def infer_scans(
-    scans: Sequence[str],
-    directory: str | Path,
-    *,
-    workers: int = 0,
-    command: str = "",
-    overwrite: bool = False,
-    progress: Progress = silent,
-    **options: Any,
-) -> Path:
-    """Infer the parameters of many scans into a folder for each, with a page and a table of all; return the page.
-
-    A scan whose folder has a fit of the same command and version is not inferred again. `options` are those of `infer`.
-    Raises ValueError as `infer`, with the scan's name, and where a folder has others' files.
-    """
-    target, folders = Path(directory), name_folders(scans)
-    page.check_result_folder(LAWS_FORMAT, LAWS_FILES, target, scans, overwrite, command)
-    for folder in folders:
-        check_report(target / folder, scans, overwrite, command)
-    tasks: dict[int, Task] = {
-        k: partial(_infer_one, scans[k], target / folder, command, overwrite, options)
-        for k, folder in enumerate(folders)
-        if not _is_done(target / folder, command)
-    }
-    target.mkdir(parents=True, exist_ok=True)
-    share_out(tasks, folders, workers, progress)
-    fits = {folder: Fit.load(target / folder / "fit.json") for folder in folders}
-    record = page.start_record(command, scans={name: fit.provenance.get("scan", "") for name, fit in fits.items()})
-    rows = [row for name, fit in fits.items() for row in _rows(name, fit)]
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for name, fit in fits.items():
-        for strip in filter(itemgetter("low"), list_strips(fit)):
-            groups.setdefault((strip["low"], strip["high"]), []).append(strip | {"scan": name})
-    values = {"title": f"The laws of {len(fits)} scans", "fits": fits, "groups": groups}
-    return page.write_study(target, LAWS_FORMAT, LAWS_FILES, record, values, {"laws.csv": rows})
-
-
-def name_folders(scans: Sequence[str]) -> list[str]:
-    """Return a folder's name for each scan: that of its file, without suffixes unless two would have one name."""
-    names = [Path(scan.partition("::")[0]).name for scan in scans]
-    stems = [name.partition(".")[0] or name for name in names]
-    folders = [stem if stems.count(stem) == 1 else name for stem, name in zip(stems, names, strict=True)]
-    if duplicates := sorted({name for name in folders if folders.count(name) > 1}):
-        raise ValueError(f"expected scans with names of their own, got several named {duplicates[0]}")
-    return folders
-
-
-def _infer_one(
-    scan: str, folder: Path, command: str, overwrite: bool, options: dict[str, Any], progress: Progress
-) -> None:
-    with name_errors(scan):
-        inference = infer(scan, progress=progress, **options)
-    write_inference(inference, folder, command=command, overwrite=overwrite)
-
-
-def _is_done(folder: Path, command: str) -> bool:
-    """Return whether a folder has the fit of a command, by this version."""
-    if not (folder / "report.html").exists():
-        return False
-    made = Fit.load(folder / "fit.json").provenance
-    return (made.get("command"), made.get("curvafit")) == (command, version("curvafit"))
-
-
-def _rows(name: str, fit: Fit) -> Iterator[dict[str, Any]]:
-    """Yield a table row for each combination and parameter of a fit, and for its p; None where a value is missing."""
-    columns = ("scan", "quantity", "value", "low", "high", "known", "version")
-    rows: list[tuple[Any, ...]] = []
-    for combination in filter(attrgetter("low"), fit.combinations):
-        quantity = f"from {combination.low} to {combination.high}"
-        rows.append((quantity, combination.median, *combination.interval, combination.known))
-    rows += [(key, interval["median"], *interval["90"], None) for key, interval in (fit.intervals() or {}).items()]
-    rows.append(("p of the law", None if fit.misfit is None else fit.misfit.probability, None, None, None))
-    for row in rows:
-        yield dict(zip(columns, (name, *row, version("curvafit")), strict=True))

@@ -366,7 +366,7 @@ def measure_scans(
         for k, case in enumerate(cases)
         if k not in measured
     }
-    measured |= share_out(tasks, [case.name for case in cases], workers, sub_progress(progress, 0.05, 1.0))
+    measured |= _share_out(tasks, [case.name for case in cases], workers, sub_progress(progress, 0.05, 1.0))
     measures: list[Measures] = [measured[k][0] for k in range(len(cases))]
     if flat := [case.name for case, scan in zip(cases, measures, strict=True) if not scan.diagram.area > 0]:
         raise ValueError(
@@ -408,7 +408,7 @@ def measure_each(
     for k, scan in enumerate(scans):
         tiles = {} if labels or store is None else {"store": store / f"{k:04d}"}
         tasks[k] = partial(_measure_one, scan, scan if several else "", labels, options | tiles)
-    measured = share_out(tasks, scans, workers if several else 0, progress)
+    measured = _share_out(tasks, scans, workers if several else 0, progress)
     results = [measured[k] for k in tasks]
     if labels or any(scan.unit == "voxel" for (scan,) in results):
         return results
@@ -419,14 +419,14 @@ def _measure_one(
     scan: Any, name: str, labels: bool, options: dict[str, Any], progress: Progress
 ) -> tuple[Measures, ...]:
     """Measure a scan, or its instances; a scan with a `name` is one of several, so its diagram is binned finely."""
-    with name_errors(name):
+    with _name_errors(name):
         if labels:
             return measure_instances(scan, progress=progress, **options)
         whole = measure(scan, progress=progress, **options)
     return (_bin_diagrams(replace(whole, source=whole.source or name)) if name else whole,)
 
 
-def share_out(tasks: Mapping[int, Task], names: Sequence[str], workers: int, progress: Progress) -> dict[int, Any]:
+def _share_out(tasks: Mapping[int, Task], names: Sequence[str], workers: int, progress: Progress) -> dict[int, Any]:
     """Run the tasks of scans, by index in `names`, in this process or by several; return the results by index."""
     count, results = len(names), {}
     with cluster(workers) as pool:
@@ -491,7 +491,7 @@ def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progr
         if isinstance(case.source, Measures):
             units.setdefault(case.source.unit, case.name)
             continue
-        with name_errors(case.name):
+        with _name_errors(case.name):
             field = load(case.source, **reading)
         units.setdefault(field.unit, case.name)
         edges.setdefault(case.label, []).append(float(np.prod(field.spacing) ** (1 / 3)))
@@ -515,7 +515,7 @@ def check_units(scans: Sequence[str], progress: Progress = silent, **reading: An
 
 
 @contextmanager
-def name_errors(name: str) -> Iterator[None]:
+def _name_errors(name: str) -> Iterator[None]:
     """Add a scan's name to the message of a ValueError."""
     try:
         yield

@@ -1,4 +1,4 @@
-"""The pages of many scans, measured and inferred: their files, tables and names, and what is refused."""
+"""The page of measured scans: its files, tables and names, and what is refused."""
 
 import csv
 from pathlib import Path
@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calling import call, done, refused
-from found import lattice, without_drawing
+from found import lattice
 
-from curvafit.report.inference import infer_scans, name_folders
 from curvafit.report.page import WORD, name_parts, outlines_figure, shorten
 from curvafit.scan.measures import Measures, Outline
 from curvafit.scan.tiles import measure
@@ -133,36 +132,3 @@ def test_names_are_short_and_differ(scans: list[Path]) -> None:
     found: list[Measures] = [measure(scan).convert("mm") for scan in scans]
     assert name_parts(found) == ["r45.nii.gz", "r60.nii.gz"]
     assert len(set(name_parts([measure(lattice(56, 28, 5.0)), measure(lattice(56, 28, 6.0))]))) == 2  # arrays
-
-
-# ---- laws ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_each_scan_has_its_report_and_its_rows(scans: list[Path], tmp_path: Path, monkeypatch) -> None:
-    without_drawing(monkeypatch)
-    names = list(map(str, scans))
-    page = infer_scans(names, tmp_path / "out", growth=None, command="one")
-    rows = rows_of(tmp_path / "out" / "laws.csv")
-    assert {row["scan"] for row in rows} == {"r45", "r60"}
-    assert all(float(row["low"]) <= float(row["value"]) <= float(row["high"]) for row in rows if row["low"])
-    assert 'href="r45/report.html"' in page.read_text(encoding="utf-8")
-    times = [(tmp_path / "out" / name / "fit.json").stat().st_mtime_ns for name in ("r45", "r60")]
-    infer_scans(names, tmp_path / "out", growth=None, command="one")
-    assert times == [(tmp_path / "out" / name / "fit.json").stat().st_mtime_ns for name in ("r45", "r60")]
-    infer_scans(names[:1], tmp_path / "out", growth=None, command="another", overwrite=True)
-    assert times[0] != (tmp_path / "out" / "r45" / "fit.json").stat().st_mtime_ns
-
-
-def test_what_is_wrong_is_said_with_the_scan(scans: list[Path], tmp_path: Path) -> None:
-    empty = save(Volume(np.zeros((40, 40, 40), np.uint8)), tmp_path / "empty.nii.gz")
-    with pytest.raises(ValueError, match="empty.nii.gz"):
-        infer_scans([str(empty), str(scans[0])], tmp_path / "out", growth=None, command="one")
-    assert not (tmp_path / "out" / "laws.html").exists()
-
-
-def test_folders_are_named_by_scans() -> None:
-    assert name_folders(["a/x.nii.gz", "b/y.tif", "c.h5::raw"]) == ["x", "y", "c"]
-    assert name_folders(["a/x.nii.gz", "b/x.tif"]) == ["x.nii.gz", "x.tif"]
-    with pytest.raises(ValueError, match="several named x.tif"):
-        name_folders(["a/x.tif", "b/x.tif"])
