@@ -37,7 +37,7 @@ from curvafit.priors.grid import WORKING_EPSILON
 from curvafit.priors.kernels.threads import map_threads
 from curvafit.priors.law import Law
 from curvafit.scan.measures import scan_diagram
-from curvafit.scan.preparation import HALF, NOISE, Prepared, coarser_level, prepare, read_scan, why_no_texture
+from curvafit.scan.preparation import HALF, NOISE, Prepared, prepare, read_scan, why_no_texture
 from curvafit.scan.structure import check_options, is_rounded, read_region
 from curvafit.volumes.read import Source
 from curvafit.volumes.volume import Volume
@@ -278,25 +278,15 @@ def _test_law(
 def _read_and_prepare(
     scan: Source, options: Mapping[str, Any], reading: Mapping[str, Any]
 ) -> tuple[Volume, tuple[int, int, int], Prepared]:
-    """Read and prepare a scan; of a large one its middle, at the level of its pyramid that suits its structure. Returns
-    the scan as read, the shape of that level, and the prepared scan."""
-    roi, crop = options["roi"], reading.get("crop")
+    """Read and prepare a scan; of a large one its middle. Returns the scan as read, the shape of all of it, and the
+    prepared scan."""
+    roi = options["roi"]
     volume, shape = read_scan(scan, whole=roi is not None or options["periodic"], **reading)
     if roi is not None:
         position = {name: value for name, value in reading.items() if name not in ("label", "crop")}
-        region, region_notes = read_region(roi, volume, scan, crop, **position)
+        region, region_notes = read_region(roi, volume, scan, reading.get("crop"), **position)
         volume, options = replace(volume, notes=volume.notes + region_notes), {**options, "roi": region}
-    prepared = prepare(volume, one_scale=True, **options)
-    if crop is None and reading.get("label") is None and volume.shape != shape:
-        level = coarser_level(scan, shape, prepared, **reading)
-        if level is not None:
-            coarser, coarser_shape = read_scan(scan, **{**reading, "key": level})
-            note = f"Read at the level {level} of its pyramid, which shows more of this large scan than the finest."
-            coarser = replace(coarser, notes=(*coarser.notes, note))
-            coarser_prepared = prepare(coarser, one_scale=True, **options)
-            if coarser_prepared.kind == prepared.kind:  # a coarser level may average a mask to an image
-                return coarser, coarser_shape, coarser_prepared
-    return volume, shape, prepared
+    return volume, shape, prepare(volume, one_scale=True, **options)
 
 
 def _build_fit(

@@ -34,7 +34,8 @@ def bounding_box(shape: tuple[int, int, int], region: np.ndarray | None, longest
     if any(s.stop - s.start > longest for s in box):
         box = [_middle(s, longest) for s in box]
         sides = " x ".join(str(s.stop - s.start) for s in box)
-        notes.append(f"Of this large scan the middle {sides} voxels are used.")
+        more = "of a pyramid a coarser level (scan.zarr::1) shows more"
+        notes.append(f"Of this large scan the middle {sides} voxels are used; {more}.")
     return (box[0], box[1], box[2]), tuple(notes)
 
 

@@ -17,7 +17,7 @@ from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
 from curvafit.scan import grids, structure
 from curvafit.scan.quality import Quality, measure_quality, sample_mask
 from curvafit.scan.structure import Kind
-from curvafit.volumes.read import Source, levels_of, load
+from curvafit.volumes.read import Source, load
 from curvafit.volumes.volume import Box, Crop, ScanError, Volume
 
 #: Median thickness in voxels that a scan is resampled to; those of isotropic scans whose grid is kept: where a shape is
@@ -30,8 +30,6 @@ THINNEST = 3.0
 LARGEST_WINDOW = 128
 LARGEST_BOX = 256
 LARGEST_SCAN = 512
-#: Of a large scan a coarser level is read where its structure is at least so many voxels thick there.
-SUITED = 10.0
 #: Bytes that a working voxel takes while it is made.
 WORKED = 64
 #: A structure that fills more than this part of the volume may be the wrong phase, which a note says.
@@ -177,29 +175,6 @@ def read_scan(
     except ScanError as error:
         raise ScanError(f"{error}, in the middle of this large scan: name another part with crop") from error
     return replace(part, notes=part.notes + notes), shape
-
-
-def coarser_level(
-    scan: Source, shape: tuple[int, int, int], prepared: Prepared, *, key: str | None = None, **reading: Any
-) -> str | None:
-    """Return the key of the level of a pyramid that shows most of a large scan and still resolves its structure; None
-    if that is the finest level, whose `shape` and `prepared` scan are given."""
-    levels = levels_of(scan, key)
-    # A phase field has its ε at the finest level alone, and a spacing of the caller's is that of one level.
-    only_one = len(levels) < 2 or None in levels.values()
-    if only_one or prepared.noise or prepared.kind == "field" or reading.get("spacing") is not None:
-        return None
-    (_, finest), *coarser = [(name, np.array(spacing)[-3:]) for name, spacing in levels.items()]
-    best, size = None, np.array(shape, dtype=float)
-    for name, edges in coarser:
-        if size.max() <= LARGEST_SCAN:  # the level before shows all of the scan
-            break
-        size = shape * finest / edges
-        thickness = prepared.thickness * prepared.scale[0] * finest[0] / edges.max()
-        if thickness < SUITED or size.min() < FEWEST:
-            break
-        best = name
-    return best
 
 
 def prepare(

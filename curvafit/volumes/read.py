@@ -265,16 +265,6 @@ def split_key(path: str | os.PathLike[str], key: str | None) -> tuple[Path | str
     return (name if is_url(name) else Path(name)), key or stated_key or None
 
 
-def levels_of(source: object, key: str | None = None) -> dict[str, tuple[float, ...] | None]:
-    """Return the spacing of each level of an OME-Zarr image by key, finest first; {} if the key names one level."""
-    if not isinstance(source, str | os.PathLike):
-        return {}
-    path, key = split_key(source, key)
-    if not (isinstance(path, Path) and path.is_dir() and pick_reader(path) is zarr.read_zarr):
-        return {}
-    return zarr.list_levels(path, key)
-
-
 def _pick_folder(path: Path) -> Callable[..., Stated]:
     """Return the reader of a folder: of a Zarr store, or of slices, as images or DICOM."""
     if is_zarr(path) or path.suffix == ".zarr":

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from exact import Gyroid, centres
-from found import lattice
 from scipy import ndimage
 from shapes import grown
 
@@ -30,7 +29,6 @@ from curvafit.scan.measures import read_texture, scan_diagram
 from curvafit.scan.preparation import prepare
 from curvafit.scan.quality import Quality
 from curvafit.volumes.volume import Volume
-from curvafit.volumes.write import save
 
 GRID = Grid((32, 32, 32))
 
@@ -241,18 +239,6 @@ def test_a_region_of_interest_hides_the_surface_that_it_cuts() -> None:
     assert measured.area == pytest.approx(kept.area, rel=0.02)
     near, far = wasserstein(measured, kept), wasserstein(bare, kept)
     assert 2 * near < far, (near, far)
-
-
-def test_of_a_large_pyramid_the_level_that_suits_the_structure_is_read(tmp_path, monkeypatch) -> None:
-    """Tubes 24 voxels thick: of the finest level a quarter would be read, of the next one all."""
-    monkeypatch.setattr("curvafit.scan.preparation.LARGEST_SCAN", 64)
-    monkeypatch.setattr("curvafit.volumes.formats.zarr.CHUNK", 48)
-    mask = (lattice(96, 48, 12.0) > 0).astype(np.uint8)
-    path = save(Volume(mask, (0.5, 0.5, 0.5), "um"), tmp_path / "scan.zarr")
-    found = infer(path, growth=None)
-    assert found.scan.shape == (48, 48, 48) and found.scan.spacing == (1.0, 1.0, 1.0)
-    assert any("the level 1 of its pyramid" in note for note in found.fit.notes)
-    assert found.fit.morphometry.thickness_mean == pytest.approx(12, rel=0.2)
 
 
 def test_the_largest_cube_of_a_region_is_described() -> None:

@@ -80,20 +80,6 @@ def read_remote(url: str, key: str | None = None) -> Stated:
     return _state_array(array, None, levels.get(name), node)
 
 
-def list_levels(path: Path, key: str | None) -> dict[str, tuple[float, ...] | None]:
-    """Return the spacing of each level of the image that `read_zarr` reads, by key; {} if it reads a named array."""
-    import zarr
-
-    _check_store(path)
-    node: Any = zarr.open(path, mode="r")
-    if isinstance(node, zarr.Array):
-        return {}
-    arrays, levels, name = _pick_array(node, key, path)
-    if key is not None and key.strip("/") == name:
-        return {}
-    return {level: geometry["steps"] for level, geometry in levels.items() if level in arrays}
-
-
 def _pick_array(node: Any, key: str | None, path: Path) -> tuple[dict[str, Any], dict[str, _Geometry], str]:
     """Return the arrays of a group, the levels of the image that is read, if it is one, and the name of its array."""
     import zarr
