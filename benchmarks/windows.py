@@ -1,9 +1,8 @@
 """What maps of windows say of volumes whose local size is known.
 
 White noise, blurred by a Gaussian whose width is another in each slice, is cut at its 70 % quantile. The width is
-the only length there: thickness goes with it, surface per volume and curvedness with its inverse. In `graded` volumes
-the width goes from 2.5 to 4.5 voxels along z; in `halves` it is one or the other, and the clusters of windows that do
-not straddle are held against it. A window holds few periods: what R² lacks is mostly chance.
+the only length there: thickness goes with it, surface per volume and curvedness with its inverse. The width goes from
+2.5 to 4.5 voxels along z. A window holds few periods: what R² lacks is mostly chance.
 """
 
 from __future__ import annotations
@@ -31,17 +30,13 @@ def textured(widths: np.ndarray, seed: int) -> np.ndarray:
     return (field > np.quantile(field, 0.7)).astype(np.uint8)
 
 
-def case(kind: str, seed: int) -> Values:
-    steps = np.linspace(*ENDS, 17 if kind == "graded" else 2)
+def case(seed: int) -> Values:
+    steps = np.linspace(*ENDS, 17)
     widths = steps[np.arange(SHAPE[0]) * len(steps) // SHAPE[0]]
     maps = windows(textured(widths, seed), SIZE, STRIDE, kind="mask")
     known = maps.known
     local = np.lib.stride_tricks.sliding_window_view(widths, SIZE)[::STRIDE]
     truth = np.broadcast_to(local.mean(1)[:, None, None], known.shape)
-    if kind == "halves":
-        whole = known & (np.ptp(local, axis=1) == 0)[:, None, None]
-        right = (maps.clusters.values == 2) == (truth > np.mean(ENDS))
-        return {"clusters": float(right[whole].mean()), "windows": int(whole.sum())}
     return {
         name: float(np.corrcoef(truth[known] ** power, maps[name].values[known])[0, 1] ** 2)
         for name, power in POWERS.items()
@@ -50,10 +45,9 @@ def case(kind: str, seed: int) -> Values:
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     seeds = range(1 if options.quick else SEEDS)
-    found = cases.all({f"{kind}-{seed}": partial(case, kind, seed) for kind in ("graded", "halves") for seed in seeds})
+    found = cases.all({f"graded-{seed}": partial(case, seed) for seed in seeds})
     figures = {}
-    for name in (*POWERS, "clusters"):
-        values = [row[name] for row in found.values() if name in row]
-        figures[f"windows.{name.replace(' ', '_')}"] = bootstrap(values, np.mean)
-    show(["R² of the map with the truth; share of windows in their half's cluster", "mean"], list(figures.items()))
+    for name in POWERS:
+        figures[f"windows.{name.replace(' ', '_')}"] = bootstrap([row[name] for row in found.values()], np.mean)
+    show(["R² of the map with the truth", "mean"], list(figures.items()))
     return figures

@@ -9,7 +9,7 @@ curvatures at constant volume.
   one of annotated slices; `curvafit.priors` has the loss for networks.
 - Files: `load(path)` and `save(volume, path)` read and write volumes with their spacing and unit.
 - Compare: `compare(*groups)` or `compare(table, by="age")` tells whether scans differ by group or number, in what.
-- Map: `windows(scan)` measures a scan in windows: where its texture differs, in maps and clusters.
+- Map: `windows(scan)` measures a scan in windows: where its texture differs, in maps.
 - Measure: `measure(scan)`, `measure_instances(labels)`, `diagram(u, grid, epsilon)` and `wasserstein(a, b)`; more in
   `curvafit.geometry`.
 

@@ -36,17 +36,16 @@ def parse_windows(
         str | None,
         typer.Option(help="Voxels from window to window, by default half of one; divides --windows.", metavar="N"),
     ] = None,
-    clusters: Annotated[int | None, typer.Option(help="Clusters of windows, by default 2.")] = None,
 ) -> dict[str, Any] | None:
-    """Return size, stride and clusters of windows, as `curvafit.windows` takes them; None without `--windows`."""
+    """Return size and stride of windows, as `curvafit.windows` takes them; None without `--windows`."""
     if windows is None:
-        if (stride, clusters) != (None, None):
-            raise ValueError("--stride and --clusters go with --windows")
+        if stride is not None:
+            raise ValueError("--stride goes with --windows")
         return None
     size = parse_whole_triple(windows, "--windows")
     halves = tuple(n if n % 2 else n // 2 for n in size)  # a stride divides the size: an odd one has no half
     steps = halves if stride is None else parse_whole_triple(stride, "--stride")
-    return {"size": size, "stride": steps, "clusters": 2 if clusters is None else clusters}
+    return {"size": size, "stride": steps}
 
 
 def parse_page(

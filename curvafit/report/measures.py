@@ -9,14 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from curvafit.core.records import Format
-from curvafit.core.units import convert_length, format_length, format_number, format_percent, power_name, unit_name
+from curvafit.core.units import convert_length, format_length, format_number, power_name, unit_name
 from curvafit.drawing import plot
 from curvafit.report.comparison import describe_measures, name_quantity
 from curvafit.report.page import (
@@ -48,10 +46,6 @@ WINDOWS_FORMAT = Format("curvafit windows", 1, title="the record of a scan measu
 #: Of a scan measured in windows, what is written into the folder beside the maps.
 WINDOWS_FILES = ("windows.json", "windows.html", "windows.csv", "windows.svg", "windows.png")
 WINDOWS_FILES += ("outlines.svg", "outlines.png")
-#: Grey of structure whose windows are not known.
-UNKNOWN = 0.88
-#: Colours of clusters from 0 on: the strong ones of labels first.
-COLOURS = np.vstack([plot.LABELS[:1], plot.LABELS[1::2], plot.LABELS[2::2]])
 #: Returns the folder if `write_measures` can write there, else raises ValueError; call it before the work.
 check_measures = partial(check_result_folder, FORMAT, FILES)
 #: The most scans whose diagrams and numbers are drawn.
@@ -221,7 +215,7 @@ def intervals_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figu
 def list_files(source: str | Path) -> tuple[str, ...]:
     """Return the names of all files; maps are Zarr stores if the scan is one, else NIfTI files."""
     suffix = ".ome.zarr" if ".zarr" in str(source).lower() else ".nii.gz"
-    return (*WINDOWS_FILES, *(f"{name.replace(' ', '_')}{suffix}" for name in ("clusters", *NAMES)))
+    return (*WINDOWS_FILES, *(f"{name.replace(' ', '_')}{suffix}" for name in NAMES))
 
 
 def check_windows(directory: str | Path, source: str | Path = "", overwrite: bool = False, command: str = "") -> Path:
@@ -236,146 +230,59 @@ def write_windows(windows: Windows, directory: str | Path, *, command: str = "",
     The files are moved into the folder once all are whole. Those of the same command are replaced; others are a
     ValueError without `overwrite`. `command` is what the record calls the command line.
     """
-    source = windows.clusters.source
+    source = windows.grid.source
     target, files = check_windows(directory, source, overwrite, command), list_files(source)
     record = start_record(
         command, unit=windows.unit, options=windows.options, status=windows.status, notes=windows.notes,
-        scan=source, kind=windows.kind, explained=windows.explained,
+        scan=source, kind=windows.kind,
     )  # fmt: skip
     rows = [_format_row(windows, k) for k in range(len(NAMES))]
-    clusters = (f"cluster {k}" for k in range(1, 1 + int(windows.clusters.values.max())))
-    head = ["", "", "least", "median", "most", *clusters, "between"]
-    page = {"title": "A scan in windows", "head": head, "rows": rows}
+    page = {"title": "A scan in windows", "head": ["", "", "least", "median", "greatest"], "rows": rows}
     outlines = outlines_figure([Path(source).name], [windows.outline], windows.unit)
     figures = {
         "outlines": (outlines, "Three slices of the scan, and the outline of its structure"),
-        "windows": (windows_figure(windows), "The structure, coloured by clusters and by six numbers"),
+        "windows": (windows_figure(windows), "Maps of six numbers, on three slices"),
     }
-    volumes = (windows.clusters, *map(windows.__getitem__, NAMES))
-    maps = dict(zip(files[len(WINDOWS_FILES) :], volumes, strict=True))
+    maps = dict(zip(files[len(WINDOWS_FILES) :], map(windows.__getitem__, NAMES), strict=True))
     tables = {"windows.csv": _rows(windows)}
     return write_study(target, WINDOWS_FORMAT, files, record, page, tables, figures=figures, maps=maps)
 
 
 def _rows(windows: Windows) -> Iterator[dict[str, Any]]:
-    """Yield a row for each window: its centre, cluster and quantities; None where a value is not known."""
-    for index in np.ndindex(windows.clusters.shape):
+    """Yield a row for each window: its centre and quantities; None where a value is not known."""
+    for index in np.ndindex(windows.grid.shape):
         centre = dict(zip("zyx", windows.centres[index].tolist(), strict=True))
         values = (value if np.isfinite(value) else None for value in windows.values[index].tolist())
-        row = {**centre, "unit": windows.unit, "cluster": int(windows.clusters.values[index])}
-        yield row | dict(zip(NAMES, values, strict=True))
+        yield {**centre, "unit": windows.unit} | dict(zip(NAMES, values, strict=True))
 
 
 def _format_row(windows: Windows, k: int) -> list[str]:
-    """Return the page's table row of quantity k: name, least, median, greatest, the clusters' means, and the fraction
-    of the variance that lies between clusters."""
+    """Return the page's table row of quantity k: name, symbol and unit, least, median and greatest."""
     values = windows.values[..., k]
-    labels = np.where(np.isfinite(values), windows.clusters.values, 0)
-    clusters = [values[labels == label] for label in range(1, 1 + int(windows.clusters.values.max()))]
-    means = [float(cluster.mean()) if len(cluster) else np.nan for cluster in clusters]
-    total = float(np.var(values[labels > 0]) * np.count_nonzero(labels)) if labels.any() else 0.0
-    within = sum(cluster.var() * len(cluster) for cluster in clusters if len(cluster))
-    between = format_percent(1 - within / total) if total else "–"
     percentiles = np.nanpercentile(values, (0, 50, 100)) if np.isfinite(values).any() else [np.nan] * 3
-    figures = (format_number(float(value)) for value in (*percentiles, *means))
-    return [*name_quantity(*QUANTITIES[k][:3], windows.unit), *figures, between]
+    return [*name_quantity(*QUANTITIES[k][:3], windows.unit), *(format_number(float(value)) for value in percentiles)]
 
 
 def windows_figure(windows: Windows) -> Figure:
-    """Return a figure of the clusters on the middle slices, and of familiar numbers where they are least and greatest.
-
-    Each voxel of the structure has the colour of the nearest window, grey where its value is not known. Each number has
-    two slices across z, through the windows of its extremes, which are framed; its colours go from one to the other.
-    """
-    figure = plot.make_figure(13.2, 13.2, layout="constrained")
-    panels = figure.subplots(4, 4)
-    structure = windows.structure
-    for axis, axes in enumerate(panels[0, :3]):
-        index = structure.shape[axis] // 2
-        labels = _colour_structure(windows, windows.clusters.values, axis, index)
-        colours = COLOURS[np.where(np.isfinite(labels), labels, 0).astype(int)]
-        colours[~np.isfinite(labels) | (labels == 0)] = 0
-        _section_on(axes, windows, colours, axis, index)
-        axes.set_title(f"clusters, {_position(windows, axis, index)}", fontsize=9.5)
-    _legend_on(panels[0, 3], windows)
-    pairs = panels[1:].reshape(len(plot.FAMILIAR), 2)
+    """Return a figure of the maps of familiar numbers, each on the middle slices of windows across z, y and x."""
     familiar = [quantity for quantity in QUANTITIES if quantity[1] in plot.FAMILIAR]
-    for pair, (name, symbol, power, _) in zip(pairs, familiar, strict=True):
+    figure = plot.make_figure(8.4, 2.6 * len(familiar), layout="constrained")
+    rows = figure.subplots(len(familiar), 3)
+    middle = tuple(n // 2 for n in windows.grid.shape)
+    for axes, name, place in zip(rows[0], "zyx", windows.centres[middle], strict=True):
+        axes.set_title(f"{name} = {format_length(place, windows.unit)}", fontsize=9)
+    for row, (name, symbol, power, _) in zip(rows, familiar, strict=True):
         values = windows[name].values
-        label = f"{symbol} ({power_name(windows.unit, power)})" if power else symbol
-        extremes = windows.extremes(name)
-        for axes, title, window in zip(pair, ("least", "greatest"), extremes, strict=False):
-            low, high = (values[extreme] for extreme in extremes)
-            index = _fullest_slice(windows, window)
-            plane = _colour_structure(windows, values, 0, index)
-            picture = _section_on(axes, windows, plane, 0, index, vmin=low, vmax=max(high, low + 1e-12), cmap="viridis")
-            value = format_number(values[window] + 0.0)  # -0 becomes 0
-            axes.set_title(f"{title} {symbol}: {value}, {_position(windows, 0, index)}", fontsize=9.5)
-            axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
-            edges = (np.array(windows.size) * windows.clusters.spacing / windows.stride)[1:]
-            corner = windows.centres[window][1:] - edges / 2
-            axes.add_patch(Rectangle(corner[::-1], *edges[::-1], fill=False, edgecolor=plot.INK, linestyle=(0, (4, 3))))
-        if not extremes:
-            pair[0].set_title(f"{label} is not known", fontsize=9.5)
-            continue
-        plot.scale_on(pair[0], 1.0, windows.unit)
-        bar = figure.colorbar(picture, ax=list(pair), label=label, ticks=MaxNLocator(5), pad=0.02, shrink=0.85)
+        known = values[np.isfinite(values)]
+        low, high = (known.min(), known.max()) if known.size else (0.0, 1.0)
+        for axis, axes in enumerate(row):
+            down, across = np.delete(windows.grid.spacing, axis)
+            plane, colours = values.take(middle[axis], axis), {"vmin": low, "vmax": high, "cmap": "viridis"}
+            picture = axes.imshow(plane, aspect=down / across, interpolation="nearest", **colours)
+            axes.set(xticks=[], yticks=[])
+            axes.spines[:].set_color(plot.QUIET)
+        unit = power_name(windows.unit, power)
+        bar = figure.colorbar(picture, ax=list(row), label=symbol + (f" ({unit})" if unit else ""), shrink=0.85)
         bar.ax.tick_params(labelsize=8, length=2)
-        bar.outline.set_visible(False)  # type: ignore[operator]
+    plot.scale_on(rows[-1, 0], windows.grid.spacing[2], windows.unit)
     return figure
-
-
-def _position(windows: Windows, axis: int, index: int) -> str:
-    """Return the position of a slice as text, in the scan's unit."""
-    position = index * windows.structure.spacing[axis]
-    return f"{'zyx'[axis]} = {format_number(position)} {unit_name(windows.unit, 2)}"
-
-
-def _legend_on(axes: Axes, windows: Windows) -> None:
-    """Write which colour is which cluster, with its number of windows and its thickness."""
-    labels, thickness = windows.clusters.values, windows["thickness"].values
-    handles = []
-    if unknown := (labels == 0).sum():
-        handles.append(Patch(color=str(UNKNOWN), label=f"not known: {unknown} of {labels.size}"))
-    for k in range(1, 1 + int(labels.max())):
-        mean = format_length(float(thickness[labels == k].mean()), windows.unit)
-        handles.append(Patch(color=COLOURS[k], label=f"{k}: {(labels == k).sum()} windows, {mean} thick"))
-    axes.set_axis_off()
-    axes.legend(handles=handles, title="cluster", loc="center left", frameon=False, fontsize=9.5, alignment="left")
-
-
-def _section_on(axes: Axes, windows: Windows, plane: np.ndarray, axis: int, index: int, **colours: Any) -> Any:
-    """Draw values (rows, columns) of a slice over the grey structure, on axes in the scan's unit; return the image."""
-    mask = windows.structure.values.take(index, axis)
-    down, across = np.delete(windows.structure.spacing, axis)
-    rows, columns = mask.shape
-    extent = (-across / 2, (columns - 0.5) * across, (rows - 0.5) * down, -down / 2)
-    axes.imshow(np.where(mask, UNKNOWN, 1.0), cmap="gray", vmin=0, vmax=1, extent=extent)
-    axes.locator_params(nbins=4)
-    axes.tick_params(length=2, labelsize=8)
-    axes.spines[:].set_color(plot.QUIET)
-    vertical, horizontal = (f"{name} ({unit_name(windows.unit, 2)})" for k, name in enumerate("zyx") if k != axis)
-    axes.set_ylabel(vertical, fontsize=8)
-    axes.set_xlabel(horizontal, fontsize=8)
-    return axes.imshow(plane, extent=extent, interpolation="nearest", **colours)
-
-
-def _nearest(windows: Windows, axis: int) -> np.ndarray:
-    """Return, for each index of voxels along an axis, the index of the nearest windows along it."""
-    count, step = windows.clusters.shape[axis], windows.clusters.spacing[axis]
-    positions = np.arange(windows.structure.shape[axis]) * windows.structure.spacing[axis]
-    return np.clip(np.rint((positions - windows.centres[0, 0, 0, axis]) / step).astype(int), 0, count - 1)
-
-
-def _fullest_slice(windows: Windows, window: tuple[int, ...]) -> int:
-    """Return the index of the slice across z that has most of the structure nearest to a window."""
-    near = [np.flatnonzero(_nearest(windows, axis) == k) for axis, k in enumerate(window)]
-    counts = windows.structure.values[np.ix_(*near)].sum((1, 2))
-    return int(near[0][counts.argmax()])
-
-
-def _colour_structure(windows: Windows, values: np.ndarray, axis: int, index: int) -> np.ndarray:
-    """Return a slice of voxels across an axis, each with its nearest window's value; NaN outside the structure."""
-    rows, columns = (_nearest(windows, k) for k in range(3) if k != axis)
-    plane = values.take(_nearest(windows, axis)[index], axis)[np.ix_(rows, columns)]
-    return np.where(windows.structure.values.take(index, axis), plane, np.nan)

@@ -1,4 +1,4 @@
-"""Where in a scan does its texture differ? Its numbers in windows as maps, and clusters of the windows."""
+"""Where in a scan does its texture differ? Its numbers in windows, as maps."""
 
 from __future__ import annotations
 
@@ -8,19 +8,18 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from scipy.cluster.vq import kmeans, vq
 
-from curvafit.core.checks import as_tuple, check_int, check_seed
+from curvafit.core.checks import as_tuple, check_int
 from curvafit.core.runtime import Pictured, Progress, silent
-from curvafit.core.units import format_length, format_number, format_percent, format_sampling, unit_name
+from curvafit.core.units import format_length, format_number, format_sampling, unit_name
 from curvafit.scan.measures import QUANTITIES, Blocks, Outline, combine, measure_maps
 from curvafit.scan.structure import check_options
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.volume import Volume
 
 NAMES = tuple(name for name, *_ in QUANTITIES)
-#: Most clusters, most blocks of a stride's edges, and most voxels along an axis that are kept for pictures.
-MOST_CLUSTERS, MOST_BLOCKS, MOST_SHOWN = 20, 10**6, 256
+#: Most blocks of a stride's edges.
+MOST_BLOCKS = 10**6
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -36,13 +35,8 @@ class Windows(Pictured):
     values
         The numbers of `measure` in each window, `(nz, ny, nx, Q)` in the scan's unit; NaN in a window with less surface
         than a layer across it has, and where a scan is too large for its curvature.
-    clusters
-        The cluster of each window, 1 to K from the thinnest structure to the thickest, 0 where a number is not known;
-        on the grid of windows, with its spacing, affine and unit.
-    explained
-        The fraction of the variance of standardised numbers that is between clusters.
-    structure
-        The structure, for pictures: every n-th voxel, so that at most `MOST_SHOWN` remain along each axis.
+    grid
+        Which windows have all numbers that any window has, uint8; with the spacing, affine and unit of the windows.
     outline
         What was taken for the structure, on three slices.
     """
@@ -51,57 +45,49 @@ class Windows(Pictured):
     size: tuple[int, int, int]
     stride: tuple[int, int, int]
     values: np.ndarray
-    clusters: Volume
-    explained: float
-    structure: Volume
+    grid: Volume
     outline: Outline
     options: dict[str, Any]
     notes: tuple[str, ...]
 
     def __repr__(self) -> str:
-        grid = "×".join(map(str, self.clusters.shape))
-        return f"Windows({grid}, {self.known.sum()} known, of {self.clusters.source or 'an array'})"
+        counts = "×".join(map(str, self.grid.shape))
+        return f"Windows({counts}, {self.known.sum()} known, of {self.grid.source or 'an array'})"
 
     def __getitem__(self, name: str) -> Volume:
         """Return the map of a quantity by name or symbol, float32; raise KeyError where there is none."""
         for k, (full_name, symbol, *_) in enumerate(QUANTITIES):
             if name in (full_name, symbol):
-                return replace(self.clusters, array=self.values[..., k].astype(np.float32))
+                return replace(self.grid, array=self.values[..., k].astype(np.float32))
         raise KeyError(f"expected one of {', '.join(NAMES)}, got {name!r}")
 
     @property
     def unit(self) -> str:
         """Return the unit of lengths."""
-        return self.clusters.unit
+        return self.grid.unit
 
     @property
     def known(self) -> np.ndarray:
-        """Return which windows have all the numbers of `measure`, bool (nz, ny, nx)."""
-        return self.clusters.values > 0
+        """Return which windows have all numbers that any window has, bool (nz, ny, nx)."""
+        return self.grid.values > 0
 
     @property
     def centres(self) -> np.ndarray:
         """Return the windows' centres (nz, ny, nx, 3), as (z, y, x) from the centre of the first voxel, in `unit`."""
-        indices = np.moveaxis(np.indices(self.clusters.shape), 0, -1)
-        return (indices + (np.array(self.size) - 1) / 2 / np.array(self.stride)) * self.clusters.spacing
+        indices = np.moveaxis(np.indices(self.grid.shape), 0, -1)
+        return (indices + (np.array(self.size) - 1) / 2 / np.array(self.stride)) * self.grid.spacing
 
     @property
     def status(self) -> str:
-        """Return the answer in some sentences: how many windows, in which clusters, and where the extremes are."""
-        labels, thickness = self.clusters.values, self.values[..., NAMES.index("thickness")]
-        edges = " x ".join(map(str, self.size))
-        clusters = (
-            f"{k} ({(labels == k).sum()} windows, {format_length(thickness[labels == k].mean(), self.unit)} thick)"
-            for k in range(1, labels.max() + 1)
-        )
+        """Return the answer in some sentences: how many windows, and where the thickness is least and greatest."""
+        thickness, edges = self.values[..., NAMES.index("thickness")], " x ".join(map(str, self.size))
         extremes = (
             f"{name} window at {', '.join(map(format_number, self.centres[index]))}: "
             f"{format_length(thickness[index], self.unit, 3)}"
             for name, index in zip(("thinnest", "thickest"), self.extremes("thickness"), strict=True)
         )
         return (
-            f"{labels.size} windows of {edges} voxels, {(~self.known).sum()} of them without enough structure. "
-            f"Clusters: {', '.join(clusters)}; {format_percent(self.explained)} of the variance is between them. "
+            f"{self.known.size} windows of {edges} voxels, {(~self.known).sum()} of them without enough structure. "
             f"By z, y, x in {unit_name(self.unit, 2)}: {'; '.join(extremes)}."
         )
 
@@ -119,8 +105,6 @@ def windows(
     size: int | Sequence[int] = 64,
     stride: int | Sequence[int] = 32,
     *,
-    clusters: int = 2,
-    seed: int = 0,
     kind: Literal["auto", "field", "mask", "image"] = "auto",
     periodic: bool = False,
     threshold: Literal["otsu"] | float = "otsu",
@@ -128,7 +112,7 @@ def windows(
     progress: Progress = silent,
     **reading: Any,
 ) -> Windows:
-    """Measure a scan in windows, as `measure` does the whole, and divide the windows into clusters by k-means.
+    """Measure a scan in windows, as `measure` does the whole.
 
     Thickness, spacing, surface and curvature are measured once in the whole scan, so that no window cuts a ball or a
     surface: a window sums them over its blocks, whose edges are the stride. Raises ValueError where the stride does not
@@ -138,16 +122,10 @@ def windows(
     ----------
     size, stride
         Of the windows, in voxels: one number, or three (z, y, x).
-    clusters
-        How many clusters: there are so many even where all windows are alike, unless there are fewer windows.
-    seed
-        Of k-means, which keeps the best of 20 starts.
     kind, periodic, threshold, dark, reading
         As in `measure`.
     """
     check_options(kind, threshold, reading.get("label"))
-    check_int(clusters, f"a number of clusters from 1 to {MOST_CLUSTERS}", 1, MOST_CLUSTERS)
-    check_seed(seed)
     field = load(scan, **reading)
     sizes, strides = _check_grid(field.shape, size, stride)
     starts = tuple(tuple(range(0, n, step)) for n, step in zip(field.shape, strides, strict=True))
@@ -155,25 +133,19 @@ def windows(
     sampling = format_sampling(field.shape, field.spacing, field.unit)
     maps, blocks = measure_maps(field, kind, options, progress), Blocks(field.shape, starts)  # type: ignore[arg-type]
     values = _sum_windows(maps.sum(blocks).reshape(*blocks.counts, -1), field, sizes, strides)
-    labels, explained = _cluster(values, clusters, seed)
+    finite = np.isfinite(values)
+    known = finite[..., finite.any((0, 1, 2))].all(-1)  # a thin stack has no curvature
     first_centre = field.move_origin([(n - 1) / 2 for n in sizes]).affine
     assert first_centre is not None
     spacing = tuple(h * step for h, step in zip(field.spacing, strides, strict=True))
     affine = first_centre @ np.diag([*strides[::-1], 1])  # an affine's axes are x, y, z
-    cluster_map = replace(field, array=labels, spacing=spacing, affine=affine)  # type: ignore[arg-type]
-    steps = tuple(math.ceil(n / MOST_SHOWN) for n in field.shape)
-    shown = np.ascontiguousarray(maps.mask[tuple(slice(None, None, step) for step in steps)])
-    shown_spacing = tuple(h * step for h, step in zip(field.spacing, steps, strict=True))
-    structure = replace(field, array=shown, spacing=shown_spacing, affine=None)
+    grid = replace(field, array=known.astype(np.uint8), spacing=spacing, affine=affine)  # type: ignore[arg-type]
     notes = [f"{sampling}.", *maps.notes]
     if any(rest := [n % step for n, step in zip(field.shape, strides, strict=True)]):
         notes.append(f"The last {', '.join(map(str, rest))} voxels along z, y, x are in no window.")
-    settings = {"size": sizes, "stride": strides, "clusters": clusters, "seed": seed, "kind": kind}
-    return Windows(
-        kind=maps.kind, size=sizes, stride=strides, values=values, clusters=cluster_map, explained=explained,
-        structure=structure, outline=Outline.cut(field, maps.mask.__getitem__),
-        options=settings | options | reading, notes=tuple(notes),
-    )  # fmt: skip
+    settings = {"size": sizes, "stride": strides, "kind": kind} | options | reading
+    outline = Outline.cut(field, maps.mask.__getitem__)
+    return Windows(maps.kind, sizes, strides, values, grid, outline, settings, tuple(notes))
 
 
 def _check_grid(shape: Sequence[int], *sizes: int | Sequence[int]) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
@@ -208,24 +180,3 @@ def _sum_windows(sums: np.ndarray, field: Volume, size: Sequence[int], stride: S
             "choose a larger size"
         )
     return values
-
-
-def _cluster(values: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, float]:
-    """Divide windows into `count` clusters by k-means of their standardised numbers (nz, ny, nx, Q). Returns labels
-    (nz, ny, nx) uint8, as `Windows.clusters`, and the fraction of the variance that is between clusters."""
-    used = np.any(np.isfinite(values), axis=(0, 1, 2))  # a thin stack has no curvature
-    used[NAMES.index("Euler number")] = False  # with Conn.D it would count twice
-    thickness_column = int(used[: NAMES.index("thickness")].sum())
-    selected = values[..., used]
-    complete = np.isfinite(selected).all(-1)
-    labels, rows = np.zeros(complete.shape, dtype=np.uint8), selected[complete]
-    if not len(rows):
-        return labels, 0.0
-    deviation = rows.std(0)
-    scaled = (rows - rows.mean(0)) / np.where(deviation > 0, deviation, 1)
-    centres, _ = kmeans(scaled, min(count, len(rows)), seed=np.random.default_rng(seed))  # type: ignore[call-arg]
-    centres = centres[np.argsort(centres[:, thickness_column])]
-    indices, distances = vq(scaled, centres)
-    labels[complete] = indices + 1
-    total = float((scaled**2).sum())
-    return labels, 1 - float((distances**2).sum()) / total if total > 0 else 0.0  # windows alike have no clusters
