@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,11 @@ class Surface:
     @property
     def barycentres(self) -> np.ndarray:
         """Return the centre of each triangle, `(F, 3)`."""
-        return _measure_triangles(self.vertices, self.faces)[0]
+        return self._triangles[0]
+
+    @cached_property
+    def _triangles(self) -> tuple[np.ndarray, np.ndarray]:
+        return _measure_triangles(self.vertices, self.faces)
 
 
 def surface(u: np.ndarray | Tensor, grid: Grid, level: float = 0.0) -> Surface:
@@ -115,14 +120,13 @@ def areas(mesh: Surface) -> np.ndarray:
 
 def area_vectors(mesh: Surface) -> np.ndarray:
     """Return half the cross product of each triangle's edges, `(F, 3)` in (x, y, z)."""
-    return _measure_triangles(mesh.vertices, mesh.faces)[1]
+    return mesh._triangles[1]
 
 
 def fabric(mesh: Surface) -> tuple[np.ndarray, np.ndarray]:
     """Return the triangles' centres, `(F, 3)`, and columns `(F, 7)`, float32: area, and the parts zz zy zx yy yx xx of
     n⊗n dA with the normal n."""
-    centres, vectors = _measure_triangles(mesh.vertices, mesh.faces)
-    return centres, _measure_fabric(vectors)
+    return mesh.barycentres, _measure_fabric(area_vectors(mesh))
 
 
 @njit(cache=True, nogil=True)

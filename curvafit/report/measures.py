@@ -281,8 +281,8 @@ def windows_figure(windows: Windows) -> Figure:
             picture = axes.imshow(plane, aspect=down / across, interpolation="nearest", **colours)
             axes.set(xticks=[], yticks=[])
             axes.spines[:].set_color(plot.QUIET)
-        unit = power_name(windows.unit, power)
-        bar = figure.colorbar(picture, ax=list(row), label=symbol + (f" ({unit})" if unit else ""), shrink=0.85)
+        label = f"{symbol} ({power_name(windows.unit, power)})" if power else symbol
+        bar = figure.colorbar(picture, ax=list(row), label=label, ticks=MaxNLocator(5), shrink=0.85)
         bar.ax.tick_params(labelsize=8, length=2)
     plot.scale_on(rows[-1, 0], windows.grid.spacing[2], windows.unit)
     return figure

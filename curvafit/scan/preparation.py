@@ -421,7 +421,10 @@ def _clean_mask(
 
 
 def thinner_thickness(mask: np.ndarray) -> float:
-    """Return the median thickness, in voxels, of the phase of a periodic mask `(Z, Y, X)` that fills less."""
+    """Return the median thickness, in voxels, of the phase of a periodic mask `(Z, Y, X)` that fills less; raise
+    ScanError where there is one phase only."""
+    if mask.all() or not mask.any():
+        raise ScanError("expected a structure and background in a mask, got one of them only")
     return grids.median_thickness(mask if mask.mean() <= HALF else ~mask, (1.0, 1.0, 1.0), periodic=True)[0]
 
 

@@ -115,10 +115,7 @@ def measure(
     if roi is not None:
         region, region_notes = _read_compartments(roi, volume, scan, reading)
         volume = replace(volume, notes=(*volume.notes, *region_notes))
-    sampling, unit, edge = format_sampling(volume.shape, volume.spacing, volume.unit), volume.unit, min(volume.spacing)
-    # Lengths are counted in the finest edge: which of two is greater must not depend on a unit.
-    spacing = tuple(round(h / edge, 12) for h in volume.spacing)
-    volume = replace(volume, spacing=spacing, unit="voxel", affine=None, notes=(f"{sampling}.", *volume.notes))  # type: ignore[arg-type]
+    volume, unit, edge = _count_in_edges(volume), volume.unit, min(volume.spacing)
     if periodic or (region is None and tile is None and max(volume.shape) <= LARGEST_BOX):
         check_memory(volume.shape, WORKED, "a scan in one piece")
         try:
@@ -132,6 +129,15 @@ def measure(
     structure = Structure(volume, region=region, **options)  # type: ignore[arg-type]
     found, arrays = _measure_tiles(structure, tile, workers, store, maps, progress)
     return _keep_maps(found.scale(edge, unit), arrays, frame, edge, region)
+
+
+def _count_in_edges(volume: Volume) -> Volume:
+    """Return a volume whose lengths are counted in its finest edge, with a note on its voxels: which of two lengths is
+    greater must not depend on a unit."""
+    spacing, finest = volume.spacing, min(volume.spacing)
+    note = f"{format_sampling(volume.shape, spacing, volume.unit)}."
+    edges: Any = tuple(round(h / finest, 12) for h in spacing)
+    return replace(volume, spacing=edges, unit="voxel", affine=None, notes=(note, *volume.notes))
 
 
 def _read_compartments(
@@ -473,7 +479,7 @@ def _prepare_window(plan: Plan, phase: np.ndarray, mask: np.ndarray, window: Box
     z, y, x = (slice(0, n) for n in phase.shape)
     size = (plan.scale, plan.edge, plan.volume.unit, plan.thickness / plan.edge)
     origin = tuple(edge.start * s for edge, s in zip(window, plan.scale, strict=True))
-    return Prepared(plan.structure.kind, phase, mask, grid, *size, ((z, y, x),), (), origin)  # type: ignore[arg-type]
+    return Prepared(plan.structure.kind, phase, mask, grid, *size, (z, y, x), (), origin)  # type: ignore[arg-type]
 
 
 def _bin(plan: Plan, diagram: Diagram, kept: np.ndarray, part: str) -> Record:

@@ -460,7 +460,7 @@ def gather_notes(measures: Sequence[Measures], cases: Sequence[Case]) -> Iterato
 
 
 def merge_notes(measures: Sequence[Measures]) -> Iterator[tuple[list[int], str]]:
-    """Yield the scans' notes, each after the indices of the scans that have it: `([0, 1], "Split at 78–84.")`.
+    """Yield the scans' notes, each after the indices of the scans that have it: `([0, 1], "Split at 78 to 84.")`.
 
     Notes that differ in numbers only are one, with the range of each number.
     """
@@ -471,7 +471,7 @@ def merge_notes(measures: Sequence[Measures]) -> Iterator[tuple[list[int], str]]
     for notes in by_wording.values():
         columns = zip(*(_NUMBER.findall(note) for _, note in notes), strict=True)
         ends = ((min(column, key=float), max(column, key=float)) for column in columns)
-        ranges = iter([low if float(low) == float(high) else f"{low}–{high}" for low, high in ends])
+        ranges = iter([low if float(low) == float(high) else f"{low} to {high}" for low, high in ends])
         # The first note, with each of its numbers replaced by that number's range.
         yield sorted({k for k, _ in notes}), _NUMBER.sub(lambda _, ranges=ranges: next(ranges), notes[0][1])
 

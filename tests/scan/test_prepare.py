@@ -23,7 +23,7 @@ from curvafit.scan.grids import (
     remove_specks,
     resample,
 )  # fmt: skip
-from curvafit.scan.preparation import WORKING_THICKNESS, Prepared, is_ball, prepare, read_scan
+from curvafit.scan.preparation import WORKING_THICKNESS, Prepared, is_ball, prepare, read_scan, thinner_thickness
 from curvafit.scan.quality import Quality, measure_quality, sample_mask
 from curvafit.scan.structure import find_structure, is_noise
 from curvafit.volumes import ScanError, Volume, load, save
@@ -331,6 +331,12 @@ FLAT[3, 3, 3] = -0.8
 def test_what_has_no_shape_is_refused(values: np.ndarray, options: dict, word: str) -> None:
     with pytest.raises(ValueError, match=word):
         prepare(Volume(values), **options)
+
+
+def test_a_mask_of_one_phase_has_no_thickness() -> None:
+    for mask in (np.zeros((8, 8, 8), bool), np.ones((8, 8, 8), bool)):
+        with pytest.raises(ValueError, match="one of them only"):
+            thinner_thickness(mask)
 
 
 # ---- real scans ------------------------------------------------------------------------------------------------------

@@ -338,7 +338,7 @@ def test_tubes_that_grow_go_with_time_and_in_another_order_do_not() -> None:
 def test_notes_that_differ_in_numbers_are_one_with_their_ranges() -> None:
     notes = [("3 of 1e-05.", "own"), ("-2.5 of 1e-05.",), ("7 of 1e-05.", "own")]
     scans = [replace(drawn(np.random.default_rng(0)), notes=each) for each in notes]
-    assert list(merge_notes(scans)) == [([0, 1, 2], "-2.5–7 of 1e-05."), ([0, 2], "own")]
+    assert list(merge_notes(scans)) == [([0, 1, 2], "-2.5 to 7 of 1e-05."), ([0, 2], "own")]
 
 
 def test_units_are_converted(shapes: Comparison) -> None:
