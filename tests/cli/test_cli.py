@@ -58,7 +58,7 @@ REFUSALS: dict[str, dict[str, str]] = {
         "--kind mask --threshold 4": "threshold",
         "--label 1 --threshold 4": "label", "--atlas nowhere.npz": "atlas", "--roi nowhere.npy": "no such file",
         "--label 77": "label", "--crop 1:4": "crop", "--crop 1:4,:,0:21": "crop", "--channel 0": "channel",
-        "--threshold 5": "threshold",
+        "--threshold 5": "threshold", "flat.npy": "unexpected extra argument",
     },
     "segment scan.npy -o b.npy --prior tubes": {"--steps 0": "(see curvafit segment --help)"},
     "reconstruct scan.npy --prior tubes -o out.npy": {"--known 0,8 --first 2": "--first"},
