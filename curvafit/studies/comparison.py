@@ -16,7 +16,7 @@ from scipy.stats import rankdata
 from curvafit.core import permutation
 from curvafit.core.checks import check_choice, check_int, check_seed
 from curvafit.core.runtime import Pictured, Progress, silent, sub_progress
-from curvafit.core.units import format_number, format_percent, per_unit, power_name
+from curvafit.core.units import format_number, format_percent, power_name
 from curvafit.drawing.plot import SIGNED, shared_limits
 from curvafit.geometry.diagrams import FAMILIES, Diagram
 from curvafit.geometry.distances import sliced_embedding
@@ -178,8 +178,9 @@ class Comparison(Pictured):
                 f"{self._describe(strongest)} is the largest."
             )
         verdict, p = "differ" if self.p <= LEVEL else "are not told apart", format_number(self.p, 2)
-        name, unit = ("energy distance", f" {per_unit(self.unit, 1)}") if self.groups else ("distance correlation", "")
-        lines.append(f"Curvature diagrams {verdict}: p = {p}, {name} {format_number(self.statistic, 2)}{unit}.")
+        name, power = ("energy distance", -1) if self.groups else ("distance correlation", 0)
+        strength = f"{name} {format_number(self.statistic, 2)} {power_name(self.unit, power)}".rstrip()
+        lines.append(f"Curvature diagrams {verdict}: p = {p}, {strength}.")
         return " ".join(lines)
 
     @property
