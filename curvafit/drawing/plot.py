@@ -180,7 +180,7 @@ def _name_families(axes: Axes, limits: Limits) -> None:
     if low < -0.15 * high:
         end = min(high, -low)
         axes.plot([0, end], [0, -end], color=QUIET, linewidth=0.7, linestyle=(0, (2, 3)), zorder=1)
-        side = "right" if end > 0.8 * high else "left"
+        side = "right" if end > 0.6 * high else "left"
         axes.text(end + (-pad if side == "right" else pad), pad - end, "saddles", ha=side, va="bottom", **style)
 
 
