@@ -28,10 +28,7 @@ if TYPE_CHECKING:
 
 _what = partial(typer.Option, rich_help_panel="What to do")
 
-Target = Annotated[
-    Path,
-    typer.Option("-o", "--output", help="Mask to write: .nii.gz .nii .tif .npy .mrc .zarr; or IMAGE.zarr/labels/NAME."),
-]
+Target = Annotated[Path, typer.Option("-o", "--output", help="Mask to write: .nii.gz .nii .tif .npy .mrc .zarr.")]
 
 
 def parse_network(

@@ -37,7 +37,7 @@ _DOUBLE = (".nii.gz", ".ome.tif", ".ome.tiff", ".ome.zarr")
 #: names takes far less; a file that is newer was changed by somebody, and is not ours to replace.
 LATER = 10.0
 #: Files of a Zarr group of images that `curvafit.volumes` wrote.
-_WRITTEN = re.compile(r"(\d+/)?(zarr\.json|\.zgroup|\.zattrs|\.zarray)|\d+/(c/)?(\d+/)*\d+|\d+/c")
+_WRITTEN = re.compile(r"(\d+/)?zarr\.json|\d+/c(/\d+)*")
 #: What may be raised where a result is built from a damaged file.
 _FAULTS = (KeyError, ValueError, IndexError, TypeError, AttributeError, RuntimeError)
 #: The most digits of a whole number in JSON.
@@ -186,6 +186,8 @@ def can_write(
         Whether files and folders of another origin may be replaced.
     """
     target = Path(path)
+    if (store := next(filter(is_zarr, target.absolute().parents), None)) is not None:
+        raise ValueError(f"{target} is in the Zarr store {store}, to which nothing is added: write beside it")
     check_folder(target.parent)
     if target.is_dir() and not (target.name.lower().endswith(".zarr") or is_zarr(target)):
         raise ValueError(f"{target} is a folder: give the name of a file")
@@ -250,10 +252,8 @@ def is_own_zarr(folder: Path, kind: str) -> bool:
     if is_empty(folder):
         return True
     try:
-        is_format_2 = (folder / ".zattrs").exists()  # Zarr's format 3 has the attributes in zarr.json
-        metadata = folder / (".zattrs" if is_format_2 else "zarr.json")
-        content = parse_json(metadata.read_bytes(), "a Zarr group", folder)
-        if (content if is_format_2 else content["attributes"])[MARK]["kind"] != kind:
+        content = parse_json((folder / "zarr.json").read_bytes(), "a Zarr group", folder)
+        if content["attributes"][MARK]["kind"] != kind:
             return False
     except (OSError, *_FAULTS):
         return False

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from curvafit.core.files import move_together, remove, temporary_folder
-from curvafit.core.records import Format, can_write, is_own_zarr, sibling
+from curvafit.core.records import Format, can_write, sibling
 from curvafit.core.runtime import Pictured, check_memory, hold_signals
 from curvafit.core.units import format_sampling
 from curvafit.priors.coefficients import Coefficients
 from curvafit.segmentation.slices import filled_range
 from curvafit.segmentation.uncertainty import doubt
 from curvafit.volumes.formats.nifti import write_nifti_like
-from curvafit.volumes.formats.zarr import CHUNK, add_labels, check_place, image_of, mark, store_of, write_labels
+from curvafit.volumes.formats.zarr import CHUNK
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import is_streamed, pick_writer, save
 
@@ -171,36 +171,20 @@ def check_mask_target(
     maps: Sequence[str] = (),
 ) -> Path:
     """Return the path, or raise ValueError where the mask of a scan cannot be written there; to be called before the
-    work. None of the `inputs`, files or folders, may be overwritten, except that an image may get labels. `overwrite`
-    says whether files of other origin may be replaced, `maps` which of `MAPS` go beside the mask."""
-    target, image = Path(path), image_of(Path(path))
+    work. None of the `inputs`, files or folders, may be overwritten. `overwrite` says whether files of other origin may
+    be replaced, `maps` which of `MAPS` go beside the mask."""
+    target = Path(path)
+    more = [sibling(target, ".json"), sibling(target, ".png"), *(map_path(target, name) for name in maps)]
+    can_write(target, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
     pick_writer(target, "mm" if scan is None else scan.unit)
     if scan is not None and not is_streamed(target):
         check_memory(scan.shape, 4, "a result that is not written into Zarr")
-    record, more = beside(target, ".json"), (beside(target, ".png"), *(map_path(target, name) for name in maps))
-    if image is None:
-        return can_write(target, FORMAT, more=(record, *more), inputs=inputs, overwrite=overwrite)
-    if scan is not None:
-        check_place(scan, image)
-    inputs = list(inputs)
-    # Labels lie within their image's store: only an input within the labels would be overwritten.
-    within = [path for path in inputs if Path(str(path).replace("::", "/")).resolve().is_relative_to(target.resolve())]
-    can_write(target, lambda path: is_own_zarr(path, FORMAT.name), inputs=within, overwrite=overwrite)
-    can_write(record, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
     return target
 
 
-def beside(target: Path, ending: str) -> Path:
-    """Return the path of a file beside a mask, `mask.json` for `mask.nii.gz` and `.json`. For labels of an image,
-    `scan.zarr/labels/NAME`, it is `scan_NAME.json`, beside the store."""
-    if (image := image_of(target)) is None:
-        return sibling(target, ending)
-    return sibling(store_of(image), f"_{target.name}{ending}")
-
-
 def hidden_store(target: Path) -> Path:
-    """Return the folder for finished parts of a run, beside a mask and outside the user's store."""
-    return beside(target, ".tiles").with_name(f".{target.name}.curvafit-tiles")
+    """Return the folder for finished parts of a run, beside a mask."""
+    return target.with_name(f".{target.name}.curvafit-tiles")
 
 
 def write_mask(
@@ -216,8 +200,7 @@ def write_mask(
     """Write the mask (0 and 1, uint8) or labels, a picture, a record, and the probability where there is one.
 
     The files `mask.nii.gz`, `mask.png`, `mask.json` and `mask_probability.nii.gz` appear together once all are whole;
-    their paths are returned. Former ones of `MAPS` are removed. Of labels in an image, `scan.zarr/labels/NAME`, all
-    others lie beside the store: `scan_NAME.png` and so on.
+    their paths are returned. Former ones of `MAPS` are removed.
 
     Where the scan's file, `like`, and the target are NIfTI, the mask gets the same header but for type and range, and
     `unit`. `record` has entries to add to the record; with `overwrite` files of other origin may be replaced.
@@ -225,7 +208,6 @@ def write_mask(
     maps = {} if segmentation.probability is None else {MAPS[0]: segmentation.probability}
     inputs = () if like is None else (like,)
     target = check_mask_target(path, scan, inputs, overwrite, maps=list(maps))
-    image = image_of(target)
 
     def write(volume: Volume, file: Path) -> None:
         if like is not None and all(str(path).lower().endswith(_NIFTI) for path in (like, target)):
@@ -233,42 +215,35 @@ def write_mask(
         else:
             save(replace(volume, spacing=scan.spacing, unit=scan.unit, affine=scan.affine), file, kind=FORMAT.name)
 
-    with temporary_folder(beside(target, ".json")) as work:
+    with temporary_folder(sibling(target, ".json")) as work:
         mask, labels = segmentation.mask, segmentation.labels
         if labels is None:  # the mask, as 0 and 1
             numbers = replace(mask.array, label=None) if mask.in_file else mask.values.view(np.uint8)
             labels = replace(mask, array=numbers)
         for name, volume in maps.items():
             write(volume, work / map_path(target, name).name)
-        if image is None:
-            write(labels, work / target.name)
-        else:
-            write_labels(replace(scan, array=labels.array), work / target.name, image=image)
-            mark(work / target.name, FORMAT.name)
+        write(labels, work / target.name)
         rows = {} if maps else {"scan": (scan.values, None), "mask": (scan.values, mask.values)}
         content = describe_run(segmentation, record or {}, scan)
         return _finish(work, target, list(maps), _figure(segmentation, rows), content)
 
 
 def _finish(work: Path, target: Path, maps: Sequence[str], figure: Figure, content: dict[str, Any]) -> tuple[Path, ...]:
-    """Write picture and record into the folder `work`, where the mask and its `maps` are; move all files at once beside
-    the target, but labels into their image; remove maps of an earlier run, and return the paths."""
+    """Write picture and record into the folder `work`, where the mask and its `maps` are; move all files at once to
+    the target's folder, remove maps of an earlier run, and return the paths."""
     from curvafit.drawing.plot import DPI
 
-    image, record, picture = image_of(target), beside(target, ".json"), beside(target, ".png")
-    former = FORMAT.companions(target if image is None else record)
+    record, picture, former = sibling(target, ".json"), sibling(target, ".png"), FORMAT.companions(target)
     others = [map_path(target, name) for name in MAPS if name not in maps]
     old_maps = [path for path in others if path.name in former]
-    names = [] if image else [target.name]
-    names += [picture.name, record.name, *(map_path(target, name).name for name in maps)]
+    names = [target.name, picture.name, record.name, *(map_path(target, name).name for name in maps)]
     figure.savefig(work / picture.name, dpi=DPI)
     FORMAT.write(work / record.name, {**content, "files": names})
     with hold_signals():
-        added = () if image is None else (add_labels(work / target.name, image, target.name),)
-        files = move_together([work / name for name in names], record.parent)
+        files = move_together([work / name for name in names], target.parent)
         for path in old_maps:
             remove(path)
-    return (*added, *files)
+    return files
 
 
 def segmentation_figure(segmentation: Segmentation) -> Figure:
@@ -315,8 +290,7 @@ def _read_planes(volume: Volume, places: Sequence[int]) -> list[np.ndarray]:
 
 def map_path(target: Path, name: str) -> Path:
     """Return the path of a map beside a mask: `mask_probability.nii.gz` for `mask.nii.gz` and `probability`."""
-    suffix = ".zarr" if image_of(target) else target.name.removeprefix(sibling(target, "").name)
-    return beside(target, f"_{name}{suffix}")
+    return sibling(target, f"_{name}{target.name.removeprefix(sibling(target, '').name)}")
 
 
 def describe_run(segmentation: Segmentation, options: Mapping[str, Any], scan: Volume) -> dict[str, Any]:

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from curvafit.core.files import temporary_folder, write_atomically
+from curvafit.core.files import write_atomically
 from curvafit.core.records import can_write, is_own_zarr
 from curvafit.volumes.formats.arrays import write_npy
 from curvafit.volumes.formats.base import ScanError, first_voxel, smallest_type
 from curvafit.volumes.formats.headers import check_mrc, write_mrc
 from curvafit.volumes.formats.nifti import write_nifti
 from curvafit.volumes.formats.tiff import check_ome_tiff, write_ome_tiff, write_tiff
-from curvafit.volumes.formats.zarr import add_labels, image_of, mark, store_of, write_labels, write_zarr
+from curvafit.volumes.formats.zarr import mark, write_zarr
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.volume import Volume
 
@@ -41,7 +40,7 @@ def save(
     kind: str = "volume",
     overwrite: bool = False,
 ) -> Path:
-    """Write a volume as NIfTI, TIFF, NPY, MRC or Zarr, by suffix; or as labels of an OME-Zarr image.
+    """Write a volume as NIfTI, TIFF, NPY, MRC or Zarr, by suffix.
 
     A file of that name is replaced once the new one is whole. A folder is replaced only if it is empty, if it is a Zarr
     store that `save` wrote with the same `kind`, or with `overwrite`.
@@ -49,11 +48,10 @@ def save(
     NIfTI keeps the affine (qform and sform) and the unit. TIFF (ImageJ's or OME's metadata), MRC (in Å) and Zarr
     (OME-Zarr 0.5, with halved copies of a large volume) keep spacing and unit; Zarr and MRC also keep the position of
     the first voxel, unless axes are rotated. NPY keeps the values only. `note_lost` says what is lost. TIFF stores
-    64-bit integers in the smallest type that holds them, and float16 as float32. A path `IMAGE/labels/NAME` in an image
-    of OME-Zarr 0.4 or 0.5 gets labels on that image's voxels.
+    64-bit integers in the smallest type that holds them, and float16 as float32.
 
     Raises ValueError if the suffix is unknown, the format cannot hold the values' type or needs a unit and the volume
-    has none, the source is not a volume, or another folder has that name.
+    has none, the source is not a volume, another folder has that name, or the path is in a Zarr store.
 
     Parameters
     ----------
@@ -69,20 +67,15 @@ def save(
     target = Path(path)
     lazy = is_streamed(target) and isinstance(source, Volume)  # of a path the values are read, and checked, first
     field = load(source, spacing=spacing, unit=unit, lazy=lazy)
-    writer = pick_writer(target, field.unit, np.empty(0, field.dtype) if field.in_file else field.values)
     can_write(target, lambda existing: not existing.is_dir() or is_own_zarr(existing, kind), overwrite=overwrite)
+    writer = pick_writer(target, field.unit, np.empty(0, field.dtype) if field.in_file else field.values)
 
     def write(temporary: Path) -> None:
         writer(field, temporary)
         if temporary.is_dir():
             mark(temporary, kind)
 
-    image = image_of(target)
-    if image is None:
-        return write_atomically(target, write)
-    with temporary_folder(store_of(image)) as work:
-        write(work / target.name)
-        return add_labels(work / target.name, image, target.name)
+    return write_atomically(target, write)
 
 
 def pick_writer(path: Path, unit: str, values: np.ndarray | None = None) -> Callable[[Any, Path], None]:
@@ -90,8 +83,6 @@ def pick_writer(path: Path, unit: str, values: np.ndarray | None = None) -> Call
 
     To check before the work, pass an array of the values' type with only the smallest and the largest of them.
     """
-    if (image := image_of(path)) is not None:
-        return partial(write_labels, image=image)
     suffix = next((suffix for suffix in WRITERS if path.name.lower().endswith(suffix)), None)
     if suffix is None:
         raise ScanError(f"a volume's name must end in one of {', '.join(WRITERS)}, got {path.name!r}")
@@ -106,7 +97,7 @@ def pick_writer(path: Path, unit: str, values: np.ndarray | None = None) -> Call
 
 def is_streamed(path: Path) -> bool:
     """Return whether a volume is written box by box, and need not fit into memory."""
-    return path.name.lower().endswith(".zarr") or image_of(path) is not None
+    return path.name.lower().endswith(".zarr")
 
 
 def note_lost(path: Path, volume: Volume) -> tuple[str, ...]:
@@ -120,7 +111,7 @@ def note_lost(path: Path, volume: Volume) -> tuple[str, ...]:
         lost = "the place" if rotated or shifted else ""
     else:
         lost = "turned axes and the place" if rotated and not name.endswith((".nii", ".nii.gz")) else ""
-    return (f"{path.name} does not hold {lost}: NIfTI does.",) if lost and image_of(path) is None else ()
+    return (f"{path.name} does not hold {lost}: NIfTI does.",) if lost else ()
 
 
 def check_labels(path: str | Path, labels: Volume) -> None:

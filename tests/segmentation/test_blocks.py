@@ -18,7 +18,6 @@ from curvafit.segmentation.flow import Working
 from curvafit.segmentation.reconstruction import reconstruct
 from curvafit.segmentation.result import write_mask
 from curvafit.volumes import Volume, load, save
-from curvafit.volumes.formats.zarr import write_zarr
 
 #: Blocks of 64 leave a last one of 3 voxels along z, and of 5 along x.
 SHAPE = (67, 40, 69)
@@ -97,21 +96,6 @@ def test_slices_across_any_axis(tmp_path: Path, axis: int) -> None:
     assert "annotate next" in found.status and found.mask.in_file
     write_mask(found, volume, tmp_path / "blocks" / "whole.zarr")
     check_alike(tmp_path / "blocks" / "whole.zarr", tmp_path / "whole.zarr")
-
-
-@pytest.mark.parametrize("version", ["0.4", "0.5"])
-def test_labels_of_an_image_are_those_of_the_whole(labels: Path, tmp_path: Path, version: str) -> None:
-    """With chunks, metadata and their place in the image's list."""
-    for name in ("one", "two"):
-        volume = load(labels)
-        write_zarr(volume.label(1), tmp_path / name / "scan.zarr", version)
-        target = tmp_path / name / "scan.zarr" / "labels" / "filled"
-        done("reconstruct", labels, "--every", 8, *(("--tile", 64) if name == "two" else ()), "-o", target)
-    one, two = (files(tmp_path / name / "scan.zarr") for name in ("one", "two"))
-    assert one.keys() == two.keys()
-    assert all(one[name] == two[name] for name in one if not name.rpartition("/")[2].isdigit())
-    first, second = (levels(tmp_path / name / "scan.zarr/labels/filled")["0"] for name in ("one", "two"))
-    assert (first != second).mean() < 1e-4
 
 
 def test_the_same_command_goes_on_after_a_kill(labels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,10 +1,8 @@
-"""Zarr: OME-NGFF level by level, chunks that are not stored, and labels on the voxels of an image."""
+"""Zarr: OME-NGFF level by level, chunks that are not stored, and transforms of coordinates."""
 
 import json
 import pickle
-import warnings
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -23,10 +21,8 @@ from curvafit.volumes.read import read_values
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
 
-def content(path: Path, version: str) -> dict[str, Any]:
-    """The attributes of a group, of OME's namespace where the version has one."""
-    if version == "0.4":
-        return json.loads((path / ".zattrs").read_text())
+def content(path: Path) -> dict[str, Any]:
+    """The attributes of a group in OME's namespace."""
     return json.loads((path / "zarr.json").read_text())["attributes"]["ome"]
 
 
@@ -34,8 +30,8 @@ def content(path: Path, version: str) -> dict[str, Any]:
 def test_axes_have_a_name_a_type_and_a_unit(tmp_path: Path, unit: str, named: str | None) -> None:
     values = np.arange(60.0).reshape(3, 4, 5)
     path = save(Volume(values, (3.0, 2.0, 0.5), unit), tmp_path / "scan.zarr")
-    (found,) = content(path, "0.5")["multiscales"]
-    assert content(path, "0.5")["version"] == "0.5"
+    (found,) = content(path)["multiscales"]
+    assert content(path)["version"] == "0.5"
     assert found["axes"] == [{"name": name, "type": "space", **({"unit": named} if named else {})} for name in "zyx"]
     scale = {"type": "scale", "scale": [3.0, 2.0, 0.5]}
     assert found["datasets"] == [{"path": "0", "coordinateTransformations": [scale]}]
@@ -49,7 +45,7 @@ def test_halved_levels_lie_where_the_whole_one_does(tmp_path: Path, dtype: str) 
     """A ramp along z stays the same function of the place that scale and translation give a voxel."""
     z = np.arange(130, dtype=dtype)
     path = save(Volume(z[:, None, None] * np.ones((1, 70, 8), dtype), (2.0, 1.0, 0.5), "um"), tmp_path / "scan.zarr")
-    levels = content(path, "0.5")["multiscales"][0]["datasets"]
+    levels = content(path)["multiscales"][0]["datasets"]
     shapes = [zarr.open_array(path / level["path"], mode="r").shape for level in levels]
     assert shapes == [(130, 70, 8), (65, 35, 4), (33, 18, 2)]
     for level, (n, _, _) in zip(levels, shapes, strict=True):
@@ -130,7 +126,7 @@ SHAPE, SPACING = (20, 70, 66), (0.5, 0.25, 0.25)
 
 
 @pytest.fixture(params=["0.4", "0.5"])
-def image(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, str]:
+def image(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """A tube in noise, as the second of two channels, with two levels; the first voxel is not at 0."""
     z, y, x = np.mgrid[: SHAPE[0], : SHAPE[1], : SHAPE[2]]
     tube = np.hypot(y - 30 + 5 * np.sin(z / 5), x - 32) < 12
@@ -149,130 +145,32 @@ def image(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, str]:
     scales = {"axes": axes, "datasets": levels, "coordinateTransformations": all_levels}
     named = {"version": request.param, "multiscales": [scales | ({"version": "0.4"} if old else {})]}
     group.attrs.update(named if old else {"ome": named})
-    return path, request.param
+    return path
 
 
-def tube_of(path: Path, **part: Any) -> Volume:
-    """The mask of the tube, on the voxels of the image or a part of it."""
-    field = load(path, channel=1, **part)
-    return Volume(field.values > 110, field.spacing, field.unit, field.affine)
-
-
-def test_steps_of_all_levels_place_each(image: tuple[Path, str]) -> None:
-    field = load(image[0], channel=1)
+def test_steps_of_all_levels_place_each(image: Path) -> None:
+    field = load(image, channel=1)
     assert (field.shape, field.spacing, field.unit) == (SHAPE, SPACING, "um")
     assert field.affine is not None and field.affine[:3, 3].tolist() == [1, 2, 3]
-    coarse = load(f"{image[0]}::1", channel=1)
+    coarse = load(f"{image}::1", channel=1)
     assert coarse.spacing == (1.0, 0.5, 0.5)
     assert coarse.affine is not None and coarse.affine[:3, 3].tolist() == [1, 2, 3]
 
 
-def test_labels_lie_on_the_image_and_are_listed(image: tuple[Path, str]) -> None:
-    path, version = image
-    before, mask, part = tree(path), tube_of(path), tube_of(path, crop="4:14,:,:")
-    assert save(mask, path / "labels/tube") == path / "labels/tube"
-    save(Volume(part.values.astype(np.uint16) * 700, part.spacing, part.unit, part.affine), path / "labels/part")
-    assert {name: data for name, data in tree(path).items() if not name.startswith("labels")} == before
-    assert content(path / "labels", version)["labels"] == ["tube", "part"]
-    own = content(path / "labels/tube", version)
-    assert own["image-label"]["source"] == {"image": "../../"}
-    (scales,) = own["multiscales"]
-    assert scales["name"] == "tube" and [axis["name"] for axis in scales["axes"]] == list("zyx")
-    steps = [level["coordinateTransformations"] for level in scales["datasets"]]
-    for k, (scale, first) in enumerate(steps):
-        assert scale["scale"] == [2**k * h for h in SPACING] and first["translation"] == [3, 2, 1]
-    back = load(f"{path}::labels/tube")
-    assert back.values.dtype == np.uint8 and np.array_equal(back.values, mask.values)
-    np.testing.assert_array_equal(back.affine, mask.affine)
-    low = load(f"{path}::labels/part")
-    assert low.values.max() == 700 and low.affine is not None and low.affine[:3, 3].tolist() == [1, 2, 5]
-    assert load(path, channel=1).shape == SHAPE  # the image is still what the store is read as
-    np.testing.assert_allclose(load(save(part, path.parent / "part.zarr")).affine, part.affine)
-
-
-def test_labels_are_replaced_by_what_wrote_them_alone_and_a_consolidated_store_shows_them(image) -> None:
-    path, version = image
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        zarr.consolidate_metadata(path)
-    mask = tube_of(path)
-    for _ in range(2):
-        save(mask, path / "labels/tube", kind="ours")
-    assert content(path / "labels", version)["labels"] == ["tube"]
-    assert "labels/tube/0" in dict(zarr.open_group(path, mode="r").members(max_depth=None))
-    with pytest.raises(ValueError, match="not free"):
-        save(mask, path / "labels/tube", kind="other")
-
-
-@pytest.mark.parametrize(
-    ("change", "name", "words"),
-    [
-        *(({name: value}, "tube", "voxels of a level")  # without a place it begins before the image does
-          for name, value in (("spacing", (0.5, 0.25, 0.2)), ("unit", "mm"), ("affine", None))),
-        ({"array": np.ones(SHAPE, np.float32)}, "tube", "whole numbers"),
-        ({}, ".tube", "name of labels"),
-    ],
-)  # fmt: skip
-def test_other_voxels_are_refused(image: tuple[Path, str], change: dict[str, Any], name: str, words: str) -> None:
-    path, field = image[0], load(image[0], channel=1)
-    before = tree(path)
-    with pytest.raises(ScanError, match=words):
-        save(replace(field, **change), path / "labels" / name)
-    assert tree(path) == before
-
-
-def test_an_image_of_another_version_or_none_is_refused(tmp_path: Path) -> None:
-    group, mask = zarr.open_group(tmp_path / "scan.zarr", mode="w"), Volume(np.indices((4, 4, 4))[0] > 1)
-    newer = {"version": "0.6", "multiscales": [{}]}
-    for attributes, words in (({}, "no image of OME-Zarr"), (newer, r"OME-Zarr 0\.6")):
-        group.attrs["ome"] = attributes
-        with pytest.raises(ScanError, match=words):
-            save(mask, tmp_path / "scan.zarr/labels/a")
-
-
-def test_levels_that_disagree_are_said_and_one_can_be_named(image: tuple[Path, str]) -> None:
-    path = image[0]
-    group: Any = zarr.open_group(path, mode="r+")
-    attributes = group.attrs.asdict()
-    scales = attributes.get("ome", attributes)["multiscales"][0]
-    scales["datasets"][1]["coordinateTransformations"][0]["scale"][3] *= 2
-    group.attrs.update(attributes)
-    refused(call("measure", path, "--channel", 1), "levels of", progress=True)
-    assert load(f"{path}::0", channel=1).shape == SHAPE
-    scales["datasets"][1]["path"] = "9"
-    group.attrs.update(attributes)
-    unreadable(path, "level 9, which is not there", channel=1)
-
-
-def test_an_interrupted_writing_is_made_whole_by_the_next(image: tuple[Path, str], monkeypatch) -> None:
-    path, version = image
-    mask = tube_of(path)
-    with monkeypatch.context() as patch:
-        patch.setattr("curvafit.volumes.formats.zarr.write_content", lambda *_: (_ for _ in ()).throw(OSError("full")))
-        with pytest.raises(OSError, match="full"):
-            save(mask, path / "labels/tube")
-    save(mask, path / "labels/tube")
-    assert content(path / "labels", version)["labels"] == ["tube"]
-    assert np.array_equal(load(f"{path}::labels/tube").values, mask.values)
-    assert [place.name for place in path.parent.iterdir()] == ["scan.zarr"]
-
-
-def test_a_command_writes_labels_and_the_rest_beside_the_store(image: tuple[Path, str], monkeypatch) -> None:
-    path, version = image
-    monkeypatch.chdir(path.parent)
-    command = ("segment", "scan.zarr", "--channel", 1, "--prior", "tubes", "--weight", 0.1, "--steps", 2)
-    done(*command, "-o", "scan.zarr/labels/tube")
-    assert sorted(place.name for place in path.parent.iterdir()) == ["scan.zarr", "scan_tube.json", "scan_tube.png"]
-    assert content(path / "labels", version)["labels"] == ["tube"]
-    record = json.loads(Path("scan_tube.json").read_text())
-    assert record["files"] == ["scan_tube.png", "scan_tube.json"]
-    truth = load(path, channel=1).values > 110
-    assert (load(f"{path}::labels/tube").values == truth).mean() > 0.97
-    before = tree(path.parent)
-    target = ("-o", "scan.zarr/labels/tube")
-    refused(call(*command, "--spacing", 0.3, "--unit", "um", *target), "voxels of a level", progress=True)
-    refused(call("segment", "scan.zarr::labels/tube", *command[4:], *target), "write over the input")
-    assert tree(path.parent) == before
+def test_a_mask_lies_where_its_part_of_the_image_does(image: Path) -> None:
+    """In a store of its own: nothing is written into the image's."""
+    before = tree(image)
+    part = load(image, channel=1, crop="4:14,:,:")
+    mask = Volume(part.values > 110, part.spacing, part.unit, part.affine)
+    back = load(save(mask, image.with_name("mask.zarr")))
+    assert np.array_equal(back.values, mask.values) and back.affine is not None
+    assert back.affine[:3, 3].tolist() == [1, 2, 5]
+    for target in (image / "labels" / "tube", image / "labels" / "tube.zarr", image / "0" / "mask.nii.gz"):
+        with pytest.raises(ValueError, match="in the Zarr store"):
+            save(mask, target, overwrite=True)
+    segment = ("segment", image, "--channel", 1, "--prior", "tubes", "-o", image / "labels" / "tube.zarr")
+    refused(call(*segment), "in the Zarr store", progress=True)
+    assert tree(image) == before
 
 
 # ---- axes, transforms, addresses -------------------------------------------------------------------------------------
@@ -286,45 +184,37 @@ def states(folder: Path, ome: dict, values: np.ndarray, **options: Any) -> Volum
 
 
 SPACE = [{"name": axis, "type": "space", "unit": "micrometer"} for axis in "zyx"]
-SCALE, ONE = {"type": "scale", "scale": [2, 1, 0.5]}, {"type": "translation", "translation": [1, 1, 1]}
+SCALE = {"type": "scale", "scale": [2, 1, 0.5]}
 
 
 def test_transforms_of_coordinates_are_applied_or_refused(tmp_path: Path) -> None:
-    """Those of version 0.6 lead from a level to a system of coordinates; one that is not known is refused."""
+    """Scales and translations, in order. Others are refused, and so is a version that has others, unless a caller
+    states spacing and unit."""
     values = np.arange(60, dtype=np.float32).reshape(3, 4, 5)
-    turn = np.eye(3)[[0, 2, 1]] * [1, -1, 1]  # about z, in the order z, y, x
-    for name, steps, spacing, corner in (
-        ("scale", [SCALE], (2, 1, 0.5), (0, 0, 0)),
-        ("identity", [{"type": "identity"}], (1, 1, 1), (0, 0, 0)),
-        ("both", [SCALE, {"type": "translation", "translation": [3, 4, 5]}], (2, 1, 0.5), (3, 4, 5)),
-        ("sequence", [{"type": "sequence", "transformations": [ONE, SCALE]}], (2, 1, 0.5), (2, 1, 0.5)),
-        ("affine", [{"type": "affine", "affine": [[2, 0, 0, 7], [0, 1, 0, 8], [0, 0, 3, 9]]}], (2, 1, 3), (7, 8, 9)),
-        ("rotation", [SCALE, {"type": "rotation", "rotation": turn.tolist()}], (2, 1, 0.5), (0, 0, 0)),
+
+    def read(name: str, transforms: list[dict], version: str = "0.5", images: int = 1, **options: Any) -> Volume:
+        image = {"axes": SPACE, "datasets": [{"path": "0", "coordinateTransformations": transforms}]}
+        return states(tmp_path / name, {"version": version, "multiscales": [image] * images}, values, **options)
+
+    moved = {"type": "translation", "translation": [3, 4, 5]}
+    for name, transforms, corner in (
+        ("scale", [SCALE, {"type": "identity"}], (0, 0, 0)), ("both", [SCALE, moved], (3, 4, 5)),
+        ("moved", [moved, SCALE], (6, 4, 2.5)),
     ):  # fmt: skip
-        for system in (False, True):
-            given = [{**step, "input": "0", "output": "world"} for step in steps]
-            level = {"path": "0", "coordinateTransformations": given}
-            axes = {"coordinateSystems": [{"name": "world", "axes": SPACE}]} if system else {"axes": SPACE}
-            ome = {"version": "0.6" if system else "0.5", "multiscales": [{**axes, "datasets": [level]}]}
-            field = states(tmp_path / f"{name}{system}.zarr", ome, values)
-            assert np.array_equal(field.values, values) and field.unit == "um" and not field.notes
-            assert field.spacing == pytest.approx(spacing)
-            place = np.diag([*spacing[::-1], 1.0]) if field.affine is None else field.affine
-            assert place[:3, 3] == pytest.approx(corner[::-1], abs=1e-12)
-            if name == "rotation":
-                assert place[:3, :3] == pytest.approx((turn * spacing)[::-1, ::-1])
-    odd = [{"type": "displacements", "path": "field"}]
-    image = {"axes": SPACE, "datasets": [{"path": "0", "coordinateTransformations": odd}]}
-    ome = {"version": "0.6", "multiscales": [image] * 2}
-    with pytest.raises(ScanError, match="displacements"):
-        states(tmp_path / "odd.zarr", ome, values)
-    field = states(tmp_path / "odd.zarr", ome, values, spacing=2.0, unit="um")
-    assert field.spacing == (2, 2, 2) and "2 images" in field.notes[0]
-    assert "0.9" in states(tmp_path / "new.zarr", {**ome, "version": "0.9"}, values, spacing=2.0, unit="um").notes[1]
-    tilted = [{"type": "affine", "affine": [[1, 0.3, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}]
-    image = {"axes": SPACE, "datasets": [{"path": "0", "coordinateTransformations": tilted}]}
-    with pytest.raises(ScanError, match="right angles"):
-        states(tmp_path / "tilted.zarr", {"version": "0.6", "multiscales": [image]}, values)
+        field = read(name, transforms)
+        assert np.array_equal(field.values, values) and field.unit == "um" and not field.notes
+        assert field.spacing == (2, 1, 0.5)
+        place = np.eye(4) if field.affine is None else field.affine
+        assert place[:3, 3].tolist() == [*corner[::-1]]
+    odd = [SCALE, {"type": "displacements", "path": "field"}]
+    for name, transforms, version, word in (
+        ("odd", odd, "0.5", "displacements"), ("path", [{"type": "scale"}], "0.4", "'scale'"),
+        ("new", [SCALE], "0.6", "OME-Zarr 0.6"), ("newer", [SCALE], "1.0", "OME-Zarr 1.0"),
+    ):  # fmt: skip
+        with pytest.raises(ScanError, match=word):
+            read(name, transforms, version)
+        field = read(name, transforms, version, images=2, spacing=2.0, unit="um")
+        assert field.spacing == (2, 2, 2) and "2 images" in field.notes[0]
 
 
 def test_names_of_dimensions_order_axes(tmp_path: Path) -> None:

@@ -1,12 +1,10 @@
-"""Zarr: reading of arrays, groups and OME-Zarr; writing of OME-Zarr 0.5, and of labels into images of 0.4 and 0.5."""
+"""Zarr: reading of arrays, groups and OME-Zarr; writing of OME-Zarr 0.5."""
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,10 +12,8 @@ from typing import Any
 import numpy as np
 
 from curvafit.core.checks import require
-from curvafit.core.files import move_into_place, write_content
-from curvafit.core.records import MARK, is_zarr
+from curvafit.core.records import MARK
 from curvafit.core.runtime import hold_signals
-from curvafit.core.units import common_unit, format_sampling, parse_unit
 from curvafit.volumes.formats import base
 from curvafit.volumes.formats.base import ScanError, Stated
 from curvafit.volumes.volume import Box, cut_boxes
@@ -30,8 +26,6 @@ _MOST = 10_000_000
 _BOX = 2
 #: Our unit -> OME-Zarr's, which has none for the voxel.
 _UNITS = {"nm": "nanometer", "um": "micrometer", "mm": "millimeter", "m": "meter"}
-#: Version of OME-Zarr -> Zarr's format, for writing.
-_FORMATS = {"0.4": 2, "0.5": 3}
 #: In a shard's index: bytes of a chunk's offset and length, of the checksum at the end, and either of an absent chunk.
 _ENTRY, _CHECKSUM, _ABSENT = 16, 4, 2**64 - 1
 #: The axes, steps, units, origin or affine and notes of an array, as the fields of `Stated`.
@@ -51,8 +45,6 @@ def read_zarr(path: Path, *, key: str | None = None, **_: object) -> Stated:
     if isinstance(node, zarr.Array):
         return _state_array(node, path)
     arrays, levels, name = _pick_array(node, key, path)
-    if key is None:
-        _check_levels(arrays, levels, path)
     return _state_array(arrays[name], path / arrays[name].path, levels.get(name), node)
 
 
@@ -117,13 +109,10 @@ def _state_array(array: Any, folder: Path | None, geometry: _Geometry | None = N
     return Stated(array, **{**geometry, "axes": axes, "units": units, "notes": notes}, gaps=gaps)
 
 
-def write_zarr(field: Any, path: Path, version: str = "0.5", labels: bool = False) -> None:
-    """Write an image of OME-Zarr: the volume as `0`, halved copies as `1`, `2` … down to one chunk.
-
-    `labels` says that its whole numbers are labels of the image two folders above.
-    """
+def write_zarr(field: Any, path: Path) -> None:
+    """Write an image of OME-Zarr 0.5: the volume as `0`, halved copies as `1`, `2` … down to one chunk."""
     with hold_signals():
-        group = _create_zarr(field, path, version, labels)
+        group = _create_zarr(field, path)
     finest = _open_level(group, 0)
     for box in _chunk_boxes(group, 0):
         values = field.read(box).astype(finest.dtype, copy=False)
@@ -135,16 +124,15 @@ def write_zarr(field: Any, path: Path, version: str = "0.5", labels: bool = Fals
                 _halve_level(group, level, box)
 
 
-def _create_zarr(frame: Any, path: Path, version: str, labels: bool) -> Any:
+def _create_zarr(frame: Any, path: Path) -> Any:
     """Create an image of OME-Zarr with the shape, type, spacing and position of a volume, and return its group."""
     import zarr
 
-    dtype = np.dtype(np.uint8) if labels and frame.dtype.kind == "b" else frame.dtype
     shapes = [tuple(frame.shape)]
     while max(shapes[-1]) > CHUNK:
         shapes.append(tuple(-(-n // 2) for n in shapes[-1]))
     # A mean of 2ᵏ voxels along an axis lies (2ᵏ - 1) / 2 voxels behind the first one's centre; a picked voxel does not.
-    shift = 0.5 if dtype.kind == "f" else 0.0
+    shift = 0.5 if frame.dtype.kind == "f" else 0.0
     space = {"type": "space", **({"unit": _UNITS[frame.unit]} if frame.unit in _UNITS else {})}
     datasets = []
     for k in range(len(shapes)):
@@ -154,21 +142,12 @@ def _create_zarr(frame: Any, path: Path, version: str, labels: bool) -> Any:
             transforms += [{"type": "translation", "translation": first}]
         datasets.append({"path": str(k), "coordinateTransformations": transforms})
     axes = [{"name": name, **space} for name in "zyx"]
-    image = {"name": path.name if labels else "volume", "axes": axes, "datasets": datasets}
-    is_format_2 = _FORMATS[version] == 2
-    versioned = {"version": version} if is_format_2 else {}
-    content: dict[str, Any] = {"multiscales": [image | versioned]}
-    if labels:
-        content["image-label"] = {"source": {"image": "../../"}} | versioned
-    naming: dict[str, Any] = {"dimension_names": ("z", "y", "x")}
-    if is_format_2:
-        naming = {"chunk_key_encoding": {"name": "v2", "separator": "/"}}
-    attributes = content if is_format_2 else {"ome": {"version": version, **content}}
-    group = zarr.create_group(path, attributes=attributes, zarr_format=2 if is_format_2 else 3)
-    dtype = np.dtype(dtype.newbyteorder("=").str)  # of the two 64-bit types of C, Zarr knows one
+    image = {"name": "volume", "axes": axes, "datasets": datasets}
+    group = zarr.create_group(path, attributes={"ome": {"version": "0.5", "multiscales": [image]}}, zarr_format=3)
+    dtype = np.dtype(frame.dtype.newbyteorder("=").str)  # of the two 64-bit types of C, Zarr knows one
     for k, shape in enumerate(shapes):
         chunks = tuple(min(CHUNK, n) for n in shape)
-        group.create_array(str(k), shape=shape, dtype=dtype, chunks=chunks, **naming)
+        group.create_array(str(k), shape=shape, dtype=dtype, chunks=chunks, dimension_names=("z", "y", "x"))
     return group
 
 
@@ -196,101 +175,6 @@ def _halve_level(group: Any, level: int, box: Box) -> None:
     _open_level(group, level)[box] = values
 
 
-# ---- labels of an image ----------------------------------------------------------------------------------------------
-
-
-def image_of(path: Path) -> Path | None:
-    """Return the OME-Zarr image of a path to its labels, `IMAGE/labels/NAME`; None for any other path.
-
-    Raises ScanError if the group is no such image, its version is not 0.4 or 0.5, or the name is not valid.
-    """
-    image = path.parent.parent
-    if path.parent.name != "labels" or not is_zarr(image):
-        return None
-    version = version_of(image)
-    if version not in _FORMATS:
-        kind = "no image of OME-Zarr" if version is None else f"OME-Zarr {version}"
-        raise ScanError(f"labels are written into an image of OME-Zarr 0.4 or 0.5, {image} is {kind}")
-    if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", path.name):
-        raise ScanError(f"a name of labels has letters, digits and _ . - alone, got {path.name!r}")
-    return image
-
-
-def store_of(image: Path) -> Path:
-    """Return the outermost Zarr group around an image."""
-    while is_zarr(image.parent):
-        image = image.parent
-    return image
-
-
-def write_labels(field: Any, path: Path, *, image: Path) -> None:
-    """Write whole numbers, or a mask, as labels of an image; `path` may be anywhere until `add_labels`."""
-    if field.dtype.kind not in "biu":
-        raise ScanError(f"labels must be whole numbers, got values of type {field.dtype}")
-    check_place(field, image)
-    write_zarr(field, path, version_of(image) or "", labels=True)
-
-
-def check_place(field: Any, image: Path) -> None:
-    """Raise ScanError where a field's voxels are not those of a level of an image, or of a box of one."""
-    import zarr
-
-    group: Any = zarr.open_group(image, mode="r")
-    for name, level in _read_levels("", group.attrs.asdict()).items():
-        axes = level["axes"] or "zyx"
-        zyx, count = [axes.index(letter) for letter in "zyx"], len(axes)
-        by_axis = (level["steps"] or (1.0,) * count, level.get("origin") or (0.0,) * count, group[name].shape)
-        edges, origin, shape = (np.array([values[axis] for axis in zyx]) for values in by_axis)
-        common, to_common = common_unit([level["units"][axis] for axis in zyx] if level["units"] else [None] * 3)
-        unit, from_common = parse_unit(common)  # lengths of the field are in `unit`, those of the level by axis
-        same_edges = np.allclose(np.array(field.spacing) / from_common, edges * to_common, rtol=1e-3, atol=0)
-        first = (np.array(base.first_voxel(field)) / from_common / to_common - origin) / edges  # in voxels of the level
-        if unit == field.unit and same_edges and (first > -0.01).all() and (first + field.shape < shape + 0.01).all():
-            return
-    size = format_sampling(field.shape, field.spacing, field.unit)
-    raise ScanError(f"labels must have the voxels of a level of {image} or of a part of one, got {size}")
-
-
-@hold_signals()
-def add_labels(written: Path, image: Path, name: str) -> Path:
-    """Move written labels into an image, under a name, list them in its metadata, and return their path."""
-    import zarr
-
-    folder = image / "labels"
-    folder.mkdir(exist_ok=True)
-    target = move_into_place(written, folder / name)
-    version, is_format_2 = version_of(image), (image / ".zgroup").exists()
-    metadata = folder / (".zattrs" if is_format_2 else "zarr.json")
-    content = json.loads(metadata.read_text(encoding="utf-8")) if metadata.exists() else {}
-    if is_format_2:
-        attributes = content
-    else:
-        content = {"zarr_format": 3, "node_type": "group", "attributes": {}, **content}
-        attributes = content["attributes"].setdefault("ome", {"version": version})
-    if name not in attributes.setdefault("labels", []):
-        attributes["labels"].append(name)
-        write_content(metadata, json.dumps(content, indent=2))
-    if is_format_2 and not (folder / ".zgroup").exists():
-        write_content(folder / ".zgroup", json.dumps({"zarr_format": 2}))
-    root = store_of(image)
-    if (root / ".zmetadata").exists() or zarr.open_group(root, mode="r").metadata.consolidated_metadata is not None:
-        with warnings.catch_warnings():  # that consolidated metadata are no part of format 3, which this store has
-            warnings.simplefilter("ignore")
-            zarr.consolidate_metadata(root)
-    return target
-
-
-def version_of(image: Path) -> str | None:
-    """Return the version of OME-Zarr of an image; None if a group is no image."""
-    import zarr
-
-    attributes: Any = zarr.open_group(image, mode="r").attrs.asdict()
-    images = attributes.get("ome", attributes).get("multiscales")
-    if not images:
-        return None
-    return str(attributes.get("ome", {}).get("version") or images[0].get("version") or "0.4")
-
-
 @hold_signals()
 def mark(folder: Path, kind: str) -> None:
     """Write into a group's attributes that this program wrote it, and its kind."""
@@ -304,87 +188,39 @@ def _read_levels(name: str, attributes: Mapping[str, Any]) -> dict[str, _Geometr
     ome = attributes.get("ome", attributes)
     images = ome.get("multiscales") or [{}]
     image = images[0]
-    systems = {system["name"]: system["axes"] for system in image.get("coordinateSystems", [])}
-    notes = (f"The group holds {len(images)} images: the first is used.",) if len(images) > 1 else ()
     version = str(ome.get("version") or image.get("version") or "0.4")
-    notes += () if re.match(r"0\.[1-6]\b", version) else (f"It is of OME-Zarr {version}, and read as of 0.6.",)
+    notes = (f"The group holds {len(images)} images: the first is used.",) if len(images) > 1 else ()
+    axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes") or []]
+    names = [str(axis["type"] if axis.get("type") in ("channel", "time") else axis.get("name")) for axis in axes]
+    geometry = {"axes": base.name_axes(names), "units": [axis.get("unit") for axis in axes], "notes": notes}
     levels: dict[str, _Geometry] = {}
     for dataset in image.get("datasets", []):
-        transforms = list(dataset.get("coordinateTransformations", []))
-        listed = image.get("axes") or systems.get(transforms[0].get("output") if transforms else "") or []
-        # The image's own come after a level's, unless there are systems of coordinates: then they lead to another one.
-        transforms += [] if systems else image.get("coordinateTransformations", [])
-        axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in listed]
-        names = [str(axis["type"] if axis.get("type") in ("channel", "time") else axis.get("name")) for axis in axes]
-        geometry = {"axes": base.name_axes(names), "units": [axis.get("unit") for axis in axes], "notes": notes}
-        levels[f"{name}/{dataset['path']}".strip("/")] = geometry | _read_transforms(transforms, geometry["axes"])
+        transforms = [*dataset.get("coordinateTransformations", []), *image.get("coordinateTransformations", [])]
+        place = (
+            _read_transforms(transforms) if re.match(r"0\.[1-5]\b", version) else _unknown_unit(f"OME-Zarr {version}")
+        )
+        levels[f"{name}/{dataset['path']}".strip("/")] = geometry | place
     return levels
 
 
-def _read_transforms(transforms: Sequence[Mapping[str, Any]], axes: str) -> _Geometry:
-    """Return steps and origin, or steps and affine, that transforms of indices state.
-
-    An unknown transform becomes the name of a unit, which is refused unless the caller states spacing and unit.
-    """
-    lengths = [len(value) for t in transforms if isinstance(value := t.get(str(t.get("type"))), list)]
-    n = len(axes) or max(lengths, default=0)
-    matrix = _compose(transforms, n)
-    if isinstance(matrix, str):
-        return {"steps": None, "units": (f"coordinates of a transform {matrix}",) * n}
-    linear, offset = matrix[:n, :n], matrix[:n, n]
-    if all(t.get("type") == "translation" for t in transforms):
-        return {"steps": None, "origin": offset.tolist() if transforms else None}
-    steps, space = np.linalg.norm(linear, axis=0), [axes.index(axis) for axis in "xyz" if axis in axes]
-    if np.array_equal(linear, np.diag(steps)):
-        return {"steps": steps.tolist(), "origin": offset.tolist() if offset.any() else None}
-    in_space = linear[np.ix_(space, space)]
-    # An affine has x, y and z alone: any other axis must have its step on the diagonal, and nothing else.
-    if len(space) < 3 or np.count_nonzero(linear) != n - 3 + np.count_nonzero(in_space):
-        return {"steps": None, "units": ("coordinates of a transform of axes that are not of space",) * n}
-    return {"steps": steps.tolist(), "affine": base.affine_of(in_space, offset[space])}
-
-
-def _compose(transforms: Sequence[Mapping[str, Any]], n: int) -> np.ndarray | str:
-    """Return the matrix (n + 1, n + 1) of transforms, applied in order, or the type of the first unknown one."""
-    composed = np.eye(n + 1)
+def _read_transforms(transforms: Sequence[Mapping[str, Any]]) -> _Geometry:
+    """Return the steps and the origin that transforms of indices, applied in order, state."""
+    steps, origin = np.array(1.0), np.array(0.0)
     for transform in transforms:
-        kind, matrix = str(transform.get("type")), np.eye(n + 1)
-        value: Any = transform.get({"sequence": "transformations"}.get(kind, kind))
-        if kind == "identity":
-            continue
-        if kind not in ("scale", "translation", "affine", "rotation", "mapAxis", "sequence") or value is None:
-            return repr(kind)
-        if kind == "scale":
-            matrix[:n, :n] = np.diag(np.array(value, dtype=np.float64))
-        elif kind == "translation":
-            matrix[:n, n] = value
-        elif kind == "affine":
-            matrix[:n] = value
-        elif kind == "sequence":
-            inner = _compose(value, n)
-            if isinstance(inner, str):
-                return inner
-            matrix = inner
-        else:
-            matrix[:n, :n] = value if kind == "rotation" else np.eye(n)[value]
-        composed = matrix @ composed
-    return composed
+        kind = str(transform.get("type"))
+        value = transform.get(kind)
+        if kind == "scale" and value is not None:
+            steps, origin = steps * value, origin * value
+        elif kind == "translation" and value is not None:
+            origin = origin + value
+        elif kind != "identity":
+            return _unknown_unit(f"a transform {kind!r}")
+    return {"steps": steps.tolist() if steps.ndim else None, "origin": origin.tolist() if origin.any() else None}
 
 
-def _check_levels(arrays: Mapping[str, Any], levels: Mapping[str, _Geometry], path: Path) -> None:
-    """Raise ScanError where levels of an image are missing, or differ in extent by more than one of their voxels."""
-    extents: dict[str, np.ndarray] = {}
-    for name, level in levels.items():
-        if name not in arrays:
-            raise ScanError(f"{path} lists the level {name}, which is not there: name another, as in {path}::0")
-        if level["steps"] is None or len(level["steps"]) != arrays[name].ndim:
-            continue
-        extents[name] = np.array(level["steps"]) * arrays[name].shape
-        first = next(iter(extents))
-        if (np.abs(extents[name] - extents[first]) > 1.01 * np.array(level["steps"])).any():
-            sizes = {key: " x ".join(f"{edge:g}" for edge in extents[key]) for key in (first, name)}
-            listed = " and ".join(f"{size} of {key}" for key, size in sizes.items())
-            raise ScanError(f"the levels of {path} disagree in extent, {listed}: name one, as in {path}::{first}")
+def _unknown_unit(source: str) -> _Geometry:
+    """Return coordinates that are not read as an unknown unit: refused, unless the caller states spacing and unit."""
+    return {"steps": None, "units": (f"coordinates of {source}",) * 3}
 
 
 # ---- chunks that are not stored --------------------------------------------------------------------------------------
