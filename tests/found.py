@@ -77,6 +77,7 @@ def made_fit(chosen: str | None = "posterior", lost: bool = False) -> Fit:
     return Fit(
         kind="image",
         family="tubes",
+        diagram=None,
         candidates=candidates if chosen else (),
         chosen=chosen,
         draws=rows if chosen else None,
@@ -112,16 +113,14 @@ def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page, "png", lambda figure: b"\x89PNG")
 
 
-COLUMNS = (("true", "1"), ("2", "-1"), ("2", ""))
-#: What every reader of a `fit.json` refuses: where, and the JSON that stands there, or nothing.
+#: What a reader of all of a `fit.json` refuses: where, and the JSON that stands there, or nothing.
 BROKEN = [
     (where, text)
     for where, texts in {
-        "mass": ("1", "-1.5", "true", None), "epsilon_physical": ("0", '"0.02"'), "working_voxel": ("-1", "[0.01]"),
-        "length_unit": ('"furlong"', "[]"), "coefficients": ("[1, 2, 3, 4, 5, 6]",), "coefficients.a02": (None,),
-        "coefficients_physical.a10": ('"x"',), "morphometry": ("7",), "morphometry.volume_fraction": ("2",),
+        "thickness": ("0", '"0.02"', "true", None), "working_voxel": ("-1", "[0.01]"),
+        "length_unit": ('"furlong"', "[]"), "morphometry": ("7",), "morphometry.volume_fraction": ("2",),
         "kind": ("3",), "family": ("{}",), "matches": ("{}", "[7]"), "provenance": ('{"scan": 5}',),
-        "diagram": ("7", *('{{"kappa1": [1], "kappa2": [{}], "share": [{}]}}'.format(*each) for each in COLUMNS)),
+        "draws": ("7", "[[true]]", '[["1"]]'), "diagram": ("7", '{"points": 3, "weights": [1]}'),
     }.items()
     for text in texts
 ]  # fmt: skip

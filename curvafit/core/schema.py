@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
+
 from curvafit.core.checks import quoted
 
 
@@ -20,8 +22,6 @@ class Rule(NamedTuple):
         Bounds of a number, the last two exclusive.
     unknown
         Whether a number may be NaN, which JSON writes as null.
-    filled
-        Whether a list has at least one item.
     keys
         Keys of some entries of a dictionary, with their types.
     """
@@ -31,7 +31,6 @@ class Rule(NamedTuple):
     above: float = -math.inf
     below: float = math.inf
     unknown: bool = False
-    filled: bool = False
     keys: tuple[tuple[str, Any], ...] = ()
 
 
@@ -39,7 +38,8 @@ _PLAIN: dict[Any, str] = {str: "a text", bool: "true or false"}
 
 
 def decode(hint: Any, value: Any, name: str = "") -> Any:
-    """Return a value from JSON as the type of `hint`: a dataclass, text, number, `Literal`, tuple, dictionary or None.
+    """Return a value from JSON as the type of `hint`: a dataclass, text, number, `Literal`, tuple, array, dictionary or
+    None.
 
     Raises ValueError with the first fault, such as `"mass as a positive number, got 0"`, in which the value is `name`.
     """
@@ -63,6 +63,8 @@ def decode(hint: Any, value: Any, name: str = "") -> Any:
                 decode(entry_hint, value[key], f"{name}.{key}")
         inner = get_args(kind)[1]
         return {k: v if v is None or inner is Any else decode(inner, v, f"{name}.{k}") for k, v in value.items()}
+    if kind is np.ndarray:
+        return np.array(value, dtype=np.float64)
     return kind(value) if kind in (int, float) else value
 
 
@@ -90,9 +92,12 @@ def _check_value(kind: Any, rule: Rule, value: Any) -> tuple[str, bool]:
     if get_origin(kind) is tuple:
         items = get_args(kind)
         count = 0 if items[-1] is Ellipsis else len(items)  # 0: any number of items
-        is_list = isinstance(value, (list, tuple))
-        is_full = is_list and (len(value) == count if count else len(value) >= int(rule.filled))
-        return f"a list of {count} numbers" if count else "a list", is_full
+        is_list = isinstance(value, (list, tuple)) and (not count or len(value) == count)
+        return f"a list of {count} numbers" if count else "a list", is_list
+    if kind is np.ndarray:
+        items = np.array(value, dtype=object).flat  # lists, where rows differ in length
+        is_array = isinstance(value, list) and all(_check_value(float, rule, item)[1] for item in items)
+        return "numbers in rows of one length", is_array
     return "an object", isinstance(value, Mapping)
 
 
@@ -106,11 +111,13 @@ def _describe_number(rule: Rule) -> str:
 
 
 def encode(value: Any) -> Any:
-    """Return a dataclass and its content as JSON's types; NaN becomes None."""
+    """Return a dataclass and its content as JSON's types: NaN is None, numbers of arrays have six digits."""
     if dataclasses.is_dataclass(value):
         return {field.name: encode(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return {name: encode(item) for name, item in value.items()}
     if isinstance(value, (tuple, list)):
         return [encode(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return np.array([float(f"{x:.6g}") for x in value.flat]).reshape(value.shape).tolist()
     return None if isinstance(value, float) and math.isnan(value) else value

@@ -307,7 +307,7 @@ def _build_fit(
         morphometry=figures,
         notes=prepared.notes,
         provenance=provenance,
-        diagram=None if diagram is None else diagram.thin(BIN_WIDTH, TAIL_SHARE),
+        diagram=None if diagram is None else diagram.thin(BIN_WIDTH, TAIL_SHARE).normalised,
         candidates=estimate.candidates,
         chosen=chosen,
         draws=estimate.draws,

@@ -22,7 +22,7 @@ from curvafit.priors.published import PUBLISHED
 
 Content = TypeVar("Content")
 #: The format of a `fit.json`.
-FORMAT = "curvafit-fit-3"
+FORMAT = "curvafit-fit-4"
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,8 @@ def parse_fit(text: str | bytes, place: object, kind: type[Content]) -> Content:
     try:
         return decode(kind, content)
     except ValueError as error:
-        raise ValueError(f"expected {expected} with {error} in {place}") from None
+        fault = str(error).removeprefix("expected ")  # of a dataclass that checks itself
+        raise ValueError(f"expected {expected} with {fault} in {place}") from None
 
 
 # ---- presets ---------------------------------------------------------------------------------------------------------

@@ -107,8 +107,7 @@ def test_fit_json_holds_what_the_generator_needs(inference: Inference, tmp_path)
     assert content["provenance"]["seed"] == 3 and content["length_unit"] == "um"
     assert content["provenance"]["schedule"] == schedule(LEARNED, steps=400).as_dict()
     kept = content["diagram"]
-    assert kept["seen_as"] == "mask" and sum(kept["share"]) == pytest.approx(1, abs=1e-4)
-    assert len(kept["kappa1"]) == len(kept["share"]) and path.read_text().count("\n") < 1000
+    assert sum(kept["weights"]) == pytest.approx(1, abs=1e-4) and path.read_text().count("\n") < 1000
     prior, law = Law.load(path), fit.to_law()
     assert tuple(prior.coefficients) == pytest.approx(tuple(law.coefficients))
     assert tuple(prior.physical) == pytest.approx(tuple(law.physical))
