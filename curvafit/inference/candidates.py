@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
-from os import PathLike
 from typing import Annotated
 
 import numpy as np
@@ -20,7 +19,6 @@ from curvafit.geometry.distances import one_to_many
 from curvafit.geometry.morphology import Morphometry, morphometry
 from curvafit.priors.coefficients import NAMES, Coefficients
 from curvafit.priors.grid import Grid
-from curvafit.priors.law import LawLike, read_fit
 from curvafit.scan.measures import scan_diagram
 from curvafit.scan.preparation import Prepared, thinner_thickness
 
@@ -124,24 +122,6 @@ def seed_noise_of(candidates: Sequence[Candidate]) -> float | None:
     if best is not None and best.seed_noise is not None:
         return best.seed_noise
     return next((candidate.seed_noise for candidate in candidates if candidate.seed_noise is not None), None)
-
-
-@dataclass(frozen=True)
-class _File:
-    """The entries of a `fit.json` that are read; it may hold any others."""
-
-    format: str
-    candidates: tuple[Candidate, ...] = ()
-
-
-def load_candidates(law: LawLike) -> tuple[Candidate, ...]:
-    """Return the candidates of a fit, an inference or a `fit.json`; none of any other law.
-
-    A file may lack all other entries. Raises FileNotFoundError or ValueError as `Fit.load`.
-    """
-    if not isinstance(law, (str, PathLike)):
-        return getattr(getattr(law, "fit", law), "candidates", ())
-    return read_fit(law, _File).candidates
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -53,7 +52,7 @@ from curvafit.segmentation.trials import (
     Trial,
     choose_by_masks,
     crop_to_surface,
-    laws_of,
+    law_of,
     leave_out_slices,
 )
 from curvafit.segmentation.uncertainty import (
@@ -156,12 +155,12 @@ def reconstruct(
 
 @dataclass(frozen=True, eq=False)
 class _Inputs:
-    """What a volume is filled from: its labels, the options `which` of its known slices, laws with notes on them, the
+    """What a volume is filled from: its labels, the options `which` of its known slices, a law with notes on it, the
     network, an image and an example; and whether it is filled in blocks."""
 
     volume: Volume
     which: dict[str, Any]
-    laws: Sequence[Coefficients]
+    law: Coefficients | None
     notes: tuple[str, ...]
     taught: Taught
     image: Volume | None
@@ -181,13 +180,13 @@ class _Inputs:
             check_memory(volume.shape, LEAST_BYTES, "a volume that is filled at once, not in blocks,")
             volume = volume.load()
             volume = replace(volume, array=round_labels(volume.values))
-        laws, notes = ((), ()) if prior is None else laws_of(prior, volume)
-        if image is not None and (example is not None or laws):
+        law, notes = (None, ()) if prior is None else law_of(prior, volume)
+        if image is not None and (example is not None or law is not None):
             raise ScanError("give an image, or an example or a law, but not both: nothing joins them yet")
         taught = Taught.load(working.filler, image=image is not None)
         grey = None if image is None else load_image(image, volume, reading)
         annotated = None if example is None else load_example(example, volume, reading)
-        return cls(volume, which, laws, notes, taught, grey, annotated, in_blocks)
+        return cls(volume, which, law, notes, taught, grey, annotated, in_blocks)
 
     def open_run(self, working: Working, progress: Progress) -> AbstractContextManager[Run]:
         """Open the run of the blocks; a volume that is filled at once is one block in memory."""
@@ -210,9 +209,9 @@ def _fill_between(inputs: _Inputs, suggest: int, run: Run, working: Working, pro
     taught, evidence, input_notes = _adapt(inputs, known, slices, example, step)
     notes = (*notes, *input_notes)
     engine = _Engine(taught, evidence, working.epsilon, progress)
-    grid, tiles = engine.cut(slices, working.tile) if inputs.laws else (None, [])
+    grid, tiles = engine.cut(slices, working.tile) if inputs.law else (None, [])
     strength = (working.stiffness, working.steps)
-    trial, task, head = _choose_law(engine, slices, inputs.laws, example, strength, len(tiles))
+    trial, task, head = _try_law(engine, slices, inputs.law, example, strength, len(tiles))
     if grid is None or trial.law is None:
         filled, phase = _fill_volume(known, slices, engine, run, working.tile, inputs.in_blocks), None
         inside = flow_summary(filled.share)
@@ -247,18 +246,18 @@ def _adapt(
     return taught, None, ()
 
 
-def _choose_law(
-    engine: _Engine, slices: Slices, laws: Sequence[Coefficients], example: Example | None,
+def _try_law(
+    engine: _Engine, slices: Slices, law: Coefficients | None, example: Example | None,
     strength: tuple[float | None, int], tiles: int,
 ) -> tuple[Trial, Task[Slices] | None, str]:  # fmt: skip
-    """Return the trial to run, with a law if one is better than the network alone; the task that laws were tried on, or
-    else the example's; and the beginning of the status. `strength` is the stiffness and the steps: a given stiffness
-    takes the first law untried. Of a volume of several `tiles`, laws are tried in a box."""
+    """Return the trial to run, with the law if it is better than the network alone; the task that it was tried on, or
+    else the example's; and the beginning of the status. `strength` is the stiffness and the steps: with a given
+    stiffness the law is not tried. Of a volume of several `tiles`, it is tried in a box."""
     (stiffness, steps), untried = strength, None if example is None else example.task
-    if not laws:
+    if law is None:
         return Trial(), untried, engine.taught.status
     if stiffness is not None:
-        return Trial(laws[0], stiffness, steps), untried, "the law is lowered from the network's volume"
+        return Trial(law, stiffness, steps), untried, "the law is lowered from the network's volume"
     part = slices if tiles == 1 else crop_to_surface(slices, PART)[0]
     task = leave_out_slices(part) if example is None else example.part
     if task is None:
@@ -266,7 +265,7 @@ def _choose_law(
             "to try the prior out, give three or more known slices with voxels inside and outside, an example or a "
             f"stiffness, got {len(part.places)} slices"
         )
-    trials = [Trial(law, STIFFNESS, steps, pull) for law, pull in product(laws, PULLS)]
+    trials = [Trial(law, STIFFNESS, steps, pull) for pull in PULLS]
 
     def fill_part(part: Slices, trial: Trial) -> np.ndarray:
         return (engine.level(part) if trial.law is None else engine.lower(part, trial)) > 0

@@ -20,7 +20,7 @@ from curvafit.segmentation.flow import BENDING, HALO, Working, WorkingGrid, bend
 from curvafit.segmentation.result import Segmentation, flow_summary
 from curvafit.segmentation.slices import check_spacing, load_with, require_labels
 from curvafit.segmentation.tiles import LoweredVolume, Problem, cut_tiles, lower_volume
-from curvafit.segmentation.trials import Task, Trial, choose_by_masks, law_of, laws_of
+from curvafit.segmentation.trials import Task, Trial, choose_by_masks, law_of
 from curvafit.volumes.read import Source, load
 from curvafit.volumes.volume import Box, ScanError, Volume, check_finite, lay
 
@@ -278,8 +278,8 @@ def calibrate(
 ) -> Calibration:
     """Choose the law and weight that bring a network's probabilities nearest to a true mask, for `segment`.
 
-    The laws that a fit trusts and the Willmore energy are tried at weights over decades, on the part of 96³ voxels that
-    holds most of the surface. Where none has a better Dice than p > 1/2 beyond the noise, the choice is p > 1/2.
+    The law of a prior and the Willmore energy are tried at weights over decades, on the part of 96³ voxels that holds
+    most of the surface. Where none has a better Dice than p > 1/2 beyond the noise, the choice is p > 1/2.
 
     `label` is the value of the structure in the mask. See `segment` for the other parameters, and for errors.
     """
@@ -294,10 +294,10 @@ def calibrate(
         from curvafit.inference.inference import infer  # takes long to import
 
         prior = infer(truth, kind="mask", growth=None, progress=progress)
-    laws, notes = laws_of(prior, field)
-    tried = laws if WILLMORE in laws else (*laws, WILLMORE)
-    for law in tried:
-        bending(law)  # refuses a law before the work
+    law, notes = law_of(prior, field)
+    tried = (law,) if law == WILLMORE else (law, WILLMORE)
+    for candidate in tried:
+        bending(candidate)  # refuses a law before the work
     probability_evidence(field)  # refuses values outside [0, 1] beyond the part, too
     box = box_with_most_surface(inside, EDGE)
     part = replace(field, array=field.values[box])
@@ -315,6 +315,6 @@ def calibrate(
             return np.zeros(part.shape, dtype=bool)
 
     task = Task(probability_evidence(part), inside[box], range(part.shape[0]))
-    first = [Trial(law, FIRST, working.steps) for law in tried]  # a trial's strength is the weight, in nats
+    first = [Trial(candidate, FIRST, working.steps) for candidate in tried]  # a trial's strength is the weight, in nats
     best = choose_by_masks(task, first, fill, NATS)
-    return Calibration(best, best.law in laws, field, (*notes, *truth.notes, *place_notes))
+    return Calibration(best, best.law == law, field, (*notes, *truth.notes, *place_notes))

@@ -1,4 +1,4 @@
-"""The laws that a prior offers, and the choice among them and their strengths by true masks.
+"""The law that a prior states, and the choice among laws and their strengths by true masks.
 
 Each law is tried at one strength, then the best law at stronger and weaker ones as long as it gets better. A law is
 chosen only where it beats the result without a law by more than the noise.
@@ -14,7 +14,6 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from curvafit.core.units import METRES, unit_name
-from curvafit.inference.candidates import load_candidates
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import Law, LawLike
 from curvafit.scan.grids import box_with_most_surface
@@ -25,8 +24,6 @@ from curvafit.volumes.volume import Box, ScanError, Volume
 
 #: The known part of a volume.
 Given = TypeVar("Given")
-#: Candidates of a fit that are laws of their own: the nearest match's destroys.
-TRUSTED = ("refined", "posterior", "simulation", "optimum")
 #: Longest edge, in voxels, of the box of an example that is read, and of the one on which laws are lowered.
 LARGEST, PART = 256, 96
 #: The fewest known slices of a box.
@@ -53,18 +50,6 @@ def law_of(prior: LawLike, scan: Volume) -> tuple[Coefficients, tuple[str, ...]]
     if law.length_unit not in (None, scan.unit):
         notes = (f"The prior's lengths, in {unit_name(law.length_unit)}, are converted to {unit_name(scan.unit)}.",)
     return coefficients, (*notes, f"{law.doubt} Compare the mask with the scan.") if law.doubt else notes
-
-
-def laws_of(prior: LawLike, scan: Volume) -> tuple[tuple[Coefficients, ...], tuple[str, ...]]:
-    """Return the laws to try for a prior, with lengths in the scan's unit, and sentences on their origin. The first is
-    that of `law_of`; of a fit the candidates in `TRUSTED` follow."""
-    first, notes = law_of(prior, scan)
-    law = Law.of(prior)
-    if not law.fitted:
-        return (first,), notes
-    candidates = [candidate.coefficients for candidate in load_candidates(prior) if candidate.name in TRUSTED]
-    others = [replace(law, coefficients=other) for other in candidates if other != law.coefficients]
-    return (first, *(law_of(other, scan)[0] for other in others)), notes
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,8 @@ import pytest
 import torch
 from annotated import EDGES, ball, known, leaning, organelles
 from calling import done
-from found import made_fit
 
 import curvafit.segmentation.trials as room
-from curvafit.inference.candidates import Candidate
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.law import preset
 from curvafit.scan.grids import box_with_most_surface
@@ -23,7 +21,7 @@ from curvafit.segmentation.labels import reconstruct_labels
 from curvafit.segmentation.reconstruction import MARGIN, STIFFNESS, reconstruct
 from curvafit.segmentation.segmentation import FIRST, NATS, calibrate
 from curvafit.segmentation.slices import WAYS, Slices
-from curvafit.segmentation.trials import Task, Trial, choose_by_masks, dice, laws_of
+from curvafit.segmentation.trials import Task, Trial, choose_by_masks, dice
 from curvafit.volumes.volume import ScanError, Volume
 from tests.options import grouped
 
@@ -186,25 +184,6 @@ def test_bad_slices_and_examples_are_refused(word: str) -> None:
     for options in REFUSALS[word]:
         with pytest.raises((ValueError, FileNotFoundError), match=word):
             reconstruct(**grouped(**{"slices": BALL, "prior": WILLMORE, "every": 8, **options}))
-
-
-def test_a_fit_has_the_laws_that_it_trusts(tmp_path: Path) -> None:
-    assert [len(laws_of(prior, Volume(ball()))[0]) for prior in (WILLMORE, "tubes")] == [1, 1]
-    fit, names = made_fit(), ("match", *room.TRUSTED)
-    known = [Candidate(name, Coefficients(1, k, 2, 3, 4, 5), -0.5, {}) for k, name in enumerate(names)]
-    fit = replace(fit, candidates=(*fit.candidates, *known))
-    path = tmp_path / "fit.json"
-    path.write_text(fit.to_json())
-    scan = Volume(ball(), (0.0195,) * 3, "mm")
-    laws, _ = laws_of(fit, scan)
-    assert laws[0] == room.law_of(fit, scan)[0]
-    for each in known[1:]:
-        wanted = each.coefficients.in_unit(1 / fit.length)
-        assert sum(law.as_dict() == pytest.approx(wanted.as_dict()) for law in laws) == 1
-    unwanted = known[0].coefficients.in_unit(1 / fit.length)
-    assert not any(law.as_dict() == pytest.approx(unwanted.as_dict()) for law in laws)
-    for law, read in zip(laws, laws_of(path, scan)[0], strict=True):
-        assert read.as_dict() == pytest.approx(law.as_dict())
 
 
 def test_known_voxels_leave_the_profile_free() -> None:
