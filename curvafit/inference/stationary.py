@@ -278,10 +278,6 @@ def call_in_double(make: Callable[[], Callable[..., Any]], *arguments: Any) -> A
     _import_jax()
     import jax
 
-    if hasattr(jax, "enable_x64"):
-        double_precision = jax.enable_x64
-    else:  # an earlier JAX
-        from jax.experimental import enable_x64 as double_precision  # pyright: ignore[reportAttributeAccessIssue]
-    with double_precision(True), jax.default_device(jax.devices("cpu")[0]):
+    with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
         converted = jax.tree.map(lambda value: jax.numpy.asarray(value, float), arguments)
         return jax.tree.map(np.asarray, make()(*converted))
