@@ -248,6 +248,20 @@ def test_nrrd(tmp_path: Path) -> None:
     assert np.array_equal(field.affine, np.diag([-1, -2, 3, 1]))
 
 
+def test_an_nrrd_header_names_one_file_of_values(tmp_path: Path) -> None:
+    header = "NRRD0004\ntype: float\ndimension: 3\nsizes: {2} {1} {0}\nendian: little\nencoding: raw\n"
+    path, head = tmp_path / "scan.nhdr", header.format(*ramp().shape)
+    (tmp_path / "a.raw").write_bytes(ramp().tobytes())
+    path.write_text(f"{head}data file: a.raw\n")
+    assert np.array_equal(load(path).values, ramp())
+    for more, word in (
+        ("data file: LIST\na.raw\nb.raw", "several files"), ("datafile: a%03d.raw 1 9 1", "several files"),
+        ("byte skip: -1\ndata file: a.raw", "byte skip"), ("lineskip: 2\ndata file: a.raw", "line skip"),
+    ):  # fmt: skip
+        path.write_text(f"{head}{more}\n")
+        unreadable(path, word)
+
+
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("suffix", [".mha", ".mhd"])
 def test_metaimages_lie_where_itk_puts_them(tmp_path: Path, packed: bool, suffix: str) -> None:

@@ -16,6 +16,7 @@ import re
 import warnings
 import zlib
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import IO, Any
 
@@ -53,8 +54,10 @@ def read_nrrd(path: Path, **_: object) -> Stated:
     """Read an NRRD file; lengths along space directions without a unit are in mm."""
     nrrd = require("nrrd", "io", "reading NRRD files")
     with path.open("rb") as file:
-        header, names = _read_header(nrrd, file)
-        values = _read_files(nrrd, header, names, path) if names else _read_values(nrrd, header, file, path)
+        header = _read_header(nrrd, file, path)
+        detached = base.check_regular(path.parent / header["data file"]) if "data file" in header else None
+        with nullcontext(file) if detached is None else detached.open("rb") as content:
+            values = _read_values(nrrd, header, content, path)
     notes: tuple[str, ...] = ()
     if {"old min", "old max"} & header.keys():
         notes = (f"The values stand for {header.get('old min')} to {header.get('old max')}: they are as stored.",)
@@ -90,21 +93,18 @@ def read_nrrd(path: Path, **_: object) -> Stated:
     return Stated(values, axes, notes=notes)
 
 
-def _read_header(nrrd: Any, file: IO[bytes]) -> tuple[dict[str, Any], list[str]]:
-    """Return the fields of a header, and the names of the files that hold the values, if they do not follow it."""
+def _read_header(nrrd: Any, file: IO[bytes], path: Path) -> dict[str, Any]:
+    """Return the fields of a header, whose `data file` holds the values if they do not follow it."""
     lines: list[bytes] = []
     while file.tell() < _HEADER and (line := file.readline(_HEADER)).strip():
         lines.append(line)
-    end = next((k for k, line in enumerate(lines) if re.match(rb"data ?file:\s*LIST\b", line)), len(lines))
-    header = dict(nrrd.read_header(lines[:end]))
+    if any(re.match(rb"data ?file:\s*(LIST\b|.*%\d*d.* \d)", line) for line in lines):
+        raise ScanError(f"{path} has its values in several files, which are not joined: write it as .nrrd")
+    header = dict(nrrd.read_header(lines))
     header |= {name: header[joined] for name in _SPACED if (joined := name.replace(" ", "")) in header}
-    if end < len(lines):  # the lines behind `data file: LIST` are names
-        return header, [line.decode().strip() for line in lines[end + 1 :]]
-    pattern, *numbers = str(header.get("data file", "")).split(" ")
-    if "%" in pattern and len(numbers) >= 3:  # NAME%03d.raw FIRST LAST STEP
-        first, last, step = map(int, numbers[:3])
-        return header, [pattern % k for k in range(first, last + 1, step)]
-    return header, [str(header["data file"])] if "data file" in header else []
+    if skip := next((name for name in ("line skip", "byte skip") if int(header.get(name, 0))), ""):
+        raise ScanError(f"{path} has a {skip}, which is not followed: write it as .nrrd")
+    return header
 
 
 def _to_right_anterior_superior(space: str) -> np.ndarray | None:
@@ -114,18 +114,6 @@ def _to_right_anterior_superior(space: str) -> np.ndarray | None:
     signs = [-1.0 if letter in "lpi" else 1.0 for letter in letters]
     known = [letter in pair for letter, pair in zip(letters, ("rl", "ap", "si"), strict=False)] == [True] * 3
     return np.diag([*signs, 1.0]) if known else None
-
-
-def _read_files(nrrd: Any, header: dict[str, Any], names: Sequence[str], path: Path) -> np.ndarray:
-    """Return the values, z first, of the files of a header, which share the slowest axis equally."""
-    sizes, chunks = [int(n) for n in header["sizes"]], []
-    if not names or sizes[-1] % len(names):
-        raise base.Damaged(f"{sizes[-1]} slices in {len(names)} files")
-    chunk_header = {**header, "sizes": [*sizes[:-1], sizes[-1] // len(names)]}
-    for name in names:
-        with base.check_regular(path.parent / name).open("rb") as file:
-            chunks.append(_read_values(nrrd, chunk_header, file, path))
-    return np.concatenate(chunks) if len(chunks) > 1 else chunks[0]
 
 
 def _read_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path) -> np.ndarray:
@@ -140,14 +128,7 @@ def _read_values(nrrd: Any, header: dict[str, Any], file: IO[bytes], path: Path)
         raise base.Damaged("its numbers have several bytes, and it does not state their order, endian")
     if encoding not in _NRRD_ENCODINGS:
         raise ScanError(f"{path} has the encoding {encoding[:40]!r}: write it as raw, gzip or bzip2")
-    for _ in range(int(header.get("line skip", 0))):
-        file.readline()
-    stream, skipped = _NRRD_ENCODINGS[encoding](file), int(header.get("byte skip", 0))
-    if skipped < 0:  # the values are the last bytes of the file
-        stream.seek(-math.prod(shape) * dtype.itemsize, os.SEEK_END)
-    else:
-        stream.seek(skipped, os.SEEK_CUR)
-    return base.read_numbers(stream, shape, dtype, path)
+    return base.read_numbers(_NRRD_ENCODINGS[encoding](file), shape, dtype, path)
 
 
 def _name_axes(header: dict[str, Any]) -> str:
