@@ -36,7 +36,7 @@ def parse_law(
     mass: Annotated[float | None, _what(help="Mean of the field, in (-1, 1).")] = None,
     volume_fraction: Annotated[float | None, _what(help="Share of the volume inside, instead of a mass.")] = None,
     orientation: Annotated[str | None, _what(help="θz,θy,θx,μ: tubes and layers lie along θ if μ is large.")] = None,
-    maps: Annotated[Path | None, _what(help="Volumes a20 … a00, mass, epsilon that vary: an .npz or a folder.")] = None,
+    maps: Annotated[Path | None, _what(help="An .npz of volumes a20 … a00, mass, epsilon that vary.")] = None,
     epsilon: Annotated[float | None, _what(help="Interface width in working units; by default 0.02.")] = None,
 ) -> dict[str, Any]:
     """Return the options that determine which shape is grown, by name."""

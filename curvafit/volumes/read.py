@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -172,22 +171,6 @@ class FileArray:
         stats = [path.stat() for path in files]
         size, time = sum(stat.st_size for stat in stats), max(stat.st_mtime_ns for stat in stats)
         return f"{self.path.resolve()} {self.reading}: {size} bytes at {time}"
-
-
-def read_values(path: str | os.PathLike[str]) -> np.ndarray:
-    """Return the array in a volume file, z first, without leading axes of length one beyond three axes.
-
-    Values are not checked; a warning tells if some are not stored.
-    """
-    stated = read_file(Path(path))
-    for gap in stated.gaps:
-        warnings.warn(f"{path}: {gap}", UserWarning, stacklevel=2)
-    base.check_array(stated.array.shape, stated.array.dtype, path)
-    with _name_damage(Path(path)):
-        values = np.asarray(stated.array[...])
-    while values.ndim > 3 and values.shape[0] == 1:
-        values = values[0]
-    return values
 
 
 def read_file(
@@ -445,27 +428,25 @@ def _check_angles(matrix: np.ndarray, source: str) -> None:
 
 
 def read_maps(path: str | Path, shape: tuple[int, int, int] | None = None) -> dict[str, float | Tensor]:
-    """Return a map `(Z, Y, X)`, float32, or a number for each parameter in a file or folder.
+    """Return a map `(Z, Y, X)`, float32, or a number for each parameter in a file.
 
-    Raises FileNotFoundError if there is no such file or folder, and ValueError if it is empty or holds another name, or
-    a map has another shape or values that are not finite.
+    Raises FileNotFoundError if there is no such file, and ValueError if it is empty or holds another name, or a map has
+    another shape or values that are not finite.
 
     Parameters
     ----------
     path
-        An NPZ file of arrays named as in `PARAMETERS`, or a folder of volumes with these names (`a20.nii.gz`,
-        `mass.tif` …). An array of one number holds everywhere.
+        An NPZ file of arrays named as in `PARAMETERS`. An array of one number holds everywhere.
     shape
         Voxels of every map (z, y, x); by default the shape of the first map.
     """
     source = Path(path)
     if not source.exists():
-        raise FileNotFoundError(f"no such file or folder of maps: {source}")
+        raise FileNotFoundError(f"no such file of maps: {source}")
     try:
-        content = None if source.is_dir() else read_archive(source)
+        content = read_archive(source)
     except (ValueError, OSError) as reason:
-        raise ValueError(f"{source} is neither an NPZ file nor a folder of maps") from reason
-    content = _read_folder(source) if content is None else content
+        raise ValueError(f"{source} is not an NPZ file of maps") from reason
     unknown = sorted(content.keys() - set(PARAMETERS))
     if unknown or not content:
         listed = ", ".join(unknown) or "none"
@@ -488,16 +469,3 @@ def map_shape(maps: Mapping[str, float | Tensor]) -> tuple[int, int, int] | None
     """Return the common shape of the maps, None if all are numbers."""
     shapes = [tuple(values.shape) for values in maps.values() if isinstance(values, Tensor)]
     return shapes[0] if shapes else None  # type: ignore[return-value]
-
-
-def _read_folder(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a folder's volume files by name; files of unknown names get an empty array, unread."""
-    suffixes = tuple(READERS)
-    files = [p for p in sorted(path.iterdir()) if p.name.lower().endswith(suffixes) and not p.name.startswith(".")]
-    content: dict[str, np.ndarray] = {}
-    for file in files:
-        name = file.name.split(".")[0]
-        if name in content:
-            raise ScanError(f"{path} holds two maps {name}")
-        content[name] = read_values(file) if name in PARAMETERS else np.empty(0)
-    return content

@@ -16,7 +16,7 @@ from exact_store import flat_recipe
 
 from curvafit.data_synth import sets
 from curvafit.data_synth.sets import SetSpec, build_set, make_case, read_spec
-from curvafit.volumes.read import load, read_values
+from curvafit.volumes.read import load
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_a_set_goes_on_and_ends_the_same(tmp_path, order):
     torn.write_bytes(b"torn")
     (whole / "cases" / "case_00001.json").unlink()  # killed before the record, which comes last
     build_set(whole, order, 4)
-    assert sums(whole) == sums(part) and (read_values(torn) == order.recipe.case(1).image).all()
+    assert sums(whole) == sums(part) and (load(torn).values == order.recipe.case(1).image).all()
 
 
 @pytest.mark.slow
@@ -163,9 +163,9 @@ def test_labels_besides_the_mask_are_of_the_structure_itself(folder, wide):
     assert distance.values.dtype == np.float32 and distance.spacing == case.spacing
     inside = case.field > 0
     assert ((distance.values > 0) == inside).all()
-    assert ((read_values(parts / "instances" / "case_00000.nii.gz") > 0) == inside).all()
+    assert ((load(parts / "instances" / "case_00000.nii.gz").values > 0) == inside).all()
     assert {path.suffix for path in (parts / "centreline").iterdir()} == {".graphml"}
-    label = read_values(folder / "labelsTr" / "case_00000.nii.gz") > 0
+    label = load(folder / "labelsTr" / "case_00000.nii.gz").values > 0
     assert (label == case.labels).all() and label[inside].all() and label.sum() > 1.1 * inside.sum()
     record = json.loads((folder / "cases" / "case_00000.json").read_text())
     assert len(record["betti"]) == 3 and record["betti"][0] >= 1

@@ -16,7 +16,6 @@ from calling import call, done, refused
 from disk import tree, unreadable
 
 from curvafit.volumes import ScanError, Volume, load, save
-from curvafit.volumes.read import read_values
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
@@ -110,8 +109,6 @@ def test_missing_chunks_are_said_or_refused(tmp_path: Path, kind: str) -> None:
     assert field.notes == (note,)
     assert np.count_nonzero(field.values != VALUES) <= lost * 4 * 5 * 6
     unreadable(path, f"{lost} of 12 chunks", strict=True)
-    with pytest.warns(UserWarning, match=f"{lost} of 12 chunks"):
-        read_values(path)
 
 
 def test_chunks_that_a_shard_lacks_are_counted(tmp_path: Path) -> None:
