@@ -119,7 +119,7 @@ BROKEN = [
     for where, texts in {
         "thickness": ("0", '"0.02"', "true", None), "working_voxel": ("-1", "[0.01]"),
         "length_unit": ('"furlong"', "[]"), "morphometry": ("7",), "morphometry.volume_fraction": ("2",),
-        "kind": ("3",), "family": ("{}",), "matches": ("{}", "[7]"), "provenance": ('{"scan": 5}',),
+        "kind": ("3",), "family": ("{}",), "matches": ("{}", "[7]"), "provenance": ("5",),
         "draws": ("7", "[[true]]", '[["1"]]'), "diagram": ("7", '{"points": 3, "weights": [1]}'),
     }.items()
     for text in texts

@@ -22,8 +22,6 @@ class Rule(NamedTuple):
         Bounds of a number, the last two exclusive.
     unknown
         Whether a number may be NaN, which JSON writes as null.
-    keys
-        Keys of some entries of a dictionary, with their types.
     """
 
     least: float = -math.inf
@@ -31,7 +29,6 @@ class Rule(NamedTuple):
     above: float = -math.inf
     below: float = math.inf
     unknown: bool = False
-    keys: tuple[tuple[str, Any], ...] = ()
 
 
 _PLAIN: dict[Any, str] = {str: "a text", bool: "true or false"}
@@ -58,9 +55,6 @@ def decode(hint: Any, value: Any, name: str = "") -> Any:
     if get_origin(kind) is tuple:
         return tuple(decode(get_args(kind)[0], item, f"{name}[{k}]") for k, item in enumerate(value))
     if get_origin(kind) is dict:
-        for key, entry_hint in rule.keys:  # checked only: what is returned is decoded by the dictionary's own type
-            if key in value:
-                decode(entry_hint, value[key], f"{name}.{key}")
         inner = get_args(kind)[1]
         return {k: v if v is None or inner is Any else decode(inner, v, f"{name}.{k}") for k, v in value.items()}
     if kind is np.ndarray:

@@ -17,7 +17,7 @@ from curvafit.generation.schedule import LEARNED, Schedule
 from curvafit.geometry.diagrams import Diagram
 from curvafit.geometry.distances import one_to_many
 from curvafit.geometry.morphology import Morphometry, morphometry
-from curvafit.priors.coefficients import NAMES, Coefficients
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.scan.measures import scan_diagram
 from curvafit.scan.preparation import Prepared, thinner_thickness
@@ -45,7 +45,7 @@ NEAR = 0.15
 
 NotNegative = Annotated[float, Rule(least=0)]
 #: Standard deviations by coefficient, and of the mass.
-Deviations = Annotated[dict[str, float], Rule(keys=tuple((name, NotNegative) for name in (*NAMES, "mass")))]
+Deviations = dict[str, NotNegative]
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from numbers import Real
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Annotated, Literal, Protocol, TypeVar, runtime_checkable
 
 from torch import Tensor
 
@@ -101,7 +101,7 @@ class Law:
         if file.coefficients is None or file.mass is None or file.coefficients_physical is None:
             raise ValueError(f"expected a fit with a law, got one without in {path}: {file.status}")
         epsilon = file.epsilon_physical * WORKING_SPACING / file.working_voxel
-        volume_fraction = (file.morphometry or {}).get("volume_fraction")
+        volume_fraction = None if file.morphometry is None else file.morphometry.volume_fraction
         return cls(
             file.coefficients, file.mass, f"prior {os.fspath(path)}", epsilon=epsilon, working_voxel=file.working_voxel,
             length_unit=file.length_unit, volume_fraction=volume_fraction, status=file.status,
@@ -210,7 +210,13 @@ def _read_numbers(law: object) -> Coefficients | None:
 
 Positive = Annotated[float, Rule(above=0)]
 Mass = Annotated[float | None, Rule(above=-1, below=1)]
-Fraction = Annotated[float, Rule(least=0, most=1, unknown=True)]
+
+
+@dataclass(frozen=True)
+class _Filling:
+    """What a law needs of a `fit.json`'s morphometry."""
+
+    volume_fraction: Annotated[float | None, Rule(least=0, most=1)] = None
 
 
 @dataclass(frozen=True)
@@ -224,7 +230,7 @@ class _LawFile:
     working_voxel: Positive
     length_unit: Literal["voxel", *METRES]  # type: ignore[valid-type]
     status: str = ""
-    morphometry: Annotated[dict[str, Any] | None, Rule(keys=(("volume_fraction", Fraction),))] = None
+    morphometry: _Filling | None = None
 
 
 def read_fit(path: str | PathLike[str], kind: type[Content]) -> Content:

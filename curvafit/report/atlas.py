@@ -146,7 +146,7 @@ def write_map(
 def _read_fits(fits: Sequence[str | PathLike[str] | Fit]) -> tuple[list[str], list[Fit]]:
     """Return the names of scans and their fits; raise ValueError where a fit has no diagram."""
     scans = [fit if isinstance(fit, Fit) else Fit.load(fit) for fit in fits]
-    names = [name_source(fit.provenance.get("scan")) or f"scan {k}" for k, fit in enumerate(scans, 1)]
+    names = [name_source(str(fit.provenance.get("scan") or "")) or f"scan {k}" for k, fit in enumerate(scans, 1)]
     for name, fit in zip(names, scans, strict=True):
         if fit.diagram is None:
             raise ValueError(f"the fit of {name} has no curvature diagram: {fit.status}")
