@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -153,16 +153,19 @@ def infer(
     seed = check_int(seed, "a seed that is a whole number from 0", 0, SEEDS - 2)  # and the next one
     progress = progress or log_stages()
     progress("reading the scan", 0.0)
-    references = _References.load(atlas, posterior)
+    check_type(atlas, (str, Path, Atlas, type(None)), "an atlas, as the path of a file or as Atlas")
+    check_type(posterior, (str, Path, Posterior, type(None)), "a posterior, as the path of a file or as Posterior")
+    atlas = atlas if isinstance(atlas, Atlas) else load_atlas(atlas)
+    posterior = posterior if isinstance(posterior, Posterior) else load_posterior(posterior)
     structure = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark, "roi": roi}
     volume, shape, prepared = _read_and_prepare(scan, structure, reading)
     settings = {"refined": REFINED[method], "growth": growth, "seed": seed, "progress": progress}
-    return _infer_prepared(volume, shape, prepared, references, **settings)
+    return _infer_prepared(volume, shape, prepared, atlas, posterior, **settings)
 
 
 def _infer_prepared(
-    volume: Volume, shape: tuple[int, int, int], prepared: Prepared, references: _References, *, refined: bool,
-    growth: Growth | None, seed: int, progress: Progress,
+    volume: Volume, shape: tuple[int, int, int], prepared: Prepared, atlas: Atlas, posterior: Posterior, *,
+    refined: bool, growth: Growth | None, seed: int, progress: Progress,
 ) -> Inference:  # fmt: skip
     """Measure a prepared scan, estimate its law, grow and compare shapes, judge, and return all in one result."""
     progress("measuring curvature", 0.05)
@@ -175,49 +178,32 @@ def _infer_prepared(
         progress("measuring descriptors", 0.1)
         described = measure_descriptors(prepared)
         settings = {"refined": refined, "growth": growth, "seed": seed, "progress": progress}
-        estimate = _estimate(prepared, diagram, described, references, **settings)
+        estimate = _estimate(prepared, diagram, described, atlas, posterior, **settings)
         if growth is not None:
             estimate, twins = _grow(estimate, diagram, prepared, growth, seed, progress)
-            misfit = _test_law(estimate, prepared, described, references, growth, seed, progress)
+            misfit = _test_law(estimate, prepared, described, posterior, growth, seed, progress)
             estimate = estimate if misfit is None else replace(estimate, misfit=misfit)
         chosen, status = verdict(estimate.candidates, estimate.misfit, figures, grown=growth is not None)
         progress("done", 1.0)
-    provenance = _describe_provenance(volume, shape, references, growth, seed)
+    provenance = _describe_provenance(volume, shape, atlas, posterior, growth, seed)
     fit = _build_fit(prepared, diagram, figures, estimate, chosen, status, provenance)
     return Inference(volume, prepared, diagram, twins, fit, estimate.simulated)
 
 
-class _References(NamedTuple):
-    """What a scan is compared with."""
-
-    atlas: Atlas
-    posterior: Posterior
-
-    @classmethod
-    def load(cls, atlas: str | Path | Atlas | None, posterior: str | Path | Posterior | None) -> _References:
-        """Load those given by a path, keep those given as objects, and take the packaged ones for None."""
-        if atlas is not None:
-            check_type(atlas, (str, Path, Atlas), "an atlas, as the path of a file or as Atlas")
-        if posterior is not None:
-            check_type(posterior, (str, Path, Posterior), "a posterior, as the path of a file or as Posterior")
-        atlas = atlas if isinstance(atlas, Atlas) else load_atlas(atlas)
-        return cls(atlas, posterior if isinstance(posterior, Posterior) else load_posterior(posterior))
-
-
 def _estimate(
-    prepared: Prepared, diagram: Diagram, described: Described | None, references: _References, *, refined: bool,
-    growth: Growth | None, seed: int, progress: Progress,
+    prepared: Prepared, diagram: Diagram, described: Described | None, atlas: Atlas, posterior: Posterior, *,
+    refined: bool, growth: Growth | None, seed: int, progress: Progress,
 ) -> Estimate:  # fmt: skip
     """Estimate the law of a scan; the candidates to grow are, in this order, the law by which a phase field is
     stationary, those read from the descriptors, and the nearest match of the atlas."""
     estimate = Estimate()
     if described is not None and not refined:
         stage = sub_progress(progress, 0.15, 0.5)
-        estimate = estimate_law(described, references.posterior, growth=growth, seed=seed, progress=stage)
+        estimate = estimate_law(described, posterior, growth=growth, seed=seed, progress=stage)
     progress("searching the atlas", 0.5)
-    matches = _find_matches(prepared, diagram, references.atlas, exact=refined)
+    matches = _find_matches(prepared, diagram, atlas, exact=refined)
     if described is not None and refined:
-        estimate = Estimate(candidates=(refine_matches(described, references.posterior, matches),))
+        estimate = Estimate(candidates=(refine_matches(described, posterior, matches),))
     match = Candidate("match", matches[0].coefficients, matches[0].mass, {}, matches[0].thickness)
     laws = (*estimate.candidates, match)
     if prepared.kind == "field" and not is_rounded(prepared.phase):
@@ -264,7 +250,7 @@ def _grow(
 
 
 def _test_law(
-    estimate: Estimate, prepared: Prepared, described: Described | None, references: _References, growth: Growth,
+    estimate: Estimate, prepared: Prepared, described: Described | None, posterior: Posterior, growth: Growth,
     seed: int, progress: Progress,
 ) -> Misfit | None:  # fmt: skip
     """Test the best law by further shapes; None where nothing grew, or there are no descriptors."""
@@ -272,7 +258,7 @@ def _test_law(
     if best is None or described is None:
         return None
     options = {"seed": seed + TWINS, "schedule": growth.schedule, "progress": sub_progress(progress, 0.8, 1.0)}
-    return check_law(best, prepared, described, references.posterior, **options)
+    return check_law(best, prepared, described, posterior, **options)
 
 
 def _read_and_prepare(
@@ -319,7 +305,7 @@ def _build_fit(
 
 
 def _describe_provenance(
-    volume: Volume, shape: tuple[int, ...], references: _References, growth: Growth | None, seed: int
+    volume: Volume, shape: tuple[int, ...], atlas: Atlas, posterior: Posterior, growth: Growth | None, seed: int
 ) -> dict[str, Any]:
     return {
         "curvafit": version("curvafit"),
@@ -329,8 +315,8 @@ def _describe_provenance(
         "seed": seed,
         "schedule": schedule(LEARNED if growth is None else growth.schedule).as_dict(),
         "epsilon": WORKING_EPSILON,
-        "atlas": {"format": VERSION, "shapes": len(references.atlas.ids)},
-        "posterior": {name: value for name, value in references.posterior.provenance.items() if name != "table"},
+        "atlas": {"format": VERSION, "shapes": len(atlas.ids)},
+        "posterior": {name: value for name, value in posterior.provenance.items() if name != "table"},
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "python": platform.python_version(),
         "torch": version("torch"),
