@@ -108,11 +108,6 @@ def format_length(value: float, unit: str, digits: int = 2) -> str:
     return f"{format_number(metres / METRES[best], digits)}{_GLUE}{unit_name(best)}"
 
 
-def per_unit(unit: str, power: int) -> str:
-    """Return one over a unit to a power: 1/µm, 1/µm² or 1/µm³."""
-    return f"1/{unit_name(unit)}{ {1: '', 2: '²', 3: '³'}[power] }"
-
-
 def plain_unit(unit: str, power: int) -> str:
     """Return a unit to a power in plain signs: mm, 1/mm, 1/mm^3."""
     raised = unit if abs(power) == 1 else f"{unit}^{abs(power)}"
@@ -121,7 +116,7 @@ def plain_unit(unit: str, power: int) -> str:
 
 def power_name(unit: str, power: int) -> str:
     """Return a unit to a power as written in text: µm, µm³, 1/µm³, or nothing for a plain number."""
-    return "" if power == 0 else per_unit(unit, abs(power))[2 if power > 0 else 0 :]
+    return plain_unit(unit_name(unit), power).replace("^2", "²").replace("^3", "³")
 
 
 def unit_name(unit: str, count: float = 1) -> str:

@@ -60,10 +60,6 @@ class Atlas:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def shape_coefficients(self, position: int) -> Coefficients:
-        """Return the six coefficients of the shape at a position."""
-        return Coefficients(*map(float, self.coefficients[position]))
-
     def diagrams(self, seen_as: str) -> tuple[Diagram, ...]:
         """Return the diagrams of the shapes seen as `"field"` or as `"mask"`.
 
@@ -187,6 +183,7 @@ def nearest(
         position = shortlist[k]
         distance = wasserstein(diagram, candidates[position]) if exact else float(distances[k])
         others = (column[position].item() for column in (atlas.masses, atlas.seeds, atlas.thicknesses))
-        matches.append(Match(atlas.ids[position], distance, atlas.shape_coefficients(position), *others))
+        law = Coefficients(*atlas.coefficients[position].tolist())
+        matches.append(Match(atlas.ids[position], distance, law, *others))
     # Exact distances may give another order than those in float32.
     return tuple(sorted(matches, key=lambda match: match.distance))

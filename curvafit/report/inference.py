@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from curvafit.core.records import Format
-from curvafit.core.units import format_length, format_number, format_percent, per_unit, power_name, unit_name
+from curvafit.core.units import format_length, format_number, format_percent, power_name, unit_name
 from curvafit.drawing import plot
 from curvafit.geometry.diagrams import Diagram
 from curvafit.inference.candidates import TITLES, Candidate, seed_noise_of
@@ -193,8 +193,7 @@ def _parameters(inference: Inference) -> list[tuple[str, tuple[str, ...], str]]:
         σ = best.uncertainty.get(name)
         deviation = "" if σ is None else "fixed" if σ == 0 else format_number(σ, 2)
         scaled = "" if name == "mass" else format_number(physical.as_dict()[name])
-        power = _TERMS[name][2]
-        unit = per_unit(fit.length_unit, power) if power else ""
+        unit = power_name(fit.length_unit, -_TERMS[name][2])
         rows.append((name, (format_number(value), deviation, *posterior, scaled), unit))
     return rows
 

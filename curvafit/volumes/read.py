@@ -118,6 +118,7 @@ def load(
         _refuse(reading, "the path of a file", "an array")
         edges = positive_triple(1.0 if spacing is None else spacing)
         volume = Volume(_to_numpy(source), edges, "voxel" if unit is None else unit)
+        check_finite(volume.values, "an array")
     else:
         raise ScanError(f"a volume must be the path of a file, a Volume, an array or a tensor, got {quoted(source)}")
     volume = volume if box is None else volume.crop(box)
@@ -228,15 +229,11 @@ def _refuse(options: dict[str, Any], expected: str, got: str) -> None:
 
 
 def _to_numpy(source: np.ndarray | torch.Tensor) -> np.ndarray:
-    """Return an array or tensor as an array of real, finite numbers."""
-    if isinstance(source, torch.Tensor):
-        tensor = source.detach().cpu()
-        source = (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).numpy()
-    if source.dtype.kind not in "biuf":
-        raise ScanError(f"a volume must hold real numbers, got an array of type {source.dtype}")
-    if source.size:
-        check_finite(source, "an array")
-    return source
+    """Return an array or tensor as an array."""
+    if isinstance(source, np.ndarray):
+        return source
+    tensor = source.detach().cpu()
+    return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).numpy()
 
 
 def split_key(path: str | os.PathLike[str], key: str | None) -> tuple[Path | str, str | None]:
@@ -278,8 +275,6 @@ def to_volume(
     where axes are not at right angles; or where lengths are in no known unit and the caller gives none.
     """
     array = stated.array
-    if array.dtype.kind not in "biuf":
-        raise ScanError(f"a volume must hold real numbers, got values of type {array.dtype} in {source}")
     order, numbers, axis_notes = _find_axes(array.shape, stated.axes, channel, time, source)
     index = tuple(numbers.get(axis, slice(0, n)) for axis, n in enumerate(array.shape))
     if isinstance(array, np.ndarray):

@@ -127,7 +127,8 @@ class Volume(Pictured):
         if len(array.shape) != 3:
             raise ScanError(f"a volume must be 3D, got an array of shape {array.shape}")
         if array.dtype.kind not in "biuf":
-            raise ScanError(f"a volume must hold real numbers, got values of type {array.dtype}")
+            place = self.source or "an array"
+            raise ScanError(f"a volume must hold real numbers, got values of type {array.dtype} in {place}")
         spacing = positive_triple(self.spacing)
         unit, factor = parse_unit(self.unit)
         object.__setattr__(self, "array", array)

@@ -19,6 +19,7 @@ from curvafit.geometry.diagrams import Diagram
 from curvafit.geometry.distances import one_to_many, wasserstein
 from curvafit.inference import atlas as matching
 from curvafit.inference.atlas import ARRAYS, Atlas, load_atlas, nearest, save_atlas
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import optimal_profile
 
@@ -137,7 +138,7 @@ def test_wrong_counts_and_other_settings_are_refused(tmp_path, balls):
 def test_an_atlas_holds_what_the_store_does(store, atlas):
     viable = [r for r in map(store.record, store.indices()) if r.viability.viable]
     assert atlas.ids == tuple(f"s-{r.index:05d}" for r in viable)
-    assert [atlas.shape_coefficients(i) for i in range(6)] == [r.coefficients for r in viable]
+    assert atlas.coefficients[:6].tolist() == [list(r.coefficients) for r in viable]
     np.testing.assert_array_equal(atlas.masses, [r.mass for r in viable])
     np.testing.assert_array_equal(atlas.seeds, [r.seed for r in viable])
     np.testing.assert_allclose(atlas.volume_fractions[0], np.mean(store.field(viable[0].index) > 0))
@@ -253,7 +254,7 @@ def test_the_packaged_atlas_is_of_its_designs_and_small():
     for position, name in enumerate(atlas.ids):
         store, index = name.split("-")
         settings = stores[store]["settings"]
-        point = (atlas.shape_coefficients(position), atlas.masses[position], atlas.seeds[position])
+        point = (Coefficients(*atlas.coefficients[position]), atlas.masses[position], atlas.seeds[position])
         assert Design.from_dict(settings["design"]).draw(settings["seed"], int(index)) == point
     assert atlas.masses.min() > -0.85 and atlas.masses.max() < INTERVALS["mass"][1]
     assert all(np.isfinite(d.points).all() and d.weights.min() > 0 for d in atlas.diagrams("mask"))
