@@ -13,7 +13,7 @@ COLUMNS = sum(BLOCKS.values())
 #: Deviation of the five components, and the direction of the parameters that none tells.
 NOISE, HIDDEN = 0.1, np.array([1.0, 0, 0, 0, -1.0, 0]) / np.sqrt(2)
 #: The first five columns as they come: no scale, no mixing.
-PLAIN = Compression(("curvature",), np.zeros(288), np.ones(288), np.eye(288)[:5])
+PLAIN = Compression(np.zeros(COLUMNS), np.ones(COLUMNS), np.eye(COLUMNS)[:5])
 
 
 def told(parameters: np.ndarray) -> np.ndarray:

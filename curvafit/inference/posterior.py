@@ -6,7 +6,7 @@ shapes.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,14 +14,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from curvafit.core.checks import check_float, check_int, quoted, require
+from curvafit.core.checks import check_float, check_int, require
 from curvafit.core.files import open_packaged
 from curvafit.core.records import Format
 from curvafit.core.schema import Rule
 from curvafit.core.units import format_number
 from curvafit.geometry.description import BLOCKS
 from curvafit.inference.emulator import Emulator, Layer
-from curvafit.inference.table import PARAMETERS, TARGETS, Compression, column_names, encode_seen
+from curvafit.inference.table import PARAMETERS, TARGETS, Compression, encode_seen
 from curvafit.scan.measures import Reading
 
 POSTERIOR_FILE = Format("curvafit posterior", 4, "a posterior", "train it again", {"blocks": BLOCKS})
@@ -38,8 +38,8 @@ KNOWN = 0.5
 @dataclass(frozen=True)
 class Architecture:
     """Sizes of a flow of splines: principal components of the descriptors that it sees, widths of its hidden layers,
-    transforms, bins of a spline, dropout of the components in training, and blocks of descriptors. Raises ValueError if
-    a size is not a whole number from 1 to `WIDEST`, or a block has another name.
+    transforms, bins of a spline, and dropout of the components in training. Raises ValueError if a size is not a whole
+    number from 1 to `WIDEST`.
     """
 
     components: int = 32
@@ -47,14 +47,11 @@ class Architecture:
     transforms: int = 2
     bins: int = 8
     dropout: float = 0.1
-    blocks: tuple[str, ...] = tuple(BLOCKS)
 
     def __post_init__(self) -> None:
         for size in (self.components, *self.hidden, self.transforms, self.bins):
             check_int(size, "sizes of a flow that are whole numbers", 1, WIDEST)
         check_float(self.dropout, "a dropout", 0.0, 0.9)
-        if not self.blocks or not set(self.blocks) <= set(BLOCKS):
-            raise ValueError(f"expected blocks among {', '.join(BLOCKS)}, got {quoted(list(self.blocks))}")
 
 
 class Member(nn.Module):
@@ -285,10 +282,10 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
     """Return the posterior of a file's header and arrays; raise ValueError where they do not fit together."""
     if not all(np.isfinite(array).all() for array in arrays.values() if array.dtype.kind == "f"):
         raise ValueError("numbers that are not finite")
-    sizes = header["architecture"]
-    architecture = Architecture(**sizes | {name: tuple(sizes[name]) for name in ("hidden", "blocks")})
+    sizes = {field.name: header["architecture"][field.name] for field in fields(Architecture)}
+    architecture = Architecture(**sizes | {"hidden": tuple(sizes["hidden"])})
     views = tuple(str(view) for view in header["views"])
-    columns, components = int(np.isin(column_names(), architecture.blocks).sum()), architecture.components
+    columns, components = sum(BLOCKS.values()), architecture.components
     arrays = {"departures": np.zeros(0), "discriminant": np.zeros(0)} | arrays  # which earlier files lack
     by_view = ("misfits", "discriminants") if len(arrays["discriminant"]) else ("misfits",)
     expected: dict[str, tuple[int | None, ...]] = {"mean": (columns,), "scale": (columns,)}
@@ -308,7 +305,7 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
         split = ((key.partition("."), value) for key, value in arrays.items())
         member.load_state_dict({name: torch.from_numpy(value) for (n, _, name), value in split if n == str(k)})
         members.append(member)
-    compression = Compression(architecture.blocks, arrays["mean"], arrays["scale"], arrays["basis"])
+    compression = Compression(arrays["mean"], arrays["scale"], arrays["basis"])
     mean, spread = (_read_layers(arrays, f"emulator.{name}", len(views), components) for name in ("mean", "spread"))
     inflation, box = check_float(header["inflation"], "an emulator's inflation", 1e-3, 1e3), arrays["box"]
     emulator = Emulator(compression, views, box[: len(PARAMETERS)], mean, spread, arrays["emulator.basis"], inflation)

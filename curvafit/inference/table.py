@@ -252,45 +252,42 @@ def _open(u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 class Compression:
     """From descriptors to their principal components: means and scales by column `(c,)`, basis `(k, c)`."""
 
-    blocks: tuple[str, ...]
     mean: np.ndarray
     scale: np.ndarray
     basis: np.ndarray
 
     def __call__(self, descriptors: np.ndarray) -> np.ndarray:
         """Return the components `(N, k)`, their mean square 1, of descriptors `(N, 351)`."""
-        columns = columns_of(descriptors, self.blocks)
+        columns = columns_of(descriptors)
         return np.clip((columns - self.mean) / self.scale, -FURTHEST, FURTHEST) @ self.basis.T
 
 
-def compression_of(descriptors: np.ndarray, components: int, blocks: tuple[str, ...] = tuple(BLOCKS)) -> Compression:
+def compression_of(descriptors: np.ndarray, components: int) -> Compression:
     """Return the compression to the principal components of descriptors `(N, 351)`.
 
     Columns are scaled to deviation 1 (those of the curvature block by one factor, which keeps distances), and blocks
     weighted by `WEIGHTS`. Components are half whitened: one of deviation σ is divided by √σ, so that the first do not
     drown the others. The components' mean square is 1.
     """
-    names = np.array(column_names())
-    names = names[np.isin(names, blocks)]
-    columns = columns_of(descriptors, blocks)
+    names, columns = np.array(column_names()), columns_of(descriptors)
     mean, scale = columns.mean(0), columns.std(0) + 1e-9
     weight = np.ones(len(names))
-    for block in set(names.tolist()):
+    for block in BLOCKS:
         in_block = names == block
         weight[in_block] = WEIGHTS.get(block, 1.0) / np.sqrt(in_block.sum())
         if block == "curvature":
             scale[in_block] = np.sqrt((scale[in_block] ** 2).mean())
-    uncompressed = Compression(blocks, mean, scale, np.diag(weight))
+    uncompressed = Compression(mean, scale, np.diag(weight))
     weighted = uncompressed(descriptors)
     values, vectors = np.linalg.eigh(weighted.T @ weighted / len(weighted))
     order = np.argsort(-values)[:components]
     # An eigenvalue is σ², so its fourth root is √σ.
     basis = (vectors[:, order] / (values[order] + 1e-12) ** (1 / 4)).T * weight
     basis /= np.sqrt(np.mean(np.sqrt(values[order])))
-    return Compression(blocks, mean, scale, basis)
+    return Compression(mean, scale, basis)
 
 
-def columns_of(descriptors: np.ndarray, blocks: Sequence[str]) -> np.ndarray:
+def columns_of(descriptors: np.ndarray, blocks: Sequence[str] = tuple(BLOCKS)) -> np.ndarray:
     """Return the columns of some blocks, lengths and densities as logarithms."""
     names = np.array(column_names())
     columns = np.array(descriptors, dtype=np.float64)

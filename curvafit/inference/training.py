@@ -105,7 +105,7 @@ def train_posterior(
     box = np.stack([table.targets.min(0), table.targets.max(0)], axis=1)
     if fixed := [name for name, (low, high) in zip(TARGETS, box, strict=True) if low == high]:
         raise ValueError(f"expected shapes whose parameters all vary, got {', '.join(fixed)} the same in all")
-    compression = compression_of(table.descriptors, architecture.components, architecture.blocks)
+    compression = compression_of(table.descriptors, architecture.components)
     flow_plan, emulator_plan = plans or PLANS
     options = {"seed": seed, "plan": emulator_plan, "progress": sub_progress(progress, 0.0, EMULATOR_PART)}
     emulator, misfits_by_view = train_emulator(table, compression, box[: len(PARAMETERS)], **options)
