@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from curvafit.geometry.centreline import skeleton_of
 from curvafit.geometry.diagrams import LEAST_SLOPE, MARGIN, find_resolved
 from curvafit.geometry.mesh import NoSurface
 from curvafit.geometry.morphology import local_thickness
-from curvafit.geometry.topology import betti_numbers, number_pieces
+from curvafit.geometry.topology import betti_numbers
 from curvafit.priors.curvature import geometric_curvatures, jet
 from curvafit.priors.grid import Grid
 from curvafit.priors.profile import profile_distance
@@ -35,8 +36,8 @@ def labels_of(
 ) -> dict[str, Any]:
     """Return the labels named in `which` of a phase field `(Z, Y, X)`, positive inside: arrays of its shape by name.
 
-    Labels of a periodic grid go on across its faces, and the Betti numbers are those on the torus. A tube that is cut
-    by the face of a crop (replicate) ends there. A field that does not cross 0 is a NoSurface, a ValueError.
+    The box is a window, whatever the grid's boundary: a tube that is cut by a face ends there. A field that does not
+    cross 0 is a NoSurface, a ValueError.
 
     mask
         bool: u > 0.
@@ -49,7 +50,7 @@ def labels_of(
     kappa1, kappa2
         float32: the surface's principal curvatures κ1 ≥ κ2 in 1/spacing's unit, positive where the shape is convex, in
         voxels with one of their six neighbours on the other side of the surface. NaN elsewhere, where the grid does not
-        resolve the curvature, and within `diagram.MARGIN` voxels of the faces of a crop.
+        resolve the curvature, and within `diagram.MARGIN` voxels of the faces of the box.
     radius
         float32: the radius of the largest ball inside that covers the voxel, in spacing's unit; 0 outside. Up to half a
         voxel too little on tubes and balls; see `morphology.local_thickness`.
@@ -59,56 +60,64 @@ def labels_of(
     wanted = {which} if isinstance(which, str) else set(which)
     if unknown := sorted(wanted - set(NAMES)):
         raise ValueError(f"labels are {', '.join(NAMES)}, got {', '.join(unknown)}")
-    u = _check_field(field, grid, epsilon)
+    u, grid = _check_field(field, grid, epsilon), replace(grid, boundary="replicate")
     mask = (u > 0).cpu().numpy()
     labels: dict[str, Any] = {"mask": mask}
     if wanted & {"distance", "skeleton", "instances", "radius"}:
         labels["distance"] = distance = field_distance(u, grid, epsilon)
         if "skeleton" in wanted:
-            labels["skeleton"] = skeleton_of(distance, grid)
+            labels["skeleton"] = skeleton_of(distance)
         if "instances" in wanted:
-            labels["instances"] = instances_of(distance, grid)
+            labels["instances"] = instances_of(distance)
         if "radius" in wanted:
-            labels["radius"] = local_thickness(distance > 0, grid.spacing, periodic=grid.periodic) / 2
+            labels["radius"] = local_thickness(distance > 0, grid.spacing) / 2
     if wanted & {"kappa1", "kappa2"}:
         labels["kappa1"], labels["kappa2"] = _measure_curvatures(u, mask, grid, epsilon)
     if "betti" in wanted:
-        labels["betti"] = betti_numbers(mask, periodic=grid.periodic)
+        labels["betti"] = betti_numbers(mask)
     return {name: labels[name] for name in NAMES if name in wanted}
 
 
-def instances_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
+def instances_of(distance: np.ndarray) -> np.ndarray:
     """Return the pieces of {distance > 0}: int32 `(Z, Y, X)`, 0 outside and 1, 2, … in the order of their first voxels.
 
-    Pieces are 26-connected, in a periodic box across its faces too, and divided at necks: the distance's watershed has
-    a basin around every maximum, and basins are joined, widest neck first, unless the neck between them is thinner than
-    `NECK` times the thinner one's greatest radius. So beads on a thin tube are several, an even tube is one.
+    Pieces are 26-connected, and divided at necks: the distance's watershed has a basin around every maximum, and basins
+    are joined, widest neck first, unless the neck between them is thinner than `NECK` times the thinner one's greatest
+    radius. So beads on a thin tube are several, an even tube is one.
     """
     basins = watershed(-distance, mask=distance > 0, connectivity=3).astype(np.int64)
     widest = np.zeros(basins.max() + 1, dtype=np.float32)
     np.maximum.at(widest, basins.ravel(), distance.ravel())  # the greatest radius of each basin
     widest[0] = 0
     pieces = DisjointSet(range(len(widest)))
-    for width, first, second in _find_necks(basins, distance, grid):
+    for width, first, second in _find_necks(basins, distance):
         a, b = pieces[first], pieces[second]
         if a != b and width >= NECK * min(widest[a], widest[b]):
             pieces.merge(a, b)
             widest[pieces[a]] = max(widest[a], widest[b])
-    return number_pieces(np.array([pieces[k] for k in pieces])[basins])
+    return _number_pieces(np.array([pieces[k] for k in pieces])[basins])
 
 
-def _find_necks(basins: np.ndarray, distance: np.ndarray, grid: Grid) -> list[tuple[float, int, int]]:
+def _find_necks(basins: np.ndarray, distance: np.ndarray) -> list[tuple[float, int, int]]:
     """Return the necks between basins that touch by faces, widest first: the neck's radius and both basins."""
     # Radii are negated, so that `np.unique` sorts the widest first. Where that does not join two basins, none does.
     necks = []
     for axis in range(3):
-        next_basins, next_distance = np.roll(basins, -1, axis), np.roll(distance, -1, axis)
-        touch = (basins > 0) & (next_basins > 0) & (basins != next_basins)
-        if not grid.periodic:
-            np.moveaxis(touch, axis, 0)[-1] = False
-        pair = np.sort([basins[touch], next_basins[touch]], axis=0)
-        necks.append(np.stack([-np.minimum(distance[touch], next_distance[touch]), *pair], 1))
+        (labels, next_labels), (radii, next_radii) = (
+            (np.delete(values, -1, axis), np.delete(values, 0, axis)) for values in (basins, distance)
+        )
+        touch = (labels > 0) & (next_labels > 0) & (labels != next_labels)
+        pair = np.sort([labels[touch], next_labels[touch]], axis=0)
+        necks.append(np.stack([-np.minimum(radii[touch], next_radii[touch]), *pair], 1))
     return [(-width, int(a), int(b)) for width, a, b in np.unique(np.concatenate(necks), axis=0).tolist()]
+
+
+def _number_pieces(labels: np.ndarray) -> np.ndarray:
+    """Renumber pieces 1, 2, … in the order of their first voxels, int32; 0 stays."""
+    first_voxels = np.full(labels.max() + 1, labels.size)
+    np.minimum.at(first_voxels, labels.ravel(), np.arange(labels.size))
+    first_voxels[0] = -1
+    return np.argsort(np.argsort(first_voxels)).astype(np.int32)[labels]
 
 
 def _measure_curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float) -> tuple[np.ndarray, np.ndarray]:
@@ -118,11 +127,8 @@ def _measure_curvatures(u: Tensor, mask: np.ndarray, grid: Grid, epsilon: float)
     slope = distance.gradient.square().sum(-4).sqrt()
     d = distance.value / slope.clamp_min(LEAST_SLOPE)
     κ1, κ2 = (κ / (1 + κ * d) for κ in geometric_curvatures(distance)[:2])
-    touching = find_boundaries(np.pad(mask, 1, mode="wrap"))[1:-1, 1:-1, 1:-1]  # by a face
-    if not grid.periodic:
-        inner = np.zeros_like(mask)
-        inner[(slice(MARGIN, -MARGIN),) * 3] = True
-        touching &= inner
+    touching, inner = np.zeros_like(mask), (slice(MARGIN, -MARGIN),) * 3
+    touching[inner] = find_boundaries(mask)[inner]  # by a face
     valid = find_resolved(slope, κ1, κ2, grid) & torch.from_numpy(touching)
     return torch.where(valid, κ1, torch.nan).float().numpy(), torch.where(valid, κ2, torch.nan).float().numpy()
 

@@ -4,7 +4,6 @@ from .diagrams import Diagram as Diagram
 from .diagrams import diagram as diagram
 from .diagrams import family_of as family_of
 from .diagrams import family_shares as family_shares
-from .diagrams import half_thickness as half_thickness
 from .distances import one_to_many as one_to_many
 from .distances import pairwise as pairwise
 from .distances import sliced_embedding as sliced_embedding
@@ -21,5 +20,4 @@ from .morphology import Morphometry as Morphometry
 from .morphology import local_thickness as local_thickness
 from .morphology import morphometry as morphometry
 from .topology import betti_numbers as betti_numbers
-from .topology import components as components
 from .topology import euler_number as euler_number

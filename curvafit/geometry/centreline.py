@@ -17,7 +17,6 @@ from skimage import measure
 
 from curvafit.core.files import write_atomically
 from curvafit.geometry.topology import betti_numbers
-from curvafit.priors.grid import Grid
 
 #: A spur is shorter than a voxel plus so many radii of its other node.
 SPUR = 1.0
@@ -32,30 +31,29 @@ CORNERS = ((_OFFSETS.max(2) == 1) @ _BITS) & ~(1 << MIDDLE)
 SIDES = ((_OFFSETS.sum(2) == 1) @ _BITS) & EIGHTEEN
 
 
-def skeleton_of(distance: np.ndarray, grid: Grid) -> np.ndarray:
+def skeleton_of(distance: np.ndarray) -> np.ndarray:
     """Return one-voxel wide curves in the middle of {distance > 0}, bool (Z, Y, X), with the mask's topology.
 
     The distance (Z, Y, X) is positive inside, as `labels.field_distance` gives it. The curves have as many pieces,
-    tunnels and cavities as the mask; a cavity keeps a closed sheet around it. Curves run up to the faces of a crop, and
-    across those of a periodic box.
+    tunnels and cavities as the mask; a cavity keeps a closed sheet around it. Curves run up to the faces of the box.
     """
     skeleton = (distance > 0).astype(np.uint8)
     # From the surface inwards; equals come in random order, as one along a tube would eat it from its end.
     order = np.random.default_rng(0).permutation(np.flatnonzero(skeleton))
     order = order[np.argsort(distance.ravel()[order], kind="stable")]
     fixed = np.zeros(skeleton.shape, dtype=bool)
-    for axis, side in [] if grid.periodic else product(range(3), (0, -1)):
+    for axis, side in product(range(3), (0, -1)):
         face = np.moveaxis(distance, axis, 0)[side]
         pieces, count = measure.label(face > 0, return_num=True)  # type: ignore
         middles = np.array(ndimage.maximum_position(face, pieces, range(1, count + 1)), dtype=int).reshape(-1, 2)
         np.moveaxis(fixed, axis, 0)[side][tuple(middles.T)] = True
-    _thin(skeleton, fixed, order.copy(), grid.periodic)
-    _thin(skeleton, np.zeros_like(fixed), order[skeleton.ravel()[order] > 0], grid.periodic)
+    _thin(skeleton, fixed, order.copy())
+    _thin(skeleton, np.zeros_like(fixed), order[skeleton.ravel()[order] > 0])
     return skeleton.astype(bool)
 
 
 @njit(cache=True)
-def _thin(mask, fixed, order, periodic):  # pragma: no cover
+def _thin(mask, fixed, order):  # pragma: no cover
     """Delete simple voxels from the mask, in the given order, until none is left; `fixed` voxels and ends stay."""
     nz, ny, nx = mask.shape
     changed = True
@@ -69,9 +67,7 @@ def _thin(mask, fixed, order, periodic):  # pragma: no cover
             for k in range(27):
                 a, b, c = z + k // 9 - 1, y + k // 3 % 3 - 1, x + k % 3 - 1
                 if a < 0 or b < 0 or c < 0 or a >= nz or b >= ny or c >= nx:
-                    if not periodic:
-                        continue
-                    a, b, c = a % nz, b % ny, c % nx
+                    continue
                 if k != MIDDLE and mask[a, b, c]:
                     neighbours |= 1 << k
                     count += 1

@@ -43,10 +43,6 @@ _FLAT_RADII = 2.5
 _LAYERS = 0.5
 #: All families, in the order in which they are listed.
 FAMILIES = ("spheres", "layers", "tubes", "sponge", "tubular cavities", "bubbles")
-#: Where the search for a half-thickness ends.
-_DEEPEST = 6.0
-#: Points whose area is followed inwards together.
-_TOGETHER = 4096
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -274,28 +270,5 @@ def families(points: np.ndarray, radius: float) -> np.ndarray:
 
 def family_of(diagram: Diagram, radius: float) -> str:
     """Return the family's name: the largest share, or layers where at least half the area is flat."""
-    return leading_family(family_shares(diagram, radius))
-
-
-def leading_family(shares: dict[str, float]) -> str:
-    """Return the family with the largest share of area, or layers where they hold at least half."""
-    if shares["layers"] >= _LAYERS:
-        return "layers"
-    return max(_ANGLES, key=lambda name: shares[name])
-
-
-def half_thickness(diagram: Diagram, volume: float) -> float:
-    """Return the half-thickness of what a surface bounds, from its volume and its diagram alone, in the diagram's unit.
-
-    It is the depth at which the inner parallel surfaces have swept the volume: an element of area dA has
-    (1 - κ1 t)(1 - κ2 t) dA at depth t, and nothing beyond its centres of curvature (Steiner's formula). Exact for
-    plates, cylinders and balls; at most `_DEEPEST` times volume / area, where a ball's is 3.
-    """
-    depths = np.linspace(0, _DEEPEST * volume / diagram.area, 601)
-    inner_areas = np.zeros_like(depths)
-    for start in range(0, len(diagram.points), _TOGETHER):
-        block = slice(start, start + _TOGETHER)
-        factors = np.clip(1 - diagram.points[block, :, None] * depths, 0, None)
-        inner_areas += diagram.weights[block] @ factors.prod(axis=1)
-    swept = np.append(0, np.cumsum(inner_areas[1:] + inner_areas[:-1]) * depths[1] / 2)
-    return float(depths[np.searchsorted(swept, min(volume, swept[-1]) * (1 - 1e-9))])
+    shares = family_shares(diagram, radius)
+    return "layers" if shares["layers"] >= _LAYERS else max(_ANGLES, key=lambda name: shares[name])

@@ -33,7 +33,7 @@ from curvafit.data_synth.atlas import extract, open_all, shape_id, summarise
 from curvafit.data_synth.store import Store
 from curvafit.drawing.plot import DENSITY, DIAGONAL, FAMILY_COLOURS, INK, shared_limits
 from curvafit.drawing.rendering import CAP, SURFACE, render
-from curvafit.geometry.diagrams import FAMILIES, Diagram, family_shares, half_thickness, leading_family
+from curvafit.geometry.diagrams import FAMILIES, Diagram, family_of
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.geometry.mesh import capped_surface
 from curvafit.inference.atlas import Atlas
@@ -67,8 +67,9 @@ def families_of(atlas: Atlas) -> tuple[str, ...]:
     """Return the family of each shape: the region of the curvature plane with most of its surface."""
     sampling = atlas.provenance["settings"]
     box_volume = float(np.prod(sampling["shape"]) * np.prod(sampling["spacing"]))
+    # Volume over area is the half-thickness of plates, and too little to call a tube or a ball flat.
     return tuple(
-        leading_family(family_shares(diagram, half_thickness(diagram, float(fraction) * box_volume)))
+        family_of(diagram, float(fraction) * box_volume / diagram.area)
         for diagram, fraction in zip(atlas.field_diagrams, atlas.volume_fractions, strict=True)
     )
 

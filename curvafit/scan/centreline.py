@@ -19,7 +19,6 @@ from curvafit.core.units import convert_length
 from curvafit.geometry.centreline import centreline, skeleton_of, write_graphml
 from curvafit.geometry.morphology import smooth_surface
 from curvafit.geometry.topology import betti_numbers
-from curvafit.priors.grid import Grid
 from curvafit.scan.measures import LEAST, Blocks, Formula, Measures, Quantity, combine, errors, find_quantity
 from curvafit.volumes.volume import ScanError
 
@@ -124,7 +123,7 @@ def trace(measures: Measures) -> Centreline:
     edges = (scale * volume.spacing[0], scale * volume.spacing[1], scale * volume.spacing[2])
     spacing = np.array(edges)
     distance = np.asarray(ndimage.distance_transform_edt(mask, edges)).astype(np.float32)
-    skeleton = skeleton_of(distance, Grid(volume.shape, edges, "replicate"))
+    skeleton = skeleton_of(distance)
     # Near the lines, where radii are read, distances are to the surface and not to the voxels outside.
     near = np.argwhere(ndimage.binary_dilation(skeleton, np.ones((3, 3, 3)), 2))
     triangles = KDTree(smooth_surface(mask, edges).barycentres)

@@ -134,7 +134,7 @@ def test_a_tube_of_an_even_width_stays(radius: float, axis: int) -> None:
     box = Grid(shape, 1.0, "replicate")  # type: ignore[arg-type]
     mask = Tubes(radius, (line,)).distance(centres(box)).numpy() > 0
     distance = ndimage.distance_transform_edt(mask)
-    graph = centreline(skeleton_of(distance, box), distance, (1.0, 1.0, 1.0))
+    graph = centreline(skeleton_of(distance), distance, (1.0, 1.0, 1.0))
     assert kinds(graph) == {"end": 2} and total(graph) == pytest.approx(40, abs=4)
 
 

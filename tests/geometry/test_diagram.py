@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from curvafit.geometry import distances as module
-from curvafit.geometry.diagrams import Diagram, diagram, family_of, family_shares, half_thickness
+from curvafit.geometry.diagrams import Diagram, diagram, family_of, family_shares
 from curvafit.geometry.distances import one_to_many, pairwise, sliced_embedding, wasserstein
 from curvafit.inference.atlas import load_atlas
 from curvafit.priors.grid import Grid
@@ -205,26 +205,6 @@ def test_ideal_shapes_are_named(points: list[tuple[float, float]], name: str) ->
     assert family_of(at(*points), RADIUS) == name
     assert family_of(Diagram(at(*points).points / 7, np.ones(len(points))), 7 * RADIUS) == name
     assert sum(family_shares(at(*points), RADIUS).values()) == pytest.approx(1)
-
-
-R, OUTER, INNER = RADIUS, 0.11, 0.05
-
-
-@pytest.mark.parametrize(
-    ("points", "areas", "volume", "thickness"),
-    [
-        ([(0.0, 0.0)], [2.0], 2 * R, R),
-        ([(1 / R, 0.0)], [2 * np.pi * R], np.pi * R**2, R),
-        ([(1 / R, 1 / R)], [4 * np.pi * R**2], 4 / 3 * np.pi * R**3, R),
-        ([(1 / R, -1 / R)], [1.0], 2 / 3 * R, R),
-        ([(1 / OUTER,) * 2, (-1 / INNER,) * 2], [4 * np.pi * OUTER**2, 4 * np.pi * INNER**2],
-         4 / 3 * np.pi * (OUTER**3 - INNER**3), (OUTER - INNER) / 2),
-    ],
-    ids=["plate", "cylinder", "ball", "saddle", "thick shell"],
-)  # fmt: skip
-def test_volume_and_curvatures_tell_how_thick_plates_cylinders_and_balls_are(points, areas, volume, thickness) -> None:
-    several = Diagram(np.array(points), 3 * np.array(areas))
-    assert half_thickness(several, 3 * volume) == pytest.approx(thickness, rel=0.02)
 
 
 def blob(seed: int = 0, centre: tuple[float, float] = (20.0, -5.0), width: float = 4.0, count: int = 300) -> Diagram:
