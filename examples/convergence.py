@@ -8,12 +8,13 @@ Preset `flow`: a = (1, 2.4, 9, 30, 170, -195), m₀ = -0.66. A killed run goes o
 from __future__ import annotations
 
 import numpy as np
+import torch
 from common import CELL, DIAGRAM, SURFACE, draw, parser, plan_of, program, write_table
 from matplotlib.figure import Figure
 
 from curvafit.drawing.plot import write_picture
 from curvafit.generation.flow import Execution, Flow, generate
-from curvafit.generation.result import Watch, viability
+from curvafit.generation.result import State, viability
 from curvafit.geometry.diagrams import Diagram, diagram
 from curvafit.geometry.distances import wasserstein
 from curvafit.geometry.mesh import NoSurface
@@ -30,19 +31,26 @@ def main() -> None:
     options.output.mkdir(parents=True, exist_ok=True)
     grid, plan, shape = Grid((options.edge,) * 3), plan_of(options), preset("flow")
     marks = sorted({mark for mark in MARKS if mark < plan.steps} | {plan.steps})
+    files = {mark: options.output / f"convergence-{mark}.npy" for mark in marks}
+
+    def keep(step: int, total: int, state: State) -> None:
+        if step in files:  # on disk, so that a run that goes on has the stages before
+            np.save(files[step], state.field.numpy())
+
     flow = generate(
         shape.coefficients,
         shape.mass,
         grid,
         schedule=plan,
         seed=options.seed,
-        watch=Watch(snapshots=marks),
+        callbacks=[keep],
         execution=Execution(device=options.device, checkpoint=options.output / "convergence.checkpoint"),
     )
-    diagrams = {step: diagram_of(u.numpy(), grid, options.curvature) for step, u in flow.snapshots.items()}
-    write_table(options, "convergence", [*table(flow, diagrams), flow.status], [program()])
-    shown = [step for step in marks if step in (*SHOWN, plan.steps)]
-    print(write_picture(picture(flow, diagrams, shown), options.output / "convergence.png"))
+    stages = {step: np.load(file) for step, file in files.items()}
+    diagrams = {step: diagram_of(u, grid, options.curvature) for step, u in stages.items()}
+    write_table(options, "convergence", [*table(flow, stages, diagrams), flow.status], [program()])
+    shown = {step: (stages[step], diagrams[step]) for step in marks if step in (*SHOWN, plan.steps)}
+    print(write_picture(picture(flow, shown), options.output / "convergence.png"))
 
 
 def diagram_of(u: np.ndarray, grid: Grid, kind) -> Diagram | None:
@@ -53,29 +61,29 @@ def diagram_of(u: np.ndarray, grid: Grid, kind) -> Diagram | None:
         return None
 
 
-def table(flow: Flow, diagrams: dict[int, Diagram | None]) -> list[str]:
+def table(flow: Flow, stages: dict[int, np.ndarray], diagrams: dict[int, Diagram | None]) -> list[str]:
     """A line a mark; the distance is the one to the last diagram."""
     history, last = flow.history, diagrams[max(diagrams)]
     lines = [
         f"{'step':>5} {'energy':>12} {'max |∂G|':>10} {'mean |∂G|':>10} {'discrep.':>9} {'u > 0':>7} {'distance':>9}"
     ]
-    for step, u in flow.snapshots.items():
+    for step, u in stages.items():
         at = int(np.flatnonzero(history.step == step)[0])
         seen = diagrams[step]
         away = wasserstein(seen, last) if seen and last else float("nan")
-        ratio = viability(u, flow.grid, WORKING_EPSILON).discrepancy
+        ratio = viability(torch.from_numpy(u), flow.grid, WORKING_EPSILON).discrepancy
         line = (
             f"{step:5d} {history.energy[at]:12.4f} {history.gradient_max[at]:10.3e} {history.gradient_mean[at]:10.3e}"
         )
-        lines.append(f"{line} {ratio:9.3f} {float((u > 0).double().mean()):7.4f} {away:9.3f}")
+        lines.append(f"{line} {ratio:9.3f} {(u > 0).mean():7.4f} {away:9.3f}")
     return lines
 
 
-def picture(flow: Flow, diagrams: dict[int, Diagram | None], shown: list[int]) -> Figure:
+def picture(flow: Flow, shown: dict[int, tuple[np.ndarray, Diagram | None]]) -> Figure:
     """Surfaces and diagrams at some steps, above the curves."""
     figure = Figure(figsize=(CELL * len(shown), SURFACE + DIAGRAM + 3), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=[SURFACE + DIAGRAM, 3], squeeze=False).flat
-    draw(above, {f"{step} steps": (flow.snapshots[step].numpy(), diagrams[step]) for step in shown}, len(shown))
+    draw(above, {f"{step} steps": stage for step, stage in shown.items()}, len(shown))
     history, axes = flow.history, below.subplots(1, 3)
     curves = {"energy": history.energy, "max |∂G|": history.gradient_max, "mean |∂G|": history.gradient_mean}
     for each, (name, values) in zip(axes, curves.items(), strict=True):

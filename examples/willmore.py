@@ -23,8 +23,7 @@ import torch
 from rich.progress import Progress
 
 from curvafit.drawing.plot import gallery_figure, write_picture
-from curvafit.generation.flow import Execution, Flow, Optimiser, descend
-from curvafit.generation.result import Watch
+from curvafit.generation.flow import Execution, Flow, descend
 from curvafit.geometry.mesh import surface
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energies import cahn_hilliard_area
@@ -100,9 +99,9 @@ def flow_of(name: str, edge: int, width: float, steps: int, folder: Path) -> Row
             field,
             Coefficients.willmore(),
             grid,
-            optimiser=Optimiser(steps=steps),
+            steps=steps,
             epsilon=ε,
-            watch=Watch(callbacks=[lambda made, total, state: progress.update(task, completed=made)]),
+            callbacks=[lambda made, total, state: progress.update(task, completed=made)],
             execution=Execution(checkpoint=folder / f"{name}-{edge}-{width:.3g}.checkpoint"),
         )
     area = float(cahn_hilliard_area(flow.field, grid, ε)) / SIGMA

@@ -36,7 +36,7 @@ def parse_law(
     mass: Annotated[float | None, _what(help="Mean of the field, in (-1, 1).")] = None,
     volume_fraction: Annotated[float | None, _what(help="Share of the volume inside, instead of a mass.")] = None,
     orientation: Annotated[str | None, _what(help="θz,θy,θx,μ: tubes and layers lie along θ if μ is large.")] = None,
-    maps: Annotated[Path | None, _what(help="An .npz of volumes a20 … a00, mass, epsilon that vary.")] = None,
+    maps: Annotated[Path | None, _what(help="An .npz of volumes a20 … a00 and mass that vary.")] = None,
     epsilon: Annotated[float | None, _what(help="Interface width in working units; by default 0.02.")] = None,
 ) -> dict[str, Any]:
     """Return the options that determine which shape is grown, by name."""
@@ -64,13 +64,12 @@ def parse_run(
 def parse_output(
     spacing: Annotated[str | None, _out(help="Edge of a voxel, in --unit; by default 1, or the prior's.")] = None,
     unit: Annotated[str | None, _out(help="nm, um, mm or m; needs --spacing.")] = None,
-    tile: Annotated[str | None, _out(help="Repeat a periodic box N or Z,Y,X times.")] = None,
 ) -> dict[str, Any]:
-    """Return voxel edge, unit and repeats of the file to write; raise ValueError where options do not go together."""
+    """Return voxel edge and unit of the file to write; raise ValueError where options do not go together."""
     if unit is not None and spacing is None:
         raise ValueError("--unit needs --spacing")
     edge = None if spacing is None else parse_numbers(spacing, "--spacing", 1)[0]
-    return {"edge": edge, "unit": unit, "repeats": (1, 1, 1) if tile is None else parse_whole_triple(tile, "--tile")}
+    return {"edge": edge, "unit": unit}
 
 
 @command(
@@ -106,13 +105,11 @@ def generate(
     maps = {} if wanted["maps"] is None else read_maps(wanted["maps"], size)
     law = _read_law(wanted["preset"], wanted["coefficients"], wanted["prior"], maps)
     options = _choose_parameters(law, maps, wanted)
-    options["grid"] = grid = Grid(size or map_shape(maps) or EDGE, boundary=boundary)  # type: ignore[arg-type]
+    options["grid"] = Grid(size or map_shape(maps) or EDGE, boundary=boundary)  # type: ignore[arg-type]
     options["schedule"] = make_schedule(choose_schedule([law], running.pop("schedule")), running.pop("steps"))
     running["checkpoint"] = checkpoint = _locate_checkpoint(running["checkpoint"], out)
     options |= {"seed": seed, "execution": Execution(keep_checkpoint=True, **running)}
-    edge, unit = writing["edge"] or law.working_voxel or 1.0, writing["unit"] or law.length_unit or "voxel"
-    output = Output(edge, unit, writing["repeats"])
-    output.shape(grid)  # raises ValueError where the volume cannot be repeated or does not fit into memory
+    output = Output(writing["edge"] or law.working_voxel or 1.0, writing["unit"] or law.length_unit or "voxel")
     law_file = None if not law.fitted else wanted["prior"] or wanted["preset"]
     inputs = [str(path) for path in (law_file, wanted["maps"]) if path is not None]
     check_target(out, output, inputs=inputs, picture=picture, overwrite=overwrite)
@@ -158,9 +155,8 @@ def _choose_parameters(law: Law, maps: Maps3D, wanted: dict[str, Any]) -> dict[s
     from curvafit.priors.energies import orientation
     from curvafit.priors.grid import WORKING_EPSILON
 
-    for name in ("mass", "epsilon"):
-        if wanted[name] is not None and name in maps:
-            raise ValueError(f"give either --{name} or a map of it, got both")
+    if wanted["mass"] is not None and "mass" in maps:
+        raise ValueError("give either --mass or a map of it, got both")
     mass, fraction = maps.get("mass", wanted["mass"]), wanted["volume_fraction"]
     if mass is not None and fraction is not None:
         raise ValueError("give either a mass or --volume-fraction, got both")
@@ -171,7 +167,7 @@ def _choose_parameters(law: Law, maps: Maps3D, wanted: dict[str, Any]) -> dict[s
         *direction, strength = parse_numbers(wanted["orientation"], "--orientation", 4)
         Q = orientation(direction, strength)
     coefficients = replace(law.coefficients, **{name: maps[name] for name in NAMES if name in maps})
-    ε = maps.get("epsilon", WORKING_EPSILON if wanted["epsilon"] is None else wanted["epsilon"])
+    ε = WORKING_EPSILON if wanted["epsilon"] is None else wanted["epsilon"]
     return {"law": coefficients, "mass": mass, "volume_fraction": fraction, "epsilon": ε, "orientation": Q}
 
 
@@ -191,7 +187,6 @@ def _locate_checkpoint(file: Path | None, out: Path) -> Path | None:
 def _grow(options: dict[str, Any]) -> Flow:
     """Run the flow with progress; exit with code 1 where it failed or has no surface."""
     from curvafit.generation.flow import generate as make
-    from curvafit.generation.result import Watch
 
     checkpoint = options["execution"].checkpoint
 
@@ -200,8 +195,7 @@ def _grow(options: dict[str, Any]) -> Flow:
 
     with resumable(resume_command), show_stages() as progress:
         progress("starting (a first run compiles the kernels for this processor)", 0.0)
-        watch = Watch(callbacks=[lambda step, total, _: progress("growing", step / total)])
-        flow = make(**options, watch=watch)
+        flow = make(**options, callbacks=[lambda step, total, _: progress("growing", step / total)])
     # The surface is the level 0 of the field: without values on both sides there is none.
     if not (flow.finite and flow.viability.lowest < 0 < flow.viability.highest):
         _remove(checkpoint)

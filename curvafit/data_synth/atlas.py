@@ -30,7 +30,7 @@ from curvafit.data_synth.design import Design, design_box
 from curvafit.data_synth.store import Record, Settings, Store, open_store
 from curvafit.generation.flow import WORKING_BLUR, generate
 from curvafit.generation.result import is_well_formed
-from curvafit.generation.schedule import Schedule, present_name
+from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE, Diagram, diagram
 from curvafit.inference.atlas import Atlas
@@ -175,7 +175,7 @@ def summarise(store: Store) -> dict[str, str]:
         "epsilon": f"{settings.epsilon:g} (voxel edges {', '.join(f'{edge:g}' for edge in settings.spacing)})",
         "design": str(Design.from_dict(settings.design)),
         "seed": str(settings.seed),
-        "schedule": f"{present_name(settings.schedule)}, {settings.schedule['steps']} steps",
+        "schedule": "{name}, {steps} steps".format(**settings.schedule),
         "made with": "; ".join(f"{text} ({count})" for text, count in makers.items()),
         "seconds a draw": f"{np.mean([record.seconds for record in records]):.2f}" if records else "none",
     }

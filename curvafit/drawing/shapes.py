@@ -15,10 +15,10 @@ import torch
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from curvafit.core.checks import LONGEST, SHORTEST, as_tuple, check_float, check_int, check_type
+from curvafit.core.checks import LONGEST, SHORTEST, check_float, check_type
 from curvafit.core.files import move_together, remove, temporary_folder
 from curvafit.core.records import Format, can_write, sibling
-from curvafit.core.runtime import FILE, check_memory, hold_signals
+from curvafit.core.runtime import hold_signals
 from curvafit.core.units import parse_unit
 from curvafit.drawing.plot import surface_figure, write_picture
 from curvafit.generation.flow import Flow
@@ -32,21 +32,17 @@ from curvafit.volumes.write import WRITERS, pick_writer, save
 
 #: What a record beside a shape says that it is.
 FORMAT = Format("curvafit-shape-1", title="the record of a shape")
-#: Times that a box may be repeated along an axis.
-MOST = 10**6
 
 
 @dataclasses.dataclass(frozen=True)
 class Output:
     """How a field becomes a file: the edge of a voxel and its unit, for spacing or vertices; ValueError for others.
 
-    A periodic box is repeated `tile` times along z, y, x. A surface is closed on the box's faces, watertight around the
-    volume of {u > 0}.
+    A surface is closed on the box's faces, watertight around the volume of {u > 0}.
     """
 
     voxel: float = 1.0
     unit: str = "voxel"
-    tile: tuple[int, int, int] = (1, 1, 1)
 
     def __post_init__(self) -> None:
         check_type(self.unit, str, "a unit as text")
@@ -54,20 +50,6 @@ class Output:
         object.__setattr__(self, "unit", unit)
         edge = check_float(self.voxel, "a positive voxel edge", SHORTEST, LONGEST)
         object.__setattr__(self, "voxel", edge * factor)
-        expected = "3 whole repeats of at least 1 (z, y, x)"
-        tile = tuple(check_int(n, expected, 1, MOST, of=self.tile) for n in as_tuple(self.tile, expected, 3))
-        object.__setattr__(self, "tile", tile)
-
-    def shape(self, grid: Grid) -> tuple[int, ...]:
-        """Return the shape of the volume that is written of a field on a grid, repeats included.
-
-        A volume that does not fit into memory, or repeats of a box that is not periodic, are a ValueError.
-        """
-        if not grid.periodic and self.tile != (1, 1, 1):
-            raise ValueError(f"only a periodic box can be repeated, this one has boundary {grid.boundary!r}")
-        shape = tuple(n * times for n, times in zip(grid.shape, self.tile, strict=True))
-        check_memory(shape, FILE, "a file")
-        return shape
 
 
 def check_target(
@@ -102,7 +84,7 @@ def write_shape(
     picture: bool = True,
     overwrite: bool = False,
 ) -> tuple[Path, ...]:
-    """Write a flow's field as a volume or a surface, by suffix, with a record and a picture of one period.
+    """Write a flow's field as a volume or a surface, by suffix, with a record and a picture.
 
     Return the paths of the shape, the record (`.json`, see `shape_record`) and the picture (`.png`). All files are made
     in a temporary folder, then moved together. If the picture cannot be drawn, a warning says so. The picture of a
@@ -137,8 +119,7 @@ def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | No
     `kappa1` and `kappa2` at the vertices, 0 on caps.
     """
     target, output = Path(path), output or Output()
-    output.shape(grid)  # raises where the field cannot be repeated so
-    values, spacing = np.tile(field.numpy(), output.tile), (output.voxel, output.voxel, output.voxel)
+    values, spacing = field.numpy(), (output.voxel, output.voxel, output.voxel)
     if not target.name.lower().endswith(SUFFIXES):
         return save(Volume(values, spacing, output.unit), target, kind=FORMAT.name)
     mesh = solid_surface(values, Grid(values.shape, spacing, grid.boundary))
@@ -164,7 +145,7 @@ def shape_record(
         "format": FORMAT.name,
         "coefficients": dict(zip(NAMES, map(_number_or_range, flow.coefficients), strict=True)),
         "mass": _number_or_range(flow.mass if mass is None else mass), "shape": list(flow.grid.shape),
-        "working_spacing": list(flow.grid.spacing), "epsilon": _number_or_range(flow.epsilon),
+        "working_spacing": list(flow.grid.spacing), "epsilon": flow.epsilon,
         "boundary": flow.grid.boundary, "seed": flow.seed, "schedule": flow.schedule.as_dict(), "status": flow.status,
         "viable": flow.viability.viable, "volume_fraction": float(np.mean(flow.field.numpy() > 0)),
         **dataclasses.asdict(output or Output()), **more, "curvafit": version("curvafit"), "torch": version("torch"),

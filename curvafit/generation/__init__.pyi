@@ -1,15 +1,14 @@
 from .flow import Execution as Execution
-from .flow import Optimiser as Optimiser
 from .flow import descend as descend
 from .flow import generate as generate
 from .problem import Data as Data
 from .problem import Evidence as Evidence
 from .problem import Hinge as Hinge
 from .problem import white_noise as white_noise
+from .result import Callback as Callback
 from .result import Flow as Flow
 from .result import History as History
 from .result import State as State
 from .result import Viability as Viability
-from .result import Watch as Watch
 from .schedule import SCHEDULES as SCHEDULES
 from .schedule import Schedule as Schedule

@@ -7,7 +7,7 @@ import hashlib
 import io
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -19,11 +19,11 @@ import torch
 from filelock import FileLock, Timeout
 from torch import Tensor
 
-from curvafit.core.checks import check_open_interval, check_type
+from curvafit.core.checks import check_open_interval
 from curvafit.core.files import remove_leftovers, write_content
-from curvafit.core.runtime import FIELD, FLOW, check_memory, hold_signals
+from curvafit.core.runtime import hold_signals
 from curvafit.generation.problem import Cost
-from curvafit.generation.result import RECORD_EVERY, Flow, History, State, Viability, Watch, viability
+from curvafit.generation.result import RECORD_EVERY, Callback, Flow, History, State, Viability, viability
 from curvafit.generation.schedule import Schedule
 from curvafit.generation.stepper import Stepper
 from curvafit.priors.coefficients import Coefficients
@@ -43,64 +43,40 @@ FRACTION_BOUND = 0.95
 #: The largest constant that is added at the end to make the share exact; beyond, the share was not reached.
 FRACTION_LAST = 0.1
 #: First words of a checkpoint, before the SHA-256 of its content.
-_HEAD = b"curvafit checkpoint 2 "
+_HEAD = b"curvafit checkpoint 3 "
 
 
-@dataclass(frozen=True)
-class FlowOptions:
-    """The task of a flow: the functional, the steps, and options as `generate` describes them."""
+@dataclass(eq=False)
+class Run:
+    """The run of a shape: its stepper, what that lowers, by which steps, and options as `generate` describes them."""
 
+    stepper: Stepper
     cost: Cost
     plan: Schedule
-    watch: Watch = Watch()
+    callbacks: Sequence[Callback] = ()
     reject_early: bool = False
     volume_fraction: float | None = None
+    seed: int | None = None
 
     def __post_init__(self) -> None:
-        check_type(self.watch, Watch, "a Watch")
-        snapshots = tuple(map(self.plan.check_step, self.watch.snapshots))
-        object.__setattr__(self, "watch", dataclasses.replace(self.watch, snapshots=snapshots))
-
-    def check_memory(self, device: torch.device | str) -> None:
-        """Raise ValueError where a flow does not fit into the device's memory, or its snapshots into the machine's."""
-        check_memory(self.cost.grid.shape, FLOW, "a box", device)
-        snapshots = len(set(self.watch.snapshots))
-        check_memory(self.cost.grid.shape, FIELD * snapshots, f"a box with {snapshots} snapshots")
-
-    def next_mark(self, steps: int) -> int:
-        """Return the number of steps after which the next record, snapshot, check or phase of the plan is due."""
-        regular = steps + RECORD_EVERY - steps % RECORD_EVERY
-        checks = self.plan.checks if self.reject_early else ()
-        marks = (regular, self.plan.steps, *self.plan.bounds, *self.watch.snapshots, *checks)
-        return min(mark for mark in marks if mark > steps)
-
-
-def run(stepper: Stepper, options: FlowOptions, seed: int | None, checkpoint: Checkpoint | None = None) -> Flow:
-    """Step a shape until the plan ends, or it stops.
-
-    It stops earlier where its energy, gradient or field is not finite, where a callback or a check stops it, and where
-    the optimiser stalls. At the end the checkpoint is closed, or saved where a callback stopped the flow.
-    """
-    with nullcontext() if checkpoint is None else checkpoint.lock():
-        shape = _Run(stepper, options, seed)
-        shape.advance(checkpoint)
-    return shape.flow()
-
-
-class _Run:
-    """The run of a shape: its records, its snapshots, and the reason why it stopped."""
-
-    def __init__(self, stepper: Stepper, options: FlowOptions, seed: int | None) -> None:
-        self._stepper, self._options, self._seed = stepper, options, seed
         self._rows: list[list[float]] = []
-        self._snapshots: dict[int, Tensor] = {}
         #: The reason for a stop before the plan's end, and whether a callback is the reason.
         self._stop, self._stopped_by_callback = "", False
         self._shortfall, self._failure = "", ""
 
-    def advance(self, checkpoint: Checkpoint | None) -> None:
+    def flow(self, checkpoint: Checkpoint | None = None) -> Flow:
+        """Step the shape until the plan ends, or it stops.
+
+        It stops earlier where its energy, gradient or field is not finite, where a callback or a check stops it, and
+        where the optimiser stalls. At the end the checkpoint is closed, or saved where a callback stopped the flow.
+        """
+        with nullcontext() if checkpoint is None else checkpoint.lock():
+            self._advance(checkpoint)
+        return self._describe()
+
+    def _advance(self, checkpoint: Checkpoint | None) -> None:
         """Step until the plan ends or the shape stops, and save checkpoints."""
-        stepper, plan = self._stepper, self._options.plan
+        stepper, plan = self.stepper, self.plan
         steps = self._resume(checkpoint)
         while True:
             # One step whose statistics are read, then those up to the next mark, without statistics.
@@ -112,7 +88,7 @@ class _Run:
             self._observe(steps, last)
             if last or self._stop:
                 break
-            mark = self._options.next_mark(steps)
+            mark = self._next_mark(steps)
             steps += 1 + stepper.run([plan.rate(step) for step in range(steps + 1, mark)])
             if checkpoint is not None and checkpoint.is_due():
                 checkpoint.save(self._pack_state(steps))
@@ -126,53 +102,56 @@ class _Run:
         content = checkpoint.load() if checkpoint else None
         if content is None:
             return 0
-        self._stepper.restore(content["stepper"])
-        ((self._rows, self._snapshots),) = content["lanes"]
+        self.stepper.restore(content["stepper"])
+        self._rows = content["rows"]
         return content["made"]
 
     def _pack_state(self, steps: int) -> dict[str, Any]:
-        return {"made": steps, "lanes": [(self._rows, self._snapshots)], "stepper": self._stepper.state()}
+        return {"made": steps, "rows": self._rows, "stepper": self.stepper.state()}
+
+    def _next_mark(self, steps: int) -> int:
+        """Return the number of steps after which the next record, check or phase of the plan is due."""
+        regular = steps + RECORD_EVERY - steps % RECORD_EVERY
+        checks = self.plan.checks if self.reject_early else ()
+        return min(mark for mark in (regular, self.plan.steps, *self.plan.bounds, *checks) if mark > steps)
 
     def _set_fraction(self) -> bool:
         """Add the constant to u that makes the volume fraction exact, if it is small; return whether it was added."""
-        share = self._options.volume_fraction
+        share = self.volume_fraction
         if share is None:
             return False
-        u = self._stepper.field()
+        u = self.stepper.field()
         shift, end = last_shift(u, share), self._viability(u)
         if end.viable and abs(shift) <= FRACTION_LAST:
-            self._stepper.shift(shift)
+            self.stepper.shift(shift)
             return True
         self._shortfall = f"; volume fraction {float((u > 0).double().mean()):.4f} instead of {share:.4f}"
         return False
 
     def _observe(self, steps: int, last: bool) -> None:
-        """Take the snapshot, the record and the viability check that are due after `steps` steps."""
-        watch, plan = self._options.watch, self._options.plan
-        if steps in watch.snapshots:
-            self._snapshots[steps] = self._stepper.field()
+        """Take the record and the viability check that are due after `steps` steps."""
         if last or steps % RECORD_EVERY == 0:
             self._record(steps, last)
-        if not self._stop and self._options.reject_early and steps in plan.checks:
-            check = self._viability(self._stepper.field())
-            self._stop = "" if check.viable else f"stopped after {steps} of {plan.steps} steps: {check.reason}"
+        if not self._stop and self.reject_early and steps in self.plan.checks:
+            check = self._viability(self.stepper.field())
+            self._stop = "" if check.viable else f"stopped after {steps} of {self.plan.steps} steps: {check.reason}"
 
-    def flow(self) -> Flow:
+    def _describe(self) -> Flow:
         """Return the result of a run that has stopped."""
-        options, cost, field = self._options, self._options.cost, self._stepper.field()
+        cost, field = self.cost, self.stepper.field()
         end = self._viability(field)
         if self._failure:
             end = dataclasses.replace(end, viable=False, reason=self._failure)
         history = History(*np.array(self._rows, dtype=np.float64).T)
         status = self._describe_end(end, history)
         return Flow(
-            field, history, status, cost.grid, end, options.plan, self._seed, self._stepper.mass(), self._snapshots,
-            cost.coefficients, cost.epsilon,
+            field, history, status, cost.grid, end, self.plan, self.seed, self.stepper.mass(), cost.coefficients,
+            cost.epsilon,
         )  # fmt: skip
 
     def _record(self, steps: int, last: bool) -> None:
         """Add a row to the history, stop where a figure is not finite, call the callbacks, and correct the mass."""
-        options, stepper, total = self._options, self._stepper, self._options.plan.steps
+        stepper, total = self.stepper, self.plan.steps
         statistics, mass = stepper.statistics(), stepper.mass()
         self._rows.append([steps, *statistics, mass])
         figures = {"the energy": [statistics.energy], "the gradient": statistics[1:], "the field": [mass]}
@@ -180,17 +159,17 @@ class _Run:
             self._failure = f"{infinite[0]} is not finite"
             self._stop = f"stopped after {steps} of {total} steps: {self._failure}"
             return
-        if options.watch.callbacks:
+        if self.callbacks:
             state = State(stepper.field(), *statistics, mass)
-            stops = [bool(callback(steps, total, state)) for callback in options.watch.callbacks]  # each one is called
+            stops = [bool(callback(steps, total, state)) for callback in self.callbacks]  # each one is called
             if any(stops):
                 self._stop, self._stopped_by_callback = f"stopped by a callback after {steps} of {total} steps", True
-        share = options.volume_fraction
+        share = self.volume_fraction
         if share is not None and not last and steps >= FRACTION_BEGIN * total:
             stepper.shift(correct_mass(stepper.field(), share, mass, total))
 
     def _viability(self, u: Tensor) -> Viability:
-        return viability(u, self._options.cost.grid, self._options.cost.epsilon)
+        return viability(u, self.cost.grid, self.cost.epsilon)
 
     def _describe_end(self, end: Viability, history: History) -> str:
         """Return the sentence that says how the flow ended."""
@@ -199,7 +178,7 @@ class _Run:
         steps = int(history.step[-1])
         if not end.viable:
             return f"no shape after {steps} steps: {end.reason}{self._shortfall}"
-        if self._stepper.stalled:
+        if self.stepper.stalled:
             return f"stopped after {steps} steps: the line search finds no lower energy{self._shortfall}"
         earlier = history.energy[np.searchsorted(history.step, 0.9 * steps, side="right") - 1]
         fall = (earlier - history.energy[-1]) / max(abs(earlier), 1e-30)

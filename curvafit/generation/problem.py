@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
@@ -14,7 +13,8 @@ from curvafit.core.checks import check_float, check_seed, check_type, quoted
 from curvafit.core.runtime import FIELD, check_memory
 from curvafit.priors.coefficients import NAMES, Coefficients, check_strengths
 from curvafit.priors.grid import Float, Grid
-from curvafit.priors.stencils import divergence, gaussian_blur, gradient
+from curvafit.priors.kernels import gaussian_blur
+from curvafit.priors.stencils import divergence, gradient
 
 #: The smallest ε, in voxels: two are published; below a tenth no voxel lies on the interface.
 FINEST = 0.1
@@ -23,8 +23,6 @@ FINEST = 0.1
 VOXEL_EDGES = (1e-8, 1e5)
 #: Width of the published start's interval, 40 Δx at Δx = 0.01.
 AMPLITUDE = 0.4
-#: A function of field, grid and standard deviation that returns k ∗ field.
-Blur = Callable[[Tensor, Grid, float], Tensor]
 
 
 @dataclass(frozen=True)
@@ -37,7 +35,7 @@ class Cost:
 
     coefficients: Coefficients
     grid: Grid
-    epsilon: float | Tensor
+    epsilon: float
     orientation: Tensor | None
     blur: float
     data: Data | None = None
@@ -55,23 +53,17 @@ class Cost:
         if not VOXEL_EDGES[0] <= min(edges) <= max(edges) <= VOXEL_EDGES[1]:
             raise ValueError(f"a flow needs voxel edges from {VOXEL_EDGES[0]:g} to {VOXEL_EDGES[1]:g}, got {edges}")
         expected = "epsilon > 0 and blur >= 0 in the spacing's unit"
-        if not isinstance(self.epsilon, Tensor):
-            object.__setattr__(self, "epsilon", check_float(self.epsilon, expected, math.ulp(0)))
+        object.__setattr__(self, "epsilon", check_float(self.epsilon, expected, math.ulp(0)))
         object.__setattr__(self, "blur", check_float(self.blur, expected, 0))
-        epsilons = torch.as_tensor(self.epsilon, dtype=torch.float64)
-        low, high = float(epsilons.min()), float(epsilons.max())
-        if not (low > 0 and math.isfinite(high)):
-            raise ValueError(f"expected {expected}, got {low} to {high} and {self.blur}")
-        if not FINEST * min(edges) <= low <= high <= box:
-            got = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+        if not FINEST * min(edges) <= self.epsilon <= box:
             least = f"{FINEST:g} of a voxel ({FINEST * min(edges):.3g})"
-            raise ValueError(f"epsilon must be from {least} to the box's side ({box:.3g}), got {got}")
+            raise ValueError(f"epsilon must be from {least} to the box's side ({box:.3g}), got {self.epsilon:g}")
         if self.blur > box:
             raise ValueError(f"the blur must be at most the box's side ({box:.3g}), got {self.blur:g}")
 
     def _check_tensors(self) -> None:
         """Raise ValueError where a tensor does not broadcast with the voxels, or data or orientation do not fit."""
-        for name, value in zip(("epsilon", *NAMES), (self.epsilon, *self.coefficients), strict=True):
+        for name, value in zip(NAMES, self.coefficients, strict=True):
             if isinstance(value, Tensor):
                 check_shape(name, value, self.grid)
         if self.data is not None and not callable(getattr(self.data, "slope", None)):
@@ -169,7 +161,7 @@ class Hinge(_VoxelTerm):
         return value, force * (-0.5 * grid.voxel_volume)
 
 
-# ---- forms and their starts ------------------------------------------------------------------------------------------
+# ---- forms and their start ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -183,27 +175,19 @@ class DivergenceForm:
     grid: Grid
     width: float
     base: float | Tensor
-    blur: Blur = gaussian_blur
 
     @classmethod
-    def of(
-        cls, grid: Grid, width: float, base: float | Float[Tensor, "z y x"], blur: Blur = gaussian_blur
-    ) -> DivergenceForm:
+    def of(cls, grid: Grid, width: float, base: float | Float[Tensor, "z y x"]) -> DivergenceForm:
         """Return the form u = k ∗ (div A + base) for a base that is not blurred yet."""
-        return cls(grid, width, blur(base, grid, width) if isinstance(base, Tensor) else float(base), blur)
-
-    @classmethod
-    def start_at(cls, field: Tensor, grid: Grid, width: float, blur: Blur) -> tuple[DivergenceForm, Tensor]:
-        """Return the form for which u = k ∗ field at A = 0, and that A."""
-        return cls.of(grid, width, field, blur), field.new_zeros((3, *grid.shape))
+        return cls(grid, width, gaussian_blur(base, grid, width) if isinstance(base, Tensor) else float(base))
 
     def field(self, vector: Float[Tensor, "3 z y x"]) -> Float[Tensor, "z y x"]:
         """Return u for A."""
-        return self.blur(divergence(vector, self.grid), self.grid, self.width) + self.base
+        return gaussian_blur(divergence(vector, self.grid), self.grid, self.width) + self.base
 
     def pullback(self, slope: Float[Tensor, "z y x"]) -> Float[Tensor, "3 z y x"]:
         """Return -∇(k ∗ slope), as the blur is its own adjoint and div = -∇ᵀ."""
-        return -gradient(self.blur(slope, self.grid, self.width), self.grid)
+        return -gradient(gaussian_blur(slope, self.grid, self.width), self.grid)
 
 
 @dataclass(frozen=True)
@@ -212,25 +196,17 @@ class DirectForm:
 
     grid: Grid
     width: float
-    blur: Blur = gaussian_blur
-
-    @classmethod
-    def start_at(cls, field: Tensor, grid: Grid, width: float, blur: Blur) -> tuple[DirectForm, Tensor]:
-        """Return the form and the start v = field."""
-        return cls(grid, width, blur), field
 
     def field(self, values: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
         """Return u for v."""
-        return self.blur(values, self.grid, self.width)
+        return gaussian_blur(values, self.grid, self.width)
 
     def pullback(self, slope: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
         """Return k ∗ slope."""
-        return self.blur(slope, self.grid, self.width)
+        return gaussian_blur(slope, self.grid, self.width)
 
 
 Form = DivergenceForm | DirectForm
-#: The flows by name, as forms that can start at a field.
-FORMS: dict[str, type[DivergenceForm] | type[DirectForm]] = {"h-1": DivergenceForm, "l2": DirectForm}
 
 
 def white_noise(grid: Grid, seed: int) -> Float[torch.Tensor, "3 z y x"]:

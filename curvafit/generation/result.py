@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from curvafit.core.checks import as_tuple, quoted
 from curvafit.core.runtime import Pictured
 from curvafit.core.schema import Rule
 from curvafit.core.units import format_sampling
@@ -72,31 +71,12 @@ class State:
 Callback = Callable[[int, int, State], bool | None]
 
 
-@dataclass(frozen=True)
-class Watch:
-    """What is taken from a flow while it runs.
-
-    `snapshots` are numbers of steps after which `Flow.snapshots` keeps the field; `callbacks` are functions as
-    `Callback` describes them. A callback that cannot be called is a ValueError.
-    """
-
-    snapshots: Sequence[int] = ()
-    callbacks: Sequence[Callback] = ()
-
-    def __post_init__(self) -> None:
-        for name in ("snapshots", "callbacks"):
-            object.__setattr__(self, name, as_tuple(getattr(self, name), name))
-        if invalid := [callback for callback in self.callbacks if not callable(callback)]:
-            raise ValueError(f"expected callbacks that can be called, got {quoted(invalid[0])}")
-
-
 @dataclass(frozen=True, repr=False, eq=False)
 class Flow(Pictured):
     """The result of a flow: the field u, float32 `(Z, Y, X)`, its mean (`mass`), and whether the field is a shape.
 
-    The `status` is a sentence that says how the flow ended. Coefficients and ε are numbers, or tensors that vary in
-    space, in the unit of the grid's spacing. The seed is None where the flow started from a field. Snapshots are fields
-    by the number of steps after which they were taken.
+    The `status` is a sentence that says how the flow ended. Coefficients are numbers, or tensors that vary in
+    space; they and ε are in the unit of the grid's spacing. The seed is None where the flow started from a field.
     """
 
     field: Tensor
@@ -107,9 +87,8 @@ class Flow(Pictured):
     schedule: Schedule
     seed: int | None
     mass: float
-    snapshots: Mapping[int, Tensor]
     coefficients: Coefficients
-    epsilon: float | Tensor
+    epsilon: float
 
     def __repr__(self) -> str:
         """Return one line with voxels, energy, viability and status."""
@@ -130,7 +109,7 @@ def is_well_formed(end: Viability) -> bool:
     return end.viable and all(FORMED[0] < extent < FORMED[1] for extent in (end.highest, -end.lowest))
 
 
-def viability(u: Float[Tensor, "z y x"], grid: Grid, epsilon: float | Tensor) -> Viability:
+def viability(u: Float[Tensor, "z y x"], grid: Grid, epsilon: float) -> Viability:
     """Test discrepancy ratio < 0.75, max u > 0.1 and min u < -0.1 (paper, Experiment 4)."""
     highest, lowest = float(u.max()), float(u.min())
     ratio = _discrepancy(u, grid, epsilon)
@@ -138,16 +117,15 @@ def viability(u: Float[Tensor, "z y x"], grid: Grid, epsilon: float | Tensor) ->
     return Viability(ratio, highest, lowest, not reason, reason)
 
 
-def _discrepancy(u: Tensor, grid: Grid, epsilon: float | Tensor) -> float:
+def _discrepancy(u: Tensor, grid: Grid, epsilon: float) -> float:
     """Return ∫|ε/2 |∇u|² - W(u)/ε| / 𝓐_ε, from 0 (the optimal profile) to 1, a few planes at a time to save memory."""
     Z, Y, X = grid.shape
-    ε = epsilon.expand(grid.shape) if isinstance(epsilon, Tensor) else epsilon
     difference = total = 0.0
     for planes in torch.arange(Z).tensor_split(max(1, Z // 16)):  # some 16 planes at a time
         padded = torch.arange(int(planes[0]) - 1, int(planes[-1]) + 2)  # with the neighbours that differences need
         padded = padded % Z if grid.periodic else padded.clamp(0, Z - 1)
         slab = Grid((len(padded), Y, X), grid.spacing, grid.boundary)
-        densities = cahn_hilliard_parts(u[padded], slab, ε[padded] if isinstance(ε, Tensor) else ε)
+        densities = cahn_hilliard_parts(u[padded], slab, epsilon)
         slope, well = (density[1:-1].double() for density in densities)
         difference += float((slope - well).abs().sum())
         total += float((slope + well).sum())

@@ -79,10 +79,6 @@ class Schedule:
         check_open_interval(total, "phases with shares below 1 in all", -1, 1)
         object.__setattr__(self, "opening", phases)
 
-    def check_step(self, step: int) -> int:
-        """Return the number of steps after which a snapshot is due, or raise ValueError where it is out of range."""
-        return check_int(step, f"snapshots at 0 to {self.steps} steps", 0, self.steps)
-
     def rate(self, step: int) -> float:
         """Return the length of a step, numbered from 0 to steps - 1."""
         phase, first, count = self._find_phase(step)
@@ -168,15 +164,3 @@ def choose_schedule(laws: Sequence[Law], stated: str | Schedule | None = None) -
     """Return the stated schedule; where none is, that of the laws, and `fast` where these differ."""
     names = {law.schedule for law in laws}
     return schedule((names.pop() if len(names) == 1 else "fast") if stated is None else stated)
-
-
-def present_name(fields: dict[str, Any]) -> str:
-    """Return today's name, in `SCHEDULES`, of a schedule recorded by `Schedule.as_dict`; its own name if it has none.
-
-    The name and the number of steps of a record do not count: schedules were renamed, and users choose the steps.
-    """
-    recorded = Schedule(**fields)
-    for name, today in SCHEDULES.items():
-        if dataclasses.replace(today, name=recorded.name, steps=recorded.steps) == recorded:
-            return name
-    return recorded.name

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from curvafit.generation.problem import Cost, DivergenceForm, Form
 from curvafit.priors import kernels
-from curvafit.priors.energies import energy_gradient, energy_gradient_by_autograd
+from curvafit.priors.energies import energy_gradient
 
 #: The number that Adam adds to the root, as published instead of the usual 1e-8; shapes depend on it.
 ADAM_EPS = 1e-2
@@ -25,7 +25,7 @@ FIRST_MOVE = 1e-2
 
 
 class Statistics(NamedTuple):
-    """F_ε, and maximum and mean of the modulus of its gradient over free parameters."""
+    """F_ε, and maximum and mean of the modulus of its gradient over the parameters."""
 
     energy: float
     gradient_max: float
@@ -80,18 +80,14 @@ class Stepper(Protocol):
 class FusedStepper(Stepper):
     """The flow of Algorithm 1 on a processor, by fused kernels; `step(None)` advances Adam's moments all the same."""
 
-    def __init__(
-        self, start: Tensor, form: DivergenceForm, cost: Cost, betas: tuple[float, float], frozen: Tensor | None
-    ) -> None:
+    def __init__(self, start: Tensor, form: DivergenceForm, cost: Cost, betas: tuple[float, float]) -> None:
         from curvafit.priors.kernels.cpu import FusedFlow
 
         base = form.base.numpy() if isinstance(form.base, Tensor) else form.base
-        a, epsilon, Q = kernels.to_numpy_cost(cost.coefficients, cost.grid, cost.epsilon, cost.orientation)
-        frozen_voxels = None if frozen is None else torch.as_tensor(frozen).numpy()
+        a, Q = kernels.to_numpy_cost(cost.coefficients, cost.grid, cost.orientation)
         self._flow = FusedFlow(
-            start.numpy(), base, a, cost.grid, epsilon, cost.blur, frozen_voxels,
-            betas=betas, adam_eps=ADAM_EPS, orientation=Q,
-        )  # fmt: skip
+            start.numpy(), base, a, cost.grid, cost.epsilon, cost.blur, betas=betas, adam_eps=ADAM_EPS, orientation=Q
+        )
         self.betas, self._statistics = betas, Statistics(0.0, 0.0, 0.0)
 
     def step(self, rate: float | None) -> None:
@@ -119,25 +115,18 @@ class FusedStepper(Stepper):
 
 
 class TorchStepper(Stepper):
-    """Adam on the parameters of a form, on any device, where its whole state stays.
-
-    `fused` takes the energy's gradient from a fused kernel where there is one, instead of from autograd. `frozen` are
-    the voxels `(Z, Y, X)` whose parameters stay.
-    """
+    """Adam on the parameters of a form, on any device, where its whole state stays."""
 
     def __init__(
-        self, start: Tensor, form: Form, cost: Cost, betas: tuple[float, float], frozen: Tensor | None,
-        device: torch.device | str, *, fused: bool = False,
-    ) -> None:  # fmt: skip
+        self, start: Tensor, form: Form, cost: Cost, betas: tuple[float, float], device: torch.device | str
+    ) -> None:
         def move(value):
             return value.to(device, torch.float32) if isinstance(value, Tensor) and value.dim() > 0 else value
 
         self._form = replace(form, base=move(form.base)) if isinstance(form, DivergenceForm) else form
         self.betas = betas
         self._data = None if cost.data is None else cost.data.to(device)
-        self._cost = [*map(move, cost.coefficients)], cost.grid, move(cost.epsilon), move(cost.orientation)
-        self._energy_gradient = energy_gradient if fused else energy_gradient_by_autograd
-        self._free = None if frozen is None else ~torch.as_tensor(frozen, dtype=torch.bool, device=device)
+        self._cost = [*map(move, cost.coefficients)], cost.grid, cost.epsilon, move(cost.orientation)
         self._parameters = start.to(device).clone()
         self._value: Tensor | float = 0.0
         self._u = self._gradient = self._parameters
@@ -153,12 +142,11 @@ class TorchStepper(Stepper):
     def _evaluate(self, parameters: Tensor, offset: Tensor) -> tuple[Tensor | float, Tensor, Tensor]:
         """Return the energy, u, and the energy's gradient with respect to the parameters."""
         u = self._form.field(parameters) + offset
-        value, gradient_u = self._energy_gradient(u, *self._cost)
+        value, gradient_u = energy_gradient(u, *self._cost)
         if self._data is not None:
             data_value, data_gradient = self._data.slope(u, self._form.grid)
             value, gradient_u = value + data_value, gradient_u + data_gradient
-        gradient = self._form.pullback(gradient_u)
-        return value, u, gradient if self._free is None else gradient * self._free
+        return value, u, self._form.pullback(gradient_u)
 
     def step(self, rate: float | None) -> None:
         self._statistics = None
@@ -185,8 +173,7 @@ class TorchStepper(Stepper):
     def statistics(self) -> Statistics:
         if self._statistics is None:
             moduli = self._gradient.abs()
-            count = moduli.numel() if self._free is None else int(self._free.expand_as(moduli).sum())
-            mean = float(moduli.sum(dtype=torch.float64)) / max(1, count)
+            mean = float(moduli.mean(dtype=torch.float64))
             self._statistics = Statistics(float(self._value), float(moduli.amax()), mean)
         return self._statistics
 
@@ -201,11 +188,17 @@ class TorchStepper(Stepper):
 
     def state(self) -> dict[str, Any]:
         point = {"parameters": self._parameters, "offset": self._offset, "stalled": self.stalled}
-        return {**point, "moments": list(self._moments), "taken": self._taken}
+        return {**point, "optimiser": self._optimiser_state()}
 
     def restore(self, state: dict[str, Any]) -> None:
         self._parameters.copy_(state["parameters"])
         self._offset, self.stalled = state["offset"].to(self._offset.device), state["stalled"]
+        self._restore_optimiser(state["optimiser"])
+
+    def _optimiser_state(self) -> dict[Any, Any]:
+        return {"moments": list(self._moments), "taken": self._taken}
+
+    def _restore_optimiser(self, state: dict[Any, Any]) -> None:
         for moment, saved in zip(self._moments, state["moments"], strict=True):
             moment.copy_(saved)
         self._taken = state["taken"]
@@ -261,12 +254,9 @@ class LbfgsStepper(TorchStepper):
         super().shift(amount)
         self._cached = None
 
-    def state(self) -> dict[str, Any]:
-        point = {"parameters": self._parameters, "offset": self._offset, "stalled": self.stalled}
-        return {**point, "optimiser": self._optimiser.state_dict()["state"]}
+    def _optimiser_state(self) -> dict[Any, Any]:
+        return self._optimiser.state_dict()["state"]
 
-    def restore(self, state: dict[str, Any]) -> None:
-        self._parameters.copy_(state["parameters"])
-        self._offset, self.stalled = state["offset"].to(self._offset.device), state["stalled"]
+    def _restore_optimiser(self, state: dict[Any, Any]) -> None:
         groups = self._optimiser.state_dict()["param_groups"]
-        self._optimiser.load_state_dict({"state": state["optimiser"], "param_groups": groups})
+        self._optimiser.load_state_dict({"state": state, "param_groups": groups})

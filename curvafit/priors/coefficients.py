@@ -56,11 +56,6 @@ class Coefficients:
     def __iter__(self):
         return (getattr(self, name) for name in NAMES)
 
-    def tensor(self, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None) -> Tensor:
-        """Return the six values stacked along a first axis, `(6,)` or `(6, *shape)`; differentiable."""
-        values = [torch.as_tensor(value, dtype=dtype, device=device) for value in self]
-        return torch.stack(torch.broadcast_tensors(*values))
-
     def polynomial(self, kappa1, kappa2):
         """Return p(κ1, κ2), elementwise."""
         quadratic = self.a20 * kappa1**2 + self.a11 * kappa1 * kappa2 + self.a02 * kappa2**2
@@ -112,15 +107,13 @@ class Coefficients:
         return {name: float(value) for name, value in zip(NAMES, self, strict=True)}
 
 
-def check_strengths(
-    coefficients: Iterable[float | Tensor], epsilon: float | Tensor, orientation: Tensor | None = None
-) -> None:
+def check_strengths(coefficients: Iterable[float | Tensor], epsilon: float, orientation: Tensor | None = None) -> None:
     """Raise ValueError where a coefficient, or the orientation, exceeds `STRONGEST` with lengths in units of ε."""
     terms = [(name, value, POWERS[name]) for name, value in zip(NAMES, coefficients, strict=True)]
     if orientation is not None:
         terms.append(("the orientation", orientation, POWERS["a00"]))
     for name, value, power in terms:
-        strength = _largest(value) * _largest(epsilon) ** power
+        strength = _largest(value) * epsilon**power
         if not strength <= STRONGEST:
             unit = {0: "", 1: " epsilon", 2: " epsilon²"}[power]
             raise ValueError(f"expected |{name}|{unit} of at most {STRONGEST:g}, got {strength:.3g}")

@@ -54,7 +54,7 @@ def jet(u: Tensor, grid: Grid) -> Jet:
     return Jet(u, gradient(u, grid), hessian(u, grid))
 
 
-def second_form(field: Jet, epsilon: float | Tensor) -> SecondForm:
+def second_form(field: Jet, epsilon: float) -> SecondForm:
     """Return the invariants of M_ε = -ε Hess u + W'(u)/ε n⊗n (paper, eq. 7), where n⊗n = ∇u⊗∇u / (|∇u|² + ξ²).
 
     ε is a number or a tensor that broadcasts with the field. For the derivative of the root see `positive_root`.
@@ -87,7 +87,7 @@ def positive_root(square: Tensor, squares: Tensor) -> Tensor:
     return torch.where(resolved, square, square.detach().clamp_min(ROOT_FLOOR)).sqrt()
 
 
-def diffuse_curvatures(field: Jet, epsilon: float | Tensor) -> Curvatures:
+def diffuse_curvatures(field: Jet, epsilon: float) -> Curvatures:
     """Return κ1, κ2 = (Tr M ± √(2|M|² - (Tr M)²)⁺) / 2ε|∇u|, H and K (paper, eqs. 15 to 18)."""
     trace, norm2, root, slope = second_form(field, epsilon)
     denominator = 2 * epsilon * slope

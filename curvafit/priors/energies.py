@@ -25,7 +25,7 @@ def energy(
     u: Float[Tensor, "*batch z y x"],
     coefficients: Iterable[float | Tensor],
     grid: Grid,
-    epsilon: float | Tensor,
+    epsilon: float,
     orientation: Float[Tensor, "3 3"] | None = None,
     mask: Tensor | None = None,
 ) -> Float[Tensor, "*batch"]:
@@ -38,18 +38,18 @@ def energy(
     coefficients
         `Coefficients`, or six numbers, or tensors that broadcast with `u` (`(batch, 1, 1, 1)` for one set per field).
     grid, epsilon
-        The sampling, and the interface parameter in spacing's unit: a number, or a tensor that broadcasts with `u`.
+        The sampling, and the interface parameter in spacing's unit.
     orientation
         Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x; see `orientation`.
     mask
         Weights of the density, which broadcast with `u`.
     """
-    field, ε = jet(u, grid), _match_field(epsilon, u)
-    terms = energy_terms(field, ε).unbind(-4)
+    field = jet(u, grid)
+    terms = energy_terms(field, epsilon).unbind(-4)
     weighted = (_match_field(a, u) * term for a, term in zip(coefficients, terms, strict=True))
     per_voxel = sum(weighted, start=torch.zeros_like(u))
     if orientation is not None:
-        per_voxel = per_voxel + ε * orientation_form(field.gradient, orientation)
+        per_voxel = per_voxel + epsilon * orientation_form(field.gradient, orientation)
     if mask is not None:
         per_voxel = per_voxel * mask.to(u)
     return per_voxel.sum((-3, -2, -1)) * grid.voxel_volume
@@ -59,7 +59,7 @@ def energy_gradient(
     u: Tensor,
     coefficients: Iterable[float | Tensor],
     grid: Grid,
-    epsilon: float | Tensor,
+    epsilon: float,
     orientation: Tensor | None = None,
     mask: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
@@ -72,9 +72,9 @@ def energy_gradient(
         return energy_gradient_by_autograd(u, coefficients, grid, epsilon, orientation, mask)
     from curvafit.priors.kernels import cpu
 
-    a, ε, Q = kernels.to_numpy_cost(coefficients, grid, epsilon, orientation)
+    a, Q = kernels.to_numpy_cost(coefficients, grid, orientation)
     weights = None if mask is None else mask.detach().numpy()
-    value, du = cpu.fused_energy_gradient(u.detach().numpy(), a, grid, ε, Q, weights)
+    value, du = cpu.fused_energy_gradient(u.detach().numpy(), a, grid, epsilon, Q, weights)
     return torch.tensor(value, dtype=torch.float64), torch.from_numpy(du)
 
 
@@ -83,18 +83,10 @@ def energy_gradient_by_autograd(u: Tensor, *cost: Any) -> tuple[Tensor, Tensor]:
 
     `cost` are the other arguments of `energy`.
     """
-
-    def sum_energies(u: Tensor) -> tuple[Tensor, Tensor]:
-        values = energy(u, *cost)
-        return values.sum(), values
-
-    if torch.compiler.is_compiling():  # compilers read only `torch.func.grad`, which takes more memory uncompiled
-        gradients, values = torch.func.grad(sum_energies, has_aux=True)(u)
-        return values, gradients
     leaf = u.detach().requires_grad_()
     with torch.enable_grad():
-        total, values = sum_energies(leaf)
-        (gradients,) = torch.autograd.grad(total, leaf)
+        values = energy(leaf, *cost)
+        (gradients,) = torch.autograd.grad(values.sum(), leaf)
     return values.detach(), gradients
 
 
@@ -124,7 +116,7 @@ def orientation_form(slope: Float[Tensor, "*batch 3 z y x"], orientation: Float[
     return torch.einsum("ij,...izyx,...jzyx->...zyx", Q, slope, slope)
 
 
-def energy_terms(field: Jet, epsilon: float | Tensor) -> Float[Tensor, "*batch 6 z y x"]:
+def energy_terms(field: Jet, epsilon: float) -> Float[Tensor, "*batch 6 z y x"]:
     """Return the six densities, stacked on axis -4, that a20, a11, a02, a10, a01 and a00 multiply in F_ε (eq. 20).
 
     With R = √(2|M|² - (Tr M)²)⁺, the density of κ1² is (|M|² + R Tr M)/2ε and that of κ2² (|M|² - R Tr M)/2ε, since
@@ -145,16 +137,16 @@ def energy_terms(field: Jet, epsilon: float | Tensor) -> Float[Tensor, "*batch 6
     return torch.stack(terms, -4)
 
 
-def cahn_hilliard_area(u: Tensor, grid: Grid, epsilon: float | Tensor) -> Tensor:
+def cahn_hilliard_area(u: Tensor, grid: Grid, epsilon: float) -> Tensor:
     """Return 𝓐_ε(u) = ∫ ε/2 |∇u|² + W(u)/ε, about σ × area (paper, eq. 8)."""
     gradient_part, well_part = cahn_hilliard_parts(u, grid, epsilon)
     return (gradient_part + well_part).sum((-3, -2, -1)) * grid.voxel_volume
 
 
-def cahn_hilliard_parts(u: Tensor, grid: Grid, epsilon: float | Tensor) -> tuple[Tensor, Tensor]:
+def cahn_hilliard_parts(u: Tensor, grid: Grid, epsilon: float) -> tuple[Tensor, Tensor]:
     """Return ε/2 |∇u|² and W(u)/ε in every voxel."""
-    ε, slope2 = _match_field(epsilon, u), gradient(u, grid).square().sum(-4)
-    return ε / 2 * slope2, double_well(u) / ε
+    slope2 = gradient(u, grid).square().sum(-4)
+    return epsilon / 2 * slope2, double_well(u) / epsilon
 
 
 def _match_field(value: float | Tensor, u: Tensor) -> float | Tensor:

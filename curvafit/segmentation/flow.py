@@ -16,9 +16,8 @@ from curvafit.core.checks import LONGEST, SHORTEST, check_float, check_int
 from curvafit.core.runtime import Progress, silent
 from curvafit.core.units import unit_name
 from curvafit.core.workers import Cluster
-from curvafit.generation.flow import WORKING_BLUR, Flow, Optimiser, descend
+from curvafit.generation.flow import WORKING_BLUR, Flow, descend
 from curvafit.generation.problem import Data
-from curvafit.generation.result import Watch
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.grid import MOST, WORKING_EPSILON, Grid
 from curvafit.priors.loss import RESOLVED, choose_refinement
@@ -97,9 +96,10 @@ def lower_energy(
         law.scale(BENDING / bending(law)).in_unit(grid.unit),
         grid.grid,
         data=data,
-        optimiser=Optimiser("adam", steps),
+        method="adam",
+        steps=steps,
         blur=WORKING_BLUR,
-        watch=Watch(callbacks=[lambda step, total, _: progress("lowering the energy", step / total)]),
+        callbacks=[lambda step, total, _: progress("lowering the energy", step / total)],
     )
     if not flow.finite:
         raise ScanError(f"the energy did not stay finite ({flow.status}): lower the weight")

@@ -22,9 +22,9 @@ def has_kernel(device: torch.device | str) -> bool:
 
 
 def to_numpy_cost(
-    coefficients: Iterable[float | Tensor], grid: Grid, epsilon: float | Tensor, orientation: Tensor | None
-) -> tuple[list[float | np.ndarray], float | np.ndarray, np.ndarray | None]:
-    """Return coefficients, ε and orientation as `cpu` takes them: numbers, or arrays `(Z, Y, X)` if they vary."""
+    coefficients: Iterable[float | Tensor], grid: Grid, orientation: Tensor | None
+) -> tuple[list[float | np.ndarray], np.ndarray | None]:
+    """Return coefficients and orientation as `cpu` takes them: numbers, or arrays `(Z, Y, X)` if they vary."""
 
     def to_numpy(value: float | Tensor) -> float | np.ndarray:
         if not isinstance(value, Tensor) or value.dim() == 0:
@@ -32,7 +32,7 @@ def to_numpy_cost(
         return value.detach().double().expand(grid.shape).numpy()
 
     Q = None if orientation is None else orientation.double().numpy()
-    return [to_numpy(value) for value in coefficients], to_numpy(epsilon), Q
+    return [to_numpy(value) for value in coefficients], Q
 
 
 def gaussian_blur(u: Tensor, grid: Grid, width: float) -> Tensor:

@@ -41,7 +41,7 @@ def fused_energy_gradient(
 ) -> tuple[float, np.ndarray]:
     """Return F_ε(u) and its gradient in float32, as `energies.energy_gradient` does, from arrays `(Z, Y, X)`.
 
-    The coefficients (a20 first) and ε are numbers, or arrays where they vary.
+    The coefficients (a20 first) are numbers, or arrays where they vary.
     """
     density = _Density(a, grid, epsilon, _choose_threads(grid), orientation, mask)
     gradient = _make_volume(grid)
@@ -61,14 +61,11 @@ def gaussian_blur(u: np.ndarray, grid: Grid, width: float) -> np.ndarray:
 class FusedFlow:
     """The flow u = k ∗ (div A + base) under Adam on A, stepped in place; its cost is as in `fused_energy_gradient`.
 
-    `start` is A at the first step, `(3, Z, Y, X)`, components z, y, x; None for zeros, to be filled in place through
-    `vector`. `base` is k ∗ base: the mass m₀, or a blurred field. `width` is the blur's standard deviation in spacing's
-    unit; A is constant in `frozen` voxels; `betas` and `adam_eps` are `torch.optim.Adam`'s.
+    `start` is A at the first step, `(3, Z, Y, X)`, components z, y, x. `base` is k ∗ base: the mass m₀, or a blurred
+    field. `width` is the blur's standard deviation in spacing's unit; `betas` and `adam_eps` are `torch.optim.Adam`'s.
     """
 
-    def __init__(
-        self, start, base, a, grid: Grid, epsilon, width: float, frozen=None, *, betas, adam_eps, orientation=None
-    ) -> None:  # fmt: skip
+    def __init__(self, start, base, a, grid: Grid, epsilon, width: float, *, betas, adam_eps, orientation=None) -> None:
         Z, Y, X = grid.shape
         self.grid, self.taken = grid, 0
         self._adam_eps = adam_eps
@@ -79,16 +76,10 @@ class FusedFlow:
         self._vector, self._first, self._second = (_make_zeros(3 * voxels + 2 * SLACK) for _ in range(3))
         #: Whether `_gradient` holds div A, blurred along y and x, which the last step computed for the next one.
         self._divergence_ready = False
-        if start is not None:
-            self.vector[...] = start
+        self.vector[...] = start
         self._half = np.array([0.5 / h for h in grid.spacing], np.float32)
         self._blur, self._density = _Blur(grid, width, threads), _Density(a, grid, epsilon, threads, orientation)
         self._mass, self._base = (base, _NO_FIELD) if np.ndim(base) == 0 else (0.0, _pad_field(base, grid))
-        self._keep, self._free_count = np.empty(0, np.float32), 3 * voxels
-        if frozen is not None:
-            self._keep = _make_zeros(voxels + 2 * SLACK)
-            self._keep[SLACK:-SLACK] = 1 - np.asarray(frozen, np.float32).ravel()
-            self._free_count = 3 * int(np.count_nonzero(self._keep))
         self._field, self._gradient, self._gradient_along_z = (_make_volume(grid) for _ in range(3))
         #: Of each plane, the sum of |∂F_ε/∂A|, and the bits of its maximum (see `loops._measure_sizes`).
         self._sums, self._highest = np.empty(Z), np.empty(Z, np.int32)
@@ -145,12 +136,12 @@ class FusedFlow:
         self._adam_step(MOVE, adam)
         self._adam_step(ENDS, adam)
         highest, total = self._highest.max().view(np.float32), self._sums.sum()
-        return float(highest), float(total) / max(1, self._free_count)
+        return float(highest), float(total) / (3 * math.prod(self.grid.shape))
 
     def _adam_step(self, phase: int, adam: np.ndarray) -> None:
         """Run a phase of `loops.adam_step`, the last pass of a step."""
         loops.adam_step(
-            self._threads, phase, self._gradient_along_z, self._vector, self._first, self._second, self._keep,
+            self._threads, phase, self._gradient_along_z, self._vector, self._first, self._second,
             self._gradient, self._blur.rows, self._rings, self._slopes, self._fluxes, self._sums, self._highest,
             self._half, adam, self.grid.shape, self.grid.periodic, self._index_z, self._blur.planes,
         )  # fmt: skip
@@ -197,14 +188,14 @@ class _Density:
         self._grid, self._threads = grid, threads
         self._block, self._tile = max(1, min(8, _BLOCK // stride)), min(Y, max(8, _TILE // stride))
         weights, ratios = _compute_weights(a, grid, epsilon), _compute_ratios(grid)
-        self._constants = _make_constants(weights, grid)
+        self._constants = _make_constants(weights, grid, epsilon)
         #: `ratios`, `orient`, `local` and `table` of `loops._differentiate`: None where the loop can do without.
         self._optional = (ratios, None, None, None)
         ratios = _RATIOS if ratios is None else ratios  # the cases below have one compiled form each
         if orientation is not None or any(np.ndim(value) > 0 for value in weights):
-            weights.append(_check_voxelwise(epsilon, grid) * grid.voxel_volume / (2 * grid.spacing[2]) ** 2)
+            weights.append(epsilon * grid.voxel_volume / (2 * grid.spacing[2]) ** 2)
             if mask is not None:
-                weights[1:] = [value * _check_voxelwise(mask, grid) for value in weights[1:]]
+                weights = [value * mask for value in weights]
             self._optional = ratios, _mirror_orientation(orientation, grid), *_join_weights(weights, self._block, grid)
         elif mask is not None:
             self._optional = (ratios, None, _pad_field(np.asarray(mask), grid), None)
@@ -294,28 +285,19 @@ def _continue_index(n: int, before: int, after: int, periodic: bool) -> np.ndarr
     return np.pad(np.arange(n), (before, after), mode="wrap" if periodic else "symmetric")
 
 
-def _check_voxelwise(value, grid: Grid):
-    """Return a number in float64, or an array with a value for every voxel."""
-    value = np.asarray(value)
-    if value.ndim and value.shape != grid.shape:
-        raise ValueError(f"expected a number or an array of shape {grid.shape}, got one of shape {value.shape}")
-    return value if value.ndim else float(value)
-
-
 def _compute_weights(a, grid: Grid, epsilon) -> list:
-    """Return (h/ε)² and the weights of X, T², TS, GT, GS and s in the density, numbers or arrays where they vary.
+    """Return the weights of X, T², TS, GT, GS and s in the density, numbers or arrays where they vary.
 
     Differences are in units of the spacing h along x: with g = 2h∇u, D = h² Hess u, T = (ε/h²) T', where
     T' = w (h/ε)² r - tr D, and likewise X and P. The voxel's volume is included.
     """
-    a20, a11, a02, a10, a01, a00 = (_check_voxelwise(value, grid) for value in a)
-    ε, h = _check_voxelwise(epsilon, grid), grid.spacing[2]
+    a20, a11, a02, a10, a01, a00 = a
+    h = grid.spacing[2]
     # In eq. 20, |M|²/2ε has (ε/h²)² and the ½ of |M|² = (X + T²)/2, |∇u|/2 has G/2h, and |∇u|² has s/4h²: with the
     # factors 0.75 and 0.5 below, all three are ε V / 4h^power.
-    second, first, zeroth = (ε * (grid.voxel_volume / (power * h**power)) for power in (4, 3, 2))
+    second, first, zeroth = (epsilon * grid.voxel_volume / (power * h**power) for power in (4, 3, 2))
     X = (a20 + a02 - a11) * second
     return [
-        (h / ε) ** 2,
         X,
         2 * a11 * second + X,
         2 * (a20 - a02) * second,
@@ -325,15 +307,12 @@ def _compute_weights(a, grid: Grid, epsilon) -> list:
     ]
 
 
-def _make_constants(weights: list, grid: Grid) -> np.ndarray:
+def _make_constants(weights: list, grid: Grid, epsilon: float) -> np.ndarray:
     """Return the constants `k` of `loops._differentiate`: ξ², literals, weights that do not vary, `ROOT_ROUNDING`."""
     h = grid.spacing[2]
-    well, *terms = (float(value) if np.ndim(value) == 0 else math.nan for value in weights)
-    # The floor of X in units of (ε/h²)², without the factor (h/ε)² where that may vary.
-    floor = ROOT_FLOOR * h**2
-    if all(np.ndim(value) == 0 for value in weights):
-        floor *= well
-    X, T2, *_, s = terms
+    well = (h / epsilon) ** 2
+    floor = ROOT_FLOOR * h**2 * well  # of X, in units of (ε/h²)²
+    X, T2, *_, s = terms = [float(value) if np.ndim(value) == 0 else math.nan for value in weights]
     literals = (0, 0.5, 0.25, 1, 2, 3)
     constants = [(2 * h * XI) ** 2, *literals, well, floor, *terms, 2 * X, 2 * T2, 2 * s, ROOT_ROUNDING]
     return np.array(constants, np.float32)

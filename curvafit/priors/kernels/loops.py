@@ -292,7 +292,8 @@ def _read(local, table, which, cell):
 def _read_cost(k, local, table, cell):
     """Read (h/ε)², the floor of X, the weights of X, T², TS, GT, GS and s, and twice those of X, T² and s.
 
-    They are constants of `k` where `local` is None; these times the mask `local` where `table` is None; else arrays.
+    The weights are constants of `k` where `local` is None; these times the mask `local` where `table` is None; else
+    arrays.
     """
     if local is None:
         return (
@@ -305,10 +306,9 @@ def _read_cost(k, local, table, cell):
             _fill(k[7]), _fill(k[8]), mask * k[9], mask * k[10], mask * k[11], mask * k[12], mask * k[13], mask * k[14],
             mask * k[15], mask * k[16], mask * k[17],
         )  # fmt: skip
-    well, X, T2 = _read(local, table, 0, cell), _read(local, table, 1, cell), _read(local, table, 2, cell)
-    TS, GT = _read(local, table, 3, cell), _read(local, table, 4, cell)
-    GS, s = _read(local, table, 5, cell), _read(local, table, 6, cell)
-    return well, well * k[8], X, T2, TS, GT, GS, s, X + X, T2 + T2, s + s
+    X, T2, TS = _read(local, table, 0, cell), _read(local, table, 1, cell), _read(local, table, 2, cell)
+    GT, GS, s = _read(local, table, 3, cell), _read(local, table, 4, cell), _read(local, table, 5, cell)
+    return _fill(k[7]), _fill(k[8]), X, T2, TS, GT, GS, s, X + X, T2 + T2, s + s
 
 
 @njit(**_SERIAL)
@@ -322,7 +322,7 @@ def _mirror(orient, across_z, across_y):
 @njit(**_SERIAL)
 def _tilt(gz, gy, gx, orient, local, table, cell, i):
     """Compute Q∇u times the weight of ∇uᵀQ∇u; the signs in `local` are negative where x is mirrored."""
-    weight, sign = _read(local, table, 7, cell), _load(local, table[8, 0] + i)
+    weight, sign = _read(local, table, 6, cell), _load(local, table[7, 0] + i)
     gz, gy, gx = weight * gz, weight * gy, weight * gx
     across = sign * gx
     tz = gz * orient[0] + gy * orient[3] + across * orient[4]
@@ -721,15 +721,11 @@ def _measure_sizes(slopes, n):
 
 
 @njit(**_INLINE)
-def _adam_rows(A, m, v, o, keep, keep_at, slopes, n, adam):
+def _adam_rows(A, m, v, o, slopes, n, adam):
     """Make Adam's step on n samples of a component, from `o` on, by n slopes; `m` and `v` are Adam's moments.
 
-    `adam` is 1 - β1, β2, 1 - β2, the corrected rate, the corrected factor of √v, and eps. Slopes are multiplied by
-    `keep`, from `keep_at` on, where it is not empty.
+    `adam` is 1 - β1, β2, 1 - β2, the corrected rate, the corrected factor of √v, and eps.
     """
-    if keep.size > 0:
-        for i in range(n):
-            slopes[_at(i)] *= keep[_at(keep_at + i)]
     for i in range(n):
         slope = slopes[_at(i)]
         first = m[_at(o + i)]
@@ -742,11 +738,11 @@ def _adam_rows(A, m, v, o, keep, keep_at, slopes, n, adam):
 
 
 @njit(**_INLINE)
-def _adam_plane(A, m, v, keep, ring, slopes, below, here, above, half, adam, z, shape):
+def _adam_plane(A, m, v, ring, slopes, below, here, above, half, adam, z, shape):
     """Make Adam's step of plane z of A along -∇, some rows at a time; return `_measure_sizes` of the plane's slopes.
 
     `below`, `here`, `above` are the first samples' offsets in the ring, which has planes with continued borders; A and
-    the moments have none. `half` is 1 / 2h along each axis, `keep` 0 where A is frozen.
+    the moments have none. `half` is 1 / 2h along each axis.
     """
     Z, Y, X = shape
     stride, whole = X + 2 * EDGE, (X + LANES - 1) & -LANES
@@ -765,7 +761,7 @@ def _adam_plane(A, m, v, keep, ring, slopes, below, here, above, half, adam, z, 
                 for i in range(whole):
                     difference = ring[_at(before + row + i)] - ring[_at(after + row + i)]
                     slopes[_at(k * X + i)] = difference * half[_at(component)]
-            _adam_rows(A, m, v, component * Z * Y * X + at, keep, at, slopes, count * X, adam)
+            _adam_rows(A, m, v, component * Z * Y * X + at, slopes, count * X, adam)
             rows_total, rows_highest = _measure_sizes(slopes, count * X)
             total += rows_total
             highest = max(highest, rows_highest)
@@ -774,7 +770,7 @@ def _adam_plane(A, m, v, keep, ring, slopes, below, here, above, half, adam, z, 
 
 @njit(**_INLINE)
 def _adam_chunk(
-    chunk, phase, g, A, m, v, keep, next_g, rows, rings, slopes, fluxes, sums, highest, half, adam, shape, periodic,
+    chunk, phase, g, A, m, v, next_g, rows, rings, slopes, fluxes, sums, highest, half, adam, shape, periodic,
     index_z, blur,
 ):  # fmt: skip
     """Make `adam_step`'s step on a chunk of planes."""
@@ -804,13 +800,13 @@ def _adam_chunk(
             if not is_divergence and z > first:
                 below, here = SLACK + (z + 1) % 3 * plane + corner, SLACK + (z + 2) % 3 * plane + corner
                 sums[z - 1], highest[z - 1] = _adam_plane(
-                    A, m, v, keep, rings[chunk], slopes[chunk], below, here, target, half, adam, z - 1, shape
+                    A, m, v, rings[chunk], slopes[chunk], below, here, target, half, adam, z - 1, shape
                 )
 
 
 @partial(Kernel, **_PARALLEL)
 def adam_step(
-    phase, g, A, m, v, keep, out, rows, rings, slopes, fluxes, sums, highest, half, adam, shape, periodic, index_z, blur
+    phase, g, A, m, v, out, rows, rings, slopes, fluxes, sums, highest, half, adam, shape, periodic, index_z, blur
 ):
     """Run the last pass of a step, in the phases `MOVE` and `ENDS`, or compute div A alone, of `ALL` planes.
 
@@ -821,6 +817,6 @@ def adam_step(
     for chunk in prange(rows.shape[0]):
         # numba infers a signed counter but makes an unsigned one: without int64, both would be compiled.
         _adam_chunk(
-            np.int64(chunk), phase, g, A, m, v, keep, out, rows, rings, slopes, fluxes, sums, highest, half, adam,
+            np.int64(chunk), phase, g, A, m, v, out, rows, rings, slopes, fluxes, sums, highest, half, adam,
             shape, periodic, index_z, blur,
         )  # fmt: skip

@@ -114,17 +114,13 @@ def map_threads(function: Callable[[_Item], _Result], items: Iterable[_Item]) ->
     Flows of small boxes are faster so than one after another on all threads, which wait for each other several times a
     step.
     """
-
-    def compute(item: _Item) -> _Result:
-        with one_thread():
-            return function(item)
-
-    threads = count_threads()
+    threads, before = count_threads(), torch.get_num_threads()
     if threads == 1:
         yield from map(function, items)
         return
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            yield from pool.map(compute, items)
-        finally:
-            pool.shutdown(cancel_futures=True)
+    pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
+    try:
+        yield from pool.map(function, items)
+    finally:
+        pool.shutdown(cancel_futures=True)
+        torch.set_num_threads(before)  # the pool's threads have set the number of those to come as well
