@@ -282,8 +282,9 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
     """Return the posterior of a file's header and arrays; raise ValueError where they do not fit together."""
     if not all(np.isfinite(array).all() for array in arrays.values() if array.dtype.kind == "f"):
         raise ValueError("numbers that are not finite")
-    sizes = {field.name: header["architecture"][field.name] for field in fields(Architecture)}
-    architecture = Architecture(**sizes | {"hidden": tuple(sizes["hidden"])})
+    sizes: dict[str, Any] = {field.name: header["architecture"][field.name] for field in fields(Architecture)}
+    sizes["hidden"] = tuple(sizes["hidden"])
+    architecture = Architecture(**sizes)
     views = tuple(str(view) for view in header["views"])
     columns, components = sum(BLOCKS.values()), architecture.components
     arrays = {"departures": np.zeros(0), "discriminant": np.zeros(0)} | arrays  # which earlier files lack

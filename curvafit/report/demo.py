@@ -15,8 +15,8 @@ from curvafit.drawing.plot import diagram_figure, gallery_figure
 from curvafit.inference.candidates import UNBELIEVABLE
 from curvafit.inference.inference import Inference, infer
 from curvafit.report.inference import check_report, describe, describe_scan, write_inference
-from curvafit.report.measures import check_measures, describe_range, thickness_figure, write_measures
-from curvafit.report.page import MARK, Chosen, picture_of, render
+from curvafit.report.measures import check_measures, write_measures
+from curvafit.report.page import MARK, Chosen, outlines_figure, picture_of, render
 from curvafit.scan.measures import Measures
 from curvafit.scan.structure import find_structure
 from curvafit.scan.tiles import measure
@@ -27,6 +27,8 @@ from curvafit.volumes.volume import ScanError, Volume
 
 #: Of this many slices one is kept.
 EVERY = 8
+#: The numbers on the page.
+SHOWN = ("BV/TV", "Tb.Th", "Tb.Sp", "Conn.D", "BS/BV")
 
 
 def write_demo(
@@ -43,7 +45,7 @@ def write_demo(
     folder = check_report(directory, inputs, overwrite)
     check_measures(directory, inputs, overwrite)
     can_write(folder / "demo.html", lambda path: has_mark(path, MARK), overwrite=overwrite)
-    measures = measure(scan, maps=True, progress=sub_progress(progress, 0.0, 0.2))
+    measures = measure(scan, progress=sub_progress(progress, 0.0, 0.2))
     inference = infer(scan, growth=None, progress=sub_progress(progress, 0.2, 0.5))
     if inference.diagram is None:
         raise ScanError(f"expected a scan with a structure: {inference.fit.status}")
@@ -74,12 +76,14 @@ def demo_page(inference: Inference, measures: Measures, shapes: Figure, scores: 
     assert diagram is not None
     λ = inference.prepared.length
     (_, network), *plain = ((name, f"{value:.3f}") for name, value in scores.items())
+    outlines = outlines_figure([""], [measures.outline], measures.unit)
+    numbers = ((measures[symbol].name, *measures[symbol].format(measures.unit)) for symbol in SHOWN)
     return render(
         "demo.html", title=f"{describe(inference)}.", made={}, scan=describe_scan(inference), every=EVERY,
         axis="zyx"[axis], shapes=picture_of(shapes, "Known slices, the filled volume, and the scan"),
         scores=[("the network", Chosen(network)), *((f"plain interpolation, {name}", value) for name, value in plain)],
-        range=describe_range([measures]),
-        thickness=picture_of(thickness_figure(measures), "The thickness at each voxel, on three slices"),
+        numbers=[(name, " ".join(filter(None, number))) for name, *number in numbers],
+        outlines=picture_of(outlines, "Three slices with the outline of what was measured"),
         diagram=picture_of(diagram_figure(diagram, unit=fit.length_unit, length=λ), "The scan's curvature diagram"),
         misfit=fit.misfit, reading=fit.status,
         believed=fit.misfit is not None and fit.misfit.probability >= UNBELIEVABLE,
