@@ -38,9 +38,9 @@ def labyrinth():
     return profile(Gyroid(0.32), centres(grid), 0.02).float(), grid
 
 
-@pytest.fixture(autouse=True)
-def _fused_where_asked(request: pytest.FixtureRequest) -> None:
-    """A test of the fused backend is skipped where numba is not installed."""
-    names = getattr(request.node, "callspec", None)
-    if names is not None and names.params.get("backend") == "fused":
-        pytest.importorskip("numba")
+@pytest.fixture(params=["torch", "fused"])
+def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Flows step in plain torch, as on a GPU, or in the fused kernels."""
+    if request.param == "torch":
+        monkeypatch.setattr("curvafit.priors.kernels.has_kernel", lambda device: False)
+    return request.param

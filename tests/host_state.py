@@ -1,7 +1,7 @@
 """What a program that calls curvafit may have set, and which call changes any of it.
 
-This file, run as a program, makes every public call in a process that has done nothing yet, and prints what each call
-changed, by name. What a first call alone can change, as numbers of threads, shows only there.
+This file, run as a program, makes the calls in a process that has done nothing yet, and prints what each one changed,
+by name. What a first call alone can change, as numbers of threads, shows only there.
 """
 
 import contextlib
@@ -31,7 +31,6 @@ import torch
 
 import curvafit
 from curvafit import priors
-from curvafit.generation.flow import Optimiser
 from curvafit.generation.schedule import schedule
 from curvafit.inference import Growth
 from curvafit.segmentation import Working
@@ -105,13 +104,14 @@ def _digest(value: str | bytes) -> str:
 
 
 def calls(folder: Path) -> dict[str, Callable[[], object]]:
-    """Every public call by name, in the order to make them; later ones take what earlier ones left in `kept`."""
+    """The public calls that start threads, draw or write, by name, in the order to make them; some take what earlier
+    ones left in `kept`."""
     grid, law, brief = priors.Grid((24, 24, 24)), priors.preset("tubes").coefficients, schedule("fast", 50)
     noise = torch.rand((1, 1, 24, 24, 24), generator=torch.Generator().manual_seed(0))
-    u, mse = noise[0, 0], torch.nn.functional.mse_loss
+    mse = torch.nn.functional.mse_loss
     z, y, x = np.mgrid[:24, :24, :24] - 11.5
     ball = (z**2 + y**2 + x**2 < 49).astype(np.uint8)
-    mask, kept = torch.from_numpy(ball > 0), {}
+    kept = {}
 
     def keep(name: str, value: Any) -> None:
         kept[name] = value
@@ -120,13 +120,13 @@ def calls(folder: Path) -> dict[str, Callable[[], object]]:
         value = noise.clone().requires_grad_()
         loss(value, noise.round()).backward()
 
-    def descend(method: Any = "lbfgs", **options: Any) -> object:
-        return curvafit.descend(kept["flow"].field, law, grid, optimiser=Optimiser(method, 2), **options)
+    def descend(method: Any) -> object:
+        return curvafit.descend(kept["flow"].field, law, grid, method=method, steps=2)
 
     def plot() -> None:
         from curvafit.drawing import plot
 
-        plot.png(plot.diagram_figure(kept["diagram"]))
+        plot.png(plot.diagram_figure(curvafit.diagram(kept["flow"].field, grid, 0.02)))
         plot.png(plot.surface_figure(kept["flow"].field.numpy(), width=32))
 
     def infer() -> None:
@@ -136,40 +136,21 @@ def calls(folder: Path) -> dict[str, Callable[[], object]]:
 
     scan, slices, files = curvafit.Volume(200.0 * ball + 1), curvafit.Volume(ball), ("a.nii.gz", "a.tif", "a.ome.tif")
     sized = curvafit.Volume(ball, (2.0, 1.0, 1.0), "um")
-    every = {
-        "Coefficients": lambda: curvafit.Coefficients(1, 2, 6).in_unit(2.0),
-        "Grid": lambda: curvafit.Grid((8, 8, 8)).volume, "__version__": lambda: curvafit.__version__,
-        "preset": lambda: curvafit.preset("tubes"), "energy": lambda: priors.energy(u, law, grid, 0.02),
-        "energy_gradient": lambda: priors.energy_gradient(u, law, grid, 0.02),
-        "energy_terms": lambda: priors.energy_terms(priors.jet(u, grid), 0.02), "jet": lambda: priors.jet(u, grid),
-        "diffuse_curvatures": lambda: priors.diffuse_curvatures(priors.jet(u, grid), 0.02),
-        "geometric_curvatures": lambda: priors.geometric_curvatures(priors.jet(u, grid)),
-        "cahn_hilliard_area": lambda: priors.cahn_hilliard_area(u, grid, 0.02),
-        "orientation": lambda: priors.orientation((1, 0, 0), 2.0),
-        "optimal_profile": lambda: priors.optimal_profile(u, 0.02),
-        "profile_distance": lambda: priors.profile_distance(u, 0.02),
-        "signed_distance": lambda: priors.signed_distance(mask, grid),
-        "phase_field": lambda: priors.phase_field(mask, grid, 0.02),
-        "curvature_prior": lambda: priors.curvature_prior(noise[0], law, (0.01, 0.01, 0.01), 0.02),
+    return {
         "CurvaturePrior": lambda: train(priors.CurvaturePrior("tubes")),
         "CombinedLoss": lambda: train(priors.CombinedLoss(mse, priors.CurvaturePrior("tubes"), 0.1, 2)),
+        "curvature_prior": lambda: priors.curvature_prior(noise[0], law, (0.01, 0.01, 0.01), 0.02),
         "generate": lambda: keep("flow", curvafit.generate("tubes", grid=grid, seed=1)),
-        "descend": lambda: (descend(), descend("adam", flow="h-1")),
-        "diagram": lambda: keep("diagram", curvafit.diagram(kept["flow"].field, grid, 0.02)),
-        "Diagram": lambda: curvafit.Diagram(np.zeros((1, 2)), np.ones(1)),
-        "wasserstein": lambda: curvafit.wasserstein(kept["diagram"], kept["diagram"]), "plot": plot,
-        "Volume": lambda: curvafit.Volume(ball),
+        "descend": lambda: (descend("lbfgs"), descend("adam")),
+        "plot": plot,
         "save": lambda: [curvafit.save(sized, folder / name) for name in (*files, "a.npy", "a.mrc", "a.zarr")],
         "load": lambda: [curvafit.load(path) for path in sorted(folder.glob("a.*"))],
         "segment": lambda: curvafit.segment(scan, "tubes", threshold=100.0, working=Working(steps=2)),
-        "reconstruct": lambda: curvafit.reconstruct(slices, "tubes", every=4, working=Working(steps=2)), "infer": infer,
-        "measure": lambda: curvafit.measure(ball), "measure_instances": lambda: curvafit.measure_instances(ball),
-        "windows": lambda: curvafit.windows((np.indices((24, 24, 36))[2] % 12 < 6).astype(np.uint8), 24, 12),
+        "reconstruct": lambda: curvafit.reconstruct(slices, "tubes", every=4, working=Working(steps=2)),
+        "infer": infer,
+        "measure": lambda: (curvafit.measure(ball), curvafit.measure_instances(ball)),
         "compare": lambda: curvafit.compare(*[[np.roll(ball, k, 0) for k in (0, 1)]] * 2),
-        "read_laws": lambda: priors.read_laws(["tubes", law, folder / "fit.json"]),
-    }  # fmt: skip
-    public = {*curvafit.__all__, *priors.__all__, "__version__"}
-    return {name: call for name, call in every.items() if name in public}
+    }
 
 
 def main() -> None:

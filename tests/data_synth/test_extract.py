@@ -9,7 +9,6 @@ from calling import call, refused
 from exact import Gyroid, centres, profile
 from exact_store import exact_record, exact_store
 
-from curvafit.core.workers import cluster
 from curvafit.data_synth import atlas as measuring
 from curvafit.data_synth.atlas import describe
 from curvafit.geometry.description import BLOCKS, descriptors
@@ -126,19 +125,6 @@ def test_a_stopped_table_goes_on_and_grows(tmp_path: Path, monkeypatch: pytest.M
     grown = describe([store.path], tmp_path / "table.npz")
     assert grown.views.tolist() == whole.views.tolist() + ["scan"] * 5
     assert np.array_equal(grown.descriptors[: len(whole)], whole.descriptors)
-
-
-@pytest.mark.slow
-def test_workers_measure_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    see(monkeypatch, "mask", "scan")
-    store = exact_store(tmp_path / "store", 6)
-    alone = describe([store.path], tmp_path / "alone.npz")
-    with cluster(2) as workers:
-        table = describe([store.path], tmp_path / "table.npz", workers=workers)
-    order, other = (np.lexsort((each.views, each.shapes)) for each in (table, alone))
-    assert np.array_equal(table.shapes[order], alone.shapes[other])
-    expected = alone.descriptors[other]  # a worker has one thread, which sums in another order
-    assert table.descriptors[order] == pytest.approx(expected, rel=1e-3, abs=1e-3, nan_ok=True)
 
 
 def test_a_view_without_a_surface_is_a_row_without_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from curvafit.data_synth import atlas
 from curvafit.data_synth.store import open_store
-from curvafit.generation import SCHEDULES, Execution, Optimiser, Schedule, descend
-from curvafit.generation.loop import FlowOptions, run
+from curvafit.generation import SCHEDULES, Schedule, descend
+from curvafit.generation.loop import Run
 from curvafit.generation.problem import Cost
 from curvafit.generation.result import viability
 from curvafit.generation.stepper import Statistics, Stepper
@@ -59,27 +59,22 @@ class Seen(Stepper):
 @pytest.mark.parametrize("part", ["energy", "gradient", "field"])
 def test_figures_that_are_not_finite_end_a_flow(part: str, step: int, bad: float) -> None:
     assert viability(ball(), GRID, 0.02).viable
-    good, options = Statistics(1.0, 1.0, 1.0), FlowOptions(COST, Schedule("x", 20, 1e-3, 1e-3, "constant"))
-    fine = run(Seen({}), options, 0)
+    good, plan = Statistics(1.0, 1.0, 1.0), Schedule("x", 20, 1e-3, 1e-3, "constant")
+    fine = Run(Seen({}), COST, plan).flow()
     assert fine.finite and fine.viability.viable
     figures = {"energy": good._replace(energy=bad), "gradient": good._replace(gradient_max=bad)}
-    flow = run(Seen({step: figures.get(part, good)}, bad if part == "field" else 0.0), options, 0)
+    flow = Run(Seen({step: figures.get(part, good)}, bad if part == "field" else 0.0), COST, plan).flow()
     at = 0 if part == "field" else step
     assert not flow.finite and not flow.viability.viable
     assert flow.viability.reason == f"the {part} is not finite"
     assert flow.status == f"stopped after {at} of 20 steps: the {part} is not finite"
 
 
-@pytest.mark.parametrize("backend", ["torch", "auto"])
 def test_every_flow_tells_of_a_field_too_large_for_float32(backend) -> None:
     """Its energy is finite in float64."""
-    huge, execution = 1e30 * ball(), Execution(backend)
-    flows = [
-        relax(huge, TUBES, GRID, schedule=RUNAWAY, execution=execution),
-        descend(huge, TUBES, GRID, optimiser=Optimiser(steps=3), execution=execution),
-        descend(huge, TUBES, GRID, optimiser=Optimiser("adam", 3), execution=execution),
-    ]
-    for flow in flows:
+    huge = 1e30 * ball()
+    lowered = [descend(huge, TUBES, GRID, method=method, steps=3) for method in ("lbfgs", "adam")]
+    for flow in (relax(huge, TUBES, GRID, RUNAWAY), *lowered):
         assert "not finite" in flow.status and not flow.viability.viable and not flow.finite
         assert flow.history.step[-1] < flow.schedule.steps
 

@@ -137,14 +137,13 @@ def _geometry(_: Path) -> dict[str, Any]:
 def _flows(_: Path) -> dict[str, Any]:
     """Two shapes grown, and a field lowered."""
     import curvafit
-    from curvafit.generation.flow import Optimiser
     from curvafit.generation.schedule import schedule
     from curvafit.priors import Grid
 
     plan = schedule("fast", steps=30)
     batch = [curvafit.generate("tubes", grid=16, schedule=plan, seed=seed) for seed in (1, 2)]
-    field, brief = torch.from_numpy(_field("field.nii.gz").copy()), Optimiser(steps=10)
-    lowered = curvafit.descend(field, "tubes", Grid((24, 24, 24)), optimiser=brief)
+    field = torch.from_numpy(_field("field.nii.gz").copy())
+    lowered = curvafit.descend(field, "tubes", Grid((24, 24, 24)), steps=10)
     return {"batch": [volume((flow.field > 0).numpy()) for flow in (*batch, lowered)]}
 
 

@@ -36,26 +36,6 @@ def ome(path: Path, values: np.ndarray | None = None, axes: str = "ZYX", **sizes
     return path
 
 
-def test_a_unit_for_each_axis(tmp_path: Path) -> None:
-    """ImageJ's `yunit` and `zunit`, OME's and NRRD's units are converted to that of x."""
-    for more, spacing in (
-        ({"zunit": "um", "spacing": 0.02}, (20, 20, 10)),
-        ({"yunit": "\\u00B5m", "zunit": "\\u00C5", "spacing": 200.0}, (20, 20000, 10)),
-    ):
-        field = load(imagej(tmp_path / "mixed.tif", **more))
-        assert (field.spacing, field.unit) == (pytest.approx(spacing), "nm")
-    unreadable(imagej(tmp_path / "mixed.tif", zunit="furlong", yunit="um"), "um and nm")
-    nrrd = pytest.importorskip("nrrd")
-    directions = {"space": "right-anterior-superior", "space directions": np.diag([2.0, 3.0, 4.0])}
-    header = {**directions, "space units": ["um", "um", "mm"], "space origin": [1.0, 2.0, 3.0]}
-    nrrd.write(str(tmp_path / "place.nrrd"), numbers().T, header)
-    field = load(tmp_path / "place.nrrd")
-    assert (field.spacing, field.unit) == (pytest.approx((4, 3e-3, 2e-3)), "mm")
-    assert field.affine is not None and field.affine[:3, 3] == pytest.approx((1e-3, 2e-3, 3))
-    nrrd.write(str(tmp_path / "plain.nrrd"), numbers().T, {"spacings": [2.0, 3.0, 4.0], "units": ["um", "nm", "nm"]})
-    assert load(tmp_path / "plain.nrrd").spacing == pytest.approx((4e-3, 3e-3, 2))
-
-
 def test_a_calibration(tmp_path: Path) -> None:
     """ImageJ's straight calibration is applied, labels stay whole numbers, and a curved one is said."""
     path, values = tmp_path / "grey.tif", numbers(dtype="uint16")

@@ -5,6 +5,7 @@ import platform
 import subprocess
 import sys
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -13,9 +14,10 @@ from kernel_cases import ADAM_EPS, BETAS, BLUR, BOUNDARIES, EPSILON, SPACINGS, T
 from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energies import energy, energy_gradient_by_autograd
 from curvafit.priors.grid import Grid
+from curvafit.priors.kernels import cpu
+from curvafit.priors.kernels.threads import count_threads
 from curvafit.priors.stencils import divergence, gaussian_blur, gradient
 
-cpu = pytest.importorskip("curvafit.priors.kernels.cpu")
 #: Symmetric, with every entry at work: mirrors change its signs.
 ORIENTATION = torch.tensor([[300.0, 50.0, -100.0], [50.0, 200.0, 70.0], [-100.0, 70.0, -100.0]], dtype=torch.float64)
 UNEQUAL = Coefficients(1.3, -0.7, 4.0, -60.0, 35.0, 500.0)
@@ -27,7 +29,7 @@ UNEQUAL = Coefficients(1.3, -0.7, 4.0, -60.0, 35.0, 500.0)
     ("shape", "varies"),
     [
         ((12, 9, 21), ""), ((4, 5, 16), ""), ((5, 4, 4), ""), ((9, 8, 13), "orientation"),
-        ((9, 8, 13), "coefficients"), ((9, 8, 13), "epsilon"), ((9, 8, 13), "orientation, coefficients, epsilon"),
+        ((9, 8, 13), "coefficients"), ((9, 8, 13), "orientation, coefficients"),
         ((9, 8, 35), "mask"), ((9, 8, 35), "orientation, coefficients, mask"),
     ],
 )  # fmt: skip
@@ -35,20 +37,19 @@ def test_energy_and_gradient_are_the_definitions(shape, varies, spacing, boundar
     """No farther from float64 than a few times what the definition itself loses in float32.
 
     The gradient has a factor 1/S, S = √X⁺, which amplifies rounding where X crosses zero: a few voxels, other ones in
-    each program, so nine in ten voxels are held to the tight bound and all to the loose one. All of ε inside the
-    density varies with it; numbers and arrays may be mixed; a mask has its own kernel, or goes with what varies.
+    each program, so nine in ten voxels are held to the tight bound and all to the loose one. Numbers and arrays may
+    be mixed; a mask has its own kernel, or goes with what varies.
     """
     grid = Grid(shape, spacing, boundary)
     u, a = smooth_field(grid), list(TUBES if varies else UNEQUAL)
     if "coefficients" in varies:
         a[1], a[3], a[5] = (a[k] * (1 + 0.3 * smooth_field(grid, k)) for k in (1, 3, 5))
-    ε = EPSILON * (1.3 + 0.1 * smooth_field(grid, 9)) if "epsilon" in varies else EPSILON
     Q = ORIENTATION if "orientation" in varies else None
     mask = (smooth_field(grid, 5) > -0.3) * (1 + smooth_field(grid, 6).abs()) if "mask" in varies else None
-    cost = Coefficients(*a), grid, ε, Q, mask
+    cost = Coefficients(*a), grid, EPSILON, Q, mask
     (value, slope), (value32, slope32) = (energy_gradient_by_autograd(each, *cost) for each in (u, u.float()))
-    given = [each.numpy() if isinstance(each, torch.Tensor) else each for each in (*a, ε, Q, mask)]
-    found, gradient_found = cpu.fused_energy_gradient(u.numpy(), given[:6], grid, *given[6:])
+    given = [each.numpy() if isinstance(each, torch.Tensor) else each for each in (*a, Q, mask)]
+    found, gradient_found = cpu.fused_energy_gradient(u.numpy(), given[:6], grid, EPSILON, *given[6:])
     assert abs(found - value) <= 4 * abs(value32 - value) + 1e-6 * abs(value)
     scale = float(slope.abs().max())
     error, error32 = np.abs(gradient_found - slope.numpy()) / scale, (slope32 - slope).abs().numpy() / scale
@@ -105,7 +106,6 @@ def test_wrong_shapes_and_orientations_are_refused():
     grid, u, law = Grid((6, 7, 16)), np.zeros((6, 7, 16), np.float32), list(TUBES)
     for word, call in (
         ("field", lambda: cpu.fused_energy_gradient(u[..., 1:], law, grid, EPSILON)),
-        ("array", lambda: cpu.fused_energy_gradient(u, law, grid, u[..., 1:])),
         ("symmetric", lambda: cpu.fused_energy_gradient(u, law, grid, EPSILON, np.tri(3))),
         ("field", lambda: cpu.gaussian_blur(u[..., 1:], grid, BLUR)),
     ):
@@ -120,9 +120,9 @@ GRID = Grid((8, 9, 18))
 x86 = pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="needs an x86 processor")
 
 
-def small_flow(grid: Grid, frozen: np.ndarray | None = None, base: float | np.ndarray = -0.3, seed: int = 4):
+def small_flow(grid: Grid, base: float | np.ndarray = -0.3, seed: int = 4):
     start = 0.01 * np.random.default_rng(seed).standard_normal((3, *grid.shape))
-    flow = cpu.FusedFlow(start, base, list(TUBES), grid, EPSILON, BLUR, frozen, betas=BETAS, adam_eps=ADAM_EPS)
+    flow = cpu.FusedFlow(start, base, list(TUBES), grid, EPSILON, BLUR, betas=BETAS, adam_eps=ADAM_EPS)
     return flow, torch.from_numpy(start)
 
 
@@ -170,22 +170,8 @@ def test_adam_is_torchs():
     assert np.abs(flow.vector - vector.detach().numpy()).max() < 1e-5
 
 
-def test_frozen_voxels_keep_their_vector():
-    frozen = np.random.default_rng(6).random(GRID.shape) > 0.5
-    flow, start = small_flow(GRID, frozen)
-    steps(flow, 3)
-    moved = np.abs(flow.vector - start.numpy().astype(np.float32))
-    assert not moved[:, frozen].any()
-    assert (moved[:, ~frozen] > 0).all()
-
-
 def test_a_restored_flow_goes_on_bit_for_bit():
-    """And a start may be filled in place."""
-    flow, start = small_flow(GRID)
-    other = cpu.FusedFlow(None, -0.3, list(TUBES), GRID, EPSILON, BLUR, betas=BETAS, adam_eps=ADAM_EPS)
-    assert not other.vector.any()
-    other.vector[...] = start
-    assert steps(other, 2) == steps(flow, 2)
+    flow, _ = small_flow(GRID)
     flow.shift(0.1)
     steps(flow, 3)
     state, other = flow.state(), small_flow(GRID, seed=5)[0]
@@ -246,9 +232,6 @@ print(sum(loops.pitch.stats.cache_hits.values()))
 
 
 def test_threads_do_not_change_the_result():
-    numba = pytest.importorskip("numba")
-    from curvafit.priors.kernels.threads import count_threads
-
     if count_threads() < 2:
         pytest.skip("expected two threads, got one")
     before, results = numba.get_num_threads(), []

@@ -1,4 +1,4 @@
-"""The loss beside kernels elsewhere: in a loader's workers by every start method, and in several Python threads."""
+"""The loss beside kernels elsewhere: in a loader's workers by both start methods, and in several Python threads."""
 
 import multiprocessing
 import os
@@ -10,19 +10,17 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 #: A loss on two of numba's threads, and data whose shapes workers grow.
-HEAD = """
+TRAINING = """
 import sys
 import torch
-from curvafit.data_synth import TextureDataset, as_dict, as_monai
+from curvafit.data_synth import TextureDataset, as_dict
 from curvafit.priors import CurvaturePrior
 
 prior = CurvaturePrior("tubes", sigmoid=True)
+data = TextureDataset("tubes", "micro-ct", 24, length=2, shapes=1, transform=as_dict)
 
-def make(transform):
-    return TextureDataset("tubes", "micro-ct", 24, length=2, shapes=1, transform=transform)
-
-def look(batch, scale=1.0):
-    return prior(scale * torch.randn(1, 1, 48, 48, 48, requires_grad=True)) + batch["image"].mean()
+def look(batch):
+    return prior(torch.randn(1, 1, 48, 48, 48, requires_grad=True)) + batch["image"].mean()
 
 def main(start):
     for workers, persistent in (((1, False), (2, True)) if start == "fork" else ((2, True),)):
@@ -31,37 +29,16 @@ def main(start):
         train(options)
     from curvafit.priors.kernels.threads import count_threads
     print("threads", count_threads())
-"""
-PLAIN = """
+
 def train(options):
-    loader = DataLoader(make(TRANSFORM), batch_size=1, **options)
+    loader = torch.utils.data.DataLoader(data, batch_size=1, **options)
     for epoch in range(2):
         for batch in loader:
             look(batch).backward()
+
+if __name__ == "__main__":
+    main(sys.argv[1])
 """
-LOOPS = {
-    "torch": "from torch.utils.data import DataLoader" + PLAIN.replace("TRANSFORM", "as_dict"),
-    "monai": "from monai.data import DataLoader" + PLAIN.replace("TRANSFORM", "as_monai"),
-    "lightning": """
-import lightning
-
-class Segmenter(lightning.LightningModule):
-    def __init__(self):
-        super().__init__()
-        self.scale = torch.nn.Parameter(torch.ones(()))
-
-    def training_step(self, batch, _):
-        return look(batch, self.scale)
-
-    def configure_optimizers(self):
-        return torch.optim.SGD(self.parameters(), 1e-3)
-
-def train(options):
-    quiet = dict.fromkeys(("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
-    loader = torch.utils.data.DataLoader(make(as_dict), batch_size=1, **options)
-    lightning.Trainer(max_epochs=2, accelerator="cpu", **quiet).fit(Segmenter(), loader)
-""",
-}
 
 
 def run(program: Path, *arguments: str, **environment: str) -> tuple[str, str]:
@@ -75,17 +52,13 @@ def run(program: Path, *arguments: str, **environment: str) -> tuple[str, str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("loop", "start"),
-    [("torch", "fork"), ("torch", "spawn"), ("torch", "forkserver"), ("monai", "fork"), ("lightning", "fork")],
-)
-def test_workers_grow_shapes_beside_the_loss(loop, start, tmp_path) -> None:
+@pytest.mark.parametrize("start", ["fork", "spawn"])
+def test_workers_grow_shapes_beside_the_loss(start, tmp_path) -> None:
     """Two workers that persist, and forked also one that does not; the main process keeps its threads."""
     if start not in multiprocessing.get_all_start_methods():
         pytest.skip(f"this platform has no {start}")
-    pytest.importorskip(loop, reason=f"{loop} is not installed: pip install {loop}")
     program = tmp_path / "train.py"
-    program.write_text(f"{HEAD}\n{LOOPS[loop]}\nif __name__ == '__main__':\n    main(sys.argv[1])\n")
+    program.write_text(TRAINING)
     assert run(program, start)[0] == "threads 2"
 
 

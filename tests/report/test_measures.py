@@ -92,13 +92,6 @@ def test_a_slice_shows_its_contour_in_physical_places() -> None:
     assert figure.axes[0].texts[0].get_text() == "1\xa0mm"
 
 
-@pytest.mark.slow
-def test_workers_measure_the_same(scans: list[Path], tmp_path: Path) -> None:
-    for workers in (0, 2):
-        assert call("measure", *scans, "-o", tmp_path / f"by{workers}", "--workers", workers).exit_code == 0
-    assert rows_of(tmp_path / "by0" / "measures.csv") == rows_of(tmp_path / "by2" / "measures.csv")
-
-
 def test_compartments_have_rows(scans: list[Path], tmp_path: Path) -> None:
     labels = np.ones((56, 56, 56), np.uint8)
     labels[28:] = 2

@@ -20,9 +20,9 @@ def test_an_npz_holds_maps_by_name(tmp_path: Path) -> None:
 
 
 def test_one_number_holds_everywhere(tmp_path: Path) -> None:
-    np.savez(tmp_path / "maps.npz", a11=-3, epsilon=np.array([0.02]))
+    np.savez(tmp_path / "maps.npz", a11=-3, mass=np.array([0.02]))
     maps = read_maps(tmp_path / "maps.npz", (9, 9, 9))
-    assert maps == {"a11": -3.0, "epsilon": 0.02} and map_shape(maps) is None
+    assert maps == {"a11": -3.0, "mass": 0.02} and map_shape(maps) is None
 
 
 @pytest.mark.parametrize(

@@ -1,49 +1,12 @@
-"""Real files of other packages and the shared scans, against nibabel and ITK; or refused for a reason."""
+"""Real files of DICOM, against pydicom; or refused for a reason."""
 
-import os
 from pathlib import Path
 
-import nibabel
-import numpy as np
 import pydicom.data
 import pytest
-import SimpleITK
 from disk import unreadable
 
 from curvafit.volumes import load
-
-DATA = Path(os.environ.get("CURVAFIT_DATA", "none"))
-NIBABEL = Path(nibabel.__file__).parent / "tests" / "data"
-
-
-def test_nibabel_files() -> None:
-    names = (
-        "anatomical.nii",
-        "functional.nii",
-        "reoriented_anat_moved.nii",
-        "standard.nii.gz",
-    )
-    for name in (*names, "example4d.nii.gz", "example_nifti2.nii.gz"):
-        if not (NIBABEL / name).exists():
-            pytest.skip("nibabel without its test data")
-        image = nibabel.load(NIBABEL / name)
-        series = len(image.shape) == 4
-        field = load(NIBABEL / name, **({"channel": 1} if series else {}))
-        expected = np.asarray(image.dataobj[..., 1] if series else image.dataobj).T
-        assert np.array_equal(field.values, expected) and np.allclose(field.spacing, image.header.get_zooms()[2::-1])
-        assert field.affine is not None and np.allclose(field.affine, image.affine)
-    unreadable(NIBABEL / "resampled_anat_moved.nii", "153 values that are NaN")
-
-
-def test_shared_scans() -> None:
-    if not DATA.is_dir():
-        pytest.skip("$CURVAFIT_DATA is not there")
-    for path in [*sorted((DATA / "gallery").glob("*.nii.gz"))[:6], *sorted((DATA / "scans").glob("*.nii.gz"))]:
-        image, field = SimpleITK.ReadImage(str(path)), load(path)
-        assert np.array_equal(field.values, SimpleITK.GetArrayViewFromImage(image))
-        scale = {"um": 1e-3, "nm": 1e-6}.get(field.unit, 1.0)
-        assert np.allclose(np.array(field.spacing) * scale, image.GetSpacing()[::-1], rtol=1e-4)
-
 
 #: A slice is no volume; colours need a channel; a report has no pixels; some have no mark of DICOM.
 DICOM = {
