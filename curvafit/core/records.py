@@ -176,7 +176,7 @@ def can_write(
     Parameters
     ----------
     path
-        A file, or a Zarr store, that may exist.
+        A file, or a Zarr store, that may exist; nothing is added to a store.
     ours
         The format of the file: an existing `path` may be replaced if it is of this format, and so may its companions
         (`Format.companions`). Or a function that says which existing paths may be replaced.

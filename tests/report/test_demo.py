@@ -35,7 +35,7 @@ def test_scores_are_of_the_slices_left_out_alone() -> None:
 @pytest.mark.slow
 def test_the_page_stands_alone_and_escapes_what_it_is_told() -> None:
     inference, mask = made_inference(), lattice(48, 24, 5.0) > 0
-    measures, scores = measure(Volume(mask, (SCALE,) * 3, "mm"), maps=True), score(mask, mask, 1)
+    measures, scores = measure(Volume(mask, (SCALE,) * 3, "mm")), score(mask, mask, 1)
     page = demo_page(inference, measures, shape_figure(mask, mask, 1, (SCALE,) * 3), scores, 1)
     assert "tubes &lt;b&gt;&amp;.tif" in page and page.count("data:image/png;base64,") == 3
     assert set(re.findall(r'(?:src|href)="(?!data:)([^"]*)', page)) == {"measures.html", "report.html"}
