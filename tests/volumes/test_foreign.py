@@ -23,7 +23,7 @@ from curvafit.volumes import Volume, load, save
 sitk = pytest.importorskip("SimpleITK")
 mrcfile, nrrd = pytest.importorskip("mrcfile"), pytest.importorskip("nrrd")
 LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
-TYPES = ("uint8", "int16", "uint16", "uint32", "float32", "float64")
+TYPES = ("uint8", "int16", "uint16", "float32", "float64")
 ORDERS = ("zyx", "zxy", "yzx", "yxz", "xzy", "xyz")
 
 
