@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import multiprocessing
 import os
 import pickle
 import subprocess
@@ -166,15 +165,14 @@ def test_shapes_of_laws():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "persistent"), [("fork", False), ("spawn", True)])
-def test_workers_and_epochs_share_shapes(method, persistent):
-    """Two workers, which stay or are new in each of two epochs, read the shapes that their parent grew."""
-    if method not in multiprocessing.get_all_start_methods():
-        pytest.skip(f"this system has no {method}")
+@pytest.mark.parametrize("persistent", [False, True])
+def test_workers_and_epochs_share_shapes(persistent):
+    """Two workers, which stay or are new in each of two epochs, read the shapes that their parent grew; forked ones are
+    in tests/priors/test_workers.py, in a process without JAX."""
     pairs = TextureDataset("tubes", QUIET, 12, length=6, shapes=2, transform=brief)
     paths = [path for path, *_ in pairs.recipes[0].source.shapes]
     before, found = [path.stat().st_mtime_ns for path in paths], []
-    loader = DataLoader(pairs, None, num_workers=2, multiprocessing_context=method, persistent_workers=persistent)
+    loader = DataLoader(pairs, None, num_workers=2, multiprocessing_context="spawn", persistent_workers=persistent)
     for epoch in range(2):
         pairs.set_epoch(epoch)
         found += list(loader)
