@@ -46,10 +46,10 @@ def main() -> None:
         callbacks=[keep],
         execution=Execution(device=options.device, checkpoint=options.output / "convergence.checkpoint"),
     )
-    stages = {step: np.load(file) for step, file in files.items()}
+    stages = {step: np.load(file) for step, file in files.items() if step in flow.history.step}
     diagrams = {step: diagram_of(u, grid, options.curvature) for step, u in stages.items()}
     write_table(options, "convergence", [*table(flow, stages, diagrams), flow.status], [program()])
-    shown = {step: (stages[step], diagrams[step]) for step in marks if step in (*SHOWN, plan.steps)}
+    shown = {step: (stages[step], diagrams[step]) for step in stages if step in (*SHOWN, plan.steps)}
     print(write_picture(picture(flow, shown), options.output / "convergence.png"))
 
 

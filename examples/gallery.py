@@ -1,4 +1,4 @@
-"""The twelve shapes of the gallery, each with its curvature diagram (paper, Experiment 2).
+"""The shapes of the gallery, each with its curvature diagram (paper, Experiment 2).
 
 python examples/gallery.py [--small] [--edge 100] [--schedule fast] [-o gallery]
 
@@ -57,7 +57,7 @@ AGAINST = "".join(f" | {kind:>9}: {'author':>6} {'seeds':>6}" for kind in KINDS)
 def row(name: str, shape: Shape) -> str:
     """Figures of our shape; the mean curvatures are geometric."""
     facts = shape.facts
-    line = f"{name:10} {facts['energy']:10.2f} {facts['discrepancy']:8.3f}"
+    line = f"{name:13} {facts['energy']:10.2f} {facts['discrepancy']:8.3f}"
     if not shape.diagrams:
         return f"{line} {facts['status']}"
     κ1, κ2 = shape.diagrams["geometric"].mean()

@@ -48,7 +48,7 @@ def main() -> None:
     for name, pictures in turns.items():
         write_strip(pictures, options.output / f"{name}.webp")
     write_strip([still(shape.field, 32.0) for shape in between(options)], options.output / "between.webp")
-    write_moving([turns[name] for name in MOVING], options.output / "turning.gif")
+    write_moving([turns[name] for name in MOVING], options.output.parent / "turning.gif")
 
 
 def between(options) -> list[Shape]:

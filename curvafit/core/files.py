@@ -112,8 +112,12 @@ def is_url(path: str) -> bool:
 
 
 def check_folder(path: str | Path) -> Path:
-    """Return the path of a folder that can be written to, or made; raise ValueError where it cannot."""
+    """Return the path of a folder that can be written to, or made; raise ValueError where it cannot, or is in a store
+    of Zarr, to which nothing is added."""
     folder = Path(path)
+    resolved = folder.resolve()
+    if (store := next(filter(is_zarr, (resolved, *resolved.parents)), None)) is not None:
+        raise ValueError(f"{folder} is in the Zarr store {store}, to which nothing is added: write beside it")
     existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     if not existing.is_dir():
         raise ValueError(f"cannot write to the folder {folder}: {existing} is a file")
@@ -122,6 +126,11 @@ def check_folder(path: str | Path) -> Path:
             return folder
     except OSError as error:
         raise ValueError(f"the folder {existing} cannot be written to: {error.strerror or error}") from None
+
+
+def is_zarr(folder: Path) -> bool:
+    """Return whether a folder is a group or an array of Zarr."""
+    return any((folder / name).exists() for name in ("zarr.json", ".zgroup", ".zarray"))
 
 
 def is_empty(folder: Path) -> bool:

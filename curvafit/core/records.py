@@ -22,7 +22,7 @@ from typing import IO, Any, NamedTuple, TypeVar
 import numpy as np
 
 from curvafit.core.checks import quoted
-from curvafit.core.files import check_folder, is_empty, write_content
+from curvafit.core.files import check_folder, is_empty, is_zarr, write_content
 from curvafit.core.runtime import memory
 
 Content = TypeVar("Content")
@@ -186,8 +186,6 @@ def can_write(
         Whether files and folders of another origin may be replaced.
     """
     target = Path(path)
-    if (store := next(filter(is_zarr, target.absolute().parents), None)) is not None:
-        raise ValueError(f"{target} is in the Zarr store {store}, to which nothing is added: write beside it")
     check_folder(target.parent)
     if target.is_dir() and not (target.name.lower().endswith(".zarr") or is_zarr(target)):
         raise ValueError(f"{target} is a folder: give the name of a file")
@@ -238,11 +236,6 @@ def sibling(path: str | Path, ending: str) -> Path:
     target = Path(path)
     suffix = next((suffix for suffix in _DOUBLE if target.name.lower().endswith(suffix)), target.suffix)
     return target.with_name(target.name[: len(target.name) - len(suffix)] + ending)
-
-
-def is_zarr(folder: Path) -> bool:
-    """Return whether a folder is a group or an array of Zarr."""
-    return any((folder / name).exists() for name in ("zarr.json", ".zgroup", ".zarray"))
 
 
 def is_own_zarr(folder: Path, kind: str) -> bool:

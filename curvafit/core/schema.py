@@ -100,7 +100,8 @@ def _describe_number(rule: Rule) -> str:
     if rule.above > -math.inf:
         return "a positive number" if rule.below == math.inf else f"a number between {rule.above:g} and {rule.below:g}"
     if rule.least > -math.inf:
-        return f"a number from {rule.least:g}" + ("" if rule.most == math.inf else f" to {rule.most:g}")
+        most = f" to below {rule.below:g}" if rule.below < math.inf else f" to {rule.most:g}"
+        return f"a number from {rule.least:g}" + ("" if most == " to inf" else most)
     return "a finite number"
 
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import shutil
 import time
 import zipfile
@@ -42,6 +43,8 @@ STORE = Format("curvafit shapes", 3, "a store of shapes", remedy="build it anew 
 DRAW = Format("curvafit shape", title="a draw of a store")
 #: The record of the store.
 HEADER = "curvafit.json"
+#: What a process that was killed may leave.
+_TEMPORARY = re.compile(r"\.(\d+\.npz|curvafit\.json)\.[0-9a-f]{8}|\.[0-9a-f]{8}\.curvafit\.json")
 #: A number that may be NaN.
 Unknown = Annotated[float, Rule(unknown=True)]
 
@@ -136,9 +139,9 @@ class Store:
         """
         if self.has(record.index):
             return False
-        for leftover in self.path.glob(".*"):
-            if time.time() - leftover.stat().st_mtime > 600:  # a killed process left it
-                shutil.rmtree(leftover, ignore_errors=True)
+        for entry in self.path.iterdir():
+            if _TEMPORARY.fullmatch(entry.name) and time.time() - entry.stat().st_mtime > 600:  # of a killed process
+                shutil.rmtree(entry, ignore_errors=True)
         # NumPy's numbers become Python's, and NaN and infinity null.
         text = json.dumps(dataclasses.asdict(record), default=np.generic.item)
         header, target = json.loads(text, parse_constant=lambda _: None), self._file(record.index)
@@ -160,6 +163,8 @@ class Store:
                 member = read_member(archive, f"{name}.npy") if present else None
         except Exception as error:  # zipfile, zlib and numpy raise a dozen types of error
             raise ValueError(str(error)) from error
+        if member is None and name == "header":
+            raise ValueError("it has no record")
         if member is None:
             raise KeyError(f"{self.path} has no viable draw {index}")
         return member
@@ -221,7 +226,7 @@ def _decode_settings(content: Any) -> Settings:
 
 def _is_free(path: Path) -> bool:
     """Return whether a folder is empty, but for files that a process is writing."""
-    return path.is_dir() and all(entry.name.startswith(".") for entry in path.iterdir())
+    return path.is_dir() and all(_TEMPORARY.fullmatch(entry.name) for entry in path.iterdir())
 
 
 def _publish(file: Path, target: Path) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
@@ -160,12 +160,11 @@ class Fit(Pictured):
         if self.best is None:
             raise ValueError(f"expected a fit with a law, got one without: {self.status}")
         width = self.epsilon_physical * WORKING_SPACING / self.working_voxel
-        return replace(self._law(self.best.coefficients, self.best.mass, "prior", self.working_voxel), epsilon=width)
-
-    def _law(self, coefficients: Coefficients, mass: float, origin: str, edge: float) -> Law:
-        """Return a law whose working voxel is `edge` long, with the scan's unit, volume fraction and status."""
-        scan = {"volume_fraction": self.morphometry.volume_fraction, "status": self.status}
-        return Law(coefficients, mass, origin, working_voxel=edge, length_unit=self.length_unit, **scan)
+        return Law(
+            self.best.coefficients, self.best.mass, "prior", working_voxel=self.working_voxel,
+            length_unit=self.length_unit, epsilon=width, volume_fraction=self.morphometry.volume_fraction,
+            status=self.status,
+        )  # fmt: skip
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers, strings, lists and dicts, as `fit.json` holds them."""

@@ -240,7 +240,7 @@ def _grow(
             stage(f"grown: {TITLES[name]}, shape {len(twins[name])}", min(1.0, sum(map(len, twins.values())) / total))
         laws.update({name: laws[name].compare(diagram, twins[name]) for name in {name for name, _ in wanted}})
 
-    total = len(laws) + growth.twins - 1
+    total = max(1, len(laws) + growth.twins - 1)
     grow([(name, 0) for name in laws])
     for _ in range(2):  # the second time, further twins may have made another law the best
         best = best_candidate(tuple(laws.values()))

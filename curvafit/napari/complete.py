@@ -97,8 +97,13 @@ class Complete(Dock):
             self.suggestions.append(button)
 
     def _go_to(self, result: Filled, k: int) -> None:
-        """Show a slice; where nothing is drawn on it, copy what was filled there, which napari can undo as one step."""
+        """Show a slice; where nothing is drawn on it, copy what was filled there, which napari can undo as one step.
+
+        Where slices are named as known, it is one of them from then on.
+        """
         layer, axis = result.drawn, result.axis
+        if layer.data.shape[-3:] != result.values.shape:
+            return
         corner = np.zeros(layer.ndim)
         corner[layer.ndim - 3 + axis] = k
         dims = self.viewer.dims
@@ -109,6 +114,8 @@ class Complete(Dock):
         if not layer.data[in_slice].any():
             indices = np.nonzero(in_slice)
             layer.data_setitem(indices, result.values.reshape(layer.data.shape)[indices])
+            if self.known.value.strip():
+                self.known.value = f"{self.known.value},{k}"
 
 
 def _fill(layer: Any, field: Volume, label: int | None, options: dict[str, Any], progress: Progress) -> Filled:

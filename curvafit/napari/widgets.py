@@ -93,7 +93,7 @@ def put_layer(viewer: Any, kind: str, data: Any, name: str, **options: Any) -> A
 def drop_layer(viewer: Any, name: str) -> None:
     """Remove the layer of a name that the plugin added, if it is there."""
     for layer in list(viewer.layers):
-        if layer.metadata.get("curvafit") == name:
+        if layer.name == name == layer.metadata.get("curvafit"):  # renamed, it is the user's
             viewer.layers.remove(layer)
 
 

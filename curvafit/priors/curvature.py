@@ -57,7 +57,7 @@ def jet(u: Tensor, grid: Grid) -> Jet:
 def second_form(field: Jet, epsilon: float) -> SecondForm:
     """Return the invariants of M_ε = -ε Hess u + W'(u)/ε n⊗n (paper, eq. 7), where n⊗n = ∇u⊗∇u / (|∇u|² + ξ²).
 
-    ε is a number or a tensor that broadcasts with the field. For the derivative of the root see `positive_root`.
+    For the derivative of the root see `positive_root`.
     """
     ε = epsilon
     slope2, laplacian, hess2, normal = _invariants(field)

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from curvafit.core.checks import SEEDS, check_int, quoted
-from curvafit.core.files import is_url
-from curvafit.core.records import is_zarr, read_archive
+from curvafit.core.files import is_url, is_zarr
+from curvafit.core.records import read_archive
 from curvafit.core.runtime import one_line
 from curvafit.core.units import common_unit, convert_length, format_length, is_unit, parse_unit
 from curvafit.priors.coefficients import NAMES

@@ -150,7 +150,7 @@ class Imaging(Checked):
     illumination: Illumination = Illumination()
     noise: Noise = Noise()
     detector: Detector = Detector()
-    visible: Share = 0.0
+    visible: Annotated[float, Rule(least=0, below=1)] = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -26,6 +26,8 @@ CPUTargetOptions.noalias = TargetOptions.Mapping("noalias")  # type: ignore[attr
 _njit: Any = njit
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+#: In a thread of `map_threads`, the event `left` says that nobody waits for its result.
+_LOCAL = threading.local()
 #: Held where numba's threads serve one caller at a time.
 _ONE_CALLER = threading.Lock()
 
@@ -44,7 +46,10 @@ class Kernel:
         self._serial = _njit(noalias=True, **options)(copy)
 
     def __call__(self, threads: int, *arguments: Any) -> None:
-        """Run the loop on at most `threads` threads."""
+        """Run the loop on at most `threads` threads; KeyboardInterrupt where `map_threads` was left."""
+        left = getattr(_LOCAL, "left", None)
+        if left is not None and left.is_set():
+            raise KeyboardInterrupt
         threads = min(threads, count_threads()) if threads > 1 else 1
         if threads == 1:
             self._serial(*arguments)
@@ -112,15 +117,21 @@ def map_threads(function: Callable[[_Item], _Result], items: Iterable[_Item]) ->
     """Yield the results of a function of each item, in order, computed side by side on one thread each.
 
     Flows of small boxes are faster so than one after another on all threads, which wait for each other several times a
-    step.
+    step. Where the caller leaves before the end, work that has begun ends at its next loop.
     """
-    threads, before = count_threads(), torch.get_num_threads()
+    threads, before, left = count_threads(), torch.get_num_threads(), threading.Event()
+
+    def begin() -> None:
+        torch.set_num_threads(1)
+        _LOCAL.left = left
+
     if threads == 1:
         yield from map(function, items)
         return
-    pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
+    pool = ThreadPoolExecutor(threads, initializer=begin)
     try:
         yield from pool.map(function, items)
     finally:
+        left.set()
         pool.shutdown(cancel_futures=True)
         torch.set_num_threads(before)  # the pool's threads have set the number of those to come as well
