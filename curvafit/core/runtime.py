@@ -46,6 +46,12 @@ def log_stages() -> Progress:
     return log
 
 
+def show_share(text: str, share: float) -> None:
+    """Show a sentence and a bar on the error stream, on one line of a terminal."""
+    start, end = ("\r", "" if share < 1 else "\n") if sys.stderr.isatty() else ("", "\n")
+    print(f"{start}[{'#' * round(20 * share):.<20}] {text}", end=end, file=sys.stderr, flush=True)
+
+
 def sub_progress(progress: Progress, start: float, stop: float) -> Progress:
     """Return the progress of a part of the work, from one share of the whole to another."""
     return lambda text, share: progress(text, start + (stop - start) * share)

@@ -26,7 +26,7 @@ from curvafit.core.checks import (
     check_type,
     quoted,
 )
-from curvafit.core.runtime import Progress, silent
+from curvafit.core.runtime import Progress, show_share
 from curvafit.core.schema import decode, encode
 from curvafit.data_synth.imaging.modality import Imaging, Modality, field_shape, image, label_voxels, modality, regrid
 from curvafit.data_synth.sources import Generated, Pool, ShapeSource, Stored, choose_voxel, decode_source
@@ -227,7 +227,7 @@ class TextureDataset(IterableDataset):
         shapes: int = 16,
         volume_fraction: float | None = None,
         transform: Callable[[Sample], Any] | None = None,
-        progress: Progress = silent,
+        progress: Progress = show_share,
     ) -> None:
         kinds = [modalities] if isinstance(modalities, (str, Modality)) else list(modalities)
         kinds = [modality(kind) if isinstance(kind, str) else kind for kind in kinds]

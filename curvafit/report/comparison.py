@@ -42,7 +42,8 @@ from curvafit.studies.scans import list_wide, merge_notes
 FORMAT = Format("curvafit comparison", 1, title="the record of a comparison")
 #: What a comparison writes into its folder.
 FILES = ("compare.json", "compare.html", "measures.csv", "wide.csv", "numbers.csv")
-FILES += ("difference.svg", "difference.png", "numbers.svg", "numbers.png", "outlines.svg", "outlines.png")
+_PICTURES = ("difference", "numbers", "all_numbers", "outlines")
+FILES += tuple(f"{name}.{kind}" for name in _PICTURES for kind in ("svg", "png"))
 #: Colours of what is less and of what is more.
 MORE = LinearSegmentedColormap.from_list("more", [plot.FIRST, "#8CC0E0", "#FFFFFF", "#F0B48A", plot.SECOND])
 #: Letters of groups' names that a panel has room for, and diagrams or panels in a row.
@@ -78,10 +79,12 @@ def write_comparison(
         "rows": [_format_row(number, c) for number in c.numbers], "level": f"{LEVEL:.2g}",
         "methods": describe_methods(c), "omitted": max(0, len(c.measures) - MOST_OUTLINES),
     }  # fmt: skip
+    shown = [*plot.FIRST_SHOWN, *(number.symbol for number in c.found if number.symbol not in plot.FIRST_SHOWN)]
     outlines = outlines_figure(name_parts(c.measures), [scan.outline for scan in c.measures], c.unit)
     figures = {
         "difference": (comparison_figure(c), "Mean curvature diagrams and their difference"),
-        "numbers": (numbers_figure(c), f"Each number by {c.by}"),
+        "numbers": (numbers_figure(c, shown), f"Familiar numbers, and those that differ, by {c.by}"),
+        "all_numbers": (numbers_figure(c, [number.symbol for number in c.numbers]), f"Each number by {c.by}"),
         "outlines": (outlines, "Three slices of each scan, and the outline of its structure"),
     }
     columns = [{"subject": case.subject, label: case.label} for case in c.cases]
@@ -207,14 +210,14 @@ def _bar_on(axes: Axes, picture: QuadMesh, **options: Any) -> None:
     bar.outline.set_linewidth(0.5)
 
 
-def numbers_figure(comparison: Comparison) -> Figure:
-    """Return a figure of each quantity: subjects by group or over the number, with the 95 % intervals of their scans.
+def numbers_figure(comparison: Comparison, symbols: Sequence[str]) -> Figure:
+    """Return a figure of quantities: subjects by group or over the number, with the 95 % intervals of their scans.
 
     A long line is a group's mean, or the regression line; a thin line joins the values of one subject in paired groups.
     The names of quantities that differ significantly, all tested, are bold.
     """
     c = comparison
-    figure, panels = _draw_panels(c)
+    figure, panels = _draw_panels(c, symbols)
     pairs = [] if c.blocks is None else [np.flatnonzero(c.blocks == block) for block in np.unique(c.blocks)]
     x = np.array(c.labels, dtype=float)
     for group, count in enumerate(c.counts if c.groups and not pairs else ()):
@@ -255,10 +258,11 @@ def numbers_figure(comparison: Comparison) -> Figure:
     return figure
 
 
-def _draw_panels(comparison: Comparison) -> tuple[Figure, dict[int, Axes]]:
-    """Return a figure and its panel for each number by its index, `FIRST_SHOWN` first, with the tests above it."""
-    numbers, ranks = comparison.numbers, {symbol: k for k, symbol in enumerate(plot.FIRST_SHOWN)}
-    order = sorted(range(len(numbers)), key=lambda k: ranks.get(numbers[k].symbol, len(ranks)))
+def _draw_panels(comparison: Comparison, symbols: Sequence[str]) -> tuple[Figure, dict[int, Axes]]:
+    """Return a figure and its panel for each number by its index, in the order of their symbols, with the tests."""
+    numbers = comparison.numbers
+    index = {number.symbol: k for k, number in enumerate(numbers)}
+    order = [index[symbol] for symbol in symbols]
     rows = math.ceil(len(order) / ROW)
     figure = plot.make_figure(3.3 * ROW, 3.1 * rows + 0.4, layout="constrained")
     panels = {k: figure.add_subplot(rows, ROW, place) for place, k in enumerate(order, 1)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -31,11 +32,13 @@ _AROUND = 5
 _DENSE = 2**20
 #: Voxels a side of the blocks in which labels are looked for, the names of the passes, and of the labels in errors.
 _BLOCK, _LOOK, _MEASURE, _LABELS = 256, "looking for instances", "measuring instances", "labels of instances"
+#: What is said of a volume with one label.
+ONE_LABEL = "One label, which is one body: number its pieces first, by scipy.ndimage.label, to have each by itself."
 #: Name, symbol and power of each number of a body, and how it comes from sums.
 OF_BODIES: tuple[tuple[str, str, int, Callable[[whole.Sums], np.ndarray]], ...] = (
     ("volume", "V", 3, lambda s: s["inside"]),
     ("surface", "S", 2, lambda s: s["area"]),
-    ("sphericity", "Ψ", 0, lambda s: math.pi ** (1 / 3) * (6 * s["inside"]) ** (2 / 3) / (s["area"] + s["cut"])),
+    ("sphericity", "Ψ", 0, lambda s: math.nan if s["cut"] else _find_sphericity(s["inside"], s["area"])),
     ("elongation", "E", 0, lambda s: s["elongation"]),
     ("area at the border", "S.cut", 2, lambda s: s["cut"]),
     *(quantity for quantity in whole.QUANTITIES if quantity[1] not in _OF_TEXTURES),
@@ -69,7 +72,15 @@ def measure_instances(
         run = Run(crew, progress=progress, ends={_LOOK: 0.1, _MEASURE: 1.0})
         boxes = _join_boxes(run(_LOOK, partial(_look_for_labels, volume, blocks), len(blocks)))
         bodies = run(_MEASURE, partial(_measure_body, volume, list(boxes.items())), len(boxes))
-        return tuple(body["measures"] for body in bodies)
+        measured = tuple(body["measures"] for body in bodies)
+    if len(measured) == 1:
+        return (replace(measured[0], notes=(*measured[0].notes, ONE_LABEL)),)
+    return measured
+
+
+def _find_sphericity(volume: float, area: float) -> float:
+    """Return the surface of the ball of a body's volume over the body's own."""
+    return math.pi ** (1 / 3) * (6 * volume) ** (2 / 3) / area
 
 
 def _look_for_labels(volume: Volume, blocks: Sequence[Box], number: int) -> Record:

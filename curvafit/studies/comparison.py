@@ -170,7 +170,7 @@ class Comparison(Pictured):
         if found:
             rest = f"; and {len(found) - NAMED} more" if len(found) > NAMED else ""
             described, s = "; ".join(map(self._describe, found[:NAMED])), "s" * (len(found) == 1)
-            lines.append(f"Of {count} numbers {len(found)} differ{s} ({level}): {described}{rest}.")
+            lines.append(f"Of {count} numbers {len(found)} differ{s}, {level}: {described}{rest}.")
         else:
             strongest = max((self[name] for name in FAMILIAR), key=lambda number: abs(np.nan_to_num(number.effect)))
             lines.append(
@@ -220,7 +220,7 @@ class Comparison(Pictured):
             change = f"from {' to '.join(map(format_number, number.means))} {unit}".rstrip()
         else:
             change = f"{format_number(number.difference)} {unit}".rstrip() + f" a unit of {self.by}"
-        p = f"p = {format_number(number.p if alone else number.family, 2)}"
+        p = f"p = {format_number(number.p, 2)}" if alone else f"family-wise p = {format_number(number.family, 2)}"
         facts = ", ".join([*symbol, change, f"{self.effect} = {format_number(number.effect, 2)}", p])
         return " ".join(filter(None, (number.name, self._change(number), f"({facts})")))
 

@@ -452,8 +452,14 @@ def _bin_diagrams(measures: Measures) -> Measures:
 
 
 def gather_notes(measures: Sequence[Measures], cases: Sequence[Case]) -> Iterator[str]:
-    """Yield the scans' notes, each after the scans that have it; notes that differ in numbers only are one."""
-    for scans, note in merge_notes(measures):
+    """Yield the scans' notes, each after the scans that have it; notes of one group that differ in numbers only are
+    one, so that groups whose numbers differ, such as thresholds, are told apart."""
+    scans_of: dict[str, list[int]] = {}
+    for label in dict.fromkeys(case.label if isinstance(case.label, str) else "" for case in cases):
+        own = [k for k, case in enumerate(cases) if label in ("", case.label)]
+        for scans, note in merge_notes([measures[k] for k in own]):
+            scans_of.setdefault(note, []).extend(own[k] for k in scans)
+    for note, scans in scans_of.items():
         first, others = cases[scans[0]].name, len(scans) - 1
         some = f"{first} and {others} more" if others else first
         yield f"{some if len(scans) < len(cases) else f'All {len(cases)} scans'}: {note}"
