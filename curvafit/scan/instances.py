@@ -38,7 +38,7 @@ ONE_LABEL = "One label, which is one body: number its pieces first, by scipy.ndi
 OF_BODIES: tuple[tuple[str, str, int, Callable[[whole.Sums], np.ndarray]], ...] = (
     ("volume", "V", 3, lambda s: s["inside"]),
     ("surface", "S", 2, lambda s: s["area"]),
-    ("sphericity", "Ψ", 0, lambda s: math.nan if s["cut"] else _find_sphericity(s["inside"], s["area"])),
+    ("sphericity", "Ψ", 0, lambda s: np.where(s["cut"], math.nan, np.cbrt(36 * math.pi * s["inside"] ** 2) / s["area"])),
     ("elongation", "E", 0, lambda s: s["elongation"]),
     ("area at the border", "S.cut", 2, lambda s: s["cut"]),
     *(quantity for quantity in whole.QUANTITIES if quantity[1] not in _OF_TEXTURES),
@@ -76,11 +76,6 @@ def measure_instances(
     if len(measured) == 1:
         return (replace(measured[0], notes=(*measured[0].notes, ONE_LABEL)),)
     return measured
-
-
-def _find_sphericity(volume: float, area: float) -> float:
-    """Return the surface of the ball of a body's volume over the body's own."""
-    return math.pi ** (1 / 3) * (6 * volume) ** (2 / 3) / area
 
 
 def _look_for_labels(volume: Volume, blocks: Sequence[Box], number: int) -> Record:
