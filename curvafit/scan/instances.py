@@ -38,7 +38,7 @@ ONE_LABEL = "One label, which is one body: number its pieces first, by scipy.ndi
 OF_BODIES: tuple[tuple[str, str, int, Callable[[whole.Sums], np.ndarray]], ...] = (
     ("volume", "V", 3, lambda s: s["inside"]),
     ("surface", "S", 2, lambda s: s["area"]),
-    ("sphericity", "Ψ", 0, lambda s: np.where(s["cut"], math.nan, np.cbrt(36 * math.pi * s["inside"] ** 2) / s["area"])),
+    ("sphericity", "Ψ", 0, lambda s: np.where(s["cut"], np.nan, np.cbrt(36 * math.pi * s["inside"] ** 2) / s["area"])),
     ("elongation", "E", 0, lambda s: s["elongation"]),
     ("area at the border", "S.cut", 2, lambda s: s["cut"]),
     *(quantity for quantity in whole.QUANTITIES if quantity[1] not in _OF_TEXTURES),
