@@ -228,7 +228,7 @@ def reconstruct(
             return reconstruct_labels(volume.load(), prior, **_without(several, "labels"), **options)
         return fill(volume, prior, **options)
 
-    job = _Job(slices, out, prior, reading, record, overwrite, inputs, ("probability",))
+    job = _Job(slices, out, prior, reading, record, overwrite, inputs, probability=True)
     working |= {"filler": filler, "stiffness": stiffness}
     _run(job, compute, partial(load, slices, **reading, lazy=True), working)
 
@@ -244,7 +244,7 @@ class _Job:
     record: dict[str, Any]
     overwrite: bool
     inputs: Sequence[str | Path] = ()  # other files that are read
-    maps: tuple[str, ...] = ()  # volumes beside the mask
+    probability: bool = False  # whether it goes beside the mask
     image: Path | None = None  # the file whose header the mask gets; by default the source
 
     def check(self, frame: Volume | None = None) -> None:
@@ -253,7 +253,9 @@ class _Job:
         from curvafit.segmentation.result import check_mask_target
 
         law = [] if self.prior is None or preset_name(self.prior) else [self.prior]
-        check_mask_target(self.out, frame, [self.source, *law, *self.inputs], self.overwrite, maps=self.maps)
+        check_mask_target(
+            self.out, frame, [self.source, *law, *self.inputs], self.overwrite, probability=self.probability
+        )
         if self.prior is not None:
             Law.of(self.prior)
 

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 SETTLED = 0.001
 #: `format` of the record beside a mask.
 FORMAT = Format("curvafit-mask-1", title="the record of a mask")
-#: Volumes that may lie beside a mask, by the ending of their names.
-MAPS = ("probability",)
 #: Expected Dice below which a note says that the known slices are too few.
 HALF = 0.5
 #: Relative difference of the mask's volume and that by known slices below which there is no note.
@@ -168,13 +166,13 @@ def check_mask_target(
     inputs: Iterable[str | Path] = (),
     overwrite: bool = False,
     *,
-    maps: Sequence[str] = (),
+    probability: bool = False,
 ) -> Path:
     """Return the path, or raise ValueError where the mask of a scan cannot be written there; to be called before the
     work. None of the `inputs`, files or folders, may be overwritten. `overwrite` says whether files of other origin may
-    be replaced, `maps` which of `MAPS` go beside the mask."""
+    be replaced, `probability` whether it goes beside the mask."""
     target = Path(path)
-    more = [sibling(target, ".json"), sibling(target, ".png"), *(map_path(target, name) for name in maps)]
+    more = [sibling(target, ".json"), sibling(target, ".png"), *([probability_path(target)] if probability else [])]
     can_write(target, FORMAT, more=more, inputs=inputs, overwrite=overwrite)
     pick_writer(target, "mm" if scan is None else scan.unit)
     if scan is not None and not is_streamed(target):
@@ -200,14 +198,14 @@ def write_mask(
     """Write the mask (0 and 1, uint8) or labels, a picture, a record, and the probability where there is one.
 
     The files `mask.nii.gz`, `mask.png`, `mask.json` and `mask_probability.nii.gz` appear together once all are whole;
-    their paths are returned. Former ones of `MAPS` are removed.
+    their paths are returned. A former probability is removed.
 
     Where the scan's file, `like`, and the target are NIfTI, the mask gets the same header but for type and range, and
     `unit`. `record` has entries to add to the record; with `overwrite` files of other origin may be replaced.
     """
-    maps = {} if segmentation.probability is None else {MAPS[0]: segmentation.probability}
+    probability = segmentation.probability
     inputs = () if like is None else (like,)
-    target = check_mask_target(path, scan, inputs, overwrite, maps=list(maps))
+    target = check_mask_target(path, scan, inputs, overwrite, probability=probability is not None)
 
     def write(volume: Volume, file: Path) -> None:
         if like is not None and all(str(path).lower().endswith(_NIFTI) for path in (like, target)):
@@ -220,29 +218,28 @@ def write_mask(
         if labels is None:  # the mask, as 0 and 1
             numbers = replace(mask.array, label=None) if mask.in_file else mask.values.view(np.uint8)
             labels = replace(mask, array=numbers)
-        for name, volume in maps.items():
-            write(volume, work / map_path(target, name).name)
+        if probability is not None:
+            write(probability, work / probability_path(target).name)
         write(labels, work / target.name)
-        rows = {} if maps else {"scan": (scan.values, None), "mask": (scan.values, mask.values)}
+        rows = {} if probability is not None else {"scan": (scan.values, None), "mask": (scan.values, mask.values)}
         content = describe_run(segmentation, record or {}, scan)
-        return _finish(work, target, list(maps), _figure(segmentation, rows), content)
+        return _finish(work, target, probability is not None, _figure(segmentation, rows), content)
 
 
-def _finish(work: Path, target: Path, maps: Sequence[str], figure: Figure, content: dict[str, Any]) -> tuple[Path, ...]:
-    """Write picture and record into the folder `work`, where the mask and its `maps` are; move all files at once to
-    the target's folder, remove maps of an earlier run, and return the paths."""
+def _finish(work: Path, target: Path, probable: bool, figure: Figure, content: dict[str, Any]) -> tuple[Path, ...]:
+    """Write picture and record into the folder `work`, where the mask is, and its probability if `probable`; move all
+    files at once to the target's folder, remove the probability of an earlier run, and return the paths."""
     from curvafit.drawing.plot import DPI
 
     record, picture, former = sibling(target, ".json"), sibling(target, ".png"), FORMAT.companions(target)
-    others = [map_path(target, name) for name in MAPS if name not in maps]
-    old_maps = [path for path in others if path.name in former]
-    names = [target.name, picture.name, record.name, *(map_path(target, name).name for name in maps)]
+    probability = probability_path(target)
+    names = [target.name, picture.name, record.name, *([probability.name] if probable else [])]
     figure.savefig(work / picture.name, dpi=DPI)
     FORMAT.write(work / record.name, {**content, "files": names})
     with hold_signals():
         files = move_together([work / name for name in names], target.parent)
-        for path in old_maps:
-            remove(path)
+        if not probable and probability.name in former:
+            remove(probability)
     return files
 
 
@@ -288,9 +285,9 @@ def _read_planes(volume: Volume, places: Sequence[int]) -> list[np.ndarray]:
     return planes
 
 
-def map_path(target: Path, name: str) -> Path:
-    """Return the path of a map beside a mask: `mask_probability.nii.gz` for `mask.nii.gz` and `probability`."""
-    return sibling(target, f"_{name}{target.name.removeprefix(sibling(target, '').name)}")
+def probability_path(target: Path) -> Path:
+    """Return the path of the probability beside a mask: `mask_probability.nii.gz` for `mask.nii.gz`."""
+    return sibling(target, f"_probability{target.name.removeprefix(sibling(target, '').name)}")
 
 
 def describe_run(segmentation: Segmentation, options: Mapping[str, Any], scan: Volume) -> dict[str, Any]:

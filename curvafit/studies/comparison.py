@@ -87,9 +87,9 @@ class Comparison(Pictured):
     subjects, labels, blocks
         Label and name of each subject; the index of its group, or its number, (S,); and the index of its name, (S,),
         where subjects are paired, else None.
-    values, errors, halves
-        Each subject's quantities (S, K), means over its scans; their standard errors and the halves of their 95 %
-        intervals, which follow from the scans' own intervals, NaN where a scan has none.
+    values, halves
+        Each subject's quantities (S, K), means over its scans; and the halves of their 95 % intervals, which follow
+        from the scans' own intervals, NaN where a scan has none.
     numbers
         A test of each quantity.
     statistic, p, least
@@ -114,7 +114,6 @@ class Comparison(Pictured):
     labels: np.ndarray
     blocks: np.ndarray | None
     values: np.ndarray
-    errors: np.ndarray
     halves: np.ndarray
     numbers: tuple[Number, ...]
     statistic: float
@@ -327,7 +326,7 @@ def _compare_measures(
     least_p = permutation.share_beyond(permutation.correlate(scores[:, None], arrangements, blocks))[0]
     return Comparison(
         by=options["by"], groups=groups, unit=measures[0].unit, cases=tuple(cases), measures=tuple(measures),
-        subjects=tuple(subjects), labels=labels, blocks=blocks, values=values, errors=errors, halves=halves,
+        subjects=tuple(subjects), labels=labels, blocks=blocks, values=values, halves=halves,
         numbers=_compare_numbers(measures[0], values, errors, labels, arrangements, blocks),
         statistic=float(statistics[0]), p=float(permutation.share_beyond(statistics)), least=float(least_p),
         sides=sides, diagrams=means, edges=edges, differences=differences,
@@ -368,7 +367,8 @@ def _compare_bins(
 
 
 def _average(measures: Sequence[Measures], scans: Sequence[Sequence[int]]) -> tuple[np.ndarray, ...]:
-    """Return `values`, `errors` and `halves` of a `Comparison`; `scans` are the indices of each subject's scans."""
+    """Return `values` of a `Comparison`, their standard errors, and its `halves`; `scans` are the indices of each
+    subject's scans."""
     values = np.array([[quantity.value for quantity in scan.quantities] for scan in measures])
     halves = np.array([[quantity.half for quantity in scan.quantities] for scan in measures])
     errors = halves / np.array([[interval_reach(scan.blocks)] for scan in measures])
