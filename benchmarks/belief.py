@@ -1,180 +1,169 @@
 """The test of a law: how often it rejects shapes of the model, and how often what only looks like them.
 
-Shapes of stores (`--shapes STORE…`), laws that no choice has seen, as masks cut open, go through the whole of `infer`,
-which tests the law that it found itself. So do their level cuts: cuts of a Gaussian field with the same volume
-fraction and two-point function, which no law made. The p of each is as `infer` states it (`compare_windows`): of the
-rank of its departure (`Misfit.departure`) among those of the packaged posterior, and of the rank of its discriminant.
-`size` is the part of shapes with p at most .05, `power` that of level cuts; a cut that has not gone through `infer` is
-counted by its discriminant alone, which can only reject fewer. `law_error` is how far the law that `infer` chooses
-lies from the shape's own, `medians_error` the posterior's medians: the mean over the six parameters and the laws, in
-deviations of the box of `curvafit atlas build`.
+Shapes of stores (`--shapes STORE…`), of laws that neither posterior nor discriminants have seen, are asked for as
+masks cut open and as images of five qualities; so are their level cuts, as masks: cuts of a Gaussian field with the
+same volume fraction and two-point function, which no law made. The p of each is as `infer` states it
+(`measure_misfit`). `size` is the part of shapes with p below .05, `power` that of level cuts. `left_out` is the part of
+textures of a kind that is ruled out where only the other kinds were learned from, by the discriminant alone.
 
-`--teach STORE…` learns the discriminant from shapes of other laws, as masks, and their level cuts. `--calibrate FILE`
-writes the packaged posterior with it and with the departures of all shapes; each law's is then ranked among the others.
+`--teach FILE` writes the packaged posterior, or that of `--posterior`, with what tells shapes of the model from
+textures of no law: level cuts, walls of cells, grains, trees of tubes, fibres, `--textures` of each. They are described
+once, into `benchmarks/results/textures.npz`.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
-from scipy import optimize, stats
+from scipy import ndimage, optimize, stats
 
-from benchmarks.closure import PRIOR, TABLE
-from benchmarks.harness import Cases, Figure, Values, bootstrap, show
+from benchmarks.harness import RESULTS, Cases, Figure, Values, show, write_whole
+from benchmarks.teaching import VIEWS, gather
+from curvafit.data_synth.atlas import measure_view
 from curvafit.data_synth.store import Store, find_well_formed
-from curvafit.inference.candidates import join_tests
-from curvafit.inference.estimate import measure_descriptors, rank_level_cut, tail_probability
-from curvafit.inference.inference import infer
-from curvafit.inference.posterior import Posterior, load_posterior, save_posterior
-from curvafit.inference.simulate import Growth
-from curvafit.inference.table import column_names, load_table, parameters_of
+from curvafit.data_synth.textures import KINDS
+from curvafit.inference.candidates import UNBELIEVABLE, Misfit, join_tests
+from curvafit.inference.estimate import DRAWS, STARTS, measure_descriptors, measure_misfit, tail_probability
+from curvafit.inference.posterior import Discriminant, Posterior, load_posterior, save_posterior
+from curvafit.inference.table import Scanned, Table, see_mask, see_scan
+from curvafit.inference.training import keep_laws
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.scan.preparation import prepare
-from curvafit.volumes.volume import Volume
+from curvafit.volumes.volume import ScanError, Volume
 
-KINDS = ("shape", "cut")
-LEVEL = 0.05
+SEED, TEXTURES = 7, RESULTS / "textures.npz"
+
+
+def see_grains(u: np.ndarray, rng: np.random.Generator) -> Scanned:
+    """Return {u > 0}, cut open at random, as an image blurred by 1.5 voxels whose noise is correlated as far."""
+    scan, kind, periodic = see_scan(u, rng, blur=1.5, thick=1, snr=math.inf)
+    noise = ndimage.gaussian_filter(rng.standard_normal(scan.values.shape), 1.5, mode="wrap")
+    grey = scan.values + (0.06 / noise.std()) * noise
+    return Scanned(Volume(grey.astype(np.float32), scan.spacing, scan.unit), kind, periodic)
+
+
+#: Ways in which shapes are seen: a mask, and images by blur and slices in voxels, and signal over noise.
+SEEN: dict[str, Callable[[np.ndarray, np.random.Generator], Scanned]] = {
+    "mask": see_mask,
+    "good": partial(see_scan, blur=0.7, thick=1, snr=20.0),
+    "blurred": partial(see_scan, blur=1.5, thick=1, snr=20.0),
+    "sliced": partial(see_scan, blur=1.0, thick=2, snr=20.0),
+    "grainy": see_grains,
+    "bad": see_scan,
+}
 #: Angles at which the integral of `cut_covariance` is tabulated.
 ANGLES = 4001
-#: Part of the mean variance of a column that is added to each, where the discriminant is learned.
+#: Part of the mean variance of a column that is added to each, where a discriminant is learned.
 RIDGE = 0.1
 
 
-def masked(store: Store, index: int, cut: bool) -> Volume:
-    """Return a shape, or its level cut, as a mask that is cut open at another place."""
-    mask, random = store.field(index) > 0, np.random.default_rng(index)
-    if cut:
-        mask = level_cut(mask, Grid(mask.shape), index) > 0
-    return Volume(np.roll(mask, random.integers(mask.shape[0], size=3), (0, 1, 2)).astype(np.uint8))
+# ---- what tells textures of no law -----------------------------------------------------------------------------------
 
 
-def case(store: Store, index: int, cut: bool) -> Values:
-    """Return p, of all descriptors and by block, the departure and the verdict of a shape or of its level cut."""
-    fit = infer(masked(store, index, cut), kind="mask", growth=Growth(), seed=index).fit
-    found: Values = {"status": fit.status.partition(":")[0]}
-    if not cut and (best := fit.best) is not None and fit.draws is not None:
-        truth, law = (parameters_of(each.coefficients, each.mass) for each in (store.record(index), best))
-        for name, parameters in (("law", law), ("medians", np.median(fit.draws[:, :-1], 0))):
-            found[f"{name} error"] = float(np.mean(np.abs(parameters - truth) / PRIOR))
-    if (misfit := fit.misfit) is not None:
-        found |= {"p": misfit.probability, "departure": misfit.departure, **misfit.blocks}
-    return found
+def describe_textures(count: int, cases: Cases) -> np.ndarray:
+    """Return the descriptors `(views, n, 351)` of so many textures of each kind; NaN where one cannot be read."""
+    if not TEXTURES.exists():
+        rows = [cases.array(f"{kind}-{k}", partial(_describe, kind, k)) for kind, k in product(KINDS, range(count))]
+        write_whole(TEXTURES, partial(np.savez_compressed, descriptors=np.stack(rows, 1).astype(np.float16)))
+    with np.load(TEXTURES) as file:
+        return file["descriptors"].astype(np.float32)
 
 
-def describe(store: Store, index: int, cut: bool) -> np.ndarray:
-    """Return the descriptors `(k, 351)` of windows of a shape, or of its level cut, as `infer` measures them."""
-    try:
-        found = measure_descriptors(prepare(masked(store, index, cut), kind="mask", one_scale=True))
-    except ValueError:  # such as of one ball, which is a few voxels wide at the thickness of the training
-        found = None
-    return np.zeros((0, len(column_names()))) if found is None else found.reading.windows
+def _describe(kind: str, number: int) -> np.ndarray:
+    texture = KINDS[kind](np.random.default_rng([SEED, *kind.encode(), number]))
+    texture = texture if (texture > 0).mean() <= 0.5 else -texture
+    return np.array([measure_view(texture, view, number)[0] for view in VIEWS])
 
 
-def describe_all(shapes: Sequence[tuple[Store, int]], cases: Cases) -> dict[str, list[np.ndarray]]:
-    """Return the descriptors of windows `(k, 351)` of shapes, and of their level cuts, by kind."""
-    return {kind: [cases.array(name_of(*each, kind), partial(describe, *each, kind == "cut")) for each in shapes]
-            for kind in KINDS}  # fmt: skip
-
-
-def name_of(store: Store, index: int, kind: str) -> str:
-    return f"{store.settings.shape[0]}-{store.name}-{index}-{kind}"
-
-
-def teach(posterior: Posterior, rows: Mapping[str, Sequence[np.ndarray]]) -> Posterior:
-    """Return a posterior with Fisher's discriminant of windows `(k, 351)` of shapes and of their level cuts."""
+def teach(posterior: Posterior, table: Table, textures: np.ndarray) -> Posterior:
+    """Return a posterior with Fisher's discriminants of a table's shapes and of textures `(views, n, 351)`."""
+    table, found = table.visible.pooled, {}
+    kept = keep_laws(table, posterior.provenance["seed"])
     plain = replace(posterior.compression, basis=np.eye(len(posterior.compression.mean)))
-    shapes, cuts = (np.array([plain(each).mean(0) for each in rows[kind] if len(each)]) for kind in KINDS)
-    variance = np.cov(np.concatenate([shapes, cuts]).T, bias=True)
-    ridge = RIDGE * np.diag(variance).mean() * np.eye(len(variance))
-    weights = np.linalg.solve(variance + ridge, shapes.mean(0) - cuts.mean(0))
-    taught = replace(posterior, discriminant=weights.astype(np.float32))
-    table = load_table(TABLE)
-    values = {view: taught.discriminate(table.rows(table.views == view).descriptors) for view in posterior.views}
-    return replace(taught, discriminants={view: np.sort(each) for view, each in values.items()})
+    for view, others in zip(VIEWS, textures, strict=True):
+        in_view = table.views == view
+        both = plain(table.rows(in_view & ~kept).descriptors), plain(others[np.isfinite(others).all(1)])
+        variance = sum(np.cov(rows.T, bias=True) for rows in both) / 2
+        ridge = RIDGE * np.diag(variance).mean() * np.eye(len(variance))
+        weights = np.linalg.solve(variance + ridge, both[0].mean(0) - both[1].mean(0)).astype(np.float32)
+        usual = posterior.discriminate(table.rows(in_view & kept).descriptors, weights)
+        found[view] = Discriminant(weights, np.sort(usual))
+    return replace(posterior, discriminants=found)
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--shapes", type=Path, nargs="+", required=True, help="stores of laws that no choice has seen")
-    parser.add_argument("--count", type=int, default=100, help="shapes of each store, and as many level cuts")
-    parser.add_argument(
-        "--teach", type=Path, nargs="+", help="stores of other laws, from which to learn what tells cuts"
-    )
-    parser.add_argument("--calibrate", type=Path, help="write the packaged posterior with the departures found")
-
-
-def level_cuts(posterior: Posterior, windows: Sequence[np.ndarray]) -> np.ndarray:
-    """Return `rank_level_cut` `(n,)` of windows `(k, 351)` of n masks, NaN where there are none."""
-    return np.array([rank_level_cut(posterior, "mask", each) if len(each) else np.nan for each in windows])
-
-
-def rank(
-    usual: np.ndarray | None, departures: Mapping[str, Mapping[int, float]], cuts: Mapping[str, np.ndarray]
-) -> dict[str, dict[int, float]]:
-    """Return p by kind and number of the law, of departures by both and of `level_cuts` by kind `(laws,)`.
-
-    Departures are ranked among usual ones `(n,)`; where these are None, among those of the other laws' shapes. A shape
-    without a departure is left out; a cut without one stands with the rank of its discriminant.
-    """
-    found: dict[str, dict[int, float]] = {}
-    for kind, mine in departures.items():
-        own = {} if kind == "shape" else dict.fromkeys(range(len(cuts[kind])), 1.0)
-        for law, departure in mine.items():
-            others = np.array([each for other, each in departures["shape"].items() if other != law])
-            own[law] = tail_probability(others if usual is None else usual, departure)
-        both = {law: (p, cuts[kind][law]) for law, p in own.items()}
-        found[kind] = {law: join_tests(*each) for law, each in both.items() if np.isfinite(each[1])}
-    return found
-
-
-def figures_of(
-    tested: Mapping[str, Mapping[int, float]], errors: Mapping[int, Values], edges: np.ndarray
-) -> dict[str, Figure]:
-    """Return the part that is rejected, by kind, and mean errors of `infer`, by edge of the laws' shapes `(laws,)`."""
-    figures = {}
-    for edge in dict.fromkeys(edges):
-        for (_, found), title in zip(tested.items(), ("size", "power"), strict=True):
-            p = np.array([p for law, p in found.items() if edges[law] == edge])
-            hits = int(np.sum(p <= LEVEL))
-            interval = stats.binomtest(hits, len(p)).proportion_ci(method="wilson") if len(p) else (np.nan, np.nan)
-            figures[f"belief.{edge}.{title}"] = Figure(hits / max(len(p), 1), *map(float, interval))
-        for name in ("law", "medians"):
-            away = [values[f"{name} error"] for law, values in errors.items() if edges[law] == edge]
-            figures |= {f"belief.{edge}.{name}_error": bootstrap(away, np.mean)} if away else {}
-    show([f"part with p at most {LEVEL}; mean errors", ""], list(figures.items()))
+def leave_out(posterior: Posterior, table: Table, textures: np.ndarray) -> dict[str, Figure]:
+    """Return which part of the textures of each kind is ruled out by a discriminant that learned from the others."""
+    kind, figures = np.arange(textures.shape[1]) % len(KINDS), {}
+    for number, name in enumerate(KINDS):
+        told = teach(posterior, table, textures[:, kind != number]).discriminants
+        for view, asked in zip(VIEWS, textures[:, kind == number], strict=True):
+            values = posterior.discriminate(asked[np.isfinite(asked).all(1)], told[view].weights)
+            rows = [{"p": join_tests(1.0, tail_probability(-told[view].usual, -value))} for value in values]
+            figures[f"left_out.{name.replace(' ', '_')}.{view}"] = part_below(rows)
     return figures
 
 
+# ---- size and power --------------------------------------------------------------------------------------------------
+
+
+def case(posterior: Posterior, store: Store, index: int, seen: str, cut: bool) -> Values:
+    """Return the p of a shape, or of its level cut, as it is seen."""
+    field, random = store.field(index), np.random.default_rng([SEED, index, zlib.crc32(seen.encode())])
+    scan, kind, _ = SEEN[seen](level_cut(field > 0, Grid(field.shape), index) if cut else field, random)
+    try:
+        misfit = ask(posterior, scan, kind)
+    except ScanError:
+        misfit = None
+    return {} if misfit is None else {"p": misfit.probability, "unexplained": misfit.unexplained, "alike": misfit.alike}
+
+
+def ask(posterior: Posterior, scan: object, kind: str) -> Misfit | None:
+    """Return the misfit of a scan as `infer` states it; None where it cannot be read."""
+    described = measure_descriptors(prepare(scan, kind=kind, one_scale=True))  # type: ignore[arg-type]
+    if described is None:
+        return None
+    return measure_misfit(described, posterior, posterior.draw(described.reading, DRAWS)[:STARTS, :-1])
+
+
+def part_below(rows: list[Values], name: str = "p") -> Figure:
+    """Return the part of cases that the test rules out, of those that can be read, with Wilson's interval."""
+    p = [row[name] for row in rows if row.get(name) is not None]
+    hits = sum(value < UNBELIEVABLE for value in p)
+    interval = stats.binomtest(hits, len(p)).proportion_ci(method="wilson") if p else (np.nan, np.nan)
+    return Figure(hits / max(len(p), 1), *map(float, interval))
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--shapes", type=Path, nargs="*", default=[], help="stores of laws that no choice has seen")
+    parser.add_argument("--textures", type=int, default=40, help="textures of each kind to learn from")
+    parser.add_argument("--posterior", type=Path, help="posterior to teach, instead of the packaged one")
+    parser.add_argument("--teach", type=Path, help="write the posterior, taught, to this file")
+
+
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
-    if options.quick and options.calibrate is not None:
-        raise SystemExit("--quick makes two shapes only: no test is calibrated by them")
-    posterior, most = load_posterior(), 2 if options.quick else None
+    posterior, figures = load_posterior(options.posterior), dict[str, Figure]()
     if options.teach is not None:
-        posterior = teach(posterior, describe_all(find_well_formed(tuple(options.teach))[:most], cases))
-    stores = [find_well_formed((path,))[: most or options.count] for path in options.shapes]
-    shapes = [shape for store in stores for shape in store]
-    cuts = {kind: level_cuts(posterior, windows) for kind, windows in describe_all(shapes, cases).items()}
-    departures: dict[str, dict[int, float]] = {kind: {} for kind in KINDS}
-    errors: dict[int, Values] = {}
-    for number, (store, index) in enumerate(shapes):
-        for kind, found in departures.items():
-            job = partial(case, store, index, kind == "cut")
-            for values in cases.all({name_of(store, index, kind): job}, seed=index).values():
-                if "departure" in values:
-                    found[number] = values["departure"]
-                if "law error" in values:
-                    errors[number] = values
-    edges = np.array([store.settings.shape[0] for store, _ in shapes])
-    p = rank(None if options.calibrate else posterior.departures, departures, cuts)
-    figures = figures_of(p, errors, edges)
-    if options.calibrate is not None:
-        found = np.sort(np.array([*departures["shape"].values()], dtype=np.float32))
-        save_posterior(replace(posterior, departures=found), options.calibrate)
+        told = (gather(), describe_textures(options.textures, cases))
+        figures |= leave_out(posterior, *told)
+        posterior = teach(posterior, *told)
+        save_posterior(posterior, options.teach)
+    for path in options.shapes:
+        shapes = find_well_formed((path,))[: 1 if options.quick else None]
+        edge = shapes[0][0].settings.shape[0]
+        for title, cut in (("size", False), ("power", True)):
+            for seen in ("mask",) if cut else SEEN:
+                names = {f"{edge}-{title}-{seen}-{index}": (store, index) for store, index in shapes}
+                jobs = {name: partial(case, posterior, *each, seen, cut) for name, each in names.items()}
+                figures[f"belief.{title}_{seen}.{edge}"] = part_below(list(cases.all(jobs, SEED).values()))
+    show(["part ruled out", ""], list(figures.items()))
     return {} if options.quick else figures
 
 

@@ -1,7 +1,8 @@
 """How many laws a posterior must be taught: errors on laws left out, by the number of laws that it learns from.
 
 Of five folds of the laws of `results/table.npz` one is asked for, and of the others so many teach a posterior of one
-flow with its emulator, as `curvafit atlas train` does, on masks and degraded scans. Errors are those of the medians of
+flow with its emulator, as `curvafit atlas train` does, on masks and degraded scans; beside the most of them all laws
+of `teaching`, a shape each, teach `all`. Errors are those of the medians of
 its draws of one mask of each law that was left out, in deviations of the box, the mean over six parameters of the
 medians over laws; `emulator` is the part of the variance of descriptors between laws that the emulator misses, over the
 same laws. `learning.doubling` is what twice the laws take off the error, by a line through the four numbers of laws.
@@ -15,31 +16,31 @@ from itertools import product
 
 import numpy as np
 
-from benchmarks.closure import PRIOR, TABLE
+from benchmarks.closure import PRIOR
 from benchmarks.harness import Cases, Figure, Values, show
-from curvafit.inference.table import PARAMETERS, Table, load_table
+from benchmarks.teaching import gather
+from curvafit.inference.table import PARAMETERS, Table
 from curvafit.inference.training import train_posterior
 
 SEED, FOLDS, DRAWS, VIEW = 70, 5, 400, "mask"
-COUNTS = (88, 177, 354, 708)
+COUNTS: dict[str, int] = {"88": 88, "177": 177, "354": 354, "708": 708, "all": 708}
 VIEWS = ("mask", "scan")
 
 
-def split(table: Table, fold: int, count: int) -> tuple[Table, Table]:
+def split(table: Table, fold: int, name: str) -> tuple[Table, Table]:
     """Return rows of so many laws to learn from, and one mask of each law that is left out."""
-    _, law = np.unique(table.parameters, axis=0, return_inverse=True)
-    law, laws = law.ravel(), np.random.default_rng(SEED).permutation(law.max() + 1)
+    law, added = table.laws, np.char.startswith(table.shapes, "teaching/")
+    laws = np.random.default_rng(SEED).permutation(np.unique(law[~added]))
     asked = laws[fold::FOLDS]
     taught = np.setdiff1d(laws, asked, assume_unique=True)
-    taught = np.random.default_rng([SEED, fold]).permutation(taught)[:count]
+    taught = np.random.default_rng([SEED, fold]).permutation(taught)[: COUNTS[name]]
     seen = table.views == VIEW
     first = [np.flatnonzero((law == each) & seen)[:1] for each in asked]
-    return table.rows(np.isin(law, taught)), table.rows(np.concatenate(first))
+    return table.rows(np.isin(law, taught) | (added & (name == "all"))), table.rows(np.concatenate(first))
 
 
-def learn(fold: int, count: int) -> Values:
-    table = load_table(TABLE).visible.select_views(VIEWS)
-    taught, asked = split(table, fold, count)
+def learn(fold: int, name: str) -> Values:
+    taught, asked = split(gather().visible.select_views(VIEWS), fold, name)
     posterior = train_posterior(taught, members=1, seed=fold)
     drawn = posterior.sample(asked.descriptors, asked.views, asked.amount, DRAWS)[..., : len(PARAMETERS)]
     least, median, most = np.quantile(drawn, (0.05, 0.5, 0.95), axis=1)
@@ -58,7 +59,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
-    counts = COUNTS[:1] if options.quick else COUNTS
+    counts = ["88"] if options.quick else [*COUNTS]
     names = {(fold, count): f"{fold}-{count}" for fold, count in product(range(options.folds), counts)}
     found = cases.all({name: partial(learn, *key) for key, name in names.items()}, SEED)
     figures = dict[str, Figure]()
@@ -67,8 +68,10 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
         for key in ("error", "in90", "missed") if rows else ():
             each = [float(np.mean(row[key])) for row in rows]
             figures[f"learning.{count}.{key}"] = Figure(float(np.mean(each)), min(each), max(each))
-    errors = [figures[key].value for count in counts if (key := f"learning.{count}.error") in figures]
-    if len(errors) == len(COUNTS):
-        figures["learning.doubling"] = Figure(float(-np.polyfit(np.log2(COUNTS), errors, 1)[0]))
+    numbers = [name for name in COUNTS if name != "all"]
+    errors = [figures[key].value for name in numbers if (key := f"learning.{name}.error") in figures]
+    if len(errors) == len(numbers):
+        slope = np.polyfit(np.log2([COUNTS[name] for name in numbers]), errors, 1)[0]
+        figures["learning.doubling"] = Figure(float(-slope))
     show(["", ""], list(figures.items()), "intervals are the folds' least and most")
     return {} if options.quick else figures

@@ -1,7 +1,7 @@
 """Reports of real scans: what `infer` says of each.
 
-Needs $CURVAFIT_DATA. Of each scan the structure's share, thickness and spacing in working voxels; p and departure of
-`misfit`, and the blocks of descriptors that reject it; the means of the chosen law's twins over the scan; the verdict.
+Needs $CURVAFIT_DATA. Of each scan the structure's share, thickness and spacing in working voxels; p and its two parts
+(`misfit`); the means of the chosen law's twins over the scan; the verdict.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.harness import Cases, Figure, Values, data, show
+from curvafit.inference.candidates import Growth
 from curvafit.inference.inference import infer
-from curvafit.inference.simulate import Growth
 from curvafit.volumes.read import load
 from curvafit.volumes.volume import ScanError, Volume
 
@@ -65,19 +65,19 @@ def report(name: str) -> Values:
         for key in RATIOS if twins else ():
             values[key] = float(np.mean([getattr(each, key) for each in twins]) / getattr(own, key))
     if fit.misfit is not None:
-        away = fit.misfit.departure
-        values |= {"p": fit.misfit.probability, "departure": np.nan if away is None else away}
-        values["rejected by"] = ", ".join(name for name, p in fit.misfit.blocks.items() if p <= 0.05)
+        alike = fit.misfit.alike
+        values |= {"p": fit.misfit.probability, "unexplained": fit.misfit.unexplained}
+        values["alike"] = np.nan if alike is None else alike
     return values
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     names = ["capillaries"] if options.quick else [*SCANS]
     found = cases.all({name: lambda name=name: report(name) for name in names})
-    columns = ("share", "thickness", "spacing", "p", "departure", *RATIOS, "rejected by", "verdict")
+    columns = ("share", "thickness", "spacing", "p", "unexplained", "alike", *RATIOS, "verdict")
     show(["scan", *columns], [[name, *(row.get(key, "") for key in columns)] for name, row in found.items()])
     figures = {f"scans.{name}.{key}": Figure(row[key]) for name, row in found.items()
-               for key in columns[:-2] if key in row}  # fmt: skip
+               for key in columns[:-1] if key in row}  # fmt: skip
     if len(found) == len(SCANS):
         supported = sum(row["verdict"].startswith("Supported") for row in found.values())
         figures["scans.supported"] = Figure(float(supported))

@@ -10,6 +10,7 @@ that the sentinel disagrees, until it is measured again.
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import time
 import warnings
@@ -20,11 +21,11 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from benchmarks import belief, centreline, completion, convergence, curvature, networks, prior, step
+from benchmarks import centreline, completion, convergence, curvature, networks, prior, step
 from benchmarks.harness import SENTINEL, append_lines, provenance, read_lines, show
 from curvafit.geometry.diagrams import diagram
 from curvafit.geometry.distances import wasserstein
-from curvafit.inference.estimate import measure_descriptors
+from curvafit.inference.estimate import STARTS, measure_descriptors, measure_misfit
 from curvafit.inference.posterior import load_posterior
 from curvafit.priors import CurvaturePrior
 from curvafit.priors.coefficients import Coefficients
@@ -90,12 +91,14 @@ def check_texture() -> Checked:
 
 
 def check_reading() -> Checked:
-    """Check what the posterior reads from a texture, and how much that looks like a level cut, which it is."""
+    """Check what the posterior reads from a level cut, and the rank of what the best parameters leave unexplained."""
     found, posterior = measure_descriptors(prepare(Volume(texture(64)), kind="mask", one_scale=True)), load_posterior()
     assert found is not None
     medians = np.median(posterior.standardise(posterior.draw(found.reading, 2000)), axis=0)[:6]
     checked = {f"parameter {k + 1}": (float(value), 0.1) for k, value in enumerate(medians)}
-    return checked | {"rank": (float(belief.level_cuts(posterior, [found.reading.windows])[0]), 0.02)}
+    starts = posterior.draw(found.reading, STARTS)[:, :-1]
+    misfit = measure_misfit(found, posterior, starts)
+    return checked | {"rank": (math.nan if misfit is None else misfit.unexplained, 0.02)}
 
 
 def check_completion() -> Checked:

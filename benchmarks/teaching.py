@@ -98,8 +98,8 @@ def _save(path: Path, kept: dict[str, list[Any]]) -> None:
 
 
 def gather() -> Table:
-    """Return all rows as a table, after those of the packaged posterior's in these views."""
-    first, parts = load_table(RESULTS / "table.npz").select_views(VIEWS), []
+    """Return all rows as a table, after those of `results/table.npz`, which are of phase fields too."""
+    first, parts = load_table(RESULTS / "table.npz"), []
     for path in sorted(FOLDER.glob("*.npz")):
         with np.load(path) as file:
             parts.append([file[name] for name in ("index", "descriptors", "amount", "thickness")])

@@ -86,7 +86,7 @@ def made_fit(chosen: str | None = "posterior", lost: bool = False) -> Fit:
             Combination("flat", "round", {"a11": 0.1, "log a02": 0.8}, 1.2, (1.0, 1.4), 0.98),
             Combination("sparse", "full", {"a11": 0.9, "log a02": 0.1}, 0.1, (-1.5, 1.6), 0.02),
         ),
-        misfit=Misfit(0.4, {"curvature": 0.3, "fabric": 0.004}, "12 simulations", 1.2, 0.2),
+        misfit=Misfit(0.4, 0.3, 0.2),
         scale=(1.0, 1.0, 1.0),
         working_voxel=SCALE,
         length_unit="mm",

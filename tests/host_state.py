@@ -130,7 +130,7 @@ def calls(folder: Path) -> dict[str, Callable[[], object]]:
         plot.png(plot.surface_figure(kept["flow"].field.numpy(), width=32))
 
     def infer() -> None:
-        few = Growth(simulations=1, rounds=1, twins=1, schedule=brief)
+        few = Growth(twins=1, schedule=brief)
         found = curvafit.infer(curvafit.Volume(kept["flow"].field.numpy()), kind="field", periodic=True, growth=few)
         (folder / "fit.json").write_text(found.fit.to_json())
 

@@ -30,7 +30,7 @@ def slope_of(loss, value: Tensor) -> Tensor:
 
 
 def fit_file(path: Path, unit: str, status: str = "") -> Path:
-    fit = {"format": "curvafit-fit-4", "status": status, "mass": -0.3, "epsilon_physical": 4.0}
+    fit = {"format": "curvafit-fit-5", "status": status, "mass": -0.3, "epsilon_physical": 4.0}
     fit |= {"working_voxel": 2.0, "length_unit": unit}
     fit["coefficients"] = TUBES.as_dict()
     fit["coefficients_physical"] = TUBES.in_unit(1 / 200).as_dict()

@@ -18,7 +18,7 @@ def parse_inference(
     atlas: Annotated[Path | None, typer.Option(help="Atlas (.npz) instead of the packaged one.")] = None,
     posterior: Annotated[Path | None, typer.Option(help="Posterior (.npz) instead of the packaged one.")] = None,
     method: Annotated[str, typer.Option(help="posterior, or match: the nearest shape, refined.")] = "posterior",
-    test: Annotated[bool, typer.Option("--test", help="Grow shapes: can the law have made the scan? Minutes.")] = False,
+    test: Annotated[bool, typer.Option("--test", help="Grow shapes of the law beside the scan: a minute.")] = False,
 ) -> dict[str, Any]:
     """Return the options by which a law is inferred and tested, by name."""
     return {"atlas": atlas, "posterior": posterior, "method": method, "test": test}
@@ -44,8 +44,8 @@ def infer(
     """Infer the parameters of a scanned volume, and write a report."""
     files = [path for path in (roi, law["atlas"], law["posterior"]) if path is not None]
     with show_stages() as progress:
+        from curvafit.inference.candidates import Growth
         from curvafit.inference.inference import infer as infer_scan
-        from curvafit.inference.simulate import Growth
         from curvafit.report.inference import check_report, write_inference
 
         law["growth"] = Growth() if law.pop("test") else None

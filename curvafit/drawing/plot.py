@@ -276,7 +276,7 @@ def section_on(axes: Axes, plane: np.ndarray, outline: np.ndarray | None, limits
         axes.contour(outline, [0.5], colors=CONTOUR, linewidths=1.0)
 
 
-# ---- draws, and bands ------------------------------------------------------------------------------------------------
+# ---- draws -----------------------------------------------------------------------------------------------------------
 
 
 def corner_figure(
@@ -315,30 +315,6 @@ def corner_figure(
     handles, labels = figure.axes[1].get_legend_handles_labels() if d > 1 else ([], [])  # axes 1 show the first pair
     if handles:
         figure.legend(handles, labels, loc="upper right", bbox_to_anchor=(0.98, 0.98), frameon=False, fontsize=11)
-    return figure
-
-
-def bands_figure(blocks: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
-    """Return a figure with a panel for each block of numbers: a scan's `(k,)` over bands of simulated ones `(n, k)`.
-
-    Bands hold 50 and 90 % of the simulations. A block of at most three numbers is drawn as dots on bars.
-    """
-    rows, columns = math.ceil(len(blocks) / 3), 3
-    figure = make_figure(10.0, 1.95 * rows, layout="constrained")
-    for panel, (name, (scan, simulations)) in enumerate(blocks.items(), 1):
-        axes = figure.add_subplot(rows, columns, panel)
-        x = np.arange(len(scan))
-        for percent, shade in ((90, DENSITY(0.12)), (50, DENSITY(0.35))):
-            low, high = np.percentile(simulations, (50 - percent / 2, 50 + percent / 2), axis=0)
-            if len(scan) > 3:
-                axes.fill_between(x, low, high, color=shade, linewidth=0)
-            else:
-                axes.vlines(x, low, high, color=shade, linewidth=14)
-        axes.plot(x, scan, "-" if len(scan) > 3 else "o", color=CONTOUR, linewidth=1.8, markersize=6)
-        axes.set_title(name, fontsize=10)
-        axes.set(xlim=(-0.5, len(scan) - 0.5), xticks=[])
-        axes.tick_params(length=2, labelsize=8)
-        axes.spines[:].set_color(QUIET)
     return figure
 
 

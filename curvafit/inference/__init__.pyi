@@ -4,6 +4,7 @@ from .atlas import load_atlas as load_atlas
 from .atlas import nearest as nearest
 from .atlas import save_atlas as save_atlas
 from .candidates import Candidate as Candidate
+from .candidates import Growth as Growth
 from .candidates import Misfit as Misfit
 from .fit import Fit as Fit
 from .inference import Inference as Inference
@@ -11,7 +12,6 @@ from .inference import infer as infer
 from .posterior import Posterior as Posterior
 from .posterior import load_posterior as load_posterior
 from .posterior import save_posterior as save_posterior
-from .simulate import Growth as Growth
 from .stationary import stationarity as stationarity
 from .table import Table as Table
 from .table import load_table as load_table

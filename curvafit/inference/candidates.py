@@ -26,10 +26,8 @@ from curvafit.scan.preparation import Prepared, thinner_thickness
 RARE = 1 - 1e-6
 #: Where a law comes from, as people read it.
 TITLES = {
-    "refined": "refined by simulation",
     "posterior": "middle of the posterior",
     "optimum": "best fit of the descriptors",
-    "simulation": "nearest of the simulations",
     "stationarity": "refined by stationarity",
     "match": "nearest match",
 }
@@ -39,9 +37,30 @@ EDGES = (32, 100)
 UNBELIEVABLE = 0.05
 #: What a verdict begins with where no law is the scan's, and where it is not known.
 UNBELIEVED, UNDECIDED, UNTESTED = "No believable twin", "Undecided", "Not tested"
+#: Why a scan has no p.
+UNASKED = "It has no p: its descriptors cannot be measured, or it is noisier than all images that taught what is usual."
+#: What a scan without a law has still.
+LAWLESS = "Measures and comparisons need no law (curvafit measure, compare)."
 #: Familiar numbers in which twins may differ from the scan, and the relative difference of all twins that is named.
 FAMILIAR = {"thickness": "thickness_mean", "spacing": "spacing_mean", "connectivity": "connectivity_density"}
 NEAR = 0.15
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Which shapes of each law that is read of a scan are grown, to be compared with it.
+
+    Attributes
+    ----------
+    twins
+        How many shapes of the best law; of each other one.
+    schedule
+        Steps of each shape.
+    """
+
+    twins: int = 3
+    schedule: Schedule | str = LEARNED
+
 
 NotNegative = Annotated[float, Rule(least=0)]
 #: Standard deviations by coefficient, and of the mass.
@@ -176,20 +195,23 @@ def _measure_twin(flow: Flow, prepared: Prepared, seed: int) -> Twin:
 
 @dataclass(frozen=True)
 class Misfit:
-    """The fraction of the model's shapes whose descriptors are as unusual as the scan's.
+    """How unusual a scan is among shapes of the model, whose laws nothing has learnt from.
 
-    `probability` is of all descriptors together, `blocks` of each block alone; `method` says what was compared with.
-    `departure` is the mean distance of the scan from shapes of the law, less the mean distance between these, in the
-    emulator's uncorrelated directions; None where nothing grew. `level_cut` is the fraction of the model's shapes that
-    look as much like a level cut of a random field as the scan does; None where the posterior cannot say. `grain` is
-    the step in which `probability` comes: what it was ranked among is finite.
+    Attributes
+    ----------
+    probability
+        The p of both tests together (`join_tests`).
+    unexplained
+        The fraction of shapes of which the emulator's best parameters leave as much unexplained.
+    alike
+        The fraction of shapes that look as much like textures of no law; None where the posterior cannot say.
+    grain
+        The step in which the probability comes: what it was ranked among is finite.
     """
 
     probability: Annotated[float, Rule(least=0, most=1)]
-    blocks: dict[str, float]
-    method: str
-    departure: float | None = None
-    level_cut: Annotated[float | None, Rule(least=0, most=1)] = None
+    unexplained: Annotated[float, Rule(least=0, most=1)]
+    alike: Annotated[float | None, Rule(least=0, most=1)] = None
     grain: Annotated[float, Rule(least=0, most=1)] = 0.0
 
 
@@ -206,8 +228,8 @@ def verdict(
 ) -> tuple[str | None, str]:
     """Return the name of the best supported law of a scan, and the verdict on it; no name where nothing grew.
 
-    The test of the misfit alone decides whether a law is believable; one that is not is still named, as the nearest
-    there is. A p that is nearer to `UNBELIEVABLE` than its grain decides nothing. `grown` says whether shapes were.
+    The misfit alone decides whether a law is believable; one that is not is still named, as the nearest there is. A p
+    that is nearer to `UNBELIEVABLE` than its grain decides nothing. `grown` says whether shapes were.
     """
     if not grown:
         law = f"{UNTESTED} ({TITLES[candidates[0].name]}): no shape was grown (--test grows some)."
@@ -218,12 +240,11 @@ def verdict(
     noise = seed_noise_of(candidates)
     distances = f"its twins lie {best.distance:.1f} from the scan's curvature diagram"
     distances += f", {noise:.1f} from each other." if noise else "."
-    rating, reason = UNDECIDED, "Too few shapes grew to test the law."
+    rating, reason = UNDECIDED, UNASKED
     if misfit is not None:
         reason = _describe_misfit(misfit)
         if misfit.probability < UNBELIEVABLE:
             rating = UNBELIEVED
-            reason += " Measures and comparisons need no law (curvafit measure, compare)."
         elif misfit.probability < UNBELIEVABLE + misfit.grain:
             reason += f" That is too near to {UNBELIEVABLE:g} for a test that knows p in steps of {misfit.grain:.2g}."
         else:
@@ -255,21 +276,13 @@ def find_differences(scan: Morphometry, twins: Sequence[Morphometry]) -> list[st
 
 
 def _describe_misfit(misfit: Misfit | None) -> str:
-    """Say in a sentence whether shapes of the law look like the scan, and what differs; "" where that is not known."""
+    """Say in a sentence whether the scan looks like a shape of the model, and what to use if not."""
     if misfit is None:
-        return ""
+        return UNASKED
     p = format_number(misfit.probability, 2)
     if misfit.probability >= UNBELIEVABLE:
-        if misfit.departure is None:
-            return f"A quick reading does not rule it out (p = {p})."
-        return f"Shapes of this law look like the scan (p = {p})."
-    # The level cut is one of two joined tests, so that its probability is doubled here as it is there.
-    like_level_cut = misfit.level_cut is not None and join_tests(1.0, misfit.level_cut) < UNBELIEVABLE
-    note = "It looks more like a level cut of a random field, which no law made." if like_level_cut else ""
-    if misfit.departure is None:
-        return _join(f"A quick reading rules it out (p = {p}).", note)
-    blocks = sorted(misfit.blocks.items(), key=itemgetter(1))
-    unlikely = [name for name, probability in blocks if probability < UNBELIEVABLE]
-    difference = f"what differs most: {', '.join(unlikely)}" if unlikely else "no descriptor tells it alone"
-    direction = "The scan has a direction (fabric), and the model has none." if "fabric" in unlikely else ""
-    return _join(f"Shapes of this law do not look like the scan (p = {p}); {difference}.", direction, note)
+        return f"The scan looks as shapes of laws do (p = {p})."
+    # Either is one of two joined tests, so that its probability is doubled here as it is there.
+    unlike = misfit.alike is not None and join_tests(1.0, misfit.alike) < UNBELIEVABLE
+    reason = "it looks more like textures that no law makes" if unlike else "no law explains its numbers"
+    return f"The scan does not look as shapes of laws do (p = {p}): {reason}. {LAWLESS}"

@@ -20,18 +20,10 @@ from curvafit.generation.schedule import LEARNED, schedule
 from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE, Diagram, family_of
 from curvafit.geometry.morphology import Morphometry, morphometry
 from curvafit.inference.atlas import VERSION, Atlas, Match, load_atlas, mirror_match, nearest
-from curvafit.inference.candidates import TITLES, Candidate, Misfit, Twin, best_candidate, twin, verdict
-from curvafit.inference.estimate import (
-    Described,
-    Estimate,
-    check_law,
-    estimate_law,
-    measure_descriptors,
-    refine_matches,
-)
+from curvafit.inference.candidates import TITLES, Candidate, Growth, Twin, best_candidate, twin, verdict
+from curvafit.inference.estimate import Estimate, estimate_law, measure_descriptors, refine_matches
 from curvafit.inference.fit import KINDS, Fit
 from curvafit.inference.posterior import Posterior, load_posterior
-from curvafit.inference.simulate import Growth
 from curvafit.inference.stationary import stationarity
 from curvafit.priors.grid import WORKING_EPSILON
 from curvafit.priors.kernels.threads import map_threads
@@ -46,8 +38,6 @@ from curvafit.volumes.volume import Volume
 MATCHES, STARTS = 5, 3
 #: Whether a method refines the nearest match, in place of draws from the posterior.
 REFINED = {"posterior": False, "match": True}
-#: Distance of the seeds of the shapes that test a law from the seeds of its twins.
-TWINS = 1000
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -64,9 +54,6 @@ class Inference(Pictured):
         Shapes grown from each candidate's law, by the candidate's name.
     fit
         The law with its uncertainty, the candidates and the verdict.
-    simulated
-        By block of descriptors, the scan's numbers `(k,)` and those of shapes grown from draws of the posterior
-        `(n, k)`; None where none were.
     """
 
     scan: Volume
@@ -74,7 +61,6 @@ class Inference(Pictured):
     diagram: Diagram | None
     twins: dict[str, tuple[Twin, ...]]
     fit: Fit
-    simulated: dict[str, tuple[np.ndarray, np.ndarray]] | None = None
 
     def __repr__(self) -> str:
         fit = self.fit
@@ -114,9 +100,9 @@ def infer(
 ) -> Inference:
     """Infer the generation parameters (a, m₀) of a scanned volume.
 
-    A posterior of the parameters is read from the scan's descriptors. With `growth`, laws drawn from it, the nearest
-    shape of the atlas and, of a phase field, its stationarity are grown; what grows is compared with the scan, and the
-    best law is tested.
+    A posterior of the parameters is read from the scan's descriptors, and the scan is tested: does it look as shapes of
+    laws do? With `growth`, shapes of the law in the posterior's middle, of the nearest shape of the atlas and, of a
+    phase field, of its stationarity are grown; the law is the one whose shapes are nearest to the scan.
 
     With `method="match"` a law is inferred as the paper's author would: the shape of the atlas whose curvature diagram
     is nearest in Wasserstein distance (geomloss), then gradient refinement from it by Levenberg and Marquardt's method
@@ -139,8 +125,8 @@ def infer(
     method
         `"posterior"`, or `"match"`: nearest match, then gradient refinement. A match alone has no intervals.
     growth
-        Which shapes are grown to refine, compare and test laws: `Growth()` takes minutes. By default nothing is grown:
-        the result takes seconds, and its law is `Not tested`.
+        Which shapes are grown to compare laws: `Growth()` takes a minute. By default nothing is grown: the result takes
+        seconds, and its law is `Not tested`.
     seed, progress
         Seed of draws and shapes. `progress` is called with a sentence and the share done; by default the logger
         `curvafit` gets each stage once, at level INFO.
@@ -175,39 +161,34 @@ def _infer_prepared(
     estimate, chosen = Estimate(), None
     twins: dict[str, tuple[Twin, ...]] = {}
     if diagram is not None and not status:
-        progress("measuring descriptors", 0.1)
-        described = measure_descriptors(prepared)
-        settings = {"refined": refined, "growth": growth, "seed": seed, "progress": progress}
-        estimate = _estimate(prepared, diagram, described, atlas, posterior, **settings)
+        estimate = _estimate(prepared, diagram, atlas, posterior, refined=refined, seed=seed, progress=progress)
         if growth is not None:
             estimate, twins = _grow(estimate, diagram, prepared, growth, seed, progress)
-            misfit = _test_law(estimate, prepared, described, posterior, growth, seed, progress)
-            estimate = estimate if misfit is None else replace(estimate, misfit=misfit)
         chosen, status = verdict(estimate.candidates, estimate.misfit, figures, grown=growth is not None)
         progress("done", 1.0)
     provenance = _describe_provenance(volume, shape, atlas, posterior, growth, seed)
     fit = _build_fit(prepared, diagram, figures, estimate, chosen, status, provenance)
-    return Inference(volume, prepared, diagram, twins, fit, estimate.simulated)
+    return Inference(volume, prepared, diagram, twins, fit)
 
 
 def _estimate(
-    prepared: Prepared, diagram: Diagram, described: Described | None, atlas: Atlas, posterior: Posterior, *,
-    refined: bool, growth: Growth | None, seed: int, progress: Progress,
+    prepared: Prepared, diagram: Diagram, atlas: Atlas, posterior: Posterior, *, refined: bool, seed: int,
+    progress: Progress,
 ) -> Estimate:  # fmt: skip
     """Estimate the law of a scan; the candidates to grow are, in this order, the law by which a phase field is
-    stationary, those read from the descriptors, and the nearest match of the atlas."""
-    estimate = Estimate()
-    if described is not None and not refined:
-        stage = sub_progress(progress, 0.15, 0.5)
-        estimate = estimate_law(described, posterior, growth=growth, seed=seed, progress=stage)
-    progress("searching the atlas", 0.5)
-    matches = _find_matches(prepared, diagram, atlas, exact=refined)
-    if described is not None and refined:
-        estimate = Estimate(candidates=(refine_matches(described, posterior, matches),))
+    stationary, that read from the descriptors, and the nearest match of the atlas."""
+    progress("measuring descriptors", 0.1)
+    described = measure_descriptors(prepared)
+    progress("searching the atlas", 0.3)
+    matches, estimate = _find_matches(prepared, diagram, atlas, exact=refined), Estimate()
+    if described is not None:
+        progress("reading the posterior", 0.4)
+        law = (described, posterior)
+        estimate = refine_matches(*law, matches) if refined else estimate_law(*law, seed)
     match = Candidate("match", matches[0].coefficients, matches[0].mass, {}, matches[0].thickness)
     laws = (*estimate.candidates, match)
     if prepared.kind == "field" and not is_rounded(prepared.phase):
-        starts = [law.coefficients for law in (*estimate.candidates[:1], *matches[:STARTS])]
+        starts = [law.coefficients for law in (*estimate.candidates, *matches[:STARTS])]
         options = {"starts": starts, "seed": seed, "progress": sub_progress(progress, 0.5, 0.6)}
         window = prepared.window
         phase = torch.from_numpy(np.ascontiguousarray(prepared.phase[window]))
@@ -231,7 +212,7 @@ def _grow(
     """Grow a twin of each law, and `growth.twins` of the best; return the compared laws, and the twins by law."""
     laws = {law.name: law for law in estimate.candidates}
     twins: dict[str, tuple[Twin, ...]] = dict.fromkeys(laws, ())
-    stage = sub_progress(progress, 0.6, 0.8)
+    stage = sub_progress(progress, 0.6, 1.0)
 
     def grow(wanted: list[tuple[str, int]]) -> None:
         shapes = map_threads(lambda one: twin(laws[one[0]], prepared, seed + one[1], growth.schedule), wanted)
@@ -247,18 +228,6 @@ def _grow(
         if best is not None:
             grow([(best.name, k) for k in range(len(twins[best.name]), growth.twins)])
     return replace(estimate, candidates=tuple(laws.values())), twins
-
-
-def _test_law(
-    estimate: Estimate, prepared: Prepared, described: Described | None, posterior: Posterior, growth: Growth,
-    seed: int, progress: Progress,
-) -> Misfit | None:  # fmt: skip
-    """Test the best law by further shapes; None where nothing grew, or there are no descriptors."""
-    best = best_candidate(estimate.candidates)
-    if best is None or described is None:
-        return None
-    options = {"seed": seed + TWINS, "schedule": growth.schedule, "progress": sub_progress(progress, 0.8, 1.0)}
-    return check_law(best, prepared, described, posterior, **options)
 
 
 def _read_and_prepare(

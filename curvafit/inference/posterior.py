@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -42,7 +42,7 @@ class Architecture:
     number from 1 to `WIDEST`.
     """
 
-    components: int = 32
+    components: int = 64
     hidden: tuple[int, ...] = (64, 64)
     transforms: int = 2
     bins: int = 8
@@ -83,6 +83,14 @@ class Member(nn.Module):
         return torch.distributions.TransformedDistribution(self.flow(self.dropout(context)), [line])
 
 
+class Discriminant(NamedTuple):
+    """Fisher's discriminant of the model's shapes and textures of no law: its weights `(351,)` of the descriptors, and
+    its values `(n,)` for shapes of laws that it has not learnt from, increasing."""
+
+    weights: np.ndarray
+    usual: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
 class Posterior:
     """The posterior of (a11, log a02, a10, a01, a00, m₀), with a20 = 1, and of the thickness of their shapes, given
@@ -106,13 +114,8 @@ class Posterior:
         By view, what the emulator's best parameters leave unexplained of shapes that it did not learn from, increasing.
     combinations
         Sums of parameters, ordered by how well textures determine them.
-    departures
-        Departures (`Misfit.departure`) of shapes of the model, run as masks through all of `infer`, from shapes of the
-        law that it inferred; empty where that was not measured.
-    discriminant, discriminants
-        Weights of the descriptors that separate shapes of the model from level cuts of Gaussian random fields with the
-        same two-point function (`discriminate`), and the discriminants of shapes of the model, by view, increasing;
-        empty where that was not trained.
+    discriminants
+        By view, what tells the model's shapes from textures of no law; a view is missing where that was not learned.
     """
 
     architecture: Architecture
@@ -126,9 +129,7 @@ class Posterior:
     misfits: dict[str, np.ndarray]
     combinations: Combinations
     provenance: dict[str, Any]
-    departures: np.ndarray
-    discriminant: np.ndarray
-    discriminants: dict[str, np.ndarray]
+    discriminants: dict[str, Discriminant]
 
     def sample(
         self, descriptors: np.ndarray, views: np.ndarray, amount: np.ndarray, count: int = 1000, seed: int = 0
@@ -156,9 +157,9 @@ class Posterior:
             raise ValueError(f"expected descriptors that are finite, got {bad} of {len(descriptors)} rows with others")
         return torch.from_numpy(np.concatenate([self.compression(descriptors), seen], axis=1)).float()
 
-    def discriminate(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return Fisher's discriminant `(N,)` of descriptors `(N, 351)`: level cuts have the least."""
-        return replace(self.compression, basis=self.discriminant[None])(descriptors)[:, 0]
+    def discriminate(self, descriptors: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return a discriminant `(N,)` of descriptors `(N, 351)` by its weights: textures of no law have the least."""
+        return replace(self.compression, basis=weights[None])(descriptors)[:, 0]
 
     def to_logits(self, parameters: np.ndarray) -> np.ndarray:
         """Return the logits of the parameters' positions in the box, from 0 to 1: numbers without bounds."""
@@ -244,7 +245,7 @@ class Combinations:
 
 def save_posterior(posterior: Posterior, path: str | Path) -> None:
     """Write a posterior as one compressed `.npz`: arrays and a JSON header, nothing that runs when it is read."""
-    arrays = {name: getattr(posterior, name) for name in ("box", "centre", "spread", "departures", "discriminant")}
+    arrays = {name: getattr(posterior, name) for name in ("box", "centre", "spread")}
     arrays |= {name: getattr(posterior.compression, name) for name in ("mean", "scale", "basis")}
     for k, member in enumerate(posterior.members):
         arrays |= {f"{k}.{name}": value.numpy() for name, value in member.state_dict().items()}
@@ -252,8 +253,9 @@ def save_posterior(posterior: Posterior, path: str | Path) -> None:
         for k, layer in enumerate(layers):
             arrays |= {f"emulator.{name}.{k}.{field}": value for field, value in layer._asdict().items()}
     arrays["emulator.basis"] = posterior.emulator.basis.astype(np.float32)
-    for name in ("misfits", "discriminants"):
-        arrays |= {f"{name}.{view}": values.astype(np.float32) for view, values in getattr(posterior, name).items()}
+    arrays |= {f"misfits.{view}": values.astype(np.float32) for view, values in posterior.misfits.items()}
+    for view, told in posterior.discriminants.items():
+        arrays |= {f"{name}.{view}": values.astype(np.float32) for name, values in told._asdict().items()}
     arrays |= {f"combinations.{name}": getattr(posterior.combinations, name) for name in ("weights", "centre")}
     header = {
         "architecture": asdict(posterior.architecture),
@@ -287,14 +289,13 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
     architecture = Architecture(**sizes)
     views = tuple(str(view) for view in header["views"])
     columns, components = sum(BLOCKS.values()), architecture.components
-    arrays = {"departures": np.zeros(0), "discriminant": np.zeros(0)} | arrays  # which earlier files lack
-    by_view = ("misfits", "discriminants") if len(arrays["discriminant"]) else ("misfits",)
+    told = [view for view in views if f"weights.{view}" in arrays]
     expected: dict[str, tuple[int | None, ...]] = {"mean": (columns,), "scale": (columns,)}
-    expected |= {"basis": (components, columns), "emulator.basis": (components, components), "departures": (None,)}
+    expected |= {"basis": (components, columns), "emulator.basis": (components, components)}
     expected |= {"box": (len(TARGETS), 2), "centre": (len(TARGETS),), "spread": (len(TARGETS),)}
     expected |= {"combinations.weights": (len(PARAMETERS), len(PARAMETERS)), "combinations.centre": (len(PARAMETERS),)}
-    expected |= {"discriminant": (columns if "discriminants" in by_view else 0,)}
-    expected |= {f"{name}.{view}": (None,) for name in by_view for view in views}
+    expected |= {f"misfits.{view}": (None,) for view in views}
+    expected |= {f"weights.{view}": (columns,) for view in told} | {f"usual.{view}": (None,) for view in told}
     for name, shape in expected.items():
         actual = arrays[name].shape
         if len(actual) != len(shape) or any(n not in (None, m) for n, m in zip(shape, actual, strict=True)):
@@ -310,8 +311,9 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
     mean, spread = (_read_layers(arrays, f"emulator.{name}", len(views), components) for name in ("mean", "spread"))
     inflation, box = check_float(header["inflation"], "an emulator's inflation", 1e-3, 1e3), arrays["box"]
     emulator = Emulator(compression, views, box[: len(PARAMETERS)], mean, spread, arrays["emulator.basis"], inflation)
-    references = {name: {view: arrays[f"{name}.{view}"] for view in views} for name in by_view}
-    if not all(map(len, references["misfits"].values())):
+    references = {view: arrays[f"misfits.{view}"] for view in views}
+    discriminants = {view: Discriminant(arrays[f"weights.{view}"], arrays[f"usual.{view}"]) for view in told}
+    if not all(map(len, (*references.values(), *(each.usual for each in discriminants.values())))):
         raise ValueError("misfits without numbers")
     ends = tuple((str(low), str(high)) for low, high in header["ends"])
     if len(ends) != len(PARAMETERS):
@@ -319,8 +321,7 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
     combinations = Combinations(arrays["combinations.weights"], arrays["combinations.centre"], ends)
     return Posterior(
         architecture, tuple(members), compression, views, box, arrays["centre"], arrays["spread"], emulator,
-        references["misfits"], combinations, header["provenance"], arrays["departures"], arrays["discriminant"],
-        references.get("discriminants", {}),
+        references, combinations, header["provenance"], discriminants,
     )  # fmt: skip
 
 

@@ -38,6 +38,8 @@ LOGARITHMIC = ("fraction", "chords", "gaps", "depths", "clearances")
 LEAST = 1e-3
 #: Of the densities of ∫H and χ, in these units, the inverse sinh is taken.
 BENDS, EULERS = 50.0, 100.0
+#: Least deviation by which a column is scaled: what hardly varies, as the least depths do, says little.
+LEAST_SCALE = 0.03
 #: Most deviations from its mean to which a column is clipped.
 FURTHEST = 6.0
 #: Typical amount seen of a texture, and the most that training shows, in cubes of a thickness.
@@ -226,13 +228,15 @@ def see_mask(u: np.ndarray, rng: np.random.Generator) -> Scanned:
     return Scanned(Volume(coarse.astype(np.uint8)), "mask")
 
 
-def see_scan(u: np.ndarray, rng: np.random.Generator) -> Scanned:
+def see_scan(
+    u: np.ndarray, rng: np.random.Generator, blur: float = BLUR, thick: int = SLICE, snr: float = SNR
+) -> Scanned:
     """Return {u > 0}, cut open at random, scanned badly: blurred, slices two voxels thick, noise at SNR 5."""
-    grey = ndimage.gaussian_filter(_open(u, rng).astype(np.float32), BLUR, mode="nearest")
-    padded = np.pad(grey, ((0, -len(grey) % SLICE), (0, 0), (0, 0)), mode="edge")
-    grey = padded.reshape(-1, SLICE, *grey.shape[1:]).mean(1)
-    grey += rng.standard_normal(grey.shape, dtype=np.float32) / SNR
-    return Scanned(Volume(grey, (float(SLICE), 1.0, 1.0), "voxel"), "image")
+    grey = ndimage.gaussian_filter(_open(u, rng).astype(np.float32), blur, mode="nearest")
+    padded = np.pad(grey, ((0, -len(grey) % thick), (0, 0), (0, 0)), mode="edge")
+    grey = padded.reshape(-1, thick, *grey.shape[1:]).mean(1)
+    grey += rng.standard_normal(grey.shape, dtype=np.float32) / snr
+    return Scanned(Volume(grey, (float(thick), 1.0, 1.0), "voxel"), "image")
 
 
 #: Views by name.
@@ -270,7 +274,7 @@ def compression_of(descriptors: np.ndarray, components: int) -> Compression:
     drown the others. The components' mean square is 1.
     """
     names, columns = np.array(column_names()), columns_of(descriptors)
-    mean, scale = columns.mean(0), columns.std(0) + 1e-9
+    mean, scale = columns.mean(0), np.maximum(columns.std(0), LEAST_SCALE)
     weight = np.ones(len(names))
     for block in BLOCKS:
         in_block = names == block

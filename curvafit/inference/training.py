@@ -30,10 +30,10 @@ STEPS = 12_000
 EMULATOR_PART = 0.2
 #: Folds of the laws; the emulator has as many networks of the mean, and of the deviations: each leaves out one fold.
 FOLDS = 5
+#: One law of so many teaches no network of the emulator: misfits are ranked among those of its shapes.
+KEPT = 10
 #: Widths of the hidden layers.
 HIDDEN = (96, 96)
-#: Most rows of a view whose misfits are kept.
-REFERENCE = 400
 #: Least and most rows of a step, and steps that an epoch has between the two.
 BATCH, PACE = (64, 512), 100
 #: Draws of a flow whose mean is compared with the truth.
@@ -72,7 +72,7 @@ def train_posterior(
     table: Table,
     architecture: Architecture | None = None,
     *,
-    members: int = 4,
+    members: int = 8,
     seed: int = 0,
     plans: tuple[Plan, Plan] | None = None,
     progress: Progress = silent,
@@ -114,7 +114,7 @@ def train_posterior(
     # Members, the scaling of the parameters and combinations are replaced below.
     posterior = Posterior(
         architecture, (), compression, views, box, np.zeros(len(TARGETS)), np.ones(len(TARGETS)), emulator,
-        misfits_by_view, Combinations(np.eye(6), np.zeros(6), ()), provenance, np.zeros(0), np.zeros(0), {},
+        misfits_by_view, Combinations(np.eye(6), np.zeros(6), ()), provenance, {},
     )  # fmt: skip
     logits = posterior.to_logits(table.targets)
     posterior = dataclasses.replace(posterior, centre=logits.mean(0), spread=logits.std(0))
@@ -178,10 +178,14 @@ def train_emulator(
     """Fit networks to the compressed descriptors of a table's rows, given their parameters.
 
     One ensemble of networks learns the mean. A second one learns the deviations of the first one's errors on shapes
-    held out. Returns the emulator and, by view, the misfits (`emulator.misfits`) of shapes held out, of `REFERENCE`
-    rows at most, with which the misfit of a scan is compared.
+    held out. Returns the emulator and, by view, the misfits (`emulator.misfits`) of laws that no network has learnt
+    from (`keep_laws`), with which the misfit of a scan is compared.
     """
     views = tuple(sorted(set(table.views.tolist())))
+    kept = keep_laws(table, seed)
+    if few := [view for view in views if not (kept & (table.views == view)).any()]:
+        raise ValueError(f"expected many shapes in each of the views {', '.join(views)}, got few in {', '.join(few)}")
+    references, table = table.rows(kept), table.rows(~kept)
     target = compression(table.descriptors)
     law_of_row = table.laws
     fold = np.random.default_rng(seed).permutation(law_of_row.max() + 1)[law_of_row] % FOLDS
@@ -201,22 +205,15 @@ def train_emulator(
     emulator = Emulator(compression, views, box, _layers(means), _layers(spreads), basis, 1.0)
     residuals = (whitened / deviation).double().numpy()
     emulator = dataclasses.replace(emulator, inflation=_inflation(emulator, table, residuals))
-    rows = [[np.flatnonzero((table.views == view) & (fold == k)) for k in range(FOLDS)] for view in views]
-    rows_of_fold = min(REFERENCE // FOLDS, *(len(chosen) for by_fold in rows for chosen in by_fold))
-    if not rows_of_fold:
-        raise ValueError(f"expected many shapes in each of the views {', '.join(views)}, got few in one")
-    references: dict[str, list[np.ndarray]] = {view: [] for view in views}
-    for k in range(FOLDS):
-        # The k-th networks did not learn from the rows of fold k.
-        mean, spread = (
-            tuple(Layer(w[k : k + 1], b[k : k + 1]) for w, b in layers) for layers in (emulator.mean, emulator.spread)
-        )
-        single = dataclasses.replace(emulator, mean=mean, spread=spread)
-        for view, by_fold in zip(views, rows, strict=True):
-            held_out = table.rows(by_fold[k][:rows_of_fold])
-            columns = (held_out.descriptors, held_out.views, held_out.amount)
-            references[view].append(misfits(single, *columns, held_out.parameters[:, None]))
-    return emulator, {view: np.sort(np.concatenate(values)) for view, values in references.items()}
+    columns = (references.descriptors, references.views, references.amount)
+    unexplained = misfits(emulator, *columns, references.parameters[:, None])
+    return emulator, {view: np.sort(unexplained[references.views == view]) for view in views}
+
+
+def keep_laws(table: Table, seed: int) -> np.ndarray:
+    """Return which rows `(N,)` are of the laws from which the emulator does not learn: one of `KEPT`, by the seed."""
+    laws = table.laws
+    return np.random.default_rng([seed, KEPT]).permutation(laws.max() + 1)[laws] % KEPT == 0
 
 
 def _inflation(emulator: Emulator, table: Table, residuals: np.ndarray) -> float:

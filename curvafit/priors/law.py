@@ -22,7 +22,7 @@ from curvafit.priors.published import PUBLISHED
 
 Content = TypeVar("Content")
 #: The format of a `fit.json`.
-FORMAT = "curvafit-fit-4"
+FORMAT = "curvafit-fit-5"
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,7 @@ def report_html(inference: Inference) -> str:
         diagrams=[] if inference.diagram is None else _diagrams(inference), distances=_distances(inference),
         unit=format_length(fit.length, fit.length_unit, 3), twins=0 if fit.best is None else len(fit.best.twins),
         numbers=_number_rows(inference), strips=list_strips(fit), law=_law(inference), corner=_corner(inference),
-        bands=bands(inference), symbols=[symbol for symbol, _, _ in _TERMS.values()],
+        symbols=[symbol for symbol, _, _ in _TERMS.values()],
     )  # fmt: skip
 
 
@@ -338,17 +338,3 @@ def _corner(inference: Inference) -> page.Picture | None:
     margin = 0.06 * np.maximum(high - low, 1e-6)
     limits = list(zip((low - margin).tolist(), (high + margin).tolist(), strict=True))
     return page.picture_of(plot.corner_figure(draws, SYMBOLS, limits, marks), "Draws of the parameters, two by two")
-
-
-def bands(inference: Inference) -> page.Picture | None:
-    """Return a figure of the scan's descriptors on the bands of simulated ones; None where none were simulated."""
-    misfit = inference.fit.misfit
-    if inference.simulated is None or misfit is None:
-        return None
-    titles = {name: f"{name}, p = {format_number(misfit.blocks.get(name), 2)}" for name in inference.simulated}
-    return page.picture_of(
-        plot.bands_figure({titles[name]: block for name, block in inference.simulated.items()}),
-        "The scan's descriptors on the bands of simulated shapes",
-        text="Orange: the scan. Bands: 50 and 90 % of shapes grown from draws of the posterior, seen as the scan is. "
-        "Lengths in working units; quantiles from the least to the greatest.",
-    )

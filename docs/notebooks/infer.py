@@ -29,7 +29,7 @@ print(flow.status)
 
 # %%
 scan = curvafit.Volume(flow.field.numpy(), (20.0, 20.0, 20.0), "um")
-fewer = Growth(simulations=2, rounds=1, twins=1)  # shapes than by default, so that this page is made soon
+fewer = Growth(twins=1)  # shapes than by default, so that this page is made soon
 inference = curvafit.infer(scan, kind="field", periodic=True, seed=1, growth=fewer)
 fit = inference.fit
 print(fit.status)

@@ -191,20 +191,6 @@ def test_a_corner_plot_has_a_histogram_of_each_and_a_picture_of_each_pair() -> N
     assert len(plot.corner_figure(draws[:, :1], ("a",), limits[:1], {}).axes) == 1
 
 
-def test_bands_hold_what_they_say_and_show_the_scan_s_numbers() -> None:
-    others = np.outer(np.arange(101.0), np.ones(5))
-    own = np.array([3.0, 1, 4, 1, 5])
-    figure = plot.bands_figure({"curve": (own, others), "number": (own[:1], others[:, :1])})
-    curve, dot = figure.axes
-    assert [curve.get_title(), dot.get_title()] == ["curve", "number"]
-    assert curve.lines[0].get_ydata() == pytest.approx(own) and dot.lines[0].get_ydata() == pytest.approx([3])
-    for band, ends in zip(curve.collections, ((5, 95), (25, 75)), strict=True):
-        values = band.get_paths()[0].vertices[:, 1]
-        assert (values.min(), values.max()) == pytest.approx(ends)
-    for bar, ends in zip(dot.collections, ((5, 95), (25, 75)), strict=True):
-        assert bar.get_paths()[0].vertices[:, 1] == pytest.approx(ends)
-
-
 def test_the_three_middle_slices_are_drawn_in_proportion() -> None:
     values = np.arange(5 * 6 * 7, dtype=np.float32).reshape(5, 6, 7)
     figure = Volume(values, (3.0, 2.0, 1.0), "um").plot()

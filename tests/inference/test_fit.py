@@ -114,7 +114,7 @@ def test_a_file_is_read_as_a_fit_and_as_a_prior(tmp_path: Path, fit: Fit) -> Non
     path = fit.save(tmp_path / "fit.json")
     assert fields(Fit.load(path)) == fields(fit)
     assert Law.load(path) == fit.to_law() == Fit.load(path).to_law()
-    content = json.loads(path.read_text()) | {"format": "curvafit-fit-3"}
+    content = json.loads(path.read_text()) | {"format": "curvafit-fit-4"}
     path.write_text(json.dumps(content))
     for load in (Law.load, Fit.load):
         with pytest.raises(ValueError, match="again"):
@@ -157,7 +157,7 @@ BOMBS = [
     ("provenance", "{", "which is not JSON"), ("status", None, "status, got none"),
     ("chosen", "3", "chosen as a text, or null, got 3"), ("chosen", '"optimum"', "optimum"),
     ("candidates", "[{}]", "candidates[0].name, got none"),
-    ("misfit", '{"probability": 2, "blocks": {}, "method": ""}', "misfit.probability as a number from 0 to 1, got 2"),
+    ("misfit", '{"probability": 2, "unexplained": 1}', "misfit.probability as a number from 0 to 1, got 2"),
     ("scale", "[1, 1]", "scale as a list of 3 numbers"), ("draws", "[[0.1]]", "draws (n, 7), got (1, 1)"),
     ("draws", "[]", "draws (n, 7)"), ("draws", "[[0.1], [0.1, 2]]", "draws as numbers in rows of one length"),
     ("diagram", '{"points": [[1, 2]], "weights": [1, 1]}', "points (N, 2) and weights (N,), got (1, 2) and (2,)"),
@@ -182,7 +182,7 @@ def test_content_that_is_no_fit_is_refused(tmp_path: Path, fit: Fit) -> None:
     for text in ("[]", "7", '"x"', "null", "{}"):
         assert "expected a fit.json written by `curvafit infer` with" in refused(tmp_path / "fit.json", text)
     said = refused(tmp_path / "fit.json", json.dumps({"format": ["x" * 10**6] * 100}))
-    assert "expected a fit.json of format curvafit-fit-4, got [" in said
+    assert "expected a fit.json of format curvafit-fit-5, got [" in said
 
 
 def test_what_is_written_is_what_can_be_read() -> None:
@@ -206,8 +206,7 @@ def test_a_quotation_is_short() -> None:
 
 
 LAW = Coefficients(1, 2, 6, -40, -40, 400)
-USUAL = Misfit(0.4, {"gaps": 0.3, "chords": 0.2}, "24 windows", 1.1)
-ODD = Misfit(0.001, {"gaps": 0.004, "chords": 0.3, "depths": 0.0005}, "24 windows", 3.0)
+USUAL, ODD = Misfit(0.4, 0.2, 0.5), Misfit(0.001, 0.0005, 0.5)
 
 
 def law(name: str, distance: float | None = None, noise: float | None = None, status: str = "") -> Candidate:
@@ -225,8 +224,8 @@ def twin(diagram: Diagram | None, mass: float) -> Twin:
 
 
 def test_the_nearest_is_the_best_or_stationarity_within_seed_noise_of_it() -> None:
-    barren, first, last = law("optimum"), law("posterior", 2.5), law("match", 2.25)
-    nearest, quiet, single = (law("simulation", 2.0, noise) for noise in (0.5, 0.25, None))
+    barren, first, last = law("match"), law("posterior", 2.5), law("match", 2.25)
+    nearest, quiet, single = (law("optimum", 2.0, noise) for noise in (0.5, 0.25, None))
     exact = law("stationarity", 2.5)
     for order, best in (
         ((barren, first, nearest, last), nearest), ((last, nearest, first), nearest), ((barren, first, last), last),
@@ -237,7 +236,7 @@ def test_the_nearest_is_the_best_or_stationarity_within_seed_noise_of_it() -> No
 
 
 def test_seed_noise_is_the_best_one_s_or_another_s() -> None:
-    best, other = law("simulation", 2.0, 0.5), law("match", 5.0, 1.5)
+    best, other = law("optimum", 2.0, 0.5), law("match", 5.0, 1.5)
     assert seed_noise_of((other, best)) == 0.5
     assert seed_noise_of((law("posterior", 1.0), other)) == 1.5
     assert seed_noise_of((law("posterior", 1.0), law("optimum"))) is None
@@ -251,19 +250,19 @@ def test_what_grew_is_measured_against_the_scan() -> None:
     assert both.seed_noise is not None and both.distance == pytest.approx(both.seed_noise / 2) and both.distance > 1
     assert (both.mass, both.twins, both.status) == (-0.375, (NUMBERS, NUMBERS), "")
     assert both.thickness == pytest.approx(6, abs=1)
-    three = law("simulation").compare(scan, (twin(scan, -0.5), twin(other, -0.25), twin(other, -0.25)))
+    three = law("optimum").compare(scan, (twin(scan, -0.5), twin(other, -0.25), twin(other, -0.25)))
     assert three.seed_noise == pytest.approx(2 / 3 * both.seed_noise)  # of three pairs, two differ
-    assert three.mass == law("simulation").mass  # as it was read
+    assert three.mass == law("optimum").mass  # as it was read
     over = law("match").compare(scan, (twin(scan, -1.002), twin(scan, -1.001)))
     assert -1 < over.mass < -0.999  # a rare structure's field lies below -1 in the mean, and a fit holds no such mass
-    one = law("simulation").compare(scan, (twin(scan, -0.5),))
+    one = law("optimum").compare(scan, (twin(scan, -0.5),))
     assert (one.distance, one.seed_noise, one.twins) == (0.0, None, (NUMBERS,))
-    none = law("simulation", status="Hm.").compare(scan, (twin(None, 0.0),))
-    assert none == law("simulation", status="Hm. No shape grew: the field is of one phase.")
+    none = law("optimum", status="Hm.").compare(scan, (twin(None, 0.0),))
+    assert none == law("optimum", status="Hm. No shape grew: the field is of one phase.")
 
 
 def test_a_candidate_comes_back_from_its_json() -> None:
-    whole = dataclasses.replace(law("simulation", 2.0, 0.5, "Hm."), twins=(NUMBERS, NUMBERS))
+    whole = dataclasses.replace(law("optimum", 2.0, 0.5, "Hm."), twins=(NUMBERS, NUMBERS))
     for each in (whole, law("match")):
         assert decode(Candidate, json.loads(json.dumps(encode(each)))) == each
     full = dataclasses.replace(whole, twins=(dataclasses.replace(NUMBERS, spacing_mean=math.nan),))
@@ -274,8 +273,7 @@ def test_a_candidate_comes_back_from_its_json() -> None:
 # ---- verdicts --------------------------------------------------------------------------------------------------------
 
 
-BARE = dataclasses.replace(ODD, blocks={"gaps": 0.3})
-QUICK = [dataclasses.replace(each, departure=None) for each in (USUAL, ODD)]
+UNLIKE = Misfit(0.002, 0.3, 0.001)
 EDGE = dataclasses.replace(USUAL, probability=UNBELIEVABLE)
 COARSE = dataclasses.replace(EDGE, grain=0.01)
 BARREN = (law("posterior", status="No shape grew: one phase."), law("match"))
@@ -285,21 +283,18 @@ FAT = dataclasses.replace(NEAR, twins=(THICK,))
 #: Candidates, their test and whether shapes were grown; the law that is named, and words of the verdict in order.
 VERDICTS: list[tuple[tuple[Candidate, ...], Misfit | None, bool, str | None, tuple[str, ...]]] = [
     ((law("optimum"), law("match")), None, False, "optimum", ("Not tested (best fit of the descriptors)",)),
-    ((law("optimum"),), QUICK[0], False, "optimum", ("Not tested", "does not rule it out (p = 0.40)")),
-    ((law("optimum"),), QUICK[1], False, "optimum", ("Not tested", "rules it out (p = 0.0010)")),
+    ((law("optimum"),), USUAL, False, "optimum", ("Not tested", "looks as shapes of laws do (p = 0.40)")),
+    ((law("optimum"),), ODD, False, "optimum", ("Not tested", "does not look", "(p = 0.0010)", "need no law")),
     (BARREN, USUAL, True, None, ("No law: nothing grew", "No shape grew: one phase.")),
     ((NEAR,), USUAL, True, "match", ("Supported (nearest match)", "lie 0.9", "0.5 from each other", "p = 0.40")),
-    ((law("match", 0.9, status="Hm."),), USUAL, True, "match", ("Supported", "look like the scan", "Hm.")),
+    ((law("match", 0.9, status="Hm."),), USUAL, True, "match", ("Supported", "looks as shapes of laws", "Hm.")),
     ((FAR,), EDGE, True, "match", ("Supported",)),  # whatever the distances are
     ((FAR,), COARSE, True, "match", ("Undecided", "p = 0.050", "steps of 0.01")),
-    ((FAR,), None, True, "match", ("Undecided (nearest match)", "lie 9.0", "Too few shapes")),
+    ((FAR,), None, True, "match", ("Undecided (nearest match)", "lie 9.0", "has no p")),
     ((FAT,), USUAL, True, "match", ("Supported", "Twins over scan: thickness 1.5.")),  # which do not decide
     ((FAT,), ODD, True, "match", ("No believable twin", "Twins over scan: thickness 1.5.")),
-    ((law("simulation", 0.1, 0.5), FAR), ODD, True, "simulation", ("No believable twin", "depths, gaps.")),
-    ((law("simulation", 0.1),), BARE, True, "simulation", ("no descriptor tells it alone",)),
-    ((law("simulation", 0.1),), dataclasses.replace(BARE, level_cut=0.01), True, "simulation", ("level cut",)),
-    ((law("simulation", 0.1),), dataclasses.replace(ODD, blocks={"fabric": 0.001}), True, "simulation",
-     ("has a direction (fabric)",)),
+    ((law("posterior", 0.1, 0.5), FAR), ODD, True, "posterior", ("No believable twin", "no law explains its numbers")),
+    ((law("posterior", 0.1),), UNLIKE, True, "posterior", ("more like textures that no law makes", "curvafit measure")),
 ]  # fmt: skip
 
 
