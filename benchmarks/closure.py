@@ -4,9 +4,8 @@
 `--views`). Errors are medians, in deviations of the box of `curvafit atlas build`; R² is 1 - mean square error /
 variance of a parameter; intervals are of the bootstrap over laws.
 
-Methods: `posterior`, the packaged one; and from a `--table` (`curvafit atlas describe`), by default that of the
-packaged posterior, `match`, the nearest shape by the curvature block, and `process`, a Gaussian process for each
-parameter on principal components.
+Methods: `posterior`, the packaged one; and from the rows that taught it `match`, the nearest shape by the curvature
+block, and `process`, a Gaussian process for each parameter on principal components.
 """
 
 from __future__ import annotations
@@ -21,17 +20,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.harness import RESULTS, Cases, Figure, Values, show
+from benchmarks.harness import Cases, Figure, Values, show
+from benchmarks.teaching import gather
 from curvafit.data_synth.design import INTERVALS
 from curvafit.data_synth.store import Store, find_well_formed, open_store
-from curvafit.inference.posterior import Architecture, Posterior, load_posterior
+from curvafit.inference.posterior import Posterior, load_posterior
 from curvafit.inference.table import (
     PARAMETERS,
     VIEWS,
     Table,
     column_names,
     compression_of,
-    load_table,
     parameters_of,
     to_row,
 )
@@ -40,8 +39,8 @@ from curvafit.scan.preparation import prepare, thinner_thickness
 from curvafit.volumes.volume import ScanError
 
 DRAWS = 400
-#: What the packaged posterior was trained on; its columns are float16 between their ends (`load_table`).
-TABLE = RESULTS / "table.npz"
+#: Components that the Gaussian process sees.
+COMPONENTS = 32
 #: Edge of the shapes that posteriors learn from, in voxels.
 UNIT = 64
 #: Names of the parameters in the ledger.
@@ -71,7 +70,7 @@ def process(training: Table, queries: Table) -> Answers:
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-    compression = compression_of(training.descriptors, Architecture().components)
+    compression = compression_of(training.descriptors, COMPONENTS)
     x, at, found = compression(training.descriptors), compression(queries.descriptors), []
     for y in training.parameters.T:
         kernel = ConstantKernel(1.0) * RBF(5.0, (0.3, 1e3)) + WhiteKernel(0.1)
@@ -85,9 +84,9 @@ def asked(trained: Posterior, queries: Table) -> Answers:
     return Answers(np.median(draws, axis=1), draws)
 
 
-def methods(path: Path, view: str) -> dict[str, Callable[[Table], Answers]]:
-    """Return the methods by name; the last two learn from a table."""
-    trained, training = load_posterior(), load_table(path).visible.select_views([view])
+def methods(view: str) -> dict[str, Callable[[Table], Answers]]:
+    """Return the methods by name."""
+    trained, training = load_posterior(), gather().visible.select_views([view])
     return {
         "posterior": partial(asked, trained),
         "match": partial(match, training),
@@ -162,7 +161,6 @@ def unseen_table(paths: list[Path], view: str, cases: Cases) -> Table:
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--unseen", type=Path, nargs="+", required=True, help="stores of laws that no choice has seen")
     parser.add_argument("--views", default="mask,scan")
-    parser.add_argument("--table", type=Path, default=TABLE, help="what `match` and `process` learn from")
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
@@ -171,7 +169,7 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     group, figures = "unseen" + (str(edge) if edge != UNIT else ""), dict[str, Figure]()
     for view in options.views.split(","):
         queries = unseen_table(options.unseen, view, cases)
-        for name, method in methods(options.table, view).items():
+        for name, method in methods(view).items():
             case = f"{group}-{view}-{name}"
             row = cases.all({case: partial(judge, queries, method)})[case]
             figures |= report(f"{view}_{name}", group, row)

@@ -19,9 +19,8 @@ from itertools import product
 import numpy as np
 from scipy import stats
 
-from benchmarks.closure import TABLE
 from benchmarks.completion import DRAWN, LAWS
-from benchmarks.harness import Cases, Figure, Values, show
+from benchmarks.harness import RESULTS, Cases, Figure, Values, show
 from benchmarks.reading import law_of
 from curvafit.data_synth.atlas import measure_view
 from curvafit.generation.flow import generate
@@ -38,7 +37,7 @@ WINDOWS, RIGHT = (1, 8, 64), 0.95
 
 def spread_of_seeds(emulator: Emulator) -> np.ndarray:
     """Return the deviation `(k,)` between shapes of one law in each uncorrelated direction, from the table."""
-    table = load_table(TABLE).visible.select_views([VIEW])
+    table = load_table(RESULTS / "table.npz").visible.select_views([VIEW])
     _, law, count = np.unique(table.parameters, axis=0, return_inverse=True, return_counts=True)
     rows, law = emulator.decorrelate(table.descriptors), law.ravel()
     means = np.stack([np.bincount(law, column) / count for column in rows.T], axis=1)
