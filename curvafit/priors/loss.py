@@ -35,9 +35,9 @@ class CurvaturePrior(nn.Module):
     `forward(input, target=None, mask=None)` takes an `input` `(B, N, D, H, W)` of N classes and returns a scalar, or
     `(B, N, 1, 1, 1)` with `reduction="none"`. It computes in float32 under autocast too; float64 input stays float64.
     The target states only which voxels to ignore. The mask holds weights of voxels from 0, in the input's shape or with
-    1 for B or N. The loss is deterministic, and a constant or saturated input has a finite value and gradient. First
-    derivatives work in reverse and forward mode and through `torch.func`, also over batches of batches. Second
-    derivatives need float64; in float32 they raise a RuntimeError.
+    1 for B or N. The loss is deterministic, and a constant or saturated input has a finite value and gradient. Float32
+    has first derivatives in reverse mode, as a training takes them; second ones, forward mode and `torch.func` need
+    float64, or raise a RuntimeError.
 
     Parameters
     ----------
