@@ -127,7 +127,7 @@ def generate(
     check_memory(grid.shape, FLOW, "a box", execution.device)
     base = choose_base(mass, volume_fraction, grid)
     form, start = DivergenceForm.of(grid, cost.blur, base), white_noise(grid, seed)
-    if kernels.has_kernel(execution.device):
+    if kernels.has_kernel(execution.device) and cost.fused:
         stepper = FusedStepper(start, form, cost, plan.betas_at(0))
     else:
         stepper = TorchStepper(start, form, cost, plan.betas_at(0), execution.device)

@@ -47,6 +47,12 @@ class Cost:
         self._check_tensors()
         check_strengths(self.coefficients, self.epsilon, self.orientation)
 
+    @property
+    def fused(self) -> bool:
+        """Whether the cost is F_ε of six numbers alone, which fused steppers take."""
+        varies = any(isinstance(value, Tensor) and value.dim() > 0 for value in self.coefficients)
+        return not varies and self.orientation is None and self.data is None
+
     def _check_lengths(self) -> None:
         """Convert ε and the blur to numbers; raise ValueError where they or the voxels' edges are out of range."""
         edges, box = self.grid.spacing, self.grid.longest

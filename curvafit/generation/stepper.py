@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from curvafit.generation.problem import Cost, DivergenceForm, Form
-from curvafit.priors import kernels
 from curvafit.priors.energies import energy_gradient
 
 #: The number that Adam adds to the root, as published instead of the usual 1e-8; shapes depend on it.
@@ -78,15 +77,16 @@ class Stepper(Protocol):
 
 
 class FusedStepper(Stepper):
-    """The flow of Algorithm 1 on a processor, by fused kernels; `step(None)` advances Adam's moments all the same."""
+    """The flow of Algorithm 1 on a processor, by fused kernels, for a law of six numbers; `step(None)` advances Adam's
+    moments all the same."""
 
     def __init__(self, start: Tensor, form: DivergenceForm, cost: Cost, betas: tuple[float, float]) -> None:
         from curvafit.priors.kernels.cpu import FusedFlow
 
         base = form.base.numpy() if isinstance(form.base, Tensor) else form.base
-        a, Q = kernels.to_numpy_cost(cost.coefficients, cost.grid, cost.orientation)
+        a = [float(value) for value in cost.coefficients]
         self._flow = FusedFlow(
-            start.numpy(), base, a, cost.grid, cost.epsilon, cost.blur, betas=betas, adam_eps=ADAM_EPS, orientation=Q
+            start.numpy(), base, a, cost.grid, cost.epsilon, cost.blur, betas=betas, adam_eps=ADAM_EPS
         )
         self.betas, self._statistics = betas, Statistics(0.0, 0.0, 0.0)
 

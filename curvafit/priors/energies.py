@@ -18,7 +18,7 @@ from curvafit.priors import kernels
 from curvafit.priors.curvature import Jet, jet, second_form
 from curvafit.priors.grid import Float, Grid
 from curvafit.priors.profile import double_well
-from curvafit.priors.stencils import gradient
+from curvafit.priors.stencils import gradient, gradient_adjoint
 
 
 def energy(
@@ -70,12 +70,34 @@ def energy_gradient(
     """
     if u.dtype != torch.float32 or not kernels.has_kernel(u.device):
         return energy_gradient_by_autograd(u, coefficients, grid, epsilon, orientation, mask)
-    from curvafit.priors.kernels import cpu
+    parts = [
+        kernels.energy_gradient(u, numbers, grid, epsilon, weights)
+        for numbers, weights in _split_cost(tuple(coefficients), mask)
+    ]
+    if orientation is not None:
+        parts.append(_orientation_gradient(u, grid, epsilon, orientation, mask))
+    values, gradients = zip(*parts, strict=True)
+    return torch.stack(values).sum(), sum(gradients[1:], start=gradients[0])
 
-    a, Q = kernels.to_numpy_cost(coefficients, grid, orientation)
-    weights = None if mask is None else mask.detach().numpy()
-    value, du = cpu.fused_energy_gradient(u.detach().numpy(), a, grid, epsilon, Q, weights)
-    return torch.tensor(value, dtype=torch.float64), torch.from_numpy(du)
+
+def _split_cost(a: tuple[float | Tensor, ...], mask: Tensor | None) -> list[tuple[list[float], Tensor | None]]:
+    """Return six numbers and a mask for each part of F_ε, which is linear in its coefficients: those that are numbers,
+    and for each one that varies a 1 in its place, with the coefficient as the mask."""
+    fields = {k: value for k, value in enumerate(a) if isinstance(value, Tensor) and value.dim() > 0}
+    parts = [([0.0 if k in fields else float(value) for k, value in enumerate(a)], mask)]
+    for k, field in fields.items():
+        parts.append(([float(k == place) for place in range(6)], field if mask is None else field * mask))
+    return parts
+
+
+def _orientation_gradient(
+    u: Tensor, grid: Grid, epsilon: float, orientation: Tensor, mask: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Return ε ∫ ∇uᵀQ∇u and its gradient."""
+    slope, weight = gradient(u, grid), epsilon * grid.voxel_volume * (1 if mask is None else mask)
+    value = (weight * orientation_form(slope, orientation)).sum(dtype=torch.float64)
+    force = torch.einsum("ij,jzyx->izyx", orientation.to(u), slope)
+    return value, gradient_adjoint(2 * weight * force, grid)
 
 
 def energy_gradient_by_autograd(u: Tensor, *cost: Any) -> tuple[Tensor, Tensor]:

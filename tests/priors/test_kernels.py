@@ -12,7 +12,7 @@ import torch
 from kernel_cases import ADAM_EPS, BETAS, BLUR, BOUNDARIES, EPSILON, SPACINGS, TUBES, smooth_field
 
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.energies import energy, energy_gradient_by_autograd
+from curvafit.priors.energies import energy, energy_gradient, energy_gradient_by_autograd
 from curvafit.priors.grid import Grid
 from curvafit.priors.kernels import cpu
 from curvafit.priors.kernels.threads import count_threads
@@ -37,8 +37,8 @@ def test_energy_and_gradient_are_the_definitions(shape, varies, spacing, boundar
     """No farther from float64 than a few times what the definition itself loses in float32.
 
     The gradient has a factor 1/S, S = √X⁺, which amplifies rounding where X crosses zero: a few voxels, other ones in
-    each program, so nine in ten voxels are held to the tight bound and all to the loose one. Numbers and arrays may
-    be mixed; a mask has its own kernel, or goes with what varies.
+    each program, so nine in ten voxels are held to the tight bound and all to the loose one. Numbers and fields may be
+    mixed; a mask has its own kernel, which what varies takes too.
     """
     grid = Grid(shape, spacing, boundary)
     u, a = smooth_field(grid), list(TUBES if varies else UNEQUAL)
@@ -48,11 +48,10 @@ def test_energy_and_gradient_are_the_definitions(shape, varies, spacing, boundar
     mask = (smooth_field(grid, 5) > -0.3) * (1 + smooth_field(grid, 6).abs()) if "mask" in varies else None
     cost = Coefficients(*a), grid, EPSILON, Q, mask
     (value, slope), (value32, slope32) = (energy_gradient_by_autograd(each, *cost) for each in (u, u.float()))
-    given = [each.numpy() if isinstance(each, torch.Tensor) else each for each in (*a, Q, mask)]
-    found, gradient_found = cpu.fused_energy_gradient(u.numpy(), given[:6], grid, EPSILON, *given[6:])
+    found, gradient_found = energy_gradient(u.float(), *cost)
     assert abs(found - value) <= 4 * abs(value32 - value) + 1e-6 * abs(value)
     scale = float(slope.abs().max())
-    error, error32 = np.abs(gradient_found - slope.numpy()) / scale, (slope32 - slope).abs().numpy() / scale
+    error, error32 = (gradient_found - slope).abs().numpy() / scale, (slope32 - slope).abs().numpy() / scale
     assert np.quantile(error, 0.9) <= 4 * np.quantile(error32, 0.9) + 1e-6
     assert error.max() < 1e-2
 
@@ -104,9 +103,10 @@ def test_blur_is_its_own_adjoint(boundary):
 
 def test_wrong_shapes_and_orientations_are_refused():
     grid, u, law = Grid((6, 7, 16)), np.zeros((6, 7, 16), np.float32), list(TUBES)
+    odd = torch.ones(3, 3).tril()
     for word, call in (
         ("field", lambda: cpu.fused_energy_gradient(u[..., 1:], law, grid, EPSILON)),
-        ("symmetric", lambda: cpu.fused_energy_gradient(u, law, grid, EPSILON, np.tri(3))),
+        ("symmetric", lambda: energy_gradient(torch.from_numpy(u), law, grid, EPSILON, odd)),
         ("field", lambda: cpu.gaussian_blur(u[..., 1:], grid, BLUR)),
     ):
         with pytest.raises(ValueError, match=word):

@@ -6,9 +6,8 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterable
+from collections.abc import Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,18 +20,15 @@ def has_kernel(device: torch.device | str) -> bool:
     return torch.device(device).type == "cpu" and importlib.util.find_spec("numba") is not None
 
 
-def to_numpy_cost(
-    coefficients: Iterable[float | Tensor], grid: Grid, orientation: Tensor | None
-) -> tuple[list[float | np.ndarray], np.ndarray | None]:
-    """Return coefficients and orientation as `cpu` takes them: numbers, or arrays `(Z, Y, X)` if they vary."""
+def energy_gradient(
+    u: Tensor, coefficients: Sequence[float], grid: Grid, epsilon: float, mask: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Return `energies.energy_gradient` of a field where there is a kernel; coefficients are six numbers."""
+    from curvafit.priors.kernels import cpu
 
-    def to_numpy(value: float | Tensor) -> float | np.ndarray:
-        if not isinstance(value, Tensor) or value.dim() == 0:
-            return float(value)
-        return value.detach().double().expand(grid.shape).numpy()
-
-    Q = None if orientation is None else orientation.double().numpy()
-    return [to_numpy(value) for value in coefficients], Q
+    weights = None if mask is None else mask.detach().expand(grid.shape).numpy()
+    value, slope = cpu.fused_energy_gradient(u.detach().numpy(), coefficients, grid, epsilon, weights)
+    return torch.tensor(value, dtype=torch.float64), torch.from_numpy(slope)
 
 
 def gaussian_blur(u: Tensor, grid: Grid, width: float) -> Tensor:

@@ -21,7 +21,7 @@ from numpy.lib.stride_tricks import as_strided
 from curvafit.priors.curvature import ROOT_FLOOR, ROOT_ROUNDING, XI
 from curvafit.priors.grid import Grid
 from curvafit.priors.kernels import loops
-from curvafit.priors.kernels.loops import ALL, BLUR_ROWS, EDGE, ENDS, MOVE, SLACK, TAPS, WIDE
+from curvafit.priors.kernels.loops import ALL, BLUR_ROWS, EDGE, ENDS, MOVE, SLACK, TAPS
 from curvafit.priors.kernels.threads import count_threads
 from curvafit.priors.stencils import gaussian_taps
 
@@ -32,18 +32,14 @@ _VOXELS_PER_THREAD = 32768
 _BLOCK, _TILE = 432, 43_000
 #: Floats of a cache line.
 _LINE = 16
-#: These stand for a field that is not there, and for the ratios of `_compute_ratios` where all are one.
-_NO_FIELD, _RATIOS = np.empty(0, np.float32), np.ones(9, np.float32)
+#: Stands for a field that is not there.
+_NO_FIELD = np.empty(0, np.float32)
 
 
-def fused_energy_gradient(
-    u: np.ndarray, a, grid: Grid, epsilon, orientation=None, mask=None
-) -> tuple[float, np.ndarray]:
-    """Return F_ε(u) and its gradient in float32, as `energies.energy_gradient` does, from arrays `(Z, Y, X)`.
-
-    The coefficients (a20 first) are numbers, or arrays where they vary.
-    """
-    density = _Density(a, grid, epsilon, _choose_threads(grid), orientation, mask)
+def fused_energy_gradient(u: np.ndarray, a, grid: Grid, epsilon, mask=None) -> tuple[float, np.ndarray]:
+    """Return F_ε(u) and its gradient in float32, as `energies.energy_gradient` does, from arrays `(Z, Y, X)` and six
+    coefficients (a20 first)."""
+    density = _Density(a, grid, epsilon, _choose_threads(grid), mask)
     gradient = _make_volume(grid)
     value = density(_pad_field(u, grid), gradient)
     return value, _view_field(gradient, grid).copy()
@@ -65,7 +61,7 @@ class FusedFlow:
     field. `width` is the blur's standard deviation in spacing's unit; `betas` and `adam_eps` are `torch.optim.Adam`'s.
     """
 
-    def __init__(self, start, base, a, grid: Grid, epsilon, width: float, *, betas, adam_eps, orientation=None) -> None:
+    def __init__(self, start, base, a, grid: Grid, epsilon, width: float, *, betas, adam_eps) -> None:
         Z, Y, X = grid.shape
         self.grid, self.taken = grid, 0
         self._adam_eps = adam_eps
@@ -78,7 +74,7 @@ class FusedFlow:
         self._divergence_ready = False
         self.vector[...] = start
         self._half = np.array([0.5 / h for h in grid.spacing], np.float32)
-        self._blur, self._density = _Blur(grid, width, threads), _Density(a, grid, epsilon, threads, orientation)
+        self._blur, self._density = _Blur(grid, width, threads), _Density(a, grid, epsilon, threads)
         self._mass, self._base = (base, _NO_FIELD) if np.ndim(base) == 0 else (0.0, _pad_field(base, grid))
         self._field, self._gradient, self._gradient_along_z = (_make_volume(grid) for _ in range(3))
         #: Of each plane, the sum of |∂F_ε/∂A|, and the bits of its maximum (see `loops._measure_sizes`).
@@ -182,23 +178,13 @@ class _Blur:
 class _Density:
     """F_ε on a grid: its constants and scratch arrays."""
 
-    def __init__(self, a, grid: Grid, epsilon, threads: int, orientation, mask=None) -> None:
+    def __init__(self, a, grid: Grid, epsilon, threads: int, mask=None) -> None:
         Z, Y, X = grid.shape
         stride = X + 2 * EDGE
         self._grid, self._threads = grid, threads
         self._block, self._tile = max(1, min(8, _BLOCK // stride)), min(Y, max(8, _TILE // stride))
-        weights, ratios = _compute_weights(a, grid, epsilon), _compute_ratios(grid)
-        self._constants = _make_constants(weights, grid, epsilon)
-        #: `ratios`, `orient`, `local` and `table` of `loops._differentiate`: None where the loop can do without.
-        self._optional = (ratios, None, None, None)
-        ratios = _RATIOS if ratios is None else ratios  # the cases below have one compiled form each
-        if orientation is not None or any(np.ndim(value) > 0 for value in weights):
-            weights.append(epsilon * grid.voxel_volume / (2 * grid.spacing[2]) ** 2)
-            if mask is not None:
-                weights = [value * mask for value in weights]
-            self._optional = ratios, _mirror_orientation(orientation, grid), *_join_weights(weights, self._block, grid)
-        elif mask is not None:
-            self._optional = (ratios, None, _pad_field(np.asarray(mask), grid), None)
+        self._constants, self._ratios = _make_constants(a, grid, epsilon), _compute_ratios(grid, mask is not None)
+        self._mask = None if mask is None else _pad_field(mask, grid)
         self._index = _continue_index(Z, EDGE, EDGE, grid.periodic)
         row = np.zeros(stride, np.float32)
         row[EDGE:-EDGE] = 1
@@ -215,7 +201,7 @@ class _Density:
         """Fill `gradient` with ∂F_ε/∂u of the volume `u`; return the energy."""
         loops.fill_gradient(
             self._threads, u, gradient, self._energies, self._rings, self._sums, self._inside, self._constants,
-            *self._optional, self._index, self._block, self._tile, *self._grid.shape,
+            self._ratios, self._mask, self._index, self._block, self._tile, *self._grid.shape,
         )  # fmt: skip
         return float(self._energies.sum())
 
@@ -285,8 +271,9 @@ def _continue_index(n: int, before: int, after: int, periodic: bool) -> np.ndarr
     return np.pad(np.arange(n), (before, after), mode="wrap" if periodic else "symmetric")
 
 
-def _compute_weights(a, grid: Grid, epsilon) -> list:
-    """Return the weights of X, T², TS, GT, GS and s in the density, numbers or arrays where they vary.
+def _make_constants(a, grid: Grid, epsilon: float) -> np.ndarray:
+    """Return the constants `k` of `loops._differentiate`: ξ², literals, (h/ε)², the floor of X, the weights of X, T²,
+    TS, GT, GS and s in the density, twice those of X, T² and s, and `ROOT_ROUNDING`.
 
     Differences are in units of the spacing h along x: with g = 2h∇u, D = h² Hess u, T = (ε/h²) T', where
     T' = w (h/ε)² r - tr D, and likewise X and P. The voxel's volume is included.
@@ -297,57 +284,19 @@ def _compute_weights(a, grid: Grid, epsilon) -> list:
     # factors 0.75 and 0.5 below, all three are ε V / 4h^power.
     second, first, zeroth = (epsilon * grid.voxel_volume / (power * h**power) for power in (4, 3, 2))
     X = (a20 + a02 - a11) * second
-    return [
-        X,
-        2 * a11 * second + X,
-        2 * (a20 - a02) * second,
-        (a10 + a01) * 0.75 * first,
-        (a10 - a01) * 0.75 * first,
-        a00 * 0.5 * zeroth,
-    ]
-
-
-def _make_constants(weights: list, grid: Grid, epsilon: float) -> np.ndarray:
-    """Return the constants `k` of `loops._differentiate`: ξ², literals, weights that do not vary, `ROOT_ROUNDING`."""
-    h = grid.spacing[2]
+    T2, s = 2 * a11 * second + X, a00 * 0.5 * zeroth
+    terms = (X, T2, 2 * (a20 - a02) * second, (a10 + a01) * 0.75 * first, (a10 - a01) * 0.75 * first, s)
     well = (h / epsilon) ** 2
     floor = ROOT_FLOOR * h**2 * well  # of X, in units of (ε/h²)²
-    X, T2, *_, s = terms = [float(value) if np.ndim(value) == 0 else math.nan for value in weights]
     literals = (0, 0.5, 0.25, 1, 2, 3)
     constants = [(2 * h * XI) ** 2, *literals, well, floor, *terms, 2 * X, 2 * T2, 2 * s, ROOT_ROUNDING]
     return np.array(constants, np.float32)
 
 
-def _join_weights(weights: list, block: int, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Return `local` and `table` of `loops._differentiate`: all weights in one array, and for each a row of its offset
-    and whether it varies. A weight is a flat volume where it varies, else `WIDE` equal numbers, a vector. After them
-    come the signs of x in a block of rows, -1 where x is mirrored.
-    """
-    arrays, varies = [], [np.ndim(value) > 0 for value in weights]
-    for value, varying in zip(weights, varies, strict=True):
-        array = _pad_field(value, grid) if varying else np.full(WIDE, value, np.float32)
-        if varying:
-            array[:SLACK] = array[-SLACK:] = 1  # so that no root of 0 makes a NaN in cells that count 0 times
-        arrays.append(array)
-    signs = np.ones(grid.shape[2] + 2 * EDGE, np.float32)
-    if not grid.periodic:
-        signs[:EDGE] = signs[-EDGE:] = -1
-    arrays.append(np.pad(np.tile(signs, block), (0, SLACK)))
-    offsets = np.cumsum([0, *(array.size for array in arrays[:-1])])
-    return np.concatenate(arrays), np.array([offsets, [*varies, True]]).T.copy()
-
-
-def _mirror_orientation(orientation, grid: Grid) -> np.ndarray:
-    """Return the components zz, yy, xx, zy, zx, yx of Q, `(4, 6)`: as it is, and mirrored in y, in z and in both."""
-    Q = np.zeros((3, 3)) if orientation is None else np.asarray(orientation, np.float64)
-    if Q.shape != (3, 3) or not np.array_equal(Q, Q.T):
-        raise ValueError(f"expected a symmetric 3×3 orientation (z, y, x), got {Q.tolist()}")
-    odd = 1 if grid.periodic else -1
-    signs = np.array([[1, 1, 1, z * y, z, y] for z in (1, odd) for y in (1, odd)])
-    return (signs * Q[(0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]).astype(np.float32)
-
-
-def _compute_ratios(grid: Grid) -> np.ndarray | None:
-    """Return the ratios of the spacing along x to that along z, y, x, and their products; None if all are one."""
+def _compute_ratios(grid: Grid, masked: bool) -> np.ndarray | None:
+    """Return the ratios of the spacing along x to that along z, y, x, and their products; None if all are one and there
+    is no mask, whose loop has one compiled form."""
     z, y, x = (grid.spacing[2] / h for h in grid.spacing)
-    return None if z == y == 1 else np.array([z, y, x, z * z, y * y, x * x, z * y, z * x, y * x], np.float32)
+    if z == y == 1 and not masked:
+        return None
+    return np.array([z, y, x, z * z, y * y, x * x, z * y, z * x, y * x], np.float32)

@@ -283,68 +283,34 @@ def _scale(value, ratios, which):
 
 
 @njit(**_SERIAL)
-def _read(local, table, which, cell):
-    """Read the vector of the density's weight number `which` at a cell."""
-    return _load(local, table[which, 0] + table[which, 1] * cell)
-
-
-@njit(**_SERIAL)
-def _read_cost(k, local, table, cell):
-    """Read (h/ε)², the floor of X, the weights of X, T², TS, GT, GS and s, and twice those of X, T² and s.
-
-    The weights are constants of `k` where `local` is None; these times the mask `local` where `table` is None; else
-    arrays.
-    """
-    if local is None:
+def _read_cost(k, mask, cell):
+    """Read (h/ε)², the floor of X, the weights of X, T², TS, GT, GS and s, and twice those of X, T² and s: constants of
+    `k`, times the `mask` where it is not None."""
+    if mask is None:
         return (
             _fill(k[7]), _fill(k[8]), _fill(k[9]), _fill(k[10]), _fill(k[11]), _fill(k[12]), _fill(k[13]), _fill(k[14]),
             _fill(k[15]), _fill(k[16]), _fill(k[17]),
         )  # fmt: skip
-    if table is None:
-        mask = _load(local, cell)
-        return (
-            _fill(k[7]), _fill(k[8]), mask * k[9], mask * k[10], mask * k[11], mask * k[12], mask * k[13], mask * k[14],
-            mask * k[15], mask * k[16], mask * k[17],
-        )  # fmt: skip
-    X, T2, TS = _read(local, table, 0, cell), _read(local, table, 1, cell), _read(local, table, 2, cell)
-    GT, GS, s = _read(local, table, 3, cell), _read(local, table, 4, cell), _read(local, table, 5, cell)
-    return _fill(k[7]), _fill(k[8]), X, T2, TS, GT, GS, s, X + X, T2 + T2, s + s
+    m = _load(mask, cell)
+    return (
+        _fill(k[7]), _fill(k[8]), m * k[9], m * k[10], m * k[11], m * k[12], m * k[13], m * k[14], m * k[15],
+        m * k[16], m * k[17],
+    )  # fmt: skip
 
 
 @njit(**_SERIAL)
-def _mirror(orient, across_z, across_y):
-    """Return Q in the box's mirror image: components with one mirrored axis change sign."""
-    if orient is None:
-        return None
-    return orient[2 * across_z + across_y]
-
-
-@njit(**_SERIAL)
-def _tilt(gz, gy, gx, orient, local, table, cell, i):
-    """Compute Q∇u times the weight of ∇uᵀQ∇u; the signs in `local` are negative where x is mirrored."""
-    weight, sign = _read(local, table, 6, cell), _load(local, table[7, 0] + i)
-    gz, gy, gx = weight * gz, weight * gy, weight * gx
-    across = sign * gx
-    tz = gz * orient[0] + gy * orient[3] + across * orient[4]
-    ty = gz * orient[3] + gy * orient[1] + across * orient[5]
-    return tz, ty, sign * (gz * orient[4] + gy * orient[5]) + gx * orient[2]
-
-
-@njit(**_SERIAL)
-def _differentiate(u, m, c, p, stride, n, ring, size, at, inside, inside_at, k, ratios, orient, local, table):
+def _differentiate(u, m, c, p, stride, n, ring, size, at, inside, inside_at, k, ratios, mask):
     """Compute the energy of n cells; store the partial derivatives from `at` on in the ring's ten arrays, `size` apart.
 
     `m`, `c`, `p` are the cells' offsets in the planes z-1, z, z+1 of u; `inside`, from `inside_at` on, is 1 in cells of
     the box, else 0. Differences are in units of the spacing, and the constants `k` are scaled so; these are read where
-    they are used, since in registers they would push the variables out. Where weights vary, `local` holds them one
-    after the other, and a row of `table` is a weight's offset in it, and 1 or, for one vector that all cells share, 0;
-    `orient` then holds Q's zz, yy, xx, zy, zx, yx. `local` without `table` is a mask that multiplies all weights.
+    they are used, since in registers they would push the variables out. A `mask` multiplies the density.
     """
     energy = _fill(k[1])
     for i in range(0, n, WIDE):
         ξ2, zero, quarter = _fill(k[0]), _fill(k[1]), _fill(k[3])
         one, two, three = _fill(k[4]), _fill(k[5]), _fill(k[6])
-        well, low, of_X, of_T2, of_TS, of_GT, of_GS, of_s, two_X, two_T2, two_s = _read_cost(k, local, table, c + i)
+        well, low, of_X, of_T2, of_TS, of_GT, of_GS, of_s, two_X, two_T2, two_s = _read_cost(k, mask, c + i)
         u_ = _load(u, c + i)
         zm, zp = _load(u, m + i), _load(u, p + i)
         ym, yp = _load(u, c + i - stride), _load(u, c + i + stride)
@@ -389,10 +355,6 @@ def _differentiate(u, m, c, p, stride, n, ring, size, at, inside, inside_at, k, 
         e_S = TS + of_GS * G
         e_G = of_GT * T + of_GS * S
         e = of_X * X + of_T2 * T2 + TS * S + G * e_G + of_s * s
-        tz = ty = tx = zero
-        if orient is not None:
-            tz, ty, tx = _tilt(gz, gy, gx, orient, local, table, c + i, i)
-            e = e + (gz * tz + gy * ty + gx * tx)
         energy = energy + e * _load(inside, inside_at + i)
         # Its derivatives, from the outside in, as at the file's head. The root's is zero where X is not resolved
         # (`curvature.positive_root`); `e_q` and `e_s` are the factors of D g and g in ∂e/∂g.
@@ -407,8 +369,6 @@ def _differentiate(u, m, c, p, stride, n, ring, size, at, inside, inside_at, k, 
         e_w = r * e_wr - P2 * q
         e_s = two_s + e_G * i_G + e_q * q + two * damping * i_d * (w * e_wr)
         dz, dy, dx = e_s * gz - e_q * hz, e_s * gy - e_q * hy, e_s * gx - e_q * hx
-        if orient is not None:
-            dz, dy, dx = dz + (tz + tz), dy + (ty + ty), dx + (tx + tx)
         dz, dy, dx = _scale(dz, ratios, 0), _scale(dy, ratios, 1), _scale(dx, ratios, 2)
         dzz, dyy = _scale(P2 * zz - e_T - Q * gzz, ratios, 3), _scale(P2 * yy - e_T - Q * gyy, ratios, 4)
         dxx = _scale(P2 * xx - e_T - Q * gxx, ratios, 5)
@@ -471,8 +431,7 @@ def _carry(ring, size, stride, count):
 
 @njit(**_SERIAL)
 def _fill_gradient_chunk(
-    u, out, energies, ring, sums, inside, k, ratios, orient, local, table, index,
-    first, last, y0, y1, block, Z, Y, stride,
+    u, out, energies, ring, sums, inside, k, ratios, mask, index, first, last, y0, y1, block, Z, Y, stride,
 ):  # fmt: skip
     """Compute the gradient in planes first to last - 1, rows y0 to y1 - 1, from partials of one cell more around."""
     plane, size = pitch(Y, stride - 2 * EDGE), (ring.size - 2 * SLACK) // PARTIALS
@@ -491,7 +450,7 @@ def _fill_gradient_chunk(
             at = SLACK + 2 * stride
             energy += _differentiate(
                 u, m + o, c + o, p + o, stride, count * stride, ring, size, at, inside, inside_at, k, ratios,
-                _mirror(orient, z < 0 or z >= Z, y < 0 or y >= Y), local, table,
+                mask,
             )  # fmt: skip
             # A row is gathered after the next one has its partials, so that the rows gathered are one behind.
             begin = max(y - 1, y0)
@@ -511,7 +470,7 @@ def _fill_gradient_chunk(
 
 
 @partial(Kernel, **_PARALLEL)
-def fill_gradient(u, out, energies, rings, sums, inside, k, ratios, orient, local, table, index, block, tile, Z, Y, X):
+def fill_gradient(u, out, energies, rings, sums, inside, k, ratios, mask, index, block, tile, Z, Y, X):
     """Compute the energies of tiles of rows in planes, and the gradient."""
     chunks = rings.shape[0]
     for chunk in prange(chunks):
@@ -519,8 +478,8 @@ def fill_gradient(u, out, energies, rings, sums, inside, k, ratios, orient, loca
         if first < last:
             for y0 in range(0, Y, tile):
                 _fill_gradient_chunk(
-                    u, out, energies[y0 // tile], rings[chunk], sums[chunk], inside, k, ratios, orient,
-                    local, table, index, first, last, y0, min(Y, y0 + tile), block, Z, Y, X + 2 * EDGE,
+                    u, out, energies[y0 // tile], rings[chunk], sums[chunk], inside, k, ratios, mask,
+                    index, first, last, y0, min(Y, y0 + tile), block, Z, Y, X + 2 * EDGE,
                 )  # fmt: skip
 
 
