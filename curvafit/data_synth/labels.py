@@ -159,11 +159,11 @@ def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
     edges = np.array(grid.spacing, dtype=np.float32)
     touching, feet = np.zeros(profile.shape, dtype=bool), np.zeros((*profile.shape, 6), dtype=np.float32)
     distance = np.full(profile.shape, np.nan, dtype=np.float32)
-    _measure_near(profile, edges, grid.periodic, touching, feet, distance)
+    _measure_near(profile, edges, touching, feet, distance)
     far = np.isnan(distance)
-    nearest = _find_nearest(touching, edges, grid.periodic)[far]
+    nearest = ndimage.distance_transform_edt(~touching, edges, return_distances=False, return_indices=True)[:, far].T  # type: ignore[index]
     # The distance is the offset's part along the normal and the sagitta of a sphere of radius `BEND` across it.
-    foot = feet[tuple((nearest % profile.shape).T)]
+    foot = feet[tuple(nearest.T)]
     offset = (nearest - np.argwhere(far)) * edges + foot[:, :3]
     square = np.square(offset).sum(1)
     along = np.abs((offset * foot[:, 3:]).sum(1))
@@ -172,17 +172,8 @@ def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
     return distance
 
 
-def _find_nearest(touching: np.ndarray, edges: np.ndarray, periodic: bool) -> np.ndarray:
-    """Return the indices (Z, Y, X, 3) of the marked voxel nearest to each voxel, beyond a periodic box's faces too."""
-    margin = np.array(touching.shape) // 2 if periodic else np.zeros(3, dtype=int)
-    padded = np.pad(~touching, np.stack([margin, margin], 1), mode="wrap")
-    nearest = ndimage.distance_transform_edt(padded, edges, return_distances=False, return_indices=True)
-    inner = tuple(slice(m, m + n) for m, n in zip(margin, touching.shape, strict=True))
-    return np.moveaxis(np.asarray(nearest)[:, *inner], 0, -1) - margin
-
-
 @njit(cache=True)
-def _measure_near(profile, edges, periodic, touching, feet, distance):  # pragma: no cover
+def _measure_near(profile, edges, touching, feet, distance):  # pragma: no cover
     """Fill `touching`, the voxels with a neighbour of the other sign; `feet` (…, 6), their offset to the surface and
     normal inwards; and the `distance` of all voxels near the surface. `profile` is the distance that tanh states."""
     # It returns no array: Ctrl-C while compiled code returns one ends the process.
@@ -197,9 +188,7 @@ def _measure_near(profile, edges, periodic, touching, feet, distance):  # pragma
                 neighbour[0], neighbour[1], neighbour[2] = z, y, x
                 neighbour[axis] += step
                 if neighbour[axis] < 0 or neighbour[axis] >= shape[axis]:
-                    if not periodic:
-                        continue
-                    neighbour[axis] %= shape[axis]
+                    continue
                 neighbour_value = profile[neighbour[0], neighbour[1], neighbour[2]]
                 count += 1
                 total += step * (neighbour_value - value)
