@@ -15,7 +15,7 @@ from curvafit.core.units import METRES, convert_length
 from curvafit.priors.coefficients import POWERS, Coefficients, check_strengths
 from curvafit.priors.grid import WORKING_EPSILON, Float, Grid
 from curvafit.priors.kernels.differentiable import energies
-from curvafit.priors.law import Law, LawLike, read_laws
+from curvafit.priors.law import Law, LawLike
 from curvafit.priors.profile import refine_profile
 
 #: Voxels that ε spans; an axis on which it spans fewer, by more than a tenth, is refined, at most `FINEST`-fold.
@@ -24,7 +24,7 @@ RESOLVED, FINEST = 2, 16
 LONGEST = 2.05
 #: The greatest ε in voxels of the smallest edge; no window is longer.
 COARSEST = 10_000
-#: The greatest weight, or value of a mask, whose products float32 holds.
+#: The greatest value of a mask whose products float32 holds.
 HEAVIEST = 1e9
 _Values = TypeVar("_Values", bound=Tensor | None)
 
@@ -43,8 +43,7 @@ class CurvaturePrior(nn.Module):
     ----------
     law
         `Coefficients` with lengths in spacing's unit; a `Law`, or a preset's name, in working units, where the smallest
-        voxel edge is 0.01; the path of a `fit.json`, or a fit. Or a sequence of laws, one for each class.
-        A warning says where a fit is not `Supported`.
+        voxel edge is 0.01; the path of a `fit.json`, or a fit. A warning says where a fit is not `Supported`.
     sigmoid, softmax
         Whether the input is logits, to which this function is applied first. Else it is probabilities, and a warning
         says where it has other values.
@@ -71,8 +70,6 @@ class CurvaturePrior(nn.Module):
         says so. Up to voxels as long as ε the energy is that of fine ones within 4 %, up to 2 ε within 20 %; where they
         are longer it is up to 3 times larger, and the warning says that. A refinement of more than 16-fold is refused,
         and so is an ε longer than the window.
-    weight
-        A factor, or one for each class; classes of weight 0 are not computed.
     border
         Number of voxels at each face of the input that do not count, since their neighbours are unknown.
     shape
@@ -83,7 +80,7 @@ class CurvaturePrior(nn.Module):
 
     def __init__(
         self,
-        law: LawLike | Sequence[LawLike],
+        law: LawLike,
         *,
         sigmoid: bool = False,
         softmax: bool = False,
@@ -94,7 +91,6 @@ class CurvaturePrior(nn.Module):
         spacing: float | Sequence[float] = 1.0,
         unit: str | None = None,
         epsilon: float | None = None,
-        weight: float | Sequence[float] = 1.0,
         border: int = 1,
         shape: Sequence[int] | None = None,
     ) -> None:
@@ -111,13 +107,10 @@ class CurvaturePrior(nn.Module):
         self.epsilon = check_float(epsilon, "epsilon > 0 in spacing's unit", math.ulp(0), COARSEST * edge)
         self.border = check_int(border, "a border of whole voxels from 0", 0, 2**31)
         self._warned: set[str] = set()
-        self.weight = _read_weights(weight)
-        laws = read_laws(law)
-        self.coefficients = tuple(_read_coefficients(law, edge, unit, self.epsilon) for law in laws)
-        self._origins = tuple(law.origin for law in laws)
-        presets = [law.origin for law in laws if law.working]
-        if unit is not None and presets and not any(law.fitted for law in laws):
-            warnings.warn(f"a unit changes nothing for {presets[0]}: its lengths follow the voxel edge", stacklevel=2)
+        law = Law.of(law)
+        self.coefficients, self._origin = _read_coefficients(law, edge, unit, self.epsilon), law.origin
+        if unit is not None and law.working and not law.fitted:
+            warnings.warn(f"a unit changes nothing for {law.origin}: its lengths follow the voxel edge", stacklevel=2)
         refinement, longest = choose_refinement(self.spacing, self.epsilon), max(self.spacing)
         if max(refinement) > 1:
             axes = ", ".join(f"{axis} {n}-fold" for axis, n in zip("zyx", refinement, strict=True) if n > 1)
@@ -127,14 +120,12 @@ class CurvaturePrior(nn.Module):
             warnings.warn(message, stacklevel=2)
 
     def extra_repr(self) -> str:
-        """Return the settings that `repr` shows: the laws, what is not the default, spacing, ε, weights, border."""
+        """Return the settings that `repr` shows: the law, what is not the default, spacing, ε, border."""
         defaults = {"sigmoid": False, "softmax": False, "include_background": True, "to_onehot_y": False}
         defaults |= {"reduction": "mean", "ignore_index": None, "shape": None}
         shown = [f"{name}={getattr(self, name)!r}" for name, value in defaults.items() if getattr(self, name) != value]
-        numbers = (", ".join(f"{float(a):.6g}" for a in law) for law in self.coefficients)
-        laws = [f"{origin} ({six_numbers})" for origin, six_numbers in zip(self._origins, numbers, strict=True)]
-        scale = f"spacing={self.spacing}, epsilon={self.epsilon:g}, weight={self.weight}, border={self.border}"
-        return ", ".join((*laws, *shown, scale))
+        law = f"{self._origin} ({', '.join(f'{float(a):.6g}' for a in self.coefficients)})"
+        return ", ".join((law, *shown, f"spacing={self.spacing}, epsilon={self.epsilon:g}, border={self.border}"))
 
     def forward(self, input: Tensor, target: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
         """Return the loss of a batch; see the class."""
@@ -144,21 +135,15 @@ class CurvaturePrior(nn.Module):
             if ignored is not None:  # before the activation, as its derivative at a NaN is NaN
                 input = torch.where(ignored, 0.0 if self.sigmoid or self.softmax else 0.5, input)
             probability = self._probability(input)
-            classes, spacing, skipped = probability.shape[1], self._spacing_of(input), self._is_skipped(input)
-            refinement = (1, 1, 1) if skipped else choose_refinement(spacing, self.epsilon)
-            options = {"normalize": self.reduction != "sum", "border": self.border}
-            laws = _repeat_per_class(self.coefficients, classes, "one law")
-            weights = _repeat_per_class(self.weight, classes, "one weight")
-            losses = []
-            for channel, (law, weight) in enumerate(zip(laws, weights, strict=True)):
-                field = probability[:, channel]
-                if weight == 0 or skipped:
-                    losses.append(field.sum((-3, -2, -1)) * 0)  # a zero that has a gradient
-                    continue
-                own_mask = None if mask is None else mask[:, min(channel, mask.shape[1] - 1)]
-                energy = _measure_window(field, law, spacing, self.epsilon, refinement, own_mask, **options)
-                losses.append(weight * energy)
-            values = torch.stack(losses, 1)
+            if self._is_skipped(input):
+                values = probability.sum((-3, -2, -1)) * 0  # zeros that have a gradient
+            else:
+                spacing = self._spacing_of(input)
+                numbers = self.coefficients, spacing, self.epsilon, choose_refinement(spacing, self.epsilon)
+                weights = None if mask is None else mask.expand_as(probability).flatten(0, 1)
+                options = {"normalize": self.reduction != "sum", "border": self.border}
+                energies = _measure_window(probability.flatten(0, 1), *numbers, weights, **options)
+                values = energies.unflatten(0, probability.shape[:2])
             if self.reduction == "none":
                 return values[..., None, None, None]
             return values.sum() if self.reduction == "sum" else values.mean()
@@ -376,17 +361,6 @@ def choose_refinement(spacing: Sequence[float], epsilon: float) -> tuple[int, in
     return z, y, x
 
 
-def _read_weights(weight: float | Sequence[float]) -> tuple[float, ...]:
-    """Return one weight, or the weights of all classes."""
-    try:
-        values = tuple(torch.as_tensor(weight, dtype=torch.float64).flatten().tolist())
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        values = ()
-    if not values or not all(0 <= value <= HEAVIEST for value in values):
-        raise ValueError(f"expected a weight from 0 to {HEAVIEST:g}, or one for each class, got {quoted(weight)}")
-    return values
-
-
 def _read_coefficients(law: Law, edge: float, unit: str | None, epsilon: float) -> Coefficients:
     """Return a law's coefficients with lengths in spacing's unit; warn where its fit is in doubt or had another ε."""
     coefficients = law.in_unit(unit, edge)
@@ -396,20 +370,13 @@ def _read_coefficients(law: Law, edge: float, unit: str | None, epsilon: float) 
             raise ValueError(f"expected a unit among {', '.join(METRES)}, got {quoted(unit)}")
         return coefficients
     if law.doubt:
-        warnings.warn(law.doubt, stacklevel=4)
+        warnings.warn(law.doubt, stacklevel=3)
     unit = unit or law.length_unit
     fit_epsilon = convert_length(law.epsilon_physical, law.length_unit, unit)
     if not 1 / 4 <= epsilon / fit_epsilon <= 4:
         difference = f"ε is {epsilon:g} {unit} here and was {fit_epsilon:g} {unit} in the fit"
-        warnings.warn(f"{difference}: state spacing and its unit if the two should be alike", stacklevel=4)
+        warnings.warn(f"{difference}: state spacing and its unit if the two should be alike", stacklevel=3)
     return coefficients
-
-
-def _repeat_per_class(values: tuple, classes: int, name: str) -> tuple:
-    """Return one value for each class."""
-    if len(values) not in (1, classes):
-        raise ValueError(f"expected {name}, or one for each class that counts ({classes} in all), got {len(values)}")
-    return values * classes if len(values) == 1 else values
 
 
 def _measure_window(

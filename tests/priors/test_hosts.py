@@ -68,12 +68,12 @@ def test_the_warm_up_counts_training_steps_and_survives_a_restart():
 
 
 def test_it_can_be_copied_and_shown():
-    prior = CurvaturePrior(("tubes", "sponge"), weight=(1, 2), spacing=(1, 1, 2), epsilon=4.0, softmax=True)
+    prior = CurvaturePrior("tubes", spacing=(1, 1, 2), epsilon=4.0, softmax=True)
     logits = noise(1, 2, 8, 8, 8)
     assert torch.equal(copy.deepcopy(prior)(logits), prior(logits))
     assert all(word in repr(prior) for word in ("preset tubes", "softmax=True", "epsilon=4"))
     for law in ((1, 2, 1, 0, 0, 0), {"a20": 1, "a11": 2, "a02": 1}):
-        assert CurvaturePrior(law).coefficients == (Coefficients.willmore(),)  # type: ignore[arg-type]
+        assert CurvaturePrior(law).coefficients == Coefficients.willmore()  # type: ignore[arg-type]
 
 
 # ---- torch and MONAI -------------------------------------------------------------------------------------------------

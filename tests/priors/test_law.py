@@ -100,7 +100,7 @@ def test_several_laws_are_read_in_order(fit_path: Path) -> None:
 
 @pytest.mark.parametrize("stated", ["tubes", TUBES, TUBES.coefficients.in_unit(0.01)])
 def test_the_training_loss_takes_every_law(stated: LawLike) -> None:
-    (own,) = CurvaturePrior(stated).coefficients
+    own = CurvaturePrior(stated).coefficients
     assert tuple(own) == pytest.approx(tuple(TUBES.coefficients.in_unit(0.01)))
 
 

@@ -60,7 +60,7 @@ def test_a_change_of_unit_changes_nothing():
 def test_a_fit_is_in_its_own_unit_or_converted(tmp_path):
     path = fit_file(tmp_path / "fit.json", "um", "Supported (refined): …")  # its ε is 4 um
     for options, unit in (({"spacing": 2.0}, 1 / 200), ({"spacing": 2e-3, "unit": "mm"}, 1e3 / 200)):
-        (law,) = CurvaturePrior(str(path), **options).coefficients
+        law = CurvaturePrior(str(path), **options).coefficients
         assert tuple(law) == pytest.approx(tuple(TUBES.in_unit(unit)))
     for good in (1.01, 3.9):
         CurvaturePrior(path, spacing=good * 2e-3, unit="mm")
@@ -102,7 +102,7 @@ def test_the_mean_compares_across_patch_sizes():
 def test_the_level_of_a_deep_supervision_has_its_own_spacing():
     p, fine = probabilities(1, 1, 8, 8, 8), probabilities(1, 1, 8, 16, 16)
     level = CurvaturePrior("tubes", spacing=0.5, epsilon=2.0, shape=(8, 16, 16))
-    coarse = CurvaturePrior(level.coefficients[0], spacing=(0.5, 1.0, 1.0), epsilon=2.0)
+    coarse = CurvaturePrior(level.coefficients, spacing=(0.5, 1.0, 1.0), epsilon=2.0)
     assert_close(level(p), coarse(p))
     assert_close(level(fine), CurvaturePrior("tubes", spacing=0.5, epsilon=2.0)(fine))
 
@@ -175,7 +175,7 @@ def test_gradcheck(options):
 def test_float32_is_float64(options):
     """Values and gradients of the fused kernels and of the definition, per class, under a mask of each class; the
     fused ones are deterministic."""
-    prior = CurvaturePrior((LAW, "tubes"), **options)
+    prior = CurvaturePrior(LAW, **options)
     p, mask = torch.cat([probabilities(2, 1, 9, 12, 11, seed=k) for k in range(2)], 1), noise(2, 2, 9, 12, 11, seed=3)
     mask = mask.abs() * (mask > -0.5)
     exact, found, again = (slope_of(lambda x: prior(x, mask=mask), x) for x in (p, p.float(), p.float()))
@@ -210,17 +210,17 @@ def test_a_constant_or_saturated_input_is_harmless(logits, dtype):
 
 @types
 @pytest.mark.parametrize("include", [True, False])
-def test_each_class_has_its_law_its_weight_and_its_mask(dtype, include):
+def test_each_class_has_its_mask(dtype, include):
     p = torch.cat([probabilities(2, 1, 8, 9, 10, seed=k) for k in range(3)], 1).to(dtype)
-    mask, laws, weights = noise(2, 3, 8, 9, 10).abs(), ("tubes", LAW, "sponge"), (1.0, 0.0, 3.0)
-    first = 0 if include else 1
-    options = {"weight": weights[first:], "include_background": include}
-    found = CurvaturePrior(laws[first:], reduction="none", **options)(p, mask=mask)
+    mask, first = noise(2, 3, 8, 9, 10).abs(), 0 if include else 1
+    found = CurvaturePrior(LAW, reduction="none", include_background=include)(p, mask=mask)
     assert found.shape == (2, 3 - first, 1, 1, 1)
     for k, column in zip(range(first, 3), found.unbind(1), strict=True):
-        alone = CurvaturePrior(laws[k], reduction="none")(p[:, k : k + 1], mask=mask[:, k : k + 1])
-        assert_close(column, weights[k] * alone[:, 0])
-    assert_close(CurvaturePrior(laws[first:], **options)(p, mask=mask), found.mean())
+        alone = CurvaturePrior(LAW, reduction="none")(p[:, k : k + 1], mask=mask[:, k : k + 1])
+        assert_close(column, alone[:, 0])
+    assert_close(CurvaturePrior(LAW, include_background=include)(p, mask=mask), found.mean())
+    shared = CurvaturePrior(LAW, reduction="none")
+    assert_close(shared(p, mask=mask[:1, :1]), shared(p, mask=mask[:1, :1].expand_as(p)))
 
 
 # ---- what counts ----------------------------------------------------------------------------------------------------
@@ -327,13 +327,12 @@ REFUSALS = [
     ({"epsilon": 1e30}, (), "expected epsilon > 0 in spacing's unit, at most 10000, got 1e.30"),
     ({"epsilon": 11.0}, (box(1, 1, 8, 9, 10),), "expected an ε of at most the window's longest side, 10, got 11"),
     ({"epsilon": 0.02}, (), "fold"), ({"epsilon": 2.0, "spacing": (16.1, 1.0, 1.0)}, (), "fold"),
-    ({"border": 0.5}, (), "expected a border of whole voxels"), ({"weight": -1}, (), "expected a weight from 0"),
-    ({"weight": None}, (), "expected a weight from 0 to 1e.09, or one for each class, got None"),
+    ({"border": 0.5}, (), "expected a border of whole voxels"),
     ({"shape": (8, 8)}, (), "expected a shape of 3 whole numbers"), ({"unit": "furlong"}, (), "unit"),
     ({"law": LAW, "unit": "furlong"}, (), "unit"), ({"law": "tubs"}, (), "preset"),
     ({"law": Path("nowhere/fit.json")}, (), "no file"), ({"law": Coefficients(torch.ones(2), 1, 1)}, (), "numbers"),
     ({"law": Coefficients(1, 1, 1, a00=1e7)}, (), "a00"),
-    ({"law": ("tubes", "sponge")}, (box(1, 1, 8, 8, 8),), "one law"),
+    ({"law": ("tubes", "sponge")}, (), "expected a law"),
     ({}, (box(1, 1, 1, 16, 16),), "at least 4 voxels"),
     ({}, (box(1, 16, 16, 16),), "expected an input of floats .B, N, D, H, W."),
     ({}, (box(0, 1, 8, 8, 8),), "expected an input of floats .B, N, D, H, W., got torch.float32 .0, 1, 8, 8, 8."),
@@ -385,7 +384,7 @@ def finite_or_a_sentence(loss) -> bool:
 
 
 @pytest.mark.parametrize("spacing", [1.0, 1e-9, 1e9, (1e-12, 1.0, 1.0), (1e12, 1e12, 1e11)])
-@pytest.mark.parametrize("option", ["epsilon", "weight", "border", "shape", "spacing", *NAMES])
+@pytest.mark.parametrize("option", ["epsilon", "border", "shape", "spacing", *NAMES])
 def test_any_number_is_finite_or_refused(option, spacing) -> None:
     """In any unit of length: what counts is the product with ε."""
     taken = []
@@ -424,11 +423,6 @@ def test_an_axis_a_little_coarser_is_not_interpolated_and_others_have_two_voxels
     assert choose_refinement(spacing, epsilon) == times
 
 
-@pytest.mark.parametrize("weight", [np.float32(2), torch.tensor(2.0), np.array([2.0]), [torch.tensor(2.0)], 2])
-def test_weights_are_numbers_of_any_kind(weight):
-    assert CurvaturePrior("tubes", weight=weight).weight == (2.0,)
-
-
 def test_a_look_without_gradients_leaves_later_ones_alone():
     """With an interpolated axis, whose weights are kept between calls; of a size no other test has."""
     prior, p = CurvaturePrior("tubes", spacing=(2.0, 1.0, 1.0)), probabilities(1, 1, 11, 9, 9)
@@ -442,7 +436,7 @@ def test_a_look_without_gradients_leaves_later_ones_alone():
 )
 def test_a_level_too_coarse_is_zero(shape, options):
     whole = {"shape": (32, 32, 32)} | options
-    prior, value = CurvaturePrior(("tubes", LAW), reduction="none", **whole), torch.rand(2, 2, *shape)
+    prior, value = CurvaturePrior("tubes", reduction="none", **whole), torch.rand(2, 2, *shape)
     with pytest.warns(UserWarning, match="coarse"):
         found = prior(value.requires_grad_())
     assert found.shape == (2, 2, 1, 1, 1) and not bool(found.any())
