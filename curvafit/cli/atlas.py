@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from curvafit.cli.console import command_line, error_console, resumable, say, say_notes, show_stages
+from curvafit.cli.console import command_line, error_console, say, show_stages
 from curvafit.cli.options import OverwriteOption, Workers, add_commands, command, parse_whole_triple
 
 if TYPE_CHECKING:
@@ -139,48 +139,6 @@ def train_atlas(
 
 
 @command(
-    "curvafit atlas teach mixed -o filler.npz",
-    "curvafit atlas teach mixed store --filler filler.npz -o more.npz",
-    "curvafit atlas teach mixed store --images 160 -o image.npz",
-)
-def teach_filler(
-    stores: Annotated[
-        list[Path], typer.Argument(help="Stores made by `curvafit atlas build`, masks, or `mixed`: textures of no law.")
-    ],
-    out: Annotated[Path, typer.Option("-o", "--output", help="The weights (.npz) to write.")],
-    images: Annotated[int, typer.Option(help="Teach for `reconstruct --image`, from so many shapes.", min=0)] = 0,
-    filler: Annotated[
-        Path | None, typer.Option(help="Filler to begin with; else a new one; with --images the packaged.")
-    ] = None,
-    steps: Annotated[int | None, typer.Option(help="Steps, by default 4500; 1500 with --images.", min=1)] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the teaching.")] = 0,
-    overwrite: OverwriteOption = False,
-) -> None:
-    """Teach the network that `reconstruct` fills volumes with. The same command resumes one that was stopped."""
-    from curvafit.core.files import remove
-    from curvafit.segmentation.filler import FILLER_FILE, Taught
-    from curvafit.segmentation.teach import FEW, image_folder, load_textures, teach
-
-    _check_archive(out, FILLER_FILE, stores if filler is None else [*stores, filler], overwrite)
-    checkpoint = out.with_name(f".{out.name}.curvafit-steps")
-    with resumable(), show_stages() as progress:
-        # With images, a filler that was taught on masks alone learns to use them.
-        first = Taught.load(filler) if images or filler else None
-        sources, card = load_textures(stores, progress)
-        if (count := sum(map(len, sources))) < FEW:
-            say_notes([f"{count} shapes teach little: {FEW} or more are better"])
-        settings = {"first": first, "volumes": images, "steps": steps, "seed": seed}
-        card["command"] = command_line()
-        taught = teach(sources, card, **settings, checkpoint=checkpoint, progress=progress)
-    taught.save(out)
-    for path in (checkpoint, image_folder(checkpoint)):
-        remove(path)
-    loss, cubic = taught.card["held_out_loss"], taught.card["held_out_cubic"]
-    say(f"cross entropy of shapes held out {loss:.4f}, of the cubic interpolation {cubic:.4f}", to=error_console())
-    say(str(out))
-
-
-@command(
     "curvafit atlas map store -o map.html",
     "curvafit atlas map box corner --fit bone/fit.json --fit lung/fit.json -o map.html",
 )
@@ -200,7 +158,7 @@ def map_atlas(
 
 
 add_commands(atlas_app, build_atlas, info_atlas, verify_atlas)
-add_commands(atlas_app, extract_atlas, describe_atlas, train_atlas, teach_filler, map_atlas)
+add_commands(atlas_app, extract_atlas, describe_atlas, train_atlas, map_atlas)
 
 
 def _check_archive(out: Path, kind: Format, inputs: list[Path], overwrite: bool) -> None:

@@ -80,7 +80,7 @@ def parse_labels(
 def parse_learning(
     image: Annotated[str | None, _what(help="The grey levels of the volume, on the same voxels.")] = None,
     example: Annotated[Path | None, _what(help="Mask of another such volume, to tune the network.")] = None,
-    filler: Annotated[Path | None, _what(help="Weights of `curvafit atlas teach`, not the packaged ones.")] = None,
+    filler: Annotated[Path | None, _what(help="Weights of `examples/teach.py`, not the packaged ones.")] = None,
 ) -> dict[str, str | None]:
     """Return the paths of the files that improve the filling, by name."""
     paths = {"image": image, "example": example, "filler": filler}

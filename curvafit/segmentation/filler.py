@@ -29,7 +29,7 @@ from curvafit.scan.grids import centre_distance
 from curvafit.segmentation.slices import WHOLE, Slices, plane_distances
 from curvafit.volumes.volume import Box
 
-FILLER_FILE = Format("curvafit filler", 1, "weights of a filler", "teach them again with `curvafit atlas teach`")
+FILLER_FILE = Format("curvafit filler", 1, "weights of a filler", "teach them again with `examples/teach.py`")
 #: Signed distances are cut here, in pixels: what is further away does not matter for a gap of 24 pixels at most.
 FAR = 16.0
 #: Radius, in pixels, of what the network sees around a pixel, by convolutions and distances; a multiple of 4.

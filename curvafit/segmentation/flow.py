@@ -55,7 +55,7 @@ class Working:
         Stiffness of the springs on known voxels, in working units: `reconstruct` lowers the first law with it, and
         tries nothing out.
     filler
-        Weights of the network that fills, of `curvafit atlas teach`, for an image those of `--images`; by default the
+        Weights of the network that fills, of `examples/teach.py`, for an image those of `--images`; by default the
         packaged ones.
     tile
         The energy is lowered on overlapping tiles of at most this many working voxels a side, which bounds the memory;

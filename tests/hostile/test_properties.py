@@ -136,7 +136,7 @@ FEW, MANY = (settings(DRAWN, max_examples=EXAMPLES or n, derandomize=not EXAMPLE
 #: Commands that fetch a file.
 FETCHING = {"demo", "samples get"}
 #: What is typed to draw, which is no table, and to teach, which takes hours.
-REFUSED = ("atlas map none -o out", "atlas train none.npz -o out.npz", "atlas teach none -o out.npz")
+REFUSED = ("atlas map none -o out", "atlas train none.npz -o out.npz")
 
 NUMBERS = "0 -0 1 -1 2 7 0.5 -0.5 1e-300 1e30 -1e30 1e300 nan inf -inf 18446744073709551616 1,2 0,0,1 1,2,3 -1,-1,-1"
 WORDS = (

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from annotated import known, stirred
+from scripts import example
 from skimage import measure
 
 import curvafit.segmentation.image as room
@@ -15,12 +16,12 @@ from curvafit.segmentation.filler import Filler, Gaps, Taught, fill
 from curvafit.segmentation.image import read_image
 from curvafit.segmentation.labels import are_instances, reconstruct_labels, split_structure
 from curvafit.segmentation.reconstruction import reconstruct
-from curvafit.segmentation.teach import ImageMix, Texture, Whole, image_shape, teach
 from curvafit.segmentation.trials import dice
 from curvafit.volumes.volume import Volume
 
 pytest.importorskip("sklearn", reason="reading an image needs scikit-learn")
 
+script = example("teach")
 EVERY = 6
 
 
@@ -82,14 +83,14 @@ def test_the_packaged_filler_finds_what_only_the_image_shows_across_any_axis() -
     assert any("image" in note for note in blank.notes) and "image" not in blank.status
 
 
-def texture() -> Texture:
+def texture():
     z, y, x = np.mgrid[:24, :24, :24] * (2 * np.pi / 24)
-    return Texture((np.sin(z) * np.cos(y) + np.sin(y) * np.cos(x) + np.sin(x) * np.cos(z)).astype(np.float32))
+    return script.Texture((np.sin(z) * np.cos(y) + np.sin(y) * np.cos(x) + np.sin(x) * np.cos(z)).astype(np.float32))
 
 
 def test_imaged_shapes_depend_on_their_seed_alone() -> None:
-    mix = ImageMix(edge=24, gap=(3, 4))
-    one, same, other = (image_shape([[texture()]], mix, (0, k)) for k in (1, 1, 2))
+    mix = script.ImageMix(edge=24, gap=(3, 4))
+    one, same, other = (script.image_shape([[texture()]], mix, (0, k)) for k in (1, 1, 2))
     assert np.array_equal(one.distances, same.distances) and np.array_equal(one.evidence, same.evidence)
     assert one.distances.shape != other.distances.shape or not np.array_equal(one.evidence, other.evidence)
     assert (len(one.distances) - 1) % one.gap == 0 and one.evidence.shape == one.distances.shape
@@ -99,25 +100,25 @@ def test_imaged_shapes_depend_on_their_seed_alone() -> None:
 def test_teaching_with_images_makes_a_filler_for_images_and_goes_on(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("curvafit.segmentation.teach.JUDGED", 6)
+    monkeypatch.setattr(script, "JUDGED", 6)
     plain = Taught(Filler(4).eval(), np.array([[2.0, 16.0], [1.0, 1.0]]), {"name": "plain"}, 0.0)
-    taught = teach([[texture()]], {}, first=plain, steps=2, volumes=2, workers=0)
+    taught = script.teach([[texture()]], {}, first=plain, steps=2, volumes=2, workers=0)
     assert taught.filler.image and taught.card["first"] == {"name": "plain"} and taught.card["volumes"] == 2
     assert set(taught.card["losses"]) and np.isfinite(taught.card["held_out_loss"])
-    imaged: list[int] = []
+    imaged, image_shape = [], script.image_shape
 
-    def image_two(textures: object, mix: ImageMix, seed: tuple[int, int]) -> Whole:
+    def image_two(textures: object, mix: object, seed: tuple[int, int]) -> object:
         if len(imaged) == 2:
             raise KeyboardInterrupt
         imaged.append(seed[1])
-        return image_shape(textures, mix, seed)  # type: ignore[arg-type]
+        return image_shape(textures, mix, seed)
 
-    monkeypatch.setattr("curvafit.segmentation.teach.image_shape", image_two)
+    monkeypatch.setattr(script, "image_shape", image_two)
     options: dict[str, Any] = {"first": plain, "steps": 2, "volumes": 2, "workers": 0, "checkpoint": tmp_path / "steps"}
     with pytest.raises(KeyboardInterrupt):
-        teach([[texture()]], {}, **options)
+        script.teach([[texture()]], {}, **options)
     imaged[:] = imaged[1:]
-    assert teach([[texture()]], {}, **options).card["losses"] == taught.card["losses"] and imaged == [1, 2]
+    assert script.teach([[texture()]], {}, **options).card["losses"] == taught.card["losses"] and imaged == [1, 2]
 
 
 def cells() -> np.ndarray:

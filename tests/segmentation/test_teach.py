@@ -1,23 +1,26 @@
 """Lessons cut from shapes, learning that a stop does not change, and what an example adds."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from calling import call, done, refused
+from scripts import example
 
 import curvafit.segmentation.teach as room
 from curvafit.data_synth.atlas import build
 from curvafit.data_synth.textures import KINDS
 from curvafit.generation.schedule import schedule
 from curvafit.segmentation.filler import FAR, Filler, Taught
-from curvafit.segmentation.teach import Lessons, Mix, Texture, Whole, WholeLessons, learn, load_textures, teach
+from curvafit.segmentation.teach import Whole, WholeLessons, learn
 from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
+script = example("teach")
+Mix, Texture, Lessons = script.Mix, script.Texture, script.Lessons
 #: Windows along the axes of a shape, as it is.
 EXACT = Mix(upright=1, stretch=0, coarse=0, ends=0, pairs=0, holes=0, trembling=0, partial=0)
 
@@ -32,7 +35,7 @@ def rods(n: int = 24) -> np.ndarray:
 TEXTURE = Texture(rods())
 
 
-def lessons(mix: Mix = EXACT, length: int = 6, **sizes: int) -> Lessons:
+def lessons(mix=EXACT, length: int = 6, **sizes: int):
     return Lessons([[TEXTURE]], mix, 0, length, **{"size": 2, "edge": 16, "halo": 4, **sizes})
 
 
@@ -107,20 +110,20 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(tmp_path: Path, monkeyp
 
 @pytest.mark.slow
 def test_teaching_lowers_the_loss_of_shapes_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room, "JUDGED", 6)
+    monkeypatch.setattr(script, "JUDGED", 6)
     turned = [Texture(np.roll(rods(), k, 0)) for k in range(4)]
-    taught = teach([turned], {"sources": []}, steps=35, workers=0, mix=replace(EXACT, gap=(2.0, 8.0), most=6))
+    taught = script.teach([turned], {"sources": []}, steps=35, workers=0, mix=replace(EXACT, gap=(2.0, 8.0), most=6))
     card = json.loads(json.dumps(taught.card))
     assert card["held_out_loss"] < 0.9 * card["held_out_cubic"] and 0 <= taught.error < 0.2
     assert (card["shapes"], card["held_out"], card["steps"]) == (3, 1, 35)
-    assert taught.temperatures.shape == (2, room.TEMPERATURES) and (np.diff(taught.temperatures[0]) >= 0).all()
+    assert taught.temperatures.shape == (2, script.TEMPERATURES) and (np.diff(taught.temperatures[0]) >= 0).all()
 
 
 def test_stores_masks_and_textures_teach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room, "TEXTURES", 2)
+    monkeypatch.setattr(script, "TEXTURES", 2)
     build(tmp_path / "store", 2, (16, 16, 16), 0, schedule("fast", 300))
     save(Volume((rods() > 0).astype(np.uint8)), tmp_path / "mask.npy")
-    sources, card = load_textures([tmp_path / "store", tmp_path / "mask.npy", "mixed"])
+    sources, card = script.load_textures([tmp_path / "store", tmp_path / "mask.npy", "mixed"])
     assert [source[-1].periodic for source in sources] == [True, False, *[True] * len(KINDS)]
     assert [each["source"] for each in card["sources"]] == ["store", "mask.npy", *KINDS]
     assert card["sources"][0]["shapes"] == len(sources[0]) >= 1 and "design" in card["sources"][0]
@@ -128,21 +131,29 @@ def test_stores_masks_and_textures_teach(tmp_path: Path, monkeypatch: pytest.Mon
     nearly[4, 4, 4] = 1
     np.save(tmp_path / "nearly.npy", nearly)
     with pytest.raises(ValueError, match="no shape"):
-        load_textures([tmp_path / "nearly.npy"])
+        script.load_textures([tmp_path / "nearly.npy"])
 
 
 @pytest.mark.slow
-def test_the_command_teaches_and_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room, "JUDGED", 5)
+def test_the_script_teaches_and_refuses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(script, "JUDGED", 5)
     save(Volume((rods() > 0).astype(np.uint8)), tmp_path / "mask.npy")
-    target = tmp_path / "filler.npz"
-    result = done("atlas", "teach", tmp_path / "mask.npy", "-o", target, "--steps", 2)
-    assert "200" in result.stderr and Taught.load(target).card["steps"] == 2
+    target, new = tmp_path / "filler.npz", tmp_path / "new.npz"
+
+    def run(source: str, out: Path, *options: object) -> None:
+        monkeypatch.setattr(sys, "argv", ["teach.py", str(tmp_path / source), "-o", str(out), *map(str, options)])
+        script.main()
+
+    run("mask.npy", target, "--steps", 2)
+    assert "200" in capsys.readouterr().out and Taught.load(target).card["steps"] == 2
     assert not list(tmp_path.glob(".*"))
-    refused(call("atlas", "teach", tmp_path / "mask.npy", "-o", tmp_path / "filler.txt"), "npz")
-    refused(call("atlas", "teach", tmp_path / "none", "-o", tmp_path / "new.npz"), "none")
-    new = ("atlas", "teach", tmp_path / "mask.npy", "-o", tmp_path / "new.npz", "--steps", 2, "--filler")
-    refused(call(*new, tmp_path / "mask.npy"), "mask.npy")
-    assert not (tmp_path / "new.npz").exists()
-    done(*new, target)
-    assert Taught.load(tmp_path / "new.npz").card["first"] == Taught.load(target).card
+    with pytest.raises(SystemExit):
+        run("mask.npy", tmp_path / "filler.txt")
+    for source, options in (("none", ()), ("mask.npy", ("--filler", tmp_path / "mask.npy"))):
+        with pytest.raises((ValueError, FileNotFoundError), match=source):
+            run(source, new, *options)
+    assert not new.exists()
+    run("mask.npy", new, "--steps", 2, "--filler", target)
+    assert Taught.load(new).card["first"] == Taught.load(target).card
