@@ -42,7 +42,8 @@ class Execution:
     Parameters
     ----------
     device
-        Where the flow runs, such as `"cpu"` or `"cuda"`: by a fused step on processors, in plain torch elsewhere.
+        Where the flow runs, such as `"cpu"` or `"cuda"`. On processors `generate` takes a fused step where the law is
+        six numbers; all else is torch.
     checkpoint, checkpoint_every
         A file in which the run is saved at intervals of that many seconds, and from which it resumes where the file
         exists: the result is the same bit for bit on one machine and number of threads. The file is removed at the end

@@ -84,7 +84,8 @@ def _split_cost(a: tuple[float | Tensor, ...], mask: Tensor | None) -> list[tupl
     """Return six numbers and a mask for each part of F_ε, which is linear in its coefficients: those that are numbers,
     and for each one that varies a 1 in its place, with the coefficient as the mask."""
     fields = {k: value for k, value in enumerate(a) if isinstance(value, Tensor) and value.dim() > 0}
-    parts = [([0.0 if k in fields else float(value) for k, value in enumerate(a)], mask)]
+    numbers = [0.0 if k in fields else float(value) for k, value in enumerate(a)]
+    parts = [(numbers, mask)] if any(numbers) or not fields else []
     for k, field in fields.items():
         parts.append(([float(k == place) for place in range(6)], field if mask is None else field * mask))
     return parts
@@ -94,7 +95,7 @@ def _orientation_gradient(
     u: Tensor, grid: Grid, epsilon: float, orientation: Tensor, mask: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Return ε ∫ ∇uᵀQ∇u and its gradient."""
-    slope, weight = gradient(u, grid), epsilon * grid.voxel_volume * (1 if mask is None else mask)
+    slope, weight = gradient(u, grid), epsilon * grid.voxel_volume * (1 if mask is None else mask.to(u))
     value = (weight * orientation_form(slope, orientation)).sum(dtype=torch.float64)
     force = torch.einsum("ij,jzyx->izyx", orientation.to(u), slope)
     return value, gradient_adjoint(2 * weight * force, grid)
