@@ -77,7 +77,7 @@ def energy_gradient(
     if orientation is not None:
         parts.append(_orientation_gradient(u, grid, epsilon, orientation, mask))
     values, gradients = zip(*parts, strict=True)
-    return torch.stack(values).sum(), sum(gradients[1:], start=gradients[0])
+    return torch.stack(values).sum(), sum(gradients[1:], start=gradients[0])  # type: ignore[return-value]
 
 
 def _split_cost(a: tuple[float | Tensor, ...], mask: Tensor | None) -> list[tuple[list[float], Tensor | None]]:

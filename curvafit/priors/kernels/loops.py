@@ -16,7 +16,7 @@ right for one sample beyond the box and finite and unused for the second. A and 
 between the same slack. The last vector of a run overshoots its end, into what is computed later or never read.
 
 Notation follows the plain-torch definition: s = |∇u|², d = s + ξ², G = √d, r = s/d, w = W'(u) = u³ - u, N = |Hess u|²,
-q = ∇uᵀ Hess u ∇u / d, T = Tr M, P = |M|², X = 2P - T², S = √(X⁺), all in the units of `_density_constants`. The root
+q = ∇uᵀ Hess u ∇u / d, T = Tr M, P = |M|², X = 2P - T², S = √(X⁺), all in the units of `cpu._make_constants`. The root
 and what is taken as its derivative at umbilics, X = 0, are `curvature.positive_root`.
 
 The density and its adjoint (`_differentiate`), by hand since autograd would store some thirty fields. Write g = ∇u and
@@ -449,8 +449,8 @@ def _fill_gradient_chunk(
             inside_at = (block - count if in_tile else block) * stride
             at = SLACK + 2 * stride
             energy += _differentiate(
-                u, m + o, c + o, p + o, stride, count * stride, ring, size, at, inside, inside_at, k, ratios,
-                mask,
+                u, m + o, c + o, p + o, stride, count * stride, ring, size, at, inside, inside_at, k,
+                ratios, mask,
             )  # fmt: skip
             # A row is gathered after the next one has its partials, so that the rows gathered are one behind.
             begin = max(y - 1, y0)
@@ -478,8 +478,8 @@ def fill_gradient(u, out, energies, rings, sums, inside, k, ratios, mask, index,
         if first < last:
             for y0 in range(0, Y, tile):
                 _fill_gradient_chunk(
-                    u, out, energies[y0 // tile], rings[chunk], sums[chunk], inside, k, ratios, mask,
-                    index, first, last, y0, min(Y, y0 + tile), block, Z, Y, X + 2 * EDGE,
+                    u, out, energies[y0 // tile], rings[chunk], sums[chunk], inside, k, ratios, mask, index,
+                    first, last, y0, min(Y, y0 + tile), block, Z, Y, X + 2 * EDGE,
                 )  # fmt: skip
 
 
