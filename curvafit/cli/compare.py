@@ -22,9 +22,8 @@ def parse_tests(
 
 @command(
     "curvafit compare control/ treated/ --spacing 0.0195 --unit mm -o compared",
-    "curvafit compare control/ low/ high/ --subjects mice.csv -o compared",
+    "curvafit compare control/ low/ high/ -o compared",
     "curvafit compare before/ after/ --paired -o compared",
-    "curvafit compare sham/ ovx/ --roi '{stem}_roi.tif' -o compared",
     "curvafit compare study.csv --by age -o compared",
     "curvafit compare measured --by group -o compared",
     "curvafit compare study.csv --by treatment --paired -o compared",
@@ -33,7 +32,7 @@ def parse_tests(
 def compare(
     scans: Annotated[
         list[Path],
-        typer.Argument(help="Folders of scans, two or more; a CSV: scan, group, subject; a folder of measure."),
+        typer.Argument(help="Folders of scans, two or more; a CSV: scan, group, subject, roi; a folder of measure."),
     ],
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for compare.html, figures and tables.")],
     by: Annotated[
@@ -42,11 +41,6 @@ def compare(
     paired: Annotated[
         bool, typer.Option("--paired", help="Compare within subjects of one name (of a file, or in the CSV).")
     ] = False,
-    subjects: Annotated[Path | None, typer.Option(help="CSV for folders, or scans: scan, subject.")] = None,
-    regions: Annotated[
-        str | None,
-        typer.Option("--roi", help="Region of each scan, from its folder: {stem}_roi.tif. Or a column roi of the CSV."),
-    ] = None,
     *,
     structure: Structure,
     reading: Reading,
@@ -59,9 +53,8 @@ def compare(
         from curvafit.report.comparison import check_comparison, write_comparison
         from curvafit.studies.comparison import compare as compare_scans
 
-        check_comparison(out, [*scans, *([] if subjects is None else [subjects])], overwrite, command_line())
-        settings: dict[str, Any] = {**tests, "subjects": subjects}
-        settings |= {"roi": regions, "workers": workers, "progress": progress, "paired": paired}
+        check_comparison(out, scans, overwrite, command_line())
+        settings: dict[str, Any] = {**tests, "workers": workers, "progress": progress, "paired": paired}
         # `--by 0,7,14` has a number for each scan of one list; otherwise each argument is a group or a CSV.
         labels = by.split(",") if by and "," in by else by
         groups = [scans] if isinstance(labels, list) else scans

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from os import PathLike
 from typing import Any, Literal
 
 import numpy as np
@@ -233,8 +232,6 @@ def compare(
     *groups: Group,
     by: str | Sequence[Any] | None = None,
     paired: bool = False,
-    subjects: str | PathLike[str] | None = None,
-    roi: str | None = None,
     kind: Literal["auto", "field", "mask", "image"] = "auto",
     periodic: bool = False,
     threshold: Literal["otsu"] | float = "otsu",
@@ -259,19 +256,14 @@ def compare(
     ----------
     groups
         Two or more: folders of scans; or sequences of scans, paths or `Measures`; or such sequences by subject. Or one
-        CSV table of the columns scan, group and optionally subject, with paths relative to it. Or one sequence, with
-        `by`.
+        CSV table of the columns scan, group and optionally subject and roi, the scan's region, with paths relative to
+        it. Or one sequence, with `by`.
     by
         The table's column to compare by; or a label for each scan of one sequence. Where all are numbers, such as times
         or doses, what goes with the number is tested; else they name groups.
     paired
         Compare within subjects, each of which is in every group, or at several numbers. A subject has one name in the
         column subject of a table, one file name in folders, and one position in sequences.
-    subjects
-        A CSV table of the columns scan and subject, for groups. Without it each scan is a subject.
-    roi
-        Where each scan's region lies, from the scan's folder: `"{stem}_roi.tif"` or `"../regions/{name}"`; `{stem}` is
-        its file's name up to the first point. A table of scans may have a column roi instead.
     kind, periodic, threshold, dark
         As in `measure`.
     primary
@@ -291,12 +283,12 @@ def compare(
     if primary is not None:
         names = {word for name, symbol, *_ in QUANTITIES for word in (name, symbol)}
         check_choice(primary, names, f"a primary number of {', '.join(symbol for _, symbol, *_ in QUANTITIES)}")
-    cases, notes = list_cases(groups, by, subjects, paired, roi)
+    cases, notes = list_cases(groups, by, paired)
     options = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark}
     measures, measure_notes = measure_scans(cases, options, reading, workers, sub_progress(progress, 0.0, 0.97))
     progress("comparing", 0.97)
     name = by if isinstance(by, str) else "group" if isinstance(cases[0].label, str) else "the number"
-    parameters = {**options, **reading, "roi": roi, "by": name, "paired": paired, "primary": primary}
+    parameters = {**options, **reading, "by": name, "paired": paired, "primary": primary}
     parameters |= {"permutations": permutations, "seed": seed}
     return _compare_measures(measures, cases, parameters, [*notes, *measure_notes])
 

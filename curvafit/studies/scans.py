@@ -67,62 +67,31 @@ class Case(NamedTuple):
     roi: Path | None = None
 
 
-def list_cases(
-    groups: Sequence[Group], by: str | Sequence[Any] | None, table: str | PathLike[str] | None, paired: bool,
-    roi: str | None = None,
-) -> tuple[list[Case], list[str]]:  # fmt: skip
+def list_cases(groups: Sequence[Group], by: str | Sequence[Any] | None, paired: bool) -> tuple[list[Case], list[str]]:
     """Return the scans of a study, those of one group together, and notes on what was assumed.
 
     They are those of several groups; of a single sequence, with a label for each in `by`; or of a single table, with
-    labels in its column `by`, and regions in its column `roi`. Else `roi` is where the region of each scan lies. Raises
-    ValueError where labels cannot be exchanged between subjects; FileNotFoundError where a folder, a table, or a scan
-    or region that it names is not there.
+    labels in its column `by`, and regions in its column `roi`. Raises ValueError where labels cannot be exchanged
+    between subjects; FileNotFoundError where a folder, a table, or a scan or region that it names is not there.
     """
     notes: list[str] = []
     if len(groups) == 1 and isinstance(groups[0], str | PathLike):
-        if not isinstance(by, str | None) or table is not None:
+        if not isinstance(by, str | None):
             raise ValueError("expected a table alone, or scans with a label for each, or two groups or more")
         measured = Path(groups[0]) / MEASURED
         read, path = (_read_measured, measured) if measured.exists() else (_read_cases, Path(groups[0]))
         cases = read(path, by or "group", paired)
     else:
         cases = _list_labelled(groups[0], by) if len(groups) == 1 else _list_groups(groups, by, paired, notes)
-        if table is not None:
-            rows = _read_table(Path(table), ("scan", "subject"))
-            if "group" in rows[0]:
-                raise ValueError(
-                    f"expected the groups once, got two folders and a column group in {table}: leave one out"
-                )
-            subjects = {row["scan"]: row["subject"] for row in rows}
-            cases = [case._replace(subject=_find_row(case.source, case.name, subjects, Path(table))) for case in cases]
-        elif not paired and not any(isinstance(group, Mapping) for group in groups):
-            notes.append("Each scan counts as a subject; a table (--subjects) tells if several are of one.")
+        if not paired and not any(isinstance(group, Mapping) for group in groups):
+            notes.append("Each scan counts as a subject; a table of scans tells if several are of one.")
             groups_of = Counter(subject for subject, _ in {(case.subject, case.label) for case in cases})
             if common := sum(count > 1 for count in groups_of.values()):
                 notes.append(f"The groups have {common} names in common: they count as different subjects.")
                 cases = [case._replace(subject=f"{case.label}/{case.subject}") for case in cases]
-    cases = _name_labels(cases if roi is None else _find_regions(cases, roi), by)
+    cases = _name_labels(cases, by)
     _check_labels(cases, paired)
     return cases, notes
-
-
-def _find_regions(cases: Sequence[Case], pattern: str) -> list[Case]:
-    """Return scans with their regions, which `compare` explains; files that are regions of others are no scans."""
-    if "{name}" not in pattern and "{stem}" not in pattern:
-        raise ValueError(f"expected regions with {{stem}} or {{name}} for the scan's own, got {pattern}")
-    found = []
-    for case in cases:
-        if not isinstance(case.source, str | PathLike):
-            raise ValueError(f"a region goes with a file that is measured, got one for {case.name}")
-        scan = Path(case.source)
-        names = {"{name}": scan.name, "{stem}": scan.name.partition(".")[0]}
-        filled = re.sub(r"{name}|{stem}", lambda found, names=names: names[found[0]], pattern)
-        found.append(case._replace(roi=scan.parent / filled))
-    regions = {case.roi for case in found}
-    scans = [case for case in found if Path(str(case.source)) not in regions]
-    if missing := [case for case in scans if case.roi is not None and not case.roi.exists()]:
-        raise FileNotFoundError(f"no such file: {missing[0].roi}, the region of {missing[0].name}")
-    return scans
 
 
 def _name_labels(cases: Sequence[Case], by: Any) -> list[Case]:
