@@ -20,6 +20,8 @@ from curvafit.scan.preparation import HALF, Prepared
 DRAWS = 400
 #: Draws from which the search for the best parameters starts.
 STARTS = 8
+#: How many more of the draws nearest to the middle are tried where nothing grows from the nearest.
+OTHERS = 4
 #: Most noise over the contrast of an image that is tested: that of those which taught what is usual is a fifth.
 NOISIEST = 0.3
 
@@ -38,7 +40,10 @@ class Described(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What is read of a scan's law: draws, view, combinations, candidates, misfit and matches, as a `Fit` has them."""
+    """What is read of a scan's law: draws, view, combinations, candidates, misfit and matches, as a `Fit` has them.
+
+    `others` are draws to take the place of the posterior's middle, in this order, where nothing grows from that.
+    """
 
     draws: np.ndarray | None = None
     view: str = ""
@@ -46,6 +51,7 @@ class Estimate:
     candidates: tuple[Candidate, ...] = ()
     misfit: Misfit | None = None
     matches: tuple[Match, ...] = ()
+    others: tuple[Candidate, ...] = ()
 
 
 def measure_descriptors(prepared: Prepared) -> Described | None:
@@ -63,12 +69,17 @@ def estimate_law(described: Described, posterior: Posterior, seed: int) -> Estim
     draws = posterior.draw(reading, DRAWS, seed)
     parameters, log_thickness = draws[:, :-1], draws[:, -1]
     thickness = float(np.exp(np.median(log_thickness)))
-    middle = Candidate("posterior", *law_of(mirror(middle_of(parameters))), _deviations(mirror(parameters)), thickness)
+    deviations = _deviations(mirror(parameters))
+    middle, *others = (
+        Candidate("posterior", *law_of(mirror(row)), deviations, thickness)
+        for row in sort_by_middle(parameters)[: 1 + OTHERS]
+    )
     return Estimate(
         draws=np.column_stack([mirror(parameters), log_thickness]),
         view=reading.view,
         combinations=posterior.combinations.read(parameters, background=described.background),
         candidates=(middle,),
+        others=tuple(others),
         misfit=measure_misfit(described, posterior, parameters[:STARTS]),
     )
 
@@ -88,11 +99,11 @@ def refine_matches(described: Described, posterior: Posterior, matches: Sequence
     return Estimate(candidates=(Candidate("optimum", *law, matches[0].thickness),), misfit=misfit)
 
 
-def middle_of(parameters: np.ndarray) -> np.ndarray:
-    """Return the row of parameters `(n, 6)` nearest to the medians, in units of each column's range."""
+def sort_by_middle(parameters: np.ndarray) -> np.ndarray:
+    """Return the rows of parameters `(n, 6)` by their distance from the medians, in units of each column's range."""
     # As parameters are correlated, the medians of all six together may be a law that the posterior holds unlikely.
     offsets = (parameters - np.median(parameters, 0)) / np.ptp(parameters, axis=0)
-    return parameters[np.square(offsets).sum(1).argmin()]
+    return parameters[np.square(offsets).sum(1).argsort(kind="stable")]
 
 
 def _deviations(parameters: np.ndarray) -> dict[str, float]:

@@ -223,6 +223,10 @@ def _grow(
 
     total = max(1, len(laws) + growth.twins - 1)
     grow([(name, 0) for name in laws])
+    for law in estimate.others:
+        if laws[law.name].distance is None:
+            laws[law.name], twins[law.name] = law, ()
+            grow([(law.name, 0)])
     for _ in range(2):  # the second time, further twins may have made another law the best
         best = best_candidate(tuple(laws.values()))
         if best is not None:

@@ -5,18 +5,22 @@ import json
 import math
 import re
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 from found import BROKEN, NUMBERS, broken, lattice, made_fit, measured
 
+import curvafit.inference.inference as room
 from curvafit.core.records import quoted
+from curvafit.core.runtime import silent
 from curvafit.core.schema import decode, encode
 from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE, Diagram
 from curvafit.geometry.morphology import Morphometry
 from curvafit.inference.candidates import (
     UNBELIEVABLE,
     Candidate,
+    Growth,
     Misfit,
     Twin,
     best_candidate,
@@ -24,11 +28,12 @@ from curvafit.inference.candidates import (
     seed_noise_of,
     verdict,
 )
-from curvafit.inference.estimate import middle_of
+from curvafit.inference.estimate import Estimate, sort_by_middle
 from curvafit.inference.fit import Fit
 from curvafit.inference.table import COLUMNS, to_columns
 from curvafit.priors import Law
 from curvafit.priors.coefficients import Coefficients
+from curvafit.scan.preparation import Prepared
 
 
 @pytest.fixture(scope="module")
@@ -105,9 +110,9 @@ def test_intervals_are_central_and_in_powers_of_a_length(fit: Fit) -> None:
 def test_the_middle_is_the_draw_nearest_to_the_medians() -> None:
     rows = np.repeat(np.array([-3, -1, 0.5, 1, 9])[:, None], 6, 1)  # median .5
     rows[:, 2] = (0, 0, 40, 3, 0)  # median 0
-    assert middle_of(rows) == pytest.approx(rows[3])
+    assert sort_by_middle(rows)[0] == pytest.approx(rows[3])
     rows[0, 2] = -4000  # of this range 40 is little
-    assert middle_of(rows) == pytest.approx(rows[2])
+    assert sort_by_middle(rows)[0] == pytest.approx(rows[2])
 
 
 def test_a_file_is_read_as_a_fit_and_as_a_prior(tmp_path: Path, fit: Fit) -> None:
@@ -259,6 +264,16 @@ def test_what_grew_is_measured_against_the_scan() -> None:
     assert (one.distance, one.seed_noise, one.twins) == (0.0, None, (NUMBERS,))
     none = law("optimum", status="Hm.").compare(scan, (twin(None, 0.0),))
     assert none == law("optimum", status="Hm. No shape grew: the field is of one phase.")
+
+
+def test_where_the_middle_grows_nothing_the_next_draw_that_grows_takes_its_place(monkeypatch) -> None:
+    scan = Diagram(np.array([(3.0, 1.0)]), np.ones(1))
+    others = tuple(dataclasses.replace(law("posterior"), mass=mass) for mass in (-0.5, -0.4, -0.3))
+    monkeypatch.setattr(room, "twin", lambda each, *_: twin(scan if each.mass == -0.4 else None, each.mass))
+    estimate = Estimate(candidates=(law("posterior"), law("match")), others=others)
+    found, twins = room._grow(estimate, scan, cast(Prepared, None), Growth(twins=2), 0, silent)
+    assert [each.mass for each in found.candidates] == [-0.4, -0.6] and found.candidates[0].distance == 0
+    assert {name: len(grown) for name, grown in twins.items()} == {"posterior": 2, "match": 1}
 
 
 def test_a_candidate_comes_back_from_its_json() -> None:
