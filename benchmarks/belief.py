@@ -7,8 +7,9 @@ same volume fraction and two-point function, which no law made. The p of each is
 textures of a kind that is ruled out where only the other kinds were learned from, by the discriminant alone.
 
 `--teach FILE` writes the packaged posterior, or that of `--posterior`, with what tells shapes of the model from
-textures of no law: level cuts, walls of cells, grains, trees of tubes, fibres, `--textures` of each. They are described
-once, into `benchmarks/results/textures.npz`.
+textures of no law: level cuts, walls of cells, grains, trees of tubes, fibres, `--textures` of each, and such level
+cuts of the shapes that `reading` grows by `fast` and by `paper`. They are described once, into
+`benchmarks/results/textures.npz`, kind by kind in turn, the last cuts last.
 """
 
 from __future__ import annotations
@@ -25,12 +26,14 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage, optimize, stats
 
+from benchmarks import reading
 from benchmarks.harness import RESULTS, Cases, Figure, Values, show, write_whole
 from benchmarks.teaching import VIEWS, gather
 from curvafit.data_synth.atlas import measure_view
 from curvafit.data_synth.store import Store, find_well_formed
 from curvafit.data_synth.textures import KINDS
-from curvafit.inference.candidates import UNBELIEVABLE, Misfit, join_tests
+from curvafit.geometry.description import BLOCKS
+from curvafit.inference.candidates import Misfit, join_tests
 from curvafit.inference.estimate import DRAWS, STARTS, measure_descriptors, measure_misfit, tail_probability
 from curvafit.inference.posterior import Discriminant, Posterior, load_posterior, save_posterior
 from curvafit.inference.table import Scanned, Table, see_mask, see_scan
@@ -71,7 +74,9 @@ RIDGE = 0.1
 def describe_textures(count: int, cases: Cases) -> np.ndarray:
     """Return the descriptors `(views, n, 351)` of so many textures of each kind; NaN where one cannot be read."""
     if not TEXTURES.exists():
-        rows = [cases.array(f"{kind}-{k}", partial(_describe, kind, k)) for kind, k in product(KINDS, range(count))]
+        rows = [cases.array(f"{kind}-{k}", partial(_describe, kind, k)) for k, kind in product(range(count), KINDS)]
+        grown = product(("fast", "paper"), (*reading.LAWS, *reading.DRAWN))
+        rows += [cases.array(f"cut-{by}-{name}", partial(_describe_cut, name, by, cases)) for by, name in grown]
         write_whole(TEXTURES, partial(np.savez_compressed, descriptors=np.stack(rows, 1).astype(np.float16)))
     with np.load(TEXTURES) as file:
         return file["descriptors"].astype(np.float32)
@@ -81,6 +86,14 @@ def _describe(kind: str, number: int) -> np.ndarray:
     texture = KINDS[kind](np.random.default_rng([SEED, *kind.encode(), number]))
     texture = texture if (texture > 0).mean() <= 0.5 else -texture
     return np.array([measure_view(texture, view, number)[0] for view in VIEWS])
+
+
+def _describe_cut(name: str, by: str, cases: Cases) -> np.ndarray:
+    mask = reading.grow(name, by, cases.of("reading"))
+    if mask.all() or not mask.any():
+        return np.full((len(VIEWS), sum(BLOCKS.values())), np.nan)
+    cut = level_cut(mask, Grid(mask.shape), 1)
+    return np.array([measure_view(cut, view, 1)[0] for view in VIEWS])
 
 
 def teach(posterior: Posterior, table: Table, textures: np.ndarray) -> Posterior:
@@ -101,13 +114,15 @@ def teach(posterior: Posterior, table: Table, textures: np.ndarray) -> Posterior
 
 def leave_out(posterior: Posterior, table: Table, textures: np.ndarray) -> dict[str, Figure]:
     """Return which part of the textures of each kind is ruled out by a discriminant that learned from the others."""
-    kind, figures = np.arange(textures.shape[1]) % len(KINDS), {}
+    # the last cuts are a kind of their own
+    count = textures.shape[1] - 2 * len((*reading.LAWS, *reading.DRAWN))
+    kind, figures = np.where(np.arange(textures.shape[1]) < count, np.arange(textures.shape[1]) % len(KINDS), -1), {}
     for number, name in enumerate(KINDS):
         told = teach(posterior, table, textures[:, kind != number]).discriminants
         for view, asked in zip(VIEWS, textures[:, kind == number], strict=True):
             values = posterior.discriminate(asked[np.isfinite(asked).all(1)], told[view].weights)
             rows = [{"p": join_tests(1.0, tail_probability(-told[view].usual, -value))} for value in values]
-            figures[f"left_out.{name.replace(' ', '_')}.{view}"] = part_below(rows)
+            figures[f"left_out.{name.replace(' ', '_')}.{view}"] = reading.part_below(rows)
     return figures
 
 
@@ -133,14 +148,6 @@ def ask(posterior: Posterior, scan: object, kind: str) -> Misfit | None:
     return measure_misfit(described, posterior, posterior.draw(described.reading, DRAWS)[:STARTS, :-1])
 
 
-def part_below(rows: list[Values], name: str = "p") -> Figure:
-    """Return the part of cases that the test rules out, of those that can be read, with Wilson's interval."""
-    p = [row[name] for row in rows if row.get(name) is not None]
-    hits = sum(value < UNBELIEVABLE for value in p)
-    interval = stats.binomtest(hits, len(p)).proportion_ci(method="wilson") if p else (np.nan, np.nan)
-    return Figure(hits / max(len(p), 1), *map(float, interval))
-
-
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shapes", type=Path, nargs="*", default=[], help="stores of laws that no choice has seen")
     parser.add_argument("--textures", type=int, default=40, help="textures of each kind to learn from")
@@ -162,7 +169,7 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
             for seen in ("mask",) if cut else SEEN:
                 names = {f"{edge}-{title}-{seen}-{index}": (store, index) for store, index in shapes}
                 jobs = {name: partial(case, posterior, *each, seen, cut) for name, each in names.items()}
-                figures[f"belief.{title}_{seen}.{edge}"] = part_below(list(cases.all(jobs, SEED).values()))
+                figures[f"belief.{title}_{seen}.{edge}"] = reading.part_below(list(cases.all(jobs, SEED).values()))
     show(["part ruled out", ""], list(figures.items()))
     return {} if options.quick else figures
 

@@ -19,8 +19,8 @@ from functools import partial
 from itertools import product
 
 import numpy as np
+from scipy import stats
 
-from benchmarks.belief import part_below
 from benchmarks.closure import PRIOR, SLUGS, over_laws
 from benchmarks.completion import DRAWN, EDGE, LAWS, SOBOL, shape
 from benchmarks.harness import Cases, Figure, Values, show
@@ -29,6 +29,7 @@ from curvafit.data_synth.design import design_box
 from curvafit.data_synth.textures import KINDS
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import Schedule, schedule
+from curvafit.inference.candidates import UNBELIEVABLE
 from curvafit.inference.inference import infer
 from curvafit.inference.table import VIEWS, parameters_of
 from curvafit.priors import preset
@@ -91,6 +92,14 @@ def texture_case(kind: str, number: int, seen: str) -> Values:
     return read(KINDS[kind](random) > 0, f"{kind}-{number}", seen, None)
 
 
+def part_below(rows: list[Values], name: str = "p") -> Figure:
+    """Return the part of cases that the test rules out, of those that can be read, with Wilson's interval."""
+    p = [row[name] for row in rows if row.get(name) is not None]
+    hits = sum(value < UNBELIEVABLE for value in p)
+    interval = stats.binomtest(hits, len(p)).proportion_ci(method="wilson") if p else (np.nan, np.nan)
+    return Figure(hits / max(len(p), 1), *map(float, interval))
+
+
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--share", default="0/1", help="of the cases, for several processes")
 
@@ -111,11 +120,11 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
             rows = [found[case] for name in names if (case := f"{by}-{name}-{seen}") in found]
             of_laws += rows
             if known := [row for row in rows if "error" in row]:
-                away, number = np.abs([row["error"] for row in known]), np.arange(len(known))
+                away, order = np.abs([row["error"] for row in known]), np.arange(len(known))
                 covered = np.mean([row["in 90"] for row in known], axis=1, keepdims=True)
-                for slug, each in zip(SLUGS, over_laws(away, number, np.median), strict=True):
+                for slug, each in zip(SLUGS, over_laws(away, order, np.median), strict=True):
                     figures[f"reading.{seen}_{by}.{slug}"] = each
-                figures[f"reading.{seen}_{by}.in90"] = over_laws(covered, number, np.mean)[0]
+                figures[f"reading.{seen}_{by}.in90"] = over_laws(covered, order, np.mean)[0]
         figures[f"quick.laws.{seen}"] = part_below(of_laws)
         for kind in KINDS:
             rows = [found[case] for k in range(number) if (case := f"{kind}-{k}-{seen}") in found]
