@@ -5,7 +5,8 @@
 variance of a parameter; intervals are of the bootstrap over laws.
 
 Methods: `posterior`, the packaged one; and from the rows that taught it `match`, the nearest shape by the curvature
-block, and `process`, a Gaussian process for each parameter on principal components.
+block, and `process`, a Gaussian process for each parameter on principal components. `--before FILE` is another
+posterior: `gain` is by how much the packaged one errs less, the mean over parameters, paired by laws.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.harness import Cases, Figure, Values, show
+from benchmarks.harness import Cases, Figure, Values, bootstrap, show
 from benchmarks.teaching import gather
 from curvafit.data_synth.design import INTERVALS
 from curvafit.data_synth.store import Store, find_well_formed, open_store
@@ -161,6 +162,7 @@ def unseen_table(paths: list[Path], view: str, cases: Cases) -> Table:
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--unseen", type=Path, nargs="+", required=True, help="stores of laws that no choice has seen")
     parser.add_argument("--views", default="mask,scan")
+    parser.add_argument("--before", type=Path, help="a posterior to compare with")
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
@@ -169,6 +171,10 @@ def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     group, figures = "unseen" + (str(edge) if edge != UNIT else ""), dict[str, Figure]()
     for view in options.views.split(","):
         queries = unseen_table(options.unseen, view, cases)
+        if options.before is not None:
+            answers = (asked(load_posterior(path), queries).best for path in (options.before, None))
+            before, after = (np.abs(best - queries.parameters) / PRIOR for best in answers)
+            figures[f"{group}_gain.{view}"] = bootstrap((before - after).mean(1), np.mean)
         for name, method in methods(view).items():
             case = f"{group}-{view}-{name}"
             row = cases.all({case: partial(judge, queries, method)})[case]
