@@ -1,4 +1,4 @@
-"""What `infer` says in seconds: of shapes of laws that no choice has seen, by three schedules, and of what no law made.
+"""What `infer` says in seconds: of shapes of laws that taught nothing, by three schedules, and of what no law made.
 
 Laws are the presets and the random ones of `completion`; each grows a shape of 64³ by `deep`, by `fast` and by `paper`
 with half its steps, in a periodic box; the paper author's own volumes ($CURVAFIT_DATA) are of 100³. Each is seen as a

@@ -38,7 +38,7 @@ UNBELIEVABLE = 0.05
 #: What a verdict begins with where no law is the scan's, and where it is not known.
 UNBELIEVED, UNDECIDED, UNTESTED = "No believable twin", "Undecided", "Not tested"
 #: Why a scan has no p.
-UNASKED = "It has no p: its descriptors cannot be measured, or it is noisier than all images that taught what is usual."
+UNASKED = "It has no p: its descriptors cannot be measured, or its image is noisier than any that is tested."
 #: What a scan without a law has still.
 LAWLESS = "Measures and comparisons need no law (curvafit measure, compare)."
 #: Familiar numbers in which twins may differ from the scan, and the relative difference of all twins that is named.
@@ -159,16 +159,14 @@ class Twin:
     seen: Prepared | None = None
 
 
-def twin(
-    law: Candidate, prepared: Prepared, seed: int, schedule: Schedule | str = LEARNED, longest: int = EDGES[1]
-) -> Twin:
-    """Grow a shape of a law in a box as many thicknesses long as the scan's main window, of `longest` voxels at most.
+def twin(law: Candidate, prepared: Prepared, seed: int, schedule: Schedule | str = LEARNED) -> Twin:
+    """Grow a shape of a law in a box as many thicknesses long as the scan's main window, within `EDGES`.
 
     A match to a mask or an image has another mass than the scan: its shape is grown at the structure's volume fraction
     (`Prepared.true_volume_fraction`), or at the law's own mass where nothing grows at that.
     """
     ratio = 1.0 if law.thickness is None else law.thickness / prepared.thickness
-    z, y, x = (int(np.clip(ratio * (edge.stop - edge.start), EDGES[0], longest)) for edge in prepared.window)
+    z, y, x = (int(np.clip(ratio * (edge.stop - edge.start), *EDGES)) for edge in prepared.window)
     grid = Grid((z, y, x), prepared.grid.spacing, "periodic")
     options = {"schedule": schedule, "seed": seed, "reject_early": True}
     if law.name == "match" and prepared.kind != "field":
@@ -195,7 +193,7 @@ def _measure_twin(flow: Flow, prepared: Prepared, seed: int) -> Twin:
 
 @dataclass(frozen=True)
 class Misfit:
-    """How unusual a scan is among shapes of the model, whose laws nothing has learnt from.
+    """How unusual a scan is among shapes of laws from which neither emulator nor discriminant has learnt.
 
     Attributes
     ----------
@@ -245,9 +243,7 @@ def verdict(
         reason = _describe_misfit(misfit)
         if misfit.probability < UNBELIEVABLE:
             rating = UNBELIEVED
-        elif misfit.probability < UNBELIEVABLE + misfit.grain:
-            reason += f" That is too near to {UNBELIEVABLE:g} for a test that knows p in steps of {misfit.grain:.2g}."
-        else:
+        elif misfit.probability >= UNBELIEVABLE + misfit.grain:
             rating = "Supported"
     differences = ", ".join(find_differences(scan, best.twins))
     ratios = f"Twins over scan: {differences}." if differences else ""
@@ -280,8 +276,10 @@ def _describe_misfit(misfit: Misfit | None) -> str:
     if misfit is None:
         return UNASKED
     p = format_number(misfit.probability, 2)
-    if misfit.probability >= UNBELIEVABLE:
+    if misfit.probability >= UNBELIEVABLE + misfit.grain:
         return f"The scan looks as shapes of laws do (p = {p})."
+    if misfit.probability >= UNBELIEVABLE:
+        return f"p = {p} is too near to {UNBELIEVABLE:g} for a test that knows it in steps of {misfit.grain:.2g}."
     # Either is one of two joined tests, so that its probability is doubled here as it is there.
     unlike = misfit.alike is not None and join_tests(1.0, misfit.alike) < UNBELIEVABLE
     reason = "it looks more like textures that no law makes" if unlike else "no law explains its numbers"

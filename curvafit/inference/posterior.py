@@ -24,7 +24,7 @@ from curvafit.inference.emulator import Emulator, Layer
 from curvafit.inference.table import PARAMETERS, TARGETS, Compression, encode_seen
 from curvafit.scan.measures import Reading
 
-POSTERIOR_FILE = Format("curvafit posterior", 4, "a posterior", "train it again", {"blocks": BLOCKS})
+POSTERIOR_FILE = Format("curvafit posterior", 5, "a posterior", "train it again", {"blocks": BLOCKS})
 #: Largest size of a flow, and most flows of an ensemble.
 WIDEST, MOST = 2048, 64
 #: Which of the parameters is the mass.

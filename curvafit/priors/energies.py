@@ -95,6 +95,7 @@ def _orientation_gradient(
     u: Tensor, grid: Grid, epsilon: float, orientation: Tensor, mask: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Return ε ∫ ∇uᵀQ∇u and its gradient."""
+    u = u.detach()
     slope, weight = gradient(u, grid), epsilon * grid.voxel_volume * (1 if mask is None else mask.to(u))
     value = (weight * orientation_form(slope, orientation)).sum(dtype=torch.float64)
     force = torch.einsum("ij,jzyx->izyx", orientation.to(u), slope)

@@ -230,16 +230,18 @@ def _read_cases(table: Path, by: str, paired: bool) -> list[Case]:
     by = by.strip().casefold()
     cases = []
     for row in _read_table(table, ("scan", by, *["subject"] * paired)):
-        # Relative to the table, or else to the working folder; what follows :: names a part of the file.
-        paths = (table.parent / row["scan"], Path(row["scan"]))
-        path = next((path for path in paths if Path(str(path).partition("::")[0]).exists()), None)
-        if path is None:
-            raise FileNotFoundError(f"no such file: {row['scan']}, which {table} names")
-        region = table.parent / row["roi"] if row.get("roi") else None
-        if region is not None and not region.exists():
-            raise FileNotFoundError(f"no such file: {row['roi']}, which {table} names")
+        path = _find_beside(table, row["scan"])
+        region = _find_beside(table, row["roi"]) if row.get("roi") else None
         cases.append(Case(str(path), path.name, row.get("subject") or row["scan"], row[by], region))
     return cases
+
+
+def _find_beside(table: Path, name: str) -> Path:
+    """Return a file that a table names, sought beside the table, or else in the working folder."""
+    for path in (table.parent / name, Path(name)):
+        if Path(str(path).partition("::")[0]).exists():  # what follows :: names a part of the file
+            return path
+    raise FileNotFoundError(f"no such file: {name}, which {table} names")
 
 
 def write_measured(measures: Sequence[Measures], columns: Sequence[Mapping[str, str]], path: Path) -> Path:

@@ -273,6 +273,7 @@ def test_where_the_middle_grows_nothing_the_next_draw_that_grows_takes_its_place
     estimate = Estimate(candidates=(law("posterior"), law("match")), others=others)
     found, twins = room._grow(estimate, scan, cast(Prepared, None), Growth(twins=2), 0, silent)
     assert [each.mass for each in found.candidates] == [-0.4, -0.6] and found.candidates[0].distance == 0
+    assert "draw 3" in found.candidates[0].status
     assert {name: len(grown) for name, grown in twins.items()} == {"posterior": 2, "match": 1}
 
 
@@ -305,6 +306,7 @@ VERDICTS: list[tuple[tuple[Candidate, ...], Misfit | None, bool, str | None, tup
     ((law("match", 0.9, status="Hm."),), USUAL, True, "match", ("Supported", "looks as shapes of laws", "Hm.")),
     ((FAR,), EDGE, True, "match", ("Supported",)),  # whatever the distances are
     ((FAR,), COARSE, True, "match", ("Undecided", "p = 0.050", "steps of 0.01")),
+    ((law("optimum"),), COARSE, False, "optimum", ("Not tested", "p = 0.050", "steps of 0.01")),
     ((FAR,), None, True, "match", ("Undecided (nearest match)", "lie 9.0", "has no p")),
     ((FAT,), USUAL, True, "match", ("Supported", "Twins over scan: thickness 1.5.")),  # which do not decide
     ((FAT,), ODD, True, "match", ("No believable twin", "Twins over scan: thickness 1.5.")),

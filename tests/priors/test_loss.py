@@ -58,7 +58,7 @@ def test_a_change_of_unit_changes_nothing():
 
 
 def test_a_fit_is_in_its_own_unit_or_converted(tmp_path):
-    path = fit_file(tmp_path / "fit.json", "um", "Supported (refined): …")  # its ε is 4 um
+    path = fit_file(tmp_path / "fit.json", "um", "Supported (nearest match): …")  # its ε is 4 um
     for options, unit in (({"spacing": 2.0}, 1 / 200), ({"spacing": 2e-3, "unit": "mm"}, 1e3 / 200)):
         law = CurvaturePrior(str(path), **options).coefficients
         assert tuple(law) == pytest.approx(tuple(TUBES.in_unit(unit)))
@@ -71,7 +71,7 @@ def test_a_fit_is_in_its_own_unit_or_converted(tmp_path):
     with pytest.raises(ValueError, match="units"):
         CurvaturePrior(path, unit="voxel")
     with pytest.warns(UserWarning, match="is not `Supported`"):
-        CurvaturePrior(fit_file(tmp_path / "doubt.json", "um", "No believable twin (refined): …"), spacing=2.0)
+        CurvaturePrior(fit_file(tmp_path / "doubt.json", "um", "No believable twin (nearest match): …"), spacing=2.0)
 
 
 # ---- windows --------------------------------------------------------------------------------------------------------

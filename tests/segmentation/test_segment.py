@@ -103,7 +103,10 @@ def test_a_prior_comes_in_the_scan_s_unit(tmp_path: Path) -> None:
     assert working.as_dict() == pytest.approx(preset("tubes").coefficients.as_dict())
 
 
-@pytest.mark.parametrize(("status", "count"), [("Supported (refined): …", 0), ("No believable twin (refined): …", 1)])
+@pytest.mark.parametrize(
+    ("status", "count"),
+    [("Supported (nearest match): …", 0), ("No believable twin (nearest match): …", 1)],
+)
 def test_a_prior_that_is_not_supported_is_said_to_be_so(status: str, count: int) -> None:
     mm = Volume(np.zeros((4, 4, 4)), (0.0195,) * 3, "mm")
     fit = dataclasses.replace(made_fit(), status=status)
