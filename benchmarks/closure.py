@@ -46,9 +46,9 @@ COMPONENTS = 32
 UNIT = 64
 #: Names of the parameters in the ledger.
 SLUGS = ("a11", "log_a02", "a10", "a01", "a00", "m0")
-#: Middle and deviation of each parameter in the box.
-_ENDS = np.array([np.log(ends) if name == "a02" else ends for name, ends in INTERVALS.items()], dtype=float)
-MIDDLE, PRIOR = _ENDS.mean(1), np.ptp(_ENDS, axis=1) / np.sqrt(12)
+#: Ends, middle and deviation of each parameter in the box.
+ENDS = np.array([np.log(ends) if name == "a02" else ends for name, ends in INTERVALS.items()], dtype=float)
+MIDDLE, PRIOR = ENDS.mean(1), np.ptp(ENDS, axis=1) / np.sqrt(12)
 
 
 class Answers(NamedTuple):

@@ -1,10 +1,11 @@
 """What `infer` says in seconds: of shapes of laws that taught nothing, by three schedules, and of what no law made.
 
 Laws are the presets and the random ones of `completion`; each grows a shape of 64³ by `deep`, by `fast` and by `paper`
-with half its steps, in a periodic box; the paper author's own volumes ($CURVAFIT_DATA) are of 100³. Each is seen as a
-mask, cut open, and as a bad scan, on a scanner's voxels, as `curvafit atlas describe` sees them. Other textures are
-those that teach the network that fills volumes: level cuts, walls of cells, grains, trees of tubes, fibres, so many of
-each, seen in the same way.
+with half its steps, in a periodic box. `published` are laws that no choice has seen, near presets and of the box, at
+100³ by the whole of `paper`; the paper author's own volumes ($CURVAFIT_DATA) are of 100³. Each is seen as a mask, cut
+open, and as a bad scan, on a scanner's voxels, as `curvafit atlas describe` sees them. Other textures are those that
+teach the network that fills volumes: level cuts, walls of cells, grains, trees of tubes, fibres, so many of each, seen
+in the same way.
 
 `quick` is the part of shapes whose p is below .05 (the size of the test for laws, its power for others). Errors are
 those of the posterior's medians, in deviations of the box; `in90` is the part of the parameters that lie within the
@@ -28,17 +29,28 @@ from benchmarks.texture import author_field, author_volumes
 from curvafit.data_synth.design import design_box
 from curvafit.data_synth.textures import KINDS
 from curvafit.generation.flow import generate
+from curvafit.generation.result import is_well_formed
 from curvafit.generation.schedule import Schedule, schedule
 from curvafit.inference.candidates import UNBELIEVABLE
 from curvafit.inference.inference import infer
 from curvafit.inference.table import VIEWS, parameters_of
+from curvafit.inference.table import law_of as coefficients_of
 from curvafit.priors import preset
 from curvafit.volumes.volume import ScanError
 
 SEED = 2
-SCHEDULES: dict[str, Schedule] = {"deep": schedule("deep"), "fast": schedule("fast"), "paper": schedule("paper", 4000)}
+SCHEDULES: dict[str, Schedule] = {
+    "deep": schedule("deep"),
+    "fast": schedule("fast"),
+    "paper": schedule("paper", 4000),
+    "published": schedule("paper"),
+}
 SEEN = ("mask", "scan")
 TEXTURES = 20
+#: Laws near presets, and further draws of the box: half of the draws grow nothing.
+PUBLISHED = (*(f"near-{k}" for k in range(12)), *(f"draw-{k}" for k in range(50, 74)))
+#: How far from a preset a law near it is, in deviations of the box, in the root mean square of the parameters.
+NEAR = 0.15
 
 
 def law_of(name: str) -> tuple[np.ndarray, tuple]:
@@ -46,6 +58,11 @@ def law_of(name: str) -> tuple[np.ndarray, tuple]:
     if name.startswith("draw-"):
         draw = design_box("sobol", ["a02"]).draw(SOBOL, int(name.removeprefix("draw-")))
         return parameters_of(draw.coefficients, draw.mass), (draw.coefficients, draw.mass)
+    if name.startswith("near-"):
+        number = int(name.removeprefix("near-"))
+        way = np.random.default_rng([SEED, number]).standard_normal(6)
+        around = law_of(LAWS[number % len(LAWS)])[0] + NEAR * PRIOR * way * np.sqrt(6) / np.linalg.norm(way)
+        return around, coefficients_of(around)
     law = preset(name)
     return parameters_of(law.coefficients, law.mass), (name,)
 
@@ -57,11 +74,14 @@ def grow(name: str, by: str, cases: Cases) -> np.ndarray:
     if by == "deep":
         return shape(name, SEED, cases)
 
-    def made() -> np.ndarray:
-        flow = generate(*law_of(name)[1], grid=EDGE, schedule=SCHEDULES[by], seed=SEED)
-        return np.packbits(flow.field.numpy() > 0)
+    edge = 100 if by == "published" else EDGE
 
-    return np.unpackbits(cases.array(f"{by}-{name}", made)).reshape(EDGE, EDGE, EDGE) > 0
+    def made() -> np.ndarray:
+        law = law_of(name)[1]
+        flow = generate(*law, grid=edge, schedule=SCHEDULES[by], seed=SEED, reject_early=by == "published")
+        return np.packbits((flow.field.numpy() > 0) & (by != "published" or is_well_formed(flow.viability)))
+
+    return np.unpackbits(cases.array(f"{by}-{name}", made)).reshape(edge, edge, edge) > 0
 
 
 def read(mask: np.ndarray, name: str, seen: str, truth: np.ndarray | None) -> Values:
@@ -106,7 +126,10 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     laws, number = (LAWS[:1], 1) if options.quick else ((*LAWS, *DRAWN), TEXTURES)
-    grown = dict.fromkeys(SCHEDULES, laws) | {"author": () if options.quick else tuple(author_volumes())}
+    grown = dict.fromkeys(SCHEDULES, laws)
+    grown |= (
+        {"published": (), "author": ()} if options.quick else {"published": PUBLISHED, "author": (*author_volumes(),)}
+    )
     jobs = {f"{by}-{name}-{seen}": partial(law_case, name, by, seen, cases)
             for by, names in grown.items() for name, seen in product(names, SEEN)}  # fmt: skip
     jobs |= {f"{kind}-{k}-{seen}": partial(texture_case, kind, k, seen)

@@ -19,6 +19,7 @@ from itertools import product
 import numpy as np
 from scipy import stats
 
+from benchmarks.closure import ENDS, PRIOR
 from benchmarks.completion import DRAWN, LAWS
 from benchmarks.harness import RESULTS, Cases, Figure, Values, show
 from benchmarks.reading import law_of
@@ -44,21 +45,21 @@ def spread_of_seeds(emulator: Emulator) -> np.ndarray:
     return np.sqrt(np.square(rows - means[law]).sum(0) / (count - 1).sum())
 
 
-def step_from(name: str, length: float, emulator: Emulator) -> np.ndarray:
+def step_from(name: str, length: float) -> np.ndarray:
     """Return the parameters `(6,)` at a distance from a law, in its random direction, within the box."""
     here, random = law_of(name)[0], np.random.default_rng([SEED, *name.encode()])
-    low, high = emulator.box.T
+    low, high = ENDS.T
     while True:
         way = random.standard_normal(6)
-        way *= np.sqrt(6) / np.linalg.norm(way) * emulator.deviation
+        way *= np.sqrt(6) / np.linalg.norm(way) * PRIOR
         furthest = here + max(STEPS) * way
         if ((low <= furthest) & (furthest <= high)).all():
             return here + length * way
 
 
-def grow(name: str, length: float, emulator: Emulator) -> np.ndarray:
-    """Return the uncorrelated descriptors of shapes `(n, k)`, SHAPES of them if so many of twice as many are formed."""
-    parameters, rows = step_from(name, length, emulator), list[np.ndarray]()
+def grow(name: str, length: float) -> np.ndarray:
+    """Return the descriptors of shapes `(n, 351)`, SHAPES of them if so many of twice as many are well formed."""
+    parameters, rows = step_from(name, length), list[np.ndarray]()
     for number in range(2 * SHAPES):
         if len(rows) == SHAPES:
             break
@@ -67,7 +68,7 @@ def grow(name: str, length: float, emulator: Emulator) -> np.ndarray:
         if is_well_formed(flow.viability):
             row, _ = measure_view(flow.field.numpy(), VIEW, seed)
             rows += [] if np.isnan(row).any() else [row]
-    return emulator.decorrelate(np.reshape(rows, (-1, 351)))
+    return np.reshape(rows, (-1, 351))
 
 
 def pair(name: str, length: float, cases: Cases) -> Values:
@@ -75,7 +76,7 @@ def pair(name: str, length: float, cases: Cases) -> Values:
     emulator = load_posterior().emulator
     spread = spread_of_seeds(emulator)
     first, second = (
-        cases.array(f"{name}-{step}", partial(grow, name, step, emulator)) / spread for step in (0, length)
+        emulator.decorrelate(cases.array(f"{name}-{step}", partial(grow, name, step))) / spread for step in (0, length)
     )
     if min(len(first), len(second)) < SHAPES:
         return {"grown": [len(first), len(second)]}

@@ -33,6 +33,8 @@ class Scan(NamedTuple):
 
 #: The voxels of UroCell, whose headers state others.
 _NANOMETRES = {"spacing": 16.0, "unit": "nm"}
+_POON = {"spacing": (5.0, 0.994, 0.994), "unit": "um"}
+#: The first ten were in view while the test was made; the last three were looked at once, when its rule stood.
 SCANS = {
     "bone": Scan("lhdl_trabecular_200.tif", "bone"),
     "mitochondria-1": Scan("urocell_mito_fib1-0-0-0.nii.gz", "mitochondria", _NANOMETRES, kind="mask"),
@@ -44,6 +46,9 @@ SCANS = {
     "minivess": Scan("minivess_mv68_mask.nii.gz", "capillaries", kind="mask"),
     "sandstone": Scan("openpnm_berea_100_to_300.npz", "sandstone"),
     "vessel-tree": Scan("poreture_h61_vessel_tree.nii.gz", "vessel tree", kind="mask"),
+    "axons": Scan("trailmap_axons_img.tif", "axons"),
+    "leaking": Scan("vesselNN/poon2015_BBB_Leakage_label.tif", "capillaries", _POON, kind="mask"),
+    "autophagosome": Scan("autophagosome_labels.tif", "membranes", kind="mask"),
 }
 
 
