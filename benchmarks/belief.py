@@ -3,7 +3,7 @@
 Shapes of stores (`--shapes STORE…`), of laws that neither posterior nor discriminants have seen, are asked for as
 masks cut open and as images of five qualities; so are their level cuts, as masks: cuts of a Gaussian field with the
 same volume fraction and two-point function, which no law made. The p of each is as `infer` states it
-(`measure_misfit`). `size` is the part of shapes with p below .05, `power` that of level cuts. `left_out` is the part of
+(`estimate_law`). `size` is the part of shapes with p below .05, `power` that of level cuts. `left_out` is the part of
 textures of a kind that is ruled out where only the other kinds were learned from, by the discriminant alone.
 
 `--teach FILE` writes the packaged posterior, or that of `--posterior`, with what tells shapes of the model from
@@ -34,7 +34,7 @@ from curvafit.data_synth.store import Store, find_well_formed
 from curvafit.data_synth.textures import KINDS
 from curvafit.geometry.description import BLOCKS
 from curvafit.inference.candidates import Misfit, join_tests
-from curvafit.inference.estimate import DRAWS, STARTS, measure_descriptors, measure_misfit, tail_probability
+from curvafit.inference.estimate import estimate_law, measure_descriptors, tail_probability
 from curvafit.inference.posterior import Discriminant, Posterior, load_posterior, save_posterior
 from curvafit.inference.table import Scanned, Table, see_mask, see_scan
 from curvafit.inference.training import keep_laws
@@ -107,8 +107,8 @@ def teach(posterior: Posterior, table: Table, textures: np.ndarray) -> Posterior
         variance = sum(np.cov(rows.T, bias=True) for rows in both) / 2
         ridge = RIDGE * np.diag(variance).mean() * np.eye(len(variance))
         weights = np.linalg.solve(variance + ridge, both[0].mean(0) - both[1].mean(0)).astype(np.float32)
-        usual = posterior.discriminate(table.rows(in_view & kept).descriptors, weights)
-        found[view] = Discriminant(weights, np.sort(usual))
+        reference = posterior.discriminate(table.rows(in_view & kept).descriptors, weights)
+        found[view] = Discriminant(weights, np.sort(reference))
     return replace(posterior, discriminants=found)
 
 
@@ -118,10 +118,10 @@ def leave_out(posterior: Posterior, table: Table, textures: np.ndarray) -> dict[
     count = textures.shape[1] - 2 * len((*reading.LAWS, *reading.DRAWN))
     kind, figures = np.where(np.arange(textures.shape[1]) < count, np.arange(textures.shape[1]) % len(KINDS), -1), {}
     for number, name in enumerate(KINDS):
-        told = teach(posterior, table, textures[:, kind != number]).discriminants
+        fishers = teach(posterior, table, textures[:, kind != number]).discriminants
         for view, asked in zip(VIEWS, textures[:, kind == number], strict=True):
-            values = posterior.discriminate(asked[np.isfinite(asked).all(1)], told[view].weights)
-            rows = [{"p": join_tests(1.0, tail_probability(-told[view].usual, -value))} for value in values]
+            values = posterior.discriminate(asked[np.isfinite(asked).all(1)], fishers[view].weights)
+            rows = [{"p": join_tests(1.0, tail_probability(-fishers[view].reference, -value))} for value in values]
             figures[f"left_out.{name.replace(' ', '_')}.{view}"] = reading.part_below(rows)
     return figures
 
@@ -137,15 +137,17 @@ def case(posterior: Posterior, store: Store, index: int, seen: str, cut: bool) -
         misfit = ask(posterior, scan, kind)
     except ScanError:
         misfit = None
-    return {} if misfit is None else {"p": misfit.probability, "unexplained": misfit.unexplained, "alike": misfit.alike}
+    return (
+        {}
+        if misfit is None
+        else {"p": misfit.probability, "unexplained": misfit.unexplained, "discriminant": misfit.discriminant}
+    )
 
 
 def ask(posterior: Posterior, scan: object, kind: str) -> Misfit | None:
     """Return the misfit of a scan as `infer` states it; None where it cannot be read."""
     described = measure_descriptors(prepare(scan, kind=kind, one_scale=True))  # type: ignore[arg-type]
-    if described is None:
-        return None
-    return measure_misfit(described, posterior, posterior.draw(described.reading, DRAWS)[:STARTS, :-1])
+    return None if described is None else estimate_law(described, posterior, 0).misfit
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -158,9 +160,9 @@ def options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     posterior, figures = load_posterior(options.posterior), dict[str, Figure]()
     if options.teach is not None:
-        told = (gather(), describe_textures(options.textures, cases))
-        figures |= leave_out(posterior, *told)
-        posterior = teach(posterior, *told)
+        lessons = (gather(), describe_textures(options.textures, cases))
+        figures |= leave_out(posterior, *lessons)
+        posterior = teach(posterior, *lessons)
         save_posterior(posterior, options.teach)
     for path in options.shapes:
         shapes = find_well_formed((path,))[: 1 if options.quick else None]

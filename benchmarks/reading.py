@@ -112,9 +112,9 @@ def texture_case(kind: str, number: int, seen: str) -> Values:
     return read(KINDS[kind](random) > 0, f"{kind}-{number}", seen, None)
 
 
-def part_below(rows: list[Values], name: str = "p") -> Figure:
+def part_below(rows: list[Values]) -> Figure:
     """Return the part of cases that the test rules out, of those that can be read, with Wilson's interval."""
-    p = [row[name] for row in rows if row.get(name) is not None]
+    p = [row["p"] for row in rows if row.get("p") is not None]
     hits = sum(value < UNBELIEVABLE for value in p)
     interval = stats.binomtest(hits, len(p)).proportion_ci(method="wilson") if p else (np.nan, np.nan)
     return Figure(hits / max(len(p), 1), *map(float, interval))

@@ -70,16 +70,16 @@ def report(name: str) -> Values:
         for key in RATIOS if twins else ():
             values[key] = float(np.mean([getattr(each, key) for each in twins]) / getattr(own, key))
     if fit.misfit is not None:
-        alike = fit.misfit.alike
+        discriminant = fit.misfit.discriminant
         values |= {"p": fit.misfit.probability, "unexplained": fit.misfit.unexplained}
-        values["alike"] = np.nan if alike is None else alike
+        values["discriminant"] = np.nan if discriminant is None else discriminant
     return values
 
 
 def run(options: argparse.Namespace, cases: Cases) -> dict[str, Figure]:
     names = ["capillaries"] if options.quick else [*SCANS]
     found = cases.all({name: lambda name=name: report(name) for name in names})
-    columns = ("share", "thickness", "spacing", "p", "unexplained", "alike", *RATIOS, "verdict")
+    columns = ("share", "thickness", "spacing", "p", "unexplained", "discriminant", *RATIOS, "verdict")
     show(["scan", *columns], [[name, *(row.get(key, "") for key in columns)] for name, row in found.items()])
     figures = {f"scans.{name}.{key}": Figure(row[key]) for name, row in found.items()
                for key in columns[:-1] if key in row}  # fmt: skip

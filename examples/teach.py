@@ -24,10 +24,12 @@ from typing import Any
 
 import numpy as np
 import torch
+import typer
 from scipy import ndimage
 from torch.nn import functional as F
 from torch.utils.data import DataLoader
 
+from curvafit.cli.console import plain_errors, resumable, say_notes, show_stages
 from curvafit.core.checks import check_int, check_seed
 from curvafit.core.files import remove
 from curvafit.core.records import can_write
@@ -439,29 +441,35 @@ def main() -> None:
     parser.add_argument("--steps", type=int, help=f"by default {STEPS}; {IMAGE_STEPS} with --images")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
+    try:
+        with plain_errors(), resumable(), show_stages() as progress:
+            run(options, progress)
+    except typer.Exit as end:
+        sys.exit(end.exit_code)
+
+
+def run(options: argparse.Namespace, progress: Progress) -> None:
+    """Teach what the command asks for, and write it."""
     out = options.output
     if out.suffix != ".npz":
-        parser.error(f"the output's name must end in .npz, got {out.name}")
+        raise ValueError(f"the output's name must end in .npz, got {out.name}")
     can_write(out, FILLER_FILE, inputs=[*options.sources, *([options.filler] if options.filler else [])])
     checkpoint = out.with_name(f".{out.name}.curvafit-steps")
     # With images, a filler that was taught on masks alone learns to use them.
     first = Taught.load(options.filler) if options.images or options.filler else None
-    sources, card = load_textures(options.sources, _print_progress)
+    sources, card = load_textures(options.sources, progress)
     if (count := sum(map(len, sources))) < FEW:
-        print(f"{count} shapes teach little: {FEW} or more are better")
+        say_notes([f"{count} shapes teach little: {FEW} or more are better"])
     settings = {"first": first, "volumes": options.images, "steps": options.steps, "seed": options.seed}
     card["command"] = shlex.join(["python", *sys.argv])
-    taught = teach(sources, card, **settings, checkpoint=checkpoint, progress=_print_progress)
+    taught = teach(sources, card, **settings, checkpoint=checkpoint, progress=progress)
+    can_write(out, FILLER_FILE)  # hours later, the place may be taken
     taught.save(out)
     for path in (checkpoint, image_folder(checkpoint)):
         remove(path)
     loss, cubic = taught.card["held_out_loss"], taught.card["held_out_cubic"]
     print(f"cross entropy of shapes held out {loss:.4f}, of the cubic interpolation {cubic:.4f}")
     print(out)
-
-
-def _print_progress(text: str, share: float) -> None:
-    print(f"\r{100 * share:3.0f} % {text:60.60}", end="" if share < 1 else "\n", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -35,8 +35,8 @@ TITLES = {
 EDGES = (32, 100)
 #: The probability below which a law is not believed to have made a scan.
 UNBELIEVABLE = 0.05
-#: What a verdict begins with where no law is the scan's, and where it is not known.
-UNBELIEVED, UNDECIDED, UNTESTED = "No believable twin", "Undecided", "Not tested"
+#: What a verdict begins with: a law is believed, it is not, it is not known, or nothing grew to tell.
+SUPPORTED, UNBELIEVED, UNDECIDED, UNTESTED = "Supported", "No believable twin", "Undecided", "Not tested"
 #: Why a scan has no p.
 UNASKED = "It has no p: its descriptors cannot be measured, or its image is noisier than any that is tested."
 #: What a scan without a law has still.
@@ -201,7 +201,7 @@ class Misfit:
         The p of both tests together (`join_tests`).
     unexplained
         The fraction of shapes of which the emulator's best parameters leave as much unexplained.
-    alike
+    discriminant
         The fraction of shapes that look as much like textures of no law; None where the posterior cannot say.
     grain
         The step in which the probability comes: what it was ranked among is finite.
@@ -209,8 +209,27 @@ class Misfit:
 
     probability: Annotated[float, Rule(least=0, most=1)]
     unexplained: Annotated[float, Rule(least=0, most=1)]
-    alike: Annotated[float | None, Rule(least=0, most=1)] = None
+    discriminant: Annotated[float | None, Rule(least=0, most=1)] = None
     grain: Annotated[float, Rule(least=0, most=1)] = 0.0
+
+    @property
+    def rating(self) -> str:
+        """What a verdict begins with; a probability nearer to `UNBELIEVABLE` than its grain is `UNDECIDED`."""
+        if self.probability < UNBELIEVABLE:
+            return UNBELIEVED
+        return SUPPORTED if self.probability >= UNBELIEVABLE + self.grain else UNDECIDED
+
+    def __str__(self) -> str:
+        """Whether the scan looks like a shape of the model, in a sentence, and what to use if not."""
+        p = format_number(self.probability, 2)
+        if self.rating == SUPPORTED:
+            return f"The scan looks as shapes of laws do (p = {p})."
+        if self.rating == UNDECIDED:
+            return f"p = {p} is too near to {UNBELIEVABLE:g} for a test that knows it in steps of {self.grain:.2g}."
+        # Either is one of two joined tests, so that its probability is doubled here as it is there.
+        unlike = self.discriminant is not None and join_tests(1.0, self.discriminant) < UNBELIEVABLE
+        reason = "it looks more like textures that no law makes" if unlike else "no law explains its numbers"
+        return f"The scan does not look as shapes of laws do (p = {p}): {reason}. {LAWLESS}"
 
 
 def join_tests(*probabilities: float) -> float:
@@ -226,25 +245,20 @@ def verdict(
 ) -> tuple[str | None, str]:
     """Return the name of the best supported law of a scan, and the verdict on it; no name where nothing grew.
 
-    The misfit alone decides whether a law is believable; one that is not is still named, as the nearest there is. A p
-    that is nearer to `UNBELIEVABLE` than its grain decides nothing. `grown` says whether shapes were.
+    The misfit alone decides whether a law is believable; one that is not is still named, as the nearest there is.
+    `grown` says whether shapes were.
     """
+    reason = UNASKED if misfit is None else str(misfit)
     if not grown:
         law = f"{UNTESTED} ({TITLES[candidates[0].name]}): no shape was grown (--test grows some)."
-        return candidates[0].name, _join(law, _describe_misfit(misfit))
+        return candidates[0].name, _join(law, reason)
     best = best_candidate(candidates)
     if best is None or best.distance is None:
         return None, _join("No law: nothing grew from any candidate.", candidates[0].status)
     noise = seed_noise_of(candidates)
     distances = f"its twins lie {best.distance:.1f} from the scan's curvature diagram"
     distances += f", {noise:.1f} from each other." if noise else "."
-    rating, reason = UNDECIDED, UNASKED
-    if misfit is not None:
-        reason = _describe_misfit(misfit)
-        if misfit.probability < UNBELIEVABLE:
-            rating = UNBELIEVED
-        elif misfit.probability >= UNBELIEVABLE + misfit.grain:
-            rating = "Supported"
+    rating = UNDECIDED if misfit is None else misfit.rating
     differences = ", ".join(find_differences(scan, best.twins))
     ratios = f"Twins over scan: {differences}." if differences else ""
     return best.name, _join(f"{rating} ({TITLES[best.name]}): {distances}", reason, ratios, best.status)
@@ -269,18 +283,3 @@ def find_differences(scan: Morphometry, twins: Sequence[Morphometry]) -> list[st
             ratio = float(ratios.mean())
             differences.append(f"{label} of the other sign" if ratio < 0 else f"{label} {format_number(ratio, 2)}")
     return differences
-
-
-def _describe_misfit(misfit: Misfit | None) -> str:
-    """Say in a sentence whether the scan looks like a shape of the model, and what to use if not."""
-    if misfit is None:
-        return UNASKED
-    p = format_number(misfit.probability, 2)
-    if misfit.probability >= UNBELIEVABLE + misfit.grain:
-        return f"The scan looks as shapes of laws do (p = {p})."
-    if misfit.probability >= UNBELIEVABLE:
-        return f"p = {p} is too near to {UNBELIEVABLE:g} for a test that knows it in steps of {misfit.grain:.2g}."
-    # Either is one of two joined tests, so that its probability is doubled here as it is there.
-    unlike = misfit.alike is not None and join_tests(1.0, misfit.alike) < UNBELIEVABLE
-    reason = "it looks more like textures that no law makes" if unlike else "no law explains its numbers"
-    return f"The scan does not look as shapes of laws do (p = {p}): {reason}. {LAWLESS}"

@@ -22,7 +22,7 @@ DRAWS = 400
 STARTS = 8
 #: How many more of the draws nearest to the middle are tried where nothing grows from the nearest.
 OTHERS = 4
-#: Most noise over the contrast of an image that is tested: that of those which taught what is usual is a fifth.
+#: Most noise over the contrast of an image that is tested: a fifth is that of the images in the reference.
 NOISIEST = 0.3
 
 
@@ -123,11 +123,12 @@ def measure_misfit(described: Described, posterior: Posterior, starts: np.ndarra
     reading, quality = described.reading, described.prepared.quality
     if quality is not None and quality.noise > NOISIEST:
         return None
-    usual = posterior.misfits[reading.view]
-    unexplained = tail_probability(usual, misfits(posterior.emulator, *reading.columns, starts[None])[0])
-    told = posterior.discriminants.get(reading.view)
-    if told is None:
-        return Misfit(unexplained, unexplained, grain=1 / (1 + len(usual)))
-    alike = tail_probability(-told.usual, -posterior.discriminate(reading.columns[0], told.weights)[0])
-    grain = 2 / (1 + min(len(usual), len(told.usual)))
-    return Misfit(join_tests(unexplained, alike), unexplained, alike, grain)
+    others = posterior.misfits[reading.view]
+    unexplained = tail_probability(others, misfits(posterior.emulator, *reading.columns, starts[None])[0])
+    fisher = posterior.discriminants.get(reading.view)
+    if fisher is None:
+        return Misfit(unexplained, unexplained, grain=1 / (1 + len(others)))
+    value = posterior.discriminate(reading.columns[0], fisher.weights)[0]
+    discriminant = tail_probability(-fisher.reference, -value)
+    grain = 2 / (1 + min(len(others), len(fisher.reference)))
+    return Misfit(join_tests(unexplained, discriminant), unexplained, discriminant, grain)

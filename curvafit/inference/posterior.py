@@ -88,7 +88,7 @@ class Discriminant(NamedTuple):
     its values `(n,)` for shapes of laws that it has not learnt from, increasing."""
 
     weights: np.ndarray
-    usual: np.ndarray
+    reference: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,8 +254,8 @@ def save_posterior(posterior: Posterior, path: str | Path) -> None:
             arrays |= {f"emulator.{name}.{k}.{field}": value for field, value in layer._asdict().items()}
     arrays["emulator.basis"] = posterior.emulator.basis.astype(np.float32)
     arrays |= {f"misfits.{view}": values.astype(np.float32) for view, values in posterior.misfits.items()}
-    for view, told in posterior.discriminants.items():
-        arrays |= {f"{name}.{view}": values.astype(np.float32) for name, values in told._asdict().items()}
+    for view, fisher in posterior.discriminants.items():
+        arrays |= {f"{name}.{view}": values.astype(np.float32) for name, values in fisher._asdict().items()}
     arrays |= {f"combinations.{name}": getattr(posterior.combinations, name) for name in ("weights", "centre")}
     header = {
         "architecture": asdict(posterior.architecture),
@@ -289,13 +289,13 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
     architecture = Architecture(**sizes)
     views = tuple(str(view) for view in header["views"])
     columns, components = sum(BLOCKS.values()), architecture.components
-    told = [view for view in views if f"weights.{view}" in arrays]
+    asked = [view for view in views if f"weights.{view}" in arrays]
     expected: dict[str, tuple[int | None, ...]] = {"mean": (columns,), "scale": (columns,)}
     expected |= {"basis": (components, columns), "emulator.basis": (components, components)}
     expected |= {"box": (len(TARGETS), 2), "centre": (len(TARGETS),), "spread": (len(TARGETS),)}
     expected |= {"combinations.weights": (len(PARAMETERS), len(PARAMETERS)), "combinations.centre": (len(PARAMETERS),)}
     expected |= {f"misfits.{view}": (None,) for view in views}
-    expected |= {f"weights.{view}": (columns,) for view in told} | {f"usual.{view}": (None,) for view in told}
+    expected |= {f"weights.{view}": (columns,) for view in asked} | {f"reference.{view}": (None,) for view in asked}
     for name, shape in expected.items():
         actual = arrays[name].shape
         if len(actual) != len(shape) or any(n not in (None, m) for n, m in zip(shape, actual, strict=True)):
@@ -312,8 +312,8 @@ def _from_arrays(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Poste
     inflation, box = check_float(header["inflation"], "an emulator's inflation", 1e-3, 1e3), arrays["box"]
     emulator = Emulator(compression, views, box[: len(PARAMETERS)], mean, spread, arrays["emulator.basis"], inflation)
     references = {view: arrays[f"misfits.{view}"] for view in views}
-    discriminants = {view: Discriminant(arrays[f"weights.{view}"], arrays[f"usual.{view}"]) for view in told}
-    if not all(map(len, (*references.values(), *(each.usual for each in discriminants.values())))):
+    discriminants = {view: Discriminant(arrays[f"weights.{view}"], arrays[f"reference.{view}"]) for view in asked}
+    if not all(map(len, (*references.values(), *(each.reference for each in discriminants.values())))):
         raise ValueError("misfits without numbers")
     ends = tuple((str(low), str(high)) for low, high in header["ends"])
     if len(ends) != len(PARAMETERS):

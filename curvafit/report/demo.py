@@ -12,7 +12,6 @@ from curvafit.core.files import write_content
 from curvafit.core.records import can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.drawing.plot import diagram_figure, gallery_figure
-from curvafit.inference.candidates import UNBELIEVABLE
 from curvafit.inference.inference import Inference, infer
 from curvafit.report.inference import check_report, describe, describe_scan, write_inference
 from curvafit.report.measures import check_measures, write_measures
@@ -85,8 +84,7 @@ def demo_page(inference: Inference, measures: Measures, shapes: Figure, scores: 
         numbers=[(name, " ".join(filter(None, number))) for name, *number in numbers],
         outlines=picture_of(outlines, "Three slices with the outline of what was measured"),
         diagram=picture_of(diagram_figure(diagram, unit=fit.length_unit, length=λ), "The scan's curvature diagram"),
-        misfit=fit.misfit, reading=fit.status,
-        believed=fit.misfit is not None and fit.misfit.probability >= UNBELIEVABLE,
+        verdict=fit.misfit or fit.status,
         notes=dict.fromkeys((*inference.scan.notes, *fit.notes)),
     )  # fmt: skip
 

@@ -17,7 +17,7 @@ from curvafit.core.records import Format
 from curvafit.core.units import format_length, format_number, format_percent, power_name, unit_name
 from curvafit.drawing import plot
 from curvafit.geometry.diagrams import Diagram
-from curvafit.inference.candidates import TITLES, Candidate, seed_noise_of
+from curvafit.inference.candidates import SUPPORTED, TITLES, UNBELIEVABLE, Candidate, seed_noise_of
 from curvafit.inference.fit import Fit
 from curvafit.inference.inference import Inference
 from curvafit.inference.posterior import KNOWN
@@ -90,7 +90,8 @@ def report_html(inference: Inference) -> str:
         diagrams=[] if inference.diagram is None else _diagrams(inference), distances=_distances(inference),
         unit=format_length(fit.length, fit.length_unit, 3), twins=0 if fit.best is None else len(fit.best.twins),
         numbers=_number_rows(inference), strips=list_strips(fit), law=_law(inference), corner=_corner(inference),
-        symbols=[symbol for symbol, _, _ in _TERMS.values()],
+        symbols=[symbol for symbol, _, _ in _TERMS.values()], level=UNBELIEVABLE,
+        supported=fit.status.startswith(SUPPORTED),
     )  # fmt: skip
 
 
@@ -279,7 +280,7 @@ def _outline(inference: Inference) -> Outline:
 def _shapes(inference: Inference) -> list[page.Picture]:
     """Return pictures of the surfaces of the scan and of each candidate's shape, in boxes of one size."""
     fit = inference.fit
-    verdict = "best supported" if fit.status.startswith("Supported") else "the nearest"
+    verdict = "best supported" if fit.status.startswith(SUPPORTED) else "the nearest"
     pictures = [_shape(inference, "The scan", scan_box(inference))]
     for candidate in _chosen_first(inference):
         distance = "" if candidate.distance is None else f"; distance {candidate.distance:.1f}"

@@ -507,15 +507,11 @@ class Reading(NamedTuple):
         return self.descriptors[None], np.array([self.view]), np.array([self.amount])
 
 
-def read_texture(prepared: Prepared, view: str | None = None, across: Sequence[int] | None = None) -> Reading | None:
+def read_texture(prepared: Prepared) -> Reading | None:
     """Measure a scan's descriptors in windows of one size that fill its grid, or in the largest cube within its region
     of interest. Return None where that cube is smaller than `SMALLEST_CUBE` voxels, or no window has a surface.
-
-    `view` is the kind of view, by default the scan's own; `across` is the number of windows along each axis, by default
-    that of `windows_along`.
     """
-    view = _kind_of_view(prepared) if view is None else view
-    across = windows_along(prepared, prepared.grid.shape) if across is None else across
+    view, across = _kind_of_view(prepared), _windows_along(prepared)
     edges = [n // count for n, count in zip(prepared.grid.shape, across, strict=True)]
     windows = cut_boxes([edge * count for edge, count in zip(edges, across, strict=True)], edges)
     if prepared.roi is not None:
@@ -529,11 +525,11 @@ def read_texture(prepared: Prepared, view: str | None = None, across: Sequence[i
     return Reading(np.array(rows), view, len(rows) * size / prepared.thickness**3) if rows else None
 
 
-def windows_along(prepared: Prepared, shape: Sequence[int]) -> list[int]:
-    """Return the number of windows, of `READ` voxels or more, along each axis of a part of a scan's working grid; it is
-    1 where the scan repeats or has a region of interest."""
+def _windows_along(prepared: Prepared) -> list[int]:
+    """Return the number of windows, of `READ` voxels or more, along each axis of a scan's working grid; it is 1 where
+    the scan repeats or has a region of interest."""
     single = prepared.grid.periodic or prepared.roi is not None
-    return [1 if single else max(n // READ, 1) for n in shape]
+    return [1 if single else max(n // READ, 1) for n in prepared.grid.shape]
 
 
 def _kind_of_view(prepared: Prepared) -> str:

@@ -170,7 +170,7 @@ def draw_row(seed: int) -> np.ndarray:
 
 def test_what_no_parameters_explain_is_not_believed() -> None:
     alike = [ask(draw_row(seed)) for seed in range(20)]
-    assert all(found.alike is None and found.grain == 1 / 401 for found in alike)
+    assert all(found.discriminant is None and found.grain == 1 / 401 for found in alike)
     assert np.mean([found.probability for found in alike]) > 0.3
     rows = draw_row(0)
     rows[0, 2] += 5  # beyond the box
@@ -183,9 +183,9 @@ def test_a_scan_that_looks_like_other_textures_is_not_believed(value: float, p: 
     rows = draw_row(3)
     rows[0, -1] = value
     found = ask(rows, "mask")
-    assert found.alike == pytest.approx(min(value + 2, 92) / 100) and found.grain == 2 / 100
+    assert found.discriminant == pytest.approx(min(value + 2, 92) / 100) and found.grain == 2 / 100
     assert found.probability == pytest.approx(min(p, 2 * found.unexplained, 1.0))
-    assert ask(rows, "scan").alike is None
+    assert ask(rows, "scan").discriminant is None
 
 
 def test_an_image_noisier_than_all_that_taught_is_not_tested() -> None:

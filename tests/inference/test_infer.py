@@ -58,7 +58,7 @@ def test_a_mask_is_taken_to_parameters_and_back(inference: Inference) -> None:
     assert distances[fit.best.name] == min(distances.values()) < 6
     assert [match.distance for match in fit.matches] == sorted(match.distance for match in fit.matches)
     assert inference.best is not None and min(inference.best.shape) == max(inference.best.shape) >= EDGES[0]
-    assert fit.misfit is not None and fit.misfit.alike is not None
+    assert fit.misfit is not None and fit.misfit.discriminant is not None
     share = fit.morphometry.volume_fraction
     # The mass of the match's twins is set so, which holds for phases at ±1: flows as short as these leave them off it
     # by up to 4 %, and the share by half of that. Of the others it is as read, and their twins have that of the mass.
@@ -136,9 +136,9 @@ def test_a_quick_reading_tells_a_level_cut(straight: Fit) -> None:
     grey = ndimage.gaussian_filter(np.random.default_rng(0).standard_normal((64, 64, 64)), 4, mode="wrap")
     cut = quick(grey > np.quantile(grey, 0.7)).misfit
     assert cut is not None and straight.misfit is not None
-    assert cut.alike is not None and straight.misfit.alike is not None
-    assert cut.alike < 0.02 < straight.misfit.alike
-    assert cut.probability <= 2 * cut.alike
+    assert cut.discriminant is not None and straight.misfit.discriminant is not None
+    assert cut.discriminant < 0.02 < straight.misfit.discriminant
+    assert cut.probability <= 2 * cut.discriminant
 
 
 @pytest.mark.slow

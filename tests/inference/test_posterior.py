@@ -119,7 +119,7 @@ def test_a_file_holds_it(raw: Posterior, tmp_path: Path) -> None:
     again, row = load_posterior(path), columns(table(1, seed=2).select_views(["mask"]))
     assert np.array_equal(again.sample(*row, 50), raw.sample(*row, 50))
     assert again.provenance == raw.provenance
-    assert [*again.discriminants] == ["mask"] and again.discriminants["mask"].usual.tolist() == [0, 1, 2]
+    assert [*again.discriminants] == ["mask"] and again.discriminants["mask"].reference.tolist() == [0, 1, 2]
     assert np.array_equal(again.discriminants["mask"].weights, weights)
     content = path.read_bytes()
     path.write_bytes(content[:1000])
