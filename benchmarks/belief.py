@@ -31,7 +31,6 @@ from benchmarks.harness import RESULTS, Cases, Figure, Values, show, write_whole
 from benchmarks.teaching import VIEWS, gather
 from curvafit.data_synth.atlas import measure_view
 from curvafit.data_synth.store import Store, find_well_formed
-from curvafit.data_synth.textures import KINDS
 from curvafit.geometry.description import BLOCKS
 from curvafit.inference.candidates import Misfit, join_tests
 from curvafit.inference.estimate import estimate_law, measure_descriptors, tail_probability
@@ -41,6 +40,7 @@ from curvafit.inference.training import keep_laws
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.scan.preparation import prepare
 from curvafit.volumes.volume import ScanError, Volume
+from examples.mixed import KINDS
 
 SEED, TEXTURES = 7, RESULTS / "textures.npz"
 

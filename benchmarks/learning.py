@@ -18,14 +18,13 @@ import numpy as np
 
 from benchmarks.closure import PRIOR
 from benchmarks.harness import Cases, Figure, Values, show
-from benchmarks.teaching import gather
+from benchmarks.teaching import VIEWS, gather
 from curvafit.inference.posterior import Architecture
 from curvafit.inference.table import PARAMETERS, Table
 from curvafit.inference.training import train_posterior
 
 SEED, FOLDS, DRAWS, VIEW = 70, 5, 400, "mask"
 COUNTS: dict[str, int] = {"88": 88, "177": 177, "354": 354, "708": 708, "all": 708}
-VIEWS = ("mask", "scan")
 #: Of 64 components 88 laws are too few to learn.
 SMALL = Architecture(components=32)
 

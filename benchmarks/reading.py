@@ -27,7 +27,6 @@ from benchmarks.completion import DRAWN, EDGE, LAWS, SOBOL, shape
 from benchmarks.harness import Cases, Figure, Values, show
 from benchmarks.texture import author_field, author_volumes
 from curvafit.data_synth.design import design_box
-from curvafit.data_synth.textures import KINDS
 from curvafit.generation.flow import generate
 from curvafit.generation.result import is_well_formed
 from curvafit.generation.schedule import Schedule, schedule
@@ -37,6 +36,7 @@ from curvafit.inference.table import VIEWS, parameters_of
 from curvafit.inference.table import law_of as coefficients_of
 from curvafit.priors import preset
 from curvafit.volumes.volume import ScanError
+from examples.mixed import KINDS
 
 SEED = 2
 SCHEDULES: dict[str, Schedule] = {

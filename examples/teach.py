@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 import typer
+from mixed import KINDS
 from scipy import ndimage
 from torch.nn import functional as F
 from torch.utils.data import DataLoader
@@ -36,7 +37,6 @@ from curvafit.core.records import can_write
 from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.data_synth.imaging.modality import MODALITIES, field_shape, image, regrid
 from curvafit.data_synth.store import HEADER, find_well_formed
-from curvafit.data_synth.textures import KINDS
 from curvafit.scan.grids import centre_distance
 from curvafit.segmentation.filler import (
     FAR,
@@ -361,7 +361,7 @@ def teach(
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         filler = Filler() if first is None else copy.deepcopy(first.filler)
-        filler = Filler.with_image(filler) if volumes and not filler.image else filler
+        filler = see_images(filler) if volumes and not filler.image else filler
     settings = {"steps": steps, "seed": seed} | ({} if first is None else {"first": first.card})
     if not volumes:
         held_out = [texture for source in sources for texture in source[HELD_OUT - 1 :: HELD_OUT]] or [sources[-1][-1]]
@@ -382,6 +382,19 @@ def teach(
     temperatures, figures, error = judge(filler, tests)
     progress("judging on shapes held out", 1.0)
     return Taught(filler, temperatures, {**card, **settings, "losses": losses, **figures}, error)
+
+
+def see_images(plain: Filler) -> Filler:
+    """Return a filler that also takes the evidence of an image, with the weights of a plain one, and weights of 0 for
+    the channels that a plain one lacks."""
+    filler, plain_state = Filler(plain.width, image=True), plain.state_dict()
+    state = filler.state_dict()
+    for name, values in plain_state.items():
+        added = [n - m for n, m in zip(state[name].shape, values.shape, strict=True)]
+        # torch pads the last axis first, before and after each
+        state[name] = F.pad(values, [width for n in reversed(added) for width in (0, n)])
+    filler.load_state_dict(state)
+    return filler
 
 
 def image_folder(checkpoint: Path) -> Path:

@@ -157,19 +157,6 @@ class Filler(nn.Module):
             if isinstance(module, nn.Conv2d):
                 module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    @classmethod
-    def with_image(cls, plain: Filler) -> Filler:
-        """Return a filler that also takes the evidence of an image, with the weights of a plain one, and weights of 0
-        for the channels that a plain one lacks."""
-        filler, plain_state = cls(plain.width, image=True), plain.state_dict()
-        state = filler.state_dict()
-        for name, values in plain_state.items():
-            added = [n - m for n, m in zip(state[name].shape, values.shape, strict=True)]
-            # torch pads the last axis first, before and after each
-            state[name] = F.pad(values, [width for n in reversed(added) for width in (0, n)])
-        filler.load_state_dict(state)
-        return filler
-
     def forward(self, gaps: Gaps, drop: int = 0) -> Tensor:
         """Return the log-odds of the inside (B, n, Y - 2 drop, X - 2 drop) in the slices to fill. `drop` pixels at each
         border are read but not filled: 0, or a multiple of 4 from 16 on."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import ndimage
+from scripts import example
 
-from curvafit.data_synth.textures import EDGE, KINDS, draw_tubes, draw_walls
+mixed = example("mixed")
+EDGE, KINDS = mixed.EDGE, mixed.KINDS
 
 
 def draw(kind: str, seed: int) -> np.ndarray:
@@ -29,7 +31,7 @@ def test_a_texture_repeats_and_is_about_a_distance(kind: str) -> None:
 
 def test_walls_part_cells_and_tubes_are_few_pieces() -> None:
     random = np.random.default_rng
-    cells, tubes = ndimage.label(draw_walls(random(1)) < 0)[0], draw_tubes(random(1)) > 0
+    cells, tubes = ndimage.label(mixed.draw_walls(random(1)) < 0)[0], mixed.draw_tubes(random(1)) > 0
     assert (np.bincount(cells.ravel())[1:] > 500).sum() >= 6
     largest = np.bincount(ndimage.label(tubes)[0].ravel())[1:]
     assert largest.max() > 0.05 * tubes.sum()

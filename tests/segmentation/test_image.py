@@ -50,14 +50,14 @@ def test_a_filler_that_takes_images_begins_as_a_plain_one() -> None:
     distances = 3 * torch.randn(2, 4, 24, 24, generator=generator)
     gaps = Gaps(distances, torch.ones(2), torch.zeros(2, 3, 24, 24))
     with torch.no_grad():
-        wider = Filler.with_image(plain)(replace(gaps, evidence=torch.zeros(2, 3, 24, 24)))
+        wider = script.see_images(plain)(replace(gaps, evidence=torch.zeros(2, 3, 24, 24)))
         assert torch.allclose(wider, plain(gaps), atol=1e-6)
 
 
 def test_background_around_an_image_changes_nothing() -> None:
     mask = rods()
     said = np.where(mask, 3, -3).astype(np.float32)
-    filler = Filler.with_image(stirred()).eval()
+    filler = script.see_images(stirred()).eval()
     torch.nn.init.normal_(filler.up_fine.first.weight, std=0.1, generator=torch.Generator().manual_seed(0))
     taught = Taught(filler, np.array([[4.0, 16.0], [1.0, 1.0]]), {}, 0.0)
     border = ((0, 0), (60, 60), (60, 60))

@@ -12,7 +12,6 @@ from scripts import example
 
 import curvafit.segmentation.teach as room
 from curvafit.data_synth.atlas import build
-from curvafit.data_synth.textures import KINDS
 from curvafit.generation.schedule import schedule
 from curvafit.segmentation.filler import FAR, Filler, Taught
 from curvafit.segmentation.teach import Whole, WholeLessons, learn
@@ -20,7 +19,7 @@ from curvafit.volumes.volume import Volume
 from curvafit.volumes.write import save
 
 script = example("teach")
-Mix, Texture, Lessons = script.Mix, script.Texture, script.Lessons
+Mix, Texture, Lessons, KINDS = script.Mix, script.Texture, script.Lessons, script.KINDS
 #: Windows along the axes of a shape, as it is.
 EXACT = Mix(upright=1, stretch=0, coarse=0, ends=0, pairs=0, holes=0, trembling=0, partial=0)
 
@@ -147,13 +146,17 @@ def test_the_script_teaches_and_refuses(
         script.main()
 
     run("mask.npy", target, "--steps", 2)
-    assert "200" in capsys.readouterr().out and Taught.load(target).card["steps"] == 2
+    assert "200" in capsys.readouterr().err and Taught.load(target).card["steps"] == 2
     assert not list(tmp_path.glob(".*"))
-    with pytest.raises(SystemExit):
-        run("mask.npy", tmp_path / "filler.txt")
-    for source, options in (("none", ()), ("mask.npy", ("--filler", tmp_path / "mask.npy"))):
-        with pytest.raises((ValueError, FileNotFoundError), match=source):
-            run(source, new, *options)
+    bad = {
+        "filler.txt": ("mask.npy", ()),
+        "none": ("none", ()),
+        "mask.npy": ("mask.npy", ("--filler", tmp_path / "mask.npy")),
+    }
+    for word, (source, options) in bad.items():
+        with pytest.raises(SystemExit, match="2"):
+            run(source, tmp_path / word if word.endswith("txt") else new, *options)
+        assert word in (said := capsys.readouterr().err) and said.count("error") == 1
     assert not new.exists()
     run("mask.npy", new, "--steps", 2, "--filler", target)
     assert Taught.load(new).card["first"] == Taught.load(target).card

@@ -1,6 +1,6 @@
 """Textures that no law makes, each drawn in a second: level cuts of random fields, cells, grains, tubes and fibres.
 
-They teach the filler (`examples/teach.py`) how structures go on between slices. Each is a field, float32 (N, N, N),
+They teach the filler (`teach.py`) how structures go on between slices. Each is a field, float32 (N, N, N),
 that repeats along all axes; it is positive inside, and about a distance in voxels near its surface.
 """
 
