@@ -29,18 +29,16 @@ from scipy import ndimage, optimize, stats
 from benchmarks import reading
 from benchmarks.harness import RESULTS, Cases, Figure, Values, show, write_whole
 from benchmarks.teaching import VIEWS, gather
-from curvafit.data_synth.atlas import measure_view
 from curvafit.data_synth.store import Store, find_well_formed
 from curvafit.geometry.description import BLOCKS
 from curvafit.inference.candidates import Misfit, join_tests
 from curvafit.inference.estimate import estimate_law, measure_descriptors, tail_probability
 from curvafit.inference.posterior import Discriminant, Posterior, load_posterior, save_posterior
-from curvafit.inference.table import Scanned, Table, see_mask, see_scan
-from curvafit.inference.training import keep_laws
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.scan.preparation import prepare
 from curvafit.volumes.volume import ScanError, Volume
 from examples.mixed import KINDS
+from examples.train import Scanned, Table, keep_laws, measure_view, see_mask, see_scan
 
 SEED, TEXTURES = 7, RESULTS / "textures.npz"
 

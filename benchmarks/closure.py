@@ -31,18 +31,11 @@ from benchmarks.teaching import gather
 from curvafit.data_synth.design import INTERVALS
 from curvafit.data_synth.store import Store, find_well_formed, open_store
 from curvafit.inference.posterior import Posterior, load_posterior
-from curvafit.inference.table import (
-    PARAMETERS,
-    VIEWS,
-    Table,
-    column_names,
-    compression_of,
-    parameters_of,
-    to_row,
-)
+from curvafit.inference.table import PARAMETERS, column_names, parameters_of
 from curvafit.scan.measures import read_texture
 from curvafit.scan.preparation import prepare, thinner_thickness
 from curvafit.volumes.volume import ScanError
+from examples.train import VIEWS, Table, compression_of, to_row
 
 DRAWS = 400
 #: Components that the Gaussian process sees.

@@ -1,7 +1,7 @@
 """How many laws a posterior must be taught: errors on laws left out, by the number of laws that it learns from.
 
 Of five folds of the laws of `results/table.npz` one is asked for, and of the others so many teach a posterior of one
-flow with its emulator, as `curvafit atlas train` does, on masks and degraded scans; beside the most of them all laws
+flow with its emulator, as `examples/train.py` does, on masks and degraded scans; beside the most of them all laws
 of `teaching`, a shape each, teach `all`. Errors are those of the medians of
 its draws of one mask of each law that was left out, in deviations of the box, the mean over six parameters of the
 medians over laws; `emulator` is the part of the variance of descriptors between laws that the emulator misses, over the
@@ -20,8 +20,8 @@ from benchmarks.closure import PRIOR
 from benchmarks.harness import Cases, Figure, Values, show
 from benchmarks.teaching import VIEWS, gather
 from curvafit.inference.posterior import Architecture
-from curvafit.inference.table import PARAMETERS, Table
-from curvafit.inference.training import train_posterior
+from curvafit.inference.table import PARAMETERS
+from examples.train import Table, train_posterior
 
 SEED, FOLDS, DRAWS, VIEW = 70, 5, 400, "mask"
 COUNTS: dict[str, int] = {"88": 88, "177": 177, "354": 354, "708": 708, "all": 708}

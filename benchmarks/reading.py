@@ -3,7 +3,7 @@
 Laws are the presets and the random ones of `completion`; each grows a shape of 64³ by `deep`, by `fast` and by `paper`
 with half its steps, in a periodic box. `published` are laws that no choice has seen, near presets and of the box, at
 100³ by the whole of `paper`; the paper author's own volumes ($CURVAFIT_DATA) are of 100³. Each is seen as a mask, cut
-open, and as a bad scan, on a scanner's voxels, as `curvafit atlas describe` sees them. Other textures are those that
+open, and as a bad scan, on a scanner's voxels, as `examples/train.py` sees them. Other textures are those that
 teach the network that fills volumes: level cuts, walls of cells, grains, trees of tubes, fibres, so many of each, seen
 in the same way.
 
@@ -32,11 +32,12 @@ from curvafit.generation.result import is_well_formed
 from curvafit.generation.schedule import Schedule, schedule
 from curvafit.inference.candidates import UNBELIEVABLE
 from curvafit.inference.inference import infer
-from curvafit.inference.table import VIEWS, parameters_of
 from curvafit.inference.table import law_of as coefficients_of
+from curvafit.inference.table import parameters_of
 from curvafit.priors import preset
 from curvafit.volumes.volume import ScanError
 from examples.mixed import KINDS
+from examples.train import VIEWS
 
 SEED = 2
 SCHEDULES: dict[str, Schedule] = {

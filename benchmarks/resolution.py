@@ -23,13 +23,12 @@ from benchmarks.closure import ENDS, PRIOR
 from benchmarks.completion import DRAWN, LAWS
 from benchmarks.harness import RESULTS, Cases, Figure, Values, show
 from benchmarks.reading import law_of
-from curvafit.data_synth.atlas import measure_view
 from curvafit.generation.flow import generate
 from curvafit.generation.result import is_well_formed
 from curvafit.inference.emulator import Emulator
 from curvafit.inference.posterior import load_posterior
 from curvafit.inference.table import law_of as coefficients_of
-from curvafit.inference.table import load_table
+from examples.train import load_table, measure_view
 
 SEED, EDGE, SHAPES, VIEW = 70, 64, 4, "mask"
 STEPS = (0.05, 0.1, 0.2)

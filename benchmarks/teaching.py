@@ -2,10 +2,10 @@
 
 Draw k is the k-th point of a Sobol sequence in the atlas's box, of a00, a10 and a01 in the arsinh of their own scales,
 so that small coefficients, where the presets lie, have their share; its schedule is drawn, as scans come from none.
-A shape of 64³ that is well formed is seen as a mask and as a bad scan, as `curvafit atlas describe` sees it. Draws are
+A shape of 64³ that is well formed is seen as a mask and as a bad scan, as `examples/train.py` describes it. Draws are
 kept in shards under `benchmarks/results/teaching`, float16; a run that is stopped goes on. Several processes share the
 work by `--share 0/2` and `--share 1/2`. `--table` writes all rows, with those of `results/table.npz`, for
-`curvafit atlas train`.
+`examples/train.py train`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ import numpy as np
 from scipy.stats import qmc
 
 from benchmarks.harness import RESULTS, Cases, Figure, Values, write_whole
-from curvafit.data_synth.atlas import measure_view
 from curvafit.generation.flow import generate
 from curvafit.generation.result import is_well_formed
 from curvafit.generation.schedule import Schedule, schedule
-from curvafit.inference.table import Table, law_of, load_table, save_table
+from curvafit.inference.table import law_of
 from curvafit.scan.preparation import thinner_thickness
+from examples.train import Table, load_table, measure_view, save_table
 
 SEED, EDGE, SHARD = 70, 64, 500
 FOLDER = RESULTS / "teaching"

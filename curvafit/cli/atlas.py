@@ -93,52 +93,6 @@ def extract_atlas(
 
 
 @command(
-    "curvafit atlas describe store -o table.npz",
-    "curvafit atlas describe box corner -o table.npz",
-)
-def describe_atlas(
-    stores: Annotated[list[Path], typer.Argument(help="Stores made by `curvafit atlas build`.")],
-    out: Annotated[Path, typer.Option("-o", "--output", help="The table (.npz) to write; one that exists goes on.")],
-    *,
-    crew: Workers,
-    overwrite: OverwriteOption = False,
-) -> None:
-    """Measure each shape of stores as field, mask and scan: the table that `atlas train` reads."""
-    from curvafit.data_synth.atlas import describe
-    from curvafit.inference.table import TABLE_FILE
-
-    _check_archive(out, TABLE_FILE, stores, overwrite)
-    with crew.start() as (workers, progress):
-        table = describe(stores, out, progress, workers=workers, command=[command_line()], overwrite=overwrite)
-    say(f"{len(set(table.shapes.tolist()))} shapes, {len(table)} views", to=error_console())
-    say(str(out))
-
-
-@command("curvafit atlas train table.npz -o posterior.npz")
-def train_atlas(
-    table: Annotated[Path, typer.Argument(help="A table made by `curvafit atlas describe`.")],
-    out: Annotated[Path, typer.Option("-o", "--output", help="The posterior (.npz) to write.")],
-    views: Annotated[str | None, typer.Option(help="Views to learn from, between commas; by default all.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the training.")] = 0,
-    overwrite: OverwriteOption = False,
-) -> None:
-    """Train the posterior of the parameters, given descriptors, on a table of them."""
-    from curvafit.inference.posterior import POSTERIOR_FILE, save_posterior
-    from curvafit.inference.table import load_table
-    from curvafit.inference.training import train_posterior
-
-    _check_archive(out, POSTERIOR_FILE, [table], overwrite)
-    descriptors = load_table(table)
-    if views is not None:
-        descriptors = descriptors.select_views(views.split(","))
-    with show_stages() as progress:
-        posterior = train_posterior(descriptors, seed=seed, progress=progress)
-    save_posterior(posterior, out)
-    say(f"{posterior.provenance['shapes']} shapes", to=error_console())
-    say(str(out))
-
-
-@command(
     "curvafit atlas map store -o map.html",
     "curvafit atlas map box corner --fit bone/fit.json --fit lung/fit.json -o map.html",
 )
@@ -157,8 +111,7 @@ def map_atlas(
     say(str(page))
 
 
-add_commands(atlas_app, build_atlas, info_atlas, verify_atlas)
-add_commands(atlas_app, extract_atlas, describe_atlas, train_atlas, map_atlas)
+add_commands(atlas_app, build_atlas, info_atlas, verify_atlas, extract_atlas, map_atlas)
 
 
 def _check_archive(out: Path, kind: Format, inputs: list[Path], overwrite: bool) -> None:

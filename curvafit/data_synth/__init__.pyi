@@ -1,5 +1,4 @@
 from .atlas import build as build
-from .atlas import describe as describe
 from .atlas import extract as extract
 from .dataset import TextureDataset as TextureDataset
 from .dataset import as_dict as as_dict

@@ -1,4 +1,4 @@
-"""Stores of generated shapes: built, summarised, verified; measured, for an atlas to search or a table to train on."""
+"""Stores of generated shapes: built, summarised, verified; and measured, for an atlas to search."""
 
 from __future__ import annotations
 
@@ -11,13 +11,11 @@ import platform
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -34,20 +32,16 @@ from curvafit.generation.schedule import Schedule
 from curvafit.generation.schedule import schedule as named_schedule
 from curvafit.geometry.diagrams import BIN_WIDTH, TAIL_SHARE, Diagram, diagram
 from curvafit.inference.atlas import Atlas
-from curvafit.inference.table import VIEWS, Table, load_table, parameters_of, save_table, to_row
 from curvafit.priors.grid import WORKING_EPSILON, Grid
 from curvafit.priors.kernels.threads import one_thread
-from curvafit.scan.measures import Reading, read_texture, scan_diagram
+from curvafit.scan.measures import scan_diagram
 from curvafit.scan.preparation import prepare, thinner_thickness
-from curvafit.volumes.volume import ScanError, Volume
+from curvafit.volumes.volume import Volume
 
 #: A build ends with an error where fewer than one draw in this many is viable.
 BARREN = 200
 #: Viable shapes that a store may be asked for.
 MOST = 10**7
-#: A row of a table: its columns in their order.
-Row = tuple[str, str, np.ndarray, float, np.ndarray, float]
-
 
 # ---- builds ----------------------------------------------------------------------------------------------------------
 
@@ -214,8 +208,10 @@ def extract(stores: Sequence[str | Path | Store], command: Sequence[str] = (), p
         thicknesses=np.array(thicknesses),
         field_diagrams=field_diagrams,
         mask_diagrams=mask_diagrams,
-        provenance=_provenance(None, sources, command)
-        | {
+        provenance={
+            "stores": {store.name: json.loads(json.dumps(dataclasses.asdict(store.settings))) for store in sources},
+            "command": list(command),
+            "measured_with": versions(),
             "settings": {name: getattr(sources[0].settings, name) for name in ("shape", "spacing", "epsilon")},
             "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         },
@@ -243,90 +239,3 @@ def _measure_shape(store: Store, record: Record) -> tuple[float, float, Diagram,
     mask = prepare(Volume((u > 0).astype(np.uint8)), kind="mask", periodic=True, one_scale=True)
     field_diagram, mask_diagram = (full.thin(BIN_WIDTH, TAIL_SHARE) for full in (field_diagram, scan_diagram(mask)))
     return float((u > 0).mean()), thinner_thickness(u > 0), field_diagram, mask_diagram
-
-
-def describe(
-    stores: Sequence[str | Path],
-    out: str | Path,
-    progress: Progress = silent,
-    *,
-    workers: Cluster | None = None,
-    command: Sequence[str] = (),
-    overwrite: bool = False,
-) -> Table:
-    """Measure the well-formed shapes of stores in each view (`VIEWS`), and add them to a table, whose own rows stay.
-
-    The table `out` (.npz) is written every minute; with `overwrite` it is begun anew. A view depends only on the shape,
-    its seed and the view's name: a resumed table has the same rows, possibly in another order. Shapes that a build adds
-    or removes meanwhile are left out. `workers` (see `cluster`) measure, or this process; `command` is for provenance.
-
-    Raises FileNotFoundError or ValueError where a store is missing, two have one name, `out` is no table, or no shape
-    is well-formed.
-    """
-    sources, path = open_all(stores), Path(out)
-    table = load_table(path) if path.exists() and not overwrite else None
-    provenance, rows = _provenance(table, sources, command), []
-    if table is not None:
-        columns = dataclasses.fields(table)[:-1]  # the last is the provenance
-        rows += zip(*(getattr(table, column.name) for column in columns), strict=True)
-    present = {row[:2] for row in rows}
-    jobs: list[tuple[Path, int, tuple[str, ...]]] = []  # shapes that lack views in the table
-    for store, index in ((source, k) for source in sources for k in source.indices()):
-        missing = tuple(name for name in VIEWS if (f"{store.name}/{index:06d}", name) not in present)
-        with suppress(KeyError):  # a draw that was removed since it was listed
-            if missing and store.viable(index) and is_well_formed(store.record(index).viability):
-                jobs.append((store.path.resolve(), index, missing))
-    last_save = time.monotonic()
-    try:
-        for count, measured in enumerate(run_jobs(measure, jobs, workers), 1):
-            rows += measured
-            progress(f"measured {count} of {len(jobs)} shapes", count / len(jobs))
-            if time.monotonic() - last_save > 60:
-                save_table(_to_table(rows, provenance), path)
-                last_save = time.monotonic()
-    finally:
-        if rows:
-            save_table(_to_table(rows, provenance), path)
-    if not rows:
-        raise ValueError(f"no well-formed shape in {', '.join(store.name for store in sources)}")
-    return _to_table(rows, provenance)
-
-
-def measure(job: tuple[Path, int, Sequence[str]]) -> list[Row]:
-    """Measure a shape, by its store, index and views; return no row where it is no longer in the store."""
-    path, index, views = job
-    store = open_store(path)
-    try:
-        record, u = store.record(index), store.field(index)
-    except KeyError:
-        return []
-    numbers = parameters_of(record.coefficients, record.mass), thinner_thickness(u > 0)
-    return [(f"{store.name}/{index:06d}", name, *numbers, *measure_view(u, name, record.seed)) for name in views]
-
-
-def measure_view(u: np.ndarray, name: str, seed: int) -> tuple[np.ndarray, float]:
-    """Return descriptors and amount of a field in one view, read as `infer` reads a scan; NaN without a surface."""
-    reading: Reading | None = None
-    with suppress(ScanError):
-        view = VIEWS[name](u, np.random.default_rng([seed, *name.encode()]))
-        reading = read_texture(prepare(view.scan, kind=view.kind, periodic=view.periodic, one_scale=True))
-    return to_row(reading).astype(np.float32), math.nan if reading is None else reading.amount
-
-
-def _provenance(table: Table | None, stores: Sequence[Store], command: Sequence[str]) -> dict[str, Any]:
-    """Return the provenance of what is measured of stores, or of a table with stores added; ValueError where the table
-    has another store of such a name."""
-    previous = {} if table is None else table.provenance
-    settings = {store.name: json.loads(json.dumps(dataclasses.asdict(store.settings))) for store in stores}
-    for name, current in settings.items():
-        if previous.get("stores", {}).get(name, current) != current:
-            raise ValueError(f"the table was begun with another store {name}: choose another name, or overwrite it")
-    return {
-        "stores": previous.get("stores", {}) | settings,
-        "command": [*previous.get("command", []), *command],
-        "measured_with": versions(),
-    }
-
-
-def _to_table(rows: Sequence[Row], provenance: dict[str, Any]) -> Table:
-    return Table(*map(np.array, zip(*rows, strict=True)), provenance=provenance)

@@ -13,7 +13,3 @@ from .posterior import Posterior as Posterior
 from .posterior import load_posterior as load_posterior
 from .posterior import save_posterior as save_posterior
 from .stationary import stationarity as stationarity
-from .table import Table as Table
-from .table import load_table as load_table
-from .table import save_table as save_table
-from .training import train_posterior as train_posterior

@@ -5,26 +5,26 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from calling import call, refused
 from exact import Gyroid, centres, profile
 from exact_store import exact_record, exact_store
+from scripts import example, refused
 
-from curvafit.data_synth import atlas as measuring
-from curvafit.data_synth.atlas import describe
 from curvafit.geometry.description import BLOCKS, descriptors
 from curvafit.inference import table as tables
-from curvafit.inference.table import VIEWS, Table, column_names, law_of, load_table, parameters_of, save_table
+from curvafit.inference.table import column_names, law_of, parameters_of
 from curvafit.priors import Coefficients, Grid, preset
 from curvafit.scan.measures import read_texture
 from curvafit.scan.preparation import WORKING_THICKNESS, prepare, thinner_thickness
 from curvafit.volumes.volume import ScanError
 
+script = example("train")
+VIEWS, describe, load_table, save_table = dict(script.VIEWS), script.describe, script.load_table, script.save_table
 FAST = ("field", "mask")
 
 
 def see(patch: pytest.MonkeyPatch, *names: str) -> None:
     """Let shapes be seen in some views alone."""
-    patch.setattr(measuring, "VIEWS", {name: VIEWS[name] for name in names})
+    patch.setattr(script, "VIEWS", {name: VIEWS[name] for name in names})
 
 
 def gyroid(n: int = 48) -> tuple[np.ndarray, Grid]:
@@ -64,8 +64,8 @@ def test_a_scan_is_blurred_and_noisy() -> None:
     seen = VIEWS["scan"](gyroid()[0], np.random.default_rng(1))
     quality = prepare(seen.scan, kind=seen.kind, one_scale=True).quality
     assert seen.scan.spacing == (2.0, 1.0, 1.0) and quality is not None
-    assert quality.blur == pytest.approx(tables.BLUR, abs=0.5)
-    assert quality.noise == pytest.approx(1 / tables.SNR, rel=0.05)
+    assert quality.blur == pytest.approx(script.BLUR, abs=0.5)
+    assert quality.noise == pytest.approx(1 / script.SNR, rel=0.05)
 
 
 def test_what_is_pooled_is_as_if_one_scan_had_shown_it() -> None:
@@ -110,10 +110,10 @@ def test_a_stopped_table_goes_on_and_grows(tmp_path: Path, monkeypatch: pytest.M
         measured.append(1)
         if len(measured) == 2:
             raise KeyboardInterrupt
-        return tables.see_field(u, rng)
+        return script.see_field(u, rng)
 
     with monkeypatch.context() as patch:
-        patch.setitem(measuring.VIEWS, "field", stops)
+        patch.setitem(script.VIEWS, "field", stops)
         with pytest.raises(KeyboardInterrupt):
             describe([store.path], tmp_path / "table.npz")
     assert len(load_table(tmp_path / "table.npz")) == 2
@@ -129,7 +129,7 @@ def test_a_stopped_table_goes_on_and_grows(tmp_path: Path, monkeypatch: pytest.M
 
 def test_a_view_without_a_surface_is_a_row_without_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     see(monkeypatch, "mask", "scan")
-    monkeypatch.setitem(measuring.VIEWS, "scan", Mock(side_effect=ScanError("expected a surface, got none")))
+    monkeypatch.setitem(script.VIEWS, "scan", Mock(side_effect=ScanError("expected a surface, got none")))
     table = describe([exact_store(tmp_path / "store", 2).path], tmp_path / "table.npz")
     assert table.visible.views.tolist() == ["mask", "mask"]
     assert np.isnan(table.descriptors[table.views == "scan"]).all()
@@ -151,9 +151,9 @@ def test_parameters_are_those_of_the_law_in_its_gauge() -> None:
             parameters_of(unbounded, mass)
 
 
-def small_table(rows: int = 3) -> Table:
+def small_table(rows: int = 3):
     rng, names = np.random.default_rng(0), np.array([f"s/{k:06d}" for k in range(rows)])
-    return Table(
+    return script.Table(
         names, np.array(["mask"] * rows), rng.random((rows, 6)), rng.uniform(4, 9, rows),
         rng.random((rows, sum(BLOCKS.values()))), rng.uniform(100, 900, rows), {},
     )  # fmt: skip
@@ -177,10 +177,11 @@ def test_damaged_tables_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     with pytest.raises(ValueError, match="blocks"):
         load_table(path)
     with pytest.raises(ValueError, match="shape"):
-        Table(np.array(["s/0"]), np.array(["mask"]), np.zeros((1, 6)), np.ones(1), np.zeros((1, 3)), np.ones(1), {})
+        empty = np.zeros((1, 6)), np.ones(1), np.zeros((1, 3)), np.ones(1)
+        script.Table(np.array(["s/0"]), np.array(["mask"]), *empty, {})
 
 
-def test_the_command_refuses_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_refuses_in_one_sentence(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     exact_store(tmp_path / "store", 1)
     np.savez(tmp_path / "mine.npz", a=1)
@@ -189,7 +190,7 @@ def test_the_command_refuses_in_one_sentence(tmp_path: Path, monkeypatch: pytest
         "nothing -o table.npz": "store", "store -o mine.npz": "mine.npz",
         "store store -o table.npz": "names",
     }.items():  # fmt: skip
-        refused(call("atlas", "describe", *words.split(), "--workers", 0), key, progress=True)
+        refused(script, key, capsys, "describe", *words.split())
         assert not (tmp_path / "table.npz").exists()
 
 

@@ -46,7 +46,6 @@ COMMANDS = {
     "atlas-build": "atlas build out --shape 16 --design near.yaml --steps 40 --count 2 --workers 0",
     "atlas-info": "atlas info store", "atlas-verify": "atlas verify store",
     "atlas-extract": "atlas extract store -o out.npz",
-    "atlas-describe": "atlas describe store -o out.npz --workers 0",
 }  # fmt: skip
 #: Rows that agree less closely. A flow from noise is chaotic: on another processor it grows another shape of the law,
 #: of which few numbers are alike. An emulator's optimum is flat along some directions.

@@ -6,17 +6,19 @@ from typing import cast
 import numpy as np
 import pytest
 from emulated import BOX, COLUMNS, HIDDEN, HIGH, LOW, NOISE, PLAIN, linear, reading, row, seen, told
+from scripts import example
 
 from curvafit.geometry.description import BLOCKS
 from curvafit.inference.candidates import Misfit
 from curvafit.inference.emulator import best_parameters, misfits
 from curvafit.inference.estimate import Described, measure_misfit, tail_probability
 from curvafit.inference.posterior import Combinations, Discriminant, Posterior
-from curvafit.inference.table import Table
-from curvafit.inference.training import PLANS, find_combinations, keep_laws, train_emulator
 from curvafit.scan.preparation import Prepared
 from curvafit.scan.quality import Quality
 
+training = example("train")
+PLANS, Table, find_combinations = training.PLANS, training.Table, training.find_combinations
+keep_laws, train_emulator = training.keep_laws, training.train_emulator
 DEVIATION = (HIGH - LOW) / np.sqrt(12)
 
 

@@ -5,17 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calling import call, done, refused
 from emulated import HIGH, LOW
+from scripts import example, refused, run
 
 import curvafit.inference.table as room
-import curvafit.inference.training as training
 from curvafit.geometry.description import BLOCKS
 from curvafit.inference.posterior import Architecture, Discriminant, Posterior, load_posterior, save_posterior
 from curvafit.inference.table import columns_of, mirror_parameters
-from curvafit.inference.training import PLANS, train_posterior
 from curvafit.scan.measures import Reading
 
+training = example("train")
+PLANS, train_posterior = training.PLANS, training.train_posterior
 SMALL = Architecture(components=4, hidden=(64,), transforms=1, dropout=0.0)
 NOISE = 0.2
 ONCE = (PLANS[0]._replace(epochs=1), PLANS[1]._replace(epochs=1))
@@ -23,7 +23,7 @@ ONCE = (PLANS[0]._replace(epochs=1), PLANS[1]._replace(epochs=1))
 TOLD = {0: 0, 100: 2}
 
 
-def table(shapes: int = 400, seed: int = 0) -> room.Table:
+def table(shapes: int = 400, seed: int = 0):
     """Two views of each shape. The mask's curvature block holds a11 and a10, in deviations, in the noise of a fifth of
     them; the crop's in noise of once their size. Of the others nothing is told."""
     rng = np.random.default_rng(seed)
@@ -38,10 +38,10 @@ def table(shapes: int = 400, seed: int = 0) -> room.Table:
     views = np.repeat(["mask", "crop"], shapes)
     thickness, amount = rng.uniform(5, 12, shapes), 10 ** rng.uniform(2, 4, shapes)
     columns = (np.tile(parameters, (2, 1)), np.tile(thickness, 2), descriptors, np.tile(amount, 2))
-    return room.Table(np.tile(names, 2), views, *columns, {})
+    return training.Table(np.tile(names, 2), views, *columns, {})
 
 
-def columns(rows: room.Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def columns(rows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return rows.descriptors, rows.views, rows.amount
 
 
@@ -159,7 +159,7 @@ def test_an_architecture_has_bounds(sizes: dict, word: str) -> None:
 
 def test_components_are_uncorrelated_and_the_first_are_the_largest() -> None:
     rows = np.random.default_rng(0).random((300, sum(BLOCKS.values()))) + 0.5
-    components = room.compression_of(rows, SMALL.components)(rows)
+    components = training.compression_of(rows, SMALL.components)(rows)
     variance = components.var(0)
     assert variance.mean() == pytest.approx(1, abs=0.02)
     assert (np.diff(variance) < 0).all()
@@ -182,24 +182,24 @@ def test_shapes_and_flows_that_do_not_do_are_refused() -> None:
 
 
 @pytest.mark.slow
-def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(training, "PLANS", ONCE)
     source, out = tmp_path / "table.npz", tmp_path / "posterior.npz"
-    room.save_table(table(130), source)
-    result = done("atlas", "train", source, "-o", out, "--views", "mask")
-    assert result.stdout.strip() == str(out)
+    training.save_table(table(130), source)
+    run(training, "train", source, "-o", out, "--views", "mask")
+    assert capsys.readouterr().out.strip() == str(out)
     assert load_posterior(out).views == ("mask",)
 
 
-def test_the_command_refuses_and_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_refuses_and_writes_nothing(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    room.save_table(table(5), "table.npz")
+    training.save_table(table(5), "table.npz")
     for words, said in {
         "nothing.npz -o posterior.npz --views mask": "nothing.npz", "table.npz -o posterior.pt --views mask": ".npz",
         "table.npz -o table.npz --views mask": "input", "table.npz -o posterior.npz --views ghost": "ghost",
         "table.npz -o posterior.npz --views mask": "shapes",
     }.items():  # fmt: skip
-        refused(call("atlas", "train", *words.split()), said, progress=True)
+        refused(training, said, capsys, "train", *words.split())
         assert [path.name for path in tmp_path.iterdir()] == ["table.npz"]
 
 
