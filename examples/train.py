@@ -330,7 +330,8 @@ def see_mask(u: np.ndarray, rng: np.random.Generator) -> Scanned:
 def see_scan(
     u: np.ndarray, rng: np.random.Generator, blur: float = BLUR, thick: int = SLICE, snr: float = SNR
 ) -> Scanned:
-    """Return {u > 0}, cut open at random, scanned badly: blurred, slices two voxels thick, noise at SNR 5."""
+    """Return {u > 0}, cut open at random, as a bad scan: `blur` in voxels, slices so many voxels `thick`, and noise of
+    contrast / `snr`."""
     grey = ndimage.gaussian_filter(_open(u, rng).astype(np.float32), blur, mode="nearest")
     padded = np.pad(grey, ((0, -len(grey) % thick), (0, 0), (0, 0)), mode="edge")
     grey = padded.reshape(-1, thick, *grey.shape[1:]).mean(1)

@@ -224,11 +224,12 @@ def _grow(
     total = max(1, len(laws) + growth.twins - 1)
     grow([(name, 0) for name in laws])
     for number, law in enumerate(estimate.others, 2):
-        if laws[law.name].distance is None:
-            middle, twins[law.name] = laws[law.name], ()
-            laws[law.name] = replace(law, status=f"Nothing grew from the middle: this is draw {number} from there.")
-            grow([(law.name, 0)])
-            laws[law.name] = middle if laws[law.name].distance is None else laws[law.name]
+        if (middle := laws[law.name]).distance is not None:
+            break
+        twins[law.name] = ()
+        laws[law.name] = replace(law, status=f"Nothing grew from the middle: this is draw {number} from there.")
+        grow([(law.name, 0)])
+        laws[law.name] = middle if laws[law.name].distance is None else laws[law.name]
     for _ in range(2):  # the second time, further twins may have made another law the best
         best = best_candidate(tuple(laws.values()))
         if best is not None:
