@@ -66,6 +66,7 @@ def parse_page(
     "curvafit measure femur.nii.gz --roi compartments.nii.gz -o femur.csv",
     "curvafit measure mitochondria_labels.tif --labels --spacing 5 --unit nm -o mitochondria.csv",
     "curvafit measure lung_2048.ome.zarr --workers 2 -o lung.csv",
+    "curvafit measure cell.stl --spacing 0.1 --unit um",
     "curvafit measure bone.tif --maps -o bone",
     "curvafit measure vessels.tif --graph --spacing 0.002 --unit mm -o vessels",
     "curvafit measure bone.tif --windows 64 --stride 32 -o maps",

@@ -103,7 +103,7 @@ def add_commands(app: typer.Typer, *functions: Callable[..., None]) -> None:
 _read = partial(typer.Option, rich_help_panel="How to read the file")
 _work = partial(typer.Option, rich_help_panel="How to work")
 
-FILES = "NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr …"
+FILES = "NIfTI, TIFF (or folder of slices), NPY, NPZ, HDF5 (file.h5::key), RAW, Zarr, STL …"
 Input = Annotated[str, typer.Argument(help=FILES)]
 
 

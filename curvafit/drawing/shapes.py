@@ -122,15 +122,15 @@ def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | No
     values, spacing = field.numpy(), (output.voxel, output.voxel, output.voxel)
     if not target.name.lower().endswith(SUFFIXES):
         return save(Volume(values, spacing, output.unit), target, kind=FORMAT.name)
-    mesh = solid_surface(values, Grid(values.shape, spacing, grid.boundary))
-    data = None
+    box, data = Grid(grid.shape, spacing, grid.boundary), None
+    mesh = solid_surface(values, box)
     if target.suffix.lower() == ".ply":
-        data = _vertex_curvatures(mesh, field, Grid(grid.shape, spacing, grid.boundary))
+        data = _vertex_curvatures(mesh, field, box)
         middle = (np.array(values.shape) - 1) / 2
         offsets = np.abs(mesh.vertices / np.array(spacing) - middle)
         capped = np.any(offsets > middle + 0.5 - 1e-6, axis=1)  # faces are half a voxel beyond the outermost centres
         data = {name: np.where(capped, 0, κ) for name, κ in data.items()}
-    return write_surface(mesh, target, unit=output.unit, data=data)
+    return write_surface(mesh, target, unit=output.unit, data=data, grid=box)
 
 
 def shape_record(

@@ -193,10 +193,13 @@ def _weld(mesh: Surface) -> Surface:
     return Surface(vertices, faces[(a != b) & (b != c) & (c != a)])
 
 
-def write_surface(mesh: Surface, path: str | Path, *, unit: str = "voxel", data: Data | None = None) -> Path:
+def write_surface(
+    mesh: Surface, path: str | Path, *, unit: str = "voxel", data: Data | None = None, grid: Grid | None = None
+) -> Path:
     """Write a binary STL or PLY file by suffix; whole or not at all.
 
-    The unit of the lengths is written as a remark: neither format has a field for it. `data` is numbers `(V,)` at the
+    The unit of the lengths is written as a remark, and the `grid`, if its voxels are cubes, in whose box the surface is
+    capped: neither format has a field for them, and `volumes.load` reads the remark. `data` is numbers `(V,)` at the
     vertices by name, for PLY; STL cannot hold them. Another suffix or shape is a ValueError.
     """
     path = Path(path)
@@ -207,7 +210,9 @@ def write_surface(mesh: Surface, path: str | Path, *, unit: str = "voxel", data:
         if np.shape(values) != (len(mesh.vertices),):
             raise ValueError(f"expected {name} of shape ({len(mesh.vertices)},), got {np.shape(values)}")
     encode = {".stl": _stl, ".ply": _ply}[suffix]
-    return write_content(path, encode(mesh, f"curvafit surface, lengths in {unit}", data or {}))
+    cubes = grid is not None and len(set(grid.spacing)) == 1
+    box = f", {' x '.join(map(str, grid.shape))} voxels of {grid.spacing[0]:.9g}" if cubes else ""
+    return write_content(path, encode(mesh, f"curvafit surface, lengths in {unit}{box}", data or {}))
 
 
 def _stl(mesh: Surface, remark: str, _: Data) -> bytes:

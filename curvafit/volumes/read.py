@@ -23,13 +23,13 @@ from curvafit.core.records import read_archive
 from curvafit.core.runtime import one_line
 from curvafit.core.units import common_unit, convert_length, format_length, is_unit, parse_unit
 from curvafit.priors.coefficients import NAMES
-from curvafit.volumes.formats import arrays, base, dicom, headers, nifti, tiff, zarr
+from curvafit.volumes.formats import arrays, base, dicom, headers, meshes, nifti, tiff, zarr
 from curvafit.volumes.formats.base import ScanError, Stated
 from curvafit.volumes.volume import Crop, StoredArray, Volume, check_finite, parse_box, positive_triple
 
 #: A volume as a caller gives it.
 Source = str | os.PathLike[str] | Volume | np.ndarray | torch.Tensor
-#: Suffix -> reader(path, key=, raw_shape=, dtype=).
+#: Suffix -> reader(path, key=, raw_shape=, dtype=, spacing=, unit=).
 READERS: dict[str, Callable[..., Stated]] = {
     **dict.fromkeys((".nii", ".nii.gz"), nifti.read_nifti),
     **dict.fromkeys((".tif", ".tiff"), tiff.read_tiff),
@@ -46,6 +46,7 @@ READERS: dict[str, Callable[..., Stated]] = {
     **dict.fromkeys(arrays.MICROSCOPES, arrays.read_microscope),
     ".isq": headers.read_isq,
     ".aim": headers.read_aim,
+    **dict.fromkeys(meshes.SUFFIXES, meshes.read_mesh),
 }
 #: Largest cosine of the angle between axes that count as orthogonal: a shear of 2 % turns normals by a degree.
 RIGHT = 0.02
@@ -81,14 +82,14 @@ def load(
     ----------
     source
         A path; a `Volume`, which has its own spacing and unit; or an array or tensor (Z, Y, X). Files are NIfTI, TIFF,
-        NPY, NPZ, HDF5, Imaris, RAW, Zarr, Scanco's ISQ and AIM; with `curvafit[io]` also NRRD, MHA/MHD, MRC and DICOM;
-        with `curvafit[microscopes]` CZI, LIF and ND2; with `curvafit[remote]` the URL (https, s3) of a Zarr store.
-        Folders hold slices as TIFF, BMP, PNG, JPEG or DICOM. `file.h5::key` names an array within a file; `key` does
-        the same.
+        NPY, NPZ, HDF5, Imaris, RAW, Zarr, Scanco's ISQ and AIM; with `curvafit[io]` also NRRD, MHA/MHD, MRC and DICOM,
+        and closed meshes (STL, PLY, OBJ, OFF) as masks of their inside; with `curvafit[microscopes]` CZI, LIF and ND2;
+        with `curvafit[remote]` the URL (https, s3) of a Zarr store. Folders hold slices as TIFF, BMP, PNG, JPEG or
+        DICOM. `file.h5::key` names an array within a file; `key` does the same.
     spacing, unit
         Voxel edges (z, y, x), or one for all, and nm, um, mm or m, in place of what the file says; for an array the
-        default is one voxel. A `unit` alone converts the lengths of a file that names their unit, and names that of
-        others.
+        default is one voxel, for a mesh 1/128 of its longest side. A `unit` alone converts the lengths of a file that
+        names their unit, and names that of others.
     channel, time
         The channel and the time to read, counted from 0, from a file of several. Colours and components of vectors are
         channels, and so are times in a file without channels.
@@ -138,7 +139,7 @@ def _open(
     """Return the volume of a file, whose values are read only when they are used, if the format allows it."""
     location, key = split_key(path, key)
     reading = {"key": key, "raw_shape": raw_shape, "dtype": dtype}
-    stated = read_file(location, **reading)  # type: ignore[arg-type]
+    stated = read_file(location, **reading, spacing=options["spacing"], unit=options["unit"])  # type: ignore[arg-type]
     if strict and stated.gaps:
         raise ScanError(f"{location} is not whole: {stated.gaps[0]}")
     if not isinstance(stated.array, np.ndarray) or isinstance(stated.array, np.memmap):
@@ -175,9 +176,16 @@ class FileArray:
 
 
 def read_file(
-    path: Path | str, key: str | None = None, raw_shape: Sequence[int] | None = None, dtype: str | None = None
+    path: Path | str,
+    key: str | None = None,
+    raw_shape: Sequence[int] | None = None,
+    dtype: str | None = None,
+    **sampling: Any,
 ) -> Stated:
-    """Return what a file, a folder, or a store at a URL states; errors of the reading library become a ScanError."""
+    """Return what a file, a folder, or a store at a URL states; errors of the reading library become a ScanError.
+
+    `sampling` are the caller's spacing and unit, at which a mesh is made a volume.
+    """
     if isinstance(path, str):
         with _name_damage(path):
             return zarr.read_remote(path, key)
@@ -189,7 +197,7 @@ def read_file(
             f"a key applies to NPZ, HDF5, Imaris, Zarr, DICOM, CZI, LIF and ND2 only, got {quoted(key)} for {path}"
         )
     with _name_damage(path):
-        return reader(path, key=key, raw_shape=raw_shape, dtype=dtype)
+        return reader(path, key=key, raw_shape=raw_shape, dtype=dtype, **sampling)
 
 
 @contextmanager
