@@ -343,9 +343,10 @@ def measure_maps(
             curved, diagram = measure_curvatures(prepared)
             of_curvature, lost = prepared.notes, ()
         except ValueError as reason:
-            if isinstance(reason, preparation.TooLarge) or min(field.shape) >= FEWEST_SLICES:
+            thin = isinstance(reason, preparation.Unresolved)
+            if isinstance(reason, preparation.TooLarge) or (min(field.shape) >= FEWEST_SLICES and not thin):
                 raise
-            of_curvature, (curved, diagram, lost) = (), no_curvature(field.unit, TOO_THIN)
+            of_curvature, (curved, diagram, lost) = (), no_curvature(field.unit, reason if thin else TOO_THIN)
         (mask, *voxels), notes = others.result() if others else measure()
     notes = (*notes, *(f"Of curvature: {note}" for note in of_curvature if note not in notes), *lost)
     return Maps(field.spacing, mask, *voxels, curved, diagram, detected, notes)  # type: ignore[call-arg]

@@ -24,8 +24,12 @@ from curvafit.volumes.volume import Box, Crop, ScanError, Volume
 #: measured, and where a law is read.
 WORKING_THICKNESS = 8.0
 KEPT, KEPT_FOR_LAWS = (5.0, 16.0), (7.84, 8.16)
-#: A structure is refused when it is nowhere thicker than this many scan voxels.
+#: A structure has no curvature when it is nowhere thicker than this many scan voxels, and why it has not.
 THINNEST = 3.0
+STAIRS = (
+    "curvature is smoothed over a quarter of the thickness, here less than a voxel, so that it is that of the voxels' "
+    "stairs; fill the body that a membrane encloses, thicken an open sheet to 6 voxels, or scan finer"
+)
 #: Longest sides: of a window and of the whole working grid, in working voxels; of what is read, in scan voxels.
 LARGEST_WINDOW = 128
 LARGEST_BOX = 256
@@ -49,6 +53,10 @@ NOISE = "No law: the scan is noise, its voxels have nothing to do with those a f
 
 class TooLarge(ScanError):
     """A scan whose working grid is larger than the caller allows."""
+
+
+class Unresolved(ScanError):
+    """A structure that is too thin for its voxels to show its curvature."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,13 +327,14 @@ def note_on_filling(share: float) -> tuple[str, ...]:
 def judge_thickness(
     name: str, median: float, thick: float, spacing: tuple[float, float, float], keeps_grid: bool
 ) -> str:
-    """Return a note on a phase's median thickness; raise ScanError where its 95th percentile, `thick`, is too thin."""
+    """Return a note on a phase's median thickness; raise Unresolved where its 95th percentile, `thick`, is too thin."""
     voxel = math.prod(spacing) ** (1 / 3)
     thin = thick < (THINNEST - 0.5) * voxel  # balls on the grid understate thin tubes
     if thin and not keeps_grid:
-        raise ScanError(f"expected a {name} at least {THINNEST:g} voxels thick, got one thinner nearly everywhere")
+        fault = "got one thinner nearly everywhere, whose smoothed surface may have holes"
+        raise Unresolved(f"expected a {name} at least {THINNEST:g} voxels thick, {fault}: {STAIRS}")
     if median < THINNEST * voxel:
-        return f"Half of the {name} is thinner than {median / voxel:.2g} scan voxels: its curvature is uncertain."
+        return f"Half of the {name} is thinner than {median / voxel:.2g} scan voxels: {STAIRS}."
     return f"Median thickness of the {name} {median / voxel:.3g} scan voxels."
 
 

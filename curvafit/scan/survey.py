@@ -31,8 +31,9 @@ class Plan:
     `smallest` is the fewest voxels of a piece of an image's structure that is no speck, 0 where all pieces count;
     `scale` is the edges of a working voxel in the volume's voxels, `edge` its edge in the volume's unit, and `working`
     the number of working voxels along (z, y, x); `reach` is the radius of the largest ball where the thickness was
-    measured. Tiles have `cores`; balls of structure and background are painted on grids coarser by `factors`. With
-    `maps`, structure and thickness are kept at each voxel.
+    measured; `unresolved` says why a structure too thin for curvature has none. Tiles have `cores`; balls of structure
+    and background are painted on grids coarser by `factors`. With `maps`, structure and thickness are kept at each
+    voxel.
     """
 
     structure: Structure
@@ -45,6 +46,7 @@ class Plan:
     edge: float = 1.0
     reach: float = 0.0
     working_notes: tuple[str, ...] = ()
+    unresolved: str = ""
     cores: tuple[Box, ...] = ()
     factors: tuple[int, int] = (1, 1)
     maps: bool = False
@@ -84,7 +86,10 @@ def survey(structure: Structure, run: Run) -> Plan:
         median, thick, plan = _measure_thickness(plan, box, False)
     # the working grid, as `preparation.prepare` chooses it
     keeps_grid, name = structure.kind == "field" or noise, "structure" if structure_is_thinner else "background"
-    note = preparation.judge_thickness(name, median, thick, volume.spacing, keeps_grid)
+    try:
+        note = preparation.judge_thickness(name, median, thick, volume.spacing, keeps_grid)
+    except preparation.Unresolved as reason:
+        return replace(plan, thickness=median, unresolved=str(reason))
     scale, why = preparation.choose_scale(volume.shape, volume.spacing, median, keeps_grid)
     working = preparation.count_voxels(volume.shape, scale) if min(volume.shape) > 3 else (0, 0, 0)  # no curvature
     edge = preparation.working_edge(scale, volume.spacing)

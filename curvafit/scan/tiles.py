@@ -78,11 +78,11 @@ def measure(
     Volume fraction, thickness, spacing, connectivity, surface and fabric are those of the structure on the scan's own
     voxels, all of them. Curvature is that of the scan on the working grid, as `infer` reads it. Intervals are 95 %, by
     a jackknife over blocks of a period (thickness and spacing) of the structure (`errors`); a scan with fewer than
-    eight has none. A stack of under ten slices may have no curvature (NaN, and a note). A scan with a side of more than
-    `LARGEST_BOX` voxels is measured in tiles, which have the numbers of the scan in one piece; of Zarr, HDF5, NPY, RAW
-    and uncompressed NIfTI no more than a tile is in memory. Raises ValueError if the scan has no structure, or none
-    that the voxels resolve, a region does not fit it or it repeats, or a large scan repeats and does not fit into
-    memory; or as `curvafit.load`, and FileNotFoundError if there is no such file.
+    eight has none. A stack of under ten slices may have no curvature (NaN, and a note), a structure that is nowhere 3
+    voxels thick has none. A scan with a side of more than `LARGEST_BOX` voxels is measured in tiles, which have the
+    numbers of the scan in one piece; of Zarr, HDF5, NPY, RAW and uncompressed NIfTI no more than a tile is in memory.
+    Raises ValueError if the scan has no structure, a region does not fit it or it repeats, or a large scan repeats and
+    does not fit into memory; or as `curvafit.load`, and FileNotFoundError if there is no such file.
 
     Parameters
     ----------
@@ -544,13 +544,14 @@ def _summarise(plan: Plan, records: Sequence[Record], wide_records: Sequence[Rec
     if not 0 < total["inside"] < total["volume"]:
         raise ScanError("expected a structure and background in the scan, got one of them only")
     has_curvature = total["curved"] > 0
-    if not has_curvature and min(volume.shape) >= whole.FEWEST_SLICES:
+    reason = plan.unresolved or (whole.TOO_THIN if min(volume.shape) < whole.FEWEST_SLICES else "")
+    if not has_curvature and not reason:
         raise ScanError("expected a surface between structure and background, got none on the working grid")
     period = total["thickness"] / total["inside"] + total["gap"] / (total["volume"] - total["inside"])
     blocks = Blocks.divide(volume.shape, volume.spacing, period)
     χ = float(sum(record["euler"] for record in records))
     density = connectivity_density(χ, volume.shape, volume.spacing, periodic=False)
-    _, empty, why = whole.no_curvature(volume.unit, whole.TOO_THIN)
+    _, empty, why = whole.no_curvature(volume.unit, reason)
     notes = (*_notes(plan, records), *(() if has_curvature else why), *([tiles_note] if len(plan.cores) > 1 else []))
 
     def summarise(part: str, label: int | None = None) -> Measures:

@@ -340,9 +340,7 @@ def measure_scans(
     measured |= _share_out(tasks, [case.name for case in cases], workers, sub_progress(progress, 0.05, 1.0))
     measures: list[Measures] = [measured[k][0] for k in range(len(cases))]
     if flat := [case.name for case, scan in zip(cases, measures, strict=True) if not scan.diagram.area > 0]:
-        raise ValueError(
-            f"{flat[0]}: expected a scan with curvature, got a stack too thin for it: measure has its numbers"
-        )
+        raise ValueError(f"{flat[0]}: expected a scan with curvature, got one too thin for it: measure has its numbers")
     units = {scan.unit for scan in measures}
     measures = to_one_unit(measures, reading.get("unit"))
     unit = measures[0].unit

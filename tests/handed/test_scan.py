@@ -15,6 +15,7 @@ from scipy import ndimage
 import curvafit
 from curvafit.core.runtime import log_stages
 from curvafit.scan.measures import measure_surface
+from curvafit.scan.preparation import prepare
 from curvafit.studies.scans import format_csv
 from curvafit.volumes.volume import Volume
 
@@ -112,6 +113,38 @@ def test_a_thin_stack() -> None:
         with pytest.raises(ValueError, match="too thin"):
             curvafit.compare([found, found], [found, found])
         assert tiled["BS/TV"].value == pytest.approx(found["BS/TV"].value, rel=1e-6)
+
+
+def sheet(thickness: float, radius: float = 20.0) -> np.ndarray:
+    """An open sheet: the upper half of a shell, about its middle."""
+    z, y, x = np.indices((34, 64, 64)) - np.array([33.5, 31.5, 31.5])[:, None, None, None]
+    return np.abs(np.sqrt(z**2 + y**2 + x**2) - radius) < thickness / 2
+
+
+def test_a_membrane_of_one_voxel_says_why_it_has_no_curvature() -> None:
+    one, two, six = (curvafit.measure(sheet(thickness), spacing=1.0, unit="nm") for thickness in (1, 2, 6))
+    assert [any("stairs" in note for note in found.notes) for found in (one, two, six)] == [True, True, False]
+    assert np.isnan([one[symbol].value for symbol in ("H", "K", "share of tubes")]).all()
+    area = 2 * 2 * np.pi * 20**2 / (34 * 64 * 64)  # of both sides; smoothing tears holes into a single voxel
+    assert two["BS/TV"].value == pytest.approx(area, rel=0.1) and 0 < one["BS/TV"].value < 0.8 * area
+    tiled = curvafit.measure(sheet(1), spacing=1.0, unit="nm", tile=32)
+    assert next(note for note in one.notes if "stairs" in note) in tiled.notes
+    for symbol in ("BV/TV", "Tb.Th", "BS/TV", "χ"):
+        assert tiled[symbol].value == pytest.approx(one[symbol].value, rel=1e-5)
+    with pytest.raises(ValueError, match="stairs"):
+        prepare(Volume(sheet(1)))
+    with pytest.raises(ValueError, match="too thin"):
+        curvafit.compare([one, one], [one, one])
+
+
+def test_a_membrane_that_is_thickened_has_its_own_curvature() -> None:
+    """Within a fifth, where that of two voxels is several times too large: both sides count, without the rim."""
+    whole, thick = sheet(1), ndimage.distance_transform_edt(~sheet(1)) <= 3
+    inner = np.broadcast_to((np.arange(34) < 24)[:, None, None], whole.shape).astype(np.uint8)
+    found, raw = curvafit.measure(thick, roi=inner), curvafit.measure(sheet(2), roi=inner)
+    assert found["C"].value == pytest.approx(1 / 20, rel=0.2) and raw["C"].value > 3 / 20
+    assert found["K"].value == pytest.approx(1 / 20**2, rel=0.2)
+    assert abs(found["H"].value) < 0.4 / 20 and not any("stairs" in note for note in found.notes)
 
 
 def test_an_empty_mask() -> None:
