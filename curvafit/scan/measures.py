@@ -509,10 +509,11 @@ class Reading(NamedTuple):
 
 
 def read_texture(prepared: Prepared) -> Reading | None:
-    """Measure a scan's descriptors in windows of one size that fill its grid, or in the largest cube within its region
-    of interest. Return None where that cube is smaller than `SMALLEST_CUBE` voxels, or no window has a surface.
-    """
-    view, across = _kind_of_view(prepared), _windows_along(prepared)
+    """Measure a scan's descriptors in windows of one size, of `READ` voxels or more, that fill its grid; in a single
+    one of a scan that repeats, and in the largest cube within a region of interest. Return None where that cube is
+    smaller than `SMALLEST_CUBE` voxels, or no window has a surface."""
+    view, single = _kind_of_view(prepared), prepared.grid.periodic or prepared.roi is not None
+    across = [1 if single else max(n // READ, 1) for n in prepared.grid.shape]
     edges = [n // count for n, count in zip(prepared.grid.shape, across, strict=True)]
     windows = cut_boxes([edge * count for edge, count in zip(edges, across, strict=True)], edges)
     if prepared.roi is not None:
@@ -524,13 +525,6 @@ def read_texture(prepared: Prepared) -> Reading | None:
             rows.append(descriptors(np.ascontiguousarray(values[window]), prepared.part(window)).vector())
             size = values[window].size
     return Reading(np.array(rows), view, len(rows) * size / prepared.thickness**3) if rows else None
-
-
-def _windows_along(prepared: Prepared) -> list[int]:
-    """Return the number of windows, of `READ` voxels or more, along each axis of a scan's working grid; it is 1 where
-    the scan repeats or has a region of interest."""
-    single = prepared.grid.periodic or prepared.roi is not None
-    return [1 if single else max(n // READ, 1) for n in prepared.grid.shape]
 
 
 def _kind_of_view(prepared: Prepared) -> str:

@@ -36,25 +36,16 @@ def read_mesh(
     Voxels have the edges `spacing`, or else those that a surface of `generate` states, or there are `DIVISIONS` along
     the longest side. No other mesh states a unit.
     """
-    trimesh = require("trimesh", "io", "reading meshes")
-    try:
-        triangles = trimesh.load_mesh(path, process=False, skip_materials=True).triangles
-    except ImportError as reason:  # of a package that guesses at the encoding of what is no UTF-8
-        raise base.Damaged("it is neither text nor binary as its header says") from reason
-    triangles = np.asarray(triangles, np.float64)[..., ::-1]
-    if not triangles.size or not 0 < np.ptp(triangles) < math.inf:
-        raise base.Damaged("it has no triangles, or corners that are no numbers")
+    triangles = _read_triangles(path)
     turned = _check_closed(triangles, path)
     with path.open("rb") as file:
         remark = file.read(_REMARKS).decode("latin-1")
     own = _OWN.search(remark)
     named = None if own is None else own[1]
-    box, edge, note = _choose_box(triangles, own)
-    edges = np.full(3, edge) if spacing is None else _convert_edges(spacing, unit, named)
-    counted = spacing is None and unit is None and named is None  # in voxels, as in all files without a unit
-    notes = (note,) if note else ()
-    if note and spacing is None:
-        notes += (f"A voxel is {edge:g} of the mesh's lengths, 1/{DIVISIONS} of its longest side: --spacing sets it.",)
+    box, edge, notes = _choose_box(triangles, own)
+    edges, counted = np.full(3, edge), unit is None and named is None  # in voxels, as in all files without a unit
+    if spacing is not None:
+        edges, counted, notes = _convert_edges(spacing, unit, named), False, notes[:1]
     if not turned:
         notes += ("Its triangles face both ways: a voxel is inside where an odd number of them lie to one side of it.",)
     mask, first = _fill(triangles, box, edges, turned, path)
@@ -62,6 +53,18 @@ def read_mesh(
     affine[:3] /= edge if counted else 1.0
     affine = LPS_TO_RAS @ affine if _SLICER in remark else affine
     return Stated(mask, "zyx", None if counted else edges.tolist(), (named,) * 3, None, affine, notes=notes)
+
+
+def _read_triangles(path: Path) -> np.ndarray:
+    """Return the corners (F, 3, 3) of a mesh's triangles, each z, y, x, one copy for each triangle."""
+    trimesh = require("trimesh", "io", "reading meshes")
+    try:
+        triangles = trimesh.load_mesh(path, process=False, skip_materials=True).triangles
+    except ImportError as reason:  # of a package that guesses at the encoding of what is no UTF-8
+        raise base.Damaged("it is neither text nor binary as its header says") from reason
+    if not triangles.size or not 0 < np.ptp(triangles) < math.inf:
+        raise base.Damaged("it has no triangles, or corners that are no numbers")
+    return np.asarray(triangles, np.float64)[..., ::-1]
 
 
 def _check_closed(triangles: np.ndarray, path: Path) -> bool:
@@ -80,8 +83,8 @@ def _check_closed(triangles: np.ndarray, path: Path) -> bool:
     return not np.bincount(index, way).any()
 
 
-def _choose_box(triangles: np.ndarray, own: re.Match[str] | None) -> tuple[np.ndarray, float, str]:
-    """Return the box (2, 3) of a mesh's volume, the edge of its voxels where none is given, and a note.
+def _choose_box(triangles: np.ndarray, own: re.Match[str] | None) -> tuple[np.ndarray, float, tuple[str, ...]]:
+    """Return the box (2, 3) of a mesh's volume, and the edge of its voxels where none is given; and a note on each.
 
     A surface of `generate` states both: its caps lie in the faces of the box, and are no surface there.
     """
@@ -90,10 +93,12 @@ def _choose_box(triangles: np.ndarray, own: re.Match[str] | None) -> tuple[np.nd
         edge = float(own[5])
         box = edge * (np.array([[0, 0, 0], own.groups()[1:4]], np.float64) - 0.5)
         if np.abs(np.clip(ends, *box) - ends).max() < edge / 100:
-            return box, edge, ""
+            return box, edge, ()
     side = float(np.ptp(ends, axis=0).max())
+    edge = float(f"{side / DIVISIONS:.3g}")
     note = f"A mesh: its inside is the structure, and BV/TV that of a box {AROUND:g} of its longest side around it."
-    return ends + AROUND * side * np.array([[-1], [1]]), float(f"{side / DIVISIONS:.3g}"), note
+    size = f"A voxel is {edge:g} of the mesh's lengths, 1/{DIVISIONS} of its longest side: --spacing sets it."
+    return ends + AROUND * side * np.array([[-1], [1]]), edge, (note, size)
 
 
 def _convert_edges(spacing: Sequence[float] | float, unit: str | None, named: str | None) -> np.ndarray:
