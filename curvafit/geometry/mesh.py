@@ -210,9 +210,10 @@ def write_surface(
         if np.shape(values) != (len(mesh.vertices),):
             raise ValueError(f"expected {name} of shape ({len(mesh.vertices)},), got {np.shape(values)}")
     encode = {".stl": _stl, ".ply": _ply}[suffix]
-    cubes = grid is not None and len(set(grid.spacing)) == 1
-    box = f", {' x '.join(map(str, grid.shape))} voxels of {grid.spacing[0]:.9g}" if cubes else ""
-    return write_content(path, encode(mesh, f"curvafit surface, lengths in {unit}{box}", data or {}))
+    remark = f"curvafit surface, lengths in {unit}"
+    if grid is not None and len(set(grid.spacing)) == 1:
+        remark += f", {' x '.join(map(str, grid.shape))} voxels of {grid.spacing[0]:.9g}"
+    return write_content(path, encode(mesh, remark, data or {}))
 
 
 def _stl(mesh: Surface, remark: str, _: Data) -> bytes:
