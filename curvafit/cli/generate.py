@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from curvafit.generation.result import Flow
     from curvafit.priors.law import Law
+    from curvafit.volumes.volume import Volume
 
     #: Parameters that vary in space, by name; see `volumes.read_maps`.
     Maps3D = dict[str, float | Tensor]
@@ -32,16 +33,24 @@ _out = partial(typer.Option, rich_help_panel="What to write")
 def parse_law(
     preset: Annotated[str | None, _what(help="A published shape; see `curvafit presets`.")] = None,
     coefficients: Annotated[str | None, _what(help="a20,a11,a02,a10,a01,a00 in working units; needs a mass.")] = None,
+    helfrich: Annotated[str | None, _what(help="Bending energy κ,κ_G,C0 (or κ,κ_G or κ); needs a mass.")] = None,
     prior: Annotated[str | None, _what(help="fit.json of `curvafit infer`, or a preset's name.")] = None,
+    start: Annotated[
+        str | None, _what(help="Mask or phase field to begin from, with its mass, not from noise.")
+    ] = None,
+    free_mass: Annotated[bool, _what("--free-mass", help="With --start: let the volume change (L-BFGS).")] = False,
     mass: Annotated[float | None, _what(help="Mean of the field, in (-1, 1).")] = None,
     volume_fraction: Annotated[float | None, _what(help="Share of the volume inside, instead of a mass.")] = None,
     orientation: Annotated[str | None, _what(help="θz,θy,θx,μ: tubes and layers lie along θ if μ is large.")] = None,
-    maps: Annotated[Path | None, _what(help="An .npz of volumes a20 … a00 and mass that vary.")] = None,
+    maps: Annotated[Path | None, _what(help="An .npz of volumes a20 … a00, mass, theta_z … theta_x, mu.")] = None,
     epsilon: Annotated[float | None, _what(help="Interface width in working units; by default 0.02.")] = None,
 ) -> dict[str, Any]:
     """Return the options that determine which shape is grown, by name."""
-    law = {"preset": preset, "coefficients": coefficients, "prior": prior, "mass": mass, "epsilon": epsilon}
-    return law | {"volume_fraction": volume_fraction, "orientation": orientation, "maps": maps}
+    if free_mass and start is None:
+        raise ValueError("--free-mass needs --start")
+    law = {"preset": preset, "coefficients": coefficients, "helfrich": helfrich, "prior": prior, "epsilon": epsilon}
+    law |= {"mass": mass, "volume_fraction": volume_fraction, "orientation": orientation, "maps": maps}
+    return law | {"start": start, "free_mass": free_mass}
 
 
 def parse_run(
@@ -78,6 +87,7 @@ def parse_output(
     "curvafit generate --preset sponge --volume-fraction 0.3 --shape 64 -o sponge.zarr",
     "curvafit generate --prior bone/fit.json --shape 128 --seed 3 -o more_bone.tif",
     "curvafit generate --preset tubes --shape 300 --checkpoint run.pt -o large.nii.gz",
+    "curvafit generate --helfrich 2,0,40 --start rod.nii.gz -o beads.nii.gz",
 )
 def generate(
     out: Annotated[
@@ -86,7 +96,7 @@ def generate(
     wanted: Annotated[dict[str, Any], Group(parse_law)],
     shape: Annotated[str | None, _what(help=f"Voxels: N or Z,Y,X; {EDGE} or the maps' by default.")] = None,
     boundary: Annotated[str, _what(help="periodic, or replicate (walls, met at right angles).")] = "periodic",
-    seed: Annotated[int, _what(help="Seed of the noise that the shape grows from.")] = 0,
+    seed: Annotated[int | None, _what(help="Seed of the noise that the shape grows from; by default 0.")] = None,
     *,
     running: Annotated[dict[str, Any], Group(parse_run)],
     writing: Annotated[dict[str, Any], Group(parse_output)],
@@ -96,27 +106,31 @@ def generate(
     """Make a shape from parameters, with a record (.json) and a picture (.png) beside it."""
     from curvafit.drawing.shapes import Output, check_target, shape_record
     from curvafit.generation.flow import Execution
-    from curvafit.generation.schedule import choose_schedule
-    from curvafit.generation.schedule import schedule as make_schedule
     from curvafit.priors.grid import Grid
     from curvafit.volumes.read import map_shape, read_maps
 
     size = None if shape is None else parse_whole_triple(shape, "--shape")
+    start = None if wanted["start"] is None else _read_start(wanted, running, writing, {"shape": shape, "seed": seed})
+    size = size if start is None else start.shape
     maps = {} if wanted["maps"] is None else read_maps(wanted["maps"], size)
-    law = _read_law(wanted["preset"], wanted["coefficients"], wanted["prior"], maps)
-    options = _choose_parameters(law, maps, wanted)
+    law = _read_law(wanted, maps)
+    options = _choose_parameters(law, maps, wanted) | {"seed": seed or 0}
     options["grid"] = Grid(size or map_shape(maps) or EDGE, boundary=boundary)  # type: ignore[arg-type]
-    options["schedule"] = make_schedule(choose_schedule([law], running.pop("schedule")), running.pop("steps"))
+    plan = {"schedule": running.pop("schedule"), "steps": running.pop("steps")}
     running["checkpoint"] = checkpoint = _locate_checkpoint(running["checkpoint"], out)
-    options |= {"seed": seed, "execution": Execution(keep_checkpoint=True, **running)}
+    options["execution"] = Execution(keep_checkpoint=True, **running)
     output = Output(writing["edge"] or law.working_voxel or 1.0, writing["unit"] or law.length_unit or "voxel")
+    output = output if start is None else Output(start.spacing[0], start.unit, start.affine)
     law_file = None if not law.fitted else wanted["prior"] or wanted["preset"]
-    inputs = [str(path) for path in (law_file, wanted["maps"]) if path is not None]
+    inputs = [str(path) for path in (law_file, wanted["maps"], wanted["start"]) if path is not None]
     check_target(out, output, inputs=inputs, picture=picture, overwrite=overwrite)
-    flow, Q = _grow(options), options["orientation"]
-    facts = {"orientation": None if Q is None else Q.tolist(), "maps": wanted["maps"] and str(wanted["maps"])}
-    facts |= {"origin": law.origin, "wanted_volume_fraction": wanted["volume_fraction"], "command": command_line()}
-    record = shape_record(flow, mass=options["mass"], output=output, **facts)
+    notes = () if start is None else _begin_at(start, law, options)
+    flow = _grow(law, options, plan, free_mass=wanted["free_mass"])
+    facts = {name: wanted[name] and str(wanted[name]) for name in ("maps", "start")}
+    facts |= {"start_digest": start and start.digest, "orientation": options["orientation"], "origin": law.origin}
+    facts |= {"wanted_volume_fraction": wanted["volume_fraction"], "command": command_line()}
+    record = shape_record(flow, mass=options["mass"] if start is None else None, output=output, **facts)
+    say_notes(notes)
     _write(flow, out, record, output=output, picture=picture, overwrite=overwrite)
     _remove(checkpoint)
 
@@ -134,41 +148,81 @@ def presets() -> None:
     print_table(("name", *NAMES, "mass", "source"), rows, right=range(1, 8))
 
 
-def _read_law(preset: str | None, coefficients: str | None, prior: str | None, maps: Maps3D) -> Law:
+def _read_start(
+    wanted: dict[str, Any], running: dict[str, Any], writing: dict[str, Any], noise: dict[str, Any]
+) -> Volume:
+    """Return the volume that the flow begins from; raise ValueError for options that it leaves no use for."""
+    from curvafit.volumes.read import load
+
+    useless = {**noise, "volume-fraction": wanted["volume_fraction"]}
+    if wanted["free_mass"]:
+        useless |= {"mass": wanted["mass"], "orientation": wanted["orientation"], "schedule": running["schedule"]}
+    if given := [name for name, value in useless.items() if value is not None]:
+        raise ValueError(f"--{given[0]} has no use with --start{' --free-mass' * wanted['free_mass']}: leave it out")
+    return load(wanted["start"], spacing=writing["edge"], unit=writing["unit"])
+
+
+def _read_law(wanted: dict[str, Any], maps: Maps3D) -> Law:
     """Return the law that one of the options gives, or a placeholder where maps give all six coefficients."""
     from curvafit.priors.coefficients import NAMES, Coefficients
     from curvafit.priors.law import Law
 
-    laws = [value for value in (preset, coefficients, prior) if value is not None]
+    stated = {name: wanted[name] for name in ("preset", "coefficients", "helfrich", "prior")}
+    laws = {name: text for name, text in stated.items() if text is not None}
     if len(laws) > 1 or (not laws and not set(NAMES) <= maps.keys()):
-        raise ValueError(f"give one of --preset, --coefficients and --prior, got {len(laws)} of them")
+        raise ValueError(f"give one of --preset, --coefficients, --helfrich and --prior, got {len(laws)} of them")
     if not laws:
         return Law(Coefficients(1, 0, 1), None, "maps")
-    if coefficients is not None:
-        return Law.of(Coefficients(*parse_numbers(coefficients, "--coefficients", 6)))
-    return Law.of(laws[0])
+    ((name, text),) = laws.items()
+    if name == "coefficients":
+        return Law.of(Coefficients(*parse_numbers(text, "--coefficients", 6)))
+    if name == "helfrich":
+        return Law.of(Coefficients.helfrich(*parse_numbers(text, "--helfrich", min(text.count(",") + 1, 3))))
+    return Law.of(text)
 
 
 def _choose_parameters(law: Law, maps: Maps3D, wanted: dict[str, Any]) -> dict[str, Any]:
     """Return law, mass or volume fraction, ε and Q as arguments of `generate`; maps take the place of numbers."""
     from curvafit.priors.coefficients import NAMES
-    from curvafit.priors.energies import orientation
     from curvafit.priors.grid import WORKING_EPSILON
 
-    if wanted["mass"] is not None and "mass" in maps:
-        raise ValueError("give either --mass or a map of it, got both")
+    for other in ("mass", "start"):
+        if wanted[other] is not None and "mass" in maps:
+            raise ValueError(f"give either --{other} or a map of the mass, got both")
     mass, fraction = maps.get("mass", wanted["mass"]), wanted["volume_fraction"]
     if mass is not None and fraction is not None:
         raise ValueError("give either a mass or --volume-fraction, got both")
-    if mass is None and fraction is None:
+    if mass is None and fraction is None and wanted["start"] is None:
         mass = law.mass
-    Q = None
-    if wanted["orientation"] is not None:
-        *direction, strength = parse_numbers(wanted["orientation"], "--orientation", 4)
-        Q = orientation(direction, strength)
     coefficients = replace(law.coefficients, **{name: maps[name] for name in NAMES if name in maps})
     ε = WORKING_EPSILON if wanted["epsilon"] is None else wanted["epsilon"]
+    Q = _choose_orientation(wanted["orientation"], maps)
     return {"law": coefficients, "mass": mass, "volume_fraction": fraction, "epsilon": ε, "orientation": Q}
+
+
+def _choose_orientation(text: str | None, maps: Maps3D) -> Tensor | None:
+    """Return Q of the option's direction and strength and of maps, which take the place of its numbers, or None."""
+    from curvafit.priors.energies import orientation
+    from curvafit.volumes.read import ORIENTATION
+
+    numbers = () if text is None else parse_numbers(text, "--orientation", 4)
+    parts = dict(zip(ORIENTATION, numbers)) | {name: maps[name] for name in ORIENTATION if name in maps}  # noqa: B905
+    if not parts:
+        return None
+    if missing := [name for name in ORIENTATION if name not in parts]:
+        raise ValueError(f"an orientation in maps needs {', '.join(missing)} too, or --orientation for numbers")
+    *direction, strength = (parts[name] for name in ORIENTATION)
+    return orientation(direction, strength)
+
+
+def _begin_at(start: Volume, law: Law, options: dict[str, Any]) -> tuple[str, ...]:
+    """Make the start's field the mass m(x) of a flow without noise, with the mean that is stated; return notes."""
+    from curvafit.scan.preparation import make_start
+
+    options["grid"], field, notes = make_start(start, law, options["grid"].boundary, options["epsilon"])
+    mass = options["mass"]
+    options |= {"mass": field if mass is None else field + (mass - field.mean()), "seed": None}
+    return notes
 
 
 def _locate_checkpoint(file: Path | None, out: Path) -> Path | None:
@@ -184,10 +238,19 @@ def _locate_checkpoint(file: Path | None, out: Path) -> Path | None:
     return checkpoint
 
 
-def _grow(options: dict[str, Any]) -> Flow:
+def _grow(law: Law, options: dict[str, Any], plan: dict[str, Any], *, free_mass: bool) -> Flow:
     """Run the flow with progress; exit with code 1 where it failed or has no surface."""
-    from curvafit.generation.flow import generate as make
+    from curvafit.generation import flow as flows
+    from curvafit.generation.schedule import choose_schedule, schedule
 
+    make, options = (
+        flows.generate,
+        options | {"schedule": schedule(choose_schedule([law], plan["schedule"]), plan["steps"])},
+    )
+    if free_mass:
+        make, field = flows.descend, options["mass"]
+        options = {name: options[name] for name in ("law", "grid", "epsilon", "execution")} | {"field": field}
+        options |= {} if plan["steps"] is None else {"steps": plan["steps"]}
     checkpoint = options["execution"].checkpoint
 
     def resume_command() -> str:

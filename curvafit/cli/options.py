@@ -26,7 +26,7 @@ OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace file
 
 #: Parameters of commands that are volumes to read; those that are laws, each with the name of its option.
 _VOLUMES = ("scan", "scans", "slices", "roi", "image", "example", "example_probabilities", "like",
-            "like_mask")  # fmt: skip
+            "like_mask", "start")  # fmt: skip
 _LAWS = {"preset": "preset", "prior": "prior", "laws": "preset"}
 
 

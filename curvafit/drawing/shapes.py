@@ -38,11 +38,13 @@ FORMAT = Format("curvafit-shape-1", title="the record of a shape")
 class Output:
     """How a field becomes a file: the edge of a voxel and its unit, for spacing or vertices; ValueError for others.
 
-    A surface is closed on the box's faces, watertight around the volume of {u > 0}.
+    A surface is closed on the box's faces, watertight around the volume of {u > 0}. A volume may have the `affine` of
+    another (see `Volume`), so that it lies where that one does.
     """
 
     voxel: float = 1.0
     unit: str = "voxel"
+    affine: np.ndarray | None = dataclasses.field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         check_type(self.unit, str, "a unit as text")
@@ -121,7 +123,7 @@ def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | No
     target, output = Path(path), output or Output()
     values, spacing = field.numpy(), (output.voxel, output.voxel, output.voxel)
     if not target.name.lower().endswith(SUFFIXES):
-        return save(Volume(values, spacing, output.unit), target, kind=FORMAT.name)
+        return save(Volume(values, spacing, output.unit, output.affine), target, kind=FORMAT.name)
     box, data = Grid(grid.shape, spacing, grid.boundary), None
     mesh = solid_surface(values, box)
     if target.suffix.lower() == ".ply":
@@ -134,7 +136,12 @@ def write_field(field: Tensor, grid: Grid, path: str | Path, output: Output | No
 
 
 def shape_record(
-    flow: Flow, *, mass: float | Tensor | None = None, output: Output | None = None, **more: Any
+    flow: Flow,
+    *,
+    mass: float | Tensor | None = None,
+    orientation: Tensor | None = None,
+    output: Output = Output(),
+    **more: Any,
 ) -> dict[str, Any]:
     """Return what is needed to make a shape again (parameters, sampling, seed, schedule, versions), and its status.
 
@@ -148,7 +155,8 @@ def shape_record(
         "working_spacing": list(flow.grid.spacing), "epsilon": flow.epsilon,
         "boundary": flow.grid.boundary, "seed": flow.seed, "schedule": flow.schedule.as_dict(), "status": flow.status,
         "viable": flow.viability.viable, "volume_fraction": float(np.mean(flow.field.numpy() > 0)),
-        **dataclasses.asdict(output or Output()), **more, "curvafit": version("curvafit"), "torch": version("torch"),
+        "orientation": None if orientation is None else [[*map(_number_or_range, row)] for row in orientation],
+        "voxel": output.voxel, "unit": output.unit, **more, "curvafit": version("curvafit"), "torch": version("torch"),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }  # fmt: skip
 

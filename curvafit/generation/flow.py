@@ -76,15 +76,15 @@ def generate(
     *,
     volume_fraction: float | None = None,
     schedule: str | Schedule | None = None,
-    seed: int = 0,
+    seed: int | None = 0,
     epsilon: float = WORKING_EPSILON,
     blur: float = WORKING_BLUR,
-    orientation: Float[Tensor, "3 3"] | None = None,
+    orientation: Float[Tensor, "3 3 *zyx"] | None = None,
     callbacks: Sequence[Callback] = (),
     reject_early: bool = False,
     execution: Execution = Execution(),
 ) -> Flow:
-    """Make a shape: lower F_ε from white noise at constant mass (paper, Algorithm 1).
+    """Make a shape: lower F_ε at constant mass, from white noise or from a field (paper, Algorithm 1).
 
     Parameters
     ----------
@@ -92,8 +92,8 @@ def generate(
         `Coefficients`: numbers, or tensors that broadcast with the voxels `(Z, Y, X)` and vary in space. Or a `Law`, a
         preset's name, the path of a `fit.json`, or a fit, all in working units.
     mass
-        m₀, the mean of u, in (-1, 1), exact to 1e-6 at every step. A tensor is m(x): u = k ∗ (div A + m). None takes
-        the law's mass, or the mass that the volume fraction needs.
+        m₀, the mean of u, in (-1, 1), exact to 1e-6 at every step. A tensor `(Z, Y, X)` is m(x), whose mean is m₀: u =
+        k ∗ (div A + m). None takes the law's mass, or the mass that the volume fraction needs.
     grid, epsilon, blur
         The sampling, or the number of voxels along (z, y, x), or along each axis, of a periodic box in working units.
         ε and the blur's standard deviation are in spacing's unit.
@@ -106,9 +106,10 @@ def generate(
         `"fast"`, `"paper"`, `"deep"`, `"cosine"` (see `SCHEDULES`), or a `Schedule`. None takes the law's: `"deep"` of
         a fit, which was read from such shapes, else `"fast"`.
     seed
-        Seed of the start. The same seed, grid and number of threads make the same field, bit for bit.
+        Seed of A's noise at the start. The same seed, grid and number of threads make the same field, bit for bit. None
+        starts from A = 0, so that u begins as k ∗ m: the flow of a field m, such as a scan's, which keeps its mass.
     orientation
-        Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x; see `priors.orientation`.
+        Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x, or a matrix for each voxel; see `priors.orientation`.
     callbacks
         Functions that are called while the flow runs, and may stop it; see `Callback`.
     reject_early
@@ -122,12 +123,14 @@ def generate(
     check_type(execution, Execution, "an Execution")
     law = Law.of(law)
     mass = law.mass if mass is None and volume_fraction is None else mass
-    grid, seed = grid if isinstance(grid, Grid) else Grid(grid), check_seed(seed)  # type: ignore[arg-type]
+    grid = grid if isinstance(grid, Grid) else Grid(grid)  # type: ignore[arg-type]
+    seed = None if seed is None else check_seed(seed)
     cost = Cost(law.coefficients, grid, epsilon, orientation, blur)
     plan, callbacks = choose_schedule([law], schedule), _check_callbacks(callbacks)
     check_memory(grid.shape, FLOW, "a box", execution.device)
     base = choose_base(mass, volume_fraction, grid)
-    form, start = DivergenceForm.of(grid, cost.blur, base), white_noise(grid, seed)
+    form = DivergenceForm.of(grid, cost.blur, base)
+    start = torch.zeros(3, *grid.shape) if seed is None else white_noise(grid, seed)
     if kernels.has_kernel(execution.device) and cost.fused:
         stepper = FusedStepper(start, form, cost, plan.betas_at(0))
     else:
@@ -225,6 +228,5 @@ def choose_base(mass: float | Tensor | None, share: float | None, grid: Grid) ->
     if not isinstance(mass, Tensor) or mass.dim() == 0:
         return check_open_interval(mass, "a mass in (-1, 1)", -1, 1)
     check_shape("mass", mass, grid)
-    if not bool((mass.abs() < 1).all()):
-        raise ValueError(f"the mass must be in (-1, 1), got {float(mass.min())} to {float(mass.max())}")
+    check_open_interval(mass.mean(dtype=torch.float64), "a mass of finite numbers with a mean in (-1, 1)", -1, 1)
     return mass.detach().to("cpu", torch.float32).expand(grid.shape).contiguous()

@@ -12,6 +12,7 @@ from torch import Tensor
 from curvafit.core.checks import check_float, check_seed, check_type, quoted
 from curvafit.core.runtime import FIELD, check_memory
 from curvafit.priors.coefficients import NAMES, Coefficients, check_strengths
+from curvafit.priors.energies import check_orientation
 from curvafit.priors.grid import Float, Grid
 from curvafit.priors.kernels import gaussian_blur
 from curvafit.priors.stencils import divergence, gradient
@@ -77,10 +78,9 @@ class Cost:
         for name, value in getattr(self.data, "__dict__", {}).items():
             if isinstance(value, Tensor):
                 check_shape(f"the data's {name}", value, self.grid)
-        Q = self.orientation
-        if Q is not None and (not isinstance(Q, Tensor) or tuple(Q.shape) != (3, 3) or not torch.equal(Q, Q.T)):
-            values = Q.tolist() if isinstance(Q, Tensor) else Q
-            raise ValueError(f"the orientation must be symmetric, of shape (3, 3) (z, y, x), got {quoted(values)}")
+        if self.orientation is not None:
+            check_orientation(self.orientation)
+            check_shape("the orientation", self.orientation[0, 0], self.grid)
 
 
 def check_shape(name: str, value: Tensor, grid: Grid) -> None:

@@ -6,7 +6,6 @@ Every energy is a sum over voxels times the voxel's volume. Fields are `(..., Z,
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -26,7 +25,7 @@ def energy(
     coefficients: Iterable[float | Tensor],
     grid: Grid,
     epsilon: float,
-    orientation: Float[Tensor, "3 3"] | None = None,
+    orientation: Float[Tensor, "3 3 *zyx"] | None = None,
     mask: Tensor | None = None,
 ) -> Float[Tensor, "*batch"]:
     """Return F_ε(u) (paper, eq. 20), differentiable in the field and in the coefficients.
@@ -40,7 +39,7 @@ def energy(
     grid, epsilon
         The sampling, and the interface parameter in spacing's unit.
     orientation
-        Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x; see `orientation`.
+        Q of a further term ε ∫ ∇uᵀQ∇u, symmetric, axes z, y, x, or one for each voxel; see `orientation`.
     mask
         Weights of the density, which broadcast with `u`.
     """
@@ -49,7 +48,9 @@ def energy(
     weighted = (_match_field(a, u) * term for a, term in zip(coefficients, terms, strict=True))
     per_voxel = sum(weighted, start=torch.zeros_like(u))
     if orientation is not None:
-        per_voxel = per_voxel + epsilon * orientation_form(field.gradient, orientation)
+        check_orientation(orientation)
+        force = turn_slope(field.gradient, orientation)
+        per_voxel = per_voxel + epsilon * (force * field.gradient).sum(-4)
     if mask is not None:
         per_voxel = per_voxel * mask.to(u)
     return per_voxel.sum((-3, -2, -1)) * grid.voxel_volume
@@ -95,11 +96,10 @@ def _orientation_gradient(
     u: Tensor, grid: Grid, epsilon: float, orientation: Tensor, mask: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Return ε ∫ ∇uᵀQ∇u and its gradient."""
-    u = u.detach()
-    slope, weight = gradient(u, grid), epsilon * grid.voxel_volume * (1 if mask is None else mask.to(u))
-    value = (weight * orientation_form(slope, orientation)).sum(dtype=torch.float64)
-    force = torch.einsum("ij,jzyx->izyx", orientation.to(u), slope)
-    return value, gradient_adjoint(2 * weight * force, grid)
+    check_orientation(orientation)
+    slope, weight = gradient(u.detach(), grid), epsilon * grid.voxel_volume * (1 if mask is None else mask.to(u))
+    force = weight * turn_slope(slope, orientation)
+    return (force * slope).sum(dtype=torch.float64), gradient_adjoint(2 * force, grid)
 
 
 def energy_gradient_by_autograd(u: Tensor, *cost: Any) -> tuple[Tensor, Tensor]:
@@ -114,30 +114,41 @@ def energy_gradient_by_autograd(u: Tensor, *cost: Any) -> tuple[Tensor, Tensor]:
     return values.detach(), gradients
 
 
-def orientation(direction: Sequence[int | float] | Tensor, strength: int | float) -> Float[Tensor, "3 3"]:
+def orientation(
+    direction: Sequence[int | float | Tensor] | Tensor, strength: int | float | Tensor
+) -> Float[Tensor, "3 3 *zyx"]:
     """Return Q = μ θθᵀ, which turns normals away from θ: tubes run along θ and layers contain it (paper, "Extensions").
 
     The direction θ (z, y, x) has any length above 0; where the strength μ is negative, normals turn towards θ. Q is
-    symmetric `(3, 3)`, float64; a sum of orientations is an orientation too.
+    symmetric `(3, 3)`, float64; a sum of orientations is an orientation too. Components of θ, or μ, that are tensors
+    `(Z, Y, X)` vary in space, and Q is then `(3, 3, Z, Y, X)`, a matrix for each voxel.
+
+    Raises ValueError where a number is not finite, or θ is 0 somewhere: there μ is to be 0, with any θ.
     """
     expected = "a direction of 3 finite numbers (z, y, x), not all 0"
-    components = [check_float(component, expected, of=direction) for component in as_tuple(direction, expected, 3)]
-    θ = torch.tensor(components, dtype=torch.float64)
-    if not bool(θ.any()):
+    components = [_as_finite(component, expected, of=direction) for component in as_tuple(direction, expected, 3)]
+    θ = torch.stack(torch.broadcast_tensors(*components))
+    if not bool(θ.any(0).all()):
         raise ValueError(f"expected {expected}, got {quoted(direction)}")
-    strength = check_float(strength, "a finite strength")
-    _, exponent = math.frexp(float(θ.abs().max()))
-    θ = θ * 2.0**-exponent  # a power of two: exact, and the squares in the norm are finite
-    θ = θ / θ.norm()
-    return strength * torch.outer(θ, θ)
+    _, exponent = torch.frexp(θ.abs().amax(0))
+    θ = torch.ldexp(θ, -exponent)  # by powers of two: exact, and the squares in the norm are finite
+    θ = θ / θ.square().sum(0).sqrt()
+    return _as_finite(strength, "a finite strength") * (θ[:, None] * θ[None])
 
 
-def orientation_form(slope: Float[Tensor, "*batch 3 z y x"], orientation: Float[Tensor, "3 3"]) -> Tensor:
-    """Return ∇uᵀQ∇u in every voxel, which is μ (θ·∇u)² for Q = μ θθᵀ (paper, "Extensions")."""
+def check_orientation(orientation: object) -> None:
+    """Raise ValueError where an orientation is no symmetric tensor `(3, 3)` or `(3, 3, Z, Y, X)`."""
+    Q = orientation if isinstance(orientation, Tensor) else torch.empty(0)
+    if Q.shape[:2] != (3, 3) or Q.dim() not in (2, 5) or not torch.equal(Q, Q.transpose(0, 1)):
+        expected = "the orientation as a symmetric tensor of shape (3, 3) or (3, 3, Z, Y, X), axes z, y, x"
+        raise ValueError(f"expected {expected}, got {quoted(Q.tolist() if Q.dim() == 2 else orientation)}")
+
+
+def turn_slope(slope: Float[Tensor, "*batch 3 z y x"], orientation: Float[Tensor, "3 3 *zyx"]) -> Tensor:
+    """Return Q∇u in every voxel: its product with ∇u is μ (θ·∇u)² for Q = μ θθᵀ (paper, "Extensions")."""
     Q = orientation.to(slope)
-    if tuple(Q.shape) != (3, 3) or not torch.equal(Q, Q.T):
-        raise ValueError(f"expected a symmetric orientation of shape (3, 3) (z, y, x), got {orientation.tolist()}")
-    return torch.einsum("ij,...izyx,...jzyx->...zyx", Q, slope, slope)
+    columns = (Q if Q.dim() > 2 else Q[..., None, None, None]).unbind(1)
+    return sum(column * part.unsqueeze(-4) for column, part in zip(columns, slope.unbind(-4), strict=True))  # type: ignore[return-value]
 
 
 def energy_terms(field: Jet, epsilon: float) -> Float[Tensor, "*batch 6 z y x"]:
@@ -176,3 +187,12 @@ def cahn_hilliard_parts(u: Tensor, grid: Grid, epsilon: float) -> tuple[Tensor, 
 def _match_field(value: float | Tensor, u: Tensor) -> float | Tensor:
     """Return a number unchanged, or a tensor in the field's type and on the field's device."""
     return value.to(u) if isinstance(value, Tensor) else value
+
+
+def _as_finite(value: Any, expected: str, of: Any = None) -> Tensor:
+    """Return a number, or a tensor of finite numbers, in float64; `of` is quoted where it is not."""
+    if not isinstance(value, Tensor) or value.dim() != 3:
+        return torch.tensor(check_float(value, expected, of=of), dtype=torch.float64)
+    if value.is_complex() or not bool(torch.isfinite(value).all()):
+        raise ValueError(f"expected {expected}, got values that are not finite")
+    return value.double()

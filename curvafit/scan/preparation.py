@@ -11,9 +11,11 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from curvafit.core.units import convert_length
 from curvafit.geometry.diagrams import Diagram
 from curvafit.geometry.topology import betti_numbers
-from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, phase_field
+from curvafit.priors import WORKING_EPSILON, WORKING_SPACING, Grid, Law, phase_field
+from curvafit.priors.grid import Boundary
 from curvafit.scan import grids, structure
 from curvafit.scan.quality import Quality, measure_quality, sample_mask
 from curvafit.scan.structure import Kind
@@ -240,6 +242,29 @@ def prepare(
         quality = measure_quality(-cropped.values if dark else cropped.values, signed.values > 0, cropped.spacing)
     origin = tuple(edge.start + start for edge, start in zip(box, prepared.origin, strict=True))
     return replace(prepared, quality=quality, origin=origin)  # type: ignore[arg-type]
+
+
+def make_start(
+    field: Volume, law: Law, boundary: Boundary = "periodic", epsilon: float = WORKING_EPSILON
+) -> tuple[Grid, torch.Tensor, tuple[str, ...]]:
+    """Return the start of a flow on the voxels of a scan: its grid and ε in working units, u `(Z, Y, X)`, and notes.
+
+    A phase field is u as it is; a mask becomes the profile that belongs to ε. A voxel has the edge of a working voxel,
+    but of a fit's where both units are known: the law's lengths are then those of the scan. Raises ScanError for grey
+    levels, and for voxels that are not cubes.
+    """
+    edge, longest = min(field.spacing), max(field.spacing)
+    if longest > 1.01 * edge:
+        raise ScanError(f"a start must have voxels that are cubes, got {field.spacing}: resample it")
+    kind, signed = structure.find_structure(field)
+    if kind == "image":
+        raise ScanError("a start must be a mask or a phase field, got grey levels: `curvafit segment` makes a mask")
+    if law.working_voxel is not None and "voxel" not in (field.unit, law.length_unit):
+        edge = convert_length(edge, field.unit, law.length_unit) / law.working_voxel
+    else:
+        edge = 1.0
+    grid, values = Grid(field.shape, WORKING_SPACING * edge, boundary), torch.from_numpy(signed.values)
+    return grid, values if kind == "field" else phase_field(values > 0, grid, epsilon), signed.notes
 
 
 def prepare_whole(kind: Kind, signed: Volume, periodic: bool, most: int) -> Prepared:

@@ -50,8 +50,10 @@ READERS: dict[str, Callable[..., Stated]] = {
 }
 #: Largest cosine of the angle between axes that count as orthogonal: a shear of 2 % turns normals by a degree.
 RIGHT = 0.02
-#: What may vary in space: the six coefficients and the mass, in working units.
-PARAMETERS = (*NAMES, "mass")
+#: Names of an orientation's direction θ and strength μ.
+ORIENTATION = ("theta_z", "theta_y", "theta_x", "mu")
+#: What may vary in space: the six coefficients, the mass and an orientation, in working units.
+PARAMETERS = (*NAMES, "mass", *ORIENTATION)
 #: Readers of formats that can hold several arrays, by key.
 KEYED = (arrays.read_npz, arrays.read_hdf5, arrays.read_imaris, arrays.read_microscope)
 KEYED += (zarr.read_zarr, dicom.read_dicom)

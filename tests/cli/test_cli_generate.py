@@ -19,10 +19,12 @@ from matplotlib.figure import Figure
 
 from curvafit.drawing.plot import make_figure
 from curvafit.generation.schedule import schedule
+from curvafit.priors.coefficients import Coefficients
 from curvafit.priors.energies import orientation
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import preset
-from curvafit.volumes.read import load
+from curvafit.priors.profile import phase_field
+from curvafit.volumes import Volume, load, save
 
 pytestmark = pytest.mark.filterwarnings("ignore::numba.NumbaPerformanceWarning")
 
@@ -105,6 +107,24 @@ def test_every_option_reaches_the_generator(tmp_path: Path, handed: dict[str, An
     refused(call("generate", *LAW, "--shape", "8", "--maps", maps, "-o", tmp_path / "out.npy"), "a00")
 
 
+def test_a_law_is_a_bending_energy_and_maps_may_hold_a_direction(tmp_path: Path, handed: dict[str, Any]) -> None:
+    """Whose numbers are the option's where there are no maps of them."""
+    out, maps = ["-o", tmp_path / "out.npy"], tmp_path / "maps.npz"
+    for text, law in (("3,-1.5,7", (3, -1.5, 7)), ("3,1", (3, 1)), ("3", (3,))):
+        call("generate", "--helfrich", text, "--mass", "-0.5", *out)
+        assert handed["law"] == Coefficients.helfrich(*law) and handed["mass"] == -0.5
+    for text in ("3,1,7,2", "k", "3,,7"):
+        refused(call("generate", "--helfrich", text, "--mass", 0, *out), "--helfrich")
+    refused(call("generate", "--helfrich", 3, "--preset", "tubes", *out), "--helfrich")
+    z, y, x = np.indices((5, 6, 7), dtype=np.float32)
+    np.savez(maps, theta_z=1 + z, theta_y=y, mu=x)
+    call("generate", "--preset", "tubes", "--maps", maps, "--orientation", "5,6,7,8", *out)
+    assert torch.equal(handed["orientation"], orientation((*map(torch.from_numpy, (1 + z, y)), 7), torch.from_numpy(x)))
+    refused(call("generate", "--preset", "tubes", "--maps", maps, *out), "theta_x")
+    np.savez(maps, theta_z=z, theta_y=y, theta_x=x, mu=3.0)
+    refused(call("generate", "--preset", "tubes", "--maps", maps, *out), "not all 0")
+
+
 @pytest.mark.parametrize(
     ("name", "given", "spacing", "unit"),
     [
@@ -164,6 +184,62 @@ def test_a_volume_fraction_is_reached_and_its_mass_recorded(tmp_path: Path, prio
     assert (again["voxel"], again["unit"], again["working_spacing"]) == (0.04, "mm", [0.01] * 3)
     refused(call("generate", *options, "-o", tmp_path / "fit.npy"), "input")
     assert prior.read_text() == made_fit().to_json()
+
+
+# ---- from a volume ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def ball(tmp_path: Path) -> Path:
+    """A mask of voxels of 0.039 mm, somewhere in the world."""
+    z, y, x = np.indices((32, 32, 34)) - 15.5
+    affine = np.array([[0.039, 0, 0, 5], [0, 0.039, 0, -3], [0, 0, 0.039, 2], [0, 0, 0, 1]])
+    inside = (z**2 + y**2 + x**2 < 64).astype(np.uint8)
+    return save(Volume(inside, (0.039,) * 3, "mm", affine), tmp_path / "ball.nii.gz")
+
+
+def test_a_start_gives_its_mass_voxels_and_place(tmp_path: Path, ball: Path, prior: Path) -> None:
+    """A fit's lengths are those of the scan; a mass that is stated is the mean; a phase field is taken as it is."""
+    record = made("--preset", "tubes", "--start", ball, "--steps", 20, "-o", tmp_path / "out.nii.gz")
+    out, start = load(tmp_path / "out.nii.gz"), load(ball)
+    assert (record["seed"], record["start"], record["start_digest"]) == (None, str(ball), start.digest)
+    assert (record["unit"], record["voxel"], record["working_spacing"]) == ("mm", pytest.approx(0.039), [0.01] * 3)
+    np.testing.assert_allclose(out.affine, start.affine, rtol=1e-6)
+    assert record["mass"] == pytest.approx(out.values.mean(), abs=1e-6)
+    profile = phase_field(torch.from_numpy(start.values > 0), Grid(start.shape), 0.02)
+    assert record["mass"] == pytest.approx(float(profile.mean()), abs=1e-5)
+    again = made("--prior", prior, "--start", ball, "--mass", "-0.7", "--steps", 20, "-o", tmp_path / "more.nii.gz")
+    assert again["mass"] == pytest.approx(-0.7, abs=1e-6) and again["working_spacing"] == pytest.approx([0.02] * 3)
+    more = made("--preset", "tubes", "--start", tmp_path / "out.nii.gz", "--steps", 1, "-o", tmp_path / "next.npy")
+    assert more["mass"] == pytest.approx(record["mass"], abs=1e-6) and more["shape"] == [32, 32, 34]
+    refused(call("generate", "--preset", "tubes", "--start", ball, "--overwrite", "-o", ball), "input")
+
+
+def test_a_vesicle_of_free_volume_has_its_spontaneous_curvature(tmp_path: Path, ball: Path) -> None:
+    """H0 = 2 / R, where Helfrich's energy is 0: R of 8 voxels becomes 9.5; it is of order (ε / R)² = 0.04 longer."""
+    words = ["--helfrich", f"2,0,{2 / 0.095}", "--start", ball, "--free-mass"]
+    made(*words, "--checkpoint", tmp_path / "run.pt", "-o", tmp_path / "out.npy")
+    inside = np.load(tmp_path / "out.npy") > 0
+    assert 9.5 < (3 * inside.sum() / (4 * np.pi)) ** (1 / 3) < 1.05 * 9.5
+
+
+def test_what_does_not_go_with_a_start_is_refused(tmp_path: Path, ball: Path) -> None:
+    np.savez(tmp_path / "mass.npz", mass=-0.5)
+    np.save(tmp_path / "grey.npy", np.random.default_rng(0).random((9, 9, 9)))
+    save(Volume(load(ball).values, (0.1, 0.1, 0.3), "mm"), tmp_path / "flat.nii.gz")
+    words = {
+        "--shape 32": "--shape", "--seed 0": "--seed", "--volume-fraction 0.3": "--volume-fraction",
+        "--maps mass.npz": "mass", "--start grey.npy": "mask", "--start flat.nii.gz": "cubes",
+        "--start no.tif": "no.tif",
+        "--free-mass --mass 0": "--mass", "--free-mass --orientation 0,0,1,5": "--orientation",
+        "--free-mass --schedule deep": "--schedule", "--spacing 1,1,1": "--spacing", "--mass 2": "mass",
+    }  # fmt: skip
+    for line, word in words.items():
+        options = [str(tmp_path / text) if "." in text and text[0].isalpha() else text for text in line.split()]
+        start = [] if "--start" in options else ["--start", ball]
+        refused(call("generate", "--preset", "tubes", *start, *options, "-o", tmp_path / "out.npy"), word)
+    refused(call("generate", "--preset", "tubes", "--free-mass", "-o", tmp_path / "out.npy"), "--start")
+    assert not list(tmp_path.glob("out.*"))
 
 
 def full(*_: Any, **__: Any) -> None:

@@ -17,12 +17,13 @@ from curvafit.generation.loop import first_mass
 from curvafit.generation.problem import DivergenceForm, white_noise
 from curvafit.generation.result import RECORD_EVERY, viability
 from curvafit.generation.schedule import SCHEDULES, Phase, Schedule, choose_schedule, schedule
+from curvafit.geometry.topology import betti_numbers
 from curvafit.priors import kernels
 from curvafit.priors.coefficients import Coefficients
-from curvafit.priors.energies import energy, energy_gradient_by_autograd, orientation
+from curvafit.priors.energies import energy, energy_gradient_by_autograd, orientation, turn_slope
 from curvafit.priors.grid import Grid
 from curvafit.priors.law import Law, preset
-from curvafit.priors.profile import optimal_profile
+from curvafit.priors.profile import optimal_profile, phase_field
 from curvafit.priors.stencils import divergence, gaussian_blur, gradient
 
 TUBES, MASS = preset("tubes").coefficients, preset("tubes").mass
@@ -201,12 +202,22 @@ def test_steps_are_those_of_torch_s_adam_bit_for_bit(boundary, monkeypatch):
 def test_relax_starts_at_the_field(boundary):
     grid, fields = Grid((16, 17, 18), 0.01, boundary), []
     watch = [lambda step, total, state: fields.append(state.field.clone())]
-    flow = relax(gyroid(grid), TUBES, grid, short(20, 1e-3), watch)
+    flow = generate(TUBES, gyroid(grid), grid, seed=None, schedule=short(20, 1e-3), callbacks=watch)
     assert float((fields[0] - gaussian_blur(gyroid(grid), grid, BLUR)).abs().max()) < 1e-5
     assert float((flow.field - fields[0]).abs().max()) > 0.01
     assert flow.history.energy[-1] < flow.history.energy[0]
     assert np.abs(flow.history.mass - float(gyroid(grid).double().mean())).max() < 1e-6
     assert flow.seed is None
+
+
+def test_spontaneous_curvature_splits_a_disc():
+    """Of one body come several, with its mass."""
+    grid, law = Grid((40, 40, 40)), Coefficients.helfrich(2, 0, 40)
+    z, y, x = centres(grid, origin=(-0.2, -0.2, -0.2)).unbind(-1)
+    disc = phase_field((torch.hypot(z, y) < 0.15) & (x.abs() < 0.035), grid, EPSILON)
+    flow = generate(law, disc, grid, seed=None, schedule=schedule("cosine", 400))
+    assert flow.mass == pytest.approx(float(disc.double().mean()), abs=1e-6)
+    assert [betti_numbers((u > 0).numpy())[0] > 1 for u in (disc, flow.field)] == [False, True]
 
 
 def test_fast_makes_a_shape():
@@ -268,6 +279,28 @@ def test_an_orientation_turns_the_shape():
     free, held = (generate(TUBES, MASS, grid, schedule=short(150), orientation=each).field for each in (None, Q))
     shares = [gradient(u, grid).square().mean((1, 2, 3)) for u in (free, held)]
     assert float(shares[1][1] / shares[1].sum()) < 0.5 * float(shares[0][1] / shares[0].sum())
+
+
+def test_tubes_lie_along_a_direction_that_turns():
+    """By 90°, along circles about an edge of a box with walls, where the structure tensor's least eigenvector is θ; and
+    maps of one direction are that direction, bit for bit."""
+    grid, ones = Grid((28, 16, 28), boundary="replicate"), torch.ones(28, 16, 28)
+    z, _, x = (centres(grid) / 0.01).unbind(-1)
+    along, plan = orientation((-x, 0, z), 3000.0), short(150)
+    even, number, turned, free = (
+        generate(TUBES, MASS, grid, schedule=plan, orientation=each).field
+        for each in (orientation((2 * ones, 0, ones), 3000 * ones), orientation((2, 0, 1), 3000.0), along, None)
+    )
+    assert torch.equal(even, number)
+    slopes = gradient(turned, grid)
+    paid, all_paid = (float((turn_slope(gradient(u, grid), along) * gradient(u, grid)).sum()) for u in (turned, free))
+    assert paid < 0.2 * all_paid
+    angle = torch.atan2(z, x)
+    for low in (0, 30, 60):
+        part = slopes[:, (angle > math.radians(low)) & (angle < math.radians(low + 30))]
+        _, vectors = torch.linalg.eigh(part @ part.T)
+        θ = torch.tensor([math.cos(math.radians(low + 15)), 0, -math.sin(math.radians(low + 15))])
+        assert float((vectors[:, 0] @ θ).abs()) > math.cos(math.radians(25))
 
 
 # ---- a volume fraction instead of a mass: reached, told of, or told that it was not ----------------------------------

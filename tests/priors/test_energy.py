@@ -196,11 +196,13 @@ def test_batches_precision_and_coefficients_in_space() -> None:
 @boundaries
 @pytest.mark.parametrize("turned", [False, True])
 def test_gradients_by_finite_differences(turned: bool, boundary: str) -> None:
-    """In the field and in the coefficients, with an orientation too. No root's argument is within its smoothing of
-    0: it would be stiff."""
+    """In the field and in the coefficients, with an orientation that varies too. No root's argument is within its
+    smoothing of 0: it would be stiff."""
     grid = Grid((4, 5, 4), (0.2, 0.3, 0.25), boundary)  # type: ignore[arg-type]
     u = rough(grid, 3).requires_grad_()
-    Q, a = (orientation((1, 2, -1), 40.0), (1.3, -0.7, 1.3, -20.0, -20.0, 150.0)) if turned else (None, UNEQUAL)
+    Q, a = None, UNEQUAL
+    if turned:
+        Q, a = orientation((1, rough(grid, 4), -1), 40 * rough(grid, 5)), (1.3, -0.7, 1.3, -20.0, -20.0, 150.0)
     trace, norm2, _, _ = second_form(jet(u.detach(), grid), ε)
     assert float((2 * norm2 - trace**2).abs().min()) > 1e-4
     given = u, torch.tensor([*a], dtype=torch.float64).requires_grad_()
@@ -298,6 +300,24 @@ def test_orientation_is_strength_times_the_directions_square() -> None:
     assert float(Q.trace()) == pytest.approx(50)
 
 
+def test_an_orientation_that_varies_is_its_own_in_every_voxel() -> None:
+    """Numbers among maps hold everywhere, the length of θ says nothing, and equal maps cost what numbers do."""
+    θz, θx, μ = (1 + rough(GRIDS[0], k).abs() for k in (1, 2, 3))
+    Q, place = orientation((θz, -2, θx), μ), (1, 2, 3)
+    assert Q.shape == (3, 3, *GRIDS[0].shape)
+    assert_close(Q[(..., *place)], orientation((θz[place], -2, θx[place]), μ[place]), rtol=1e-12, atol=0)
+    assert_close(Q, orientation(torch.stack((7 * θz, -14 * torch.ones_like(μ), 7 * θx)), μ), rtol=1e-12, atol=0)
+    u, ones = rough(GRIDS[0]), torch.ones(GRIDS[0].shape)
+    same = orientation((ones, -2 * ones, 0.5), 40 * ones)
+    for program in (energy, lambda *cost: energy_gradient(*cost)[1]):
+        here, there = (program(u, UNEQUAL, GRIDS[0], ε, each) for each in (same, orientation((1, -2, 0.5), 40)))
+        assert_close(here, there, rtol=1e-12, atol=1e-12)
+    with pytest.raises(ValueError, match="not all 0"):
+        orientation((θz - θz, 0, 0), μ)
+    with pytest.raises(ValueError, match="finite"):
+        orientation((θz, 0, 0), μ / (μ - μ))
+
+
 @pytest.mark.parametrize("waves", [(1, 0, 0), (1, -2, 0), (2, 1, 3)])
 def test_plane_wave(waves: tuple[int, int, int]) -> None:
     """u = sin k·x on a periodic grid: ∫ (θ·∇u)² = |Ω|/2 (Σ θ_i sin(k_i h_i) / h_i)², exact for central differences."""
@@ -310,6 +330,14 @@ def test_plane_wave(waves: tuple[int, int, int]) -> None:
     truth = ε * μ * grid.volume / 2 * float(slope) ** 2
     found = float(energy(u, NOTHING, grid, ε, orientation(θ, μ)))
     assert found == pytest.approx(truth, rel=1e-6)
+
+
+def test_layers_pay_where_they_are_not_along() -> None:
+    """A plane across z, in whose halves θ lies along and across: 3 σ times half of the area (from below)."""
+    ε, grid = 0.05, Grid((160, 4, 8), (1 / 160, 0.25, 0.125), "replicate")
+    u, far = optimal_profile(centres(grid)[..., 0] - 0.5, ε), centres(grid)[..., 2] > 0.5
+    found = float(energy(u, NOTHING, grid, ε, orientation((far.double(), 0.0, 1 - far.double()), 3.0)))
+    assert 0.99 * 1.5 * SIGMA < found <= 1.5 * SIGMA + 1e-9
 
 
 def test_layers_pay_by_their_angle() -> None:

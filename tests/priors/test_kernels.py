@@ -31,6 +31,7 @@ UNEQUAL = Coefficients(1.3, -0.7, 4.0, -60.0, 35.0, 500.0)
         ((12, 9, 21), ""), ((4, 5, 16), ""), ((5, 4, 4), ""), ((9, 8, 13), "orientation"),
         ((9, 8, 13), "coefficients"), ((9, 8, 13), "orientation, coefficients"),
         ((9, 8, 35), "mask"), ((9, 8, 35), "orientation, coefficients, mask"),
+        ((9, 8, 13), "orientation, directions"), ((9, 8, 35), "orientation, directions, coefficients, mask"),
     ],
 )  # fmt: skip
 def test_energy_and_gradient_are_the_definitions(shape, varies, spacing, boundary):
@@ -45,6 +46,8 @@ def test_energy_and_gradient_are_the_definitions(shape, varies, spacing, boundar
     if "coefficients" in varies:
         a[1], a[3], a[5] = (a[k] * (1 + 0.3 * smooth_field(grid, k)) for k in (1, 3, 5))
     Q = ORIENTATION if "orientation" in varies else None
+    if "directions" in varies:
+        Q = ORIENTATION[..., None, None, None] * (1 + smooth_field(grid, 7)) + 50 * torch.eye(3)[..., None, None, None]
     mask = (smooth_field(grid, 5) > -0.3) * (1 + smooth_field(grid, 6).abs()) if "mask" in varies else None
     cost = Coefficients(*a), grid, EPSILON, Q, mask
     (value, slope), (value32, slope32) = (energy_gradient_by_autograd(each, *cost) for each in (u, u.float()))

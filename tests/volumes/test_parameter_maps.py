@@ -12,9 +12,9 @@ RAMP = np.linspace(1, 2, 4 * 5 * 6).reshape(4, 5, 6)
 
 
 def test_an_npz_holds_maps_by_name(tmp_path: Path) -> None:
-    np.savez(tmp_path / "maps.npz", a20=RAMP, mass=-RAMP / 4)
+    np.savez(tmp_path / "maps.npz", a20=RAMP, mass=-RAMP / 4, theta_z=RAMP, mu=3)
     maps = read_maps(tmp_path / "maps.npz")
-    assert sorted(maps) == ["a20", "mass"] and map_shape(maps) == (4, 5, 6)
+    assert sorted(maps) == ["a20", "mass", "mu", "theta_z"] and map_shape(maps) == (4, 5, 6)
     assert torch.equal(maps["a20"], torch.from_numpy(RAMP.astype(np.float32)))
     assert torch.equal(maps["mass"], torch.from_numpy((-RAMP / 4).astype(np.float32)))
 
