@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -33,13 +34,13 @@ _out = partial(typer.Option, rich_help_panel="What to write")
 def parse_law(
     preset: Annotated[str | None, _what(help="A published shape; see `curvafit presets`.")] = None,
     coefficients: Annotated[str | None, _what(help="a20,a11,a02,a10,a01,a00 in working units; needs a mass.")] = None,
-    helfrich: Annotated[str | None, _what(help="Bending energy κ,κ_G,C0 (or κ,κ_G or κ); needs a mass.")] = None,
-    prior: Annotated[str | None, _what(help="fit.json of `curvafit infer`, or a preset's name.")] = None,
-    start: Annotated[
-        str | None, _what(help="Mask or phase field to begin from, with its mass, not from noise.")
+    helfrich: Annotated[
+        str | None, _what(help="Bending energy κ,κ_G,C0 (or κ,κ_G or κ), such as 2,0,40; needs a mass.")
     ] = None,
+    prior: Annotated[str | None, _what(help="fit.json of `curvafit infer`, or a preset's name.")] = None,
+    start: Annotated[str | None, _what(help="Mask or phase field to begin from, in place of noise.")] = None,
     free_mass: Annotated[bool, _what("--free-mass", help="With --start: let the volume change (L-BFGS).")] = False,
-    mass: Annotated[float | None, _what(help="Mean of the field, in (-1, 1).")] = None,
+    mass: Annotated[float | None, _what(help="Mean of the field, in (-1, 1); by default the start's or law's.")] = None,
     volume_fraction: Annotated[float | None, _what(help="Share of the volume inside, instead of a mass.")] = None,
     orientation: Annotated[str | None, _what(help="θz,θy,θx,μ: tubes and layers lie along θ if μ is large.")] = None,
     maps: Annotated[Path | None, _what(help="An .npz of volumes a20 … a00, mass, theta_z … theta_x, mu.")] = None,
@@ -87,7 +88,7 @@ def parse_output(
     "curvafit generate --preset sponge --volume-fraction 0.3 --shape 64 -o sponge.zarr",
     "curvafit generate --prior bone/fit.json --shape 128 --seed 3 -o more_bone.tif",
     "curvafit generate --preset tubes --shape 300 --checkpoint run.pt -o large.nii.gz",
-    "curvafit generate --helfrich 2,0,40 --start rod.nii.gz -o beads.nii.gz",
+    "curvafit generate --helfrich 2,0,40 --start disc.nii.gz -o beads.nii.gz",
 )
 def generate(
     out: Annotated[
@@ -105,7 +106,9 @@ def generate(
 ) -> None:
     """Make a shape from parameters, with a record (.json) and a picture (.png) beside it."""
     from curvafit.drawing.shapes import Output, check_target, shape_record
-    from curvafit.generation.flow import Execution
+    from curvafit.generation import flow as flows
+    from curvafit.generation.schedule import choose_schedule
+    from curvafit.generation.schedule import schedule as make_schedule
     from curvafit.priors.grid import Grid
     from curvafit.volumes.read import map_shape, read_maps
 
@@ -116,17 +119,22 @@ def generate(
     law = _read_law(wanted, maps)
     options = _choose_parameters(law, maps, wanted) | {"seed": seed or 0}
     options["grid"] = Grid(size or map_shape(maps) or EDGE, boundary=boundary)  # type: ignore[arg-type]
-    plan = {"schedule": running.pop("schedule"), "steps": running.pop("steps")}
+    steps = running.pop("steps")
+    options["schedule"] = make_schedule(choose_schedule([law], running.pop("schedule")), steps)
     running["checkpoint"] = checkpoint = _locate_checkpoint(running["checkpoint"], out)
-    options["execution"] = Execution(keep_checkpoint=True, **running)
+    options["execution"] = flows.Execution(keep_checkpoint=True, **running)
     output = Output(writing["edge"] or law.working_voxel or 1.0, writing["unit"] or law.length_unit or "voxel")
     output = output if start is None else Output(start.spacing[0], start.unit, start.affine)
     law_file = None if not law.fitted else wanted["prior"] or wanted["preset"]
     inputs = [str(path) for path in (law_file, wanted["maps"], wanted["start"]) if path is not None]
     check_target(out, output, inputs=inputs, picture=picture, overwrite=overwrite)
     notes = () if start is None else _begin_at(start, law, options)
-    flow = _grow(law, options, plan, free_mass=wanted["free_mass"])
-    facts = {name: wanted[name] and str(wanted[name]) for name in ("maps", "start")}
+    grow = partial(flows.generate, **options)
+    if wanted["free_mass"]:
+        kept = {name: options[name] for name in ("law", "grid", "epsilon", "execution")}
+        grow = partial(flows.descend, options["mass"], **kept, **({} if steps is None else {"steps": steps}))
+    flow = _grow(grow, checkpoint)
+    facts: dict[str, Any] = {name: wanted[name] and str(wanted[name]) for name in ("maps", "start")}
     facts |= {"start_digest": start and start.digest, "orientation": options["orientation"], "origin": law.origin}
     facts |= {"wanted_volume_fraction": wanted["volume_fraction"], "command": command_line()}
     record = shape_record(flow, mass=options["mass"] if start is None else None, output=output, **facts)
@@ -156,7 +164,7 @@ def _read_start(
 
     useless = {**noise, "volume-fraction": wanted["volume_fraction"]}
     if wanted["free_mass"]:
-        useless |= {"mass": wanted["mass"], "orientation": wanted["orientation"], "schedule": running["schedule"]}
+        useless |= {"schedule": running["schedule"], **{name: wanted[name] for name in ("mass", "orientation", "maps")}}
     if given := [name for name, value in useless.items() if value is not None]:
         raise ValueError(f"--{given[0]} has no use with --start{' --free-mass' * wanted['free_mass']}: leave it out")
     return load(wanted["start"], spacing=writing["edge"], unit=writing["unit"])
@@ -205,8 +213,9 @@ def _choose_orientation(text: str | None, maps: Maps3D) -> Tensor | None:
     from curvafit.priors.energies import orientation
     from curvafit.volumes.read import ORIENTATION
 
-    numbers = () if text is None else parse_numbers(text, "--orientation", 4)
-    parts = dict(zip(ORIENTATION, numbers)) | {name: maps[name] for name in ORIENTATION if name in maps}  # noqa: B905
+    parts: Maps3D = {name: maps[name] for name in ORIENTATION if name in maps}
+    if text is not None:
+        parts = dict(zip(ORIENTATION, parse_numbers(text, "--orientation", 4), strict=True)) | parts
     if not parts:
         return None
     if missing := [name for name in ORIENTATION if name not in parts]:
@@ -238,27 +247,15 @@ def _locate_checkpoint(file: Path | None, out: Path) -> Path | None:
     return checkpoint
 
 
-def _grow(law: Law, options: dict[str, Any], plan: dict[str, Any], *, free_mass: bool) -> Flow:
+def _grow(grow: Callable[..., Flow], checkpoint: Path | None) -> Flow:
     """Run the flow with progress; exit with code 1 where it failed or has no surface."""
-    from curvafit.generation import flow as flows
-    from curvafit.generation.schedule import choose_schedule, schedule
-
-    make, options = (
-        flows.generate,
-        options | {"schedule": schedule(choose_schedule([law], plan["schedule"]), plan["steps"])},
-    )
-    if free_mass:
-        make, field = flows.descend, options["mass"]
-        options = {name: options[name] for name in ("law", "grid", "epsilon", "execution")} | {"field": field}
-        options |= {} if plan["steps"] is None else {"steps": plan["steps"]}
-    checkpoint = options["execution"].checkpoint
 
     def resume_command() -> str:
         return "the same command" if checkpoint is not None and checkpoint.exists() else ""
 
     with resumable(resume_command), show_stages() as progress:
         progress("starting (a first run compiles the kernels for this processor)", 0.0)
-        flow = make(**options, callbacks=[lambda step, total, _: progress("growing", step / total)])
+        flow = grow(callbacks=[lambda step, total, _: progress("growing", step / total)])
     # The surface is the level 0 of the field: without values on both sides there is none.
     if not (flow.finite and flow.viability.lowest < 0 < flow.viability.highest):
         _remove(checkpoint)

@@ -232,7 +232,8 @@ def test_what_does_not_go_with_a_start_is_refused(tmp_path: Path, ball: Path) ->
         "--maps mass.npz": "mass", "--start grey.npy": "mask", "--start flat.nii.gz": "cubes",
         "--start no.tif": "no.tif",
         "--free-mass --mass 0": "--mass", "--free-mass --orientation 0,0,1,5": "--orientation",
-        "--free-mass --schedule deep": "--schedule", "--spacing 1,1,1": "--spacing", "--mass 2": "mass",
+        "--free-mass --schedule deep": "--schedule", "--free-mass --maps mass.npz": "--maps",
+        "--spacing 1,1,1": "--spacing", "--mass 2": "mass",
     }  # fmt: skip
     for line, word in words.items():
         options = [str(tmp_path / text) if "." in text and text[0].isalpha() else text for text in line.split()]

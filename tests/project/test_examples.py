@@ -62,9 +62,10 @@ def test_convergence(run) -> None:
     assert numbers(rows[-1])[-1] == 0 and 0.02 < numbers(rows[-1])[-2] < 0.4
     assert "after 300 steps" in status
     _, *rows = run("orientation", "--edge", 32, "--steps", 120)
-    free_tubes, tubes, free_layers, layers = map(numbers, rows)
+    free_tubes, tubes, free_layers, layers, *turning = map(numbers, rows)
     assert [free_tubes[0], tubes[0], free_layers[0], layers[0]] == [0, 1000, 0, 800]
     assert tubes[1] < free_tubes[1] and layers[1] < free_layers[1] < 1
+    assert max(lean for _, lean, *_ in turning) < 0.3
 
 
 @pytest.mark.parametrize(("name", "size"), [("gallery", 28), ("interpolation", 28), ("spatialised", 20)])
