@@ -23,6 +23,7 @@ def parse_tests(
 @command(
     "curvafit compare control/ treated/ --spacing 0.0195 --unit mm -o compared",
     "curvafit compare control/ low/ high/ -o compared",
+    "curvafit compare control.csv drug.csv --primary V -o compared",
     "curvafit compare before/ after/ --paired -o compared",
     "curvafit compare study.csv --by age -o compared",
     "curvafit compare measured --by group -o compared",
@@ -32,7 +33,7 @@ def parse_tests(
 def compare(
     scans: Annotated[
         list[Path],
-        typer.Argument(help="Folders of scans, two or more; a CSV: scan, group, subject, roi; a folder of measure."),
+        typer.Argument(help="Folders of scans, two or more; a CSV: scan, group, subject, roi; what measure wrote."),
     ],
     out: Annotated[Path, typer.Option("-o", "--output", help="Folder for compare.html, figures and tables.")],
     by: Annotated[
@@ -48,7 +49,7 @@ def compare(
     workers: Annotated[int, typer.Option(help="Processes that measure; 0 is this one.")] = 0,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Tell whether groups of scans differ, or what goes with a number: in which curvature, and by how much."""
+    """Tell whether groups of scans or bodies differ, or what goes with a number: in what, and by how much."""
     with show_stages() as progress:
         from curvafit.report.comparison import check_comparison, write_comparison
         from curvafit.studies.comparison import compare as compare_scans

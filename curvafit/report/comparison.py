@@ -41,11 +41,14 @@ from curvafit.studies.scans import list_wide, merge_notes
 #: `format` of a comparison's record.
 FORMAT = Format("curvafit comparison", 1, title="the record of a comparison")
 #: What a comparison writes into its folder.
-FILES = ("compare.json", "compare.html", "measures.csv", "wide.csv", "numbers.csv")
+FILES = ("compare.json", "compare.html", "measures.csv", "wide.csv", "subjects.csv", "numbers.csv")
 _PICTURES = ("difference", "numbers", "all_numbers", "outlines")
 FILES += tuple(f"{name}.{kind}" for name in _PICTURES for kind in ("svg", "png"))
 #: Colours of what is less and of what is more.
 MORE = LinearSegmentedColormap.from_list("more", [plot.FIRST, "#8CC0E0", "#FFFFFF", "#F0B48A", plot.SECOND])
+#: Symbols of the familiar numbers of bodies; the most bodies of a subject that have a point in a figure, and the
+#: percentiles of all that its axis spans.
+OF_BODIES, POINTS, SPAN = ("V", "S", "Ψ", "E"), 300, (5, 95)
 #: Letters of groups' names that a panel has room for, and diagrams or panels in a row.
 WORDS, ROW = 28, 4
 #: Returns the folder if `write_comparison` can write there, else raises ValueError; call it before the work.
@@ -68,29 +71,32 @@ def write_comparison(
     c = comparison
     label, change = ("group", "difference") if c.groups else ("number", "slope")
     record = start_record(command, unit=c.unit, options=c.options, status=c.status, notes=c.notes)
-    record["scans"] = [
+    scans = [
         {"scan": scan.source, "subject": case.subject, label: case.label, "kind": scan.kind, "notes": list(scan.notes)}
         | ({} if case.roi is None else {"roi": str(case.roi)})
+        | ({"table": case.name} if c.of_bodies else {})
         for scan, case in zip(c.measures, c.cases, strict=True)
     ]
+    record["scans"] = list({str(scan): scan for scan in scans}.values()) if c.of_bodies else scans
     page = {
         "title": c.verdict, "scans": "; ".join(_count_scans(c)) + ".", "groups": c.groups, "effect": c.effect,
         "head": ["", "", *c.groups, change, c.effect, "95 %", "p", "family-wise", "known error"],
         "rows": [_format_row(number, c) for number in c.numbers], "level": f"{LEVEL:.2g}",
-        "methods": describe_methods(c), "omitted": max(0, len(c.measures) - MOST_OUTLINES),
+        "methods": describe_methods(c), "omitted": max(0, len(c.measures) - MOST_OUTLINES), "of_bodies": c.of_bodies,
     }  # fmt: skip
-    shown = [*plot.FIRST_SHOWN, *(number.symbol for number in c.found if number.symbol not in plot.FIRST_SHOWN)]
     outlines = outlines_figure(name_parts(c.measures), [scan.outline for scan in c.measures], c.unit)
     figures = {
-        "difference": (comparison_figure(c), "Mean curvature diagrams and their difference"),
-        "numbers": (numbers_figure(c, shown), f"Familiar numbers, and those that differ, by {c.by}"),
+        "difference": (None if c.of_bodies else comparison_figure(c), "Mean curvature diagrams and their difference"),
+        "numbers": (numbers_figure(c, _choose_shown(c)), f"Familiar numbers, and those that differ, by {c.by}"),
         "all_numbers": (numbers_figure(c, [number.symbol for number in c.numbers]), f"Each number by {c.by}"),
         "outlines": (outlines, "Three slices of each scan, and the outline of its structure"),
     }
     columns = [{"subject": case.subject, label: case.label} for case in c.cases]
-    rows = (row for scan, more in zip(c.measures, columns, strict=True) for row in scan.rows(**more))
-    tables: dict[str, Any] = {"measures.csv": rows, "wide.csv": list_wide(c.measures, columns)}
+    tables: dict[str, Any] = {"wide.csv": list_wide(c.measures, columns), "subjects.csv": _list_subjects(c, label)}
     tables["numbers.csv"] = _test_rows(c)
+    if not c.of_bodies:  # the tables of bodies stand
+        pairs = zip(c.measures, columns, strict=True)
+        tables["measures.csv"] = (row for scan, more in pairs for row in scan.rows(**more))
     return write_study(target, FORMAT, FILES, record, page, tables, figures=figures)
 
 
@@ -117,8 +123,9 @@ def _count_scans(comparison: Comparison) -> list[str]:
     """Return the name of each group, or half of the numbers, with the counts of its scans and subjects."""
     side_of = dict(zip(comparison.subjects, comparison.sides.tolist(), strict=True))
     scans = Counter(side_of[case.label, case.subject] for case in comparison.cases)
+    things = "bodies" if comparison.of_bodies else "scans"
     return [
-        f"{name} ({subjects} subjects{f', {scans[side]} scans' if scans[side] > subjects else ''})"
+        f"{name} ({subjects} subjects{f', {scans[side]} {things}' if scans[side] > subjects else ''})"
         for side, (name, subjects) in enumerate(zip(comparison.parts, comparison.counts, strict=True))
     ]
 
@@ -145,7 +152,24 @@ def name_quantity(name: str, symbol: str, power: int, unit: str) -> tuple[str, s
     return name[0].upper() + name[1:], ", ".join(part for part in parts if part)
 
 
+def _choose_shown(comparison: Comparison) -> list[str]:
+    """Return the symbols of the familiar numbers, and then of those that differ."""
+    symbols = dict.fromkeys((*OF_BODIES, *plot.FIRST_SHOWN, *(number.symbol for number in comparison.found)))
+    return [symbol for symbol in symbols if symbol in {number.symbol for number in comparison.numbers}]
+
+
 # ---- tables ------------------------------------------------------------------------------------------------------
+
+
+def _list_subjects(comparison: Comparison, label: str) -> Iterator[dict[str, Any]]:
+    """Yield each subject with its label, the number of its scans or bodies, and its values; None where not known."""
+    c = comparison
+    counts = Counter((case.label, case.subject) for case in c.cases)
+    units = (plain_unit(c.unit, number.power) for number in c.numbers)
+    names = [f"{n.symbol} ({unit})".removesuffix(" ()") for n, unit in zip(c.numbers, units, strict=True)]
+    for (group, subject), values in zip(c.subjects, c.values.tolist(), strict=True):
+        row = {"subject": subject, label: group, "bodies" if c.of_bodies else "scans": counts[group, subject]}
+        yield row | {name: v if math.isfinite(v) else None for name, v in zip(names, values, strict=True)}
 
 
 def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
@@ -161,7 +185,8 @@ def _test_rows(comparison: Comparison) -> Iterator[dict[str, Any]]:
         diagrams |= {"symbol": "E", "unit": plain_unit(c.unit, -1), "difference": c.statistic}
     else:
         diagrams |= {"symbol": "R", "unit": "", "r": c.statistic}
-    yield dict.fromkeys(columns) | diagrams
+    if not c.of_bodies:
+        yield dict.fromkeys(columns) | diagrams
     for number in c.numbers:
         cells = (number.name, number.symbol, plain_unit(c.unit, number.power), *number.means, *number.deviations)
         cells += (number.difference, number.effect, number.low, number.high, number.p, number.family, number.known)
@@ -176,8 +201,10 @@ def comparison_figure(comparison: Comparison) -> Figure:
     """Return a figure of the mean curvature diagrams of groups, or halves of numbers, and their differences.
 
     A difference is the second of two groups less the first; each of more groups less the mean of all; or the change
-    from the least number to the greatest.
+    from the least number to the greatest. Of bodies, which have no diagram here, it is the figure of familiar numbers.
     """
+    if comparison.of_bodies:
+        return numbers_figure(comparison, _choose_shown(comparison))
     c, names, edges = comparison, [plot.plain(name) for name in comparison.parts], comparison.edges
     limits, unit = (edges[0], edges[-1]), c.unit
     single = len(c.differences) == 1  # in one row with the two diagrams; else differences lie in rows of their own
@@ -211,7 +238,8 @@ def _bar_on(axes: Axes, picture: QuadMesh, **options: Any) -> None:
 
 
 def numbers_figure(comparison: Comparison, symbols: Sequence[str]) -> Figure:
-    """Return a figure of quantities: subjects by group or over the number, with the 95 % intervals of their scans.
+    """Return a figure of quantities: subjects by group or over the number, with the 95 % intervals of their scans; and
+    bodies, as small points beside their subject's.
 
     A long line is a group's mean, or the regression line; a thin line joins the values of one subject in paired groups.
     The names of quantities that differ significantly, all tested, are bold.
@@ -231,6 +259,8 @@ def numbers_figure(comparison: Comparison, symbols: Sequence[str]) -> Figure:
         for pair in pairs:
             pair = pair[np.argsort(x[pair])]
             axes.plot(x[pair], values[pair], color=plot.QUIET, linewidth=0.8, zorder=1)
+        if c.of_bodies:
+            _draw_bodies(axes, c, k, x)
         for inside, colour in zip(members, itertools.cycle(plot.GROUPS)):
             axes.vlines(x[inside], low[inside], high[inside], color=colour, alpha=0.35, linewidth=1.4)
             axes.plot(x[inside], values[inside], "o", color=colour, markersize=4, markeredgewidth=0)
@@ -247,15 +277,43 @@ def numbers_figure(comparison: Comparison, symbols: Sequence[str]) -> Figure:
             axes.set_xlabel(plot.plain(c.by), fontsize=8)
         if number.symbol not in plot.SIGNED and axes.get_ylim()[0] < 0:
             axes.set_ylim(bottom=0)
+    _draw_legend(figure, c)
+    return figure
+
+
+def _draw_legend(figure: Figure, c: Comparison) -> None:
+    things = "bodies" if c.of_bodies else "scans"
     handles = [
         Line2D([], [], color=plot.QUIET, marker="o", linestyle="", markersize=4, label="a subject"),
-        Line2D([], [], color=plot.QUIET, linewidth=1.4, label="95 % interval of the subject's own scans"),
+        Line2D([], [], color=plot.QUIET, linewidth=1.4, label=f"95 % interval of the subject's own {things}"),
         Line2D([], [], color=plot.INK, linewidth=1.4, label="mean of the group" if c.groups else "slope"),
     ]
-    if pairs:
+    if c.of_bodies:
+        handles.append(Line2D([], [], color=plot.QUIET, marker=".", linestyle="", markersize=3, label="a body"))
+    if c.blocks is not None:
         handles.append(Line2D([], [], color=plot.QUIET, linewidth=0.8, label="of one subject"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=9)
-    return figure
+
+
+def _draw_bodies(axes: Axes, comparison: Comparison, number: int, x: np.ndarray) -> None:
+    """Draw the values of bodies about the positions of their subjects (S,), and let the axis span most of them."""
+    c, random = comparison, np.random.default_rng(0)
+    index = {subject: k for k, subject in enumerate(c.subjects)}
+    owners = np.array([index[case.label, case.subject] for case in c.cases])
+    values = np.array([body.quantities[number].value for body in c.measures])
+    known = np.isfinite(values)
+    width = 0.36 / max(c.counts) / 3 if c.groups else np.ptp(x) / 60
+    for k, place in enumerate(x):
+        own = random.permutation(np.flatnonzero(known & (owners == k)))[:POINTS]
+        shifted = place + width * random.uniform(-1, 1, len(own))
+        colour = plot.GROUPS[int(c.sides[k]) % len(plot.GROUPS)] if c.groups else plot.GROUPS[0]
+        axes.plot(shifted, values[own], ".", color=colour, alpha=0.25, markersize=2.5, markeredgewidth=0, zorder=0.8)
+    if known.any():
+        reach = np.nan_to_num(c.halves[:, number])
+        ends = c.values[:, number] - reach, c.values[:, number] + reach, np.percentile(values[known], SPAN)
+        low, high = np.nanmin(np.concatenate(ends)), np.nanmax(np.concatenate(ends))
+        margin = 0.08 * (high - low) or 0.05 * abs(high) or 1.0
+        axes.set_ylim(low - margin, high + margin)
 
 
 def _draw_panels(comparison: Comparison, symbols: Sequence[str]) -> tuple[Figure, dict[int, Axes]]:

@@ -1,13 +1,15 @@
-"""Do groups of scans differ, or change with a number such as time or dose: in which curvature, and by how much?"""
+"""Do groups of scans, or of bodies, differ, or change with a number such as dose: in which curvature, by how much?"""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from scipy import special
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.distance import cdist
 from scipy.stats import rankdata
@@ -19,16 +21,23 @@ from curvafit.core.units import format_number, format_percent, power_name
 from curvafit.drawing.plot import SIGNED, shared_limits
 from curvafit.geometry.diagrams import FAMILIES, Diagram
 from curvafit.geometry.distances import sliced_embedding
+from curvafit.scan.instances import OF_BODIES
 from curvafit.scan.measures import QUANTITIES, SURE, Measures, find_quantity, interval_reach
 from curvafit.scan.structure import check_options
-from curvafit.studies.scans import Case, Group, gather_notes, list_cases, measure_scans
+from curvafit.studies.scans import Case, Group, gather_notes, is_body, list_cases, measure_scans
 
 #: Most arrangements of the labels that are tried; all are, where there are no more.
 PERMUTATIONS = 9999
 #: Greatest p of a difference that is significant.
 LEVEL = 1 - SURE
 #: The familiar numbers, without those of curvature.
-FAMILIAR = ("BV/TV", "Tb.Th", "Tb.Th.SD", "Tb.Sp", "Tb.N", "Conn.D", "χ", "BS/BV", "BS/TV", "DA")
+FAMILIAR = ("BV/TV", "Tb.Th", "Tb.Th.SD", "Tb.Sp", "Tb.N", "Conn.D", "χ", "BS/BV", "BS/TV", "DA", "V", "S", "Ψ", "E")
+#: What tells that the border cuts a body, which is no number of the body itself.
+CUT = "S.cut"
+#: How `measure` finds the structure if nothing is stated.
+STRUCTURE = {"kind": "auto", "periodic": False, "threshold": "otsu", "dark": False}
+#: Fewest bodies of a subject whose median has an error.
+FEWEST_BODIES = 5
 #: Most numbers that differ and are named in the answer.
 NAMED = 3
 #: Bins along each axis of the difference of diagrams, and the width in bins of the Gaussian that smooths it.
@@ -82,18 +91,19 @@ class Comparison(Pictured):
     by, groups
         What subjects are compared by, and the names of the groups; none where it is a number.
     measures, cases
-        The scans' measures in `unit`; and their names, subjects and labels.
+        The scans' measures in `unit`, or those of each body; and their names, subjects and labels.
     subjects, labels, blocks
         Label and name of each subject; the index of its group, or its number, (S,); and the index of its name, (S,),
         where subjects are paired, else None.
     values, halves
-        Each subject's quantities (S, K), means over its scans; and the halves of their 95 % intervals, which follow
-        from the scans' own intervals, NaN where a scan has none.
+        Each subject's quantities (S, K), means over its scans, or medians over its bodies; and the halves of their 95 %
+        intervals, which follow from the scans' own intervals, or the spread of the bodies; NaN where there are none.
     numbers
         A test of each quantity.
     statistic, p, least
         Energy distance of the groups' curvature diagrams, in 1 / `unit`, or the diagrams' distance correlation with the
-        number's rank; the share of arrangements with at least as much, and the least possible share.
+        number's rank; the share of arrangements with at least as much, and the least possible share. Of bodies the
+        first two are NaN, and there are no `diagrams` and `differences`.
     sides, diagrams
         The index (S,) of each subject's part: its group, or the lower or upper half of the numbers; and the mean
         diagram of each part, of total area 1.
@@ -129,11 +139,16 @@ class Comparison(Pictured):
 
     def __repr__(self) -> str:
         groups = ", ".join(map(repr, self.groups)) or f"by {self.by!r}"
-        return f"Comparison({groups}, p {self.p:.3g}, {len(self.cases)} scans)"
+        return f"Comparison({groups}, p {self.p:.3g}, {len(self.cases)} {'bodies' if self.of_bodies else 'scans'})"
 
     def __getitem__(self, name: str) -> Number:
         """Return the test of a quantity by its name or symbol; raise KeyError where there is none."""
         return find_quantity(self.numbers, name)
+
+    @property
+    def of_bodies(self) -> bool:
+        """Return whether bodies of label images are compared, not scans."""
+        return is_body(self.measures[0])
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -170,11 +185,14 @@ class Comparison(Pictured):
             described, s = "; ".join(map(self._describe, found[:NAMED])), "s" * (len(found) == 1)
             lines.append(f"Of {count} numbers {len(found)} differ{s}, {level}: {described}{rest}.")
         else:
-            strongest = max((self[name] for name in FAMILIAR), key=lambda number: abs(np.nan_to_num(number.effect)))
+            familiar = (number for number in self.numbers if number.symbol in FAMILIAR)
+            strongest = max(familiar, key=lambda number: abs(np.nan_to_num(number.effect)))
             lines.append(
                 f"None of {count} numbers is seen to differ ({level}). Of the familiar ones the effect on "
                 f"{self._describe(strongest)} is the largest."
             )
+        if self.of_bodies:
+            return " ".join(lines)
         verdict, p = "differ" if self.p <= LEVEL else "are not told apart", format_number(self.p, 2)
         name, power = ("energy distance", -1) if self.groups else ("distance correlation", 0)
         strength = f"{name} {format_number(self.statistic, 2)} {power_name(self.unit, power)}".rstrip()
@@ -197,7 +215,8 @@ class Comparison(Pictured):
             return f"{who} {differ if self.primary.p <= LEVEL else alike} by their {self.primary.name}"
         if self.found:
             return f"{who} {differ}: {', '.join(map(self._summarise, self.found[:2]))}"
-        return f"{who} {differ if self.p <= LEVEL else alike} by their curvature diagrams"
+        by = f"the numbers of their {len(self.cases)} bodies" if self.of_bodies else "their curvature diagrams"
+        return f"{who} {differ if self.p <= LEVEL else alike} by {by}"
 
     def _summarise(self, number: Number) -> str:
         """Return a number's symbol, and its change in per cent where it cannot be negative."""
@@ -247,17 +266,19 @@ def compare(
 
     Each scan is measured (`curvafit.measure`). Scans of a subject are averaged: the subject is what counts. Diagrams of
     groups are compared by the energy distance of the subjects' diagrams, by a number by their distance correlation with
-    its rank; each quantity by its correlation with the labels: all over the same arrangements of the labels. Raises
-    ValueError where labels cannot be exchanged (fewer than two groups of two subjects, fewer than three numbers, a
-    subject with several labels that is not `paired`, or with one that is), a scan is listed twice, or only some have a
-    physical unit; and as `measure`, with the scan's name.
+    its rank; each quantity by its correlation with the labels: all over the same arrangements of the labels. Of bodies
+    (`curvafit.measure_instances`, or its tables) the subject's value is the median over them, and there is no diagram.
+    Raises ValueError where labels cannot be exchanged (fewer than two groups of two subjects, fewer than three numbers,
+    a subject with several labels that is not `paired`, or with one that is), a scan is listed twice, bodies come with
+    scans or without subjects, or only some have a physical unit; and as `measure`, with the scan's name.
 
     Parameters
     ----------
     groups
         Two or more: folders of scans; or sequences of scans, paths or `Measures`; or such sequences by subject. Or one
         CSV table of the columns scan, group and optionally subject and roi, the scan's region, with paths relative to
-        it. Or one sequence, with `by`.
+        it. Or one sequence, with `by`. A scan may be a table that `curvafit measure --labels` wrote, or what
+        `measure_instances` returns; such a table may be a group, or all, with columns that `--subjects` gave it.
     by
         The table's column to compare by; or a label for each scan of one sequence. Where all are numbers, such as times
         or doses, what goes with the number is tested; else they name groups.
@@ -280,13 +301,20 @@ def compare(
     check_options(kind, threshold, reading.get("label"))
     check_int(permutations, "a number of permutations from 99", 99, 10**6)
     check_seed(seed)
-    if primary is not None:
-        names = {word for name, symbol, *_ in QUANTITIES for word in (name, symbol)}
-        check_choice(primary, names, f"a primary number of {', '.join(symbol for _, symbol, *_ in QUANTITIES)}")
     cases, notes = list_cases(groups, by, paired)
+    of_bodies = is_body(cases[0].source)
+    if primary is not None:
+        known = [formula[:2] for formula in (OF_BODIES if of_bodies else QUANTITIES) if formula[1] != CUT]
+        check_choice(primary, set(sum(known, ())), f"a primary number of {', '.join(symbol for _, symbol in known)}")
     options = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark}
+    stated = [value for value in reading.values() if value is not None and value is not False]
+    if of_bodies and (stated or options != STRUCTURE):
+        raise ValueError("bodies of a table are measured: leave out options of scans such as --spacing, --unit, --kind")
     measures, measure_notes = measure_scans(cases, options, reading, workers, sub_progress(progress, 0.0, 0.97))
     progress("comparing", 0.97)
+    if of_bodies:
+        measures, body_notes = _describe_bodies(measures)
+        measure_notes += body_notes
     name = by if isinstance(by, str) else "group" if isinstance(cases[0].label, str) else "the number"
     parameters = {**options, **reading, "by": name, "paired": paired, "primary": primary}
     parameters |= {"permutations": permutations, "seed": seed}
@@ -299,31 +327,32 @@ def _compare_measures(
     """Test measures of scans by the labels of their subjects, and describe how far apart the groups or halves are."""
     subject_of_scan = [(case.label, case.subject) for case in cases]
     subjects = list(dict.fromkeys(subject_of_scan))
-    scans = [[k for k, key in enumerate(subject_of_scan) if key == subject] for subject in subjects]
+    index = {subject: k for k, subject in enumerate(subjects)}
+    positions = np.array([index[subject] for subject in subject_of_scan])
+    scans = [np.flatnonzero(positions == k).tolist() for k in range(len(subjects))]
     groups = tuple(dict.fromkeys(label for label, _ in subjects if isinstance(label, str)))
     labels = np.array([groups.index(label) if isinstance(label, str) else label for label, _ in subjects])
     blocks = np.unique([name for _, name in subjects], return_inverse=True)[1] if options["paired"] else None
     # A quantity may depend on a number in a straight line or level off: ranks detect both.
     scores = labels if groups else rankdata(labels)
     arrangements, exact = permutation.relabel(scores, options["permutations"], options["seed"], blocks)
-    test = permutation.measure_energy if groups else permutation.measure_dependence
-    diagrams = [_pool([measures[k].diagram for k in own_scans]) for own_scans in scans]
-    embeddings = np.stack([sliced_embedding(diagram) for diagram in diagrams])
-    statistics = test(cdist(embeddings, embeddings), arrangements, blocks)
     sides = labels if groups else _halve(labels)
-    means = tuple(_pool([diagrams[k] for k in np.flatnonzero(sides == side)]) for side in np.unique(sides))
-    edges, differences = _compare_bins(diagrams, labels, blocks)
-    values, errors, halves = _average(measures, scans)
+    if is_body(measures[0]):
+        of_diagrams = {"statistic": math.nan, "p": math.nan, "diagrams": (), "edges": np.zeros(0)}
+        of_diagrams["differences"] = np.zeros((0, 0, 0))
+        values, errors, halves = _take_medians(measures, scans)
+    else:
+        diagrams = [_pool([measures[k].diagram for k in own]) for own in scans]
+        of_diagrams = _compare_diagrams(diagrams, labels, sides, arrangements, blocks)
+        values, errors, halves = _average(measures, scans)
     # The least possible p is that of a quantity equal to the labels.
     least_p = permutation.share_beyond(permutation.correlate(scores[:, None], arrangements, blocks))[0]
     return Comparison(
         by=options["by"], groups=groups, unit=measures[0].unit, cases=tuple(cases), measures=tuple(measures),
         subjects=tuple(subjects), labels=labels, blocks=blocks, values=values, halves=halves,
         numbers=_compare_numbers(measures[0], values, errors, labels, arrangements, blocks),
-        statistic=float(statistics[0]), p=float(permutation.share_beyond(statistics)), least=float(least_p),
-        sides=sides, diagrams=means, edges=edges, differences=differences,
-        permutations=len(arrangements), exact=exact, options=options,
-        notes=(*notes, *gather_notes(measures, cases)),
+        least=float(least_p), sides=sides, permutations=len(arrangements), exact=exact, options=options,
+        notes=(*notes, *gather_notes(measures, cases)), **of_diagrams,
     )  # fmt: skip
 
 
@@ -331,6 +360,21 @@ def _halve(numbers: np.ndarray) -> np.ndarray:
     """Return which numbers are in the upper half, 0 or 1; neither half is empty."""
     median = np.median(numbers)
     return (numbers > median if median < numbers.max() else numbers >= median).astype(int)
+
+
+def _compare_diagrams(
+    diagrams: Sequence[Diagram], labels: np.ndarray, sides: np.ndarray, arrangements: np.ndarray,
+    blocks: np.ndarray | None,
+) -> dict[str, Any]:  # fmt: skip
+    """Test diagrams of subjects; return `statistic`, `p`, `diagrams`, `edges` and `differences` of a `Comparison`."""
+    is_number = np.issubdtype(labels.dtype, np.floating)
+    test = permutation.measure_dependence if is_number else permutation.measure_energy
+    embeddings = np.stack([sliced_embedding(diagram) for diagram in diagrams])
+    statistics = test(cdist(embeddings, embeddings), arrangements, blocks)
+    of_side = ([d for d, own in zip(diagrams, sides, strict=True) if own == side] for side in np.unique(sides))
+    edges, differences = _compare_bins(diagrams, labels, blocks)
+    tested = {"statistic": float(statistics[0]), "p": float(permutation.share_beyond(statistics))}
+    return tested | {"diagrams": tuple(map(_pool, of_side)), "edges": edges, "differences": differences}
 
 
 def _pool(diagrams: Sequence[Diagram]) -> Diagram:
@@ -356,6 +400,37 @@ def _compare_bins(
         return edges, np.ptp(labels) * np.tensordot(x, shares, 1)[None] / (x @ x)
     means = np.stack([shares[labels == group].mean(0) for group in np.unique(labels)])
     return edges, means[1:] - means[:1] if len(means) == 2 else means - shares.mean(0)
+
+
+def _describe_bodies(bodies: Sequence[Measures]) -> tuple[list[Measures], list[str]]:
+    """Return bodies without the area that the border cuts, and notes on how many it cuts and how many are thin."""
+    count, notes = len(bodies), []
+    if cut := sum(body[CUT].value > 0 for body in bodies):
+        notes.append(f"The border cuts {cut} of {count} bodies: what lies inside counts, but for sphericity.")
+    if thin := sum(math.isnan(body["H"].value) for body in bodies):
+        notes.append(f"Curvature is not known of {thin} of {count} bodies, which are too thin for it: others count.")
+    kept = [tuple(quantity for quantity in body.quantities if quantity.symbol != CUT) for body in bodies]
+    return [replace(body, quantities=own) for body, own in zip(bodies, kept, strict=True)], notes
+
+
+def _take_medians(bodies: Sequence[Measures], of_subjects: Sequence[Sequence[int]]) -> tuple[np.ndarray, ...]:
+    """Return what `_average` does of bodies: medians of subjects, of bodies whose value is known, and their errors.
+
+    The error is that of Maritz & Jarrett (1978), the deviation of the medians of resampled bodies; it takes a subject's
+    bodies for independent.
+    """
+    values = np.array([[quantity.value for quantity in body.quantities] for body in bodies])
+    medians, errors = np.full((2, len(of_subjects), values.shape[1]), np.nan)
+    for (k, own), column in itertools.product(enumerate(of_subjects), range(values.shape[1])):
+        known = np.sort(values[own, column])
+        known = known[np.isfinite(known)]
+        if len(known):
+            medians[k, column] = np.median(known)
+        if len(known) >= FEWEST_BODIES:
+            half = (len(known) + 1) / 2
+            weights = np.diff(special.betainc(half, half, np.linspace(0, 1, len(known) + 1)))
+            errors[k, column] = math.sqrt(weights @ (known - weights @ known) ** 2)
+    return medians, errors, float(special.ndtri((1 + SURE) / 2)) * errors
 
 
 def _average(measures: Sequence[Measures], scans: Sequence[Sequence[int]]) -> tuple[np.ndarray, ...]:

@@ -1,7 +1,7 @@
 """Many scans: their subjects and groups, their measures in one unit, and tables of their numbers.
 
-Scans come from folders, sequences or a table. All are read once before long work. Numbers are written as CSV, a row for
-each scan and quantity.
+Scans, or the bodies of label images, come from folders, sequences or a table. All are read once before long work.
+Numbers are written as CSV, a row for each scan and quantity.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from functools import partial
 from itertools import permutations
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -26,17 +26,19 @@ from curvafit.core.checks import as_tuple, quoted
 from curvafit.core.files import write_content
 from curvafit.core.records import Format, can_write, has_mark
 from curvafit.core.runtime import Progress, silent, sub_progress
-from curvafit.core.units import format_number, unit_name
+from curvafit.core.units import format_number, plain_unit, unit_name
 from curvafit.core.workers import cluster, run_jobs
 from curvafit.geometry.diagrams import Diagram
-from curvafit.scan.instances import measure_instances
+from curvafit.scan.instances import OF_BODIES, measure_instances
 from curvafit.scan.measures import COLUMNS, QUANTITIES, Measures, Quantity
 from curvafit.scan.tiles import measure
 from curvafit.volumes.read import Source, load, pick_reader
 from curvafit.volumes.volume import ScanError
 
-#: A group as a caller gives it: a folder of scans, scans, or scans by subject; `Measures` are not measured again.
-Group = str | PathLike[str] | Sequence[Source | Measures] | Mapping[str, Sequence[Source | Measures]]
+#: A scan as a caller gives it, and a group: a folder of scans, scans, or scans by subject; `Measures`, of a scan or of
+#: the bodies of a label image, are not measured again.
+Scan = Source | Measures | tuple[Measures, ...]
+Group = str | PathLike[str] | Sequence[Scan] | Mapping[str, Sequence[Scan]]
 #: The fewest subjects of a group whose spread can be measured.
 FEWEST = 2
 #: Edge of the bins to which a scan's diagram is reduced, over the inverse of the structure's thickness.
@@ -58,7 +60,8 @@ MEASURED_FILE = Format("curvafit measured", 1, "measured scans", "measure them a
 
 
 class Case(NamedTuple):
-    """A scan, its name, its subject, and its label: the name of its group, or a number; and its region of interest."""
+    """A scan or a body, its name or its table's, its subject, its label (the name of its group, or a number), and its
+    region of interest."""
 
     source: Source | Measures
     name: str
@@ -78,18 +81,21 @@ def list_cases(groups: Sequence[Group], by: str | Sequence[Any] | None, paired: 
     if len(groups) == 1 and isinstance(groups[0], str | PathLike):
         if not isinstance(by, str | None):
             raise ValueError("expected a table alone, or scans with a label for each, or two groups or more")
-        measured = Path(groups[0]) / MEASURED
-        read, path = (_read_measured, measured) if measured.exists() else (_read_cases, Path(groups[0]))
-        cases = read(path, by or "group", paired)
+        path = Path(groups[0])
+        read = _read_measured if (path / MEASURED).exists() else _read_bodies if _holds_bodies(path) else _read_cases
+        cases = read(path, (by or "group").strip().casefold(), paired)
     else:
         cases = _list_labelled(groups[0], by) if len(groups) == 1 else _list_groups(groups, by, paired, notes)
         if not paired and not any(isinstance(group, Mapping) for group in groups):
-            notes.append("Each scan counts as a subject; a table of scans tells if several are of one.")
+            images = "Each image counts as a subject, unless its table names one (measure --subjects)."
+            scans = "Each scan counts as a subject; a table of scans tells if several are of one."
+            notes.append(images if is_body(cases[0].source) else scans)
             groups_of = Counter(subject for subject, _ in {(case.subject, case.label) for case in cases})
             if common := sum(count > 1 for count in groups_of.values()):
                 notes.append(f"The groups have {common} names in common: they count as different subjects.")
                 cases = [case._replace(subject=f"{case.label}/{case.subject}") for case in cases]
     cases = _name_labels(cases, by)
+    _check_sources(cases)
     _check_labels(cases, paired)
     return cases, notes
 
@@ -116,11 +122,24 @@ def _parse_number(label: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
+def _check_sources(cases: Sequence[Case]) -> None:
+    """Raise ValueError if a scan or a body is listed twice, or scans come with bodies."""
+    listed: Counter[tuple[object, ...]] = Counter()
+    for case in cases:
+        if isinstance(case.source, str | PathLike):
+            listed[Path(case.source).resolve(),] += 1
+        elif is_body(case.source) and case.name.endswith(".csv"):  # those of arrays may share a name
+            listed[case.name, case.source.source, case.source.part] += 1
+    for (path, *_), count in listed.most_common(1):
+        if count > 1:
+            raise ValueError(f"expected each scan once, got {path} {count} times")
+    names = {("body" if is_body(case.source) else "scan"): case.name for case in cases}
+    if len(names) > 1:
+        raise ValueError(f"expected scans, or tables of measure --labels, got both, as {' and '.join(names.values())}")
+
+
 def _check_labels(cases: Sequence[Case], paired: bool) -> None:
-    """Raise ValueError if a scan is listed twice, or labels cannot be exchanged between enough subjects."""
-    paths = Counter(Path(str(case.source)).resolve() for case in cases if isinstance(case.source, str | PathLike))
-    if repeated := [path for path, count in paths.most_common(1) if count > 1]:
-        raise ValueError(f"expected each scan once, got {repeated[0]} {paths[repeated[0]]} times")
+    """Raise ValueError if labels cannot be exchanged between enough subjects."""
     pairs = list(dict.fromkeys((case.subject, case.label) for case in cases))
     counts = Counter(label for _, label in pairs)
     groups = isinstance(pairs[0][1], str)
@@ -147,9 +166,11 @@ def _list_labelled(scans: Any, by: Any) -> list[Case]:
     if by is None or isinstance(by, str) or isinstance(scans, Mapping):
         raise ValueError("expected two groups or more, a table, or scans with a label for each")
     labels, cases = as_tuple(by, "labels"), _list_group(as_tuple(scans, "scans"), "scan ", [])
-    if len(labels) != len(cases):
-        raise ValueError(f"expected a label for each of {len(cases)} scans (--by), got {len(labels)}")
-    return [case._replace(label=label) for case, label in zip(cases, labels, strict=True)]
+    subjects = list(dict.fromkeys(case.subject for case in cases))
+    if len(labels) != len(subjects):
+        raise ValueError(f"expected a label for each of {len(subjects)} scans (--by), got {len(labels)}")
+    label_of = dict(zip(subjects, labels, strict=True))
+    return [case._replace(label=label_of[case.subject]) for case in cases]
 
 
 def _list_groups(groups: Sequence[Group], by: Any, paired: bool, notes: list[str]) -> list[Case]:
@@ -160,25 +181,26 @@ def _list_groups(groups: Sequence[Group], by: Any, paired: bool, notes: list[str
     for group, name in zip(groups, _name_groups(groups), strict=True):
         group_cases = _list_group(group, name, notes)
         if paired and not isinstance(group, str | PathLike | Mapping):
-            group_cases = [case._replace(subject=str(k)) for k, case in enumerate(group_cases, 1)]
+            places = {subject: str(k) for k, subject in enumerate(dict.fromkeys(c.subject for c in group_cases), 1)}
+            group_cases = [case._replace(subject=places[case.subject]) for case in group_cases]
         cases += group_cases
     return cases
 
 
 def _name_groups(groups: Sequence[Group]) -> list[str]:
-    """Return the names of groups: those of their folders, or A, B, C."""
+    """Return the names of groups: those of their folders or tables, or A, B, C."""
     if not all(isinstance(group, str | PathLike) for group in groups):
         return [chr(ord("A") + k) for k in range(len(groups))]
     folders = [Path(group) for group in groups]  # type: ignore[arg-type]
     for folder in folders:
         if not folder.exists():
             raise FileNotFoundError(f"no such folder: {folder}")
-        if not folder.is_dir():
+        if not folder.is_dir() and not _holds_bodies(folder):
             raise ValueError(f"expected a folder of scans, got the file {folder}; single scans need --by")
     for folder, other in permutations((folder.resolve() for folder in folders), 2):
         if folder.is_relative_to(other):
             raise ValueError(f"expected folders apart from each other, got {folder} and {other}")
-    names = [folder.resolve().name for folder in folders]
+    names = [folder.resolve().name.removesuffix(".csv") for folder in folders]
     return names if len(set(names)) == len(names) else list(map(str, folders))
 
 
@@ -190,21 +212,26 @@ def _list_group(group: Group, name: str, notes: list[str]) -> list[Case]:
         pairs: list[tuple[str, Any]] = [(str(subject), scan) for subject, scans in group.items() for scan in scans]
     else:
         pairs = [(f"{name}{k}", scan) for k, scan in enumerate(group, 1)]
+        if any(is_body(scan) for scan in group):
+            raise ValueError("expected bodies by subject, as in {'mouse 1': measure_instances(labels)}, got some alone")
     cases = []
     for k, (subject, scan) in enumerate(pairs, 1):
-        source = scan if isinstance(scan, str | PathLike) else getattr(scan, "source", "")  # empty of an array
-        cases.append(Case(scan, Path(str(source)).name or f"{name}{k}", subject, name))
+        for part in scan if isinstance(scan, tuple) else (scan,):
+            source = part if isinstance(part, str | PathLike) else getattr(part, "source", "")  # empty of an array
+            cases += _open_table(Case(part, Path(str(source)).name or f"{name}{k}", subject, name), True)
     return cases
 
 
 def _list_folder(folder: Path, group: str, notes: list[str]) -> list[Case]:
-    """Return the scans in a folder: files, and folders of slices or Zarr stores, that `curvafit.load` reads."""
+    """Return the scans in a folder: files, and folders of slices or Zarr stores, that `curvafit.load` reads; and the
+    bodies of its tables. A table may stand for a folder."""
     cases, skipped = [], []
-    for path in sorted(folder.iterdir()):
+    for path in sorted(folder.iterdir()) if folder.is_dir() else [folder]:
         if path.name.startswith("."):
             continue
         try:
-            pick_reader(path)
+            if not _holds_bodies(path):
+                pick_reader(path)
         except ScanError:
             skipped.append(path.name)
         else:
@@ -215,7 +242,84 @@ def _list_folder(folder: Path, group: str, notes: list[str]) -> list[Case]:
         notes.append(f"{len(skipped)} other files in {folder.name} were left aside: {', '.join(skipped[:3])}.")
     # A scan is named by its stem, such as that of a subject, unless another file shares it.
     stems = Counter(case.subject for case in cases)
-    return [case if stems[case.subject] == 1 else case._replace(subject=case.name) for case in cases]
+    named = (case if stems[case.subject] == 1 else case._replace(subject=case.name) for case in cases)
+    return [opened for case in named for opened in _open_table(case, False)]
+
+
+# ---- bodies, measured before -----------------------------------------------------------------------------------------
+
+
+def is_body(scan: object) -> TypeGuard[Measures]:
+    """Return whether a scan is one of the bodies of a label image."""
+    return isinstance(scan, Measures) and scan.part is not None and scan.part[0] == "instance"
+
+
+def _holds_bodies(path: Path) -> bool:
+    """Return whether a file is a table of bodies, as `measure --labels` writes it."""
+    if path.suffix.lower() != ".csv" or not path.is_file():
+        return False
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        return {"scan", "instance", "symbol"} <= set(re.split("[,;\t]", file.readline().strip().casefold()))
+
+
+def _open_table(case: Case, stated: bool) -> list[Case]:
+    """Return a case for each body, if a case is a table of bodies; else the case itself.
+
+    The subject is the case's own if it is `stated`; else that in the table's column; else the image, where the table
+    has several.
+    """
+    if not (isinstance(case.source, str | PathLike) and _holds_bodies(Path(case.source))):
+        return [case]
+    path, bodies = Path(case.source).resolve(), _read_measures(Path(case.source))
+    images = {body.source: Path(body.source).name.partition(".")[0] for body, _ in bodies}
+    if len(images) == 1:
+        images = dict.fromkeys(images, case.subject)
+    elif len(set(images.values())) < len(images):
+        images = {image: image for image in images}
+    return [
+        case._replace(
+            source=body, name=str(path), subject=case.subject if stated else row.get("subject") or images[body.source]
+        )
+        for body, row in bodies
+    ]
+
+
+def _read_bodies(path: Path, by: str, paired: bool) -> list[Case]:
+    """Return the bodies of a table, with labels and subjects from columns that `measure` was given."""
+    cases = []
+    for body, row in _read_measures(path):
+        _check_columns(row, by, paired, path)
+        cases.append(Case(body, str(path), row.get("subject") or body.source, row[by]))
+    return cases
+
+
+def _read_measures(path: Path) -> list[tuple[Measures, dict[str, str]]]:
+    """Return the bodies in a table of `measure --labels`, each with the row of its further columns."""
+    rows: dict[tuple[str, str], dict[str, dict[str, str]]] = {}
+    try:
+        for row in _read_table(path, ("scan", "instance", "symbol")):
+            by_symbol = rows.setdefault((row["scan"], row["instance"]), {})
+            if by_symbol.setdefault(row["symbol"], row) is not row:
+                raise ValueError(f"instance {row['instance']} of {row['scan']} is there twice")
+        return [(_read_body(by_symbol), next(iter(by_symbol.values()))) for by_symbol in rows.values()]
+    except ValueError as fault:
+        raise ValueError(f"expected a table of bodies, as measure --labels writes it: {fault} ({path})") from None
+
+
+def _read_body(rows: Mapping[str, Mapping[str, str]]) -> Measures:
+    """Return a body's measures from its rows by symbol; raise ValueError where one is missing, or in another unit."""
+    if missing := [symbol for _, symbol, *_ in OF_BODIES if symbol not in rows]:
+        raise ValueError(f"a body has no {missing[0]}")
+    unit, first = rows["Tb.Th"]["unit"], rows["V"]
+    quantities = []
+    for name, symbol, power, _ in OF_BODIES:
+        if rows[symbol]["unit"] != plain_unit(unit, power):
+            raise ValueError(f"{symbol} in {rows[symbol]['unit']}, and Tb.Th in {unit}")
+        quantities.append(Quantity(name, symbol, float(rows[symbol]["value"] or "nan"), math.nan, power))
+    empty = Diagram(np.zeros((0, 2)), np.zeros(0), f"1/{unit}")
+    part = ("instance", int(first["instance"]))
+    nowhere = math.nan, math.nan, math.nan
+    return Measures(first["scan"], unit, "mask", tuple(quantities), nowhere, empty, (1, 1, 1), (), part)
 
 
 # ---- tables that name scans ------------------------------------------------------------------------------------------
@@ -227,12 +331,12 @@ def _read_cases(table: Path, by: str, paired: bool) -> list[Case]:
         raise ValueError(f"expected two folders or more, or a table, got the folder {table} alone")
     if not table.exists():
         raise FileNotFoundError(f"no such file: {table}")
-    by = by.strip().casefold()
     cases = []
     for row in _read_table(table, ("scan", by, *["subject"] * paired)):
         path = _find_beside(table, row["scan"])
         region = _find_beside(table, row["roi"]) if row.get("roi") else None
-        cases.append(Case(str(path), path.name, row.get("subject") or row["scan"], row[by], region))
+        case = Case(str(path), path.name, row.get("subject") or row["scan"], row[by], region)
+        cases += _open_table(case, bool(row.get("subject")))
     return cases
 
 
@@ -254,7 +358,7 @@ def write_measured(measures: Sequence[Measures], columns: Sequence[Mapping[str, 
     return MEASURED_FILE.write(path, {"scans": scans, "columns": list(map(dict, columns))}, arrays)
 
 
-def _read_measured(path: Path, by: str, paired: bool) -> list[Case]:
+def _read_measured(folder: Path, by: str, paired: bool) -> list[Case]:
     """Return scans that were measured before, with their labels from the column `by` that `measure` was given."""
 
     def build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[tuple[Measures, dict[str, str]]]:
@@ -268,12 +372,17 @@ def _read_measured(path: Path, by: str, paired: bool) -> list[Case]:
         return found
 
     cases = []
-    for scan, row in MEASURED_FILE.read(path, build):
-        if by not in row or (paired and "subject" not in row):
-            needed = f"{by} and subject" if paired else by
-            raise ValueError(f"expected scans measured with --subjects, and its column {needed}, got {path.parent}")
+    for scan, row in MEASURED_FILE.read(folder / MEASURED, build):
+        _check_columns(row, by, paired, folder)
         cases.append(Case(scan, Path(scan.source).name, row.get("subject") or scan.source, row[by]))
     return cases
+
+
+def _check_columns(row: Mapping[str, str], by: str, paired: bool, path: Path) -> None:
+    """Raise ValueError where a scan that was measured lacks a label, or, to be paired, a subject."""
+    if not row.get(by) or (paired and not row.get("subject")):
+        needed = f"{by} and subject" if paired else by
+        raise ValueError(f"expected scans measured with --subjects, and its column {needed}, got {path}")
 
 
 def read_columns(table: str | PathLike[str], scans: Sequence[str], taken: Sequence[str] = ()) -> list[dict[str, str]]:
@@ -339,8 +448,9 @@ def measure_scans(
     }
     measured |= _share_out(tasks, [case.name for case in cases], workers, sub_progress(progress, 0.05, 1.0))
     measures: list[Measures] = [measured[k][0] for k in range(len(cases))]
-    if flat := [case.name for case, scan in zip(cases, measures, strict=True) if not scan.diagram.area > 0]:
-        raise ValueError(f"{flat[0]}: expected a scan with curvature, got one too thin for it: measure has its numbers")
+    pairs = zip(cases, measures, strict=True)
+    if flat := next((case.name for case, scan in pairs if not is_body(scan) and not scan.diagram.area), None):
+        raise ValueError(f"{flat}: expected a scan with curvature, got one too thin for it: measure has its numbers")
     units = {scan.unit for scan in measures}
     measures = to_one_unit(measures, reading.get("unit"))
     unit = measures[0].unit
@@ -353,7 +463,7 @@ def to_one_unit(measures: Sequence[Measures], stated: str | None = None) -> list
     """Return scans in the first one's unit; in mm, as bone is measured, where that is µm, the first scan's structure is
     `THICK` or thicker, and no unit is `stated`. Raises ValueError where only some are in a physical unit."""
     first = measures[0]
-    bone = stated is None and first.unit == "um" and first["thickness"].value >= THICK
+    bone = stated is None and first.unit == "um" and first["thickness"].value >= THICK and not is_body(first)
     return [scan.convert("mm" if bone else first.unit) for scan in measures]
 
 
