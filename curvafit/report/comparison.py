@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -121,8 +120,7 @@ def describe_measures(measures: Sequence[Measures], **values: Any) -> str:
 
 def _count_scans(comparison: Comparison) -> list[str]:
     """Return the name of each group, or half of the numbers, with the counts of its scans and subjects."""
-    side_of = dict(zip(comparison.subjects, comparison.sides.tolist(), strict=True))
-    scans = Counter(side_of[case.label, case.subject] for case in comparison.cases)
+    scans = np.bincount(comparison.sides[comparison.owners])
     things = "bodies" if comparison.of_bodies else "scans"
     return [
         f"{name} ({subjects} subjects{f', {scans[side]} {things}' if scans[side] > subjects else ''})"
@@ -163,12 +161,11 @@ def _choose_shown(comparison: Comparison) -> list[str]:
 
 def _list_subjects(comparison: Comparison, label: str) -> Iterator[dict[str, Any]]:
     """Yield each subject with its label, the number of its scans or bodies, and its values; None where not known."""
-    c = comparison
-    counts = Counter((case.label, case.subject) for case in c.cases)
+    c, things = comparison, "bodies" if comparison.of_bodies else "scans"
     units = (plain_unit(c.unit, number.power) for number in c.numbers)
     names = [f"{n.symbol} ({unit})".removesuffix(" ()") for n, unit in zip(c.numbers, units, strict=True)]
-    for (group, subject), values in zip(c.subjects, c.values.tolist(), strict=True):
-        row = {"subject": subject, label: group, "bodies" if c.of_bodies else "scans": counts[group, subject]}
+    for (group, subject), count, values in zip(c.subjects, np.bincount(c.owners), c.values.tolist(), strict=True):
+        row = {"subject": subject, label: group, things: int(count)}
         yield row | {name: v if math.isfinite(v) else None for name, v in zip(names, values, strict=True)}
 
 
@@ -297,9 +294,7 @@ def _draw_legend(figure: Figure, c: Comparison) -> None:
 
 def _draw_bodies(axes: Axes, comparison: Comparison, number: int, x: np.ndarray) -> None:
     """Draw the values of bodies about the positions of their subjects (S,), and let the axis span most of them."""
-    c, random = comparison, np.random.default_rng(0)
-    index = {subject: k for k, subject in enumerate(c.subjects)}
-    owners = np.array([index[case.label, case.subject] for case in c.cases])
+    c, owners, random = comparison, comparison.owners, np.random.default_rng(0)
     values = np.array([body.quantities[number].value for body in c.measures])
     known = np.isfinite(values)
     width = 0.36 / max(c.counts) / 3 if c.groups else np.ptp(x) / 60
@@ -307,7 +302,8 @@ def _draw_bodies(axes: Axes, comparison: Comparison, number: int, x: np.ndarray)
         own = random.permutation(np.flatnonzero(known & (owners == k)))[:POINTS]
         shifted = place + width * random.uniform(-1, 1, len(own))
         colour = plot.GROUPS[int(c.sides[k]) % len(plot.GROUPS)] if c.groups else plot.GROUPS[0]
-        axes.plot(shifted, values[own], ".", color=colour, alpha=0.25, markersize=2.5, markeredgewidth=0, zorder=0.8)
+        style = {"color": colour, "alpha": 0.25, "markersize": 2.5, "markeredgewidth": 0, "zorder": 0.8}
+        axes.plot(shifted, values[own], ".", rasterized=True, **style)
     if known.any():
         reach = np.nan_to_num(c.halves[:, number])
         ends = c.values[:, number] - reach, c.values[:, number] + reach, np.percentile(values[known], SPAN)

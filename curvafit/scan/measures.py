@@ -34,8 +34,9 @@ from curvafit.scan.preparation import LARGEST_WINDOW, Prepared
 from curvafit.scan.structure import Kind, find_structure, is_rounded
 from curvafit.volumes.volume import Box, ScanError, Volume, cut_boxes
 
-#: Columns of a table of measures; a CSV file begins with them.
+#: Columns of a table of measures, with which a CSV file begins, and the version that it states.
 COLUMNS = ("scan", "quantity", "symbol", "value", "low", "high", "unit", "direction", "version")
+RELEASE = version("curvafit")
 #: What is summed over blocks, in powers of the scan's unit; n0 to n5 are the parts zz zy zx yy yx xx of n⊗n.
 SUMS = ("volume", "inside", "thickness", "thickness²", "gap", "χ", "area", *(f"n{k}" for k in range(6)))
 SUMS += ("curved", "H", "H²", "K", "κ1", "κ2", "C", *FAMILIES)
@@ -236,13 +237,13 @@ def list_quantities(
     source: str, unit: str, quantities: Sequence[Quantity], direction: Sequence[float] = (math.nan,) * 3
 ) -> list[dict[str, Any]]:
     """Return a row for each quantity of a scan (`COLUMNS`); the direction is the anisotropy's."""
-    rows, release, (z, y, x) = [], version("curvafit"), direction
+    rows, (z, y, x) = [], direction
     for quantity in quantities:
         bounds = (quantity.value, quantity.value - quantity.half, quantity.value + quantity.half)
         value, low, high = (bound if math.isfinite(bound) else None for bound in bounds)
         axis = f"{z:.4f} {y:.4f} {x:.4f}" if quantity.symbol == "DA" and math.isfinite(z) else ""
         cells = (source, quantity.name, quantity.symbol, value, low, high, plain_unit(unit, quantity.power), axis)
-        rows.append(dict(zip(COLUMNS, (*cells, release), strict=True)))
+        rows.append(dict(zip(COLUMNS, (*cells, RELEASE), strict=True)))
     return rows
 
 

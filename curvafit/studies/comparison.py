@@ -19,7 +19,7 @@ from curvafit.core.checks import check_choice, check_int, check_seed
 from curvafit.core.runtime import Pictured, Progress, silent, sub_progress
 from curvafit.core.units import format_number, format_percent, power_name
 from curvafit.drawing.plot import SIGNED, shared_limits
-from curvafit.geometry.diagrams import FAMILIES, Diagram
+from curvafit.geometry.diagrams import FAMILIES, Diagram, join_diagrams
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.scan.instances import OF_BODIES
 from curvafit.scan.measures import QUANTITIES, SURE, Measures, find_quantity, interval_reach
@@ -34,8 +34,6 @@ LEVEL = 1 - SURE
 FAMILIAR = ("BV/TV", "Tb.Th", "Tb.Th.SD", "Tb.Sp", "Tb.N", "Conn.D", "χ", "BS/BV", "BS/TV", "DA", "V", "S", "Ψ", "E")
 #: What tells that the border cuts a body, which is no number of the body itself.
 CUT = "S.cut"
-#: How `measure` finds the structure if nothing is stated.
-STRUCTURE = {"kind": "auto", "periodic": False, "threshold": "otsu", "dark": False}
 #: Fewest bodies of a subject whose median has an error.
 FEWEST_BODIES = 5
 #: Most numbers that differ and are named in the answer.
@@ -149,6 +147,12 @@ class Comparison(Pictured):
     def of_bodies(self) -> bool:
         """Return whether bodies of label images are compared, not scans."""
         return is_body(self.measures[0])
+
+    @property
+    def owners(self) -> np.ndarray:
+        """Return the index of the subject of each scan or body."""
+        index = {subject: k for k, subject in enumerate(self.subjects)}
+        return np.array([index[case.label, case.subject] for case in self.cases])
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -307,8 +311,8 @@ def compare(
         known = [formula[:2] for formula in (OF_BODIES if of_bodies else QUANTITIES) if formula[1] != CUT]
         check_choice(primary, set(sum(known, ())), f"a primary number of {', '.join(symbol for _, symbol in known)}")
     options = {"kind": kind, "periodic": periodic, "threshold": threshold, "dark": dark}
-    stated = [value for value in reading.values() if value is not None and value is not False]
-    if of_bodies and (stated or options != STRUCTURE):
+    stated = kind != "auto" or periodic or threshold != "otsu" or dark
+    if of_bodies and (stated or any(value is not None and value is not False for value in reading.values())):
         raise ValueError("bodies of a table are measured: leave out options of scans such as --spacing, --unit, --kind")
     measures, measure_notes = measure_scans(cases, options, reading, workers, sub_progress(progress, 0.0, 0.97))
     progress("comparing", 0.97)
@@ -379,9 +383,7 @@ def _compare_diagrams(
 
 def _pool(diagrams: Sequence[Diagram]) -> Diagram:
     """Return the mean of diagrams, each scaled to total area 1."""
-    points = np.concatenate([diagram.points for diagram in diagrams])
-    weights = np.concatenate([diagram.normalised.weights / len(diagrams) for diagram in diagrams])
-    return Diagram(points, weights, unit=diagrams[0].unit)
+    return join_diagrams([replace(diagram, weights=diagram.normalised.weights / len(diagrams)) for diagram in diagrams])
 
 
 def _compare_bins(

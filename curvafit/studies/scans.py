@@ -270,6 +270,8 @@ def _open_table(case: Case, stated: bool) -> list[Case]:
     """
     if not (isinstance(case.source, str | PathLike) and _holds_bodies(Path(case.source))):
         return [case]
+    if case.roi:
+        raise ValueError(f"expected a region for scans alone, got one for the table of bodies {case.name}")
     path, bodies = Path(case.source).resolve(), _read_measures(Path(case.source))
     images = {body.source: Path(body.source).name.partition(".")[0] for body, _ in bodies}
     if len(images) == 1:

@@ -222,6 +222,7 @@ def test_the_command_compares_spheres_of_two_sizes(tmp_path: Path, monkeypatch: 
         ("control whole", "none that can be read"), ("control cut", "no Ψ"), ("control bent", "Tb.Th in um"),
         ("control words", "1,5"), ("control.csv control.csv", "apart"), ("control.csv", "column group"),
         ("twice.csv", "each scan once"), ("all.csv --by cage", "column cage"), ("all.csv", "--paired"),
+        ("region.csv", "region"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_sentence_and_nothing_is_written(
@@ -238,6 +239,7 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(
     for name in ("b0", "b1"):
         write_table([replace(body, source="b.tif")], f"voxels/{name}.csv")
     write_table([measure(Volume(spheres(8.0) > 0, (1.0,) * 3, "um"))], "whole/b0.csv")
+    Path("region.csv").write_text("scan,group,roi\ncontrol/a0.csv,1,mixed/b1.npy\n", encoding="utf-8")
     Path("twice.csv").write_text("scan,group\ncontrol/a0.csv,1\ncontrol/a0.csv,2\n", encoding="utf-8")
     before = sorted(home.rglob("*"))
     refused(call("compare", "--output", "out", *arguments.split()), word, progress=True)
