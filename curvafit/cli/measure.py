@@ -100,12 +100,10 @@ def measure(
 ) -> None:
     """Measure scans in seconds: morphometry, fabric and curvature in physical units, with 95 % intervals."""
     folder = _choose_folder(out, labels, subjects)
-    if any(page.values()) and grid is not None:
-        raise ValueError("--maps and --graph are of a scan as a whole: leave out --windows")
-    if any(page.values()) and folder is None:
-        raise ValueError("--maps and --graph are for a page: give a name without a suffix with -o")
-    if (page["maps"] or page["graph"]) and len(scans) > 1:
-        raise ValueError("--maps and --graph are of one scan: give one")
+    if any(page.values()) and (grid is not None or folder is None or len(scans) > 1):
+        raise ValueError(
+            "--maps and --graph are for the page of one scan: give one, and a name without suffix with -o, no --windows"
+        )
     if page["graph"] and (roi is not None or structure["periodic"]):
         raise ValueError("--graph traces a whole scan that does not repeat: leave out --roi and --periodic, or --crop")
     if labels and (roi is not None or tile is not None or structure != parse_structure()):

@@ -310,13 +310,11 @@ def _read_measures(path: Path) -> list[tuple[Measures, dict[str, str]]]:
 
 def _read_body(rows: Mapping[str, Mapping[str, str]]) -> Measures:
     """Return a body's measures from its rows by symbol; raise ValueError where one is missing, or in another unit."""
-    if missing := [symbol for _, symbol, *_ in OF_BODIES if symbol not in rows]:
-        raise ValueError(f"a body has no {missing[0]}")
-    unit, first = rows["Tb.Th"]["unit"], rows["V"]
-    quantities = []
+    first, unit, quantities = next(iter(rows.values())), rows.get("Tb.Th", {}).get("unit", ""), []
     for name, symbol, power, _ in OF_BODIES:
-        if rows[symbol]["unit"] != plain_unit(unit, power):
-            raise ValueError(f"{symbol} in {rows[symbol]['unit']}, and Tb.Th in {unit}")
+        expected = plain_unit(unit, power)
+        if rows.get(symbol, {}).get("unit") != expected:
+            raise ValueError(f"a body has no {symbol} {expected and f'in {expected}'}".rstrip())
         quantities.append(Quantity(name, symbol, float(rows[symbol]["value"] or "nan"), math.nan, power))
     empty = Diagram(np.zeros((0, 2)), np.zeros(0), f"1/{unit}")
     part = ("instance", int(first["instance"]))

@@ -219,7 +219,7 @@ def test_the_command_compares_spheres_of_two_sizes(tmp_path: Path, monkeypatch: 
     [
         ("control drug --spacing 2", "--spacing"), ("control drug --kind mask", "--kind"),
         ("control drug --primary Tb.Sp", "primary"), ("control mixed", "both"), ("control voxels", "physical spacing"),
-        ("control whole", "none that can be read"), ("control cut", "no Ψ"), ("control bent", "Tb.Th in um"),
+        ("control whole", "none that can be read"), ("control cut", "no Ψ"), ("control bent", "no V in um^3"),
         ("control words", "1,5"), ("control.csv control.csv", "apart"), ("control.csv", "column group"),
         ("twice.csv", "each scan once"), ("all.csv --by cage", "column cage"), ("all.csv", "--paired"),
         ("region.csv", "region"),
