@@ -32,6 +32,7 @@ from curvafit.geometry.diagrams import Diagram
 from curvafit.scan.instances import OF_BODIES, measure_instances
 from curvafit.scan.measures import COLUMNS, QUANTITIES, Measures, Quantity
 from curvafit.scan.tiles import measure
+from curvafit.volumes.formats.meshes import SUFFIXES as MESHES
 from curvafit.volumes.read import Source, load, pick_reader
 from curvafit.volumes.volume import ScanError
 
@@ -236,6 +237,11 @@ def _list_folder(folder: Path, group: str, notes: list[str]) -> list[Case]:
             skipped.append(path.name)
         else:
             cases.append(Case(str(path), path.name, path.name.partition(".")[0], group))
+    # A surface beside volumes is likely to be that of one of them.
+    meshes = [case for case in cases if case.name.lower().endswith(MESHES)]
+    if len(meshes) < len(cases):
+        skipped += [case.name for case in meshes]
+        cases = [case for case in cases if case not in meshes]
     if not cases:
         raise ValueError(f"expected scans in the folder {folder}, got none that can be read")
     if skipped:

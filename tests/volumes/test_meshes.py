@@ -18,6 +18,7 @@ import curvafit
 from curvafit.drawing.shapes import Output, write_field
 from curvafit.priors.grid import Grid
 from curvafit.scan import measure_instances
+from curvafit.studies.scans import list_cases
 from curvafit.volumes import Volume, load
 
 R = 3.0
@@ -163,3 +164,18 @@ def test_the_command_takes_a_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     refused(call("measure", path, "--spacing", 1e-9, "--unit", "um"), "memory", progress=True)
     monkeypatch.setitem(sys.modules, "trimesh", None)
     refused(call("measure", path, "--unit", "um"), 'pip install "curvafit[io]"', progress=True)
+
+
+def test_in_a_folder_of_volumes_a_surface_is_no_scan(tmp_path: Path) -> None:
+    """It is likely to be that of one of them; in a folder of its own it is."""
+    for group in ("a", "b"):
+        (tmp_path / group).mkdir()
+        for k in range(2):
+            written(ball(R + k), tmp_path / group / f"{k}.stl")
+    surfaces, notes = list_cases((tmp_path / "a", tmp_path / "b"), None, False)
+    assert [case.name for case in surfaces] == ["0.stl", "1.stl"] * 2 and "left aside" not in str(notes)
+    for k in range(2):
+        np.save(tmp_path / "a" / f"{k}.npy", np.ones((8, 8, 8)))
+    cases, notes = list_cases((tmp_path / "a", tmp_path / "b"), None, False)
+    assert [case.name for case in cases] == ["0.npy", "1.npy", "0.stl", "1.stl"]
+    assert any("2 other files in a were left aside: 0.stl" in note for note in notes)
