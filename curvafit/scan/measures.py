@@ -181,6 +181,11 @@ class Measures(Pictured):
     outline: Outline | None = None
     maps: Mapping[str, Volume] = default(default_factory=dict)
 
+    @property
+    def with_intervals(self) -> bool:
+        """Return whether the scan was large enough for intervals."""
+        return any(math.isfinite(quantity.half) for quantity in self.quantities)
+
     def __repr__(self) -> str:
         values = ", ".join(f"{quantity.symbol} {quantity.value:.4g}" for quantity in self.quantities[:4])
         return f"Measures({values}, in {unit_name(self.unit)}, of {self.source or 'an array'})"
