@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import lazy_loader
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 #: The function that draws each type with a picture, as `module:function`; see `curvafit.core.runtime`.
 _FIGURES = {

@@ -9,6 +9,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from curvafit.core.files import write_atomically
 from curvafit.drawing.plot import gallery_figure, write_picture
@@ -36,6 +37,7 @@ def main() -> None:
         inside = f"{100 * np.mean(fields[name] > 0):.1f} %"
         lines.append(row(name, *numbers, inside, "yes" if flow.viability.viable else "no", shape.source))
     picture = write_picture(gallery_figure(fields, columns=6, width=1800), options.output / "presets.png")
+    Image.open(picture).convert("RGB").quantize(256).save(picture, optimize=True)
     page = write_atomically(options.output / "presets.md", lambda path: write_page(path, lines, edge, options.seed))
     print(picture, page, sep="\n")
 

@@ -54,6 +54,9 @@ def demo(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Fill a real scan from every 8th slice, measure and read it: one page, in a minute."""
+    from curvafit.core.checks import require
+
+    require("zuko", "infer", "reading a posterior")
     with show_stages() as progress:
         from curvafit.data_synth.samples import SYNTHETIC, SampleUnavailable, fetch
         from curvafit.report.demo import EVERY, write_demo

@@ -42,7 +42,7 @@ except ImportError as error:
 print(json.dumps(answers))
 """
 #: The extra that a command asks for; the others need none.
-NEEDED = dict.fromkeys(("infer-fast", "infer-match", "python"), "infer") | {"workers": "synth", "map": "atlas"}
+NEEDED = dict.fromkeys(("infer-fast", "infer-match", "python", "demo"), "infer") | {"workers": "synth", "map": "atlas"}
 NEEDED |= {"remote": "remote"}
 NEEDED |= dict.fromkeys(("reconstruct-image", "reconstruct-cells"), "image")
 #: A command of each room that needs none.
@@ -51,6 +51,7 @@ MORE = {
     "mask": "measure mask.nii.gz",
     "workers": "synth -o out --preset tubes --modality micro-ct --count 1 --shape 16",
     "map": "atlas map store -o out",
+    "demo": "demo -o out",
     "remote": "measure https://example.org/scan.zarr",
 }
 
