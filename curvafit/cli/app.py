@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from curvafit import __version__
 from curvafit.cli import compare, generate, infer, measure, samples, segment, synth
 from curvafit.cli.atlas import atlas_app
 from curvafit.cli.console import Commands, say
@@ -35,9 +36,7 @@ def main() -> None:
 
 def _show_version(version_only: bool) -> None:
     if version_only:
-        from importlib.metadata import version
-
-        say(f"curvafit {version('curvafit')}")
+        say(f"curvafit {__version__}")
         raise typer.Exit
 
 

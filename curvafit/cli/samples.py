@@ -12,9 +12,6 @@ import typer
 from curvafit.cli.console import error_console, print_table, say, show_stages
 from curvafit.cli.options import OverwriteOption, add_commands, command
 
-#: The sample of the first look.
-_FIRST = "shell"
-
 samples_app = typer.Typer(help="Sample volumes, with their licences.", invoke_without_command=True)
 
 
@@ -62,7 +59,7 @@ def demo(
         from curvafit.report.demo import EVERY, write_demo
         from curvafit.volumes.read import load
 
-        name = sample or _FIRST
+        name = sample or "shell"
         progress(f"fetching {name}", 0.0)
         try:
             path = fetch(name)
@@ -73,8 +70,7 @@ def demo(
             path = fetch(SYNTHETIC)
         page, scores = write_demo(load(path), out, overwrite=overwrite, progress=progress)
     network, *others = scores.values()
-    plain = max(others)
-    say(f"Filled from every {EVERY}th slice: Dice {network:.3f}; by the best plain interpolation {plain:.3f}.")
+    say(f"Filled from every {EVERY}th slice: Dice {network:.3f}; by the best plain interpolation {max(others):.3f}.")
     say(str(page))
 
 

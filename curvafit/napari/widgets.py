@@ -156,7 +156,7 @@ class Dock(Container):
 
     def say(self, text: str) -> None:
         """Show a sentence."""
-        self.status.value = text[:1].upper() + text[1:]
+        self.status.value = self.status.tooltip = text[:1].upper() + text[1:]
 
     def _note_progress(self, text: str, share: float) -> None:
         """Note how far the work is; called in its thread, which it ends where the user stopped it."""

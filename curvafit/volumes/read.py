@@ -84,7 +84,7 @@ def load(
     ----------
     source
         A path; a `Volume`, which has its own spacing and unit; or an array or tensor (Z, Y, X). Files are NIfTI, TIFF,
-        NPY, NPZ, HDF5, Imaris, RAW, Zarr, Scanco's ISQ and AIM; with `curvafit[io]` also NRRD, MHA/MHD, MRC and DICOM,
+        NPY, NPZ, HDF5, Imaris, RAW, Zarr, MHA/MHD, Scanco's ISQ and AIM; with `curvafit[io]` also NRRD, MRC and DICOM,
         and closed meshes (STL, PLY, OBJ, OFF) as masks of their inside; with `curvafit[microscopes]` CZI, LIF and ND2;
         with `curvafit[remote]` the URL (https, s3) of a Zarr store. Folders hold slices as TIFF, BMP, PNG, JPEG or
         DICOM. `file.h5::key` names an array within a file; `key` does the same.
