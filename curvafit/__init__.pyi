@@ -23,5 +23,3 @@ from .studies.windowed import windows as windows
 from .volumes.read import load as load
 from .volumes.volume import Volume as Volume
 from .volumes.write import save as save
-
-__version__: str

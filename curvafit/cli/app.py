@@ -10,7 +10,6 @@ from typing import Annotated
 
 import typer
 
-from curvafit import __version__
 from curvafit.cli import compare, generate, infer, measure, samples, segment, synth
 from curvafit.cli.atlas import atlas_app
 from curvafit.cli.console import Commands, say
@@ -36,7 +35,9 @@ def main() -> None:
 
 def _show_version(version_only: bool) -> None:
     if version_only:
-        say(f"curvafit {__version__}")
+        from importlib.metadata import version
+
+        say(f"curvafit {version('curvafit')}")
         raise typer.Exit
 
 
