@@ -34,9 +34,7 @@ _out = partial(typer.Option, rich_help_panel="What to write")
 def parse_law(
     preset: Annotated[str | None, _what(help="A published shape; see `curvafit presets`.")] = None,
     coefficients: Annotated[str | None, _what(help="a20,a11,a02,a10,a01,a00 in working units; needs a mass.")] = None,
-    helfrich: Annotated[
-        str | None, _what(help="Bending energy κ,κ_G,C0 (or κ,κ_G or κ), such as 2,0,40; needs a mass.")
-    ] = None,
+    helfrich: Annotated[str | None, _what(help="Bending energy κ,κ_G,H0, as 2,0,40; needs a mass or start.")] = None,
     prior: Annotated[str | None, _what(help="fit.json of `curvafit infer`, or a preset's name.")] = None,
     start: Annotated[str | None, _what(help="Mask or phase field to begin from, in place of noise.")] = None,
     free_mass: Annotated[bool, _what("--free-mass", help="With --start: let the volume change (L-BFGS).")] = False,
@@ -72,7 +70,7 @@ def parse_run(
 
 
 def parse_output(
-    spacing: Annotated[str | None, _out(help="Edge of a voxel, in --unit; by default 1, or the prior's.")] = None,
+    spacing: Annotated[str | None, _out(help="Edge of a voxel, in --unit; else 1, or the start's or prior's.")] = None,
     unit: Annotated[str | None, _out(help="nm, um, mm or m; needs --spacing.")] = None,
 ) -> dict[str, Any]:
     """Return voxel edge and unit of the file to write; raise ValueError where options do not go together."""
@@ -95,7 +93,7 @@ def generate(
         Path, _out("-o", "--output", help="Volume (.nii.gz .nii .tif .npy .mrc .zarr) or surface (.stl .ply).")
     ],
     wanted: Annotated[dict[str, Any], Group(parse_law)],
-    shape: Annotated[str | None, _what(help=f"Voxels: N or Z,Y,X; {EDGE} or the maps' by default.")] = None,
+    shape: Annotated[str | None, _what(help=f"Voxels: N or Z,Y,X; else {EDGE}, or the start's or maps'.")] = None,
     boundary: Annotated[str, _what(help="periodic, or replicate (walls, met at right angles).")] = "periodic",
     seed: Annotated[int | None, _what(help="Seed of the noise that the shape grows from; by default 0.")] = None,
     *,
