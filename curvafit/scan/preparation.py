@@ -259,9 +259,10 @@ def make_start(
     kind, signed = structure.find_structure(field)
     if kind == "image":
         raise ScanError("a start must be a mask or a phase field, got grey levels: `curvafit segment` makes a mask")
-    physical = law.working_voxel is not None and "voxel" not in (field.unit, law.length_unit)
-    step = convert_length(edge, field.unit, law.length_unit) / law.working_voxel if physical else 1.0
-    grid = Grid(field.shape, WORKING_SPACING * step, boundary)  # type: ignore[arg-type]
+    step = WORKING_SPACING
+    if law.working_voxel is not None and "voxel" not in (field.unit, law.length_unit):
+        step *= convert_length(edge, field.unit, law.length_unit) / law.working_voxel
+    grid = Grid(field.shape, step, boundary)  # type: ignore[arg-type]
     values = torch.from_numpy(signed.values)
     return grid, values if kind == "field" else phase_field(values > 0, grid, epsilon), signed.notes
 
