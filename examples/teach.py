@@ -34,7 +34,7 @@ from curvafit.cli.console import plain_errors, resumable, say_notes, show_stages
 from curvafit.core.checks import check_int, check_seed
 from curvafit.core.files import remove
 from curvafit.core.records import can_write
-from curvafit.core.runtime import Progress, silent, sub_progress
+from curvafit.core.runtime import Progress, listen, silent, sub_progress
 from curvafit.data_synth.imaging.modality import MODALITIES, field_shape, image, regrid
 from curvafit.data_synth.store import HEADER, find_well_formed
 from curvafit.scan.grids import centre_distance
@@ -446,6 +446,7 @@ def judge(filler: Filler, lessons: Batches) -> tuple[np.ndarray, dict[str, float
 
 
 def main() -> None:
+    listen()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sources", nargs="+", help="stores, masks, or `mixed`")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the weights (.npz) to write")
@@ -453,6 +454,7 @@ def main() -> None:
     parser.add_argument("--filler", help="filler to begin with; else a new one; with --images the packaged")
     parser.add_argument("--steps", type=int, help=f"by default {STEPS}; {IMAGE_STEPS} with --images")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--overwrite", action="store_true", help="replace a file of another origin")
     options = parser.parse_args()
     try:
         with plain_errors(), resumable(), show_stages() as progress:
@@ -466,7 +468,8 @@ def run(options: argparse.Namespace, progress: Progress) -> None:
     out = options.output
     if out.suffix != ".npz":
         raise ValueError(f"the output's name must end in .npz, got {out.name}")
-    can_write(out, FILLER_FILE, inputs=[*options.sources, *([options.filler] if options.filler else [])])
+    inputs = [*options.sources, *([options.filler] if options.filler else [])]
+    can_write(out, FILLER_FILE, inputs=inputs, overwrite=options.overwrite)
     checkpoint = out.with_name(f".{out.name}.curvafit-steps")
     # With images, a filler that was taught on masks alone learns to use them.
     first = Taught.load(options.filler) if options.images or options.filler else None
@@ -476,7 +479,7 @@ def run(options: argparse.Namespace, progress: Progress) -> None:
     settings = {"first": first, "volumes": options.images, "steps": options.steps, "seed": options.seed}
     card["command"] = shlex.join(["python", *sys.argv])
     taught = teach(sources, card, **settings, checkpoint=checkpoint, progress=progress)
-    can_write(out, FILLER_FILE)  # hours later, the place may be taken
+    can_write(out, FILLER_FILE, overwrite=options.overwrite)  # hours later, the place may be taken
     taught.save(out)
     for path in (checkpoint, image_folder(checkpoint)):
         remove(path)

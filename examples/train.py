@@ -35,7 +35,7 @@ from torch import Tensor, nn
 from curvafit.cli.console import plain_errors, resumable, say, show_stages
 from curvafit.core.checks import check_int, check_seed
 from curvafit.core.records import Format, can_write, encode_json
-from curvafit.core.runtime import Progress, silent, sub_progress
+from curvafit.core.runtime import Progress, listen, silent, sub_progress
 from curvafit.core.workers import Cluster, cluster, run_jobs
 from curvafit.data_synth.atlas import open_all, versions
 from curvafit.data_synth.store import Store, open_store
@@ -682,6 +682,7 @@ def _measure_looks(descriptors: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
+    listen()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = parser.add_subparsers(required=True)
     first = parts.add_parser("describe", help="describe shapes of stores in a table, which goes on if it exists")
@@ -693,10 +694,15 @@ def main() -> None:
     second.add_argument("--seed", type=int, default=0, help="seed of the training")
     for part, run in ((first, run_describe), (second, run_train)):
         part.add_argument("-o", "--output", type=Path, required=True, help="file (.npz) to write")
+        part.add_argument("--overwrite", action="store_true", help="replace a file of another origin, or begin anew")
         part.set_defaults(run=run)
     options = parser.parse_args()
     try:
-        with plain_errors(), resumable(), show_stages() as progress:
+        with (
+            plain_errors(),
+            resumable(lambda: "the same command" if options.run is run_describe else ""),
+            show_stages() as progress,
+        ):
             if options.output.suffix != ".npz":
                 raise ValueError(f"the output's name must end in .npz, got {options.output.name!r}")
             options.run(options, progress)
@@ -706,13 +712,14 @@ def main() -> None:
 
 
 def run_describe(options: argparse.Namespace, progress: Progress) -> None:
-    can_write(options.output, TABLE_FILE, inputs=options.stores)
+    can_write(options.output, TABLE_FILE, inputs=options.stores, overwrite=options.overwrite)
+    more: dict[str, Any] = {"command": [shlex.join(sys.argv)], "overwrite": options.overwrite}
     with cluster(options.workers) as workers:
-        describe(options.stores, options.output, progress, workers=workers, command=[shlex.join(sys.argv)])
+        describe(options.stores, options.output, progress, workers=workers, **more)
 
 
 def run_train(options: argparse.Namespace, progress: Progress) -> None:
-    can_write(options.output, POSTERIOR_FILE, inputs=[options.table])
+    can_write(options.output, POSTERIOR_FILE, inputs=[options.table], overwrite=options.overwrite)
     table = load_table(options.table)
     table = table if options.views is None else table.select_views(options.views.split(","))
     save_posterior(train_posterior(table, seed=options.seed, progress=progress), options.output)

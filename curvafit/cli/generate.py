@@ -195,6 +195,8 @@ def _choose_parameters(law: Law, maps: Maps3D, wanted: dict[str, Any]) -> dict[s
     for other in ("mass", "start"):
         if wanted[other] is not None and "mass" in maps:
             raise ValueError(f"give either --{other} or a map of the mass, got both")
+    if "mass" in maps and not bool((abs(maps["mass"]) < 1).all()):  # type: ignore[union-attr]
+        raise ValueError("the map of the mass must be in (-1, 1)")
     mass, fraction = maps.get("mass", wanted["mass"]), wanted["volume_fraction"]
     if mass is not None and fraction is not None:
         raise ValueError("give either a mass or --volume-fraction, got both")

@@ -102,7 +102,7 @@ def measure(
     folder = _choose_folder(out, labels, subjects)
     if any(page.values()) and (grid is not None or folder is None or len(scans) > 1):
         raise ValueError(
-            "--maps and --graph are for the page of one scan: give one, and a name without suffix with -o, no --windows"
+            "--maps and --graph are for the page of a single scan, with a name without a suffix at -o, and no --windows"
         )
     if page["graph"] and (roi is not None or structure["periodic"]):
         raise ValueError("--graph traces a whole scan that does not repeat: leave out --roi and --periodic, or --crop")

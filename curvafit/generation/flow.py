@@ -228,5 +228,5 @@ def choose_base(mass: float | Tensor | None, share: float | None, grid: Grid) ->
     if not isinstance(mass, Tensor) or mass.dim() == 0:
         return check_open_interval(mass, "a mass in (-1, 1)", -1, 1)
     check_shape("mass", mass, grid)
-    check_open_interval(mass.mean(dtype=torch.float64), "a mass of finite numbers with a mean in (-1, 1)", -1, 1)
+    check_open_interval(float(mass.mean(dtype=torch.float64)), "a mass of finite numbers with a mean in (-1, 1)", -1, 1)
     return mass.detach().to("cpu", torch.float32).expand(grid.shape).contiguous()

@@ -127,13 +127,18 @@ def orientation(
     """
     expected = "a direction of 3 finite numbers (z, y, x), not all 0"
     components = [_as_finite(component, expected, of=direction) for component in as_tuple(direction, expected, 3)]
-    θ = torch.stack(torch.broadcast_tensors(*components))
+    components.append(_as_finite(strength, "a finite strength"))
+    shapes = {tuple(component.shape) for component in components if component.dim()}
+    if len(shapes) > 1:
+        raise ValueError(f"expected maps of direction and strength of one shape, got {quoted(sorted(shapes))}")
+    *components, μ = torch.broadcast_tensors(*components)
+    θ = torch.stack(components)
     if not bool(θ.any(0).all()):
         raise ValueError(f"expected {expected}, got {quoted(direction)}")
     _, exponent = torch.frexp(θ.abs().amax(0))
     θ = torch.ldexp(θ, -exponent)  # by powers of two: exact, and the squares in the norm are finite
     θ = θ / θ.square().sum(0).sqrt()
-    return _as_finite(strength, "a finite strength") * (θ[:, None] * θ[None])
+    return μ * (θ[:, None] * θ[None])
 
 
 def check_orientation(orientation: object) -> None:

@@ -81,7 +81,8 @@ def write_comparison(
         "title": c.verdict, "scans": "; ".join(_count_scans(c)) + ".", "groups": c.groups, "effect": c.effect,
         "head": ["", "", *c.groups, change, c.effect, "95 %", "p", "family-wise", "known error"],
         "rows": [_format_row(number, c) for number in c.numbers], "level": f"{LEVEL:.2g}",
-        "methods": describe_methods(c), "omitted": max(0, len(c.measures) - MOST_OUTLINES), "of_bodies": c.of_bodies,
+        "methods": describe_methods(c), "count": c.count, "of_bodies": c.of_bodies,
+        "omitted": max(0, len(c.measures) - MOST_OUTLINES),
     }  # fmt: skip
     outlines = outlines_figure(name_parts(c.measures), [scan.outline for scan in c.measures], c.unit)
     figures = {

@@ -262,6 +262,8 @@ def make_start(
     step = WORKING_SPACING
     if law.working_voxel is not None and "voxel" not in (field.unit, law.length_unit):
         step *= convert_length(edge, field.unit, law.length_unit) / law.working_voxel
+    if step > epsilon:
+        raise ScanError(f"a voxel of the start is {step / WORKING_SPACING:.2g} of the law's, too coarse: resample it")
     grid = Grid(field.shape, step, boundary)  # type: ignore[arg-type]
     values = torch.from_numpy(signed.values)
     return grid, values if kind == "field" else phase_field(values > 0, grid, epsilon), signed.notes

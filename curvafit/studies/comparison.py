@@ -183,7 +183,7 @@ class Comparison(Pictured):
         lines = [few] if self.least > LEVEL else []
         if self.primary:
             lines.append(f"{self.verdict}, named beforehand: {self._describe(self.primary, alone=True)}.")
-        found, count, level = self.found, len(self.numbers), f"family-wise p at most {LEVEL:.2g}"
+        found, count, level = self.found, self.count, f"family-wise p at most {LEVEL:.2g}"
         if found:
             rest = f"; and {len(found) - NAMED} more" if len(found) > NAMED else ""
             described, s = "; ".join(map(self._describe, found[:NAMED])), "s" * (len(found) == 1)
@@ -202,6 +202,11 @@ class Comparison(Pictured):
         strength = f"{name} {format_number(self.statistic, 2)} {power_name(self.unit, power)}".rstrip()
         lines.append(f"Curvature diagrams {verdict}: p = {p}, {strength}.")
         return " ".join(lines)
+
+    @property
+    def count(self) -> int:
+        """Return how many numbers are tested: those that are known of every subject."""
+        return sum(math.isfinite(number.p) for number in self.numbers)
 
     @property
     def primary(self) -> Number | None:
@@ -349,6 +354,7 @@ def _compare_measures(
         diagrams = [_pool([measures[k].diagram for k in own]) for own in scans]
         of_diagrams = _compare_diagrams(diagrams, labels, sides, arrangements, blocks)
         values, errors, halves = _average(measures, scans)
+    notes = [*notes, *_note_unknown(measures[0], values, subjects, options["primary"])]
     # The least possible p is that of a quantity equal to the labels.
     least_p = permutation.share_beyond(permutation.correlate(scores[:, None], arrangements, blocks))[0]
     return Comparison(
@@ -381,6 +387,20 @@ def _compare_diagrams(
     return tested | {"diagrams": tuple(map(_pool, of_side)), "edges": edges, "differences": differences}
 
 
+def _note_unknown(
+    scan: Measures, values: np.ndarray, subjects: Sequence[tuple[str | float, str]], primary: str | None
+) -> list[str]:
+    """Return notes on the numbers (S, K) that are not known of every subject; ValueError if the primary is one."""
+    notes, missing = [], ~np.isfinite(values.T)
+    for absent in np.unique(missing[missing.any(1)], axis=0):
+        numbers = [each for each, own in zip(scan.quantities, missing, strict=True) if (own == absent).all()]
+        who = ", ".join(name for (_, name), lacks in zip(subjects, absent, strict=True) if lacks)
+        if primary in [name for each in numbers for name in (each.name, each.symbol)]:
+            raise ValueError(f"the primary number {primary} is not known of {who}: leave that out, or name another")
+        notes.append(f"Not tested, as not known of {who}: {', '.join(each.symbol for each in numbers)}.")
+    return notes
+
+
 def _pool(diagrams: Sequence[Diagram]) -> Diagram:
     """Return the mean of diagrams, each scaled to total area 1."""
     return join_diagrams([replace(diagram, weights=diagram.normalised.weights / len(diagrams)) for diagram in diagrams])
@@ -410,7 +430,7 @@ def _describe_bodies(bodies: Sequence[Measures]) -> tuple[list[Measures], list[s
     if cut := sum(body[CUT].value > 0 for body in bodies):
         notes.append(f"The border cuts {cut} of {count} bodies: what lies inside counts, but for sphericity.")
     if thin := sum(math.isnan(body["H"].value) for body in bodies):
-        notes.append(f"Curvature is not known of {thin} of {count} bodies, which are too thin for it: others count.")
+        notes.append(f"Curvature is not known of {thin} of {count} bodies, which are too thin for it.")
     kept = [tuple(quantity for quantity in body.quantities if quantity.symbol != CUT) for body in bodies]
     return [replace(body, quantities=own) for body, own in zip(bodies, kept, strict=True)], notes
 

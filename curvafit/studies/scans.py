@@ -236,7 +236,8 @@ def _list_folder(folder: Path, group: str, notes: list[str]) -> list[Case]:
         except ScanError:
             skipped.append(path.name)
         else:
-            cases.append(Case(str(path), path.name, path.name.partition(".")[0], group))
+            # a table that is a group of its own names no subject
+            cases.append(Case(str(path), path.name, path.name.partition(".")[0] if folder.is_dir() else "", group))
     # A surface beside volumes is likely to be that of one of them.
     meshes = [case for case in cases if case.name.lower().endswith(MESHES)]
     if len(meshes) < len(cases):
@@ -272,7 +273,7 @@ def _open_table(case: Case, stated: bool) -> list[Case]:
     """Return a case for each body, if a case is a table of bodies; else the case itself.
 
     The subject is the case's own if it is `stated`; else that in the table's column; else the image, where the table
-    has several.
+    has several or the case has no subject.
     """
     if not (isinstance(case.source, str | PathLike) and _holds_bodies(Path(case.source))):
         return [case]
@@ -280,10 +281,11 @@ def _open_table(case: Case, stated: bool) -> list[Case]:
         raise ValueError(f"expected a region for scans alone, got one for the table of bodies {case.name}")
     path, bodies = Path(case.source).resolve(), _read_measures(Path(case.source))
     images = {body.source: Path(body.source).name.partition(".")[0] for body, _ in bodies}
-    if len(images) == 1:
-        images = dict.fromkeys(images, case.subject)
-    elif len(set(images.values())) < len(images):
+    if len(set(images.values())) < len(images):
         images = {image: image for image in images}
+    if case.subject:
+        names = (case.subject if len(images) == 1 else f"{case.subject}/{name}" for name in images.values())
+        images = dict(zip(images, names, strict=True))
     return [
         case._replace(
             source=body, name=str(path), subject=case.subject if stated else row.get("subject") or images[body.source]
@@ -323,7 +325,7 @@ def _read_body(rows: Mapping[str, Mapping[str, str]]) -> Measures:
             raise ValueError(f"a body has no {symbol} {expected and f'in {expected}'}".rstrip())
         quantities.append(Quantity(name, symbol, float(rows[symbol]["value"] or "nan"), math.nan, power))
     empty = Diagram(np.zeros((0, 2)), np.zeros(0), f"1/{unit}")
-    part = ("instance", int(first["instance"]))
+    part = ("instance", int(float(first["instance"])))
     nowhere = math.nan, math.nan, math.nan
     return Measures(first["scan"], unit, "mask", tuple(quantities), nowhere, empty, (1, 1, 1), (), part)
 
@@ -588,9 +590,10 @@ def _check_scans(cases: Sequence[Case], reading: dict[str, Any], progress: Progr
         edges.setdefault(case.label, []).append(float(np.prod(field.spacing) ** (1 / 3)))
     if len(units) > 1 and "voxel" in units:
         other = next(name for name in units if name != "voxel")
+        remedy = "measure the labels again" if is_body(cases[0].source) else "say it"
         raise ValueError(
             f"expected a physical spacing in all scans or in none, got none in {units['voxel']} and {other} in "
-            f"{units[other]}: say it with --spacing and --unit"
+            f"{units[other]}: {remedy} with --spacing and --unit"
         )
     notes = ["Lengths are counted in voxels: compare only scans of one voxel size."] if "voxel" in units else []
     medians = [float(np.median(edge)) for edge in edges.values()]

@@ -381,3 +381,10 @@ def test_the_kernels_entry_is_the_definition() -> None:
     value, slope = energy_gradient(u, VARYING, grid, 0.02, Q)
     assert float(value) == pytest.approx(float(truth[0]), rel=1e-5) and slope.dtype == torch.float32
     assert not kernels.has_kernel("meta")
+
+
+def test_a_direction_of_numbers_takes_a_map_of_strength() -> None:
+    μ = torch.rand(3, 4, 5, dtype=torch.float64)
+    assert torch.equal(orientation((0, 0, 2), μ)[2, 2], μ) and orientation((0, 0, 2), μ).shape == (3, 3, 3, 4, 5)
+    with pytest.raises(ValueError, match="one shape"):
+        orientation((0, torch.ones(3, 4, 6), 1), μ)

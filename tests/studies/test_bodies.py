@@ -170,12 +170,12 @@ def test_the_answer_is_the_same_however_the_tables_are_given(home: Path, body: M
 
 def test_a_table_that_names_subjects_keeps_images_of_one_together(home: Path, body: Measures) -> None:
     """Of two images a subject; without the column each image is one."""
-    for path in ("control.csv", "drug.csv"):
+    for path, other in (("control.csv", "drug"), ("drug.csv", "control")):
         bodies = [each for k in range(2 * SUBJECTS) for each in drawn(body, np.random.default_rng(k), 1.0)]
         bodies = [replace(each, source=f"{k // BODIES}/labels.tif") for k, each in enumerate(bodies)]
         names = [{"subject": f"{path[0]}{k // BODIES // 2}"} for k in range(len(bodies))]
         write_table(bodies, path, overwrite=True)
-        assert len({case.subject for case in compare("control.csv", "drug").cases}) >= 2 * SUBJECTS
+        assert sorted(compare(path, other).counts) == [SUBJECTS, 2 * SUBJECTS]
         write_table(bodies, path, columns=names, overwrite=True)
     assert compare("control.csv", "drug.csv").counts == (SUBJECTS, SUBJECTS)
 
@@ -250,3 +250,19 @@ def test_bodies_need_a_subject(body: Measures) -> None:
     bodies = drawn(body, np.random.default_rng(0), 1.0)
     with pytest.raises(ValueError, match="by subject"):
         compare(bodies[:6], bodies[6:])
+
+
+def test_a_number_that_a_subject_lacks_is_said_not_to_be_tested(home: Path, body: Measures) -> None:
+    """Not as if it had been compared: a note, fewer numbers, and no primary."""
+    random = study(body, 0, spread=0.1, ratio=1.2)[1]
+    subject, bodies = next(iter(random.items()))
+    lacks = [
+        replace(each, quantities=tuple(replace(q, value=math.nan) if q.symbol == "H" else q for q in each.quantities))
+        for each in bodies
+    ]
+    write_table(lacks, f"drug/{subject}.csv", overwrite=True)
+    found = compare("control", "drug")
+    assert any(f"Not tested, as not known of {subject}: H" in note for note in found.notes)
+    assert found.count == len(found.numbers) - 1 and f"of {found.count} numbers" in found.status.lower()
+    with pytest.raises(ValueError, match=f"not known of .*{subject}"):
+        compare("control", "drug", primary="H")

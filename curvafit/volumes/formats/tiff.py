@@ -231,7 +231,9 @@ def read_slices(path: Path, **_: object) -> Stated:
         planes.append(plane)
         if plane.ndim != 2 + ("s" in first.axes) or plane.shape != planes[0].shape:
             got = f"{plane.shape} in {file.name} of {path}"
-            raise ScanError(f"slices of a folder must be 2D and of one shape, got {got}; of volumes name the files")
+            raise ScanError(
+                f"slices of a folder must be 2D and of one shape, got {got}; to read volumes, name the files"
+            )
         if plane.dtype != planes[0].dtype:
             got = f"{planes[0].dtype} in {files[0].name} and {plane.dtype} in {file.name} of {path}"
             raise ScanError(f"slices must be of one type, got {got}")
