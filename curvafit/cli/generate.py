@@ -189,13 +189,15 @@ def _read_law(wanted: dict[str, Any], maps: Maps3D) -> Law:
 
 def _choose_parameters(law: Law, maps: Maps3D, wanted: dict[str, Any]) -> dict[str, Any]:
     """Return law, mass or volume fraction, ε and Q as arguments of `generate`; maps take the place of numbers."""
+    import torch
+
     from curvafit.priors.coefficients import NAMES
     from curvafit.priors.grid import WORKING_EPSILON
 
     for other in ("mass", "start"):
         if wanted[other] is not None and "mass" in maps:
             raise ValueError(f"give either --{other} or a map of the mass, got both")
-    if "mass" in maps and not bool((abs(maps["mass"]) < 1).all()):  # type: ignore[union-attr]
+    if "mass" in maps and not bool((torch.as_tensor(maps["mass"]).abs() < 1).all()):
         raise ValueError("the map of the mass must be in (-1, 1)")
     mass, fraction = maps.get("mass", wanted["mass"]), wanted["volume_fraction"]
     if mass is not None and fraction is not None:
