@@ -135,11 +135,9 @@ def case(posterior: Posterior, store: Store, index: int, seen: str, cut: bool) -
         misfit = ask(posterior, scan, kind)
     except ScanError:
         misfit = None
-    return (
-        {}
-        if misfit is None
-        else {"p": misfit.probability, "unexplained": misfit.unexplained, "discriminant": misfit.discriminant}
-    )
+    if misfit is None:
+        return {}
+    return {"p": misfit.probability, "unexplained": misfit.unexplained, "discriminant": misfit.discriminant}
 
 
 def ask(posterior: Posterior, scan: object, kind: str) -> Misfit | None:

@@ -37,22 +37,22 @@ def read_mesh(
     the longest side. No other mesh states a unit.
     """
     triangles = _read_triangles(path)
-    turned = _check_closed(triangles, path)
+    coherent = _check_closed(triangles, path)
     with path.open("rb") as file:
         remark = file.read(_REMARKS).decode("latin-1")
     own = _OWN.search(remark)
-    named = None if own is None else own[1]
+    own_unit = None if own is None else own[1]
     box, edge, notes = _choose_box(triangles, own)
-    edges, counted = np.full(3, edge), unit is None and named is None  # in voxels, as in all files without a unit
+    edges, in_voxels = np.full(3, edge), unit is None and own_unit is None  # as in all files without a unit
     if spacing is not None:
-        edges, counted, notes = _convert_edges(spacing, unit, named), False, notes[:1]
-    if not turned:
+        edges, in_voxels, notes = _convert_edges(spacing, unit, own_unit), False, notes[:1]
+    if not coherent:
         notes += ("Its triangles face both ways: a voxel is inside where an odd number of them lie to one side of it.",)
-    mask, first = _fill(triangles, box, edges, turned, path)
+    mask, first = _fill(triangles, box, edges, coherent, path)
     affine = base.affine_of(np.diag(edges[::-1]), first[::-1])
-    affine[:3] /= edge if counted else 1.0
+    affine[:3] /= edge if in_voxels else 1.0
     affine = LPS_TO_RAS @ affine if _SLICER in remark else affine
-    return Stated(mask, "zyx", None if counted else edges.tolist(), (named,) * 3, None, affine, notes=notes)
+    return Stated(mask, "zyx", None if in_voxels else edges.tolist(), (own_unit,) * 3, None, affine, notes=notes)
 
 
 def _read_triangles(path: Path) -> np.ndarray:
@@ -101,14 +101,14 @@ def _choose_box(triangles: np.ndarray, own: re.Match[str] | None) -> tuple[np.nd
     return ends + AROUND * side * np.array([[-1], [1]]), edge, (note, size)
 
 
-def _convert_edges(spacing: Sequence[float] | float, unit: str | None, named: str | None) -> np.ndarray:
+def _convert_edges(spacing: Sequence[float] | float, unit: str | None, own_unit: str | None) -> np.ndarray:
     """Return voxel edges (z, y, x) in the unit that a mesh names; where it names none, lengths are in the caller's."""
-    converts = unit is not None and named is not None and is_unit(unit) and "voxel" not in (unit, named)
-    return np.array(positive_triple(spacing)) * (convert_length(1.0, unit, named) if converts else 1.0)
+    converts = unit is not None and own_unit is not None and is_unit(unit) and "voxel" not in (unit, own_unit)
+    return np.array(positive_triple(spacing)) * (convert_length(1.0, unit, own_unit) if converts else 1.0)
 
 
 def _fill(
-    triangles: np.ndarray, box: np.ndarray, edges: np.ndarray, turned: bool, path: Path
+    triangles: np.ndarray, box: np.ndarray, edges: np.ndarray, coherent: bool, path: Path
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the mask (Z, Y, X) of the voxels inside a mesh, and the first voxel's centre, of voxels that fill a box.
 
@@ -124,7 +124,7 @@ def _fill(
     turns = np.zeros(shape.astype(np.int64), np.int16)
     _count_crossings((triangles - first) / edges, turns)
     np.cumsum(turns, axis=2, dtype=np.int16, out=turns)
-    return ((turns if turned else turns % 2) != 0).view(np.uint8), first
+    return ((turns if coherent else turns % 2) != 0).view(np.uint8), first
 
 
 @njit(cache=True, nogil=True)
