@@ -8,11 +8,9 @@ from __future__ import annotations
 import base64
 import io
 import json
-import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import replace
-from html import escape
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -33,7 +31,7 @@ from curvafit.data_synth.atlas import extract, open_all, shape_id, summarise
 from curvafit.data_synth.store import Store
 from curvafit.drawing.plot import DENSITY, DIAGONAL, FAMILY_COLOURS, INK, shared_limits
 from curvafit.drawing.rendering import CAP, SURFACE, render
-from curvafit.geometry.diagrams import FAMILIES, Diagram, family_of
+from curvafit.geometry.diagrams import Diagram, family_of
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.geometry.mesh import capped_surface
 from curvafit.inference.atlas import Atlas
@@ -92,7 +90,7 @@ def write_map(
     fewer than `LEAST_SHAPES` shapes, for a fit without a diagram, and where a file of another origin would be replaced
     without `overwrite`.
     """
-    script = require("plotly.offline", "atlas", "the map of an atlas").get_plotlyjs()
+    plotly = require("plotly.offline", "atlas", "the map of an atlas").get_plotlyjs()
     sources = open_all(stores)
     target, fit_files = Path(path), [Path(fit) for fit in fits if not isinstance(fit, Fit)]
     if target.suffix.lower() not in (".html", ".htm"):
@@ -123,10 +121,10 @@ def write_map(
     for k, (shape, name) in enumerate(zip(shapes, [*atlas.ids, *names], strict=True)):
         shape |= {"name": name, "place": positions[k].round(4).tolist(), "near": neighbours[k].tolist()}
         shape |= {"distances": distances[k].round(3).tolist(), "diagram": _pack(_shades(diagrams[k], limits))}
-    figure = _map_figure(fractions, positions, names, families, columns)
     shades = [to_hex(DENSITY(level)) for level in np.linspace(0, 1, 9)]
-    data = {"shapes": shapes, "count": n, "map": json.loads(figure.to_json()), "bins": BINS, "limits": limits}
-    data |= {"shades": shades, "colours": [to_hex(SURFACE), to_hex(CAP)], "diagonal": DIAGONAL}
+    data = {"shapes": shapes, "count": n, "bins": BINS, "limits": limits, "variances": fractions.round(4).tolist()}
+    data |= {"columns": {title: values.tolist() for title, values in columns.items()}, "families": FAMILY_COLOURS}
+    data |= {"shades": shades, "colours": [to_hex(SURFACE), to_hex(CAP)], "diagonal": DIAGONAL, "ink": INK}
     made = {"command": command, "shapes": f"{n}, well-formed", "solids": f"of {len(solids)} shapes, at most {SOLIDS}"}
     for store in sources:
         facts = {"store": str(store.path), **summarise(store)}
@@ -136,7 +134,7 @@ def write_map(
     made["measured on"] = atlas.provenance["date"]
     text = page.render(
         "atlas.html", title=f"Atlas of {n} shapes", made={name: value for name, value in made.items() if value},
-        plotly=script,
+        plotly=plotly,
         data=json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
         names=[*enumerate(names, n), *enumerate(atlas.ids)], scans=len(names), solids=len(solids),
         missing=n - len(solids),
@@ -207,54 +205,6 @@ def _describe_fit(fit: Fit, far: bool) -> list[tuple[str, str]]:
     phase = "background, which fills less" if fit.morphometry.volume_fraction > HALF else "structure"
     distance = f"{'farther from shapes than 95 % of them from' if far else 'as near to shapes as they to'} each other"
     return [("family", fit.family), ("placed by its", phase), ("lies", distance), ("verdict", fit.status)]
-
-
-def _map_figure(
-    fractions: np.ndarray, positions: np.ndarray, scans: Sequence[str], families: Sequence[str],
-    columns: dict[str, np.ndarray],
-) -> Any:  # fmt: skip
-    """Return the map: points coloured by family or by a column, stars for scans, and last a ring, which the page's
-    script puts around the chosen one. `positions` has those of the shapes first, then those of the scans."""
-    n = len(families)
-    figure = require("plotly.graph_objects", "atlas", "the map of an atlas").Figure()
-    size = float(np.clip(130 / math.sqrt(n), 6, 13))
-    mark = {"size": size, "opacity": 0.85, "line": {"width": 0.6, "color": "white"}}
-
-    def add_points(indices: np.ndarray, colours: dict[str, Any], **options: Any) -> None:
-        x, y = positions[indices].T
-        options |= {"mode": "markers", "hoverinfo": "none", "marker": mark | colours}
-        figure.add_scatter(x=x, y=y, customdata=indices.tolist(), **options)
-
-    present = [family for family in FAMILIES if family in families]
-    for family in present:
-        indices = np.flatnonzero(np.array(families) == family)
-        add_points(indices, {"color": FAMILY_COLOURS[family]}, name=f"{family}  {len(indices)}")
-    for title, values in columns.items():
-        bar = {"title": {"text": title, "side": "right"}, "thickness": 12, "outlinewidth": 0, "len": 0.8}
-        colours = {"color": values, "colorscale": "Viridis", "colorbar": bar}
-        add_points(np.arange(n), colours, visible=False, showlegend=False)
-    x, y = positions[n:].T
-    star = {"symbol": "star", "size": 17, "color": INK, "line": {"width": 1.3, "color": "white"}}
-    figure.add_scatter(
-        x=x, y=y, customdata=list(range(n, len(positions))), mode="markers+text", name="scans", marker=star,
-        text=[f"<b>{escape(name)}</b>" for name in scans], textposition="top center", hoverinfo="none",
-        showlegend=len(scans) > 0,
-    )  # fmt: skip
-    ring = {"symbol": "circle-open", "size": size + 9, "color": INK, "line": {"width": 2.4}}
-    figure.add_scatter(x=[None], y=[None], mode="markers", showlegend=False, hoverinfo="skip", marker=ring)
-    choices = []
-    for title in ("family", *columns):  # a trace for each family or one for the column, and those of scans and ring
-        visible = [title == "family"] * len(present) + [title == column for column in columns] + [True, True]
-        choices.append({"label": f"colour: {title}", "method": "restyle", "args": [{"visible": visible}]})
-    menu = {"buttons": choices, "x": 0, "y": 1.07, "xanchor": "left", "yanchor": "bottom", "bgcolor": "white"}
-    titles = [f"direction {k}, {share:.0%} of the variance" for k, share in enumerate(fractions, 1)]
-    first, second = ({"title": title, "title_font_size": 13} for title in titles)
-    figure.update_layout(
-        margin={"l": 62, "r": 8, "t": 84, "b": 50}, template="simple_white", uirevision="kept", hovermode="closest",
-        dragmode="pan", updatemenus=[menu], legend={"orientation": "h", "y": 1.0, "yanchor": "bottom"}, font_color=INK,
-        xaxis=first, yaxis=second | {"scaleanchor": "x"},
-    )  # fmt: skip
-    return figure
 
 
 # ---- one shape -------------------------------------------------------------------------------------------------------
