@@ -46,8 +46,8 @@ DENSITY = LinearSegmentedColormap.from_list(
 )
 #: Colours of labels from 0 on, which begin again after the last.
 LABELS = np.vstack([(0, 0, 0, 1), colormaps["tab20"](np.arange(20))])
-#: Bins along each axis of a drawn diagram, and decades that its colours span.
-BINS, DECADES = 72, 3.0
+#: Bins along each axis of a drawn diagram, the width in bins of the Gaussian that smooths it, and its colours' decades.
+BINS, SMOOTH, DECADES = 72, 0.8, 3.0
 #: The colour of draws, and the width in inches of one square of a corner plot.
 _DRAWN, _SQUARE = "#2B6FA8", 1.25
 #: Percent of the voxels that are drawn black, white; most voxels along an axis of which these are taken.
@@ -100,44 +100,34 @@ def gallery_figure(fields: Mapping[str, np.ndarray], *, columns: int = 4, width:
 # ---- curvature diagrams ----------------------------------------------------------------------------------------------
 
 
-def diagram_figure(
-    diagram: Diagram, *, limits: Limits | None = None, unit: str | None = None, length: float = 1.0
-) -> Figure:
-    """Return a figure of one diagram, which must have area, in its own unit or another; see `diagram_on`."""
+def diagram_figure(diagram: Diagram, *, limits: Limits | None = None) -> Figure:
+    """Return a figure of one diagram, which must have area; see `diagram_on`."""
     if not diagram.area > 0:
         raise ValueError("the diagram is empty: it has no area to draw")
-    unit = diagram.unit.removeprefix("1/") if unit is None else unit
     figure = make_figure(4.2, 4.2, layout="constrained")
-    axes = figure.subplots()
-    diagram_on(axes, diagram, limits=limits or shared_limits([diagram], length=length), unit=unit, length=length)
+    diagram_on(figure.subplots(), diagram, limits=limits or shared_limits([diagram]))
     return figure
 
 
-def diagram_on(
-    axes: Axes,
-    diagram: Diagram,
-    *,
-    limits: Limits,
-    unit: str = "working unit",
-    length: float = 1.0,
-) -> QuadMesh:
+def diagram_on(axes: Axes, diagram: Diagram, *, limits: Limits) -> QuadMesh:
     """Draw the share of area over (κ1, κ2): κ1 to the right, κ2 up, colours by the logarithm.
 
-    The diagram's own unit of length is `length` in `unit`: curvatures are divided by it. `limits`, in 1 / `unit`, are
-    those of both axes. Returns the picture, for a colour bar.
+    `limits`, in the diagram's unit, are those of both axes. Returns the picture, for a colour bar.
     """
-    low, high = limits
-    edges = np.linspace(low, high, BINS + 1)
-    points = np.asarray(diagram.points) / length
-    weights = np.asarray(diagram.weights) / float(np.sum(diagram.weights))
-    shares, _, _ = np.histogram2d(points[:, 0], points[:, 1], bins=[edges, edges], weights=weights)
-    shares = gaussian_filter(shares, 0.8).T
+    edges = np.linspace(*limits, BINS + 1)
+    shares = bin_diagram(diagram.normalised, edges, SMOOTH)
     highest = max(float(shares.max()), 1e-9)
     norm = LogNorm(highest * 10**-DECADES, highest)
     shown = np.ma.masked_less(shares, highest * 10**-DECADES)  # bins below the scale stay white
     picture = axes.pcolormesh(edges, edges, shown, cmap=DENSITY, norm=norm, rasterized=True, zorder=2)
-    frame_diagram(axes, limits, unit)
+    frame_diagram(axes, limits, diagram.unit.removeprefix("1/"))
     return picture
+
+
+def bin_diagram(diagram: Diagram, edges: np.ndarray, width: float) -> np.ndarray:
+    """Return a diagram's area in bins (κ2, κ1) between `edges`, smoothed by a Gaussian of `width` bins."""
+    areas, _, _ = np.histogram2d(*diagram.points.T, bins=[edges, edges], weights=diagram.weights)
+    return gaussian_filter(areas, width).T
 
 
 def frame_diagram(axes: Axes, limits: Limits, unit: str) -> None:
@@ -157,11 +147,11 @@ def frame_diagram(axes: Axes, limits: Limits, unit: str) -> None:
     _name_families(axes, limits)
 
 
-def shared_limits(diagrams: Sequence[Diagram], *, length: float = 1.0) -> Limits:
+def shared_limits(diagrams: Sequence[Diagram]) -> Limits:
     """Return one interval for both curvatures of all diagrams: it holds 0 and all but 0.6 % of the area at each end."""
     bounds = [0.0, 0.0]
     for diagram in diagrams:
-        for kappa in np.asarray(diagram.points).T / length:
+        for kappa in diagram.points.T:
             low, high = np.quantile(kappa, [0.006, 0.994], weights=diagram.weights, method="inverted_cdf")
             bounds = [min(bounds[0], float(low)), max(bounds[1], float(high))]
     width = max(bounds[1] - bounds[0], 1e-9)

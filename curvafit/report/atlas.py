@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import to_hex
 from PIL import Image
-from scipy.ndimage import gaussian_filter
 from scipy.signal import resample
 from scipy.spatial.distance import cdist
 
@@ -29,7 +28,7 @@ from curvafit.core.runtime import Progress, silent, sub_progress
 from curvafit.core.units import format_number
 from curvafit.data_synth.atlas import extract, open_all, shape_id, summarise
 from curvafit.data_synth.store import Store
-from curvafit.drawing.plot import DENSITY, DIAGONAL, FAMILY_COLOURS, INK, shared_limits
+from curvafit.drawing.plot import DECADES, DENSITY, DIAGONAL, FAMILY_COLOURS, INK, SMOOTH, bin_diagram, shared_limits
 from curvafit.drawing.rendering import CAP, SURFACE, render
 from curvafit.geometry.diagrams import Diagram, family_of
 from curvafit.geometry.distances import sliced_embedding
@@ -45,8 +44,8 @@ from curvafit.scan.preparation import HALF, WORKING_THICKNESS
 LEAST_SHAPES, NEIGHBOURS = 6, 5
 #: The most shapes whose solids are in the page, and the most voxels along an edge of one: 40 kB a shape.
 SOLIDS, EDGE = 150, 24
-#: Width of a small picture in pixels, bins along an axis of a diagram, and decades of its colours.
-THUMBNAIL, BINS, DECADES = 144, 48, 3.0
+#: Width of a small picture in pixels, and bins along an axis of a diagram.
+THUMBNAIL, BINS = 144, 48
 #: The numbers of a shape, in words, in the order of the coefficients and then of the others.
 COLUMNS = ("a₂₀, of κ₁²", "a₁₁, of κ₁κ₂", "a₀₂, of κ₂²", "a₁₀, of κ₁", "a₀₁, of κ₂", "a₀₀, constant",
            "m₀, mass", "share of the volume", "thickness in voxels")  # fmt: skip
@@ -217,9 +216,7 @@ def _pack(values: np.ndarray) -> str:
 
 def _shades(diagram: Diagram, limits: tuple[float, float]) -> np.ndarray:
     """Return a diagram as bytes `(BINS, BINS)`, κ2 by κ1: the logarithm of the area, 255 in the fullest bin."""
-    edges = np.linspace(*limits, BINS + 1)
-    areas, _, _ = np.histogram2d(*diagram.points.T, bins=[edges, edges], weights=diagram.weights)
-    areas = gaussian_filter(areas, 0.8).T
+    areas = bin_diagram(diagram, np.linspace(*limits, BINS + 1), SMOOTH)
     levels = 1 + np.log10(np.maximum(areas, 1e-30) / max(float(areas.max()), 1e-30)) / DECADES
     return np.rint(255 * np.clip(levels, 0, 1)).astype(np.uint8)
 

@@ -204,14 +204,14 @@ def comparison_figure(comparison: Comparison) -> Figure:
     if comparison.of_bodies:
         return numbers_figure(comparison, _choose_shown(comparison))
     c, names, edges = comparison, [plot.plain(name) for name in comparison.parts], comparison.edges
-    limits, unit = (edges[0], edges[-1]), c.unit
+    limits = edges[0], edges[-1]
     single = len(c.differences) == 1  # in one row with the two diagrams; else differences lie in rows of their own
     columns = 3 if single else min(len(names), ROW)
     rows = 1 if single else 2 * math.ceil(len(names) / columns)
     figure = plot.make_figure(13.2, 3.6 * rows * 3 / max(columns, 3), layout="constrained")
     for k, (name, diagram) in enumerate(zip(names, c.diagrams, strict=True)):
         axes = figure.add_subplot(rows, columns, k + 1)
-        picture = plot.diagram_on(axes, diagram, limits=limits, unit=unit)
+        picture = plot.diagram_on(axes, diagram, limits=limits)
         axes.set_title(f"{name}, {c.counts[k]} subjects", fontsize=11, color=plot.GROUPS[k % len(plot.GROUPS)])
         _bar_on(axes, picture, format=FuncFormatter(lambda share, _: f"{100 * share:g}"))
     titles = [f"{names[1]} less {names[0]}"] if c.groups else ["from the least to the most"]
@@ -222,7 +222,7 @@ def comparison_figure(comparison: Comparison) -> Figure:
     for k, (title, difference) in enumerate(zip(titles, percents, strict=True)):
         axes = figure.add_subplot(rows, columns, k + (3 if single else rows // 2 * columns + 1))
         picture = axes.pcolormesh(edges, edges, difference, rasterized=True, zorder=0.5, **colours)
-        plot.frame_diagram(axes, limits, unit)
+        plot.frame_diagram(axes, limits, c.unit)
         axes.set_title(f"{title}, p = {format_number(c.p, 2)}", fontsize=11)
         _bar_on(axes, picture, ticks=MaxNLocator(4, symmetric=True))
     return figure

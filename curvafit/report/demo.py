@@ -71,9 +71,7 @@ def score(mask: np.ndarray, filled: np.ndarray, axis: int) -> dict[str, float]:
 
 def demo_page(inference: Inference, measures: Measures, shapes: Figure, scores: dict[str, float], axis: int) -> str:
     """Return the page, with links to those of the measures and the inference, as the text of an HTML file."""
-    fit, diagram = inference.fit, inference.diagram
-    assert diagram is not None
-    λ = inference.prepared.length
+    fit = inference.fit
     (_, network), *plain = ((name, f"{value:.3f}") for name, value in scores.items())
     outlines = outlines_figure([""], [measures.outline], measures.unit)
     numbers = ((measures[symbol].name, *measures[symbol].format(measures.unit)) for symbol in SHOWN)
@@ -83,7 +81,7 @@ def demo_page(inference: Inference, measures: Measures, shapes: Figure, scores: 
         scores=[("the network", Chosen(network)), *((f"plain interpolation, {name}", value) for name, value in plain)],
         numbers=[(name, " ".join(filter(None, number))) for name, *number in numbers],
         outlines=picture_of(outlines, "Three slices with the outline of what was measured"),
-        diagram=picture_of(diagram_figure(diagram, unit=fit.length_unit, length=λ), "The scan's curvature diagram"),
+        diagram=picture_of(diagram_figure(measures.diagram), "The scan's curvature diagram"),
         verdict=fit.misfit or fit.status,
         notes=dict.fromkeys((*inference.scan.notes, *fit.notes)),
     )  # fmt: skip

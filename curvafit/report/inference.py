@@ -311,16 +311,17 @@ def scan_box(inference: Inference) -> np.ndarray:
 
 def _diagrams(inference: Inference) -> list[page.Picture]:
     """Return curvature diagrams of the scan, the chosen law and the match, with shared axes, in the scan's unit."""
-    diagrams: list[tuple[str, Diagram | None]] = [("The scan", inference.diagram)]
+    working = {"The scan": inference.diagram}
     for candidate in _chosen_first(inference) if inference.twins else ():
         if candidate.name in (inference.fit.chosen, "match"):
             regrown = (twin.diagram for twin in inference.twins.get(candidate.name, ()) if twin.diagram)
-            diagrams.append((f"{_title(candidate)}, regrown", next(regrown, None)))
-    λ, unit = inference.prepared.length, inference.fit.length_unit
-    limits = plot.shared_limits([diagram for _, diagram in diagrams if diagram is not None], length=λ)
+            working[f"{_title(candidate)}, regrown"] = next(regrown, None)
+    λ, unit = inference.prepared.length, f"1/{inference.fit.length_unit}"
+    diagrams = {title: d and dataclasses.replace(d, points=d.points / λ, unit=unit) for title, d in working.items()}
+    limits = plot.shared_limits([diagram for diagram in diagrams.values() if diagram is not None])
     pictures = []
-    for title, diagram in diagrams:
-        figure = None if diagram is None else plot.diagram_figure(diagram, limits=limits, unit=unit, length=λ)
+    for title, diagram in diagrams.items():
+        figure = None if diagram is None else plot.diagram_figure(diagram, limits=limits)
         pictures.append(page.picture_of(figure, f"Curvature diagram: {title}", title=title))
     return pictures
 

@@ -176,7 +176,7 @@ def diagrams_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figur
             axes.text(0.5, 0.5, "no surface", ha="center", transform=axes.transAxes, color=plot.QUIET)
             axes.set(xticks=[], yticks=[])
             continue
-        plot.diagram_on(axes, scan.diagram, limits=limits, unit=scan.unit)
+        plot.diagram_on(axes, scan.diagram, limits=limits)
         axes.tick_params(labelsize=7)
         for label in (axes.xaxis.label, axes.yaxis.label):
             label.set_fontsize(8)

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from curvafit.core.files import move_together, remove, temporary_folder
@@ -191,15 +190,10 @@ def outlines_figure(names: Sequence[str], outlines: Sequence[Outline | None], un
         return None
     figure = plot.make_figure(7.6, 2.6 * len(known), layout="constrained")
     for row, (name, outline) in zip(figure.subplots(len(known), 3, squeeze=False), known, strict=True):
-        draw_outline(row, outline, unit)
+        limits = plot.grey_limits(np.concatenate([plane.ravel() for plane in outline.levels]))
+        plot.sections_on(row, plot.Sections(outline.levels, outline.inside, limits), outline.spacing)
+        for axes, axis, place in zip(row, "zyx", outline.places, strict=True):
+            axes.set_title(f"{axis} = {place}", fontsize=8)
+        plot.scale_on(row[0], outline.spacing[2], unit)
         row[0].set_ylabel(plot.plain(name), fontsize=9)
     return figure
-
-
-def draw_outline(row: Sequence[Axes], outline: Outline, unit: str) -> None:
-    """Draw the slices of an outline with what counts inside, their positions and the scale."""
-    limits = plot.grey_limits(np.concatenate([plane.ravel() for plane in outline.levels]))
-    plot.sections_on(row, plot.Sections(outline.levels, outline.inside, limits), outline.spacing)
-    for axes, name, place in zip(row, "zyx", outline.places, strict=True):
-        axes.set_title(f"{name} = {place}", fontsize=8)
-    plot.scale_on(row[0], outline.spacing[2], unit)

@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 import numpy as np
 from scipy import special
-from scipy.ndimage import gaussian_filter
 from scipy.spatial.distance import cdist
 from scipy.stats import rankdata
 
@@ -18,7 +17,7 @@ from curvafit.core import permutation
 from curvafit.core.checks import check_choice, check_int, check_seed
 from curvafit.core.runtime import Pictured, Progress, silent, sub_progress
 from curvafit.core.units import format_number, format_percent, power_name
-from curvafit.drawing.plot import SIGNED, shared_limits
+from curvafit.drawing.plot import SIGNED, bin_diagram, shared_limits
 from curvafit.geometry.diagrams import FAMILIES, Diagram, join_diagrams
 from curvafit.geometry.distances import sliced_embedding
 from curvafit.scan.instances import OF_BODIES
@@ -411,12 +410,7 @@ def _compare_bins(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return `edges` and `differences` of a `Comparison`."""
     edges = np.linspace(*shared_limits(diagrams), BINS + 1)
-    histograms = []
-    for diagram in diagrams:
-        κ1, κ2 = diagram.points.T
-        histogram, _, _ = np.histogram2d(κ2, κ1, bins=(edges, edges), weights=diagram.weights)
-        histograms.append(gaussian_filter(histogram, SMOOTH))
-    shares = np.stack(histograms)
+    shares = np.stack([bin_diagram(diagram, edges, SMOOTH) for diagram in diagrams])
     if np.issubdtype(labels.dtype, np.floating):  # the change along a line fitted from the lowest label to the highest
         x = permutation.center(labels, blocks)
         return edges, np.ptp(labels) * np.tensordot(x, shares, 1)[None] / (x @ x)

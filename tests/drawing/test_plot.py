@@ -133,7 +133,6 @@ def test_shared_limits_hold_both_curvatures_and_leave_out_a_thin_tail() -> None:
     second = Diagram(np.array([[5.0, 5.0]]), np.array([1.0]))
     low, high = plot.shared_limits([first, second])
     assert low < -2 and high > 5 and high - low < 10
-    assert plot.shared_limits([first, second], length=2.0) == pytest.approx((low / 2, high / 2))
 
 
 def test_a_diagram_puts_its_mass_where_the_curvatures_are() -> None:
