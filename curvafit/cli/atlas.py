@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from curvafit.cli.console import command_line, error_console, say, show_stages
 from curvafit.cli.options import OverwriteOption, Workers, add_commands, command, parse_whole_triple
-
-if TYPE_CHECKING:
-    from curvafit.core.records import Format
 
 atlas_app = typer.Typer(help="Collections of generated shapes to match scans against.", no_args_is_help=True)
 
@@ -45,7 +42,7 @@ def build_atlas(
     crew.check_memory(size)
     plan = make_schedule(schedule, steps)
     check_folder(store.parent)
-    with crew.start() as (workers, progress):
+    with crew.start(store) as (workers, progress):
         build(store, count, size, seed, plan, progress, design=rule, workers=workers)
     say(str(store))
 
@@ -81,10 +78,13 @@ def extract_atlas(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Measure the shapes of stores, and write the atlas that `infer --atlas` reads."""
+    from curvafit.core.records import can_write
     from curvafit.data_synth.atlas import extract
     from curvafit.inference.atlas import ATLAS_FILE, save_atlas
 
-    _check_archive(out, ATLAS_FILE, stores, overwrite)
+    if out.suffix.lower() != ".npz":
+        raise ValueError(f"the output's name must end in .npz, got {out.name!r}")
+    can_write(out, ATLAS_FILE, inputs=stores, overwrite=overwrite)
     with show_stages() as progress:
         atlas = extract(stores, [command_line()], progress=progress)
     save_atlas(atlas, out)
@@ -112,12 +112,3 @@ def map_atlas(
 
 
 add_commands(atlas_app, build_atlas, info_atlas, verify_atlas, extract_atlas, map_atlas)
-
-
-def _check_archive(out: Path, kind: Format, inputs: list[Path], overwrite: bool) -> None:
-    """Raise an error if the output is not a `.npz`, cannot be written, is an input, or is a file of another kind."""
-    from curvafit.core.records import can_write
-
-    if out.suffix.lower() != ".npz":
-        raise ValueError(f"the output's name must end in .npz, got {out.name!r}")
-    can_write(out, kind, inputs=inputs, overwrite=overwrite)

@@ -10,6 +10,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, NoReturn
 
 import typer
@@ -88,14 +89,14 @@ def plain_errors() -> Iterator[None]:
 
 
 @contextmanager
-def resumable(again: Callable[[], str] = lambda: "the same command") -> Iterator[None]:
-    """On a signal, print how to resume: `again` returns the command, or an empty text where nothing is saved."""
+def resumable(kept: Path | None) -> Iterator[None]:
+    """On a signal, say that the same command resumes, if finished parts are in the file or folder `kept`."""
     try:
         yield
     except KeyboardInterrupt as signal:
-        if not (command := again()):
+        if kept is None or not kept.exists():
             raise
-        say(f"{_name_signal(signal)}: finished parts are saved. Run {command} to resume", to=error_console())
+        say(f"{_name_signal(signal)}: finished parts are saved. Run the same command to resume", to=error_console())
         raise typer.Exit(exit_code(signal)) from None
 
 

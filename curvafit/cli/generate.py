@@ -92,7 +92,7 @@ def generate(
     out: Annotated[
         Path, _out("-o", "--output", help="Volume (.nii.gz .nii .tif .npy .mrc .zarr) or surface (.stl .ply).")
     ],
-    wanted: Annotated[dict[str, Any], Group(parse_law)],
+    what: Annotated[dict[str, Any], Group(parse_law)],
     shape: Annotated[str | None, _what(help=f"Voxels: N or Z,Y,X; else {EDGE}, or the start's or maps'.")] = None,
     boundary: Annotated[str, _what(help="periodic, or replicate (walls, met at right angles).")] = "periodic",
     seed: Annotated[int | None, _what(help="Seed of the noise that the shape grows from; by default 0.")] = None,
@@ -111,11 +111,11 @@ def generate(
     from curvafit.volumes.read import map_shape, read_maps
 
     size = None if shape is None else parse_whole_triple(shape, "--shape")
-    start = None if wanted["start"] is None else _read_start(wanted, running, writing, {"shape": shape, "seed": seed})
+    start = None if what["start"] is None else _read_start(what, running, writing, {"shape": shape, "seed": seed})
     size = size if start is None else start.shape
-    maps = {} if wanted["maps"] is None else read_maps(wanted["maps"], size)
-    law = _read_law(wanted, maps)
-    options = _choose_parameters(law, maps, wanted) | {"seed": seed or 0}
+    maps = {} if what["maps"] is None else read_maps(what["maps"], size)
+    law = _read_law(what, maps)
+    options = _choose_parameters(law, maps, what) | {"seed": seed or 0}
     options["grid"] = Grid(size or map_shape(maps) or EDGE, boundary=boundary)  # type: ignore[arg-type]
     steps = running.pop("steps")
     options["schedule"] = make_schedule(choose_schedule([law], running.pop("schedule")), steps)
@@ -123,18 +123,18 @@ def generate(
     options["execution"] = flows.Execution(keep_checkpoint=True, **running)
     output = Output(writing["edge"] or law.working_voxel or 1.0, writing["unit"] or law.length_unit or "voxel")
     output = output if start is None else Output(start.spacing[0], start.unit, start.affine)
-    law_file = None if not law.fitted else wanted["prior"] or wanted["preset"]
-    inputs = [str(path) for path in (law_file, wanted["maps"], wanted["start"]) if path is not None]
+    law_file = None if not law.fitted else what["prior"] or what["preset"]
+    inputs = [str(path) for path in (law_file, what["maps"], what["start"]) if path is not None]
     check_target(out, output, inputs=inputs, picture=picture, overwrite=overwrite)
     notes = () if start is None else _begin_at(start, law, options)
     grow = partial(flows.generate, **options)
-    if wanted["free_mass"]:
+    if what["free_mass"]:
         kept = {name: options[name] for name in ("law", "grid", "epsilon", "execution")}
         grow = partial(flows.descend, options["mass"], **kept, **({} if steps is None else {"steps": steps}))
     flow = _grow(grow, checkpoint)
-    facts: dict[str, Any] = {name: wanted[name] and str(wanted[name]) for name in ("maps", "start")}
+    facts: dict[str, Any] = {name: what[name] and str(what[name]) for name in ("maps", "start")}
     facts |= {"start_digest": start and start.digest, "orientation": options["orientation"], "origin": law.origin}
-    facts |= {"wanted_volume_fraction": wanted["volume_fraction"], "command": command_line()}
+    facts |= {"wanted_volume_fraction": what["volume_fraction"], "command": command_line()}
     record = shape_record(flow, mass=options["mass"] if start is None else None, output=output, **facts)
     say_notes(notes)
     _write(flow, out, record, output=output, picture=picture, overwrite=overwrite)
@@ -155,26 +155,26 @@ def presets() -> None:
 
 
 def _read_start(
-    wanted: dict[str, Any], running: dict[str, Any], writing: dict[str, Any], noise: dict[str, Any]
+    what: dict[str, Any], running: dict[str, Any], writing: dict[str, Any], noise: dict[str, Any]
 ) -> Volume:
     """Return the volume that the flow begins from; raise ValueError for options that it leaves no use for."""
     from curvafit.volumes.read import load
 
-    useless = {**noise, "volume-fraction": wanted["volume_fraction"]}
-    if wanted["free_mass"]:
-        useless |= {"schedule": running["schedule"], **{name: wanted[name] for name in ("mass", "orientation", "maps")}}
-    if given := [name for name, value in useless.items() if value is not None]:
-        raise ValueError(f"--{given[0]} has no use with --start{' --free-mass' * wanted['free_mass']}: leave it out")
-    return load(wanted["start"], spacing=writing["edge"], unit=writing["unit"])
+    useless = {**noise, "volume-fraction": what["volume_fraction"]}
+    if what["free_mass"]:
+        useless |= {"schedule": running["schedule"], **{name: what[name] for name in ("mass", "orientation", "maps")}}
+    if names := [name for name, value in useless.items() if value is not None]:
+        raise ValueError(f"--{names[0]} has no use with --start{' --free-mass' * what['free_mass']}: leave it out")
+    return load(what["start"], spacing=writing["edge"], unit=writing["unit"])
 
 
-def _read_law(wanted: dict[str, Any], maps: Maps3D) -> Law:
+def _read_law(what: dict[str, Any], maps: Maps3D) -> Law:
     """Return the law that one of the options gives, or a placeholder where maps give all six coefficients."""
     from curvafit.priors.coefficients import NAMES, Coefficients
     from curvafit.priors.law import Law
 
-    stated = {name: wanted[name] for name in ("preset", "coefficients", "helfrich", "prior")}
-    laws = {name: text for name, text in stated.items() if text is not None}
+    options = ("preset", "coefficients", "helfrich", "prior")
+    laws = {name: what[name] for name in options if what[name] is not None}
     if len(laws) > 1 or (not laws and not set(NAMES) <= maps.keys()):
         raise ValueError(f"give one of --preset, --coefficients, --helfrich and --prior, got {len(laws)} of them")
     if not laws:
@@ -187,7 +187,7 @@ def _read_law(wanted: dict[str, Any], maps: Maps3D) -> Law:
     return Law.of(text)
 
 
-def _choose_parameters(law: Law, maps: Maps3D, wanted: dict[str, Any]) -> dict[str, Any]:
+def _choose_parameters(law: Law, maps: Maps3D, what: dict[str, Any]) -> dict[str, Any]:
     """Return law, mass or volume fraction, ε and Q as arguments of `generate`; maps take the place of numbers."""
     import torch
 
@@ -195,18 +195,18 @@ def _choose_parameters(law: Law, maps: Maps3D, wanted: dict[str, Any]) -> dict[s
     from curvafit.priors.grid import WORKING_EPSILON
 
     for other in ("mass", "start"):
-        if wanted[other] is not None and "mass" in maps:
+        if what[other] is not None and "mass" in maps:
             raise ValueError(f"give either --{other} or a map of the mass, got both")
     if "mass" in maps and not bool((torch.as_tensor(maps["mass"]).abs() < 1).all()):
         raise ValueError("the map of the mass must be in (-1, 1)")
-    mass, fraction = maps.get("mass", wanted["mass"]), wanted["volume_fraction"]
+    mass, fraction = maps.get("mass", what["mass"]), what["volume_fraction"]
     if mass is not None and fraction is not None:
         raise ValueError("give either a mass or --volume-fraction, got both")
-    if mass is None and fraction is None and wanted["start"] is None:
+    if mass is None and fraction is None and what["start"] is None:
         mass = law.mass
     coefficients = replace(law.coefficients, **{name: maps[name] for name in NAMES if name in maps})
-    ε = WORKING_EPSILON if wanted["epsilon"] is None else wanted["epsilon"]
-    Q = _choose_orientation(wanted["orientation"], maps)
+    ε = WORKING_EPSILON if what["epsilon"] is None else what["epsilon"]
+    Q = _choose_orientation(what["orientation"], maps)
     return {"law": coefficients, "mass": mass, "volume_fraction": fraction, "epsilon": ε, "orientation": Q}
 
 
@@ -251,11 +251,7 @@ def _locate_checkpoint(file: Path | None, out: Path) -> Path | None:
 
 def _grow(grow: Callable[..., Flow], checkpoint: Path | None) -> Flow:
     """Run the flow with progress; exit with code 1 where it failed or has no surface."""
-
-    def resume_command() -> str:
-        return "the same command" if checkpoint is not None and checkpoint.exists() else ""
-
-    with resumable(resume_command), show_stages() as progress:
+    with resumable(checkpoint), show_stages() as progress:
         progress("starting (a first run compiles the kernels for this processor)", 0.0)
         flow = grow(callbacks=[lambda step, total, _: progress("growing", step / total)])
     # The surface is the level 0 of the field: without values on both sides there is none.

@@ -140,7 +140,8 @@ def _write_page(
         from curvafit.studies.scans import check_units, count_notes, measure_each
 
         options["maps"] = shown["maps"] or shown["graph"]
-        check_measures(folder, _inputs(scans, options.get("roi"), subjects), overwrite, command_line())
+        inputs = [*scans, *filter(None, (options.get("roi"), subjects))]
+        check_measures(folder, inputs, overwrite, command_line())
         check_units(scans, sub_progress(progress, 0.0, 0.05), **reading)
         columns = _read_subjects(subjects, scans)
         measuring = sub_progress(progress, 0.05, 1.0)
@@ -170,7 +171,7 @@ def _write_table(
         from curvafit.studies.scans import check_table, measure_each, write_table
 
         if out is not None:
-            check_table(out, _inputs(scans, options.get("roi"), subjects), overwrite)
+            check_table(out, [*scans, *filter(None, (options.get("roi"), subjects))], overwrite)
         columns = _read_subjects(subjects, scans)
         results = measure_each(scans, progress=progress, **options, **reading)
     _print_results(results, options["labels"])
@@ -179,10 +180,6 @@ def _write_table(
             columns = [row for row, measures in zip(columns, results, strict=True) for _ in measures]
         flat = [measures for of_scan in results for measures in of_scan]
         say(str(write_table(flat, out, columns=columns, overwrite=overwrite)))
-
-
-def _inputs(scans: list[str], *paths: Path | None) -> list[str | Path]:
-    return [*scans, *(path for path in paths if path is not None)]
 
 
 def _read_subjects(subjects: Path | None, scans: list[str]) -> Any:
@@ -226,14 +223,14 @@ def _keep_tiles(store: Path | None) -> Iterator[None]:
     """Delete the folder of finished tiles once the block succeeds; after a signal or an error it stays, to resume."""
     from curvafit.core.files import is_empty, remove
 
-    with resumable(lambda: "the same command" if store is not None and store.exists() else ""):
+    with resumable(store):
         try:
             yield
         except ValueError:  # raised before the first tile: there is nothing to resume
-            if store is not None and store.is_dir() and is_empty(store):
+            if store is not None and is_empty(store):
                 remove(store)
             raise
-    if store is not None and store.exists():
+    if store is not None:
         remove(store)
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args
 
 import typer
@@ -193,11 +194,11 @@ class Crew:
             check_memory(shape, FLOW, "a shape")
 
     @contextmanager
-    def start(self) -> Iterator[tuple[Cluster | None, Progress]]:
-        """Start the workers and their progress bar; after an interrupt the same command resumes."""
+    def start(self, kept: Path) -> Iterator[tuple[Cluster | None, Progress]]:
+        """Start the workers and their progress bar; after an interrupt the same command resumes what is `kept`."""
         from curvafit.core.workers import cluster
 
-        with resumable(), show_stages() as progress:
+        with resumable(kept), show_stages() as progress:
             progress("starting workers", 0.0)
             with cluster(self.workers, self.scheduler) as workers:
                 yield workers, progress

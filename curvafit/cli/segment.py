@@ -259,11 +259,6 @@ class _Job:
         if self.prior is not None:
             Law.of(self.prior)
 
-    @property
-    def content(self) -> dict[str, Any]:
-        """What the mask's record states on the command."""
-        return {"command": command_line(), "prior": self.prior, **self.record}
-
 
 def _run(job: _Job, compute: Callable[..., Segmentation], read: Callable[[], Volume], working: dict[str, Any]) -> None:
     """Compute a volume's mask and write it; finished tiles are kept until then."""
@@ -284,13 +279,14 @@ def _run(job: _Job, compute: Callable[..., Segmentation], read: Callable[[], Vol
         lost = note_lost(job.out, volume)  # what the output's format does not hold
         say_notes(lost)
         store = hidden_store(job.out)
-        with resumable(lambda: "the same command" if store.exists() else ""):
+        with resumable(store):
             result = compute(volume, progress=progress, working=Working(**working, store=store))
             progress("writing", 1.0)
             # The mask gets the source's header unless an option of reading makes that wrong for its voxels.
             changing = ("spacing", "crop") if job.image else ("spacing", "crop", "channel", "time")
             like = (job.image or job.source) if all(reading[name] is None for name in changing) else None
-            record = job.content | ({"not_held": lost} if lost else {})
+            record = {"command": command_line(), "prior": job.prior, **job.record}
+            record |= {"not_held": lost} if lost else {}
             settings = {"like": like, "unit": reading["unit"], "overwrite": job.overwrite}
             paths = write_mask(result, volume, job.out, record=record, **settings)
         remove(store)

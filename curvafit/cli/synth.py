@@ -95,7 +95,7 @@ def synth(
     sets.check_set(out, spec)
     if source.edge == math.inf:  # shapes are grown at any size, not cropped from a store
         crew.check_memory(recipe.largest)
-    with crew.start() as (workers, progress):
+    with crew.start(out) as (workers, progress):
         sets.build_set(out, spec, count, progress, workers=workers, command=command_line())
     if (total := len(sets.list_cases(out))) > count:
         say(f"note: {out} holds {total} cases, more than --count {count}: all are listed", to=error_console())
