@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from scipy import ndimage
 from scipy.cluster.hierarchy import DisjointSet
 from skimage.segmentation import find_boundaries, watershed
@@ -155,59 +155,41 @@ def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
     A voxel further away takes the point of the nearest such voxel, as if the surface there were a sphere of radius
     `BEND`: right to 0.04 voxels on average, 0.4 at worst. A crop has no surface beyond its faces.
     """
-    profile = profile_distance(field.detach().cpu().float(), epsilon).contiguous().numpy()
+    profile = profile_distance(field.detach().cpu().float(), epsilon).numpy()
     edges = np.array(grid.spacing, dtype=np.float32)
-    touching, feet = np.zeros(profile.shape, dtype=bool), np.zeros((*profile.shape, 6), dtype=np.float32)
-    distance = np.full(profile.shape, np.nan, dtype=np.float32)
-    _measure_near(profile, edges, touching, feet, distance)
-    far = np.isnan(distance)
+    crossing, normal = _find_crossings(profile, edges)
+    slope = np.stack(np.gradient(profile, *grid.spacing), axis=-1)
+    steepness = np.linalg.norm(slope, axis=-1)
+    resolved = steepness > LEAST_SLOPE
+    normal[resolved] = slope[resolved] / steepness[resolved, None]
+    length = np.minimum(crossing, np.where(resolved, np.abs(profile) / np.where(resolved, steepness, 1), np.inf))
+    distance = np.where(profile > 0, length, -length)
+    touching = np.isfinite(crossing)
+    # Away from the surface the profile is trusted where its slope is not far from 1, which a distance has.
+    far = ~touching & ((steepness <= 0.5) | (length > 1.5 * edges.max()))
     nearest = ndimage.distance_transform_edt(~touching, edges, return_distances=False, return_indices=True)[:, far].T  # type: ignore[index]
     # The distance is the offset's part along the normal and the sagitta of a sphere of radius `BEND` across it.
-    foot = feet[tuple(nearest.T)]
-    offset = (nearest - np.argwhere(far)) * edges + foot[:, :3]
+    foot = tuple(nearest.T)
+    offset = (nearest - np.argwhere(far)) * edges - distance[foot][:, None] * normal[foot]
     square = np.square(offset).sum(1)
-    along = np.abs((offset * foot[:, 3:]).sum(1))
+    along = np.abs((offset * normal[foot]).sum(1))
     sagitta = np.maximum(square - along**2, 0) / (2 * (np.sqrt(square) + BEND * edges.max()))
     distance[far] = np.where(profile[far] > 0, along + sagitta, -along - sagitta)
     return distance
 
 
-@njit(cache=True)
-def _measure_near(profile, edges, touching, feet, distance):  # pragma: no cover
-    """Fill `touching`, the voxels with a neighbour of the other sign; `feet` (…, 6), their offset to the surface and
-    normal inwards; and the `distance` of all voxels near the surface. `profile` is the distance that tanh states."""
-    # It returns no array: Ctrl-C while compiled code returns one ends the process.
-    shape, widest = profile.shape, edges.max()
-    slope, neighbour = np.zeros(3, dtype=np.float32), np.zeros(3, dtype=np.int64)
-    for z, y, x in np.ndindex(shape):
-        value = profile[z, y, x]
-        shortest, nearest_axis, nearest_step = np.float32(np.inf), -1, 0
-        for axis in range(3):
-            total, count = np.float32(0), 0
-            for step in (-1, 1):
-                neighbour[0], neighbour[1], neighbour[2] = z, y, x
-                neighbour[axis] += step
-                if neighbour[axis] < 0 or neighbour[axis] >= shape[axis]:
-                    continue
-                neighbour_value = profile[neighbour[0], neighbour[1], neighbour[2]]
-                count += 1
-                total += step * (neighbour_value - value)
-                if (neighbour_value > 0) != (value > 0):
-                    crossing = edges[axis] * abs(value) / (abs(value) + abs(neighbour_value))
-                    if crossing < shortest:
-                        shortest, nearest_axis, nearest_step = crossing, axis, step
-            slope[axis] = total / (count * edges[axis])
-        steepness = np.sqrt(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2)
-        sign = 1 if value > 0 else -1
-        if nearest_axis < 0:
-            # Away from the surface the profile is trusted where its slope is not far from 1, which a distance has.
-            if steepness > 0.5 and abs(value) <= 1.5 * steepness * widest:
-                distance[z, y, x] = value / steepness
-            continue
-        touching[z, y, x] = True
-        length = min(shortest, abs(value) / steepness) if steepness > LEAST_SLOPE else shortest
-        feet[z, y, x, 3 + nearest_axis] = -sign * nearest_step  # the axis stands for a normal that is not resolved
-        if steepness > LEAST_SLOPE:
-            feet[z, y, x, 3:] = slope / steepness
-        feet[z, y, x, :3] = -sign * length * feet[z, y, x, 3:]
-        distance[z, y, x] = sign * length
+def _find_crossings(profile: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the shortest way along an axis from each voxel to the surface, infinite where none of six neighbours is on
+    the other side, and that axis as a normal inwards (Z, Y, X, 3), 0 there."""
+    inside = profile > 0
+    shortest, normal = np.full(profile.shape, np.inf, np.float32), np.zeros((*profile.shape, 3), np.float32)
+    for axis, step in itertools.product(range(3), (-1, 1)):
+        last = profile.shape[axis] - 1
+        neighbour = profile.take(np.clip(np.arange(last + 1) + step, 0, last), axis)
+        crosses = (neighbour > 0) != inside
+        share = np.abs(profile) / np.where(crosses, np.abs(profile - neighbour), 1)
+        length = np.where(crosses, edges[axis] * share, np.inf)
+        nearer = length < shortest
+        shortest[nearer] = length[nearer]
+        normal[nearer] = np.eye(3)[axis] * np.where(inside[nearer], -step, step)[:, None]
+    return shortest, normal
