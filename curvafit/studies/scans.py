@@ -83,7 +83,7 @@ def list_cases(groups: Sequence[Group], by: str | Sequence[Any] | None, paired: 
         if not isinstance(by, str | None):
             raise ValueError("expected a table alone, or scans with a label for each, or two groups or more")
         path = Path(groups[0])
-        read = _read_measured if (path / MEASURED).exists() else _read_bodies if _holds_bodies(path) else _read_cases
+        read = _read_measured if (path / MEASURED).exists() or _holds_bodies(path) else _read_cases
         cases = read(path, (by or "group").strip().casefold(), paired)
     else:
         cases = _list_labelled(groups[0], by) if len(groups) == 1 else _list_groups(groups, by, paired, notes)
@@ -279,7 +279,7 @@ def _open_table(case: Case, stated: bool) -> list[Case]:
         return [case]
     if case.roi:
         raise ValueError(f"expected a region for scans alone, got one for the table of bodies {case.name}")
-    path, bodies = Path(case.source).resolve(), _read_measures(Path(case.source))
+    path, bodies = Path(case.source).resolve(), _read_bodies(Path(case.source))
     images = {body.source: Path(body.source).name.partition(".")[0] for body, _ in bodies}
     if len(set(images.values())) < len(images):
         images = {image: image for image in images}
@@ -294,16 +294,7 @@ def _open_table(case: Case, stated: bool) -> list[Case]:
     ]
 
 
-def _read_bodies(path: Path, by: str, paired: bool) -> list[Case]:
-    """Return the bodies of a table, with labels and subjects from columns that `measure` was given."""
-    cases = []
-    for body, row in _read_measures(path):
-        _check_columns(row, by, paired, path)
-        cases.append(Case(body, str(path), row.get("subject") or body.source, row[by]))
-    return cases
-
-
-def _read_measures(path: Path) -> list[tuple[Measures, dict[str, str]]]:
+def _read_bodies(path: Path) -> list[tuple[Measures, dict[str, str]]]:
     """Return the bodies in a table of `measure --labels`, each with the row of its further columns."""
     rows: dict[tuple[str, str], dict[str, dict[str, str]]] = {}
     try:
@@ -366,31 +357,29 @@ def write_measured(measures: Sequence[Measures], columns: Sequence[Mapping[str, 
     return MEASURED_FILE.write(path, {"scans": scans, "columns": list(map(dict, columns))}, arrays)
 
 
-def _read_measured(folder: Path, by: str, paired: bool) -> list[Case]:
-    """Return scans that were measured before, with their labels from the column `by` that `measure` was given."""
-
-    def build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[tuple[Measures, dict[str, str]]]:
-        found = []
-        for k, (scan, columns) in enumerate(zip(header["scans"], header["columns"], strict=True)):
-            pairs = zip(QUANTITIES, arrays["numbers"][k].tolist(), strict=True)
-            quantities = tuple(Quantity(*names[:2], value, half, names[2]) for names, (value, half) in pairs)
-            diagram = Diagram(arrays[f"points{k}"], arrays[f"weights{k}"], f"1/{scan['unit']}")
-            facts = scan["source"], scan["unit"], scan["kind"], quantities, tuple(arrays["directions"][k].tolist())
-            found.append((Measures(*facts, diagram, tuple(scan["blocks"]), tuple(scan["notes"])), columns))  # type: ignore[arg-type]
-        return found
-
-    cases = []
-    for scan, row in MEASURED_FILE.read(folder / MEASURED, build):
-        _check_columns(row, by, paired, folder)
-        cases.append(Case(scan, Path(scan.source).name, row.get("subject") or scan.source, row[by]))
+def _read_measured(path: Path, by: str, paired: bool) -> list[Case]:
+    """Return the scans in a folder of `measure`, or the bodies in a table of it, with labels and subjects from columns
+    that it was given."""
+    is_folder, cases = path.is_dir(), []
+    for scan, row in MEASURED_FILE.read(path / MEASURED, _build_measures) if is_folder else _read_bodies(path):
+        if not row.get(by) or (paired and not row.get("subject")):
+            needed = f"{by} and subject" if paired else by
+            raise ValueError(f"expected scans measured with --subjects, and its column {needed}, got {path}")
+        name = Path(scan.source).name if is_folder else str(path)
+        cases.append(Case(scan, name, row.get("subject") or scan.source, row[by]))
     return cases
 
 
-def _check_columns(row: Mapping[str, str], by: str, paired: bool, path: Path) -> None:
-    """Raise ValueError where a scan that was measured lacks a label, or, to be paired, a subject."""
-    if not row.get(by) or (paired and not row.get("subject")):
-        needed = f"{by} and subject" if paired else by
-        raise ValueError(f"expected scans measured with --subjects, and its column {needed}, got {path}")
+def _build_measures(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[tuple[Measures, dict[str, str]]]:
+    """Return the scans of `write_measured`, each with its further columns."""
+    scans = []
+    for k, (scan, columns) in enumerate(zip(header["scans"], header["columns"], strict=True)):
+        pairs = zip(QUANTITIES, arrays["numbers"][k].tolist(), strict=True)
+        quantities = tuple(Quantity(*names[:2], value, half, names[2]) for names, (value, half) in pairs)
+        diagram = Diagram(arrays[f"points{k}"], arrays[f"weights{k}"], f"1/{scan['unit']}")
+        facts = scan["source"], scan["unit"], scan["kind"], quantities, tuple(arrays["directions"][k].tolist())
+        scans.append((Measures(*facts, diagram, tuple(scan["blocks"]), tuple(scan["notes"])), columns))  # type: ignore[arg-type]
+    return scans
 
 
 def read_columns(table: str | PathLike[str], scans: Sequence[str], taken: Sequence[str] = ()) -> list[dict[str, str]]:
