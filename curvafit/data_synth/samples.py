@@ -8,9 +8,12 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from collections.abc import Sequence
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
+import yaml
 from scipy import ndimage
 
 from curvafit.core.files import write_content
@@ -30,30 +33,10 @@ class SampleUnavailable(OSError):
     """A sample that could not be fetched; the message is one sentence."""
 
 
-#: Files of the package, under the MIT licence, by the samples' names in the order to show them; each with its SHA-256
-#: and a description. Their voxels have no stated size.
-SAMPLES = {
-    "bone": (
-        "bone_128x128x128.tif",
-        "8899e5674fefad047e6c1e8a98cccb04258f002433d22b53164aa2a049cf6377",
-        "micro-CT of bone: a compact rind and the trabeculae beneath it",
-    ),
-    "shell": (
-        "shell_225x128x128.tif",
-        "4445025627dc6b0443395275a8c805eff43fdbba52445cb9a31443e9627e80d9",
-        "micro-CT of a coiled shell: curved walls around chambers",
-    ),
-    "fibers": (
-        "fibers_150x150x150.tif",
-        "b32b1035125c46274947763e46ed1f20fdd7560f9a3cb45c40ca7279e0da3e18",
-        "CT of a fibre composite: bundles in two directions",
-    ),
-    "fly": (
-        "fly_150x256x256.tif",
-        "19b3b8101d45b8ac9dd2cec4625b367d248981c02ecf7cd9a2ed23916f52fed9",
-        "micro-CT of a fly: thin walls and limbs, mostly air",
-    ),
-}
+#: File, SHA-256 and description of each sample of the package, by name.
+SAMPLES: dict[str, Sequence[str]] = yaml.safe_load(
+    files("curvafit.data_synth").joinpath("samples.yaml").read_text("utf-8")
+)
 
 
 def list_samples() -> dict[str, tuple[str, str, str]]:
