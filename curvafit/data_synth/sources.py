@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 from multiprocessing.util import get_temp_dir
@@ -112,9 +113,27 @@ class Generated:
         return content | {"schedule": named_schedule(self.schedule).as_dict(), "fraction": self.fraction}
 
 
+class CropSource(ABC):
+    """Random crops of shapes, under the symmetries of the cube."""
+
+    @abstractmethod
+    def choose(self, rng: np.random.Generator) -> PhaseField:
+        """Return any of the shapes, whole."""
+
+    def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
+        """Return a crop of any of the shapes that shows both structure and background; ValueError where none does."""
+        for _ in range(CROPS):
+            whole = self.choose(rng)
+            crop, record = random_crop(whole.values, voxels, rng)
+            if crop.min() < 0 < crop.max():
+                return PhaseField(crop, whole.epsilon, whole.origin | record)
+        edges = " x ".join(map(str, voxels))
+        raise ValueError(f"{CROPS} crops of {edges} voxels show no structure, or nothing else: take larger ones")
+
+
 @dataclass(frozen=True)
-class Stored:
-    """Random crops of the well-formed shapes of one or more stores, under the symmetries of the cube.
+class Stored(CropSource):
+    """Crops of the well-formed shapes of one or more stores.
 
     `draws` is the number of well-formed shapes in all stores, counted by default; a store that has grown is refused.
     """
@@ -126,20 +145,16 @@ class Stored:
         if self.draws is None:
             object.__setattr__(self, "draws", len(find_well_formed(self.paths)))
 
-    def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
-        """Return a crop of any of the stores' shapes that shows both structure and background."""
+    def choose(self, rng: np.random.Generator) -> PhaseField:
+        """Return any of the stores' shapes."""
         draws = find_well_formed(self.paths)
         if len(draws) != self.draws:
             raise ValueError(f"the stores had {self.draws} well-formed shapes and grew to {len(draws)}: begin anew")
-
-        def choose() -> PhaseField:
-            store, draw = draws[int(rng.integers(len(draws)))]
-            record, settings = store.record(draw), store.settings
-            point = dict(zip(PARAMETERS, (*map(float, record.coefficients), record.mass), strict=True))
-            origin = {"name": f"{store.path.name} {draw}", "parameters": point, "seed": record.seed}
-            return PhaseField(store.field(draw), settings.epsilon / settings.spacing[0], origin)
-
-        return _crop_shape(choose, voxels, rng)
+        store, draw = draws[int(rng.integers(len(draws)))]
+        record, settings = store.record(draw), store.settings
+        point = dict(zip(PARAMETERS, (*map(float, record.coefficients), record.mass), strict=True))
+        origin = {"name": f"{store.path.name} {draw}", "parameters": point, "seed": record.seed}
+        return PhaseField(store.field(draw), settings.epsilon / settings.spacing[0], origin)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the source in JSON's types, for a set's record; `decode_source` reads it."""
@@ -152,8 +167,8 @@ class Stored:
 
 
 @dataclass(frozen=True)
-class Pool:
-    """Random crops, as those of `Stored`, of `count` shapes with `edge` voxels along each axis, at least one of a law.
+class Pool(CropSource):
+    """Crops of `count` shapes with `edge` voxels along each axis, at least one of a law.
 
     `grow` makes them. They are files in a temporary folder of the process that grew them, which deletes it at its end;
     its workers read them there.
@@ -183,14 +198,10 @@ class Pool:
             progress(f"{len(shapes)} of {self.count} shapes grown", len(shapes) / self.count)
         return replace(self, edge=edge, shapes=tuple(shapes))
 
-    def shape(self, voxels: Sequence[int], index: int, rng: np.random.Generator) -> PhaseField:
-        """Return a crop of any of the pool's shapes that shows both structure and background."""
-
-        def choose() -> PhaseField:
-            path, epsilon, origin = self.shapes[int(rng.integers(self.count))]
-            return PhaseField(np.asarray(np.load(path, mmap_mode="r")), epsilon, origin)
-
-        return _crop_shape(choose, voxels, rng)
+    def choose(self, rng: np.random.Generator) -> PhaseField:
+        """Return any of the pool's shapes."""
+        path, epsilon, origin = self.shapes[int(rng.integers(self.count))]
+        return PhaseField(np.asarray(np.load(path, mmap_mode="r")), epsilon, origin)
 
 
 #: Endless shapes for a set: `shape(voxels, index, rng)` depends on its arguments alone; no side is longer than `edge`.
@@ -216,17 +227,6 @@ def choose_voxel(laws: Iterable[LawLike], kind: Modality) -> float:
     if len(edges) > 1:
         raise ValueError(f"the fits' voxels have edges of {sorted(edges)}: give one voxel")
     return edges.pop() if edges else kind.voxel
-
-
-def _crop_shape(choose: Callable[[], PhaseField], voxels: Sequence[int], rng: np.random.Generator) -> PhaseField:
-    """Return a random crop, with both structure and background, of the shapes that `choose` draws."""
-    for _ in range(CROPS):
-        whole = choose()
-        crop, record = random_crop(whole.values, voxels, rng)
-        if crop.min() < 0 < crop.max():
-            return PhaseField(crop, whole.epsilon, whole.origin | record)
-    edges = " x ".join(map(str, voxels))
-    raise ValueError(f"{CROPS} crops of {edges} voxels show no structure, or nothing else: take larger ones")
 
 
 def apply_symmetry(values: np.ndarray, symmetry: int) -> np.ndarray:
