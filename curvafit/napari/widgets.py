@@ -17,7 +17,7 @@ from qtpy.QtWidgets import QSizePolicy
 from scipy import ndimage
 
 from curvafit.core.runtime import Progress
-from curvafit.core.units import convert_length, format_number, is_unit, parse_unit, power_name
+from curvafit.core.units import common_unit, format_number, is_unit, power_name
 from curvafit.drawing.plot import diagram_figure
 from curvafit.generation.flow import generate
 from curvafit.generation.schedule import schedule
@@ -57,15 +57,11 @@ def field_of_layer(layer: Any, kind: str = "a layer") -> Volume:
 
 def _lengths(layer: Any) -> tuple[tuple[float, float, float], str]:
     """Return voxel edges (z, y, x) and their unit, that of the last axis."""
-    names = [str(unit) for unit in layer.units[-3:]]
-    if other := next((name for name in names if not is_unit(name)), None):
-        raise ScanError(f"expected lengths along the axes of {layer.name}, got the unit {other}")
-    units = [parse_unit(name)[0] for name in names]
-    if 0 < units.count("voxel") < 3:
-        raise ScanError(f"expected one kind of unit along the axes of {layer.name}, got pixels and lengths")
-    edges = zip(layer.scale[-3:], names, strict=True)
-    z, y, x = (convert_length(abs(float(edge)), unit, units[-1]) for edge, unit in edges)
-    return (z, y, x), units[-1]
+    unit, factors = common_unit([str(unit) for unit in layer.units[-3:]])
+    if not is_unit(unit):
+        raise ScanError(f"expected one kind of unit of length along the axes of {layer.name}, got the unit {unit}")
+    z, y, x = (abs(float(edge)) * factor for edge, factor in zip(layer.scale[-3:], factors, strict=True))
+    return (z, y, x), str(unit)
 
 
 def place_of_layer(layer: Any) -> dict[str, Any]:
