@@ -82,9 +82,9 @@ def plain_errors() -> Iterator[None]:
         say(f"{_name_signal(signal)}: nothing is left half-written", to=error_console())
         raise typer.Exit(exit_code(signal)) from None
     except (ValueError, OSError, ImportError, MemoryError, RuntimeError) as error:
-        if os.environ.get(DEBUG) or not _is_expected(error):
+        if os.environ.get(DEBUG) or not (text := _explain(error)):
             raise
-        say(_explain(error), to=error_console())
+        say(text, to=error_console())
         raise typer.Exit(2) from None
 
 
@@ -104,17 +104,13 @@ def _name_signal(signal: KeyboardInterrupt) -> str:
     return "terminated" if isinstance(signal, Terminated) else "interrupted"
 
 
-def _is_expected(error: Exception) -> bool:
-    """Return whether the input or the machine is at fault, rather than the program."""
-    if isinstance(error, ImportError):
-        return not (error.name or "").startswith("curvafit")
-    return not isinstance(error, RuntimeError) or "memory" in str(error).lower()
-
-
 def _explain(error: Exception) -> str:
-    """Return the sentence of an expected exception."""
+    """Return the sentence of an exception; an empty text where the program is at fault."""
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "memory" in str(error).lower()):
         return "error: the volume does not fit into memory"
+    ours = isinstance(error, ImportError) and (error.name or "").startswith("curvafit")
+    if ours or isinstance(error, RuntimeError):
+        return ""
     if isinstance(error, OSError) and error.strerror:
         return sentence(f"{error.strerror.lower()}: {error.filename or ''}")
     return sentence(str(error) or type(error).__name__)
