@@ -137,13 +137,13 @@ def _write_page(
     with show_stages() as progress:
         from curvafit.core.runtime import sub_progress
         from curvafit.report.measures import check_measures, write_measures
-        from curvafit.studies.scans import check_units, count_notes, measure_each
+        from curvafit.studies.scans import check_units, count_notes, measure_each, read_columns
 
         options["maps"] = shown["maps"] or shown["graph"]
         inputs = [*scans, *filter(None, (options.get("roi"), subjects))]
         check_measures(folder, inputs, overwrite, command_line())
         check_units(scans, sub_progress(progress, 0.0, 0.05), **reading)
-        columns = _read_subjects(subjects, scans)
+        columns = None if subjects is None else read_columns(subjects, scans)
         measuring = sub_progress(progress, 0.05, 1.0)
         # A page is for scans, of which each has one result; instances have a table only.
         results = [measures for (measures,) in measure_each(scans, progress=measuring, **options, **reading)]
@@ -168,11 +168,11 @@ def _write_table(
 ) -> None:  # fmt: skip
     """Measure scans, print the numbers, and write them into a table, if there is an output."""
     with show_stages() as progress:
-        from curvafit.studies.scans import check_table, measure_each, write_table
+        from curvafit.studies.scans import check_table, measure_each, read_columns, write_table
 
         if out is not None:
             check_table(out, [*scans, *filter(None, (options.get("roi"), subjects))], overwrite)
-        columns = _read_subjects(subjects, scans)
+        columns = None if subjects is None else read_columns(subjects, scans)
         results = measure_each(scans, progress=progress, **options, **reading)
     _print_results(results, options["labels"])
     if out is not None:
@@ -182,21 +182,13 @@ def _write_table(
         say(str(write_table(flat, out, columns=columns, overwrite=overwrite)))
 
 
-def _read_subjects(subjects: Path | None, scans: list[str]) -> Any:
-    """Return each scan's row of a CSV of subjects as a dict, None without a CSV."""
-    from curvafit.scan.measures import COLUMNS
-    from curvafit.studies.scans import OF_PARTS, read_columns
-
-    return None if subjects is None else read_columns(subjects, scans, (*COLUMNS, *OF_PARTS))
-
-
 def _map_windows(scan: str, folder: Path, overwrite: bool, options: dict[str, Any]) -> None:
     """Measure a scan in windows, and write its maps."""
     with show_stages() as progress:
         from curvafit.report.measures import check_windows, write_windows
         from curvafit.studies.windowed import windows as measure_windows
 
-        check_windows(folder, scan, overwrite, command_line())
+        check_windows(folder, [scan], overwrite, command_line())
         windows = measure_windows(scan, progress=progress, **options)
         progress("drawing the page", 1.0)
         page = write_windows(windows, folder, command=command_line(), overwrite=overwrite)

@@ -63,8 +63,7 @@ def write_comparison(
 ) -> Path:
     """Write the page, figures, tables and record of a comparison into a folder, and return the page's path.
 
-    The files (`FILES`) are moved into the folder once all are whole. Those of the same command are replaced;
-    others are a ValueError without `overwrite`. `command` is what the record calls the command line.
+    What is replaced, and `command`, are as in `write_measures`.
     """
     target = check_comparison(directory, overwrite=overwrite, command=command)
     c = comparison

@@ -55,9 +55,8 @@ check_report = partial(page.check_result_folder, Format(FORMAT), FILES)
 def write_inference(inference: Inference, directory: str | Path, *, command: str = "", overwrite: bool = False) -> Path:
     """Write `fit.json`, `report.html` and, if a shape was regenerated, `regenerated.nii.gz` into a folder.
 
-    Return the report's path. The files are moved into the folder once all are whole. Those of an earlier inference by
-    the same command are replaced; others are a ValueError without `overwrite`. `command` is what the fit's provenance
-    calls the command line.
+    Return the report's path. What is replaced, and `command`, which the fit's provenance has, are as in
+    `write_measures`.
     """
     if command:
         provenance = {**inference.fit.provenance, "command": command}

@@ -43,11 +43,15 @@ FILES += ("structure.nii.gz", "thickness.nii.gz")
 FILES += ("branches.csv", "centreline.csv", "centreline.graphml", "centreline.swc", "centreline.svg", "centreline.png")
 #: Of a scan measured in windows, `format` of the record.
 WINDOWS_FORMAT = Format("curvafit windows", 1, title="the record of a scan measured in windows")
-#: Of a scan measured in windows, what is written into the folder beside the maps.
+#: Of a scan measured in windows, what is written into the folder; maps are Zarr stores if the scan is one, else NIfTI.
 WINDOWS_FILES = ("windows.json", "windows.html", "windows.csv", "windows.svg", "windows.png")
 WINDOWS_FILES += ("outlines.svg", "outlines.png")
+MAPS = {suffix: [f"{name.replace(' ', '_')}{suffix}" for name in NAMES] for suffix in (".nii.gz", ".ome.zarr")}
+WINDOWS_FILES += (*MAPS[".nii.gz"], *MAPS[".ome.zarr"])
 #: Returns the folder if `write_measures` can write there, else raises ValueError; call it before the work.
 check_measures = partial(check_result_folder, FORMAT, FILES)
+#: The same for `write_windows`.
+check_windows = partial(check_result_folder, WINDOWS_FORMAT, WINDOWS_FILES)
 #: The most scans whose diagrams and numbers are drawn.
 MOST_DIAGRAMS, MOST_ROWS = 25, 100
 #: Diagrams in a row, and panels of numbers in a row.
@@ -67,10 +71,10 @@ def write_measures(
 ) -> Path:
     """Write the page, figures, tables and record of scans into a folder, and return the page's path.
 
-    Lengths are in the first scan's unit. A scan with compartments has a row for each of them. The files (`FILES`) are
-    moved into the folder once all are whole; those of the same command are replaced, others are a ValueError without
-    `overwrite`. `columns` has further columns of each scan, such as its subject; `centreline` is the first scan's,
-    whose `maps` are written if it has some; `options` and `command` are for the record.
+    Lengths are in the first scan's unit. A scan with compartments has a row for each of them. The files are moved into
+    the folder once all are whole; those of the same `command` (the command line, in the record) are replaced, others
+    are a ValueError without `overwrite`. `columns` has further columns of each scan, such as its subject; `centreline`
+    is the first scan's, whose `maps` are written if it has some; `options` are for the record.
     """
     if not measures:
         raise ValueError("expected at least one scan, got none")
@@ -212,26 +216,13 @@ def intervals_figure(names: Sequence[str], measures: Sequence[Measures]) -> Figu
 # ---- a scan in windows -----------------------------------------------------------------------------------------------
 
 
-def list_files(source: str | Path) -> tuple[str, ...]:
-    """Return the names of all files; maps are Zarr stores if the scan is one, else NIfTI files."""
-    suffix = ".ome.zarr" if ".zarr" in str(source).lower() else ".nii.gz"
-    return (*WINDOWS_FILES, *(f"{name.replace(' ', '_')}{suffix}" for name in NAMES))
-
-
-def check_windows(directory: str | Path, source: str | Path = "", overwrite: bool = False, command: str = "") -> Path:
-    """Return the folder if `write_windows` can write there, else raise ValueError; call it before the work."""
-    inputs = [source] if source else []
-    return check_result_folder(WINDOWS_FORMAT, list_files(source), directory, inputs, overwrite, command)
-
-
 def write_windows(windows: Windows, directory: str | Path, *, command: str = "", overwrite: bool = False) -> Path:
     """Write the page, maps, figure, table and record of windows into a folder, and return the page's path.
 
-    The files are moved into the folder once all are whole. Those of the same command are replaced; others are a
-    ValueError without `overwrite`. `command` is what the record calls the command line.
+    What is replaced, and `command`, are as in `write_measures`.
     """
     source = windows.grid.source
-    target, files = check_windows(directory, source, overwrite, command), list_files(source)
+    target = check_windows(directory, [source] if source else [], overwrite, command)
     record = start_record(
         command, unit=windows.unit, options=windows.options, status=windows.status, notes=windows.notes,
         scan=source, kind=windows.kind,
@@ -243,9 +234,10 @@ def write_windows(windows: Windows, directory: str | Path, *, command: str = "",
         "outlines": (outlines, "Three slices of the scan, and the outline of its structure"),
         "windows": (windows_figure(windows), "Maps of six numbers, on three slices"),
     }
-    maps = dict(zip(files[len(WINDOWS_FILES) :], map(windows.__getitem__, NAMES), strict=True))
+    names = MAPS[".ome.zarr" if ".zarr" in source.lower() else ".nii.gz"]
+    maps = dict(zip(names, map(windows.__getitem__, NAMES), strict=True))
     tables = {"windows.csv": _rows(windows)}
-    return write_study(target, WINDOWS_FORMAT, files, record, page, tables, figures=figures, maps=maps)
+    return write_study(target, WINDOWS_FORMAT, WINDOWS_FILES, record, page, tables, figures=figures, maps=maps)
 
 
 def _rows(windows: Windows) -> Iterator[dict[str, Any]]:

@@ -382,16 +382,17 @@ def _build_measures(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> li
     return scans
 
 
-def read_columns(table: str | PathLike[str], scans: Sequence[str], taken: Sequence[str] = ()) -> list[dict[str, str]]:
+def read_columns(table: str | PathLike[str], scans: Sequence[str]) -> list[dict[str, str]]:
     """Return, for each scan, its row of a table without the column `scan`: such as its subject, group and time.
 
-    Raises ValueError where a scan has no row, or a column's name is `taken`; FileNotFoundError where there is no table.
+    Raises ValueError where a scan has no row, or a column has the name of one in a table of measures; FileNotFoundError
+    where there is no table.
     """
     path = Path(table)
     if not path.exists():
         raise FileNotFoundError(f"no such file: {path}")
     rows = {row["scan"]: row for row in _read_table(path, ("scan",))}
-    if clashes := sorted({name for row in rows.values() for name in row} & set(taken) - {"scan"}):
+    if clashes := sorted({name for row in rows.values() for name in row} & {*COLUMNS, *OF_PARTS} - {"scan"}):
         raise ValueError(f"expected columns in {path} that a table of measures has not, got {', '.join(clashes)}")
     scan_rows = [_find_row(scan, Path(scan.partition("::")[0]).name, rows, path) for scan in scans]
     return [{name: value for name, value in row.items() if name != "scan"} for row in scan_rows]

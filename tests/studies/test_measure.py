@@ -344,9 +344,9 @@ def test_the_command_writes_maps_table_and_page(halves: Volume, mapped: Windows,
     rows = list(csv.DictReader((out / "windows.csv").read_text(encoding="utf-8").splitlines()))
     assert [float(row["thickness"]) for row in rows] == pytest.approx(mapped["Tb.Th"].values.ravel())
     command = json.loads((out / "windows.json").read_text(encoding="utf-8"))["command"]
-    assert check_windows(out, scan, command=command) == out  # its own files
+    assert check_windows(out, [scan], command=command) == out  # its own files
     with pytest.raises(ValueError, match="free"):
-        check_windows(out, scan, command="curvafit measure another.npy -o maps")
+        check_windows(out, [scan], command="curvafit measure another.npy -o maps")
 
 
 def test_windows_smaller_than_the_structure_are_refused() -> None:
