@@ -70,7 +70,8 @@ def _print_result(inference: Inference) -> None:
     say(fit.status)
     for combination in fit.combinations:
         say(str(combination))
-    if rows := parameter_table(inference):
+    if table := parameter_table(inference):
+        rows = [(*row[:3], interval, f"{physical} {unit}".strip()) for *row, interval, physical, unit in table]
         heads = ("", "working units", "±", "90 % of the posterior", f"with lengths in {unit_name(fit.length_unit)}")
         print_table(heads, rows, right=range(1, 5))
     if inference.twins:

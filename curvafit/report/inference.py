@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from curvafit.core.records import Format
-from curvafit.core.units import format_length, format_number, format_percent, power_name, unit_name
+from curvafit.core.units import format_length, format_number, format_percent, format_sampling, power_name, unit_name
 from curvafit.drawing import plot
 from curvafit.geometry.diagrams import Diagram
 from curvafit.inference.candidates import SUPPORTED, TITLES, UNBELIEVABLE, Candidate, seed_noise_of
@@ -125,13 +125,9 @@ def family_radius(diagram: Diagram, family: str) -> float | None:
 
 def describe_scan(inference: Inference) -> str:
     """Return what was read: name, kind, voxels and their size."""
-    scan, fit = inference.scan, inference.fit
-    shape = " × ".join(str(n) for n in scan.values.shape)
-    kind = "phase field" if fit.kind == "field" else fit.kind
-    isotropic = len({round(h / scan.spacing[0], 6) for h in scan.spacing}) == 1
-    spacing = (scan.spacing[0],) if isotropic else scan.spacing
-    voxel = " × ".join(f"{h:.4g}" for h in spacing) + f" {unit_name(scan.unit, spacing[0])}"
-    return f"{name_source(scan.source) or 'a volume'}: {kind} of {shape} voxels (z, y, x), voxel edge {voxel}."
+    scan, kind = inference.scan, inference.fit.kind
+    sampling = format_sampling(scan.shape, scan.spacing, scan.unit)
+    return f"{name_source(scan.source) or 'a volume'}: {'phase ' * (kind == 'field')}{kind} of {sampling} (z, y, x)."
 
 
 def name_source(source: str | None) -> str:
@@ -167,19 +163,9 @@ def _number_rows(inference: Inference) -> list[list[str]]:
     return rows
 
 
-def parameter_table(inference: Inference) -> list[tuple[str, str, str, str, str]]:
-    """Return a row for each parameter: name, chosen value, deviation, the posterior's 90 % interval, physical value.
-
-    Without a law there are no rows.
-    """
-    return [
-        (name, value, deviation, interval, f"{physical} {unit}".strip())
-        for name, (value, deviation, _, _, interval, physical), unit in _parameters(inference)
-    ]
-
-
-def _parameters(inference: Inference) -> list[tuple[str, tuple[str, ...], str]]:
-    """Return (name, (value, deviation, median, 50 % and 90 % interval, physical value), unit) of each parameter."""
+def parameter_table(inference: Inference) -> list[tuple[str, ...]]:
+    """Return a row for each parameter: name, chosen value, deviation, the posterior's median, 50 % and 90 % interval,
+    physical value and its unit; without a law there are no rows."""
     fit, best, physical = inference.fit, inference.fit.best, inference.fit.coefficients_physical
     if best is None or physical is None:
         return []
@@ -194,7 +180,7 @@ def _parameters(inference: Inference) -> list[tuple[str, tuple[str, ...], str]]:
         deviation = "" if σ is None else "fixed" if σ == 0 else format_number(σ, 2)
         scaled = "" if name == "mass" else format_number(physical.as_dict()[name])
         unit = power_name(fit.length_unit, -_TERMS[name][2])
-        rows.append((name, (format_number(value), deviation, *posterior, scaled), unit))
+        rows.append((name, format_number(value), deviation, *posterior, scaled, unit))
     return rows
 
 
@@ -218,7 +204,7 @@ def _law(inference: Inference) -> dict[str, Any] | None:
         return None
     rows = [
         (*_TERMS[name][:2], page.Chosen(value), *cells, page.Chosen(physical), unit)
-        for name, (value, *cells, physical), unit in _parameters(inference)
+        for name, value, *cells, physical, unit in parameter_table(inference)
     ]
     width = ("0.02", "", "", "", "", format_number(fit.epsilon_physical), unit_name(fit.length_unit, 2))
     coefficients = best.coefficients.as_dict()  # only their ratios matter: a law fixes one of them, its gauge
