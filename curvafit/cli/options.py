@@ -52,10 +52,9 @@ def command(*examples: str) -> Callable[[Callable[..., None]], Callable[..., Non
         @functools.wraps(function)
         def run(**arguments: Any) -> None:
             with plain_errors():
-                values = dict(arguments)
+                _check_inputs(arguments)
                 for name, make in makers.items():
                     arguments[name] = make(**{option: arguments.pop(option) for option in groups[name]})
-                _check_inputs(values)
                 function(**arguments)
 
         # typer reads a command's options from signature and annotations: these list a group's options in its place.
@@ -129,18 +128,10 @@ def parse_reading(
         from curvafit.volumes.volume import parse_box
 
         parse_box(crop)
-    return {
-        "spacing": None if spacing is None else parse_triple(spacing, "--spacing"),
-        "unit": unit,
-        "channel": channel,
-        "time": time,
-        "label": label,
-        "crop": crop,
-        "raw_shape": None if raw_shape is None else parse_whole_triple(raw_shape, "--raw-shape"),
-        "dtype": dtype,
-        "key": key,
-        "strict": strict,
-    }
+    edges = None if spacing is None else parse_triple(spacing, "--spacing")
+    voxels = None if raw_shape is None else parse_whole_triple(raw_shape, "--raw-shape")
+    reading = {"spacing": edges, "unit": unit, "channel": channel, "time": time, "label": label, "crop": crop}
+    return reading | {"raw_shape": voxels, "dtype": dtype, "key": key, "strict": strict}
 
 
 Reading = Annotated[dict[str, Any], Group(parse_reading)]

@@ -15,7 +15,6 @@ from curvafit.cli.options import Group, Reading, Workers, command, parse_numbers
 
 if TYPE_CHECKING:
     from curvafit.data_synth.imaging.modality import Modality
-    from curvafit.data_synth.sources import ShapeSource
 
 _what = partial(typer.Option, rich_help_panel="Shapes: one of these")
 _image = partial(typer.Option, rich_help_panel="Images")
@@ -33,14 +32,22 @@ Parts = Annotated[
 ]
 
 
-def parse_shapes(
+def choose_shapes(
     laws: Laws = None,
     atlas: Annotated[Path | None, _what(help="Store of shapes to crop.")] = None,
     volume_fraction: Annotated[float | None, _what(help="Share of the volume inside; by default the fit's.")] = None,
-) -> dict[str, Any]:
-    """Return the options on the source of shapes, by name."""
+) -> tuple[Any, list[str]]:
+    """Return the source of shapes that the options name, and the laws whose fits state the size of a voxel."""
     names = [] if laws is None else laws.split(",")
-    return {"laws": names, "atlas": atlas, "volume_fraction": volume_fraction}
+    if bool(names) == (atlas is not None):
+        raise ValueError(f"give either --prior (or --preset) or --atlas, got {'both' if names else 'neither'}")
+    from curvafit.data_synth.sources import Generated, Stored
+
+    if atlas is None:
+        return Generated.of(names, volume_fraction), names
+    if volume_fraction is not None:
+        raise ValueError("--volume-fraction is for shapes that are grown, not for those of a store")
+    return Stored((atlas.resolve(),)), []
 
 
 def parse_imaging(
@@ -62,7 +69,7 @@ def synth(
     out: Annotated[Path, _out("-o", "--output", help="Folder of the set; a set that exists is resumed.")],
     count: Annotated[int, _out(help="Number of cases in the set at the end.")] = 200,
     *,
-    shapes: Annotated[dict[str, Any], Group(parse_shapes)],
+    shapes: Annotated[tuple[Any, list[str]], Group(choose_shapes)],
     imaging: Annotated[dict[str, Any], Group(parse_imaging)],
     shape: Annotated[str, _out(help="Voxels of an image: N or Z,Y,X.")] = "96",
     voxel: Annotated[float | None, _image(help="Edge of a shape's voxel, in --unit; by default the law's.")] = None,
@@ -79,7 +86,7 @@ def synth(
         if voxel is None:
             raise ValueError("--unit needs --spacing or --voxel")
         reading["unit"] = None  # it is that of --voxel, not of --like
-    source, laws = _choose_source(**shapes)
+    source, laws = shapes
     modality = _choose_modality(**imaging, reading=reading)
     from curvafit.core.files import check_folder
     from curvafit.core.units import convert_length
@@ -101,19 +108,6 @@ def synth(
         say(f"note: {out} holds {total} cases, more than --count {count}: all are listed", to=error_console())
     for path in (out / "dataset.json", sets.write_preview(out)):
         say(str(path))
-
-
-def _choose_source(laws: list[str], atlas: Path | None, volume_fraction: float | None) -> tuple[ShapeSource, list[str]]:
-    """Return the source of shapes that the options name, and the laws whose fits state the size of a voxel."""
-    if bool(laws) == (atlas is not None):
-        raise ValueError(f"give either --prior (or --preset) or --atlas, got {'both' if laws else 'neither'}")
-    from curvafit.data_synth.sources import Generated, Stored
-
-    if atlas is None:
-        return Generated.of(laws, volume_fraction), laws
-    if volume_fraction is not None:
-        raise ValueError("--volume-fraction is for shapes that are grown, not for those of a store")
-    return Stored((atlas.resolve(),)), []
 
 
 def _choose_modality(
