@@ -57,25 +57,25 @@ def labels_of(
     betti
         b0 pieces, b1 tunnels, b2 cavities; see `topology.betti_numbers`.
     """
-    wanted = {which} if isinstance(which, str) else set(which)
-    if unknown := sorted(wanted - set(NAMES)):
+    names = {which} if isinstance(which, str) else set(which)
+    if unknown := sorted(names - set(NAMES)):
         raise ValueError(f"labels are {', '.join(NAMES)}, got {', '.join(unknown)}")
     u, grid = _check_field(field, grid, epsilon), replace(grid, boundary="replicate")
     mask = (u > 0).cpu().numpy()
     labels: dict[str, Any] = {"mask": mask}
-    if wanted & {"distance", "skeleton", "instances", "radius"}:
+    if names & {"distance", "skeleton", "instances", "radius"}:
         labels["distance"] = distance = field_distance(u, grid, epsilon)
-        if "skeleton" in wanted:
+        if "skeleton" in names:
             labels["skeleton"] = skeleton_of(distance)
-        if "instances" in wanted:
+        if "instances" in names:
             labels["instances"] = instances_of(distance)
-        if "radius" in wanted:
+        if "radius" in names:
             labels["radius"] = local_thickness(distance > 0, grid.spacing) / 2
-    if wanted & {"kappa1", "kappa2"}:
+    if names & {"kappa1", "kappa2"}:
         labels["kappa1"], labels["kappa2"] = _measure_curvatures(u, mask, grid, epsilon)
-    if "betti" in wanted:
+    if "betti" in names:
         labels["betti"] = betti_numbers(mask)
-    return {name: labels[name] for name in NAMES if name in wanted}
+    return {name: labels[name] for name in NAMES if name in names}
 
 
 def instances_of(distance: np.ndarray) -> np.ndarray:

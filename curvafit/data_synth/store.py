@@ -208,13 +208,13 @@ def find_well_formed(paths: tuple[Path, ...]) -> list[tuple[Store, int]]:
     return draws
 
 
-def check_same(stored: Any, wanted: Any, path: Path, name: str = "") -> None:
-    """Raise ValueError where settings, stored and wanted, differ, with the name of the first nested value that does."""
-    if isinstance(stored, dict) and isinstance(wanted, dict) and stored.keys() == wanted.keys():
-        for key in stored:
-            check_same(stored[key], wanted[key], path, f"{name}.{key}" if name else key)
-    elif stored != wanted:
-        raise ValueError(f"{path} was begun with {name} {stored} and not {wanted}: choose another folder, or delete it")
+def check_same(old: Any, new: Any, path: Path, name: str = "") -> None:
+    """Raise ValueError where old settings differ from new ones, with the name of the first nested value that does."""
+    if isinstance(old, dict) and isinstance(new, dict) and old.keys() == new.keys():
+        for key in old:
+            check_same(old[key], new[key], path, f"{name}.{key}" if name else key)
+    elif old != new:
+        raise ValueError(f"{path} was begun with {name} {old} and not {new}: choose another folder, or delete it")
 
 
 def _decode_settings(content: Any) -> Settings:

@@ -18,7 +18,6 @@ from curvafit.core.units import format_length, format_number, format_percent, fo
 from curvafit.drawing import plot
 from curvafit.geometry.diagrams import Diagram
 from curvafit.inference.candidates import SUPPORTED, TITLES, UNBELIEVABLE, Candidate, seed_noise_of
-from curvafit.inference.fit import Fit
 from curvafit.inference.inference import Inference
 from curvafit.inference.posterior import KNOWN
 from curvafit.inference.table import parameters_of
@@ -37,8 +36,6 @@ _TERMS = {
 }  # fmt: skip
 #: The parameters as a corner plot names them.
 SYMBOLS = ("a₁₁", "log a₀₂", "a₁₀", "a₀₁", "a₀₀", "m₀")
-#: Half the width of a strip, in standard deviations among laws.
-STRIP = 2.5
 #: tan 22.5°: a family's points (κ1, κ2) lie within this angle of its ideal direction, as κ2 = 0 of tubes.
 _NARROW = math.tan(math.pi / 8)
 #: For each round family: which points (κ1, κ2) belong to it, and the curvature that is 1/radius.
@@ -88,7 +85,7 @@ def report_html(inference: Inference) -> str:
         shapes=_shapes(inference) if inference.twins else [],
         diagrams=[] if inference.diagram is None else _diagrams(inference), distances=_distances(inference),
         unit=format_length(fit.length, fit.length_unit, 3), twins=0 if fit.best is None else len(fit.best.twins),
-        numbers=_number_rows(inference), strips=list_strips(fit), law=_law(inference), corner=_corner(inference),
+        numbers=_number_rows(inference), known=KNOWN, law=_law(inference), corner=_corner(inference),
         symbols=[symbol for symbol, _, _ in _TERMS.values()], level=UNBELIEVABLE,
         supported=fit.status.startswith(SUPPORTED),
     )  # fmt: skip
@@ -182,19 +179,6 @@ def parameter_table(inference: Inference) -> list[tuple[str, ...]]:
         unit = power_name(fit.length_unit, -_TERMS[name][2])
         rows.append((name, format_number(value), deviation, *posterior, scaled, unit))
     return rows
-
-
-def list_strips(fit: Fit) -> list[dict[str, Any]]:
-    """Return for each combination of parameters its 90 % interval, as text and as a bar in percent of a strip."""
-    strips = []
-    for combination in fit.combinations:
-        start, end = (100 * float(np.clip(0.5 + x / (2 * STRIP), 0, 1)) for x in combination.interval)
-        low, high = (format_number(x, 2) for x in combination.interval)
-        strips.append({
-            "low": combination.low, "high": combination.high, "start": f"{start:.1f}", "width": f"{end - start:.1f}",
-            "known": combination.known >= KNOWN, "text": f"{low} to {high}",
-        })  # fmt: skip
-    return strips
 
 
 def _law(inference: Inference) -> dict[str, Any] | None:

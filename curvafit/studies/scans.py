@@ -457,11 +457,11 @@ def measure_scans(
     return measures, notes
 
 
-def to_one_unit(measures: Sequence[Measures], stated: str | None = None) -> list[Measures]:
+def to_one_unit(measures: Sequence[Measures], unit: str | None = None) -> list[Measures]:
     """Return scans in the first one's unit; in mm, as bone is measured, where that is µm, the first scan's structure is
-    `THICK` or thicker, and no unit is `stated`. Raises ValueError where only some are in a physical unit."""
+    `THICK` or thicker, and no `unit` was asked for. Raises ValueError where only some are in a physical unit."""
     first = measures[0]
-    bone = stated is None and first.unit == "um" and first["thickness"].value >= THICK and not is_body(first)
+    bone = unit is None and first.unit == "um" and first["thickness"].value >= THICK and not is_body(first)
     return [scan.convert("mm" if bone else first.unit) for scan in measures]
 
 

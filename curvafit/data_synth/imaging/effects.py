@@ -71,8 +71,8 @@ def blur(image: Voxels, spacing: Lengths, widths: Lengths, growth: float = 0.0, 
     factors = (wider, wider[..., None], wider[..., None]) if growth else (1.0, 1.0, 1.0)
     axes = zip(image.shape, _as_triple(widths), edges, factors, strict=True)
     maps = (_gaussian_matrix(n, σ / h * factor if σ else 0.0, image) for n, σ, h, factor in axes)
-    seen = _apply_matrices(image, *maps)
-    return seen * torch.exp(-attenuation * depth)[..., None] if attenuation else seen
+    image = _apply_matrices(image, *maps)
+    return image * torch.exp(-attenuation * depth)[..., None] if attenuation else image
 
 
 def sample(image: Voxels, spacing: Lengths, onto: Lengths, window: Lengths = 0.0) -> Float[Tensor, "Z Y X"]:
