@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
@@ -158,13 +157,14 @@ def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
     profile = profile_distance(field.detach().cpu().float(), epsilon).numpy()
     edges = np.array(grid.spacing, dtype=np.float32)
     crossing, normal = _find_crossings(profile, edges)
-    slope = np.stack(np.gradient(profile, *grid.spacing), axis=-1)
+    slope = np.stack([np.gradient(profile, h, axis=axis) for axis, h in enumerate(grid.spacing)], axis=-1)
     steepness = np.linalg.norm(slope, axis=-1)
     resolved = steepness > LEAST_SLOPE
-    normal[resolved] = slope[resolved] / steepness[resolved, None]
+    touching = np.isfinite(crossing)
+    known = touching & resolved
+    normal[known] = slope[known] / steepness[known, None]
     length = np.minimum(crossing, np.where(resolved, np.abs(profile) / np.where(resolved, steepness, 1), np.inf))
     distance = np.where(profile > 0, length, -length)
-    touching = np.isfinite(crossing)
     # Away from the surface the profile is trusted where its slope is not far from 1, which a distance has.
     far = ~touching & ((steepness <= 0.5) | (length > 1.5 * edges.max()))
     nearest = ndimage.distance_transform_edt(~touching, edges, return_distances=False, return_indices=True)[:, far].T  # type: ignore[index]
@@ -181,15 +181,15 @@ def field_distance(field: Tensor, grid: Grid, epsilon: float) -> np.ndarray:
 def _find_crossings(profile: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the shortest way along an axis from each voxel to the surface, infinite where none of six neighbours is on
     the other side, and that axis as a normal inwards (Z, Y, X, 3), 0 there."""
-    inside = profile > 0
     shortest, normal = np.full(profile.shape, np.inf, np.float32), np.zeros((*profile.shape, 3), np.float32)
-    for axis, step in itertools.product(range(3), (-1, 1)):
-        last = profile.shape[axis] - 1
-        neighbour = profile.take(np.clip(np.arange(last + 1) + step, 0, last), axis)
-        crosses = (neighbour > 0) != inside
-        share = np.abs(profile) / np.where(crosses, np.abs(profile - neighbour), 1)
-        length = np.where(crosses, edges[axis] * share, np.inf)
-        nearer = length < shortest
-        shortest[nearer] = length[nearer]
-        normal[nearer] = np.eye(3)[axis] * np.where(inside[nearer], -step, step)[:, None]
+    for axis in range(3):
+        lower = np.argwhere(np.diff(profile > 0, axis=axis))  # the first voxel of each pair that the surface divides
+        upper = lower + np.eye(3, dtype=int)[axis]
+        for voxels, neighbours, step in ((upper, lower, -1), (lower, upper, 1)):
+            value = profile[tuple(voxels.T)]
+            length = edges[axis] * np.abs(value) / np.abs(value - profile[tuple(neighbours.T)])
+            nearer = length < shortest[tuple(voxels.T)]
+            index = tuple(voxels[nearer].T)
+            shortest[index], normal[index] = length[nearer], 0
+            normal[(*index, axis)] = np.where(value[nearer] > 0, -step, step)
     return shortest, normal
