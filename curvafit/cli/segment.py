@@ -127,9 +127,8 @@ def segment(
         return
     files = {name: None if path is None else str(path) for name, path in _without(network, "kind").items()}
     record |= {"probabilities": kind, **files}
-    jobs, read = _list_jobs(_Job(scan, out, prior, reading, record, overwrite), files)
-    if example is not None:
-        probabilities = read(network["example_probabilities"], like=None, crop=None)
+    jobs, read, probabilities = _list_jobs(_Job(scan, out, prior, reading, record, overwrite), files)
+    if probabilities is not None:
         mask = load(example, **{name: reading[name] for name in ("spacing", "unit", "label", "strict")})
         say_notes((*probabilities.notes, *mask.notes))
         with show_stages() as progress:
@@ -145,8 +144,9 @@ def _without(options: Mapping[str, Any], name: str) -> dict[str, Any]:
     return {key: value for key, value in options.items() if key != name}
 
 
-def _list_jobs(job: _Job, files: dict[str, str | None]) -> tuple[list[_Job], Callable[..., Volume]]:
-    """Return a job for each probability map, of which a folder of NPZ files has several, and a function to read one.
+def _list_jobs(job: _Job, files: dict[str, str | None]) -> tuple[list[_Job], Callable[..., Volume], Volume | None]:
+    """Return a job for each probability map, of which a folder of NPZ files has several, a function to read one, and
+    the example's map.
 
     Every map is read once here, so that a bad one is refused before the first job, which may take minutes.
     """
@@ -173,7 +173,7 @@ def _list_jobs(job: _Job, files: dict[str, str | None]) -> tuple[list[_Job], Cal
         probability_evidence(probabilities)  # raises an error where values are not probabilities
         if example is not None:
             check_spacing(example, probabilities, "the probabilities")
-    return jobs, read
+    return jobs, read, example
 
 
 @command(
