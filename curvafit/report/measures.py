@@ -85,12 +85,12 @@ def write_measures(
     titles = list(dict.fromkeys(title for row in columns for title in row))
     # A scan without compartments has itself as the only one.
     compartments = [list(scan.compartments.values()) or [scan] for scan in measures]
-    parts = [part for scan_parts in compartments for part in scan_parts]
-    names, rows = name_parts(parts), []
-    for scan_parts, row in zip(compartments, columns, strict=True):
-        for part in scan_parts:
-            cells = (part[symbol].format(unit)[:2] for symbol in symbols)
-            rows.append([names[len(rows)], *(row.get(title, "") for title in titles), *cells])
+    parts = [part for of_scan in compartments for part in of_scan]
+    names, own = name_parts(parts), [row for row, of_scan in zip(columns, compartments, strict=True) for _ in of_scan]
+    rows = [
+        [name, *(row.get(title, "") for title in titles), *(part[symbol].format(unit)[:2] for symbol in symbols)]
+        for name, row, part in zip(names, own, parts, strict=True)
+    ]
     scans = [{"scan": scan.source, "kind": scan.kind, "notes": scan.notes} for scan in measures]
     facts = {"scans": scans, "notes": list(count_notes(parts))}
     record = start_record(command, unit=unit, options=dict(options or {}), **facts)

@@ -376,12 +376,19 @@ def _compare_diagrams(
     blocks: np.ndarray | None,
 ) -> dict[str, Any]:  # fmt: skip
     """Test diagrams of subjects; return `statistic`, `p`, `diagrams`, `edges` and `differences` of a `Comparison`."""
-    is_number = np.issubdtype(labels.dtype, np.floating)
-    test = permutation.measure_dependence if is_number else permutation.measure_energy
+    by_number = np.issubdtype(labels.dtype, np.floating)
+    test = permutation.measure_dependence if by_number else permutation.measure_energy
     embeddings = np.stack([sliced_embedding(diagram) for diagram in diagrams])
     statistics = test(cdist(embeddings, embeddings), arrangements, blocks)
     of_side = ([d for d, own in zip(diagrams, sides, strict=True) if own == side] for side in np.unique(sides))
-    edges, differences = _compare_bins(diagrams, labels, blocks)
+    edges = np.linspace(*shared_limits(diagrams), BINS + 1)
+    shares = np.stack([bin_diagram(diagram, edges, SMOOTH) for diagram in diagrams])
+    if by_number:  # the change along a line fitted from the lowest label to the highest
+        x = permutation.center(labels, blocks)
+        differences = np.ptp(labels) * np.tensordot(x, shares, 1)[None] / (x @ x)
+    else:
+        means = np.stack([shares[labels == group].mean(0) for group in np.unique(labels)])
+        differences = means[1:] - means[:1] if len(means) == 2 else means - shares.mean(0)
     tested = {"statistic": float(statistics[0]), "p": float(permutation.share_beyond(statistics))}
     return tested | {"diagrams": tuple(map(_pool, of_side)), "edges": edges, "differences": differences}
 
@@ -403,19 +410,6 @@ def _note_unknown(
 def _pool(diagrams: Sequence[Diagram]) -> Diagram:
     """Return the mean of diagrams, each scaled to total area 1."""
     return join_diagrams([replace(diagram, weights=diagram.normalised.weights / len(diagrams)) for diagram in diagrams])
-
-
-def _compare_bins(
-    diagrams: Sequence[Diagram], labels: np.ndarray, blocks: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return `edges` and `differences` of a `Comparison`."""
-    edges = np.linspace(*shared_limits(diagrams), BINS + 1)
-    shares = np.stack([bin_diagram(diagram, edges, SMOOTH) for diagram in diagrams])
-    if np.issubdtype(labels.dtype, np.floating):  # the change along a line fitted from the lowest label to the highest
-        x = permutation.center(labels, blocks)
-        return edges, np.ptp(labels) * np.tensordot(x, shares, 1)[None] / (x @ x)
-    means = np.stack([shares[labels == group].mean(0) for group in np.unique(labels)])
-    return edges, means[1:] - means[:1] if len(means) == 2 else means - shares.mean(0)
 
 
 def _describe_bodies(bodies: Sequence[Measures]) -> tuple[list[Measures], list[str]]:
