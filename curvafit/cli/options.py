@@ -120,14 +120,6 @@ def parse_reading(
     strict: Annotated[bool, _read("--strict", help="Refuse a volume with missing chunks or slices.")] = False,
 ) -> dict[str, Any]:
     """Return the options as `curvafit.load` takes them; raise ValueError where one is malformed."""
-    if unit is not None:
-        from curvafit.core.units import parse_unit
-
-        parse_unit(unit)
-    if crop is not None:
-        from curvafit.volumes.volume import parse_box
-
-        parse_box(crop)
     edges = None if spacing is None else parse_triple(spacing, "--spacing")
     voxels = None if raw_shape is None else parse_whole_triple(raw_shape, "--raw-shape")
     reading = {"spacing": edges, "unit": unit, "channel": channel, "time": time, "label": label, "crop": crop}
@@ -165,17 +157,12 @@ Working = Annotated[dict[str, Any], Group(parse_working)]
 
 @dataclass(frozen=True)
 class Crew:
-    """The workers that the options ask for; ValueError where they contradict each other."""
+    """The workers that the options ask for."""
 
     workers: Annotated[int | None, typer.Option(help="Worker processes; by default one per core, 0 is this one.")] = (
         None
     )
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler, tcp://HOST:PORT.")] = None
-
-    def __post_init__(self) -> None:
-        from curvafit.core.workers import check_workers
-
-        check_workers(self.workers, self.scheduler)
 
     def check_memory(self, shape: Sequence[int]) -> None:
         """Raise ValueError where a shape does not fit into this machine's memory, if it is made here."""
