@@ -100,6 +100,22 @@ def resumable(kept: Path | None) -> Iterator[None]:
         raise typer.Exit(exit_code(signal)) from None
 
 
+@contextmanager
+def keep_parts(store: Path | None) -> Iterator[None]:
+    """Delete the folder of finished parts once the block succeeds; after a signal or an error it stays, to resume."""
+    from curvafit.core.files import is_empty, remove
+
+    with resumable(store):
+        try:
+            yield
+        except ValueError:  # raised before the first part: there is nothing to resume
+            if store is not None and is_empty(store):
+                remove(store)
+            raise
+    if store is not None:
+        remove(store)
+
+
 def _name_signal(signal: KeyboardInterrupt) -> str:
     return "terminated" if isinstance(signal, Terminated) else "interrupted"
 

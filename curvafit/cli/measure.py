@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import command_line, print_table, resumable, say, say_notes, show_stages
+from curvafit.cli.console import command_line, keep_parts, print_table, say, say_notes, show_stages
 from curvafit.cli.options import (
     FILES,
     Group,
@@ -122,7 +121,7 @@ def measure(
     store = None if out is None else out.with_name(f".{out.name}.curvafit-tiles")
     options = {} if labels else {"roi": roi, "tile": tile, "store": store, **structure}
     options |= {"labels": labels, "workers": workers}
-    with _keep_tiles(store):
+    with keep_parts(store):
         if folder is None:
             _write_table(scans, out, subjects, overwrite, options, reading)
         else:
@@ -208,22 +207,6 @@ def _choose_folder(out: Path | None, labels: bool, subjects: Path | None) -> Pat
     if not out.name:
         raise ValueError(f"give the name of a table or of a folder of its own with -o, got {out}")
     return out
-
-
-@contextmanager
-def _keep_tiles(store: Path | None) -> Iterator[None]:
-    """Delete the folder of finished tiles once the block succeeds; after a signal or an error it stays, to resume."""
-    from curvafit.core.files import is_empty, remove
-
-    with resumable(store):
-        try:
-            yield
-        except ValueError:  # raised before the first tile: there is nothing to resume
-            if store is not None and is_empty(store):
-                remove(store)
-            raise
-    if store is not None:
-        remove(store)
 
 
 def _print_results(results: Sequence[tuple[Measures, ...]], labels: bool) -> None:

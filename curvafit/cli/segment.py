@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from curvafit.cli.console import command_line, resumable, say, say_notes, show_stages
+from curvafit.cli.console import command_line, keep_parts, say, say_notes, show_stages
 from curvafit.cli.options import (
     Group,
     Input,
@@ -262,7 +262,6 @@ class _Job:
 
 def _run(job: _Job, compute: Callable[..., Segmentation], read: Callable[[], Volume], working: dict[str, Any]) -> None:
     """Compute a volume's mask and write it; finished tiles are kept until then."""
-    from curvafit.core.files import remove
     from curvafit.segmentation.flow import Working
     from curvafit.segmentation.result import hidden_store, write_mask
     from curvafit.volumes.write import check_labels, note_lost
@@ -278,8 +277,7 @@ def _run(job: _Job, compute: Callable[..., Segmentation], read: Callable[[], Vol
             check_labels(job.out, volume)
         lost = note_lost(job.out, volume)  # what the output's format does not hold
         say_notes(lost)
-        store = hidden_store(job.out)
-        with resumable(store):
+        with keep_parts(store := hidden_store(job.out)):
             result = compute(volume, progress=progress, working=Working(**working, store=store))
             progress("writing", 1.0)
             # The mask gets the source's header unless an option of reading makes that wrong for its voxels.
@@ -289,7 +287,6 @@ def _run(job: _Job, compute: Callable[..., Segmentation], read: Callable[[], Vol
             record |= {"not_held": lost} if lost else {}
             settings = {"like": like, "unit": reading["unit"], "overwrite": job.overwrite}
             paths = write_mask(result, volume, job.out, record=record, **settings)
-        remove(store)
     for note in result.notes:
         say(note)
     say(f"{result.status[0].upper()}{result.status[1:]}.", style="bold")

@@ -45,8 +45,6 @@ DRAW = Format("curvafit shape", title="a draw of a store")
 HEADER = "curvafit.json"
 #: What a process that was killed may leave.
 _TEMPORARY = re.compile(r"\.(\d+\.npz|curvafit\.json)\.[0-9a-f]{8}|\.[0-9a-f]{8}\.curvafit\.json")
-#: A number that may be NaN.
-Unknown = Annotated[float, Rule(unknown=True)]
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ class Record:
     seed: Annotated[int, Rule(least=0)]
     steps: Annotated[int, Rule(least=0)]
     viability: Viability
-    energy: Unknown
+    energy: Annotated[float, Rule(unknown=True)]
     status: str
     versions: dict[str, str]
     seconds: float
